@@ -39,14 +39,20 @@ def test_opens_by_name(board: Board) -> None:
         assert (ring.header.device, ring.header.pid, ring.header.slot_count) == (DEVICE, os.getpid(), SLOTS)
 
 
-def test_no_such_ring(board: Board) -> None:
+def test_no_such_ring(board: Board, tmp_path: Path) -> None:
     with pytest.raises(ServerError, match=r"imud.imu9: no such ring; there are rings for: imu0"):
-        Ring("imu9", directory=str(board.path.parent))
-
-
-def test_no_rings_at_all(tmp_path: Path) -> None:
-    with pytest.raises(ServerError, match="is imud running"):
         Ring("imu9", directory=str(tmp_path))
+    (tmp_path / "none").mkdir()
+    with pytest.raises(ServerError, match="is imud running"):
+        Ring("imu9", directory=str(tmp_path / "none"))
+    (tmp_path / "imud.x").write_bytes(b"hello")
+    with pytest.raises(ServerError, match="is no ring of imud"):
+        Ring("x", directory=str(tmp_path))
+    with pytest.raises(ServerError, match=r"no ring of imud: expected a regular file \(-\), found another kind \(d\)"):
+        Ring(tmp_path)
+    os.truncate(board.path, HEADER_BYTES + SLOTS * SLOT_BYTES - 1)
+    with pytest.raises(ServerError, match="expected 20480 bytes, found 20479"):
+        Ring(board.path)
 
 
 def test_directory_of_the_environment(board: Board, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,25 +61,10 @@ def test_directory_of_the_environment(board: Board, tmp_path: Path, monkeypatch:
         assert ring.path == board.path
     with pytest.raises(ServerError, match=r"/nowhere/imud\.imu0: no such ring"):
         Ring(DEVICE, directory="/nowhere")  # an argument counts more
-
-
-@pytest.mark.parametrize("value", [None, ""])
-def test_directory_without_the_environment(monkeypatch: pytest.MonkeyPatch, value: str | None) -> None:
-    monkeypatch.delenv("IMUD_SHM", raising=False)
-    if value is not None:
-        monkeypatch.setenv("IMUD_SHM", value)
+    monkeypatch.setenv("IMUD_SHM", "")
     assert default_directory() == "/run/imud/shm"
-
-
-def test_no_ring_but_a_file(tmp_path: Path) -> None:
-    (tmp_path / "imud.x").write_bytes(b"hello")
-    with pytest.raises(ServerError, match="is no ring of imud"):
-        Ring("x", directory=str(tmp_path))
-
-
-def test_directory_instead_of_a_ring(tmp_path: Path) -> None:
-    with pytest.raises(ServerError, match=r"no ring of imud: expected a regular file \(-\), found another kind \(d\)"):
-        Ring(tmp_path)
+    monkeypatch.delenv("IMUD_SHM")
+    assert default_directory() == "/run/imud/shm"
 
 
 def test_permission(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,12 +73,6 @@ def test_permission(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(os, "open", refuse)
     with pytest.raises(ServerError, match="is this user in the group"):
-        Ring(board.path)
-
-
-def test_cut_file_is_refused(board: Board) -> None:
-    os.truncate(board.path, HEADER_BYTES + SLOTS * SLOT_BYTES - 1)
-    with pytest.raises(ServerError, match="expected 20480 bytes, found 20479"):
         Ring(board.path)
 
 
@@ -132,21 +117,17 @@ def test_reader_cannot_write(board: Board) -> None:
     assert sorted(line.split()[1] for line in maps if line.endswith(str(board.path))) == ["r--s", "rw-s"]
 
 
-def test_latest(board: Board, ring: Ring) -> None:
+def test_read_gives_what_comes_after_opening(board: Board, ring: Ring) -> None:
     assert ring.latest() is None
-    board.publish([1, 2])
-    assert ring.latest() == make_sample(2)
-    assert numbers(ring) == ([1, 2], 0)
-    assert ring.latest() == make_sample(2)
-
-
-def test_read_gives_what_comes_after_opening(board: Board) -> None:
     board.publish(range(1, 6))
-    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
-        assert numbers(ring) == ([], 0)
+    assert ring.latest() == make_sample(5)
+    assert numbers(ring) == ([*range(1, 6)], 0)
+    assert ring.latest() == make_sample(5)
+    with Ring(board.path, now_ns=lambda: board.now_ns) as later:
+        assert numbers(later) == ([], 0)
         board.publish([6])
-        assert numbers(ring) == ([6], 0)
-        assert numbers(ring) == ([], 0)
+        assert numbers(later) == ([6], 0)
+        assert numbers(later) == ([], 0)
 
 
 @pytest.mark.parametrize(("count", "expected"), [(0, []), (3, [1, 2, 3]), (SLOTS + 2, [*range(3, SLOTS + 3)])])
@@ -166,7 +147,7 @@ def test_slow_reader_learns_exactly_what_it_missed(board: Board, ring: Ring, cou
     assert ring.missed == first - 1
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(3))
 def test_every_sample_is_read_or_missed(board: Board, ring: Ring, seed: int) -> None:
     random, last, seen, missed = Random(seed), 0, 0, 0
     for _ in range(30):
@@ -182,7 +163,7 @@ def test_every_sample_is_read_or_missed(board: Board, ring: Ring, seed: int) -> 
 
 
 @pytest.mark.parametrize("name", TORN)
-def test_torn_slot_is_refused_until_it_is_whole(board: Board, ring: Ring, name: str) -> None:
+def test_torn_slot_is_refused_until_it_is_whole_or_lost(board: Board, ring: Ring, name: str) -> None:
     board.publish([1, 2])
     board.poke(slot_at(2), TORN[name])
     assert ring.latest() is None
@@ -190,15 +171,11 @@ def test_torn_slot_is_refused_until_it_is_whole(board: Board, ring: Ring, name: 
     assert numbers(ring) == ([], 0)  # it may still come: a store that another core sees late
     board.poke(slot_at(2), WHOLE)
     assert numbers(ring) == ([2], 0)
-
-
-@pytest.mark.parametrize("name", TORN)
-def test_slot_that_never_becomes_whole_is_missed(board: Board, ring: Ring, name: str) -> None:
-    board.publish([1, 2])
-    board.poke(slot_at(2), TORN[name])
-    assert numbers(ring) == ([1], 0)
     board.publish([3])
-    assert numbers(ring) == ([3], 1)
+    board.poke(slot_at(3), TORN[name])
+    assert numbers(ring) == ([], 0)
+    board.publish([4])
+    assert numbers(ring) == ([4], 1)
     assert numbers(ring) == ([], 0)
 
 
@@ -259,25 +236,18 @@ def test_latest_overtaken_while_copying(board: Board) -> None:
         assert ring.latest() == make_sample(SLOTS + 1)
 
 
-def test_gap_in_the_numbers_is_missed(board: Board, ring: Ring) -> None:
+def test_numbers_with_a_gap_and_numbers_that_begin_anew(board: Board, ring: Ring) -> None:
     board.publish([1, 2, 3])
     board.publish([5000, 5001])
     assert numbers(ring) == ([5000, 5001], 4999)
-
-
-def test_first_number_seen_before_the_newest_it_belongs_to(board: Board, ring: Ring) -> None:
     board.publish([1, 2])
+    assert numbers(ring) == ([1, 2], 0)
+    # the first number is seen before the newest one that it belongs to
     board.poke(OFFSETS["first_seq"], struct.pack("<Q", 5000))
-    assert numbers(ring) == ([1, 2], 0)
+    board.publish([3])
+    assert numbers(ring) == ([3], 0)
     board.publish([5000])
-    assert numbers(ring) == ([5000], 4997)
-
-
-def test_numbers_begin_anew(board: Board, ring: Ring) -> None:
-    board.publish(range(1, 10))
-    assert numbers(ring) == (list(range(1, 10)), 0)
-    board.publish([1, 2])
-    assert numbers(ring) == ([1, 2], 0)
+    assert numbers(ring) == ([5000], 4996)
 
 
 def test_restart_after_a_clean_end(board: Board, ring: Ring, tmp_path: Path) -> None:
@@ -328,26 +298,19 @@ def test_successor_of_another_layout(board: Board, ring: Ring) -> None:
         ring.read()
 
 
-def test_reopen_while_nothing_changed(board: Board, ring: Ring) -> None:
-    assert not ring.reopen()
-    board.publisher.close()
-    assert not ring.reopen()
-
-
-def test_heartbeat(board: Board, ring: Ring) -> None:
+def test_heartbeat_ledger_and_reopen(board: Board, ring: Ring) -> None:
+    assert not ring.reopen()  # nothing changed
     assert ring.alive(START_NS + 999_999_999)
     assert not ring.alive(START_NS + 1_000_000_000)
-    board.tick(900_000_000)
-    assert ring.alive(START_NS + 1_800_000_000)
-
-
-def test_ledger(board: Board, ring: Ring) -> None:
     assert ring.ledger() is None
     board.ledger.bytes_in = board.ledger.bytes_skipped = 12345678901
-    board.tick()
+    board.tick(900_000_000)
+    assert ring.alive(START_NS + 1_800_000_000)
     block = ring.ledger()
     assert block is not None
     assert (block.update, block.driver, block.ledger) == (1, "hipnuc-uart", board.ledger.snapshot())
+    board.publisher.close()
+    assert not ring.reopen()
 
 
 @pytest.mark.parametrize(

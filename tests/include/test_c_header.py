@@ -5,6 +5,7 @@ import struct
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Final, Self
@@ -137,15 +138,6 @@ def layout_program() -> tuple[str, list[str]]:
     return '#include "imud.h"\nint main(void)\n{\n' + "\n".join(lines) + "\n    return 0;\n}\n", expected
 
 
-@pytest.mark.parametrize("language", LANGUAGES)
-def test_layout_is_that_of_the_tables(build: Build, tmp_path: Path, language: str) -> None:
-    source = tmp_path / "layout.c"
-    text, expected = layout_program()
-    source.write_text(text)
-    done = subprocess.run([build(source, language)], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines() == expected
-
-
 def numbers_of(s: Sample) -> list[float]:
     """What the reader prints of a sample."""
     assert s.accel_m_s2 is not None
@@ -157,7 +149,14 @@ def numbers_of(s: Sample) -> list[float]:
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
-def test_reads_what_the_publisher_wrote(build: Build, board: Board, language: str) -> None:
+def test_layout_is_that_of_the_tables_and_samples_are_read(
+    build: Build, board: Board, tmp_path: Path, language: str
+) -> None:
+    source = tmp_path / "layout.c"
+    text, expected = layout_program()
+    source.write_text(text)
+    done = subprocess.run([build(source, language)], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == expected
     with Reader(build(READER, language), board.path) as reader:
         assert reader.ask("latest") == ["latest", "0", "0"]
         board.publish([1, 2])
@@ -192,28 +191,21 @@ def test_torn_slot_is_refused(board: Board, reader: Reader, name: str) -> None:
     assert [reader.next(), reader.next(), reader.next()] == [(4, 1), (5, 0), (0, 0)]
 
 
-def test_number_that_changes_during_the_copy(board: Board, reader: Reader) -> None:
+def test_number_that_changes_during_the_copy_and_gaps(board: Board, reader: Reader) -> None:
     board.publish([1])
     reader.ask(f"poke {board.path} {slot_at(1) + 7} 255 1")  # high byte of the number
     assert reader.next() == (0, 0)
     board.poke(slot_at(1) + 7, b"\0")
     assert reader.next() == (1, 0)
-
-
-def test_gap_in_the_numbers_is_missed(board: Board, reader: Reader) -> None:
-    board.publish([1])
     board.publish([5000])
-    assert reader.next() == (5000, 4999)
+    assert reader.next() == (5000, 4999 - 1)
     board.publish([1])
     assert reader.next() == (1, 0)  # numbers that begin anew
-
-
-def test_health(board: Board, reader: Reader) -> None:
-    assert reader.ask(f"health {START_NS + 999_999_999}") == ["health", "0"]
-    assert reader.ask(f"health {START_NS + 1_000_000_000}") == ["health", "2"]
-    assert reader.ask(f"health {START_NS - 999_999_999}") == ["health", "0"]
-    assert reader.ask(f"health {START_NS - 1_000_000_000}") == ["health", "2"]  # a heartbeat from the future
-    assert reader.ask(f"health {-(1 << 63)}") == ["health", "2"]
+    for now_ns, health in (
+        (START_NS + 999_999_999, "0"), (START_NS + 1_000_000_000, "2"), (START_NS - 999_999_999, "0"),
+        (START_NS - 1_000_000_000, "2"), (-(1 << 63), "2"),
+    ):  # fmt: skip
+        assert reader.ask(f"health {now_ns}") == ["health", health]
     board.publisher.close()
     assert reader.ask(f"health {START_NS}") == ["health", "1"]
 
@@ -266,7 +258,11 @@ def test_cut_ring(board: Board, reader: Reader, size_bytes: int) -> None:
     assert [reader.next(), reader.next()] == [(3, 2), (0, 0)]
 
 
-def test_new_ring_before_its_first_sample(board: Board, reader: Reader) -> None:
+def test_new_ring_before_its_first_sample_and_descriptors_of_reopened_rings(board: Board, reader: Reader) -> None:
+    def count() -> int:
+        return len(os.listdir(f"/proc/{reader.pid}/fd"))
+
+    before = count()
     board.publish([1, 2])
     os.truncate(board.path, 0)
     board.tick()
@@ -274,13 +270,6 @@ def test_new_ring_before_its_first_sample(board: Board, reader: Reader) -> None:
     assert [reader.next(), reader.next()] == [(0, 2), (0, 0)]
     board.publish([3])
     assert reader.next() == (3, 0)
-
-
-def test_descriptors_of_reopened_rings(board: Board, reader: Reader) -> None:
-    def count() -> int:
-        return len(os.listdir(f"/proc/{reader.pid}/fd"))
-
-    before = count()
     for _ in range(10):
         board.path.unlink()
         board.tick()
@@ -288,19 +277,22 @@ def test_descriptors_of_reopened_rings(board: Board, reader: Reader) -> None:
     assert count() == before
 
 
+def run_reader(build: Build, *arguments: str, language: str = "c99", **environment: str) -> str:
+    """Return the code of the error that opening a ring gives, or "open"."""
+    done = subprocess.run(
+        [build(READER, language), "commands", *arguments], stdin=subprocess.DEVNULL, capture_output=True, text=True,
+        check=False, env=environment or None, timeout=60,
+    )  # fmt: skip
+    assert done.returncode in (0, 1)
+    return done.stdout.split(" ", 2)[1] if done.returncode else "open"
+
+
 def test_directories_of_names(build: Build, tmp_path: Path) -> None:
     """IMUD_SHM alone where it is set, else the user's own directory where the system's has no such ring."""
     own = tmp_path / "imud" / "shm"
     own.mkdir(parents=True)
     device = "no-such-device-of-the-tests"
-    program = str(build(READER, "c99"))
-
-    def opened(**environment: str) -> str:
-        done = subprocess.run(
-            [program, "commands", device], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
-            env=environment, timeout=10,
-        )  # fmt: skip
-        return done.stdout.split(" ", 2)[1] if done.returncode else "open"
+    opened = partial(run_reader, build, device)
 
     assert opened(XDG_RUNTIME_DIR=str(tmp_path)) == "-1"
     header = encode_header(RingHeader(1, 2, 1, device, 0, SLOTS))
@@ -319,11 +311,7 @@ def test_no_wait_for_a_fifo(build: Build, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to("fifo")
     (tmp_path / "directory").mkdir()
     for name in ("fifo", "link", "directory"):
-        command = [str(build(READER, "c99")), "commands", str(tmp_path / name)]
-        done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=10
-        )
-        assert done.stdout.startswith("error -3 "), name
+        assert run_reader(build, str(tmp_path / name)) == "-3", name
 
 
 @needs_root
@@ -334,11 +322,7 @@ def test_owner(build: Build, board: Board, language: str) -> None:
     def opened(directory_uid: int, file_uid: int, *named_uid: int) -> str:
         os.chown(board.path.parent, directory_uid, -1)
         os.chown(board.path, file_uid, -1)
-        command = [str(build(READER, language)), "commands", str(board.path), *map(str, named_uid)]
-        done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=10
-        )
-        return done.stdout.split(" ", 2)[1] if done.returncode else "open"
+        return run_reader(build, str(board.path), *map(str, named_uid), language=language)
 
     assert opened(0, HOSTILE_UID) == "-8"
     assert opened(0, HOSTILE_UID, DAEMON_UID) == "-8"
@@ -416,19 +400,15 @@ def test_what_cannot_be_opened(build: Build, tmp_path: Path, content: bytes | No
     path = tmp_path / "imud.x"
     if content is not None:
         path.write_bytes(content)
-    command = [str(build(READER, "c99")), "commands", str(path)]
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
-    assert done.stdout.startswith(f"error {code} ")
-    assert done.returncode == 1
+    assert run_reader(build, str(path)) == str(code)
 
 
 @pytest.mark.parametrize(("name", "code"), [("", -6), ("x" * 250, -6), ("no-such-device-of-the-tests", -1)])
 def test_names_that_cannot_be_opened(build: Build, name: str, code: int) -> None:
-    command = [str(build(READER, "c99")), "commands", name]
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
-    assert done.stdout.startswith(f"error {code} ")
+    assert run_reader(build, name) == str(code)
 
 
+@pytest.mark.live
 @pytest.mark.parametrize("slots_in_ring", [1, SLOTS])
 def test_no_torn_sample_and_none_unaccounted_under_stress(build: Build, tmp_path: Path, slots_in_ring: int) -> None:
     """In a ring of one slot, reader and writer meet all the time."""
