@@ -15,15 +15,6 @@ import pytest
 from imud.contracts.publisher import Batch
 from imud.formats import ring as shm_layout
 from imud.formats import slot
-from imud.formats.ring import (
-    HEADER_BYTES,
-    HEADER_FIELDS,
-    LEDGER_BLOCK_OFFSET,
-    OFFSETS,
-    RingHeader,
-    encode_header,
-    encode_ledger_block,
-)
 from imud.formats.slot import PRESENT_BITS, SEQ_INVALID, SLOT_BYTES, SLOT_FIELDS, SYNC_CODES
 from imud.ledger import LEDGER_FIELDS
 from imud.publishers.socket.waker import Waker
@@ -112,7 +103,7 @@ def layout_program() -> tuple[str, list[str]]:
         lines.append(f'    printf("{name} %llu\\n", (unsigned long long)({expression}));')
         expected.append(f"{name} {value}")
 
-    for record, fields in (("slot", SLOT_FIELDS), ("header", HEADER_FIELDS)):
+    for record, fields in (("slot", SLOT_FIELDS), ("header", shm_layout.HEADER_FIELDS)):
         for field in fields:
             size = struct.calcsize(f"<{field.count}{field.code}")
             add(f"{record}.{field.name}", f"offsetof(imud_{record}, {field.name})", field.offset)
@@ -128,7 +119,7 @@ def layout_program() -> tuple[str, list[str]]:
     for name in ("HEADER_BYTES", "LEDGER_ROOM", "HEARTBEAT_LIMIT_NS", "STATE_LIVE", "STATE_CLOSED"):
         add(name, f"IMUD_{name}", getattr(shm_layout, name))
     add("slot bytes", "sizeof(imud_slot)", SLOT_BYTES)
-    add("header bytes", "sizeof(imud_header)", HEADER_BYTES)
+    add("header bytes", "sizeof(imud_header)", shm_layout.HEADER_BYTES)
     add("layout", "IMUD_LAYOUT_VERSION", shm_layout.RING_LAYOUT_VERSION)
     add("slot layout", "IMUD_SLOT_LAYOUT_VERSION", slot.SLOT_LAYOUT_VERSION)
     add("invalid", "IMUD_SEQ_INVALID", SEQ_INVALID)
@@ -242,7 +233,7 @@ def test_removed_ring(board: Board, reader: Reader) -> None:
     assert reader.next() == (6, 1)
 
 
-@pytest.mark.parametrize("size_bytes", [0, 1, HEADER_BYTES, HEADER_BYTES + SLOT_BYTES])
+@pytest.mark.parametrize("size_bytes", [0, 1, shm_layout.HEADER_BYTES, shm_layout.HEADER_BYTES + SLOT_BYTES])
 def test_cut_ring(board: Board, reader: Reader, size_bytes: int) -> None:
     """`health` says so before a page is touched that is not there."""
     board.publish([1])
@@ -295,7 +286,7 @@ def test_directories_of_names(build: Build, tmp_path: Path) -> None:
     opened = partial(run_reader, build, device)
 
     assert opened(XDG_RUNTIME_DIR=str(tmp_path)) == "-1"
-    header = encode_header(RingHeader(1, 2, 1, device, 0, SLOTS))
+    header = shm_layout.encode_header(shm_layout.RingHeader(1, 2, 1, device, 0, SLOTS))
     (own / f"imud.{device}").write_bytes(header + bytes(SLOTS * SLOT_BYTES))
     assert opened(XDG_RUNTIME_DIR=str(tmp_path)) == "open"
     assert opened(XDG_RUNTIME_DIR=str(tmp_path), IMUD_SHM="") == "open"
@@ -348,13 +339,13 @@ def test_ledger(board: Board, reader: Reader) -> None:
     board.tick()
     expected = ["ledger", "1", *(str((1 << 40) + i) for i in range(len(LEDGER_FIELDS))), "hipnuc-uart"]
     assert reader.ask("ledger") == expected
-    reader.ask(f"poke {board.path} {LEDGER_BLOCK_OFFSET + 7} 255 1")
+    reader.ask(f"poke {board.path} {shm_layout.LEDGER_BLOCK_OFFSET + 7} 255 1")
     assert reader.ask("ledger") == ["ledger", "0"]  # its number changed during the copy
-    board.poke(LEDGER_BLOCK_OFFSET + 7, b"\0")
+    board.poke(shm_layout.LEDGER_BLOCK_OFFSET + 7, b"\0")
     assert reader.ask("ledger") == expected
-    board.poke(LEDGER_BLOCK_OFFSET + 100, b"\1")
+    board.poke(shm_layout.LEDGER_BLOCK_OFFSET + 100, b"\1")
     assert reader.ask("ledger") == ["ledger", "0"]
-    board.poke(LEDGER_BLOCK_OFFSET, encode_ledger_block(SEQ_INVALID, "", {}))
+    board.poke(shm_layout.LEDGER_BLOCK_OFFSET, shm_layout.encode_ledger_block(SEQ_INVALID, "", {}))
     assert reader.ask("ledger") == ["ledger", "0"]
 
 
@@ -376,8 +367,8 @@ def test_wait(build: Build, board: Board) -> None:
 
 
 def header_with(name: str, value: int) -> bytes:
-    raw = bytearray(encode_header(RingHeader(1, 2, 1, DEVICE, 0, SLOTS)))
-    struct.pack_into("<I", raw, OFFSETS[name], value)
+    raw = bytearray(shm_layout.encode_header(shm_layout.RingHeader(1, 2, 1, DEVICE, 0, SLOTS)))
+    struct.pack_into("<I", raw, shm_layout.OFFSETS[name], value)
     return bytes(raw) + bytes(SLOTS * SLOT_BYTES)
 
 
@@ -386,7 +377,7 @@ def header_with(name: str, value: int) -> bytes:
     [
         (None, -1),
         (b"", -3),
-        (bytes(HEADER_BYTES), -3),
+        (bytes(shm_layout.HEADER_BYTES), -3),
         (header_with("layout_version", 2), -4),
         (header_with("slot_layout_version", 2), -4),
         (header_with("slot_bytes", 512), -4),

@@ -10,16 +10,7 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families 
 from prometheus_client.parser import text_string_to_metric_families as parse_text
 
 import imud
-from imud.contracts.status import (
-    LATENCY_BOUNDS_NS,
-    ClientStatus,
-    ClockStatus,
-    DeviceState,
-    FlightStatus,
-    MqttStatus,
-    OutputStatus,
-    RecorderStatus,
-)
+from imud.contracts import status as states
 from imud.event import EventKind
 from imud.ledger import LEDGER_FIELDS
 from imud.publishers.metrics.families import FAMILIES, LINE_FAMILIES, POLLING_FAMILIES, TIME_FAMILIES
@@ -72,7 +63,7 @@ def key(name: str, **labels: str) -> Key:
 DEVICES = (
     device("front", 0),
     device(
-        "rear", 1, state=DeviceState.MISSING, clock=ClockStatus(), temperature_c=None, status_bits=None,
+        "rear", 1, state=states.DeviceState.MISSING, clock=states.ClockStatus(), temperature_c=None, status_bits=None,
         expected_rate_hz=0.0, identity={},
     ),
 )  # fmt: skip
@@ -304,7 +295,7 @@ def test_state_and_sync_are_one_hot() -> None:
     shown = rendered(Snapshot(DEVICES))
     for name, state, up in (("front", "running", 1), ("rear", "missing", 0)):
         assert shown[key("imud_device_up", device=name)] == up
-        for other in DeviceState:
+        for other in states.DeviceState:
             assert shown[key("imud_device_state", device=name, state=other.value)] == (other.value == state)
     for sync in Sync:
         assert shown[key("imud_clock_sync", device="front", sync=sync.value)] == (sync is Sync.REGRESSION)
@@ -312,7 +303,7 @@ def test_state_and_sync_are_one_hot() -> None:
 
 def test_latency_histogram_is_cumulative() -> None:
     shown = rendered(Snapshot(DEVICES))
-    bounds = [f"{bound / 1e9:.6g}" for bound in LATENCY_BOUNDS_NS]
+    bounds = [f"{bound / 1e9:.6g}" for bound in states.LATENCY_BOUNDS_NS]
     counts = {
         float(dict(labels)["le"]): value
         for (name, labels), value in shown.items()
@@ -348,7 +339,12 @@ def test_clients_are_summed_and_totals_never_fall() -> None:
     totals.update([client(2, sent=6, dropped=1), client(3, sent=4)])  # 1 left
     totals.update([])
     assert (totals.sent, totals.dropped) == (10 + 6 + 4, 2 + 1)
-    clients: Sequence[ClientStatus] = [client(1, queue=7), client(2, "binary", queue=2), client(3, ""), client(4)]
+    clients: Sequence[states.ClientStatus] = [
+        client(1, queue=7),
+        client(2, "binary", queue=2),
+        client(3, ""),
+        client(4),
+    ]
     shown = rendered(Snapshot(clients=clients))
     assert {e: shown[key("imud_clients", encoding=e)] for e in ("json", "binary", "none")} == {
         "json": 2, "binary": 1, "none": 1,
@@ -395,10 +391,10 @@ def test_rendering_pauses_often() -> None:
 
 def shown_names() -> set[str]:
     """Names of all families as they stand after `# HELP`."""
-    recorder = RecorderStatus("a", "", 1, 2, 3, 4, 5, 6)
-    flight = FlightStatus("", 1, 2, 3, 4, 5, 6, 7, 8)
-    output = OutputStatus("tcp 127.0.0.1:10110", 1, 2, 3, "")
-    mqtt = MqttStatus("mqtt://127.0.0.1:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8}, 9)
+    recorder = states.RecorderStatus("a", "", 1, 2, 3, 4, 5, 6)
+    flight = states.FlightStatus("", 1, 2, 3, 4, 5, 6, 7, 8)
+    output = states.OutputStatus("tcp 127.0.0.1:10110", 1, 2, 3, "")
+    mqtt = states.MqttStatus("mqtt://127.0.0.1:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8}, 9)
     snapshot = Snapshot(
         DEVICES,
         (client(1),),
@@ -421,7 +417,7 @@ def test_every_metric_is_documented_and_nothing_else() -> None:
 def test_label_values_are_documented() -> None:
     """Those of labels whose values are known ahead."""
     text = (ROOT / "docs/metrics.md").read_text()
-    for values_of, kind in ((DeviceState, "state"), (Sync, "sync"), (EventKind, "kind"), (Refusal, "cause")):
+    for values_of, kind in ((states.DeviceState, "state"), (Sync, "sync"), (EventKind, "kind"), (Refusal, "cause")):
         rows = re.findall(rf"`{kind}`: ([a-z_, -]+)", text)
         assert {value.value for value in values_of} in [set(row.strip().split(", ")) for row in rows], kind
 

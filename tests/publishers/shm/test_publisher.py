@@ -22,19 +22,7 @@ from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import DeviceStatus
 from imud.errors import ServerError
 from imud.event import Event, EventKind
-from imud.formats.ring import (
-    HEADER_BYTES,
-    LEDGER_BLOCK_BYTES,
-    LEDGER_BLOCK_OFFSET,
-    OFFSETS,
-    STATE_CLOSED,
-    STATE_LIVE,
-    LedgerBlock,
-    RingHeader,
-    decode_header,
-    decode_ledger_block,
-    encode_header,
-)
+from imud.formats import ring as layout
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, encode_slot
 from imud.ledger import LEDGER_FIELDS
 from imud.publishers import PUBLISHERS
@@ -76,28 +64,30 @@ def test_settings_that_cannot_be(values: dict[str, object], message: str) -> Non
 
 
 def test_file_of_a_new_ring(board: Board) -> None:
-    header = decode_header(board.path.read_bytes()[:HEADER_BYTES], "x")
-    assert header == RingHeader(77, os.getpid(), STATE_LIVE, DEVICE, 3, SLOTS, 0, 1, START_NS)
+    header = layout.decode_header(board.path.read_bytes()[: layout.HEADER_BYTES], "x")
+    assert header == layout.RingHeader(77, os.getpid(), layout.STATE_LIVE, DEVICE, 3, SLOTS, 0, 1, START_NS)
     status = board.path.stat()
-    assert status.st_size == HEADER_BYTES + SLOTS * SLOT_BYTES
+    assert status.st_size == layout.HEADER_BYTES + SLOTS * SLOT_BYTES
     assert status.st_blocks * 512 >= status.st_size  # st_blocks counts 512-byte units; every block is there
 
 
 def test_ring_is_whole_before_it_appears(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[tuple[bool, RingHeader, int]] = []
+    seen: list[tuple[bool, layout.RingHeader, int]] = []
     rename = os.rename
 
     def spy(source: str, target: str, **directories: int) -> None:
         file = tmp_path / source
         mode = stat.S_IMODE(file.stat().st_mode)
-        seen.append(((tmp_path / target).exists(), decode_header(file.read_bytes()[:HEADER_BYTES], "x"), mode))
+        seen.append(
+            ((tmp_path / target).exists(), layout.decode_header(file.read_bytes()[: layout.HEADER_BYTES], "x"), mode)
+        )
         rename(source, target, **directories)
 
     monkeypatch.setattr(os, "rename", spy)
     board = Board(tmp_path)
     board.publisher.close()
     [(existed, header, mode)] = seen
-    assert (existed, header.device, header.state, mode) == (False, DEVICE, STATE_LIVE, 0o640)
+    assert (existed, header.device, header.state, mode) == (False, DEVICE, layout.STATE_LIVE, 0o640)
 
 
 def test_slots_lie_where_their_number_says_and_the_ring_wraps(board: Board) -> None:
@@ -108,7 +98,7 @@ def test_slots_lie_where_their_number_says_and_the_ring_wraps(board: Board) -> N
     raw = board.path.read_bytes()
     for seq in range(3, SLOTS + 3):
         assert raw[slot_at(seq) :][:SLOT_BYTES] == encode_slot(make_sample(seq), 3)
-    assert len(raw) == HEADER_BYTES + SLOTS * SLOT_BYTES
+    assert len(raw) == layout.HEADER_BYTES + SLOTS * SLOT_BYTES
     board.publish([507, 508])  # a gap in the numbers moves the first one
     assert (board.word("first_seq"), board.word("newest_seq")) == (507, 508)
 
@@ -129,7 +119,7 @@ def test_batches_leave_the_same_bytes_as_their_samples_one_by_one(tmp_path: Path
         for number in numbers:
             one.publish([number])
         written = [board.path.read_bytes() for board in (one, many)]
-        assert written[0][OFFSETS["newest_seq"] :] == written[1][OFFSETS["newest_seq"] :]
+        assert written[0][layout.OFFSETS["newest_seq"] :] == written[1][layout.OFFSETS["newest_seq"] :]
 
 
 Notes = list[tuple[int, int, object]]
@@ -184,7 +174,7 @@ def test_order_of_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         (slot_at(1), 8, SEQ_INVALID),
         (slot_at(1) + 8, SLOT_BYTES - 8, slot[8:]),
         (slot_at(1), 8, 1),
-        (OFFSETS["newest_seq"], 8, 1),
+        (layout.OFFSETS["newest_seq"], 8, 1),
     ]
     notes.clear()
     board.publish([2, 3])
@@ -195,20 +185,22 @@ def test_order_of_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         (slot_at(2) + 8, 2 * SLOT_BYTES - 8, SEQ_INVALID.to_bytes(8, "little").join(slots)),
         (slot_at(2), 8, 2),
         (slot_at(3), 8, 3),
-        (OFFSETS["newest_seq"], 8, 3),
+        (layout.OFFSETS["newest_seq"], 8, 3),
     ]
     notes.clear()
     board.tick()
-    update = OFFSETS["ledger_update"]
-    assert [note[:2] for note in notes[:3]] == [(update, 8), (update + 8, LEDGER_BLOCK_BYTES - 8), (update, 8)]
+    update = layout.OFFSETS["ledger_update"]
+    assert [note[:2] for note in notes[:3]] == [(update, 8), (update + 8, layout.LEDGER_BLOCK_BYTES - 8), (update, 8)]
     assert [notes[0][2], notes[2][2]] == [SEQ_INVALID, 1]
-    assert notes[3:] == [(OFFSETS["heartbeat_ns"], 8, board.now_ns)]
+    assert notes[3:] == [(layout.OFFSETS["heartbeat_ns"], 8, board.now_ns)]
     board.publisher.close()
 
 
-def ledger_in(path: Path, count: int = len(LEDGER_FIELDS)) -> LedgerBlock:
+def ledger_in(path: Path, count: int = len(LEDGER_FIELDS)) -> layout.LedgerBlock:
     """The ledger block of a file."""
-    block = decode_ledger_block(path.read_bytes()[LEDGER_BLOCK_OFFSET:][:LEDGER_BLOCK_BYTES], count)
+    block = layout.decode_ledger_block(
+        path.read_bytes()[layout.LEDGER_BLOCK_OFFSET :][: layout.LEDGER_BLOCK_BYTES], count
+    )
     assert block is not None
     return block
 
@@ -249,9 +241,9 @@ def test_close_tells_readers_and_removes_the_file(board: Board) -> None:
         board.ledger.bytes_in, board.now_ns = 9, START_NS + 7
         board.publisher.close()
         raw = file.read()
-    header = decode_header(raw[:HEADER_BYTES], "x")
-    block = decode_ledger_block(raw[LEDGER_BLOCK_OFFSET:][:LEDGER_BLOCK_BYTES], 1)
-    assert (header.state, header.heartbeat_ns) == (STATE_CLOSED, START_NS + 7)
+    header = layout.decode_header(raw[: layout.HEADER_BYTES], "x")
+    block = layout.decode_ledger_block(raw[layout.LEDGER_BLOCK_OFFSET :][: layout.LEDGER_BLOCK_BYTES], 1)
+    assert (header.state, header.heartbeat_ns) == (layout.STATE_CLOSED, START_NS + 7)
     assert block is not None
     assert block.ledger == {"bytes_in": 9}
     assert not list(board.path.parent.iterdir())
@@ -287,9 +279,9 @@ def test_leftovers_of_a_daemon_that_died_while_starting(tmp_path: Path) -> None:
     board.publisher.close()
 
 
-def other_writer(path: Path, pid: int, *, heartbeat_ns: int = START_NS - 1, state: int = STATE_LIVE) -> None:
-    header = RingHeader(5, pid, state, DEVICE, 0, SLOTS, heartbeat_ns=heartbeat_ns)
-    path.write_bytes(encode_header(header))
+def other_writer(path: Path, pid: int, *, heartbeat_ns: int = START_NS - 1, state: int = layout.STATE_LIVE) -> None:
+    header = layout.RingHeader(5, pid, state, DEVICE, 0, SLOTS, heartbeat_ns=heartbeat_ns)
+    path.write_bytes(layout.encode_header(header))
 
 
 OTHER_DAEMON = """
@@ -369,7 +361,7 @@ def dead_pid() -> int:
         lambda path: other_writer(path, dead_pid()),  # killed and restarted at once
         lambda path: other_writer(path, os.getppid()),  # number in use again: no proof
         lambda path: other_writer(path, 1, heartbeat_ns=1 << 62),
-        lambda path: other_writer(path, os.getppid(), state=STATE_CLOSED),
+        lambda path: other_writer(path, os.getppid(), state=layout.STATE_CLOSED),
         lambda path: path.write_bytes(b"of another version"),
     ],
 )

@@ -29,18 +29,6 @@ async def test_rate_is_per_client_and_device(server: SocketServer, encoding: str
 
 
 @in_server()
-async def test_rates_of_clients_are_independent(server: SocketServer) -> None:
-    peers = [await Peer.greeted(server) for _ in range(3)]
-    for peer, rate_hz in zip(peers, (100, 500, 250), strict=True):
-        await peer.result("watch", rate_hz=rate_hz)
-    for seq in range(1, 12):
-        server.publish(batch("imu0", seq))
-    expected = ([1, 11], [1, 3, 5, 7, 9, 11], [1, 5, 9])
-    for peer, numbers in zip(peers, expected, strict=True):
-        assert [(await peer.message())["params"]["seq"] for _ in numbers] == numbers
-
-
-@in_server()
 async def test_clients_with_one_rate_get_the_same_samples(server: SocketServer) -> None:
     first, second = await Peer.greeted(server), await Peer.greeted(server)
     await first.result("watch", rate_hz=100)
