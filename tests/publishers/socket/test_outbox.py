@@ -16,7 +16,7 @@ from imud.formats.jsonrpc import encode_notification
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.publishers.socket.connection import LINGER_TICKS, Connection
 from imud.publishers.socket.encoding import BinaryEncoding, JsonEncoding
-from imud.publishers.socket.outbox import Delivery, Limits, Outbox, Pool
+from imud.publishers.socket.outbox import REPLY_BYTES, SAMPLE_BYTES, Delivery, Limits, Outbox, Pool
 from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.waker import BYTE
 from tests.support.socket_rig import Peer, batch, in_server, run, until
@@ -465,12 +465,89 @@ class Evicted(Sink):
         self.outbox.close()
 
 
+MANY = Limits(4096, 1 << 22)
+
+
+def blocked(pool: Pool, uid: int = 1, limits: Limits = MANY) -> tuple[Evicted, Outbox]:
+    """A client whose socket takes nothing."""
+    owner = Evicted(uid)
+    owner.outbox = Outbox(Blocked(), limits, pool, owner)  # type: ignore[arg-type]  # all that Outbox uses
+    return owner, owner.outbox
+
+
 def waiting(pool: Pool, uid: int, size_bytes: int) -> Evicted:
     """A client that does not read, for which so much waits."""
-    owner = Evicted(uid)
-    owner.outbox = Outbox(Blocked(), Limits(20, 1 << 20), pool, owner)  # type: ignore[arg-type]  # all that Outbox uses
-    owner.outbox.put_reply(bytes(size_bytes))
+    owner, outbox = blocked(pool, uid)
+    outbox.put_reply(bytes(size_bytes))
     return owner
+
+
+def put(outbox: Outbox, first: int, count: int) -> None:
+    """Send binary samples."""
+    some = batch("imu0", first, count)
+    Outbox.put_samples([outbox], BinaryEncoding().encode(some), some, BinaryEncoding())
+
+
+EACH_BYTES = SAMPLE_BYTES + 4 + SLOT_BYTES
+"""Memory of a binary sample that waits."""
+
+
+@pytest.mark.parametrize("limits", [Limits(5, 1 << 22), Limits(4096, 5 * EACH_BYTES)])
+def test_exactly_the_limit_of_samples_may_wait(limits: Limits) -> None:
+    pool = Pool(1 << 26)
+    _owner, outbox = blocked(pool, limits=limits)
+    put(outbox, 1, 3)
+    put(outbox, 4, 2)
+    assert (outbox.queue_samples, outbox.queue_bytes, outbox.dropped) == (5, 5 * EACH_BYTES, 0)
+    put(outbox, 6, 1)
+    assert (outbox.queue_samples, outbox.queue_bytes, outbox.dropped) == (3, 3 * EACH_BYTES, 3)  # a whole delivery
+    put(outbox, 7, 20)
+    assert (outbox.queue_samples, outbox.queue_bytes, outbox.dropped) == (5, 5 * EACH_BYTES, 21)
+    outbox.put_reply(bytes(70))
+    assert (outbox.queue_bytes, pool.held_bytes) == (5 * EACH_BYTES + 70, 5 * EACH_BYTES + 70 + REPLY_BYTES)
+    outbox.close()
+    assert (outbox.queue_bytes, pool.held_bytes) == (0, 0)
+
+
+@pytest.mark.parametrize("sizes", [(30, 30, 30), (1, 99)])
+def test_exactly_the_limit_of_replies_may_wait(sizes: tuple[int, ...]) -> None:
+    """The first message was sent in part, so that it does not count."""
+    pool = Pool(1 << 26)
+    owner, outbox = blocked(pool, limits=Limits(20, 1 << 20, replies=3, reply_bytes=100))
+    outbox.put_reply(bytes(1000))
+    for size_bytes in sizes:
+        outbox.put_reply(bytes(size_bytes))
+    assert not owner.gone
+    outbox.count_owned(50)
+    held_bytes = 1000 + sum(sizes) + REPLY_BYTES * len(sizes) + 50
+    assert (outbox.held_bytes, pool.held_bytes) == (held_bytes, held_bytes)
+    outbox.put_reply(bytes(1))
+    assert owner.gone
+    assert pool.held_bytes == 0
+
+
+def test_the_share_of_a_client_shrinks_with_each_that_waits() -> None:
+    """Three eighths of the memory are for samples; at half of the memory all clients are cut to their share."""
+    pool = Pool(16 * EACH_BYTES)  # shares of 6, 3 and 2 samples, and 8 samples for all
+    first, second, third = (blocked(pool)[1] for _ in range(3))
+
+    def waiting_samples() -> list[int]:
+        return [outbox.queue_samples for outbox in (first, second, third)]
+
+    put(first, 1, 10)
+    assert waiting_samples() == [6, 0, 0]
+    put(second, 1, 2)
+    assert waiting_samples() == [6, 2, 0]
+    put(second, 3, 1)
+    assert waiting_samples() == [3, 3, 0]
+    put(third, 1, 1)
+    assert waiting_samples() == [3, 3, 1]
+    pool.trim()
+    assert waiting_samples() == [2, 1, 1]  # the first two samples of the second client are one delivery
+    assert pool.held_bytes == 4 * EACH_BYTES
+    second.close()
+    put(first, 11, 1)
+    assert waiting_samples() == [3, 0, 1]
 
 
 def test_the_user_that_holds_most_loses_a_client() -> None:
@@ -495,10 +572,7 @@ def test_samples_are_cut_at_once_when_more_and_more_clients_wait() -> None:
     encoding = BinaryEncoding()
     some = batch("imu0", 1, 50)
     messages = encoding.encode(some)
-    outboxes = [
-        Outbox(Blocked(), Limits(4096, 1 << 22), pool, Evicted(1))  # type: ignore[arg-type]  # all that Outbox uses
-        for _ in range(32)
-    ]
+    outboxes = [blocked(pool)[1] for _ in range(32)]
     most = 0
     for outbox in outboxes:
         for _ in range(40):
