@@ -63,7 +63,11 @@ class Board:
         self.context = PublisherContext(lambda: [self.status()], epoch, lambda: self.now_ns)
         self.publisher = ShmPublisher(self.settings, self.context)
         self.publisher.start()
-        self.publisher.add_device(DEVICE, 3)
+        try:
+            self.publisher.add_device(DEVICE, 3)
+        except BaseException:
+            self.publisher.close()
+            raise
 
     def status(self) -> DeviceStatus:
         return DeviceStatus(

@@ -10,7 +10,6 @@ from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families as parse_text
@@ -165,9 +164,8 @@ async def test_a_loop_that_stood_still_is_late_though_it_ticks_while_devices_are
 
 
 @in_loop
-async def test_rings_of_the_daemon_are_read(tmp_path: Path) -> None:
+async def test_rings_of_the_daemon_are_read(board: Board) -> None:
     """Samples that are in shared memory when the scrape comes; a device without a ring shows as such."""
-    board = Board(tmp_path)
     newest = device(DEVICE, newest_seq=10)
     board.now_ns = 20_000_000
     board.publish(range(1, 11))

@@ -189,6 +189,7 @@ def test_a_pause_for_every_so_many_values(tmp_path: Path) -> None:
         reader = RingReader(lambda pauses=pauses: pauses.append(1), motion=True)  # type: ignore[misc]
         reader.look({DEVICE: str(board.path)}, {DEVICE: count}, 0)
         assert len(pauses) == expected
+        board.publisher.close()
 
 
 def test_motion_is_off_by_a_switch(board: Board) -> None:
@@ -238,3 +239,4 @@ def test_the_span_is_the_time_since_the_look_before_but_ten_seconds_at_least(tmp
     reader = RingReader(lambda: None, motion=True)
     span_s(15.0)
     assert span_s(40.0) == 25.0
+    board.publisher.close()

@@ -120,6 +120,8 @@ def test_batches_leave_the_same_bytes_as_their_samples_one_by_one(tmp_path: Path
             one.publish([number])
         written = [board.path.read_bytes() for board in (one, many)]
         assert written[0][layout.OFFSETS["newest_seq"] :] == written[1][layout.OFFSETS["newest_seq"] :]
+    one.publisher.close()
+    many.publisher.close()
 
 
 Notes = list[tuple[int, int, object]]
