@@ -14,7 +14,7 @@ import pytest
 
 from imud.formats.jsonrpc import encode_notification
 from imud.formats.slot import SLOT_BYTES, decode_slot
-from imud.publishers.socket.connection import LINGER_TICKS, Connection
+from imud.publishers.socket.connection import Connection
 from imud.publishers.socket.encoding import BinaryEncoding, JsonEncoding
 from imud.publishers.socket.outbox import REPLY_BYTES, SAMPLE_BYTES, Delivery, Limits, Outbox, Pool
 from imud.publishers.socket.publisher import SocketServer
@@ -275,7 +275,7 @@ async def test_who_lingers_without_reading_is_closed_by_ticks(server: SocketServ
     (connection,) = server.hub.connections.values()
     connection.post(encode_notification("big", "x" * 500_000))
     connection.finish()
-    for _ in range(LINGER_TICKS - 1):
+    for _ in range(19):
         server.tick(0)
     assert not connection.closed
     server.tick(0)
@@ -443,11 +443,18 @@ async def test_half_lines_are_counted_and_evicted(server: SocketServer) -> None:
 
 
 class Blocked:
-    """A socket that takes nothing."""
+    """A socket that takes nothing until it has room."""
+
+    def __init__(self) -> None:
+        self.room = False
+        self.sent: list[int] = []
 
     def send(self, data: bytes) -> int:
-        """Have no room."""
-        raise BlockingIOError
+        """Take everything, or nothing."""
+        if not self.room:
+            raise BlockingIOError
+        self.sent.append(len(data))
+        return len(data)
 
 
 class Evicted(Sink):
@@ -507,6 +514,17 @@ def test_exactly_the_limit_of_samples_may_wait(limits: Limits) -> None:
     assert (outbox.queue_bytes, pool.held_bytes) == (5 * EACH_BYTES + 70, 5 * EACH_BYTES + 70 + REPLY_BYTES)
     outbox.close()
     assert (outbox.queue_bytes, pool.held_bytes) == (0, 0)
+
+
+def test_messages_that_waited_go_in_pieces() -> None:
+    sock = Blocked()
+    owner = Evicted(1)
+    outbox = Outbox(sock, MANY, Pool(1 << 26), owner)  # type: ignore[arg-type]  # all that Outbox uses
+    put(outbox, 1, 300)
+    sock.room = True
+    while outbox.flush():
+        pass
+    assert sock.sent == [127 * 260, 127 * 260, 46 * 260]  # a piece ends with the message that makes it 32 KiB
 
 
 @pytest.mark.parametrize("sizes", [(30, 30, 30), (1, 99)])

@@ -330,6 +330,45 @@ async def test_out_of_descriptors_pauses_accepting_until_the_next_tick_and_is_lo
     assert caplog.text.count("cannot accept a client: Too many open files") == 1
 
 
+@pytest.mark.parametrize(("step_ns", "accepted"), [(0, [16, 32, 40]), (100_000, [2, 4, 6])])
+def test_accepting_takes_a_limited_part_of_a_turn(tmp_path: Path, step_ns: int, accepted: list[int]) -> None:
+    """At most 16 clients, and 0.3 ms."""
+    now_ns, step = NOW_NS, 0
+
+    def clock() -> int:
+        nonlocal now_ns
+        now_ns += step
+        return now_ns
+
+    async def body() -> None:
+        nonlocal step
+        async with serving(tmp_path, clock) as server:
+            for _ in range(40):
+                await Peer.connect(server)
+            found = []
+            step = step_ns
+            for _ in range(3):
+                await asyncio.sleep(0)
+                found.append(server.hub.accepted)
+            assert found == accepted
+
+    run(body)
+
+
+@in_server()
+async def test_a_client_that_is_gone_when_it_is_accepted_leaves_nothing(
+    server: SocketServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(_sock: socket.socket) -> None:
+        raise OSError(107, "Transport endpoint is not connected")
+
+    monkeypatch.setattr("imud.publishers.socket.publisher.peer_of", gone)
+    peer = await Peer.connect(server)
+    assert await peer.ended()
+    status = server.hub.status()
+    assert (status.accepted, status.refused, status.failed) == (0, 0, 0)
+
+
 def broken(*_args: object, **_names: object) -> bytes:
     """A mistake of ours."""
     raise ZeroDivisionError("a mistake")

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 import pytest
 
 from imud.formats.jsonrpc import Code, RpcError
-from imud.publishers.socket import quota
 from imud.publishers.socket.quota import Quota, Seldom, Shares, raise_fd_limit
 from imud.publishers.socket.rights import Peer, Rights
 
@@ -152,14 +151,17 @@ def test_a_small_house_has_few_reserved_places_or_none() -> None:
 def test_connecting_again_and_again_is_limited_by_user() -> None:
     house = House()
     outcomes = []
-    for _ in range(quota.CONNECTS_BURST + 10):
-        outcomes.append(house.connect(1000))
-        house.clients.clear()
-    assert outcomes.count("") == quota.CONNECTS_BURST
-    assert "times a second" in outcomes[-1]
+    for seconds, count in ((0, 256), (1, 64), (3, 192), (60, 256)):
+        house.now_ns += seconds * 1000 * MS
+        for _ in range(count + 2):
+            outcomes.append(house.connect(1000))
+            house.clients.clear()
+        assert outcomes.count("") == count
+        assert "uid 1000 connects more than 64 times a second" in outcomes[-1]
+        outcomes.clear()
     assert house.connect(1001) == ""
-    house.now_ns += 1000 * MS
-    assert house.connect(1000) == ""
+    house.quota.tick()  # 1000 is still in debt, and is not forgotten
+    assert house.connect(1000) != ""
     for _ in range(1000):
         assert house.connect(0) == ""
         house.clients.clear()
@@ -193,7 +195,7 @@ def test_wakers_of_all_clients_of_a_user_count() -> None:
 
 def test_selections_of_fields_are_limited() -> None:
     house = House()
-    for form in range(1, 1 + quota.FORMS_PER_USER):
+    for form in range(1, 17):
         house.quota.exchange_form(1000, None, form)
     house.quota.exchange_form(1000, None, 3)
     for _ in range(2):  # a refusal counts nothing
@@ -213,16 +215,18 @@ def test_a_frequent_message_is_logged_once_a_minute_with_its_count() -> None:
     now_ns = 0
     seldom = Seldom(lambda: now_ns)
     assert [seldom.count() for _ in range(5)] == [1, 0, 0, 0, 0]
-    now_ns = 60_000 * MS
-    assert [seldom.count() for _ in range(2)] == [5, 0]
+    now_ns = 60_000 * MS - 1
+    assert seldom.count() == 0
+    now_ns += 1
+    assert [seldom.count() for _ in range(2)] == [6, 0]
 
 
 def test_the_limit_of_descriptors_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     limits = [(1024, 524_288)]
     monkeypatch.setattr(resource, "getrlimit", lambda _which: limits[-1])
     monkeypatch.setattr(resource, "setrlimit", lambda _which, pair: limits.append(pair))
-    assert raise_fd_limit() == quota.FDS_MAX
-    assert limits[-1] == (quota.FDS_MAX, 524_288)
-    assert raise_fd_limit() == quota.FDS_MAX
+    assert raise_fd_limit() == 16_384
+    assert limits[-1] == (16_384, 524_288)
+    assert raise_fd_limit() == 16_384
     limits[:] = [(1024, 4096)]
     assert raise_fd_limit() == 4096

@@ -10,6 +10,8 @@ from msgspec.structs import replace
 from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import LINE_MAX_BYTES
 from imud.publishers.socket.publisher import SocketServer
+from imud.publishers.socket.rights import Rights
+from imud.publishers.socket.rpc import METHODS
 from imud.publishers.socket.serving import BYTES_BURST
 from tests.support.socket_rig import Peer, batch, in_server, run, serving
 
@@ -58,8 +60,8 @@ async def test_bad_lines(server: SocketServer, line: bytes, code: int, request_i
     ("method", "params", "words"),
     [
         ("watch", {"rate_hz": -1}, "0.001 … 1000000, got -1"),
-        ("watch", {"rate_hz": 1e-300}, "expected 0 (every sample) or 0.001"),
-        ("watch", {"rate_hz": 1e300}, "expected 0 (every sample) or 0.001"),
+        ("watch", {"rate_hz": 0.00099}, "expected 0 (every sample) or 0.001"),
+        ("watch", {"rate_hz": 1_000_001}, "expected 0 (every sample) or 0.001"),
         ("watch", {"rate_hz": True}, "rate_hz: expected a number, or null, got true"),
         ("watch", {"rate_hz": "fast"}, 'got "fast"'),
         ("watch", {"devices": ["imu7"]}, "no device named 'imu7'; there are: imu0, imu1"),
@@ -88,6 +90,23 @@ async def test_bad_parameters(server: SocketServer, method: str, params: dict[st
 def watching(server: SocketServer) -> set[int]:
     """Numbers of the clients that watch."""
     return {client.number for client in server.hub.clients() if client.encoding}
+
+
+@in_server()
+async def test_the_limits_themselves_are_allowed(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    for rate_hz in (0.001, 1_000_000):
+        assert (await peer.result("watch", rate_hz=rate_hz))["rate_hz"] == rate_hz
+
+
+def test_rights_and_effects_of_the_methods() -> None:
+    changing = {"command", "calibrate", "settings.plan", "settings.apply", "stop_calibration"}
+    recording = {"record.start", "record.stop", "record.snapshot"}
+    assert {name for name, method in METHODS.items() if method.right is not Rights.READ} == changing | recording
+    assert {name for name, method in METHODS.items() if method.acts} == {
+        "options", "watch", "unwatch", "events", "command", "calibrate", "settings.apply", "stop_calibration",
+        "record.stop",
+    }  # fmt: skip
 
 
 @in_server()
@@ -164,9 +183,10 @@ async def test_one_client_s_flood_of_requests_leaves_turns_to_others(server: Soc
 @in_server()
 async def test_a_name_that_would_forge_a_line_of_the_log_is_refused(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
-    for name in ("x\nERROR forged", "x" * 65):
+    for name, expected in (("x\nERROR forged", -32602), ("x" * 65, -32602), ("x" * 64, -32005)):
         code, _ = await peer.error("command", device="imu0", name=name)
-        assert code == -32602
+        assert code == expected
+        assert (await peer.error("calibrate", device="imu0", kind=name))[0] == expected
 
 
 def test_a_mistake_in_an_action_ends_that_client_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -3,7 +3,7 @@
 import asyncio
 import select
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -29,8 +29,8 @@ class Clock:
 class Worker:
     """A client with `pieces` pieces of work of `cost_ns` each."""
 
-    def __init__(self, name: str, clock: Clock, log: list[str], pieces: int, cost_ns: int) -> None:
-        self.name, self.clock, self.log = name, clock, log
+    def __init__(self, name: str, rig: "SchedulerBench", pieces: int, cost_ns: int) -> None:
+        self.name, self.rig = name, rig
         self.pieces, self.cost_ns = pieces, cost_ns
         self.error: Exception | None = None
         self.failures: list[Exception] = []
@@ -42,8 +42,9 @@ class Worker:
 
     def serve(self) -> bool:
         """Do a piece, which takes its time."""
-        self.clock.ns += self.cost_ns
-        self.log.append(self.name)
+        self.rig.clock.ns += self.cost_ns
+        self.rig.log.append(self.name)
+        self.rig.on_piece()
         self.pieces -= 1
         if self.error is not None:
             raise self.error
@@ -69,6 +70,8 @@ class SchedulerBench:
     def __init__(self) -> None:
         self.clock = Clock()
         self.log: list[str] = []
+        self.on_piece: Callable[[], object] = lambda: None
+        """Called after each piece."""
         time = TokenBucket(1_000_000_000, 1_000 * MS, self.clock())
         self.scheduler = Scheduler(self.clock, self.clock, time)
         self.socks: list[socket.socket] = []
@@ -77,7 +80,7 @@ class SchedulerBench:
         """Add a client."""
         ours, theirs = socket.socketpair()
         self.socks += [ours, theirs]
-        worker = Worker(name, self.clock, self.log, pieces, cost_ns)
+        worker = Worker(name, self, pieces, cost_ns)
         place = self.scheduler.add(worker, ours.fileno(), len(self.socks), uid)
         return worker, place
 
@@ -85,10 +88,12 @@ class SchedulerBench:
 @asynccontextmanager
 async def scheduling(_folder: Path) -> AsyncIterator[SchedulerBench]:
     rig = SchedulerBench()
-    yield rig
-    rig.scheduler.close()
-    for sock in rig.socks:
-        sock.close()
+    try:
+        yield rig
+    finally:
+        rig.scheduler.close()
+        for sock in rig.socks:
+            sock.close()
 
 
 @in_context("rig", scheduling)
@@ -135,26 +140,76 @@ async def test_who_asks_too_much_is_parked_put_in_line_by_ticks_and_evicted(rig:
     rig.clock.ns += 500 * MS
     rig.scheduler.tick()
     await until(lambda: len(rig.log) > used)
-    for _ in range(serving.OVER_TICKS_MAX + 2):
+    ticks = 0
+    while not worker.overloads:
         for _ in range(100):
             await asyncio.sleep(0)
-        assert not worker.overloads
         rig.clock.ns += 20 * MS
         rig.scheduler.tick()
-        if worker.overloads:
-            break
-    assert worker.overloads == 1
+        ticks += 1
+    assert 100 <= ticks <= 102  # 10 s
 
 
 @in_context("rig", scheduling)
-async def test_bytes_count_too(rig: SchedulerBench) -> None:
-    _worker, place = rig.add("talker", 1, 5, 0)
-    place.count_bytes(serving.BYTES_BURST)
-    assert not place.is_over
-    place.count_bytes(1)
+async def test_a_client_has_an_allowance_of_cpu_time_and_of_bytes(rig: SchedulerBench) -> None:
+    place = rig.add("talker", 1, 5, 0)[1]
+    now_ns = rig.clock()
+    place.fill(now_ns + 499 * MS)
+    assert not place.is_light
+    place.fill(now_ns + 500 * MS)  # 100 ms that a new client has, and 100 ms a second
+    assert place.is_light
+    place.count_bytes(1 << 20)
+    assert (place.is_over, place.is_light) == (False, True)
+    place.count_bytes(262_144)
+    assert (place.is_over, place.is_light) == (True, False)
+    place.fill(now_ns + 1499 * MS)
     assert place.is_over
-    place.fill(rig.clock() + 1000 * MS)
+    place.fill(now_ns + 1501 * MS)
     assert not place.is_over
+    place.charge(200 * MS)  # all that can gather
+    assert not place.is_over
+    place.charge(1)
+    assert place.is_over
+    place.charge(1000 * MS)  # the debt is at most what can gather
+    place.fill(now_ns + 3500 * MS)
+    assert place.is_over
+    place.fill(now_ns + 3502 * MS)
+    assert not place.is_over
+
+
+@in_context("rig", scheduling)
+async def test_a_turn_has_a_limited_number_of_pieces(rig: SchedulerBench) -> None:
+    rig.add("free", 1, 1000, 0)[1].line_up()
+    await asyncio.sleep(0)
+    assert len(rig.log) == 64
+
+
+@in_context("rig", scheduling)
+async def test_sockets_are_looked_at_again_within_a_turn(rig: SchedulerBench) -> None:
+    """After 0.2 ms, so that a client that asks little is next."""
+    busy, place = rig.add("busy", 1, 100, MS // 10)
+    rig.add("asking", 2, 1, 0)
+    place.line_up()
+    rig.on_piece = lambda: rig.socks[3].send(b"x") if rig.log == ["busy"] else None
+    await asyncio.sleep(0)
+    assert rig.log[:4] == ["busy", "busy", "asking", "busy"]
+    assert len(rig.log) == 11  # 10 pieces make a turn of 1 ms
+    assert busy.pieces == 90
+
+
+@pytest.mark.parametrize("uid", [1, 2])
+@in_context("rig", scheduling)
+async def test_a_client_that_waited_long_is_ahead_for_a_millisecond(rig: SchedulerBench, uid: int) -> None:
+    """Of the other clients of its user, and of other users."""
+    rig.add("busy", 1, 1000, MS // 4)[1].line_up()
+    idle = rig.add("idle", uid, 1000, MS // 4)[1]
+    await until(lambda: len(rig.log) >= 100)
+    count = len(rig.log)
+    idle.line_up()
+    await until(lambda: len(rig.log) >= count + 12)
+    later = rig.log[count:]
+    assert later[:4] == ["idle"] * 4
+    assert 2 <= later[4:12].count("busy") <= 6
 
 
 @in_context("rig", scheduling)
