@@ -35,7 +35,6 @@ class Peak:
 
 @contextmanager
 def watching(stage: AttackedDaemon) -> Iterator[Peak]:
-    """Look at the daemon ten times a second."""
     peak, over = Peak(), threading.Event()
 
     def look() -> None:
@@ -85,7 +84,6 @@ def measure(entry: Attack, stage: AttackedDaemon, seconds: float, idle_mb: float
 
 
 def row(name: str, seen: Measured) -> str:
-    """A line of the table."""
     unknown = f"+{seen.ledger_unknown}?" if seen.ledger_unknown else ""
     return (
         f"{name:<15}{seen.deeds.clients:>8}{seen.deeds.connections:>9}{seen.deeds.requests:>10}"
@@ -135,7 +133,6 @@ def describe(stage: AttackedDaemon, idle_mb: float, *, delays: bool) -> str:
 
 
 def run(chosen: dict[str, Attack], seconds: float, scheduling: Scheduling, *, short: bool) -> list[str]:
-    """Run these attacks on one daemon; the bounds that were exceeded."""
     problems: list[str] = []
     with AttackedDaemon(60 + 2 * (seconds + 15) * len(chosen), scheduling) as stage:
         idle_mb = stage.rss_mb
@@ -152,7 +149,6 @@ def run(chosen: dict[str, Attack], seconds: float, scheduling: Scheduling, *, sh
 
 
 def main() -> int:
-    """Run the attacks."""
     parser = argparse.ArgumentParser(prog="make attack")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"one of {', '.join(ATTACKS)}; all when left out")
     parser.add_argument("--short", action="store_true", help="at most 75 s in all, delays not judged, for CI")

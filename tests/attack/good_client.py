@@ -32,7 +32,6 @@ class Figures:
     delays_ms: list[float] = field(default_factory=list)
 
     def report(self) -> str:
-        """As JSON."""
         return json.dumps({
             "samples": self.samples, "lost": self.lost, "dropped": self.dropped, "replies": len(self.replies_ms),
             "reply_p50_ms": quantile(self.replies_ms, 0.5), "reply_p99_ms": quantile(self.replies_ms, 0.99),
@@ -57,7 +56,6 @@ class Watcher:
         self._frame: int | None = None
 
     def read(self, figures: Figures) -> None:
-        """Take in what has come."""
         self._buffer += self.sock.recv(1 << 18)
         if not self._framed:
             reply = self._buffer.find(b'"result"')
@@ -91,14 +89,12 @@ class Watcher:
 
 
 def connect(path: str) -> socket.socket:
-    """A connected client."""
     sock = socket.socket(socket.AF_UNIX)
     sock.connect(path)
     return sock
 
 
 def main() -> None:
-    """Run until standard input ends."""
     if len(sys.argv) == 4:
         become(int(sys.argv[2]), int(sys.argv[3]))
     watcher = Watcher(sys.argv[1])

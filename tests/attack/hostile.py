@@ -64,12 +64,10 @@ class Deeds:
 
 
 def request(method: str, **params: object) -> bytes:
-    """A request as a line."""
     return json.dumps({"jsonrpc": "2.0", "id": 1, "method": method, "params": params}).encode() + b"\n"
 
 
 def padded_line(_rng: random.Random) -> bytes:
-    """A request of 64 KiB."""
     line = b'{"jsonrpc":"2.0","id":1,"method":"poll","x":"'
     return line + b"x" * (65_500 - len(line)) + b'"}\n'
 
@@ -81,12 +79,10 @@ def any_watch(rng: random.Random) -> bytes:
 
 
 def any_rate(rng: random.Random) -> bytes:
-    """A watch at any rate."""
     return request("watch", rate_hz=rng.choice([0.001, 1, 333, 999, 1000, 1e6]), fields=["sync"])
 
 
 def many_names(_rng: random.Random) -> bytes:
-    """A list of as many names as fit."""
     return request("watch", devices=["d0"] * 2000)
 
 
@@ -98,7 +94,6 @@ def deep_arguments(_rng: random.Random) -> bytes:
 
 
 def all_wakers(_rng: random.Random) -> bytes:
-    """A descriptor for each device."""
     return b"".join(request("notify", device=f"d{number}") for number in range(4))
 
 
@@ -199,7 +194,6 @@ class Hostile:
 
 
 def attack(kinds: list[Kind], path: str, metrics_port: int, clients: int, seconds: float, seed: int) -> Deeds:
-    """Run the clients; return what they did."""
     rng = random.Random(seed)
     end_s = time.monotonic() + seconds
     selector = selectors.DefaultSelector()
@@ -240,14 +234,12 @@ def attack(kinds: list[Kind], path: str, metrics_port: int, clients: int, second
 
 
 def become(uid: int, gid: int) -> None:
-    """Become another user."""
     os.setgroups([gid])
     os.setgid(gid)
     os.setuid(uid)
 
 
 def main() -> None:
-    """Run as `python -m tests.attack.hostile`."""
     parser = argparse.ArgumentParser()
     parser.add_argument("kind", choices=[*KINDS, "mix"])
     parser.add_argument("--socket", required=True)

@@ -48,7 +48,6 @@ class Witness:
     over: Event = field(default_factory=Event)
 
     def run(self) -> None:
-        """Read until it is over."""
         try:
             with Ring(self.stage.rings / "imud.d0") as ring:
                 self._follow(ring)

@@ -41,14 +41,12 @@ class Attacker:
         )  # fmt: skip
 
     def act(self) -> None:
-        """One hostile act on one name."""
         kind, path = self._random.choice(self._kinds), self._target()
         self.acts += 1
         with suppress(OSError, ValueError):
             kind(path)
 
     def clean(self) -> None:
-        """Remove what is his in the directory."""
         for descriptor in self._held:
             os.close(descriptor)
         self._held.clear()

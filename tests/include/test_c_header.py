@@ -130,7 +130,6 @@ def layout_program() -> tuple[str, list[str]]:
 
 
 def numbers_of(s: Sample) -> list[float]:
-    """What the reader prints of a sample."""
     assert s.accel_m_s2 is not None
     assert s.gyro_rad_s is not None
     assert s.temperature_c is not None

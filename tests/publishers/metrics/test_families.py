@@ -51,7 +51,6 @@ def values(metrics: Sequence[Metric]) -> dict[Key, float]:
 
 
 def rendered(snapshot: Snapshot) -> dict[Key, float]:
-    """The values of a snapshot after text and parser."""
     body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
     return values(list(parse_text(body)))
 
@@ -198,7 +197,6 @@ PARTS: dict[tuple[str, tuple[tuple[str, str], ...]], float] = {
 
 
 def parts_of(name: str, shown: dict[Key, float]) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
-    """The lines of a device that are of such parts."""
     names = {family.name for family in (*POLLING_FAMILIES, *TIME_FAMILIES, *LINE_FAMILIES)}
     return {
         (metric, tuple(pair for pair in labels if pair[0] != "device")): value

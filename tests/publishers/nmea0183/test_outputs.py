@@ -23,7 +23,6 @@ BUSY = b"$" + b"x" * 60_000 + b"\r\n"
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Let the loop run until something has happened."""
     async with asyncio.timeout(LIMIT_S):
         while not condition():
             await asyncio.sleep(0)
@@ -42,7 +41,6 @@ class Server(TcpOutput):
         return self.clients[-1]
 
     async def connected(self) -> socket.socket:
-        """A client that the server has."""
         before, sock = self.status().readers, self.connect()
         await until(lambda: self.status().readers == before + 1)
         return sock

@@ -19,7 +19,6 @@ def sample(
     euler_deg: Vector3 | None = (1.0, -2.0, 45.0), gyro_deg_s: Vector3 | None = None,
     temperature_c: float | None = None, pressure_pa: float | None = None,
 ) -> Sample:  # fmt: skip
-    """A sample in ned-frd."""
     euler = None if euler_deg is None else (radians(euler_deg[0]), radians(euler_deg[1]), radians(euler_deg[2]))
     gyro = None if gyro_deg_s is None else (radians(gyro_deg_s[0]), radians(gyro_deg_s[1]), radians(gyro_deg_s[2]))
     return Sample(

@@ -65,7 +65,6 @@ class RecordingBench:
         )  # fmt: skip
 
     def start_worker(self, name: str, work: Round, failed: Callable[[BaseException], None]) -> HandWorker:
-        """As `StartWorker`."""
         self.workers.append(HandWorker(name, work, failed))
         return self.workers[-1]
 
@@ -89,5 +88,4 @@ def records_in(path: Path) -> list[Record]:
 
 
 def kinds_in(path: Path) -> list[int]:
-    """Their kinds."""
     return [record.kind for record in records_in(path)]

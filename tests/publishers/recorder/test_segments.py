@@ -42,7 +42,6 @@ class RingBench:
 
 
 def read(reader: SegmentReader) -> list[records.Record]:
-    """The records, which must be a whole recording."""
     data = b""
     while block := reader.next_block():
         data += block

@@ -41,7 +41,6 @@ class StreamBench(RecordingBench):
             self.got += data
 
     def records(self) -> list[Record]:
-        """What was read, which must be whole."""
         reader = RecordingReader(BytesIO(self.got), "read")
         found = list(reader)
         assert reader.problems == []

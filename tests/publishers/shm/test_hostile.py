@@ -64,7 +64,6 @@ HOSTILE: Final[dict[str, Callable[[Path], object]]] = {
 
 
 def plant(path: Path, kind: str) -> None:
-    """Put something that belongs to another user there."""
     HOSTILE[kind](path)
     os.chown(path, HOSTILE_UID, HOSTILE_UID, follow_symlinks=False)
 

@@ -199,7 +199,6 @@ def test_order_of_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def ledger_in(path: Path, count: int = len(LEDGER_FIELDS)) -> layout.LedgerBlock:
-    """The ledger block of a file."""
     block = layout.decode_ledger_block(
         path.read_bytes()[layout.LEDGER_BLOCK_OFFSET :][: layout.LEDGER_BLOCK_BYTES], count
     )

@@ -21,7 +21,6 @@ ANYTHING = "…"
 
 
 def blocks(language: str) -> list[str]:
-    """The fenced examples in a language."""
     return re.findall(rf"^```{language}\n(.*?)^```$", DOCUMENT, re.MULTILINE | re.DOTALL)
 
 

@@ -42,7 +42,6 @@ EXPECTED: dict[str | None, dict[str, Any]] = {
 
 
 def published(samples: Sequence[Sample], frame: PublishedFrame | None = None) -> Batch:
-    """A batch as the path makes it."""
     frame = frame or as_sent(RFU_ENU)
     rotation = frame.rotation
     return Batch("imu0", 0, list(samples) if rotation is None else rotation.samples(samples), frame)
@@ -60,7 +59,6 @@ def assert_is(values: dict[str, Any], convention: str | None) -> None:
 
 
 def members_of(one: Sample) -> dict[str, Any]:
-    """A sample by names."""
     return {name: getattr(one, name) for name in Sample.__struct_fields__}
 
 

@@ -227,7 +227,6 @@ READ_BYTES = 64
 
 
 def fill(server: SocketServer) -> None:
-    """Publish until something is queued."""
     seq = 0
     while server.hub.clients()[0].queue_samples == 0:
         seq += 1
@@ -315,7 +314,6 @@ class Sink:
 
 
 def drained(sock: socket.socket) -> bytes:
-    """What there is to read."""
     try:
         return sock.recv(1 << 20)
     except BlockingIOError:
@@ -394,7 +392,6 @@ BIG_BYTES = 400_000
 
 
 def held_bytes(server: SocketServer) -> int:
-    """All that is held for clients, looked up in the objects themselves."""
     connections = server.hub.connections.values()
     return sum(one.outbox.queue_bytes + one.unread_bytes for one in connections)
 
@@ -450,7 +447,6 @@ class Blocked:
         self.sent: list[int] = []
 
     def send(self, data: bytes) -> int:
-        """Take everything, or nothing."""
         if not self.room:
             raise BlockingIOError
         self.sent.append(len(data))
@@ -466,7 +462,6 @@ class Evicted(Sink):
         self.outbox: Outbox | None = None
 
     def on_flooded(self) -> None:  # type: ignore[override]  # a method in place of the other's failure
-        """Close."""
         assert self.outbox is not None
         self.gone = True
         self.outbox.close()
@@ -476,7 +471,6 @@ MANY = Limits(4096, 1 << 22)
 
 
 def blocked(pool: Pool, uid: int = 1, limits: Limits = MANY) -> tuple[Evicted, Outbox]:
-    """A client whose socket takes nothing."""
     owner = Evicted(uid)
     owner.outbox = Outbox(Blocked(), limits, pool, owner)  # type: ignore[arg-type]  # all that Outbox uses
     return owner, owner.outbox
@@ -490,7 +484,6 @@ def waiting(pool: Pool, uid: int, size_bytes: int) -> Evicted:
 
 
 def put(outbox: Outbox, first: int, count: int) -> None:
-    """Send binary samples."""
     some = batch("imu0", first, count)
     Outbox.put_samples([outbox], BinaryEncoding().encode(some), some, BinaryEncoding())
 

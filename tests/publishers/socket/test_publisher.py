@@ -370,7 +370,6 @@ async def test_a_client_that_is_gone_when_it_is_accepted_leaves_nothing(
 
 
 def broken(*_args: object, **_names: object) -> bytes:
-    """A mistake of ours."""
     raise ZeroDivisionError("a mistake")
 
 
@@ -425,7 +424,6 @@ async def test_an_error_in_one_client_s_part_ends_that_client_only(
 
 
 async def descriptor(peer: Peer) -> int:
-    """Ask to be woken by imu0; the descriptor."""
     await peer.send(b'{"jsonrpc":"2.0","id":7,"method":"notify","params":{"device":"imu0"}}\n')
     while True:
         await asyncio.sleep(0)

@@ -31,14 +31,12 @@ class Fleet:
         self.server = SocketServer(SocketSettings(path=str(directory / "s")), known)
 
     def each_status(self) -> Iterator[DeviceStatus]:
-        """The states, one by one."""
         for number, name in enumerate(list(self.names)):
             self.now_ns += DEVICE_NS
             self.taken += 1
             yield device_status(name, number)
 
     async def most_in_a_turn(self, done: asyncio.Task[object]) -> int:
-        """The most states that were taken in one turn of the loop."""
         most, before = 0, self.taken
         while not done.done():
             await asyncio.sleep(0)

@@ -42,7 +42,6 @@ class RecordingPeer(Peer):
         self.fds: list[int] = []
 
     async def body(self) -> bytes:
-        """The next line."""
         while (body := self._take()) is None:
             try:
                 data, fds, _flags, _address = socket.recv_fds(self.sock, 1 << 16, 4)
@@ -56,7 +55,6 @@ class RecordingPeer(Peer):
         return body
 
     def close(self) -> None:
-        """Disconnect, and close what came."""
         super().close()
         while self.fds:
             os.close(self.fds.pop())
@@ -87,7 +85,6 @@ async def recording_of(server: SocketServer, peer: RecordingPeer) -> list[Record
 
 
 def records_of(data: bytes) -> list[Record]:
-    """The records of a whole recording."""
     reader = RecordingReader(BytesIO(data), "received")
     found = list(reader)
     assert reader.problems == []

@@ -63,7 +63,6 @@ except PermissionError:
 
 @pytest.fixture
 def open_directory() -> Iterator[Path]:
-    """A directory that every user may enter."""
     path = Path(tempfile.mkdtemp(prefix="imud-"))
     path.chmod(0o755)
     yield path
@@ -97,7 +96,6 @@ def test_other_users(open_directory: Path, groups: list[str], mode: int | None, 
 
 
 def ask(path: str, groups: Sequence[int | None]) -> str:
-    """What a user with these groups is greeted with."""
     done = subprocess.run(
         [sys.executable, "-I", "-S", "-c", CLIENT, path, *map(str, groups)],
         capture_output=True,

@@ -88,7 +88,6 @@ async def test_bad_parameters(server: SocketServer, method: str, params: dict[st
 
 
 def watching(server: SocketServer) -> set[int]:
-    """Numbers of the clients that watch."""
     return {client.number for client in server.hub.clients() if client.encoding}
 
 

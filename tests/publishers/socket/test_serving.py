@@ -37,11 +37,9 @@ class Worker:
         self.overloads = 0
 
     def on_ready(self, events: int) -> None:
-        """The socket has input."""
         assert events & select.EPOLLIN
 
     def serve(self) -> bool:
-        """Do a piece, which takes its time."""
         self.rig.clock.ns += self.cost_ns
         self.rig.log.append(self.name)
         self.rig.on_piece()
@@ -51,16 +49,13 @@ class Worker:
         return self.pieces > 0
 
     def wanted_events(self) -> int:
-        """None: the tests put it in line."""
         return 0
 
     def on_failure(self, error: Exception) -> None:
-        """Keep the error, and go on."""
         self.failures.append(error)
         self.error = None
 
     def on_overload(self) -> None:
-        """Count."""
         self.overloads += 1
 
 
@@ -77,7 +72,6 @@ class SchedulerBench:
         self.socks: list[socket.socket] = []
 
     def add(self, name: str, uid: int, pieces: int, cost_ns: int) -> tuple[Worker, Place]:
-        """Add a client."""
         ours, theirs = socket.socketpair()
         self.socks += [ours, theirs]
         worker = Worker(name, self, pieces, cost_ns)

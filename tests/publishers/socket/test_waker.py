@@ -14,7 +14,6 @@ from tests.support.socket_rig import Peer, batch, in_server, until
 
 
 async def notified(peer: Peer, device: str = "imu0") -> int:
-    """Ask for a descriptor and receive it."""
     await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"notify","params":{"device":"%s"}}\n' % device.encode())
     await until(lambda: bool(select.select([peer.sock], [], [], 0)[0]))
     data, fds, _flags, _address = socket.recv_fds(peer.sock, 4096, 4)
@@ -31,7 +30,6 @@ async def wakened() -> None:
 
 
 def read_all(fd: int) -> bytes | None:
-    """What a client reads; None for nothing there."""
     try:
         return os.read(fd, 4096)
     except BlockingIOError:
