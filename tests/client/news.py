@@ -5,7 +5,7 @@ from queue import Queue
 
 from imud.client.feed import News
 
-LIMIT_S = 10.0
+LIMIT_S = 60.0
 
 
 class Listener:

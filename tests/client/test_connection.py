@@ -57,7 +57,7 @@ def test_a_convention_is_asked_for(served: Daemon) -> None:
         publish(served, batch("imu0", 4))
         (newest,) = client.poll(convention="enu-flu")
         assert newest.accel_m_s2 == (-0.5, -0.125, 9.75)
-        watch = client.watch(convention="ned-frd", timeout_s=5)
+        watch = client.watch(convention="ned-frd", timeout_s=60)
         publish(served, batch("imu0", 5))
         assert next(watch).accel_m_s2 == (-0.5, 0.125, -9.75)
         with pytest.raises(RpcError):
@@ -83,7 +83,7 @@ def test_what_the_daemon_refuses_is_raised_and_the_connection_lives_on(served: D
 @pytest.mark.parametrize("encoding", ["json", "binary"])
 def test_watch_gives_whole_samples_and_questions_go_between(served: Daemon, encoding: str) -> None:
     with Client(served.path) as client:
-        watch = client.watch(encoding=encoding, timeout_s=5)
+        watch = client.watch(encoding=encoding, timeout_s=60)
         assert watch.device_ids == DEVICES
         publish(served, batch("imu0", 1, 2), batch("imu1", 123))
         assert len(client.devices()) == 2  # samples that come meanwhile wait
@@ -102,7 +102,7 @@ def test_watch_gives_whole_samples_and_questions_go_between(served: Daemon, enco
 
 def test_watch_selects(served: Daemon) -> None:
     with Client(served.path) as client:
-        watch = client.watch(["imu0"], ["accel_m_s2"], 100, "json", timeout_s=5)
+        watch = client.watch(["imu0"], ["accel_m_s2"], 100, "json", timeout_s=60)
         publish(served, batch("imu1"), batch("imu0", 1, 12))
         first, second = islice(watch, 2)
         assert (first.seq, second.seq) == (1, 11)
@@ -113,7 +113,7 @@ def test_a_second_watch_ends_the_first(served: Daemon) -> None:
     with Client(served.path) as client:
         first = client.watch(["imu0"])
         publish(served, batch("imu0"))
-        second = client.watch(["imu1"], encoding="json", timeout_s=5)
+        second = client.watch(["imu1"], encoding="json", timeout_s=60)
         publish(served, batch("imu0", 2), batch("imu1"))
         assert next(second) == sample("imu1")
         assert list(first) == []
@@ -122,7 +122,7 @@ def test_a_second_watch_ends_the_first(served: Daemon) -> None:
 @pytest.mark.parametrize("encoding", ["json", "binary"])
 def test_dropped_samples_are_told(served: Daemon, encoding: str) -> None:
     with Client(served.path) as client:
-        watch = client.watch(encoding=encoding, timeout_s=5)
+        watch = client.watch(encoding=encoding, timeout_s=60)
         calls: list[tuple[str, int]] = []
         watch.on_dropped = lambda device, count: calls.append((device, count))
         for first in range(1, 8000, 100):
@@ -140,7 +140,7 @@ def test_dropped_samples_are_told(served: Daemon, encoding: str) -> None:
 
 def test_null_is_nan(served: Daemon) -> None:
     with Client(served.path) as client:
-        watch = client.watch(encoding="json", timeout_s=5)
+        watch = client.watch(encoding="json", timeout_s=60)
         odd = replace(sample(), gyro_rad_s=(math.nan, 1.0, math.inf), temperature_c=math.nan)
         publish(served, Batch("imu0", 0, [odd]))
         got = next(watch)
@@ -151,7 +151,7 @@ def test_null_is_nan(served: Daemon) -> None:
 
 def test_events(served: Daemon) -> None:
     with Client(served.path) as client:
-        events = client.events(["imu1"], timeout_s=5)
+        events = client.events(["imu1"], timeout_s=60)
         down = Event(7, "imu1", EventKind.DOWN, "the adapter was pulled out", {"errno": 5})
         served.do(lambda server: server.event(replace(down, device="imu0")))
         served.do(lambda server: server.event(down))
@@ -170,7 +170,7 @@ def test_an_event_of_a_kind_to_come_is_accepted() -> None:
 
 def test_notify_gives_a_descriptor_that_wakes(served: Daemon) -> None:
     with Client(served.path) as client:
-        watch = client.watch(timeout_s=5)
+        watch = client.watch(timeout_s=60)
         publish(served, batch("imu0"))
         fd = client.notify("imu0")
         publish(served, batch("imu0", 2, 3), batch("imu1"), batch("imu0", 5))
@@ -194,13 +194,9 @@ def test_path_of_the_environment(served: Daemon, monkeypatch: pytest.MonkeyPatch
         assert client.path == served.path
     with pytest.raises(LinkMissing, match="no daemon at /nowhere"):
         Client("/nowhere")  # an argument counts more
-
-
-@pytest.mark.parametrize("value", [None, ""])
-def test_path_without_the_environment(monkeypatch: pytest.MonkeyPatch, value: str | None) -> None:
-    monkeypatch.delenv("IMUD_SOCKET", raising=False)
-    if value is not None:
-        monkeypatch.setenv("IMUD_SOCKET", value)
+    monkeypatch.setenv("IMUD_SOCKET", "")
+    assert default_path() == "/run/imud/imud.sock"
+    monkeypatch.delenv("IMUD_SOCKET")
     assert default_path() == "/run/imud/imud.sock"
 
 
@@ -245,7 +241,7 @@ def answering(path: Path, answer: bytes) -> Iterator[None]:
             sock, _ = listener.accept()
             with sock:
                 sock.sendall(answer)
-                done.wait(10)
+                done.wait(60)
 
         thread = threading.Thread(target=serve)
         thread.start()
@@ -272,8 +268,9 @@ def answering(path: Path, answer: bytes) -> Iterator[None]:
 )
 def test_servers_that_misbehave(tmp_path: Path, answer: bytes, error: type[Exception], words: str) -> None:
     path = tmp_path / "s"
-    with answering(path, answer), pytest.raises(error, match=words), Client(path, timeout_s=0.2) as client:
-        next(client.watch(timeout_s=0.2))
+    limit_s = 0.2 if error is TimeoutError else 60
+    with answering(path, answer), pytest.raises(error, match=words), Client(path, timeout_s=limit_s) as client:
+        next(client.watch(timeout_s=limit_s))
 
 
 @pytest.mark.parametrize("method", ["watch", "poll"])

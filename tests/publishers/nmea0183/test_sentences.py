@@ -12,7 +12,6 @@ from imud.sample import Sample, Sync, Vector3
 MAGNETIC = HeadingReference(Heading.MAGNETIC)
 CORRECTED = HeadingReference(Heading.TRUE, 3.0)
 TRUE = HeadingReference(Heading.TRUE)
-NO_HEADING = (HeadingReference(Heading.RELATIVE), HeadingReference(Heading.UNKNOWN))
 
 
 def sample(
@@ -33,31 +32,21 @@ def body(kind: Formatter, one: Sample, reference: HeadingReference, talker: str 
     return None if made is None else made.decode().removeprefix("$").partition("*")[0]
 
 
-def test_a_magnetic_heading_is_sent_as_such() -> None:
-    assert body(Formatter.HDG, sample(), MAGNETIC) == "HCHDG,45.0,,,,"
-    assert body(Formatter.HDM, sample(), MAGNETIC) == "HCHDM,45.0,M"
-    assert body(Formatter.HDT, sample(), MAGNETIC) is None
-
-
-def test_a_corrected_heading_is_sent_with_the_variation() -> None:
-    assert body(Formatter.HDT, sample(), CORRECTED) == "HCHDT,45.0,T"
-    assert body(Formatter.HDG, sample(), CORRECTED) == "HCHDG,42.0,,,3.0,E"
-    assert body(Formatter.HDM, sample(), CORRECTED) == "HCHDM,42.0,M"
-
-
-def test_a_device_s_own_true_heading_has_no_magnetic_one() -> None:
-    assert body(Formatter.HDT, sample(), TRUE) == "HCHDT,45.0,T"
-    assert body(Formatter.HDG, sample(), TRUE) is None
-
-
-@pytest.mark.parametrize("reference", NO_HEADING)
-def test_a_direction_at_power_on_is_never_sent_as_a_heading(reference: HeadingReference) -> None:
-    assert [body(kind, sample(), reference) for kind in (Formatter.HDT, Formatter.HDG, Formatter.HDM)] == [
-        None,
-        None,
-        None,
-    ]
-    assert body(Formatter.PASHR, sample(), reference) == "PASHR,000000.000,,T,+1.00,-2.00,,,,,0,0"
+@pytest.mark.parametrize(
+    ("reference", "sentences"),
+    [
+        (MAGNETIC, (None, "HCHDG,45.0,,,,", "HCHDM,45.0,M")),
+        (CORRECTED, ("HCHDT,45.0,T", "HCHDG,42.0,,,3.0,E", "HCHDM,42.0,M")),
+        (TRUE, ("HCHDT,45.0,T", None, None)),  # the device's own true heading has no magnetic one
+        (HeadingReference(Heading.RELATIVE), (None, None, None)),  # from the direction at power-on
+        (HeadingReference(Heading.UNKNOWN), (None, None, None)),
+    ],
+)
+def test_a_heading_is_sent_with_its_reference(reference: HeadingReference, sentences: tuple[str | None, ...]) -> None:
+    kinds = (Formatter.HDT, Formatter.HDG, Formatter.HDM)
+    assert tuple(body(kind, sample(), reference) for kind in kinds) == sentences
+    if sentences == (None, None, None):
+        assert body(Formatter.PASHR, sample(), reference) == "PASHR,000000.000,,T,+1.00,-2.00,,,,,0,0"
 
 
 def test_roll_pitch_temperature_pressure() -> None:

@@ -176,16 +176,16 @@ def test_directory_that_others_rule(shared: Path, uid: int, mode: int, message: 
         RingDirectory(str(shared))
 
 
-def test_directory_by_a_symbolic_link(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("make", "why"),
+    [
+        (lambda path: path.symlink_to("real"), "a symbolic link"), (os.mkfifo, "Not a directory"),
+    ],
+)  # fmt: skip
+def test_what_is_no_directory(tmp_path: Path, make: Callable[[Path], object], why: str) -> None:
     (tmp_path / "real").mkdir()
-    (tmp_path / "link").symlink_to("real")
-    with pytest.raises(ServerError, match=r"expected a directory for shared memory \(a symbolic link\)"):
-        RingDirectory(str(tmp_path / "link"))
-
-
-def test_fifo_instead_of_the_directory(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "shm")
-    with pytest.raises(ServerError, match=r"expected a directory for shared memory \(Not a directory\)"):
+    make(tmp_path / "shm")
+    with pytest.raises(ServerError, match=rf"expected a directory for shared memory \({why}\)"):
         RingDirectory(str(tmp_path / "shm"))
 
 
