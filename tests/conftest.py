@@ -4,6 +4,7 @@ A test of logic receives the time as an argument. A `live` test runs a real daem
 condition with `wait_until`.
 """
 
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -69,3 +70,26 @@ def board(tmp_path: Path) -> "Iterator[Board]":
     made = Board(tmp_path)
     yield made
     made.publisher.close()
+
+
+def open_descriptors() -> dict[int, str]:
+    """Return the files of the open descriptors of this process."""
+    found = {}
+    for name in os.listdir("/proc/self/fd"):
+        try:
+            found[int(name)] = os.readlink(f"/proc/self/fd/{name}")
+        except FileNotFoundError:  # the listing itself
+            continue
+    return found
+
+
+@pytest.fixture(autouse=True)
+def _no_descriptor_left(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fail if a test of an output or of the client leaves a descriptor open."""
+    path = request.node.nodeid
+    if not path.startswith(("tests/publishers/", "tests/client/")) or path.startswith("tests/publishers/mqtt/"):
+        yield
+        return
+    before = open_descriptors()
+    yield
+    assert {number: file for number, file in open_descriptors().items() if number not in before} == {}

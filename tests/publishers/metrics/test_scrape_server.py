@@ -85,12 +85,14 @@ async def test_what_is_no_http_gets_400(head: bytes) -> None:
             )
 
 
+@pytest.mark.parametrize(("size", "is_answered"), [(8192, True), (8193, False), (32768, False)])
 @in_loop
-async def test_too_long_a_request_is_ended() -> None:
+async def test_too_long_a_request_is_ended(size: int, is_answered: bool) -> None:
     async with server(hello) as served:
         with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
-            connection.sendall(b"GET / HTTP/1.1\r\nX: " + b"x" * 4 * scrape_server.REQUEST_BYTES_MAX)
-            assert await asyncio.to_thread(read_all, connection) == b""
+            head = b"GET / HTTP/1.1\r\nX: "
+            connection.sendall(head + b"x" * (size - len(head) - 4) + b"\r\n\r\n")
+            assert (await asyncio.to_thread(read_all, connection) != b"") == is_answered
 
 
 @in_loop

@@ -47,8 +47,11 @@ def bench(tmp_path: Path) -> Iterator[FlightWriterBench]:
     made.writer.close()
 
 
-def test_a_snapshot_has_all_that_came_before_it_and_nothing_after(bench: FlightWriterBench) -> None:
-    path = bench.folder / "a"
+def test_a_snapshot_has_all_that_came_before_it_and_nothing_after(
+    bench: FlightWriterBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, synced = bench.folder / "a", list[int]()
+    monkeypatch.setattr(os, "fdatasync", synced.append)
     bench.begin()
     bench.put(0)
     bench.begin()
@@ -58,6 +61,7 @@ def test_a_snapshot_has_all_that_came_before_it_and_nothing_after(bench: FlightW
     bench.work()
     (saved,) = bench.writer.saved
     assert (saved.path, saved.bytes, saved.problem) == (path, path.stat().st_size, "")
+    assert len(synced) == 1  # it is on the disk when it is reported
     assert [(one.kind, one.device) for one in records_in(path)] == [
         (Kind.SESSION, NO_DEVICE), (Kind.DATA, 0), (Kind.DATA, 1), (Kind.END, NO_DEVICE)
     ]  # fmt: skip
