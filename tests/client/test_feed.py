@@ -7,11 +7,13 @@ from time import monotonic_ns, time_ns
 
 import pytest
 
-from imud.client.feed import SAME_CLOCK_NS, Feed, Wish, clock_ahead_ns, utc_offset_ns
+from imud.client.feed import Feed, Wish, clock_ahead_ns, utc_offset_ns
 from imud.event import Event, EventKind
 from imud.units import NS_PER_S
 from tests.client.news import Listener
 from tests.support.socket_rig import NOW_NS, Daemon, batch, daemon
+
+SAME_CLOCK_NS = 2 * NS_PER_S
 
 LIMIT_S = 60.0
 OVERVIEW = Wish((), news_s=0.02, newest=True, newest_s=0.02)

@@ -28,13 +28,15 @@ from imud.publishers.metrics.family import (
 )
 from imud.publishers.metrics.mqtt import MQTT_FAMILIES
 from imud.publishers.metrics.outputs import OUTPUT_FAMILIES
-from imud.publishers.metrics.publisher import SAMPLES_PER_TURN, ClientTotals, Renderer
+from imud.publishers.metrics.publisher import ClientTotals, Renderer
 from imud.publishers.metrics.recorder import FLIGHT_FAMILIES, RECORDER_FAMILIES, RECORDINGS_FAMILIES
 from imud.publishers.metrics.rings import RingView
 from imud.sample import Sync
 from imud.utc.rmc_feed import Refusal
 from tests.support.files import ROOT
 from tests.support.metrics import FRAME, LINES, UTC, client, device, equipped, views
+
+SAMPLES_PER_TURN = 64
 
 Key = tuple[str, frozenset[tuple[str, str]]]
 

@@ -19,10 +19,12 @@ from imud.contracts.status import DeviceStatus
 from imud.errors import ServerError
 from imud.event import Event, EventKind
 from imud.publishers import PUBLISHERS
-from imud.publishers.metrics.publisher import DEVICES_PER_TURN, MetricsPublisher, MetricsSettings
+from imud.publishers.metrics.publisher import MetricsPublisher, MetricsSettings
 from tests.support.event_loops import in_loop
 from tests.support.metrics import LIMIT_S, ask, device, read_all
 from tests.support.rings import DEVICE, Board
+
+DEVICES_PER_TURN = 8
 
 DEVICES = (device("front", 0), device("rear", 1))
 

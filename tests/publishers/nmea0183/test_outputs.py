@@ -12,10 +12,13 @@ import pytest
 
 from imud.contracts.status import OutputStatus
 from imud.errors import ServerError
-from imud.publishers.nmea0183.outputs import CLIENTS_MAX, RETRY_FIRST_NS, STUCK_NS, SerialOutput, TcpOutput, UdpOutput
+from imud.publishers.nmea0183.outputs import SerialOutput, TcpOutput, UdpOutput
 from imud.publishers.nmea0183.outputs import open_serial as open_real_port
+from imud.units import NS_PER_S
 from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.socket_rig import in_context
+
+CLIENTS_MAX, RETRY_FIRST_NS, STUCK_NS = 32, NS_PER_S, 30 * NS_PER_S
 
 LIMIT_S = 60.0
 ONE = b"$HEHDT,98.3,T*2F\r\n"

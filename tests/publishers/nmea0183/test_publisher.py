@@ -21,13 +21,15 @@ from imud.contracts.status import FrameStatus
 from imud.frames.conventions import Convention, Heading
 from imud.frames.published import PublishedFrame
 from imud.frames.settings import published_frame
-from imud.publishers.nmea0183.publisher import REFERENCE_NS, USUAL_BYTES, WHO, Nmea0183, Nmea0183Settings, address_of
+from imud.publishers.nmea0183.publisher import USUAL_BYTES, WHO, Nmea0183, Nmea0183Settings, address_of
 from imud.publishers.nmea0183.sentences import Formatter, HeadingReference, make
 from imud.sample import Sample, Sync, Vector3
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.socket_rig import device_status, in_context
 from tests.support.surroundings import free_port
+
+REFERENCE_NS = NS_PER_S
 
 LIMIT_S = 60.0
 NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (make bench-deps)"

@@ -1,7 +1,9 @@
 """Which alerts of the flight recorder are saved: one at a time, so many an hour."""
 
-from imud.publishers.recorder.alerts import HOUR_NS, Alert, AlertGate
+from imud.publishers.recorder.alerts import Alert, AlertGate
 from imud.units import NS_PER_S
+
+HOUR_NS = 3600 * NS_PER_S
 
 AFTER_NS = 30 * NS_PER_S
 

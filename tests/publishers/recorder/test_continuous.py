@@ -12,12 +12,13 @@ from imud.formats.recording.file import RecordingReader
 from imud.formats.recording.records import Kind, LostRecord
 from imud.publishers.recorder import continuous as module
 from imud.publishers.recorder.continuous import Recorder
-from imud.publishers.recorder.directory import RETRY_NS, RecordingDirectory
-from imud.publishers.recorder.feed import CHECK_NS
+from imud.publishers.recorder.directory import RecordingDirectory
 from imud.publishers.recorder.settings import RecorderSettings
 from imud.publishers.recorder.writer import RecordQueue
 from imud.units import NS_PER_S
 from tests.publishers.recorder.recording_bench import RecordingBench
+
+RETRY_NS, CHECK_NS = 60 * NS_PER_S, NS_PER_S
 
 
 class RecorderBench(RecordingBench):

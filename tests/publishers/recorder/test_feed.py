@@ -3,9 +3,11 @@
 from imud.event import Event, EventKind
 from imud.formats.recording import records
 from imud.formats.recording.records import NO_DEVICE, Kind, Record
-from imud.publishers.recorder.feed import BEGIN_NS, CHECK_NS, RecordFeed
+from imud.publishers.recorder.feed import RecordFeed
 from imud.publishers.recorder.writer import RecordQueue
 from tests.publishers.recorder.recording_bench import RecordingBench
+
+BEGIN_NS, CHECK_NS = 2_000_000, 1_000_000_000
 
 
 class FeedBench(RecordingBench):

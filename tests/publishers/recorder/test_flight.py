@@ -13,13 +13,15 @@ from imud.event import Event, EventKind
 from imud.formats.recording import records
 from imud.formats.recording.file import RecordingReader
 from imud.formats.recording.records import EndRecord, Kind, SessionRecord, decode_object
-from imud.publishers.recorder.directory import RETRY_NS, RecordingDirectory
-from imud.publishers.recorder.flight import SENDS_MAX, FlightRecorder
+from imud.publishers.recorder.directory import RecordingDirectory
+from imud.publishers.recorder.flight import FlightRecorder
 from imud.publishers.recorder.settings import FlightSettings, RecorderSettings
 from imud.publishers.recorder.stream import stream_pair
 from imud.units import NS_PER_S
 from tests.publishers.recorder.recording_bench import RecordingBench, records_in
 from tests.support.socket_rig import sample
+
+SENDS_MAX, RETRY_NS = 4, 60 * NS_PER_S
 
 
 class FlightBench(RecordingBench):

@@ -11,9 +11,11 @@ from imud.formats.recording.records import NO_DEVICE, EndRecord, Kind, SessionRe
 from imud.publishers.recorder.directory import RecordingDirectory
 from imud.publishers.recorder.flight_writer import FlightWriter, Mark, Rescue, Save, Send
 from imud.publishers.recorder.segments import SegmentBegin, SegmentRing
-from imud.publishers.recorder.stream import LINGER_NS, stream_pair
+from imud.publishers.recorder.stream import stream_pair
 from imud.publishers.recorder.writer import RecordQueue
 from tests.publishers.recorder.recording_bench import RecordingBench, kinds_in, records_in
+
+LINGER_NS = 10_000_000_000
 
 END = records.encode_object(Kind.END, NO_DEVICE, EndRecord(9, 9, "a blow"))
 SESSION = records.encode_object(Kind.SESSION, NO_DEVICE, SessionRecord(1, "", "", "", 7, 0, 1, 1))

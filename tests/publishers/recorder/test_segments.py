@@ -11,7 +11,9 @@ from imud.formats.recording import records
 from imud.formats.recording.blocks import BlockEncoder
 from imud.formats.recording.file import RecordingReader
 from imud.formats.recording.records import NO_DEVICE, EndRecord, Kind, SessionRecord
-from imud.publishers.recorder.segments import SEGMENTS_MAX, SegmentBegin, SegmentReader, SegmentRing, left_behind
+from imud.publishers.recorder.segments import SegmentBegin, SegmentReader, SegmentRing, left_behind
+
+SEGMENTS_MAX = 64
 
 END = records.encode_object(Kind.END, NO_DEVICE, EndRecord(9, 9, "a blow"))
 

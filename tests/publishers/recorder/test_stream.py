@@ -10,9 +10,11 @@ from imud.formats.recording import records
 from imud.formats.recording.file import RecordingReader
 from imud.formats.recording.records import Kind, Record
 from imud.publishers.recorder import stream as module
-from imud.publishers.recorder.stream import LINGER_NS, ClientRecording, stream_pair
+from imud.publishers.recorder.stream import ClientRecording, stream_pair
 from imud.publishers.recorder.writer import RecordQueue
 from tests.publishers.recorder.recording_bench import RecordingBench
+
+LINGER_NS = 10_000_000_000
 
 
 class StreamBench(RecordingBench):

@@ -8,9 +8,11 @@ import pytest
 
 from imud.formats.recording import records
 from imud.formats.recording.file import RecordingReader
-from imud.publishers.recorder.writer import RING_BYTES, SYNC_NS, RecordingWriter, RecordQueue
+from imud.publishers.recorder.writer import RecordingWriter, RecordQueue
 from tests.support.event_loops import VirtualClock
 from tests.support.signal_bench import HandWorker
+
+RING_BYTES, SYNC_NS = 256 << 10, 5_000_000_000
 
 
 class WriterBench:

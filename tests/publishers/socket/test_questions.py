@@ -12,8 +12,9 @@ import pytest
 from imud.contracts.status import DeviceStatus
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
 from imud.publishers.socket.questions import DEVICES_PER_PIECE
-from imud.publishers.socket.serving import TURN_NS
 from tests.support.socket_rig import NOW_NS, Peer, batch, context, device_status, in_context, until
+
+TURN_NS = 1_000_000
 
 DEVICES = 100
 DEVICE_NS = 30_000

@@ -17,11 +17,12 @@ from imud.formats.recording.file import RecordingReader
 from imud.formats.recording.records import EndRecord, Kind, Record, decode_object
 from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.quota import Quota
-from imud.publishers.socket.recordings import RECORDINGS_MAX
 from imud.publishers.socket.rights import Guard, Rights
 from imud.worker import BusThread
 from tests.publishers.recorder.recording_bench import HandSource
 from tests.support.socket_rig import NOW_NS, Peer, in_context, in_server, run, serving, until
+
+RECORDINGS_MAX = 4
 
 Recorded = tuple[SocketServer, HandSource]
 
