@@ -4,13 +4,14 @@ import asyncio
 import os
 import select
 import socket
+from pathlib import Path
 
 import pytest
 
 from imud.formats.jsonrpc import encode_notification
 from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.waker import BYTE
-from tests.support.socket_rig import Peer, batch, in_server, until
+from tests.support.socket_rig import NOW_NS, Peer, batch, in_server, run, serving, until
 
 
 async def notified(peer: Peer, device: str = "imu0") -> int:
@@ -72,6 +73,32 @@ async def test_notify_again_ends_the_old_descriptor(server: SocketServer) -> Non
     assert [read_all(fd) for fd in fds] == [b"", b"", b"", b"", BYTE]
     for fd in fds:
         os.close(fd)
+
+
+def test_many_clients_are_woken_in_several_turns(tmp_path: Path) -> None:
+    """For 0.3 ms in a turn, with a look at the clock after 16 clients."""
+    now_ns, step_ns = NOW_NS, 0
+
+    def clock() -> int:
+        nonlocal now_ns
+        now_ns += step_ns
+        return now_ns
+
+    async def body() -> None:
+        nonlocal step_ns
+        async with serving(tmp_path, clock) as server:
+            fds = [await notified(await Peer.greeted(server)) for _ in range(40)]
+            step_ns = 200_000
+            server.publish(batch("imu0"))
+            woken = []
+            for _ in range(2):
+                await asyncio.sleep(0)
+                woken.append(sum(read_all(fd) == BYTE for fd in fds))
+            assert woken == [32, 8]
+            for fd in fds:
+                os.close(fd)
+
+    run(body)
 
 
 @pytest.mark.timeout(60)  # a daemon that waits never returns
