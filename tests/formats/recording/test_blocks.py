@@ -43,6 +43,9 @@ def test_the_golden_block_is_read_and_written() -> None:
     found, reader = blocks_of(GOLDEN)
     assert found == [b"abc"]
     assert (reader.bytes_bad, reader.bytes_cut, reader.blocks_missing) == (0, 0, 0)
+    assert is_recording(GOLDEN)
+    with pytest.raises(ImudError, match=r"a\.csv is no recording of imud: expected"):
+        check_begin(b"t_ns,accel", "a.csv")
 
 
 def test_a_block_that_compresses_is_a_zstandard_frame() -> None:
@@ -53,7 +56,7 @@ def test_a_block_that_compresses_is_a_zstandard_frame() -> None:
 
 
 def test_after_a_cut_at_any_byte_all_whole_blocks_are_read() -> None:
-    made = some_blocks(12)
+    made = some_blocks(6)
     data = b"".join(block for _, block in made)
     for end in range(len(data) + 1):
         whole, at = [], 0
@@ -68,7 +71,7 @@ def test_after_a_cut_at_any_byte_all_whole_blocks_are_read() -> None:
 
 
 def test_a_damaged_byte_costs_its_own_block_only() -> None:
-    made = some_blocks(6)
+    made = some_blocks(4)
     data = b"".join(block for _, block in made)
     for place in range(len(data)):
         damaged = data[:place] + bytes([data[place] ^ 0x40]) + data[place + 1 :]
@@ -94,22 +97,41 @@ def test_no_bytes_raise(data: bytes) -> None:
     assert reader.bytes_bad + reader.bytes_cut == len(data) + len(MAGIC)
 
 
-def test_a_frame_that_claims_more_than_the_head_is_refused_before_it_is_unpacked() -> None:
-    stored = zstandard.ZstdCompressor().compress(b"\0" * (64 << 20))
-    head = HEAD.pack(MAGIC, 1, 0, 1 << 16, len(stored), 0)[:-4]
-    crc = struct.pack("<I", zlib.crc32(stored, zlib.crc32(head)))
-    assert blocks_of(head + crc + stored)[0] == []
+def valid_crc(stored: bytes, plain: int, method: int = 1) -> bytes:
+    """Return a block with these contents and the CRC of them."""
+    head = HEAD.pack(MAGIC, method, 0, plain, len(stored), 0)[:-4]
+    return head + struct.pack("<I", zlib.crc32(stored, zlib.crc32(head))) + stored
 
 
-def test_a_block_has_a_largest_content() -> None:
+FRAME = zstandard.compress(b"abcd" * 1000)
+DAMAGED = {
+    "no Zstandard frame": valid_crc(b"x" * 40, 4000),
+    "a frame that is cut": valid_crc(FRAME[:-3], 4000),
+    "a frame with damaged data": valid_crc(FRAME[:-4] + b"\xff\xff\xff\xff", 4000),
+    "a frame with a byte too much": valid_crc(FRAME, 3999),
+    "a frame with a byte too few": valid_crc(FRAME, 4001),
+    "a frame without its size": valid_crc(zstandard.ZstdCompressor(write_content_size=False).compress(b"a" * 99), 99),
+    "a frame of 64 MB": valid_crc(zstandard.compress(bytes(64 << 20)), 1 << 16),
+    "a content that is too large": valid_crc(zstandard.compress(bytes(PLAIN_MAX + 1)), PLAIN_MAX + 1),
+    "a frame as large as its content": valid_crc(FRAME, len(FRAME)),
+    "another method": valid_crc(b"abc", 3, method=2),
+    "stored bytes of another size": valid_crc(b"abc", 4, method=0),
+}
+"""Blocks whose CRC is valid, as another program or a defect writes them."""
+
+
+@pytest.mark.parametrize("block", DAMAGED.values(), ids=DAMAGED)
+def test_a_block_with_a_valid_crc_and_damaged_content_costs_only_itself(block: bytes) -> None:
+    found, reader = blocks_of(GOLDEN + block + GOLDEN)
+    assert (found, reader.bytes_bad, reader.first_bad) == ([b"abc"] * 2, len(block), len(GOLDEN))
+    found, reader = blocks_of(block)
+    assert (found, reader.bytes_bad + reader.bytes_cut) == ([], len(block))
+
+
+def test_the_largest_content_is_read_and_a_larger_one_refused() -> None:
+    assert blocks_of(BlockEncoder().encode(bytes(PLAIN_MAX)))[0] == [bytes(PLAIN_MAX)]
     with pytest.raises(ValueError, match="at most"):
         BlockEncoder().encode(b"\0" * (PLAIN_MAX + 1))
-
-
-def test_what_a_recording_begins_with() -> None:
-    assert is_recording(GOLDEN)
-    with pytest.raises(ImudError, match=r"a\.csv is no recording of imud: expected"):
-        check_begin(b"t_ns,accel", "a.csv")
 
 
 def test_a_block_with_another_number_is_whole() -> None:

@@ -50,6 +50,7 @@ def test_a_file_without_its_end_says_so() -> None:
     reader = RecordingReader(io.BytesIO(data[:-5]), "a.rec")
     assert len(list(reader)) == 11
     assert len(reader.problems) == 2
+    assert (reader.ended, reader.is_damaged) == (False, False)
     assert "cut short" in reader.problems[0]
     assert "no regular end" in reader.problems[1]
 
@@ -61,6 +62,14 @@ def test_damage_and_missing_blocks_are_named() -> None:
     assert len(list(reader)) == 11
     assert "are damaged" in reader.problems[0]
     assert reader.problems[1] == "blocks that are missing by their numbers: 1"
+    assert reader.is_damaged
+
+
+def test_a_block_without_records_costs_only_itself() -> None:
+    reader = RecordingReader(io.BytesIO(written(session(), b"\xff" * 9, *reads(2), END, each=True)), "a.rec")
+    assert len(list(reader)) == 4
+    assert (reader.records_unreadable, reader.blocks_read, reader.is_damaged, reader.ended) == (1, 5, True, True)
+    assert reader.problems == ["1 blocks hold something else than records, left out"]
 
 
 @pytest.mark.parametrize("data", [b"", b"\x89imudREC", b"t_ns,accel\n" * 20])
@@ -69,12 +78,9 @@ def test_a_file_without_blocks_is_no_recording(data: bytes) -> None:
         list(RecordingReader(io.BytesIO(data), "a.rec"))
 
 
-def test_another_version_is_refused() -> None:
+def test_sizes_and_versions_are_limited() -> None:
     with pytest.raises(ImudError, match="records of version 9, this imud reads 1"):
         list(RecordingReader(io.BytesIO(written(session(9))), "a.rec"))
-
-
-def test_a_record_has_a_largest_size() -> None:
     assert RecordingReader(io.BytesIO(written(bytes(RECORD_BYTES_MAX))), "a.rec")
     with pytest.raises(ValueError, match="at most"):
         BlockGatherer().add(bytes(RECORD_BYTES_MAX + 1))
