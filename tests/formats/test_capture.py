@@ -3,8 +3,6 @@
 import io
 import re
 import struct
-import subprocess
-import sys
 from pathlib import Path
 from typing import BinaryIO, cast
 
@@ -127,13 +125,10 @@ def test_what_is_written_is_read_with_times_that_never_run_back(reads: list[tupl
         assert times[-1] == max(t_ns for data, t_ns in reads if data)
 
 
-def test_a_long_read_is_split() -> None:
+def test_what_a_writer_refuses_and_splits() -> None:
     file = io.BytesIO()
     CaptureWriter(file).write(bytes(RECORD_BYTES_MAX + 1), 1)
     assert [(t_ns, len(data)) for t_ns, data in chunks(file.getvalue())] == [(1, RECORD_BYTES_MAX), (1, 1)]
-
-
-def test_the_bound_is_kept_and_the_rest_counted() -> None:
     file = io.BytesIO()
     writer = CaptureWriter(file, bytes_max=100)
     taken = [writer.write(bytes(20), t_ns) for t_ns in range(5)]
@@ -142,17 +137,15 @@ def test_the_bound_is_kept_and_the_rest_counted() -> None:
     assert writer.bytes_refused == 60
     assert not writer.write(b"", 9)
     assert not writer.write(b"a", 9)  # it would fit, but a capture has no holes
-
-
-def test_a_first_line_that_could_not_be_read_back_is_refused() -> None:
     with pytest.raises(ValueError, match="can be read back"):
         CaptureWriter(io.BytesIO(), details={"note": "x" * 5000})
 
 
-def test_the_example_of_the_document(tmp_path: Path) -> None:
+def test_the_example_of_the_document(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "file").write_bytes(GOLDEN)
-    document = (ROOT / "docs" / "captures.md").read_text()
-    (code,) = re.findall(r"```python\n(.*?)```", document, re.DOTALL)
-    argv = [sys.executable, "-c", f"{code}        print(t_ns, data)\n"]
-    done = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=20, cwd=tmp_path)
-    assert done.stdout.splitlines()[1:] == ["258 b'abc'", "259 b'd'"], done.stderr
+    monkeypatch.chdir(tmp_path)
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/captures.md").read_text(), re.DOTALL)
+    exec(f"{code}        print(t_ns, data)\n", {})
+    assert capsys.readouterr().out.splitlines()[1:] == ["258 b'abc'", "259 b'd'"]

@@ -1,7 +1,7 @@
 """29-bit identifiers of the manual and of the standard, split and joined."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.formats.can import EXTENDED_ID_MAX
@@ -25,7 +25,6 @@ def test_known_identifiers(can_id: int, parts: J1939Id) -> None:
     assert join(parts) == can_id
 
 
-@settings(derandomize=True, deadline=None, database=None)
 @given(st.integers(0, EXTENDED_ID_MAX))
 def test_every_identifier_comes_back(can_id: int) -> None:
     assert join(split(can_id)) == can_id

@@ -3,7 +3,7 @@
 from random import Random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.formats.modbus import (
@@ -47,7 +47,6 @@ def test_silence_between_frames(baud: int, gap_ns: int) -> None:
     assert frame_gap_ns(baud) == pytest.approx(gap_ns, abs=2)
 
 
-@settings(max_examples=60, derandomize=True, deadline=None, database=None)
 @given(seed=st.integers(0, 2**32), echo=st.booleans(), known=st.booleans(), exception=st.booleans())
 def test_the_reply_is_found_in_any_split(seed: int, echo: bool, known: bool, exception: bool) -> None:
     random, reply = Random(seed), EXCEPTION if exception else REPLY
@@ -62,16 +61,13 @@ def test_the_reply_is_found_in_any_split(seed: int, echo: bool, known: bool, exc
     assert found.echo_seen is (echo if echo or not known else None)
 
 
-def test_what_belongs_to_others_is_skipped_and_counted() -> None:
+def test_bytes_that_are_not_the_reply_are_skipped_and_counted() -> None:
     found = finder()
     assert found.feed(OTHER) is None
     assert found.feed(b"\x05\x03" + REPLY[:4]) is None
     assert found.feed(REPLY[4:]) == REPLY
     assert found.strange == len(OTHER) + 2
-
-
-def test_reply_of_another_length_is_not_taken() -> None:
-    """What a module owes from before: it is asked for another number of registers now."""
+    # What a module owes from before: it is asked for another number of registers now.
     old = framed(5, bytes.fromhex("03 06 11 22 33 44 55 66"))
     found = finder()
     assert found.feed(old) is None
@@ -79,16 +75,13 @@ def test_reply_of_another_length_is_not_taken() -> None:
     assert found.strange == len(old)
 
 
-def test_damaged_reply_in_its_place_is_given_to_who_asked() -> None:
+def test_a_damaged_reply_is_returned_only_in_its_place() -> None:
     damaged = REPLY[:-1] + bytes([REPLY[-1] ^ 1])
     assert finder().feed(damaged) == damaged
     late = finder()
     assert late.feed(OTHER + damaged) is None  # behind something strange only a whole one is believed
     assert late.feed(REPLY) == REPLY
     assert late.strange == len(OTHER) + len(damaged)
-
-
-def test_reply_with_a_damaged_head_may_have_been_one_but_another_module_may_not() -> None:
     found = finder()
     assert found.feed(b"\x45" + REPLY[1:]) is None
     assert found.looks_damaged

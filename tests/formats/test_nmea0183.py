@@ -24,12 +24,9 @@ def fields(sentence: bytes) -> list[str]:
     return found
 
 
-def test_a_sentence_of_a_compass() -> None:
+def test_headings() -> None:
     # a Vector heading sensor's, in the collection of examples of gpsd
     assert nmea0183.hdg("HC", radians(101.1), radians(-7.1)) == b"$HCHDG,101.1,,,7.1,W*3C\r\n"
-
-
-def test_headings() -> None:
     assert fields(nmea0183.hdt("HE", radians(98.3))) == ["98.3", "T"]
     assert fields(nmea0183.hdm("HC", radians(-1.5))) == ["358.5", "M"]
     assert fields(nmea0183.hdg("HC", radians(7), None)) == ["7.0", "", "", "", ""]
@@ -59,9 +56,6 @@ def test_rate_of_turn_is_in_degrees_a_minute() -> None:
 def test_transducers() -> None:
     made = nmea0183.xdr("YX", [Transducer("A", -3.256, "D", "PTCH"), Transducer("P", 1.01325, "B", "BARO", 5)])
     assert fields(made) == ["A", "-3.26", "D", "PTCH", "P", "1.01325", "B", "BARO"]
-
-
-def test_the_longest_measurements_fit_and_more_are_refused() -> None:
     angles = [Transducer("A", -179.99, "D", "PTCH"), Transducer("A", -179.99, "D", "ROLL")]
     rest = [Transducer("C", -40.5, "C", "TEMP", 1), Transducer("P", 1.01325, "B", "BARO", 5)]
     assert len(fields(nmea0183.xdr("YX", angles + rest))) == 16
@@ -75,8 +69,5 @@ def test_attitude_with_time() -> None:
     assert made.startswith(b"$PASHR,083559.250,311.32,T,+1.50,+0.00,,,,,0,0*")
     assert nmea0183.checksum(made[1 : made.index(b"*")]) == int(made[-4:-2], 16)
     assert b",083559.250,,T," in nmea0183.pashr(1_795_422_959 * NS_PER_S + 250_000_000, None, 0, 0)
-
-
-def test_the_checksum_is_the_xor_of_all_bytes() -> None:
     assert nmea0183.checksum(b"") == 0
     assert nmea0183.checksum(b"AB") == 0x41 ^ 0x42

@@ -78,6 +78,7 @@ def test_a_boot_is_fresh_once_and_its_newest_offset_counts() -> None:
     assert clocks.take(not_set(samples_message(7, 8))) == later
     assert clocks.take_fresh() == {}
     assert clocks.take(samples_message(1, 2, boot="2", utc_ns=0)) is None
+    assert boot_of(samples_message(1, 1, boot="00ff-3")) == BootKey("gw", "00ff"), "a restarted device has its boot"
 
 
 def test_a_state_says_it_too() -> None:
@@ -87,17 +88,10 @@ def test_a_state_says_it_too() -> None:
     assert clocks.offsets == {}
     clocks.take_state("gw", state)
     assert clocks.take_fresh() == clocks.offsets == {BootKey("gw", "1"): BootOffset(0, UTC_NS, 40)}
-
-
-def test_what_is_kept_is_bounded_and_the_oldest_goes() -> None:
-    clocks, state = BootClocks(), GatewayState(v=1, online=True, boot="1", clock=SET)
+    clocks = BootClocks()
     for number in range(BOOTS_MAX + 1):
         clocks.take_state(f"gw-{number}", state)
     assert len(clocks.offsets) == BOOTS_MAX
     assert BootKey("gw-0", "1") not in clocks.offsets
     assert BootKey(f"gw-{BOOTS_MAX}", "1") in clocks.offsets
     assert len(clocks.take_fresh()) == BOOTS_MAX, "a reader that does not place anything never asks for them"
-
-
-def test_a_device_that_was_made_anew_is_of_the_same_boot() -> None:
-    assert boot_of(samples_message(1, 1, boot="00ff-3")) == BootKey("gw", "00ff")

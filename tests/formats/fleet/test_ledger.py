@@ -28,15 +28,17 @@ def counts_of(*messages: FleetMessage, stream: Stream = Stream.SAMPLES, from_beg
     return counts
 
 
-def test_each_number_is_of_one_kind() -> None:
-    counts = counts_of(
-        message(1, 10), message(11, 20, MessageKind.INTERVALS), message(21, 25, MessageKind.DROPPED), message(28, 30)
-    )
+def test_each_number_counts_once() -> None:
+    dropped, intervals = MessageKind.DROPPED, MessageKind.INTERVALS
+    counts = counts_of(message(1, 10), message(11, 20, intervals), message(21, 25, dropped), message(28, 30))
     assert counts == StreamCounts(1, 30, whole=13, thinned=10, dropped={"space": 5}, missing=2)
-
-
-def test_intervals_of_their_own_stream_are_not_thinned() -> None:
-    assert counts_of(message(1, 4, MessageKind.INTERVALS), stream=Stream.STATISTICS) == StreamCounts(1, 4, whole=4)
+    assert counts_of(message(1, 4, intervals), stream=Stream.STATISTICS) == StreamCounts(1, 4, whole=4)
+    counts = counts_of(message(1, 10), message(5, 20, dropped))
+    assert counts == StreamCounts(1, 20, whole=10, dropped={"space": 10}, duplicates=6)
+    counts = counts_of(message(1, 2), message(9, 10), message(4, 6))
+    assert counts == StreamCounts(1, 10, whole=7, missing=3), "missing samples can arrive later"
+    assert counts_of(message(7, 8), from_begin=False) == StreamCounts(7, 8, whole=2)
+    assert counts_of(message(7, 8)) == StreamCounts(1, 8, whole=2, missing=6)
 
 
 def test_what_comes_again_is_a_duplicate_and_not_given_twice() -> None:
@@ -48,28 +50,8 @@ def test_what_comes_again_is_a_duplicate_and_not_given_twice() -> None:
     assert [one.seq for one in partly.samples] == [11, 12]
     (counts,) = ledger.counts.values()
     assert counts == StreamCounts(1, 12, whole=12, duplicates=13)
-
-
-def test_a_note_that_covers_what_had_come_counts_only_the_rest() -> None:
-    counts = counts_of(message(1, 10), message(5, 20, MessageKind.DROPPED))
-    assert counts == StreamCounts(1, 20, whole=10, dropped={"space": 10}, duplicates=6)
-
-
-def test_what_was_missing_can_come_later() -> None:
-    counts = counts_of(message(1, 2), message(9, 10), message(4, 6))
-    assert counts == StreamCounts(1, 10, whole=7, missing=3)
-
-
-def test_a_reader_that_came_late_begins_where_it_came() -> None:
-    assert counts_of(message(7, 8), from_begin=False) == StreamCounts(7, 8, whole=2)
-    assert counts_of(message(7, 8)) == StreamCounts(1, 8, whole=2, missing=6)
-
-
-def test_boots_are_apart() -> None:
-    ledger = FleetLedger()
-    ledger.take(message(1, 5), Stream.SAMPLES)
     ledger.take(message(1, 3, boot="2"), Stream.SAMPLES)
-    assert [one.whole for one in ledger.counts.values()] == [5, 3]
+    assert [one.whole for one in ledger.counts.values()] == [12, 3]
 
 
 RANGES = st.tuples(st.integers(1, 40), st.integers(0, 12)).map(lambda pair: (pair[0], pair[0] + pair[1]))

@@ -22,9 +22,6 @@ def test_a_name_that_is_none_makes_no_topic(name: str) -> None:
     if name:
         with pytest.raises(ValueError, match="letters, digits"):
             topic_of("site", "gw", name, STATUS)
-
-
-def test_devices_and_gateways_have_their_own_ends() -> None:
     with pytest.raises(ValueError, match="of a device"):
         topic_of("site", "gw", "bow", STATE)
     with pytest.raises(ValueError, match="of a gateway"):

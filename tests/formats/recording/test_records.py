@@ -46,31 +46,32 @@ def test_a_data_record_by_hand() -> None:
     assert records.decode_data(record.body) == (258, -1, b"\x5a\xa5")
 
 
-def test_frames_come_back() -> None:
-    frames = [
-        CanFrame(0x188, False, b"\1\2\3", 10),
-        CanFrame(0x0CFF3408, True, b"", 11, True),
-        CanFrame(0x7FF, False, bytes(64), 12),
-    ]
-    assert records.decode_frames(only(records.encode_frames(0, frames)).body) == frames
+FRAMES = [
+    CanFrame(0x188, False, b"\1\2\3", 10), CanFrame(0x0CFF3408, True, b"", 11, True),
+    CanFrame(0x7FF, False, bytes(64), 12),
+]  # fmt: skip
+READINGS = [ReadingRecord(0, 5, 9, 0, b"\1" * 300), ReadingRecord(1, 10, 12, 2, "bus é".encode())]
+CLOCKS, LOST = ClocksRecord(1, -2, 3, 4, 5, 6), LostRecord(1, 2, -3)
 
 
-def test_readings_come_back() -> None:
-    readings = [ReadingRecord(0, 5, 9, 0, b"\1" * 300), ReadingRecord(1, 10, 12, 2, "bus é".encode())]
-    assert records.decode_readings(only(records.encode_readings(7, readings)).body) == readings
+@pytest.mark.parametrize(
+    ("kind", "data", "value"),
+    [
+        (Kind.FRAMES, records.encode_frames(0, FRAMES), FRAMES),
+        (Kind.READINGS, records.encode_readings(7, READINGS), READINGS),
+        (Kind.CLOCKS, records.encode_clocks(CLOCKS), CLOCKS),
+        (Kind.LOST, records.encode_lost(LOST), LOST),
+    ],
+)
+def test_records_come_back(kind: Kind, data: bytes, value: object) -> None:
+    assert only(data).kind == kind
+    assert DECODERS[kind](only(data).body) == value
 
 
 @pytest.mark.parametrize("line", records.LINES)
 def test_edges_come_back(line: str) -> None:
     edges = [EdgeRecord(-5, True, 1), EdgeRecord(1 << 60, False, 1 << 40)]
     assert records.decode_edges(only(records.encode_edges(0, line, edges)).body) == (line, edges)
-
-
-def test_clocks_and_losses_come_back() -> None:
-    clocks = ClocksRecord(1, -2, 3, 4, 5, 6)
-    assert records.decode_clocks(only(records.encode_clocks(clocks)).body) == clocks
-    lost = LostRecord(1, 2, -3)
-    assert records.decode_lost(only(records.encode_lost(lost)).body) == lost
 
 
 def test_objects_come_back() -> None:
