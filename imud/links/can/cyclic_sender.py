@@ -85,9 +85,13 @@ class LoopSender:
         self._now_ns = now_ns
         self._timers: dict[int, asyncio.TimerHandle] = {}
         begin_ns = now_ns()
-        for number, frame in enumerate(frames):
-            write(pack_frame(frame.can_id, frame.extended, frame.data))
-            self._wait(number, frame, begin_ns + frame.every_ns)
+        try:
+            for number, frame in enumerate(frames):
+                write(pack_frame(frame.can_id, frame.extended, frame.data))
+                self._wait(number, frame, begin_ns + frame.every_ns)
+        except LinkError:
+            self.close()  # the timers of the frames before
+            raise
 
     def close(self) -> None:
         """Stop; may be called twice."""

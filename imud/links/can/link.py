@@ -167,10 +167,11 @@ class SocketCanLink:
         self._state = BusState(self._settings.interface, details.state)
         try:
             self._socket = self._open_socket(self._settings, self._filters)
+            self._reader = FrameReader(self._socket, self._on_error_frame)
+            room_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         except OSError as error:
+            self.close()
             raise self._explained(error) from error
-        self._reader = FrameReader(self._socket, self._on_error_frame)
-        room_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         frame_ns = FRAME_BITS * NS_PER_S // (self.bitrate or HIGHEST_BITRATE)
         self._gather_most_ns = room_bytes // FRAME_BUFFER_BYTES // 2 * frame_ns
         self._gather_ns = min(self._gather_wanted_ns, self._gather_most_ns)

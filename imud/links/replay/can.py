@@ -14,7 +14,7 @@ from imud.contracts.link import OnBusNews, OnEnd, OnFrames
 from imud.errors import LinkError
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame
 from imud.formats.candump import CandumpReader
-from imud.links.replay.file import FileReplay, ReplaySettings, open_regular
+from imud.links.replay.file import FileReplay, ReplaySettings, open_regular, unreadable
 from imud.units import NS_PER_MS, NS_PER_S
 
 TURN_FRAMES: Final = 512
@@ -46,11 +46,15 @@ class CanReplayLink(FileReplay):
         self._file = open_regular(self.title)
         reader = CandumpReader(self._file)
         first_ns = newest_ns = -1
-        for frame in reader:
-            newest_ns = frame.t_rx_ns
-            first_ns = newest_ns if first_ns < 0 else first_ns
-            if self._settings.speed != "maximum":
-                break
+        try:
+            for frame in reader:
+                newest_ns = frame.t_rx_ns
+                first_ns = newest_ns if first_ns < 0 else first_ns
+                if self._settings.speed != "maximum":
+                    break
+        except OSError as error:
+            self.close()
+            raise unreadable(self.title, error) from error
         if first_ns < 0:
             self.close()
             raise LinkError(no_log(self.title))

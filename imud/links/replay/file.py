@@ -86,4 +86,9 @@ def open_regular(path: str) -> BinaryIO:
     except NotRegularFile as error:
         raise LinkError(f"{path} is not a regular file: a replay reads a capture file") from error
     except OSError as error:
-        raise LinkError(f"{path} cannot be read: {error.strerror}") from error
+        raise unreadable(path, error) from error
+
+
+def unreadable(path: str, error: OSError) -> LinkError:
+    """Format the error for a file that cannot be read."""
+    return LinkError(f"{path} cannot be read: {error.strerror}")

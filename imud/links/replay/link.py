@@ -24,7 +24,7 @@ from imud.errors import ImudError, LinkError, LinkMissing
 from imud.formats.candump import CandumpReader
 from imud.formats.capture import CaptureReader
 from imud.links.replay.can import CanReplayLink, no_log
-from imud.links.replay.file import FileReplay, ReplaySettings, open_regular
+from imud.links.replay.file import FileReplay, ReplaySettings, open_regular, unreadable
 from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 PIECE_NS: Final = 2 * NS_PER_MS
@@ -76,6 +76,9 @@ class ReplayLink(FileReplay):
         except LinkError:
             self.close()
             raise
+        except OSError as error:
+            self.close()
+            raise unreadable(path, error) from error
 
     def start(self, on_data: OnData, on_end: OnEnd) -> None:
         """Play from the beginning."""
