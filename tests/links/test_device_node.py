@@ -14,6 +14,7 @@ from imud.errors import LinkBusy, LinkDenied, LinkMissing
 from imud.links import LINKS
 from imud.links.device_node import SERIAL_GROUP, DeviceNode, holders_of, open_problem
 from imud.permissions import user_name
+from tests.support.daemon_process import LIMIT_S
 from tests.support.surroundings import DAEMON_UID, needs_root
 
 
@@ -36,6 +37,9 @@ def test_every_holder_is_named_by_program_and_pid(tmp_path: Path) -> None:
     (proc / "self").mkdir()
     assert holders_of(str(link), proc) == "minicom (pid 10), screen (pid 12)"
     assert holders_of("/dev/ttyUSB9", proc) == ""
+    (proc / "10" / "comm").unlink()
+    (proc / "12" / "comm").unlink()
+    assert holders_of(str(port), proc) == "a process (pid 10), a process (pid 12)"
 
 
 @pytest.mark.parametrize(
@@ -80,7 +84,7 @@ def test_access_is_waited_for_quietly(tmp_path: Path, monkeypatch: pytest.Monkey
         assert node.absence() == ""
         granted = True
         path.chmod(0o660)
-        await asyncio.wait_for(waiting, 5)
+        await asyncio.wait_for(waiting, LIMIT_S)
 
     asyncio.run(appear())
 
@@ -103,19 +107,7 @@ def test_every_link_says_that_its_port_is_not_there_and_what_to_look_at(link: st
 def test_access_that_is_not_granted_is_waited_for_no_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.links.device_node.os.access", lambda *_arguments, **_more: False)
     monkeypatch.setattr("imud.links.device_node.ACCESS_WAIT_S", 0.01)
-    asyncio.run(asyncio.wait_for(DeviceNode(str(tmp_path), "").wait_present(), 5))
-
-
-def test_a_process_without_a_name(tmp_path: Path) -> None:
-    process(tmp_path, 10, "x", "/dev/ttyUSB0")
-    (tmp_path / "10" / "comm").unlink()
-    assert holders_of("/dev/ttyUSB0", tmp_path) == "a process (pid 10)"
-
-
-def test_the_group_of_serial_ports_where_the_node_cannot_be_looked_at(tmp_path: Path) -> None:
-    denied = open_problem(PermissionError(errno.EACCES, ""), str(tmp_path / "missing"), "")
-    assert isinstance(denied, LinkDenied)
-    assert f"belongs to group {SERIAL_GROUP};" in str(denied)
+    asyncio.run(asyncio.wait_for(DeviceNode(str(tmp_path), "").wait_present(), LIMIT_S))
 
 
 @needs_root
@@ -141,6 +133,9 @@ def test_a_node_of_a_group_names_it(tmp_path: Path) -> None:
     assert f"it belongs to group {group}; `sudo usermod -aG {group} " in str(
         open_problem(PermissionError(errno.EACCES, ""), str(path), "")
     )
+    denied = open_problem(PermissionError(errno.EACCES, ""), str(tmp_path / "missing"), "")
+    assert isinstance(denied, LinkDenied)
+    assert f"belongs to group {SERIAL_GROUP};" in str(denied)
 
 
 def test_a_node_that_is_absent_or_held(tmp_path: Path) -> None:

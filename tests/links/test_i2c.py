@@ -61,8 +61,14 @@ def test_transfer_that_fails_says_how(number: int, expected: object) -> None:
 
 
 @pytest.mark.parametrize(("number", "kind"), [(errno.ENOENT, LinkMissing), (errno.EACCES, LinkDenied)])
-def test_open_that_fails_says_why(number: int, kind: type[LinkError]) -> None:
+def test_open_that_fails_says_why_and_leaves_nothing_open(number: int, kind: type[LinkError]) -> None:
+    def refuse(_fd: int, _request: int, _argument: int) -> None:
+        raise OSError(number, "by the test")
+
     bus = InProcessI2c({})
+    with pytest.raises(kind, match=r"/dev/i2c-1"):
+        I2cLink(I2cSettings(bus=1), open_bus=bus.open, ioctl=refuse).open()
+    assert (bus.opened, bus.fd) == (1, None), "the bus was opened, and closed after the failed ioctl"
     bus.open_error = number
     with pytest.raises(kind, match=r"/dev/i2c-1"):
         opened(bus)

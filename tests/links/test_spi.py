@@ -65,14 +65,9 @@ def test_controller_that_refuses_16_bits_in_a_message_only() -> None:
 @pytest.mark.manual("A 2.1 clock")
 def test_speed_is_set_at_open() -> None:
     calls: list[tuple[int, bytes]] = []
-    bus = InProcessSpi(echo)
-
-    def ioctl(fd: int, request: int, argument: bytes) -> int:
-        calls.append((request, argument))
-        return bus.ioctl(fd, request, argument)
-
     settings = SpiSettings(port="/dev/spidev0.1", speed_hz=250_000)
-    SpiLink(settings, ioctl=ioctl, open_node=bus.open, close_node=bus.close).open()
+    ioctl = lambda _fd, *request: calls.append(request)  # noqa: E731
+    SpiLink(settings, ioctl=ioctl, open_node=lambda *_: 3, close_node=lambda _: None).open()
     assert calls[0] == (WR_MAX_SPEED_HZ, (250_000).to_bytes(4, "little"))
 
 
@@ -89,6 +84,21 @@ def test_open_that_fails_says_why(number: int, kind: type[LinkError]) -> None:
     with pytest.raises(LinkError, match=r"/dev/spidev0\.1") as error:
         link_to(bus).open()
     assert type(error.value) is kind
+
+
+@pytest.mark.parametrize("step", range(2))
+def test_a_step_after_open_that_fails_closes_the_node(step: int) -> None:
+    bus, refused = InProcessSpi(echo), iter([*[0] * step, errno.EIO])
+
+    def ioctl(fd: int, request: int, argument: bytes) -> int:
+        if number := next(refused):
+            raise OSError(number, "by the test")
+        return bus.ioctl(fd, request, argument)
+
+    link = SpiLink(SpiSettings(port="/dev/spidev0.1"), ioctl=ioctl, open_node=bus.open, close_node=bus.close)
+    with pytest.raises(LinkError, match="cannot be used"):
+        link.open()
+    assert not bus.opened
 
 
 @pytest.mark.parametrize(
@@ -110,13 +120,6 @@ def test_transfer_that_fails_says_whether_the_bus_is_gone(number: int, expected:
     assert (error.value.trouble if isinstance(error.value, TransferError) else type(error.value)) is expected
 
 
-def test_too_many_items_are_refused() -> None:
-    link = link_to(InProcessSpi(echo))
-    link.open()
-    with pytest.raises(LinkError, match="1 to 32 items"):
-        link.transfer(Transfer((b"\x00\x00",) * 33))
-
-
 def test_row_and_names(tmp_path: Path) -> None:
     row = LINKS["spi"]
     node = tmp_path / "spidev3.1"
@@ -128,3 +131,7 @@ def test_row_and_names(tmp_path: Path) -> None:
         link.write(b"x")
     node.touch()
     asyncio.run(link.wait_present())
+    link = link_to(InProcessSpi(echo))
+    link.open()
+    with pytest.raises(LinkError, match="1 to 32 items"):
+        link.transfer(Transfer((b"\x00\x00",) * 33))

@@ -24,13 +24,10 @@ def test_life_of_a_controller() -> None:
     assert (bus.passive_count, bus.bus_off_count) == (1, 1)
 
 
-def test_overflow_is_counted_and_changes_no_state() -> None:
+def test_a_frame_without_news_changes_no_state() -> None:
     bus = BusState("can0", 0)
     assert bus.add_error_frame(0x4, frame(0x01)) == ""
     assert (bus.overflows, bus.state) == (1, ControllerState.ACTIVE)
-
-
-def test_other_classes_say_nothing() -> None:
     bus = BusState("can0", 2)
     assert bus.add_error_frame(0x80, frame(0x20 | 0x01)) == ""
     assert (bus.overflows, bus.state) == (0, ControllerState.PASSIVE)

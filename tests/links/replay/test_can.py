@@ -4,7 +4,7 @@ import asyncio
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from time import monotonic_ns
+from typing import Any
 
 import msgspec
 import pytest
@@ -13,11 +13,13 @@ from imud.contracts.link import CanLink
 from imud.errors import LinkError, LinkMissing
 from imud.formats.can import CanFilter, CanFrame
 from imud.links import LINKS
+from imud.links.replay.can import CanReplayLink
+from imud.links.replay.file import ReplaySettings
+from tests.support.event_loops import VirtualClock, run_virtually
 from tests.support.files import candump_line
 
 MS = 1_000_000
 BEGIN_NS = 1_763_717_507_000 * MS
-LIMIT_S = 5.0
 
 
 def write(path: Path, count: int, step_ms: int = 10) -> Path:
@@ -30,17 +32,18 @@ def write(path: Path, count: int, step_ms: int = 10) -> Path:
 
 def make(path: Path, **keys: object) -> CanLink:
     row = LINKS["replay"]
-    link = row.make_can(msgspec.convert({"path": str(path), **keys}, row.settings))
+    return row.make_can(msgspec.convert({"path": str(path), **keys}, row.settings))
+
+
+def play(path: Path, enough: int = 1 << 30, **keys: Any) -> tuple[list[CanFrame], list[LinkError | None], int]:
+    """Play in virtual time until the end, or until `enough` frames; return the frames, the ends and the duration."""
+    clock = VirtualClock()
+    link = CanReplayLink(ReplaySettings(path=str(path), **keys), clock.now_ns)
     link.filters = [CanFilter(101, 0x7FF, False), CanFilter(102, 0x7FF, False)]
-    return link
+    frames: list[CanFrame] = []
+    ends: list[LinkError | None] = []
 
-
-def play(link: CanLink, enough: int = 1 << 30) -> tuple[list[CanFrame], list[LinkError | None]]:
-    """Everything the link delivers until it ends, or has delivered enough."""
-
-    async def story() -> tuple[list[CanFrame], list[LinkError | None]]:
-        frames: list[CanFrame] = []
-        ends: list[LinkError | None] = []
+    async def story() -> None:
         done = asyncio.Event()
 
         def on_frames(some: Sequence[CanFrame]) -> None:
@@ -56,32 +59,31 @@ def play(link: CanLink, enough: int = 1 << 30) -> tuple[list[CanFrame], list[Lin
         await link.wait_present()
         link.open()
         link.start(on_frames, lambda news, problem: None, end)
-        await asyncio.wait_for(done.wait(), LIMIT_S)
+        await done.wait()
         link.close()
-        return frames, ends
 
-    return asyncio.run(story())
+    begin_ns = clock.now_ns()
+    run_virtually(clock, story())
+    return frames, ends, clock.now_ns() - begin_ns
 
 
 def test_maximum_speed_ends_now_and_keeps_the_recorded_steps(tmp_path: Path) -> None:
-    begun_ns = monotonic_ns()
-    frames, ends = play(make(write(tmp_path / "a.log", 1600), speed="maximum"))
-    assert ends == [None]
+    frames, ends, took_ns = play(write(tmp_path / "a.log", 1600), speed="maximum")
+    assert (ends, took_ns) == ([None], 0)
     assert len(frames) == sum(n % 3 != 0 for n in range(1600))
     assert {frame.can_id for frame in frames} == {101, 102}
     assert frames[1].t_rx_ns - frames[0].t_rx_ns == 10 * MS
-    assert begun_ns - 10 * MS <= frames[-1].t_rx_ns <= monotonic_ns()
+    assert VirtualClock().now_ns() - frames[-1].t_rx_ns == 10 * MS, "the last frame does not pass the filters"
 
 
 def test_recorded_speed_takes_its_time(tmp_path: Path) -> None:
-    begun_ns = monotonic_ns()
-    frames, _ = play(make(write(tmp_path / "a.log", 9, step_ms=5)))
-    assert monotonic_ns() - begun_ns >= 40 * MS
+    frames, _, took_ns = play(write(tmp_path / "a.log", 9, step_ms=5))
+    assert took_ns == pytest.approx(40 * MS, abs=100)
     assert [b.t_rx_ns - a.t_rx_ns for a, b in itertools.pairwise(frames)] == [5 * MS, 10 * MS] * 2 + [5 * MS]
 
 
 def test_it_can_repeat_and_be_closed_by_the_receiver(tmp_path: Path) -> None:
-    frames, ends = play(make(write(tmp_path / "a.log", 3, step_ms=1), repeat=True), enough=7)
+    frames, ends, _ = play(write(tmp_path / "a.log", 3, step_ms=1), enough=7, repeat=True)
     assert [frame.can_id for frame in frames[:6]] == [101, 102] * 3
     assert ends == []
     times = [frame.t_rx_ns for frame in frames]

@@ -28,9 +28,12 @@ from imud.links.rs485.line import SharedPorts
 from imud.links.rs485.link import Rs485Link, Rs485Settings
 from imud.sample import Measurement
 from tests.devices.hipnuc.modbus.test_codec import SENSORS
-from tests.support.pty_port import BAUD, LIMIT_S, PtyPort, serial_of, slave, wired
+from tests.support.daemon_process import LIMIT_S
+from tests.support.pty_port import BAUD, PtyPort, serial_of, slave, wired
 
 UPTIME = (0x0001, 0x2345)
+
+pytestmark = pytest.mark.live
 
 
 def words(data: bytes) -> list[int]:

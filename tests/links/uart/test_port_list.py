@@ -84,12 +84,9 @@ def test_ports_without_hardware_and_other_terminals_are_left_out(dev: Path, sys:
     for name in ("tty0", "tty63", "ttyprintk"):
         native(dev, sys, name, "4")
     assert [port.node for port in list_ports(dev, sys)] == [f"{dev}/ttyAMA0", f"{dev}/ttyS0"]
-
-
-def test_a_port_whose_node_is_gone_is_left_out(dev: Path, sys: Path) -> None:
     usb(dev, sys, "ttyUSB0")
     (dev / "ttyUSB0").unlink()
-    assert list_ports(dev, sys) == []
+    assert [port.node for port in list_ports(dev, sys)] == [f"{dev}/ttyAMA0", f"{dev}/ttyS0"]
 
 
 def test_the_order_is_the_natural_one(dev: Path, sys: Path) -> None:
@@ -98,9 +95,6 @@ def test_the_order_is_the_natural_one(dev: Path, sys: Path) -> None:
     assert [port.node[-2:] for port in list_ports(dev, sys)] == ["B1", "B2", "10"]
 
 
-def test_a_machine_without_ports(tmp_path: Path) -> None:
+def test_this_machine_and_one_without_ports_can_be_listed(tmp_path: Path) -> None:
     assert list_ports(tmp_path / "dev", tmp_path / "sys") == []
-
-
-def test_this_machine_can_be_listed() -> None:
     assert all(Path(port.node).exists() for port in list_ports())

@@ -29,22 +29,18 @@ LATER = (0, 0, 0, 0, 2000, 0, 6, 9, 14, 17, 22, *[0] * 9)
 @pytest.mark.parametrize(
     ("number", "kind"),
     [
-        (errno.ENOENT, LinkMissing),
-        (errno.ENXIO, LinkMissing),
-        (errno.ENODEV, LinkMissing),
-        (errno.EACCES, LinkDenied),
-        (errno.EPERM, LinkDenied),
-        (errno.EBUSY, LinkBusy),
-        (errno.EAGAIN, LinkBusy),
-        (errno.EIO, LinkError),
-        (errno.EINVAL, LinkError),
+        (errno.ENOENT, LinkMissing), (errno.ENXIO, LinkMissing), (errno.ENODEV, LinkMissing),
+        (errno.EACCES, LinkDenied), (errno.EPERM, LinkDenied), (errno.EBUSY, LinkBusy), (errno.EAGAIN, LinkBusy),
+        (errno.EIO, LinkError), (errno.EINVAL, LinkError),
     ],
-)
+)  # fmt: skip
 def test_each_number_has_its_error_which_names_the_port(number: int, kind: type[LinkError], tmp_path: Path) -> None:
     for error in (OSError(number, "text"), termios.error(number, "text")):
         explained = port_problem(error, "/dev/ttyS9", tmp_path)
         assert type(explained) is kind
         assert str(explained).startswith("/dev/ttyS9")
+    assert "in use by another program" in str(port_problem(OSError(errno.EBUSY, ""), "/dev/ttyS9", tmp_path))
+    assert "no such thing" in str(port_problem(ValueError("no such thing"), "/dev/ttyS9", tmp_path))
 
 
 def descriptors() -> int:
@@ -65,14 +61,6 @@ def test_an_open_port_has_one_descriptor_and_leaves_none() -> None:
     pty.unplug()
 
 
-def test_an_unseen_holder_is_another_program(tmp_path: Path) -> None:
-    assert "in use by another program" in str(port_problem(OSError(errno.EBUSY, ""), "/dev/ttyS9", tmp_path))
-
-
-def test_errors_without_a_number_keep_their_text(tmp_path: Path) -> None:
-    assert "no such thing" in str(port_problem(ValueError("no such thing"), "/dev/ttyS9", tmp_path))
-
-
 def timer_of(sys: Path, node: str) -> Path:
     path = sys / "class" / "tty" / node / "device" / "latency_timer"
     path.parent.mkdir(parents=True)
@@ -90,10 +78,7 @@ def test_the_timer_is_found_through_a_link(tmp_path: Path) -> None:
     node.touch()
     link.symlink_to(node)
     assert hold_ns(str(link), tmp_path) == 4 * NS_PER_MS
-
-
-def test_a_timer_that_is_no_number_is_none(tmp_path: Path) -> None:
-    timer_of(tmp_path, "ttyUSB4").write_text("?\n")
+    (tmp_path / "class/tty/ttyUSB4/device/latency_timer").write_text("?\n")
     assert read_latency_timer_ms("/dev/ttyUSB4", tmp_path) is None
 
 
@@ -101,21 +86,12 @@ def test_only_what_was_counted_since_the_start_is_reported() -> None:
     assert relative(START, START) == KernelCounters()
     # overruns of the UART's FIFO (9 - 7) and of the tty's buffer (22 - 17) are one figure
     assert relative(START, LATER) == KernelCounters(overrun=7, framing=1, parity=3, break_=4)
-
-
-def test_counters_that_wrap_go_on() -> None:
     before = (*[0] * 6, 0x7FFF_FFFF, *[0] * 13)
     after = (*[0] * 6, -0x8000_0000, *[0] * 13)
     assert relative(before, after).framing == 1
-
-
-def test_a_port_without_counters_has_zeros() -> None:
     port = PtyPort()
     assert TtyCounters(port.master).read() == KernelCounters()
     port.unplug()
-
-
-def test_the_last_state_stays_when_the_port_is_gone() -> None:
     answers = iter([START, LATER, None])
     counters = TtyCounters(0, lambda _fd: next(answers))
     assert counters.read() == counters.read() == relative(START, LATER)
