@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from tests.fleet.fleet_gateway import SendingGateway
-from tests.fleet.resetting_proxy import ResettingProxy
 from tests.publishers.mqtt.conftest import authority
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
+from tests.publishers.mqtt.proxy import Proxy
 
 __all__ = ["authority", "broker", "gateway", "proxy"]
 
@@ -29,7 +29,7 @@ def gateway(broker: Mosquitto) -> Iterator[SendingGateway]:
 
 
 @pytest.fixture
-def proxy(broker: Mosquitto) -> Iterator[ResettingProxy]:
-    one = ResettingProxy(broker.port)
+def proxy(broker: Mosquitto) -> Iterator[Proxy]:
+    one = Proxy(broker.port)
     yield one
     one.close()

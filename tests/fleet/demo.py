@@ -18,7 +18,7 @@ from typing import Final
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, running_broker
 
 GATEWAYS: Final = ("crane-1", "crane-2", "boat-1")
-LIMIT_S: Final = 10.0
+LIMIT_S: Final = 60.0
 
 
 @contextmanager
@@ -26,12 +26,8 @@ def ended_with(words: Sequence[str], log: Path) -> Iterator[None]:
     """A program that runs as long as the block."""
     with (
         log.open("w") as out,
-        subprocess.Popen(
-            words,
-            stdin=subprocess.PIPE,
-            stdout=out,
-            stderr=out,  # the simulator runs until its input ends
-        ) as process,
+        # the simulator runs until its input ends
+        subprocess.Popen(words, stdin=subprocess.PIPE, stdout=out, stderr=out) as process,
     ):
         try:
             yield

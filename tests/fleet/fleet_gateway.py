@@ -21,7 +21,7 @@ from imud.formats.fleet.topics import STATE, Stream, topic_of
 from imud.sample import Sample, Sync
 from imud.units import NS_PER_MS
 
-LIMIT_S = 20.0
+LIMIT_S = 60.0
 UTC_NS = 1_790_000_000_000_000_000
 
 

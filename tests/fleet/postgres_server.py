@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
-LIMIT_S: Final = 40
+LIMIT_S: Final = 120
 _FOLDERS: Final = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda one: float(one.parent.name))
 BIN: Final = _FOLDERS[-1] if _FOLDERS else None
 NO_POSTGRES: Final = (
@@ -27,7 +27,6 @@ class PostgresServer:
     """The server, with its data in a folder of its own. Synchronization: one thread."""
 
     def __init__(self, folder: Path) -> None:
-        """Make its data."""
         self.url = f"postgresql:///postgres?host={folder}&user=imud"
         self._folder = folder
         self._runs = False

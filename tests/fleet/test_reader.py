@@ -17,11 +17,13 @@ from imud.fleet.reader import VERSIONS
 from imud.formats.fleet.ledger import StreamKey
 from imud.formats.fleet.state import GatewayState, StreamPosition
 from imud.formats.fleet.topics import topic_of
-from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, dropped_message, samples_message
-from tests.fleet.resetting_proxy import ResettingProxy
+from tests.fleet.fleet_gateway import SendingGateway, dropped_message, samples_message
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
+from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.files import ROOT
 from tests.support.surroundings import free_port
+
+pytestmark = pytest.mark.live
 
 KEY = StreamKey("gw", "1", "bow", "samples")
 
@@ -154,30 +156,6 @@ def test_a_broker_that_restarts_loses_nothing(broker: Mosquitto, gateway: Sendin
     assert asyncio.run(play()) == [1, 11]
 
 
-def test_a_connection_that_is_reset_under_acknowledgements_is_made_again(
-    broker: Mosquitto, gateway: SendingGateway, proxy: ResettingProxy
-) -> None:
-    fleet = Fleet(f"mqtt://127.0.0.1:{proxy.port}", name="archive", retry_max_s=0.5)
-    gateway.send_state(STATE)
-
-    async def play() -> list[int]:
-        await session_begun(fleet)
-        batches, found = fleet.watch(), []
-        async with asyncio.timeout(LIMIT_S):
-            for begin in (1, 11, 21):
-                await asyncio.to_thread(gateway.send, *(samples_message(n, n) for n in range(begin, begin + 10)))
-                for _ in range(10):
-                    found.append((await anext(batches)).message.first)
-                    if found[-1] == begin + 4:
-                        proxy.reset()  # the next thing that is done is to acknowledge this one
-        await batches.aclose()
-        return found
-
-    assert asyncio.run(play()) == list(range(1, 31))
-    assert fleet.accounts[KEY].counts.missing == 0
-    assert 3 <= fleet.connections <= 5, "one for the session, and one after each reset that is noticed"
-
-
 def test_only_what_is_wanted_comes_even_where_the_session_had_more(broker: Mosquitto, gateway: SendingGateway) -> None:
     gateway.send_state(STATE)
 
@@ -251,8 +229,7 @@ def test_the_example_of_the_document(broker: Mosquitto, gateway: SendingGateway)
     code = code.replace("127.0.0.1:1883", f"127.0.0.1:{broker.port}")
     with subprocess.Popen([sys.executable, "-u", "-c", code], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        while not any("Received SUBSCRIBE" in line for line in broker.log):
-            assert process.poll() is None
+        wait_until(lambda: any("Received SUBSCRIBE" in line for line in broker.log), "the example has subscribed")
         gateway.send(samples_message(7, 9, gateway="other"), samples_message(1, 3, gateway="gw-17"))
         line = process.stdout.readline()
         process.kill()
@@ -275,13 +252,10 @@ def test_a_refusal_is_said_and_tried_again(tmp_path: Path) -> None:
         assert "refuses the connection: Not authorized" in fleet.problem
 
 
-@pytest.mark.parametrize("url", ["http://host", "mqtt://user:secret@host", "mqtt://", "host:1883", "mqtt://host:0"])
-def test_what_is_no_broker_is_refused(url: str) -> None:
-    with pytest.raises(BadArgument, match="expected a URL"):
-        Fleet("mqtt://host", url)
-
-
 def test_names_are_checked() -> None:
+    for url in ("http://host", "mqtt://user:secret@host", "mqtt://", "host:1883", "mqtt://host:0"):
+        with pytest.raises(BadArgument, match="expected a URL"):
+            Fleet("mqtt://host", url)
     with pytest.raises(BadArgument, match="at least one broker"):
         Fleet()
     with pytest.raises(BadArgument, match=r"expected MQTT 5 or 3\.1\.1, got '3'"):

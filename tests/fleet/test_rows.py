@@ -61,8 +61,4 @@ def test_a_time_before_1970_and_what_was_dropped_by_an_earlier_version() -> None
         "1969-12-31T23:59:59.999999+00:00", -1, None, False,
     )  # fmt: skip
     assert found["content"] == '{"cause":"age"}'
-
-
-def test_every_table_is_made_where_it_is_missing() -> None:
-    statements = list(SCHEMA.values())
-    assert all(one.strip().startswith("CREATE TABLE IF NOT EXISTS imud_") for one in statements)
+    assert all(one.strip().startswith("CREATE TABLE IF NOT EXISTS imud_") for one in SCHEMA.values())

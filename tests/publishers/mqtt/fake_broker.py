@@ -2,13 +2,11 @@
 
 import threading
 from collections.abc import Callable
-from typing import Final
 
 from imud.publishers.mqtt.access import BrokerError
 from imud.publishers.mqtt.broker import Received, Will
 from imud.publishers.mqtt.settings import Broker, MqttSettings
-
-LIMIT_S: Final = 10.0
+from tests.support.daemon_process import LIMIT_S
 
 
 class FakeConnection:
@@ -28,13 +26,11 @@ class FakeConnection:
         self._answered = 0
 
     def subscribe(self, topic: str) -> None:
-        """Note it."""
         self.subscribed.append(topic)
 
     def publish(
         self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
     ) -> int:
-        """Note it."""
         self.correlations.append(correlation)
         self.sent.append((topic, payload, retain))
         self.types.append(content_type)
@@ -55,11 +51,9 @@ class FakeConnection:
             self._bell.clear()
 
     def ring(self) -> None:
-        """End the wait."""
         self._bell.set()
 
     def close(self) -> None:
-        """Note it."""
         self.closed = True
 
 
@@ -96,9 +90,10 @@ class FakeBroker:
         self.connections.append(FakeConnection(self))
         return self.connections[-1]
 
-    def wait_for(self, topic: str) -> None:
-        """Wait until a message of the topic was sent."""
+    def wait_for(self, topic: str, holds: Callable[[bytes], bool] = lambda payload: True) -> None:
+        """Wait until a message of the topic was sent whose payload fits."""
         with self.changed:
             assert self.changed.wait_for(
-                lambda: any(sent[0] == topic for one in self.connections for sent in one.sent), LIMIT_S
-            )
+                lambda: any(sent[0] == topic and holds(sent[1]) for one in self.connections
+                            for sent in one.sent), LIMIT_S
+            )  # fmt: skip

@@ -26,7 +26,8 @@ from imud.publishers.mqtt.spooled import Spooled
 from imud.sample import Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.publishers.mqtt.authority import Authority
-from tests.publishers.mqtt.mosquitto import LIMIT_S, Collector
+from tests.publishers.mqtt.mosquitto import Collector
+from tests.support.daemon_process import LIMIT_S
 
 
 class LiveGateway:
@@ -55,7 +56,7 @@ class LiveGateway:
             samples.append(Sample("bow", self.seq, t_ns, 0, Sync.EDGE, t_ns, t_ns, accel_m_s2=(self.seq / 7, 0, 9.8)))
         self.output.publish(Batch("bow", 0, samples))
 
-    def wait_for(self, true: Callable[[], bool], limit_s: float = 30.0) -> None:
+    def wait_for(self, true: Callable[[], bool], limit_s: float = LIMIT_S) -> None:
         """Wait for the threads of the output."""
         end_ns, pause = self.host.now_ns() + round(limit_s * NS_PER_S), threading.Event()
         while not true():
@@ -165,6 +166,6 @@ class KilledGateway:
     def kill(self) -> None:
         """With SIGKILL."""
         self.process.send_signal(signal.SIGKILL)
-        self.process.wait(10)
+        self.process.wait(LIMIT_S)
         assert self.process.stdout is not None
         self.process.stdout.close()

@@ -17,11 +17,11 @@ from typing import Any, Final
 from imud.formats.fleet.ledger import FleetLedger
 from imud.formats.fleet.messages import FleetMessage, decode_message
 from imud.formats.fleet.topics import Stream, parse_topic
+from tests.support.daemon_process import LIMIT_S
 from tests.support.surroundings import free_port
 
 PROGRAM: Final = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/sbin")
 NO_MOSQUITTO: Final = "" if PROGRAM else "mosquitto is not installed (make mqtt-deps)"
-LIMIT_S: Final = 20.0
 RUNNING: Final = " running"
 """How the line ends that it writes when it listens."""
 
@@ -41,22 +41,12 @@ class Mosquitto:
         assert PROGRAM is not None
         own = os.geteuid() == 0
         config = self.folder / "mosquitto.conf"
-        config.write_text(
-            "\n".join(
-                (
-                    "per_listener_settings false",
-                    f"listener {self.port} 127.0.0.1",
-                    "persistence true",
-                    f"persistence_location {self.folder}/",
-                    "max_queued_messages 0",
-                    "log_dest stderr",
-                    "log_type all",
-                    *(("user root",) if own else ()),
-                    *self.lines,
-                    "",
-                )
-            )
-        )
+        lines = (
+            "per_listener_settings false", f"listener {self.port} 127.0.0.1", "persistence true",
+            f"persistence_location {self.folder}/", "max_queued_messages 0", "log_dest stderr", "log_type all",
+            *(("user root",) if own else ()), *self.lines, "",
+        )  # fmt: skip
+        config.write_text("\n".join(lines))
         self._process = subprocess.Popen(
             [PROGRAM, "-c", str(config)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )

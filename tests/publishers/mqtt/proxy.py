@@ -1,4 +1,4 @@
-"""A TCP proxy in front of a broker: passes everything on, stops passing it on, breaks connections, or is slow.
+"""A TCP proxy in front of a broker: passes everything on, stops passing it on, breaks or resets connections, is slow.
 
 One thread for all connections. What it has read and not yet passed on is bounded, so that a slow end is felt by the
 other one.
@@ -6,12 +6,15 @@ other one.
 
 import selectors
 import socket
+import struct
 import threading
 from contextlib import suppress
 from typing import Final
 
 PIECE_BYTES: Final = 16_384
 ROUND_S: Final = 0.02
+RESET_AT_CLOSE: Final = struct.pack("ii", 1, 0)
+"""SO_LINGER of 0 s: close() sends RST instead of FIN (tcp(7))."""
 
 
 class Proxy:
@@ -27,6 +30,7 @@ class Proxy:
         self._stalled = self._cut = self._ended = False
         self._pairs: dict[socket.socket, socket.socket] = {}
         self._from_gateway: set[socket.socket] = set()
+        self._passing = threading.Lock()
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._listener.setblocking(False)
         self.port = int(self._listener.getsockname()[1])
@@ -41,14 +45,20 @@ class Proxy:
         """Break all connections, and refuse new ones."""
         self._cut = True
 
+    def reset(self) -> None:
+        """Reset all connections: on loopback the other end has the RST when this returns. New ones are accepted."""
+        with self._passing:
+            for one in self._from_gateway:
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_AT_CLOSE)
+            self._drop_all()
+
     def restore(self) -> None:
         """Pass everything on."""
         self._stalled = self._cut = False
 
     def close(self) -> None:
-        """End it."""
         self._ended = True
-        self._thread.join(10)
+        self._thread.join()
         self._drop_all()
         self._listener.close()
 
@@ -70,13 +80,16 @@ class Proxy:
     def _round(self) -> None:
         with selectors.DefaultSelector() as selector:
             selector.register(self._listener, selectors.EVENT_READ)
-            for one in self._pairs:
-                selector.register(one, selectors.EVENT_READ)
-            for key, _ in selector.select(ROUND_S):
-                if key.fileobj is self._listener:
-                    self._accept()
-                else:
-                    self._pass_on(key.fileobj)  # type: ignore[arg-type]  # only sockets are registered
+            with self._passing:
+                for one in self._pairs:
+                    selector.register(one, selectors.EVENT_READ)
+            ready = selector.select(ROUND_S)
+            with self._passing:
+                for key, _ in ready:
+                    if key.fileobj is self._listener:
+                        self._accept()
+                    else:
+                        self._pass_on(key.fileobj)  # type: ignore[arg-type]  # only sockets are registered
 
     def _accept(self) -> None:
         with suppress(OSError):

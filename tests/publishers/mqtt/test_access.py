@@ -25,12 +25,15 @@ def of_tls(authority: Authority) -> MqttSettings:
     )
 
 
-def test_user_and_the_first_line_of_the_password_file_are_taken(tmp_path: Path) -> None:
+def test_a_password_file_has_the_password_in_its_first_line(tmp_path: Path) -> None:
     secret = tmp_path / "password"
     secret.write_text("first line\r\nsecond\n")
     settings = MqttSettings(user="reader", password_file=str(secret))
     client = paho_client(BROKER, settings, "one", is_v5=True, manual_ack=True)
     assert (client.username, client.password) == ("reader", "first line")
+    secret.write_bytes(b"\xff\n")
+    with pytest.raises(ValueError, match=f"^password_file {secret}: expected text in UTF-8"):
+        paho_client(BROKER, settings, "one", is_v5=True)
 
 
 @pytest.mark.parametrize("name", ["password_file", "ca_file", "cert_file", "key_file"])
@@ -42,13 +45,6 @@ def test_a_file_that_cannot_be_read_is_named_with_its_key(tmp_path: Path, author
     path.mkdir()
     with pytest.raises(ValueError, match=f"^{name} {path}: Is a directory$"):
         paho_client(TLS_BROKER, settings, "one", is_v5=True)
-
-
-def test_a_password_that_is_no_text_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "password"
-    path.write_bytes(b"\xff\n")
-    with pytest.raises(ValueError, match=f"^password_file {path}: expected text in UTF-8"):
-        paho_client(BROKER, MqttSettings(user="reader", password_file=str(path)), "one", is_v5=True)
 
 
 @pytest.mark.parametrize("name", ["ca_file", "cert_file", "key_file"])
@@ -69,11 +65,8 @@ def test_a_key_with_a_passphrase_is_refused_and_not_asked_for(tmp_path: Path, au
         paho_client(TLS_BROKER, settings, "one", is_v5=True)
 
 
-def test_an_error_of_tls_says_what_is_wrong_with_a_certificate() -> None:
+def test_problems_and_properties() -> None:
     error = ssl.SSLCertVerificationError("certificate verify failed")
     error.verify_message = "self-signed certificate"
     assert connection_problem(error) == "self-signed certificate"
-
-
-def test_properties_have_the_values_that_are_given() -> None:
     assert properties_of("CONNECT", ReceiveMaximum=7).ReceiveMaximum == 7

@@ -17,11 +17,11 @@ def longest(_low: float = 0.0) -> float:
 def test_pauses_double_to_the_longest() -> None:
     turn = BrokerTurn([A], 60.0, longest)
     assert [turn.failed(0) for _ in range(6)] == [4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
-    for _ in range(5000):
+    for _ in range(1100):  # 2.0 to this power is too large for a float
         assert turn.failed(0) == 60.0
 
 
-def test_an_attempt_that_fails_is_followed_by_the_next_broker() -> None:
+def test_brokers_take_turns() -> None:
     turn = BrokerTurn([A, B], 60.0, longest)
     seen, pauses = [], []
     for _ in range(4):
@@ -29,9 +29,6 @@ def test_an_attempt_that_fails_is_followed_by_the_next_broker() -> None:
         pauses.append(turn.failed(0))
     assert seen == [A, B, A, B]
     assert pauses == [4.0, 4.0, 8.0, 8.0]
-
-
-def test_after_a_loss_the_same_broker_comes_first() -> None:
     turn = BrokerTurn([A, B], 60.0, longest)
     turn.failed(0)
     assert turn.broker == B

@@ -7,7 +7,7 @@ never stored, and no number of theirs was given out.
 
 import os
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from random import Random
 from time import monotonic
@@ -18,11 +18,12 @@ from imud.formats.fleet.ledger import FleetLedger, StreamCounts
 from imud.formats.fleet.messages import decode_message
 from imud.formats.fleet.topics import Stream
 from tests.publishers.mqtt.gateways import KilledGateway, LiveGateway, closes, in_spool
-from tests.publishers.mqtt.mosquitto import LIMIT_S, NO_MOSQUITTO, Collector, Mosquitto, running_broker
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, Mosquitto, running_broker
 from tests.publishers.mqtt.proxy import Proxy
+from tests.support.daemon_process import LIMIT_S
 from tests.support.surroundings import free_port
 
-pytestmark = [pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO), pytest.mark.live]
 
 
 @pytest.fixture
@@ -77,15 +78,6 @@ def test_a_broker_that_freezes_is_left_and_loses_nothing(tmp_path: Path, broker:
     assert counts.newest >= 6900
 
 
-def test_the_next_broker_takes_over(tmp_path: Path, broker: Mosquitto) -> None:
-    collector = Collector(broker.port)
-    urls = [f"mqtt://127.0.0.1:{free_port()}", f"mqtt://127.0.0.1:{broker.port}"]
-    gateway = LiveGateway(tmp_path / "spool", broker.port, brokers=urls)
-    gateway.publish(1500)
-    gateway.wait_for(lambda: gateway.output.status().broker == urls[1])
-    finish(gateway, collector)
-
-
 def test_a_broker_that_refuses_messages_loses_nothing(tmp_path: Path) -> None:
     rights = tmp_path / "rights"
     rights.write_text("topic read #\ntopic write imud/default/gw/state\n")
@@ -100,37 +92,12 @@ def test_a_broker_that_refuses_messages_loses_nothing(tmp_path: Path) -> None:
         finish(gateway, collector)
 
 
-def test_kill_9_with_a_spool_that_fills_loses_nothing(tmp_path: Path) -> None:
-    port, spool = free_port(), tmp_path / "spool"
-    for epoch in (1, 2):
-        gateway = KilledGateway(port, spool, epoch)
-        gateway.wait_until(25 * epoch)
-        gateway.kill()
-    rows, _ = in_spool(spool)
-    assert len(rows) >= 50
-    with running_broker(tmp_path / "broker", port=port):
-        collector = Collector(port)
-        for epoch in (3, 4):
-            gateway = KilledGateway(port, spool, epoch)
-            boot = f"{epoch:016x}"
-            collector.wait_for(
-                lambda boot=boot: any(key.boot == boot for key in collector.ledger.counts), 40.0  # type: ignore[misc]
-            )  # fmt: skip
-            gateway.kill()
-        counts = closes(collector, spool)
-    for epoch in (1, 2, 3):
-        for stream in ("samples", "statistics"):
-            one = counts[f"{epoch:016x}", stream]
-            assert one.whole > 0
-            assert (one.missing, one.dropped, one.thinned, one.balance) == (0, {}, 0, 0)
-
-
 def test_kill_9_while_the_spool_is_full_closes_with_what_was_thinned(tmp_path: Path) -> None:
     port, spool = free_port(), tmp_path / "spool"
     live = LiveGateway(spool, port, spool_mb=1)
-    for number in range(1, 13):
+    for number in range(1, 6):
         live.publish(15_000)
-        live.wait_for(lambda least=300 * number - 10: live.output.status().spooled >= least, 60.0)  # type: ignore[misc]
+        live.wait_for(lambda least=300 * number - 10: live.output.status().spooled >= least)  # type: ignore[misc]
     live.wait_for(lambda: live.output.status().thinned > 0)
     live.output.close()
     gateway = KilledGateway(port, spool, 8, megabytes=1)
@@ -139,15 +106,15 @@ def test_kill_9_while_the_spool_is_full_closes_with_what_was_thinned(tmp_path: P
     with running_broker(tmp_path / "broker", port=port):
         collector = Collector(port)
         gateway = KilledGateway(port, spool, 9, megabytes=1)
-        collector.wait_for(lambda: any(key.boot == f"{9:016x}" for key in collector.ledger.counts), 60.0)
+        collector.wait_for(lambda: any(key.boot == f"{9:016x}" for key in collector.ledger.counts))
         gateway.kill()
         counts = closes(collector, spool)
     one = counts[BOOT, "samples"]
     assert one.thinned > 0
-    assert (one.newest, one.missing, one.balance) == (180_000, 0, 0)
+    assert (one.newest, one.missing, one.balance) == (75_000, 0, 0)
 
 
-KILLS = int(os.environ.get("IMUD_KILLS", "8"))
+KILLS = int(os.environ.get("IMUD_KILLS", "4"))
 """About 3 s each: by hand 20 and more."""
 
 
@@ -155,8 +122,8 @@ class Killings:
     """Gateways one after another, each killed: at a random time, or before a random statement of a transaction."""
 
     def __init__(self, port: int, spool: Path, seed: int) -> None:
-        self.newest: dict[int, int] = {}
-        """By epoch, the newest sample that the gateway spoke of."""
+        self.told: dict[int, list[int]] = {}
+        """By epoch, the newest sample at each transaction that the gateway reported."""
         self._port, self._spool, self._random = port, spool, Random(seed)
 
     def kill_one(self, epoch: int, *, in_commit: bool, newest_seq: int = 0) -> None:
@@ -167,7 +134,7 @@ class Killings:
         end_s = monotonic() + (LIMIT_S if in_commit else self._random.uniform(0.0, 1.5))
         with suppress(AssertionError):  # the gateway ended
             while state is not None:
-                self.newest[epoch] = state.seq
+                self.told.setdefault(epoch, []).append(state.seq)
                 state = gateway.state(max(0.0, end_s - monotonic()))
         assert not in_commit or gateway.process.wait(LIMIT_S) < 0
         gateway.kill()
@@ -175,12 +142,10 @@ class Killings:
 
 STATEMENTS = 12
 """Inside one transaction, about."""
-IN_MEMORY_MAX = 1200
-"""Samples at 1 kHz that no transaction had: those of `batch_s` (0.2 s), and what came until it was told, with a slow
-disk. Without the newest transaction they would be as many more as come in a second."""
+BATCH_SAMPLES = 200
+"""Samples of `batch_s` (0.2 s) at 1 kHz, which wait for their message."""
 
 
-@pytest.mark.timeout(400)
 def test_kill_9_at_random_moments_costs_what_was_in_memory(tmp_path: Path) -> None:
     port, spool = free_port(), tmp_path / "spool"
     with running_broker(tmp_path / "broker", port=port):
@@ -191,16 +156,16 @@ def test_kill_9_at_random_moments_costs_what_was_in_memory(tmp_path: Path) -> No
         counts = closes(collector, spool)
     _, positions = in_spool(spool)
     stored = {one.boot: one.last for one in positions if one.stream == "samples"}
-    for epoch, newest in killings.newest.items():
+    for epoch, told in killings.told.items():
         boot = f"{epoch:016x}"
-        assert newest - stored[boot] < IN_MEMORY_MAX, f"boot {epoch}"  # a transaction may be done that it did not tell
+        # a transaction has the samples from before its begin, and the begin is after the report before the last one
+        assert stored[boot] >= max([1, *(seq - BATCH_SAMPLES for seq in told[:-2])]), f"boot {epoch}"
         one = counts.get((boot, "samples"))
         if one is not None:  # what came is without a gap; what did not waits
             assert (one.missing, one.dropped, one.thinned, one.balance) == (0, {}, 0, 0)
     assert len(stored) == KILLS
 
 
-@pytest.mark.timeout(400)
 def test_kill_9_in_one_boot_shows_each_loss_as_a_gap(tmp_path: Path) -> None:
     port, spool = free_port(), tmp_path / "spool"
     begun = 0
@@ -209,7 +174,7 @@ def test_kill_9_in_one_boot_shows_each_loss_as_a_gap(tmp_path: Path) -> None:
         killings = Killings(port, spool, seed=17)
         for number in range(KILLS):
             killings.kill_one(7, in_commit=bool(number % 2), newest_seq=begun)
-            begun = max(begun, killings.newest.get(7, 0)) + 10_000  # more than it can have stored and not told
+            begun = max([begun, *killings.told.get(7, [])]) + 10_000  # more than it can have stored and not told
         rows, positions = in_spool(spool)
         closes(collector, spool)
     whole = FleetLedger(from_begin=True)
@@ -223,48 +188,13 @@ def test_kill_9_in_one_boot_shows_each_loss_as_a_gap(tmp_path: Path) -> None:
     assert one.dropped["off"] > (KILLS - 2) * 5000  # the last may have stored nothing
 
 
-@pytest.fixture
-def proxy(broker: Mosquitto) -> Iterator[Proxy]:
-    made = Proxy(broker.port)
-    yield made
-    made.close()
-
-
-def test_a_half_open_connection_is_noticed_and_loses_nothing(tmp_path: Path, broker: Mosquitto, proxy: Proxy) -> None:
-    collector = Collector(broker.port)
-    gateway = LiveGateway(tmp_path / "spool", proxy.port)
-    gateway.publish(2000)
-    gateway.wait_for(lambda: gateway.output.status().acknowledged > 0)
-    proxy.stall()
-    gateway.publish(3000)
-    gateway.wait_for(lambda: not gateway.output.status().broker)
-    assert gateway.output.status().problem
-    proxy.restore()
-    assert finish(gateway, collector).newest >= 4900
-    assert proxy.connections >= 2
-
-
-def test_a_network_that_is_cut_again_and_again_loses_nothing(tmp_path: Path, broker: Mosquitto, proxy: Proxy) -> None:
-    collector = Collector(broker.port)
-    gateway = LiveGateway(tmp_path / "spool", proxy.port)
-    for number in range(1, 4):
-        gateway.publish(1000)
-        gateway.wait_for(lambda least=number: gateway.output.status().acknowledged >= least)  # type: ignore[misc]
-        proxy.cut()
-        gateway.publish(1000)
-        gateway.wait_for(lambda: not gateway.output.status().broker)
-        proxy.restore()
-        gateway.wait_for(lambda: bool(gateway.output.status().broker))
-    assert gateway.output.status().reconnects >= 3
-    finish(gateway, collector)
-
-
-def test_a_slow_network_holds_up_nothing_and_loses_nothing(tmp_path: Path, broker: Mosquitto, proxy: Proxy) -> None:
-    collector = Collector(broker.port)
-    gateway = LiveGateway(tmp_path / "spool", proxy.port)
-    proxy.bytes_s = 20_000
-    gateway.publish(5000)
-    gateway.wait_for(lambda: gateway.output.status().waiting > 20)
-    assert gateway.output.status().broker, "slow is not gone"
-    proxy.bytes_s = None
-    finish(gateway, collector)
+def test_a_slow_network_holds_up_nothing_and_loses_nothing(tmp_path: Path, broker: Mosquitto) -> None:
+    with closing(Proxy(broker.port)) as proxy:
+        collector = Collector(broker.port)
+        gateway = LiveGateway(tmp_path / "spool", proxy.port)
+        proxy.bytes_s = 20_000
+        gateway.publish(5000)
+        gateway.wait_for(lambda: gateway.output.status().waiting > 20)
+        assert gateway.output.status().broker, "slow is not gone"
+        proxy.bytes_s = None
+        finish(gateway, collector)

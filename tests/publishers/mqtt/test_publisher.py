@@ -1,10 +1,10 @@
 """The output as a whole with a broker in memory: births and states, what is put into the queue, what goes wrong."""
 
-import builtins
+import importlib
 import json
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ from tests.publishers.mqtt.fake_broker import FakeBroker
 from tests.support.event_loops import VirtualClock
 from tests.support.signal_bench import HandWorker
 from tests.support.socket_rig import device_status, sample
+
+pytestmark = pytest.mark.live
 
 
 class PublisherBench:
@@ -62,6 +64,10 @@ class PublisherBench:
         self.output.tick(self.clock.now_ns())
         self.workers[0].work()
 
+    def start(self, device_id: int = 0, device: str = "imu0") -> None:
+        self.output.add_device(device, device_id)
+        self.output.start()
+
     def close(self) -> list[tuple[str, bytes, bool]]:
         """Close it; return all that was sent."""
         self.output.close()
@@ -71,8 +77,7 @@ class PublisherBench:
 
 def test_birth_states_and_farewell(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path)
-    bench.output.add_device("imu0", 0)
-    bench.output.start()
+    bench.start()
     bench.tick()
     bench.broker.wait_for("imud/default/gw/imu0/schema")
     sent = bench.close()
@@ -91,8 +96,7 @@ def test_birth_states_and_farewell(tmp_path: Path) -> None:
 
 def test_states_are_looked_at_after_events_and_now_and_then(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path, status_s=60)
-    bench.output.add_device("imu0", 0)
-    bench.output.start()
+    bench.start()
     bench.tick()
     assert bench.asked == 1
     for _ in range(50):
@@ -111,8 +115,7 @@ def test_states_are_looked_at_after_events_and_now_and_then(tmp_path: Path) -> N
 
 def test_a_device_that_is_removed_leaves_no_state(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path)
-    bench.output.add_device("imu0", 0)
-    bench.output.start()
+    bench.start()
     bench.tick()
     bench.output.remove_device("imu0")
     bench.statuses = []
@@ -125,7 +128,6 @@ def test_a_device_that_is_removed_leaves_no_state(tmp_path: Path) -> None:
 
 def test_settings_that_are_not_as_declared_are_published_when_they_change(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path)
-    bench.output.add_device("imu0", 0)
     topic = "imud/default/gw/imu0/settings"
 
     def declare(state: SettingsState, read_ns: int, **differences: SettingDifference) -> None:
@@ -136,15 +138,12 @@ def test_settings_that_are_not_as_declared_are_published_when_they_change(tmp_pa
         bench.output.event(Event(0, "imu0", EventKind.CONFIGURATION, "x"))
         bench.tick()
 
-    bench.output.start()
+    bench.start()
     declare(SettingsState.AGREE, 1)
     bench.broker.wait_for(topic)
     declare(SettingsState.AGREE, 2)  # read again, and nothing is different
     declare(SettingsState.DIFFER, 3, rate_hz=SettingDifference(100, 50))
-    with bench.broker.changed:
-        assert bench.broker.changed.wait_for(
-            lambda: any(b'"differ"' in sent[1] for sent in bench.broker.connections[0].sent if sent[0] == topic), 10
-        )
+    bench.broker.wait_for(topic, lambda payload: b'"differ"' in payload)
     sent = [json.loads(payload) for one, payload, retain in bench.close() if one == topic and retain]
     assert [one["state"] for one in sent] == ["agree", "differ"]
     assert sent[1]["differences"] == {"rate_hz": {"declared": 100, "actual": 50}}
@@ -169,8 +168,7 @@ def test_only_declared_devices_are_queued(tmp_path: Path) -> None:
 
 def test_a_spool_that_fails_is_an_event_and_no_end(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path / "spool")
-    bench.output.add_device("imu0", 0)
-    bench.output.start()
+    bench.start()
     database = tmp_path / "spool" / "spool.db"
     bench.output.publish(Batch("imu0", 0, [sample("imu0", 1)]))
     bench.tick()
@@ -188,19 +186,13 @@ def test_a_spool_that_fails_is_an_event_and_no_end(tmp_path: Path) -> None:
 
 
 def test_a_thread_that_ends_by_a_defect_ends_the_daemon(tmp_path: Path) -> None:
-    bench = PublisherBench(tmp_path)
-    bench.output.start()
-    bench.workers[0].failed(ZeroDivisionError())
-    with pytest.raises(ZeroDivisionError):
-        bench.output.tick(0)
-    bench.close()
-
-
-def test_two_outputs_do_not_share_a_spool(tmp_path: Path) -> None:
     first, second = PublisherBench(tmp_path), PublisherBench(tmp_path)
     first.output.start()
     with pytest.raises(ServerError, match="another running imud"):
-        second.output.start()
+        second.output.start()  # two outputs do not share a spool
+    first.workers[0].failed(ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        first.output.tick(0)
     first.close()
     second.output.start()
     second.close()
@@ -221,19 +213,10 @@ def test_the_name_of_the_host_is_the_gateway(tmp_path: Path) -> None:
 
 
 def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real: Callable[..., Any] = builtins.__import__
+    def refuse(name: str) -> None:
+        raise ImportError(name)
 
-    def without(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.partition(".")[0] == "paho":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    import importlib
-
-    def import_module(name: str) -> Any:
-        return without(name)
-
-    monkeypatch.setattr(importlib, "import_module", import_module)
+    monkeypatch.setattr(importlib, "import_module", refuse)
     output = MqttPublisher(MqttSettings(spool_directory=str(tmp_path)), PublisherBench(tmp_path).context)
     with pytest.raises(ServerError) as found:
         output.start()
@@ -278,12 +261,9 @@ def test_bad_settings_are_named(given: Mapping[str, Any], words: str) -> None:
         ("wss://[::1]", Broker("::1", 443, True, True, "/mqtt")),
     ],
 )
-def test_urls(url: str, broker: Broker) -> None:
+def test_names_of_brokers_and_devices(url: str, broker: Broker) -> None:
     assert broker_of(url) == broker
     assert broker_of(broker.name) == broker
-
-
-def test_what_is_not_named_is_as_the_star_says() -> None:
     settings = msgspec.convert({"devices": {"bow": {"rate_hz": 5}, "*": {"rate_hz": 2}}}, MqttSettings)
     assert [getattr(settings.sending(name), "rate_hz", None) for name in ("bow", "mast")] == [5, 2]
     alone = msgspec.convert({"devices": {"bow": {}}}, MqttSettings)
@@ -292,8 +272,7 @@ def test_what_is_not_named_is_as_the_star_says() -> None:
 
 def test_birth_and_messages_say_whether_the_wall_clock_is_set(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path)
-    bench.output.add_device("imu0", 0)
-    bench.output.start()
+    bench.start()
     bench.reference = UtcReference(100, 40)
     bench.tick(1000)  # more than status_s
     bench.output.event(Event(1, "imu0", EventKind.UP, "it is up"))
@@ -328,8 +307,7 @@ def fields_by_schema(slot: bytes, layout: Mapping[str, Any]) -> dict[str, Any]:
 
 def test_slots_are_read_by_the_schema_that_is_published_beside_them(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path, devices={"*": {"whole": "slots", "rate_hz": None}})
-    bench.output.add_device("imu0", 3)
-    bench.output.start()
+    bench.start(3)
     sent = [
         Sample(
             "imu0", seq, seq * NS_PER_MS, 7, Sync.EDGE, seq * NS_PER_MS + 5, 1_800_000_000 * NS_PER_S + seq,

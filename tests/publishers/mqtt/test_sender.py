@@ -11,7 +11,8 @@ from imud.publishers.mqtt.commands import CommandReply
 from imud.publishers.mqtt.sender import OUTBOX_MAX, REPLIES_MAX, MqttSender
 from imud.publishers.mqtt.settings import Broker, MqttSettings
 from imud.publishers.mqtt.spooled import Spooled
-from tests.publishers.mqtt.fake_broker import LIMIT_S, FakeBroker
+from tests.publishers.mqtt.fake_broker import FakeBroker
+from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock
 
 
@@ -54,6 +55,12 @@ def test_messages_go_in_their_order_within_the_window() -> None:
     assert bench.sender.take_acknowledged() == [(1, 1), (1, 2)]
     assert bench.sender.take_acknowledged() == []
     assert (bench.sender.sent, bench.sender.acknowledged) == (6, 2)
+    assert bench.broker.connections[0].types == [JSON_TYPE] * 6
+    bench.sender.give(bench.sender.session, [row(7, MAGIC + b"x")])
+    bench.broker.answers = 6
+    bench.sender.work()
+    bench.sender.work()
+    assert bench.broker.connections[0].types[6:] == [SLOTS_TYPE]
 
 
 def test_after_a_loss_nothing_is_held_and_the_session_is_another() -> None:
@@ -102,15 +109,7 @@ def test_retained_messages_go_first_and_again_at_each_connection() -> None:
     assert bench.sent() == [b"born"], "what was removed is not sent again"
 
 
-def test_the_type_of_a_message_is_told() -> None:
-    bench = SenderBench()
-    bench.sender.work()
-    bench.sender.give(1, [row(1, MAGIC + b"x"), row(2)])
-    bench.sender.work()
-    assert bench.broker.connections[0].types == [SLOTS_TYPE, JSON_TYPE]
-
-
-@pytest.mark.timeout(20)
+@pytest.mark.live
 def test_it_ends_with_a_farewell() -> None:
     bench = SenderBench()
     connected = threading.Event()
@@ -124,7 +123,7 @@ def test_it_ends_with_a_farewell() -> None:
     assert bench.sender.failure is None
 
 
-@pytest.mark.timeout(20)
+@pytest.mark.live
 def test_what_is_still_connecting_at_the_end_says_nothing() -> None:
     """The next output has the same name, and may be connected already."""
     bench = SenderBench()

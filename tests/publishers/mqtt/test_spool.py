@@ -2,6 +2,7 @@
 
 import sqlite3
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -88,6 +89,7 @@ def test_messages_come_in_their_order_until_they_are_acknowledged(tmp_path: Path
     assert bench.spool.messages == 2
 
 
+@pytest.mark.live
 def test_what_was_committed_is_there_after_the_end_without_a_farewell(tmp_path: Path) -> None:
     code = (
         "import os, sys; from pathlib import Path; from tests.publishers.mqtt.test_spool import SpoolBench, batch\n"
@@ -95,9 +97,7 @@ def test_what_was_committed_is_there_after_the_end_without_a_farewell(tmp_path: 
         "for n in range(5): bench.commit(batch(100 * n + 1))\n"
         "os.kill(os.getpid(), 9)\n"
     )
-    import sys
-
-    ended = subprocess.run([sys.executable, "-c", code, tmp_path], check=False, timeout=30)
+    ended = subprocess.run([sys.executable, "-c", code, tmp_path], check=False)
     assert ended.returncode == -9
     bench = SpoolBench(tmp_path)
     assert bench.counts() == StreamCounts(1, 500, whole=500)
@@ -108,14 +108,14 @@ def test_what_was_committed_is_there_after_the_end_without_a_farewell(tmp_path: 
 
 def test_the_oldest_samples_become_statistics_before_anything_is_dropped(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path, kilobytes=300)
-    for number in range(200):
+    for number in range(150):
         bench.commit(batch(100 * number + 1))
         assert bench.spool.used_bytes <= 300_000
     counts = bench.counts()
     assert counts.dropped == {}
-    assert counts.thinned >= 8_000
+    assert counts.thinned >= 3_000
     assert counts.whole >= 1000
-    assert counts.whole + counts.thinned == 20_000
+    assert counts.whole + counts.thinned == 15_000
     assert bench.spool.thinned == counts.thinned
     kinds = [row.kind for row in bench.all()]
     assert kinds == sorted(kinds), "intervals are the oldest, slots the newest"
@@ -123,13 +123,13 @@ def test_the_oldest_samples_become_statistics_before_anything_is_dropped(tmp_pat
 
 def test_when_nothing_can_be_thinned_the_oldest_are_dropped_and_it_is_said(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path, kilobytes=100)
-    for number in range(400):
+    for number in range(200):
         bench.commit(batch(100 * number + 1), batch(number + 1, 1, whole=False))
         assert bench.spool.used_bytes <= 100_000
     counts = bench.counts()
     assert counts.missing == 0
-    assert counts.newest == 40_000
-    assert counts.dropped["space"] > 20_000
+    assert counts.newest == 20_000
+    assert counts.dropped["space"] > 5_000
     rows = bench.all()
     events = sum(row.items for row in rows if row.stream == "events" and row.kind == "dropped")
     assert bench.spool.dropped["space"] == counts.dropped["space"] + events
@@ -153,14 +153,15 @@ def test_what_is_new_goes_before_what_waited_where_asked(tmp_path: Path) -> None
     assert [row.first for row in bench.spool.after(9)] == list(range(1, 900, 100))
 
 
-def test_what_was_given_ahead_is_left_alone_too(tmp_path: Path) -> None:
-    bench = SpoolBench(tmp_path, kilobytes=150, newest_first=True)
+@pytest.mark.parametrize("newest_first", [False, True])
+def test_messages_that_the_sender_has_are_not_changed(tmp_path: Path, newest_first: bool) -> None:
+    bench = SpoolBench(tmp_path, kilobytes=150, newest_first=newest_first)
     bench.commit(batch(1), batch(101))
     bench.spool.rewind()
     bench.commit(batch(201), batch(301))
     given = bench.spool.after(2)
-    assert [row.first for row in given] == [201, 301]
-    for number in range(4, 400):
+    assert [row.first for row in given] == ([201, 301] if newest_first else [1, 101])
+    for number in range(4, 200):
         bench.commit(batch(100 * number + 1))
     assert bench.spool.thinned > 0
     assert bench.spool.dropped["space"] > 0
@@ -170,7 +171,7 @@ def test_what_was_given_ahead_is_left_alone_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("newest_first", [False, True])
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(4))
 def test_everything_is_given_once_and_never_changed_afterwards(tmp_path: Path, seed: int, newest_first: bool) -> None:
     random = Random(seed)
     bench = SpoolBench(tmp_path, kilobytes=random.choice([120, 250, 100_000]), newest_first=newest_first)
@@ -202,27 +203,14 @@ def test_everything_is_given_once_and_never_changed_afterwards(tmp_path: Path, s
     assert (counts.newest, counts.missing, counts.balance) == (first - 1, 0, 0)
 
 
-def test_what_was_given_to_the_sender_is_left_alone(tmp_path: Path) -> None:
-    bench = SpoolBench(tmp_path, kilobytes=150)
-    bench.commit(batch(1), batch(101))
-    given = bench.spool.after(2)
-    for number in range(2, 100):
-        bench.commit(batch(100 * number + 1))
-    assert bench.spool.thinned > 0
-    assert bench.all()[:2] == given
-
-
-def test_what_waited_too_long_is_dropped(tmp_path: Path) -> None:
+def test_ages_count_only_while_the_clock_is_set(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path, hours=1)
     bench.commit(batch(1), batch(101))
     bench.commit(batch(201), utc_ns=UTC_NS + HOUR_NS // 2)
     bench.commit(utc_ns=UTC_NS + HOUR_NS + 1)
     assert bench.counts() == StreamCounts(1, 300, whole=100, dropped={"age": 200})
     assert bench.spool.dropped == {"age": 200}
-
-
-def test_a_clock_that_was_not_set_says_nothing_of_ages(tmp_path: Path) -> None:
-    bench = SpoolBench(tmp_path, hours=1)
+    bench = SpoolBench(tmp_path / "other", hours=1)
     bench.commit(batch(1), utc_ns=5 * NS_PER_S)
     bench.commit(batch(101), utc_ns=UTC_NS)
     bench.commit(utc_ns=UTC_NS + 1)
@@ -255,32 +243,21 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", "-l", disk], check=True)
 
 
-def test_a_full_disk_leaves_the_spool_as_it_was(small_disk: Path) -> None:
+def test_a_full_disk_leaves_the_spool_as_it_was_until_messages_are_acknowledged(small_disk: Path) -> None:
     bench = SpoolBench(small_disk)
     number = 0
     with pytest.raises(SpoolError, match="full"):  # noqa: PT012
         while True:
             bench.commit(batch(100 * number + 1))
             number += 1
+    assert (bench.spool.messages, bench.spool.thinned) == (number, 0)
     assert number > 5
-    messages, thinned = bench.spool.messages, bench.spool.thinned
-    assert messages == number
-    assert thinned == 0
     assert bench.counts() == StreamCounts(1, 100 * number, whole=100 * number)
     bench.spool.close()
-    again = SpoolBench(small_disk)
-    assert again.counts() == StreamCounts(1, 100 * number, whole=100 * number)
-
-
-def test_what_is_acknowledged_makes_room_on_a_full_disk(small_disk: Path) -> None:
     bench = SpoolBench(small_disk)
-    number = 0
-    with suppress(SpoolError):
-        while True:
-            bench.commit(batch(100 * number + 1))
-            number += 1
+    assert bench.counts() == StreamCounts(1, 100 * number, whole=100 * number)
     given = bench.spool.after(1000)
-    assert len(given) == bench.spool.messages > 5
+    assert len(given) == number
     bench.spool.remove([row.id for row in given], bench.now_ns, UTC_NS)
     assert bench.spool.messages == 0
     for _ in range(300):  # from here on the file does not grow, and what waits becomes thinner
@@ -315,6 +292,9 @@ def test_a_damaged_file_is_set_aside(tmp_path: Path) -> None:
     assert bench.spool.set_aside == str(tmp_path / "spool.db.damaged")
     bench.commit(batch(1))
     assert bench.counts() == StreamCounts(1, 100, whole=100)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SpoolError, match="file"):
+        Spool(tmp_path / "file" / "spool", 1_000_000, HOUR_NS).open()
 
 
 def test_a_file_that_is_damaged_later_is_set_aside_at_the_next_attempt(tmp_path: Path) -> None:
@@ -334,12 +314,6 @@ def test_a_file_that_is_damaged_later_is_set_aside_at_the_next_attempt(tmp_path:
             continue
     assert bench.spool.set_aside
     assert bench.counts().whole == 100
-
-
-def test_a_directory_that_cannot_be_made_is_an_error_with_its_name(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(SpoolError, match="file"):
-        Spool(tmp_path / "file" / "spool", 1_000_000, HOUR_NS).open()
 
 
 def test_a_payload_that_cannot_be_read_is_dropped_as_damaged(tmp_path: Path) -> None:
@@ -368,10 +342,10 @@ DAMAGE = {
 """What a disk can make of a row, as SQL; SQLite gives all of it back without an error."""
 
 
-def damage(folder: Path, change: str) -> None:
-    """Change the second message behind the back of the spool."""
+def damage(folder: Path, change: str, where: str = "id = 2", table: str = "message") -> None:
+    """Change rows behind the back of the spool; without more words the second message."""
     base = sqlite3.connect(folder / FILE, isolation_level=None)
-    base.execute(f"UPDATE message SET {change} WHERE id = 2")
+    base.execute(f"UPDATE {table} SET {change} WHERE {where}")
     base.close()
 
 
@@ -405,9 +379,7 @@ def test_a_damaged_row_that_says_its_numbers_is_a_note(tmp_path: Path) -> None:
 def test_messages_behind_damaged_ones_that_are_gone_are_given(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path)
     bench.commit(*(batch(100 * number + 1) for number in range(4)))
-    base = sqlite3.connect(tmp_path / FILE, isolation_level=None)
-    base.execute("UPDATE message SET topic = '' WHERE id <= 2")
-    base.close()
+    damage(tmp_path, "topic = ''", "id <= 2")
     assert [row.first for row in bench.spool.after(2)] == [201, 301]
     assert bench.spool.messages == 2
 
@@ -415,9 +387,7 @@ def test_messages_behind_damaged_ones_that_are_gone_are_given(tmp_path: Path) ->
 def test_a_damaged_position_is_left_out(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path)
     bench.commit(batch(1), batch(1, device="stern"))
-    base = sqlite3.connect(tmp_path / FILE, isolation_level=None)
-    base.execute("UPDATE progress SET stored_utc_ns = 'never', boot = CAST(x'ff' AS TEXT) WHERE device = 'stern'")
-    base.close()
+    damage(tmp_path, "stored_utc_ns = 'never', boot = CAST(x'ff' AS TEXT)", "device = 'stern'", "progress")
     bench.commit(batch(101))
     assert [(one.device, one.last) for one in bench.spool.positions()] == [("bow", 200)]
 
@@ -426,9 +396,7 @@ def test_a_file_whose_numbers_are_at_their_end_is_set_aside(tmp_path: Path) -> N
     bench = SpoolBench(tmp_path)
     bench.commit(batch(1))
     bench.spool.close()
-    base = sqlite3.connect(tmp_path / FILE, isolation_level=None)
-    base.execute("UPDATE message SET id = 9223372036854775807")
-    base.close()
+    damage(tmp_path, "id = 9223372036854775807", "id = 1")
     again = SpoolBench(tmp_path)
     again.commit(batch(101))
     assert again.spool.set_aside

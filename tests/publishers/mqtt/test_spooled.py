@@ -17,12 +17,12 @@ def test_a_row_is_what_it_was() -> None:
     assert sound_row(tuple(batch(7, 1, whole=False))) == batch(7, 1, whole=False)
 
 
-@pytest.mark.parametrize("value", FOREIGN, ids=repr)
 @pytest.mark.parametrize("column", Spooled._fields[1:])
-def test_a_column_of_another_kind_is_found_or_is_as_good(column: str, value: object) -> None:
+def test_a_column_of_another_kind_is_found_or_is_as_good(column: str) -> None:
     """The time may be any number; `items` is of no message that is sent."""
-    row = sound_row(tuple(value if name == column else one for name, one in batch(1)._asdict().items()))
-    assert row is None or column in ("stored_utc_ns", "items")
+    for value in FOREIGN:
+        row = sound_row(tuple(value if name == column else one for name, one in batch(1)._asdict().items()))
+        assert row is None or column in ("stored_utc_ns", "items"), value
 
 
 @pytest.mark.parametrize("column", ["kind", "payload"])

@@ -3,6 +3,7 @@
 import math
 from math import pi, radians, sqrt
 
+import msgspec
 import pytest
 
 from imud.publishers.mqtt.statistics import MEASURES, IntervalMaker, by_interval, summed_up
@@ -30,9 +31,6 @@ def test_values_by_hand() -> None:
     assert gyro.min == (0.0, 3.0, -1.0)
     assert gyro.rms == pytest.approx((0.0, sqrt(12.5), 1.0))
     assert set(interval.values) == {"temperature_c", "gyro_rad_s"}
-
-
-def test_only_what_is_wanted() -> None:
     maker = IntervalMaker(["mean"])
     maker.add([made(1, temperature_c=1.0)])
     interval = maker.take()
@@ -74,9 +72,6 @@ def test_headings_about_south_have_a_mean_about_south() -> None:
     assert yaw.mean[2] == pytest.approx(radians(-(180 - 2 / 3)))
     assert (yaw.min[2], yaw.max[2]) == pytest.approx((radians(179), radians(182)))
     assert abs(yaw.mean[2]) <= pi
-
-
-def test_both_signs_of_a_quaternion_are_one_attitude() -> None:
     half = sqrt(0.5)
     interval = summed_up([made(1, quat_wxyz=(half, half, 0.0, 0.0)), made(2, quat_wxyz=(-half, -half, 0.0, 0.0))])
     assert interval is not None
@@ -90,11 +85,6 @@ def test_what_is_not_finite_does_not_count() -> None:
     assert "pressure_pa" not in interval.values
     assert interval.count == 3
     assert summed_up([]) is None
-
-
-def test_the_worst_source_of_time_stamps_is_told() -> None:
-    import msgspec
-
     worse = msgspec.structs.replace(made(2), sync=Sync.REGRESSION)
     interval = summed_up([made(1), worse, made(3)])
     assert interval is not None
