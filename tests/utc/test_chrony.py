@@ -14,9 +14,9 @@ import pytest
 from imud.host_clock import HostClock
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.chrony import ChronyFeed, encode
+from tests.support.daemon_process import LIMIT_S
 
 UTC_S = 1_795_000_000
-LIMIT_S = 20.0
 
 
 @pytest.fixture
@@ -79,18 +79,12 @@ def test_a_missing_socket_is_counted_and_the_next_sample_tried(tmp_path: Path) -
 
 def test_a_receiver_that_does_not_read_blocks_nothing(receiver: socket.socket) -> None:
     chrony = feed(receiver)
-    for _ in range(5000):
+    while not chrony.refused:
         chrony.send_pulse(0)
-    assert chrony.refused > 0
-    assert chrony.sent + chrony.refused == 5000
+    assert chrony.sent > 0
     chrony.close()
-
-
-def test_a_closed_feed_refuses(receiver: socket.socket) -> None:
-    chrony = feed(receiver)
-    chrony.close()
-    assert not chrony.send_pulse(0)
-    assert chrony.refused == 1
+    assert not chrony.send_pulse(0), "a closed feed refuses"
+    assert chrony.refused == 2
 
 
 # --- a real chronyd ---------------------------------------------------------------------------------------------------
@@ -130,6 +124,7 @@ def sources(folder: Path) -> dict[str, list[str]]:
     return {}
 
 
+@pytest.mark.live
 @pytest.mark.skipif(bool(NO_CHRONY), reason=NO_CHRONY)
 def test_chronyd_takes_the_samples_and_sees_the_offset(chronyd: Path) -> None:
     offset_ns = 123 * NS_PER_MS  # UTC by the pulses is so much ahead of the system clock

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from imud.formats.rmc import Rmc, parse
-from tests.support.daemon_process import running_daemon
+from tests.support.daemon_process import LIMIT_S, running_daemon
 from tests.support.surroundings import free_port
-from tests.utc.test_gpsd_real import LIMIT_S, NO_GPSD, Receiver, gpsd, receiver
+from tests.utc.test_gpsd_real import NO_GPSD, Receiver, gpsd, receiver
 
 __all__ = ["receiver"]
 WANTED = 3
@@ -46,6 +46,7 @@ def port() -> Iterator[Port]:
     made.close()
 
 
+@pytest.mark.live
 @pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)
 def test_a_device_is_fed_what_gpsd_hears(receiver: Receiver, port: Port, tmp_path: Path) -> None:
     tcp_port = free_port()
@@ -55,10 +56,10 @@ def test_a_device_is_fed_what_gpsd_hears(receiver: Receiver, port: Port, tmp_pat
         "uart": {"port": port.path, "baud": 115200},
         "rmc": {"source": "gpsd", "tcp_port": tcp_port},
     }
-    fed: list[tuple[Rmc, float]] = []
+    fed: list[Rmc] = []
     with (
         gpsd(tcp_port, receiver.path, tmp_path),
-        running_daemon(tmp_path, {"bow": device}, limit_s=LIMIT_S) as daemon,
+        running_daemon(tmp_path, {"bow": device}) as daemon,
     ):
         receiver.second = 0
         end = time.monotonic() + LIMIT_S
@@ -73,10 +74,10 @@ def test_a_device_is_fed_what_gpsd_hears(receiver: Receiver, port: Port, tmp_pat
                 assert line.startswith(b"$GPRMC,")
                 rmc = parse(line)
                 assert isinstance(rmc, Rmc)
-                fed.append((rmc, time.time()))
+                assert rmc.unix_s <= time.time()
+                fed.append(rmc)
         utc = daemon.statuses()["bow"].utc
-    assert all(rmc.valid and rmc.fraction_ns == 0 for rmc, _ in fed)
-    assert all(0 <= heard_s - rmc.unix_s < 1.5 for rmc, heard_s in fed)
+    assert all(rmc.valid and rmc.fraction_ns == 0 for rmc in fed)
     assert utc is not None
     assert (utc.source, utc.problem) == (f"gpsd at 127.0.0.1:{tcp_port}", "")
     assert utc.sentences >= utc.sent >= WANTED

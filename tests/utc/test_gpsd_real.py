@@ -18,11 +18,11 @@ from imud.units import NS_PER_S
 from imud.utc.receivers import GpsdSource
 from imud.utc.sentence_stream import Retry
 from imud.utc.source import RmcSettings
+from tests.support.daemon_process import LIMIT_S
 from tests.support.rmc_sources import Sentences
 from tests.support.surroundings import free_port
 
 UTC_S = 1_795_000_000
-LIMIT_S = 30.0
 NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (Debian package gpsd)"
 
 
@@ -75,6 +75,7 @@ def receiver() -> Iterator[Receiver]:
     made.close()
 
 
+@pytest.mark.live
 @pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)
 def test_sentences_of_the_receiver_come_through_gpsd(receiver: Receiver, tmp_path: Path) -> None:
     port = free_port()

@@ -23,9 +23,17 @@ def test_any_split_gives_the_same(size: int) -> None:
     assert found == SENTENCES
 
 
-def test_a_sentence_behind_a_broken_one_is_found() -> None:
+def test_broken_and_too_long_sentences_are_skipped() -> None:
     broken = SENTENCES[0][:30] + SENTENCES[1]
     assert SentenceSplitter().feed(broken + b"noise\xff$" + SENTENCES[2]) == SENTENCES[1:3]
+    splitter = SentenceSplitter()
+    splitter.feed(SENTENCES[0][:20])
+    splitter.clear()
+    assert splitter.feed(SENTENCES[0][20:] + SENTENCES[1]) == [SENTENCES[1]]
+    random = Random(1)
+    assert splitter.feed(b"$GPRMC," + b"1" * 120 + b"\r\n") == []
+    for _ in range(100):
+        splitter.feed(random.randbytes(random.randrange(200)))
 
 
 def test_a_line_without_end_is_skipped_and_not_buffered() -> None:
@@ -38,20 +46,6 @@ def test_a_line_without_end_is_skipped_and_not_buffered() -> None:
     finally:
         tracemalloc.stop()
     assert splitter.feed(SENTENCES[0] + SENTENCES[1]) == [SENTENCES[1]]  # the first ends the skipped line
-
-
-def test_what_came_before_a_break_is_forgotten() -> None:
-    splitter = SentenceSplitter()
-    splitter.feed(SENTENCES[0][:20])
-    splitter.clear()
-    assert splitter.feed(SENTENCES[0][20:] + SENTENCES[1]) == [SENTENCES[1]]
-
-
-def test_too_long_sentences_and_noise_are_none() -> None:
-    splitter, random = SentenceSplitter(), Random(1)
-    assert splitter.feed(b"$GPRMC," + b"1" * 120 + b"\r\n") == []
-    for _ in range(500):
-        splitter.feed(random.randbytes(random.randrange(200)))
 
 
 def test_pauses() -> None:
