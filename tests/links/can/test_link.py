@@ -58,9 +58,8 @@ class Bus:
 
         await asyncio.wait_for(wait(), LIMIT_S)
 
-    def run(self, monkeypatch: pytest.MonkeyPatch, story: Callable[["Bus"], Coroutine[None, None, None]]) -> None:
+    def run(self, story: Callable[["Bus"], Coroutine[None, None, None]]) -> None:
         """Open, tell the story, close."""
-        monkeypatch.setattr(netlink, "can_details", lambda name: netlink.CanDetails(None, None))
 
         async def play() -> None:
             loop = asyncio.get_running_loop()
@@ -73,7 +72,7 @@ class Bus:
                 return call_later(delay_s, self._run_timer, call)
 
             loop.set_exception_handler(lambda _loop, context: self._failures.append(context))
-            monkeypatch.setattr(loop, "call_later", noted)
+            loop.call_later = noted  # type: ignore[assignment]
             self.link.open()
             self.link.start(self._on_frames, lambda news, problem: None, self.ends.append)
             await story(self)
@@ -98,8 +97,9 @@ class Bus:
 
 
 @pytest.fixture
-def ends(tmp_path: Path) -> Iterator[Ends]:
+def ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ends]:
     """Two ends of a datagram path, and a made-up /sys."""
+    monkeypatch.setattr(netlink, "can_details", lambda name: netlink.CanDetails(None, None))
     interface = tmp_path / "class/net/lo"
     interface.mkdir(parents=True)
     (interface / "type").write_text(f"{netlink.ARPHRD_CAN}\n")
@@ -114,7 +114,7 @@ def ends(tmp_path: Path) -> Iterator[Ends]:
         yield receiver, sender, tmp_path
 
 
-def test_frames_gather(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_gather(ends: Ends) -> None:
     """The first is read at once; those that come next are read together, when the time is over."""
 
     async def story(bus: Bus) -> None:
@@ -123,25 +123,25 @@ def test_frames_gather(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
         await bus.until(lambda: len(bus.batches) == 2)
 
     bus = Bus(ends, GATHER_MS)
-    bus.run(monkeypatch, story)
+    bus.run(story)
     assert [[frame.can_id for frame in batch] for batch in bus.batches] == [[1], [2, 3, 4]]
     assert bus.delays_s == [GATHER_MS / 1000] * 2
     assert bus.by_timer == [False, True]
 
 
-def test_what_is_more_than_a_batch_is_read_at_once(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_more_than_a_batch_is_read_at_once(ends: Ends) -> None:
     async def story(bus: Bus) -> None:
         bus.then = lambda: bus.send(*range(2 * BATCH_FRAMES + 5))
         bus.send(0x700)
         await bus.until(lambda: len(bus.batches) == 4)
 
     bus = Bus(ends, GATHER_MS)
-    bus.run(monkeypatch, story)
+    bus.run(story)
     assert [len(batch) for batch in bus.batches] == [1, BATCH_FRAMES, BATCH_FRAMES, 5]
     assert bus.delays_s == [GATHER_MS / 1000] * 2
 
 
-def test_a_bus_that_fell_silent_is_watched_again(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bus_that_fell_silent_is_watched_again(ends: Ends) -> None:
     async def story(bus: Bus) -> None:
         for number in range(1, 4):
             bus.then = lambda: bus.send(0x100)
@@ -150,25 +150,25 @@ def test_a_bus_that_fell_silent_is_watched_again(ends: Ends, monkeypatch: pytest
             assert len(bus.delays_s) == 2 * number  # no timer runs while nothing comes
 
     bus = Bus(ends, 1)
-    bus.run(monkeypatch, story)
+    bus.run(story)
     assert [[frame.can_id for frame in batch] for batch in bus.batches] == [[1], [0x100], [2], [0x100], [3], [0x100]]
     assert bus.by_timer == [False, True] * 3
 
 
-def test_without_it_every_frame_is_read_as_it_comes(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_it_every_frame_is_read_as_it_comes(ends: Ends) -> None:
     async def story(bus: Bus) -> None:
         for number in range(3):
             bus.send(number)
             await bus.until(lambda: len(bus.batches) == number + 1)  # noqa: B023 - as above
 
     bus = Bus(ends, 0)
-    bus.run(monkeypatch, story)
+    bus.run(story)
     assert [len(batch) for batch in bus.batches] == [1, 1, 1]
     assert bus.delays_s == []
 
 
 @pytest.mark.parametrize("at", ["delivery", "pause"])
-def test_closed_while_frames_gather(ends: Ends, monkeypatch: pytest.MonkeyPatch, at: str) -> None:
+def test_closed_while_frames_gather(ends: Ends, at: str) -> None:
     """By the one who takes the frames, or later: nothing is delivered any more, and no timer is left."""
 
     async def story(bus: Bus) -> None:
@@ -181,7 +181,7 @@ def test_closed_while_frames_gather(ends: Ends, monkeypatch: pytest.MonkeyPatch,
         await asyncio.sleep(0.005)
 
     bus = Bus(ends, 1)
-    bus.run(monkeypatch, story)
+    bus.run(story)
     assert [frame.can_id for batch in bus.batches for frame in batch] == [1]
     assert bus.looks == 0
     assert len(bus.delays_s) == (at == "pause")
@@ -206,14 +206,14 @@ def test_a_bus_that_ends_in_the_pause_says_so_once(ends: Ends, monkeypatch: pyte
 
     monkeypatch.setattr("imud.links.can.link.FrameReader", Reader)
     bus = Bus(ends, 1)
-    bus.run(monkeypatch, story)
+    bus.run(story)
     (ended,) = bus.ends
     assert isinstance(ended, LinkMissing)
     assert bus.looks == 1
     assert len(bus.delays_s) == 1
 
 
-def test_what_gathers_is_read_when_nothing_may_wait_any_more(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_gathers_is_read_when_nothing_may_wait_any_more(ends: Ends) -> None:
     async def story(bus: Bus) -> None:
         bus.then = lambda: bus.send(2)
         bus.send(1)
@@ -224,14 +224,14 @@ def test_what_gathers_is_read_when_nothing_may_wait_any_more(ends: Ends, monkeyp
         await bus.until(lambda: len(bus.batches) == 3)
 
     bus = Bus(ends, GATHER_MS)
-    bus.run(monkeypatch, story)
+    bus.run(story)
     assert bus.looks == 0
     assert len(bus.delays_s) == 1
 
 
-def test_no_more_gathers_than_half_the_buffer_holds(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_more_gathers_than_half_the_buffer_holds(ends: Ends) -> None:
     async def story(bus: Bus) -> None:
         room = ends[0].getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 960
         assert bus.link.gather_ns == room // 2 * 95_000  # frames of 95 bits at 1 Mbit/s
 
-    Bus(ends, 60_000).run(monkeypatch, story)
+    Bus(ends, 60_000).run(story)

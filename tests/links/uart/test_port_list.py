@@ -9,17 +9,14 @@ from imud.links.uart.port_list import SerialPort, list_ports
 
 @pytest.fixture
 def dev(tmp_path: Path) -> Path:
-    path = tmp_path / "dev"
-    (path / "serial" / "by-id").mkdir(parents=True)
-    (path / "serial" / "by-path").mkdir()
-    return path
+    for folder in ("dev/serial/by-id", "dev/serial/by-path", "sys/class/tty"):
+        (tmp_path / folder).mkdir(parents=True)
+    return tmp_path / "dev"
 
 
 @pytest.fixture
-def sys(tmp_path: Path) -> Path:
-    path = tmp_path / "sys"
-    (path / "class" / "tty").mkdir(parents=True)
-    return path
+def sys(dev: Path) -> Path:
+    return dev.with_name("sys")
 
 
 def native(dev: Path, sys: Path, name: str, kind: str) -> None:
@@ -45,9 +42,8 @@ def test_an_adapter_is_listed_by_its_lasting_name(dev: Path, sys: Path) -> None:
     usb(dev, sys, "ttyUSB0", manufacturer="FTDI", product="FT232R USB UART", serial="A1")
     (dev / "serial" / "by-id" / "usb-FTDI").symlink_to("../../ttyUSB0")
     (dev / "serial" / "by-path" / "pci-0").symlink_to("../../ttyUSB0")
-    assert list_ports(dev, sys) == [
-        SerialPort(f"{dev}/serial/by-id/usb-FTDI", f"{dev}/ttyUSB0", "FTDI FT232R USB UART A1"),
-    ]
+    expected = SerialPort(f"{dev}/serial/by-id/usb-FTDI", f"{dev}/ttyUSB0", "FTDI FT232R USB UART A1")
+    assert list_ports(dev, sys) == [expected]
 
 
 def test_without_by_id_the_path_and_then_the_node_is_the_name(dev: Path, sys: Path) -> None:
