@@ -3,8 +3,8 @@
     Feeder ──frames, 20 Hz──▶ Wire (pty) ──▶ Daemon in a thread ──▶ metrics
     a simulated module, a module on RS-485, lines and PPS in memory ──▶ the same daemon ──▶ mosquitto, a recording
 
-The faults of `STATUS_FAULTS` cannot be made on a machine without the hardware, or are bugs of imud that do not exist:
-the state that the daemon shows is altered instead. Everything else really happens.
+The faults of ImudGapsUnknown, ImudBusErrors, ImudBusOff and ImudLedgerOpen need hardware, or are bugs of imud that do
+not exist: the state that the daemon shows is altered instead. Everything else really happens.
 """
 
 import asyncio
@@ -17,6 +17,7 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from typing import Any, Final
 from unittest import mock
@@ -45,7 +46,8 @@ from tests.test_daemon import Cable
 PERIOD_MS: Final = 50
 LIMIT_S: Final = 120.0
 WIRES: Final = ("quiet", "gone", "flapping", "lossy", "noisy", "hot", "late", "jumping", "tilted", "lines", "mute")
-FLAP_S: Final = 1.5
+WIRE_FAULTS: Final = ("silent", "lose_every", "flip_every", "temperature_c", "hold", "jump_ms", "behind_ms", "up_m_s2")
+FLAP_S: Final = 0.8
 PutRecord = Callable[[RecordQueue[object], bytes], None]
 DISK_BYTES: Final = 16_384
 """A file of this process that is longer cannot be written further: as on a full disk."""
@@ -114,28 +116,16 @@ def unpaid(status: DeviceStatus) -> DeviceStatus:
     return msgspec.structs.replace(status, ledger={**status.ledger, "bytes_in": status.ledger["bytes_in"] + 1})
 
 
-class AlteredCounters:
-    """Errors of a port that grow with every look."""
-
-    def __init__(self, **steps: int) -> None:
-        self._steps = steps
-        self._looks = 0
-
-    def __call__(self, status: DeviceStatus) -> DeviceStatus:
-        self._looks += 1
-        grown = KernelCounters(**{name: step * self._looks for name, step in self._steps.items()})
-        return msgspec.structs.replace(status, kernel=grown)
+def kernel_errors(name: str) -> Callable[[DeviceStatus], DeviceStatus]:
+    """Return a change that adds three errors of a port with every look."""
+    looks = count(3, 3)
+    return lambda status: msgspec.structs.replace(status, kernel=KernelCounters(**{name: next(looks)}))
 
 
-class AlteredGaps:
-    """Gaps of unknown size, one more with every look."""
-
-    def __init__(self) -> None:
-        self._looks = 0
-
-    def __call__(self, status: DeviceStatus) -> DeviceStatus:
-        self._looks += 1
-        return msgspec.structs.replace(status, ledger={**status.ledger, "lost_unknown": self._looks})
+def gaps_of_unknown_size() -> Callable[[DeviceStatus], DeviceStatus]:
+    """Return a change that adds a gap with every look."""
+    looks = count(1)
+    return lambda status: msgspec.structs.replace(status, ledger={**status.ledger, "lost_unknown": next(looks)})
 
 
 class AlteredDaemon(Daemon):
@@ -192,7 +182,7 @@ class Site:
         self._thread = threading.Thread(target=event_loop.run, args=(self._serve(),), name="daemon")
         self._thread.start()
         stack.callback(self._stop)
-        wait_until(self._answers, "the daemon's socket", LIMIT_S)
+        wait_until((folder / "imud.sock").exists, "the daemon's socket", LIMIT_S)
         self._ended = threading.Event()
         self._feeder = threading.Thread(target=self._feed, name="feeder")
         self._feeder.start()
@@ -207,8 +197,7 @@ class Site:
 
     def scrape_s(self) -> float:
         """How long a scrape takes once all devices run, the longest of three."""
-        count = len(WIRES) + 2
-        wait_until(lambda: self._running() == count, "all devices run", LIMIT_S)
+        wait_until(lambda: self._running() == len(WIRES) + 2, "all devices run", LIMIT_S)
 
         def once() -> float:
             begin = time.monotonic()
@@ -233,8 +222,8 @@ class Site:
         self._pps = False
         self.in_loop(self._break_lines)
         self.daemon.altered = {
-            "quiet": AlteredCounters(framing=3), "mute": AlteredCounters(bus_off=1), "tilted": unpaid,
-            "lossy": AlteredGaps(),
+            "quiet": kernel_errors("framing"), "mute": kernel_errors("bus_off"), "tilted": unpaid,
+            "lossy": gaps_of_unknown_size(),
         }  # fmt: skip
         self._write(faulty=True)
         self.in_loop(self.daemon.reload)
@@ -260,16 +249,7 @@ class Site:
         self._slave.dead = False
         self.memory.inputs["late sout"].open_error = None
         for wire in self.wires.values():
-            for name in (
-                "silent",
-                "lose_every",
-                "flip_every",
-                "temperature_c",
-                "hold",
-                "jump_ms",
-                "behind_ms",
-                "up_m_s2",
-            ):
+            for name in WIRE_FAULTS:
                 setattr(wire, name, getattr(Wire, name))
         self._pps = True
         self._write(faulty=False)
@@ -316,9 +296,6 @@ class Site:
     def _running(self) -> int:
         with Client(self.folder / "imud.sock", timeout_s=LIMIT_S) as client:
             return sum(one["state"] == "running" for one in client.status()["devices"])
-
-    def _answers(self) -> bool:
-        return (self.folder / "imud.sock").exists()
 
     @staticmethod
     def _unplug(wire: Wire) -> None:
@@ -378,10 +355,6 @@ class Site:
             shm={"directory": str(self.folder / "shm")},
             socket={"path": str(self.folder / "imud.sock"), "queue_samples": 16},
         )  # fmt: skip
-
-
-STATUS_FAULTS: Final = ("ImudGapsUnknown", "ImudBusErrors", "ImudBusOff", "ImudLedgerOpen")
-"""Alerts whose fault is an altered state; edges, pulses and levels of lines are those of lines in memory."""
 
 
 @contextmanager

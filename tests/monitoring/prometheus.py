@@ -22,7 +22,7 @@ from tests.support.surroundings import free_port
 
 RULES: Final = ROOT / "etc/prometheus/imud.rules.yml"
 LIMIT_S: Final = 120.0
-INTERVAL_MS: Final = 500
+INTERVAL_MS: Final = 250
 """Between scrapes, and between evaluations of the rules; where a scrape takes long, `Pace` makes it longer."""
 DURATION: Final = re.compile(r"\b(\d+)([smh])\b")
 UNIT_MS: Final = {"s": 1000, "m": 60_000, "h": 3_600_000}
@@ -61,13 +61,13 @@ class Pace(NamedTuple):
     """How fast a test lets the time of the rules pass on this machine."""
 
     interval_ms: int = INTERVAL_MS
-    divisor: int = 45
-    """Of the times of the rules: 15 minutes are 20 s."""
+    divisor: int = 90
+    """Of the times of the rules: 15 minutes are 10 s."""
 
     @classmethod
     def of(cls, scrape_s: float) -> "Pace":
-        """So that a scrape that takes thrice as long as this one is in time; at the most eight times slower."""
-        slower = min(max(3000 * scrape_s / cls().interval_ms, 1.0), 8.0)
+        """Return a pace at which a scrape may take four times as long as this one; at most 16 times slower."""
+        slower = min(max(4000 * scrape_s / cls().interval_ms, 1.0), 16.0)
         return cls(round(cls().interval_ms * slower), round(cls().divisor / slower))
 
 

@@ -15,11 +15,8 @@ from tests.support.files import ROOT
 from tests.support.surroundings import free_port
 
 
-def test_the_file_is_that_of_the_description() -> None:
-    assert dashboard.FILE.read_text() == dashboard.text(), "run python -m tests.monitoring.dashboard"
-
-
 def test_panels_stand_beside_each_other() -> None:
+    assert dashboard.FILE.read_text() == dashboard.text(), "run python -m tests.monitoring.dashboard"
     taken: set[tuple[int, int]] = set()
     panels = json.loads(dashboard.text())["panels"]
     for panel in panels:
@@ -42,7 +39,7 @@ def test_what_an_operator_looks_for_is_there() -> None:
 
 
 @needs("promtool")
-@pytest.mark.timeout(300)
+@pytest.mark.live
 def test_prometheus_reads_every_query(tmp_path: Path) -> None:
     rules = [
         {"record": f"query:{number}", "expr": dashboard.filled_in(expression)}
@@ -50,9 +47,7 @@ def test_prometheus_reads_every_query(tmp_path: Path) -> None:
     ]
     file = tmp_path / "rules.yml"
     file.write_text(json.dumps({"groups": [{"name": "queries", "rules": rules}]}))
-    done = subprocess.run(
-        ["promtool", "check", "rules", file], capture_output=True, text=True, timeout=300, check=False
-    )
+    done = subprocess.run(["promtool", "check", "rules", file], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert f"{len(rules)} rules found" in done.stdout
 
@@ -77,7 +72,7 @@ def without_data(prometheus: RealPrometheus) -> list[str]:
 
 
 @needs("prometheus")
-@pytest.mark.timeout(900)
+@pytest.mark.live
 def test_every_query_has_data(tmp_path: Path) -> None:
     """Of a daemon with a device on RS-485, one with lines, and others."""
     port = free_port()
@@ -87,7 +82,7 @@ def test_every_query_has_data(tmp_path: Path) -> None:
         end = time.monotonic() + 2 * LIMIT_S
         while missing := without_data(prometheus):
             assert time.monotonic() < end, missing
-            time.sleep(0.5)
+            time.sleep(0.2)
         assert_devices_are_told_apart(prometheus, one)
 
 

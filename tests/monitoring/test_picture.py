@@ -28,11 +28,8 @@ def test_a_value_has_its_unit(value: float, unit: str, words: str) -> None:
     assert picture.shown(value, unit) == words
 
 
-def test_every_unit_of_the_dashboard_is_known() -> None:
-    assert {panel.unit for row in dashboard.ROWS for panel in row.panels} <= picture.UNITS.keys()
-
-
-def test_a_legend_has_the_labels_of_its_series() -> None:
+def test_values_and_legends_are_as_in_grafana() -> None:
     labels = {"device": "bow", "cause": "crc", "driver": "hipnuc-uart"}
     assert picture.named("{{device}}: {{cause}}", labels) == "bow: crc"
     assert picture.named("", labels).split() == ["bow", "hipnuc-uart"]
+    assert {panel.unit for row in dashboard.ROWS for panel in row.panels} <= picture.UNITS.keys()

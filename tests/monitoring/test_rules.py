@@ -15,18 +15,17 @@ from tests.support.files import ROOT
 FOLDER = RULES.parent
 TESTS = Path(__file__).with_name("imud.rules.test.yml")
 ALERTS = {alert["alert"]: alert for alert in alerts_of(RULES.read_text())}
-LIMIT_S = 300
+pytestmark = pytest.mark.live
 
 
 def run(*argv: str) -> str:
     """Run a tool; what it says."""
-    done = subprocess.run(argv, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    done = subprocess.run(argv, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
 @needs("promtool")
-@pytest.mark.timeout(LIMIT_S)
 def test_prometheus_accepts_rules_and_configuration() -> None:
     assert f"{len(ALERTS)} rules found" in run("promtool", "check", "rules", str(RULES))
     run("promtool", "check", "config", str(FOLDER / "prometheus.yml"))
@@ -49,7 +48,6 @@ def test_inhibitions_name_alerts_that_exist() -> None:
 
 
 @needs("promtool")
-@pytest.mark.timeout(LIMIT_S)  # 5 s of CPU
 def test_every_alert_waits_fires_and_clears() -> None:
     assert "SUCCESS" in run("promtool", "test", "rules", str(TESTS))
 
@@ -66,16 +64,15 @@ def test_every_alert_has_a_case_that_fires_and_others_that_do_not() -> None:
     assert outcomes.keys() == ALERTS.keys()
 
 
-@pytest.mark.parametrize("name", ALERTS)
-def test_an_alert_says_what_to_do(name: str) -> None:
-    alert = ALERTS[name]
-    assert name.startswith("Imud")
-    assert set(alert["annotations"]) == {"summary", *PARTS, "runbook"}
-    assert alert["labels"]["severity"] in ("warning", "critical")
-    page, _, anchor = alert["annotations"]["runbook"].partition("#")
-    assert anchor == name
-    assert f'<a id="{anchor}"></a>' in (ROOT / page).read_text()
-    assert "$labels" in alert["annotations"]["summary"] or name == "ImudNotScraped"
+def test_an_alert_says_what_to_do() -> None:
+    for name, alert in ALERTS.items():
+        assert name.startswith("Imud")
+        assert set(alert["annotations"]) == {"summary", *PARTS, "runbook"}, name
+        assert alert["labels"]["severity"] in ("warning", "critical"), name
+        page, _, anchor = alert["annotations"]["runbook"].partition("#")
+        assert anchor == name
+        assert f'<a id="{anchor}"></a>' in (ROOT / page).read_text()
+        assert "$labels" in alert["annotations"]["summary"] or name == "ImudNotScraped"
 
 
 def test_shortened_rules_differ_in_times_only() -> None:
@@ -102,7 +99,6 @@ EXAMPLES = dict(re.findall(r"^```yaml\n# ([\w.-]+\.yml)[^\n]*\n(.*?)^```", PAGE,
 
 
 @needs("promtool")
-@pytest.mark.timeout(LIMIT_S)
 def test_examples_of_the_page_are_accepted(tmp_path: Path) -> None:
     assert EXAMPLES.keys() == {"prometheus.yml", "imud-targets.yml", "my.rules.yml"}
     for name, text in EXAMPLES.items():
@@ -110,8 +106,5 @@ def test_examples_of_the_page_are_accepted(tmp_path: Path) -> None:
     (tmp_path / RULES.name).write_text(RULES.read_text())
     run("promtool", "check", "config", str(tmp_path / "prometheus.yml"))
     run("promtool", "check", "rules", str(tmp_path / "my.rules.yml"))
-
-
-@pytest.mark.parametrize("name", ["prometheus.yml", "imud-targets.yml"])
-def test_examples_of_the_page_are_the_files(name: str) -> None:
-    assert yaml.safe_load(EXAMPLES[name]) == yaml.safe_load((FOLDER / name).read_text())
+    for name in ("prometheus.yml", "imud-targets.yml"):
+        assert yaml.safe_load(EXAMPLES[name]) == yaml.safe_load((FOLDER / name).read_text())

@@ -193,6 +193,37 @@ def test_late_reply_is_never_taken_for_the_next(tmp_path: Path) -> None:
         assert link.heard.strange + link.heard.late >= SETTINGS.read_bytes
 
 
+def test_after_a_time_out_one_register_is_read_first_and_then_no_more(pty: PtyPort) -> None:
+    """The reply to that request differs in length from the reply that the module owes: two registers for one."""
+    one, value = read_registers(4, 1).sends[0], bytes.fromhex("03 02 0008")
+    long, serial = SERIAL.sends[0], b"\x03\x08" + serial_of(1)
+    script = [
+        (long, b""), (bytes.fromhex("03 007f 0001"), bytes.fromhex("03 02 a000")), (long, serial), (long, serial),
+        (one, b""), (bytes.fromhex("03 0004 0002"), bytes.fromhex("03 04 0008 0001")), (one, value), (one, value),
+    ]  # fmt: skip
+    heard = []
+
+    def answer() -> None:
+        for _, reply in script:
+            select.select([pty.master], [], [], LIMIT_S)
+            heard.append(pty.received())
+            if reply:
+                pty.send(framed(1, reply))
+
+    far = threading.Thread(target=answer)
+    far.start()
+    try:
+        with opened(pty.path, reply_ms=500, echo=False) as link:
+            for transfer, reply in ((SERIAL, serial), (read_registers(4, 1), value)):
+                with pytest.raises(TransferError):
+                    link.transfer(transfer)
+                for _ in range(2):
+                    assert link.transfer(transfer) == framed(1, reply)
+    finally:
+        far.join(LIMIT_S)
+    assert heard == [framed(1, request) for request, _ in script]
+
+
 def test_late_reply_of_one_is_not_taken_for_that_of_another(tmp_path: Path) -> None:
     late = slave(1, processing_ns=50_000_000)
     with wired(tmp_path, late, slave(2)) as (path, line), opened(path, reply_ms=1) as link:

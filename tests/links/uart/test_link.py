@@ -151,7 +151,9 @@ def test_the_queue_has_a_largest_size_and_ends_with_the_link(pty: PtyPort) -> No
         link.write(bytes(WRITE_QUEUE_BYTES))
         with pytest.raises(LinkError, match="bytes wait"):
             link.write(b"x")
+        numbers = [int(name) for name in os.listdir("/proc/self/fd")]
         link.close()
+        assert not any(asyncio.get_running_loop().remove_writer(number) for number in numbers)
         await drained(pty, sent)
         link.open()
         link.write(b"new")
@@ -410,6 +412,18 @@ def test_a_paused_port_keeps_what_comes_until_it_is_taken(pty: PtyPort) -> None:
 
     link = UartLink(UartSettings(port=pty.path))
     assert play(link, scene).ends == []
+
+
+def test_a_full_read_is_followed_by_another(pty: PtyPort, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scene(_receiver: Receiver) -> None:
+        link.pause()
+        pieces = iter([bytes(FULL_READ_BYTES), b"last"])
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "read", lambda _fd, _size: next(pieces))
+            assert link.take() == bytes(FULL_READ_BYTES) + b"last"
+
+    link = UartLink(UartSettings(port=pty.path))
+    play(link, scene)
 
 
 @pytest.mark.parametrize("resumed", [False, True])
