@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from imud.errors import LinkDenied, LinkError, LinkMissing
-from imud.formats.can import CyclicFrame
+from imud.formats.can import CyclicFrame, pack_frame
 from imud.links.can import netlink
 from imud.links.can.cyclic_sender import KernelSender, LoopSender
-from imud.links.can.link import SocketCanLink, SocketCanSettings, open_raw
+from imud.links.can.link import SO_RCVBUFFORCE, SocketCanLink, SocketCanSettings, open_raw
 
 FRAMES = [CyclicFrame(number, False, b"", 1_000_000) for number in (1, 2)]
 BUFFER_BYTES = 1 << 20
@@ -56,8 +56,25 @@ def test_a_raw_socket_has_the_permitted_buffer(monkeypatch: pytest.MonkeyPatch) 
     made = FakeSocket(3, errno.EPERM)
     monkeypatch.setattr(socket, "socket", lambda *_: made)
     assert open_raw(SocketCanSettings(interface="can0"), []) is made  # type: ignore[comparison-overlap]  # the fake
+    assert made.calls[2] == (socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES // 2), "the kernel doubles the value"
     assert made.calls[3] == (socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES // 2)
     assert (made.calls[-1], made.closed) == ((("can0",),), False)
+
+
+@pytest.fixture
+def sys_with_can0(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "class/net/can0"
+    folder.mkdir(parents=True)
+    (folder / "type").write_text(f"{netlink.ARPHRD_CAN}\n")
+    (folder / "flags").write_text(f"{netlink.IFF_UP:#x}\n")
+    monkeypatch.setattr(netlink, "can_details", lambda name: netlink.CanDetails(None, None))
+    return tmp_path
+
+
+def link_of(made: FakeSocket, sys: Path) -> SocketCanLink:
+    """Return a link whose socket is `made`."""
+    settings = SocketCanSettings(interface="can0")
+    return SocketCanLink(settings, sys=sys, open_socket=lambda *_: made)  # type: ignore[arg-type]  # the fake
 
 
 @pytest.mark.parametrize(
@@ -65,23 +82,28 @@ def test_a_raw_socket_has_the_permitted_buffer(monkeypatch: pytest.MonkeyPatch) 
     [(1, errno.ENODEV, LinkMissing), (2, errno.EPERM, LinkDenied), (3, errno.EAFNOSUPPORT, LinkError)],
 )
 def test_a_link_that_cannot_be_set_up_is_closed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails_at: int, error: int, kind: type[LinkError]
+    sys_with_can0: Path, fails_at: int, error: int, kind: type[LinkError]
 ) -> None:
-    folder = tmp_path / "class/net/can0"
-    folder.mkdir(parents=True)
-    (folder / "type").write_text(f"{netlink.ARPHRD_CAN}\n")
-    (folder / "flags").write_text(f"{netlink.IFF_UP:#x}\n")
-    monkeypatch.setattr(netlink, "can_details", lambda name: netlink.CanDetails(None, None))
     made = FakeSocket(fails_at, error)
-    link = SocketCanLink(
-        SocketCanSettings(interface="can0"), sys=tmp_path, open_socket=lambda *_: made  # type: ignore[arg-type]  # the fake
-    )  # fmt: skip
+    link = link_of(made, sys_with_can0)
     with pytest.raises(LinkError) as caught:
         link.open()
     assert type(caught.value) is kind
     assert made.closed
     with pytest.raises(LinkError, match="not open"):
         link.write(b"")
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [(errno.ENOBUFS, "queue is full"), (errno.EAGAIN, "queue is full"), (errno.ENETDOWN, "taken down")],
+)
+def test_a_refused_frame_is_explained(sys_with_can0: Path, error: int, words: str) -> None:
+    made = FakeSocket(4, error)  # after two options and the size of the buffer
+    link = link_of(made, sys_with_can0)
+    link.open()
+    with pytest.raises(LinkError, match=words):
+        link.write(pack_frame(1, False, b""))
 
 
 @pytest.mark.parametrize("fails_at", range(1, 4))

@@ -10,11 +10,11 @@ import pytest
 
 from imud.contracts.link import CanLink
 from imud.errors import LinkError
-from imud.formats.can import CanFilter, CanFrame, pack_frame
+from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_frame
 from imud.links import LINKS
 from imud.links.can.link import LINK, SocketCanSettings, pack_filters
 from imud.links.can.python_can import PythonCanLink
-from tests.support.daemon_process import LIMIT_S
+from tests.support.daemon_process import LIMIT_S, wait_until
 
 
 def make(channel: str, **keys: object) -> CanLink:
@@ -81,3 +81,67 @@ def test_settings_of_other_backends() -> None:
 def test_filters_as_the_kernel_takes_them() -> None:
     packed = pack_filters([CanFilter(0x65, 0x7FF, False), CanFilter(0x18FEE900, 0x03FFFF00, True)])
     assert packed.hex() == "65000000ff0700c0" + "00e9fe9800ffffc3"
+
+
+class FakeBus:
+    """A bus of python-can that gives these messages, and notes its end."""
+
+    def __init__(self, *messages: can.Message) -> None:
+        self.messages = list(messages)
+        self.sent: list[can.Message] = []
+        self.is_shut_down = False
+
+    def recv(self, _timeout: float) -> can.Message | None:
+        return self.messages.pop(0) if self.messages else None
+
+    def send(self, message: can.Message, timeout: float) -> None:
+        assert timeout == 0
+        self.sent.append(message)
+
+    def shutdown(self) -> None:
+        self.is_shut_down = True
+
+
+def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds: list[dict[str, bool]] = [{}, {"is_error_frame": True}, {"is_remote_frame": True}, {"is_fd": True}, {}]
+    bus = FakeBus(*(can.Message(arbitration_id=n, is_extended_id=False, **kind) for n, kind in enumerate(kinds)))
+    monkeypatch.setattr(can, "Bus", lambda *_, **__: bus)
+    got: list[int] = []
+
+    async def story() -> None:
+        link = make("fake")
+        link.open()
+        first = asyncio.Event()
+
+        def on_frames(frames: Sequence[CanFrame]) -> None:
+            got.extend(frame.can_id for frame in frames)
+            first.set()
+
+        link.start(on_frames, lambda news, problem: None, lambda error: None)
+        await asyncio.wait_for(first.wait(), LIMIT_S)
+        bus.messages += [can.Message(arbitration_id=9, is_extended_id=False)]
+        wait_until(lambda: not bus.messages, "the thread has read the frame")
+        link.close()
+        await asyncio.sleep(0.01)  # the loop would deliver the frame now
+
+    asyncio.run(story())
+    assert got == [0, 4]
+    assert bus.is_shut_down
+
+
+def test_cyclic_frames_are_replaced_and_end_with_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = FakeBus()
+    monkeypatch.setattr(can, "Bus", lambda *_, **__: bus)
+
+    async def story() -> None:
+        link = make("fake")
+        link.open()
+        link.send_cyclic([CyclicFrame(1, False, b"", 10**12)])
+        link.send_cyclic([CyclicFrame(2, False, b"", 10**12)])
+        running = [timer for timer in asyncio.get_running_loop()._scheduled if not timer.cancelled()]  # type: ignore[attr-defined]
+        assert len(running) == 1
+        link.close()
+        assert all(timer.cancelled() for timer in asyncio.get_running_loop()._scheduled)  # type: ignore[attr-defined]
+
+    asyncio.run(story())
+    assert [message.arbitration_id for message in bus.sent] == [1, 2]

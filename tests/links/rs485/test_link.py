@@ -326,14 +326,18 @@ class Driver:
         return struct.pack("8I", self.flags, *[0] * 7)
 
 
-def test_direction_by_the_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
-    driver = Driver(0)
+def test_direction_by_the_kernel(monkeypatch: pytest.MonkeyPatch, pty: PtyPort) -> None:
+    driver, real, requests = Driver(0), fcntl.ioctl, (TIOCGRS485, TIOCSRS485)
     monkeypatch.setattr(fcntl, "ioctl", driver.ioctl)
     direction = Direction(3, "x", required=True)
     assert direction.by_kernel
     direction.restore()
     direction.restore()
     assert driver.set == [ENABLED | RTS_ON_SEND, 0]
+    monkeypatch.setattr(fcntl, "ioctl", lambda *a: driver.ioctl(*a) if a[1] in requests else real(*a))
+    with opened(pty.path):
+        assert driver.set[2:] == [ENABLED | RTS_ON_SEND]
+    assert driver.set[3:] == [0], "the link leaves the port as it was"
     driver = Driver(ENABLED)
     monkeypatch.setattr(fcntl, "ioctl", driver.ioctl)
     direction = Direction(3, "x", required=False)
