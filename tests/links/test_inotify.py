@@ -64,6 +64,19 @@ def test_a_missing_directory_is_waited_for_level_by_level(tmp_path: Path) -> Non
     asyncio.run(scene())
 
 
+def test_a_directory_that_is_made_before_its_watch_is_set_is_watched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, add = tmp_path / "by-id" / "tty", inotify.DirectoryWatch.add
+
+    def make_and_add(watch: inotify.DirectoryWatch, directory: Path) -> bool:
+        path.parent.mkdir(exist_ok=True)
+        return add(watch, directory)
+
+    monkeypatch.setattr(inotify.DirectoryWatch, "add", make_and_add)
+    run(path, path.exists, path.touch)
+
+
 def test_other_changes_do_not_end_the_wait(tmp_path: Path) -> None:
     path = tmp_path / "tty"
 

@@ -82,5 +82,8 @@ def test_sizes_and_versions_are_limited() -> None:
     with pytest.raises(ImudError, match="records of version 9, this imud reads 1"):
         list(RecordingReader(io.BytesIO(written(session(9))), "a.rec"))
     assert RecordingReader(io.BytesIO(written(bytes(RECORD_BYTES_MAX))), "a.rec")
+    gatherer, half = BlockGatherer(), bytes(BLOCK_BYTES // 2)
+    assert (gatherer.add(half), gatherer.add(half)) == (b"", b""), "two halves fit into a block"
+    assert gatherer.add(b"x")
     with pytest.raises(ValueError, match="at most"):
         BlockGatherer().add(bytes(RECORD_BYTES_MAX + 1))

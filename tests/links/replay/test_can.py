@@ -13,7 +13,7 @@ from imud.contracts.link import CanLink
 from imud.errors import LinkError, LinkMissing
 from imud.formats.can import CanFilter, CanFrame
 from imud.links import LINKS
-from imud.links.replay.can import CanReplayLink
+from imud.links.replay.can import TURN_FRAMES, CanReplayLink
 from imud.links.replay.file import ReplaySettings
 from tests.support.event_loops import VirtualClock, run_virtually
 from tests.support.files import candump_line
@@ -47,6 +47,7 @@ def play(path: Path, enough: int = 1 << 30, **keys: Any) -> tuple[list[CanFrame]
         done = asyncio.Event()
 
         def on_frames(some: Sequence[CanFrame]) -> None:
+            assert len(some) <= TURN_FRAMES, "others get their turn"
             frames.extend(some)
             if len(frames) >= enough:
                 link.close()
