@@ -17,6 +17,7 @@ from tests.publishers.mqtt.authority import Authority
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
 from tests.publishers.mqtt.proxy import Proxy
 from tests.support.daemon_process import LIMIT_S
+from tests.support.event_loops import in_loop
 from tests.support.surroundings import free_port
 
 pytestmark = pytest.mark.live
@@ -42,46 +43,41 @@ BOTH = pytest.mark.parametrize("is_v5", [True, False], ids=["5", "3.1.1"])
 
 
 @BOTH
-def test_a_retained_message_says_so_and_none_comes_in_no_time(
+@in_loop
+async def test_a_retained_message_says_so_and_none_comes_in_no_time(
     broker: Mosquitto, gateway: SendingGateway, is_v5: bool
 ) -> None:
     gateway.publish([("imud/kept", b"x" * 200_000)], retain=True)
-
-    async def play() -> None:
-        connection = await opened(broker.port, is_v5=is_v5)
-        found = await connection.next(LIMIT_S)
-        assert found is not None
-        assert (found.topic, len(found.payload), found.retain) == ("imud/kept", 200_000, True)
-        assert await connection.next(0.01) is None
-        connection.close()
-        connection.close()
-        with pytest.raises(BrokerError, match="closed"):
-            await connection.next()
-
-    asyncio.run(play())
+    connection = await opened(broker.port, is_v5=is_v5)
+    found = await connection.next(LIMIT_S)
+    assert found is not None
+    assert (found.topic, len(found.payload), found.retain) == ("imud/kept", 200_000, True)
+    assert await connection.next(0.01) is None
+    connection.close()
+    connection.close()
+    with pytest.raises(BrokerError, match="closed"):
+        await connection.next()
 
 
 @BOTH
-def test_only_what_was_acknowledged_is_done_with(broker: Mosquitto, gateway: SendingGateway, is_v5: bool) -> None:
-    async def play() -> list[str]:
-        (await opened(broker.port, 60, is_v5=is_v5)).close()
-        await asyncio.to_thread(gateway.publish, [(f"imud/{n}", b"") for n in range(4)])
-        first = await opened(broker.port, 60, is_v5=is_v5)
-        for _ in range(2):
-            found = await first.next(LIMIT_S)
-            assert found is not None
-            first.acknowledge(found.number)
-        first.close()
-        second = await opened(broker.port, 60, is_v5=is_v5)
-        topics = []
-        for _ in range(2):
-            found = await second.next(LIMIT_S)
-            assert found is not None
-            topics.append(found.topic)
-        second.close()
-        return topics
-
-    assert asyncio.run(play()) == ["imud/2", "imud/3"]
+@in_loop
+async def test_only_what_was_acknowledged_is_done_with(broker: Mosquitto, gateway: SendingGateway, is_v5: bool) -> None:
+    (await opened(broker.port, 60, is_v5=is_v5)).close()
+    await asyncio.to_thread(gateway.publish, [(f"imud/{n}", b"") for n in range(4)])
+    first = await opened(broker.port, 60, is_v5=is_v5)
+    for _ in range(2):
+        found = await first.next(LIMIT_S)
+        assert found is not None
+        first.acknowledge(found.number)
+    first.close()
+    second = await opened(broker.port, 60, is_v5=is_v5)
+    topics = []
+    for _ in range(2):
+        found = await second.next(LIMIT_S)
+        assert found is not None
+        topics.append(found.topic)
+    second.close()
+    assert topics == ["imud/2", "imud/3"]
 
 
 async def waiting_and_taken(connection: ReaderConnection, count: int) -> tuple[int, list[int]]:
@@ -128,86 +124,75 @@ def test_a_broker_that_sends_without_bound_waits_for_the_reader(
     assert found == list(range(count))
 
 
-def test_large_messages_that_nobody_takes_wait_at_the_broker(broker: Mosquitto, gateway: SendingGateway) -> None:
+@in_loop
+async def test_large_messages_that_nobody_takes_wait_at_the_broker(broker: Mosquitto, gateway: SendingGateway) -> None:
     size, count = 200_000, 150
-
-    async def play() -> tuple[int, list[int]]:
-        connection = await opened(broker.port)
-        sending = asyncio.to_thread(gateway.publish, [(f"imud/{number}", bytes(size)) for number in range(count)])
-        async with asyncio.timeout(LIMIT_S):
-            await sending
-            while connection.waiting <= WAITING_BYTES // 2 // size:
-                await asyncio.sleep(0.002)
-        return await waiting_and_taken(connection, count)
-
-    most, found = asyncio.run(play())
+    connection = await opened(broker.port)
+    sending = asyncio.to_thread(gateway.publish, [(f"imud/{number}", bytes(size)) for number in range(count)])
+    async with asyncio.timeout(LIMIT_S):
+        await sending
+        while connection.waiting <= WAITING_BYTES // 2 // size:
+            await asyncio.sleep(0.002)
+    most, found = await waiting_and_taken(connection, count)
     assert most * size <= WAITING_BYTES + 2 * size, "a read takes two messages at most beyond the bound"
     assert found == list(range(count))
 
 
-def test_a_broker_that_ends_is_noticed(broker: Mosquitto) -> None:
-    async def play() -> None:
-        connection = await opened(broker.port)
-        await asyncio.to_thread(broker.stop)
-        with pytest.raises(BrokerError, match=f"mqtt://127.0.0.1:{broker.port}: "):
-            await connection.next(LIMIT_S)
-        connection.close()
-        with pytest.raises(BrokerError, match=f"mqtt://127.0.0.1:{broker.port}: .*refused"):
-            await opened(broker.port)
-
-    asyncio.run(play())
+@in_loop
+async def test_a_broker_that_ends_is_noticed(broker: Mosquitto) -> None:
+    connection = await opened(broker.port)
+    await asyncio.to_thread(broker.stop)
+    with pytest.raises(BrokerError, match=f"mqtt://127.0.0.1:{broker.port}: "):
+        await connection.next(LIMIT_S)
+    connection.close()
+    with pytest.raises(BrokerError, match=f"mqtt://127.0.0.1:{broker.port}: .*refused"):
+        await opened(broker.port)
 
 
 @BOTH
-def test_a_reset_that_an_acknowledgement_meets_is_a_loss_and_watches_no_other_file(
+@in_loop
+async def test_a_reset_that_an_acknowledgement_meets_is_a_loss_and_watches_no_other_file(
     broker: Mosquitto, gateway: SendingGateway, proxy: Proxy, is_v5: bool
 ) -> None:
     """paho-mqtt closes the socket inside `ack`, and the next file that is opened has its number."""
-
-    async def play() -> None:
-        connection = await opened(proxy.port, 60, is_v5=is_v5)
-        await asyncio.to_thread(gateway.publish, [(f"imud/{n}", b"") for n in range(4)])
-        first, second = await connection.next(LIMIT_S), await connection.next(LIMIT_S)
-        assert first is not None
-        assert second is not None
-        proxy.reset()  # and the event loop, which would read it, has no turn
-        connection.acknowledge(first.number)
-        others = [socket.socketpair() for _ in range(8)]  # one of them has the number that the connection had
-        try:
-            connection.acknowledge(second.number)
-            for pair in others:
-                for one in pair:
-                    assert not asyncio.get_running_loop().remove_reader(one)
-                    assert not asyncio.get_running_loop().remove_writer(one)
-            with pytest.raises(BrokerError, match=f"mqtt://127.0.0.1:{proxy.port}: the connection was lost"):
-                await lost(connection)
-        finally:
-            connection.close()
-            for pair in others:
-                for one in pair:
-                    one.close()
-
-    asyncio.run(play())
+    connection = await opened(proxy.port, 60, is_v5=is_v5)
+    await asyncio.to_thread(gateway.publish, [(f"imud/{n}", b"") for n in range(4)])
+    first, second = await connection.next(LIMIT_S), await connection.next(LIMIT_S)
+    assert first is not None
+    assert second is not None
+    proxy.reset()  # and the event loop, which would read it, has no turn
+    connection.acknowledge(first.number)
+    others = [socket.socketpair() for _ in range(8)]  # one of them has the number that the connection had
+    try:
+        connection.acknowledge(second.number)
+        for pair in others:
+            for one in pair:
+                assert not asyncio.get_running_loop().remove_reader(one)
+                assert not asyncio.get_running_loop().remove_writer(one)
+        with pytest.raises(BrokerError, match=f"mqtt://127.0.0.1:{proxy.port}: the connection was lost"):
+            await lost(connection)
+    finally:
+        connection.close()
+        for pair in others:
+            for one in pair:
+                one.close()
 
 
-def test_a_descriptor_that_the_event_loop_cannot_forget_ends_the_connection_all_the_same(
+@in_loop
+async def test_a_descriptor_that_the_event_loop_cannot_forget_ends_the_connection_all_the_same(
     broker: Mosquitto, gateway: SendingGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """epoll of a descriptor that is closed already raises where both reading and writing were waited for."""
+    connection = await opened(broker.port)
+    waiting = asyncio.ensure_future(connection.next())
+    await asyncio.sleep(0)
+    loop = asyncio.get_running_loop()
 
-    async def play() -> None:
-        connection = await opened(broker.port)
-        waiting = asyncio.ensure_future(connection.next())
-        await asyncio.sleep(0)
-        loop = asyncio.get_running_loop()
+    def refuse(number: int) -> bool:
+        raise OSError(errno.EBADF, "Bad file descriptor")
 
-        def refuse(number: int) -> bool:
-            raise OSError(errno.EBADF, "Bad file descriptor")
-
-        monkeypatch.setattr(loop, "remove_writer", refuse)
-        connection.close()
-        with pytest.raises(BrokerError, match="the connection is closed"):
-            async with asyncio.timeout(LIMIT_S):
-                await waiting
-
-    asyncio.run(play())
+    monkeypatch.setattr(loop, "remove_writer", refuse)
+    connection.close()
+    with pytest.raises(BrokerError, match="the connection is closed"):
+        async with asyncio.timeout(LIMIT_S):
+            await waiting

@@ -20,6 +20,7 @@ from imud.formats.fleet.topics import topic_of
 from tests.fleet.fleet_gateway import SendingGateway, dropped_message, samples_message
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
 from tests.support.daemon_process import LIMIT_S, wait_until
+from tests.support.event_loops import in_loop
 from tests.support.files import ROOT
 from tests.support.surroundings import free_port
 
@@ -66,18 +67,15 @@ async def until(true: Callable[[], bool]) -> None:
 STATE = GatewayState(v=1, online=True, boot="1", positions=[StreamPosition("1", "bow", "samples", 1, 50)])
 
 
-def test_batches_come_as_samples_of_the_client_and_the_account_closes(
+@in_loop
+async def test_batches_come_as_samples_of_the_client_and_the_account_closes(
     broker: Mosquitto, gateway: SendingGateway
 ) -> None:
     gateway.send_state(STATE)
     fleet = fleet_at(broker, "archive")
-
-    async def play() -> list[FleetBatch]:
-        await session_begun(fleet)
-        gateway.send(samples_message(1, 10), samples_message(1, 10), dropped_message(11, 15), samples_message(19, 20))
-        return await taken(fleet, 3)
-
-    batches = asyncio.run(play())
+    await session_begun(fleet)
+    gateway.send(samples_message(1, 10), samples_message(1, 10), dropped_message(11, 15), samples_message(19, 20))
+    batches = await taken(fleet, 3)
     assert [one.site for one in batches] == ["mill"] * 3
     assert batches[0].message == samples_message(1, 10)
     assert fleet.states["mill", "gw"] == STATE
@@ -86,117 +84,105 @@ def test_batches_come_as_samples_of_the_client_and_the_account_closes(
     assert (account.counts.dropped, account.counts.missing, account.counts.duplicates) == ({"space": 5}, 3, 10)
 
 
-def test_what_a_reader_had_not_taken_comes_again_and_nothing_else(broker: Mosquitto, gateway: SendingGateway) -> None:
+@in_loop
+async def test_what_a_reader_had_not_taken_comes_again_and_nothing_else(
+    broker: Mosquitto, gateway: SendingGateway
+) -> None:
     gateway.send_state(STATE)
 
     def acknowledged() -> int:
         """Acknowledgements that the broker has read."""
         return sum("Received PUBACK from imud-reader-archive" in line for line in broker.log)
 
-    async def play() -> list[FleetBatch]:
-        await session_begun(fleet_at(broker, "archive"))
-        gateway.publish(
-            [(topic_of("mill", "gw", "", "state"), b"")], retain=True
-        )  # one acknowledgement, before the others
-        gateway.send(*(samples_message(10 * n + 1, 10 * n + 10) for n in range(5)))
-        # a socket that is closed while something is unread is reset, and the broker may never read what was sent last
-        before = acknowledged()
-        assert len(await taken(fleet_at(broker, "archive"), 3, lambda: acknowledged() >= before + 3)) == 3
-        return await taken(fleet_at(broker, "archive"), 3)
-
-    assert [one.message.first for one in asyncio.run(play())] == [21, 31, 41]
+    await session_begun(fleet_at(broker, "archive"))
+    gateway.publish([(topic_of("mill", "gw", "", "state"), b"")], retain=True)  # one acknowledgement, before the others
+    gateway.send(*(samples_message(10 * n + 1, 10 * n + 10) for n in range(5)))
+    # a socket that is closed while something is unread is reset, and the broker may never read what was sent last
+    before = acknowledged()
+    assert len(await taken(fleet_at(broker, "archive"), 3, lambda: acknowledged() >= before + 3)) == 3
+    assert [one.message.first for one in (await taken(fleet_at(broker, "archive"), 3))] == [21, 31, 41]
 
 
-def test_the_broker_sends_no_more_than_the_reader_has_room_for(broker: Mosquitto, gateway: SendingGateway) -> None:
+@in_loop
+async def test_the_broker_sends_no_more_than_the_reader_has_room_for(
+    broker: Mosquitto, gateway: SendingGateway
+) -> None:
     gateway.send_state(STATE)
     fleet = fleet_at(broker, "slow")
-
-    async def play() -> tuple[int, int]:
-        await session_begun(fleet)
-        await asyncio.to_thread(gateway.send, *(samples_message(n, n) for n in range(1, 2 * RECEIVE_MAX + 1)))
-        before = sum("Sending PUBLISH to imud-reader-slow" in line for line in broker.log)
-        batches = fleet.watch()
-        await anext(batches)
-        gateway.send_state(STATE)  # the broker has handled all before it
-        sent = sum("Sending PUBLISH to imud-reader-slow" in line for line in broker.log) - before
-        count = 1
-        async for _ in batches:
-            count += 1
-            if count == 2 * RECEIVE_MAX:
-                break
-        await batches.aclose()
-        return sent, count
-
-    sent, count = asyncio.run(play())
+    await session_begun(fleet)
+    await asyncio.to_thread(gateway.send, *(samples_message(n, n) for n in range(1, 2 * RECEIVE_MAX + 1)))
+    before = sum("Sending PUBLISH to imud-reader-slow" in line for line in broker.log)
+    batches = fleet.watch()
+    await anext(batches)
+    gateway.send_state(STATE)  # the broker has handled all before it
+    sent = sum("Sending PUBLISH to imud-reader-slow" in line for line in broker.log) - before
+    count = 1
+    async for _ in batches:
+        count += 1
+        if count == 2 * RECEIVE_MAX:
+            break
+    await batches.aclose()
     assert sent <= RECEIVE_MAX + 1
     assert count == 2 * RECEIVE_MAX
     assert fleet.accounts[KEY].counts.missing == 0
 
 
-def test_a_broker_that_restarts_loses_nothing(broker: Mosquitto, gateway: SendingGateway) -> None:
+@in_loop
+async def test_a_broker_that_restarts_loses_nothing(broker: Mosquitto, gateway: SendingGateway) -> None:
     gateway.send_state(STATE)
     fleet = fleet_at(broker, "archive")
-
-    async def play() -> list[int]:
-        await session_begun(fleet)
-        batches, found = fleet.watch(), []
-        gateway.send(samples_message(1, 10))
-        found.append((await anext(batches)).message.first)
-        waiting = asyncio.ensure_future(anext(batches))
-        await asyncio.to_thread(broker.stop)
-        await asyncio.to_thread(broker.start)
-        other = SendingGateway(broker.port)
-        await asyncio.to_thread(other.send, samples_message(11, 20))
-        async with asyncio.timeout(LIMIT_S):
-            found.append((await waiting).message.first)
-        other.close()
-        await batches.aclose()
-        return found
-
-    assert asyncio.run(play()) == [1, 11]
+    await session_begun(fleet)
+    batches, found = fleet.watch(), []
+    gateway.send(samples_message(1, 10))
+    found.append((await anext(batches)).message.first)
+    waiting = asyncio.ensure_future(anext(batches))
+    await asyncio.to_thread(broker.stop)
+    await asyncio.to_thread(broker.start)
+    other = SendingGateway(broker.port)
+    await asyncio.to_thread(other.send, samples_message(11, 20))
+    async with asyncio.timeout(LIMIT_S):
+        found.append((await waiting).message.first)
+    other.close()
+    await batches.aclose()
+    assert found == [1, 11]
 
 
-def test_only_what_is_wanted_comes_even_where_the_session_had_more(broker: Mosquitto, gateway: SendingGateway) -> None:
+@in_loop
+async def test_only_what_is_wanted_comes_even_where_the_session_had_more(
+    broker: Mosquitto, gateway: SendingGateway
+) -> None:
     gateway.send_state(STATE)
-
-    async def play() -> list[FleetBatch]:
-        await session_begun(fleet_at(broker, "archive"))
-        gateway.send(samples_message(1, 1, gateway="other"), samples_message(1, 1, device="stern"))
-        gateway.send(samples_message(1, 2))
-        return await taken(fleet_at(broker, "archive"), 1, gateway="gw", device="bow")
-
-    assert [one.message.last for one in asyncio.run(play())] == [2]
+    await session_begun(fleet_at(broker, "archive"))
+    gateway.send(samples_message(1, 1, gateway="other"), samples_message(1, 1, device="stern"))
+    gateway.send(samples_message(1, 2))
+    assert [one.message.last for one in (await taken(fleet_at(broker, "archive"), 1, gateway="gw", device="bow"))] == [
+        2
+    ]
 
 
-def test_what_no_gateway_sends_is_counted_and_acknowledged(broker: Mosquitto, gateway: SendingGateway) -> None:
+@in_loop
+async def test_what_no_gateway_sends_is_counted_and_acknowledged(broker: Mosquitto, gateway: SendingGateway) -> None:
     gateway.send_state(STATE)
     fleet = fleet_at(broker, "archive")
-
-    async def play() -> None:
-        await session_begun(fleet)
-        wrong = topic_of("mill", "other", "bow", "samples")
-        gateway.publish([(wrong, b"{}"), (wrong, b"IMUB\xff"), (topic_of("mill", "gw", "", "state"), b"[]")])
-        gateway.publish([(wrong, b'{"v":1,"gateway":"gw","boot":"1","device":"bow","kind":"samples",'
-                                 b'"begin":1,"first":1,"last":1,"count":1,"utc_ns":0}')])  # fmt: skip
-        gateway.send(samples_message(1, 1))
-        await taken(fleet, 1)
-
-    asyncio.run(play())
+    await session_begun(fleet)
+    wrong = topic_of("mill", "other", "bow", "samples")
+    gateway.publish([(wrong, b"{}"), (wrong, b"IMUB\xff"), (topic_of("mill", "gw", "", "state"), b"[]")])
+    gateway.publish([(wrong, b'{"v":1,"gateway":"gw","boot":"1","device":"bow","kind":"samples",'
+                             b'"begin":1,"first":1,"last":1,"count":1,"utc_ns":0}')])  # fmt: skip
+    gateway.send(samples_message(1, 1))
+    await taken(fleet, 1)
     assert fleet.ignored == 4
 
 
-def test_the_next_broker_of_the_cluster_is_tried(broker: Mosquitto, gateway: SendingGateway) -> None:
+@in_loop
+async def test_the_next_broker_of_the_cluster_is_tried(broker: Mosquitto, gateway: SendingGateway) -> None:
     fleet = Fleet(
         f"mqtt://127.0.0.1:{free_port()}", f"mqtt://127.0.0.1:{broker.port}", version="3.1.1", retry_max_s=0.1
     )
-
-    async def play() -> list[FleetBatch]:
-        reading = asyncio.ensure_future(taken(fleet, 1))
-        await until(lambda: any("Received SUBSCRIBE" in line for line in broker.log))
-        await asyncio.to_thread(gateway.send, samples_message(1, 10))
-        return await reading
-
-    assert asyncio.run(play())[0].message == samples_message(1, 10)
+    reading = asyncio.ensure_future(taken(fleet, 1))
+    await until(lambda: any("Received SUBSCRIBE" in line for line in broker.log))
+    await asyncio.to_thread(gateway.send, samples_message(1, 10))
+    assert (await reading)[0].message == samples_message(1, 10)
     assert fleet.problem == ""
 
 

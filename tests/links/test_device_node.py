@@ -15,6 +15,7 @@ from imud.links import LINKS
 from imud.links.device_node import SERIAL_GROUP, DeviceNode, holders_of, open_problem
 from imud.permissions import user_name
 from tests.support.daemon_process import LIMIT_S
+from tests.support.event_loops import in_loop
 from tests.support.surroundings import DAEMON_UID, needs_root
 
 
@@ -62,7 +63,8 @@ def test_a_control_group_is_told_from_a_group() -> None:
     assert "usermod" not in by_control_group
 
 
-def test_access_is_waited_for_quietly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@in_loop
+async def test_access_is_waited_for_quietly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """udev sets the group of a node after the kernel has made it; a refusal counts only when that time is over."""
     path, granted = tmp_path / "tty", False
 
@@ -72,21 +74,16 @@ def test_access_is_waited_for_quietly(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr("imud.links.device_node.os.access", access)
     node = DeviceNode(str(path), "is it plugged in?")
     assert node.absence() == f"{path} is not there: is it plugged in?"
-
-    async def appear() -> None:
-        nonlocal granted
-        waiting = asyncio.create_task(node.wait_present())
+    waiting = asyncio.create_task(node.wait_present())
+    await asyncio.sleep(0)
+    path.touch()
+    for _ in range(50):
         await asyncio.sleep(0)
-        path.touch()
-        for _ in range(50):
-            await asyncio.sleep(0)
-        assert not waiting.done()
-        assert node.absence() == ""
-        granted = True
-        path.chmod(0o660)
-        await asyncio.wait_for(waiting, LIMIT_S)
-
-    asyncio.run(appear())
+    assert not waiting.done()
+    assert node.absence() == ""
+    granted = True
+    path.chmod(0o660)
+    await asyncio.wait_for(waiting, LIMIT_S)
 
 
 @pytest.mark.parametrize(

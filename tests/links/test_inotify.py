@@ -11,6 +11,7 @@ from imud.errors import LinkError
 from imud.links import inotify
 from imud.links.inotify import directories_of, wait_until
 from tests.support.daemon_process import LIMIT_S
+from tests.support.event_loops import in_loop
 
 
 async def turns(count: int = 20) -> None:
@@ -50,18 +51,15 @@ def test_a_new_a_renamed_and_a_changed_file_and_the_target_of_a_link_are_noticed
     run(link, link.exists, (tmp_path / "ttyUSB0").touch)
 
 
-def test_a_missing_directory_is_waited_for_level_by_level(tmp_path: Path) -> None:
+@in_loop
+async def test_a_missing_directory_is_waited_for_level_by_level(tmp_path: Path) -> None:
     path = tmp_path / "serial" / "by-id" / "usb-imu"
-
-    async def scene() -> None:
-        waiting = asyncio.create_task(wait_until(path, path.exists))
-        for directory in (path.parent.parent, path.parent):
-            await turns()
-            directory.mkdir()
-        path.touch()
-        await asyncio.wait_for(waiting, LIMIT_S)
-
-    asyncio.run(scene())
+    waiting = asyncio.create_task(wait_until(path, path.exists))
+    for directory in (path.parent.parent, path.parent):
+        await turns()
+        directory.mkdir()
+    path.touch()
+    await asyncio.wait_for(waiting, LIMIT_S)
 
 
 def test_a_directory_that_is_made_before_its_watch_is_set_is_watched(
@@ -77,23 +75,21 @@ def test_a_directory_that_is_made_before_its_watch_is_set_is_watched(
     run(path, path.exists, path.touch)
 
 
-def test_other_changes_do_not_end_the_wait(tmp_path: Path) -> None:
+@in_loop
+async def test_other_changes_do_not_end_the_wait(tmp_path: Path) -> None:
     path = tmp_path / "tty"
-
-    async def scene() -> None:
-        waiting = asyncio.create_task(wait_until(path, path.exists))
-        for number in range(5):
-            await turns(10)
-            (tmp_path / f"other{number}").touch()
-        await turns()
-        assert not waiting.done()
-        path.touch()
-        await asyncio.wait_for(waiting, LIMIT_S)
-
-    asyncio.run(scene())
+    waiting = asyncio.create_task(wait_until(path, path.exists))
+    for number in range(5):
+        await turns(10)
+        (tmp_path / f"other{number}").touch()
+    await turns()
+    assert not waiting.done()
+    path.touch()
+    await asyncio.wait_for(waiting, LIMIT_S)
 
 
-def test_a_wait_does_not_poll_and_leaves_no_descriptor_when_it_is_cancelled(tmp_path: Path) -> None:
+@in_loop
+async def test_a_wait_does_not_poll_and_leaves_no_descriptor_when_it_is_cancelled(tmp_path: Path) -> None:
     asked = 0
 
     def ready() -> bool:
@@ -104,17 +100,14 @@ def test_a_wait_does_not_poll_and_leaves_no_descriptor_when_it_is_cancelled(tmp_
     def descriptors() -> int:
         return len(os.listdir("/proc/self/fd"))
 
-    async def scene() -> None:
-        before = descriptors()
-        waiting = asyncio.create_task(wait_until(tmp_path / "tty", ready))
-        await turns(1000)
-        assert descriptors() == before + 1
-        waiting.cancel()
-        await asyncio.gather(waiting, return_exceptions=True)
-        await asyncio.get_running_loop().shutdown_default_executor()
-        assert descriptors() == before
-
-    asyncio.run(scene())
+    before = descriptors()
+    waiting = asyncio.create_task(wait_until(tmp_path / "tty", ready))
+    await turns(1000)
+    assert descriptors() == before + 1
+    waiting.cancel()
+    await asyncio.gather(waiting, return_exceptions=True)
+    await asyncio.get_running_loop().shutdown_default_executor()
+    assert descriptors() == before
     assert asked == 2  # before and after the watch was set
 
 

@@ -10,6 +10,7 @@ from imud.contracts.status import KernelCounters
 from imud.errors import LinkBusy, LinkError, LinkMissing
 from imud.links import LINKS
 from imud.links.memory import MemoryLink, MemorySettings
+from tests.support.event_loops import in_loop
 
 
 class Listener:
@@ -54,23 +55,21 @@ def test_what_is_fed_arrives_with_its_time() -> None:
     assert not link.listening
 
 
-def test_pulling_it_out_ends_it_until_it_appears() -> None:
-    async def scene() -> None:
-        link, listener = opened()
-        await link.wait_present()
-        link.disappear()
-        assert isinstance(listener.ends[0], LinkMissing)
-        link.close()
-        with pytest.raises(LinkMissing):
-            link.open()
-        waiting = asyncio.create_task(link.wait_present())
-        await asyncio.sleep(0)
-        assert not waiting.done()
-        link.appear()
-        await waiting
+@in_loop
+async def test_pulling_it_out_ends_it_until_it_appears() -> None:
+    link, listener = opened()
+    await link.wait_present()
+    link.disappear()
+    assert isinstance(listener.ends[0], LinkMissing)
+    link.close()
+    with pytest.raises(LinkMissing):
         link.open()
-
-    asyncio.run(scene())
+    waiting = asyncio.create_task(link.wait_present())
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    link.appear()
+    await waiting
+    link.open()
 
 
 def test_misuse_is_an_error() -> None:

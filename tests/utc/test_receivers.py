@@ -13,6 +13,7 @@ from imud.units import NS_PER_S
 from imud.utc.receivers import GpsdSource, NmeaPortSource, make_nmea
 from imud.utc.sentence_stream import FIRST_PAUSE_S, Retry
 from imud.utc.source import RmcSettings, SourceContext
+from tests.support.event_loops import in_loop
 from tests.support.rmc_sources import LIMIT_S, Sentences, soon
 
 SENTENCES = [build((1_795_000_000 + n) * NS_PER_S) for n in range(5)]
@@ -97,27 +98,25 @@ def test_a_server_that_closes_is_connected_to_again() -> None:
     assert set(pauses) == {FIRST_PAUSE_S}  # after each success the next pause is short again
 
 
-def test_an_unreachable_server_is_a_problem_and_not_the_end() -> None:
-    async def scene() -> None:
-        server = await asyncio.start_server(lambda _r, w: w.close(), "127.0.0.1", 0)
-        port = server.sockets[0].getsockname()[1]
-        server.close()
-        await server.wait_closed()
-        paused = asyncio.Event()
+@in_loop
+async def test_an_unreachable_server_is_a_problem_and_not_the_end() -> None:
+    server = await asyncio.start_server(lambda _r, w: w.close(), "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    server.close()
+    await server.wait_closed()
+    paused = asyncio.Event()
 
-        async def sleep(_seconds: float) -> None:
-            paused.set()
-            await asyncio.sleep(0)
+    async def sleep(_seconds: float) -> None:
+        paused.set()
+        await asyncio.sleep(0)
 
-        source = GpsdSource(RmcSettings(source="gpsd", tcp_port=port), time.monotonic_ns, Retry(sleep))
-        source.start(Sentences())
-        async with asyncio.timeout(LIMIT_S):
-            await paused.wait()
-        assert "cannot be reached" in source.problem
-        assert "is gpsd running?" in source.problem
-        source.close()
-
-    asyncio.run(scene())
+    source = GpsdSource(RmcSettings(source="gpsd", tcp_port=port), time.monotonic_ns, Retry(sleep))
+    source.start(Sentences())
+    async with asyncio.timeout(LIMIT_S):
+        await paused.wait()
+    assert "cannot be reached" in source.problem
+    assert "is gpsd running?" in source.problem
+    source.close()
 
 
 def test_a_line_that_is_too_long_is_skipped() -> None:
@@ -190,49 +189,46 @@ class Port:
         self.started.clear()
 
 
-def test_sentences_come_with_the_time_of_their_last_byte() -> None:
-    async def scene() -> None:
-        port, sentences = Port(), Sentences()
-        source = NmeaPortSource(port, Retry(soon))
-        source.start(sentences)
-        async with asyncio.timeout(LIMIT_S):
-            await port.started.wait()
-            assert "9600 bit/s" in source.problem
-            assert port.on_data
-            port.on_data(SENTENCES[0][:30], 1000)
-            port.on_data(SENTENCES[0][30:] + b"$GPGSV,*00\r\n" + SENTENCES[1], 2000)
-        assert sentences.got == [(SENTENCES[0], 2000), (SENTENCES[1], 2000)]
-        assert (source.problem, source.sentences) == ("", 2)
-        source.close()
-        source.close()
-        assert port.closed >= 1
-
-    asyncio.run(scene())
+@in_loop
+async def test_sentences_come_with_the_time_of_their_last_byte() -> None:
+    port, sentences = Port(), Sentences()
+    source = NmeaPortSource(port, Retry(soon))
+    source.start(sentences)
+    async with asyncio.timeout(LIMIT_S):
+        await port.started.wait()
+        assert "9600 bit/s" in source.problem
+        assert port.on_data
+        port.on_data(SENTENCES[0][:30], 1000)
+        port.on_data(SENTENCES[0][30:] + b"$GPGSV,*00\r\n" + SENTENCES[1], 2000)
+    assert sentences.got == [(SENTENCES[0], 2000), (SENTENCES[1], 2000)]
+    assert (source.problem, source.sentences) == ("", 2)
+    source.close()
+    source.close()
+    assert port.closed >= 1
 
 
-def test_a_port_that_goes_away_or_is_held_is_opened_again() -> None:
-    async def scene() -> None:
-        port, sentences = Port(refusals=3), Sentences()
-        source = NmeaPortSource(port, Retry(soon))
-        source.start(sentences)
-        async with asyncio.timeout(LIMIT_S):
-            await port.started.wait()
-            assert port.on_data
-            assert port.on_end
-            port.on_data(SENTENCES[0] + SENTENCES[1][:20], 1)
-            port.on_end(LinkMissing("/dev/ttyGNSS is gone"))
-            assert source.problem == "/dev/ttyGNSS is gone"
-            port.started.clear()
-            await port.started.wait()
-            port.on_data(SENTENCES[1][20:] + SENTENCES[2], 2)
-        assert sentences.data == [SENTENCES[0], SENTENCES[2]]
-        assert port.opened == 2
-        source.close()
-
-    asyncio.run(scene())
+@in_loop
+async def test_a_port_that_goes_away_or_is_held_is_opened_again() -> None:
+    port, sentences = Port(refusals=3), Sentences()
+    source = NmeaPortSource(port, Retry(soon))
+    source.start(sentences)
+    async with asyncio.timeout(LIMIT_S):
+        await port.started.wait()
+        assert port.on_data
+        assert port.on_end
+        port.on_data(SENTENCES[0] + SENTENCES[1][:20], 1)
+        port.on_end(LinkMissing("/dev/ttyGNSS is gone"))
+        assert source.problem == "/dev/ttyGNSS is gone"
+        port.started.clear()
+        await port.started.wait()
+        port.on_data(SENTENCES[1][20:] + SENTENCES[2], 2)
+    assert sentences.data == [SENTENCES[0], SENTENCES[2]]
+    assert port.opened == 2
+    source.close()
 
 
-def test_the_row_makes_it_of_the_port_that_is_named() -> None:
+@in_loop
+async def test_the_row_makes_it_of_the_port_that_is_named() -> None:
     asked: list[tuple[str, int]] = []
 
     def make_port(path: str, baud: int) -> Port:
@@ -240,10 +236,6 @@ def test_the_row_makes_it_of_the_port_that_is_named() -> None:
         return Port()
 
     context = SourceContext(make_port, time.monotonic_ns, lambda: 0)
-
-    async def scene() -> None:
-        source = make_nmea(RmcSettings(source="nmea", port="/dev/ttyGNSS", baud=38400), context)
-        assert source.title == "NMEA receiver on /dev/ttyGNSS"
-
-    asyncio.run(scene())
+    source = make_nmea(RmcSettings(source="nmea", port="/dev/ttyGNSS", baud=38400), context)
+    assert source.title == "NMEA receiver on /dev/ttyGNSS"
     assert asked == [("/dev/ttyGNSS", 38400)]

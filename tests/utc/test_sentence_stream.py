@@ -1,6 +1,5 @@
 """RMC sentences in a byte stream: found in any split, buffered within a bound; pauses between connections."""
 
-import asyncio
 import tracemalloc
 from random import Random
 
@@ -9,6 +8,7 @@ import pytest
 from imud.formats.rmc import build
 from imud.units import NS_PER_S
 from imud.utc.sentence_stream import FIRST_PAUSE_S, LINE_BYTES_MAX, LONGEST_PAUSE_S, Retry, SentenceSplitter
+from tests.support.event_loops import in_loop
 
 SENTENCES = [build((1_795_000_000 + n) * NS_PER_S) for n in range(5)]
 GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
@@ -48,19 +48,17 @@ def test_a_line_without_end_is_skipped_and_not_buffered() -> None:
     assert splitter.feed(SENTENCES[0] + SENTENCES[1]) == [SENTENCES[1]]  # the first ends the skipped line
 
 
-def test_pauses() -> None:
+@in_loop
+async def test_pauses() -> None:
     pauses: list[float] = []
 
     async def sleep(seconds: float) -> None:
         pauses.append(seconds)
 
-    async def scene() -> None:
-        retry = Retry(sleep)
-        for _ in range(10):
-            await retry.pause()
-        retry.reset()
+    retry = Retry(sleep)
+    for _ in range(10):
         await retry.pause()
-
-    asyncio.run(scene())
+    retry.reset()
+    await retry.pause()
     assert pauses[:3] == [FIRST_PAUSE_S, 2 * FIRST_PAUSE_S, 4 * FIRST_PAUSE_S]
     assert pauses[-2:] == [LONGEST_PAUSE_S, FIRST_PAUSE_S]

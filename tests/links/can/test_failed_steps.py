@@ -13,6 +13,7 @@ from imud.formats.can import CyclicFrame, pack_frame
 from imud.links.can import netlink
 from imud.links.can.cyclic_sender import KernelSender, LoopSender
 from imud.links.can.link import SO_RCVBUFFORCE, SocketCanLink, SocketCanSettings, open_raw
+from tests.support.event_loops import in_loop
 
 FRAMES = [CyclicFrame(number, False, b"", 1_000_000) for number in (1, 2)]
 BUFFER_BYTES = 1 << 20
@@ -117,7 +118,8 @@ def test_a_socket_of_the_broadcast_manager_is_closed_when_a_step_fails(
     assert made.closed
 
 
-def test_a_sender_whose_second_frame_is_refused_leaves_no_timer() -> None:
+@in_loop
+async def test_a_sender_whose_second_frame_is_refused_leaves_no_timer() -> None:
     written: list[bytes] = []
     errors: list[LinkError] = []
 
@@ -126,10 +128,7 @@ def test_a_sender_whose_second_frame_is_refused_leaves_no_timer() -> None:
             raise LinkError("full")
         written.append(data)
 
-    async def scene() -> None:
-        with pytest.raises(LinkError, match="full"):
-            LoopSender(write, errors.append, FRAMES)
-        await asyncio.sleep(0.01)  # ten periods of the first frame
-
-    asyncio.run(scene())
+    with pytest.raises(LinkError, match="full"):
+        LoopSender(write, errors.append, FRAMES)
+    await asyncio.sleep(0.01)  # ten periods of the first frame
     assert (len(written), errors) == (1, [])

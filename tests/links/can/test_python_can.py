@@ -15,6 +15,7 @@ from imud.links import LINKS
 from imud.links.can.link import LINK, SocketCanSettings, pack_filters
 from imud.links.can.python_can import PythonCanLink
 from tests.support.daemon_process import LIMIT_S, wait_until
+from tests.support.event_loops import in_loop
 
 
 def make(channel: str, **keys: object) -> CanLink:
@@ -22,33 +23,31 @@ def make(channel: str, **keys: object) -> CanLink:
     return row.make_can(msgspec.convert({"interface": channel, "backend": "virtual", **keys}, row.settings))
 
 
-def test_frames_pass_the_filters_and_come_in_the_loops_thread() -> None:
-    async def story() -> list[CanFrame]:
-        link = make("pass")
-        link.filters = [CanFilter(0x65, 0x7FF, False)]
-        await link.wait_present()
-        link.open()
-        got: list[CanFrame] = []
-        threads: set[threading.Thread] = set()
-        done = asyncio.Event()
+@in_loop
+async def test_frames_pass_the_filters_and_come_in_the_loops_thread() -> None:
+    link = make("pass")
+    link.filters = [CanFilter(0x65, 0x7FF, False)]
+    await link.wait_present()
+    link.open()
+    got: list[CanFrame] = []
+    threads: set[threading.Thread] = set()
+    done = asyncio.Event()
 
-        def on_frames(frames: Sequence[CanFrame]) -> None:
-            threads.add(threading.current_thread())
-            got.extend(frames)
-            if len(got) == 2:
-                done.set()
+    def on_frames(frames: Sequence[CanFrame]) -> None:
+        threads.add(threading.current_thread())
+        got.extend(frames)
+        if len(got) == 2:
+            done.set()
 
-        link.start(on_frames, lambda news, problem: None, lambda error: None)
-        with can.Bus("pass", "virtual") as far:
-            for can_id, extended in ((0x65, False), (0x66, False), (0x65, True), (0x65, False)):
-                far.send(can.Message(arbitration_id=can_id, is_extended_id=extended, data=b"\1\2"))
-            await asyncio.wait_for(done.wait(), LIMIT_S)
-        assert threads == {threading.current_thread()}
-        link.close()
-        link.close()
-        return got
-
-    frames = asyncio.run(story())
+    link.start(on_frames, lambda news, problem: None, lambda error: None)
+    with can.Bus("pass", "virtual") as far:
+        for can_id, extended in ((0x65, False), (0x66, False), (0x65, True), (0x65, False)):
+            far.send(can.Message(arbitration_id=can_id, is_extended_id=extended, data=b"\1\2"))
+        await asyncio.wait_for(done.wait(), LIMIT_S)
+    assert threads == {threading.current_thread()}
+    link.close()
+    link.close()
+    frames = got
     assert [frame[:3] for frame in frames] == [(0x65, False, b"\1\2")] * 2
     assert 0 < frames[0].t_rx_ns <= frames[1].t_rx_ns
     assert "can pass" not in [thread.name for thread in threading.enumerate()]
@@ -102,46 +101,40 @@ class FakeBus:
         self.is_shut_down = True
 
 
-def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatch: pytest.MonkeyPatch) -> None:
+@in_loop
+async def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatch: pytest.MonkeyPatch) -> None:
     kinds: list[dict[str, bool]] = [{}, {"is_error_frame": True}, {"is_remote_frame": True}, {"is_fd": True}, {}]
     bus = FakeBus(*(can.Message(arbitration_id=n, is_extended_id=False, **kind) for n, kind in enumerate(kinds)))
     monkeypatch.setattr(can, "Bus", lambda *_, **__: bus)
     got: list[int] = []
+    link = make("fake")
+    link.open()
+    first = asyncio.Event()
 
-    async def story() -> None:
-        link = make("fake")
-        link.open()
-        first = asyncio.Event()
+    def on_frames(frames: Sequence[CanFrame]) -> None:
+        got.extend(frame.can_id for frame in frames)
+        first.set()
 
-        def on_frames(frames: Sequence[CanFrame]) -> None:
-            got.extend(frame.can_id for frame in frames)
-            first.set()
-
-        link.start(on_frames, lambda news, problem: None, lambda error: None)
-        await asyncio.wait_for(first.wait(), LIMIT_S)
-        bus.messages += [can.Message(arbitration_id=9, is_extended_id=False)]
-        wait_until(lambda: not bus.messages, "the thread has read the frame")
-        link.close()
-        await asyncio.sleep(0.01)  # the loop would deliver the frame now
-
-    asyncio.run(story())
+    link.start(on_frames, lambda news, problem: None, lambda error: None)
+    await asyncio.wait_for(first.wait(), LIMIT_S)
+    bus.messages += [can.Message(arbitration_id=9, is_extended_id=False)]
+    wait_until(lambda: not bus.messages, "the thread has read the frame")
+    link.close()
+    await asyncio.sleep(0.01)  # the loop would deliver the frame now
     assert got == [0, 4]
     assert bus.is_shut_down
 
 
-def test_cyclic_frames_are_replaced_and_end_with_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
+@in_loop
+async def test_cyclic_frames_are_replaced_and_end_with_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
     bus = FakeBus()
     monkeypatch.setattr(can, "Bus", lambda *_, **__: bus)
-
-    async def story() -> None:
-        link = make("fake")
-        link.open()
-        link.send_cyclic([CyclicFrame(1, False, b"", 10**12)])
-        link.send_cyclic([CyclicFrame(2, False, b"", 10**12)])
-        running = [timer for timer in asyncio.get_running_loop()._scheduled if not timer.cancelled()]  # type: ignore[attr-defined]
-        assert len(running) == 1
-        link.close()
-        assert all(timer.cancelled() for timer in asyncio.get_running_loop()._scheduled)  # type: ignore[attr-defined]
-
-    asyncio.run(story())
+    link = make("fake")
+    link.open()
+    link.send_cyclic([CyclicFrame(1, False, b"", 10**12)])
+    link.send_cyclic([CyclicFrame(2, False, b"", 10**12)])
+    running = [timer for timer in asyncio.get_running_loop()._scheduled if not timer.cancelled()]  # type: ignore[attr-defined]
+    assert len(running) == 1
+    link.close()
+    assert all(timer.cancelled() for timer in asyncio.get_running_loop()._scheduled)  # type: ignore[attr-defined]
     assert [message.arbitration_id for message in bus.sent] == [1, 2]

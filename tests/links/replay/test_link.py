@@ -18,7 +18,7 @@ from imud.links.replay.can import CanReplayLink
 from imud.links.replay.file import ReplaySettings
 from imud.links.replay.link import PIECE_BYTES_MAX, PIECE_NS, ReplayLink
 from imud.units import NS_PER_MS, uart_byte_ns
-from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.event_loops import VirtualClock, in_loop, run_virtually
 from tests.support.files import CaptureWriter
 
 READS = [(b"a" * 82, 1_000_000_000), (b"b" * 41, 1_004_000_000), (b"c", 1_004_000_000), (b"d" * 82, 1_030_000_000)]
@@ -147,22 +147,18 @@ def test_maximum_speed_of_a_raw_capture_is_wire_time_or_one_instant(tmp_path: Pa
     assert set(play(path, speed="maximum").offsets_ns) == {0}
 
 
-def test_others_get_their_turn_at_maximum_speed(tmp_path: Path) -> None:
+@in_loop
+async def test_others_get_their_turn_at_maximum_speed(tmp_path: Path) -> None:
     path = tmp_path / "long"
     path.write_bytes(bytes(1 << 20))
     link = ReplayLink(ReplaySettings(path=str(path), speed="maximum"))
-
-    async def scene() -> list[str]:
-        order: list[str] = []
-        done = asyncio.Event()
-        link.open()
-        link.start(lambda data, t_rx_ns: order.append("data"), lambda error: done.set())
-        while not done.is_set():
-            order.append("other")
-            await asyncio.sleep(0)
-        return order
-
-    order = asyncio.run(scene())
+    order: list[str] = []
+    done = asyncio.Event()
+    link.open()
+    link.start(lambda data, t_rx_ns: order.append("data"), lambda error: done.set())
+    while not done.is_set():
+        order.append("other")
+        await asyncio.sleep(0)
     assert order.count("other") > order.count("data") / 16
     assert order.count("data") == (1 << 20) // 4096
 

@@ -21,6 +21,7 @@ from imud.links.uart.link import FULL_READ_BYTES, WRITE_QUEUE_BYTES, UartLink, U
 from imud.links.uart.serial_port import baud_of
 from imud.units import NS_PER_MS
 from tests.support.daemon_process import LIMIT_S, wait_until
+from tests.support.event_loops import in_loop
 from tests.support.pty_port import PtyPort, unprivileged, waiting_bytes
 
 
@@ -334,7 +335,8 @@ def test_ports_that_cannot_be_opened(pty: PtyPort, tmp_path: Path) -> None:
         UartLink(UartSettings(port=str(path))).open()
 
 
-def test_a_port_that_is_unplugged_and_comes_back_is_noticed(tmp_path: Path) -> None:
+@in_loop
+async def test_a_port_that_is_unplugged_and_comes_back_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "by-id" / "usb-imu"
     path.parent.mkdir()
     first, second = PtyPort(), PtyPort()
@@ -353,40 +355,34 @@ def test_a_port_that_is_unplugged_and_comes_back_is_noticed(tmp_path: Path) -> N
         await receiver.until(lambda: bool(receiver.ends))
         link.close()
 
-    async def scene() -> None:
-        await life(first)
-        waiting = asyncio.create_task(life(second))
+    await life(first)
+    waiting = asyncio.create_task(life(second))
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert not waiting.done()
+    path.symlink_to(second.path)
+    await waiting
+
+
+@in_loop
+async def test_after_a_refusal_access_is_waited_for(pty: PtyPort) -> None:
+    os.chmod(pty.path, 0)
+    link = UartLink(UartSettings(port=pty.path))
+    with unprivileged():
+        with pytest.raises(LinkDenied):
+            link.open()
+        waiting = asyncio.create_task(link.wait_present())
         for _ in range(20):
             await asyncio.sleep(0)
         assert not waiting.done()
-        path.symlink_to(second.path)
-        await waiting
-
-    asyncio.run(scene())
-
-
-def test_after_a_refusal_access_is_waited_for(pty: PtyPort) -> None:
-    os.chmod(pty.path, 0)
-    link = UartLink(UartSettings(port=pty.path))
-
-    async def scene() -> None:
-        with unprivileged():
-            with pytest.raises(LinkDenied):
-                link.open()
-            waiting = asyncio.create_task(link.wait_present())
-            for _ in range(20):
-                await asyncio.sleep(0)
-            assert not waiting.done()
-            if os.getuid() == 0:
-                os.seteuid(0)
-            os.chmod(pty.path, 0o666)
-            if os.getuid() == 0:
-                os.seteuid(65534)
-            await asyncio.wait_for(waiting, LIMIT_S)
-            link.open()
-            link.close()
-
-    asyncio.run(scene())
+        if os.getuid() == 0:
+            os.seteuid(0)
+        os.chmod(pty.path, 0o666)
+        if os.getuid() == 0:
+            os.seteuid(65534)
+        await asyncio.wait_for(waiting, LIMIT_S)
+        link.open()
+        link.close()
 
 
 def test_a_paused_port_keeps_what_comes_until_it_is_taken(pty: PtyPort) -> None:

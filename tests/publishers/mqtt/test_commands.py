@@ -26,7 +26,7 @@ from imud.publishers.mqtt.streams import Gateway
 from imud.units import NS_PER_S
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
 from tests.support.daemon_process import LIMIT_S
-from tests.support.event_loops import VirtualClock
+from tests.support.event_loops import VirtualClock, in_loop
 
 UTC_NS = 1_800_000_000 * NS_PER_S
 DOCS = Path(__file__).parents[3] / "docs" / "fleet.md"
@@ -272,25 +272,22 @@ def test_every_request_is_in_the_log(log_of_daemon: pytest.LogCaptureFixture) ->
     assert asked <= set(re.findall(r"request r\d+", log_of_daemon.text))
 
 
-def test_one_runs_at_a_time_and_the_end_ends_it() -> None:
+@in_loop
+async def test_one_runs_at_a_time_and_the_end_ends_it() -> None:
     bench = ChannelBench()
-
-    async def loop() -> None:
-        bench.device.go_on = asyncio.Event()
-        bench.ask(1)
-        bench.ask(2)
-        for _ in range(5):
-            bench.channel.run_next()
-            await asyncio.sleep(0)
-        assert len(bench.device.done) == 1
-        bench.channel.close()
-        bench.channel.close()
-        for _ in range(5):
-            await asyncio.sleep(0)
+    bench.device.go_on = asyncio.Event()
+    bench.ask(1)
+    bench.ask(2)
+    for _ in range(5):
         bench.channel.run_next()
         await asyncio.sleep(0)
-
-    asyncio.run(loop())
+    assert len(bench.device.done) == 1
+    bench.channel.close()
+    bench.channel.close()
+    for _ in range(5):
+        await asyncio.sleep(0)
+    bench.channel.run_next()
+    await asyncio.sleep(0)
     assert (len(bench.device.done), bench.replies) == (1, [])
 
 
