@@ -56,9 +56,6 @@ def test_the_golden_capture_is_read_and_written() -> None:
     assert list(reader) == [(258, b"abc"), (259, b"d")]
     assert reader.problem == ""
     assert written() == GOLDEN
-
-
-def test_unknown_details_and_odd_characters_survive() -> None:
     reader = CaptureReader(io.BytesIO(written(note="20 °C, 5 = five %\n", hold_ns=16_000_000)))
     assert reader.details["note"] == "20 °C, 5 = five %\n"
     assert reader.hold_ns == 16_000_000

@@ -47,7 +47,7 @@ def test_what_no_identifier_can_say(parts: J1939Id) -> None:
         join(parts)
 
 
-def test_filters_look_at_all_but_the_priority() -> None:
+def test_filters_and_senders() -> None:
     one = filter_of(0xFF34, 8)
     assert all(one.matches(priority << 26 | 0xFF3408, True) for priority in range(8))
     assert not one.matches(0x0CFF3409, True)
@@ -61,9 +61,6 @@ def test_filters_look_at_all_but_the_priority() -> None:
     reply = filter_of(0xEF00, 8, 0x55)
     assert reply.matches(0x18EF5508, True)
     assert not reply.matches(0x18EF0855, True)
-
-
-def test_sender_of_a_message() -> None:
     pgns = (0xFF34,)
     assert [sender_of(can_id, True, bytes(8), pgns) for can_id in (0x0CFF3400, 0x1CFF34FD)] == [0, 253]
     assert sender_of(0x0CFF34FE, True, bytes(8), pgns) is None  # has no address

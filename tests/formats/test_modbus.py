@@ -97,9 +97,6 @@ def test_confirmation_is_distinguished_from_the_echo() -> None:
     assert found.feed(write) is None
     assert found.feed(write) == write
     assert finder(False, write, len(write)).feed(write) == write
-
-
-def test_port_that_never_falls_silent_does_not_fill_memory() -> None:
     found = finder()
     for _ in range(100):
         assert found.feed(b"\xee" * 100) is None

@@ -24,13 +24,16 @@ def fields(sentence: bytes) -> list[str]:
     return found
 
 
-def test_headings() -> None:
+def test_headings_and_rates_of_turn() -> None:
     # a Vector heading sensor's, in the collection of examples of gpsd
     assert nmea0183.hdg("HC", radians(101.1), radians(-7.1)) == b"$HCHDG,101.1,,,7.1,W*3C\r\n"
     assert fields(nmea0183.hdt("HE", radians(98.3))) == ["98.3", "T"]
     assert fields(nmea0183.hdm("HC", radians(-1.5))) == ["358.5", "M"]
     assert fields(nmea0183.hdg("HC", radians(7), None)) == ["7.0", "", "", "", ""]
     assert fields(nmea0183.hdg("HC", radians(7), radians(12.6))) == ["7.0", "", "", "12.6", "E"]
+    assert fields(nmea0183.rot("TI", radians(2.5))) == ["150.0", "A"]
+    assert fields(nmea0183.rot("TI", radians(-0.0004))) == ["0.0", "A"]
+    assert float(pynmea2.parse(nmea0183.rot("TI", radians(-1)).decode()).rate_of_turn) == -60.0
 
 
 @pytest.mark.parametrize(("degrees", "shown"), [(359.96, "0.0"), (-0.04, "0.0"), (359.94, "359.9"), (720, "0.0")])
@@ -45,12 +48,6 @@ def test_any_heading_reads_back(angle_rad: float) -> None:
     assert 0 <= heading_deg < 360
     off_deg = (heading_deg - math.degrees(angle_rad) + 180) % 360 - 180
     assert abs(off_deg) <= 0.0501
-
-
-def test_rate_of_turn_is_in_degrees_a_minute() -> None:
-    assert fields(nmea0183.rot("TI", radians(2.5))) == ["150.0", "A"]
-    assert fields(nmea0183.rot("TI", radians(-0.0004))) == ["0.0", "A"]
-    assert float(pynmea2.parse(nmea0183.rot("TI", radians(-1)).decode()).rate_of_turn) == -60.0
 
 
 def test_transducers() -> None:

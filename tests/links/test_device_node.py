@@ -54,15 +54,6 @@ def test_another_imud_is_named_by_what_it_does(tmp_path: Path, command: list[str
     assert sorted(named.split(", ")) == ["imud probe (pid 10)", f"this imud (pid {os.getpid()})"]
 
 
-def test_a_control_group_is_told_from_a_group() -> None:
-    by_group = str(open_problem(OSError(errno.EACCES, "x"), "/dev/ttyS9", "?"))
-    by_control_group = str(open_problem(OSError(errno.EPERM, "x"), "/dev/ttyS9", "?"))
-    assert "usermod" in by_group
-    assert "DeviceAllow" not in by_group
-    assert "`DeviceAllow=/dev/ttyS9 rw`" in by_control_group
-    assert "usermod" not in by_control_group
-
-
 @in_loop
 async def test_access_is_waited_for_quietly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """udev sets the group of a node after the kernel has made it; a refusal counts only when that time is over."""
@@ -135,7 +126,7 @@ def test_a_node_of_a_group_names_it(tmp_path: Path) -> None:
     assert f"belongs to group {SERIAL_GROUP};" in str(denied)
 
 
-def test_a_node_that_is_absent_or_held(tmp_path: Path) -> None:
+def test_absent_held_and_refused_nodes(tmp_path: Path) -> None:
     process(tmp_path, 10, "minicom", "/dev/i2c-1")
     absent = open_problem(OSError(errno.ENODEV, ""), "/dev/i2c-1", "is I2C on?")
     held = open_problem(OSError(errno.EBUSY, ""), "/dev/i2c-1", "", tmp_path)
@@ -145,6 +136,12 @@ def test_a_node_that_is_absent_or_held(tmp_path: Path) -> None:
     assert "in use by minicom (pid 10): stop" in str(held)
     assert "in use by another program or by a driver of the kernel: stop" in str(by_driver)
     assert open_problem(OSError(errno.EMFILE, ""), "/dev/i2c-1", "") is None
+    by_group = str(open_problem(OSError(errno.EACCES, "x"), "/dev/ttyS9", "?"))
+    by_control_group = str(open_problem(OSError(errno.EPERM, "x"), "/dev/ttyS9", "?"))
+    assert "usermod" in by_group
+    assert "DeviceAllow" not in by_group
+    assert "`DeviceAllow=/dev/ttyS9 rw`" in by_control_group
+    assert "usermod" not in by_control_group
 
 
 @pytest.mark.parametrize(("uid", "name"), [(0, "root"), (4_242_424, "4242424")])

@@ -74,7 +74,7 @@ def test_open_that_fails_says_why_and_leaves_nothing_open(number: int, kind: typ
         opened(bus)
 
 
-def test_time_out_is_shortened_and_close_is_twice() -> None:
+def test_names_time_out_and_close() -> None:
     bus, requests = InProcessI2c({}), list[tuple[int, int]]()
     link = I2cLink(I2cSettings(), open_bus=bus.open, ioctl=lambda _fd, *request: requests.append(request))
     link.open()
@@ -84,11 +84,8 @@ def test_time_out_is_shortened_and_close_is_twice() -> None:
     assert bus.fd is None
     with pytest.raises(LinkError, match="not open"):
         link.transfer(READ_ID)
-
-
-def test_row_and_names() -> None:
-    link = LINKS["i2c"].make_polled(I2cSettings(bus=3, address=0x1B))
-    assert (link.title, link.bus, link.target, link.shared) == ("/dev/i2c-3", "/dev/i2c-3", 0x1B, True)
-    assert link.place(0x1B) == "address 0x1b"
+    row_link = LINKS["i2c"].make_polled(I2cSettings(bus=3, address=0x1B))
+    assert (row_link.title, row_link.bus, row_link.target, row_link.shared) == ("/dev/i2c-3", "/dev/i2c-3", 0x1B, True)
+    assert row_link.place(0x1B) == "address 0x1b"
     with pytest.raises(LinkError):
-        link.write(b"x")
+        row_link.write(b"x")

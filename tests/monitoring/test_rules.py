@@ -40,13 +40,6 @@ def test_alertmanager_accepts_its_configuration() -> None:
         assert run("amtool", "config", "routes", "test", f"--config.file={file}", *labels).strip() == receiver
 
 
-def test_inhibitions_name_alerts_that_exist() -> None:
-    for rule in yaml.safe_load((FOLDER / "alertmanager.yml").read_text())["inhibit_rules"]:
-        for matcher in rule["source_matchers"] + rule["target_matchers"]:
-            for name in re.findall(r"\bImud\w+", matcher):
-                assert name in ALERTS
-
-
 @needs("promtool")
 def test_every_alert_waits_fires_and_clears() -> None:
     assert "SUCCESS" in run("promtool", "test", "rules", str(TESTS))
@@ -64,7 +57,7 @@ def test_every_alert_has_a_case_that_fires_and_others_that_do_not() -> None:
     assert outcomes.keys() == ALERTS.keys()
 
 
-def test_an_alert_says_what_to_do() -> None:
+def test_an_alert_says_what_to_do_and_inhibitions_name_alerts() -> None:
     for name, alert in ALERTS.items():
         assert name.startswith("Imud")
         assert set(alert["annotations"]) == {"summary", *PARTS, "runbook"}, name
@@ -73,6 +66,10 @@ def test_an_alert_says_what_to_do() -> None:
         assert anchor == name
         assert f'<a id="{anchor}"></a>' in (ROOT / page).read_text()
         assert "$labels" in alert["annotations"]["summary"] or name == "ImudNotScraped"
+    for rule in yaml.safe_load((FOLDER / "alertmanager.yml").read_text())["inhibit_rules"]:
+        for matcher in rule["source_matchers"] + rule["target_matchers"]:
+            for name in re.findall(r"\bImud\w+", matcher):
+                assert name in ALERTS
 
 
 def test_shortened_rules_differ_in_times_only() -> None:

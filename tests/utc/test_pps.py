@@ -71,12 +71,18 @@ def test_the_stated_error_is_honest(ppm: float, late_ns: float) -> None:
     assert inside >= 95
 
 
-def test_without_sentences_only_the_pulses_count() -> None:
+def test_without_sentences_or_pulses_there_is_no_reference() -> None:
     receiver = Receiver()
     receiver.go(10, says=None)
     assert receiver.reference.pulses == 10
     assert receiver.reference.reference(receiver.t_ns()) is None
     assert receiver.seconds == []
+    receiver = Receiver()
+    receiver.go(20)
+    receiver.go(100, pulse=False, says=None)
+    assert abs(receiver.error_ns()) < 2 * receiver.known().error_ns
+    assert receiver.known().error_ns > 100_000
+    assert receiver.reference.reference(receiver.t_ns() + HOLD_NS) is None
 
 
 def test_gaps_are_bridged_until_they_are_too_long() -> None:
@@ -96,15 +102,6 @@ def test_gaps_are_bridged_until_they_are_too_long() -> None:
     receiver.go(4)
     assert abs(receiver.error_ns()) < 1000
     assert receiver.reference.pulses == 20
-
-
-def test_a_long_silence_costs_precision_and_then_the_reference() -> None:
-    receiver = Receiver()
-    receiver.go(20)
-    receiver.go(100, pulse=False, says=None)
-    assert abs(receiver.error_ns()) < 2 * receiver.known().error_ns
-    assert receiver.known().error_ns > 100_000
-    assert receiver.reference.reference(receiver.t_ns() + HOLD_NS) is None
 
 
 def test_another_receiver_takes_over() -> None:

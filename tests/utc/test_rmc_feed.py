@@ -121,14 +121,11 @@ def test_the_time_of_sending_counts_and_not_an_old_pulse() -> None:
     assert bench.give(1, 1.99) == ""
 
 
-def test_no_more_than_the_device_is_to_have() -> None:
+def test_a_device_has_no_more_sentences_than_it_may_have() -> None:
     bench = FeedBench(rate_hz=2)
     refusals = [bench.give(tenth / 10, tenth / 10 + 0.05) for tenth in range(30)]
     assert [n for n, refusal in enumerate(refusals) if not refusal] == [0, 5, 10, 15, 20, 25]
     assert set(refusals) == {"", Refusal.TOO_MANY}
-
-
-def test_no_request_script_is_interrupted_and_a_refused_one_is_not_counted_as_sent() -> None:
     bench = FeedBench()
     bench.busy = True
     assert bench.give(0, 0.1) == Refusal.BUSY

@@ -39,7 +39,7 @@ def answer(info: bytes) -> bytes:
     return struct.pack("=IHHII", 16 + len(body), 16, 0, 1, 0) + body
 
 
-def test_details_of_an_answer() -> None:
+def test_details_of_an_interface() -> None:
     timing = struct.pack("=8I", 250_000, 875, 0, 0, 0, 0, 0, 0)
     data = attribute(1, timing) + attribute(4, struct.pack("=I", 3))
     info = attribute(1, b"can\0") + attribute(2, data)
@@ -48,13 +48,7 @@ def test_details_of_an_answer() -> None:
     assert parse_details(answer(b"")) == CanDetails(None, None)
     assert parse_details(struct.pack("=IHHIIi", 20, 2, 0, 1, 0, -19)) == CanDetails(None, None)
     assert parse_details(answer(attribute(2, b"\1\0\1\0"))[:-1]) == CanDetails(None, None)
-
-
-def test_the_kernel_answers_for_an_interface_that_is_no_can() -> None:
     assert can_details("lo") == CanDetails(None, None)
     with pytest.raises(LinkError, match="nosuch0"):
         can_details("nosuch0")
-
-
-def test_waiting_returns_at_once_when_there_is_nothing_to_wait_for() -> None:
     asyncio.run(wait_until(lambda: True))

@@ -68,16 +68,13 @@ def test_commands_go_out() -> None:
         link.write(b"")
 
 
-def test_settings_of_other_backends() -> None:
+def test_settings_of_other_backends_and_filters() -> None:
     with pytest.raises(msgspec.ValidationError, match="the system sets it"):
         msgspec.convert({"interface": "can0", "bitrate": 500000}, SocketCanSettings)
     assert make("rate", bitrate=250000).bitrate == 250000
     assert LINK.make_can(SocketCanSettings(interface="can0")).title == "can0"
     with pytest.raises(LinkError, match="cannot be opened"):
         PythonCanLink("nosuch", "x").open()
-
-
-def test_filters_as_the_kernel_takes_them() -> None:
     packed = pack_filters([CanFilter(0x65, 0x7FF, False), CanFilter(0x18FEE900, 0x03FFFF00, True)])
     assert packed.hex() == "65000000ff0700c0" + "00e9fe9800ffffc3"
 

@@ -110,7 +110,7 @@ def test_recorded_speed_keeps_the_recorded_jitter(stamped: Path) -> None:
     check_times(played)
 
 
-def test_real_speed_is_the_wire_s(raw: Path) -> None:
+def test_real_speed_is_the_wire_s(raw: Path, stamped: Path) -> None:
     played = play(raw, speed="real", baud=115200)
     assert played.data == raw.read_bytes()
     byte_ns = uart_byte_ns(115200)
@@ -120,22 +120,12 @@ def test_real_speed_is_the_wire_s(raw: Path) -> None:
     assert played.delivered_ns[-1] - played.started_ns == pytest.approx(whole_ns, abs=100)
     assert played.link.hold_ns == PIECE_NS
     check_times(played)
-
-
-def test_real_speed_of_a_stamped_capture_takes_its_rate(stamped: Path) -> None:
     played = play(stamped, speed="real")
     assert played.data == b"".join(data for data, _ in READS)
     assert len(played.chunks) > len(READS)
 
 
-def test_maximum_speed_ends_at_the_start_in_virtual_time(stamped: Path) -> None:
-    played = play(stamped, speed="maximum")
-    assert played.offsets_ns == [t_ns - READS[0][1] for _, t_ns in READS]
-    assert {*played.delivered_ns} == {played.started_ns} == {played.chunks[-1][1]}  # nothing was waited for
-    check_times(played)
-
-
-def test_maximum_speed_of_a_raw_capture_is_wire_time_or_one_instant(tmp_path: Path) -> None:
+def test_maximum_speed_is_virtual_time(tmp_path: Path, stamped: Path) -> None:
     path = tmp_path / "long"
     path.write_bytes(bytes(3 * PIECE_BYTES_MAX + 5))
     played = play(path, speed="maximum", baud=921600)
@@ -145,6 +135,10 @@ def test_maximum_speed_of_a_raw_capture_is_wire_time_or_one_instant(tmp_path: Pa
     assert [b - a for a, b in pairwise(played.offsets_ns)] == [size * byte_ns for size in sizes[1:]]
     check_times(played)
     assert set(play(path, speed="maximum").offsets_ns) == {0}
+    played = play(stamped, speed="maximum")
+    assert played.offsets_ns == [t_ns - READS[0][1] for _, t_ns in READS]
+    assert {*played.delivered_ns} == {played.started_ns} == {played.chunks[-1][1]}  # nothing was waited for
+    check_times(played)
 
 
 @in_loop

@@ -224,15 +224,6 @@ def test_after_a_time_out_one_register_is_read_first_and_then_no_more(pty: PtyPo
     assert heard == [framed(1, request) for request, _ in script]
 
 
-def test_late_reply_of_one_is_not_taken_for_that_of_another(tmp_path: Path) -> None:
-    late = slave(1, processing_ns=50_000_000)
-    with wired(tmp_path, late, slave(2)) as (path, line), opened(path, reply_ms=1) as link:
-        time_out(link, SERIAL)
-        wait_until(lambda: line.requests, "the request is received")
-        link.select(2)
-        assert sure(link, SERIAL)[3:11] == serial_of(2)
-
-
 def test_unrequested_bytes_are_discarded_and_counted(pty: PtyPort) -> None:
     with opened(pty.path, reply_ms=1) as link:
         pty.send(framed(1, b"\x03\x08" + bytes(8)))

@@ -19,6 +19,11 @@ def test_pauses_double_to_the_longest() -> None:
     assert [turn.failed(0) for _ in range(6)] == [4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
     for _ in range(1100):  # 2.0 to this power is too large for a float
         assert turn.failed(0) == 60.0
+    draw = random.Random(25).random
+    pauses = [BrokerTurn([A], 60.0, draw).failed(0) for _ in range(500)]
+    in_second = [sum(second <= pause < second + 1 for pause in pauses) for second in range(4)]
+    assert sum(in_second) == 500
+    assert max(in_second) < 170
 
 
 def test_brokers_take_turns() -> None:
@@ -46,11 +51,3 @@ def test_only_a_connection_that_held_begins_anew(held_ns: int, pause_s: float) -
         turn.failed(0)
     turn.connected(0)
     assert turn.failed(held_ns) == pause_s
-
-
-def test_five_hundred_gateways_do_not_come_back_in_the_same_second() -> None:
-    draw = random.Random(25).random
-    pauses = [BrokerTurn([A], 60.0, draw).failed(0) for _ in range(500)]
-    in_second = [sum(second <= pause < second + 1 for pause in pauses) for second in range(4)]
-    assert sum(in_second) == 500
-    assert max(in_second) < 170

@@ -63,9 +63,6 @@ def test_the_configuration_has_what_home_assistant_requires() -> None:
     for part in made["components"].values():
         assert REQUIRED[part["platform"]] <= part.keys()
     assert re.fullmatch(r"homeassistant/device/[a-zA-Z0-9_-]+/config", discovery_topic(GATEWAY, "bow"))
-
-
-def test_names_and_angles() -> None:
     topics = {discovery_topic(Gateway("s", gateway, ""), device) for gateway, device in (("a", "b_c"), ("a_b", "c"))}
     topics.add(discovery_topic(Gateway("t", "a", ""), "b_c"))
     assert len(topics) == 3
@@ -73,7 +70,7 @@ def test_names_and_angles() -> None:
     assert "roll" not in parts(DeviceSending(values=["rms"]))
 
 
-def test_values_of_the_state() -> None:
+def test_values_are_rendered() -> None:
     found = parts()
     running = msgspec.json.encode(status(state=DeviceState.RUNNING, temperature_c=41.26, rate_hz=99.96))
     assert rendered(found["temperature"]["value_template"], running) == "41.3"
@@ -82,10 +79,6 @@ def test_values_of_the_state() -> None:
     silent = msgspec.json.encode(status(state=DeviceState.SILENT, temperature_c=None))
     assert rendered(found["temperature"]["value_template"], silent) == ""
     assert rendered(found["running"]["value_template"], silent) == "OFF"
-
-
-def test_values_of_the_newest_interval_are_in_degrees() -> None:
-    found = parts()
     payload = statistics([msgspec.structs.replace(sample("bow", 1), euler_rad=(0.1, -0.2, 3.0))])
     # 0.1 · 180/π = 5.7296, -0.2 · 180/π = -11.459, 3 · 180/π = 171.887
     assert rendered(found["roll"]["value_template"], payload) == "5.73"
@@ -103,6 +96,10 @@ def test_availability_follows_birth_and_last_will(tmp_path: Path) -> None:
     bench.tick()
     topic = discovery_topic(Gateway("default", "gw", ""), "imu0")
     bench.broker.wait_for(topic)
+    bench.output.remove_device("imu0")
+    bench.statuses = []
+    bench.tick()
+    bench.broker.wait_for(topic, lambda payload: not payload)  # a removed device leaves Home Assistant
     sent = bench.close()
     first = next(json.loads(payload) for one, payload, retain in sent if one == topic and payload and retain)
     (availability,) = first["availability"]
@@ -111,17 +108,3 @@ def test_availability_follows_birth_and_last_will(tmp_path: Path) -> None:
     assert bench.broker.will.topic == availability["topic"]
     assert rendered(availability["value_template"], births[0]) == "online"
     assert rendered(availability["value_template"], bench.broker.will.payload) == "offline"
-
-
-@pytest.mark.live
-def test_a_device_that_is_removed_leaves_home_assistant(tmp_path: Path) -> None:
-    bench = PublisherBench(tmp_path, home_assistant=True)
-    bench.start()
-    bench.tick()
-    topic = discovery_topic(Gateway("default", "gw", ""), "imu0")
-    bench.broker.wait_for(topic)
-    bench.output.remove_device("imu0")
-    bench.statuses = []
-    bench.tick()
-    bench.broker.wait_for(topic, lambda payload: not payload)
-    bench.close()

@@ -78,7 +78,11 @@ def test_headings_about_south_have_a_mean_about_south() -> None:
     assert interval.values["quat_wxyz"].mean == pytest.approx((half, half, 0.0, 0.0))
 
 
-def test_what_is_not_finite_does_not_count() -> None:
+def test_intervals_lie_on_a_grid() -> None:
+    samples = [made(n) for n in range(1, 8)]
+    assert [(number, [one.seq for one in part]) for number, part in by_interval(samples, 3000)] == [
+        (0, [1, 2]), (1, [3, 4, 5]), (2, [6, 7]),
+    ]  # fmt: skip
     interval = summed_up([made(1, temperature_c=math.nan), made(2, temperature_c=4.0), made(3, pressure_pa=math.inf)])
     assert interval is not None
     assert interval.values["temperature_c"].mean == (4.0,)
@@ -89,10 +93,3 @@ def test_what_is_not_finite_does_not_count() -> None:
     interval = summed_up([made(1), worse, made(3)])
     assert interval is not None
     assert interval.sync is Sync.REGRESSION
-
-
-def test_intervals_lie_on_a_grid() -> None:
-    samples = [made(n) for n in range(1, 8)]
-    assert [(number, [one.seq for one in part]) for number, part in by_interval(samples, 3000)] == [
-        (0, [1, 2]), (1, [3, 4, 5]), (2, [6, 7]),
-    ]  # fmt: skip

@@ -43,6 +43,10 @@ def test_whole_samples_go_in_batches_of_their_time() -> None:
     assert made[0].topic == "imud/site/gw/bow/samples"
     assert messages(made)[0].samples == samples(1, 99)
     assert ranges(one.flush(), Stream.SAMPLES) == [("samples", 200, 250)]
+    one = streams()
+    made = [row for n in range(3) for row in one.event(Event(n, "bow", EventKind.UP, "up"), 77)]
+    assert ranges(made, Stream.EVENTS) == [("events", n, n) for n in (1, 2, 3)]
+    assert streams(events=False).event(Event(0, "bow", EventKind.UP, "up"), 77) == []
 
 
 @pytest.mark.parametrize(("whole", "most"), [(Whole.JSON, SAMPLES_MAX), (Whole.SLOTS, SLOTS_MAX)])
@@ -86,13 +90,6 @@ def test_samples_that_had_no_room_are_noted_in_both_streams() -> None:
         (counts,) = ledger.counts.values()
         assert counts == StreamCounts(1, 80, whole=69, dropped={"queue": 11})
     assert one.gaps == 11
-
-
-def test_events_count_from_one() -> None:
-    one = streams()
-    made = [row for n in range(3) for row in one.event(Event(n, "bow", EventKind.UP, "up"), 77)]
-    assert ranges(made, Stream.EVENTS) == [("events", n, n) for n in (1, 2, 3)]
-    assert streams(events=False).event(Event(0, "bow", EventKind.UP, "up"), 77) == []
 
 
 def test_a_later_run_in_the_same_boot_goes_on() -> None:

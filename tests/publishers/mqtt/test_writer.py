@@ -303,7 +303,7 @@ def test_events_of_the_gateway_and_of_devices(tmp_path: Path) -> None:
     assert topics == ["imud/site/gw/events", "imud/site/gw/bow/events"]
 
 
-def test_the_queue_of_events_is_bounded() -> None:
+def test_the_queues_of_events_and_states_are_bounded() -> None:
     queue = WriterQueue(samples_max=10, events_max=2)
     for number in range(1000):
         queue.put_event(Event(number, "", EventKind.LINK, "x"))
@@ -315,6 +315,12 @@ def test_the_queue_of_events_is_bounded() -> None:
     assert [type(one) for one in taken] == [Event, MissedEvents, Event], "all that were missed are one item"
     assert isinstance(taken[1], MissedEvents)
     assert (taken[1].count, taken[1].t_ns) == (998, 999)
+    queue = WriterQueue(events_max=0)
+    for number in range(1000):
+        queue.put_state(SentState({"a": device_status("a", number)}, {"b": number, "c": number}))
+    queue.put_state(SentState({"b": device_status("b", 1)}, {"a": None}))
+    assert queue.take() == SentState({"b": device_status("b", 1)}, {"c": 999, "a": None})
+    assert (queue.take(), queue.dropped) == (None, 0)
 
 
 def test_events_that_have_no_room_have_numbers_in_their_place(tmp_path: Path) -> None:
@@ -333,15 +339,6 @@ def test_events_that_have_no_room_have_numbers_in_their_place(tmp_path: Path) ->
     }
     assert bench.queue.dropped == 8
     bench.writer.close()
-
-
-def test_of_states_the_newest_of_each_topic_waits() -> None:
-    queue = WriterQueue(events_max=0)
-    for number in range(1000):
-        queue.put_state(SentState({"a": device_status("a", number)}, {"b": number, "c": number}))
-    queue.put_state(SentState({"b": device_status("b", 1)}, {"a": None}))
-    assert queue.take() == SentState({"b": device_status("b", 1)}, {"c": 999, "a": None})
-    assert (queue.take(), queue.dropped) == (None, 0)
 
 
 LIFTED_NS = 1_750_000_000 * NS_PER_S
