@@ -246,7 +246,7 @@ class Site:
         for client in self._clients:
             client.close()
         self.daemon.altered = {}
-        logging.getLogger().removeHandler(self._log)  # nothing more is dropped
+        logging.getLogger().removeHandler(self._log)  # the log drops no more messages
         self._slave.dead = False
         self.memory.inputs["late sout"].open_error = None
         for wire in self.wires.values():

@@ -3,7 +3,7 @@
     site    in this process, a device per fault (`tests.monitoring.faults`)
     spare   `imud run`, which is killed and started again, has no devices, and has few files to open
 
-All times of the rules are divided, by 90 where nothing else runs (15 minutes are 10 s); as they are they run in
+The test divides all times of the rules, by 90 on an idle host: 15 minutes are 10 s. The undivided times run in
 tests/monitoring/imud.rules.test.yml. The table that the test prints (`pytest -s`) says how long each alert took.
 """
 

@@ -184,7 +184,7 @@ def test_a_spurious_wake_up_is_no_end(pty: PtyPort) -> None:
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(lambda _loop, context: failures.append(context))
         pty.send(b"x")
-        wait_until(lambda: waiting_bytes(pty.slave) == 1, "the byte is there")  # the loop does not look meanwhile
+        wait_until(lambda: waiting_bytes(pty.slave) == 1, "the byte is there")  # the loop has no turn until then
         loop.call_soon(lambda: stolen.append(os.read(pty.slave, 1)))
         for _ in range(5):  # the descriptor was readable, but not any more when the link reads it
             await asyncio.sleep(0)

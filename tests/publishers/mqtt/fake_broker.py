@@ -21,6 +21,7 @@ class FakeConnection:
         self.sent: list[tuple[str, bytes, bool]] = []
         self.types: list[str] = []
         self.closed = False
+        self.rings = 0
         self._bell = threading.Event()
         self._broker = broker
         self._answered = 0
@@ -51,6 +52,7 @@ class FakeConnection:
             self._bell.clear()
 
     def ring(self) -> None:
+        self.rings += 1
         self._bell.set()
 
     def close(self) -> None:

@@ -123,7 +123,7 @@ class Killings:
 
     def __init__(self, port: int, spool: Path, seed: int) -> None:
         self.told: dict[int, list[int]] = {}
-        """By epoch, the newest sample at each transaction that the gateway reported."""
+        """Newest sample at each transaction that the gateway reported, by epoch."""
         self._port, self._spool, self._random = port, spool, Random(seed)
 
     def kill_one(self, epoch: int, *, in_commit: bool, newest_seq: int = 0) -> None:
@@ -158,7 +158,7 @@ def test_kill_9_at_random_moments_costs_what_was_in_memory(tmp_path: Path) -> No
     stored = {one.boot: one.last for one in positions if one.stream == "samples"}
     for epoch, told in killings.told.items():
         boot = f"{epoch:016x}"
-        # a transaction has the samples from before its begin, and the begin is after the report before the last one
+        # a transaction stores the samples made before its start, which follows the last report but one
         assert stored[boot] >= max([1, *(seq - BATCH_SAMPLES for seq in told[:-2])]), f"boot {epoch}"
         one = counts.get((boot, "samples"))
         if one is not None:  # what came is without a gap; what did not waits

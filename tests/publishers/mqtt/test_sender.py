@@ -54,6 +54,9 @@ def test_messages_go_in_their_order_within_the_window() -> None:
     assert bench.sent() == [b"1", b"2", b"3", b"4", b"5", b"6"]
     assert bench.sender.take_acknowledged() == [(1, 1), (1, 2)]
     assert bench.sender.take_acknowledged() == []
+    assert bench.broker.connections[0].rings == 1
+    bench.sender.retain({})
+    assert bench.broker.connections[0].rings == 2, "each change wakes the connection"
     assert (bench.sender.sent, bench.sender.acknowledged) == (6, 2)
     assert bench.broker.connections[0].types == [JSON_TYPE] * 6
     bench.sender.give(bench.sender.session, [row(7, MAGIC + b"x")])

@@ -276,6 +276,10 @@ def test_a_device_that_counts_from_one_again_is_a_boot_of_its_own(tmp_path: Path
     again.work(4)
     again.writer.close()
     assert {one.boot: one.last for one in again.writer.positions} == {"1": 1000, "1-2": 610}
+    newest = [decode_message(payload) for payload in again.arrived()][-2:]
+    assert [(one.boot, one.kind, one.first, one.last) for one in newest] == [
+        ("1-2", "dropped", 501, 600), ("1-2", "slots", 601, 610),
+    ]  # fmt: skip
 
 
 def test_what_waits_at_the_end_is_stored_for_the_next_run(tmp_path: Path) -> None:
