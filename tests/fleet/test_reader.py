@@ -13,7 +13,7 @@ import pytest
 from imud.errors import BadArgument
 from imud.fleet import Fleet, FleetBatch
 from imud.fleet.connection import RECEIVE_MAX
-from imud.fleet.reader import VERSIONS
+from imud.fleet.reader import VERSIONS, FleetSession
 from imud.formats.fleet.ledger import StreamKey
 from imud.formats.fleet.state import GatewayState, StreamPosition
 from imud.formats.fleet.topics import topic_of
@@ -184,6 +184,15 @@ async def test_the_next_broker_of_the_cluster_is_tried(broker: Mosquitto, gatewa
     await asyncio.to_thread(gateway.send, samples_message(1, 10))
     assert (await reading)[0].message == samples_message(1, 10)
     assert fleet.problem == ""
+
+
+@in_loop
+async def test_a_wait_that_ends_before_the_next_attempt_gives_nothing() -> None:
+    fleet = Fleet(f"mqtt://127.0.0.1:{free_port()}", retry_max_s=60.0)
+    async with FleetSession(fleet, site=None, gateway=None, device=None) as session:
+        for _ in range(3):
+            assert await session.next(0.001) is None
+            assert "refused" in fleet.problem
 
 
 @pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)

@@ -106,6 +106,7 @@ def test_states_are_looked_at_after_events_and_now_and_then(tmp_path: Path) -> N
     bench.output.event(Event(0, "imu0", EventKind.DOWN, "gone"))
     bench.statuses = [msgspec.structs.replace(bench.statuses[0], state=DeviceState.MISSING)]
     bench.tick()
+    bench.broker.wait_for("imud/default/gw/imu0/status", lambda payload: b'"missing"' in payload)
     assert bench.asked == 2
     for _ in range(30):
         bench.tick()

@@ -372,6 +372,7 @@ def test_a_damaged_row_that_says_its_numbers_is_a_note(tmp_path: Path) -> None:
     damage(tmp_path, "payload = 17")
     counts = bench.counts()
     assert (counts.whole, counts.dropped, counts.missing) == (200, {"damaged": 100}, 0)
+    assert bench.counts() == counts, "the note is stored, and counts once"
     assert bench.spool.dropped == {"damaged": 100}
     assert bench.spool.messages == 3
 

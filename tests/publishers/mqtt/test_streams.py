@@ -46,6 +46,8 @@ def test_whole_samples_go_in_batches_of_their_time() -> None:
     one = streams()
     made = [row for n in range(3) for row in one.event(Event(n, "bow", EventKind.UP, "up"), 77)]
     assert ranges(made, Stream.EVENTS) == [("events", n, n) for n in (1, 2, 3)]
+    assert ranges(one.missed_events(2, 77), Stream.EVENTS) == [("dropped", 4, 5)]
+    assert ranges(streams().missed_events(2, 77), Stream.EVENTS) == [("dropped", 1, 2)]
     assert streams(events=False).event(Event(0, "bow", EventKind.UP, "up"), 77) == []
 
 
