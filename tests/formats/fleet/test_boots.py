@@ -60,6 +60,10 @@ def test_where_a_record_lies(
         (intervals_message(4, 6), BootOffset(4_000_000, UTC_NS, None)),
         (intervals_message(4, 6, utc_ns=0), None),
         (event_message(1, 5), None),
+        (
+            intervals_message(4, 6, utc_ns=CLOCK_SET_NS - 4_000_000),
+            BootOffset(4_000_000, CLOCK_SET_NS - 4_000_000, None),
+        ),
     ],
 )
 def test_what_a_message_says_of_the_clock(message: FleetMessage, expected: BootOffset | None) -> None:

@@ -129,6 +129,16 @@ def test_it_closes_whatever_comes_and_however_often_the_collector_starts_anew(st
         assert len(seqs) == len(set(seqs))
 
 
+def test_positions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.formats.fleet.state.POSITIONS_MAX", 2)
+    positions = SpoolPositions(from_begin=True)
+    for boot in ("1", "2", "1"):
+        positions.take("gw", state(5, boot))
+    with pytest.raises(OverflowError, match="at most 2 streams"):
+        positions.take("gw", state(5, "3"))
+    assert [key.boot for key in positions.accounts(FleetLedger())] == ["1", "2"]
+
+
 def test_what_was_stored_does_not_change_afterwards() -> None:
     ledger = FleetLedger()
     ledger.take(message(1, 4, MessageKind.DROPPED), Stream.SAMPLES)
