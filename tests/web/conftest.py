@@ -1,5 +1,6 @@
-"""The browser that all tests of a page share: its start takes seconds. What it showed when a test failed is kept."""
+"""Runs `async` tests in a loop. One browser for all tests of a page. Keeps the picture of a failed test."""
 
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -8,10 +9,21 @@ import pytest
 from selenium.common.exceptions import WebDriverException
 
 from tests.support.files import ROOT
+from tests.support.socket_rig import run
 from tests.web.browser import Page, browser
 
 PICTURES: Final = ROOT / "build/web"
 """Where what the browser showed goes when a test failed, by the name of the test."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run an `async` test in a new loop."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    names = inspect.signature(pyfuncitem.obj).parameters
+    run(lambda: pyfuncitem.obj(**{name: pyfuncitem.funcargs[name] for name in names}))
+    return True
 
 
 @pytest.fixture(scope="session")

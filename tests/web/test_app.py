@@ -21,7 +21,7 @@ from imud.web import app as web_app
 from imud.web import mailbox
 from imud.web.app import STATIC, WebServer
 from imud.web.guard import COOKIE, WebGuard
-from tests.support.socket_rig import batch, run, serving, until
+from tests.support.socket_rig import batch, serving, until
 
 TOKEN = "correct-horse-battery-staple"
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -115,24 +115,21 @@ async def message(socket: ClientWebSocketResponse, kind: str) -> dict[str, Any]:
     return found
 
 
-def test_the_page_and_its_files_are_served_with_safe_headers(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with running(tmp_path) as site:
-            page = await site.client.get("/")
-            text = await page.text()
-            assert page.headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self'")
-            assert page.headers["X-Content-Type-Options"] == "nosniff"
-            for path in re.findall(r'(?:src|href)="(/[^"]+)"', text):
-                answer = await site.client.get(path)
-                assert answer.status == 200, path
-                assert "Content-Security-Policy" in answer.headers
-            assert (await site.client.get("/static/../app.py")).status == 404
-            assert (await site.client.get("/static/")).status in (403, 404)
-            missing = await site.client.get("/none")
-            assert missing.status == 404
-            assert "Content-Security-Policy" in missing.headers, "errors have them too"
-
-    run(body)
+async def test_the_page_and_its_files_are_served_with_safe_headers(tmp_path: Path) -> None:
+    async with running(tmp_path) as site:
+        page = await site.client.get("/")
+        text = await page.text()
+        assert page.headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self'")
+        assert page.headers["X-Content-Type-Options"] == "nosniff"
+        for path in re.findall(r'(?:src|href)="(/[^"]+)"', text):
+            answer = await site.client.get(path)
+            assert answer.status == 200, path
+            assert "Content-Security-Policy" in answer.headers
+        assert (await site.client.get("/static/../app.py")).status == 404
+        assert (await site.client.get("/static/")).status in (403, 404)
+        missing = await site.client.get("/none")
+        assert missing.status == 404
+        assert "Content-Security-Policy" in missing.headers, "errors have them too"
 
 
 def test_nothing_is_loaded_from_elsewhere_and_no_script_stands_in_the_page() -> None:
@@ -154,169 +151,145 @@ def test_the_bundled_library_is_the_published_one_with_its_licence() -> None:
     assert "MIT" in (STATIC / "uplot" / "LICENSE").read_text()
 
 
-def test_other_names_and_other_sites_are_refused(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with running(tmp_path) as site:
-            assert (await site.get("/api/session", Host="attacker.example"))[0] == 421
-            call = {"method": "actions", "params": {"device": "imu0"}}
-            assert (await site.post("/api/call", call))[0] == 200
-            assert (await site.post("/api/call", call, Origin="http://attacker.example"))[0] == 403
-            assert (await site.client.post("/api/call", json=call)).status == 403, "a browser always has an Origin"
-            assert (await site.client.post("/api/call", json=call, headers=BEARER)).status == 200
-            for headers in ({"Origin": "http://attacker.example"}, {}, {**BEARER, "Origin": "null"}):
-                with pytest.raises(WSServerHandshakeError, match="403"):
-                    await site.client.ws_connect("/api/stream", headers=headers)
-            answer = await site.client.options("/api/call", headers={"Origin": "http://attacker.example"})
-            assert not [name for name in answer.headers if name.startswith("Access-Control")]
-
-    run(body)
+async def test_other_names_and_other_sites_are_refused(tmp_path: Path) -> None:
+    async with running(tmp_path) as site:
+        assert (await site.get("/api/session", Host="attacker.example"))[0] == 421
+        call = {"method": "actions", "params": {"device": "imu0"}}
+        assert (await site.post("/api/call", call))[0] == 200
+        assert (await site.post("/api/call", call, Origin="http://attacker.example"))[0] == 403
+        assert (await site.client.post("/api/call", json=call)).status == 403, "a browser always has an Origin"
+        assert (await site.client.post("/api/call", json=call, headers=BEARER)).status == 200
+        for headers in ({"Origin": "http://attacker.example"}, {}, {**BEARER, "Origin": "null"}):
+            with pytest.raises(WSServerHandshakeError, match="403"):
+                await site.client.ws_connect("/api/stream", headers=headers)
+        answer = await site.client.options("/api/call", headers={"Origin": "http://attacker.example"})
+        assert not [name for name in answer.headers if name.startswith("Access-Control")]
 
 
-def test_control_needs_the_token_and_a_cookie_does_for_it(tmp_path: Path) -> None:
+async def test_control_needs_the_token_and_a_cookie_does_for_it(tmp_path: Path) -> None:
     orders: tuple[tuple[str, dict[str, object]], ...] = (
         ("settings.plan", {}), ("settings.apply", {}),
         ("command", {"name": "output", "arguments": {"message": "HI91", "rate_hz": 5}}),
         ("calibrate", {"kind": "heading"}), ("stop_calibration", {}), ("settings.get", {"fresh": True}),
     )  # fmt: skip
-
-    async def body() -> None:
-        async with running(tmp_path) as site:
-            for method, params in orders:
-                call = {"method": method, "params": {"device": "imu0", **params}}
-                assert (await site.post("/api/call", call))[0] == 401, method
-                status, answer = await site.post("/api/call", call, **BEARER)
-                assert (status, "result" in answer) == (200, True), (method, answer)
-            assert (await site.get("/api/session"))[1] | {"version": ""} == {
-                "read": True, "control": False, "has_token": True, "version": "",
-            }  # fmt: skip
-            response = await site.client.post("/api/login", json={"token": TOKEN}, headers=site.origin)
-            cookie = response.headers["Set-Cookie"]
-            assert response.status == 200
-            assert "HttpOnly" in cookie
-            assert "SameSite=Strict" in cookie
-            assert TOKEN not in cookie
-            value = cookie.partition("=")[2].partition(";")[0]
-            as_browser = {"Cookie": f"{COOKIE}={value}"}
-            order = {"method": "calibrate", "params": {"device": "imu0", "kind": "heading"}}
-            status, answer = await site.post("/api/call", order, **as_browser)
-            assert (status, answer["result"]["verified"]) == (200, True)
-            assert (await site.post("/api/call", order, **as_browser, Origin="http://attacker.example"))[0] == 403
-            assert (await site.post("/api/logout", {}))[1] == {"control": False}
-
-    run(body)
+    async with running(tmp_path) as site:
+        for method, params in orders:
+            call = {"method": method, "params": {"device": "imu0", **params}}
+            assert (await site.post("/api/call", call))[0] == 401, method
+            status, answer = await site.post("/api/call", call, **BEARER)
+            assert (status, "result" in answer) == (200, True), (method, answer)
+        assert (await site.get("/api/session"))[1] | {"version": ""} == {
+            "read": True, "control": False, "has_token": True, "version": "",
+        }  # fmt: skip
+        response = await site.client.post("/api/login", json={"token": TOKEN}, headers=site.origin)
+        cookie = response.headers["Set-Cookie"]
+        assert response.status == 200
+        assert "HttpOnly" in cookie
+        assert "SameSite=Strict" in cookie
+        assert TOKEN not in cookie
+        value = cookie.partition("=")[2].partition(";")[0]
+        as_browser = {"Cookie": f"{COOKIE}={value}"}
+        order = {"method": "calibrate", "params": {"device": "imu0", "kind": "heading"}}
+        status, answer = await site.post("/api/call", order, **as_browser)
+        assert (status, answer["result"]["verified"]) == (200, True)
+        assert (await site.post("/api/call", order, **as_browser, Origin="http://attacker.example"))[0] == 403
+        assert (await site.post("/api/logout", {}))[1] == {"control": False}
 
 
 @pytest.mark.parametrize(
     "body", [b'{"method":"actions","params":{"a":' + b"[" * 30_000, b'{"method":"\xff"}', b"", b"[]"]
 )
-def test_a_body_that_cannot_be_read_is_refused(tmp_path: Path, body: bytes) -> None:
-    async def work() -> None:
-        async with running(tmp_path) as site:
-            for path in ("/api/call", "/api/login"):
-                answer = await site.client.post(path, data=body, headers=BEARER)
-                assert (answer.status, "expected" in (await answer.json())["error"]) == (400, True), path
-
-    run(work)
+async def test_a_body_that_cannot_be_read_is_refused(tmp_path: Path, body: bytes) -> None:
+    async with running(tmp_path) as site:
+        for path in ("/api/call", "/api/login"):
+            answer = await site.client.post(path, data=body, headers=BEARER)
+            assert (answer.status, "expected" in (await answer.json())["error"]) == (400, True), path
 
 
-def test_reading_can_need_the_token_too(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with running(tmp_path, reading_needs_token=True) as site:
-            call = {"method": "actions", "params": {"device": "imu0"}}
-            assert (await site.post("/api/call", call))[0] == 401
-            with pytest.raises(WSServerHandshakeError, match="401"):
-                await site.client.ws_connect("/api/stream", headers=site.origin)
-            assert (await site.post("/api/call", call, **BEARER))[0] == 200
-            socket = await site.client.ws_connect("/api/stream", headers=BEARER)
-            await socket.send_json({"look": "overview"})
-            await message(socket, "overview")
-            await socket.close()
-
-    run(body)
+async def test_reading_can_need_the_token_too(tmp_path: Path) -> None:
+    async with running(tmp_path, reading_needs_token=True) as site:
+        call = {"method": "actions", "params": {"device": "imu0"}}
+        assert (await site.post("/api/call", call))[0] == 401
+        with pytest.raises(WSServerHandshakeError, match="401"):
+            await site.client.ws_connect("/api/stream", headers=site.origin)
+        assert (await site.post("/api/call", call, **BEARER))[0] == 200
+        socket = await site.client.ws_connect("/api/stream", headers=BEARER)
+        await socket.send_json({"look": "overview"})
+        await message(socket, "overview")
+        await socket.close()
 
 
-def test_wrong_tokens_are_answered_late_and_only_so_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def body() -> None:
-        monkeypatch.setattr(web_app, "FAILURE_S", 3600.0)
-        async with running(tmp_path) as site:
-            guesses = [
-                asyncio.create_task(site.post("/api/login", {"token": "wrong"}))
-                for _ in range(web_app.FAILURES_MAX + 1)
-            ]
-            done, waiting = await asyncio.wait(guesses, return_when=asyncio.FIRST_COMPLETED)
-            assert [one.result()[0] for one in done] == [429]
-            status, _ = await site.post("/api/login", {"token": TOKEN})
-            assert status == 200, "the right one is not held up"
-            for one in waiting:
-                one.cancel()
-        monkeypatch.setattr(web_app, "FAILURE_S", 0.0)
-        async with running(tmp_path) as site:
-            assert await site.post("/api/login", {"token": "wrong"}) == (401, {"error": "this is not the token"})
-        async with running(tmp_path, token="") as site:
-            assert (await site.post("/api/login", {"token": ""}))[0] == 403
-
-    run(body)
+async def test_wrong_tokens_are_answered_late_and_only_so_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web_app, "FAILURE_S", 3600.0)
+    async with running(tmp_path) as site:
+        guesses = [
+            asyncio.create_task(site.post("/api/login", {"token": "wrong"})) for _ in range(web_app.FAILURES_MAX + 1)
+        ]
+        done, waiting = await asyncio.wait(guesses, return_when=asyncio.FIRST_COMPLETED)
+        assert [one.result()[0] for one in done] == [429]
+        status, _ = await site.post("/api/login", {"token": TOKEN})
+        assert status == 200, "the right one is not held up"
+        for one in waiting:
+            one.cancel()
+    monkeypatch.setattr(web_app, "FAILURE_S", 0.0)
+    async with running(tmp_path) as site:
+        assert await site.post("/api/login", {"token": "wrong"}) == (401, {"error": "this is not the token"})
+    async with running(tmp_path, token="") as site:
+        assert (await site.post("/api/login", {"token": ""}))[0] == 403
 
 
 @pytest.mark.parametrize(
     "bad", [b"", b"{", b"[]", b'{"method": 5}', b'{"method": "actions", "params": []}', b"\xff", b'{"x": 1}']
 )
-def test_bad_bodies_are_refused_in_words(bad: bytes, tmp_path: Path) -> None:
-    async def body() -> None:
-        async with running(tmp_path) as site:
-            for path in ("/api/call", "/api/login"):
-                status, answer = await site.post(path, bad)
-                assert status == 400
-                assert answer["error"].startswith("expected a ")
-            status, answer = await site.post("/api/call", {"method": "watch"})
-            assert status == 404
-            assert "settings.get" in answer["error"]
-            response = await site.client.post("/api/call", data=b" " * 100_000, headers=site.origin)
-            assert response.status == 413
-
-    run(body)
+async def test_bad_bodies_are_refused_in_words(bad: bytes, tmp_path: Path) -> None:
+    async with running(tmp_path) as site:
+        for path in ("/api/call", "/api/login"):
+            status, answer = await site.post(path, bad)
+            assert status == 400
+            assert answer["error"].startswith("expected a ")
+        status, answer = await site.post("/api/call", {"method": "watch"})
+        assert status == 404
+        assert "settings.get" in answer["error"]
+        response = await site.client.post("/api/call", data=b" " * 100_000, headers=site.origin)
+        assert response.status == 413
 
 
-def test_errors_of_the_daemon_are_told(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with running(tmp_path) as site:
-            status, answer = await site.post("/api/call", {"method": "actions", "params": {"device": "none"}})
-            assert (status, answer["code"]) == (200, -32602)
-            assert "no device named 'none'" in answer["error"]
-            site.daemon.close()
-            status, answer = await site.post("/api/call", {"method": "actions", "params": {"device": "imu0"}})
-            assert (status, "no daemon at" in answer["error"]) == (502, True)
-
-    run(body)
+async def test_errors_of_the_daemon_are_told(tmp_path: Path) -> None:
+    async with running(tmp_path) as site:
+        status, answer = await site.post("/api/call", {"method": "actions", "params": {"device": "none"}})
+        assert (status, answer["code"]) == (200, -32602)
+        assert "no device named 'none'" in answer["error"]
+        site.daemon.close()
+        status, answer = await site.post("/api/call", {"method": "actions", "params": {"device": "imu0"}})
+        assert (status, "no daemon at" in answer["error"]) == (502, True)
 
 
-def test_samples_statuses_and_events_come_while_a_page_is_open_and_nothing_is_read_without(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with running(tmp_path) as site:
-            assert not site.daemon.hub.connections
-            socket = await site.stream(look="device", device="imu0", rate_hz=50)
-            status = await message(socket, "status")
-            assert (status["device"], status["status"]["name"]) == ("imu0", "imu0")
-            assert len(site.daemon.hub.connections) == 1
-            site.daemon.publish(batch("imu0", 1, 100))
-            got = await message(socket, "samples")
-            assert sum(one["count"] for one in got["buckets"]) >= 19
-            site.daemon.event(Event(5, "imu0", EventKind.UP, "is there"))
-            assert (await message(socket, "events"))["events"][0]["message"] == "is there"
-            await socket.send_json({"look": "overview", "acknowledged": 3})
-            assert [row["name"] for row in (await message(socket, "overview"))["devices"]] == ["imu0", "imu1"]
-            others = [await site.stream(look="overview") for _ in range(5)]
-            for other in others:
-                await message(other, "overview")
-            assert len(site.daemon.hub.connections) == 1, "one connection for all pages"
-            for one in (socket, *others):
-                await one.close()
-            await until(lambda: not site.daemon.hub.connections)
+async def test_samples_statuses_and_events_come_while_a_page_is_open_and_nothing_is_read_without(
+    tmp_path: Path,
+) -> None:
+    async with running(tmp_path) as site:
+        assert not site.daemon.hub.connections
+        socket = await site.stream(look="device", device="imu0", rate_hz=50)
+        status = await message(socket, "status")
+        assert (status["device"], status["status"]["name"]) == ("imu0", "imu0")
+        assert len(site.daemon.hub.connections) == 1
+        site.daemon.publish(batch("imu0", 1, 100))
+        got = await message(socket, "samples")
+        assert sum(one["count"] for one in got["buckets"]) >= 19
+        site.daemon.event(Event(5, "imu0", EventKind.UP, "is there"))
+        assert (await message(socket, "events"))["events"][0]["message"] == "is there"
+        await socket.send_json({"look": "overview", "acknowledged": 3})
+        assert [row["name"] for row in (await message(socket, "overview"))["devices"]] == ["imu0", "imu1"]
+        others = [await site.stream(look="overview") for _ in range(5)]
+        for other in others:
+            await message(other, "overview")
+        assert len(site.daemon.hub.connections) == 1, "one connection for all pages"
+        for one in (socket, *others):
+            await one.close()
+        await until(lambda: not site.daemon.hub.connections)
 
-    run(body)
 
-
-def test_a_page_that_takes_nothing_holds_up_no_other_and_nothing_piles_up_for_it(
+async def test_a_page_that_takes_nothing_holds_up_no_other_and_nothing_piles_up_for_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its connection is full, and it acknowledges all the same, so that nothing but the connection can stop it."""
@@ -350,45 +323,36 @@ def test_a_page_that_takes_nothing_holds_up_no_other_and_nothing_piles_up_for_it
         assert site.web.hub.dropped_samples == 0
         await quick.close()
 
-    async def body() -> None:
-        monkeypatch.setattr(mailbox, "FRAMES_MAX", waiting_max)
-        async with running(tmp_path, small_buffers=True) as site:
-            with closing(StalledPage(site)) as stalled:
-                await watched(site, stalled)
-
-    run(body)
+    monkeypatch.setattr(mailbox, "FRAMES_MAX", waiting_max)
+    async with running(tmp_path, small_buffers=True) as site:
+        with closing(StalledPage(site)) as stalled:
+            await watched(site, stalled)
 
 
-def test_what_a_page_sends_wrong_is_reported_to_it(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with running(tmp_path) as site:
-            socket = await site.stream(look="everything")
-            assert "reload it" in (await message(socket, "problem"))["message"]
-            for text in ("{", "[]", '{"look": "overview", "more": 1}', '{"rate_hz": 7}', '{"acknowledged": "x"}'):
-                await socket.send_str(text)
-                assert (await message(socket, "problem"))["message"]
-            await socket.send_json({"look": "overview"})
-            assert await message(socket, "overview")
-            await socket.send_str("x" * 5000)
-            while (last := await socket.receive()).type is WSMsgType.TEXT:
-                pass
-            assert last.type is WSMsgType.CLOSE
-            assert last.data == 1009, "too long a message ends the connection"
-
-    run(body)
+async def test_what_a_page_sends_wrong_is_reported_to_it(tmp_path: Path) -> None:
+    async with running(tmp_path) as site:
+        socket = await site.stream(look="everything")
+        assert "reload it" in (await message(socket, "problem"))["message"]
+        for text in ("{", "[]", '{"look": "overview", "more": 1}', '{"rate_hz": 7}', '{"acknowledged": "x"}'):
+            await socket.send_str(text)
+            assert (await message(socket, "problem"))["message"]
+        await socket.send_json({"look": "overview"})
+        assert await message(socket, "overview")
+        await socket.send_str("x" * 5000)
+        while (last := await socket.receive()).type is WSMsgType.TEXT:
+            pass
+        assert last.type is WSMsgType.CLOSE
+        assert last.data == 1009, "too long a message ends the connection"
 
 
-def test_pages_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def body() -> None:
-        monkeypatch.setattr(web_app, "BROWSERS_MAX", 1)
-        async with running(tmp_path) as site:
-            socket = await site.stream(look="overview")
-            with pytest.raises(WSServerHandshakeError, match="503"):
-                await site.client.ws_connect("/api/stream", headers=site.origin)
-            await socket.close()
-            assert site.web.hub is not None
-            hub = site.web.hub
-            await until(lambda: not hub.browsers)
-            await (await site.stream(look="overview")).close()
-
-    run(body)
+async def test_pages_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web_app, "BROWSERS_MAX", 1)
+    async with running(tmp_path) as site:
+        socket = await site.stream(look="overview")
+        with pytest.raises(WSServerHandshakeError, match="503"):
+            await site.client.ws_connect("/api/stream", headers=site.origin)
+        await socket.close()
+        assert site.web.hub is not None
+        hub = site.web.hub
+        await until(lambda: not hub.browsers)
+        await (await site.stream(look="overview")).close()

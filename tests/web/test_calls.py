@@ -9,58 +9,46 @@ from imud.errors import ImudError, LinkMissing
 from imud.formats.jsonrpc import Code, RpcError
 from imud.web.calls import AT_A_TIME_MAX, Busy, Calls
 from tests.support import socket_rig
-from tests.support.socket_rig import run, serving
+from tests.support.socket_rig import serving
 
 
-def test_a_question_is_answered_and_its_connection_ends(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            calls = Calls(server.hub.path)
-            report = await calls.call("settings.get", {"device": "imu0"})
-            assert report["settings"][0]["actual"] == "6-axis"
-            arguments = {"message": "HI91", "rate_hz": 5}
-            order = {"device": "imu0", "name": "output", "arguments": arguments}
-            assert await calls.call("command", order) is None
-            await socket_rig.until(lambda: not server.hub.connections)
-
-    run(body)
+async def test_a_question_is_answered_and_its_connection_ends(tmp_path: Path) -> None:
+    async with serving(tmp_path) as server:
+        calls = Calls(server.hub.path)
+        report = await calls.call("settings.get", {"device": "imu0"})
+        assert report["settings"][0]["actual"] == "6-axis"
+        arguments = {"message": "HI91", "rate_hz": 5}
+        order = {"device": "imu0", "name": "output", "arguments": arguments}
+        assert await calls.call("command", order) is None
+        await socket_rig.until(lambda: not server.hub.connections)
 
 
-def test_what_the_daemon_refuses_is_told_with_its_code(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            with pytest.raises(RpcError, match="no device named 'none'") as caught:
-                await Calls(server.hub.path).call("actions", {"device": "none"})
-            assert caught.value.code == Code.INVALID_PARAMS
-
-    run(body)
+async def test_what_the_daemon_refuses_is_told_with_its_code(tmp_path: Path) -> None:
+    async with serving(tmp_path) as server:
+        with pytest.raises(RpcError, match="no device named 'none'") as caught:
+            await Calls(server.hub.path).call("actions", {"device": "none"})
+        assert caught.value.code == Code.INVALID_PARAMS
 
 
-def test_long_orders_hold_up_no_others_and_are_bounded(tmp_path: Path) -> None:
-    async def body() -> None:
-        socket_rig.done_late = asyncio.Event()
-        async with serving(tmp_path) as server:
-            calls = Calls(server.hub.path)
-            order = {"device": "imu0", "name": "wait", "arguments": {}}
-            waiting = [asyncio.create_task(calls.call("command", order)) for _ in range(AT_A_TIME_MAX - 1)]
-            assert await calls.call("actions", {"device": "imu1"})
-            await socket_rig.until(lambda: len(server.hub.connections) == AT_A_TIME_MAX - 1)
-            waiting.append(asyncio.create_task(calls.call("command", order)))
-            await socket_rig.until(lambda: len(server.hub.connections) == AT_A_TIME_MAX)
-            with pytest.raises(Busy, match="try again"):
-                await calls.call("actions", {"device": "imu1"})
-            socket_rig.done_late.set()
-            assert await asyncio.gather(*waiting) == [{"waited": "imu0"}] * AT_A_TIME_MAX
-
-    run(body)
+async def test_long_orders_hold_up_no_others_and_are_bounded(tmp_path: Path) -> None:
+    socket_rig.done_late = asyncio.Event()
+    async with serving(tmp_path) as server:
+        calls = Calls(server.hub.path)
+        order = {"device": "imu0", "name": "wait", "arguments": {}}
+        waiting = [asyncio.create_task(calls.call("command", order)) for _ in range(AT_A_TIME_MAX - 1)]
+        assert await calls.call("actions", {"device": "imu1"})
+        await socket_rig.until(lambda: len(server.hub.connections) == AT_A_TIME_MAX - 1)
+        waiting.append(asyncio.create_task(calls.call("command", order)))
+        await socket_rig.until(lambda: len(server.hub.connections) == AT_A_TIME_MAX)
+        with pytest.raises(Busy, match="try again"):
+            await calls.call("actions", {"device": "imu1"})
+        socket_rig.done_late.set()
+        assert await asyncio.gather(*waiting) == [{"waited": "imu0"}] * AT_A_TIME_MAX
 
 
-def test_without_a_daemon_it_says_where_it_looked(tmp_path: Path) -> None:
-    async def body() -> None:
-        with pytest.raises(LinkMissing, match=r"no daemon at .*/none: No such file"):
-            await Calls(str(tmp_path / "none")).call("schema", {})
-
-    run(body)
+async def test_without_a_daemon_it_says_where_it_looked(tmp_path: Path) -> None:
+    with pytest.raises(LinkMissing, match=r"no daemon at .*/none: No such file"):
+        await Calls(str(tmp_path / "none")).call("schema", {})
 
 
 @pytest.mark.parametrize(
@@ -73,15 +61,12 @@ def test_without_a_daemon_it_says_where_it_looked(tmp_path: Path) -> None:
         (b'{"jsonrpc":"2.0","id":null,"error":{"code":-32002,"message":"too many clients"}}\n', "too many clients"),
     ],
 )
-def test_answers_that_are_none(sent: bytes, problem: str, tmp_path: Path) -> None:
+async def test_answers_that_are_none(sent: bytes, problem: str, tmp_path: Path) -> None:
     async def serve(_reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(sent)
         writer.close()
 
-    async def body() -> None:
-        path = str(tmp_path / "fake")
-        async with await asyncio.start_unix_server(serve, path):
-            with pytest.raises(ImudError, match=problem):
-                await Calls(path).call("schema", {})
-
-    run(body)
+    path = str(tmp_path / "fake")
+    async with await asyncio.start_unix_server(serve, path):
+        with pytest.raises(ImudError, match=problem):
+            await Calls(path).call("schema", {})

@@ -51,7 +51,7 @@ def test_other_hosts_are_refused(host: str | None) -> None:
         assert "see imud web --host" in make().host_problem(host)
 
 
-def test_an_origin_is_that_of_the_page_itself() -> None:
+def test_origins() -> None:
     guard = make()
     good = guard.origin_problem("http://localhost:9322", "localhost:9322", with_token=False)
     assert good == ""
@@ -65,14 +65,11 @@ def test_an_origin_is_that_of_the_page_itself() -> None:
     ):
         assert guard.origin_problem(origin, "localhost:9322", with_token=False), origin
         assert guard.origin_problem(origin, "localhost:9322", with_token=True), origin
-
-
-def test_only_a_program_with_the_token_may_leave_the_origin_out() -> None:
     assert make().origin_problem(None, "localhost", with_token=True) == ""
     assert make().origin_problem(None, "localhost", with_token=False)
 
 
-def test_rights_by_header_and_by_cookie() -> None:
+def test_rights() -> None:
     guard = make(reading_needs_token=True)
     assert guard.rights(None, None) == WebRights(False, False)
     assert guard.rights(f"Bearer {TOKEN}", None) == WebRights(True, True)
@@ -81,9 +78,6 @@ def test_rights_by_header_and_by_cookie() -> None:
     assert guard.rights(None, guard.new_session()) == WebRights(True, True, by_cookie=True)
     assert guard.rights(None, TOKEN) == WebRights(False, False)
     assert make().rights(None, None) == WebRights(True, False), "reading is open"
-
-
-def test_without_a_token_nobody_controls() -> None:
     guard = make(token="")
     assert guard.rights("Bearer ", "") == WebRights(True, False)
     assert guard.rights("Bearer", guard.new_session()) == WebRights(True, False)
@@ -105,10 +99,14 @@ def test_a_session_ends_and_cannot_be_prolonged_or_forged() -> None:
     assert not guard.is_session(cookie)
 
 
-def test_names_of_hosts_and_loopback() -> None:
+def test_loopback_and_policy() -> None:
     assert host_name("[fe80::1]:80") == "fe80::1"
     assert [is_loopback(one) for one in ("127.0.0.1", "127.8.8.8", "::1", "localhost")] == [True] * 4
     assert [is_loopback(one) for one in ("0.0.0.0", "::", "192.168.1.1", "", "gateway")] == [False] * 5
+    policy = safety_headers()["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert "frame-ancestors 'none'" in policy
 
 
 def test_a_token_comes_from_the_first_line_of_a_file(tmp_path: Path) -> None:
@@ -120,10 +118,3 @@ def test_a_token_comes_from_the_first_line_of_a_file(tmp_path: Path) -> None:
         read_token(str(file))
     with pytest.raises(BadArgument, match="No such file"):
         read_token(str(tmp_path / "none"))
-
-
-def test_the_page_may_run_its_own_scripts_only() -> None:
-    policy = safety_headers()["Content-Security-Policy"]
-    assert "default-src 'none'" in policy
-    assert "unsafe" not in policy
-    assert "frame-ancestors 'none'" in policy

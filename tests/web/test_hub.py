@@ -13,7 +13,7 @@ from imud.event import Event, EventKind
 from imud.web.hub import DEVICES_MAX, EVENTS_KEPT, WAITING_MAX, Browser, BrowserHub, row_of, status_message
 from imud.web.messages import Look
 from tests.support.metrics import device
-from tests.support.socket_rig import run, sample
+from tests.support.socket_rig import sample
 
 HELLO = Hello(1, "0.1.0", 2**62 + 1, ("read",))
 
@@ -74,16 +74,10 @@ def test_what_is_read_is_what_all_pages_together_need() -> None:
         hub.remove(browser)
         hub.remove(two)
     assert feed.wanted[-1] is None, "no page is shown: nothing is read"
-
-
-def test_hidden_pages_are_no_reason_to_read() -> None:
     hub, feed = make()
     browser = opened(hub, look="device", device="bow")
     hub.look(browser, Look("nothing", "bow"))
     assert feed.wanted[-1] is None
-
-
-def test_an_acknowledgement_changes_nothing_that_is_read() -> None:
     hub, feed = make()
     browser = opened(hub, look="overview")
     asked = len(feed.wanted)
@@ -91,153 +85,126 @@ def test_an_acknowledgement_changes_nothing_that_is_read() -> None:
     assert len(feed.wanted) == asked
 
 
-def test_buckets_go_to_those_that_look_at_the_device_at_that_rate() -> None:
-    async def body() -> None:
-        hub, _ = make()
-        slow = opened(hub, look="device", device="bow", rate_hz=10)
-        fast = opened(hub, look="device", device="bow", rate_hz=50)
-        other = opened(hub, look="device", device="stern", rate_hz=10)
-        hub.spread(news(1, 201))
-        messages = {id(one): await heard(one, "samples") for one in (slow, fast, other)}
-        assert messages[id(other)] == []
-        (at_10,), (at_50,) = messages[id(slow)], messages[id(fast)]
-        assert (at_10["rate_hz"], [one["count"] for one in at_10["buckets"]]) == (10, [99, 100])
-        assert (at_50["rate_hz"], [one["count"] for one in at_50["buckets"]]) == (50, [19, *[20] * 9])
-        assert at_10["buckets"][0]["accel_m_s2"] == [[0.125, -0.5, 9.75]] * 2
-
-    run(body)
+async def test_buckets_go_to_those_that_look_at_the_device_at_that_rate() -> None:
+    hub, _ = make()
+    slow = opened(hub, look="device", device="bow", rate_hz=10)
+    fast = opened(hub, look="device", device="bow", rate_hz=50)
+    other = opened(hub, look="device", device="stern", rate_hz=10)
+    hub.spread(news(1, 201))
+    messages = {id(one): await heard(one, "samples") for one in (slow, fast, other)}
+    assert messages[id(other)] == []
+    (at_10,), (at_50,) = messages[id(slow)], messages[id(fast)]
+    assert (at_10["rate_hz"], [one["count"] for one in at_10["buckets"]]) == (10, [99, 100])
+    assert (at_50["rate_hz"], [one["count"] for one in at_50["buckets"]]) == (50, [19, *[20] * 9])
+    assert at_10["buckets"][0]["accel_m_s2"] == [[0.125, -0.5, 9.75]] * 2
 
 
-def test_every_sample_goes_to_those_that_want_a_spectrum_of_it() -> None:
-    async def body() -> None:
-        hub, _ = make()
-        plain = opened(hub, look="device", device="bow")
-        wanting = opened(hub, look="device", device="bow", spectrum="gyro_rad_s")
-        hub.spread(news(5, 30))
-        assert await heard(plain, "raw") == []
-        (raw,) = await heard(wanting, "raw")
-        assert raw["seq"] == [*range(5, 35)]
-        assert raw["axes"][2] == [-0.75] * 30
-
-    run(body)
+async def test_every_sample_goes_to_those_that_want_a_spectrum_of_it() -> None:
+    hub, _ = make()
+    plain = opened(hub, look="device", device="bow")
+    wanting = opened(hub, look="device", device="bow", spectrum="gyro_rad_s")
+    hub.spread(news(5, 30))
+    assert await heard(plain, "raw") == []
+    (raw,) = await heard(wanting, "raw")
+    assert raw["seq"] == [*range(5, 35)]
+    assert raw["axes"][2] == [-0.75] * 30
 
 
-def test_a_message_is_encoded_once_for_all_browsers() -> None:
-    async def body() -> None:
-        hub, _ = make()
-        browsers = [opened(hub, look="device", device="bow") for _ in range(20)]
-        hub.spread(news(1, 120))
-        texts = []
-        for browser in browsers:
-            while browser.mailbox.waiting:
-                text = await browser.mailbox.take()
-                if '"samples"' in text:
-                    texts.append(text)
-        assert len(texts) == 20
-        assert len({id(text) for text in texts}) == 1
-
-    run(body)
+async def test_a_message_is_encoded_once_for_all_browsers() -> None:
+    hub, _ = make()
+    browsers = [opened(hub, look="device", device="bow") for _ in range(20)]
+    hub.spread(news(1, 120))
+    texts = []
+    for browser in browsers:
+        while browser.mailbox.waiting:
+            text = await browser.mailbox.take()
+            if '"samples"' in text:
+                texts.append(text)
+    assert len(texts) == 20
+    assert len({id(text) for text in texts}) == 1
 
 
-def test_the_overview_has_a_row_per_device_and_the_page_its_whole_status() -> None:
-    async def body() -> None:
-        hub, _ = make()
-        overview = opened(hub, look="overview")
-        page = opened(hub, look="device", device="bow")
-        gone = opened(hub, look="device", device="gone")
-        statuses = (device("bow"), device("stern", 1, state=DeviceState.MISSING, problem="it is not there"))
-        asked_ns = sample("bow").t_ns + 500_000_000
-        hub.spread(News(statuses=statuses, clients=3, newest=(sample("bow"),), newest_ns=asked_ns, now_ns=asked_ns + 7))
-        (message,) = await heard(overview, "overview")
-        bow, stern = message["devices"]
-        assert (message["clients"], bow["name"], bow["is_well"], bow["age_s"]) == (3, "bow", True, 0.5)
-        assert (stern["problem"], stern["is_well"], stern["age_s"]) == ("it is not there", False, None)
-        (status,) = await heard(page, "status")
-        assert status["status"]["ledger"] == statuses[0].ledger
-        assert (status["bytes_open"], status["frames_open"], status["lost"]) == (0, 0, bow["lost"])
-        assert (await heard(gone, "status"))[0]["status"] is None
-
-    run(body)
+async def test_the_overview_has_a_row_per_device_and_the_page_its_whole_status() -> None:
+    hub, _ = make()
+    overview = opened(hub, look="overview")
+    page = opened(hub, look="device", device="bow")
+    gone = opened(hub, look="device", device="gone")
+    statuses = (device("bow"), device("stern", 1, state=DeviceState.MISSING, problem="it is not there"))
+    asked_ns = sample("bow").t_ns + 500_000_000
+    hub.spread(News(statuses=statuses, clients=3, newest=(sample("bow"),), newest_ns=asked_ns, now_ns=asked_ns + 7))
+    (message,) = await heard(overview, "overview")
+    bow, stern = message["devices"]
+    assert (message["clients"], bow["name"], bow["is_well"], bow["age_s"]) == (3, "bow", True, 0.5)
+    assert (stern["problem"], stern["is_well"], stern["age_s"]) == ("it is not there", False, None)
+    (status,) = await heard(page, "status")
+    assert status["status"]["ledger"] == statuses[0].ledger
+    assert (status["bytes_open"], status["frames_open"], status["lost"]) == (0, 0, bow["lost"])
+    assert (await heard(gone, "status"))[0]["status"] is None
 
 
-def test_the_state_comes_once_and_again_when_it_changes() -> None:
-    async def body() -> None:
-        hub, _ = make()
-        browser = opened(hub, look="overview")
-        assert [one["problem"] for one in await heard(browser)] == ["connecting to the daemon"]
-        hub.spread(News(hello=HELLO))
-        (state,) = await heard(browser, "state")
-        assert (state["problem"], state["version"], state["epoch"]) == ("", "0.1.0", str(2**62 + 1))
-        hub.spread(News())
-        assert await heard(browser, "state") == []
-        hub.spread(News("the connection is lost"))
-        assert [one["problem"] for one in await heard(browser, "state")] == ["the connection is lost"]
-        late = opened(hub, look="overview")
-        assert (await heard(late, "state"))[0]["problem"] == "the connection is lost"
-
-    run(body)
+async def test_the_state_comes_once_and_again_when_it_changes() -> None:
+    hub, _ = make()
+    browser = opened(hub, look="overview")
+    assert [one["problem"] for one in await heard(browser)] == ["connecting to the daemon"]
+    hub.spread(News(hello=HELLO))
+    (state,) = await heard(browser, "state")
+    assert (state["problem"], state["version"], state["epoch"]) == ("", "0.1.0", str(2**62 + 1))
+    hub.spread(News())
+    assert await heard(browser, "state") == []
+    hub.spread(News("the connection is lost"))
+    assert [one["problem"] for one in await heard(browser, "state")] == ["the connection is lost"]
+    late = opened(hub, look="overview")
+    assert (await heard(late, "state"))[0]["problem"] == "the connection is lost"
 
 
-def test_events_come_and_new_pages_get_those_that_are_remembered() -> None:
-    async def body() -> None:
-        hub, _ = make()
-        browser = opened(hub, look="overview")
-        for number in range(EVENTS_KEPT + 1):
-            hub.spread(News(events=(Event(number * 10**9, "bow", EventKind.UP, str(number), {"n": number}),)))
-        (last,) = (await heard(browser, "events"))[-1]["events"]
-        assert last == {
-            "t_s": float(EVENTS_KEPT), "device": "bow", "event": "up", "message": str(EVENTS_KEPT),
-            "detail": {"n": EVENTS_KEPT},
-        }  # fmt: skip
-        (late,) = await heard(opened(hub, look="device", device="bow"), "events")
-        assert [event["message"] for event in late["events"]] == [str(number) for number in range(1, EVENTS_KEPT + 1)]
-
-    run(body)
+async def test_events_come_and_new_pages_get_those_that_are_remembered() -> None:
+    hub, _ = make()
+    browser = opened(hub, look="overview")
+    for number in range(EVENTS_KEPT + 1):
+        hub.spread(News(events=(Event(number * 10**9, "bow", EventKind.UP, str(number), {"n": number}),)))
+    (last,) = (await heard(browser, "events"))[-1]["events"]
+    assert last == {
+        "t_s": float(EVENTS_KEPT), "device": "bow", "event": "up", "message": str(EVENTS_KEPT),
+        "detail": {"n": EVENTS_KEPT},
+    }  # fmt: skip
+    (late,) = await heard(opened(hub, look="device", device="bow"), "events")
+    assert [event["message"] for event in late["events"]] == [str(number) for number in range(1, EVENTS_KEPT + 1)]
 
 
-def test_the_progress_of_a_calibration_is_not_remembered_and_its_begin_and_end_are() -> None:
+async def test_the_progress_of_a_calibration_is_not_remembered_and_its_begin_and_end_are() -> None:
     def turning(phase: str) -> Event:
         return Event(1, "bow", EventKind.CALIBRATION, phase, {"kind": "magnetometer", "phase": phase})
 
-    async def body() -> None:
-        hub, _ = make()
-        browser = opened(hub, look="device", device="bow")
-        for phase in ("begin", "turn", "rest", "turn", "end"):
-            hub.spread(News(events=(turning(phase),)))
-        assert len(await heard(browser, "events")) == 5
-        (late,) = await heard(opened(hub, look="device", device="bow"), "events")
-        assert [event["message"] for event in late["events"]] == ["begin", "end"]
-
-    run(body)
+    hub, _ = make()
+    browser = opened(hub, look="device", device="bow")
+    for phase in ("begin", "turn", "rest", "turn", "end"):
+        hub.spread(News(events=(turning(phase),)))
+    assert len(await heard(browser, "events")) == 5
+    (late,) = await heard(opened(hub, look="device", device="bow"), "events")
+    assert [event["message"] for event in late["events"]] == ["begin", "end"]
 
 
-def test_a_browser_that_reads_nothing_holds_up_no_other_and_is_told_what_it_missed() -> None:
-    async def body() -> None:
-        hub, _ = make()
-        slow = opened(hub, look="device", device="bow", rate_hz=50)
-        quick = opened(hub, look="device", device="bow", rate_hz=50)
-        seen = 0
-        for number in range(300):
-            hub.spread(news(1 + 20 * number, 20))
-            seen += len(await heard(quick, "samples"))
-            quick.mailbox.acknowledge(10)
-        assert seen == 300
-        assert quick.mailbox.dropped == 0
-        assert slow.mailbox.waiting < 110
-        assert slow.mailbox.dropped > 150
-        assert {"kind": "dropped", "messages": slow.mailbox.dropped, "samples": 0} in await heard(slow)
-
-    run(body)
+async def test_a_browser_that_reads_nothing_holds_up_no_other_and_is_told_what_it_missed() -> None:
+    hub, _ = make()
+    slow = opened(hub, look="device", device="bow", rate_hz=50)
+    quick = opened(hub, look="device", device="bow", rate_hz=50)
+    seen = 0
+    for number in range(300):
+        hub.spread(news(1 + 20 * number, 20))
+        seen += len(await heard(quick, "samples"))
+        quick.mailbox.acknowledge(10)
+    assert seen == 300
+    assert quick.mailbox.dropped == 0
+    assert slow.mailbox.waiting < 110
+    assert slow.mailbox.dropped > 150
+    assert {"kind": "dropped", "messages": slow.mailbox.dropped, "samples": 0} in await heard(slow)
 
 
-def test_samples_that_the_daemon_dropped_are_told() -> None:
-    async def body() -> None:
-        hub, _ = make()
-        browser = opened(hub, look="device", device="bow")
-        hub.spread(news(1, 60, dropped=12))
-        assert {"kind": "dropped", "messages": 0, "samples": 12} in await heard(browser)
-
-    run(body)
+async def test_samples_that_the_daemon_dropped_are_told() -> None:
+    hub, _ = make()
+    browser = opened(hub, look="device", device="bow")
+    hub.spread(news(1, 60, dropped=12))
+    assert {"kind": "dropped", "messages": 0, "samples": 12} in await heard(browser)
 
 
 def test_a_loop_that_is_behind_lets_the_feed_wait() -> None:
@@ -251,20 +218,17 @@ def test_a_loop_that_is_behind_lets_the_feed_wait() -> None:
     assert len(waiting) == WAITING_MAX
 
 
-def test_devices_beyond_the_most_are_said_to_be() -> None:
-    async def body() -> None:
-        hub, feed = make()
-        for number in range(DEVICES_MAX):
-            opened(hub, look="device", device=f"imu{number}")
-        late = opened(hub, look="device", device="a")
-        assert any("most" in one["message"] for one in await heard(late, "problem"))
-        wanted = feed.wanted[-1]
-        assert wanted is not None
-        assert wanted.devices is not None
-        assert len(wanted.devices) == DEVICES_MAX
-        assert "a" not in wanted.devices
-
-    run(body)
+async def test_devices_beyond_the_most_are_said_to_be() -> None:
+    hub, feed = make()
+    for number in range(DEVICES_MAX):
+        opened(hub, look="device", device=f"imu{number}")
+    late = opened(hub, look="device", device="a")
+    assert any("most" in one["message"] for one in await heard(late, "problem"))
+    wanted = feed.wanted[-1]
+    assert wanted is not None
+    assert wanted.devices is not None
+    assert len(wanted.devices) == DEVICES_MAX
+    assert "a" not in wanted.devices
 
 
 def test_a_ledger_of_another_version_counts_as_zero_what_it_does_not_have() -> None:
