@@ -22,13 +22,17 @@ ALPHAS = {
 }  # fmt: skip
 
 
-def test_a_deviation_by_hand() -> None:
+def test_a_deviation_and_an_interval_by_hand() -> None:
     rate = np.array([[1.0], [2.0], [4.0], [3.0]])  # differences of neighbours 1, 2, -1: 6 / (2 · 3) = 1
     curve = allan_curve([rate], 1.0, np.array([1]))
     assert curve.deviation[0, 0] == pytest.approx(1.0)
     means = [1.5, 3.0, 3.5]  # two samples each, overlapping: the first and the last differ by 2
     curve = allan_curve([rate], 1.0, np.array([2]))
     assert curve.deviation[0, 0] == pytest.approx((means[2] - means[0]) / np.sqrt(2))
+    # χ² of 10 degrees of freedom at 5 and 95 %: 3.940 and 18.307 (any table)
+    low, high = interval(np.array([1.0]), np.array([10.0]), confidence=0.9)
+    assert low[0] == pytest.approx(np.sqrt(10 / 18.307), rel=1e-4)
+    assert high[0] == pytest.approx(np.sqrt(10 / 3.940), rel=1e-4)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -73,13 +77,6 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     assert held / rounds == pytest.approx([0.683] * 3, abs=0.08)
 
 
-def test_an_interval_by_hand() -> None:
-    # χ² of 10 degrees of freedom at 5 and 95 %: 3.940 and 18.307 (any table)
-    low, high = interval(np.array([1.0]), np.array([10.0]), confidence=0.9)
-    assert low[0] == pytest.approx(np.sqrt(10 / 18.307), rel=1e-4)
-    assert high[0] == pytest.approx(np.sqrt(10 / 3.940), rel=1e-4)
-
-
 @pytest.mark.parametrize(
     ("made", "expected"),
     [
@@ -96,20 +93,14 @@ def test_types_of_noise_are_recognised(made: FloatArray, expected: NoiseType) ->
     assert types[2, 0] == types[1, 0], "too few averages: as at the τ before"
 
 
-def test_factors_are_even_in_the_logarithm() -> None:
+def test_factors_a_constant_and_a_short_run() -> None:
     factors = averaging_factors(3000)
     assert factors[0] == 1
     assert factors[-1] == 1000
     assert len(factors) > 24
     with pytest.raises(BadArgument, match="at least 3 samples"):
         averaging_factors(2)
-
-
-def test_a_constant_has_no_deviation() -> None:
     curve = allan_curve([np.full((200, 3), 9.81)], 100.0)
     assert curve.deviation == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_run_that_is_too_short_is_refused() -> None:
     with pytest.raises(BadArgument, match="at least 200 samples"):
         allan_curve([np.zeros((50, 1))], 1.0, np.array([100]))

@@ -81,12 +81,9 @@ def test_drift_with_temperature() -> None:
     assert slopes[2].slope == pytest.approx(-2e-3, rel=0.02)
 
 
-def test_a_temperature_that_hardly_changes_has_no_slope() -> None:
+def test_a_temperature_that_hardly_changes_or_comes_now_and_then() -> None:
     temperature = np.linspace(20.0, 21.5, COUNT)
     assert temperature_drift(temperature, noise_of_three(7)[:, 0], RATE_HZ) is None
-
-
-def test_temperatures_that_come_now_and_then_are_used() -> None:
     temperature = np.full(COUNT, np.nan)
     temperature[:: int(RATE_HZ)] = np.linspace(20.0, 40.0, COUNT // int(RATE_HZ))
     values = noise_of_three(8, 1e-4) + np.outer(np.linspace(-10, 10, COUNT), [1e-3] * 3)
@@ -95,14 +92,11 @@ def test_temperatures_that_come_now_and_then_are_used() -> None:
     assert drift.slope == pytest.approx(1e-3, rel=0.02)
 
 
-def test_seconds_in_which_it_was_moved_are_counted() -> None:
+def test_disturbances_and_counts() -> None:
     values = noise_of_three(9)
     values[2000:2010] += 1.0
     values[30_000:30_400] += np.sin(np.arange(400))[:, None]
     assert sensor_noise(readings_of(values), values).disturbed_s == 3
-
-
-def test_counts_are_recognised() -> None:
     values = np.round(noise_of_three(10) / 1.065e-3) * 1.065e-3
     assert step_of(values) == pytest.approx(1.065e-3)
     assert step_of(noise_of_three(10)) is None

@@ -18,12 +18,11 @@ def terms_of(series: FloatArray, rate_hz: float = RATE_HZ) -> NoiseTerms:
     return noise_terms(allan_curve([series[:, None]], rate_hz), 0)
 
 
-def test_the_factor_of_the_bias_instability() -> None:
+def test_basis_factor_and_a_constant() -> None:
     assert pytest.approx(0.664, abs=5e-4) == BIAS_FACTOR
-
-
-def test_the_basis_by_hand() -> None:
     assert basis(np.array([2.0]))[0] == pytest.approx([3 / 4, 1 / 2, 2 * np.log(2) / np.pi, 2 / 3, 2.0])
+    found = terms_of(np.zeros(500))
+    assert all(term.value is None for term in found)
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
@@ -108,8 +107,3 @@ def test_short_filtered_points_are_left_out() -> None:
     assert noise_terms(curve, 0, tau_least_s=0.8).random_walk.value == pytest.approx(1e-3, rel=WITHIN)
     with pytest.raises(BadArgument, match="a longer series is needed"):
         noise_terms(curve, 0, tau_least_s=curve.tau_s[-3])
-
-
-def test_a_constant_has_no_noise() -> None:
-    found = terms_of(np.zeros(500))
-    assert all(term.value is None for term in found)

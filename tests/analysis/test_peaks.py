@@ -79,24 +79,18 @@ def test_fewer_averages_need_a_higher_line() -> None:
     assert threshold(few) > threshold(many) == 4.0
 
 
-def test_bands_add_up_to_the_whole() -> None:
+def test_bands() -> None:
     series = white(np.random.default_rng(11), 50_000, RATE_HZ, 1.0)
     spectrum = power_spectrum([three(series)], RATE_HZ, SIZE)
     low, middle, high = bands_of(spectrum, [(0, 40), (40, 100.3), (100.3, 200)])
     together = np.sqrt(low.rms[0] ** 2 + middle.rms[0] ** 2 + high.rms[0] ** 2)
     assert together == pytest.approx(series.std(), rel=0.01)
     assert middle.rms[0] == pytest.approx(np.sqrt(2 * 60.3), rel=0.03)
-
-
-def test_octaves_by_default() -> None:
     found = bands_of(power_spectrum([three(white(np.random.default_rng(12), 9000, RATE_HZ, 1.0))], RATE_HZ, SIZE))
     edges = [(band.low_hz, band.high_hz) for band in found]
     assert edges[-2:] == [(64.0, 128.0), (128.0, 200.0)]
     assert edges[0][0] == pytest.approx(3 * BIN_HZ)
     assert all(one[1] == other[0] for one, other in pairwise(edges))
-
-
-def test_the_power_of_a_line_is_in_its_band() -> None:
     spectrum = power_spectrum([three(line(20_000, 50.0, 2.0))], RATE_HZ, SIZE)
     assert bands_of(spectrum, [(40, 60)])[0].rms[0] == pytest.approx(np.sqrt(2), rel=1e-3)
 

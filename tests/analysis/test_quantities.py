@@ -10,7 +10,7 @@ def unit_of(sensor: str, key: str, place: int = 0) -> float:
     return next(one for one in quantities if one.key == key).units[place].factor
 
 
-def test_units_of_a_gyroscope() -> None:
+def test_units() -> None:
     # 1 deg/√h = 1 deg / 60 √s: 2.9088821e-4 rad/√s
     assert 2.9088821e-4 * unit_of("gyro", "random_walk") == pytest.approx(1.0, rel=1e-7)
     # 1 deg/h = π / 180 / 3600: 4.8481368e-6 rad/s
@@ -20,17 +20,11 @@ def test_units_of_a_gyroscope() -> None:
     # 1 deg/h/h = 4.8481368e-6 / 3600
     assert 1.3467047e-9 * unit_of("gyro", "rate_ramp") == pytest.approx(1.0, rel=1e-7)
     assert 0.017453293 * unit_of("gyro", "noise_density") == pytest.approx(1.0, rel=1e-7)
-
-
-def test_units_of_an_accelerometer() -> None:
     assert unit_of("accel", "random_walk") / 60 == pytest.approx(1.0), "1 m/s/√h = 1 m/s / 60 √s"
     assert 9.80665e-6 * unit_of("accel", "random_walk", 1) == pytest.approx(1.0)
     assert 9.80665e-3 * unit_of("accel", "bias_instability") == pytest.approx(1.0)
     assert 9.80665e-6 * unit_of("accel", "noise_density") == pytest.approx(1.0)
     assert 9.80665e-3 / 60 * unit_of("accel", "rate_random_walk") == pytest.approx(1.0)
-
-
-def test_both_sensors_have_the_same_figures() -> None:
     gyro, accel = ([one.key for one in QUANTITIES[name]] for name in QUANTITIES)
     assert gyro == accel
 

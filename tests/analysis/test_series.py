@@ -8,30 +8,28 @@ from imud.errors import BadArgument
 from tests.analysis.synthetic import stamps_ns
 
 
-def test_the_rate_is_that_of_the_stamps() -> None:
+def test_rate_missing_samples_and_runs() -> None:
     grid = grid_of(stamps_ns(1000, 408.0))
     assert grid.rate_hz == pytest.approx(408.0, rel=1e-6)
     assert grid.missing == 0
     assert grid.runs == ((0, 1000),)
     assert grid.duration_s == pytest.approx(1000 / 408)
     assert "no sample is missing" in grid.words()
-
-
-def test_missing_samples_are_found_and_filled() -> None:
     t_ns = np.delete(stamps_ns(1000, 100.0), [10, 500, 501])
     grid = grid_of(t_ns)
     assert (grid.missing, grid.filled, grid.runs) == (3, 3, ((0, 997),))
     assert grid.place[9] == 9
     assert grid.place[10] == 11
     assert "3 samples are missing (0.30 %)" in grid.words()
-
-
-def test_a_longer_gap_ends_a_run() -> None:
     gone = list(range(300, 300 + FILL_MOST + 1))
     grid = grid_of(np.delete(stamps_ns(1000, 100.0), gone))
     assert grid.runs == ((0, 300), (300, 995))
     assert (grid.missing, grid.filled) == (5, 0)
     assert "2 runs" in grid.words()
+    first, second = stamps_ns(1000, 100.0), stamps_ns(1000, 100.0, 1_000_000_000 + 13_333_000_000)
+    grid = grid_of(np.concatenate((first, second)))
+    assert grid.rate_hz == pytest.approx(100.0, rel=1e-7)
+    assert len(grid.runs) == 2
 
 
 @pytest.mark.parametrize("rate_hz", [300.0, 400.0, 667.0])
@@ -40,13 +38,6 @@ def test_stamps_in_whole_milliseconds_hide_neither_rate_nor_gap(rate_hz: float) 
     grid = grid_of(t_ns)
     assert grid.rate_hz == pytest.approx(rate_hz, rel=1e-5)
     assert grid.missing == 1
-
-
-def test_the_pause_between_runs_does_not_move_the_rate() -> None:
-    first, second = stamps_ns(1000, 100.0), stamps_ns(1000, 100.0, 1_000_000_000 + 13_333_000_000)
-    grid = grid_of(np.concatenate((first, second)))
-    assert grid.rate_hz == pytest.approx(100.0, rel=1e-7)
-    assert len(grid.runs) == 2
 
 
 def test_scattered_stamps_are_said_to_hide_gaps() -> None:
@@ -82,13 +73,10 @@ def test_what_is_no_series_is_refused(t_ns: np.ndarray, words: str) -> None:
         grid_of(t_ns)
 
 
-def test_samples_without_a_value_are_left_out() -> None:
+def test_samples_without_a_value_and_duration() -> None:
     values = np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0], [4.0, 5.0, 6.0]])
     t_ns, found = with_values(np.array([1, 2, 3]), values)
     assert t_ns.tolist() == [1, 3]
     assert found.tolist() == [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
-
-
-def test_the_duration_of_readings() -> None:
     assert Readings(stamps_ns(101, 100.0), None, None, None).duration_s == pytest.approx(1.0)
     assert Readings(np.array([], dtype=np.int64), None, None, None).duration_s == 0.0

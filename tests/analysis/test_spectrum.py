@@ -11,22 +11,16 @@ from tests.analysis.synthetic import white
 RATE_HZ = 500.0
 
 
-def test_it_is_that_of_scipy() -> None:
+def test_density_and_bandwidth() -> None:
     series = white(np.random.default_rng(1), 10_000, RATE_HZ, 1.0)
     found = power_spectrum([series[:, None]], RATE_HZ, 1024)
     frequency, density = welch(series, RATE_HZ, nperseg=1024)
     assert found.frequency_hz == pytest.approx(frequency)
     assert found.density[:, 0] == pytest.approx(density, rel=1e-9, abs=1e-15)
-
-
-def test_white_noise_has_its_density_and_its_power() -> None:
     series = white(np.random.default_rng(2), 200_000, RATE_HZ, 1e-2)
     found = power_spectrum([series[:, None]], RATE_HZ)
     assert found.density[5:-5, 0].mean() == pytest.approx(2 * 1e-4, rel=0.01), "one-sided: 2 N²"
     assert found.density[:, 0].sum() * found.bin_hz == pytest.approx(series.var(), rel=0.01)
-
-
-def test_the_noise_bandwidth_of_hann_is_one_and_a_half_bins() -> None:
     found = power_spectrum([white(np.random.default_rng(3), 5000, RATE_HZ, 1.0)[:, None]], RATE_HZ, 256)
     assert found.bandwidth_hz / found.bin_hz == pytest.approx(1.5, rel=1e-6)
     assert noise_bandwidth(np.ones(10), 10.0) == pytest.approx(1.0)

@@ -7,7 +7,7 @@ import pytest
 from imud.bridges.cdr import ENCAPSULATION, CdrWriter, Layout
 
 
-def test_numbers_are_aligned_to_their_size_behind_the_encapsulation() -> None:
+def test_numbers_and_texts_are_aligned() -> None:
     layout = Layout("B", "I", "B", "d", "H")
     assert layout.pack(ENCAPSULATION, 1, 2, 3, 1.0, 4) == bytes.fromhex(
         "00010000"  # CDR_LE
@@ -17,32 +17,17 @@ def test_numbers_are_aligned_to_their_size_behind_the_encapsulation() -> None:
         "000000000000f03f"
         "0400"
     )
-
-
-def test_a_text_has_its_length_with_the_nul_before_it() -> None:
     layout = Layout("B", '"bow', "I")
     assert layout.texts == (bytes.fromhex("04000000 626f7700"),)
     assert layout.pack(ENCAPSULATION, 7, *layout.texts, 5) == bytes.fromhex(
         "00010000 07000000 04000000 626f7700 05000000"
     )
-
-
-def test_what_follows_a_text_is_aligned() -> None:
     layout = Layout('"ab', "2d")
     packed = layout.pack(ENCAPSULATION, *layout.texts, 1.0, 2.0)
     assert packed == bytes.fromhex("00010000 03000000 616200 00") + struct.pack("<2d", 1.0, 2.0)
-
-
-def test_a_writer_makes_the_same_as_a_layout() -> None:
     layout = Layout("B", '"boé', "q", "H")
     written = CdrWriter().number("B", 9).text("boé").number("q", -1).number("H", 3).done()
     assert written == layout.pack(ENCAPSULATION, 9, *layout.texts, -1, 3)
-
-
-def test_a_nul_inside_a_text_ends_nothing() -> None:
     assert CdrWriter().text("a\0b").done() == bytes.fromhex("00010000 03000000 616200")
-
-
-def test_a_number_that_does_not_fit_is_an_error() -> None:
     with pytest.raises(struct.error):
         CdrWriter().number("B", 256)

@@ -14,38 +14,26 @@ def test_topics_are_names_that_ros_2_takes(device: str, expected: str) -> None:
     assert topic(device, "imu/data") == expected
 
 
-def test_frames_of_a_device_with_north() -> None:
+def test_frames_covariances_and_warnings() -> None:
     assert MessageFrames("bow").body == "bow"
     assert MessageFrames("bow").navigation == "enu"
     assert MessageFrames("bow", Convention.NED_FRD).body == "bow_frd"
     assert MessageFrames("bow", Convention.NED_FRD).navigation == "ned"
-
-
-def test_a_device_without_north_shares_no_navigation_frame_with_others() -> None:
     assert MessageFrames("bow", has_north=False).navigation == "bow_level"
     assert MessageFrames("bow", Convention.NED_FRD, has_north=False).navigation == "bow_level_ned"
-
-
-def test_covariances() -> None:
     assert covariance(None) == 9 * (0.0,)  # not known
     assert covariance(None, present=False) == (-1.0, *(8 * (0.0,)))  # no such value
     assert covariance(0.5) == (0.25, 0, 0, 0, 0.25, 0, 0, 0, 0.25)
     assert covariance(0.5, present=False)[0] == -1
+    assert StampedEvent(Event(1, "bow", EventKind.DOWN, "gone"), 2).is_warning
+    assert not StampedEvent(Event(1, "bow", EventKind.UP, "there"), 2).is_warning
 
 
-def test_a_steady_value_passes_when_it_changes_and_once_a_second() -> None:
+def test_a_steady_value_passes_when_it_changes_once_a_second_and_after_a_step_of_the_clock() -> None:
     steady = Steady()
     passed = [steady.passes(20.0 if t < 5 else 21.0, t * STEADY_NS // 4) for t in range(13)]
     assert [t for t, one in enumerate(passed) if one] == [0, 4, 5, 9]
-
-
-def test_a_steady_value_passes_after_the_clock_was_set_back() -> None:
     steady = Steady()
     assert steady.passes(20.0, 100 * STEADY_NS)
     assert steady.passes(20.0, 50 * STEADY_NS)
     assert not steady.passes(20.0, 50 * STEADY_NS + 1)
-
-
-def test_what_is_a_warning() -> None:
-    assert StampedEvent(Event(1, "bow", EventKind.DOWN, "gone"), 2).is_warning
-    assert not StampedEvent(Event(1, "bow", EventKind.UP, "there"), 2).is_warning

@@ -42,7 +42,7 @@ def read(channel: MessageChannel[Any], item: object) -> Any:
     return message
 
 
-def test_imu() -> None:
+def test_quantities() -> None:
     assert read(channels()["/bow/imu/data"], FULL) == {
         "timestamp": STAMP,
         "frame_id": "bow",
@@ -50,9 +50,6 @@ def test_imu() -> None:
         "angular_velocity": {"x": 0.25, "y": 0.5, "z": -0.75},
         "linear_acceleration": {"x": 0.125, "y": -0.5, "z": 9.75},
     }
-
-
-def test_what_is_missing_is_left_out_and_nan_is_null() -> None:
     assert read(channels()["/bow/imu/data"], BARE) == {
         "timestamp": {"sec": 1_790_000_000, "nsec": 133_456_789},
         "frame_id": "bow",
@@ -60,9 +57,6 @@ def test_what_is_missing_is_left_out_and_nan_is_null() -> None:
     }
     for name in ("imu/mag", "temperature", "pressure", "attitude"):
         assert channels()[f"/bow/{name}"].encode(BARE) is None
-
-
-def test_covariances_where_they_are_known() -> None:
     made = channels(MessageFrames("bow", deviations=Deviations(gyro_rad_s=0.5, mag_t=2.0, pressure_pa=10.0)))
     imu = read(made["/bow/imu/data"], FULL)
     assert imu["angular_velocity_covariance"] == [0.25, 0, 0, 0, 0.25, 0, 0, 0, 0.25]
@@ -71,16 +65,13 @@ def test_covariances_where_they_are_known() -> None:
     assert read(made["/bow/pressure"], FULL) == {
         "timestamp": STAMP, "frame_id": "bow", "fluid_pressure": 101325.0, "variance": 100.0
     }  # fmt: skip
-
-
-def test_magnetic_field_and_temperature() -> None:
     made = channels()
     assert read(made["/bow/imu/mag"], FULL)["magnetic_field"] == {"x": 1e-5, "y": -2e-5, "z": 4e-5}
     assert read(made["/bow/temperature"], FULL) == {"timestamp": STAMP, "frame_id": "bow", "temperature": 31.5}
     assert made["/bow/temperature"].encode(FULL) is None  # the same, at once again
 
 
-def test_attitude_is_the_transform_of_foxglove() -> None:
+def test_attitude_and_stamp() -> None:
     channel = channels(MessageFrames("bow", has_north=False))["/bow/attitude"]
     assert channel.schema.name == "foxglove.FrameTransform"
     assert read(channel, FULL) == {
@@ -90,9 +81,6 @@ def test_attitude_is_the_transform_of_foxglove() -> None:
         "translation": {"x": 0.0, "y": 0.0, "z": 0.0},
         "rotation": {"x": 0.5, "y": -0.5, "z": 0.5, "w": 0.5},
     }
-
-
-def test_the_stamp_has_what_has_no_other_place() -> None:
     message = read(channels()["/bow/stamp"], FULL)
     assert message.pop("timestamp") == STAMP
     assert message == {
@@ -101,23 +89,17 @@ def test_the_stamp_has_what_has_no_other_place() -> None:
         "pps_age_ms": 40, "edge_seq": 9,
     }  # fmt: skip
     assert "t_dev_ns" not in read(channels()["/bow/stamp"], BARE)
-
-
-def test_every_field_of_a_sample_is_in_a_channel() -> None:
     said = {field for channel in channels().values() for field in channel.fields}
     assert said == set(Sample.__struct_fields__) - {"device"}
 
 
-def test_events_are_the_log_of_foxglove() -> None:
+def test_events_losses_status_and_diagnoses() -> None:
     channel = DIALECT.events()
     assert channel.schema.name == "foxglove.Log"
     message = read(channel, StampedEvent(EVENT, UTC_NS))
     assert message == {
         "timestamp": STAMP, "level": 3, "message": 'loss: lost 3, "damaged"', "name": "bow", "file": "", "line": 0
     }  # fmt: skip
-
-
-def test_losses_and_status() -> None:
     losses = read(DIALECT.losses("bow"), LossCounts(1, UTC_NS, "bow", 100, 1, 2, 3, 4, 5))
     assert losses == {
         "timestamp": STAMP, "samples": 100, "lost_gap_device": 1, "lost_crc": 2, "lost_overrun": 3, "lost_queue": 4,
@@ -125,9 +107,6 @@ def test_losses_and_status() -> None:
     }  # fmt: skip
     status = read(status_channel("bow"), (device_status("bow", 0), UTC_NS))
     assert (status["state"], status["rate_hz"], status["clock"]["sync"]) == ("running", 1000.0, "regression")
-
-
-def test_diagnoses() -> None:
     bow = Diagnosis("bow", DiagnosisLevel.WARN, "searching", "17", {"t_err_ns": "12000"})
     assert read(DIALECT.diagnostics(), Diagnoses(UTC_NS, (bow,))) == {
         "header": {"stamp": STAMP, "frame_id": ""},

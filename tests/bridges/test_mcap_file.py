@@ -53,15 +53,12 @@ def whole() -> tuple[BytesIO, list[tuple[str, int, bytes]]]:
 Whole = tuple[BytesIO, list[tuple[str, int, bytes]]]
 
 
-def test_every_message_is_read_back(whole: Whole) -> None:
+def test_a_file_is_read_back_by_order_index_and_summary(whole: Whole) -> None:
     out, messages = whole
     out.seek(0)
     assert read(SeekingReader(out, validate_crcs=True)) == messages
     out.seek(0)
     assert read(NonSeekingReader(out, validate_crcs=True)) == messages
-
-
-def test_a_span_of_one_topic_is_found_by_the_indexes(whole: Whole) -> None:
     out, messages = whole
     out.seek(0)
     reader = SeekingReader(out)
@@ -71,9 +68,6 @@ def test_a_span_of_one_topic_is_found_by_the_indexes(whole: Whole) -> None:
     ]
     assert found == [t_ns for name, t_ns, _ in messages if name == "/second" and 12_000 <= t_ns < 13_000]
     assert len(found) == 100
-
-
-def test_the_summary_counts_what_is_there(whole: Whole) -> None:
     out, messages = whole
     out.seek(0)
     reader = SeekingReader(out)
@@ -88,9 +82,6 @@ def test_the_summary_counts_what_is_there(whole: Whole) -> None:
     assert {schema.name for schema in summary.schemas.values()} == {"a.B", "c.D"}
     assert reader.get_header().profile == "ros2"
     assert [(one.name, one.metadata) for one in reader.iter_metadata()] == [("imud", {"source": "a.imudrec"})]
-
-
-def test_chunks_are_bounded_and_compressed(whole: Whole) -> None:
     out, _ = whole
     out.seek(0)
     chunks = [one for one in StreamReader(out, emit_chunks=True).records if isinstance(one, Chunk)]
@@ -110,7 +101,7 @@ def test_a_file_that_was_cut_has_its_chunks_before_the_cut(whole: Whole) -> None
     assert len(found) > len(messages) // 4
 
 
-def test_numbers_of_messages_and_times_out_of_range() -> None:
+def test_times_out_of_range_and_no_messages() -> None:
     out = BytesIO()
     file = McapFile(out, "", "imud", {})
     channel = file.add_channel(FIRST)
@@ -120,9 +111,6 @@ def test_numbers_of_messages_and_times_out_of_range() -> None:
     out.seek(0)
     messages = [message for _, _, message in SeekingReader(out).iter_messages(log_time_order=False)]
     assert [(one.sequence, one.log_time) for one in messages] == [(0, 0), (1, (1 << 64) - 1), (2, 7)]
-
-
-def test_a_file_without_messages_is_whole() -> None:
     out = BytesIO()
     McapFile(out, "", "imud", {}).finish()
     out.seek(0)

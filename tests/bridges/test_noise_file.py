@@ -33,25 +33,16 @@ def test_the_quadratic_mean_of_the_axes(tmp_path: Path) -> None:
     assert noise.gyro_rad_s == pytest.approx(0.005)  # (1 + 49 + 25) / 3 = 25
     assert noise.accel_m_s2 == pytest.approx(0.02)
     assert (noise.mag_t, noise.attitude_rad) == (None, None)
-
-
-def test_a_sensor_that_was_not_measured_or_never_changed_is_not_known(tmp_path: Path) -> None:
     assert read_noise(written(tmp_path, report(gyro=[0.0, 0.0, 0.0])))[1] == Deviations()
+    with pytest.raises(ImudError, match=r"nothing\.json: expected a report"):
+        read_noise(tmp_path / "nothing.json")
+    had = Deviations(gyro_rad_s=1.0, mag_t=2.0)
+    assert had.updated(Deviations(gyro_rad_s=3.0, accel_m_s2=4.0)) == Deviations(
+        gyro_rad_s=3.0, mag_t=2.0, accel_m_s2=4.0
+    )
 
 
 @pytest.mark.parametrize("content", [[], {}, {"measurement": {"device": "bow"}, "sensors": {"gyro": 1}}, "text"])
 def test_what_is_no_report_is_an_error_that_says_what_was_expected(tmp_path: Path, content: object) -> None:
     with pytest.raises(ImudError, match="expected a report of `imud noise --json`"):
         read_noise(written(tmp_path, content))
-
-
-def test_a_file_that_is_not_there_is_an_error_that_names_it(tmp_path: Path) -> None:
-    with pytest.raises(ImudError, match=r"nothing\.json: expected a report"):
-        read_noise(tmp_path / "nothing.json")
-
-
-def test_known_values_take_the_place_of_others() -> None:
-    had = Deviations(gyro_rad_s=1.0, mag_t=2.0)
-    assert had.updated(Deviations(gyro_rad_s=3.0, accel_m_s2=4.0)) == Deviations(
-        gyro_rad_s=3.0, mag_t=2.0, accel_m_s2=4.0
-    )

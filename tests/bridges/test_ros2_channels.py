@@ -44,7 +44,7 @@ def xyz(vector: Any) -> tuple[float, float, float]:
     return vector.x, vector.y, vector.z
 
 
-def test_imu_with_attitude() -> None:
+def test_quantities() -> None:
     imu = read(channels()["/bow/imu/data"], FULL)
     assert (imu.header.stamp.sec, imu.header.stamp.nanosec) == (1_790_000_000, 123_456_789)
     assert imu.header.frame_id == "bow"
@@ -54,9 +54,6 @@ def test_imu_with_attitude() -> None:
     for matrix in (imu.orientation_covariance, imu.angular_velocity_covariance, imu.linear_acceleration_covariance):
         assert list(matrix) == 9 * [0.0]
     assert channels()["/bow/imu/data_raw"].encode(FULL) is None
-
-
-def test_what_an_imu_does_not_send_has_minus_one_in_its_covariance() -> None:
     assert channels()["/bow/imu/data"].encode(BARE) is None
     imu = read(channels()["/bow/imu/data_raw"], BARE)
     assert imu.orientation_covariance[0] == -1
@@ -64,9 +61,6 @@ def test_what_an_imu_does_not_send_has_minus_one_in_its_covariance() -> None:
     assert imu.angular_velocity_covariance[0] == 0
     assert xyz(imu.angular_velocity)[0::2] == (0.0, 1.0)
     assert math.isnan(imu.angular_velocity.y)
-
-
-def test_known_noise_is_the_diagonal_of_the_covariance() -> None:
     noise = Deviations(accel_m_s2=0.5, gyro_rad_s=0.25, mag_t=2.0, attitude_rad=0.125, temperature_c=3.0)
     made = channels(MessageFrames("bow", deviations=noise))
     imu = read(made["/bow/imu/data"], FULL)
@@ -75,9 +69,6 @@ def test_known_noise_is_the_diagonal_of_the_covariance() -> None:
     assert imu.orientation_covariance[8] == 0.015625
     assert read(made["/bow/imu/mag"], FULL).magnetic_field_covariance[0] == 4.0
     assert read(made["/bow/temperature"], FULL).variance == 9.0
-
-
-def test_the_other_quantities() -> None:
     made = channels()
     assert xyz(read(made["/bow/imu/mag"], FULL).magnetic_field) == FULL.mag_t
     assert read(made["/bow/temperature"], FULL).temperature == 31.5
@@ -86,7 +77,7 @@ def test_the_other_quantities() -> None:
         assert made[f"/bow/{name}"].encode(BARE) is None
 
 
-def test_attitude_as_a_transform() -> None:
+def test_transform_and_stamp() -> None:
     tf = channels(MessageFrames("bow"))["/tf"]
     (transform,) = read(tf, FULL).transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("enu", "bow")
@@ -94,9 +85,6 @@ def test_attitude_as_a_transform() -> None:
     assert xyz(transform.transform.translation) == (0, 0, 0)
     assert transform.header.stamp.nanosec == 123_456_789
     assert tf.encode(BARE) is None
-
-
-def test_number_times_and_error_of_a_sample() -> None:
     stamp = channels()["/bow/stamp"]
     full, bare = read(stamp, FULL), read(stamp, BARE)
     assert (full.seq, full.t_ns, full.t_rx_ns, full.t_dev_ns) == (7, FULL.t_ns, FULL.t_rx_ns, 5_000_000)
@@ -122,16 +110,13 @@ def test_every_length_of_a_name_is_aligned(length: int) -> None:
             assert bytes(again) == data, where
 
 
-def test_losses_and_events() -> None:
+def test_losses_events_and_diagnoses() -> None:
     losses = read(DIALECT.losses("bow"), LossCounts(1, UTC_NS, "bow", 100, 1, 2, 3, 4, 5))
     assert (losses.samples, losses.lost_gap_device, losses.lost_crc) == (100, 1, 2)
     assert (losses.lost_overrun, losses.lost_queue, losses.lost_unknown) == (3, 4, 5)
     log = read(DIALECT.events(), StampedEvent(EVENT, UTC_NS))
     assert (log.level, log.name, log.msg) == (30, "bow", 'loss: lost 3, "damaged"')
     assert log.stamp.sec == 1_790_000_000
-
-
-def test_diagnoses() -> None:
     values = {"t_err_ns": "12000", "state": "running"}
     bow = Diagnosis("bow", DiagnosisLevel.OK, "running", "17", values)
     mast = Diagnosis("mast", DiagnosisLevel.STALE, "silent: nothing comes", "", {})
@@ -153,9 +138,6 @@ def test_definitions_are_those_of_ros_2() -> None:
         store = get_typestore(Stores.EMPTY)
         store.register(get_types_from_msg(schema(name).data.decode(), full))
         assert store.hash_rihs01(full) == ROS.hash_rihs01(full), name
-
-
-def test_a_definition_has_each_type_that_it_is_made_of_once() -> None:
     text = schema("tf2_msgs/TFMessage").data.decode()
     assert text.count("MSG: geometry_msgs/Quaternion") == 1
     assert text.count("MSG: builtin_interfaces/Time") == 1

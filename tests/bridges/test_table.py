@@ -14,16 +14,13 @@ from imud.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, Sample
 from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
 
 
-def test_columns_of_all_fields() -> None:
+def test_columns_and_rows() -> None:
     assert table.sample_columns(SAMPLE_FIELDS) == [
         "device", "seq", "t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns", "t_dev_ns",
         "accel_x_m_s2", "accel_y_m_s2", "accel_z_m_s2", "gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s",
         "mag_x_t", "mag_y_t", "mag_z_t", "quat_w", "quat_x", "quat_y", "quat_z", "roll_rad", "pitch_rad", "yaw_rad",
         "temperature_c", "pressure_pa", "incli_x_rad", "incli_y_rad", "status", "pps_age_ms", "edge_seq",
     ]  # fmt: skip
-
-
-def test_a_row_has_a_cell_for_each_column() -> None:
     names = SAMPLE_FIELDS
     row = table.sample_row(names)
     by_column = dict(zip(table.sample_columns(names), row(FULL), strict=True))
@@ -34,29 +31,17 @@ def test_a_row_has_a_cell_for_each_column() -> None:
     assert [name for name, cell in bare.items() if cell is not None] == [
         "device", "seq", "t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns", "gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s"
     ]  # fmt: skip
-
-
-def test_chosen_fields_are_in_the_order_that_was_asked_for() -> None:
     names = ("gyro_rad_s", "t_ns")
     assert table.sample_columns(names) == ["gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s", "t_ns"]
     assert table.sample_row(names)(FULL) == [0.25, 0.5, -0.75, FULL.t_ns]
-
-
-def test_without_times_their_cells_are_empty() -> None:
     names = ("seq", "t_ns", "utc_ns", "t_err_ns", "sync", "t_rx_ns", "t_dev_ns")
     assert table.sample_row(names, without_times=True)(FULL) == [7, None, None, None, None, None, 5_000_000]
-
-
-def test_events_and_losses() -> None:
     event = dict(zip(table.EVENT_COLUMNS, table.event_row(StampedEvent(EVENT, UTC_NS)), strict=True))
     assert (event["utc_ns"], event["device"], event["kind"]) == (UTC_NS, "bow", "loss")
     assert event["detail"] == '{"count":3,"cause":"crc"}'
     losses = LossCounts(1, UTC_NS, "bow", 100, 1, 2, 3, 4, 5)
-    row = dict(zip(table.LOSS_COLUMNS, table.loss_row(losses), strict=True))
-    assert (row["samples"], row["lost_crc"], row["lost_unknown"]) == (100, 2, 5)
-
-
-def test_every_array_has_a_column_for_each_of_its_numbers() -> None:
+    counts = dict(zip(table.LOSS_COLUMNS, table.loss_row(losses), strict=True))
+    assert (counts["samples"], counts["lost_crc"], counts["lost_unknown"]) == (100, 2, 5)
     lengths = {field.name: int(field.type[7:-1]) for field in SAMPLE_SCHEMA if field.type.startswith("number[")}
     assert {name: len(columns) for name, columns in table.AXES.items()} == lengths
 
@@ -113,18 +98,16 @@ def test_numbers_of_every_size_are_written_as_python_writes_them() -> None:
 VECTORS = ("accel_m_s2", "gyro_rad_s", "mag_t")
 
 
-def test_samples_that_have_different_fields_stand_in_one_text() -> None:
+def test_different_samples_in_one_text() -> None:
     whole = msgspec.structs.replace(BARE, temperature_c=21)
     samples = [FULL, BARE, msgspec.structs.replace(FULL, mag_t=(nan, 0.0, 0.0)), whole, BARE]
     for chosen in (samples, samples[:2], samples[3:], samples[1:2]):
         assert table.SampleText(SAMPLE_FIELDS).of(chosen) == by_rows(chosen)
     assert table.SampleText(("seq", "temperature_c")).of([whole]) == b"%d,21.0\r\n" % whole.seq
-
-
-def test_a_missing_value_is_not_taken_for_one_that_is_no_number() -> None:
-    """Both are null in JSON: as many of the one kind as of the other must not be confused."""
     samples = [msgspec.structs.replace(FULL, pressure_pa=None), msgspec.structs.replace(FULL, pressure_pa=nan)]
     assert table.SampleText(("seq", "pressure_pa")).of(samples) == b"7,\r\n7,nan\r\n"
+    names = ("seq", "t_ns", "utc_ns", "t_err_ns", "sync", "t_rx_ns", "t_dev_ns")
+    assert table.SampleText(names, without_times=True).of([FULL]) == b"7,,,,,,5000000\r\n"
 
 
 @pytest.mark.parametrize(
@@ -139,8 +122,3 @@ def test_the_name_of_a_device_stays_as_it_is(name: str) -> None:
 @pytest.mark.parametrize("field", ["status", "temperature_c", "device", "sync", "t_dev_ns", "incli_rad"])
 def test_a_field_alone(field: str) -> None:
     assert table.SampleText((field,)).of([BARE, FULL]) == by_rows([BARE, FULL], (field,))
-
-
-def test_text_without_times_has_empty_cells_for_them() -> None:
-    names = ("seq", "t_ns", "utc_ns", "t_err_ns", "sync", "t_rx_ns", "t_dev_ns")
-    assert table.SampleText(names, without_times=True).of([FULL]) == b"7,,,,,,5000000\r\n"

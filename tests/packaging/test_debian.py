@@ -56,7 +56,7 @@ def run_script(name: str, *arguments: str, root: Path) -> None:
     subprocess.run(["sh", "-c", moved, name, *arguments], check=True, timeout=30)
 
 
-def test_only_a_purge_removes_the_state(tmp_path: Path) -> None:
+def test_only_a_purge_removes_the_state_and_never_that_of_another_package(tmp_path: Path) -> None:
     state = tmp_path / "var/lib/imud/state.json"
     state.parent.mkdir(parents=True)
     state.touch()
@@ -65,6 +65,15 @@ def test_only_a_purge_removes_the_state(tmp_path: Path) -> None:
         assert state.exists(), action
     run_script("imud-daemon.postrm", "purge", root=tmp_path)
     assert not state.parent.exists()
+    unit, state = tmp_path / "usr/lib/systemd/system/imud.service", tmp_path / "var/lib/imud/theirs"
+    for path in (unit, state):
+        path.parent.mkdir(parents=True)
+        path.touch()
+    run_script("imud-daemon.postrm", "purge", root=tmp_path)
+    assert state.exists()
+    unit.unlink()
+    run_script("imud-daemon.postrm", "purge", root=tmp_path)
+    assert not state.exists()
 
 
 def test_what_was_compiled_at_the_installation_goes_before_the_package(tmp_path: Path) -> None:
@@ -96,7 +105,7 @@ def test_a_removal_stops_the_service_and_an_upgrade_does_not(tmp_path: Path, mon
     assert calls.read_text() == "stop imud-web.service imud.service\n"
 
 
-def test_control_has_what_debian_wants() -> None:
+def test_control_overrides_and_version() -> None:
     source, package = map(fields, (DEBIAN / "control").read_text().strip().split("\n\n"))
     assert source["Source"] == package["Package"] == "imud-daemon"
     assert {"Maintainer", "Section", "Priority", "Standards-Version"} <= source.keys()
@@ -107,6 +116,13 @@ def test_control_has_what_debian_wants() -> None:
     assert len(summary) < 80
     assert rest
     assert all(len(line) <= 80 for line in rest)
+    lines = (DEBIAN / "imud-daemon.lintian-overrides").read_text().splitlines()
+    assert lines[0].startswith("# ")
+    assert all(re.match(r"# |imud-daemon( \[arm64\])?: ", line) for line in lines)
+    assert (DEBIAN / "imud.py").read_text().startswith("#!/usr/lib/imud/bin/python3 -I\n")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == __version__
+    assert re.match(r"imud-daemon \(@VERSION@-1~@RELEASE@\) @RELEASE@; ", (DEBIAN / "changelog").read_text())
 
 
 OTHERS = {
@@ -134,18 +150,6 @@ def test_an_installation_by_hand_has_the_extras_and_the_units_of_the_package() -
     for unit in ("imud.service", "imud-web.service"):
         assert f"systemd/{unit}" in installing
         assert f"/etc/systemd/system/{unit}" in removing
-
-
-def test_a_late_purge_leaves_alone_what_another_package_has_at_the_same_places(tmp_path: Path) -> None:
-    unit, state = tmp_path / "usr/lib/systemd/system/imud.service", tmp_path / "var/lib/imud/theirs"
-    for path in (unit, state):
-        path.parent.mkdir(parents=True)
-        path.touch()
-    run_script("imud-daemon.postrm", "purge", root=tmp_path)
-    assert state.exists()
-    unit.unlink()
-    run_script("imud-daemon.postrm", "purge", root=tmp_path)
-    assert not state.exists()
 
 
 def test_every_file_that_the_build_takes_is_there() -> None:
@@ -202,19 +206,6 @@ def test_without_lintian_ci_makes_no_package(tmp_path: Path, ci: str, said: str)
     assert done.returncode == 1
     assert said in done.stderr
     assert "THIS PACKAGE IS NOT CHECKED" in (DEBIAN / "build").read_text()
-
-
-def test_overrides_have_reasons_and_the_launcher_its_own_python() -> None:
-    lines = (DEBIAN / "imud-daemon.lintian-overrides").read_text().splitlines()
-    assert lines[0].startswith("# ")
-    assert all(re.match(r"# |imud-daemon( \[arm64\])?: ", line) for line in lines)
-    assert (DEBIAN / "imud.py").read_text().startswith("#!/usr/lib/imud/bin/python3 -I\n")
-
-
-def test_the_version_is_that_of_the_package() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["version"] == __version__
-    assert re.match(r"imud-daemon \(@VERSION@-1~@RELEASE@\) @RELEASE@; ", (DEBIAN / "changelog").read_text())
 
 
 def test_sysusers_make_every_group_that_unit_and_udev_rules_name() -> None:

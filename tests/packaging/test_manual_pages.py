@@ -47,49 +47,36 @@ def test_a_page_has_every_argument_with_its_help(name: str) -> None:
     assert arguments > 0
 
 
-def test_the_synopsis_says_what_excludes_each_other() -> None:
+def test_synopsis_commands_and_summary() -> None:
     synopsis = plain(PAGES["imud-settings.1"].partition(".SH DESCRIPTION")[0])
     assert "[--apply | --set NAME=VALUE" in synopsis
-
-
-def test_commands_of_a_command_are_on_its_page() -> None:
     text = plain(PAGES["imud-modbus.1"])
     assert ".SS imud modbus scan List the module at every address." in text
     assert ".SS imud modbus assign" in text
-
-
-def test_a_page_names_command_section_and_summary() -> None:
     assert PAGES["imud-watch.1"].startswith('.TH "IMUD\\-WATCH" "1" ')
     assert ".SH NAME\nimud\\-watch \\- print samples as they come\n" in PAGES["imud-watch.1"]
     assert "RS\\-485" in PAGES["imud-modbus.1"]
 
 
-def test_the_exit_statuses_of_doctor_and_setup_are_their_own() -> None:
+def test_exit_statuses_are_those_of_each_command() -> None:
     """Status 2 of `imud doctor` is an error that was found, not that it could not run."""
     doctor, setup = (PAGES[f"imud-{name}.1"].partition(".SH EXIT STATUS")[2] for name in ("doctor", "setup"))
     for severity, status in STATUS.items():
         assert f"\\fB{status}\\fR\nA{'n' * (severity[0] in 'aeiou')} {severity}: " in doctor
     assert "The command ran" not in doctor + setup
     assert "not taken back" in setup
-
-
-def test_the_exit_statuses_of_the_daemon_are_those_of_its_document() -> None:
     rows = re.findall(r"^\| (\d+) \|", (ROOT / "docs/operate.md").read_text(), re.MULTILINE)
     part = PAGES["imud-run.1"].partition(".SH EXIT STATUS")[2]
     assert re.findall(r"^\\fB(\d+)\\fR$", part, re.MULTILINE) == rows
 
 
-def test_the_configuration_page_has_every_key_with_what_is_expected() -> None:
+def test_the_configuration_page_has_every_key_in_words_that_fit_a_line() -> None:
     text = PAGES["imud.yaml.5"]
     keys = [path + field.name for _, path, one in references.settings_parts() for field in msgspec.structs.fields(one)]
     assert len(keys) > 100
     for key in keys:
         assert f".TP\n\\fB{escaped(key)}\\fR\n" in text, key
     assert "Expected: a whole number from 1 to 4096; default 256." in plain(text)
-
-
-def test_the_configuration_page_has_no_word_that_is_longer_than_a_line() -> None:
-    """Lintian, which lets no such page pass, reads it in 80 columns."""
     words = re.sub(r"\\f[BIR]", "", PAGES["imud.yaml.5"]).split()
     assert max(map(len, words)) <= 60, max(words, key=len)
 
