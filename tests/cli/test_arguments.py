@@ -1,33 +1,63 @@
-"""Settings of a driver on the command line, for captures of devices that are not set as delivered."""
+"""Arguments that several commands share: numbers, durations, settings of a driver, names of fields."""
 
+import argparse
 import json
 from pathlib import Path
 
 import pytest
 
-from imud.cli import main
-from imud.cli.arguments import chosen_fields
+from imud.cli.arguments import argument, chosen_fields, confirmed, duration_s
 from imud.errors import BadArgument
+from tests.cli.conftest import Cli
 from tests.cli.test_decode import MANUAL_FRAME
 from tests.support.files import imu61x_log
 
 
 @pytest.mark.parametrize(
-    "words",
+    ("command", "option", "value"),
     [
-        ("watch", "--rate"),
-        ("watch", "--latency"),
-        ("clock", "--duration"),
-        ("demo", "--duration"),
-        ("demo", "--rate"),
+        ("watch", "--rate", "nan"), ("watch", "--rate", "-inf"), ("watch", "--rate", "ten"),
+        ("watch", "--latency", "inf"), ("clock", "--duration", "inf"), ("demo", "--duration", "inf"),
+        ("demo", "--rate", "inf"), ("setup", "--wait", "inf"),
     ],
-)
-@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "ten"])
-def test_what_is_no_number_is_refused(words: tuple[str, str], value: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main([*words, value] if value != "-inf" else [words[0], f"{words[1]}={value}"])
-    assert ended.value.code == 2
-    assert f"argument {words[1]}: expected a number, got '{value}'" in capsys.readouterr().err
+)  # fmt: skip
+def test_an_option_that_is_not_a_finite_number_is_refused(command: str, option: str, value: str, cli: Cli) -> None:
+    cli.refuses(f"argument {option}: expected a number, got '{value}'", command, f"{option}={value}")
+
+
+def test_durations_have_units() -> None:
+    texts = {"90": 90, "90s": 90, "10min": 600, "1.5h": 5400, "2 d": 172_800, " .5s ": 0.5}
+    assert {text: duration_s(text) for text in texts} == texts
+
+
+@pytest.mark.parametrize("text", ["", "min", "0", "-1s", "1 week", "1e3", "10m", "nan", "9" * 400 + "s"])
+def test_an_invalid_duration_is_refused(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="expected a duration as 90s, 10min or 2h"):
+        duration_s(text)
+
+
+def test_values_are_json_or_text() -> None:
+    texts = ("axes=9", "enabled=false", "turned=[1,0,0]", "turned=x-90", "a=b=c", "a=")
+    assert [argument(text)[1] for text in texts] == [9, False, [1, 0, 0], "x-90", "b=c", ""]
+    assert argument("axes=9")[0] == "axes"
+    for text in ("axes", "=9"):
+        with pytest.raises(BadArgument, match="expected NAME=VALUE"):
+            argument(text)
+
+
+@pytest.mark.parametrize(("typed", "agreed"), [("y", True), (" YES ", True), ("n", False), ("", False)])
+def test_a_risk_is_confirmed_on_a_terminal(
+    typed: str, agreed: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = {"all is lost; reset bow? [y/N] ": typed}
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", answers.pop)
+    assert confirmed("reset bow", "all is lost", yes=False) is agreed
+    assert capsys.readouterr().out == ("" if agreed else "nothing was done\n")
+    assert confirmed("reset bow", "all is lost", yes=True)
+    monkeypatch.setattr("sys.stdin.isatty", lambda: False, raising=False)
+    with pytest.raises(BadArgument, match="all is lost: expected a terminal to ask on, or --yes"):
+        confirmed("reset bow", "all is lost", yes=False)
 
 
 @pytest.fixture
@@ -41,29 +71,21 @@ def moved(tmp_path: Path) -> Path:
     return log
 
 
-def test_decode_and_replay_take_the_drivers_settings(moved: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    decode = ["decode", "--driver", "imu61x-can", str(moved)]
-    assert main(decode) == 1
-    assert json.loads(capsys.readouterr().err)["bytes_skipped"] == 400
-    assert main([*decode, "--option", "base_id=512"]) == 0
-    assert [json.loads(line)["index"] for line in capsys.readouterr().out.splitlines()] == list(range(10))
-    replay = ["replay", "--driver", "imu61x-can", "--json", str(moved)]
-    assert main(replay) == 1
-    capsys.readouterr()
-    assert main([*replay, "--option", "base_id=512"]) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 10
+def test_decode_and_replay_take_the_drivers_settings(moved: Path, cli: Cli) -> None:
+    decode = ("decode", "--driver", "imu61x-can", moved)
+    assert json.loads(cli(*decode, status=1).err)["bytes_skipped"] == 400
+    lines = cli(*decode, "--option", "base_id=512").out.splitlines()
+    assert [json.loads(line)["index"] for line in lines] == list(range(10))
+    replay = ("replay", "--driver", "imu61x-can", "--json", moved)
+    cli(*replay, status=1)
+    assert len(cli(*replay, "--option", "base_id=512").out.splitlines()) == 10
 
 
-def test_settings_of_a_stream_driver(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capture = tmp_path / "c.raw"
-    capture.write_bytes(MANUAL_FRAME)
-    decode = ["decode", "--driver", "hipnuc-uart", str(capture)]
-    shown = []
-    for meaning in ("pps", "status"):
-        assert main([*decode, "--option", f"hi91_word={meaning}"]) == 0
-        shown.append(json.loads(capsys.readouterr().out))
-    assert "pps_age_ms" in shown[0]
-    assert "pps_age_ms" not in shown[1]
+def test_settings_of_a_stream_driver(tmp_path: Path, cli: Cli) -> None:
+    (tmp_path / "c.raw").write_bytes(MANUAL_FRAME)
+    decode = ("decode", "--driver", "hipnuc-uart", tmp_path / "c.raw", "--option")
+    assert "pps_age_ms" in json.loads(cli(*decode, "hi91_word=pps").out)
+    assert "pps_age_ms" not in json.loads(cli(*decode, "hi91_word=status").out)
 
 
 @pytest.mark.parametrize("command", ["decode", "replay"])
@@ -77,11 +99,9 @@ def test_settings_of_a_stream_driver(tmp_path: Path, capsys: pytest.CaptureFixtu
         ("base_id", "expected NAME=VALUE, got 'base_id'"),
     ],
 )  # fmt: skip
-def test_bad_option_is_one_clear_line(
-    command: str, option: str, said: str, moved: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([command, "--driver", "imu61x-can", "--option", option, str(moved)]) == 2
-    assert capsys.readouterr().err == f"imud {command}: {said}\n"
+def test_bad_option_is_one_clear_line(command: str, option: str, said: str, moved: Path, cli: Cli) -> None:
+    printed = cli(command, "--driver", "imu61x-can", "--option", option, moved, status=2)
+    assert printed.err == f"imud {command}: {said}\n"
 
 
 def test_fields_come_in_the_order_in_which_they_are_named() -> None:

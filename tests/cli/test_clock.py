@@ -1,61 +1,49 @@
 """`imud clock` on a running daemon."""
 
+import signal
 from collections import deque
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from imud.cli import main
 from imud.cli.clock import EDGES_ENOUGH, ENOUGH, aids, block, verdict
 from imud.contracts.status import ClockStatus
 from imud.sample import Sync
 from imud.units import NS_PER_MS
-from tests.support.daemon_process import RunningDaemon, running_daemon, sending_daemon
+from tests.cli.conftest import Cli
+from tests.support.daemon_process import running_daemon, sending_daemon, wait_until, write_config
 from tests.support.files import hi91
 from tests.support.metrics import LINES, device, equipped
 
 
-@pytest.fixture
-def daemon(tmp_path: Path) -> Iterator[RunningDaemon]:
-    """A daemon with one device that sends 100 frames a second, or nearly."""
-    with sending_daemon(tmp_path, lambda number: hi91(10 * number)) as made:
-        yield made
-
-
-def test_a_page_for_people(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["clock", "--socket", str(daemon.socket), "--duration", "0.3"]) == 0
-    out = capsys.readouterr().out
+@pytest.mark.live
+def test_a_page_for_people_and_json(tmp_path: Path, cli: Cli) -> None:
+    with sending_daemon(tmp_path, lambda number: hi91(10 * number)) as daemon:
+        out = cli("clock", "--socket", daemon.socket, "--duration", "1").out
+        clocks = msgspec.json.decode(cli("clock", "--socket", daemon.socket, "--json").out, type=dict[str, ClockStatus])
     assert out.startswith("bow: time stamps by ")
     for word in ("offset", "skew", "residual", "verdict", "###"):
         assert word in out
-
-
-def test_json_has_the_clocks(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["clock", "--socket", str(daemon.socket), "--json"]) == 0
-    clocks = msgspec.json.decode(capsys.readouterr().out, type=dict[str, ClockStatus])
     assert clocks["bow"].t_err_ns > 0
 
 
-def test_silence_ends_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.live
+def test_a_missing_device_and_no_device(tmp_path: Path, cli: Cli) -> None:
     device = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
     with running_daemon(tmp_path, {"bow": device}) as daemon:
-        assert main(["clock", "--socket", str(daemon.socket), "--duration", "0.1"]) == 1
-    out = capsys.readouterr().out
-    assert "0 samples" in out
-    assert f"bow is missing: {tmp_path}/none is not there: is the cable plugged in" in out
+        daemon.wait_for("bow", "missing")
+        out = cli("clock", "--socket", daemon.socket, "--duration", "0.1", status=1).out
+        assert "0 samples" in out
+        assert f"bow is missing: {tmp_path}/none is not there: is the cable plugged in" in out
+        write_config(tmp_path, {})
+        daemon.signal(signal.SIGHUP)
+        wait_until(lambda: not daemon.statuses(), "the daemon has no device")
+        cli.refuses("imud clock: the daemon has no device; `imud setup` finds", "clock", "--socket", daemon.socket)
+        assert cli("clock", "--socket", daemon.socket, "--json").out == "{}\n"
 
 
-def test_without_a_device_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with running_daemon(tmp_path, {}) as daemon:
-        assert main(["clock", "--socket", str(daemon.socket)]) == 2
-        assert "imud clock: the daemon has no device; `imud setup` finds" in capsys.readouterr().err
-        assert main(["clock", "--socket", str(daemon.socket), "--json"]) == 0
-        assert capsys.readouterr().out == "{}\n"
-
-
-def test_what_tells_the_time_besides_arrivals_has_rows() -> None:
+def test_aids_of_the_clock_have_rows() -> None:
     assert list(aids(device("plain"))) == []
     assert list(aids(equipped("bow"))) == [
         ("SOUT", "4998 pulses, 9 belong to no sample; 17 samples without theirs"),
@@ -66,9 +54,6 @@ def test_what_tells_the_time_besides_arrivals_has_rows() -> None:
     page = block(equipped("bow"), deque([9_000_000] * 100))
     assert "\n  SOUT      4998 pulses" in page
     assert "  verdict   limited by the kernel's stamps" in page
-
-
-def test_a_device_that_is_triggered_and_has_no_sout_shows_triggers_only() -> None:
     lines = msgspec.structs.replace(LINES, edges={})
     assert [name for name, _ in aids(equipped("bow", lines=lines, utc=None))] == ["SIN", "UTC"]
 

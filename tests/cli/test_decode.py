@@ -9,27 +9,27 @@ from pathlib import Path
 
 import pytest
 
-from imud.cli import main
-from tests.support.files import hi91
+from tests.cli.conftest import Cli
+from tests.support.files import hi91, imu61x_log
 
 MANUAL_FRAME = bytes.fromhex(
     "5AA54C0014BB910815 2309A2C447 08151C00 CCE861BE9A35563E65EA723F 31D07CBD75DDC5BB6BD724BC"
     "8988FC4001006A41AB2A70C2 96D45041ED03434141F4F4C2 CCCAF8BE736A19BEF0001C3D8D375C3F".replace(" ", "")
 )
 """Section 3.5 of the manual."""
+DECODE = ("decode", "--driver", "hipnuc-uart")
 
 
 def lines(text: str) -> list[dict[str, object]]:
     return [json.loads(line) for line in text.splitlines()]
 
 
-def test_one_object_per_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_object_per_message(tmp_path: Path, cli: Cli) -> None:
     damaged = bytearray(MANUAL_FRAME)
     damaged[40] ^= 0xFF
     capture = tmp_path / "capture.raw"
     capture.write_bytes(MANUAL_FRAME + b"OK\r\n" + bytes(damaged) + b"\x00")
-    assert main(["decode", "--driver", "hipnuc-uart", str(capture)]) == 0
-    printed = capsys.readouterr()
+    printed = cli(*DECODE, capture)
     sample, text, bad = lines(printed.out)
     assert sample["t_dev_ns"] == 1_840_392_000_000  # 1,840,392 ms in the manual's table
     assert sample["accel_m_s2"] == pytest.approx([-0.220615 * 9.8, 0.209189 * 9.8, 0.948889 * 9.8], rel=1e-5)
@@ -43,33 +43,22 @@ def test_one_object_per_message(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert ledger["frames_in_samples"] == 1
 
 
-def test_standard_input(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_standard_input(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(MANUAL_FRAME * 3)))
-    assert main(["decode", "--driver", "hipnuc-uart", "-"]) == 0
-    assert len(lines(capsys.readouterr().out)) == 3
+    assert len(lines(cli(*DECODE, "-").out)) == 3
 
 
-def test_nothing_in_it_is_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capture = tmp_path / "noise"
-    capture.write_bytes(bytes(range(128, 256)) * 8)
-    assert main(["decode", "--driver", "hipnuc-uart", str(capture)]) == 1
-    assert json.loads(capsys.readouterr().err)["bytes_in"] == 1024
+def test_a_file_without_a_message_and_none(tmp_path: Path, cli: Cli) -> None:
+    (tmp_path / "noise").write_bytes(bytes(range(128, 256)) * 8)
+    assert json.loads(cli(*DECODE, tmp_path / "noise", status=1).err)["bytes_in"] == 1024
+    assert cli(*DECODE, tmp_path / "none", status=2).err == f"imud decode: {tmp_path}/none: No such file or directory\n"
+    cli.refuses("/dev/zero is a character device, expected a regular file", *DECODE, "/dev/zero")
 
 
-def test_missing_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["decode", "--driver", "hipnuc-uart", str(tmp_path / "none")]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert "No such file" in error
-
-
-def test_log_of_a_can_bus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from tests.support.files import imu61x_log
-
+def test_log_of_a_can_bus(tmp_path: Path, cli: Cli) -> None:
     log = tmp_path / "drive.log"
     log.write_text(imu61x_log([65535, 65536]) + "(1.0) can0 7FF#00\nnoise\n")
-    assert main(["decode", "--driver", "imu61x-can", str(log)]) == 0
-    printed = capsys.readouterr()
+    printed = cli("decode", "--driver", "imu61x-can", log)
     first, second = lines(printed.out)
     assert (first["index"], second["index"]) == (65535, 65536)
     assert "t_dev_ns" not in first
@@ -81,27 +70,17 @@ def test_log_of_a_can_bus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert ledger["frames_in_samples"] == 10
 
 
-@pytest.mark.timeout(20)
 def test_a_fifo_is_read_as_it_comes_and_not_waited_for_without_a_writer(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "fifo"
     os.mkfifo(path)
     monkeypatch.setattr("imud.cli.decode.FIFO_WAIT_MS", 1)
-    assert main(["decode", "--driver", "hipnuc-uart", str(path)]) == 2
-    assert capsys.readouterr().err == (
-        f"imud decode: {path} is a FIFO that no program writes to; `-` reads standard input\n"
-    )
-    monkeypatch.setattr("imud.cli.decode.FIFO_WAIT_MS", 10_000)
+    cli.refuses(f"imud decode: {path} is a FIFO that no program writes to; `-` reads", *DECODE, path)
+    monkeypatch.setattr("imud.cli.decode.FIFO_WAIT_MS", 60_000)
     reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     writer = os.open(path, os.O_WRONLY)
     os.write(writer, hi91(1000) + hi91(1010))
     threading.Timer(0.0, os.close, (writer,)).start()
-    assert main(["decode", "--driver", "hipnuc-uart", str(path)]) == 0
+    assert len(cli(*DECODE, path).out.splitlines()) == 2
     os.close(reader)
-    assert len(capsys.readouterr().out.splitlines()) == 2
-
-
-def test_a_device_is_no_capture(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["decode", "--driver", "hipnuc-uart", "/dev/zero"]) == 2
-    assert "/dev/zero is a character device, expected a regular file" in capsys.readouterr().err

@@ -1,13 +1,14 @@
-"""`imud command` on a running daemon with a simulated module."""
+"""`imud devices`, and `imud command` on a running daemon with a simulated module."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from imud.cli import main
-from imud.cli.arguments import argument
-from imud.errors import BadArgument
-from tests.support.daemon_process import RunningDaemon, daemon_with_module
+from tests.cli.conftest import Cli
+from tests.support.daemon_process import RunningDaemon, daemon_with_module, running_daemon
+
+live = pytest.mark.live
 
 
 @pytest.fixture(scope="module")
@@ -17,18 +18,19 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
         yield daemon
 
 
-def test_the_list(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["command", "--socket", str(daemon.socket), "bow"]) == 0
-    out = capsys.readouterr().out
+@live
+def test_devices_and_actions_are_listed_and_a_module_obeys(daemon: RunningDaemon, cli: Cli) -> None:
+    head, bow = cli("devices", "--socket", daemon.socket).out.splitlines()
+    assert head.split() == ["DEVICE", "STATE", "RATE", "HZ", "DRIVER", "PRODUCT", "SERIAL", "NUMBER", "LINK"]
+    assert bow.split()[:2] == ["bow", "running"]
+    assert f"{daemon.folder}/port at 115200 baud" in bow
+    out = cli("command", "--socket", daemon.socket, "bow").out
     assert "sout_divider" in out
     assert "divisor (a whole number from 1 to 64)" in out
+    assert cli("command", "--socket", daemon.socket, "bow", "mode", "axes=9").out == "done\n"
 
 
-def test_a_module_obeys(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["command", "--socket", str(daemon.socket), "bow", "mode", "axes=9"]) == 0
-    assert capsys.readouterr().out == "done\n"
-
-
+@live
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -37,25 +39,16 @@ def test_a_module_obeys(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str
         (["mode", "nine"], "expected NAME=VALUE, got 'nine'"),
     ],
 )
-def test_mistakes_are_explained(
-    daemon: RunningDaemon, words: list[str], expected: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["command", "--socket", str(daemon.socket), "bow", *words]) == 2
-    assert expected in capsys.readouterr().err
+def test_mistakes_are_explained(daemon: RunningDaemon, words: list[str], expected: str, cli: Cli) -> None:
+    cli.refuses(expected, "command", "--socket", daemon.socket, "bow", *words)
 
 
-def test_values_are_json_or_text() -> None:
-    assert argument("axes=9") == ("axes", 9)
-    assert argument("enabled=false") == ("enabled", False)
-    assert argument("turned=[1,0,0]") == ("turned", [1, 0, 0])
-    assert argument("turned=x-90") == ("turned", "x-90")
-    assert argument("a=b=c") == ("a", "b=c")
-    for text in ("axes", "=9"):
-        with pytest.raises(BadArgument):
-            argument(text)
+@live
+def test_without_a_running_device_the_status_is_1(tmp_path: Path, cli: Cli) -> None:
+    device = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
+    with running_daemon(tmp_path, {"bow": device}) as daemon:
+        assert "bow" in cli("devices", "--socket", daemon.socket, status=1).out
 
 
-def test_only_the_device_is_required(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["command"])
-    assert capsys.readouterr().err.endswith("the following arguments are required: DEVICE\n")
+def test_only_the_device_is_required(cli: Cli) -> None:
+    cli.refuses("the following arguments are required: DEVICE", "command")

@@ -7,31 +7,19 @@ import pytest
 from imud.cli.output import BARS, WIDTH, bar_width, fitted, histogram, local_time, table
 
 
-def test_nothing_for_no_values() -> None:
+def test_a_histogram_has_bars_with_shares() -> None:
     assert histogram([], "µs") == []
-
-
-def test_equal_values_are_one_bar() -> None:
     assert histogram([7.0] * 10, "µs") == ["           7 µs 100.0 % " + "#" * WIDTH]
-
-
-def test_bars_have_shares_and_lengths() -> None:
     lines = histogram([0.0] * 50 + [1.5] * 25 + [8.0] * 25, "ms")
     assert len(lines) == 9
     assert lines[0] == "           0 ms  50.0 % " + "#" * WIDTH
     assert lines[1] == "           1 ms  25.0 % " + "#" * (WIDTH // 2)
     assert lines[5] == "           5 ms   0.0 % "
     assert lines[8] == "           8 ms  25.0 % " + "#" * (WIDTH // 2)
-
-
-def test_values_below_zero_and_below_one() -> None:
     lines = histogram([-0.25, -0.15, 0.05], "ms")
     assert lines[0].startswith("       -0.25 ms")
     assert 3 <= len(lines) <= BARS + 1
     assert sum(float(line.split()[2]) for line in lines) == pytest.approx(100, abs=0.2)
-
-
-def test_a_stray_value_hides_nothing() -> None:
     values = [float(v % 10) for v in range(999)] + [1e9]
     lines = histogram(values, "µs")
     assert len(lines) == 10
@@ -43,11 +31,8 @@ def test_widths_are_round(span: float, width: float) -> None:
     assert bar_width(span) == pytest.approx(width)
 
 
-def test_a_cell_cannot_write_to_the_terminal() -> None:
+def test_a_table_aligns_numbers_and_cannot_write_to_the_terminal() -> None:
     assert table(("A",), [("x\x1b[2J\ny",)]) == "A\nx\\x1b[2J\\ny"
-
-
-def test_numbers_stand_to_the_right_in_columns_that_have_nothing_else() -> None:
     rows = [("mode", "6-axis, slowly", 7), ("baud", 115200, 11), ("node", "-", "-")]
     assert table(("SETTING", "ACTUAL", "N"), rows).splitlines() == [
         "SETTING  ACTUAL          N",

@@ -7,19 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from imud.cli import main
+from tests.cli.conftest import Cli
 from tests.support.files import ROOT
 from tests.support.surroundings import pipe
 
 
-def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, cli: Cli) -> None:
     shipped = ROOT / "etc" / "imud.yaml"
-    assert main(["check", str(shipped)]) == 0
-    assert "good" in capsys.readouterr().out
+    assert "good" in cli("check", shipped).out
     bad = tmp_path / "bad.yaml"
     bad.write_text("devices:\n  bow:\n    uart:\n      port: /dev/ttyUSB0\n      baut: 9600\n")
-    assert main(["check", str(bad)]) == 2
-    error = capsys.readouterr().err
+    error = cli("check", bad, status=2).err
     assert error.startswith(f"{bad}:5:7: devices.bow.uart.baut: expected a key that imud knows")
     assert "did you mean baud?" in error
 
@@ -27,16 +25,14 @@ def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, caps
 @pytest.mark.parametrize(
     ("words", "hint", "status"), [(["check"], "is the path right?", 2), (["run", "--config"], "--config", 78)]
 )
-def test_a_file_that_is_not_there(
-    words: list[str], hint: str, status: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_is_not_there(words: list[str], hint: str, status: int, tmp_path: Path, cli: Cli) -> None:
     """The hint names an argument that the command has."""
-    assert main([*words, str(tmp_path / "none")]) == status
-    error = capsys.readouterr().err
+    error = cli(*words, tmp_path / "none", status=status).err
     assert error.startswith(f"{tmp_path}/none: cannot be read: No such file or directory; ")
     assert hint in error
 
 
+@pytest.mark.live
 def test_what_is_wrong_has_its_priority_in_the_journal(tmp_path: Path) -> None:
     """Else `journalctl --priority=err` shows no reason why the service does not start."""
     bad = tmp_path / "bad.yaml"
@@ -52,52 +48,41 @@ def test_what_is_wrong_has_its_priority_in_the_journal(tmp_path: Path) -> None:
     assert all(line.startswith(f"<2>{bad}:") for line in lines)
 
 
+RMC = "devices: {a: {driver: hipnuc-uart, uart: {port: x}, rmc: {source: gpsd, host: '%s'}}}"
+
+
 @pytest.mark.parametrize(
     ("text", "place"),
     [
-        (
-            "metrics: {address: 127.0.0.300}",
-            "1:20: metrics.address: expected an IP address such as 127.0.0.1 or ::1, got",
-        ),
+        ("metrics: {address: 127.0.0.300}", "1:20: metrics.address: expected an IP address such as 127.0.0.1 or ::1, "),
         ("metrics: {address: not an address}", "1:20: metrics.address: expected an IP address"),
         ("metrics: {address: '::1'}", ""),
         ("metrics: {address: localhost}", ""),
         ("metrics: {address: gateway}", "1:20: metrics.address: expected an IP address"),
+        *((RMC % host, "") for host in ("10.1.2.3", "gps.local")),
+        *((RMC % host, "1:79: devices.a.rmc.host: expected") for host in ("10.1.2.300", "a b", "")),
         ("socket: {path: /%s}" % ("x" * 99), "1:16: socket.path: expected at most 99 bytes, got 100"),
         ("socket: {path: /%s}" % ("x" * 98), ""),
         ("socket: {path: imud.sock}", '1:16: socket.path: expected an absolute path, got "imud.sock"'),
     ],
 )
-def test_an_address_that_is_none(text: str, place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_address_is_named(text: str, place: str, tmp_path: Path, cli: Cli) -> None:
     file = tmp_path / "imud.yaml"
-    file.write_text(text + "\ndevices: {}\n")
-    assert main(["check", str(file)]) == (2 if place else 0)
-    assert capsys.readouterr().err.startswith(f"{file}:{place}" if place else "")
+    file.write_text(text + ("" if "devices" in text else "\ndevices: {}\n"))
+    assert cli("check", file, status=2 if place else 0).err.startswith(f"{file}:{place}" if place else "")
 
 
-@pytest.mark.parametrize(
-    ("host", "good"), [("10.1.2.3", True), ("gps.local", True), ("10.1.2.300", False), ("a b", False), ("", False)]
-)
-def test_the_host_of_gpsd(host: str, good: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "imud.yaml"
-    rmc = f"{{source: gpsd, host: '{host}'}}"
-    file.write_text(f"devices:\n  a: {{driver: hipnuc-uart, uart: {{port: x}}, rmc: {rmc}}}\n")
-    assert main(["check", str(file)]) == (0 if good else 2)
-    assert ("devices.a.rmc.host: expected" in capsys.readouterr().err) is not good
-
-
-def test_check_notes_a_recording_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_notes_a_recording_that_is_not_there(tmp_path: Path, cli: Cli) -> None:
     there, file = tmp_path / "a.cap", tmp_path / "imud.yaml"
     there.touch()
     file.write_text(
         f"devices:\n  a: {{driver: hipnuc-uart, replay: {{path: {there}, speed: maximum}}}}\n"
         f"  b: {{driver: hipnuc-uart, replay: {{path: {there}2}}}}\n"
     )
-    assert main(["check", str(file)]) == 0
-    assert capsys.readouterr().out.splitlines()[1:] == [f"{file}:3: note: b: {there}2 is not there: imud waits for it"]
+    assert cli("check", file).out.splitlines()[1:] == [f"{file}:3: note: b: {there}2 is not there: imud waits for it"]
 
 
-def test_check_notes_a_device_of_an_output_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_notes_a_device_of_an_output_that_is_none(tmp_path: Path, cli: Cli) -> None:
     """A misspelled name is no mistake, since the device may come later; nothing is recorded or sent until then."""
     file = tmp_path / "imud.yaml"
     file.write_text(
@@ -105,8 +90,7 @@ def test_check_notes_a_device_of_an_output_that_is_none(tmp_path: Path, capsys: 
         "recorder: {devices: [bow, mast, bwo]}\nnmea0183: {device: masd}\n"
         "mqtt: {devices: {'*': {rate_hz: 1}, bow: {rate_hz: 1}, keel: {rate_hz: 1}}}\n"
     )
-    assert main(["check", str(file)]) == 0
-    notes = [line.removeprefix(f"{file}: note: ") for line in capsys.readouterr().out.splitlines()[1:]]
+    notes = [line.removeprefix(f"{file}: note: ") for line in cli("check", file).out.splitlines()[1:]]
     assert notes == [
         'recorder.devices: expected a device that imud knows, got "bwo"; did you mean bow? known: bow, mast',
         'nmea0183.device: expected a device that imud knows, got "masd"; did you mean mast? known: bow, mast',
@@ -114,13 +98,12 @@ def test_check_notes_a_device_of_an_output_that_is_none(tmp_path: Path, capsys: 
     ]
 
 
-def test_check_says_what_a_device_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_says_what_a_device_cannot_do(tmp_path: Path, cli: Cli) -> None:
     file = tmp_path / "imud.yaml"
     file.write_text(
         "devices:\n  bow:\n    driver: hipnuc-uart\n    uart: {port: /dev/ttyUSB0, baud: 921600}\n"
         "    settings: {output: {hi91: 50, hi92: 50}}\n  stern:\n    uart: {port: /dev/ttyUSB1}\n"
     )
-    assert main(["check", str(file)]) == 0
-    good, note = capsys.readouterr().out.splitlines()
+    good, note = cli("check", file).out.splitlines()
     assert good == f"{file}: good; devices: bow, stern"
     assert note.startswith(f"{file}:2: note: bow: HI92 beside HI91 is dated by its arrival")

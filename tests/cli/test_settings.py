@@ -10,10 +10,12 @@ from typing import Any
 import pytest
 
 from imud import config
-from imud.cli import main
 from imud.client import Client
 from imud.contracts.device_settings import declared_values
-from tests.support.daemon_process import RunningDaemon, daemon_with_module
+from tests.cli.conftest import Cli
+from tests.support.daemon_process import LIMIT_S, RunningDaemon, daemon_with_module
+
+pytestmark = pytest.mark.live
 
 DECLARED = {"mode": "9-axis", "output": {"hi91": 50}}
 
@@ -32,162 +34,128 @@ class Terminal(io.StringIO):
         return True
 
 
-def run(daemon: RunningDaemon, *words: str) -> int:
-    return main(["settings", "--socket", str(daemon.socket), "bow", *words])
+@pytest.fixture
+def words(daemon: RunningDaemon) -> tuple[object, ...]:
+    return "settings", "--socket", daemon.socket, "bow"
 
 
 def actual(daemon: RunningDaemon) -> dict[str, Any]:
     """What the module says now."""
-    with Client(daemon.socket, timeout_s=30) as client:
+    with Client(daemon.socket, timeout_s=LIMIT_S) as client:
         found = client.call("settings.get", device="bow", fresh=True)
     return {one["name"]: one["actual"] for one in found["settings"]}
 
 
 def test_from_difference_to_agreement_and_back(
-    daemon: RunningDaemon, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    daemon: RunningDaemon, words: tuple[object, ...], cli: Cli, tmp_path: Path
 ) -> None:
     # what there is
-    assert run(daemon) == 1
-    out = capsys.readouterr().out
+    out = cli(*words, status=1).out
     assert out.splitlines()[0].split() == ["SETTING", "DECLARED", "ACTUAL"]
     assert [line.split() for line in out.splitlines() if line.startswith("mode")] == [
         ["mode", "9-axis", "6-axis", "differs"]
     ]
     assert "2 of 10 differ; `--apply` sets them" in out
-    assert run(daemon, "--verbose") == 1
-    assert "2.2.4" in capsys.readouterr().out
-    assert run(daemon, "--json") == 1
-    assert json.loads(capsys.readouterr().out)["status"]["state"] == "differ"
+    assert "2.2.4" not in out
+    assert "2.2.4" in cli(*words, "--verbose", status=1).out
+    assert json.loads(cli(*words, "--json", status=1).out)["status"]["state"] == "differ"
     # a backup, and the module as YAML
     file = tmp_path / "bow.yaml"
-    assert run(daemon, "--backup", str(file)) == 0
+    cli(*words, "--backup", file)
     before = actual(daemon)
-    capsys.readouterr()
-    assert run(daemon, "--yaml") == 0
-    pasted = capsys.readouterr().out
+    pasted = cli(*words, "--yaml").out
     text = "devices:\n  bow:\n    driver: hipnuc-uart\n    uart: {port: x}\n" + "".join(
         f"    {line}\n" for line in pasted.splitlines()
     )
     (device,) = config.parse(text, "pasted").devices
     assert declared_values(device.declared)["output"] == before["output"]
     # set what is declared
-    assert run(daemon, "--apply") == 0
-    out = capsys.readouterr().out
+    out = cli(*words, "--apply").out
     assert "to do:\n  mode: 6-axis → 9-axis\n" in out
     assert "done:\n  mode: done\n  output: done" in out
     assert (actual(daemon)["mode"], actual(daemon)["output"]["hi91"]) == ("9-axis", 50)
-    assert run(daemon) == 0
-    assert "all that can be read is as declared" in capsys.readouterr().out
-    assert run(daemon, "--apply") == 0
-    assert capsys.readouterr().out == "nothing to do\n"
-    assert run(daemon, "--save") == 0
-    assert "saved to flash" in capsys.readouterr().out
-    assert run(daemon) == 0
-    assert "flash written by imud: 1 time, 1 within 24 hours" in capsys.readouterr().out
+    assert "all that can be read is as declared" in cli(*words).out
+    assert cli(*words, "--apply").out == "nothing to do\n"
+    assert "saved to flash" in cli(*words, "--save").out
+    assert "flash written by imud: 1 time, 1 within 24 hours" in cli(*words).out
     # and back
-    assert run(daemon, "--restore", str(file), "--json") == 0
-    assert json.loads(capsys.readouterr().out)["problem"] == ""
+    assert json.loads(cli(*words, "--restore", file, "--json").out)["problem"] == ""
     assert actual(daemon) == before
+    out = cli("status", "--socket", daemon.socket).out
+    assert '  settings  differ: mode is "6-axis", declared "9-axis"' in out
 
 
-def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(daemon, "--set", "sout_divisor=4", 'output={"hi91": 20}') == 0
+def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, words: tuple[object, ...], cli: Cli) -> None:
+    cli(*words, "--set", "sout_divisor=4", 'output={"hi91": 20}')
     assert (actual(daemon)["sout_divisor"], actual(daemon)["output"]["hi91"]) == (4, 20)
-    assert run(daemon, "--set", "mounting=x_up") == 1
-    assert "left out: mounting comes into force by save and restart only" in capsys.readouterr().out
+    out = cli(*words, "--set", "mounting=x_up", status=1).out
+    assert "left out: mounting comes into force by save and restart only" in out
 
 
 def test_another_rate_is_asked_for_and_followed(
-    daemon: RunningDaemon, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    daemon: RunningDaemon, words: tuple[object, ...], cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ("--save", "--set", "baud=460800")
-    assert run(daemon, *words) == 2
-    assert (
-        "the device may not be reached afterwards: expected a terminal to ask on, or --yes" in capsys.readouterr().err
-    )
+    more = (*words, "--save", "--set", "baud=460800")
+    cli.refuses("the device may not be reached afterwards: expected a terminal to ask on, or --yes", *more)
     monkeypatch.setattr(sys, "stdin", Terminal("n\n"))
-    assert run(daemon, *words) == 1
-    assert "nothing was done" in capsys.readouterr().out
-    assert run(daemon, *words, "--yes") == 0
+    assert "nothing was done" in cli(*more, status=1).out
+    cli(*more, "--yes")
     assert actual(daemon)["baud"] == 460800
     daemon.wait_for("bow", "running")
     monkeypatch.setattr(sys, "stdin", Terminal("y\n"))
-    assert run(daemon, "--save", "--set", "baud=115200") == 0
+    cli(*words, "--save", "--set", "baud=115200")
     assert actual(daemon)["baud"] == 115200
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["--set", "mode"], "expected NAME=VALUE, got 'mode'"),
-        (["--set", "mod=9"], 'expected a setting that imud knows, got "mod"; did you mean mode?'),
-        (["--set", "mode=7"], 'mode: expected one of "6-axis", "9-axis", got 7'),
-        (["--set", "magnetometer_bias=1"], "magnetometer_bias: it can only be read"),
-        (["--restore", "{none}"], "none.yaml: No such file or directory"),
-        (["--restore", "{list}"], "expected the key settings with values"),
-        (["--restore", "{broken}"], "broken.yaml:2:"),
-        (["--restore", "{foreign}"], "is of imu61x-uart, bow has driver hipnuc-uart"),
-    ],
-)
-def test_mistakes_are_explained(
-    daemon: RunningDaemon, words: list[str], expected: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    files = {
-        "none": None,
-        "list": "[1]",
-        "broken": "settings:\n  a: b: c",
-        "foreign": "driver: imu61x-uart\nsettings: {}",
-    }
-    for name, text in files.items():
-        if text is not None:
-            (tmp_path / f"{name}.yaml").write_text(text)
-    given = [word.format(**{name: tmp_path / f"{name}.yaml" for name in files}) for word in words]
-    assert run(daemon, *given) == 2
-    assert expected in capsys.readouterr().err
+def test_mistakes_are_explained(words: tuple[object, ...], cli: Cli, tmp_path: Path) -> None:
+    for value, problem in {
+        "mode": "expected NAME=VALUE, got 'mode'",
+        "mod=9": 'expected a setting that imud knows, got "mod"; did you mean mode?',
+        "mode=7": 'mode: expected one of "6-axis", "9-axis", got 7',
+        "magnetometer_bias=1": "magnetometer_bias: it can only be read",
+    }.items():
+        cli.refuses(problem, *words, "--set", value)
+    file = tmp_path / "bow.yaml"
+    cli.refuses("bow.yaml: No such file or directory", *words, "--restore", file)
+    for text, problem in {
+        "[1]": "expected the key settings with values",
+        "settings:\n  a: b: c": "bow.yaml:2:",
+        "driver: imu61x-uart\nsettings: {}": "is of imu61x-uart, bow has driver hipnuc-uart",
+    }.items():
+        file.write_text(text)
+        cli.refuses(problem, *words, "--restore", file)
 
 
-def test_a_backup_of_another_module_is_told_of(
-    daemon: RunningDaemon, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_backup_of_another_module_is_told_of(words: tuple[object, ...], cli: Cli, tmp_path: Path) -> None:
     file = tmp_path / "other.yaml"
     file.write_text(
         'driver: hipnuc-uart\nidentity: {product: "CH020", serial_number: "77"}\nsettings: {mode: 6-axis, strange: 1}\n'
     )
-    assert run(daemon, "--restore", str(file)) == 2
-    err = capsys.readouterr().err
-    assert "the backup is of product CH020, bow has " in err
-    assert "the backup is of serial number 77, bow has " in err
-    assert "left out: strange, which hipnuc-uart cannot set" in err
-    assert "the backup is of another module: expected a terminal to ask on, or --yes" in err
-    assert run(daemon, "--restore", str(file), "--yes") == 0
+    err = cli(*words, "--restore", file, status=2).err
+    for problem in (
+        "the backup is of product CH020, bow has ",
+        "the backup is of serial number 77, bow has ",
+        "left out: strange, which hipnuc-uart cannot set",
+        "the backup is of another module: expected a terminal to ask on, or --yes",
+    ):
+        assert problem in err
+    cli(*words, "--restore", file, "--yes")
 
 
-def test_a_backup_is_not_written_over_unasked(
-    daemon: RunningDaemon, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_backup_is_not_written_over_unasked(words: tuple[object, ...], cli: Cli, tmp_path: Path) -> None:
     file = tmp_path / "bow.yaml"
     file.write_text("mine")
-    assert run(daemon, "--backup", str(file)) == 2
+    cli(*words, "--backup", file, status=2)
     assert file.read_text() == "mine"
-    assert run(daemon, "--backup", str(file), "--yes") == 0
-    capsys.readouterr()
-    assert run(daemon, "--backup", "-") == 0
-    assert 'driver: "hipnuc-uart"' in capsys.readouterr().out
+    cli(*words, "--backup", file, "--yes")
+    assert 'driver: "hipnuc-uart"' in file.read_text()
+    assert 'driver: "hipnuc-uart"' in cli(*words, "--backup", "-").out
 
 
-def test_status_has_the_difference(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(daemon, "--set", "mode=6-axis") in (0, 1)
-    capsys.readouterr()
-    main(["status", "--socket", str(daemon.socket)])
-    out = capsys.readouterr().out
-    assert '  settings  differ: mode is "6-axis", declared "9-axis"' in out
-
-
-def test_a_factory_reset_is_asked_for_and_backed_up(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["command", "--socket", str(daemon.socket), "bow", "factory_reset"]
-    assert main(command) == 2
-    assert "all settings of the device are lost: expected a terminal to ask on, or --yes" in capsys.readouterr().err
+def test_a_factory_reset_is_asked_for_and_backed_up(daemon: RunningDaemon, cli: Cli) -> None:
+    command = ("command", "--socket", daemon.socket, "bow", "factory_reset")
+    cli.refuses("all settings of the device are lost: expected a terminal to ask on, or --yes", *command)
     backups = daemon.folder / "backups"
     assert not backups.exists()
-    assert main([*command, "--yes"]) == 0
+    cli(*command, "--yes")
     assert len(list(backups.iterdir())) == 1

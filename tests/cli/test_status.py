@@ -3,49 +3,36 @@
 import json
 from pathlib import Path
 
-import msgspec
 import pytest
 from msgspec.structs import replace
 
-from imud.cli import main
 from imud.cli.status import axes, block, driven, page, parts, utc, watched
 from imud.client import Client
 from imud.contracts.status import DeviceState, FrameStatus, LinesStatus, UtcStatus
 from imud.frames.conventions import Heading
+from tests.cli.conftest import Cli
 from tests.support.metrics import LINES, POLLING, UTC, device, equipped
 from tests.support.socket_rig import daemon
 
 
-def test_a_device_without_parts_has_no_rows_of_them() -> None:
+def test_each_part_of_a_device_has_its_row() -> None:
     assert list(parts(device("bow"))) == []
     assert block(device("bow")).splitlines()[-1].startswith("  kernel ")
-
-
-def test_parts_of_the_identity_have_names() -> None:
     identity = {"product": "IMU61x", "serial_number": "0032", "firmware": "10203", "hardware_version": "2"}
     lines = block(replace(device("bow"), identity=identity)).splitlines()
     at = lines.index("  identity  product IMU61x, serial_number 0032, firmware 10203, hardware_version")
     assert lines[at + 1] == "            2"
     assert "  identity  not known" in block(replace(device("bow"), identity={})).splitlines()
-
-
-def test_axes_heading_and_what_contradicts_them() -> None:
     frame = FrameStatus("body: x forward", "ned-frd", "ZYX", "NED", Heading.TRUE, -3.5, {}, "its z axis points down")
     lines = block(replace(device("bow"), frame=frame)).splitlines()
     at = lines.index("  axes      ned-frd, body: x forward; heading true by a declination of -3.5°")
     assert lines[at + 1] == "            (its z axis points down)"
     own = replace(frame, frame="sensor: x right", convention="device", declination_deg=None, problem="")
     assert axes(own) == "sensor: x right; heading true"
-
-
-def test_polling_is_shown_for_a_device_that_is_polled() -> None:
     assert block(device("front", polling=POLLING)).splitlines()[-2:] == [
         "  polling   1000 reads, 20 late, 3 missed, 4 stale, 5 failed; 70.0 µs after the",
         "            deadline, 8000.0 at worst; vanished 6 times",
     ]
-
-
-def test_every_part_has_its_row() -> None:
     assert block(equipped("bow")).splitlines()[-10:] == [
         "  line      11 requests unanswered; 12 bytes unasked, 13 strange; 14 echoes (all",
         "            devices of the line)",
@@ -72,15 +59,12 @@ def test_long_names_fit_80_columns_and_keep_both_ends() -> None:
     assert lines[2] == "  is not there"
 
 
-def test_json_is_all_that_the_socket_sends(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_json_is_all_that_the_socket_sends(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.cli.status.closes", lambda ledger: True)  # the server of the test has not all of it
     with daemon(tmp_path) as served:
         with Client(served.path) as client:
             said = client.status()
-        main(["status", "--socket", str(served.path), "--json"])
-        shown = json.loads(capsys.readouterr().out)
+        shown = json.loads(cli("status", "--socket", served.path, "--json").out)
         assert shown.keys() == said.keys() == {"now_ns", "devices", "socket"}
         assert shown["devices"] == said["devices"]
 
@@ -92,29 +76,17 @@ def test_a_device_that_does_not_run_has_its_reason_and_the_next_step() -> None:
     assert text.endswith("\n\n`sudo imud doctor` looks for the cause, and says what to do next")
 
 
-@pytest.mark.parametrize(("alarm", "words"), [(True, "ACTIVE"), (False, "inactive"), (None, "level not known")])
-def test_level_of_the_alarm_line(alarm: bool | None, words: str) -> None:
-    assert watched(msgspec.structs.replace(LINES, alarm=alarm), "alarm", 2).startswith(f"{words}, raised")
-
-
-def test_why_sin_is_not_driven() -> None:
+def test_lines_and_utc_say_only_what_is_known() -> None:
     lines = LinesStatus({"sin": "GPIO4 is in use by another program"}, {}, {}, sin=True)
+    for alarm, words in ((True, "ACTIVE"), (False, "inactive"), (None, "level not known")):
+        assert watched(replace(LINES, alarm=alarm), "alarm", 2).startswith(f"{words}, raised")
     assert driven(lines).endswith("(GPIO4 is in use by another program)")
-
-
-def test_sin_has_its_row_before_the_first_trigger() -> None:
     assert [name for name, _ in parts(device("bow", lines=LinesStatus({}, {}, {}, sin=True)))] == ["sin"]
-
-
-def test_a_line_that_only_has_a_problem_has_its_row() -> None:
     lines = LinesStatus({"reset": "GPIO5 is in use by another program"}, {}, {})
     assert list(parts(device("bow", lines=lines))) == [("reset", "GPIO5 is in use by another program")]
-
-
-def test_utc_says_only_what_there_is() -> None:
     assert utc(UtcStatus("", "")) == "nothing yet"
     assert utc(UtcStatus("", "", pulses=3)) == "3 pulses, 0 ignored"
-    assert utc(msgspec.structs.replace(UTC, refused={}, pulses=0, pulses_ignored=0, chrony_refused=0, chrony_sent=0,
+    assert utc(replace(UTC, refused={}, pulses=0, pulses_ignored=0, chrony_refused=0, chrony_sent=0,
                                        problem="")) == "gpsd at 127.0.0.1:2947: 100 sentences, 90 sent"  # fmt: skip
 
 

@@ -1,19 +1,20 @@
 """`imud web`: what it refuses to start with, and what it says of itself. The server is tested in tests/web."""
 
 import signal
-import subprocess
+import socket
 import sys
 from http.client import HTTPConnection
 from pathlib import Path
 
 import pytest
 
-from imud.cli import build_parser, main
-from imud.cli.web import guard_of
+from imud.cli import build_parser
+from imud.cli.web import _say, guard_of
 from imud.errors import BadArgument
+from tests.cli.conftest import Cli, imud_process
+from tests.support.daemon_process import LIMIT_S
 
 TOKEN = "correct-horse-battery-staple"
-LIMIT_S = 20.0
 
 
 @pytest.fixture
@@ -37,12 +38,6 @@ def test_another_address_needs_a_token() -> None:
         parsed("--reading", "token")
 
 
-@pytest.mark.parametrize("port", ["-1", "65536", "99999999999999999999"])
-def test_a_port_that_there_is_not(port: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["web", "--port", port]) == 2
-    assert f"--port: expected 0 to 65535, got {port}" in capsys.readouterr().err
-
-
 def test_who_may_look(token: str) -> None:
     def can_read(*words: str) -> bool:
         guard = guard_of(build_parser(("web",)).parse_args(["web", *words]))
@@ -55,47 +50,46 @@ def test_who_may_look(token: str) -> None:
     assert can_read("--token-file", token, "--address", "0.0.0.0", "--reading", "open")
 
 
-def test_without_the_library_it_says_how_to_get_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_the_library_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     monkeypatch.setitem(sys.modules, "aiohttp", None)
     monkeypatch.delitem(sys.modules, "imud.web.app", raising=False)
-    assert main(["web"]) == 2
-    assert "pip install 'imud[web]'" in capsys.readouterr().err
+    cli.refuses("pip install 'imud[web]'", "web")
 
 
+@pytest.mark.live
 @pytest.mark.parametrize(("words", "is_open"), [(("--address", "0.0.0.0"), True), ((), False)])
 def test_it_serves_until_a_signal_and_says_where_it_is_open(
     words: tuple[str, ...], is_open: bool, token: str, tmp_path: Path
 ) -> None:
-    argv = [sys.executable, "-X", "dev", "-W", "error", "-m", "imud", "web", "--port", "0", "--token-file", token]
-    argv += [*words, "--socket", str(tmp_path / "none")]
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        line = process.stdout.readline().strip()
-        try:
-            asked = HTTPConnection("127.0.0.1", int(line.rstrip("/").rpartition(":")[2]), timeout=LIMIT_S)
-            asked.request("GET", "/")
-            assert b"<title>imud</title>" in asked.getresponse().read()
-            asked.close()
-        finally:
-            process.send_signal(signal.SIGTERM)
-            _, errors = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 0, errors
+    more = ("--port", 0, "--token-file", token, *words, "--socket", tmp_path / "none")
+    with imud_process("web", *more, python=("-X", "dev", "-W", "error")) as web:
+        line = web.out.readline().strip()
+        asked = HTTPConnection("127.0.0.1", int(line.rstrip("/").rpartition(":")[2]), timeout=LIMIT_S)
+        asked.request("GET", "/")
+        assert b"<title>imud</title>" in asked.getresponse().read()
+        asked.close()
+        errors = web.end(signal.SIGTERM).err
     assert ("OPEN: 0.0.0.0 port" in errors) == is_open
     assert "Traceback" not in errors
     assert TOKEN not in line + errors
 
 
-@pytest.mark.parametrize("port", ["-1", "65536"])
-def test_a_port_that_no_machine_has_is_refused(port: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["web", "--port", port]) == 2
-    assert capsys.readouterr().err == f"imud web: --port: expected 0 to 65535, got {port}\n"
-
-
-def test_a_port_that_is_taken_is_said_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import socket
-
+def test_a_port_that_cannot_be_had_is_refused(cli: Cli) -> None:
+    for port in ("-1", "65536", "99999999999999999999"):
+        assert cli("web", "--port", port, status=2).err == f"imud web: --port: expected 0 to 65535, got {port}\n"
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        assert main(["web", "--port", str(taken.getsockname()[1])]) == 2
-    assert "cannot listen on 127.0.0.1 port" in capsys.readouterr().err
+        port = taken.getsockname()[1]
+        cli.refuses(f"cannot listen on 127.0.0.1 port {port}: ", "web", "--port", port)
+
+
+def test_addresses_and_who_may_look_and_change_are_said(capsys: pytest.CaptureFixture[str]) -> None:
+    def said(*words: str) -> tuple[str, str]:
+        _say(build_parser(("web",)).parse_args(["web", *words]), 81)
+        return capsys.readouterr()
+
+    assert said() == ("http://127.0.0.1:81/\nnothing can be changed here: there is no --token-file\n", "")
+    assert said("--address", "::1", "--token-file", "x") == ("http://[::1]:81/\n", "")
+    out, err = said("--address", "::", "--token-file", "x", "--reading", "open")
+    assert out == "http://[::]:81/\n"
+    assert "OPEN: :: port 81 is reached from other machines: everybody on these networks can look" in err
+    assert "who has the token can look" in said("--address", "0.0.0.0", "--token-file", "x")[1]

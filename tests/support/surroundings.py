@@ -187,3 +187,10 @@ class Machine:
 
     def told(self, check: DoctorCheck) -> list[tuple[str, str]]:
         return [(str(finding.severity), f"{finding.seen} → {finding.advice}") for finding in self.find(check)]
+
+    def tells(self, check: DoctorCheck, severity: str, *words: str) -> None:
+        """Assert that a check has one finding, with this severity and these words in any case."""
+        ((got, text),) = self.told(check)
+        assert got == severity, text
+        for word in words:
+            assert word.lower() in text.lower()

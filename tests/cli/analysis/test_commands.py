@@ -18,6 +18,7 @@ from imud.sim.physics.motion import GRAVITY_M_S2
 from imud.sim.physics.noise import NoiseLevels
 from imud.units import NS_PER_MS
 from tests.cli.analysis.captures import frame, resting, shaken, write_capture
+from tests.cli.conftest import Cli
 from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
 from tests.support.daemon_process import RunningDaemon, daemon_with_module, running_daemon, sending_daemon
 from tests.support.files import CaptureWriter, hi91
@@ -46,9 +47,8 @@ def resting_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
 
 
-def test_a_line_is_found_at_the_true_rate(shaken_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["spectrum", "--json", "--skip", "5s", str(shaken_file)]) == 0
-    accel = json.loads(capsys.readouterr().out)["sensors"]["accel"]
+def test_a_line_is_found_at_the_true_rate(shaken_file: Path, cli: Cli) -> None:
+    accel = json.loads(cli("spectrum", "--json", "--skip", "5s", shaken_file).out)["sensors"]["accel"]
     assert accel["rate_hz"] == pytest.approx(TRUE_HZ, rel=1e-5)
     assert accel["missing"] == pytest.approx(160, abs=2)
     peak = accel["peaks"][0]
@@ -57,11 +57,10 @@ def test_a_line_is_found_at_the_true_rate(shaken_file: Path, capsys: pytest.Capt
     assert peak["images_hz"] == pytest.approx([TRUE_HZ - SHAKEN_HZ, TRUE_HZ + SHAKEN_HZ], abs=0.1)
 
 
-def test_a_spectrum_in_words(shaken_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_spectrum_in_words(shaken_file: Path, tmp_path: Path, cli: Cli) -> None:
     picture = tmp_path / "vibration.png"
     words = ["spectrum", "--sensor", "accel", "--bands", "5-60,60-70", "-o", str(picture), str(shaken_file)]
-    assert main([*words, "--resolution", "0.5"]) == 0
-    out = capsys.readouterr().out
+    out = cli(*words, "--resolution", "0.5").out
     assert max(map(len, out.splitlines())) <= COLUMNS
     assert "P1" in out
     assert "60 to 70" in out
@@ -71,11 +70,10 @@ def test_a_spectrum_in_words(shaken_file: Path, tmp_path: Path, capsys: pytest.C
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_noise_of_a_capture(resting_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_noise_of_a_capture(resting_file: Path, tmp_path: Path, cli: Cli) -> None:
     sheet = tmp_path / "sheet.yaml"
     sheet.write_text(SHEET)
-    assert main(["noise", "--json", "--sheet", str(sheet), str(resting_file)]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(cli("noise", "--json", "--sheet", sheet, resting_file).out)
     gyro, accel = told["sensors"]["gyro"], told["sensors"]["accel"]
     assert gyro["axes"]["y"]["random_walk"]["value"] == pytest.approx(1e-4, rel=0.05)
     assert gyro["axes"]["y"]["random_walk"]["deg/√h"] == pytest.approx(1e-4 * 3437.747, rel=0.05)
@@ -87,13 +85,10 @@ def test_the_noise_of_a_capture(resting_file: Path, tmp_path: Path, capsys: pyte
 
 
 @pytest.mark.parametrize("end", [".html", ".svg", ".png"])
-def test_a_report_for_a_supplier(
-    resting_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], end: str
-) -> None:
+def test_a_report_for_a_supplier(resting_file: Path, tmp_path: Path, cli: Cli, end: str) -> None:
     sheet, file = tmp_path / "sheet.yaml", tmp_path / f"report{end}"
     sheet.write_text(SHEET)
-    assert main(["noise", "--sheet", str(sheet), "--for", "60s", "-o", str(file), str(resting_file)]) == 0
-    out = capsys.readouterr().out
+    out = cli("noise", "--sheet", sheet, "--for", "60s", "-o", file, resting_file).out
     assert max(map(len, out.splitlines())) <= COLUMNS
     for words in ("angle random walk N", "µg/√Hz", "of 0.5 deg/√h = 0.6", "times: within", "times: ABOVE", "a sheet"):
         assert words in out, words
@@ -107,35 +102,27 @@ def test_a_report_for_a_supplier(
         assert "hipnuc-uart" in text
 
 
-def test_without_a_sheet_the_report_says_what_the_manual_has(
-    resting_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["noise", "--for", "20s", str(resting_file)]) == 0
-    assert "no figure of noise for any model" in " ".join(capsys.readouterr().out.split())
+def test_without_a_sheet_the_report_says_what_the_manual_has(resting_file: Path, cli: Cli) -> None:
+    assert "no figure of noise for any model" in " ".join(cli("noise", "--for", "20s", resting_file).out.split())
 
 
 # --- recordings -------------------------------------------------------------------------------------------------------
 
 
-def test_a_recording_of_two_devices(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_recording_of_two_devices(tmp_path: Path, cli: Cli) -> None:
     (file,) = run_recorded(tmp_path)[2]
-    assert main(["noise", str(file)]) == 2
-    assert "it has bow, mast: choose one with --device" in capsys.readouterr().err
-    assert main(["noise", "--device", "stern", str(file)]) == 2
-    assert "--device stern: expected one of the recording's, bow, mast" in capsys.readouterr().err
-    assert main(["noise", "--json", "--device", "bow", str(file)]) == 0
-    measurement = json.loads(capsys.readouterr().out)["measurement"]
+    cli.refuses("it has bow, mast: choose one with --device", "noise", str(file))
+    cli.refuses("--device stern: expected one of the recording's, bow, mast", "noise", "--device", "stern", str(file))
+    measurement = json.loads(cli("noise", "--json", "--device", "bow", file).out)["measurement"]
     assert measurement["samples"] == FRAMES
     assert (measurement["device"], measurement["driver"]) == ("bow", "hipnuc-uart")
     assert measurement["begun_utc_ns"] > 0
-    assert main(["noise", "--driver", "hipnuc-uart", str(file)]) == 2
-    assert "--driver: expected none with a recording" in capsys.readouterr().err
+    cli.refuses("--driver: expected none with a recording", "noise", "--driver", "hipnuc-uart", str(file))
 
 
-def test_a_part_of_a_recording_says_nothing_of_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_part_of_a_recording_says_nothing_of_its_end(tmp_path: Path, cli: Cli) -> None:
     (file,) = run_recorded(tmp_path)[2]
-    assert main(["noise", "--json", "--device", "bow", "--for", "1s", str(file)]) == 0
-    measurement = json.loads(capsys.readouterr().out)["measurement"]
+    measurement = json.loads(cli("noise", "--json", "--device", "bow", "--for", "1s", file).out)["measurement"]
     assert measurement["samples"] < FRAMES
     assert measurement["notes"] == []
 
@@ -155,29 +142,26 @@ def gappy(file: Path) -> Path:
 @pytest.mark.parametrize(
     ("part", "lost"), [([], 100), (["--for", "5s"], 0), (["--skip", "7.5s"], 0), (["--skip", "2s"], 100)]
 )
-def test_losses_are_those_of_the_part_that_was_taken(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], part: list[str], lost: int
-) -> None:
-    assert main(["noise", "--json", *part, str(gappy(tmp_path / "c.capture"))]) == 0
-    assert json.loads(capsys.readouterr().out)["measurement"]["lost"] == ({"lost_gap_device": lost} if lost else {})
+def test_losses_are_those_of_the_part_that_was_taken(tmp_path: Path, cli: Cli, part: list[str], lost: int) -> None:
+    assert json.loads(cli("noise", "--json", *part, gappy(tmp_path / "c.capture")).out)["measurement"]["lost"] == (
+        {"lost_gap_device": lost} if lost else {}
+    )
 
 
-def test_a_damaged_capture_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_capture_is_named(tmp_path: Path, cli: Cli) -> None:
     file = gappy(tmp_path / "c.capture")
     file.write_bytes(file.read_bytes() * 2)
-    assert main(["spectrum", str(file)]) == 0
-    assert "damaged at byte" in capsys.readouterr().out
+    assert "damaged at byte" in cli("spectrum", file).out
 
 
 # --- what is wrong ----------------------------------------------------------------------------------------------------
 
 
-def test_a_raw_capture_is_dated_by_the_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_raw_capture_is_dated_by_the_device(tmp_path: Path, cli: Cli) -> None:
     accel, gyro = resting(500, 100.0)
     file = tmp_path / "raw"
     file.write_bytes(b"".join(frame(10 * number, accel[number], gyro[number]) for number in range(500)))
-    assert main(["spectrum", str(file)]) == 0
-    out = " ".join(capsys.readouterr().out.split())
+    out = " ".join(cli("spectrum", file).out.split())
     assert "even grid of 100.0000 Hz" in out
     assert "as true as its crystal" in out
 
@@ -194,18 +178,15 @@ def test_a_raw_capture_is_dated_by_the_device(tmp_path: Path, capsys: pytest.Cap
         (["noise", "-o", "/nowhere/a.svg"], "/nowhere/a.svg"),
     ],
 )
-def test_what_cannot_be_done_is_said(
-    resting_file: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
-) -> None:
-    assert main([*words, str(resting_file)]) == 2
-    assert message in capsys.readouterr().err
+def test_what_cannot_be_done_is_said(resting_file: Path, cli: Cli, words: list[str], message: str) -> None:
+    cli.refuses(message, *words, str(resting_file))
 
 
-def test_what_is_neither_file_nor_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["noise", "bow", "--socket", str(tmp_path / "none")]) == 2
-    assert "no daemon at" in capsys.readouterr().err
-    assert main(["noise", "bow", "--baud", "9600", "--socket", str(tmp_path / "none")]) == 2
-    assert "--baud: expected none with a device" in capsys.readouterr().err
+def test_what_is_neither_file_nor_device(tmp_path: Path, cli: Cli) -> None:
+    cli.refuses("no daemon at", "noise", "bow", "--socket", str(tmp_path / "none"))
+    cli.refuses(
+        "--baud: expected none with a device", "noise", "bow", "--baud", "9600", "--socket", str(tmp_path / "none")
+    )
 
 
 def test_a_missing_extra_is_named(resting_file: Path) -> None:
@@ -240,26 +221,32 @@ def daemon(tmp_path: Path) -> Iterator[RunningDaemon]:
         yield made
 
 
-def test_a_live_device(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["spectrum", "--json", "--for", "1.5s", "--socket", str(daemon.socket), "bow"]) == 0
-    measurement = json.loads(capsys.readouterr().out)["measurement"]
+def test_a_live_device(daemon: RunningDaemon, cli: Cli) -> None:
+    measurement = json.loads(cli("spectrum", "--json", "--for", "1.5s", "--socket", daemon.socket, "bow").out)[
+        "measurement"
+    ]
     assert measurement["device"] == "bow"
     assert measurement["source"] == f"live from {daemon.socket}"
     assert measurement["duration_s"] == pytest.approx(1.5, abs=0.1)
     assert measurement["begun_utc_ns"] > 0
-    assert main(["noise", "--for", "1s", "--socket", str(daemon.socket), "stern"]) == 2
-    assert "stern: expected a file, or a device of the daemon (bow)" in capsys.readouterr().err
+    cli.refuses(
+        "stern: expected a file, or a device of the daemon (bow)",
+        "noise",
+        "--for",
+        "1s",
+        "--socket",
+        str(daemon.socket),
+        "stern",
+    )
 
 
-def test_the_noise_of_a_live_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_noise_of_a_live_device(tmp_path: Path, cli: Cli) -> None:
     """A simulated module at rest: its white noise is what the simulator adds, whatever its bias."""
     levels = NoiseLevels()
     with daemon_with_module(tmp_path, "--motion", "still", "--boot", "0") as daemon:
         words = ["noise", "--socket", str(daemon.socket), "bow"]
-        assert main([*words, "--json", "--for", "3s"]) == 0
-        told = json.loads(capsys.readouterr().out)
-        assert main([*words, "--skip", "0.2s", "--for", "1.5s"]) == 0
-        text = capsys.readouterr().out
+        told = json.loads(cli(*words, "--json", "--for", "3s").out)
+        text = cli(*words, "--skip", "0.2s", "--for", "1.5s").out
     measurement, sensors = told["measurement"], told["sensors"]
     assert (measurement["device"], measurement["driver"]) == ("bow", "hipnuc-uart")
     assert measurement["source"] == f"live from {daemon.socket}"
@@ -277,23 +264,28 @@ def test_the_noise_of_a_live_device(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_a_device_that_falls_silent_loses_nothing_of_before(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, cli: Cli, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(taking, "SILENCE_S", 0.5)
     with sending_daemon(tmp_path, lambda n: hi91(10 * n) if n < 400 else b"") as daemon:
-        assert main(["noise", "--json", "--for", "7s", "--socket", str(daemon.socket), "bow"]) == 0
+        cli("noise", "--json", "--for", "7s", "--socket", daemon.socket, "bow")
     measurement = json.loads(capsys.readouterr().out)["measurement"]
     assert 100 < measurement["samples"] < 400
 
 
 @pytest.mark.parametrize("on_a_terminal", [True, False])
 def test_a_device_that_sends_nothing_at_all_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *, on_a_terminal: bool
+    tmp_path: Path,
+    cli: Cli,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    on_a_terminal: bool,
 ) -> None:
     monkeypatch.setattr(taking, "SILENCE_S", 0.2)
     monkeypatch.setattr(spectrum_live, "SILENCE_S", 0.2)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: on_a_terminal)
     device = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
     with running_daemon(tmp_path, {"bow": device}) as daemon:
-        assert main(["spectrum", "--socket", str(daemon.socket), "bow"]) == 2
+        cli("spectrum", "--socket", daemon.socket, "bow", status=2)
     assert capsys.readouterr().err == "imud spectrum: bow: it sends no samples; `imud status` says why\n"

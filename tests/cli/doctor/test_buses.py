@@ -58,19 +58,14 @@ def test_transfers_need_the_daemon_and_the_device_in_it(machine: Machine) -> Non
 def test_failed_transfers(machine: Machine, counts: dict[str, int], severity: str, words: str) -> None:
     machine.configure(KEEL)
     machine.status = [polled("keel", counts=counts)]
-    ((got, text),) = machine.told(I2C)
-    assert got == severity
-    assert words in text
+    machine.tells(I2C, severity, words)
 
 
-def test_damaged_answers(machine: Machine) -> None:
+def test_damaged_answers_and_clock_stretching(machine: Machine) -> None:
     machine.configure(MAST)
     one = polled("mast", counts={"polls": 1000})
     machine.status = [msgspec.structs.replace(one, ledger=one.ledger | {"frames_bad_crc": 2})]
     assert "2 of 1000 answers were damaged → shorter wires, a slower clock than 1000000 Hz" in machine.told(SPI)[0][1]
-
-
-def test_clock_stretching_is_named_where_the_controller_mishandles_it(machine: Machine) -> None:
     machine.configure(KEEL)
     machine.status = [polled("keel", counts={"polls": 100, "failed": 50})]
     assert "stretching" not in machine.told(I2C)[0][1]
@@ -81,9 +76,7 @@ def test_clock_stretching_is_named_where_the_controller_mishandles_it(machine: M
 def test_a_device_that_does_not_answer(machine: Machine) -> None:
     machine.configure(KEEL, MAST)
     machine.status = [polled("keel", DeviceState.SEARCHING), polled("mast", DeviceState.FAILED)]
-    ((severity, text),) = machine.told(I2C)
-    assert severity == "error"
-    assert "`sudo i2cdetect -y 3` should show 18; no answer at address 0x18" in text
+    machine.tells(I2C, "error", "`sudo i2cdetect -y 3` should show 18; no answer at address 0x18")
     assert "words of 8 bits" in machine.told(SPI)[0][1]
     assert "has mode 3" in machine.told(SPI)[0][1]
     machine.configure("mast: {driver: imu61x-spi, spi: {port: /dev/spidev0.0}}")
@@ -131,6 +124,4 @@ def unusable(**refuse: int) -> str:
 def test_mode_and_word_size_by_what_was_read(machine: Machine, problem: str, words: str) -> None:
     machine.configure(MAST)
     machine.status = [msgspec.structs.replace(polled("mast", DeviceState.SEARCHING), problem=problem)]
-    ((severity, text),) = machine.told(SPI)
-    assert severity == "error"
-    assert words in text
+    machine.tells(SPI, "error", words)

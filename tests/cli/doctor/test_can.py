@@ -57,20 +57,14 @@ def controller(state: str = "ERROR-ACTIVE", tx: int = 0, rx: int = 0, **more: ob
     }  # fmt: skip
 
 
-def test_an_interface_that_is_not_there_down_or_up(mast: Machine) -> None:
+def test_an_interface_that_is_absent_down_up_or_virtual(mast: Machine) -> None:
     assert mast.told(UP)[0][1].startswith("can0 is not there; CAN interfaces of this machine: none →")
     up(mast, "0x40080")
     mast.prints(COMMAND, json.dumps(RECORDED["down"]))
-    ((severity, text),) = mast.told(UP)
-    assert severity == "error"
-    assert "can0 is down" in text
-    assert "up type can bitrate" in text
+    mast.tells(UP, "error", "can0 is down", "up type can bitrate")
     assert mast.find(STATE) == []  # nothing is known of an interface that is down
     interface(mast)
     assert mast.find(UP)[0].severity == "ok"
-
-
-def test_a_virtual_interface_has_no_controller(mast: Machine) -> None:
     interface(mast)
     assert mast.told(STATE) == [("ok", "can0 is virtual: it has no controller → ")]
     assert mast.find(RATE) == []
@@ -93,17 +87,13 @@ def test_state_and_error_counters(
 ) -> None:
     interface(mast, packets=packets, data=data)
     mast.on_pause = lambda: interface(mast, packets=packets + 20, data=data)
-    ((got, text),) = mast.told(STATE)
-    assert got == severity
-    assert words in text
+    mast.tells(STATE, severity, words)
 
 
 def test_errors_on_a_bus_that_carried_frames_before(mast: Machine) -> None:
     """The module was unplugged, or the bit rate changed: the kernel goes on counting frames from before."""
     interface(mast, packets=100, data=controller("ERROR-PASSIVE", 128, 0))
-    ((severity, text),) = mast.told(STATE)
-    assert severity == "error"
-    assert "100 frames received, none now → no other node acknowledges" in text
+    mast.tells(STATE, "error", "100 frames received, none now → no other node acknowledges")
     mast.status = [device("mast", state=DeviceState.RUNNING)]  # one that sends when it is asked
     assert mast.find(STATE)[0].severity == "warning"
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from imud.cli import main
 from imud.cli.doctor.command import CHECKS
 from imud.cli.doctor.report import examine, exit_status, verdict
 from imud.contracts.status import KernelCounters
+from tests.cli.conftest import Cli
 from tests.support.files import ROOT
 from tests.support.metrics import device
 from tests.support.surroundings import Machine
@@ -45,6 +45,40 @@ def test_nothing_wrong_is_said_only_where_all_was_seen(machine: Machine) -> None
     )
 
 
+@pytest.mark.parametrize("program", ["journalctl", "systemctl", "ip", "vcgencmd"])
+def test_a_missing_program_is_not_checked_and_ends_no_check(machine: Machine, program: str) -> None:
+    """For example, a container has no systemd, and a small image has no ip."""
+    healthy(machine)
+    machine.write("/proc/device-tree/model", "Raspberry Pi 4 Model B")
+    machine.prints("vcgencmd get_throttled", "throttled=0x0\n")
+    machine.configure(
+        "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}",
+        "mast: {driver: hipnuc-canopen, socketcan: {interface: can0}}",
+    )
+    machine.write("/sys/class/net/can0/type", "280\n")
+    machine.write("/sys/class/net/can0/flags", "0x40081\n")
+    machine.prints("ip", '[{"stats64": {"rx": {"packets": 1}}, "linkinfo": {"info_kind": "vcan"}}]')
+
+    def unseen() -> set[str]:
+        machine.sync_s = [0.01, 0.01, 0.01]
+        return {
+            one.name for one in examine(CHECKS, machine.surroundings())
+            if any(finding.severity == "not checked" for finding in one.findings)
+        }  # fmt: skip
+
+    before = unseen()
+    for words in [words for words in machine.outputs if words.split()[0] == program]:
+        del machine.outputs[words]
+    assert unseen() - before == MISSING[program]
+
+
+MISSING = {
+    "journalctl": {"kernel log"}, "systemctl": {"service", "ModemManager"}, "ip": {"CAN state", "CAN bit rate"},
+    "vcgencmd": {"power"},
+}  # fmt: skip
+"""Checks that need a program."""
+
+
 def test_an_empty_machine_ends_no_check(machine: Machine) -> None:
     examined = examine(CHECKS, machine.surroundings())
     assert [one.name for one in examined] == [check.name for check in CHECKS]
@@ -52,32 +86,26 @@ def test_an_empty_machine_ends_no_check(machine: Machine) -> None:
     assert "could not be checked" in verdict(examined)
 
 
-def test_on_this_machine_without_a_daemon(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_on_this_machine_without_a_daemon(tmp_path: Path, cli: Cli) -> None:
     file = tmp_path / "imud.yaml"
     file.write_text(f"state_dir: {tmp_path}\ndevices:\n  bow: {{driver: auto, uart: {{port: {tmp_path}/none}}}}\n")
     words = ["doctor", "--config", str(file), "--socket", str(tmp_path / "none")]
-    assert main(words) == 2
-    printed = capsys.readouterr().out
+    printed = cli(*words, status=2).out
     assert max(map(len, printed.splitlines())) <= 80
     assert "is not there" in printed
-    assert main([*words, "--json"]) == 2
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(cli(*words, "--json", status=2).out)
     assert [check["name"] for check in told["checks"]] == [check.name for check in CHECKS]
     (storage,) = [check for check in told["checks"] if check["name"] == "storage"]
     assert "writing 4 KiB" in storage["findings"][0]["seen"]
     assert sorted(tmp_path.iterdir()) == [file]
 
 
-def test_names_are_unique_and_in_the_document() -> None:
+def test_the_document_has_each_check_and_those_provoked_on_real_kernels() -> None:
     text = (ROOT / "docs/doctor.md").read_text()
     names = [check.name for check in CHECKS]
     assert len(set(names)) == len(names)
     for name in names:
         assert f"| {name} |" in text, name
-
-
-def test_the_document_has_the_checks_that_are_provoked_on_real_kernels() -> None:
-    """Each name that tests of a booted kernel see an error, a warning or a note of."""
     tests = ("tests/lab/test_doctor.py", "tests/lab_debian/guest/first_contact.py")
     call = re.compile(r'(?:has|expect_finding)\(\s*"([^"]+)",\s*"(?:error|warning|note|not checked)"')
     provoked = {name for test in tests for name in call.findall((ROOT / test).read_text())}

@@ -39,9 +39,7 @@ def test_storage_is_judged_by_the_worst_of_three_writes(machine: Machine, worst_
         "/proc/mounts", "/dev/sda1 / ext4 rw 0 0\n/dev/mmcblk0p2 /srv ext4 rw 0 0\n/dev/sdb /srv/im ext4 rw 0 0\n"
     )
     machine.sync_s = [0.01, worst_s, 0.02]
-    ((got, text),) = machine.told(STORAGE)
-    assert got == severity
-    assert f"to /srv/imud (/dev/mmcblk0p2) took {worst_s * 1000:.0f} ms" in text
+    machine.tells(STORAGE, severity, f"to /srv/imud (/dev/mmcblk0p2) took {worst_s * 1000:.0f} ms")
 
 
 def test_storage_that_is_not_there_or_may_not_be_written(machine: Machine) -> None:
@@ -96,9 +94,7 @@ def test_load_of_two_processors(machine: Machine, load: str, pressure: str | Non
     machine.write("/proc/loadavg", f"9.00 {load} 9.00 1/200 999\n")
     if pressure is not None:
         machine.write("/proc/pressure/cpu", f"some avg10=0.00 avg60={pressure} avg300=0.00 total=1\nfull avg10=0.00\n")
-    ((got, text),) = machine.told(PROCESSOR)
-    assert got == severity
-    assert "on 2 processors" in text
+    machine.tells(PROCESSOR, severity, "on 2 processors")
 
 
 def test_samples_lost_and_reads_late_by_a_busy_machine(machine: Machine) -> None:

@@ -36,33 +36,29 @@ QUIET = (
 )
 def test_each_kind_of_trouble(machine: Machine, line: str, words: str) -> None:
     machine.prints("journalctl", QUIET + line + "\n")
-    ((severity, text),) = machine.told(LOG)
-    assert severity == "warning"
-    assert f"kernel log: 1 lines on {words}, the last: {line[:40]}" in text
+    machine.tells(LOG, "warning", f"kernel log: 1 lines on {words}, the last: {line[:40]}")
 
 
-def test_a_quiet_log(machine: Machine) -> None:
+def test_a_quiet_log_unplugged_adapters_and_other_sources(machine: Machine) -> None:
     machine.prints("journalctl", QUIET)
     assert machine.told(LOG) == [
         ("ok", "nothing on ports, buses, storage or voltage in 6 lines of the kernel's log → ")
     ]
-
-
-def test_adapters_unplugged_again_and_again(machine: Machine) -> None:
     machine.prints("journalctl", QUIET * 3)
     ((_, text),) = machine.told(LOG)
     assert "3 lines on unplugged serial adapters" in text
-
-
-def test_dmesg_where_there_is_no_journal(machine: Machine) -> None:
     machine.prints("journalctl", "", 1, "No journal files were found.")
     machine.prints("dmesg", QUIET)
     assert machine.find(LOG)[0].severity == "ok"
-
-
-def test_a_log_that_may_not_be_read(machine: Machine) -> None:
     machine.prints("journalctl", "")
     machine.prints("dmesg", "", 1, "dmesg: read kernel buffer failed: Operation not permitted")
-    ((severity, text),) = machine.told(LOG)
-    assert severity == "not checked"
-    assert "Operation not permitted → run `sudo imud doctor`" in text
+    machine.tells(LOG, "not checked", "Operation not permitted → run `sudo imud doctor`")
+
+
+def test_missing_programs(machine: Machine) -> None:
+    machine.tells(LOG, "not checked", "the kernel's log cannot be read: journalctl: No such file", "join the group adm")
+    machine.outputs["journalctl"] = PermissionError(13, "Permission denied", "journalctl")
+    machine.tells(LOG, "not checked", "journalctl: Permission denied")
+    machine.prints("dmesg --notime", "", 1, "dmesg: unknown option --notime")
+    machine.prints("dmesg", QUIET)
+    machine.tells(LOG, "ok", "in 6 lines of the kernel's log")

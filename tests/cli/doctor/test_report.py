@@ -34,14 +34,11 @@ def test_verdict_and_exit_status(findings: list[DoctorFinding], status: int, wor
     assert told["complete"] is (UNSEEN not in findings)
 
 
-def test_json_has_every_check_with_its_findings() -> None:
+def test_json_and_page() -> None:
     assert json.loads(as_json([Examined("a", [WARNING]), Examined("b", [])]))["checks"] == [
         {"name": "a", "findings": [{"severity": "warning", "seen": "slow", "advice": "faster"}]},
         {"name": "b", "findings": []},
     ]
-
-
-def test_the_page_has_80_columns_and_what_is_wrong_last() -> None:
     long = error("word " * 60, "another " * 40)
     lines = page([Examined("a", [long, GOOD, UNSEEN])]).splitlines()
     assert max(map(len, lines)) <= 80
@@ -49,9 +46,6 @@ def test_the_page_has_80_columns_and_what_is_wrong_last() -> None:
     assert lines[1] == "not checked  hidden"
     assert lines[2].startswith("error        word word")
     assert any(line.startswith("             → another") for line in lines)
-
-
-def test_text_of_devices_is_made_printable() -> None:
     assert "\x1b" not in page([Examined("a", [error("\x1b[2J", "")])])
 
 

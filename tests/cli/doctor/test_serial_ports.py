@@ -28,15 +28,10 @@ def hold(machine: Machine, pid: int, name: str, *, command: str = "") -> None:
     (machine.root / f"proc/{pid}/fd/3").symlink_to(os.path.realpath(machine.root / "dev/ttyUSB0"))
 
 
-def test_a_port_that_is_not_there_among_others(bow: Machine) -> None:
+def test_a_port_that_is_absent_and_one_with_a_stable_name(bow: Machine) -> None:
     assert bow.told(PRESENT)[0][1].startswith("/dev/ttyUSB0 is not there; ports of this machine: none → is the cable")
     bow.port("ttyUSB1")
-    ((severity, text),) = bow.told(PRESENT)
-    assert severity == "error"
-    assert "ports of this machine: /dev/ttyUSB1 → is another of these ports the one?" in text
-
-
-def test_a_port_with_a_stable_name_has_it_proposed(bow: Machine) -> None:
+    bow.tells(PRESENT, "error", "ports of this machine: /dev/ttyUSB1 → is another of these ports the one?")
     bow.port("ttyUSB0")
     assert bow.find(PRESENT)[0].severity == "ok"
     folder = bow.root / "dev/serial/by-id"
@@ -59,16 +54,12 @@ def test_another_program_and_the_daemon_on_a_port(bow: Machine) -> None:
     hold(bow, 10, "python3", command="/usr/bin/python3 /usr/bin/imud run")
     assert bow.find(TAKEN)[0].severity == "ok"
     hold(bow, 11, "minicom")
-    ((severity, text),) = bow.told(TAKEN)
-    assert severity == "error"
-    assert "/dev/ttyUSB0 is open in minicom (pid 11)" in text
+    bow.tells(TAKEN, "error", "/dev/ttyUSB0 is open in minicom (pid 11)")
 
 
 def test_a_user_cannot_say_that_a_port_is_free(bow: Machine) -> None:
     bow.port("ttyUSB0")
-    ((severity, text),) = bow.told(TAKEN)
-    assert severity == "not checked"
-    assert "sudo imud doctor" in text
+    bow.tells(TAKEN, "not checked", "sudo imud doctor")
     bow.status = [device("bow")]  # runs on it, so has it alone
     assert bow.find(TAKEN)[0].severity == "ok"
     problem = "/dev/ttyUSB0 is in use by gpsd (pid 3): stop that first"
@@ -100,9 +91,6 @@ def test_latency_timers(bow: Machine) -> None:
     bow.port("ttyUSB0")
     assert bow.find(LATENCY) == []  # an adapter without one
     bow.write("/sys/class/tty/ttyUSB0/device/latency_timer", "16\n")
-    ((severity, text),) = bow.told(LATENCY)
-    assert severity == "warning"
-    assert "up to 16 ms" in text
-    assert 'ATTR{latency_timer}="1"' in text
+    bow.tells(LATENCY, "warning", "up to 16 ms", 'ATTR{latency_timer}="1"')
     bow.write("/sys/class/tty/ttyUSB0/device/latency_timer", "1\n")
     assert bow.find(LATENCY)[0].severity == "ok"

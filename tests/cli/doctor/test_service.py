@@ -18,33 +18,20 @@ BOW = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}"
 ACTIVE = ("ActiveState=active", "UnitFileState=enabled", "Result=success", "NRestarts=0", "NeedDaemonReload=no")
 
 
-def test_a_good_configuration_and_its_disabled_device(machine: Machine) -> None:
+def test_configurations(machine: Machine) -> None:
+    machine.tells(CONFIGURATION, "error", "No such file", "`sudo imud setup` writes one")
     machine.configure(BOW, "old: {enabled: false, driver: hipnuc-uart, uart: {port: /dev/ttyUSB1, baud: 115200}}")
     assert machine.told(CONFIGURATION) == [
         ("ok", "/etc/imud.yaml has no mistakes; devices: bow → "),
         ("note", "device old is disabled in /etc/imud.yaml → "),
     ]
-
-
-def test_a_configuration_without_devices_is_a_warning(machine: Machine) -> None:
     machine.configure()
     assert [finding.severity for finding in machine.find(CONFIGURATION)] == ["warning"]
-
-
-def test_each_mistake_is_an_error_with_its_place(machine: Machine) -> None:
     machine.configure("bow: {driver: hipnuc-uart, uart: {prt: /dev/ttyUSB0}}")
     found = machine.told(CONFIGURATION)
     assert found
     assert {severity for severity, _ in found} == {"error"}
     assert any("imud.yaml:2:" in text and "prt" in text for _, text in found)
-
-
-def test_no_configuration_is_an_error(machine: Machine) -> None:
-    ((severity, text),) = machine.told(CONFIGURATION)
-    assert severity == "error"
-    assert "No such file" in text
-    assert "`sudo imud setup` writes one" in text
-    assert "correct it" not in text
 
 
 def test_a_service_that_runs(machine: Machine) -> None:
@@ -112,19 +99,14 @@ def test_a_file_newer_than_the_last_reload(machine: Machine) -> None:
 
 
 def test_a_daemon_with_other_devices(machine: Machine) -> None:
+    assert machine.find(STALE)[0].severity == "not checked"
+    machine.configure(BOW)
+    assert machine.find(STALE)[0].severity == "not checked"
     machine.configure(BOW)
     machine.status = [device("stern")]
-    ((severity, text),) = machine.told(STALE)
-    assert severity == "warning"
-    assert "has the devices stern, /etc/imud.yaml has bow" in text
+    machine.tells(STALE, "warning", "has the devices stern, /etc/imud.yaml has bow")
     machine.status = [device("bow")]
     assert machine.find(STALE)[0].severity == "ok"
-
-
-def test_nothing_to_compare_is_not_checked(machine: Machine) -> None:
-    assert machine.find(STALE)[0].severity == "not checked"
-    machine.configure(BOW)
-    assert machine.find(STALE)[0].severity == "not checked"
 
 
 def test_states_come_with_the_reason_of_the_daemon(machine: Machine) -> None:

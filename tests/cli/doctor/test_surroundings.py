@@ -12,40 +12,31 @@ from tests.support.metrics import device
 from tests.support.surroundings import Machine
 
 
-def test_a_command_with_its_status_and_the_last_line_of_its_complaint() -> None:
+@pytest.mark.live
+def test_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     program = "import sys, os; print(os.environ['LC_ALL']); sys.stderr.write('one\\ntwo\\n'); sys.exit(3)"
     assert run_command([sys.executable, "-c", program]) == (3, "C\n", "two")
-
-
-def test_a_command_that_is_not_there() -> None:
     with pytest.raises(FileNotFoundError):
         run_command(["/no/such/command"])
-
-
-def test_a_command_that_does_not_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(TimeoutError, match=r"sleep did not end within 0\.01 s"):
+        run_command(["sleep", "60"], limit_s=0.01)
+    monkeypatch.setattr(surroundings, "OUTPUT_CHARACTERS_MAX", 4)
+    assert run_command([sys.executable, "-c", "print('abcdef')"]).text == "def\n"
     monkeypatch.setattr(surroundings, "COMMAND_S", 0.01)
-    with pytest.raises(TimeoutError, match=r"did not end within 0\.01 s"):
+    with pytest.raises(TimeoutError):
         run_command(["sleep", "60"])
 
 
-def test_output_is_bounded_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(surroundings, "OUTPUT_CHARACTERS_MAX", 4)
-    assert run_command([sys.executable, "-c", "print('abcdef')"]).text == "def\n"
-
-
-def test_measuring_the_storage_leaves_nothing(tmp_path: Path) -> None:
+def test_storage_servers_and_the_daemon(tmp_path: Path) -> None:
     assert measure_sync_s(tmp_path) > 0
     assert list(tmp_path.iterdir()) == []
-
-
-def test_no_server_and_no_daemon(tmp_path: Path) -> None:
     with pytest.raises(ConnectionRefusedError):
         fetch_over_http("127.0.0.1", 1, "/")
     with pytest.raises(LinkMissing):
         ask_daemon(str(tmp_path / "none"))
 
 
-def test_the_daemon_is_asked_once(machine: Machine) -> None:
+def test_the_daemon_files_and_the_unit(machine: Machine) -> None:
     machine.status = [device("bow")]
     at = machine.surroundings()
     assert at.status is not None
@@ -53,17 +44,11 @@ def test_the_daemon_is_asked_once(machine: Machine) -> None:
     assert at.status_of("bow") is not None
     assert at.status_of("stern") is None
     assert at.status_error is None
-
-
-def test_files_are_below_the_root_and_unreadable_ones_are_none(machine: Machine) -> None:
     machine.write("/proc/device-tree/model", "Raspberry Pi\0\n")
     at = machine.surroundings()
     assert at.text("/proc/device-tree/model") == "Raspberry Pi"
     assert at.text("/proc/none") is None
     assert at.at("/dev/ttyUSB0") == machine.root / "dev/ttyUSB0"
-
-
-def test_properties_of_the_unit_that_come_several_times(machine: Machine) -> None:
     assert machine.surroundings().unit == {}
     machine.unit("DeviceAllow=char-ttyUSB rw", "DeviceAllow=/dev/i2c-1 rw", "Environment=A=b")
     at = machine.surroundings()

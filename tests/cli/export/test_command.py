@@ -25,6 +25,7 @@ from imud.frames.published import as_sent
 from imud.sample import Sample
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.cli.analysis.captures import resting, write_capture
+from tests.cli.conftest import Cli
 from tests.cli.recording.recorded_daemon import FRAMES, run_recorded, stamped_capture
 from tests.support.files import hi91, imu61x_log
 
@@ -74,9 +75,8 @@ def rows(text: str) -> list[dict[str, str]]:
 # --- CSV --------------------------------------------------------------------------------------------------------------
 
 
-def test_csv_has_every_sample_with_all_its_digits(recorded: Recorded, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", "--to", "csv", str(recorded.file)]) == 0
-    printed = capsys.readouterr()
+def test_csv_has_every_sample_with_all_its_digits(recorded: Recorded, cli: Cli) -> None:
+    printed = cli("export", "--to", "csv", recorded.file)
     found = rows(printed.out)
     assert len(found) == len(recorded.samples) > FRAMES
     for row, sample in zip(found, recorded.samples, strict=True):
@@ -89,8 +89,8 @@ def test_csv_has_every_sample_with_all_its_digits(recorded: Recorded, capsys: py
     assert f"{len(found)} samples to standard output" in printed.err
 
 
-def test_csv_is_that_of_rfc_4180(recorded: Recorded, tmp_path: Path) -> None:
-    assert main(["export", "--to", "csv", "-o", str(tmp_path / "a.csv"), str(recorded.file)]) == 0
+def test_csv_is_that_of_rfc_4180(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
+    cli("export", "--to", "csv", "-o", tmp_path / "a.csv", recorded.file)
     data = (tmp_path / "a.csv").read_bytes()
     lines = data.split(b"\r\n")
     assert lines[-1] == b""
@@ -98,17 +98,15 @@ def test_csv_is_that_of_rfc_4180(recorded: Recorded, tmp_path: Path) -> None:
     assert len({line.count(b",") for line in lines[:-1]}) == 1
 
 
-def test_one_device_and_some_fields(recorded: Recorded, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_device_and_some_fields(recorded: Recorded, cli: Cli) -> None:
     words = ["export", "--to", "csv", "--device", "mast", "--fields", "gyro_rad_s,t_ns", str(recorded.file)]
-    assert main(words) == 0
-    found = rows(capsys.readouterr().out)
+    found = rows(cli(*words).out)
     assert list(found[0]) == ["gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s", "t_ns"]
     assert len(found) == sum(sample.device == "mast" for sample in recorded.samples)
 
 
-def test_events_and_losses_are_tables_of_their_own(recorded: Recorded, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", "--to", "csv", "--table", "events", str(recorded.file)]) == 0
-    events = rows(capsys.readouterr().out)
+def test_events_and_losses_are_tables_of_their_own(recorded: Recorded, cli: Cli) -> None:
+    events = rows(cli("export", "--to", "csv", "--table", "events", recorded.file).out)
     assert [(one["device"], one["kind"], one["t_ns"]) for one in events[-3:]] == [
         (event.device, event.kind, str(event.t_ns)) for event in EVENTS
     ]
@@ -116,8 +114,7 @@ def test_events_and_losses_are_tables_of_their_own(recorded: Recorded, capsys: p
     for one in events[-3:]:
         offset_ns = int(one["utc_ns"]) - int(one["t_ns"])
         assert abs(offset_ns - (newest.utc_ns - newest.t_ns)) < NS_PER_MS
-    assert main(["export", "--to", "csv", "--table", "losses", str(recorded.file)]) == 0
-    losses = rows(capsys.readouterr().out)
+    losses = rows(cli("export", "--to", "csv", "--table", "losses", recorded.file).out)
     assert {(one["device"], one["lost_crc"]) for one in losses} == {("bow", "0"), ("mast", "0")}
 
 
@@ -131,9 +128,9 @@ def messages(file: Path) -> Iterator[tuple[str, str, int, bytes]]:
             yield channel.topic, schema.name, message.log_time, message.data
 
 
-def test_mcap_with_json(recorded: Recorded, tmp_path: Path) -> None:
+def test_mcap_with_json(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
     out = tmp_path / "a.mcap"
-    assert main(["export", "--to", "mcap", "-o", str(out), str(recorded.file)]) == 0
+    cli("export", "--to", "mcap", "-o", out, recorded.file)
     found: dict[str, list[Any]] = {}
     for topic, _, t_ns, data in messages(out):
         found.setdefault(topic, []).append((t_ns, json.loads(data)))
@@ -159,9 +156,9 @@ def test_mcap_with_json(recorded: Recorded, tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path) -> None:
+def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
     out = tmp_path / "a.mcap"
-    assert main(["export", "--to", "mcap", "--schema", "ros2", "-o", str(out), str(recorded.file)]) == 0
+    cli("export", "--to", "mcap", "--schema", "ros2", "-o", out, recorded.file)
     found: dict[str, list[Any]] = {}
     with AnyReader([out]) as reader:
         types = {connection.topic: connection.msgtype for connection in reader.connections}
@@ -187,13 +184,15 @@ def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path
     assert found["/bow/losses"][0][1].lost_crc == 0
 
 
-def test_diagnostics_of_a_recording_have_its_losses_states_and_errors(recorded: Recorded, tmp_path: Path) -> None:
+def test_diagnostics_of_a_recording_have_its_losses_states_and_errors(
+    recorded: Recorded, tmp_path: Path, cli: Cli
+) -> None:
     """Of a recording for the errors; of a capture in which 7 messages are missing for the losses."""
     accel, gyro = resting(1500, 100.0)
     gap = write_capture(tmp_path / "gap.capture", accel, gyro, rate_hz=100.0, missing=range(700, 707))
     for file in (recorded.file, gap):
         out = tmp_path / f"{file.name}.mcap"
-        assert main(["export", "--to", "mcap", "--schema", "ros2", "-o", str(out), str(file)]) == 0
+        cli("export", "--to", "mcap", "--schema", "ros2", "-o", out, file)
         with AnyReader([out]) as reader:
             found = [
                 (t_ns, reader.deserialize(data, connection.msgtype))
@@ -216,21 +215,18 @@ def test_diagnostics_of_a_recording_have_its_losses_states_and_errors(recorded: 
     assert [t_ns for t_ns, _ in found] == [max(stamp_ns, 0) for stamp_ns in stamps_ns], "MCAP begins in 1970"
 
 
-def test_covariances_come_from_the_configuration_and_from_reports(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_covariances_come_from_the_configuration_and_from_reports(tmp_path: Path, cli: Cli) -> None:
     pytest.importorskip("scipy", reason="the analysis needs the extra imud[analysis]")
     accel, gyro = resting(12_000, 100.0)
     resting_file = write_capture(tmp_path / "rest.capture", accel, gyro, rate_hz=100.0)
     _, _, (file,) = run_recorded(tmp_path, more="noise: {gyro_rad_s: 0.5, attitude_rad: 0.25}")
-    assert main(["noise", "--json", str(resting_file)]) == 0
-    report = json.loads(capsys.readouterr().out)
+    report = json.loads(cli("noise", "--json", resting_file).out)
     report["measurement"]["device"] = "mast"
     (tmp_path / "mast.json").write_text(json.dumps(report))
     sigma = sum(axis["spread"]["value"] ** 2 for axis in report["sensors"]["gyro"]["axes"].values()) / 3
     for words, variance in (([], 0.25), (["--noise", str(tmp_path / "mast.json")], sigma)):
         out = tmp_path / "a.mcap"
-        assert main(["export", "--to", "mcap", "--schema", "ros2", "--force", *words, "-o", str(out), str(file)]) == 0
+        cli("export", "--to", "mcap", "--schema", "ros2", "--force", *words, "-o", out, file)
         with AnyReader([out]) as reader:
             imu: dict[str, Any] = {
                 connection.topic: reader.deserialize(data, connection.msgtype)
@@ -243,18 +239,18 @@ def test_covariances_come_from_the_configuration_and_from_reports(
         assert not any(imu["/bow/imu/data"].angular_velocity_covariance)
 
 
-def test_fields_choose_channels(recorded: Recorded, tmp_path: Path) -> None:
+def test_fields_choose_channels(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
     out = tmp_path / "a.mcap"
     words = ["--to", "mcap", "--fields", "mag_t,temperature_c", "--device", "bow", "-o", str(out)]
-    assert main(["export", *words, str(recorded.file)]) == 0
+    cli("export", *words, recorded.file)
     topics = {topic for topic, *_ in messages(out)}
     assert topics == {"/bow/imu/mag", "/bow/temperature", "/bow/losses", "/events", "/diagnostics"}
 
 
-def test_ned_has_frames_of_its_own(recorded: Recorded, tmp_path: Path) -> None:
+def test_ned_has_frames_of_its_own(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
     out = tmp_path / "a.mcap"
     words = ["--to", "mcap", "--convention", "ned-frd", "--device", "bow", "-o", str(out)]
-    assert main(["export", *words, str(recorded.file)]) == 0
+    cli("export", *words, recorded.file)
     found = [json.loads(data) for topic, _, _, data in messages(out) if topic in ("/bow/imu/data", "/bow/attitude")]
     assert {one.get("frame_id", one.get("child_frame_id")) for one in found} == {"bow_frd"}
     assert {one["linear_acceleration"]["z"] for one in found if "linear_acceleration" in one} == {-9.8}
@@ -263,12 +259,9 @@ def test_ned_has_frames_of_its_own(recorded: Recorded, tmp_path: Path) -> None:
 # --- captures ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_raw_capture_has_the_times_of_the_device_and_says_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_raw_capture_has_the_times_of_the_device_and_says_so(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "c.raw").write_bytes(b"".join(hi91(10 * i) for i in range(300)))
-    assert main(["export", "--to", "csv", str(tmp_path / "c.raw")]) == 0
-    printed = capsys.readouterr()
+    printed = cli("export", "--to", "csv", tmp_path / "c.raw")
     found = rows(printed.out)
     assert len(found) == 300
     for name in ("t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns"):
@@ -280,10 +273,10 @@ def test_a_raw_capture_has_the_times_of_the_device_and_says_so(
     assert "live run" not in words
 
 
-def test_a_raw_capture_in_mcap(tmp_path: Path) -> None:
+def test_a_raw_capture_in_mcap(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "c.raw").write_bytes(b"".join(hi91(10 * i) for i in range(30)))
     out = tmp_path / "c.mcap"
-    assert main(["export", "--to", "mcap", "-o", str(out), str(tmp_path / "c.raw")]) == 0
+    cli("export", "--to", "mcap", "-o", out, tmp_path / "c.raw")
     stamps = [(t_ns, json.loads(data)) for topic, _, t_ns, data in messages(out) if topic == "/replay/stamp"]
     assert [t_ns for t_ns, _ in stamps] == [10_000_000 * i for i in range(30)]
     assert {one["t_err_ns"] for _, one in stamps} == {0xFFFF_FFFF}
@@ -292,10 +285,9 @@ def test_a_raw_capture_in_mcap(tmp_path: Path) -> None:
     assert "no time of any read" in metadata["times"]
 
 
-def test_a_stamped_capture_has_its_own_times(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stamped_capture_has_its_own_times(tmp_path: Path, cli: Cli) -> None:
     file = stamped_capture(tmp_path / "c.capture")
-    assert main(["export", "--to", "csv", str(file)]) == 0
-    printed = capsys.readouterr()
+    printed = cli("export", "--to", "csv", file)
     found = rows(printed.out)
     assert len(found) == FRAMES
     assert abs(int(found[-1]["t_ns"]) - (1000 * 10**9 + 299 * 10**7)) < 10**7
@@ -303,10 +295,9 @@ def test_a_stamped_capture_has_its_own_times(tmp_path: Path, capsys: pytest.Capt
     assert "does not say what time of day that was" in " ".join(printed.err.split())
 
 
-def test_a_log_of_candump_has_the_wall_clock(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_of_candump_has_the_wall_clock(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "can.log").write_text(imu61x_log(range(200)))
-    assert main(["export", "--to", "csv", "--driver", "imu61x-can", str(tmp_path / "can.log")]) == 0
-    printed = capsys.readouterr()
+    printed = cli("export", "--to", "csv", "--driver", "imu61x-can", tmp_path / "can.log")
     found = rows(printed.out)
     assert len(found) == 200
     assert abs(int(found[100]["utc_ns"]) - (1_763_717_507 * 10**9 + 100 * 10**7)) < 10**6
@@ -329,11 +320,10 @@ def test_a_damaged_recording_is_exported_as_far_as_it_goes_and_is_an_answer_of_n
     assert "damaged" in capsys.readouterr().err
 
 
-def test_what_is_no_recording_is_a_capture_without_samples(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_recording_is_a_capture_without_samples(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "noise").write_bytes(b"\x00" * 500)
-    assert main(["export", "--to", "csv", str(tmp_path / "noise")]) == 1
-    assert main(["export", "--to", "csv", str(tmp_path / "none")]) == 2
-    assert "expected a recording or a capture" in capsys.readouterr().err
+    cli("export", "--to", "csv", tmp_path / "noise", status=1)
+    cli.refuses("expected a recording or a capture", "export", "--to", "csv", str(tmp_path / "none"))
 
 
 @pytest.mark.parametrize(
@@ -348,33 +338,36 @@ def test_what_is_no_recording_is_a_capture_without_samples(tmp_path: Path, capsy
         (["--to", "csv", "--device", "stern"], "expected a device of the recording, which has bow, mast"),
     ],
 )
-def test_options_that_mean_nothing(
-    words: list[str], expected: str, recorded: Recorded, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["export", *words, str(recorded.file)]) == 2
-    assert expected in " ".join(capsys.readouterr().err.split())
+def test_options_that_mean_nothing(words: list[str], expected: str, recorded: Recorded, cli: Cli) -> None:
+    assert expected in " ".join(cli("export", *words, recorded.file, status=2).err.split())
 
 
-def test_a_polled_driver_has_no_captures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_polled_driver_has_no_captures(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "c.raw").write_bytes(hi91(0))
-    assert main(["export", "--to", "csv", "--driver", "hipnuc-modbus", str(tmp_path / "c.raw")]) == 2
-    assert "expected a driver of bytes or of CAN frames" in capsys.readouterr().err
+    cli.refuses(
+        "expected a driver of bytes or of CAN frames",
+        "export",
+        "--to",
+        "csv",
+        "--driver",
+        "hipnuc-modbus",
+        str(tmp_path / "c.raw"),
+    )
 
 
 def test_without_the_library_it_says_how_to_get_it(
-    recorded: Recorded, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch, cli: Cli, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "mcap.records", None)
     monkeypatch.delitem(sys.modules, "imud.bridges.mcap_file", raising=False)
-    assert main(["export", "--to", "mcap", "-o", str(tmp_path / "a"), str(recorded.file)]) == 2
-    assert "pip install 'imud[export]'" in capsys.readouterr().err
+    cli.refuses("pip install 'imud[export]'", "export", "--to", "mcap", "-o", str(tmp_path / "a"), str(recorded.file))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_csv_needs_no_extra(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_csv_needs_no_extra(recorded: Recorded, monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     for name in [name for name in sys.modules if name.partition(".")[0] == "mcap"]:
         monkeypatch.setitem(sys.modules, name, None)
-    assert main(["export", "--to", "csv", str(recorded.file)]) == 0
+    cli("export", "--to", "csv", recorded.file)
 
 
 def test_a_reader_that_goes_away_ends_it(recorded: Recorded) -> None:
@@ -388,10 +381,9 @@ def test_a_reader_that_goes_away_ends_it(recorded: Recorded) -> None:
         assert "Traceback" not in done.stderr
 
 
-def test_a_full_disk_is_an_error_that_names_the_file(recorded: Recorded, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_full_disk_is_an_error_that_names_the_file(recorded: Recorded, cli: Cli) -> None:
     for to in ("csv", "mcap"):
-        assert main(["export", "--to", to, "-o", "/dev/full", str(recorded.file)]) == 2
-        assert "/dev/full: No space left on device" in capsys.readouterr().err
+        cli.refuses("/dev/full: No space left on device", "export", "--to", to, "-o", "/dev/full", str(recorded.file))
 
 
 def test_defaults_are_those_of_replay() -> None:

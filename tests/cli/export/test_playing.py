@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from imud.bridges.channel import LossCounts, StampedEvent
-from imud.cli import main
 from imud.cli.export import playing
 from imud.cli.export.playing import play_beside, play_here
 from imud.contracts.publisher import Batch
 from imud.errors import ImudError
 from imud.frames.conventions import Convention
 from imud.sample import Sample
+from tests.cli.conftest import Cli
 from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
 
 
@@ -113,11 +113,10 @@ def test_the_player_ends_quietly_when_nobody_reads(file: Path) -> None:
 
 
 def test_the_command_writes_the_same_file(
-    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli
 ) -> None:
-    assert main(["export", "--to", "csv", "-o", str(tmp_path / "here"), str(file)]) == 0
+    cli("export", "--to", "csv", "-o", tmp_path / "here", file)
     monkeypatch.setattr("imud.cli.export.source.BESIDE_BYTES", 0)
-    assert main(["export", "--to", "csv", "-o", str(tmp_path / "beside"), str(file)]) == 0
+    cli("export", "--to", "csv", "-o", tmp_path / "beside", file)
     assert (tmp_path / "here").read_bytes() == (tmp_path / "beside").read_bytes()
-    assert main(["export", "--to", "csv", "--device", "stern", str(file)]) == 2
-    assert "which has bow, mast" in capsys.readouterr().err
+    cli.refuses("which has bow, mast", "export", "--to", "csv", "--device", "stern", str(file))

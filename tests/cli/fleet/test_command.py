@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from imud.cli import main
 from imud.formats.fleet.state import GatewayState, StreamPosition
+from tests.cli.conftest import Cli
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, dropped_message, samples_message
 from tests.publishers.mqtt.mosquitto import Mosquitto
 
@@ -87,6 +87,5 @@ def test_what_was_not_acknowledged_by_a_killed_collector_comes_again(broker: Mos
         (["mqtt://host", "--to", "-", "--key-file", "f"], "expected --cert-file"),
     ],
 )
-def test_arguments_are_checked(words: list[str], problem: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fleet", "collect", *words]) == 2
-    assert problem in capsys.readouterr().err
+def test_arguments_are_checked(words: list[str], problem: str, cli: Cli) -> None:
+    cli.refuses(problem, "fleet", "collect", *words)

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from imud.cli import main
 from imud.formats.fleet.state import GatewayState
+from tests.cli.conftest import Cli
 from tests.fleet.demo import GATEWAYS
 from tests.fleet.demo import main as demonstrate
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, samples_message
@@ -61,9 +61,8 @@ def test_on_a_terminal_the_picture_is_redrawn(gateway: tuple[Mosquitto, SendingG
     os.close(master)
 
 
-def test_no_gateway_is_an_answer_of_no_and_the_reason_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fleet", "top", "mqtt://127.0.0.1:1", "--plain", "--interval", "0.2", "--duration", "1s"]) == 1
-    printed = capsys.readouterr()
+def test_no_gateway_is_an_answer_of_no_and_the_reason_is_told(cli: Cli) -> None:
+    printed = cli("fleet", "top", "mqtt://127.0.0.1:1", "--plain", "--interval", "0.2", "--duration", "1s", status=1)
     assert "no gateway yet; " in printed.out
     assert "nothing comes at the end: mqtt://127.0.0.1:1" in printed.err
 
@@ -89,6 +88,5 @@ def test_every_gateway_of_the_demonstration_is_online_and_sends(capfd: pytest.Ca
         (["mqtt://host", "--gateway", "a/b"], "gateway: expected 1 to 64 letters"),
     ],
 )
-def test_arguments_are_checked(words: list[str], problem: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fleet", "top", "--plain", *words]) == 2
-    assert problem in capsys.readouterr().err
+def test_arguments_are_checked(words: list[str], problem: str, cli: Cli) -> None:
+    cli.refuses(problem, "fleet", "top", "--plain", *words)

@@ -17,11 +17,11 @@ import pytest
 
 from imud.bridges.channel import MessageFrames, StampedEvent
 from imud.bridges.json_channels import JsonDialect
-from imud.cli import main
 from imud.cli.foxglove.origins import ViewerOrigins
 from imud.cli.foxglove.server import FoxgloveServer, hidden_address
 from imud.errors import ServerError
 from tests.bridges.samples import EVENT, FULL, UTC_NS
+from tests.cli.conftest import Cli
 from tests.cli.foxglove.protocol_client import LIMIT_S, SUBPROTOCOL, connected
 from tests.support.daemon_process import running_daemon
 from tests.test_daemon import cable, device
@@ -141,21 +141,26 @@ def test_the_command_shows_what_the_device_sent(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("address", ["0.0.0.0", "::", "192.168.1.2", "gateway"])
-def test_another_address_needs_to_be_opened(address: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["foxglove", "--address", address, "--port", "0"]) == 2
-    assert "expected --open as well, or no --address, and a tunnel: ssh -L 8765:" in capsys.readouterr().err
+def test_another_address_needs_to_be_opened(address: str, cli: Cli) -> None:
+    cli.refuses(
+        "expected --open as well, or no --address, and a tunnel: ssh -L 8765:",
+        "foxglove",
+        "--address",
+        address,
+        "--port",
+        "0",
+    )
 
 
-def test_the_warning_stands_before_the_first_sample(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_warning_stands_before_the_first_sample(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     monkeypatch.setattr("imud.cli.foxglove.relay.Relay.run", lambda _relay: None)
     handler = signal.getsignal(signal.SIGTERM)
     try:
-        assert main(["foxglove", "--address", "0.0.0.0", "--open", "--port", "0"]) == 0
-        assert "WARNING: 0.0.0.0 is not a loopback address" in capsys.readouterr().err
-        assert main(["foxglove", "--port", "0"]) == 0
-        assert "WARNING" not in capsys.readouterr().err
+        assert (
+            "WARNING: 0.0.0.0 is not a loopback address"
+            in cli("foxglove", "--address", "0.0.0.0", "--open", "--port", "0").err
+        )
+        assert "WARNING" not in cli("foxglove", "--port", "0").err
     finally:
         signal.signal(signal.SIGTERM, handler)
 
@@ -163,15 +168,11 @@ def test_the_warning_stands_before_the_first_sample(
 @pytest.mark.parametrize(
     "words", [["--port", "70000"], ["--rate", "-1"], ["--rate", "nan"], ["--allow-origin", "viewer.example"]]
 )
-def test_arguments_out_of_range(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["foxglove", *words]) == 2
-    assert f"{words[0]}: expected" in capsys.readouterr().err
+def test_arguments_out_of_range(words: list[str], cli: Cli) -> None:
+    cli.refuses(f"{words[0]}: expected", "foxglove", *words)
 
 
-def test_without_the_library_it_says_how_to_get_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_the_library_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
     monkeypatch.delitem(sys.modules, "imud.cli.foxglove.server", raising=False)
-    assert main(["foxglove"]) == 2
-    assert "pip install 'imud[foxglove]'" in capsys.readouterr().err
+    cli.refuses("pip install 'imud[foxglove]'", "foxglove")

@@ -37,7 +37,7 @@ class Terminal:
         return True
 
 
-def test_one_device_has_a_line_of_80_columns() -> None:
+def test_lines_have_80_columns() -> None:
     lines = SampleTable().text(WHOLE).splitlines()
     assert lines == [
         "                  -----ACCEL m/s²----- ------GYRO °/s------ -----ATTITUDE °-----",
@@ -45,9 +45,6 @@ def test_one_device_has_a_line_of_80_columns() -> None:
         "19:43:20.123 0.25   0.00   0.50   9.80   57.3    0.0  -57.3    5.7  -11.5  171.9",
     ]
     assert max(map(len, lines)) == 80
-
-
-def test_several_devices_have_a_column_and_80_columns_too() -> None:
     table = SampleTable()
     table.add_devices(["bow", "stern"])
     assert table.text(WHOLE).splitlines() == [
@@ -57,7 +54,7 @@ def test_several_devices_have_a_column_and_80_columns_too() -> None:
     ]
 
 
-def test_the_largest_values_stay_in_their_columns() -> None:
+def test_values_stay_in_their_columns() -> None:
     one, several = SampleTable(), SampleTable()
     several.add_devices(["a", "b"])
     assert one.text(LARGEST).splitlines()[-1] == (
@@ -66,24 +63,17 @@ def test_the_largest_values_stay_in_their_columns() -> None:
     assert several.text(LARGEST).splitlines()[-1] == (
         "nnnnn…nnnm 19:43:20.123  -157  -157  -157 -2292 -2292 -2292 -179.9 -179.9 -179.9"
     )
-
-
-def test_absent_values_are_a_dash() -> None:
     assert SampleTable().text(ONE).splitlines()[-1].split() == ["19:43:20.123", "0.25", *["-"] * 9]
-
-
-def test_every_field_can_be_shown_and_all_of_them_take_several_lines() -> None:
     assert FIELDS.keys() == set(SAMPLE_FIELDS)
     lines = SampleTable(SAMPLE_FIELDS).text(LARGEST).splitlines()
     assert max(map(len, lines)) <= 80
     assert len(lines) > 4
     assert [line.split()[-1] for line in lines[-4:]] == ["19:43:20.123", "-2292", "-179.9", "999999999"]
-
-
-def test_chosen_fields_come_in_their_order() -> None:
     assert SampleTable(("temperature_c", "device", "status")).text(msgspec.structs.replace(WHOLE, status=8)) == (
         "   °C DEVICE     STATUS\n 31.5 bow        0x00000008\n"
     )
+    table = SampleTable(("device",))
+    assert "\x1b" not in table.text(msgspec.structs.replace(ONE, device="\x1b[2J"))
 
 
 @pytest.mark.parametrize(
@@ -110,7 +100,7 @@ def test_a_very_narrow_terminal_still_shows_every_column() -> None:
     assert len(lines) == 4
 
 
-def test_a_pipe_has_one_header_and_a_terminal_one_on_each_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_headers(monkeypatch: pytest.MonkeyPatch) -> None:
     piped = SampleTable()
     heads = [piped.text(WHOLE).count("TIME") for _ in range(100)]
     assert heads == [1, *[0] * 99]
@@ -122,9 +112,6 @@ def test_a_pipe_has_one_header_and_a_terminal_one_on_each_screen(monkeypatch: py
     low = SampleTable()
     heads = [low.text(WHOLE).count("TIME") for _ in range(ROWS_LEAST + 1)]
     assert [n for n, head in enumerate(heads) if head] == [0, ROWS_LEAST]
-
-
-def test_a_terminal_that_becomes_wider_shows_more_with_the_next_header(monkeypatch: pytest.MonkeyPatch) -> None:
     Terminal(monkeypatch, 80, 23)
     table = SampleTable()
     before = [table.text(WHOLE) for _ in range(20)]
@@ -142,8 +129,3 @@ def test_a_second_device_makes_a_new_header() -> None:
     assert other.splitlines()[1].startswith("DEVICE")
     assert other.splitlines()[2].startswith("stern ")
     assert table.text(WHOLE).startswith("bow ")
-
-
-def test_a_name_cannot_move_the_cursor() -> None:
-    table = SampleTable(("device",))
-    assert "\x1b" not in table.text(msgspec.structs.replace(ONE, device="\x1b[2J"))

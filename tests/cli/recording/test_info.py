@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from imud.cli import main
 from imud.cli.recording.info import Contents
 from imud.formats.recording.records import CheckRecord, Kind, PathRecord, encode_object, records_of
 from imud.ledger import LEDGER_FIELDS
 from imud.units import NS_PER_S
+from tests.cli.conftest import Cli
 from tests.cli.recording.recorded_daemon import run_recorded
 
 
@@ -19,20 +19,15 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def test_a_whole_file(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", str(file)]) == 0
-    page = capsys.readouterr().out
+def test_a_whole_file_for_people_and_programs(file: Path, cli: Cli) -> None:
+    page = cli("info", file).out
     assert "integrity  whole" in page
     assert "dropped    nothing" in page
     assert "bow: " in page
     assert "driver imu61x-can" in page
     assert "bytes per sample" in page
     assert all(len(line) <= 80 for line in page.splitlines())
-
-
-def test_numbers_for_programs(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", "--json", str(file)]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(cli("info", "--json", file).out)
     assert [device["name"] for device in told["devices"]] == ["bow", "mast"]
     bow, mast = told["devices"]
     assert (bow["samples"], bow["reads"], bow["lost"]) == (300, 300, 0)
@@ -43,25 +38,26 @@ def test_numbers_for_programs(file: Path, capsys: pytest.CaptureFixture[str]) ->
     assert told["file_number"] == 0
 
 
-def test_a_damaged_file_is_an_answer_of_no_and_a_cut_one_is_not(
-    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_file_is_an_answer_of_no_and_a_cut_one_is_not(file: Path, tmp_path: Path, cli: Cli) -> None:
     data = bytearray(file.read_bytes())
     (tmp_path / "cut").write_bytes(data[:-3])
-    assert main(["info", str(tmp_path / "cut")]) == 0
-    assert "no regular end" in " ".join(capsys.readouterr().out.split())
+    assert "no regular end" in " ".join(cli("info", tmp_path / "cut").out.split())
     data[len(data) // 2] ^= 1
     (tmp_path / "damaged").write_bytes(data + file.read_bytes())
-    assert main(["info", str(tmp_path / "damaged")]) == 1
-    assert "are damaged" in capsys.readouterr().out
+    assert "are damaged" in cli("info", tmp_path / "damaged", status=1).out
+    data = bytearray(file.read_bytes())
+    data[100] ^= 1
+    (tmp_path / "damaged").write_bytes(data)
+    page = " ".join(cli("info", tmp_path / "damaged", status=1).out.split())
+    assert "begun not known: the block that says it and names the devices is damaged or missing" in page
+    assert "duration not known" in page
+    assert "blocks that are missing by their numbers: 1" in page
 
 
-def test_what_is_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_recording(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "a.csv").write_text("t_ns,accel\n" * 50)
-    assert main(["info", str(tmp_path / "a.csv")]) == 2
-    assert "no recording of imud" in capsys.readouterr().err
-    assert main(["info", str(tmp_path / "none")]) == 2
-    assert "No such file" in capsys.readouterr().err
+    cli.refuses("no recording of imud", "info", str(tmp_path / "a.csv"))
+    cli.refuses("No such file", "info", str(tmp_path / "none"))
 
 
 def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> None:
@@ -87,16 +83,3 @@ def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> No
     assert device.samples == 400 + 100 + 200
     assert device.lost == 2 + 3 + 5
     assert device.rate_hz == pytest.approx(700 / (4 + 1 + 2))
-
-
-def test_a_file_whose_begin_is_damaged_says_what_is_not_known(
-    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    data = bytearray(file.read_bytes())
-    data[100] ^= 1
-    (tmp_path / "damaged").write_bytes(data)
-    assert main(["info", str(tmp_path / "damaged")]) == 1
-    page = " ".join(capsys.readouterr().out.split())
-    assert "begun not known: the block that says it and names the devices is damaged or missing" in page
-    assert "duration not known" in page
-    assert "blocks that are missing by their numbers: 1" in page

@@ -1,7 +1,5 @@
 """Snapshots of the flight recorder, from the middle of a run: they replay as the daemon ran."""
 
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,12 +7,12 @@ import msgspec
 import pytest
 
 from imud import config
-from imud.cli import main
 from imud.daemon import Daemon
 from imud.publishers.recorder import flight
 from imud.runtime import event_loop
+from tests.cli.conftest import Cli
 from tests.cli.recording.recorded_daemon import FRAMES, Collector, stamped_capture
-from tests.support.daemon_process import LIMIT_S, running_daemon, wait_until
+from tests.support.daemon_process import running_daemon, wait_until
 from tests.support.files import imu61x_log
 
 
@@ -41,16 +39,16 @@ devices:
     return collector, sorted((folder / "recordings").iterdir())
 
 
+@pytest.mark.live
 @pytest.mark.parametrize("place", ["memory", "directory"])
 def test_a_snapshot_whose_begin_is_gone_replays_as_the_daemon_ran(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli, place: str
 ) -> None:
     monkeypatch.setattr(flight, "SEGMENT_NS_MIN", 300_000_000)
     monkeypatch.setattr(flight, "MEGABYTE", 28_000)  # of 39,000 that the run makes: the oldest segments go
     directory = f"directory: {tmp_path / 'flight'}, " if place == "directory" else ""
     collector, (file,) = run_flying(tmp_path, f"{directory}memory_mb: 1, minutes: 0.1, acceleration_m_s2: 5")
-    assert main(["replay", "--json", str(file)]) == 0
-    printed = capsys.readouterr()
+    printed = cli("replay", "--json", file)
     assert printed.err.count("the same as the live run") == 2
     assert "0 of 0 checks" not in printed.err
     for name in ("bow", "mast"):
@@ -58,23 +56,19 @@ def test_a_snapshot_whose_begin_is_gone_replays_as_the_daemon_ran(
         again = [line for line in printed.out.splitlines() if f'"device":"{name}"' in line]
         assert 20 < len(again) < len(live)
         assert again == live[len(live) - len(again) :]
-    assert main(["info", str(file)]) == 0
-    assert "integrity  whole" in capsys.readouterr().out
+    assert "integrity  whole" in cli("info", file).out
 
 
-def test_a_client_saves_the_last_minutes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.live
+def test_a_client_saves_the_last_minutes(tmp_path: Path, cli: Cli) -> None:
     capture = str(stamped_capture(tmp_path / "capture"))
     played = {"driver": "hipnuc-uart", "replay": {"path": capture, "speed": "recorded", "repeat": True}}
     recorder = {"directory": str(tmp_path / "recordings"), "flight": {"enabled": True}}
     file = tmp_path / "snapshot.imudrec"
     with running_daemon(tmp_path, {"bow": played}, recorder=recorder) as daemon:
         wait_until(lambda: daemon.wait_for("bow", "running").newest_seq > 150, "150 samples")
-        argv = [sys.executable, "-m", "imud", "record", "--socket", str(daemon.socket), "--snapshot", str(file)]
-        done = subprocess.run(argv, capture_output=True, text=True, timeout=LIMIT_S, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "samples of 1 device" in done.stderr
-    assert main(["replay", "--json", str(file)]) == 0
-    printed = capsys.readouterr()
+        assert "samples of 1 device" in cli("record", "--socket", daemon.socket, "--snapshot", file).err
+    printed = cli("replay", "--json", file)
     assert len(printed.out.splitlines()) > 150
     assert "the same as the live run" in printed.err
     assert list((tmp_path / "recordings").iterdir()) == []

@@ -31,6 +31,8 @@ class LivingMachine(Machine):
         self.ran: list[str] = []
         self.failing: dict[str, str] = {}
         """What a command complains of, by its first words."""
+        self.missing: set[str] = set()
+        """Programs that are not installed."""
         for folder in ("/run/systemd/system", "/run/udev", "/etc/udev/rules.d", "/dev", "/proc", "/sys/class/tty"):
             (self.root / folder[1:]).mkdir(parents=True)
         self.write("/etc/group", GROUPS)
@@ -44,6 +46,8 @@ class LivingMachine(Machine):
     def run(self, words: Sequence[str]) -> CommandOutput:
         """Carry out a command."""
         line = " ".join(words)
+        if words[0] in self.missing:
+            raise FileNotFoundError(2, "No such file or directory", words[0])
         if any(line.startswith(begin) for begin in self.failing):
             self.ran.append(line)
             return CommandOutput(1, "", next(why for begin, why in self.failing.items() if line.startswith(begin)))
@@ -175,8 +179,9 @@ class Attachments:
 class Setup:
     """`imud setup` on a made-up machine."""
 
-    def __init__(self, machine: LivingMachine, attachments: Attachments) -> None:
+    def __init__(self, machine: LivingMachine, attachments: Attachments, capsys: pytest.CaptureFixture[str]) -> None:
         self.machine, self.attachments = machine, attachments
+        self._capsys = capsys
         self.time_s = 0.0
         self.slept: list[float] = []
 
@@ -190,6 +195,10 @@ class Setup:
         self.time_s += s
         self.slept.append(s)
 
+    def said(self) -> str:
+        """The output since the last call, with single spaces."""
+        return " ".join(self._capsys.readouterr().out.split())
+
 
 @pytest.fixture
 def machine(tmp_path: Path) -> LivingMachine:
@@ -202,8 +211,8 @@ def attachments() -> Attachments:
 
 
 @pytest.fixture
-def setup(machine: LivingMachine, attachments: Attachments) -> Setup:
-    return Setup(machine, attachments)
+def setup(machine: LivingMachine, attachments: Attachments, capsys: pytest.CaptureFixture[str]) -> Setup:
+    return Setup(machine, attachments, capsys)
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from imud.cli import main
 from imud.cli.doctor.surroundings import Surroundings
 from imud.cli.setup import command
 from imud.cli.setup.command import numbered, sudo_user
+from tests.cli.conftest import Cli
 
 
 @pytest.mark.parametrize(("text", "parts"), [("can0=500000", ("can0", 500000)), ("/dev/ttyUSB0", ("/dev/ttyUSB0", 0))])
@@ -34,9 +34,8 @@ def test_names_without_a_usable_rate_are_refused(text: str) -> None:
         (["--yes", "--i2c", "/dev/i2c-1"], "expected the number of a bus"),
     ],
 )
-def test_arguments_that_do_not_go_together(words: list[str], reason: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["setup", *words]) == 2
-    assert reason in capsys.readouterr().err
+def test_arguments_that_do_not_go_together(words: list[str], reason: str, cli: Cli) -> None:
+    cli.refuses(reason, "setup", *words)
 
 
 @pytest.mark.parametrize(("value", "user"), [("ann", "ann"), ("root", ""), ("", "")])
@@ -45,9 +44,7 @@ def test_the_user_that_ran_sudo(monkeypatch: pytest.MonkeyPatch, value: str, use
     assert sudo_user() == user
 
 
-def test_a_look_at_this_machine(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_look_at_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     """With the ports of a folder that has none; nothing of the machine is opened."""
     real = Surroundings
 
@@ -55,7 +52,8 @@ def test_a_look_at_this_machine(
         return real(file, *arguments, root=tmp_path, **more)  # type: ignore[arg-type]
 
     monkeypatch.setattr(command, "Surroundings", elsewhere)
-    assert main(["setup", "--dry-run", "--json", "--socket", str(tmp_path / "none"), "-c", "/etc/imud.yaml"]) == 1
-    said = json.loads(capsys.readouterr().out)
+    said = json.loads(
+        cli("setup", "--dry-run", "--json", "--socket", tmp_path / "none", "-c", "/etc/imud.yaml", status=1).out
+    )
     assert said == {"found": [], "changes": [], "made": False, "notes": [], "devices": []}
     assert list(tmp_path.iterdir()) == []

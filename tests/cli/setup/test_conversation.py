@@ -7,22 +7,16 @@ from imud.cli.setup.conversation import Conversation, attached_table
 from imud.errors import BadArgument
 
 
-def test_paragraphs_have_80_columns_and_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
+def test_paragraphs_silence_and_defaults(capsys: pytest.CaptureFixture[str]) -> None:
     Conversation(ask=False).say("note: " + "word " * 40 + "\x1b[31m", indent="      ")
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     assert all(line.startswith("      ") for line in lines[1:])
     assert "\x1b" not in "".join(lines)
-
-
-def test_silence(capsys: pytest.CaptureFixture[str]) -> None:
     talk = Conversation(ask=False, silent=True)
     talk.say("word")
     talk.show(["line"])
     assert capsys.readouterr().out == ""
-
-
-def test_without_questions_defaults_are_the_answers() -> None:
     talk = Conversation(ask=False)
     assert talk.agreed("?", default=True)
     assert not talk.agreed("?", default=False)
@@ -63,7 +57,7 @@ def test_an_interrupted_question_ends_it_with_a_word(
     assert capsys.readouterr().out == "\nNothing more was changed.\n"
 
 
-def test_the_table_has_the_node_and_reasons_below() -> None:
+def test_the_table_has_80_columns() -> None:
     here = [
         Attached("/dev/serial/by-id/usb-A", "/dev/ttyUSB0", "Adapter " * 9, "hipnuc-uart", "", 115200, {}, "bow"),
         Attached("can0", "can0", "", problem="nothing is heard: " + "is the bus terminated? " * 6),
@@ -74,9 +68,6 @@ def test_the_table_has_the_node_and_reasons_below() -> None:
     assert lines[1].endswith("bow")
     assert lines[3].startswith("  can0: nothing is heard")
     assert lines[4].startswith("  ")
-
-
-def test_the_widest_table_has_80_columns() -> None:
     widest = Attached(
         "/dev/ttyUSB10", "/dev/ttyUSB10", "t" * 90, "hipnuc-nmea2000", "source 253", 1_000_000, {}, "n" * 32
     )

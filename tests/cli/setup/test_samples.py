@@ -24,18 +24,12 @@ def waited(
     return found, now[0]
 
 
-def test_it_ends_four_seconds_after_all_run() -> None:
+def test_waiting_ends_four_seconds_after_all_run_or_at_the_limit() -> None:
     found, end_s = waited(lambda now: [device("bow"), device("other")] if now >= 3 else [SEARCHING], ["bow"])
     assert [one.name for one in found] == ["bow"]
     assert end_s == 7.0
-
-
-def test_a_device_that_stops_is_waited_for_again() -> None:
     found, end_s = waited(lambda now: [SEARCHING if 2 <= now < 5 else device("bow")], ["bow"])
     assert (found[0].state, end_s) == ("running", 9.0)
-
-
-def test_at_the_limit_what_there_is_is_returned() -> None:
     found, end_s = waited(lambda _: [SEARCHING, device("mast")], ["bow", "mast"])
     assert ([one.state for one in found], end_s) == (["searching", "running"], 30.0)
 
@@ -48,14 +42,11 @@ def test_a_daemon_that_never_answers_is_an_error() -> None:
         waited(gone, ["bow"])
 
 
-def test_reasons_for_those_without_samples() -> None:
+def test_reasons_and_table() -> None:
     assert reasons([device("bow")], ["bow"]) == []
     assert reasons([SEARCHING, device("mast")], ["bow", "mast", "keel"]) == [
         "bow: nothing is heard", "keel: the daemon does not have it: `systemctl status imud`",
     ]  # fmt: skip
-
-
-def test_the_table_has_rate_product_and_error() -> None:
     head, bow, mast = samples_table(
         [device("bow"), device("mast", state=DeviceState.MISSING, identity={})]
     ).splitlines()

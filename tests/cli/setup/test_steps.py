@@ -31,13 +31,11 @@ def gateway(machine: LivingMachine, attachments: Attachments) -> LivingMachine:
     return machine
 
 
-def test_a_new_gateway_is_set_up_and_taken_back(
-    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_new_gateway_is_set_up_and_taken_back(gateway: LivingMachine, setup: Setup) -> None:
     before = gateway.files()
     assert setup.steps(user="ann").set_up(PORT, ()) == 0
-    out = capsys.readouterr().out
-    for words in ("/dev/ttyUSB0  hipnuc-uart", f"+      port: {BY_ID}", "999.5", "HI13", "0.045 ms", "Samples come."):
+    out = setup.said()
+    for words in ("/dev/ttyUSB0 hipnuc-uart", f"+ port: {BY_ID}", "999.5", "HI13", "0.045 ms", "Samples come."):
         assert words in out, words
     text = (gateway.root / "etc/imud.yaml").read_text()
     (imu,) = config.parse(text, "imud.yaml").devices
@@ -51,36 +49,32 @@ def test_a_new_gateway_is_set_up_and_taken_back(
     assert "imud:x:990:ann\n" in (gateway.root / "etc/group").read_text()
 
     assert setup.steps().undo() == 0
-    assert "Everything is as it was" in capsys.readouterr().out
+    assert "Everything is as it was" in setup.said()
     assert gateway.files() == before
     assert gateway.units["imud.service"] == ["disabled", "inactive"]
     assert setup.steps().undo() == 0
-    assert "nothing to take back" in capsys.readouterr().out
+    assert "nothing to take back" in setup.said()
 
 
-def test_a_second_run_changes_nothing(
-    gateway: LivingMachine, setup: Setup, attachments: Attachments, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_second_run_changes_nothing(gateway: LivingMachine, setup: Setup) -> None:
     setup.steps(user="ann").set_up(PORT, ())
     before, ran = gateway.files(), list(gateway.ran)
-    attachments.listened.clear()
-    capsys.readouterr()
+    setup.attachments.listened.clear()
+    setup.said()
     assert setup.steps(user="ann", date="LATER").set_up(PORT, ()) == 0
-    out = capsys.readouterr().out
+    out = setup.said()
     assert "Nothing to change." in out
     assert "Changes:" not in out
-    assert attachments.listened == []  # the daemon has the port
+    assert setup.attachments.listened == []  # the daemon has the port
     assert (gateway.files(), gateway.ran) == (before, ran)
 
 
-def test_a_dry_run_changes_nothing_and_tells_all(
-    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dry_run_changes_nothing_and_tells_all(gateway: LivingMachine, setup: Setup) -> None:
     before = gateway.files()
     steps = setup.steps(dry_run=True, user="ann")
     assert steps.set_up(PORT, ()) == 0
     assert (gateway.files(), gateway.ran) == (before, [])
-    out = capsys.readouterr().out
+    out = setup.said()
     for words in ("device imu", "61-imud-setup.rules (new)", "usermod --append --groups imud ann",
                   "systemctl enable imud.service", "systemctl restart imud.service"):  # fmt: skip
         assert words in out
@@ -90,15 +84,13 @@ def test_a_dry_run_changes_nothing_and_tells_all(
     assert said["made"] is False
 
 
-def test_what_a_person_wrote_stays_and_devices_are_added(
-    gateway: LivingMachine, setup: Setup, attachments: Attachments
-) -> None:
+def test_what_a_person_wrote_stays_and_devices_are_added(gateway: LivingMachine, setup: Setup) -> None:
     mine = (
         "log_level: debug  # mine\ndevices:\n  bow:  # on the mast\n    driver: auto\n    uart: {port: /dev/ttyUSB7}\n"
     )
     gateway.write("/etc/imud.yaml", mine)
     gateway.can("can0", up=True)
-    attachments.hears("can0", "hipnuc-canopen", "node 8", 500000)
+    setup.attachments.hears("can0", "hipnuc-canopen", "node 8", 500000)
     gateway.status = [
         device("bow", state=DeviceState.MISSING, problem="it is not there"),
         device("imu"),
@@ -114,17 +106,15 @@ def test_what_a_person_wrote_stays_and_devices_are_added(
     assert (gateway.root / "etc/imud.yaml").read_text() == mine
 
 
-def test_a_running_daemon_is_left_running_and_reads_the_new_file(
-    gateway: LivingMachine, setup: Setup, attachments: Attachments
-) -> None:
+def test_a_running_daemon_is_left_running_and_reads_the_new_file(gateway: LivingMachine, setup: Setup) -> None:
     gateway.write("/etc/imud.yaml", "devices:\n  bow: {uart: {port: /dev/ttyUSB0}}\n")
     gateway.hold("ttyUSB0", "imud run")
     gateway.units["imud.service"] = ["enabled", "active"]
     gateway.usb_port("ttyUSB1", "usb-B", serial="B")
-    attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
+    setup.attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
     gateway.status = [device("bow"), device("imu")]
     assert setup.steps().set_up(PORT, ()) == 0
-    assert attachments.listened == ["/dev/serial/by-id/usb-B"]
+    assert setup.attachments.listened == ["/dev/serial/by-id/usb-B"]
     assert [line for line in gateway.ran if line.startswith("systemctl")] == [
         "systemctl try-reload-or-restart imud.service"
     ]
@@ -141,34 +131,30 @@ def test_a_file_and_its_copy_keep_the_mode(gateway: LivingMachine, setup: Setup)
     assert [path.stat().st_mode & 0o777 for path in (file, copy)] == [0o662, 0o662]
 
 
-def test_an_example_that_the_daemon_uses_is_no_example(
-    gateway: LivingMachine, setup: Setup, attachments: Attachments
-) -> None:
+def test_an_example_that_the_daemon_uses_is_no_example(gateway: LivingMachine, setup: Setup) -> None:
     gateway.units["imud.service"] = ["enabled", "active"]
     gateway.hold("ttyUSB0", "imud run")
     assert setup.steps().set_up(PORT, ()) == 0
     assert (gateway.root / "etc/imud.yaml").read_text() == EXAMPLE
-    assert attachments.listened == []
+    assert setup.attachments.listened == []
 
 
-def test_nothing_attached(machine: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_attached(machine: LivingMachine, setup: Setup) -> None:
     machine.write("/etc/imud.yaml", EXAMPLE)
     before = machine.files()
     assert setup.steps(user="ann").set_up(PORT, ()) == 1
-    out = capsys.readouterr().out
+    out = setup.said()
     assert "no serial port and no CAN interface" in out
     assert "No sensor was found. Next steps:" in out
     assert "imud doctor" in out
     assert (machine.files(), machine.ran) == (before, [])
 
 
-def test_a_user_without_rights_is_told_what_would_be_done(
-    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_user_without_rights_is_told_what_would_be_done(gateway: LivingMachine, setup: Setup) -> None:
     gateway.uid = 1000
     before = gateway.files()
     assert setup.steps().set_up(PORT, ()) == 1
-    out = capsys.readouterr().out
+    out = setup.said()
     assert "systemctl enable imud.service" in out
     assert "Nothing was changed: only root may." in out
     assert gateway.files() == before
@@ -176,12 +162,10 @@ def test_a_user_without_rights_is_told_what_would_be_done(
         setup.steps().undo()
 
 
-def test_without_systemd_the_configuration_is_written(
-    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_systemd_the_configuration_is_written(gateway: LivingMachine, setup: Setup) -> None:
     shutil.rmtree(gateway.root / "run")
     assert setup.steps().set_up(PORT, ()) == 0
-    out = capsys.readouterr().out
+    out = setup.said()
     assert "systemd does not run here, so no service is started" in out
     assert "udev does not run" in out
     assert BY_ID in (gateway.root / "etc/imud.yaml").read_text()
@@ -197,35 +181,75 @@ def test_a_configuration_with_a_mistake_is_not_touched(gateway: LivingMachine, s
 
 @pytest.mark.parametrize("activity", ["inactive", "active"])
 def test_a_service_with_another_configuration_is_left_as_it_is(
-    activity: str, gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
+    activity: str, gateway: LivingMachine, setup: Setup
 ) -> None:
     """It would not have the devices that are set up, and may have others."""
     gateway.started = "/usr/bin/imud run --config /home/ann/bow.yaml"
     gateway.units["imud.service"] = ["disabled", activity]
     gateway.status = []
     assert setup.steps().set_up(PORT, ()) == 0
-    out = " ".join(capsys.readouterr().out.split())
+    out = setup.said()
     assert "imud.service reads another configuration than /etc/imud.yaml, so it is left as it is" in out
     assert gateway.units["imud.service"] == ["disabled", activity]
     assert not any("systemctl" in line for line in gateway.ran)
 
 
-def test_a_service_that_is_not_known_is_told(
-    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_service_that_is_not_known_is_told(gateway: LivingMachine, setup: Setup) -> None:
     gateway.units.clear()
     assert setup.steps().set_up(PORT, ()) == 0
-    assert "systemd does not know imud.service" in " ".join(capsys.readouterr().out.split())
+    assert "systemd does not know imud.service" in setup.said()
+
+
+@pytest.mark.parametrize(
+    ("program", "note"),
+    [
+        ("udevadm", "note: `udevadm control --reload` could not be run: No such file or directory"),
+        ("usermod", "note: `usermod --append --groups imud ann` could not be run: No such file"),
+        ("getent", "Samples come."),
+        ("systemctl", "note: systemd does not know imud.service, so nothing is started"),
+    ],
+)
+def test_a_missing_program_is_told_and_the_rest_is_done(
+    gateway: LivingMachine, setup: Setup, program: str, note: str
+) -> None:
+    before = gateway.files()
+    gateway.missing = {program}
+    assert setup.steps(user="ann").set_up(PORT, ()) == 0
+    assert note in setup.said()
+    assert BY_ID in (gateway.root / "etc/imud.yaml").read_text()
+    gateway.missing = set() if program == "getent" else {program}
+    assert setup.steps().undo() == 0
+    assert gateway.files() == before
+
+
+def test_a_masked_service_and_a_missing_group_are_told(gateway: LivingMachine, setup: Setup) -> None:
+    gateway.write("/etc/group", "root:x:0:\n")
+    gateway.units["imud.service"] = ["masked", "inactive"]
+    with pytest.raises(ImudError, match=r"imud.service is masked: `sudo systemctl unmask imud.service` first"):
+        setup.steps(user="ann").set_up(PORT, ())
+    gateway.units["imud.service"] = ["disabled", "inactive"]
+    assert setup.steps(user="ann").set_up(PORT, (), control=True) == 0
+    said = setup.said()
+    for name in ("imud", "imud-control"):
+        assert f"there is no group {name} here, so ann is not made a member" in said
+
+
+def test_control_and_wait_have_an_effect(gateway: LivingMachine, setup: Setup) -> None:
+    gateway.status = [device("imu", state=DeviceState.SEARCHING, problem="nothing is heard")]
+    assert setup.steps(user="ann").set_up(PORT, (), control=True, wait_s=7.0) == 1
+    assert (gateway.root / "etc/group").read_text().count(":ann\n") == 2
+    assert 7 <= setup.time_s < 9
+    said = setup.said()
+    assert "imu: nothing is heard" in said
+    assert "`sudo imud doctor` says what to do next" in said
 
 
 # --- questions --------------------------------------------------------------------------------------------------------
 
 
-def test_questions_name_and_leave_out(
-    gateway: LivingMachine, setup: Setup, attachments: Attachments, answers: dict[str, str]
-) -> None:
+def test_questions_name_and_leave_out(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
     gateway.usb_port("ttyUSB1", "usb-B", serial="B")
-    attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
+    setup.attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
     answers |= {"on /dev/ttyUSB0?": "-", "on /dev/ttyUSB1?": "mast", "also change": "y"}
     gateway.status = [device("mast")]
     assert setup.steps(ask=True, user="ann").set_up(PORT, ()) == 0
@@ -234,10 +258,10 @@ def test_questions_name_and_leave_out(
 
 
 def test_a_proposed_name_is_not_one_that_was_just_given(
-    gateway: LivingMachine, setup: Setup, attachments: Attachments, answers: dict[str, str]
+    gateway: LivingMachine, setup: Setup, answers: dict[str, str]
 ) -> None:
     gateway.usb_port("ttyUSB1", "usb-B", serial="B")
-    attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
+    setup.attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
     answers["on /dev/ttyUSB0?"] = "imu2"
     gateway.status = [device("imu2"), device("imu")]
     assert setup.steps(ask=True).set_up(PORT, ()) == 0
@@ -245,21 +269,19 @@ def test_a_proposed_name_is_not_one_that_was_just_given(
 
 
 def test_a_device_without_a_usable_name_is_left_out_and_that_is_said(
-    gateway: LivingMachine, setup: Setup, answers: dict[str, str], capsys: pytest.CaptureFixture[str]
+    gateway: LivingMachine, setup: Setup, answers: dict[str, str]
 ) -> None:
     answers["on /dev/ttyUSB0?"] = "My Sensor"
     assert setup.steps(ask=True).set_up(PORT, ()) == 1
-    assert "/dev/ttyUSB0 is left out: 10 answers were no new name" in capsys.readouterr().out
+    assert "/dev/ttyUSB0 is left out: 10 answers were no new name" in setup.said()
 
 
-def test_a_bit_rate_that_is_none_is_explained(
-    gateway: LivingMachine, setup: Setup, answers: dict[str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bit_rate_that_is_none_is_explained(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
     gateway.can("can0")
     answers |= {"can0 is down": "y", "Bit rate": "500k"}
     with pytest.raises(ImudError, match="expected a bit rate for can0"):
         setup.steps(ask=True).set_up(PORT, ())
-    assert "500k: expected a whole number from 1 to 1000000" in capsys.readouterr().out
+    assert "500k: expected a whole number from 1 to 1000000" in setup.said()
 
 
 def test_a_no_changes_nothing(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
@@ -267,6 +289,13 @@ def test_a_no_changes_nothing(gateway: LivingMachine, setup: Setup, answers: dic
     answers["Make these changes?"] = "n"
     assert setup.steps(ask=True).set_up(PORT, ()) == 1
     assert (gateway.files(), gateway.ran) == (before, [])
+    setup.steps().set_up(PORT, ())
+    after = gateway.files()
+    answers["Take these changes back?"] = "n"
+    assert setup.steps(ask=True).undo() == 1
+    assert setup.steps(dry_run=True).undo() == 0
+    assert "Will be taken back, the newest first:" in setup.said()
+    assert gateway.files() == after
 
 
 def test_without_a_terminal_questions_are_an_error(gateway: LivingMachine, setup: Setup) -> None:
@@ -278,44 +307,38 @@ def test_without_a_terminal_questions_are_an_error(gateway: LivingMachine, setup
 # --- ports in use, consoles, CAN --------------------------------------------------------------------------------------
 
 
-def test_ports_of_others_and_consoles_are_not_opened(
-    gateway: LivingMachine, setup: Setup, attachments: Attachments, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ports_of_others_and_consoles_are_not_opened(gateway: LivingMachine, setup: Setup) -> None:
     gateway.hold("ttyUSB0", "gpsd")
     gateway.uart("ttyAMA0", console=True)
     assert setup.steps().set_up(PORT, ()) == 1
-    assert attachments.listened == []
-    out = capsys.readouterr().out
+    assert setup.attachments.listened == []
+    out = setup.said()
     assert "it is in use by gpsd (pid 10)" in out
     assert "a console of the kernel is on it" in out
 
 
-def test_a_console_is_taken_off_the_port_that_is_named(
-    gateway: LivingMachine, setup: Setup, attachments: Attachments, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_console_is_taken_off_the_port_that_is_named(gateway: LivingMachine, setup: Setup) -> None:
     gateway.uart("ttyAMA0", console=True)
     (gateway.root / "dev/serial0").symlink_to("ttyAMA0")
     line = "console=serial0,115200 console=tty1 root=PARTUUID=1-02 rootwait\n"
     gateway.write("/boot/firmware/cmdline.txt", line)
-    attachments.hears("/dev/ttyAMA0", "imu61x-uart")
+    setup.attachments.hears("/dev/ttyAMA0", "imu61x-uart")
     before = gateway.files()
     gateway.status = [device("imu")]
     assert setup.steps().set_up(Wanted(("/dev/serial0",)), ()) == 0
     assert (gateway.root / "boot/firmware/cmdline.txt").read_text() == line.removeprefix("console=serial0,115200 ")
     assert gateway.units["serial-getty@ttyAMA0.service"] == ["masked", "inactive"]
-    assert attachments.listened == ["/dev/ttyAMA0"]
-    assert "restart the machine" in capsys.readouterr().out
+    assert setup.attachments.listened == ["/dev/ttyAMA0"]
+    assert "restart the machine" in setup.said()
     assert setup.steps().undo() == 0
     assert gateway.files() == before
     assert gateway.units["serial-getty@ttyAMA0.service"] == ["disabled", "active"]
 
 
-def test_a_can_interface_is_brought_up_before_the_search(
-    gateway: LivingMachine, setup: Setup, attachments: Attachments
-) -> None:
+def test_a_can_interface_is_brought_up_before_the_search(gateway: LivingMachine, setup: Setup) -> None:
     gateway.can("can0")
     gateway.units["systemd-networkd.service"] = ["enabled", "active"]
-    attachments.hears("can0", "imu61x-can", "base_id 101", 250000)
+    setup.attachments.hears("can0", "imu61x-can", "base_id 101", 250000)
     before = gateway.files()
     run = gateway.run
 
@@ -329,7 +352,7 @@ def test_a_can_interface_is_brought_up_before_the_search(
     assert setup.steps().set_up(PORT, [("can0", 250000)]) == 0
     text = (gateway.root / "etc/systemd/network/80-imud-can0.network").read_text()
     assert "[CAN]\nBitRate=250000\n" in text
-    assert "can0" in attachments.listened
+    assert "can0" in setup.attachments.listened
     assert setup.steps().undo() == 0
     assert gateway.files() == before
     assert "ip link set can0 down" in gateway.ran
@@ -387,7 +410,7 @@ def test_killed_at_any_step_all_is_taken_back(
 
 
 def test_a_full_disk_stops_before_the_change_that_could_not_be_recorded(
-    gateway: LivingMachine, setup: Setup, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    gateway: LivingMachine, setup: Setup, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = gateway.files()
     replace = replace_file
@@ -402,21 +425,19 @@ def test_a_full_disk_stops_before_the_change_that_could_not_be_recorded(
     monkeypatch.setattr(journal, "replace_file", full)
     with pytest.raises(OSError, match="No space"):
         setup.steps().set_up(PORT, ())
-    assert "2 of 5 changes were made; `sudo imud setup --undo` takes them back" in capsys.readouterr().out
+    assert "2 of 5 changes were made; `sudo imud setup --undo` takes them back" in setup.said()
     assert (gateway.root / "etc/imud.yaml").read_text() == EXAMPLE
     monkeypatch.undo()
     assert setup.steps().undo() == 0
     assert gateway.files() == before
 
 
-def test_a_file_changed_since_is_left_and_the_rest_taken_back(
-    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_changed_since_is_left_and_the_rest_taken_back(gateway: LivingMachine, setup: Setup) -> None:
     setup.steps().set_up(PORT, ())
     mine = (gateway.root / "etc/imud.yaml").read_text() + "# mine\n"
     gateway.write("/etc/imud.yaml", mine)
     assert setup.steps().undo() == 1
-    out = " ".join(capsys.readouterr().out.split())
+    out = setup.said()
     assert "not taken back: /etc/imud.yaml was changed since `imud setup` wrote it: it is left as it is" in out
     assert (gateway.root / "etc/imud.yaml").read_text() == mine
     assert gateway.units["imud.service"] == ["disabled", "inactive"]
@@ -428,7 +449,7 @@ def test_a_file_changed_since_is_left_and_the_rest_taken_back(
 
 @pytest.mark.parametrize("gone", [False, True])
 def test_the_former_content_of_a_file_that_is_left_stays_to_be_put_back(
-    gone: bool, gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
+    gone: bool, gateway: LivingMachine, setup: Setup
 ) -> None:
     before = gateway.files()
     setup.steps().set_up(PORT, ())
@@ -437,24 +458,22 @@ def test_the_former_content_of_a_file_that_is_left_stays_to_be_put_back(
     if gone:
         file.unlink()
     assert setup.steps().undo() == 1
-    out = " ".join(capsys.readouterr().out.split())
+    out = setup.said()
     assert "/etc/imud.yaml.DATE stays, since it has the former content of /etc/imud.yaml" in out
     shutil.copy2(copy, file)  # the person settles it
     assert setup.steps().undo() == 0
     assert gateway.files() == before
 
 
-def test_what_two_runs_changed_and_a_person_since_is_named_once(
-    gateway: LivingMachine, setup: Setup, attachments: Attachments, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_two_runs_changed_and_a_person_since_is_named_once(gateway: LivingMachine, setup: Setup) -> None:
     setup.steps().set_up(PORT, ())
     gateway.usb_port("ttyUSB1", "usb-B", serial="B")
-    attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
+    setup.attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
     setup.steps(date="LATER").set_up(PORT, (), wait_s=1)
     gateway.write("/etc/imud.yaml", "devices: {}\n")
-    capsys.readouterr()
+    setup.said()
     assert setup.steps().undo() == 1
-    assert " ".join(capsys.readouterr().out.split()).count("/etc/imud.yaml was changed since") == 1
+    assert setup.said().count("/etc/imud.yaml was changed since") == 1
 
 
 def test_a_link_in_place_of_the_configuration_is_followed(gateway: LivingMachine, setup: Setup) -> None:
@@ -475,13 +494,11 @@ def test_a_link_in_place_of_the_rules_is_refused(gateway: LivingMachine, setup: 
     assert gateway.ran == []
 
 
-def test_a_command_that_fails_ends_it_and_what_was_done_is_told(
-    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_that_fails_ends_it_and_what_was_done_is_told(gateway: LivingMachine, setup: Setup) -> None:
     gateway.failing["systemctl restart"] = "Job for imud.service failed."
     with pytest.raises(ImudError, match=r"`systemctl restart imud.service` failed: Job for imud.service failed\."):
         setup.steps().set_up(PORT, ())
-    assert "4 of 5 changes were made" in capsys.readouterr().out
+    assert "4 of 5 changes were made" in setup.said()
     gateway.failing.clear()
     assert setup.steps().undo() == 0
     assert gateway.units["imud.service"] == ["disabled", "inactive"]

@@ -17,15 +17,12 @@ def lines(machine: LivingMachine, *adapters: UsbAdapter) -> list[str]:
     return [] if change is None else change.content.decode().splitlines()[1:]
 
 
-def test_an_adapter_is_found_by_its_port(machine: LivingMachine) -> None:
+def test_an_adapter_is_found_and_gets_a_latency_timer(machine: LivingMachine) -> None:
     machine.usb_port("ttyUSB0")
     machine.uart("ttyAMA0")
     at = machine.surroundings()
     assert usb_adapter(at, "/dev/ttyUSB0") == FTDI
     assert usb_adapter(at, "/dev/ttyAMA0") is None
-
-
-def test_ftdi_adapters_get_a_latency_timer(machine: LivingMachine) -> None:
     assert lines(machine, FTDI, OTHER) == [LATENCY]
 
 

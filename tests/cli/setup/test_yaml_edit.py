@@ -13,10 +13,12 @@ BLOCK = "  imu:\n    driver: auto\n    uart:\n      port: /dev/serial/by-id/usb-
 EXAMPLE = (ROOT / "etc/imud.yaml").read_bytes()
 
 
-def test_without_a_file_one_is_made() -> None:
+def test_without_a_file_one_is_made_and_disabled_devices_have_names() -> None:
     text = with_devices(None, NEW).decode()
     assert text.endswith("devices:\n" + BLOCK)
     assert [one.name for one in config.parse(text, "new").devices] == ["imu"]
+    assert device_names(b"devices:\n  bow: {enabled: false, uart: {port: /dev/ttyS0}}\n") == ["bow"]
+    assert device_names(None) == []
 
 
 @pytest.mark.parametrize(
@@ -81,8 +83,3 @@ def test_names_of_ports_stay_what_they_are(text: str, written: str) -> None:
     made = with_devices(None, {"imu": {"uart": {"port": text}}}).decode()
     assert f"port: {written}\n" in made
     assert read_yaml(made.encode()).data == {"devices": {"imu": {"uart": {"port": text}}}}
-
-
-def test_names_of_disabled_devices_are_taken_too() -> None:
-    assert device_names(b"devices:\n  bow: {enabled: false, uart: {port: /dev/ttyS0}}\n") == ["bow"]
-    assert device_names(None) == []

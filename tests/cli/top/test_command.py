@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from imud.cli import main
 from imud.cli.top.command import TopFeed
 from imud.event import Event, EventKind
+from tests.cli.conftest import Cli
 from tests.client.news import Listener
 from tests.support.socket_rig import batch, daemon
 
@@ -63,18 +63,15 @@ def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> Non
         feed.close()
 
 
-def test_without_a_terminal_it_says_what_to_use_instead(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["top"]) == 2
+def test_without_a_terminal_it_says_what_to_use_instead(cli: Cli, capsys: pytest.CaptureFixture[str]) -> None:
+    cli("top", status=2)
     words = "expected a terminal; `imud status` and `imud watch` write to anything"
     assert capsys.readouterr().err == f"imud top: {words}\n"
 
 
-def test_without_the_library_it_says_how_to_get_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_the_library_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     for stream in (sys.stdin, sys.stdout):
         monkeypatch.setattr(stream, "isatty", lambda: True)
     monkeypatch.setitem(sys.modules, "textual.app", None)
     monkeypatch.delitem(sys.modules, "imud.cli.top.app", raising=False)
-    assert main(["top"]) == 2
-    assert "pip install 'imud[top]'" in capsys.readouterr().err
+    cli.refuses("pip install 'imud[top]'", "top")

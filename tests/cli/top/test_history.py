@@ -10,7 +10,7 @@ from tests.support.metrics import device
 from tests.support.socket_rig import sample
 
 
-def test_curves_have_everyday_units() -> None:
+def test_curves() -> None:
     history = DeviceHistory(device("imu0"))
     history.add(msgspec.structs.replace(sample(), euler_rad=(math.pi, 0.0, -math.pi / 2), mag_t=(2e-5, 0.0, -4e-5)))
     shown = {series.curve.name: (series.values, series.curve.unit) for series in history.series()}
@@ -20,17 +20,14 @@ def test_curves_have_everyday_units() -> None:
     assert shown["accel z"] == ([9.75], "m/s²")
     assert shown["gyro x"][0] == pytest.approx([14.3239449])
     assert shown["mag z"][0] == pytest.approx([-40.0])
-
-
-def test_what_a_device_does_not_send_or_what_is_no_number_makes_no_curve() -> None:
     history = DeviceHistory(device("imu0"))
     history.add(msgspec.structs.replace(sample(), accel_m_s2=(math.nan, 0.0, math.inf), gyro_rad_s=None))
-    shown = {series.curve.name: series.values for series in history.series()}
-    assert shown["accel x"] == shown["accel z"] == shown["gyro x"] == shown["mag x"] == []
-    assert shown["accel y"] == [0.0]
+    values = {series.curve.name: series.values for series in history.series()}
+    assert values["accel x"] == values["accel z"] == values["gyro x"] == values["mag x"] == []
+    assert values["accel y"] == [0.0]
 
 
-def test_only_the_last_minute_is_kept_and_not_more_than_fits() -> None:
+def test_only_the_last_minute_of_one_start_is_kept() -> None:
     history = DeviceHistory(device("imu0"))
     for seq in range(1, POINTS_MAX + 100):
         history.add(sample(seq=seq))
@@ -39,9 +36,6 @@ def test_only_the_last_minute_is_kept_and_not_more_than_fits() -> None:
     assert newest is not None
     history.add(msgspec.structs.replace(newest, t_ns=newest.t_ns + SPAN_NS + 1))
     assert len(history.series()[3].values) == 1
-
-
-def test_a_daemon_that_was_restarted_begins_the_curves_anew() -> None:
     history = DeviceHistory(device("imu0"))
     history.add(sample(seq=50))
     history.add(sample(seq=1))

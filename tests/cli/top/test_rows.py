@@ -27,9 +27,6 @@ def test_a_row_has_its_values_below_their_titles() -> None:
     assert row(history(), columns, NOW_NS) == (
         "imu0       running    999.5 0.25s  4066    12   28.6  -14.3  171.9  9.76  53.6"
     )
-
-
-def test_a_device_without_samples_has_dashes() -> None:
     words = row(DeviceHistory(device("imu0", state=DeviceState.MISSING)), VIEWS["motion"], NOW_NS).split()
     assert words == ["imu0", "missing", "999.5", "-", "4066", "-", "-", "-", "-", "-", "-"]
 
@@ -67,16 +64,13 @@ def names(devices: list[DeviceHistory]) -> list[str]:
     return [one.status.name for one in devices]
 
 
-def test_the_largest_number_and_the_worst_state_come_first() -> None:
+def test_the_order_of_rows() -> None:
     devices = [history("b", 1), history("c", 0, state=DeviceState.FAILED), history("a", 2)]
     assert names(chosen(devices, NAME, NOW_NS)) == ["a", "b", "c"]
     assert names(chosen(devices, NAME, NOW_NS, backwards=True)) == ["c", "b", "a"]
     assert names(chosen(devices, RATE, NOW_NS)) == ["a", "b", "c"]
     assert names(chosen(devices, LOST, NOW_NS, backwards=True)) == ["c", "b", "a"]
     assert names(chosen(devices, STATE, NOW_NS)) == ["c", "a", "b"]
-
-
-def test_a_device_without_samples_is_the_oldest() -> None:
     devices = [history("a"), DeviceHistory(device("b"))]
     assert names(chosen(devices, AGE, NOW_NS)) == ["b", "a"]
 

@@ -1,0 +1,78 @@
+"""`imud` in this process (fixture `cli`) and as a process of its own (`imud_process`)."""
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import IO, Any, NamedTuple
+
+import pytest
+
+from imud.cli import main
+from tests.support.daemon_process import LIMIT_S
+
+
+class Printed(NamedTuple):
+    """The output of a command."""
+
+    out: str
+    err: str
+
+
+class Cli:
+    """Runs `imud` in this process."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+
+    def __call__(self, *words: object, status: int = 0) -> Printed:
+        """Run a command, check its exit status, and return its output."""
+        self._capsys.readouterr()
+        got: object = None
+        try:
+            got = main([str(word) for word in words])
+        except SystemExit as ended:  # argparse
+            got = ended.code
+        printed = Printed(*self._capsys.readouterr())
+        assert got == status, f"expected exit status {status}, got {got}: {printed.err}"
+        return printed
+
+    def refuses(self, problem: str, *words: object) -> None:
+        """Run a command that ends with exit status 2 and names this problem on standard error."""
+        assert problem in " ".join(self(*words, status=2).err.split())
+
+
+@pytest.fixture
+def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
+    return Cli(capsys)
+
+
+class ImudProcess:
+    """A running `imud` with its output in pipes."""
+
+    def __init__(self, process: "subprocess.Popen[str]") -> None:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        self.process = process
+        self.out: IO[str] = process.stdout
+        self.err: IO[str] = process.stderr
+
+    def end(self, number: signal.Signals | None = None, *, status: int = 0) -> Printed:
+        """Send a signal, wait for the end, check the exit status, and return the rest of the output."""
+        if number is not None:
+            self.process.send_signal(number)
+        rest = Printed(*self.process.communicate(timeout=LIMIT_S))
+        assert self.process.returncode == status, rest.err
+        return rest
+
+
+@contextmanager
+def imud_process(*words: object, python: tuple[str, ...] = (), **options: Any) -> Iterator[ImudProcess]:
+    """Start `imud` as a process; kill it at the end if it still runs."""
+    argv = [sys.executable, *python, "-m", "imud", *map(str, words)]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options) as process:
+        try:
+            yield ImudProcess(process)
+        finally:
+            process.kill()
