@@ -11,7 +11,7 @@ import msgspec
 from imud.cli.arguments import CliCommand, add_socket
 from imud.cli.output import table
 from imud.client import Client
-from imud.contracts.control.calibration import CalibrationInfo, CalibrationResult, Handling
+from imud.contracts.control.calibration import CalibrationInfo, CalibrationResult, Handling, Kept
 from imud.errors import BadArgument
 from imud.event import Event, EventKind
 from imud.units import RAD_PER_DEG
@@ -130,7 +130,7 @@ def _account(result: CalibrationResult, *, asked_to_save: bool) -> str:
         lines.append("  saved")
     else:
         hint = "" if asked_to_save or not result.verified else "; `--save` saves it"
-        lines.append(f"  not saved: lasts {result.kept}{hint if result.kept.endswith('saved') else ''}")
+        lines.append(f"  not saved: lasts {result.kept}{hint if result.kept is Kept.BY_SAVE else ''}")
     return "\n".join(lines)
 
 

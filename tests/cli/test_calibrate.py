@@ -1,15 +1,20 @@
 """`imud calibrate` on a running daemon with a simulated module at rest."""
 
+import io
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from imud.cli import main
-from imud.cli.calibrate import progress_line
+from imud.cli.calibrate import _account, _show, progress_line
+from imud.contracts.control.calibration import CalibrationResult, Check, Kept
 from imud.event import Event, EventKind
+from tests.cli.conftest import Cli
 from tests.support.daemon_process import RunningDaemon, daemon_with_module
+
+live = pytest.mark.live
 
 
 @pytest.fixture(scope="module")
@@ -19,64 +24,99 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
         yield daemon
 
 
-def calibrate(daemon: RunningDaemon, *words: str) -> int:
-    """Run the command."""
-    return main(["calibrate", "--socket", str(daemon.socket), "bow", *words])
-
-
-def test_the_list(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
-    assert calibrate(daemon) == 0
-    out = capsys.readouterr().out
+@live
+def test_calibrations_are_listed_verified_and_saved(daemon: RunningDaemon, cli: Cli) -> None:
+    words = ("calibrate", "--socket", daemon.socket, "bow")
+    out = cli(*words).out
     assert "magnetometer_once" in out
     assert "until power-off; it cannot be saved" in out
-
-
-def test_level_is_verified_and_saved(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
-    assert calibrate(daemon, "level", "--yes", "--save") == 0
-    out = capsys.readouterr().out
+    out = cli(*words, "level", "--yes", "--save").out
     assert "  1. Put the module down in the attitude that is to be level, and do not touch it.\n" in out
     assert "\nverified\n  roll: " in out
     assert "°, limit 0.5°: passed\n  saved\n" in out
-
-
-def test_as_json(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
-    assert calibrate(daemon, "heading", "--yes", "--json") == 0
-    *events, result = map(json.loads, capsys.readouterr().out.splitlines())
+    *events, result = map(json.loads, cli(*words, "heading", "--yes", "--json").out.splitlines())
     assert {event["kind"] for event in events} == {"calibration"}
     assert [event["detail"]["phase"] for event in events] == ["begin", "end"]
-    assert result["verified"] is True
-    assert result["kept"] == "until power-off; it cannot be saved"
+    assert (result["verified"], result["kept"]) == (True, "until power-off; it cannot be saved")
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["dance", "--yes"], "no calibration 'dance'; there are: magnetometer, "),
-        (["heading", "--yes", "--save"], "expected no `save`, for its result lasts until power-off"),
-        (["magnetometer", "--yes"], "expected 9-axis mode"),
-        (["level"], "expected a terminal to ask on, or --yes"),
-    ],
-)
-def test_mistakes_are_explained(
-    daemon: RunningDaemon, words: list[str], expected: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert calibrate(daemon, *words) == 2
-    assert expected in capsys.readouterr().err
+@live
+def test_mistakes_are_explained(daemon: RunningDaemon, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ("calibrate", "--socket", daemon.socket, "bow")
+    cli.refuses("no calibration 'dance'; there are: magnetometer, ", *words, "dance", "--yes")
+    cli.refuses("expected no `save`, for its result lasts until power-off", *words, "heading", "--yes", "--save")
+    cli.refuses("expected 9-axis mode", *words, "magnetometer", "--yes")
+    cli.refuses("expected a terminal to ask on, or --yes", *words, "level")
+    asked = iter(["Press Enter to begin, or type n: ", "Begin to turn it, and press Enter to begin"])
+
+    def refuse(question: str) -> str:
+        assert question.startswith(next(asked))
+        return "n"
+
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", refuse)
+    for kind in ("level", "magnetometer"):
+        assert cli(*words, kind, status=1).out.endswith("\nnothing was done\n")
 
 
-def test_progress_as_a_bar() -> None:
-    detail: dict[str, str | int | float | bool | None] = {
-        "kind": "magnetometer", "phase": "turn", "progress": 0.5, "field_t": 45.1e-6, "residual": 0.012,
-        "device": "bias 0, 0, 0 µT",
-    }  # fmt: skip
-    line = progress_line(Event(0, "bow", EventKind.CALIBRATION, "…", detail))
-    assert line == "[###############...............]  50%  field 45.1 µT, residual 1.2%  bias 0, 0, 0 µT"
-    assert progress_line(Event(0, "bow", EventKind.CALIBRATION, "verified", {"phase": "end"})) == "verified"
-
-
-def test_a_module_on_rs485_is_levelled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@live
+def test_a_module_on_rs485_is_levelled(tmp_path: Path, cli: Cli) -> None:
     with daemon_with_module(tmp_path, "--motion", "still", driver="hipnuc-modbus") as daemon:
-        assert calibrate(daemon, "level", "--yes", "--save") == 0
-    out = capsys.readouterr().out
+        out = cli("calibrate", "--socket", daemon.socket, "bow", "level", "--yes", "--save").out
     assert "\nverified\n  roll: " in out
     assert out.endswith("  saved\n")
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+TURN = Event(0, "bow", EventKind.CALIBRATION, "half of it", {
+    "kind": "magnetometer", "phase": "turn", "progress": 0.5, "field_t": 45.1e-6, "residual": 0.012,
+    "device": "bias 0, 0, 0 µT",
+})  # fmt: skip
+END = Event(0, "bow", EventKind.CALIBRATION, "verified", {"phase": "end"})
+
+
+def test_progress_is_a_bar_on_a_terminal_and_only_begin_and_end_elsewhere() -> None:
+    line = "[###############...............]  50%  field 45.1 µT, residual 1.2%  bias 0, 0, 0 µT"
+    assert (progress_line(TURN), progress_line(END)) == (line, "verified")
+    terminal, plain, for_programs = Terminal(), io.StringIO(), io.StringIO()
+    for event in (TURN, Event(0, "bow", EventKind.UP, "is there"), END):
+        _show(event, terminal, as_json=False)
+        _show(event, plain, as_json=False)
+        _show(event, for_programs, as_json=True)
+    assert terminal.getvalue() == f"\r\x1b[2K{line}\r\x1b[2Kverified"
+    assert plain.getvalue() == "verified\n"
+    assert [json.loads(one)["message"] for one in for_programs.getvalue().splitlines()] == ["half of it", "verified"]
+
+
+def account(kept: Kept, *checks: Check, problem: str = "", asked_to_save: bool = False) -> list[str]:
+    result = CalibrationResult("level", not problem, problem, "bias 0", checks, kept is Kept.BY_DEVICE, kept)
+    return _account(result, asked_to_save=asked_to_save).splitlines()
+
+
+def test_a_result_has_its_checks_in_units_of_people() -> None:
+    checks = (
+        Check("roll", 0.01, 0.02, "rad", True), Check("turn", 0.1, 0.05, "rad/s", False),
+        Check("field", 45.1e-6, 67e-6, "T", True), Check("share", 0.5, 1.0, "", True),
+        Check("force", None, 1.0, "m/s²", False),
+    )  # fmt: skip
+    assert account(Kept.BY_SAVE, *checks) == [
+        "verified", "  the device says: bias 0", "  roll: 0.573°, limit 1.15°: passed",
+        "  turn: 5.73 °/s, limit 2.86 °/s: NOT passed", "  field: 45.1 µT, limit 67 µT: passed",
+        "  share: 50.0%, limit 100.0%: passed", "  force: not reported, limit 1 m/s²: NOT passed",
+        "  not saved: lasts until power-off, unless it is saved; `--save` saves it",
+    ]  # fmt: skip
+
+
+def test_a_result_that_is_not_saved_names_a_way_to_save_it_only_if_there_is_one() -> None:
+    assert account(Kept.BY_SAVE, asked_to_save=True)[-1].endswith("unless it is saved")
+    assert account(Kept.NEVER)[-1] == "  not saved: lasts until power-off; it cannot be saved"
+    assert account(Kept.BY_DEVICE)[-1] == "  saved"
+    failed = account(Kept.BY_SAVE, problem="it moved")
+    assert (failed[0], failed[-1]) == (
+        "NOT verified: it moved",
+        "  not saved: lasts until power-off, unless it is saved",
+    )
