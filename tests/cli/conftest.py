@@ -1,5 +1,6 @@
 """`imud` in this process (fixture `cli`) and as a process of its own (`imud_process`)."""
 
+import io
 import signal
 import subprocess
 import sys
@@ -52,26 +53,26 @@ class ImudProcess:
     """A running `imud` with its output in pipes."""
 
     def __init__(self, process: "subprocess.Popen[str]") -> None:
-        assert process.stdout is not None
         assert process.stderr is not None
         self.process = process
-        self.out: IO[str] = process.stdout
+        self.out: IO[str] = process.stdout or io.StringIO()
         self.err: IO[str] = process.stderr
 
     def end(self, number: signal.Signals | None = None, *, status: int = 0) -> Printed:
         """Send a signal, wait for the end, check the exit status, and return the rest of the output."""
         if number is not None:
             self.process.send_signal(number)
-        rest = Printed(*self.process.communicate(timeout=LIMIT_S))
-        assert self.process.returncode == status, rest.err
-        return rest
+        out, err = self.process.communicate(timeout=LIMIT_S)
+        assert self.process.returncode == status, err
+        return Printed(out or "", err)
 
 
 @contextmanager
 def imud_process(*words: object, python: tuple[str, ...] = (), **options: Any) -> Iterator[ImudProcess]:
     """Start `imud` as a process; kill it at the end if it still runs."""
     argv = [sys.executable, *python, "-m", "imud", *map(str, words)]
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options) as process:
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
+    with subprocess.Popen(argv, text=True, **options) as process:
         try:
             yield ImudProcess(process)
         finally:

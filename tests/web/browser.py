@@ -15,13 +15,12 @@ from selenium.common.exceptions import JavascriptException
 from selenium.webdriver import Chrome, ChromeOptions, ChromeService
 from selenium.webdriver.support.ui import WebDriverWait
 
-from tests.support.daemon_process import RunningDaemon, running_daemon
+from tests.support.daemon_process import LIMIT_S, RunningDaemon, running_daemon
 from tests.support.files import hi91
 from tests.test_daemon import Cable, device
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 MISSING = "" if CHROMIUM and CHROMEDRIVER else "no chromium and chromedriver on this machine (make web-deps)"
-LIMIT_S: Final = 30.0
 LOOK_S: Final = 0.05
 PHONE: Final = (390, 844)
 PERIOD_MS: Final = 5
@@ -153,8 +152,11 @@ class Sender:
         while not self._stopped.is_set():
             frame = self._frame_of(self.measured)
             self.measured += 1
-            with suppress(BlockingIOError):  # nobody reads any more: the daemon ends before this thread
-                os.write(self._cable.master, frame)
+            while frame and not self._stopped.is_set():
+                with suppress(BlockingIOError):  # the daemon is late, or it has ended
+                    frame = frame[os.write(self._cable.master, frame) :]
+                if frame:
+                    sleep(LOOK_S)
             sleep(max(0.0, begin + self.measured * PERIOD_MS / 1000 - monotonic()))
 
 

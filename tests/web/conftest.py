@@ -8,9 +8,10 @@ from typing import Final
 import pytest
 from selenium.common.exceptions import WebDriverException
 
+from tests.support.daemon_process import RunningDaemon, daemon_with_module
 from tests.support.files import ROOT
 from tests.support.socket_rig import run
-from tests.web.browser import Page, browser
+from tests.web.browser import Page, browser, serving_web
 
 PICTURES: Final = ROOT / "build/web"
 """Where what the browser showed goes when a test failed, by the name of the test."""
@@ -40,6 +41,28 @@ def page(window: Page) -> Page:
     window.driver.get("about:blank")
     window.problems()
     return window
+
+
+@pytest.fixture(scope="session")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of `imud web` without a daemon, for scripts of the page."""
+    with serving_web(tmp_path_factory.mktemp("still") / "none") as url:
+        yield url
+
+
+@pytest.fixture
+def scripts(page: Page, still: str) -> Page:
+    """A page without a daemon."""
+    page.driver.get(still)
+    return page
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RunningDaemon, str]]:
+    """A daemon with a simulated module, `bow`, and the address of its page."""
+    folder = tmp_path_factory.mktemp("site")
+    with daemon_with_module(folder, "--rate", "100") as daemon, serving_web(daemon.socket) as url:
+        yield daemon, url
 
 
 @pytest.fixture

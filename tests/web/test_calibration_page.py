@@ -9,11 +9,11 @@ import pytest
 from imud.client import Client
 from imud.formats.jsonrpc import RpcError
 from imud.runtime.calibration.turning import COVERAGE_WANTED
-from tests.support.daemon_process import RunningDaemon, daemon_with_module
-from tests.web.browser import LIMIT_S, MISSING, Page, log_in, open_page, serving_web
+from tests.support.daemon_process import LIMIT_S, RunningDaemon
+from tests.web.browser import MISSING, Page, log_in, open_page, serving_web
 from tests.web.turned import BIAS, turned_module
 
-pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.live]
 
 TOKEN = "correct-horse-battery-staple"
 COVERED = "return Number(document.querySelector('#calibration canvas').dataset.covered)"
@@ -37,11 +37,6 @@ def token(tmp_path: Path) -> str:
     file = tmp_path / "token"
     file.write_text(TOKEN)
     return str(file)
-
-
-def calibrate(daemon: RunningDaemon, kind: str) -> Any:
-    with Client(daemon.socket, timeout_s=LIMIT_S) as client:
-        return client.call("calibrate", device="bow", kind=kind)
 
 
 def test_a_magnetometer_is_calibrated_with_the_token(page: Page, tmp_path: Path, token: str) -> None:
@@ -70,11 +65,12 @@ def test_a_magnetometer_is_calibrated_with_the_token(page: Page, tmp_path: Path,
         assert page.problems() == []
 
 
-def test_without_the_token_a_calibration_is_seen_and_not_controlled(page: Page, tmp_path: Path, token: str) -> None:
+def test_a_calibration_is_seen_without_the_token_and_stopped_with_it(page: Page, tmp_path: Path, token: str) -> None:
     with (
         turned_module(tmp_path, speed=1) as daemon,  # it does not end before it is stopped
         serving_web(daemon.socket, "--token-file", token) as url,
         ThreadPoolExecutor(1) as pool,
+        Client(daemon.socket, timeout_s=LIMIT_S) as client,
     ):
         open_page(page, url, "bow")
         page.until("return document.querySelector('#calibration').textContent.includes('Log in to begin it.')")
@@ -83,22 +79,16 @@ def test_without_the_token_a_calibration_is_seen_and_not_controlled(page: Page, 
             return call(args[0], { device: 'bow', kind: 'level' }).catch((error) => error.message)"""
         for method in ("calibrate", "stop_calibration"):
             assert page.module(ask, method) == "expected the token: log in first"
-        running: Future[Any] = pool.submit(calibrate, daemon, "magnetometer")
+        running: Future[Any] = pool.submit(client.call, "calibrate", device="bow", kind="magnetometer")
         page.until(COVERED)
         page.until_text("#calibration-progress", "of the directions and turns")
         assert not page.js("return document.querySelector('#calibration-stop')")
-        with daemon.client() as client:
-            client.call("stop_calibration", device="bow")
+        with daemon.client() as other:
+            other.call("stop_calibration", device="bow")
         with pytest.raises(RpcError, match="was cancelled"):
             running.result(LIMIT_S)
         page.until_text("#calibration-result", "calibration magnetometer: it was cancelled")
         assert page.js("return document.querySelector('#calibration .running').hidden")
-        assert [one for one in page.problems() if "401" not in one] == []
-
-
-def test_it_is_stopped_and_says_what_is_missing(page: Page, tmp_path: Path, token: str) -> None:
-    with turned_module(tmp_path) as daemon, serving_web(daemon.socket, "--token-file", token) as url:
-        open_page(page, url, "bow")
         log_in(page, TOKEN)
         page.until("return document.querySelector(arguments[0])", BEGIN.format("level"))
         page.click(BEGIN.format("level"))
@@ -106,27 +96,24 @@ def test_it_is_stopped_and_says_what_is_missing(page: Page, tmp_path: Path, toke
         page.click("#calibration-stop")
         page.until_text("#calibration-result", "the calibration was cancelled")
         page.until("return !document.querySelector(arguments[0]).disabled", BEGIN.format("level"))
+        assert [one for one in page.problems() if "401" not in one] == []
 
 
-def test_an_error_of_the_daemon_is_shown(page: Page, tmp_path: Path, token: str) -> None:
-    with daemon_with_module(tmp_path) as daemon, serving_web(daemon.socket, "--token-file", token) as url:
+def test_the_sphere_has_the_colour_of_what_is_covered_and_errors_are_shown(
+    page: Page, site: tuple[RunningDaemon, str], token: str
+) -> None:
+    daemon, _ = site
+    with serving_web(daemon.socket, "--token-file", token) as url:
         open_page(page, url, "bow")
         log_in(page, TOKEN)
         page.until("return document.querySelector(arguments[0])", BEGIN.format("magnetometer"))
         page.click(BEGIN.format("magnetometer"))
         page.until_text("#calibration-result", "magnetometer: expected 9-axis mode")
         page.until("return document.querySelector('#calibration .running').hidden")
-
-
-def test_the_sphere_has_the_colour_of_what_is_covered(page: Page, tmp_path: Path) -> None:
-    mask = "0f0f0f0f0f0f"
-    with daemon_with_module(tmp_path) as daemon, serving_web(daemon.socket) as url:
-        open_page(page, url, "bow")
         page.js("window.imud.view.calibration.turning.hidden = false")
-        cells = [tuple(one) for one in page.module(PIXEL, mask)]
-    front = {(is_covered, colour) for is_covered, is_near, colour in cells if is_near}
-    covered = {colour for is_covered, colour in front if is_covered}
-    open_ = {colour for is_covered, colour in front if not is_covered}
+        cells = [tuple(one) for one in page.module(PIXEL, "0f0f0f0f0f0f")]
+    covered = {colour for is_covered, is_near, colour in cells if is_near and is_covered}
+    open_ = {colour for is_covered, is_near, colour in cells if is_near and not is_covered}
     assert covered
     assert open_
     assert not covered & open_

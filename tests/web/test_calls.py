@@ -12,7 +12,7 @@ from tests.support import socket_rig
 from tests.support.socket_rig import serving
 
 
-async def test_a_question_is_answered_and_its_connection_ends(tmp_path: Path) -> None:
+async def test_a_question_is_answered_or_refused_and_its_connection_ends(tmp_path: Path) -> None:
     async with serving(tmp_path) as server:
         calls = Calls(server.hub.path)
         report = await calls.call("settings.get", {"device": "imu0"})
@@ -21,10 +21,6 @@ async def test_a_question_is_answered_and_its_connection_ends(tmp_path: Path) ->
         order = {"device": "imu0", "name": "output", "arguments": arguments}
         assert await calls.call("command", order) is None
         await socket_rig.until(lambda: not server.hub.connections)
-
-
-async def test_what_the_daemon_refuses_is_told_with_its_code(tmp_path: Path) -> None:
-    async with serving(tmp_path) as server:
         with pytest.raises(RpcError, match="no device named 'none'") as caught:
             await Calls(server.hub.path).call("actions", {"device": "none"})
         assert caught.value.code == Code.INVALID_PARAMS

@@ -21,7 +21,7 @@ from tests.support.metrics import device
 from tests.test_daemon import cable
 from tests.web.browser import MISSING, PERIOD_MS, Page, Sender, open_page, sent_by, serving_web
 
-pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.live]
 
 Rows = NDArray[np.float64]
 PLOTTED = """return Object.fromEntries([...window.imud.view.plots].map(([member, plot]) =>
@@ -99,20 +99,18 @@ def _is_turn(number: int) -> bool:
     return abs(vector("euler_rad", number)[2] - vector("euler_rad", number - 1)[2]) > math.pi
 
 
-def test_the_corners_of_the_block_are_round_and_it_hides_no_name(page: Page, tmp_path: Path) -> None:
-    with serving_web(tmp_path / "none") as url:
-        page.driver.get(url)
-        drawn = page.module(
-            """const { AttitudeView } = await import('/static/attitude.js');
-            const calls = [];
-            const kept = CanvasRenderingContext2D.prototype;
-            const [fill, fillText] = [kept.fill, kept.fillText];
-            kept.fill = function (...all) { calls.push(['face', this.lineJoin]); fill.apply(this, all); };
-            kept.fillText = function (...all) { calls.push([all[0], this.lineJoin]); fillText.apply(this, all); };
-            new AttitudeView().set([1, 0, 0, 0], 'ENU');
-            [kept.fill, kept.fillText] = [fill, fillText];
-            return calls"""
-        )
+def test_the_corners_of_the_block_are_round_and_it_hides_no_name(scripts: Page) -> None:
+    drawn = scripts.module(
+        """const { AttitudeView } = await import('/static/attitude.js');
+        const calls = [];
+        const kept = CanvasRenderingContext2D.prototype;
+        const [fill, fillText] = [kept.fill, kept.fillText];
+        kept.fill = function (...all) { calls.push(['face', this.lineJoin]); fill.apply(this, all); };
+        kept.fillText = function (...all) { calls.push([all[0], this.lineJoin]); fillText.apply(this, all); };
+        new AttitudeView().set([1, 0, 0, 0], 'ENU');
+        [kept.fill, kept.fillText] = [fill, fillText];
+        return calls"""
+    )
     names = [name for name, _ in drawn]
     assert {join for _, join in drawn} == {"round"}
     assert names.count("face") == 6
@@ -171,12 +169,10 @@ WORDS = {
 }  # fmt: skip
 
 
-def test_the_status_panel_has_every_row_of_imud_status(page: Page, tmp_path: Path) -> None:
-    with serving_web(tmp_path / "none") as url:
-        page.driver.get(url)
-        script = "const { aboutRows } = await import('/static/about.js'); return aboutRows(args[0])"
-        full = dict(page.module(script, msgspec.json.decode(encode(status_message("bow", STATUS, 5)))))
-        plain = dict(page.module(script, msgspec.json.decode(encode(status_message("bow", device("bow"), 5)))))
+def test_the_status_panel_has_every_row_of_imud_status(scripts: Page) -> None:
+    script = "const { aboutRows } = await import('/static/about.js'); return aboutRows(args[0])"
+    full = dict(scripts.module(script, msgspec.json.decode(encode(status_message("bow", STATUS, 5)))))
+    plain = dict(scripts.module(script, msgspec.json.decode(encode(status_message("bow", device("bow"), 5)))))
     printed = [line.split()[0] for line in block(STATUS).splitlines() if line[2:3].strip() and line.startswith("  ")]
     assert {"polling", "line", "sout", "alarm", "sin", "pps", "utc", "settings"} <= set(printed)
     assert set(printed) <= set(full)

@@ -25,44 +25,20 @@ def make(*, reading_needs_token: bool = False, token: str = TOKEN, clock: Clock 
     )
 
 
-@pytest.mark.parametrize(
-    "host",
-    [
-        "127.0.0.1:9322",
-        "localhost:8080",
-        "LOCALHOST",
-        "[::1]:9322",
-        "192.168.1.7",
-        "gateway.example:9322",
-        "localhost.",
-    ],
-)
-def test_hosts_that_nobody_else_can_have_are_good(host: str) -> None:
-    assert make().host_problem(host) == ""
-
-
-@pytest.mark.parametrize(
-    "host", ["attacker.example:9322", "127.0.0.1.attacker.example", "", None, "1", "[::1", "0x7f.1"]
-)
-def test_other_hosts_are_refused(host: str | None) -> None:
-    if host == "[::1":  # the address is whole
-        assert make().host_problem(host) == ""
-    else:
-        assert "see imud web --host" in make().host_problem(host)
+def test_only_hosts_that_nobody_else_can_have_are_good() -> None:
+    good = ("127.0.0.1:9322", "localhost:8080", "LOCALHOST", "[::1]:9322", "192.168.1.7", "gateway.example:9322",
+            "localhost.", "[::1")  # fmt: skip
+    assert [host for host in good if make().host_problem(host)] == []
+    for host in ("attacker.example:9322", "127.0.0.1.attacker.example", "", None, "1", "0x7f.1"):
+        assert "see imud web --host" in make().host_problem(host), host
 
 
 def test_origins() -> None:
     guard = make()
     good = guard.origin_problem("http://localhost:9322", "localhost:9322", with_token=False)
     assert good == ""
-    for origin in (
-        "http://localhost:8080",
-        "http://attacker.example",
-        "null",
-        "",
-        "localhost:9322",
-        "ftp://localhost:9322",
-    ):
+    others = ("http://localhost:8080", "http://attacker.example", "null", "", "localhost:9322", "ftp://localhost:9322")
+    for origin in others:
         assert guard.origin_problem(origin, "localhost:9322", with_token=False), origin
         assert guard.origin_problem(origin, "localhost:9322", with_token=True), origin
     assert make().origin_problem(None, "localhost", with_token=True) == ""

@@ -85,7 +85,7 @@ def test_what_is_read_is_what_all_pages_together_need() -> None:
     assert len(feed.wanted) == asked
 
 
-async def test_buckets_go_to_those_that_look_at_the_device_at_that_rate() -> None:
+async def test_buckets_and_raw_samples_go_to_the_pages_that_want_them() -> None:
     hub, _ = make()
     slow = opened(hub, look="device", device="bow", rate_hz=10)
     fast = opened(hub, look="device", device="bow", rate_hz=50)
@@ -97,9 +97,6 @@ async def test_buckets_go_to_those_that_look_at_the_device_at_that_rate() -> Non
     assert (at_10["rate_hz"], [one["count"] for one in at_10["buckets"]]) == (10, [99, 100])
     assert (at_50["rate_hz"], [one["count"] for one in at_50["buckets"]]) == (50, [19, *[20] * 9])
     assert at_10["buckets"][0]["accel_m_s2"] == [[0.125, -0.5, 9.75]] * 2
-
-
-async def test_every_sample_goes_to_those_that_want_a_spectrum_of_it() -> None:
     hub, _ = make()
     plain = opened(hub, look="device", device="bow")
     wanting = opened(hub, look="device", device="bow", spectrum="gyro_rad_s")
@@ -170,8 +167,6 @@ async def test_events_come_and_new_pages_get_those_that_are_remembered() -> None
     (late,) = await heard(opened(hub, look="device", device="bow"), "events")
     assert [event["message"] for event in late["events"]] == [str(number) for number in range(1, EVENTS_KEPT + 1)]
 
-
-async def test_the_progress_of_a_calibration_is_not_remembered_and_its_begin_and_end_are() -> None:
     def turning(phase: str) -> Event:
         return Event(1, "bow", EventKind.CALIBRATION, phase, {"kind": "magnetometer", "phase": phase})
 
@@ -184,7 +179,7 @@ async def test_the_progress_of_a_calibration_is_not_remembered_and_its_begin_and
     assert [event["message"] for event in late["events"]] == ["begin", "end"]
 
 
-async def test_a_browser_that_reads_nothing_holds_up_no_other_and_is_told_what_it_missed() -> None:
+async def test_dropped_messages_and_samples_are_told() -> None:
     hub, _ = make()
     slow = opened(hub, look="device", device="bow", rate_hz=50)
     quick = opened(hub, look="device", device="bow", rate_hz=50)
@@ -198,9 +193,6 @@ async def test_a_browser_that_reads_nothing_holds_up_no_other_and_is_told_what_i
     assert slow.mailbox.waiting < 110
     assert slow.mailbox.dropped > 150
     assert {"kind": "dropped", "messages": slow.mailbox.dropped, "samples": 0} in await heard(slow)
-
-
-async def test_samples_that_the_daemon_dropped_are_told() -> None:
     hub, _ = make()
     browser = opened(hub, look="device", device="bow")
     hub.spread(news(1, 60, dropped=12))

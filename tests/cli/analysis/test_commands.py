@@ -3,8 +3,6 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
-from math import hypot
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +12,11 @@ from imud.cli import main
 from imud.cli.analysis import spectrum_live, taking
 from imud.cli.analysis.commands import bands_hz
 from imud.cli.output import COLUMNS
-from imud.sim.physics.motion import GRAVITY_M_S2
-from imud.sim.physics.noise import NoiseLevels
 from imud.units import NS_PER_MS
 from tests.cli.analysis.captures import frame, resting, shaken, write_capture
 from tests.cli.conftest import Cli
 from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
-from tests.support.daemon_process import RunningDaemon, daemon_with_module, running_daemon, sending_daemon
+from tests.support.daemon_process import LIMIT_S, running_daemon, sending_daemon
 from tests.support.files import CaptureWriter, hi91
 
 SET_HZ, TRUE_HZ, SHAKEN_HZ = 400.0, 408.0, 63.7
@@ -109,22 +105,19 @@ def test_without_a_sheet_the_report_says_what_the_manual_has(resting_file: Path,
 # --- recordings -------------------------------------------------------------------------------------------------------
 
 
-def test_a_recording_of_two_devices(tmp_path: Path, cli: Cli) -> None:
+def test_a_recording_of_two_devices_and_a_part_of_it(tmp_path: Path, cli: Cli) -> None:
     (file,) = run_recorded(tmp_path)[2]
-    cli.refuses("it has bow, mast: choose one with --device", "noise", str(file))
-    cli.refuses("--device stern: expected one of the recording's, bow, mast", "noise", "--device", "stern", str(file))
-    measurement = json.loads(cli("noise", "--json", "--device", "bow", file).out)["measurement"]
+    cli.refuses("it has bow, mast: choose one with --device", "noise", file)
+    cli.refuses("--device stern: expected one of the recording's, bow, mast", "noise", "--device", "stern", file)
+    cli.refuses("--driver: expected none with a recording", "noise", "--driver", "hipnuc-uart", file)
+    words = ("noise", "--json", "--device", "bow", file)
+    measurement = json.loads(cli(*words).out)["measurement"]
     assert measurement["samples"] == FRAMES
     assert (measurement["device"], measurement["driver"]) == ("bow", "hipnuc-uart")
     assert measurement["begun_utc_ns"] > 0
-    cli.refuses("--driver: expected none with a recording", "noise", "--driver", "hipnuc-uart", str(file))
-
-
-def test_a_part_of_a_recording_says_nothing_of_its_end(tmp_path: Path, cli: Cli) -> None:
-    (file,) = run_recorded(tmp_path)[2]
-    measurement = json.loads(cli("noise", "--json", "--device", "bow", "--for", "1s", file).out)["measurement"]
+    measurement = json.loads(cli(*words, "--for", "1s").out)["measurement"]
     assert measurement["samples"] < FRAMES
-    assert measurement["notes"] == []
+    assert measurement["notes"] == [], "nothing is said of the end of the recording"
 
 
 # --- captures ---------------------------------------------------------------------------------------------------------
@@ -148,22 +141,19 @@ def test_losses_are_those_of_the_part_that_was_taken(tmp_path: Path, cli: Cli, p
     )
 
 
-def test_a_damaged_capture_is_named(tmp_path: Path, cli: Cli) -> None:
+def test_a_damaged_capture_is_named_and_a_raw_one_dated_by_the_device(tmp_path: Path, cli: Cli) -> None:
     file = gappy(tmp_path / "c.capture")
     file.write_bytes(file.read_bytes() * 2)
     assert "damaged at byte" in cli("spectrum", file).out
-
-
-# --- what is wrong ----------------------------------------------------------------------------------------------------
-
-
-def test_a_raw_capture_is_dated_by_the_device(tmp_path: Path, cli: Cli) -> None:
     accel, gyro = resting(500, 100.0)
     file = tmp_path / "raw"
     file.write_bytes(b"".join(frame(10 * number, accel[number], gyro[number]) for number in range(500)))
     out = " ".join(cli("spectrum", file).out.split())
     assert "even grid of 100.0000 Hz" in out
     assert "as true as its crystal" in out
+
+
+# --- what is wrong ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -189,18 +179,15 @@ def test_what_is_neither_file_nor_device(tmp_path: Path, cli: Cli) -> None:
     )
 
 
-def test_a_missing_extra_is_named(resting_file: Path) -> None:
+@pytest.mark.live
+def test_the_extra_is_named_if_it_is_missing_and_the_daemon_does_not_load_it(resting_file: Path) -> None:
     program = (
-        f"import sys\nsys.modules['scipy'] = None\nfrom imud.cli import main\nmain(['noise', {str(resting_file)!r}])"
+        "import sys, imud.daemon, imud.cli\nimud.cli.build_parser()\nprint({'numpy', 'scipy'} & set(sys.modules))\n"
+        f"sys.modules['scipy'] = None\nimud.cli.main(['noise', {str(resting_file)!r}])"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=True)
-    assert "imud noise: it needs scipy of the extra analysis: pip install 'imud[analysis]'" in done.stderr
-
-
-def test_the_daemon_does_not_load_the_extra() -> None:
-    program = "import sys, imud.daemon, imud.cli; imud.cli.build_parser(); print({'numpy', 'scipy'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=True)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT_S, check=True)
     assert done.stdout == "set()\n"
+    assert "imud noise: it needs scipy of the extra analysis: pip install 'imud[analysis]'" in done.stderr
 
 
 def test_bands(capsys: pytest.CaptureFixture[str]) -> None:
@@ -213,79 +200,31 @@ def test_bands(capsys: pytest.CaptureFixture[str]) -> None:
 # --- a running daemon -------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def daemon(tmp_path: Path) -> Iterator[RunningDaemon]:
-    """A daemon with one module that is shaken."""
+@pytest.mark.live
+def test_spectrum_and_noise_of_a_live_device(tmp_path: Path, cli: Cli) -> None:
     accel, gyro = shaken(1000, 100.0, 12.0)
-    with sending_daemon(tmp_path, lambda n: frame(10 * n, accel[n % 1000], gyro[n % 1000])) as made:
-        yield made
+    with sending_daemon(tmp_path, lambda n: frame(10 * n, accel[n % 1000], gyro[n % 1000])) as daemon:
+        live = ("--socket", daemon.socket, "bow")
+        measurement = json.loads(cli("spectrum", "--json", "--for", "1.5s", *live).out)["measurement"]
+        assert (measurement["device"], measurement["source"]) == ("bow", f"live from {daemon.socket}")
+        assert measurement["duration_s"] == pytest.approx(1.5, abs=0.1)
+        assert measurement["begun_utc_ns"] > 0
+        text = cli("noise", "--skip", "0.2s", "--for", "1.5s", *live).out
+        assert max(map(len, text.splitlines())) <= COLUMNS
+        for word in ("live from", "angle random walk N", "bow, driver hipnuc-uart"):
+            assert word in text, word
+        cli.refuses("stern: expected a file, or a device of the daemon (bow)", "noise", *live[:2], "stern")
 
 
-def test_a_live_device(daemon: RunningDaemon, cli: Cli) -> None:
-    measurement = json.loads(cli("spectrum", "--json", "--for", "1.5s", "--socket", daemon.socket, "bow").out)[
-        "measurement"
-    ]
-    assert measurement["device"] == "bow"
-    assert measurement["source"] == f"live from {daemon.socket}"
-    assert measurement["duration_s"] == pytest.approx(1.5, abs=0.1)
-    assert measurement["begun_utc_ns"] > 0
-    cli.refuses(
-        "stern: expected a file, or a device of the daemon (bow)",
-        "noise",
-        "--for",
-        "1s",
-        "--socket",
-        str(daemon.socket),
-        "stern",
-    )
-
-
-def test_the_noise_of_a_live_device(tmp_path: Path, cli: Cli) -> None:
-    """A simulated module at rest: its white noise is what the simulator adds, whatever its bias."""
-    levels = NoiseLevels()
-    with daemon_with_module(tmp_path, "--motion", "still", "--boot", "0") as daemon:
-        words = ["noise", "--socket", str(daemon.socket), "bow"]
-        told = json.loads(cli(*words, "--json", "--for", "3s").out)
-        text = cli(*words, "--skip", "0.2s", "--for", "1.5s").out
-    measurement, sensors = told["measurement"], told["sensors"]
-    assert (measurement["device"], measurement["driver"]) == ("bow", "hipnuc-uart")
-    assert measurement["source"] == f"live from {daemon.socket}"
-    assert measurement["duration_s"] == pytest.approx(3, abs=0.1)
-    assert 200 < measurement["samples"] <= 302
-    assert sensors["accel"]["rate_hz"] == pytest.approx(100, rel=0.02)
-    for sensor, sigma in (("accel", levels.accel_m_s2), ("gyro", levels.gyro_rad_s)):
-        for axis in "xyz":
-            assert sensors[sensor]["axes"][axis]["spread"]["value"] == pytest.approx(sigma, rel=0.2), (sensor, axis)
-    means = [sensors["accel"]["axes"][axis]["mean"]["value"] for axis in "xyz"]
-    assert hypot(*means) == pytest.approx(GRAVITY_M_S2, abs=2 * levels.accel_bias_m_s2)
-    assert max(map(len, text.splitlines())) <= COLUMNS
-    for word in ("live from", "angle random walk N", "bow, driver hipnuc-uart"):
-        assert word in text, word
-
-
-def test_a_device_that_falls_silent_loses_nothing_of_before(
-    tmp_path: Path, cli: Cli, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(taking, "SILENCE_S", 0.5)
-    with sending_daemon(tmp_path, lambda n: hi91(10 * n) if n < 400 else b"") as daemon:
-        cli("noise", "--json", "--for", "7s", "--socket", daemon.socket, "bow")
-    measurement = json.loads(capsys.readouterr().out)["measurement"]
-    assert 100 < measurement["samples"] < 400
-
-
+@pytest.mark.live
 @pytest.mark.parametrize("on_a_terminal", [True, False])
 def test_a_device_that_sends_nothing_at_all_is_named(
-    tmp_path: Path,
-    cli: Cli,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    *,
-    on_a_terminal: bool,
+    tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch, on_a_terminal: bool
 ) -> None:
     monkeypatch.setattr(taking, "SILENCE_S", 0.2)
     monkeypatch.setattr(spectrum_live, "SILENCE_S", 0.2)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: on_a_terminal)
     device = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
     with running_daemon(tmp_path, {"bow": device}) as daemon:
-        cli("spectrum", "--socket", daemon.socket, "bow", status=2)
-    assert capsys.readouterr().err == "imud spectrum: bow: it sends no samples; `imud status` says why\n"
+        printed = cli("spectrum", "--socket", daemon.socket, "bow", status=2)
+    assert printed.err == "imud spectrum: bow: it sends no samples; `imud status` says why\n"

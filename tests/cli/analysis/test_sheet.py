@@ -10,7 +10,7 @@ from imud.errors import BadArgument
 from tests.support.files import ROOT
 
 
-def test_figures_become_si(tmp_path: Path) -> None:
+def test_figures_become_si_and_those_of_the_user_come_first(tmp_path: Path) -> None:
     file = tmp_path / "sheet.yaml"
     file.write_text(
         "source: data sheet, table 2\n"
@@ -24,15 +24,19 @@ def test_figures_become_si(tmp_path: Path) -> None:
     assert found.accel.noise_density == pytest.approx(60 * 9.80665e-6)
     assert found.accel.bias_instability == pytest.approx(0.03 * 9.80665e-3)
     assert found.accel.random_walk is None
-
-
-def test_the_example_of_the_documents_has_every_figure(tmp_path: Path) -> None:
     page = (ROOT / "docs/analysis.md").read_text()
     (tmp_path / "sheet.yaml").write_text(page.partition("```yaml\n")[2].partition("```")[0])
     found = read_sheet(tmp_path / "sheet.yaml")
     for sensor in (found.gyro, found.accel):
         assert all(getattr(sensor, name) is not None for name in sensor.__struct_fields__)
     assert found.accel.temperature_slope == pytest.approx(0.05 * 9.80665e-3)
+    with pytest.raises(BadArgument, match=r"--sheet .*none\.yaml"):
+        read_sheet(tmp_path / "none.yaml")
+    given, stated = ModelFigures(source="given"), ModelFigures(source="stated")
+    sheet = DataSheet(models={"HI14": stated})
+    assert figures_for(sheet, "HI14R2", given) is given
+    assert figures_for(sheet, "HI14R2", None) is stated
+    assert figures_for(sheet, "CH100", None) is None
 
 
 @pytest.mark.parametrize(
@@ -54,16 +58,3 @@ def test_what_is_wrong_is_named(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(BadArgument, match=words) as caught:
         read_sheet(file)
     assert str(file) in str(caught.value)
-
-
-def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(BadArgument, match=r"--sheet .*none\.yaml"):
-        read_sheet(tmp_path / "none.yaml")
-
-
-def test_the_users_figures_come_before_the_manuals() -> None:
-    given, stated = ModelFigures(source="given"), ModelFigures(source="stated")
-    sheet = DataSheet(models={"HI14": stated})
-    assert figures_for(sheet, "HI14R2", given) is given
-    assert figures_for(sheet, "HI14R2", None) is stated
-    assert figures_for(sheet, "CH100", None) is None

@@ -1,13 +1,19 @@
 """Samples into arrays: which are taken, which are passed over, and what is said of them."""
 
+from argparse import Namespace
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
-from imud.cli.analysis.taking import Collector, LossTally, status_of
+from imud.cli.analysis import taking
+from imud.cli.analysis.taking import Collector, LossTally, Taken, status_of, take_live
 from imud.contracts.publisher import Batch
+from imud.contracts.status import DeviceStatus
 from imud.errors import BadArgument
 from imud.sample import Sample, Sync
 from imud.units import NS_PER_S
+from tests.support.metrics import device
 
 
 def sample(number: int, device: str = "bow", **more: object) -> Sample:
@@ -31,9 +37,6 @@ def test_values_come_in_order_with_nan_for_what_is_absent() -> None:
     assert found.temperature_c[0] == 20.0
     assert np.isnan(found.temperature_c[1])
     assert collector.stamps() == "100 % edge; mean stated error 1 µs"
-
-
-def test_a_sensor_that_sends_nothing_is_none() -> None:
     collector = Collector()
     collector.add(sample(0, accel_m_s2=None))
     found = collector.readings()
@@ -71,7 +74,7 @@ def test_the_devices_own_time_where_reads_have_none() -> None:
         collector.add(sample(8, t_dev_ns=None))
 
 
-def test_a_live_view_drops_the_past() -> None:
+def test_a_live_view_drops_the_past_and_a_device_may_be_unknown() -> None:
     collector = Collector()
     for number in range(10):
         collector.add(sample(number))
@@ -80,6 +83,8 @@ def test_a_live_view_drops_the_past() -> None:
     assert len(found.t_ns) == len(collector) == 4
     assert found.gyro_rad_s is not None
     assert found.gyro_rad_s[:, 0].tolist() == [6.0, 7.0, 8.0, 9.0]
+    with pytest.raises(BadArgument, match="bow: expected a file, or a device of the daemon"):
+        status_of([], "bow")
 
 
 def test_more_samples_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,11 +96,6 @@ def test_more_samples_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:
         collector.add(sample(2))
 
 
-def test_a_device_that_is_not_there() -> None:
-    with pytest.raises(BadArgument, match="bow: expected a file, or a device of the daemon"):
-        status_of([], "bow")
-
-
 def test_losses_are_those_between_the_looks_although_a_ledger_begins_anew() -> None:
     tally = LossTally()
     tally.look({"samples": 5000, "lost_crc": 7, "lost_unknown": 1})
@@ -103,12 +103,72 @@ def test_losses_are_those_between_the_looks_although_a_ledger_begins_anew() -> N
     tally.look({"samples": 0, "lost_crc": 0, "lost_unknown": 0})
     tally.look({"samples": 100, "lost_crc": 3, "lost_unknown": 0})
     assert tally.found() == {"lost_crc": 2 + 3}
-
-
-def test_losses_are_looked_for_when_the_first_sample_is_kept_and_when_all_are_there() -> None:
     looks: list[int] = []
     collector = Collector(skip_s=1.0, for_s=1.0)
     collector.look = lambda: looks.append(len(collector))
     for number in range(0, 60, 5):
         collector.publish(Batch("bow", 0, [sample(number + at) for at in range(5)]))
     assert looks == [5, 11]
+
+
+class Live:
+    """A daemon whose device sends 10 samples a second, 8 by a virtual clock of the host, and then nothing."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, count: int, *, interrupted: bool = False) -> None:
+        self.now_s = 0.0
+        self.dropped = {"bow": 3}
+        self.notes: list[tuple[float, int]] = []
+        self._left, self._count, self._interrupted = count, count, interrupted
+        monkeypatch.setattr(taking, "connect", lambda _args: nullcontext(self))
+        monkeypatch.setattr(taking, "statuses", lambda _client: [self.status()])
+        monkeypatch.setattr(taking, "monotonic", lambda: self.now_s)
+
+    def status(self) -> DeviceStatus:
+        return device("bow", ledger={"samples": self._count - self._left, "lost_crc": (self._count - self._left) // 7})
+
+    def watch(self, names: list[str], *, timeout_s: float, latency_ms: float) -> "Live":
+        assert (names, timeout_s, latency_ms) == (["bow"], taking.SILENCE_S, taking.LATENCY_MS)
+        return self
+
+    def __iter__(self) -> "Live":
+        return self
+
+    def __next__(self) -> Sample:
+        if self._left:
+            self._left -= 1
+            self.now_s += 0.125
+            return sample(self._count - self._left - 1)
+        if self._interrupted:
+            raise KeyboardInterrupt
+        self.now_s += taking.SILENCE_S
+        raise TimeoutError
+
+    def take(self, **arguments: object) -> Taken:
+        given = {"input": "bow", "skip": None, "duration": None, "socket": "/s", **arguments}
+        return take_live(Namespace(**given), lambda passed_s, count: self.notes.append((passed_s, count)))
+
+
+def kept(taken: Taken) -> int:
+    assert taken.readings is not None
+    return len(taken.readings.t_ns)
+
+
+def test_a_live_device_is_taken_until_the_duration_or_an_interrupt(monkeypatch: pytest.MonkeyPatch) -> None:
+    live = Live(monkeypatch, 100)
+    taken = live.take(duration=3.0)
+    assert (kept(taken), live.now_s) == (31, 4.0), "the sample after the duration ends it"
+    assert (taken.device, taken.source, taken.lost) == ("bow", "live from /s", {"lost_crc": 4, "dropped": 3})
+    assert live.notes == [(1.0, 8), (2.0, 16), (3.0, 24), (4.0, 31)]
+    assert kept(Live(monkeypatch, 100).take(skip=2.0, duration=1.0)) == 11
+    assert kept(Live(monkeypatch, 45, interrupted=True).take()) == 45
+
+
+def test_a_device_that_falls_silent_loses_nothing_of_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    live = Live(monkeypatch, 40)
+    assert kept(live.take(duration=20.0)) == 40
+    assert 20 <= live.now_s < 20 + taking.SILENCE_S
+    live = Live(monkeypatch, 40)
+    assert kept(live.take(skip=1.0, duration=20.0)) == 30
+    assert 21 <= live.now_s < 21 + taking.SILENCE_S
+    with pytest.raises(BadArgument, match="bow: it sends no samples; `imud status` says why"):
+        Live(monkeypatch, 0).take(duration=20.0)

@@ -2,8 +2,6 @@
 
 import csv
 import json
-import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from io import StringIO
@@ -14,7 +12,7 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from imud.cli import main
+from imud.cli import main, replay
 from imud.cli.export import command
 from imud.contracts.publisher import Batch
 from imud.event import Event, EventKind
@@ -89,16 +87,13 @@ def test_csv_has_every_sample_with_all_its_digits(recorded: Recorded, cli: Cli) 
     assert f"{len(found)} samples to standard output" in printed.err
 
 
-def test_csv_is_that_of_rfc_4180(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
+def test_csv_is_that_of_rfc_4180_and_has_chosen_fields(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
     cli("export", "--to", "csv", "-o", tmp_path / "a.csv", recorded.file)
     data = (tmp_path / "a.csv").read_bytes()
     lines = data.split(b"\r\n")
     assert lines[-1] == b""
     assert b"\n" not in b"".join(lines)
     assert len({line.count(b",") for line in lines[:-1]}) == 1
-
-
-def test_one_device_and_some_fields(recorded: Recorded, cli: Cli) -> None:
     words = ["export", "--to", "csv", "--device", "mast", "--fields", "gyro_rad_s,t_ns", str(recorded.file)]
     found = rows(cli(*words).out)
     assert list(found[0]) == ["gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s", "t_ns"]
@@ -239,18 +234,13 @@ def test_covariances_come_from_the_configuration_and_from_reports(tmp_path: Path
         assert not any(imu["/bow/imu/data"].angular_velocity_covariance)
 
 
-def test_fields_choose_channels(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
+def test_fields_choose_channels_and_ned_has_frames_of_its_own(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
     out = tmp_path / "a.mcap"
-    words = ["--to", "mcap", "--fields", "mag_t,temperature_c", "--device", "bow", "-o", str(out)]
-    cli("export", *words, recorded.file)
+    words = ("export", "--to", "mcap", "--device", "bow", "--force", "-o", out, recorded.file)
+    cli(*words, "--fields", "mag_t,temperature_c")
     topics = {topic for topic, *_ in messages(out)}
     assert topics == {"/bow/imu/mag", "/bow/temperature", "/bow/losses", "/events", "/diagnostics"}
-
-
-def test_ned_has_frames_of_its_own(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
-    out = tmp_path / "a.mcap"
-    words = ["--to", "mcap", "--convention", "ned-frd", "--device", "bow", "-o", str(out)]
-    cli("export", *words, recorded.file)
+    cli(*words, "--convention", "ned-frd")
     found = [json.loads(data) for topic, _, _, data in messages(out) if topic in ("/bow/imu/data", "/bow/attitude")]
     assert {one.get("frame_id", one.get("child_frame_id")) for one in found} == {"bow_frd"}
     assert {one["linear_acceleration"]["z"] for one in found if "linear_acceleration" in one} == {-9.8}
@@ -285,7 +275,7 @@ def test_a_raw_capture_in_mcap(tmp_path: Path, cli: Cli) -> None:
     assert "no time of any read" in metadata["times"]
 
 
-def test_a_stamped_capture_has_its_own_times(tmp_path: Path, cli: Cli) -> None:
+def test_a_stamped_capture_and_a_log_of_candump_have_their_own_times(tmp_path: Path, cli: Cli) -> None:
     file = stamped_capture(tmp_path / "c.capture")
     printed = cli("export", "--to", "csv", file)
     found = rows(printed.out)
@@ -293,9 +283,6 @@ def test_a_stamped_capture_has_its_own_times(tmp_path: Path, cli: Cli) -> None:
     assert abs(int(found[-1]["t_ns"]) - (1000 * 10**9 + 299 * 10**7)) < 10**7
     assert int(found[0]["utc_ns"]) < 10**7
     assert "does not say what time of day that was" in " ".join(printed.err.split())
-
-
-def test_a_log_of_candump_has_the_wall_clock(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "can.log").write_text(imu61x_log(range(200)))
     printed = cli("export", "--to", "csv", "--driver", "imu61x-can", tmp_path / "can.log")
     found = rows(printed.out)
@@ -364,29 +351,12 @@ def test_without_the_library_it_says_how_to_get_it(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_csv_needs_no_extra(recorded: Recorded, monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
+def test_a_full_disk_is_named_and_csv_needs_no_extra(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch, cli: Cli
+) -> None:
+    for to in ("csv", "mcap"):
+        cli.refuses("/dev/full: No space left on device", "export", "--to", to, "-o", "/dev/full", recorded.file)
     for name in [name for name in sys.modules if name.partition(".")[0] == "mcap"]:
         monkeypatch.setitem(sys.modules, name, None)
     cli("export", "--to", "csv", recorded.file)
-
-
-def test_a_reader_that_goes_away_ends_it(recorded: Recorded) -> None:
-    for to in ("csv", "mcap"):
-        argv = [sys.executable, "-m", "imud", "export", "--to", to, str(recorded.file)]
-        read, write = os.pipe()
-        os.close(read)
-        done = subprocess.run(argv, stdout=write, stderr=subprocess.PIPE, text=True, check=False, timeout=30)
-        os.close(write)
-        assert done.returncode == 0, done.stderr
-        assert "Traceback" not in done.stderr
-
-
-def test_a_full_disk_is_an_error_that_names_the_file(recorded: Recorded, cli: Cli) -> None:
-    for to in ("csv", "mcap"):
-        cli.refuses("/dev/full: No space left on device", "export", "--to", to, "-o", "/dev/full", str(recorded.file))
-
-
-def test_defaults_are_those_of_replay() -> None:
-    from imud.cli import replay
-
     assert (command.DRIVER, command.BAUD) == (replay.DRIVER, replay.BAUD)

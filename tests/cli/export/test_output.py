@@ -26,7 +26,7 @@ def interrupted(out: ExportFile) -> None:
         pass
 
 
-def test_the_file_is_there_when_it_is_whole(tmp_path: Path) -> None:
+def test_the_file_is_there_when_it_is_whole_and_only_then(tmp_path: Path) -> None:
     file = tmp_path / "a"
     with output(file, tmp_path) as out:
         out.write(b"one")
@@ -35,11 +35,8 @@ def test_the_file_is_there_when_it_is_whole(tmp_path: Path) -> None:
     assert file.read_bytes() == b"onetwo"
     assert out.written_bytes == 6
     assert sorted(one.name for one in tmp_path.iterdir()) == ["a", "source"]
-
-
-def test_nothing_is_left_of_what_was_interrupted(tmp_path: Path) -> None:
-    interrupted(output(tmp_path / "a", tmp_path))
-    assert [one.name for one in tmp_path.iterdir()] == ["source"]
+    interrupted(output(tmp_path / "b", tmp_path))
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["a", "source"]
 
 
 def test_a_file_that_is_there_is_kept_without_force(tmp_path: Path) -> None:
@@ -63,12 +60,9 @@ def test_what_is_exported_is_never_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "source").read_bytes() == b"a recording"
 
 
-def test_a_folder_that_is_not_there_is_an_error_with_its_name(tmp_path: Path) -> None:
+def test_a_missing_folder_and_a_full_disk_are_errors_with_the_name(tmp_path: Path) -> None:
     with pytest.raises(ImudError, match="none/a: No such file or directory"):
         output(tmp_path / "none" / "a", tmp_path)
-
-
-def test_a_full_disk_is_an_error_with_the_name(tmp_path: Path) -> None:
     out = output(Path("/dev/full"), tmp_path)
     with pytest.raises(ImudError, match="/dev/full: No space left on device"), out:
         out.write(b"x")

@@ -60,7 +60,7 @@ def test_both_ways_give_the_same_in_the_same_order(file: Path, devices: list[str
     assert 0 < positions[-1] <= file.stat().st_size
 
 
-def test_playing_goes_on_while_a_chunk_is_written(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_pipe_is_as_large_as_the_kernel_allows(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes: list[int] = []
 
     def kept(pipe: int, command: int, size: int) -> None:
@@ -71,8 +71,6 @@ def test_playing_goes_on_while_a_chunk_is_written(file: Path, monkeypatch: pytes
     play_beside(file, KeepingSink(), [], lambda _at: None)
     assert sizes == [playing.PIPE_BYTES]
 
-
-def test_a_kernel_that_allows_no_larger_pipe_changes_nothing(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_arguments: int) -> None:
         raise PermissionError(1, "Operation not permitted")
 

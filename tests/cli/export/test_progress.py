@@ -28,7 +28,7 @@ def test_a_bar_with_share_samples_and_time() -> None:
     assert progress.spent_s == 10.0
 
 
-def test_it_is_not_drawn_more_often_than_it_can_be_read() -> None:
+def test_it_is_not_drawn_more_often_than_it_can_be_read_or_without_a_terminal() -> None:
     terminal, now_s = Terminal(), [0.0]
     progress = Progress(1000, terminal, lambda: now_s[0])
     for step in range(100):
@@ -36,9 +36,6 @@ def test_it_is_not_drawn_more_often_than_it_can_be_read() -> None:
         progress.add(LOOK_SAMPLES, lambda: 0)
     assert 9 <= len(pictures(terminal)) <= 11
     assert progress.samples == 100 * LOOK_SAMPLES
-
-
-def test_without_a_terminal_nothing_is_drawn() -> None:
     out = StringIO()
     progress = Progress(1000, out, lambda: 0.0)
     progress.add(10 * LOOK_SAMPLES, lambda: 500)

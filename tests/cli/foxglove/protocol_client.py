@@ -10,9 +10,10 @@ from typing import Any
 import aiohttp
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from tests.support.daemon_process import LIMIT_S
+
 SUBPROTOCOL = "foxglove.sdk.v1"
 MESSAGE_DATA = 1
-LIMIT_S = 15.0
 
 
 def decoder_of(channel: dict[str, Any]) -> Callable[[bytes], Any]:

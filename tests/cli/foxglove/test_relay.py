@@ -19,9 +19,11 @@ from imud.contracts.sensors.deviations import Deviations
 from imud.event import Event, EventKind
 from imud.publishers.socket.publisher import SocketServer
 from tests.support import socket_rig
+from tests.support.daemon_process import LIMIT_S
 from tests.support.socket_rig import NOW_NS, batch, daemon
 
-LIMIT_S = 10.0
+pytestmark = pytest.mark.live
+
 OFFSET_NS = 1_000_000_000_000
 
 
@@ -74,36 +76,23 @@ def relaying(path: str | Path, viewer: FakeViewer, dialect: Dialect | None = Non
         assert not thread.is_alive()
 
 
-def test_samples_come_in_the_axes_of_rep_103(tmp_path: Path) -> None:
+def test_samples_events_and_status_come(tmp_path: Path) -> None:
     viewer = FakeViewer()
-    with daemon(tmp_path) as served, relaying(served.path, viewer):
+    noise = {"imu0": Deviations(gyro_rad_s=0.5)}
+    with daemon(tmp_path) as served, relaying(served.path, viewer, noise=noise):
+        status = viewer.wait_for("/imu0/status")
+        assert (status.message["state"], status.message["rate_hz"]) == ("running", 1000.0)
         viewer.wait_for("/imu1/status")
         served.do(lambda server: server.publish(batch("imu0", 7)))
         imu = viewer.wait_for("/imu0/imu/data")
         # sensor: x right, y forward; body: x forward, y left
         assert imu.message["linear_acceleration"] == {"x": -0.5, "y": -0.125, "z": 9.75}
         assert imu.message["angular_velocity"] == {"x": 0.5, "y": -0.25, "z": -0.75}
+        assert imu.message["angular_velocity_covariance"] == [0.25, 0, 0, 0, 0.25, 0, 0, 0, 0.25]
+        assert imu.message["linear_acceleration_covariance"] == [1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-4]  # of the status
         assert imu.utc_ns == 1_790_000_000_007_000_000
         stamp = viewer.wait_for("/imu0/stamp")
         assert (stamp.message["seq"], stamp.message["t_err_ns"]) == (7, 12_000)
-
-
-def test_covariances_are_those_that_were_given(tmp_path: Path) -> None:
-    viewer = FakeViewer()
-    noise = {"imu0": Deviations(gyro_rad_s=0.5)}
-    with daemon(tmp_path) as served, relaying(served.path, viewer, noise=noise):
-        viewer.wait_for("/imu1/status")
-        served.do(lambda server: server.publish(batch("imu0", 7)))
-        imu = viewer.wait_for("/imu0/imu/data")
-        assert imu.message["angular_velocity_covariance"] == [0.25, 0, 0, 0, 0.25, 0, 0, 0, 0.25]
-        assert imu.message["linear_acceleration_covariance"] == [1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-4]  # of the status
-
-
-def test_events_and_status_come(tmp_path: Path) -> None:
-    viewer = FakeViewer()
-    with daemon(tmp_path) as served, relaying(served.path, viewer):
-        status = viewer.wait_for("/imu0/status")
-        assert (status.message["state"], status.message["rate_hz"]) == ("running", 1000.0)
         served.do(lambda server: server.event(Event(5, "imu1", EventKind.DOWN, "is gone")))
         event = viewer.wait_for("/events")
         assert (event.message["name"], event.message["message"]) == ("imu1", "down: is gone")

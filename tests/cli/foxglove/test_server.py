@@ -4,7 +4,6 @@ import asyncio
 import json
 import re
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -12,17 +11,15 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
-import aiohttp
 import pytest
 
 from imud.bridges.channel import MessageFrames, StampedEvent
 from imud.bridges.json_channels import JsonDialect
 from imud.cli.foxglove.origins import ViewerOrigins
 from imud.cli.foxglove.server import FoxgloveServer, hidden_address
-from imud.errors import ServerError
 from tests.bridges.samples import EVENT, FULL, UTC_NS
-from tests.cli.conftest import Cli
-from tests.cli.foxglove.protocol_client import LIMIT_S, SUBPROTOCOL, connected
+from tests.cli.conftest import Cli, imud_process
+from tests.cli.foxglove.protocol_client import connected
 from tests.support.daemon_process import running_daemon
 from tests.test_daemon import cable, device
 
@@ -74,31 +71,6 @@ def test_messages_reach_a_client_that_subscribed() -> None:
     assert notes == ["no daemon", "samples come again"]
 
 
-def test_a_port_that_is_taken_is_an_error_that_says_so() -> None:
-    with closing(serve([])) as server:
-        port = int(server.url.rpartition(":")[2])
-        with pytest.raises(ServerError, match=f"cannot listen on 127.0.0.1 port {port}"):
-            FoxgloveServer("127.0.0.1", port, ViewerOrigins(), note=print)
-
-
-def test_a_page_of_another_site_does_not_connect_and_that_of_foxglove_does() -> None:
-    async def status_for(url: str, origin: str) -> int:
-        async with aiohttp.ClientSession() as session:
-            try:
-                socket = await session.ws_connect(url, protocols=(SUBPROTOCOL,), headers={"Origin": origin})
-            except aiohttp.WSServerHandshakeError as error:
-                return error.status
-            await socket.close()
-            return 101
-
-    notes: list[str] = []
-    with closing(serve(notes)) as server:
-        assert asyncio.run(status_for(server.url, "https://attacker.example")) == 403
-        assert asyncio.run(status_for(server.url, "https://app.foxglove.dev")) == 101
-    assert len(notes) == 1
-    assert "--allow-origin https://attacker.example" in notes[0]
-
-
 def test_the_server_behind_the_gate_is_not_found_by_trying() -> None:
     addresses = {hidden_address() for _ in range(100)}
     assert len(addresses) >= 99, "of 16 million"
@@ -106,6 +78,7 @@ def test_the_server_behind_the_gate_is_not_found_by_trying() -> None:
     assert not addresses & {"127.0.0.0", "127.255.255.255"}
 
 
+@pytest.mark.live
 def test_the_command_shows_what_the_device_sent(tmp_path: Path) -> None:
     """A module on a line, the daemon, `imud foxglove`, and a client of the protocol."""
 
@@ -124,32 +97,24 @@ def test_the_command_shows_what_the_device_sent(tmp_path: Path) -> None:
         daemon.wait_for("bow", "searching")
         port.send(1)
         daemon.wait_for("bow", "running")
-        argv = [sys.executable, "-m", "imud", "foxglove", "--port", "0", "--rate", "0", "--schema", "json"]
-        argv += ["--socket", str(tmp_path / "imud.sock")]
-        with subprocess.Popen(argv, stderr=subprocess.PIPE, text=True) as process:
-            assert process.stderr is not None
-            found = None
-            while found is None:
-                found = re.search(r"ws://\S+", process.stderr.readline())
+        words = ("foxglove", "--port", 0, "--rate", 0, "--schema", "json", "--socket", daemon.socket)
+        with imud_process(*words) as process:
+            while (found := re.search(r"ws://\S+", process.err.readline())) is None:
+                pass
             t_ns, imu = asyncio.run(look(found[0], lambda: port.send(1)))
-            process.send_signal(signal.SIGTERM)
-            rest = process.communicate(timeout=LIMIT_S)[1]
-            assert process.returncode == 0, rest
+            process.end(signal.SIGTERM)
     assert imu["linear_acceleration"]["z"] == pytest.approx(9.8, abs=1e-6)
     assert imu["frame_id"] == "bow"
     assert t_ns == imu["timestamp"]["sec"] * 10**9 + imu["timestamp"]["nsec"]
 
 
-@pytest.mark.parametrize("address", ["0.0.0.0", "::", "192.168.1.2", "gateway"])
-def test_another_address_needs_to_be_opened(address: str, cli: Cli) -> None:
-    cli.refuses(
-        "expected --open as well, or no --address, and a tunnel: ssh -L 8765:",
-        "foxglove",
-        "--address",
-        address,
-        "--port",
-        "0",
-    )
+def test_arguments_that_are_refused(cli: Cli) -> None:
+    tunnel = "expected --open as well, or no --address, and a tunnel: ssh -L 8765:"
+    for address in ("0.0.0.0", "::", "192.168.1.2", "gateway"):
+        cli.refuses(tunnel, "foxglove", "--address", address, "--port", "0")
+    for option, value in {"--port": "70000", "--rate": "-1", "--allow-origin": "viewer.example"}.items():
+        cli.refuses(f"{option}: expected", "foxglove", option, value)
+    cli.refuses("--rate: expected", "foxglove", "--rate", "nan")
 
 
 def test_the_warning_stands_before_the_first_sample(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
@@ -163,13 +128,6 @@ def test_the_warning_stands_before_the_first_sample(monkeypatch: pytest.MonkeyPa
         assert "WARNING" not in cli("foxglove", "--port", "0").err
     finally:
         signal.signal(signal.SIGTERM, handler)
-
-
-@pytest.mark.parametrize(
-    "words", [["--port", "70000"], ["--rate", "-1"], ["--rate", "nan"], ["--allow-origin", "viewer.example"]]
-)
-def test_arguments_out_of_range(words: list[str], cli: Cli) -> None:
-    cli.refuses(f"{words[0]}: expected", "foxglove", *words)
 
 
 def test_without_the_library_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
