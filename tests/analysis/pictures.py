@@ -43,7 +43,6 @@ START_S, FULL_S, FULL_HZ = 15.0, 30.0, 48.3
 
 
 def turn_rates() -> NDArray[np.float64]:
-    """Of a gyroscope with known coefficients, rad/s."""
     random, count = np.random.default_rng(SEED), int(HOURS * S_PER_H * RATE_HZ)
     axes = [
         white(random, count, RATE_HZ, N_DEG_SQRT_H / DEG_PER_RAD / ROOT_S_PER_ROOT_H)
@@ -55,13 +54,11 @@ def turn_rates() -> NDArray[np.float64]:
 
 
 def gyroscope() -> SensorNoise:
-    """The analysis of it."""
     values = turn_rates()
     return sensor_noise(Readings(stamps_ns(len(values), RATE_HZ), values, None, None), values)
 
 
 def page() -> str:
-    """The page of a report on that gyroscope, and on an accelerometer with noise alone."""
     gyro = turn_rates()
     random, count = np.random.default_rng(SEED + 1), len(gyro)
     axes = [white(random, count, RATE_HZ, VRW_M_S_SQRT_H / ROOT_S_PER_ROOT_H) for _ in range(3)]
@@ -74,7 +71,6 @@ def page() -> str:
 
 
 def noise_page_png(chromium: str) -> bytes:
-    """The begin of the page, as a browser shows it."""
     with tempfile.TemporaryDirectory(prefix="imud-") as name:
         file, picture_file = Path(name) / "noise.html", Path(name) / "noise.png"
         file.write_text(page())
@@ -103,12 +99,10 @@ def machine() -> SensorVibration:
 
 
 def noise_svg() -> bytes:
-    """The Allan deviation."""
     return picture(deviation_figure("gyro", gyroscope()), ".svg")
 
 
 def vibration_png() -> bytes:
-    """Density and spectrogram."""
     sensor = machine()
     facts = f"set to 400 Hz, true rate {sensor.grid.rate_hz:.3f} Hz, {sensor.grid.missing} samples missing"
     return picture(spectrum_figure({"accel": sensor}, "A machine that starts after 15 s", [facts]), ".png")

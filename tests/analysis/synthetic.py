@@ -39,15 +39,12 @@ def quantisation(random: Generator, count: int, rate_hz: float, q: float) -> Flo
 
 
 def ramp(count: int, rate_hz: float, r: float) -> FloatArray:
-    """Rate ramp R, unit/s."""
     return np.asarray(r * (np.arange(count) + 0.5) / rate_hz, dtype=np.float64)
 
 
 def three(one: FloatArray) -> FloatArray:
-    """The same series on three axes, (n, 3)."""
     return np.repeat(one[:, None], 3, axis=1)
 
 
 def stamps_ns(count: int, rate_hz: float, begin_ns: int = 1_000_000_000) -> IntArray:
-    """(n,) stamps on an even grid."""
     return np.asarray(begin_ns + np.rint(np.arange(count) * (1e9 / rate_hz)), dtype=np.int64)

@@ -96,7 +96,6 @@ def test_without_a_daemon_all_are_stale_and_keep_their_values() -> None:
 
 
 def run_of(device: str, second: int, count: int = 10) -> list[Sample]:
-    """Samples at 10 Hz from the begin of a second on."""
     return [sample(device, 10 * second + number, NS_PER_S // 10) for number in range(1, count + 1)]
 
 

@@ -47,7 +47,6 @@ SIZE = (80, 24)
 
 @contextmanager
 def modules() -> Iterator[dict[str, dict[str, object]]]:
-    """The simulated modules; their configuration."""
     with ExitStack() as stack:
         devices: dict[str, dict[str, object]] = {}
         for name, (driver, shown, *options) in MODULES.items():
@@ -92,7 +91,6 @@ def offline(picture: str) -> str:
 
 
 def live_pictures() -> Iterator[tuple[str, str]]:
-    """Names and contents of what needs a running daemon."""
     with tempfile.TemporaryDirectory(prefix="imud-") as made:
         folder = Path(made)
         recorder = {"enabled": True, "directory": str(folder / "recordings")}
@@ -133,7 +131,6 @@ class Flight:
 
 
 def magnitude(sample: Sample) -> float:
-    """|a|."""
     assert sample.accel_m_s2 is not None
     return hypot(*sample.accel_m_s2)
 
@@ -211,27 +208,22 @@ class Scale:
     most_m_s2: float = 90.0
 
     def x(self, t_ns: int) -> float:
-        """Where an instant is."""
         return self.left + self.width * ((t_ns - self.zero_ns) / NS_PER_S + HIT_S) / SENT_S
 
     def y(self, value_m_s2: float) -> float:
-        """Where a value is."""
         return self.bottom - self.high * min(value_m_s2, self.most_m_s2) / self.most_m_s2
 
     def curve(self, samples: list[Sample], stroke: str, width: float) -> str:
-        """|a|."""
         points = " L".join(f"{self.x(one.t_ns):.1f} {self.y(magnitude(one)):.1f}" for one in samples)
         return f"<path d='M{points}' fill='none' stroke='{stroke}' stroke-width='{width}'/>"
 
     def line(self, x: float, top: float, stroke: str, dash: str = "") -> str:
-        """A vertical line down to the axis."""
         return (
             f"<path d='M{x:.1f} {top}V{self.bottom}' stroke='{stroke}' stroke-dasharray='{dash}' stroke-width='1.5'/>"
         )
 
 
 def flight_svg(found: Flight) -> str:
-    """What was sent in grey, what the snapshot has in blue, the segments of the ring below."""
     hit = next(one for one in found.sent if magnitude(one) > BOUND_M_S2)
     scale = Scale(hit.t_ns)
     begin, end = scale.x(found.saved[0].t_ns), scale.x(found.saved[-1].t_ns)

@@ -19,7 +19,6 @@ live = pytest.mark.live
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
-    """A daemon with a simulated HiPNUC module that does not move."""
     with daemon_with_module(tmp_path_factory.mktemp("calibrate"), "--motion", "still") as daemon:
         yield daemon
 

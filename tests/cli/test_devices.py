@@ -13,7 +13,6 @@ live = pytest.mark.live
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
-    """A daemon with a simulated HiPNUC module."""
     with daemon_with_module(tmp_path_factory.mktemp("command")) as daemon:
         yield daemon
 

@@ -22,14 +22,11 @@ DECLARED = {"mode": "9-axis", "output": {"hi91": 50}}
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
-    """A daemon with a simulated module, which differs from what is declared."""
     with daemon_with_module(tmp_path_factory.mktemp("settings"), settings=DECLARED) as daemon:
         yield daemon
 
 
 class Terminal(io.StringIO):
-    """A terminal on which something is typed."""
-
     def isatty(self) -> bool:
         return True
 
@@ -40,7 +37,6 @@ def words(daemon: RunningDaemon) -> tuple[object, ...]:
 
 
 def actual(daemon: RunningDaemon) -> dict[str, Any]:
-    """What the module says now."""
     with Client(daemon.socket, timeout_s=LIMIT_S) as client:
         found = client.call("settings.get", device="bow", fresh=True)
     return {one["name"]: one["actual"] for one in found["settings"]}

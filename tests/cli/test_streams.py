@@ -23,14 +23,12 @@ ASCII = {**BUFFERED, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0
 
 
 def imud(*words: str | bytes | Path, **options: Any) -> "subprocess.CompletedProcess[bytes]":
-    """Run a command to its end."""
     argv = [sys.executable, "-m", "imud", *words]
     return subprocess.run(argv, timeout=LIMIT_S, check=False, **{"stderr": subprocess.PIPE, "env": BUFFERED, **options})
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A configuration, a capture and a recording."""
     made = tmp_path_factory.mktemp("streams")
     (made / "imud.yaml").write_text("devices: {}\n")
     (made / "capture").write_bytes(b"".join(hi91(10 * n) for n in range(100)))

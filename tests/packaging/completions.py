@@ -19,7 +19,6 @@ PATHS: Final = ("FILE", "PATH", "PORT", "CAPTURE")
 
 
 def every_parser(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """This parser and those of all commands below it."""
     yield parser
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):

@@ -75,7 +75,6 @@ def escaped(text: str) -> str:
 
 
 def bold(text: str) -> str:
-    """Text in bold."""
     return f"\\fB{inside(text)}\\fR"
 
 
@@ -91,7 +90,6 @@ def marked(text: str) -> str:
 
 
 def header(name: str, section: int, summary: str) -> Iterator[str]:
-    """The first lines of a page."""
     yield f'.TH "{escaped(name.upper())}" "{section}" "" "imud {escaped(__version__)}" "imud"'
     yield from (".SH NAME", f"{escaped(name)} \\- {escaped(summary)}")
 
@@ -102,13 +100,11 @@ def breakable(text: str) -> str:
 
 
 def listed(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """Paragraphs with a term, which is bold, and its meaning."""
     for term, meaning in rows:
         yield from (".TP", bold(term), escaped(meaning))
 
 
 def see_also(pages: Iterable[tuple[str, int]]) -> Iterator[str]:
-    """The last part of a page."""
     yield ".SH SEE ALSO"
     yield ",\n".join(f"{bold(name)}({section})" for name, section in pages)
 
@@ -117,7 +113,6 @@ def see_also(pages: Iterable[tuple[str, int]]) -> Iterator[str]:
 
 
 def sentence(text: str) -> str:
-    """The text of a help with a capital letter and a full stop."""
     return text[:1].upper() + text[1:] + ("." if text and not text.endswith((".", "?")) else "")
 
 
@@ -153,7 +148,6 @@ def arguments_of(parser: argparse.ArgumentParser) -> list[argparse.Action]:
 
 
 def helps_of(parser: argparse.ArgumentParser) -> Mapping[str, str]:
-    """The help texts of the commands below this one."""
     return {
         one.dest: one.help or ""
         for action in parser._actions
@@ -163,7 +157,6 @@ def helps_of(parser: argparse.ArgumentParser) -> Mapping[str, str]:
 
 
 def commands_of(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
-    """The parsers of the commands below this one."""
     found: dict[str, argparse.ArgumentParser] = {}
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -178,7 +171,6 @@ def synopsis(parser: argparse.ArgumentParser) -> str:
 
 
 def options(parser: argparse.ArgumentParser) -> Iterator[str]:
-    """A paragraph for each argument, the positional ones first."""
     for action in sorted(arguments_of(parser), key=lambda one: bool(one.option_strings)):
         values = values_of(action)
         names = ", ".join(f"{bold(one)} {values}".rstrip() for one in action.option_strings)
@@ -186,7 +178,6 @@ def options(parser: argparse.ArgumentParser) -> Iterator[str]:
 
 
 def main_page(parser: argparse.ArgumentParser) -> Iterator[str]:
-    """The lines of imud(1)."""
     yield from header("imud", 1, "daemon that owns inertial sensors and gives programs their samples")
     yield from (".SH SYNOPSIS", RAGGED, synopsis(parser), EVEN, ".SH DESCRIPTION")
     yield escaped(
@@ -204,7 +195,6 @@ def main_page(parser: argparse.ArgumentParser) -> Iterator[str]:
 
 
 def command_page(name: str, parser: argparse.ArgumentParser) -> Iterator[str]:
-    """The lines of imud-NAME(1)."""
     yield from header(f"imud-{name}", 1, COMMANDS[name].help)
     yield from (".SH SYNOPSIS", RAGGED)
     below = commands_of(parser)
@@ -222,7 +212,6 @@ def command_page(name: str, parser: argparse.ArgumentParser) -> Iterator[str]:
 
 
 def configuration_page() -> Iterator[str]:
-    """The lines of imud.yaml(5)."""
     yield from header("imud.yaml", 5, "configuration of imud")
     yield from (".SH SYNOPSIS", escaped("/etc/imud.yaml"), ".SH DESCRIPTION")
     yield marked(
@@ -245,7 +234,6 @@ def configuration_page() -> Iterator[str]:
 
 
 def pages() -> dict[str, str]:
-    """Every page by the name of its file."""
     parser = build_parser()
     found = {"imud.1": main_page(parser)}
     for name, command in commands_of(parser).items():

@@ -14,7 +14,6 @@ pytest.importorskip("shtab", reason="shtab is not installed (extra dev)")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the three files."""
     path = tmp_path_factory.mktemp("completions")
     for file, text in completions().items():
         (path / file).parent.mkdir()
@@ -39,7 +38,6 @@ def test_the_shell_can_read_it(folder: Path, shell: str) -> None:
 
 
 def completed_by_bash(folder: Path, *words: str) -> list[str]:
-    """What bash offers for the last of these words."""
     script = 'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _shtab_imud; echo "${COMPREPLY[@]}"'
     argv = ["bash", "--norc", "-c", script, "bash", str(folder / FILES["bash"]), *words]
     return subprocess.run(argv, capture_output=True, text=True, check=True, timeout=30).stdout.split()

@@ -18,7 +18,6 @@ SCRIPTS = ("imud-daemon.postinst", "imud-daemon.prerm", "imud-daemon.postrm")
 
 
 def fields(text: str) -> dict[str, str]:
-    """Fields of a paragraph of a control file."""
     found: dict[str, str] = {}
     name = ""
     for line in text.splitlines():
@@ -163,7 +162,6 @@ def test_every_file_that_the_build_takes_is_there() -> None:
 
 
 def unit_for(release: str, text: str) -> subprocess.CompletedProcess[str]:
-    """Run packaging/debian/unit on a unit."""
     argv = [str(DEBIAN / "unit"), release]
     return subprocess.run(argv, input=text, capture_output=True, text=True, check=False, timeout=30)
 

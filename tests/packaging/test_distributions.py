@@ -29,13 +29,11 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def distributions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Wheel and sdist of this tree."""
     folder = tmp_path_factory.mktemp("dist")
     return build(ROOT, folder, "wheel"), build(ROOT, folder, "sdist")
 
 
 def build(tree: Path, folder: Path, what: str) -> Path:
-    """Build the wheel or the sdist of a tree, into a folder."""
     done = subprocess.run(
         [sys.executable, "-c", BUILD.format(str(folder), what)], cwd=tree, capture_output=True, text=True, check=False,
         timeout=LIMIT_S,
@@ -61,7 +59,6 @@ def repository() -> set[str]:
 
 
 def members(sdist: Path) -> dict[str, bytes]:
-    """Content of the files of an sdist, by path in the repository."""
     with tarfile.open(sdist) as tar:
         read = {one.name.partition("/")[2]: tar.extractfile(one) for one in tar.getmembers() if one.isfile()}
         return {name: file.read() for name, file in read.items() if file is not None}

@@ -48,13 +48,11 @@ STUB: Final = '#!/bin/sh\necho "${0##*/} $*" >>"$CALLS"\n'
 
 
 def section(title: str) -> str:
-    """Text of one section of the page."""
     (text,) = re.findall(rf"^## {title}\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL)
     return str(text)
 
 
 def commands(title: str) -> list[str]:
-    """The shell examples of one section, in their order."""
     return re.findall(r"^```sh\n(.*?)^```", section(title), re.MULTILINE | re.DOTALL)
 
 
@@ -93,7 +91,6 @@ def run(text: str, machine: Path) -> None:
 
 
 def files(root: Path) -> dict[str, str]:
-    """Content of every file, by path."""
     return {f"/{path.relative_to(root)}": path.read_text() for path in root.rglob("*") if path.is_file()}
 
 

@@ -33,12 +33,10 @@ OFFLINE_SINCE = 250
 
 
 def values(name: str) -> list[str]:
-    """Words of all lines `NAME=` of the unit."""
     return " ".join(re.findall(rf"^{name}=(.*)$", UNIT.read_text(), re.MULTILINE)).split()
 
 
 def analyze_version() -> int:
-    """Version of systemd-analyze; 0 without one."""
     if shutil.which("systemd-analyze") is None:
         return 0
     said = subprocess.run(["systemd-analyze", "--version"], capture_output=True, text=True, check=True, timeout=30)
@@ -46,7 +44,6 @@ def analyze_version() -> int:
 
 
 def exposure(text: str, folder: str) -> float:
-    """What `systemd-analyze security` says of a unit."""
     path = f"{folder}/imud.service"
     with open(path, "w") as file:
         file.write(text)
@@ -66,12 +63,10 @@ def test_systemd_judges_the_unit_as_little_exposed(tmp_path_factory: pytest.Temp
 
 
 def directives() -> set[str]:
-    """Names of all directives of the unit."""
     return set(re.findall(r"^(\w+)=", UNIT.read_text(), re.MULTILINE))
 
 
 def reasons() -> dict[str, str]:
-    """Reasons by directive, from the table in docs/operate.md."""
     text = PAGE.read_text().partition("\n## Directives of the unit\n")[2].partition("\n## ")[0]
     rows = re.findall(r"^\| ((?:`\w+=`(?:, )?)+) \| (.*) \|$", text, re.MULTILINE)
     found = [(name, reason) for names, reason in rows for name in re.findall(r"`(\w+)=`", names)]

@@ -27,13 +27,10 @@ PERIOD_MS: Final = 5
 
 
 class Page:
-    """A tab, with questions to it."""
-
     def __init__(self, driver: Chrome) -> None:
         self.driver = driver
 
     def js(self, script: str, *arguments: object) -> Any:
-        """Run a script in the page and return its value."""
         return self.driver.execute_script(script, *arguments)
 
     def module(self, script: str, *arguments: object) -> Any:
@@ -51,16 +48,13 @@ class Page:
         return wait.until(lambda _driver: self.js(script, *arguments), what or script)
 
     def text(self, selector: str) -> str:
-        """Text of an element as it is shown."""
         return str(self.js("return document.querySelector(arguments[0])?.innerText ?? ''", selector))
 
     def until_text(self, selector: str, words: str) -> None:
-        """Wait until an element shows these words."""
         script = "return (document.querySelector(arguments[0])?.innerText ?? '').includes(arguments[1])"
         self.until(script, selector, words, what=f"{selector} shows {words!r}")
 
     def click(self, selector: str) -> None:
-        """Click an element as a script does, wherever it is."""
         self.js("document.querySelector(arguments[0]).click()", selector)
 
     def problems(self) -> list[str]:
@@ -70,7 +64,6 @@ class Page:
 
 @contextmanager
 def browser(folder: Path, size: tuple[int, int] = (1400, 2600), *, phone: bool = False) -> Iterator[Page]:
-    """A browser with one tab of this size."""
     options = ChromeOptions()
     options.binary_location = str(CHROMIUM)
     arguments = ["--headless=new", "--disable-dev-shm-usage", "--disable-gpu", "--hide-scrollbars", "--no-first-run"]
@@ -93,27 +86,23 @@ def browser(folder: Path, size: tuple[int, int] = (1400, 2600), *, phone: bool =
 
 
 def open_page(page: Page, url: str, device: str) -> None:
-    """Open the page of a device, and wait until its script runs."""
     page.driver.get(f"{url}#/device/{device}")
     page.until("return Boolean(window.imud?.view?.plots)")
 
 
 def log_in(page: Page, token: str) -> None:
-    """Give the token, and wait until the page may control."""
     page.click("#login")
     enter(page, token)
     page.until("return window.imud.session.control")
 
 
 def enter(page: Page, token: str) -> None:
-    """Write a token into the dialog and send it."""
     page.js("document.querySelector('#token').value = arguments[0]", token)
     page.click("#login-form button[type=submit]")
 
 
 @contextmanager
 def serving_web(socket: Path, *words: str, port: int = 0) -> Iterator[str]:
-    """`imud web` for a daemon; its address."""
     argv = [sys.executable, "-m", "imud", "web", "--socket", str(socket), "--port", str(port), *words]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -173,7 +162,6 @@ def sent_by(folder: Path, port: Cable) -> Iterator[RunningDaemon]:
 
 
 def choose(page: Page, selector: str, value: str) -> None:
-    """Choose a value of a list."""
     page.js(
         """const node = document.querySelector(arguments[0]);
         node.value = arguments[1];

@@ -52,14 +52,12 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture
 def scripts(page: Page, still: str) -> Page:
-    """A page without a daemon."""
     page.driver.get(still)
     return page
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RunningDaemon, str]]:
-    """A daemon with a simulated module, `bow`, and the address of its page."""
     folder = tmp_path_factory.mktemp("site")
     with daemon_with_module(folder, "--rate", "100") as daemon, serving_web(daemon.socket) as url:
         yield daemon, url
@@ -67,7 +65,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RunningDaem
 
 @pytest.fixture
 def phone(tmp_path: Path) -> Iterator[Page]:
-    """The tab of a browser on a telephone."""
     with browser(tmp_path, phone=True) as one:
         yield one
 

@@ -44,15 +44,12 @@ TOKEN = "a-token-for-pictures-only"
 
 
 class Module:
-    """A simulated module as a process."""
-
     def __init__(self, name: str, process: subprocess.Popen[str]) -> None:
         self.name = name
         self._process = process
 
     @property
     def configuration(self) -> dict[str, Any]:
-        """Of this device."""
         return configuration(self.name, MODULES[self.name][0])
 
     def unplug(self, seconds: float) -> None:
@@ -66,21 +63,18 @@ class Module:
         self._process.send_signal(signal.SIGSTOP)
 
     def end(self) -> None:
-        """End the process, also one that stands still."""
         self._process.terminate()
         self._process.send_signal(signal.SIGCONT)
         self._process.communicate()
 
 
 def configuration(name: str, driver: str) -> dict[str, Any]:
-    """Of the device behind the port with this name."""
     port = {"driver": driver, "uart": {"port": str(PORTS / f"usb-{name}"), "baud": "auto"}}
     return {**port, "settings": DECLARED[name]} if name in DECLARED else port
 
 
 @contextmanager
 def module(name: str) -> Iterator[Module]:
-    """A simulated module that runs."""
     driver, *options = MODULES[name]
     argv = [sys.executable, "-m", "tests.web.vibrating", "--device", driver, "--path", str(PORTS / f"usb-{name}")]
     with subprocess.Popen([*argv, *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
@@ -95,7 +89,6 @@ def module(name: str) -> Iterator[Module]:
 
 @contextmanager
 def ports() -> Iterator[None]:
-    """The folder of the ports."""
     PORTS.mkdir(parents=True)
     try:
         yield
@@ -117,12 +110,10 @@ def save(name: str, png: bytes) -> None:
 
 
 def shot(page: Page, name: str) -> None:
-    """Save what the window shows."""
     save(name, page.driver.get_screenshot_as_png())
 
 
 def fit(page: Page, width: int) -> None:
-    """Make the window as high as the page is."""
     height = int(page.js("return document.querySelector('main').getBoundingClientRect().bottom + window.scrollY"))
     metrics = {"width": width, "height": height + 10, "deviceScaleFactor": 1, "mobile": False}
     page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
@@ -186,7 +177,6 @@ def calibration(folder: Path) -> None:
 
 
 def main() -> None:
-    """Take all of them."""
     if MISSING:
         raise SystemExit(MISSING)
     with ports(), ExitStack() as stack:

@@ -28,8 +28,6 @@ BEARER = {"Authorization": f"Bearer {TOKEN}"}
 
 
 class Site:
-    """The server, a client, and the daemon that it reads."""
-
     def __init__(self, web: WebServer, client: Any, daemon: SocketServer) -> None:
         self.web = web
         self.client = client
@@ -89,26 +87,22 @@ class StalledPage:
         )
 
     async def open(self, **look: Any) -> None:
-        """Connect and ask for something."""
         loop = asyncio.get_running_loop()
         await loop.sock_connect(self._socket, self._address)
         await loop.sock_sendall(self._socket, self._head.encode())
         await self.send(**look)
 
     async def send(self, **look: Any) -> None:
-        """Send a message, in a frame with a mask of zeros (RFC 6455, 5.2)."""
         text = json.dumps(look).encode()
         assert len(text) < 126
         frame = bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text
         await asyncio.get_running_loop().sock_sendall(self._socket, frame)
 
     def close(self) -> None:
-        """Let go of the connection."""
         self._socket.close()
 
 
 async def message(socket: ClientWebSocketResponse, kind: str) -> dict[str, Any]:
-    """The next message of a kind."""
     while (found := json.loads((await socket.receive()).data))["kind"] != kind:
         pass
     assert isinstance(found, dict)

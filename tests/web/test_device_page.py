@@ -41,12 +41,10 @@ SHOWN = {"gyro_rad_s": math.degrees(1.0), "mag_t": 1e6, "euler_rad": math.degree
 
 
 def wrapped(angle_rad: float) -> float:
-    """The same angle within ±π."""
     return math.remainder(angle_rad, 2 * math.pi)
 
 
 def vector(member: str, number: int) -> list[float]:
-    """Values of a member in a measurement."""
     values = [rise * number for rise in RISE[member]]
     return [*values[:2], wrapped(TURN_RAD * number)] if member == "euler_rad" else values
 
@@ -60,7 +58,6 @@ def ramps(number: int) -> bytes:
 
 
 def expected(member: str, axis: int, spans: Sequence[tuple[int, int]]) -> Rows:
-    """Greatest and least value of the measurements from the first to the last of each span."""
     found = []
     for first, last in spans:
         values = [vector(member, number)[axis] * SHOWN[member] for number in range(first, last + 1)]

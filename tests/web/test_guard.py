@@ -11,8 +11,6 @@ TOKEN = "correct-horse-battery-staple"
 
 
 class Clock:
-    """The wall clock of a test."""
-
     now_s = 1_790_000_000.0
 
     def __call__(self) -> float:

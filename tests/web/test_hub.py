@@ -19,8 +19,6 @@ HELLO = Hello(1, "0.1.0", 2**62 + 1, ("read",))
 
 
 class FakeFeed:
-    """Notes what is wanted."""
-
     def __init__(self) -> None:
         self.wanted: list[Wish | None] = []
 
@@ -46,7 +44,6 @@ def opened(hub: BrowserHub, **look: Any) -> Browser:
 
 
 async def heard(browser: Browser, kind: str = "") -> list[dict[str, Any]]:
-    """All messages that wait, or those of a kind."""
     found = []
     while browser.mailbox.waiting:
         found.append(json.loads(await browser.mailbox.take()))

@@ -30,7 +30,6 @@ def wave(number: int) -> float:
 
 
 def with_losses(frame_of: Callable[[int], bytes]) -> Callable[[int], bytes]:
-    """The same frames, without those that are lost."""
     return lambda number: b"" if number % 40 in LOST or number in PAUSE else frame_of(number)
 
 

@@ -23,7 +23,6 @@ def shaking(amplitude_m_s2: float, frequency_hz: float) -> Sine:
 
 
 def engine(gravity_m_s2: float) -> Motion:
-    """The motion `engine`."""
     return Swing(
         roll=(Sine(0.21, 0.13), Sine(0.03, 0.37, 0.4)),
         pitch=(Sine(0.09, 0.17, 1.0), Sine(0.02, 0.41)),

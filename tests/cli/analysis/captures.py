@@ -15,7 +15,6 @@ BAUD = 921_600
 
 
 def frame(system_time_ms: int, accel: FloatArray, gyro: FloatArray, temperature_c: float = 25.0) -> bytes:
-    """An HI91 message."""
     return encode_hi91(
         system_time_ms=system_time_ms,
         accel_m_s2=(float(accel[0]), float(accel[1]), float(accel[2])),

@@ -45,7 +45,6 @@ def interface(
 
 
 def up(machine: Machine, flags: str = "0x40081") -> None:
-    """The interface in /sys."""
     machine.write("/sys/class/net/can0/type", "280\n")
     machine.write("/sys/class/net/can0/flags", flags + "\n")
 

@@ -21,7 +21,6 @@ def bow(machine: Machine) -> Machine:
 
 
 def hold(machine: Machine, pid: int, name: str, *, command: str = "") -> None:
-    """A process that has the port open."""
     machine.write(f"/proc/{pid}/comm", name + "\n")
     machine.write(f"/proc/{pid}/cmdline", command.replace(" ", "\0"))
     (machine.root / f"proc/{pid}/fd").mkdir()

@@ -35,8 +35,6 @@ EVENTS = (
 
 
 class Recorded(NamedTuple):
-    """A recording, and what its daemon published."""
-
     file: Path
     samples: list[Sample]
 

@@ -17,7 +17,6 @@ def output(path: Path | None, folder: Path, *, force: bool = False, binary: bool
 
 
 def interrupted(out: ExportFile) -> None:
-    """Write something, then be interrupted."""
     try:
         with out:
             out.write(b"new")

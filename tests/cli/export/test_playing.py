@@ -19,8 +19,6 @@ from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
 
 
 class KeepingSink:
-    """Keeps what it takes."""
-
     def __init__(self) -> None:
         self.taken: list[Sample | LossCounts | StampedEvent] = []
         self.largest = 0

@@ -6,8 +6,6 @@ from imud.cli.export.progress import CLEAR, EVERY_S, LOOK_SAMPLES, Progress
 
 
 class Terminal(StringIO):
-    """A text stream that says it is a terminal."""
-
     def isatty(self) -> bool:
         return True
 

@@ -82,7 +82,6 @@ def received(connection: socket.socket, size: int) -> bytes:
 
 
 def answer(gate: ViewerGate, request: bytes) -> str:
-    """Everything until the gate closes."""
     with connect(gate) as connection:
         connection.sendall(request)
         return received(connection, 1 << 30).decode()

@@ -40,8 +40,6 @@ Messages = dict[str, list[tuple[int, Any]]]
 
 
 class Seen(NamedTuple):
-    """What a viewer got, and the truth."""
-
     messages: Messages
     """By topic: the time in the protocol, and the message."""
     stale: Any
@@ -52,7 +50,6 @@ class Seen(NamedTuple):
 
 @contextmanager
 def served(daemon: RunningDaemon) -> Iterator[str]:
-    """`imud foxglove` as a process; its address."""
     with imud_process("foxglove", "--port", 0, "--rate", 0, "--socket", daemon.socket) as process:
         while (found := re.search(r"ws://\S+", line := process.err.readline())) is None:
             assert line, "it ended"
@@ -121,7 +118,6 @@ def turned(quaternion: Any, vector: Any) -> tuple[float, float, float]:
 
 
 def by_time(seen: Seen, topic: str) -> dict[int, Any]:
-    """Messages of a topic by their time."""
     return dict(seen.messages[topic])
 
 

@@ -28,16 +28,12 @@ OFFSET_NS = 1_000_000_000_000
 
 
 class Said(NamedTuple):
-    """What a viewer was given."""
-
     topic: str
     message: dict[str, Any]
     utc_ns: int
 
 
 class FakeViewer:
-    """A viewer that keeps what it is given; the test waits for what it needs."""
-
     def __init__(self) -> None:
         self.is_looked_at = True
         self.said: Queue[Said] = Queue()

@@ -8,7 +8,6 @@ import pytest
 
 @pytest.fixture
 def in_kolkata(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A time zone that is not that of the machine."""
     monkeypatch.setenv("TZ", "IST-5:30")
     time.tzset()
     yield

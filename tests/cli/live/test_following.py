@@ -99,8 +99,6 @@ def test_waiting_ends_when_nobody_reads_the_output(tmp_path: Path, monkeypatch: 
 
 
 class Answers:
-    """A client whose daemon's devices are these."""
-
     def __init__(self) -> None:
         self.found = [{"name": "bow", "state": "running", "problem": ""}]
 

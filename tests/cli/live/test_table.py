@@ -26,8 +26,6 @@ pytestmark = pytest.mark.usefixtures("in_kolkata")
 
 
 class Terminal:
-    """Standard output on a terminal of this size."""
-
     def __init__(self, monkeypatch: pytest.MonkeyPatch, columns: int, rows: int) -> None:
         monkeypatch.setenv("COLUMNS", str(columns))
         monkeypatch.setenv("LINES", str(rows))

@@ -23,8 +23,6 @@ ON = ("--baud", LINE_BAUD, "--reply-ms", REPLY_MS)
 
 
 class Bus(ModbusBench):
-    """The bench as the link of the command."""
-
     def __init__(self, *slaves: Slave) -> None:
         super().__init__(*slaves)
         self.heard = LineCounters()
@@ -33,7 +31,6 @@ class Bus(ModbusBench):
         self.paused_s: list[float] = []
 
     def opened(self, settings: Rs485Settings) -> "Bus":
-        """Use these settings."""
         assert isinstance(settings.baud, int)
         assert settings.line == "/dev/ttyUSB0"
         self.baud, self.reply_ms = settings.baud, settings.reply_ms
@@ -74,13 +71,10 @@ class Bus(ModbusBench):
         raise TransferError(Trouble.DISTURBED, f"no reply from address {address}")
 
     def slaves(self) -> list[int]:
-        """Address of each module."""
         return [one.settings.slave for one in self.line.slaves]
 
 
 class Commands:
-    """Runs `imud modbus` on a bus."""
-
     def __init__(self, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
         self._cli, self._monkeypatch = cli, monkeypatch
         self.bus = Bus()
@@ -94,7 +88,6 @@ class Commands:
         return printed.err if status == 2 else printed.out
 
     def scan(self, addresses: str, *words: object, status: int = 0) -> list[dict[str, Any]]:
-        """Return the modules that a scan finds."""
         lines = self("scan", "--addresses", addresses, "--json", *(words or ON), status=status)
         return [json.loads(line) for line in lines.splitlines()]
 

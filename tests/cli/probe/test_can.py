@@ -23,8 +23,6 @@ from tests.support.fake_drivers import fake_can_driver, fake_can_frame
 
 
 class Bus(MemoryCanLink):
-    """Sends the same frames to each new listener."""
-
     frames: Sequence[CanFrame] = ()
     problem = ""
     down = False

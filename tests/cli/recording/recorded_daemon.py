@@ -18,18 +18,14 @@ BEGIN_NS = 1000 * NS_PER_S
 
 
 class Collector:
-    """A publisher that keeps all samples."""
-
     def __init__(self) -> None:
         self.samples: list[Sample] = []
         self.events: list[Event] = []
 
     def publish(self, batch: Batch) -> None:
-        """Keep them."""
         self.samples += batch.samples
 
     def event(self, event: Event) -> None:
-        """Keep it."""
         self.events.append(event)
 
     def start(self) -> None: ...

@@ -22,14 +22,12 @@ pytestmark = pytest.mark.live
 
 
 def played(folder: Path) -> dict[str, object]:
-    """A device that plays a capture again and again."""
     capture = str(stamped_capture(folder / "capture"))
     return {"driver": "hipnuc-uart", "replay": {"path": capture, "speed": "recorded", "repeat": True}}
 
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
-    """A daemon without `recorder` and with two devices."""
     folder = tmp_path_factory.mktemp("daemon")
     device = played(folder)
     with running_daemon(folder, {"bow": device, "mast": device}) as made:

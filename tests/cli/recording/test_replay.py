@@ -12,7 +12,6 @@ from tests.support.files import hi91
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str], dict[str, dict[str, int]]]:
-    """The file, the samples as JSON lines, and the ledgers."""
     daemon, collector, (file,) = run_recorded(tmp_path_factory.mktemp("recorded"))
     lines = [msgspec.json.encode(sample).decode() for sample in collector.samples]
     return file, lines, {status.name: status.ledger for status in daemon.status()}

@@ -38,13 +38,11 @@ class LivingMachine(Machine):
         self.write("/etc/group", GROUPS)
 
     def ask(self) -> list[DeviceStatus]:
-        """The status of what the daemon serves, while the service runs."""
         if self.units.get("imud.service", ["", ""])[1] != "active":
             raise LinkMissing("no daemon at /run/imud/imud.sock")
         return super().ask()
 
     def run(self, words: Sequence[str]) -> CommandOutput:
-        """Carry out a command."""
         line = " ".join(words)
         if words[0] in self.missing:
             raise FileNotFoundError(2, "No such file or directory", words[0])
@@ -101,7 +99,6 @@ class LivingMachine(Machine):
         return CommandOutput(0, "", "")
 
     def usb_port(self, name: str, by_id: str = "", *, driver: str = "ftdi_sio", serial: str = "A1") -> None:
-        """A port of a USB adapter, with its stable name."""
         adapter = self.root / f"sys/devices/usb1/1-{name}"
         port = adapter / "1.0" / name
         port.mkdir(parents=True)
@@ -120,7 +117,6 @@ class LivingMachine(Machine):
             (folder / by_id).symlink_to(f"../../{name}")
 
     def uart(self, name: str, *, console: bool = False) -> None:
-        """A UART of the board."""
         self.write(f"/dev/{name}")
         self.write(f"/sys/class/tty/{name}/type", "32\n")
         if console:
@@ -128,12 +124,10 @@ class LivingMachine(Machine):
             self.units[f"serial-getty@{name}.service"] = ["disabled", "active"]
 
     def can(self, name: str, *, up: bool = False) -> None:
-        """A CAN interface of a controller."""
         self.write(f"/sys/class/net/{name}/type", "280\n")
         self.write(f"/sys/class/net/{name}/flags", "0x1\n" if up else "0x0\n")
 
     def hold(self, name: str, program: str, pid: int = 10) -> None:
-        """A program that has a port open."""
         self.write(f"/proc/{pid}/comm", program + "\n")
         self.write(f"/proc/{pid}/cmdline", program.replace(" ", "\0"))
         (self.root / f"proc/{pid}/fd").mkdir()
@@ -150,8 +144,6 @@ class LivingMachine(Machine):
 
 
 class Attachments:
-    """What is on ports and buses, and what was listened to."""
-
     def __init__(self) -> None:
         self.heard: dict[str, list[ProbeReport]] = {}
         """By port or interface; others are silent."""
@@ -161,7 +153,6 @@ class Attachments:
         self.buses: dict[str, list[Attached]] = {}
 
     def hears(self, place: str, driver: str, device: str = "", baud: int = 115200) -> None:
-        """A sensor sends on this port, or on this interface."""
         self.heard.setdefault(place, []).append(ProbeReport(place, "", driver, device, baud))
 
     def listen(self, places: Sequence[str], active: set[str]) -> list[ProbeReport]:
@@ -177,8 +168,6 @@ class Attachments:
 
 
 class Setup:
-    """`imud setup` on a made-up machine."""
-
     def __init__(self, machine: LivingMachine, attachments: Attachments, capsys: pytest.CaptureFixture[str]) -> None:
         self.machine, self.attachments = machine, attachments
         self._capsys = capsys

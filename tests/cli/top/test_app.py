@@ -38,7 +38,6 @@ Steps = Callable[[Pilot[None], TopApp], Awaitable[None]]
 
 
 def lines(app: TopApp) -> list[str]:
-    """What the terminal would show."""
     strips = app.screen._compositor.render_strips()
     return ["".join(segment.text for segment in strip).rstrip() for strip in strips]
 
@@ -60,8 +59,6 @@ class SilentFeed:
 
 
 def play(steps: Steps, make_feed: Callable[[Callable[[News], None]], Any] = lambda _: SilentFeed()) -> None:
-    """Run the program."""
-
     async def run() -> None:
         app = TopApp(make_feed)
         async with app.run_test(size=SIZE) as pilot:
@@ -72,13 +69,11 @@ def play(steps: Steps, make_feed: Callable[[Callable[[News], None]], Any] = lamb
 
 
 async def give(pilot: Pilot[None], app: TopApp, news: News = NEWS) -> list[str]:
-    """Let news come, and wait until they are drawn."""
     app.post_message(NewsCame(news))
     return await settled(pilot, app)
 
 
 async def press(pilot: Pilot[None], app: TopApp, *keys: str) -> list[str]:
-    """Press keys, one after the other, and wait until what they do is drawn."""
     for key in keys:
         await pilot.press(key)
     return await settled(pilot, app)

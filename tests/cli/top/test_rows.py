@@ -15,7 +15,6 @@ NOW_NS = sample().t_ns + NS_PER_S // 4
 
 
 def history(name: str = "imu0", number: int = 0, **changes: object) -> DeviceHistory:
-    """A device with a sample."""
     one = DeviceHistory(device(name, number, **changes))
     one.add(msgspec.structs.replace(sample(name), euler_rad=(0.5, -0.25, 3.0)))
     return one
