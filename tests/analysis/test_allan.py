@@ -4,15 +4,7 @@ import allantools
 import numpy as np
 import pytest
 
-from imud.analysis.allan import (
-    NoiseType,
-    allan_curve,
-    averaging_factors,
-    degrees_of_freedom,
-    interval,
-    noise_types,
-)
-from imud.analysis.series import FloatArray
+from imud.analysis.allan import NoiseType, allan_curve, averaging_factors, degrees_of_freedom, interval, noise_types
 from imud.errors import BadArgument
 from tests.analysis.synthetic import flicker, quantisation, random_walk, three, white
 
@@ -35,9 +27,8 @@ def test_a_deviation_and_an_interval_by_hand() -> None:
     assert high[0] == pytest.approx(np.sqrt(10 / 3.940), rel=1e-4)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_it_is_that_of_allantools(seed: int) -> None:
-    random = np.random.default_rng(seed)
+def test_it_is_that_of_allantools() -> None:
+    random = np.random.default_rng(1)
     rate_hz = 50.0
     one = white(random, 20_000, rate_hz, 0.1) + random_walk(random, 20_000, rate_hz, 0.02) + 9.81
     curve = allan_curve([three(one)], rate_hz)
@@ -77,23 +68,16 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     assert held / rounds == pytest.approx([0.683] * 3, abs=0.08)
 
 
-@pytest.mark.parametrize(
-    ("made", "expected"),
-    [
+def test_types_of_noise_factors_and_short_runs() -> None:
+    for made, expected in [
         (quantisation(np.random.default_rng(5), 4000, 1.0, 1.0), NoiseType.QUANTISATION),
         (white(np.random.default_rng(5), 4000, 1.0, 1.0), NoiseType.WHITE),
         (flicker(np.random.default_rng(5), 4000, 1.0), NoiseType.FLICKER),
         (random_walk(np.random.default_rng(5), 4000, 1.0, 1.0), NoiseType.RATE_RANDOM_WALK),
-    ],
-    ids=["quantisation", "white", "flicker", "random walk"],
-)
-def test_types_of_noise_are_recognised(made: FloatArray, expected: NoiseType) -> None:
-    types = noise_types(made[:, None], np.array([1, 4, 1000]))
-    assert types[0, 0] == expected
-    assert types[2, 0] == types[1, 0], "too few averages: as at the τ before"
-
-
-def test_factors_a_constant_and_a_short_run() -> None:
+    ]:
+        types = noise_types(made[:, None], np.array([1, 4, 1000]))
+        assert types[0, 0] == expected
+        assert types[2, 0] == types[1, 0], "too few averages: as at the τ before"
     factors = averaging_factors(3000)
     assert factors[0] == 1
     assert factors[-1] == 1000

@@ -23,7 +23,7 @@ def sensor() -> SensorNoise:
     return sensor_noise(Readings(stamps_ns(COUNT, RATE_HZ), values, None, None), values)
 
 
-def test_the_deviation_is_drawn_in_degrees_per_hour(sensor: SensorNoise) -> None:
+def test_plots_are_drawn_in_units_of_data_sheets(sensor: SensorNoise) -> None:
     (axes,) = deviation_figure("gyro", sensor).axes
     lines = {line.get_label(): line for line in axes.get_lines()}
     drawn = np.asarray(lines["y"].get_ydata())
@@ -31,22 +31,13 @@ def test_the_deviation_is_drawn_in_degrees_per_hour(sensor: SensorNoise) -> None
     assert axes.get_xscale() == axes.get_yscale() == "log"
     assert "deg/h" in axes.get_ylabel()
     assert len(axes.collections) == 3, "an interval for each axis"
-
-
-def test_the_density_is_drawn_in_micro_g(sensor: SensorNoise) -> None:
     (axes,) = density_figure("accel", sensor).axes
     assert "µg/√Hz" in axes.get_ylabel()
     middle = np.asarray(axes.get_lines()[0].get_ydata())[-10:].mean()
     assert middle == pytest.approx(np.sqrt(2) * 1e-3 / 9.80665e-6, rel=0.05)
-
-
-def test_a_page_has_the_text_and_four_plots(sensor: SensorNoise) -> None:
     figure = page_figure({"gyro": sensor, "accel": sensor}, ["first line", "second line"])
     assert len(figure.axes) == 4
     assert "first line\nsecond line" in [text.get_text() for text in figure.texts]
-
-
-def test_thinned_densities_keep_their_power() -> None:
     frequency = np.arange(1.0, 1001.0)
     density = np.stack([frequency, np.ones(1000)], axis=1)
     few, power = thinned(frequency, density)

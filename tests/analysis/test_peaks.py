@@ -22,16 +22,34 @@ def line(count: int, frequency_hz: float, amplitude: float, rate_hz: float = RAT
     return np.asarray(amplitude * np.sin(2 * np.pi * frequency_hz * np.arange(count) / rate_hz + phase))
 
 
-@pytest.mark.parametrize("part", [0.0, 0.1, 0.25, 0.4, 0.5, 0.75, 0.9])
-def test_a_line_between_bins(part: float) -> None:
-    frequency = (200 + part) * BIN_HZ
-    (found,) = peaks(power_spectrum([three(line(20 * SIZE, frequency, 2.5))], RATE_HZ, SIZE))[:1]
-    assert found.frequency_hz == pytest.approx(frequency, abs=0.002 * BIN_HZ)
-    assert found.amplitude == pytest.approx((2.5, 2.5, 2.5), rel=2e-3)
-    assert found.total == pytest.approx(2.5 * np.sqrt(3), rel=2e-3)
+def test_lines_noise_and_harmonics() -> None:
+    for part in (0.0, 0.1, 0.5, 0.75):
+        frequency = (200 + part) * BIN_HZ
+        first = peaks(power_spectrum([three(line(20 * SIZE, frequency, 2.5))], RATE_HZ, SIZE))[0]
+        assert first.frequency_hz == pytest.approx(frequency, abs=0.002 * BIN_HZ)
+        assert first.amplitude == pytest.approx((2.5, 2.5, 2.5), rel=2e-3)
+        assert first.total == pytest.approx(2.5 * np.sqrt(3), rel=2e-3)
+    random = np.random.default_rng(7)
+    for _ in range(6):
+        noise = np.stack([white(random, 16 * SIZE, RATE_HZ, 1.0) for _ in range(3)], axis=1)
+        assert peaks(power_spectrum([noise], RATE_HZ, SIZE)) == []
+    series = line(20_000, 30.0, 1.0) + line(20_000, 60.0, 0.3) + line(20_000, 90.0, 0.1) + line(20_000, 77.0, 0.2)
+    series += 0.01 * np.random.default_rng(8).standard_normal(20_000)
+    found = peaks(power_spectrum([three(series)], RATE_HZ, SIZE))
+    assert [round(peak.frequency_hz) for peak in found] == [30, 60, 77, 90]
+    assert [(peak.harmonic_of, peak.multiple) for peak in found] == [(None, 1), (0, 2), (None, 1), (0, 3)]
+    values = np.stack([line(9000, 50.0, a) for a in (0.1, 0.7, 0.2)], axis=1)
+    values += 1e-3 * np.random.default_rng(9).standard_normal(values.shape)
+    assert peaks(power_spectrum([values], RATE_HZ, SIZE))[0].axis == 1
+    noise = white(np.random.default_rng(10), 100 * SIZE, RATE_HZ, 1.0)[:, None]
+    few, many = (power_spectrum([noise[: k * SIZE]], RATE_HZ, SIZE) for k in (2, 100))
+    assert threshold(few) > threshold(many) == 4.0
+    assert images_hz(30.0, 400.0) == (370.0, 430.0)
+    aliased = line(20_000, 370.0, 1.0)
+    assert peaks(power_spectrum([three(aliased)], RATE_HZ, SIZE))[0].frequency_hz == pytest.approx(30.0, abs=1e-2)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_clock_that_is_off_and_missing_samples(seed: int) -> None:
     """A device set to 400 Hz whose crystal is 2 % fast: only the stamps say so. 1 % of the samples are missing."""
     random = np.random.default_rng(seed)
@@ -52,33 +70,6 @@ def test_a_clock_that_is_off_and_missing_samples(seed: int) -> None:
     assert abs(peaks(naive)[0].frequency_hz - frequency) > spectrum.bin_hz, "or else this test shows nothing"
 
 
-def test_noise_has_no_lines() -> None:
-    random = np.random.default_rng(7)
-    for _ in range(12):
-        noise = np.stack([white(random, 16 * SIZE, RATE_HZ, 1.0) for _ in range(3)], axis=1)
-        assert peaks(power_spectrum([noise], RATE_HZ, SIZE)) == []
-
-
-def test_harmonics_are_named() -> None:
-    series = line(20_000, 30.0, 1.0) + line(20_000, 60.0, 0.3) + line(20_000, 90.0, 0.1) + line(20_000, 77.0, 0.2)
-    series += 0.01 * np.random.default_rng(8).standard_normal(20_000)
-    found = peaks(power_spectrum([three(series)], RATE_HZ, SIZE))
-    assert [round(peak.frequency_hz) for peak in found] == [30, 60, 77, 90]
-    assert [(peak.harmonic_of, peak.multiple) for peak in found] == [(None, 1), (0, 2), (None, 1), (0, 3)]
-
-
-def test_the_strongest_axis_is_named() -> None:
-    values = np.stack([line(9000, 50.0, a) for a in (0.1, 0.7, 0.2)], axis=1)
-    values += 1e-3 * np.random.default_rng(9).standard_normal(values.shape)
-    assert peaks(power_spectrum([values], RATE_HZ, SIZE))[0].axis == 1
-
-
-def test_fewer_averages_need_a_higher_line() -> None:
-    noise = white(np.random.default_rng(10), 100 * SIZE, RATE_HZ, 1.0)[:, None]
-    few, many = (power_spectrum([noise[: k * SIZE]], RATE_HZ, SIZE) for k in (2, 100))
-    assert threshold(few) > threshold(many) == 4.0
-
-
 def test_bands() -> None:
     series = white(np.random.default_rng(11), 50_000, RATE_HZ, 1.0)
     spectrum = power_spectrum([three(series)], RATE_HZ, SIZE)
@@ -93,16 +84,7 @@ def test_bands() -> None:
     assert all(one[1] == other[0] for one, other in pairwise(edges))
     spectrum = power_spectrum([three(line(20_000, 50.0, 2.0))], RATE_HZ, SIZE)
     assert bands_of(spectrum, [(40, 60)])[0].rms[0] == pytest.approx(np.sqrt(2), rel=1e-3)
-
-
-@pytest.mark.parametrize("band", [(10.0, 300.0), (20.0, 10.0)])
-def test_a_band_that_cannot_be_is_refused(band: tuple[float, float]) -> None:
-    spectrum = power_spectrum([three(line(2000, 50.0, 2.0))], RATE_HZ, 256)
-    with pytest.raises(BadArgument, match="expected 0 to 200 Hz"):
-        bands_of(spectrum, [band])
-
-
-def test_images() -> None:
-    assert images_hz(30.0, 400.0) == (370.0, 430.0)
-    aliased = line(20_000, 370.0, 1.0)
-    assert peaks(power_spectrum([three(aliased)], RATE_HZ, SIZE))[0].frequency_hz == pytest.approx(30.0, abs=1e-2)
+    for band in [(10.0, 300.0), (20.0, 10.0)]:
+        spectrum = power_spectrum([three(line(2000, 50.0, 2.0))], RATE_HZ, 256)
+        with pytest.raises(BadArgument, match="expected 0 to 200 Hz"):
+            bands_of(spectrum, [band])

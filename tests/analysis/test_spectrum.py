@@ -11,7 +11,7 @@ from tests.analysis.synthetic import white
 RATE_HZ = 500.0
 
 
-def test_density_and_bandwidth() -> None:
+def test_density_bandwidth_and_windows() -> None:
     series = white(np.random.default_rng(1), 10_000, RATE_HZ, 1.0)
     found = power_spectrum([series[:, None]], RATE_HZ, 1024)
     frequency, density = welch(series, RATE_HZ, nperseg=1024)
@@ -25,9 +25,6 @@ def test_density_and_bandwidth() -> None:
     assert found.bandwidth_hz / found.bin_hz == pytest.approx(1.5, rel=1e-6)
     assert noise_bandwidth(np.ones(10), 10.0) == pytest.approx(1.0)
     assert "1.50 bins" in found.words()
-
-
-def test_windows_lie_inside_runs() -> None:
     random = np.random.default_rng(4)
     runs = [white(random, count, RATE_HZ, 1.0)[:, None] for count in (1000, 300, 600)]
     found = power_spectrum(runs, RATE_HZ, 512)
@@ -53,7 +50,7 @@ def test_the_length_of_windows() -> None:
         power_spectrum([np.zeros((10, 3))], 100.0, 64)
 
 
-def test_a_spectrogram_shows_when() -> None:
+def test_spectrograms() -> None:
     t_s = np.arange(20_000) / RATE_HZ
     series = np.where(t_s < 20, np.sin(2 * np.pi * 50 * t_s), np.sin(2 * np.pi * 120 * t_s))[:, None]
     found = spectrogram([series], [0.0], RATE_HZ, 500)
@@ -61,9 +58,6 @@ def test_a_spectrogram_shows_when() -> None:
     assert strongest[found.time_s < 19] == pytest.approx(50.0)
     assert strongest[found.time_s > 21] == pytest.approx(120.0)
     assert found.time_s[0] == pytest.approx(0.5)
-
-
-def test_a_long_spectrogram_is_averaged_and_a_gap_is_a_row_of_nothing() -> None:
     random = np.random.default_rng(5)
     runs = [white(random, 100_000, RATE_HZ, 1.0)[:, None], white(random, 50_000, RATE_HZ, 1.0)[:, None]]
     found = spectrogram(runs, [0.0, 300.0], RATE_HZ, 64)

@@ -1,20 +1,13 @@
 """Names of topics and frames, covariances by the rules of sensor_msgs/Imu, and the filter of steady values."""
 
-import pytest
-
 from imud.bridges.channel import STEADY_NS, MessageFrames, StampedEvent, Steady, covariance, topic
 from imud.event import Event, EventKind
 from imud.frames.conventions import Convention
 
 
-@pytest.mark.parametrize(
-    ("device", "expected"), [("bow", "/bow/imu/data"), ("a-b", "/a_b/imu/data"), ("2nd", "/_2nd/imu/data")]
-)
-def test_topics_are_names_that_ros_2_takes(device: str, expected: str) -> None:
-    assert topic(device, "imu/data") == expected
-
-
-def test_frames_covariances_and_warnings() -> None:
+def test_topics_frames_covariances_and_steady_values() -> None:
+    for device, expected in [("bow", "/bow/imu/data"), ("a-b", "/a_b/imu/data"), ("2nd", "/_2nd/imu/data")]:
+        assert topic(device, "imu/data") == expected
     assert MessageFrames("bow").body == "bow"
     assert MessageFrames("bow").navigation == "enu"
     assert MessageFrames("bow", Convention.NED_FRD).body == "bow_frd"
@@ -27,9 +20,6 @@ def test_frames_covariances_and_warnings() -> None:
     assert covariance(0.5, present=False)[0] == -1
     assert StampedEvent(Event(1, "bow", EventKind.DOWN, "gone"), 2).is_warning
     assert not StampedEvent(Event(1, "bow", EventKind.UP, "there"), 2).is_warning
-
-
-def test_a_steady_value_passes_when_it_changes_once_a_second_and_after_a_step_of_the_clock() -> None:
     steady = Steady()
     passed = [steady.passes(20.0 if t < 5 else 21.0, t * STEADY_NS // 4) for t in range(13)]
     assert [t for t, one in enumerate(passed) if one] == [0, 4, 5, 9]

@@ -4,7 +4,6 @@ from itertools import pairwise
 from typing import Any
 
 import msgspec
-import pytest
 
 from imud.bridges.channel import Diagnosis, DiagnosisLevel, LossCounts, StampedEvent
 from imud.bridges.diagnosis import LOSS_SHOWN_NS, STALE_S, LiveDiagnosis, RecordedDiagnosis
@@ -30,20 +29,14 @@ def one(found: DeviceStatus) -> Diagnosis:
 # --- a running daemon -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("state", "level"),
-    [
+def test_levels_and_messages_of_a_running_daemon() -> None:
+    for state, level in [
         (DeviceState.RUNNING, OK), (DeviceState.FINISHED, OK), (DeviceState.SEARCHING, WARN),
         (DeviceState.MISSING, ERROR), (DeviceState.FAILED, ERROR), (DeviceState.SILENT, STALE),
-    ],
-)  # fmt: skip
-def test_a_state_has_a_level_and_the_message_its_reason(state: DeviceState, level: DiagnosisLevel) -> None:
-    found = one(status(state=state, problem="the adapter was pulled out"))
-    assert (found.level, found.message) == (level, f"{state}: the adapter was pulled out")
-    assert found.values["state"] == state
-
-
-def test_what_is_said_of_a_device_that_runs_well() -> None:
+    ]:  # fmt: skip
+        found = one(status(state=state, problem="the adapter was pulled out"))
+        assert (found.level, found.message) == (level, f"{state}: the adapter was pulled out")
+        assert found.values["state"] == state
     clock = ClockStatus(sync=Sync.REGRESSION, t_err_ns=12_000, skew_ppm=-40.5, residual_ns=900)
     found = one(status(clock=clock, identity={"product": "HI13", "serial_number": "17"}))
     assert found[:4] == ("bow", OK, "running", "17")
@@ -53,22 +46,13 @@ def test_what_is_said_of_a_device_that_runs_well() -> None:
     }  # fmt: skip
     assert found.values.items() >= expected.items()
     assert one(status()).hardware == "HI13"
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"rate_hz": 940.0}, "running; 940.0 Hz come of 1000.0 Hz"),
-        ({"lines": LinesStatus({"sout": "line 5 is taken"}, {}, {})}, "running; sout: line 5 is taken"),
-        ({"lines": LinesStatus({}, {}, {}, alarm=True)}, "running; the ALARM line is active"),
-    ],
-)
-def test_a_device_that_runs_can_need_attention(changes: dict[str, Any], words: str) -> None:
-    found = one(status(**changes))
-    assert (found.level, found.message) == (WARN, words)
-
-
-def test_axes_that_gravity_contradicts_are_a_warning() -> None:
+    taken, raised = LinesStatus({"sout": "line 5 is taken"}, {}, {}), LinesStatus({}, {}, {}, alarm=True)
+    for found, words in (
+        (one(status(rate_hz=940.0)), "running; 940.0 Hz come of 1000.0 Hz"),
+        (one(status(lines=taken)), "running; sout: line 5 is taken"),
+        (one(status(lines=raised)), "running; the ALARM line is active"),
+    ):
+        assert (found.level, found.message) == (WARN, words)
     frame = device_status("bow", 0).frame
     assert frame is not None
     found = one(status(frame=msgspec.structs.replace(frame, problem="z points down")))
@@ -124,7 +108,7 @@ def test_a_recording_is_diagnosed_once_a_second() -> None:
     assert newest["bow"].values["samples"] == str((made[-1].utc_ns - first.utc_ns) * 10 // NS_PER_S + 1)
 
 
-def test_losses_of_a_recording_are_a_warning() -> None:
+def test_losses_and_absent_devices_of_a_recording() -> None:
     diagnosis, levels = RecordedDiagnosis(), []
     for second in range(20):
         samples = run_of("bow", second)
@@ -136,9 +120,6 @@ def test_losses_of_a_recording_are_a_warning() -> None:
     assert levels == 4 * [OK] + 10 * [WARN] + 6 * [OK]
     assert found is not None
     assert found.devices[0].values["lost_gap_device"] == "4"
-
-
-def test_a_device_goes_and_comes_back() -> None:
     diagnosis = RecordedDiagnosis()
     diagnosis.samples("bow", run_of("bow", 0))
     for detail, level in (({"state": "missing"}, ERROR), ({"state": "silent"}, STALE), ({}, ERROR)):
@@ -151,9 +132,6 @@ def test_a_device_goes_and_comes_back() -> None:
     assert found is not None
     assert found.devices[0].level is OK
     assert diagnosis.event(StampedEvent(Event(7, "bow", EventKind.MARK, "a pulse"), UTC_NS)) is None
-
-
-def test_a_device_that_stops_while_others_send_becomes_stale() -> None:
     diagnosis, levels = RecordedDiagnosis(), []
     for second in range(12):
         if second < 2:

@@ -120,16 +120,13 @@ def test_times_out_of_range_and_no_messages() -> None:
     assert summary.statistics.message_count == 0
 
 
-def test_an_error_of_the_disk_comes_out() -> None:
+def test_an_error_of_the_disk_comes_out_and_closing_ends_the_thread() -> None:
     class Full(BytesIO):
         def write(self, _data: Any) -> int:
             raise OSError(28, "No space left on device")
 
     with pytest.raises(OSError, match="No space"):
         written(Full())
-
-
-def test_closing_before_the_end_ends_the_thread() -> None:
     before = threading.enumerate()
     file = McapFile(BytesIO(), "", "imud", {})
     file.add_channel(FIRST).add(1, bytes(CHUNK_BYTES + 1))

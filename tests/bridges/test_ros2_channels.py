@@ -3,7 +3,6 @@
 import math
 from typing import Any
 
-import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imud.bridges.channel import (
@@ -77,7 +76,7 @@ def test_quantities() -> None:
         assert made[f"/bow/{name}"].encode(BARE) is None
 
 
-def test_transform_and_stamp() -> None:
+def test_transform_stamp_and_alignment() -> None:
     tf = channels(MessageFrames("bow"))["/tf"]
     (transform,) = read(tf, FULL).transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("enu", "bow")
@@ -95,19 +94,16 @@ def test_transform_and_stamp() -> None:
     assert (bare.t_dev_ns, bare.edge_seq, bare.status, bare.pps_age_ms) == (-1, -1, -1, -1)
     assert bare.t_err_ns == 0xFFFF_FFFF
     assert all(map(math.isnan, (*bare.euler_rad, *bare.incli_rad)))
-
-
-@pytest.mark.parametrize("length", range(1, 9))
-def test_every_length_of_a_name_is_aligned(length: int) -> None:
-    name = "abcdefgh"[:length]
-    for where, channel in channels(MessageFrames(name, has_north=False)).items():
-        data = channel.encode(FULL)
-        if data is not None:
-            message = ROS.deserialize_cdr(data, channel.schema.name)
-            header = message.transforms[0].header if where == "/tf" else message.header  # type: ignore[attr-defined]
-            assert header.frame_id == (f"{name}_level" if where == "/tf" else name)
-            again = ROS.serialize_cdr(message, channel.schema.name)
-            assert bytes(again) == data, where
+    for length in range(1, 9):
+        name = "abcdefgh"[:length]
+        for where, channel in channels(MessageFrames(name, has_north=False)).items():
+            data = channel.encode(FULL)
+            if data is not None:
+                message = ROS.deserialize_cdr(data, channel.schema.name)
+                header = message.transforms[0].header if where == "/tf" else message.header  # type: ignore[attr-defined]
+                assert header.frame_id == (f"{name}_level" if where == "/tf" else name)
+                again = ROS.serialize_cdr(message, channel.schema.name)
+                assert bytes(again) == data, where
 
 
 def test_losses_events_and_diagnoses() -> None:
@@ -131,8 +127,7 @@ def test_losses_events_and_diagnoses() -> None:
     assert bytes(ROS.serialize_cdr(array, channel.schema.name)) == channel.encode(Diagnoses(UTC_NS, (bow, mast)))
 
 
-def test_definitions_are_those_of_ros_2() -> None:
-    """rosbags makes the hash of a type from its fields; the same hash is the same type to ROS 2."""
+def test_definitions_are_those_of_ros_2_and_times_are_clipped() -> None:
     for name in FIELDS.keys() - OWN:
         full = name.replace("/", "/msg/")
         store = get_typestore(Stores.EMPTY)
@@ -142,9 +137,6 @@ def test_definitions_are_those_of_ros_2() -> None:
     assert text.count("MSG: geometry_msgs/Quaternion") == 1
     assert text.count("MSG: builtin_interfaces/Time") == 1
     assert schema("tf2_msgs/TFMessage").name == "tf2_msgs/msg/TFMessage"
-
-
-def test_a_time_that_ros_cannot_hold_is_clipped() -> None:
     assert time_of(1_500_000_000) == (1, 500_000_000)
     assert time_of(-1) == (-1, 999_999_999)
     assert time_of(1 << 62) == (0x7FFF_FFFF, (1 << 62) % 1_000_000_000)

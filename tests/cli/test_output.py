@@ -24,11 +24,8 @@ def test_a_histogram_has_bars_with_shares() -> None:
     lines = histogram(values, "µs")
     assert len(lines) == 10
     assert float(lines[-1].split()[2]) == pytest.approx(10.0)  # the stray one is counted in the last bar
-
-
-@pytest.mark.parametrize(("span", "width"), [(0, 1), (11, 1), (11.1, 2), (22, 2), (50, 5), (100, 10), (0.011, 0.001)])
-def test_widths_are_round(span: float, width: float) -> None:
-    assert bar_width(span) == pytest.approx(width)
+    for span, width in [(0, 1), (11, 1), (11.1, 2), (22, 2), (50, 5), (100, 10), (0.011, 0.001)]:
+        assert bar_width(span) == pytest.approx(width)
 
 
 def test_a_table_aligns_numbers_and_cannot_write_to_the_terminal() -> None:
@@ -40,21 +37,15 @@ def test_a_table_aligns_numbers_and_cannot_write_to_the_terminal() -> None:
         "baud     115200          11",
         "node     -               -",
     ]
-
-
-@pytest.mark.parametrize(
-    ("value", "width", "text"),
-    [
+    for value, width, text in [
         (12.34, 5, "12.34"),
         (12345.6, 5, "12346"),
         (123456.0, 5, "1.2e5"),
         (1234567.0, 4, "1e6"),
         (-1e300, 3, "###"),
         (-12.34, 5, "-12.3"),
-    ],
-)
-def test_numbers_lose_digits_rather_than_the_column_its_width(value: float, width: int, text: str) -> None:
-    assert fitted(value, width, lambda number: f"{number:.2f}") == text
+    ]:
+        assert fitted(value, width, lambda number: f"{number:.2f}") == text
 
 
 def test_local_time_has_its_offset_then(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,7 +72,8 @@ def test_an_invalid_address_is_named(text: str, place: str, tmp_path: Path, cli:
     assert cli("check", file, status=2 if place else 0).err.startswith(f"{file}:{place}" if place else "")
 
 
-def test_check_notes_a_recording_that_is_not_there(tmp_path: Path, cli: Cli) -> None:
+def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
+    """A misspelled name is no mistake, since the device may come later; nothing is recorded or sent until then."""
     there, file = tmp_path / "a.cap", tmp_path / "imud.yaml"
     there.touch()
     file.write_text(
@@ -80,10 +81,6 @@ def test_check_notes_a_recording_that_is_not_there(tmp_path: Path, cli: Cli) -> 
         f"  b: {{driver: hipnuc-uart, replay: {{path: {there}2}}}}\n"
     )
     assert cli("check", file).out.splitlines()[1:] == [f"{file}:3: note: b: {there}2 is not there: imud waits for it"]
-
-
-def test_check_notes_a_device_of_an_output_that_is_none(tmp_path: Path, cli: Cli) -> None:
-    """A misspelled name is no mistake, since the device may come later; nothing is recorded or sent until then."""
     file = tmp_path / "imud.yaml"
     file.write_text(
         "devices: {bow: {uart: {port: /dev/a}}, mast: {enabled: false, uart: {port: /dev/b}}}\n"
@@ -96,9 +93,6 @@ def test_check_notes_a_device_of_an_output_that_is_none(tmp_path: Path, cli: Cli
         'nmea0183.device: expected a device that imud knows, got "masd"; did you mean mast? known: bow, mast',
         'mqtt.devices: expected a device that imud knows, got "keel"; known: bow, mast',
     ]
-
-
-def test_check_says_what_a_device_cannot_do(tmp_path: Path, cli: Cli) -> None:
     file = tmp_path / "imud.yaml"
     file.write_text(
         "devices:\n  bow:\n    driver: hipnuc-uart\n    uart: {port: /dev/ttyUSB0, baud: 921600}\n"

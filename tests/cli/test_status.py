@@ -98,8 +98,5 @@ def test_settings_and_status_bits_have_names() -> None:
         status_words=("accelerometer over range",),
         status_bit_names={"5": "accelerometer over range"},
     )
-    assert dict(parts(shown)) == {
-        "status": "accelerometer over range",
-        "present": "mode 6-axis, output.hi91 100 Hz",
-    }
+    assert dict(parts(shown)) == {"status": "accelerometer over range", "present": "mode 6-axis, output.hi91 100 Hz"}
     assert dict(parts(replace(shown, status_bits=0, status_words=())))["status"] == "no bit that is known is set"

@@ -29,18 +29,15 @@ def fields(text: str) -> dict[str, str]:
     return found
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
-def test_maintainer_scripts_are_shell_and_leave_a_place_for_debhelper(name: str) -> None:
-    text = (DEBIAN / name).read_text()
-    assert text.startswith("#!/bin/sh\nset -e\n")
-    assert text.count("\n#DEBHELPER#\n") == 1
-    subprocess.run(["sh", "-n", str(DEBIAN / name)], check=True, timeout=30)
-
-
-@pytest.mark.parametrize("name", ["build", "try", "unit"])
-def test_programs_of_the_package_are_shell(name: str) -> None:
-    assert os.access(DEBIAN / name, os.X_OK)
-    subprocess.run(["bash", "-n", str(DEBIAN / name)], check=True, timeout=30)
+def test_scripts_are_shell() -> None:
+    for name in SCRIPTS:
+        text = (DEBIAN / name).read_text()
+        assert text.startswith("#!/bin/sh\nset -e\n")
+        assert text.count("\n#DEBHELPER#\n") == 1
+        subprocess.run(["sh", "-n", str(DEBIAN / name)], check=True, timeout=30)
+    for name in ["build", "try", "unit"]:
+        assert os.access(DEBIAN / name, os.X_OK)
+        subprocess.run(["bash", "-n", str(DEBIAN / name)], check=True, timeout=30)
 
 
 def run_script(name: str, *arguments: str, root: Path) -> None:
@@ -173,23 +170,17 @@ def test_the_unit_of_a_release_reloads_as_its_systemd_can() -> None:
     assert [line for line in lines if line.startswith("Type=")] == ["Type=notify-reload"]
     assert len(lines) == len(text.splitlines()) - 1, "all but ExecReload="
     assert set(text.splitlines()) - set(lines) == {"Type=notify", "ExecReload=/bin/kill -HUP $MAINPID"}
-
-
-@pytest.mark.parametrize(
-    ("release", "text"),
-    [
+    for release, text in [
         ("trixie", "[Service]\nType = notify\nExecReload=/bin/kill\n"),
         ("trixie", "[Service]\nType=notify \n"),
         ("trixie", "[Service]\nType=simple\n"),
         ("trixie", "[Service]\nType=notify\nExecReload=\nType=notify\n"),
         ("bookworm", "[Service]\nType=notify\n"),
         ("bookworm", "[Service]\nType=notify-reload\nExecReload=/bin/kill\n"),
-    ],
-)
-def test_a_unit_that_would_not_reload_ends_the_build(release: str, text: str) -> None:
-    done = unit_for(release, text)
-    assert (done.returncode, done.stdout) == (1, "")
-    assert "expected one Type=" in done.stderr
+    ]:
+        done = unit_for(release, text)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert "expected one Type=" in done.stderr
 
 
 @pytest.mark.parametrize(("ci", "said"), [("true", "lintian is missing, and CI=true"), ("", "expected the release")])

@@ -26,8 +26,17 @@ def plain(text: str) -> str:
     return " ".join(words.replace("\\e", "\\").split())
 
 
-def test_there_is_a_page_for_each_command_and_for_the_configuration() -> None:
+def test_pages_are_valid_roff() -> None:
     assert set(PAGES) == {"imud.1", "imud.yaml.5", *(f"imud-{name}.1" for name in COMMANDS)}
+    for name in PAGES:
+        for line in PAGES[name].splitlines():
+            assert not line.startswith("'")
+            if line.startswith("."):
+                assert line[1:].split()[0] in (*REQUESTS, "br"), line
+    roff = [escaped(text) for text in ("--json", ".5", "'a'", "a\\b", "~^")]
+    assert roff == ["\\-\\-json", "\\&.5", "\\&'a'", "a\\eb", "\\(ti\\(ha"]
+    assert sentence("list what is attached") == "List what is attached."
+    assert marked("see `imud check`.") == "see \\fBimud check\\fR."
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -79,27 +88,6 @@ def test_the_configuration_page_has_every_key_in_words_that_fit_a_line() -> None
     assert "Expected: a whole number from 1 to 4096; default 256." in plain(text)
     words = re.sub(r"\\f[BIR]", "", PAGES["imud.yaml.5"]).split()
     assert max(map(len, words)) <= 60, max(words, key=len)
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_no_line_is_an_unknown_request(name: str) -> None:
-    for line in PAGES[name].splitlines():
-        assert not line.startswith("'")
-        if line.startswith("."):
-            assert line[1:].split()[0] in (*REQUESTS, "br"), line
-
-
-@pytest.mark.parametrize(
-    ("text", "roff"),
-    [("--json", "\\-\\-json"), (".5", "\\&.5"), ("'a'", "\\&'a'"), ("a\\b", "a\\eb"), ("~^", "\\(ti\\(ha")],
-)
-def test_roff_is_escaped(text: str, roff: str) -> None:
-    assert escaped(text) == roff
-
-
-def test_helps_become_sentences_and_code_becomes_bold() -> None:
-    assert sentence("list what is attached") == "List what is attached."
-    assert marked("see `imud check`.") == "see \\fBimud check\\fR."
 
 
 @pytest.mark.skipif(shutil.which("mandoc") is None, reason="no mandoc on this machine")

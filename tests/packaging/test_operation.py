@@ -111,19 +111,13 @@ def test_what_a_backup_has_is_there_again_after_it_was_restored(machine: Path, m
     ]  # fmt: skip
 
 
-def test_the_table_of_a_backup_has_every_place_where_imud_keeps_something() -> None:
+def test_the_document_has_every_place_section_and_command() -> None:
     table = section("Backup")
     for path in (*KEPT, *LEFT_OUT[:3]):
         places = (path, str(Path(path).parent), re.sub(r"80-imud-\w+", "80-imud-*", path))
         assert any(f"`{place}`" in table for place in places), path
-
-
-def test_every_section_that_an_operator_looks_for_is_there() -> None:
     for title in ("Upgrade", "Backup", "Log", "Scheduling", "Confinement", "Exit status"):
         assert section(title).strip()
-
-
-def test_the_upgrade_is_checked_with_the_file_that_the_service_reads_and_can_be_taken_back() -> None:
     unit = (ROOT / "systemd" / "imud.service").read_text()
     (file,) = re.findall(r"^ExecStart=.*--config (\S+)$", unit, re.MULTILINE)
     forward, back = commands("Upgrade")

@@ -124,9 +124,7 @@ def test_the_unit_of_the_page_may_read_the_socket_and_listens_on_this_machine_on
 
 
 @pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file on this machine")
-def test_systemd_judges_the_unit_of_the_collector_as_little_exposed(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
+def test_systemd_judges_the_unit_of_the_collector_as_little_exposed(tmp_path_factory: pytest.TempPathFactory) -> None:
     assert exposure(FLEET_UNIT.read_text(), str(tmp_path_factory.mktemp("unit"))) <= COLLECTOR_EXPOSURE_MAX
 
 
@@ -148,14 +146,11 @@ def test_the_unit_of_the_collector_has_a_command_line_that_is_taken_and_starts_i
         assert f"install -m 600 /dev/null {file} " in document
 
 
-def test_of_the_calls_for_the_clock_only_those_that_read_it_are_allowed() -> None:
+def test_clock_calls_networks_and_the_documents() -> None:
     assert {name for name in values("SystemCallFilter") if "time" in name or "clock" in name or "adj" in name} == {
         "adjtimex", "clock_adjtime", "clock_adjtime64"
     }  # fmt: skip
     assert "CapabilityBoundingSet=\n" in UNIT.read_text(), "with CAP_SYS_TIME they would set it"
-
-
-def test_only_this_machine_and_private_networks_are_reached() -> None:
     assert values("IPAddressDeny") == ["any"]
     allowed = values("IPAddressAllow")
     assert {"localhost", "link-local"} <= set(allowed)
@@ -165,9 +160,6 @@ def test_only_this_machine_and_private_networks_are_reached() -> None:
         assert any(ip_address(address) in network for network in networks), address
     for network in networks:
         assert not network.is_global, network
-
-
-def test_the_documents_name_the_same_limit_and_no_setting_as_left_open_that_is_set() -> None:
     text = PAGE.read_text()
     assert f"`systemd-analyze security imud` gives {EXPOSURE_MAX} " in text
     left_open = re.findall(r"^\| `(\w+)=(\w*)` \|", text.partition("\n## Directives of the unit\n")[0], re.MULTILINE)

@@ -18,8 +18,7 @@ def at(ms: float, seq: int = 1, z: float = 9.75) -> Sample:
     return msgspec.structs.replace(made, t_ns=t_ns, t_rx_ns=t_ns + 300_000, accel_m_s2=(0.5, -0.5, z))
 
 
-def test_a_bucket_ends_with_the_first_sample_of_the_next_interval() -> None:
-    """At 20 Hz intervals are 50 ms long and begin at whole multiples: 0, 50, 100 ms."""
+def test_buckets() -> None:
     bucketing = Bucketing(20)
     early = [at(ms, seq) for seq, ms in enumerate((0, 10, 49.999), start=1)]
     assert bucketing.add(early, early[-1].t_ns) == []
@@ -28,34 +27,22 @@ def test_a_bucket_ends_with_the_first_sample_of_the_next_interval() -> None:
     (second,) = bucketing.add([], at(200).t_ns)
     assert (second.count, second.seq) == (1, 4), "it ends two periods after its interval without another sample"
     assert bucketing.add([], at(500).t_ns) == []
-
-
-def test_every_bucket_of_one_batch_comes_and_no_sample_is_lost() -> None:
     samples = [at(ms, ms + 1) for ms in range(1000)]
     bucketing = Bucketing(50)
     buckets = bucketing.add(samples, samples[-1].t_ns) + bucketing.add([], samples[-1].t_ns + 60 * MS)
     assert [bucket.count for bucket in buckets] == [20] * 50
     assert [bucket.seq for bucket in buckets] == [*range(20, 1001, 20)]
-
-
-def test_peaks_stay() -> None:
     samples = [at(0, 1, 9.0), at(1, 2, 60.0), at(2, 3, -40.0), at(3, 4, 9.5)]
     bucket = bucket_of(samples)
     assert bucket.accel_m_s2 == ((0.5, -0.5, -40.0), (0.5, -0.5, 60.0))
     assert bucket.t_err_s == 12e-6
     assert bucket.latency_s == 300e-6
-
-
-def test_values_that_are_not_finite_or_not_there_are_left_out() -> None:
     bucket = bucket_of([at(0, 1, nan), at(1, 2, 9.0), at(2, 3, inf)])
     assert bucket.accel_m_s2 == ((0.5, -0.5, 9.0), (0.5, -0.5, 9.0))
     assert bucket_of([at(0, 1, nan)]).accel_m_s2 is None
     assert bucket.mag_t is None
     assert bucket.quat_wxyz is None
     assert "mag_t" not in msgspec.to_builtins(bucket)
-
-
-def test_the_quaternion_is_that_of_the_last_sample_that_has_a_good_one() -> None:
     good = msgspec.structs.replace(at(0), quat_wxyz=(0.5, 0.5, 0.5, 0.5))
     bad = msgspec.structs.replace(at(1, 2), quat_wxyz=(nan, 0.0, 0.0, 0.0))
     assert bucket_of([good, bad, at(2, 3)]).quat_wxyz == (0.5, 0.5, 0.5, 0.5)

@@ -183,10 +183,7 @@ def test_a_setting_that_is_not_as_declared_is_marked_on_the_page_and_in_the_over
     page: Page, tmp_path: Path
 ) -> None:
     declared = {"mode": "9-axis", "magnetic_calibration": True}
-    with (
-        daemon_with_module(tmp_path, "--rate", "100", settings=declared) as daemon,
-        serving_web(daemon.socket) as url,
-    ):
+    with daemon_with_module(tmp_path, "--rate", "100", settings=declared) as daemon, serving_web(daemon.socket) as url:
         open_page(page, url, "bow")
         page.until_text("#about", "mode is 6-axis, declared 9-axis")
         page.until("return document.querySelector('[data-setting=mode]')?.className")  # actual values come after names

@@ -23,27 +23,20 @@ def make(*, reading_needs_token: bool = False, token: str = TOKEN, clock: Clock 
     )
 
 
-def test_only_hosts_that_nobody_else_can_have_are_good() -> None:
+def test_hosts_origins_rights_and_policy() -> None:
     good = ("127.0.0.1:9322", "localhost:8080", "LOCALHOST", "[::1]:9322", "192.168.1.7", "gateway.example:9322",
             "localhost.", "[::1")  # fmt: skip
     assert [host for host in good if make().host_problem(host)] == []
     for host in ("attacker.example:9322", "127.0.0.1.attacker.example", "", None, "1", "0x7f.1"):
         assert "see imud web --host" in make().host_problem(host), host
-
-
-def test_origins() -> None:
     guard = make()
-    good = guard.origin_problem("http://localhost:9322", "localhost:9322", with_token=False)
-    assert good == ""
+    assert guard.origin_problem("http://localhost:9322", "localhost:9322", with_token=False) == ""
     others = ("http://localhost:8080", "http://attacker.example", "null", "", "localhost:9322", "ftp://localhost:9322")
     for origin in others:
         assert guard.origin_problem(origin, "localhost:9322", with_token=False), origin
         assert guard.origin_problem(origin, "localhost:9322", with_token=True), origin
     assert make().origin_problem(None, "localhost", with_token=True) == ""
     assert make().origin_problem(None, "localhost", with_token=False)
-
-
-def test_rights() -> None:
     guard = make(reading_needs_token=True)
     assert guard.rights(None, None) == WebRights(False, False)
     assert guard.rights(f"Bearer {TOKEN}", None) == WebRights(True, True)
@@ -56,6 +49,13 @@ def test_rights() -> None:
     assert guard.rights("Bearer ", "") == WebRights(True, False)
     assert guard.rights("Bearer", guard.new_session()) == WebRights(True, False)
     assert not guard.has_token
+    assert host_name("[fe80::1]:80") == "fe80::1"
+    assert [is_loopback(one) for one in ("127.0.0.1", "127.8.8.8", "::1", "localhost")] == [True] * 4
+    assert [is_loopback(one) for one in ("0.0.0.0", "::", "192.168.1.1", "", "gateway")] == [False] * 5
+    policy = safety_headers()["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert "frame-ancestors 'none'" in policy
 
 
 def test_a_session_ends_and_cannot_be_prolonged_or_forged() -> None:
@@ -71,16 +71,6 @@ def test_a_session_ends_and_cannot_be_prolonged_or_forged() -> None:
         assert not guard.is_session(forged), forged
     clock.now_s += SESSION_S
     assert not guard.is_session(cookie)
-
-
-def test_loopback_and_policy() -> None:
-    assert host_name("[fe80::1]:80") == "fe80::1"
-    assert [is_loopback(one) for one in ("127.0.0.1", "127.8.8.8", "::1", "localhost")] == [True] * 4
-    assert [is_loopback(one) for one in ("0.0.0.0", "::", "192.168.1.1", "", "gateway")] == [False] * 5
-    policy = safety_headers()["Content-Security-Policy"]
-    assert "default-src 'none'" in policy
-    assert "unsafe" not in policy
-    assert "frame-ancestors 'none'" in policy
 
 
 def test_a_token_comes_from_the_first_line_of_a_file(tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ async def test_a_message_is_encoded_once_for_all_browsers() -> None:
     assert len({id(text) for text in texts}) == 1
 
 
-async def test_the_overview_has_a_row_per_device_and_the_page_its_whole_status() -> None:
+async def test_overview_page_and_state() -> None:
     hub, _ = make()
     overview = opened(hub, look="overview")
     page = opened(hub, look="device", device="bow")
@@ -134,9 +134,6 @@ async def test_the_overview_has_a_row_per_device_and_the_page_its_whole_status()
     assert status["status"]["ledger"] == statuses[0].ledger
     assert (status["bytes_open"], status["frames_open"], status["lost"]) == (0, 0, bow["lost"])
     assert (await heard(gone, "status"))[0]["status"] is None
-
-
-async def test_the_state_comes_once_and_again_when_it_changes() -> None:
     hub, _ = make()
     browser = opened(hub, look="overview")
     assert [one["problem"] for one in await heard(browser)] == ["connecting to the daemon"]

@@ -9,7 +9,7 @@ async def taken(mailbox: Mailbox, count: int) -> list[str]:
     return [await mailbox.take() for _ in range(count)]
 
 
-async def test_messages_come_in_order_and_the_newest_state_once() -> None:
+async def test_messages_wait_in_order_and_are_dropped_or_forgotten() -> None:
     mailbox = Mailbox()
     mailbox.put("a")
     mailbox.put_newest("status", "old")
@@ -17,14 +17,17 @@ async def test_messages_come_in_order_and_the_newest_state_once() -> None:
     mailbox.put("b")
     assert await taken(mailbox, 3) == ["new", "a", "b"]
     assert mailbox.waiting == 0
-
-
-async def test_the_oldest_goes_where_there_are_too_many_and_is_counted() -> None:
     mailbox = Mailbox()
     for number in range(FRAMES_MAX + 7):
         mailbox.put(str(number))
     assert mailbox.dropped == 7
     assert await taken(mailbox, 2) == ["7", "8"]
+    mailbox = Mailbox()
+    mailbox.put("a")
+    mailbox.put_newest("status", "b")
+    mailbox.forget()
+    assert mailbox.waiting == 0
+    assert mailbox.dropped == 0, "nobody misses it"
 
 
 async def test_a_page_that_does_not_acknowledge_gets_no_more() -> None:
@@ -44,12 +47,3 @@ async def test_a_page_that_does_not_acknowledge_gets_no_more() -> None:
     mailbox.acknowledge(-5)
     mailbox.put("and one")
     assert await mailbox.take() == "and one"
-
-
-async def test_what_waits_for_another_view_is_thrown_away() -> None:
-    mailbox = Mailbox()
-    mailbox.put("a")
-    mailbox.put_newest("status", "b")
-    mailbox.forget()
-    assert mailbox.waiting == 0
-    assert mailbox.dropped == 0, "nobody misses it"

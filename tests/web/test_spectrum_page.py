@@ -36,8 +36,7 @@ def with_losses(frame_of: Callable[[int], bytes]) -> Callable[[int], bytes]:
 def test_transform_and_filling_are_those_of_numpy_and_imud_spectrum(scripts: Page) -> None:
     values = np.random.default_rng(5).normal(size=256)
     found = scripts.module(
-        "const { density } = await import('/static/spectrum.js'); return [...density(args[0], 128)]",
-        values.tolist(),
+        "const { density } = await import('/static/spectrum.js'); return [...density(args[0], 128)]", values.tolist()
     )
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(256) / 256)
     expected = np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2 / (128 * np.sum(window**2))

@@ -27,21 +27,20 @@ def noise_of_three(n: float = 1e-3) -> FloatArray:
     return np.stack([white(random, COUNT, RATE_HZ, n) for _ in range(3)], axis=1)
 
 
-@pytest.mark.parametrize(
-    ("figure", "words"),
-    [
+def test_cells_and_durations() -> None:
+    for figure, words in [
         (None, "-"),
         (Coefficient(0.00123456, 0.0, 0.0), "1.23"),
         (Coefficient(0.00123456, 0.0000412, 0.0), "1.23 ±0.04"),
         (Coefficient(None, 0.0, 0.005), "< 5"),
         (Coefficient(3.26e3, 3e2, 0.0), "3.26e6 ±3e5"),
-    ],
-)
-def test_cells(figure: Coefficient | None, words: str) -> None:
-    assert cell(figure, MILLI) == words
+    ]:
+        assert cell(figure, MILLI) == words
+    for seconds, words in [(12.34, "12.3 s"), (150.0, "2 min 30 s"), (7260.0, "2 h 1 min")]:
+        assert duration_words(seconds) == words
 
 
-def test_a_figure_that_holds_and_one_that_does_not() -> None:
+def test_figures_hold_or_not_and_open_ones_have_no_verdict() -> None:
     sheet = ModelFigures(gyro=SensorFigures(random_walk=1.2e-3, noise_density=1e-3), source="a sheet")
     report = noise_report(taken_of(noise_of_three()), sheet)
     walk, density = comparisons(report, "gyro")
@@ -49,9 +48,6 @@ def test_a_figure_that_holds_and_one_that_does_not() -> None:
     assert walk.ratio == pytest.approx(1 / 1.2, rel=0.05)
     assert (density.quantity.key, density.verdict) == ("noise_density", "ABOVE")
     assert density.ratio == pytest.approx(np.sqrt(2), rel=0.05)
-
-
-def test_what_a_series_leaves_open_is_no_verdict_unless_its_bound_is_low_enough() -> None:
     report = noise_report(
         taken_of(noise_of_three()),
         ModelFigures(gyro=SensorFigures(bias_instability=1e-6, rate_random_walk=10.0), source="a sheet"),
@@ -73,21 +69,13 @@ def test_what_limits_the_figures() -> None:
     assert "the device's own filter: low-pass 47 Hz as delivered" in words
 
 
-def test_the_text_names_what_is_not_compared_and_why() -> None:
+def test_the_text_names_what_is_not_compared_and_a_device_without_sensors_is_refused() -> None:
     words = text(noise_report(taken_of(noise_of_three()), None))
     assert "bow: noise" in words
     assert "product HI14" in words
     assert "Not compared with a data sheet: HiPNUC" in words
-
-
-def test_a_device_without_sensors_is_refused() -> None:
     empty = Readings(stamps_ns(COUNT, RATE_HZ), None, None, None)
     with pytest.raises(ImudError, match="bow sends neither angular rate nor acceleration"):
         noise_report(Taken("a file", "bow", readings=empty), None)
     with pytest.raises(ImudError, match="expected samples, found none"):
         noise_report(Taken("a file", "bow"), None)
-
-
-@pytest.mark.parametrize(("seconds", "words"), [(12.34, "12.3 s"), (150.0, "2 min 30 s"), (7260.0, "2 h 1 min")])
-def test_durations_in_words(seconds: float, words: str) -> None:
-    assert duration_words(seconds) == words

@@ -45,23 +45,17 @@ def test_transfers_need_the_daemon_and_the_device_in_it(machine: Machine) -> Non
     assert "does not have this device" in machine.told(I2C)[0][1]
 
 
-@pytest.mark.parametrize(
-    ("counts", "severity", "words"),
-    [
+def test_failed_transfers_damaged_answers_and_clock_stretching(machine: Machine) -> None:
+    for counts, severity, words in [
         ({"polls": 10_000, "failed": 10}, "ok", "10 failed"),
         ({"polls": 10_000, "failed": 11}, "warning", "11 of 10000 transfers failed"),
         ({"polls": 10_000, "vanished": 1}, "warning", "vanished 1 times"),
         ({"polls": 10_000, "stale": 5001}, "note", "nothing new"),
         ({}, "not checked", "was not read yet"),
-    ],
-)
-def test_failed_transfers(machine: Machine, counts: dict[str, int], severity: str, words: str) -> None:
-    machine.configure(KEEL)
-    machine.status = [polled("keel", counts=counts)]
-    machine.tells(I2C, severity, words)
-
-
-def test_damaged_answers_and_clock_stretching(machine: Machine) -> None:
+    ]:
+        machine.configure(KEEL)
+        machine.status = [polled("keel", counts=counts)]
+        machine.tells(I2C, severity, words)
     machine.configure(MAST)
     one = polled("mast", counts={"polls": 1000})
     machine.status = [msgspec.structs.replace(one, ledger=one.ledger | {"frames_bad_crc": 2})]

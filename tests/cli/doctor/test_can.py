@@ -135,41 +135,32 @@ def test_documents_set_restart_ms_while_the_interface_is_down(file: str) -> None
         assert re.search(r"\bdown\b.* up type|pre-up ip|^ip link set can0 type can bitrate", command), command
 
 
-@pytest.mark.parametrize(
-    ("bitrate", "packets", "state", "severity"),
-    [
+def test_bit_rates(mast: Machine) -> None:
+    for bitrate, packets, state, severity in [
         (500_000, 0, DeviceState.SEARCHING, "error"),
         (500_000, 9, DeviceState.SEARCHING, "error"),
         (500_000, 9, DeviceState.SILENT, "error"),
         (500_000, 0, DeviceState.RUNNING, "ok"),
         (100_000, 9, DeviceState.RUNNING, "warning"),
-    ],
-)
-def test_bit_rates(mast: Machine, bitrate: int, packets: int, state: DeviceState, severity: str) -> None:
-    interface(mast, packets=packets, data=controller(bittiming={"bitrate": bitrate}))
-    mast.status = [device("mast", state=state)]
-    ((got, text),) = mast.told(RATE)
-    assert got == severity
-    if severity == "error":
-        assert "mast: no frame comes at 500000 bit/s on can0 → try 125000, 250000, 1000000" in text
-
-
-def test_a_bus_with_frames_of_others_has_their_bit_rate(mast: Machine) -> None:
+    ]:
+        interface(mast, packets=packets, data=controller(bittiming={"bitrate": bitrate}))
+        mast.status = [device("mast", state=state)]
+        ((got, text),) = mast.told(RATE)
+        assert got == severity
+        if severity == "error":
+            assert "mast: no frame comes at 500000 bit/s on can0 → try 125000, 250000, 1000000" in text
     interface(mast, packets=9, data=controller())
     mast.status = [device("mast", state=DeviceState.SEARCHING)]
     mast.on_pause = lambda: interface(mast, packets=10, data=controller())
     assert mast.told(RATE) == [("ok", "can0 has 500000 bit/s, 9 frames received → ")]
 
 
-@pytest.mark.parametrize("answer", ["", "{}", "[]", "[1]", '[{"linkinfo": 3}]'])
-def test_an_answer_of_another_form_is_not_checked(mast: Machine, answer: str) -> None:
-    interface(mast)
-    mast.prints(COMMAND, answer)
-    (examined,) = examine([STATE], mast.surroundings())
-    assert [finding.severity for finding in examined.findings] == ["not checked"]
-
-
-def test_ip_that_fails_or_is_not_installed_is_not_checked(mast: Machine) -> None:
+def test_ip_that_fails_is_missing_or_answers_in_another_form_is_not_checked(mast: Machine) -> None:
+    for answer in ["", "{}", "[]", "[1]", '[{"linkinfo": 3}]']:
+        interface(mast)
+        mast.prints(COMMAND, answer)
+        (examined,) = examine([STATE], mast.surroundings())
+        assert [finding.severity for finding in examined.findings] == ["not checked"]
     interface(mast)
     mast.prints("ip", "", 1, "Device does not exist")
     mast.outputs[COMMAND] = FileNotFoundError(2, "No such file", "ip")

@@ -18,28 +18,22 @@ CLOCK, STORAGE, POWER, PROCESSOR = (
 )
 
 
-@pytest.mark.parametrize(
-    ("clock", "severity"),
-    [
+def test_clock_and_storage(machine: Machine) -> None:
+    for clock, severity in [
         (KernelClock(True, 50, 1000), "ok"),
         (KernelClock(True, 100_001, 1000), "note"),
         (KernelClock(False, 0, 0), "warning"),
-    ],
-)
-def test_clock(machine: Machine, clock: KernelClock, severity: str) -> None:
-    machine.clock = clock
-    assert [finding.severity for finding in machine.find(CLOCK)] == [severity]
-
-
-@pytest.mark.parametrize(("worst_s", "severity"), [(0.05, "ok"), (0.2, "warning"), (1.0, "error")])
-def test_storage_is_judged_by_the_worst_of_three_writes(machine: Machine, worst_s: float, severity: str) -> None:
-    machine.write("/srv/imud/x")
-    machine.configure(more="state_dir: /srv/imud\n")
-    machine.write(
-        "/proc/mounts", "/dev/sda1 / ext4 rw 0 0\n/dev/mmcblk0p2 /srv ext4 rw 0 0\n/dev/sdb /srv/im ext4 rw 0 0\n"
-    )
-    machine.sync_s = [0.01, worst_s, 0.02]
-    machine.tells(STORAGE, severity, f"to /srv/imud (/dev/mmcblk0p2) took {worst_s * 1000:.0f} ms")
+    ]:
+        machine.clock = clock
+        assert [finding.severity for finding in machine.find(CLOCK)] == [severity]
+    for worst_s, severity in [(0.05, "ok"), (0.2, "warning"), (1.0, "error")]:
+        machine.write("/srv/imud/x")
+        machine.configure(more="state_dir: /srv/imud\n")
+        machine.write(
+            "/proc/mounts", "/dev/sda1 / ext4 rw 0 0\n/dev/mmcblk0p2 /srv ext4 rw 0 0\n/dev/sdb /srv/im ext4 rw 0 0\n"
+        )
+        machine.sync_s = [0.01, worst_s, 0.02]
+        machine.tells(STORAGE, severity, f"to /srv/imud (/dev/mmcblk0p2) took {worst_s * 1000:.0f} ms")
 
 
 def test_storage_that_is_not_there_or_may_not_be_written(machine: Machine) -> None:

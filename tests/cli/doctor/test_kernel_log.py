@@ -1,7 +1,5 @@
 """Lines by kind of trouble, written by hand after the messages of the drivers: not from a recorded log but for one."""
 
-import pytest
-
 from imud.cli.doctor.finding import DoctorCheck
 from imud.cli.doctor.kernel_log import kernel_log
 from tests.support.surroundings import Machine
@@ -15,9 +13,8 @@ QUIET = (
 )
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
+def test_each_kind_of_trouble_a_quiet_log_and_other_sources(machine: Machine) -> None:
+    for line, words in [
         ("usb 1-1.2: reset full-speed USB device number 4 using dwc_otg", "resets of USB devices"),
         ("usb 1-1-port2: cannot reset port (err = -71)", "resets of USB devices"),
         ("usb 1-1-port2: over-current change #3", "too much current on USB"),
@@ -32,14 +29,9 @@ QUIET = (
         ("mcp251x spi0.0 can0: bus-off", "trouble of CAN controllers"),
         ("ttyAMA0: 4 input overrun(s)", "overruns of serial ports"),
         ("oom-kill:constraint=CONSTRAINT_NONE,task=python3", "lack of memory"),
-    ],
-)
-def test_each_kind_of_trouble(machine: Machine, line: str, words: str) -> None:
-    machine.prints("journalctl", QUIET + line + "\n")
-    machine.tells(LOG, "warning", f"kernel log: 1 lines on {words}, the last: {line[:40]}")
-
-
-def test_a_quiet_log_unplugged_adapters_and_other_sources(machine: Machine) -> None:
+    ]:
+        machine.prints("journalctl", QUIET + line + "\n")
+        machine.tells(LOG, "warning", f"kernel log: 1 lines on {words}, the last: {line[:40]}")
     machine.prints("journalctl", QUIET)
     assert machine.told(LOG) == [
         ("ok", "nothing on ports, buses, storage or voltage in 6 lines of the kernel's log → ")

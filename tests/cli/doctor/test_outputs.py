@@ -24,34 +24,22 @@ def running(machine: Machine) -> Machine:
     return machine
 
 
-@pytest.mark.parametrize(
-    ("page", "severity", "words"),
-    [
-        (
-            '{"scrapes":0,"age_s":9.0}',
-            "note",
-            "nothing has scraped 127.0.0.1 port 9321 since it was opened 9 s ago",
-        ),
+def test_scrapes(running: Machine) -> None:
+    for page, severity, words in [
+        ('{"scrapes":0,"age_s":9.0}', "note", "nothing has scraped 127.0.0.1 port 9321 since it was opened 9 s ago"),
         ('{"scrapes":0,"age_s":3000.0}', "note", "opened 50 minutes ago"),
         ('{"scrapes":7,"age_s":9.0}', "ok", "scraped 7 times, last 9 s ago"),
         ('{"scrapes":7,"age_s":301.0}', "warning", "for 5 minutes, 7 times before"),
         ("<html>", "error", "another program than imud"),
-    ],
-)
-def test_scrapes(running: Machine, page: str, severity: str, words: str) -> None:
-    running.pages[AT] = page
-    running.tells(PROMETHEUS, severity, words)
-
-
-@pytest.mark.parametrize(("age_s", "severity"), [(300.0, "note"), (301.0, "warning")])
-def test_metrics_that_are_configured_and_never_scraped_are_a_warning_after_five_minutes(
-    running: Machine, age_s: float, severity: str
-) -> None:
-    running.configure(more="metrics: {port: 9321}\n")
-    running.pages[AT] = f'{{"scrapes":0,"age_s":{age_s}}}'
-    examined = examine([PROMETHEUS], running.surroundings())
-    assert [finding.severity for finding in examined[0].findings] == [severity]
-    assert exit_status(examined) == (severity == "warning")
+    ]:
+        running.pages[AT] = page
+        running.tells(PROMETHEUS, severity, words)
+    for age_s, severity in [(300.0, "note"), (301.0, "warning")]:
+        running.configure(more="metrics: {port: 9321}\n")
+        running.pages[AT] = f'{{"scrapes":0,"age_s":{age_s}}}'
+        examined = examine([PROMETHEUS], running.surroundings())
+        assert [finding.severity for finding in examined[0].findings] == [severity]
+        assert exit_status(examined) == (severity == "warning")
 
 
 def test_no_answer_another_address_and_switched_off(running: Machine) -> None:

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from imud.cli.doctor.finding import DoctorCheck, DoctorFinding, Findings, error, not_checked, note, ok, warning
+from imud.cli.doctor.finding import DoctorCheck, Findings, error, not_checked, note, ok, warning
 from imud.cli.doctor.report import Examined, as_json, examine, exit_status, page, verdict
 from imud.cli.doctor.surroundings import Surroundings
 from imud.errors import LinkError
@@ -14,27 +14,21 @@ GOOD, NOTE, WARNING, ERROR = ok("fine"), note("look"), warning("slow", "faster")
 UNSEEN = not_checked("hidden")
 
 
-@pytest.mark.parametrize(
-    ("findings", "status", "words"),
-    [
+def test_verdict_exit_status_json_and_page() -> None:
+    for findings, status, words in [
         ([], 0, "nothing wrong found"),
         ([GOOD, NOTE], 0, "nothing wrong found"),
         ([GOOD, UNSEEN], 0, "nothing wrong found in what could be checked; 1 thing could not"),
         ([WARNING, UNSEEN, UNSEEN], 1, "1 warning; 2 things could not be checked"),
         ([WARNING, ERROR, ERROR], 2, "2 errors, 1 warning"),
-    ],
-)
-def test_verdict_and_exit_status(findings: list[DoctorFinding], status: int, words: str) -> None:
-    examined = [Examined("a", findings[:1]), Examined("b", findings[1:])]
-    assert exit_status(examined) == status
-    assert verdict(examined) == words
-    assert page(examined).splitlines()[-1] == words
-    told = json.loads(as_json(examined))
-    assert (told["status"], told["verdict"]) == (status, words)
-    assert told["complete"] is (UNSEEN not in findings)
-
-
-def test_json_and_page() -> None:
+    ]:
+        examined = [Examined("a", findings[:1]), Examined("b", findings[1:])]
+        assert exit_status(examined) == status
+        assert verdict(examined) == words
+        assert page(examined).splitlines()[-1] == words
+        told = json.loads(as_json(examined))
+        assert (told["status"], told["verdict"]) == (status, words)
+        assert told["complete"] is (UNSEEN not in findings)
     assert json.loads(as_json([Examined("a", [WARNING]), Examined("b", [])]))["checks"] == [
         {"name": "a", "findings": [{"severity": "warning", "seen": "slow", "advice": "faster"}]},
         {"name": "b", "findings": []},

@@ -66,13 +66,19 @@ def test_a_user_cannot_say_that_a_port_is_free(bow: Machine) -> None:
     assert bow.told(TAKEN) == [("error", f"{problem} → `sudo imud doctor` sees which it is")]
 
 
-def test_a_console_on_the_port(bow: Machine) -> None:
+def test_a_console_and_latency_timers(bow: Machine) -> None:
     bow.port("ttyUSB0")
     bow.uid = 0
     bow.write("/sys/class/tty/console/active", "tty0 ttyUSB0\n")
     severity, text = bow.told(TAKEN)[0]
     assert severity == "error"
     assert "console=ttyUSB0" in text
+    bow.port("ttyUSB0")
+    assert bow.find(LATENCY) == []  # an adapter without one
+    bow.write("/sys/class/tty/ttyUSB0/device/latency_timer", "16\n")
+    bow.tells(LATENCY, "warning", "up to 16 ms", 'ATTR{latency_timer}="1"')
+    bow.write("/sys/class/tty/ttyUSB0/device/latency_timer", "1\n")
+    assert bow.find(LATENCY)[0].severity == "ok"
 
 
 def test_modem_manager_concerns_usb_ports_only(bow: Machine) -> None:
@@ -84,12 +90,3 @@ def test_modem_manager_concerns_usb_ports_only(bow: Machine) -> None:
     assert bow.find(MODEM)[0].severity == "ok"
     bow.configure("bow: {driver: hipnuc-uart, uart: {port: /dev/ttyAMA0, baud: 115200}}")
     assert bow.find(MODEM) == []
-
-
-def test_latency_timers(bow: Machine) -> None:
-    bow.port("ttyUSB0")
-    assert bow.find(LATENCY) == []  # an adapter without one
-    bow.write("/sys/class/tty/ttyUSB0/device/latency_timer", "16\n")
-    bow.tells(LATENCY, "warning", "up to 16 ms", 'ATTR{latency_timer}="1"')
-    bow.write("/sys/class/tty/ttyUSB0/device/latency_timer", "1\n")
-    assert bow.find(LATENCY)[0].severity == "ok"

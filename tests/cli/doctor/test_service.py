@@ -34,32 +34,23 @@ def test_configurations(machine: Machine) -> None:
     assert any("imud.yaml:2:" in text and "prt" in text for _, text in found)
 
 
-def test_a_service_that_runs(machine: Machine) -> None:
+def test_a_service_that_runs_and_what_is_wrong_with_one(machine: Machine) -> None:
     machine.unit(*ACTIVE)
     assert [finding.severity for finding in machine.find(SERVICE)] == ["ok", "ok"]
-
-
-@pytest.mark.parametrize(
-    ("changed", "severity", "words"),
-    [
+    for changed, severity, words in [
         ("UnitFileState=disabled", "warning", "sudo systemctl enable imud"),
         ("UnitFileState=masked", "error", "sudo systemctl unmask imud"),
         ("ActiveState=inactive", "error", "sudo systemctl start imud"),
         ("ActiveState=activating", "warning", "look again"),
         ("NRestarts=5", "warning", "restarted imud.service 5 times"),
         ("NeedDaemonReload=yes", "warning", "daemon-reload"),
-    ],
-)
-def test_what_is_wrong_with_a_service(machine: Machine, changed: str, severity: str, words: str) -> None:
-    key = changed.partition("=")[0]
-    machine.unit(*(line for line in ACTIVE if not line.startswith(f"{key}=")), changed)
-    wrong = [found for found in machine.told(SERVICE) if found[0] != "ok"]
-    assert len(wrong) == 1
-    assert wrong[0][0] == severity
-    assert words in wrong[0][1]
-
-
-def test_an_exit_status_of_imud_has_its_own_advice(machine: Machine) -> None:
+    ]:
+        key = changed.partition("=")[0]
+        machine.unit(*(line for line in ACTIVE if not line.startswith(f"{key}=")), changed)
+        wrong = [found for found in machine.told(SERVICE) if found[0] != "ok"]
+        assert len(wrong) == 1
+        assert wrong[0][0] == severity
+        assert words in wrong[0][1]
     machine.unit("UnitFileState=enabled", "ActiveState=failed", "Result=exit-code", "ExecMainStatus=78")
     assert "`imud check` says where" in machine.told(SERVICE)[-1][1]
 

@@ -44,7 +44,7 @@ def test_a_row_for_each_gateway_those_that_are_away_first() -> None:
     assert overview.text().endswith("2 gateways, 1 away; mqtt://broker.example:1883: the connection was lost")
 
 
-def test_the_wall_clock_of_a_gateway_has_its_error_or_is_not_set() -> None:
+def test_the_wall_clock_has_its_error_and_without_a_gateway_there_is_a_reason() -> None:
     fleet = made()
     overview = FleetOverview(fleet)
 
@@ -59,9 +59,6 @@ def test_the_wall_clock_of_a_gateway_has_its_error_or_is_not_set() -> None:
     assert last() == "0.123"
     take(fleet, overview, not_set(samples_message(3, 4)))
     assert last() == "not set"
-
-
-def test_before_there_is_anything_it_says_why() -> None:
     fleet = Fleet("mqtt://broker.example")
     assert FleetOverview(fleet).text() == "no gateway yet; connected"
     fleet.problem = "refused"

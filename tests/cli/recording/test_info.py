@@ -19,7 +19,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def test_a_whole_file_for_people_and_programs(file: Path, cli: Cli) -> None:
+def test_whole_damaged_cut_and_foreign_files(file: Path, cli: Cli, tmp_path: Path) -> None:
     page = cli("info", file).out
     assert "integrity  whole" in page
     assert "dropped    nothing" in page
@@ -36,9 +36,6 @@ def test_a_whole_file_for_people_and_programs(file: Path, cli: Cli) -> None:
     assert told["stored_bytes"] == file.stat().st_size
     assert told["problems"] == []
     assert told["file_number"] == 0
-
-
-def test_a_damaged_file_is_an_answer_of_no_and_a_cut_one_is_not(file: Path, tmp_path: Path, cli: Cli) -> None:
     data = bytearray(file.read_bytes())
     (tmp_path / "cut").write_bytes(data[:-3])
     assert "no regular end" in " ".join(cli("info", tmp_path / "cut").out.split())
@@ -52,9 +49,6 @@ def test_a_damaged_file_is_an_answer_of_no_and_a_cut_one_is_not(file: Path, tmp_
     assert "begun not known: the block that says it and names the devices is damaged or missing" in page
     assert "duration not known" in page
     assert "blocks that are missing by their numbers: 1" in page
-
-
-def test_what_is_no_recording(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "a.csv").write_text("t_ns,accel\n" * 50)
     cli.refuses("no recording of imud", "info", str(tmp_path / "a.csv"))
     cli.refuses("No such file", "info", str(tmp_path / "none"))

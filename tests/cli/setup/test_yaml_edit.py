@@ -21,9 +21,8 @@ def test_without_a_file_one_is_made_and_disabled_devices_have_names() -> None:
     assert device_names(None) == []
 
 
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
+def test_a_block_goes_behind_the_key_or_is_left_to_the_person() -> None:
+    for before, after in [
         ("devices: {}\n", "devices:\n" + BLOCK),
         ("devices: {}  # none yet\n", "devices:  # none yet\n" + BLOCK),
         ("log_level: info\n", "log_level: info\n\ndevices:\n" + BLOCK),
@@ -38,22 +37,17 @@ def test_without_a_file_one_is_made_and_disabled_devices_have_names() -> None:
         ),
         ("devices:\r\n  bow: {uart: {port: /dev/ttyS0}}\r\n", None),
         ("\ufeffdevices: {}", "devices:\n" + BLOCK),
-    ],
-)
-def test_a_block_goes_behind_the_key(before: str, after: str | None) -> None:
-    made = with_devices(before.encode(), NEW).decode()
-    assert after is None or made == after
-    assert made.count("\r\n") in (0, made.count("\n"))
-    old, new = read_yaml(before.encode()).data, read_yaml(made.encode()).data
-    assert isinstance(old, dict)
-    assert new == {**old, "devices": {**(old.get("devices") or {}), **NEW}}
-
-
-@pytest.mark.parametrize("before", ["devices: {bow: {uart: {port: /dev/ttyS0}}}\n", "{devices: {}}\n", "- a\n"])
-def test_a_notation_that_is_not_known_is_left_to_the_person(before: str) -> None:
-    with pytest.raises(ImudError, match="only you can add") as refused:
-        with_devices(before.encode(), NEW)
-    assert BLOCK.rstrip() in str(refused.value)
+    ]:
+        made = with_devices(before.encode(), NEW).decode()
+        assert after is None or made == after
+        assert made.count("\r\n") in (0, made.count("\n"))
+        old, new = read_yaml(before.encode()).data, read_yaml(made.encode()).data
+        assert isinstance(old, dict)
+        assert new == {**old, "devices": {**(old.get("devices") or {}), **NEW}}
+    for before in ["devices: {bow: {uart: {port: /dev/ttyS0}}}\n", "{devices: {}}\n", "- a\n"]:
+        with pytest.raises(ImudError, match="only you can add") as refused:
+            with_devices(before.encode(), NEW)
+        assert BLOCK.rstrip() in str(refused.value)
 
 
 def test_the_example_of_the_package_is_known_and_only_its_device_is_replaced() -> None:
