@@ -8,7 +8,9 @@ import pytest
 
 from imud.cli import COMMANDS
 from tests.packaging.completions import FILES, completions
+from tests.support.daemon_process import LIMIT_S
 
+pytestmark = pytest.mark.live
 pytest.importorskip("shtab", reason="shtab is not installed (extra dev)")
 
 
@@ -21,26 +23,23 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("shell", FILES)
-def test_every_command_and_its_options_are_known(folder: Path, shell: str) -> None:
-    text = (folder / FILES[shell]).read_text()
-    for command in (*COMMANDS, "scan", "assign"):
-        assert command in text
-    assert "convention" in text
-    assert "ned-frd" in text
-
-
-@pytest.mark.parametrize("shell", FILES)
-def test_the_shell_can_read_it(folder: Path, shell: str) -> None:
-    if shutil.which(shell) is None:
-        pytest.skip(f"no {shell} on this machine")
-    subprocess.run([shell, "-n", str(folder / FILES[shell])], check=True, timeout=30)
+def test_every_shell_can_read_its_file_and_knows_all_commands(folder: Path) -> None:
+    for shell in FILES:
+        text = (folder / FILES[shell]).read_text()
+        for command in (*COMMANDS, "scan", "assign"):
+            assert command in text
+        assert "convention" in text
+        assert "ned-frd" in text
+    for shell in FILES:
+        if shutil.which(shell) is None:
+            pytest.skip(f"no {shell} on this machine")
+        subprocess.run([shell, "-n", str(folder / FILES[shell])], check=True, timeout=LIMIT_S)
 
 
 def completed_by_bash(folder: Path, *words: str) -> list[str]:
     script = 'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _shtab_imud; echo "${COMPREPLY[@]}"'
     argv = ["bash", "--norc", "-c", script, "bash", str(folder / FILES["bash"]), *words]
-    return subprocess.run(argv, capture_output=True, text=True, check=True, timeout=30).stdout.split()
+    return subprocess.run(argv, capture_output=True, text=True, check=True, timeout=LIMIT_S).stdout.split()
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash on this machine")

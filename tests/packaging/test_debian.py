@@ -11,7 +11,10 @@ from pathlib import Path
 import pytest
 
 from imud import __version__
+from tests.support.daemon_process import LIMIT_S
 from tests.support.files import ROOT
+
+pytestmark = pytest.mark.live
 
 DEBIAN = ROOT / "packaging" / "debian"
 SCRIPTS = ("imud-daemon.postinst", "imud-daemon.prerm", "imud-daemon.postrm")
@@ -34,10 +37,10 @@ def test_scripts_are_shell() -> None:
         text = (DEBIAN / name).read_text()
         assert text.startswith("#!/bin/sh\nset -e\n")
         assert text.count("\n#DEBHELPER#\n") == 1
-        subprocess.run(["sh", "-n", str(DEBIAN / name)], check=True, timeout=30)
+        subprocess.run(["sh", "-n", str(DEBIAN / name)], check=True, timeout=LIMIT_S)
     for name in ["build", "try", "unit"]:
         assert os.access(DEBIAN / name, os.X_OK)
-        subprocess.run(["bash", "-n", str(DEBIAN / name)], check=True, timeout=30)
+        subprocess.run(["bash", "-n", str(DEBIAN / name)], check=True, timeout=LIMIT_S)
 
 
 def run_script(name: str, *arguments: str, root: Path) -> None:
@@ -49,7 +52,7 @@ def run_script(name: str, *arguments: str, root: Path) -> None:
         text,
     )
     assert moved != text
-    subprocess.run(["sh", "-c", moved, name, *arguments], check=True, timeout=30)
+    subprocess.run(["sh", "-c", moved, name, *arguments], check=True, timeout=LIMIT_S)
 
 
 def test_only_a_purge_removes_the_state_and_never_that_of_another_package(tmp_path: Path) -> None:
@@ -128,16 +131,13 @@ OTHERS = {
 """Packages of other projects, and the files that they and ours have at the same places."""
 
 
-def test_packages_that_have_the_same_files_exclude_this_one_and_are_not_taken_for_it() -> None:
+def test_conflicts_extras_units_files_and_groups_of_the_package() -> None:
     _, package = map(fields, (DEBIAN / "control").read_text().strip().split("\n\n"))
     assert package["Package"] not in OTHERS, "apt would upgrade the one to the other"
     assert set(package["Conflicts"].split(", ")) == OTHERS.keys(), "without versions: whatever theirs is"
     assert not {"Provides", "Replaces", "Breaks"} & package.keys(), "imud-mqtt and others of theirs depend on imud"
     installed = (ROOT / "docs" / "install.md").read_text()
     assert all(f"`{name}`" in installed for name in (package["Package"], *OTHERS))
-
-
-def test_an_installation_by_hand_has_the_extras_and_the_units_of_the_package() -> None:
     _, installing, removing = re.split(
         r"^```sh$", (ROOT / "docs/install.md").read_text().partition("## By hand")[2], flags=re.M
     )
@@ -146,9 +146,6 @@ def test_an_installation_by_hand_has_the_extras_and_the_units_of_the_package() -
     for unit in ("imud.service", "imud-web.service"):
         assert f"systemd/{unit}" in installing
         assert f"/etc/systemd/system/{unit}" in removing
-
-
-def test_every_file_that_the_build_takes_is_there() -> None:
     text = (DEBIAN / "build").read_text()
     taken = re.findall(r" ((?:packaging/debian|etc|systemd|imud/include)/[\w./-]+\w)(?= |\n|$)", text)
     assert len(taken) >= 8
@@ -156,11 +153,18 @@ def test_every_file_that_the_build_takes_is_there() -> None:
     (names,) = re.findall(r"for file in ([^;]*);", text)
     assert {"control", "changelog", "rules", *SCRIPTS} <= set(names.replace("\\", "").split())
     assert all((DEBIAN / one).is_file() for one in names.replace("\\", "").split())
+    sysusers = (ROOT / "systemd/imud.sysusers.conf").read_text()
+    made = set(re.findall(r"^g (\S+)", sysusers, re.MULTILINE))
+    member_of = set(re.findall(r"^m imud (\S+)$", sysusers, re.MULTILINE))
+    groups = re.findall(r"^Group=(.*)$", (ROOT / "systemd/imud.service").read_text(), re.MULTILINE)
+    rules = re.findall(r'GROUP="(\w+)"', (ROOT / "etc/udev/60-imud.rules").read_text())
+    assert {*groups, *member_of} <= made
+    assert member_of == {"dialout", *rules}
 
 
 def unit_for(release: str, text: str) -> subprocess.CompletedProcess[str]:
     argv = [str(DEBIAN / "unit"), release]
-    return subprocess.run(argv, input=text, capture_output=True, text=True, check=False, timeout=30)
+    return subprocess.run(argv, input=text, capture_output=True, text=True, check=False, timeout=LIMIT_S)
 
 
 def test_the_unit_of_a_release_reloads_as_its_systemd_can() -> None:
@@ -191,20 +195,10 @@ def test_without_lintian_ci_makes_no_package(tmp_path: Path, ci: str, said: str)
     (tmp_path / "dh").symlink_to(tmp_path / "true")
     argv = ["/bin/bash", str(DEBIAN / "build"), "sid", "amd64"]
     environment = {"PATH": str(tmp_path), "CI": ci}
-    done = subprocess.run(argv, env=environment, capture_output=True, text=True, check=False, timeout=30)
+    done = subprocess.run(argv, env=environment, capture_output=True, text=True, check=False, timeout=LIMIT_S)
     assert done.returncode == 1
     assert said in done.stderr
     assert "THIS PACKAGE IS NOT CHECKED" in (DEBIAN / "build").read_text()
-
-
-def test_sysusers_make_every_group_that_unit_and_udev_rules_name() -> None:
-    sysusers = (ROOT / "systemd/imud.sysusers.conf").read_text()
-    made = set(re.findall(r"^g (\S+)", sysusers, re.MULTILINE))
-    member_of = set(re.findall(r"^m imud (\S+)$", sysusers, re.MULTILINE))
-    unit = re.findall(r"^Group=(.*)$", (ROOT / "systemd/imud.service").read_text(), re.MULTILINE)
-    rules = re.findall(r'GROUP="(\w+)"', (ROOT / "etc/udev/60-imud.rules").read_text())
-    assert {*unit, *member_of} <= made
-    assert member_of == {"dialout", *rules}
 
 
 @pytest.mark.skipif(shutil.which("pkg-config") is None, reason="no pkg-config on this machine")
@@ -212,7 +206,7 @@ def test_pkg_config_reads_its_file(tmp_path: Path) -> None:
     (tmp_path / "imud.pc").write_text((DEBIAN / "imud.pc").read_text().replace("@VERSION@", __version__))
     argv = ["pkg-config", "--modversion", "imud"]
     environment = {**os.environ, "PKG_CONFIG_PATH": str(tmp_path)}
-    done = subprocess.run(argv, env=environment, capture_output=True, text=True, check=True, timeout=30)
+    done = subprocess.run(argv, env=environment, capture_output=True, text=True, check=True, timeout=LIMIT_S)
     assert done.stdout.strip() == __version__
 
 
@@ -230,12 +224,12 @@ def library(folder: Path, name: str, **texts: str) -> None:
 
 def copyright_of(folder: Path) -> subprocess.CompletedProcess[str]:
     """Run copyright.py on a folder of installed wheels, among them imud with what it bundles."""
-    shutil.copytree(ROOT / "imud/web/static/uplot", folder / "imud/web/static/uplot")
+    shutil.copytree(ROOT / "imud/web/static/uplot", folder / "imud/web/static/uplot", dirs_exist_ok=True)
     argv = [sys.executable, str(DEBIAN / "copyright.py"), str(folder)]
-    return subprocess.run(argv, capture_output=True, text=True, check=False, timeout=30)
+    return subprocess.run(argv, capture_output=True, text=True, check=False, timeout=LIMIT_S)
 
 
-def test_copyright_has_each_library_with_its_text(tmp_path: Path) -> None:
+def test_copyright_has_each_library_with_its_text_or_refuses_it(tmp_path: Path) -> None:
     library(tmp_path, "one", LICENSE="Copyright (c) 2020 Someone\n\nDo what you like.\n")
     library(tmp_path, "two", LICENSE="  Apache License\n  Version 2.0, January 2004\n")
     library(tmp_path, "pyserial")
@@ -249,9 +243,6 @@ def test_copyright_has_each_library_with_its_text(tmp_path: Path) -> None:
         in text
     )
     assert "License: pyserial\n Redistribution and use" in text
-
-
-def test_copyright_refuses_a_library_without_a_text(tmp_path: Path) -> None:
     library(tmp_path, "bare")
     done = copyright_of(tmp_path)
     assert done.returncode == 1

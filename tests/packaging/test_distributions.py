@@ -15,16 +15,19 @@ from typing import Final
 import pytest
 
 from imud import __version__
+from tests.support.daemon_process import LIMIT_S
 from tests.support.files import ROOT
 
-LIMIT_S: Final = 50
 BUILD: Final = "from hatchling import build; print(build.build_{1}({0!r}))"
 NOT_DISTRIBUTED: Final = {".git", ".venv", "PKG-INFO"}
 """Of the top folder: the repository, an environment, and what an sdist has besides."""
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("hatchling") is None and not os.environ.get("CI"),
-    reason="no hatchling on this machine (it is in the extra dev)",
-)
+pytestmark = [
+    pytest.mark.live,
+    pytest.mark.skipif(
+        importlib.util.find_spec("hatchling") is None and not os.environ.get("CI"),
+        reason="no hatchling on this machine (it is in the extra dev)",
+    ),
+]
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +96,9 @@ def test_the_wheel_starts_the_command_and_needs_what_the_project_says(distributi
     environment = {**os.environ, "PYTHONPATH": str(distributions[0])}
     code = "import sys, imud.cli; print(imud.__file__); sys.argv = ['imud', '--version']; imud.cli.main()"
     argv, folder = [sys.executable, "-c", code], distributions[0].parent
-    done = subprocess.run(argv, cwd=folder, env=environment, capture_output=True, text=True, check=True, timeout=30)
+    done = subprocess.run(
+        argv, cwd=folder, env=environment, capture_output=True, text=True, check=True, timeout=LIMIT_S
+    )
     assert done.stdout.splitlines() == [f"{distributions[0]}/imud/__init__.py", f"imud {__version__}"]
 
 
@@ -114,7 +119,7 @@ def test_an_unpacked_sdist_is_checked_and_built_as_the_repository_is(
     for program in (".ci/run", "packaging/debian/build"):
         assert os.access(tree / program, os.X_OK), program
     said = subprocess.run(
-        ["make", "--dry-run", "check"], cwd=tree, capture_output=True, text=True, check=True, timeout=30
+        ["make", "--dry-run", "check"], cwd=tree, capture_output=True, text=True, check=True, timeout=LIMIT_S
     )
     for program in ("ruff check .", "mypy", "pytest"):
         assert f"/{program}" in said.stdout

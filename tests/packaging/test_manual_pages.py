@@ -13,6 +13,7 @@ from imud.cli.doctor.report import STATUS
 from tests.packaging.completions import every_parser
 from tests.packaging.manual_pages import escaped, help_of, marked, pages, sentence
 from tests.support import references
+from tests.support.daemon_process import LIMIT_S
 from tests.support.files import ROOT
 
 REQUESTS = ("ad", "TH", "SH", "SS", "TP", "PP", "EX", "EE")
@@ -90,9 +91,10 @@ def test_the_configuration_page_has_every_key_in_words_that_fit_a_line() -> None
     assert max(map(len, words)) <= 60, max(words, key=len)
 
 
+@pytest.mark.live
 @pytest.mark.skipif(shutil.which("mandoc") is None, reason="no mandoc on this machine")
 @pytest.mark.parametrize("name", PAGES)
 def test_mandoc_finds_nothing_wrong(name: str) -> None:
     argv = ["mandoc", "-T", "lint", "-W", "warning"]
-    done = subprocess.run(argv, input=PAGES[name], capture_output=True, text=True, timeout=30, check=False)
+    done = subprocess.run(argv, input=PAGES[name], capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert not [line for line in done.stdout.splitlines() if "missing date" not in line]

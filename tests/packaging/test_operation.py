@@ -22,11 +22,13 @@ from imud.publishers.recorder.settings import RecorderSettings
 from imud.runtime.detection.remembered import FILE_NAME as FOUND
 from imud.runtime.settings.backup import FOLDER as BACKUPS
 from imud.runtime.settings.flash import FILE_NAME as FLASH
+from tests.support.daemon_process import LIMIT_S
 from tests.support.files import ROOT
+
+pytestmark = pytest.mark.live
 
 PAGE = (ROOT / "docs" / "operate.md").read_text()
 STATE: Final = General().state_dir
-LIMIT_S: Final = 60
 KEPT: Final = {
     "/etc/imud.yaml": "devices:\n  bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0}}\n",
     "/etc/systemd/system/imud.service.d/override.conf": "[Service]\nNice=-5\n",

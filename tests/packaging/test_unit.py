@@ -15,7 +15,10 @@ from imud.cli import build_parser
 from imud.publishers.recorder.settings import FlightSettings
 from imud.publishers.shm.publisher import ShmSettings
 from imud.web.guard import is_loopback
+from tests.support.daemon_process import LIMIT_S
 from tests.support.files import ROOT
+
+pytestmark = pytest.mark.live
 
 UNIT = ROOT / "systemd" / "imud.service"
 WEB_UNIT = ROOT / "systemd" / "imud-web.service"
@@ -39,7 +42,7 @@ def values(name: str) -> list[str]:
 def analyze_version() -> int:
     if shutil.which("systemd-analyze") is None:
         return 0
-    said = subprocess.run(["systemd-analyze", "--version"], capture_output=True, text=True, check=True, timeout=30)
+    said = subprocess.run(["systemd-analyze", "--version"], capture_output=True, text=True, check=True, timeout=LIMIT_S)
     return int(said.stdout.split()[1])
 
 
@@ -48,18 +51,23 @@ def exposure(text: str, folder: str) -> float:
     with open(path, "w") as file:
         file.write(text)
     argv = ["systemd-analyze", "security", "--offline=true", "--no-pager", path]
-    said = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=60).stdout
+    said = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=LIMIT_S).stdout
     found = re.search(r"Overall exposure level for imud\.service: ([\d.]+)", said)
     assert found, said
     return float(found[1])
 
 
-@pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file on this machine")
-def test_systemd_judges_the_unit_as_little_exposed(tmp_path_factory: pytest.TempPathFactory) -> None:
-    folder = str(tmp_path_factory.mktemp("unit"))
-    text = UNIT.read_text()
+judged = pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file here")
+
+
+@judged
+def test_systemd_judges_the_units_as_little_exposed(tmp_path: Path) -> None:
+    folder, text = str(tmp_path), UNIT.read_text()
     assert exposure(text, folder) <= EXPOSURE_MAX
-    assert exposure(text.replace("\nIPAddressDeny=any\n", "\n"), folder) > EXPOSURE_MAX, "the judge sees a setting go"
+    for setting in ("IPAddressDeny=any", "RemoveIPC=yes"):
+        assert exposure(text.replace(f"\n{setting}\n", "\n"), folder) > EXPOSURE_MAX, "the judge sees a setting go"
+    assert exposure(WEB_UNIT.read_text(), folder) <= EXPOSURE_MAX
+    assert exposure(FLEET_UNIT.read_text(), folder) <= COLLECTOR_EXPOSURE_MAX
 
 
 def directives() -> set[str]:
@@ -87,7 +95,7 @@ def test_the_rings_are_where_removing_ipc_does_not_reach_unless_the_configuratio
     assert f"/run/{values('RuntimeDirectory')[1]}" == ShmSettings().directory
 
 
-@pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file on this machine")
+@judged
 @pytest.mark.parametrize("text", DROP_INS, ids=lambda text: text.splitlines()[0])
 def test_drop_ins_of_the_document_are_taken_by_systemd(text: str, tmp_path: Path) -> None:
     head, _, rest = text.partition("\n")
@@ -97,19 +105,8 @@ def test_drop_ins_of_the_document_are_taken_by_systemd(text: str, tmp_path: Path
     plain = re.sub(r"^(Wants|Restart|After)=.*", "", plain, flags=re.MULTILINE)
     unit.write_text(f"{plain}\n{rest}ExecStart=/bin/true\n")
     argv = ["systemd-analyze", "verify", "--man=no", str(unit)]
-    said = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=60)
+    said = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=LIMIT_S)
     assert [line for line in said.stderr.splitlines() if "imud.service" in line] == []
-
-
-@pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file on this machine")
-def test_without_removing_ipc_the_unit_is_more_exposed_than_is_allowed(tmp_path: Path) -> None:
-    text = UNIT.read_text()
-    assert exposure(text.replace("\nRemoveIPC=yes\n", "\n"), str(tmp_path)) > EXPOSURE_MAX
-
-
-@pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file on this machine")
-def test_systemd_judges_the_unit_of_the_page_as_little_exposed(tmp_path_factory: pytest.TempPathFactory) -> None:
-    assert exposure(WEB_UNIT.read_text(), str(tmp_path_factory.mktemp("unit"))) <= EXPOSURE_MAX
 
 
 def test_the_unit_of_the_page_may_read_the_socket_and_listens_on_this_machine_only() -> None:
@@ -121,11 +118,6 @@ def test_the_unit_of_the_page_may_read_the_socket_and_listens_on_this_machine_on
     assert re.search(
         r"^# +ExecStart=.*--token-file \$\{CREDENTIALS_DIRECTORY\}/token$", WEB_UNIT.read_text(), re.MULTILINE
     )
-
-
-@pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file on this machine")
-def test_systemd_judges_the_unit_of_the_collector_as_little_exposed(tmp_path_factory: pytest.TempPathFactory) -> None:
-    assert exposure(FLEET_UNIT.read_text(), str(tmp_path_factory.mktemp("unit"))) <= COLLECTOR_EXPOSURE_MAX
 
 
 def test_the_unit_of_the_collector_has_a_command_line_that_is_taken_and_starts_it_again_after_status_2() -> None:

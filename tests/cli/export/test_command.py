@@ -259,9 +259,6 @@ def test_a_raw_capture_has_the_times_of_the_device_and_says_so(tmp_path: Path, c
     assert "the capture has bytes and no time of any read" in words
     assert "Hz" not in words
     assert "live run" not in words
-
-
-def test_a_raw_capture_in_mcap(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "c.raw").write_bytes(b"".join(hi91(10 * i) for i in range(30)))
     out = tmp_path / "c.mcap"
     cli("export", "--to", "mcap", "-o", out, tmp_path / "c.raw")
@@ -305,10 +302,20 @@ def test_a_damaged_recording_is_exported_as_far_as_it_goes_and_is_an_answer_of_n
     assert "damaged" in capsys.readouterr().err
 
 
-def test_what_is_no_recording_is_a_capture_without_samples(tmp_path: Path, cli: Cli) -> None:
+def test_files_that_are_no_recordings(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "noise").write_bytes(b"\x00" * 500)
     cli("export", "--to", "csv", tmp_path / "noise", status=1)
     cli.refuses("expected a recording or a capture", "export", "--to", "csv", str(tmp_path / "none"))
+    (tmp_path / "c.raw").write_bytes(hi91(0))
+    cli.refuses(
+        "expected a driver of bytes or of CAN frames",
+        "export",
+        "--to",
+        "csv",
+        "--driver",
+        "hipnuc-modbus",
+        str(tmp_path / "c.raw"),
+    )
 
 
 @pytest.mark.parametrize(
@@ -325,19 +332,6 @@ def test_what_is_no_recording_is_a_capture_without_samples(tmp_path: Path, cli: 
 )
 def test_options_that_mean_nothing(words: list[str], expected: str, recorded: Recorded, cli: Cli) -> None:
     assert expected in " ".join(cli("export", *words, recorded.file, status=2).err.split())
-
-
-def test_a_polled_driver_has_no_captures(tmp_path: Path, cli: Cli) -> None:
-    (tmp_path / "c.raw").write_bytes(hi91(0))
-    cli.refuses(
-        "expected a driver of bytes or of CAN frames",
-        "export",
-        "--to",
-        "csv",
-        "--driver",
-        "hipnuc-modbus",
-        str(tmp_path / "c.raw"),
-    )
 
 
 def test_without_the_library_it_says_how_to_get_it(

@@ -102,14 +102,6 @@ def test_a_viewer_comes_through_with_every_byte_in_both_directions(echo: Echo) -
     assert echo.ended == 1
 
 
-def test_the_end_of_a_viewer_is_that_of_the_connection_behind(echo: Echo) -> None:
-    with gated(echo) as gate:
-        with connect(gate) as connection:
-            connection.sendall(head())
-            assert received(connection, len(head())) == head()
-        wait_until(lambda: echo.ended == 1, "the connection behind ends")
-
-
 def test_pages_of_other_sites_are_refused_and_named_once(echo: Echo) -> None:
     notes: list[str] = []
     with gated(echo, notes) as gate:
@@ -122,9 +114,8 @@ def test_pages_of_other_sites_are_refused_and_named_once(echo: Echo) -> None:
     assert echo.ended == 0
 
 
-@pytest.mark.parametrize(
-    ("request_", "status"),
-    [
+def test_what_is_no_viewer_is_refused(echo: Echo) -> None:
+    for request_, status in [
         (head("Origin: file://", "Origin: https://attacker.example"), 400),
         (head("Host: 127.0.0.1"), 400),
         (head("no colon", "Origin: https://attacker.example"), 400),
@@ -133,12 +124,10 @@ def test_pages_of_other_sites_are_refused_and_named_once(echo: Echo) -> None:
         (b"\x16\x03\x01\r\n\r\n", 400),
         (head(upgrade="Upgrade: h2c"), 426),
         (b"GET / HTTP/1.1\r\nHost: attacker.example\r\nUpgrade: websocket\r\n\r\n", 403),
-    ],
-)
-def test_what_is_no_viewer_is_refused(echo: Echo, request_: bytes, status: int) -> None:
-    with gated(echo) as gate:
-        assert answer(gate, request_).startswith(f"HTTP/1.1 {status} ")
-    assert echo.ended == 0
+    ]:
+        with gated(echo) as gate:
+            assert answer(gate, request_).startswith(f"HTTP/1.1 {status} ")
+        assert echo.ended == 0
 
 
 def test_a_head_without_end_and_one_that_does_not_come(echo: Echo, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,16 +167,6 @@ def answer_starts(gate: ViewerGate) -> bytes:
         return connection.recv(20)
 
 
-def test_closing_ends_connections_and_may_be_repeated(echo: Echo) -> None:
-    with gated(echo) as gate:
-        connection = connect(gate)
-        connection.sendall(head())
-        assert received(connection, len(head())) == head()
-        gate.close()
-        assert connection.recv(1) == b""
-        connection.close()
-
-
 def test_the_gate_ends_beside_its_viewers_and_leaves_nothing_open(echo: Echo) -> None:
     """A leftover is seen twice: its thread of the server goes on, and asyncio warns when it is collected."""
     rounds, viewers_at_a_time = 3, 10
@@ -203,14 +182,16 @@ def test_the_gate_ends_beside_its_viewers_and_leaves_nothing_open(echo: Echo) ->
     wait_until(lambda: echo.ended == rounds * viewers_at_a_time, "every connection behind ends")
 
 
-def test_a_server_that_is_gone_closes_the_connection(echo: Echo) -> None:
+def test_closing_ends_connections_and_a_server_that_is_gone_too(echo: Echo) -> None:
+    with gated(echo) as gate, connect(gate) as connection:
+        connection.sendall(head())
+        assert received(connection, len(head())) == head()
+        gate.close()
+        assert connection.recv(1) == b""
     with socket.create_server(("127.0.0.1", 0)) as unused:
         nothing = unused.getsockname()
     with closing(ViewerGate("127.0.0.1", 0, nothing, ViewerOrigins(), note=print)) as gate:
         assert answer(gate, head()) == ""
-
-
-def test_an_address_that_cannot_be_had_is_an_error_that_says_so(echo: Echo) -> None:
     port = echo.socket.getsockname()[1]
     with pytest.raises(ServerError, match=f"cannot listen on 127.0.0.1 port {port}: .*another `imud foxglove`"):
         ViewerGate("127.0.0.1", port, ("127.0.0.1", 1), ViewerOrigins(), note=print)

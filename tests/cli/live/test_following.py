@@ -13,12 +13,14 @@ from tests.support.socket_rig import daemon
 from tests.support.surroundings import pipe
 
 
-def test_without_follow_a_missing_daemon_is_an_error_at_once(tmp_path: Path) -> None:
+def test_without_follow_a_missing_daemon_is_an_error_and_a_refusal_always_is(tmp_path: Path) -> None:
     def work(_client: Client) -> None:
         raise AssertionError
 
     with pytest.raises(LinkMissing, match="is imud running"):
         keep_connected("imud watch", str(tmp_path / "none"), work, follow=False)
+    with daemon(tmp_path) as served, pytest.raises(RpcError, match="imu7"):
+        keep_connected("imud watch", str(served.path), lambda c: print(c.watch(["imu7"])), follow=True)
 
 
 def test_follow_waits_for_the_daemon_and_says_so_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -76,11 +78,6 @@ def test_a_daemon_that_does_not_answer(tmp_path: Path) -> None:
             keep_connected("imud watch", str(served.path), work, follow=False)
         keep_connected("imud watch", str(served.path), work, follow=True, wait=lambda _s: None)
     assert len(tries) == 3
-
-
-def test_what_the_daemon_refuses_is_not_tried_again(tmp_path: Path) -> None:
-    with daemon(tmp_path) as served, pytest.raises(RpcError, match="imu7"):
-        keep_connected("imud watch", str(served.path), lambda c: print(c.watch(["imu7"])), follow=True)
 
 
 def test_waiting_ends_when_nobody_reads_the_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -71,12 +71,9 @@ def test_a_bus_without_a_sensor_says_why(monkeypatch: pytest.MonkeyPatch) -> Non
     assert (found.driver, "no acknowledgement at address 0x18" in found.problem) == ("", True)
 
 
-@pytest.mark.parametrize(("kind", "bus"), [("i2c", "250"), ("i2c", "900"), ("spi", "/dev/spidev250.0")])
-def test_a_bus_that_is_not_there(kind: str, bus: str) -> None:
-    (found,) = FINDERS.ask_bus(kind, bus)
-    assert found.problem
-
-
-def test_a_number_that_no_bus_has() -> None:
+def test_a_bus_that_is_not_there_and_a_number_that_no_bus_has() -> None:
+    for kind, bus in [("i2c", "250"), ("i2c", "900"), ("spi", "/dev/spidev250.0")]:
+        (found,) = FINDERS.ask_bus(kind, bus)
+        assert found.problem
     (found,) = FINDERS.ask_bus("i2c", "256")
     assert found.problem == "bus: expected a whole number from 0 to 255, got 256"

@@ -21,20 +21,14 @@ def commands(changes: object) -> list[str]:
     return [" ".join(one.words) for one in changes if isinstance(one, CommandChange)]
 
 
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
+def test_only_the_consoles_of_the_port_leave_the_command_line(machine: LivingMachine) -> None:
+    for before, after in [
         ("console=serial0,115200 console=tty1 root=/dev/x\n", "console=tty1 root=/dev/x\n"),
         ("root=/dev/x console=ttyAMA0\n", "root=/dev/x\n"),
         ("console=tty1 root=/dev/x console=ttyAMA1,9600\n", "console=tty1 root=/dev/x console=ttyAMA1,9600\n"),
         ("root=/dev/x  quiet", "root=/dev/x  quiet"),
-    ],
-)
-def test_only_the_consoles_of_the_port_leave_the_command_line(before: str, after: str) -> None:
-    assert without_console(before, {"ttyAMA0", "serial0"}) == after
-
-
-def test_the_older_place_of_the_command_line_is_used_where_the_newer_has_none(machine: LivingMachine) -> None:
+    ]:
+        assert without_console(before, {"ttyAMA0", "serial0"}) == after
     machine.uart("ttyAMA0", console=True)
     machine.write("/boot/cmdline.txt", "console=ttyAMA0,115200 root=/dev/x\n")
     changes, notes = free_console(machine.surroundings(), "/dev/ttyAMA0")

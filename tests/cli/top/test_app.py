@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 import pytest
@@ -22,7 +22,7 @@ from tests.support.metrics import device
 from tests.support.socket_rig import sample
 
 SIZE = (80, 24)
-LOOK_S, LOOKS = 0.05, 100
+LOOK_S, LOOKS = 0.01, 6000
 OFFSET_NS = 1_790_000_000_000_000_000  # 2026-09-21 14:13:20 UTC
 NEWS = News(
     statuses=(
@@ -34,6 +34,7 @@ NEWS = News(
     samples=(msgspec.structs.replace(sample("bow"), euler_rad=(0.5, -0.25, 3.0)), sample("mast")),
 )  # fmt: skip
 
+MakeFeed = Callable[[Callable[[News], None]], Any]
 Steps = Callable[[Pilot[None], TopApp], Awaitable[None]]
 
 
@@ -45,8 +46,7 @@ def lines(app: TopApp) -> list[str]:
 class SilentFeed:
     """A feed that gives no news, and notes what it is to look at."""
 
-    def __init__(self) -> None:
-        self.looked_at: list[str | None] = []
+    looked_at: ClassVar[list[str | None]] = []
 
     def start(self) -> None:
         pass
@@ -58,14 +58,21 @@ class SilentFeed:
         pass
 
 
-def play(steps: Steps, make_feed: Callable[[Callable[[News], None]], Any] = lambda _: SilentFeed()) -> None:
-    async def run() -> None:
-        app = TopApp(make_feed)
-        async with app.run_test(size=SIZE) as pilot:
-            await pilot.pause()
-            await steps(pilot, app)
+def played(
+    steps: Steps, make_feed: Callable[[Callable[[News], None]], Any] = lambda _: SilentFeed()
+) -> Callable[[], None]:
+    """A test of the program."""
 
-    asyncio.run(run())
+    def test() -> None:
+        async def run() -> None:
+            app = TopApp(make_feed)
+            async with app.run_test(size=SIZE) as pilot:
+                await pilot.pause()
+                await steps(pilot, app)
+
+        asyncio.run(run())
+
+    return test
 
 
 async def give(pilot: Pilot[None], app: TopApp, news: News = NEWS) -> list[str]:
@@ -94,101 +101,80 @@ def devices_in(text: list[str]) -> list[str]:
     return [line.split()[0] for line in text if line.startswith(("bow", "stern", "mast"))]
 
 
-def test_the_table_has_every_device_and_fits_80_columns() -> None:
-    async def steps(pilot: Pilot[None], app: TopApp) -> None:
-        text = await give(pilot, app)
-        assert text[0] == "imud: 2 of 3 devices well, 2 clients  by DEVICE"
-        assert devices_in(text) == ["bow", "mast", "stern"]
-        assert next(line for line in text if line.startswith("bow")).split()[:7] == [
-            "bow", "running", "999.5", "0.25s", "4066", "12", "28.6",
-        ]  # fmt: skip
-        assert max(map(len, text)) <= SIZE[0]
-
-    play(steps)
+@played
+async def test_the_table_has_every_device_and_fits_80_columns(pilot: Pilot[None], app: TopApp) -> None:
+    text = await give(pilot, app)
+    assert text[0] == "imud: 2 of 3 devices well, 2 clients  by DEVICE"
+    assert devices_in(text) == ["bow", "mast", "stern"]
+    assert next(line for line in text if line.startswith("bow")).split()[:7] == [
+        "bow", "running", "999.5", "0.25s", "4066", "12", "28.6",
+    ]  # fmt: skip
+    assert max(map(len, text)) <= SIZE[0]
 
 
-def test_keys_sort_reverse_and_filter() -> None:
-    async def steps(pilot: Pilot[None], app: TopApp) -> None:
-        await give(pilot, app)
-        text = await press(pilot, app, "s")
-        assert (text[0].rpartition("by ")[2], devices_in(text)) == ("STATE", ["stern", "bow", "mast"])
-        text = await press(pilot, app, "s", "r")
-        assert (text[0].rpartition("by ")[2], devices_in(text)) == ("HZ backwards", ["bow", "stern", "mast"])
-        text = await press(pilot, app, "v")
-        assert text[1].split()[1:4] == ["HZ", "EXPECT", "LOST"]
-        assert devices_in(await press(pilot, app, "slash", *"usb2")) == ["mast"]
-        assert devices_in(await press(pilot, app, "enter")) == ["mast"]
-        assert sorted(devices_in(await press(pilot, app, "escape"))) == ["bow", "mast", "stern"]
-
-    play(steps)
+@played
+async def test_keys_sort_reverse_and_filter(pilot: Pilot[None], app: TopApp) -> None:
+    await give(pilot, app)
+    text = await press(pilot, app, "s")
+    assert (text[0].rpartition("by ")[2], devices_in(text)) == ("STATE", ["stern", "bow", "mast"])
+    text = await press(pilot, app, "s", "r")
+    assert (text[0].rpartition("by ")[2], devices_in(text)) == ("HZ backwards", ["bow", "stern", "mast"])
+    text = await press(pilot, app, "v")
+    assert text[1].split()[1:4] == ["HZ", "EXPECT", "LOST"]
+    assert devices_in(await press(pilot, app, "slash", *"usb2")) == ["mast"]
+    assert devices_in(await press(pilot, app, "enter")) == ["mast"]
+    assert sorted(devices_in(await press(pilot, app, "escape"))) == ["bow", "mast", "stern"]
 
 
-def test_the_page_of_a_device_has_curves_status_and_its_events() -> None:
-    feed = SilentFeed()
-
-    async def steps(pilot: Pilot[None], app: TopApp) -> None:
-        await give(pilot, app)
-        text = "\n".join(await press(pilot, app, "enter"))
-        assert isinstance(app.screen, DevicePage)
-        assert "roll        28.65 °" in text
-        assert "accel z      9.75 m/s²" in text
-        assert "mag x" not in text, "what it does not send takes no line"
-        events = (Event(5, "bow", EventKind.UP, "is there"), Event(6, "mast", EventKind.UP, "too"))
-        text = "\n".join(await give(pilot, app, NEWS._replace(events=events)))
-        written = re.search(r"^(\S+) info    bow: up: is there$", text, re.MULTILINE)
-        assert written is not None, "as `imud events` prints it"
-        since_start = datetime.now().astimezone() - datetime.fromisoformat(written[1])
-        assert since_start.total_seconds() == pytest.approx(monotonic(), abs=60), "5 ns after the host's start"
-        assert "mast" not in text
-        await press(pilot, app, "escape")
-        assert isinstance(app.screen, Overview)
-        assert feed.looked_at[-2:] == ["bow", None], "more samples of the device while its page is shown"
-
-    play(steps, lambda _: feed)
-
-
-def test_a_device_that_left_the_configuration_is_said_to_have() -> None:
-    async def steps(pilot: Pilot[None], app: TopApp) -> None:
-        await give(pilot, app)
-        await press(pilot, app, "enter")
-        text = await give(pilot, app, News(statuses=(device("mast", 2),)))
-        assert any("bow is not in the configuration any more" in line for line in text)
-
-    play(steps)
+@played
+async def test_the_page_of_a_device_has_curves_status_and_its_events(pilot: Pilot[None], app: TopApp) -> None:
+    await give(pilot, app)
+    text = "\n".join(await press(pilot, app, "enter"))
+    assert isinstance(app.screen, DevicePage)
+    assert "roll        28.65 °" in text
+    assert "accel z      9.75 m/s²" in text
+    assert "mag x" not in text, "what it does not send takes no line"
+    events = (Event(5, "bow", EventKind.UP, "is there"), Event(6, "mast", EventKind.UP, "too"))
+    text = "\n".join(await give(pilot, app, NEWS._replace(events=events)))
+    written = re.search(r"^(\S+) info    bow: up: is there$", text, re.MULTILINE)
+    assert written is not None, "as `imud events` prints it"
+    since_start = datetime.now().astimezone() - datetime.fromisoformat(written[1])
+    assert since_start.total_seconds() == pytest.approx(monotonic(), abs=60), "5 ns after the host's start"
+    assert "mast" not in text
+    await press(pilot, app, "escape")
+    assert isinstance(app.screen, Overview)
+    assert SilentFeed.looked_at[-2:] == ["bow", None], "more samples of the device while its page is shown"
+    await press(pilot, app, "enter")
+    lines_of_page = await give(pilot, app, News(statuses=(device("mast", 2),)))
+    assert any("bow is not in the configuration any more" in line for line in lines_of_page)
 
 
-def test_a_pause_leaves_the_picture_and_a_daemon_that_is_gone_is_said_to_be() -> None:
-    async def steps(pilot: Pilot[None], app: TopApp) -> None:
-        await give(pilot, app)
-        assert "PAUSED" in (await press(pilot, app, "p"))[0]
-        assert devices_in(await give(pilot, app, News(statuses=()))) == ["bow", "mast", "stern"]
-        assert devices_in(await press(pilot, app, "p")) == []
-        assert (await give(pilot, app, News("no daemon at /x")))[0] == "no daemon at /x"
-
-    play(steps)
+@played
+async def test_a_pause_leaves_the_picture_and_a_lost_daemon_is_named(pilot: Pilot[None], app: TopApp) -> None:
+    await give(pilot, app)
+    assert "PAUSED" in (await press(pilot, app, "p"))[0]
+    assert devices_in(await give(pilot, app, News(statuses=()))) == ["bow", "mast", "stern"]
+    assert devices_in(await press(pilot, app, "p")) == []
+    assert (await give(pilot, app, News("no daemon at /x")))[0] == "no daemon at /x"
 
 
-def test_help_shows_the_keys_and_leaves_the_rows_as_they_are() -> None:
-    async def steps(pilot: Pilot[None], app: TopApp) -> None:
-        before = await give(pilot, app)
-        shown = await press(pilot, app, "question_mark")
-        assert shown[:3] == before[:3], "head and row are as wide as without"
-        await press(pilot, app, "question_mark")
-        assert any("Reverse" in line for line in (await press(pilot, app, "question_mark"))[:-1])
-        assert not any("Reverse" in line for line in (await press(pilot, app, "question_mark"))[:-1])
-
-    play(steps)
+@played
+async def test_help_shows_the_keys_and_leaves_the_rows_as_they_are(pilot: Pilot[None], app: TopApp) -> None:
+    before = await give(pilot, app)
+    shown = await press(pilot, app, "question_mark")
+    assert shown[:3] == before[:3], "head and row are as wide as without"
+    await press(pilot, app, "question_mark")
+    assert any("Reverse" in line for line in (await press(pilot, app, "question_mark"))[:-1])
+    assert not any("Reverse" in line for line in (await press(pilot, app, "question_mark"))[:-1])
 
 
+@pytest.mark.live
 def test_without_a_daemon_it_says_so_and_tries_again(tmp_path: Path) -> None:
-    async def steps(_pilot: Pilot[None], app: TopApp) -> None:
-        for _ in range(100):
-            if "no daemon at" in lines(app)[0]:
-                return
-            await asyncio.sleep(0.05)
-        pytest.fail(f"expected the reason, got {lines(app)[0]!r}")
+    async def steps(pilot: Pilot[None], app: TopApp) -> None:
+        while "no daemon at" not in lines(app)[0]:
+            await pilot.pause(LOOK_S)
 
-    play(steps, lambda on_news: TopFeed(str(tmp_path / "nobody"), on_news))
+    played(steps, lambda on_news: TopFeed(str(tmp_path / "nobody"), on_news))()
 
 
 def test_what_a_device_sends_cannot_write_to_the_terminal() -> None:

@@ -11,19 +11,24 @@ from tests.cli.conftest import Cli
 from tests.client.news import Listener
 from tests.support.socket_rig import batch, daemon
 
-LIMIT_S = 10.0
 
-
-def test_status_samples_and_events_come(tmp_path: Path) -> None:
+@pytest.mark.live
+def test_status_samples_and_events_come_and_a_page_gets_those_of_its_device(tmp_path: Path) -> None:
     heard = Listener()
     with daemon(tmp_path) as served:
         feed = TopFeed(str(served.path), heard.on_news)
+        feed.look_at("imu1")
         feed.start()
         first = heard.wait_for(lambda news: news.statuses)
         assert first.statuses is not None
         assert [status.name for status in first.statuses] == ["imu0", "imu1"]
-        assert first.clients == 1
-        assert not first.problem
+        assert (first.clients, first.problem) == (1, "")
+        served.do(lambda server: server.publish(batch("imu0", 1)))
+        served.do(lambda server: server.publish(batch("imu1", 2)))
+        assert {one.device for one in heard.wait_for(lambda news: news.samples).samples} == {"imu1"}
+        feed.look_at(None)
+        heard.wait_for(lambda news: news.now_ns)
+        heard.wait_for(lambda news: news.now_ns)
         served.do(lambda server: server.publish(batch("imu0", 7)))
         assert heard.wait_for(lambda news: news.samples).samples[-1].seq == 7
         served.do(lambda server: server.event(Event(5, "imu1", EventKind.UP, "is there")))
@@ -32,24 +37,7 @@ def test_status_samples_and_events_come(tmp_path: Path) -> None:
         feed.close()
 
 
-def test_the_page_of_a_device_gets_samples_of_it_only_until_the_overview_is_shown_again(tmp_path: Path) -> None:
-    heard = Listener()
-    with daemon(tmp_path) as served:
-        feed = TopFeed(str(served.path), heard.on_news)
-        feed.look_at("imu1")
-        feed.start()
-        heard.wait_for(lambda news: news.statuses)
-        served.do(lambda server: server.publish(batch("imu0", 1)))
-        served.do(lambda server: server.publish(batch("imu1", 2)))
-        assert {one.device for one in heard.wait_for(lambda news: news.samples).samples} == {"imu1"}
-        feed.look_at(None)
-        heard.wait_for(lambda news: news.now_ns)
-        heard.wait_for(lambda news: news.now_ns)
-        served.do(lambda server: server.publish(batch("imu0", 3)))
-        assert heard.wait_for(lambda news: news.samples).samples[0].device == "imu0"
-        feed.close()
-
-
+@pytest.mark.live
 def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> None:
     heard = Listener()
     with daemon(tmp_path) as served:
@@ -63,13 +51,9 @@ def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> Non
         feed.close()
 
 
-def test_without_a_terminal_it_says_what_to_use_instead(cli: Cli, capsys: pytest.CaptureFixture[str]) -> None:
-    cli("top", status=2)
+def test_without_a_terminal_or_the_library_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     words = "expected a terminal; `imud status` and `imud watch` write to anything"
-    assert capsys.readouterr().err == f"imud top: {words}\n"
-
-
-def test_without_the_library_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
+    assert cli("top", status=2).err == f"imud top: {words}\n"
     for stream in (sys.stdin, sys.stdout):
         monkeypatch.setattr(stream, "isatty", lambda: True)
     monkeypatch.setitem(sys.modules, "textual.app", None)
