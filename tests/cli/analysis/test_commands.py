@@ -156,9 +156,8 @@ def test_a_damaged_capture_is_named_and_a_raw_one_dated_by_the_device(tmp_path: 
 # --- what is wrong ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
+def test_what_cannot_be_done_is_said(resting_file: Path, cli: Cli) -> None:
+    for words, message in [
         (["noise", "-o", "a.pdf"], "ends in .html, .svg, .png"),
         (["spectrum", "-o", "a.html"], "ends in .svg or .png"),
         (["spectrum", "--resolution", "0.0001"], "resolution 0.0001 Hz: expected from"),
@@ -166,10 +165,8 @@ def test_a_damaged_capture_is_named_and_a_raw_one_dated_by_the_device(tmp_path: 
         (["noise", "--skip", "1h"], "expected samples later than 3600 s after its first (--skip), found none"),
         (["noise", "--sheet", "/nowhere"], "--sheet /nowhere"),
         (["noise", "-o", "/nowhere/a.svg"], "/nowhere/a.svg"),
-    ],
-)
-def test_what_cannot_be_done_is_said(resting_file: Path, cli: Cli, words: list[str], message: str) -> None:
-    cli.refuses(message, *words, str(resting_file))
+    ]:
+        cli.refuses(message, *words, str(resting_file))
 
 
 def test_what_is_neither_file_nor_device(tmp_path: Path, cli: Cli) -> None:

@@ -100,9 +100,8 @@ def test_children_that_end_too_early_are_named(
     assert capsys.readouterr().err.endswith("the child had to be killed\n")
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
+def test_devices_that_cannot_be_shown(cli: Cli) -> None:
+    for words, said in [
         (["--device", "imu61x-i2c"], "imu61x-i2c is not simulated: say where a real one is, for example --bus 1"),
         (
             ["--device", "imu61x-spi", "--bus", "1"],
@@ -117,10 +116,8 @@ def test_children_that_end_too_early_are_named(
             ["--device", "imu61x-can", "--device", "imu61x-can"],
             "expected devices that differ, for example --device imu61x-can:101 --device imu61x-can:201",
         ),
-    ],
-)
-def test_devices_that_cannot_be_shown(words: list[str], said: str, cli: Cli) -> None:
-    assert cli("demo", *words, status=2).err == f"imud demo: {said}\n"
+    ]:
+        assert cli("demo", *words, status=2).err == f"imud demo: {said}\n"
 
 
 def test_a_can_device_needs_an_interface(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:

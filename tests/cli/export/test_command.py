@@ -318,9 +318,8 @@ def test_files_that_are_no_recordings(tmp_path: Path, cli: Cli) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
+def test_options_that_mean_nothing(recorded: Recorded, cli: Cli) -> None:
+    for words, expected in [
         (["--to", "csv", "--schema", "ros2"], "--schema: expected with --to mcap only"),
         (["--to", "csv", "--noise", "a.json"], "--noise: expected with --to mcap only"),
         (["--to", "mcap", "--table", "events"], "--table: expected with --to csv only"),
@@ -328,10 +327,8 @@ def test_files_that_are_no_recordings(tmp_path: Path, cli: Cli) -> None:
         (["--to", "csv", "--table", "events", "--fields", "t_ns"], "--fields: expected with samples only"),
         (["--to", "csv", "--driver", "hipnuc-uart"], "--driver: expected none with a recording"),
         (["--to", "csv", "--device", "stern"], "expected a device of the recording, which has bow, mast"),
-    ],
-)
-def test_options_that_mean_nothing(words: list[str], expected: str, recorded: Recorded, cli: Cli) -> None:
-    assert expected in " ".join(cli("export", *words, recorded.file, status=2).err.split())
+    ]:
+        assert expected in " ".join(cli("export", *words, recorded.file, status=2).err.split())
 
 
 def test_without_the_library_it_says_how_to_get_it(

@@ -20,25 +20,22 @@ def test_names_with_a_rate() -> None:
             numbered(text)
 
 
-@pytest.mark.parametrize(
-    ("words", "reason"),
-    [
+def test_arguments_that_do_not_go_together(cli: Cli) -> None:
+    for words, reason in [
         (["--json"], "expected --yes or --dry-run"),
         (["--json", "--yes", "--undo"], "expected it without --undo"),
         (["--yes", "--can", "can0"], "expected the bit rate"),
         (["--yes", "--can", "can0=2000000"], "expected for example can0=500000"),
         (["--yes", "--can", "../x=500000"], "expected for example can0=500000"),
         (["--yes", "--i2c", "/dev/i2c-1"], "expected the number of a bus"),
-    ],
-)
-def test_arguments_that_do_not_go_together(words: list[str], reason: str, cli: Cli) -> None:
-    cli.refuses(reason, "setup", *words)
+    ]:
+        cli.refuses(reason, "setup", *words)
 
 
-@pytest.mark.parametrize(("value", "user"), [("ann", "ann"), ("root", ""), ("", "")])
-def test_the_user_that_ran_sudo(monkeypatch: pytest.MonkeyPatch, value: str, user: str) -> None:
-    monkeypatch.setenv("SUDO_USER", value)
-    assert sudo_user() == user
+def test_the_user_that_ran_sudo(monkeypatch: pytest.MonkeyPatch) -> None:
+    for value, user in [("ann", "ann"), ("root", ""), ("", "")]:
+        monkeypatch.setenv("SUDO_USER", value)
+        assert sudo_user() == user
 
 
 def test_a_look_at_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:

@@ -62,18 +62,15 @@ def test_the_example_of_the_package_is_known_and_only_its_device_is_replaced() -
     assert config.parse(made, "made").devices[0].name == "mast"
 
 
-@pytest.mark.parametrize(
-    ("text", "written"),
-    [
+def test_names_of_ports_stay_what_they_are() -> None:
+    for text, written in [
         ("/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1", "/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1"),
         ("/dev/serial/by-id/usb-A #1", '"/dev/serial/by-id/usb-A #1"'),
         ("/dev/serial/by-id/usb-\\x20", '"/dev/serial/by-id/usb-\\\\x20"'),
         ("no", '"no"'),
         ("12", '"12"'),
         ("a: b", '"a: b"'),
-    ],
-)  # fmt: skip
-def test_names_of_ports_stay_what_they_are(text: str, written: str) -> None:
-    made = with_devices(None, {"imu": {"uart": {"port": text}}}).decode()
-    assert f"port: {written}\n" in made
-    assert read_yaml(made.encode()).data == {"devices": {"imu": {"uart": {"port": text}}}}
+    ]:  # fmt: skip
+        made = with_devices(None, {"imu": {"uart": {"port": text}}}).decode()
+        assert f"port: {written}\n" in made
+        assert read_yaml(made.encode()).data == {"devices": {"imu": {"uart": {"port": text}}}}

@@ -50,20 +50,14 @@ def test_every_row_is_as_wide_as_its_titles_and_fits_80_columns(view: str, value
     assert len(text.split()) == len(columns)
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0.0, "0.00s"), (9.994, "9.99s"), (10.0, "10s"), (999.0, "999s"), (1000.0, "17m"), (59_900.0, "998m"),
-     (60_000.0, "17h"), (360_000.0, "4d"), (8.64e7, "1000d")],
-)  # fmt: skip
-def test_ages_have_five_characters_at_most(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
-
-
 def names(devices: list[DeviceHistory]) -> list[str]:
     return [one.status.name for one in devices]
 
 
-def test_the_order_of_rows() -> None:
+def test_ages_order_and_filter() -> None:
+    seconds = (0.0, 9.994, 10.0, 999.0, 1000.0, 59_900.0, 60_000.0, 360_000.0, 8.64e7)
+    ages = [duration(one) for one in seconds]
+    assert ages == ["0.00s", "9.99s", "10s", "999s", "17m", "998m", "17h", "4d", "1000d"]
     devices = [history("b", 1), history("c", 0, state=DeviceState.FAILED), history("a", 2)]
     assert names(chosen(devices, NAME, NOW_NS)) == ["a", "b", "c"]
     assert names(chosen(devices, NAME, NOW_NS, backwards=True)) == ["c", "b", "a"]
@@ -71,14 +65,10 @@ def test_the_order_of_rows() -> None:
     assert names(chosen(devices, LOST, NOW_NS, backwards=True)) == ["c", "b", "a"]
     assert names(chosen(devices, STATE, NOW_NS)) == ["c", "a", "b"]
     devices = [history("a"), DeviceHistory(device("b"))]
-    assert names(chosen(devices, AGE, NOW_NS)) == ["b", "a"]
-
-
-@pytest.mark.parametrize(
-    ("words", "found"),
-    [("", ["bow", "stern"]), ("BOW", ["bow"]), ("ttyusb1", ["stern"]), ("hi13 running", ["bow", "stern"]),
-     ("bow stern", []), ("power", ["stern"])],
-)  # fmt: skip
-def test_the_filter_looks_for_all_words_everywhere(words: str, found: list[str]) -> None:
+    assert names(chosen(devices, AGE, NOW_NS)) == ["b", "a"], "a device without samples is the oldest"
     devices = [history("bow", 0), history("stern", 1, problem="has no power")]
-    assert names(chosen(devices, NAME, NOW_NS, words=words)) == found
+    for words, found in {
+        "": ["bow", "stern"], "BOW": ["bow"], "ttyusb1": ["stern"], "hi13 running": ["bow", "stern"], "bow stern": [],
+        "power": ["stern"],
+    }.items():  # fmt: skip
+        assert names(chosen(devices, NAME, NOW_NS, words=words)) == found
