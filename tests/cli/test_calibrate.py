@@ -5,14 +5,15 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Event as ThreadingEvent
 
 import pytest
 
 from imud.cli.calibrate import _account, _show, progress_line
-from imud.contracts.control.calibration import CalibrationResult, Check, Kept
+from imud.contracts.control.calibration import CalibrationInfo, CalibrationResult, Check, Handling, Kept
 from imud.event import Event, EventKind
 from tests.cli.conftest import Cli
-from tests.support.daemon_process import RunningDaemon, daemon_with_module
+from tests.support.daemon_process import LIMIT_S, RunningDaemon, daemon_with_module
 
 live = pytest.mark.live
 
@@ -64,6 +65,60 @@ def test_a_module_on_rs485_is_levelled(tmp_path: Path, cli: Cli) -> None:
         out = cli("calibrate", "--socket", daemon.socket, "bow", "level", "--yes", "--save").out
     assert "\nverified\n  roll: " in out
     assert out.endswith("  saved\n")
+
+
+class Asked:
+    """A daemon whose device is calibrated until `events` end."""
+
+    stopped = False
+    verified = True
+    interrupts = False
+
+    def __enter__(self) -> "Asked":
+        return self
+
+    def __exit__(self, *_error: object) -> None: ...
+
+    def call(self, method: str, **params: object) -> object:
+        if method == "calibrations":
+            return [CalibrationInfo("level", "level it", "2.3", Handling.REST, ("Put it down.",), Kept.BY_SAVE)]
+        if method == "stop_calibration":
+            type(self).stopped = True
+            ENDED.set()
+            return None
+        assert (method, params) == ("calibrate", {"device": "bow", "kind": "level", "save": True})
+        ENDED.wait(LIMIT_S)
+        problem = "" if self.verified else "it moved"
+        return CalibrationResult("level", self.verified, problem, "", (), False, Kept.BY_SAVE)
+
+    def events(self, names: list[str], timeout_s: float) -> Iterator[Event]:
+        assert (names, timeout_s) == (["bow"], 0.5)
+        if self.interrupts:
+            raise KeyboardInterrupt
+        yield END
+        ENDED.set()
+        while True:
+            yield END
+
+
+ENDED = ThreadingEvent()
+
+
+@pytest.mark.parametrize(("verified", "status"), [(True, 0), (False, 1)])
+def test_exit_statuses_and_an_interrupt(verified: bool, status: int, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Made(Asked):
+        pass
+
+    Made.verified = verified
+    monkeypatch.setattr("imud.cli.calibrate.Client", lambda *_arguments, **_options: Made())
+    words = ("calibrate", "bow", "level", "--yes", "--save")
+    ENDED.clear()
+    assert ("NOT verified: it moved" in cli(*words, status=status).out) is not verified
+    assert not Made.stopped
+    Made.interrupts = True
+    ENDED.clear()
+    cli(*words, status=130)
+    assert Made.stopped, "the device does not go on"
 
 
 class Terminal(io.StringIO):

@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from imud import config
+from imud.cli.run import state_dir
+from imud.config import Config
+from imud.errors import ImudError, ServerError
 from tests.cli.conftest import Cli
 from tests.support.files import ROOT
 from tests.support.surroundings import pipe
@@ -101,3 +105,39 @@ def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
     good, note = cli("check", file).out.splitlines()
     assert good == f"{file}: good; devices: bow, stern"
     assert note.startswith(f"{file}:2: note: bow: HI92 beside HI91 is dated by its arrival")
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (ServerError("the socket is in use"), 75, "<2>the socket is in use\n"),
+        (ImudError("no such thing"), 2, "imud run: no such thing\n"),
+        (ValueError("a bug"), 1, "<2>imud ends because of an internal error"),
+        (None, 0, ""),
+    ],
+)
+def test_exit_statuses_of_the_daemon(
+    error: Exception | None, status: int, said: str, tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def serve(settings: Config, file: Path) -> None:
+        assert (settings.state_dir, file) == (str(tmp_path), tmp_path / "imud.yaml")
+        if error is not None:
+            raise error
+
+    monkeypatch.setattr("imud.cli.run.serve", serve)
+    (tmp_path / "imud.yaml").write_text(f"devices: {{}}\nstate_dir: {tmp_path}\n")
+    with pipe() as (reader, writer), monkeypatch.context() as patch:
+        patch.setattr("imud.cli.run.STDERR", writer)
+        patch.setenv("JOURNAL_STREAM", f"{os.fstat(writer).st_dev}:{os.fstat(writer).st_ino}")
+        printed = cli("run", "--config", tmp_path / "imud.yaml", status=status).err
+        os.write(writer, b"\n")
+        logged = os.read(reader, 65536).decode()
+    assert said in printed + logged
+
+
+def test_the_state_is_in_the_folder_of_the_service_manager(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = config.parse("state_dir: /srv/imud\ndevices: {}\n", "imud.yaml")
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    assert state_dir(settings) == Path("/srv/imud")
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/imud:/var/lib/other")
+    assert state_dir(settings) == Path("/var/lib/imud")

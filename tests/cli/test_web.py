@@ -44,6 +44,8 @@ def test_who_may_look(token: str) -> None:
         return guard.rights(None, None).read
 
     assert can_read()
+    guard = guard_of(build_parser(("web",)).parse_args(["web", "--host", "gw.example"]))
+    assert (guard.host_problem("gw.example"), guard.host_problem("other.example") != "") == ("", True)
     assert can_read("--token-file", token)
     assert not can_read("--token-file", token, "--reading", "token")
     assert not can_read("--token-file", token, "--address", "0.0.0.0")

@@ -152,6 +152,9 @@ def test_random_addresses(modbus: Commands) -> None:
     kept = {one.flash.slave for one in modbus.bus.line.slaves}
     assert len(kept) == 3
     assert kept <= set(range(1, 10))
+    modbus.bus = Bus(modbus_slave(80, serial=1), modbus_slave(80, serial=2, bad_crc=99))
+    out = modbus("assign", *ON, "--random", "1-9", status=1)
+    assert [one.flash.slave == one.settings.slave for one in modbus.bus.line.slaves] == [True, False], out
 
 
 def test_an_address_is_changed_and_saved_unless_not_wanted(modbus: Commands) -> None:

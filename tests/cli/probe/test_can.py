@@ -14,6 +14,7 @@ from imud.contracts.link import LinkType, OnBusNews, OnEnd, OnFrames
 from imud.devices import DRIVERS
 from imud.errors import LinkError
 from imud.formats.can import CanFrame
+from imud.links.can.bus_state import ControllerState
 from imud.links.can.link import SocketCanSettings
 from imud.links.can.netlink import CanDetails
 from imud.links.memory import MemoryCanLink, MemorySettings
@@ -101,6 +102,7 @@ def test_a_bus_that_ends_is_reported(bus: type[Bus], monkeypatch: pytest.MonkeyP
         ((500_000, 3), "bus-off"),
         ((500_000, 2), "error-passive"),
         ((1, 9), ""),
+        ((1, len(ControllerState)), ""),
     ],
 )
 def test_the_state_in_words(

@@ -61,11 +61,14 @@ def test_a_recording_from_the_middle_of_a_run_replays_as_it_ran(
     cli("info", file)
 
 
-def test_an_interrupt_ends_it_regularly(words: tuple[object, ...], tmp_path: Path, cli: Cli) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_regularly(
+    words: tuple[object, ...], tmp_path: Path, cli: Cli, number: signal.Signals
+) -> None:
     file = tmp_path / "b.imudrec"
     with imud_process(*words, file) as record:
         wait_until(lambda: file.exists() and file.stat().st_size > 20_000, "a second of records")
-        assert "of 2 devices" in record.end(signal.SIGINT).err
+        assert "of 2 devices" in record.end(number).err
     replayed(file, cli, "bow", "mast")
 
 
