@@ -25,12 +25,20 @@ def in_loop(test: Callable[P, Coroutine[None, None, None]]) -> Callable[P, None]
 
     @wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
-        event_loop.run(test(*args, **kwargs))
+        event_loop.run(_without_readers_left(test(*args, **kwargs)))
 
     return run
 
 
-DESCRIPTOR_LIMIT_S = 50.0
+async def _without_readers_left(body: Coroutine[Any, Any, None]) -> None:
+    """Run a test; then the loop may watch no descriptor for it."""
+    await body
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, event_loop.SampleLoop)
+    assert not loop._reader_selector._readers, "a descriptor is still watched"
+
+
+DESCRIPTOR_LIMIT_S = 60.0
 """How long, in real time, a loop that waits for nothing but descriptors may wait."""
 
 
@@ -135,3 +143,6 @@ def run_virtually(clock: VirtualClock, body: Coroutine[Any, Any, None]) -> None:
     """Run to its end; nothing is left behind."""
     with asyncio.Runner(loop_factory=lambda: VirtualLoop(clock)) as runner:
         runner.run(body)
+        loop: Any = runner.get_loop()
+        watched = {key.fd for key in loop._selector.get_map().values()} - {loop._ssock.fileno()}
+        assert not watched, "a descriptor is still watched"
