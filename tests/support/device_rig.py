@@ -34,6 +34,7 @@ from imud.worker import BusThread, StartWatchingWorker
 from tests.support.event_loops import VirtualClock, run_virtually
 
 LIMIT_S = 60.0
+"""Deadline of a wait, s: of a real device on a loaded host. Virtual time passes at once."""
 STEP_S = 0.002
 
 
