@@ -17,6 +17,7 @@ from msgspec import Meta
 from imud.contracts.action import Action, Risk, Target
 from imud.contracts.can import CanDriver
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, StreamCodec, TextLine
+from imud.contracts.control.calibration import Calibration, Handling, Kept
 from imud.contracts.device_settings import DeviceSettings, Effect, Setting
 from imud.contracts.driver import SAMPLE_COUNTER, Identity, StreamDriver
 from imud.contracts.session import (
@@ -324,6 +325,7 @@ class FakeModule(MemoryLink):
         command, _, rest = line.partition(" ")
         answers: dict[str, Callable[[], list[str]]] = {
             "WHO": self._who, "GET": self._get, "SAVE": self._save, "SET": lambda: self._set(rest),
+            "ZERO": lambda: ["OK"],
         }  # fmt: skip
         if command == "RESTART":
             self.restart()
@@ -465,6 +467,12 @@ FAKE_SETTINGS: Final = DeviceSettings(
 """Settings of every kind."""
 
 
+ZERO: Final = Calibration(
+    help="measure the zero", section="4.1", handling=Handling.REST, instructions=(),
+    begin=lambda _target: _send_command("ZERO"), expected=(), kept=Kept.BY_SAVE, save=_save_all,
+)  # fmt: skip
+
+
 def _set_mode(target: Target, *, mode: str) -> RequestScript[None]:
     return _setter("mode")(target, mode)
 
@@ -476,6 +484,7 @@ FAKE_MODULE_DRIVER: Final = replace(
     identify=_who,
     read_settings=_get_words,
     device_settings=FAKE_SETTINGS,
+    calibrations={"zero": ZERO},
     actions={
         "set_mode": Action("set it", _set_mode),
         "wait": Action("take an hour", lambda _target: (pause(3600 * 1_000_000_000) for _ in range(1))),

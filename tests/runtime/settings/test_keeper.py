@@ -32,6 +32,7 @@ from tests.support.event_loops import VirtualClock
 from tests.support.fake_drivers import FACTORY, FAKE_MODULE_DRIVER, FAKE_SETTINGS, FakeModule
 from tests.support.polled_bus_bench import PolledBusBench, on_i2c
 from tests.support.simulated_modules import unpack
+from tests.support.stories import played
 
 STEP_S, LONG_STEP_S = 0.05, 0.5
 """Time from one sample to the next, and while long times pass."""
@@ -135,136 +136,108 @@ class ModuleBench:
 # --- report -----------------------------------------------------------------------------------------------------------
 
 
-def test_without_a_declaration_nothing_is_asked_and_nothing_told() -> None:
-    bench = ModuleBench()
-
-    async def story() -> None:
-        await bench.pass_s(5)
-        assert bench.is_in(SettingsState.UNDECLARED)
-        assert bench.module.commands == ["WHO", "GET"]  # identity, and settings as text
-        assert bench.messages == []
-
-    bench.play(story)
+@played(ModuleBench)
+async def test_without_a_declaration_nothing_is_asked_and_nothing_told(bench: ModuleBench) -> None:
+    await bench.pass_s(5)
+    assert bench.is_in(SettingsState.UNDECLARED)
+    assert bench.module.commands == ["WHO", "GET"]  # identity, and settings as text
+    assert bench.messages == []
 
 
-def test_what_agrees_is_said_to() -> None:
-    bench = ModuleBench(declared={"mode": "6-axis", "output": {"a": 100}, "secret": 5})
-
-    async def story() -> None:
-        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
-        assert bench.is_in(SettingsState.UNKNOWN)
-        await bench.until(lambda: bench.is_in(SettingsState.AGREE))
-        assert bench.status.unverified == ("secret",)
-        assert (bench.messages, bench.written()) == ([], [])
-
-    bench.play(story)
+@played(lambda: ModuleBench(declared={"mode": "6-axis", "output": {"a": 100}, "secret": 5}))
+async def test_what_agrees_is_said_to(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    assert bench.is_in(SettingsState.UNKNOWN)
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    assert bench.status.unverified == ("secret",)
+    assert (bench.messages, bench.written()) == ([], [])
 
 
-def test_a_difference_is_told_once_and_nothing_is_written() -> None:
-    bench = ModuleBench(declared={"mode": "9-axis", "offset_deg": 1.5})
-
-    async def story() -> None:
-        await bench.until(lambda: bench.is_in(SettingsState.DIFFER))
-        await bench.pass_s(100)
-        message = 'settings are not as declared: mode is "6-axis", declared "9-axis", offset_deg is 0.0, declared 1.5'
-        assert bench.messages == [message]
-        assert bench.told[0].detail == {"mode": '"6-axis"', "offset_deg": "0.0"}
-        assert bench.status.differences["mode"].declared == "9-axis"
-        assert bench.written() == []
-        asked = bench.module.commands.count("GET")
-        await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
-        await bench.until(lambda: bench.module.commands.count("GET") >= asked + 2)  # as text, and to compare
-        await bench.pass_s(2)
-        assert bench.messages == [message]  # it is as before
-
-    bench.play(story)
+@played(lambda: ModuleBench(declared={"mode": "9-axis", "offset_deg": 1.5}))
+async def test_a_difference_is_told_once_and_nothing_is_written(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.is_in(SettingsState.DIFFER))
+    await bench.pass_s(100)
+    message = 'settings are not as declared: mode is "6-axis", declared "9-axis", offset_deg is 0.0, declared 1.5'
+    assert bench.messages == [message]
+    assert bench.told[0].detail == {"mode": '"6-axis"', "offset_deg": "0.0"}
+    assert bench.status.differences["mode"].declared == "9-axis"
+    assert bench.written() == []
+    asked = bench.module.commands.count("GET")
+    await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
+    await bench.until(lambda: bench.module.commands.count("GET") >= asked + 2)  # as text, and to compare
+    await bench.pass_s(2)
+    assert bench.messages == [message]  # it is as before
 
 
-def test_compared_again_after_a_replug_a_restart_and_a_command() -> None:
-    bench = ModuleBench(declared={"mode": "6-axis"})
-
-    async def story() -> None:
-        await bench.until(lambda: bench.is_in(SettingsState.AGREE))
-        await bench.pass_s(20)
-        bench.module.disappear()
-        await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
-        assert bench.is_in(SettingsState.UNKNOWN)
-        bench.module.set["mode"] = "9-axis"
-        bench.module.appear()
-        await bench.until(lambda: bench.is_in(SettingsState.DIFFER), "after a replug")
-        await bench.pass_s(20)
-        bench.module.restart()  # by itself: flash has what is declared
-        await bench.until(lambda: bench.is_in(SettingsState.AGREE), "after a restart")
-        await bench.doing(bench.device.act("set_mode", {"mode": "9-axis"}))
-        await bench.until(lambda: bench.is_in(SettingsState.DIFFER), "after a command")
-        await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
-        await bench.until(lambda: bench.is_in(SettingsState.AGREE), "after another one")
-        differ = 'settings are not as declared: mode is "9-axis", declared "6-axis"'
-        assert bench.messages == [differ, differ, "settings are as declared again"]
-
-    bench.play(story)
+@played(lambda: ModuleBench(declared={"mode": "6-axis"}))
+async def test_compared_again_after_a_replug_a_restart_and_a_command(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    await bench.pass_s(20)
+    bench.module.disappear()
+    await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
+    assert bench.is_in(SettingsState.UNKNOWN)
+    bench.module.set["mode"] = "9-axis"
+    bench.module.appear()
+    await bench.until(lambda: bench.is_in(SettingsState.DIFFER), "after a replug")
+    await bench.pass_s(20)
+    bench.module.restart()  # by itself: flash has what is declared
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE), "after a restart")
+    await bench.doing(bench.device.act("set_mode", {"mode": "9-axis"}))
+    await bench.until(lambda: bench.is_in(SettingsState.DIFFER), "after a command")
+    await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE), "after another one")
+    differ = 'settings are not as declared: mode is "9-axis", declared "6-axis"'
+    assert bench.messages == [differ, differ, "settings are as declared again"]
 
 
-def test_a_device_whose_clock_begins_anew_by_the_question_is_asked_once() -> None:
-    bench = ModuleBench(declared={"mode": "6-axis"})
+@played(lambda: ModuleBench(declared={"mode": "6-axis"}))
+async def test_a_device_whose_clock_begins_anew_by_the_question_is_asked_once(bench: ModuleBench) -> None:
     bench.module.pauses_clock = True
-
-    async def story() -> None:
-        await bench.until(lambda: bench.is_in(SettingsState.AGREE))
-        asked = bench.module.commands.count("GET")
-        await bench.pass_s(50)
-        assert bench.module.commands.count("GET") == asked
-        bench.module.set["mode"] = "9-axis"
-        bench.module.restart()  # and by itself it is noticed
-        await bench.until(lambda: bench.module.commands.count("GET") == asked + 1)
-
-    bench.play(story)
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    asked = bench.module.commands.count("GET")
+    await bench.pass_s(50)
+    assert bench.module.commands.count("GET") == asked
+    bench.module.set["mode"] = "9-axis"
+    bench.module.restart()  # and by itself it is noticed
+    await bench.until(lambda: bench.module.commands.count("GET") == asked + 1)
 
 
-def test_a_device_that_does_not_tell_its_settings_is_asked_ever_more_seldom() -> None:
-    bench = ModuleBench(declared={"mode": "6-axis"})
+@played(lambda: ModuleBench(declared={"mode": "6-axis"}))
+async def test_a_device_that_does_not_tell_its_settings_is_asked_ever_more_seldom(bench: ModuleBench) -> None:
     bench.module.silent = {"GET"}
-
-    async def story() -> None:
-        await bench.until(lambda: bench.messages)
-        assert bench.messages == ["settings could not be read, asked 3 times: GET: expected OK, got nothing"]
-        await bench.pass_s(sum(IDENTIFY_AGAIN_S) + 10)  # the identity is asked for with them, four times more
-        asked = bench.module.commands.count("GET")
-        await bench.pass_s(2 * IDENTIFY_AGAIN_S[-1])
-        assert asked + 1 <= bench.module.commands.count("GET") <= asked + 2
-        assert bench.is_in(SettingsState.UNKNOWN)
-        assert "could not be read" in bench.status.problem
-        bench.module.silent = set()
-        bench.module.restart()
-        await bench.until(lambda: bench.is_in(SettingsState.AGREE))
-        assert bench.status.problem == ""
-
-    bench.play(story)
+    await bench.until(lambda: bench.messages)
+    assert bench.messages == ["settings could not be read, asked 3 times: GET: expected OK, got nothing"]
+    await bench.pass_s(sum(IDENTIFY_AGAIN_S) + 10)  # the identity is asked for with them, four times more
+    asked = bench.module.commands.count("GET")
+    await bench.pass_s(2 * IDENTIFY_AGAIN_S[-1])
+    assert asked + 1 <= bench.module.commands.count("GET") <= asked + 2
+    assert bench.is_in(SettingsState.UNKNOWN)
+    assert "could not be read" in bench.status.problem
+    bench.module.silent = set()
+    bench.module.restart()
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    assert bench.status.problem == ""
     assert READ_TRIES == 3
 
 
 # --- apply ------------------------------------------------------------------------------------------------------------
 
 
-def test_apply_sets_what_is_in_force_at_once_and_leaves_flash_alone() -> None:
-    bench = ModuleBench("apply", {"mode": "9-axis", "mounting": "x_up", "secret": 5})
-
-    async def story() -> None:
-        await bench.until(lambda: bench.status.repairs)
-        await bench.until(lambda: list(bench.status.differences) == ["mounting"])
-        await bench.pass_s(50)
-        assert bench.written() == ['SET mode="9-axis"', "SET secret=5"]
-        assert bench.module.flash == FACTORY
-        assert bench.status.flash_writes == 0
-        assert "mounting comes into force by save and restart only" in bench.status.problem
-        last = bench.told[-1]
-        assert last.message == ('settings: mode set to "9-axis" (was "6-axis"), secret set to 5: written, not verified')
-        assert last.detail == {"saved": False, "mode": "done", "secret": "written, not verified"}
-        bench.module.restart()
-        await bench.until(lambda: bench.module.set["mode"] == "9-axis", "set again after a restart")
-        await bench.until(lambda: bench.module.set["secret"] == 5)
-
-    bench.play(story)
+@played(lambda: ModuleBench("apply", {"mode": "9-axis", "mounting": "x_up", "secret": 5}))
+async def test_apply_sets_what_is_in_force_at_once_and_leaves_flash_alone(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.status.repairs)
+    await bench.until(lambda: list(bench.status.differences) == ["mounting"])
+    await bench.pass_s(50)
+    assert bench.written() == ['SET mode="9-axis"', "SET secret=5"]
+    assert bench.module.flash == FACTORY
+    assert bench.status.flash_writes == 0
+    assert "mounting comes into force by save and restart only" in bench.status.problem
+    last = bench.told[-1]
+    assert last.message == ('settings: mode set to "9-axis" (was "6-axis"), secret set to 5: written, not verified')
+    assert last.detail == {"saved": False, "mode": "done", "secret": "written, not verified"}
+    bench.module.restart()
+    await bench.until(lambda: bench.module.set["mode"] == "9-axis", "set again after a restart")
+    await bench.until(lambda: bench.module.set["secret"] == 5)
 
 
 def test_apply_and_save_does_everything_once() -> None:
@@ -288,39 +261,31 @@ def test_apply_and_save_does_everything_once() -> None:
     bench.play(story)
 
 
-def test_flash_is_not_written_after_commands_that_change_nothing_or_save_themselves() -> None:
-    bench = ModuleBench("apply_and_save", {"mode": "9-axis"})
-
-    async def story() -> None:
-        await bench.until(lambda: bench.status.repairs == 1 and bench.is_in(SettingsState.AGREE))
-        await bench.doing(bench.device.act("save", {}))
-        await bench.pass_s(300)
-        assert bench.module.saves == 2
-        await bench.doing(bench.device.act("set_mode", {"mode": "9-axis"}))
-        await bench.pass_s(300)
-        assert bench.module.saves == 2
-        await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
-        await bench.until(lambda: bench.status.repairs == 2)
-        await bench.pass_s(300)
-        assert bench.module.saves == 3
-
-    bench.play(story)
+@played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis"}))
+async def test_flash_is_not_written_after_commands_that_change_nothing_or_save_themselves(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.status.repairs == 1 and bench.is_in(SettingsState.AGREE))
+    await bench.doing(bench.device.act("save", {}))
+    await bench.pass_s(300)
+    assert bench.module.saves == 2
+    await bench.doing(bench.device.act("set_mode", {"mode": "9-axis"}))
+    await bench.pass_s(300)
+    assert bench.module.saves == 2
+    await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
+    await bench.until(lambda: bench.status.repairs == 2)
+    await bench.pass_s(300)
+    assert bench.module.saves == 3
 
 
-def test_flash_is_not_written_again_after_a_change_that_a_command_has_saved() -> None:
-    bench = ModuleBench("apply_and_save", {"output": {"b": 50}})
-
+@played(lambda: ModuleBench("apply_and_save", {"output": {"b": 50}}))
+async def test_flash_is_not_written_again_after_a_change_that_a_command_has_saved(bench: ModuleBench) -> None:
     async def change_and_save() -> None:
         await asyncio.gather(bench.device.act("set_mode", {"mode": "9-axis"}), bench.device.act("save", {}))
 
-    async def story() -> None:
-        await bench.until(lambda: bench.status.repairs == 1 and bench.is_in(SettingsState.AGREE))
-        await bench.pass_s(300)
-        await bench.doing(change_and_save())
-        await bench.pass_s(300)
-        assert (bench.module.flash["mode"], bench.module.saves) == ("9-axis", 2)
-
-    bench.play(story)
+    await bench.until(lambda: bench.status.repairs == 1 and bench.is_in(SettingsState.AGREE))
+    await bench.pass_s(300)
+    await bench.doing(change_and_save())
+    await bench.pass_s(300)
+    assert (bench.module.flash["mode"], bench.module.saves) == ("9-axis", 2)
 
 
 def test_what_is_saved_and_not_told_is_not_written_again_in_the_next_run(tmp_path: Path) -> None:
@@ -338,123 +303,105 @@ def test_what_is_saved_and_not_told_is_not_written_again_in_the_next_run(tmp_pat
     assert [module.saves for module in modules] == [1, 0]
 
 
-def test_another_module_is_brought_to_the_same_settings() -> None:
-    bench = ModuleBench("apply_and_save", {"mode": "9-axis", "secret": 5})
+@played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis", "secret": 5}))
+async def test_another_module_is_brought_to_the_same_settings(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.module.saves == 1)
+    bench.module.disappear()
+    await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
+    bench.module.serial, bench.module.flash = "B2", dict(FACTORY)
+    bench.module.restart()
+    bench.module.appear()
+    await bench.until(lambda: bench.module.saves == 2)
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    assert (bench.module.flash["mode"], bench.module.flash["secret"]) == ("9-axis", 5)
+    assert bench.status.flash_writes == 1  # of this module
 
-    async def story() -> None:
-        await bench.until(lambda: bench.module.saves == 1)
+
+@played(lambda: ModuleBench("apply", {"mode": "9-axis"}))
+async def test_each_module_that_takes_the_place_of_another_is_set_at_once(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.status.repairs == 1)
+    for number, serial in enumerate(("B2", "C3", "D4"), start=2):
         bench.module.disappear()
         await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
-        bench.module.serial, bench.module.flash = "B2", dict(FACTORY)
+        bench.module.serial, bench.module.flash = serial, dict(FACTORY)
         bench.module.restart()
         bench.module.appear()
-        await bench.until(lambda: bench.module.saves == 2)
-        await bench.until(lambda: bench.is_in(SettingsState.AGREE))
-        assert (bench.module.flash["mode"], bench.module.flash["secret"]) == ("9-axis", 5)
-        assert bench.status.flash_writes == 1  # of this module
-
-    bench.play(story)
+        await bench.until(partial(bench.repaired, number), limit_s=10)
 
 
-def test_each_module_that_takes_the_place_of_another_is_set_at_once() -> None:
-    bench = ModuleBench("apply", {"mode": "9-axis"})
-
-    async def story() -> None:
-        await bench.until(lambda: bench.status.repairs == 1)
-        for number, serial in enumerate(("B2", "C3", "D4"), start=2):
-            bench.module.disappear()
-            await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
-            bench.module.serial, bench.module.flash = serial, dict(FACTORY)
-            bench.module.restart()
-            bench.module.appear()
-            await bench.until(partial(bench.repaired, number), limit_s=10)
-
-    bench.play(story)
-
-
-def test_a_device_that_forgets_is_set_again_after_growing_pauses() -> None:
-    bench = ModuleBench("apply", {"mode": "9-axis"})
+@played(lambda: ModuleBench("apply", {"mode": "9-axis"}))
+async def test_a_device_that_forgets_is_set_again_after_growing_pauses(bench: ModuleBench) -> None:
     bench.module.forgets = {"mode"}
+    await bench.until(lambda: bench.status.repairs == 1)
+    assert bench.messages[-1].endswith(
+        'mode: wrote "9-axis", read back "6-axis"; what was written before holds until the device restarts'
+    )
+    times_s, reads, asked = [], [], bench.module.commands.count("GET")
+    for number in range(2, 5):
+        before_ns = bench.clock.now_ns()
+        await bench.until(partial(bench.repaired, number), limit_s=1000)
+        times_s.append((bench.clock.now_ns() - before_ns) / 1e9)
+        asked, before = bench.module.commands.count("GET"), asked
+        reads.append(asked - before)
+    assert [round(time_s, -1) for time_s in times_s] == [10, 60, 600]
+    assert reads == [3, 3, 3]  # before and after the write, and as text: the device is not read in the pause
+    bench.module.forgets = set()
+    await bench.pass_s(3)
+    bench.module.restart()
+    await bench.pass_s(20)
+    assert "does not keep its settings" in bench.status.problem
+    assert bench.is_in(SettingsState.DIFFER)
+    asked = bench.module.commands.count("GET")
+    await bench.pass_s(3500)
+    assert bench.module.commands.count("GET") == asked
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE), limit_s=200)
 
-    async def story() -> None:
-        await bench.until(lambda: bench.status.repairs == 1)
-        assert bench.messages[-1].endswith(
-            'mode: wrote "9-axis", read back "6-axis"; what was written before holds until the device restarts'
-        )
-        times_s = []
-        for number in range(2, 5):
-            before_ns = bench.clock.now_ns()
-            await bench.until(partial(bench.repaired, number), limit_s=1000)
-            times_s.append((bench.clock.now_ns() - before_ns) / 1e9)
-        assert [round(time_s, -1) for time_s in times_s] == [10, 60, 600]
-        bench.module.forgets = set()
+
+@played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis"}))
+async def test_flash_is_written_a_few_times_a_day_by_itself_and_still_for_people(bench: ModuleBench) -> None:
+    for number in range(1, LIMIT_ITSELF + 1):
+        await bench.until(partial(bench.saved, number), limit_s=4000)
         await bench.pass_s(3)
+        bench.module.flash = dict(FACTORY)
         bench.module.restart()
-        await bench.pass_s(20)
-        assert "does not keep its settings" in bench.status.problem
-        assert bench.is_in(SettingsState.DIFFER)
-        await bench.until(lambda: bench.is_in(SettingsState.AGREE), limit_s=3700)
-
-    bench.play(story)
-
-
-def test_flash_is_written_a_few_times_a_day_by_itself_and_still_for_people() -> None:
-    bench = ModuleBench("apply_and_save", {"mode": "9-axis"})
-
-    async def story() -> None:
-        for number in range(1, LIMIT_ITSELF + 1):
-            await bench.until(partial(bench.saved, number), limit_s=4000)
-            await bench.pass_s(3)
-            bench.module.flash = dict(FACTORY)
-            bench.module.restart()
-        await bench.until(lambda: "not saved" in bench.messages[-1], limit_s=4000)
-        assert "allowed by imud itself" in bench.status.problem
-        assert bench.module.saves == LIMIT_ITSELF
-        assert bench.module.set["mode"] == "9-axis"  # it is set all the same
-        applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
-        assert applied.saved
-        assert bench.status.flash_writes_day == LIMIT_ITSELF + 1
-
-    bench.play(story)
+    await bench.until(lambda: "not saved" in bench.messages[-1], limit_s=4000)
+    assert "allowed by imud itself" in bench.status.problem
+    assert bench.module.saves == LIMIT_ITSELF
+    assert bench.module.set["mode"] == "9-axis"  # it is set all the same
+    applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
+    assert applied.saved
+    assert bench.status.flash_writes_day == LIMIT_ITSELF + 1
 
 
 # --- asked for --------------------------------------------------------------------------------------------------------
 
 
-def test_plan_and_apply_of_given_values() -> None:
-    bench = ModuleBench()
-
-    async def story() -> None:
-        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
-        plan = await bench.doing(bench.device.settings_plan({"mode": "9-axis", "baud": 921600}, save=True))
-        assert [step.name for step in plan.steps] == ["mode", "baud"]
-        assert bench.written() == []
-        applied = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
-        assert [(one.name, one.before, one.outcome) for one in applied.steps] == [("mode", "6-axis", StepOutcome.DONE)]
-        assert (applied.problem, applied.saved, applied.differences) == ("", False, {})
-        saved = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
-        assert (saved.steps, saved.saved) == ((), True)  # what was set before is saved
-        again = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
-        assert (again.steps, again.saved, bench.module.saves) == ((), False, 1)
-
-    bench.play(story)
+@played(ModuleBench)
+async def test_plan_and_apply_of_given_values(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    plan = await bench.doing(bench.device.settings_plan({"mode": "9-axis", "baud": 921600}, save=True))
+    assert [step.name for step in plan.steps] == ["mode", "baud"]
+    assert bench.written() == []
+    applied = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+    assert [(one.name, one.before, one.outcome) for one in applied.steps] == [("mode", "6-axis", StepOutcome.DONE)]
+    assert (applied.problem, applied.saved, applied.differences) == ("", False, {})
+    saved = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+    assert (saved.steps, saved.saved) == ((), True)  # what was set before is saved
+    again = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+    assert (again.steps, again.saved, bench.module.saves) == ((), False, 1)
 
 
-def test_a_report_has_what_was_told_last_or_asks_now() -> None:
-    bench = ModuleBench(declared={"mode": "9-axis"})
-
-    async def story() -> None:
-        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
-        known = await bench.device.settings_report(fresh=False)
-        assert {one.actual for one in known.settings} == {None}
-        fresh = await bench.doing(bench.device.settings_report(fresh=True))
-        assert (fresh.device, fresh.driver, fresh.identity["serial_number"]) == ("bow", "fake-module", "A1")
-        assert {one.name: one.actual for one in fresh.settings if one.readable} == {
-            name: value for name, value in FACTORY.items() if name != "secret"
-        }
-        assert [one.name for one in fresh.settings if one.differs] == ["mode"]
-
-    bench.play(story)
+@played(lambda: ModuleBench(declared={"mode": "9-axis"}))
+async def test_a_report_has_what_was_told_last_or_asks_now(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    known = await bench.device.settings_report(fresh=False)
+    assert {one.actual for one in known.settings} == {None}
+    fresh = await bench.doing(bench.device.settings_report(fresh=True))
+    assert (fresh.device, fresh.driver, fresh.identity["serial_number"]) == ("bow", "fake-module", "A1")
+    assert {one.name: one.actual for one in fresh.settings if one.readable} == {
+        name: value for name, value in FACTORY.items() if name != "secret"
+    }
+    assert [one.name for one in fresh.settings if one.differs] == ["mode"]
 
 
 @pytest.mark.parametrize(
@@ -465,32 +412,26 @@ def test_a_report_has_what_was_told_last_or_asks_now() -> None:
         ({"output": {"a": 1000, "b": 1000}}, BadArgument, "at most 1152 Hz in all"),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_is_written(given: Any, error: type[Exception], message: str) -> None:
-    bench = ModuleBench()
-
-    async def story() -> None:
-        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
-        with pytest.raises(error, match=message):
-            await bench.doing(bench.device.settings_apply(given, save=True))
-        assert bench.written() == []
-
-    bench.play(story)
+@played(ModuleBench)
+async def test_what_cannot_be_is_refused_before_anything_is_written(
+    bench: ModuleBench, given: Any, error: type[Exception], message: str
+) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    with pytest.raises(error, match=message):
+        await bench.doing(bench.device.settings_apply(given, save=True))
+    assert bench.written() == []
 
 
-def test_a_device_that_is_not_there_is_not_asked() -> None:
-    bench = ModuleBench()
-
-    async def story() -> None:
-        bench.module.disappear()
-        await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
-        for work in (
-            bench.device.settings_report(fresh=True), bench.device.settings_plan({}, save=False),
-            bench.device.settings_apply({}, save=False),
-        ):  # fmt: skip
-            with pytest.raises(CommandError, match="bow is missing"):
-                await work
-
-    bench.play(story)
+@played(ModuleBench)
+async def test_a_device_that_is_not_there_is_not_asked(bench: ModuleBench) -> None:
+    bench.module.disappear()
+    await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
+    for work in (
+        bench.device.settings_report(fresh=True), bench.device.settings_plan({}, save=False),
+        bench.device.settings_apply({}, save=False),
+    ):  # fmt: skip
+        with pytest.raises(CommandError, match="bow is missing"):
+            await work
 
 
 # --- steps that fail --------------------------------------------------------------------------------------------------
@@ -613,72 +554,67 @@ def test_without_saving_nothing_is_written_that_saves() -> None:
     assert bench.module.flash == FACTORY
 
 
-def test_commands_that_save_count_and_are_limited() -> None:
-    bench = ModuleBench()
-
-    async def story() -> None:
-        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
-        await bench.pass_s(2)
-        for _ in range(LIMIT_ASKED):
-            await bench.doing(bench.device.act("save", {}))
-        assert bench.status.flash_writes_day == bench.module.saves == LIMIT_ASKED
+@played(ModuleBench)
+async def test_commands_that_save_count_and_are_limited(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    await bench.pass_s(2)
+    assert (await bench.doing(bench.device.calibrate("zero", save=True))).saved
+    for _ in range(LIMIT_ASKED - 2):
+        await bench.doing(bench.device.act("save", {}))
+    applied = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+    assert (applied.saved, applied.problem) == (True, "")
+    assert bench.status.flash_writes_day == bench.module.saves == LIMIT_ASKED
+    sent = bench.module.commands.count("ZERO")
+    for saving in (bench.device.act("save", {}), bench.device.calibrate("zero", save=True)):
         with pytest.raises(CommandError, match="bow: its flash was written 40 times within 24 hours"):
-            await bench.doing(bench.device.act("save", {}))
-        assert bench.module.saves == LIMIT_ASKED
+            await bench.doing(saving)
+    applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
+    assert "not saved: its flash was written 40 times" in applied.problem
+    applied = await bench.doing(bench.device.settings_apply({"baud": 921600}, save=True))  # its step saves by itself
+    assert applied.problem.startswith("baud: its flash was written 40 times")
+    assert (bench.module.saves, bench.module.commands.count("ZERO"), bench.module.baud) == (LIMIT_ASKED, sent, 115200)
+    assert (await bench.doing(bench.device.calibrate("zero", save=False))).verified
+    assert bench.module.commands.count("ZERO") == sent + 1
 
-    bench.play(story)
 
-
-def test_a_command_does_not_wait_for_another_one_for_ever() -> None:
-    bench = ModuleBench()
-
-    async def story() -> None:
-        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
-        await bench.pass_s(2)
-        waiting = asyncio.ensure_future(bench.device.act("wait", {}))
-        await bench.pass_s(1)
-        with pytest.raises(CommandError, match="another command or a calibration is still under way"):
-            await bench.doing(bench.device.settings_report(fresh=True))
-        waiting.cancel()
-        await bench.pass_s(1)
+@played(ModuleBench)
+async def test_a_command_does_not_wait_for_another_one_for_ever(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    await bench.pass_s(2)
+    waiting = asyncio.ensure_future(bench.device.act("wait", {}))
+    await bench.pass_s(1)
+    with pytest.raises(CommandError, match="another command or a calibration is still under way"):
         await bench.doing(bench.device.settings_report(fresh=True))
-
-    bench.play(story)
+    waiting.cancel()
+    await bench.pass_s(1)
+    await bench.doing(bench.device.settings_report(fresh=True))
 
 
 # --- a backup before all is lost --------------------------------------------------------------------------------------
 
 
-def test_a_backup_is_made_before_a_factory_reset(tmp_path: Path) -> None:
-    bench = ModuleBench(state_dir=tmp_path)
-
-    async def story() -> None:
-        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
-        bench.module.set["mode"] = "9-axis"
-        await bench.doing(bench.device.act("factory_reset", {}))
-        (file,) = (tmp_path / "backups").iterdir()
-        assert 'mode: "9-axis"' in file.read_text()
-        assert 'serial_number: "A1"' in file.read_text()
-        assert bench.told[-1].message == f"settings before factory_reset are in {file}"
-        assert bench.module.commands[-4:] == ["GET", "RESTART", "WHO", "GET"]  # then it is asked what it has now
-
-    bench.play(story)
+@played(lambda tmp_path: ModuleBench(state_dir=tmp_path))
+async def test_a_backup_is_made_before_a_factory_reset(bench: ModuleBench, tmp_path: Path) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    bench.module.set["mode"] = "9-axis"
+    await bench.doing(bench.device.act("factory_reset", {}))
+    (file,) = (tmp_path / "backups").iterdir()
+    assert 'mode: "9-axis"' in file.read_text()
+    assert 'serial_number: "A1"' in file.read_text()
+    assert bench.told[-1].message == f"settings before factory_reset are in {file}"
+    assert bench.module.commands[-4:] == ["GET", "RESTART", "WHO", "GET"]  # then it is asked what it has now
 
 
 @pytest.mark.parametrize("silent", [True, False])
-def test_a_reset_without_a_backup_says_so(silent: bool) -> None:
-    bench = ModuleBench()
-
-    async def story() -> None:
-        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
-        await bench.pass_s(1)
-        bench.module.silent = {"GET"} if silent else set()
-        await bench.doing(bench.device.act("factory_reset", {}))
-        why = "GET: expected OK, got nothing" if silent else "there is no state directory"
-        assert bench.told[-1].message == f"no backup of the settings before factory_reset: {why}"
-        assert "RESTART" in bench.module.commands
-
-    bench.play(story)
+@played(ModuleBench)
+async def test_a_reset_without_a_backup_says_so(bench: ModuleBench, silent: bool) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    await bench.pass_s(1)
+    bench.module.silent = {"GET"} if silent else set()
+    await bench.doing(bench.device.act("factory_reset", {}))
+    why = "GET: expected OK, got nothing" if silent else "there is no state directory"
+    assert bench.told[-1].message == f"no backup of the settings before factory_reset: {why}"
+    assert "RESTART" in bench.module.commands
 
 
 # --- on other links ---------------------------------------------------------------------------------------------------

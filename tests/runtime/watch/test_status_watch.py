@@ -83,6 +83,15 @@ def test_silence_is_no_end() -> None:
     assert bench.step(0, 12) == ["status: cleared: magnetic disturbance"]
 
 
+def test_the_bits_of_another_device_are_events_again() -> None:
+    bench = WatchBench()
+    assert bench.step(DISTURBED | OVER_RANGE, 20)
+    bench.path = FakePath()
+    assert bench.step(AT_REST, 20) == []  # nothing of the former device is cleared
+    assert bench.step(DISTURBED) == ["status: magnetic disturbance"]
+    assert bench.step(0, 20) == ["status: cleared: magnetic disturbance"]
+
+
 def test_a_driver_without_bits_is_not_watched() -> None:
     bench = WatchBench()
     bench.path.status = ~0
