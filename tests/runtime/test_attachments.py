@@ -28,6 +28,7 @@ from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.event_loops import VirtualClock, run_virtually
 from tests.support.polled_bus_bench import PolledBusBench
+from tests.support.stories import in_bench
 
 LINES = DeviceLines(reset=ResetSettings(line="R"))
 BOOT_S = 2.9
@@ -93,111 +94,99 @@ async def polled(bench: PolledBusBench, **more: Any) -> AsyncIterator[Scene]:
         yield scene
 
 
-def test_a_device_that_hangs_is_reset_and_set_up_again(bench: PolledBusBench) -> None:
-    async def body() -> None:
-        async with polled(bench) as it:
-            await it.rig.until_samples(5)
-            it.hang()
-            down_ns = bench.clock.now_ns()
-            await it.rig.until(lambda: EventKind.DOWN in it.rig.kinds, "down")
+@in_bench
+async def test_a_device_that_hangs_is_reset_and_set_up_again(bench: PolledBusBench) -> None:
+    async with polled(bench) as it:
+        await it.rig.until_samples(5)
+        it.hang()
+        down_ns = bench.clock.now_ns()
+        await it.rig.until(lambda: EventKind.DOWN in it.rig.kinds, "down")
+        await it.rig.until_samples(5, 20)
+        assert it.pulses == 1
+        (up_ns, _), (released_ns, _) = it.line.history
+        assert 4.4e9 < up_ns - down_ns < 5.1e9
+        assert released_ns - up_ns == pytest.approx(10e6, abs=10)
+        assert it.told == ["not found for 4 s: reset by its line"]
+        assert it.rig.kinds.count(EventKind.UP) == 2
+        assert (it.device.extended, it.device.filter & 0x0F) == (1, 2)
+        assert bench.clock.now_ns() - up_ns < 4e9
+
+
+@in_bench
+async def test_a_device_that_comes_back_by_itself_is_not_reset(bench: PolledBusBench) -> None:
+    async with polled(bench) as it:
+        for _ in range(5):
             await it.rig.until_samples(5, 20)
-            assert it.pulses == 1
-            (up_ns, _), (released_ns, _) = it.line.history
-            assert 4.4e9 < up_ns - down_ns < 5.1e9
-            assert released_ns - up_ns == pytest.approx(10e6, abs=10)
-            assert it.told == ["not found for 4 s: reset by its line"]
-            assert it.rig.kinds.count(EventKind.UP) == 2
-            assert (it.device.extended, it.device.filter & 0x0F) == (1, 2)
-            assert bench.clock.now_ns() - up_ns < 4e9
-
-    bench.run(body())
-
-
-def test_a_device_that_comes_back_by_itself_is_not_reset(bench: PolledBusBench) -> None:
-    async def body() -> None:
-        async with polled(bench) as it:
-            for _ in range(5):
-                await it.rig.until_samples(5, 20)
-                it.hang()
-                await asyncio.sleep(3.5)
-                it.boot()
-            await it.rig.until_samples(5, 20)
-            assert it.pulses == 0
-            assert it.rig.kinds.count(EventKind.UP) == 6
-
-    bench.run(body())
-
-
-def test_a_device_that_is_not_there_is_reset_once_a_minute(bench: PolledBusBench) -> None:
-    async def body() -> None:
-        async with polled(bench) as it:
-            it.device.faults.line = 0
-            it.dead = True
-            await it.rig.until(lambda: it.pulses == 3, "three", 200)
-            times_ns = [t_ns for t_ns, active in it.line.history if active]
-            assert all(60e9 <= b - a < 61e9 for a, b in pairwise(times_ns))
-            assert "only 0x00" in it.rig.device.status().problem
-
-    bench.run(body())
-
-
-def test_nothing_is_asked_while_the_line_is_active_and_for_3_s(bench: PolledBusBench) -> None:
-    async def body() -> None:
-        async with polled(bench, hold_ms=500) as it:
-            await it.rig.until_samples(5)
-            begin_ns = bench.clock.now_ns()
-            task = asyncio.create_task(it.rig.device.act("reset", {}))
-            await it.rig.until(lambda: it.line.active, "active")
-            await it.rig.until(lambda: it.rig.state is DeviceState.SEARCHING, "left")
-            asked = it.device.transactions
-            samples = len(it.rig.samples)
-            await it.rig.until(lambda: not it.line.active, "released")
-            await it.rig.until(task.done, "over")
-            assert it.device.transactions - asked <= 1  # the transfer that was under way
-            assert await task is None
-            assert bench.clock.now_ns() - begin_ns == pytest.approx(3.5e9, abs=10e6)
-            await it.rig.until_samples(5)
-            assert len(it.rig.samples) > samples
-            assert it.pulses == 1
-            assert [e.message for e in it.rig.events if e.kind is EventKind.DOWN] == ["reset by its line"]
-
-    bench.run(body())
-
-
-def test_reset_is_offered_with_a_line_only_and_also_while_no_device_is_found(bench: PolledBusBench) -> None:
-    async def body() -> None:
-        async with bench.running(bench.on_spi()) as (rig,):
-            assert "reset" not in rig.device.actions
-            with pytest.raises(BadArgument, match="no action 'reset'"):
-                await rig.device.act("reset", {})
-        async with polled(bench) as it:
             it.hang()
-            await it.rig.until(lambda: "only 0xFF" in it.rig.device.status().problem, "searching")
-            with pytest.raises(BadArgument, match="hard"):
-                await it.rig.device.act("reset", {"hard": True})
-            await it.rig.until(lambda: it.line.is_open, "open")
-            assert await it.rig.device.act("reset", {}) is None
-            assert it.pulses == 1
-            await it.rig.until_samples(5)
-            assert it.told == []
-
-    bench.run(body())
+            await asyncio.sleep(3.5)
+            it.boot()
+        await it.rig.until_samples(5, 20)
+        assert it.pulses == 0
+        assert it.rig.kinds.count(EventKind.UP) == 6
 
 
-def test_the_line_is_held_from_the_beginning_to_the_end_and_its_trouble_shown(bench: PolledBusBench) -> None:
-    async def body() -> None:
-        async with polled(bench) as it:
-            await it.rig.until_samples(1)
-            assert it.line.is_open
-            status = it.rig.device.status()
-            assert status.lines is not None
-            assert status.lines.problems == {}
-        assert not it.line.is_open
-        it.rig.device.tick(bench.clock.now_ns())
-        assert not it.line.is_open
-        assert it.line.history == []
+@in_bench
+async def test_a_device_that_is_not_there_is_reset_once_a_minute(bench: PolledBusBench) -> None:
+    async with polled(bench) as it:
+        it.device.faults.line = 0
+        it.dead = True
+        await it.rig.until(lambda: it.pulses == 3, "three", 200)
+        times_ns = [t_ns for t_ns, active in it.line.history if active]
+        assert all(60e9 <= b - a < 61e9 for a, b in pairwise(times_ns))
+        assert "only 0x00" in it.rig.device.status().problem
 
-    bench.run(body())
+
+@in_bench
+async def test_nothing_is_asked_while_the_line_is_active_and_for_3_s(bench: PolledBusBench) -> None:
+    async with polled(bench, hold_ms=500) as it:
+        await it.rig.until_samples(5)
+        begin_ns = bench.clock.now_ns()
+        task = asyncio.create_task(it.rig.device.act("reset", {}))
+        await it.rig.until(lambda: it.line.active, "active")
+        await it.rig.until(lambda: it.rig.state is DeviceState.SEARCHING, "left")
+        asked = it.device.transactions
+        samples = len(it.rig.samples)
+        await it.rig.until(lambda: not it.line.active, "released")
+        await it.rig.until(task.done, "over")
+        assert it.device.transactions - asked <= 1  # the transfer that was under way
+        assert await task is None
+        assert bench.clock.now_ns() - begin_ns == pytest.approx(3.5e9, abs=10e6)
+        await it.rig.until_samples(5)
+        assert len(it.rig.samples) > samples
+        assert it.pulses == 1
+        assert [e.message for e in it.rig.events if e.kind is EventKind.DOWN] == ["reset by its line"]
+
+
+@in_bench
+async def test_reset_is_offered_with_a_line_only_and_also_while_no_device_is_found(bench: PolledBusBench) -> None:
+    async with bench.running(bench.on_spi()) as (rig,):
+        assert "reset" not in rig.device.actions
+        with pytest.raises(BadArgument, match="no action 'reset'"):
+            await rig.device.act("reset", {})
+    async with polled(bench) as it:
+        it.hang()
+        await it.rig.until(lambda: "only 0xFF" in it.rig.device.status().problem, "searching")
+        with pytest.raises(BadArgument, match="hard"):
+            await it.rig.device.act("reset", {"hard": True})
+        await it.rig.until(lambda: it.line.is_open, "open")
+        assert await it.rig.device.act("reset", {}) is None
+        assert it.pulses == 1
+        await it.rig.until_samples(5)
+        assert it.told == []
+
+
+@in_bench
+async def test_the_line_is_held_from_the_beginning_to_the_end_and_its_trouble_shown(bench: PolledBusBench) -> None:
+    async with polled(bench) as it:
+        await it.rig.until_samples(1)
+        assert it.line.is_open
+        status = it.rig.device.status()
+        assert status.lines is not None
+        assert status.lines.problems == {}
+    assert not it.line.is_open
+    it.rig.device.tick(bench.clock.now_ns())
+    assert not it.line.is_open
+    assert it.line.history == []
 
 
 def frame(timer_us: int) -> bytes:
@@ -305,23 +294,21 @@ def test_where_the_measurement_is_reaches_the_clock() -> None:
     assert (answer.sync, answer.t_ns - at_ns) == (Sync.EDGE, 9_000)
 
 
-def test_at_the_start_a_device_on_a_bus_is_reset_before_it_is_asked(bench: PolledBusBench) -> None:
-    async def body() -> None:
-        async with polled(bench, at_start=True) as it:
-            await it.rig.until(lambda: it.pulses == 1, "the pulse")
-            assert it.device.transactions == 0
-            pulsed_ns = bench.clock.now_ns()
-            await it.rig.until(lambda: it.device.transactions, "the first question", 10)
-            assert 3e9 <= bench.clock.now_ns() - pulsed_ns < 3.2e9
-            await it.rig.until_samples(5)
-            it.hang()
-            await it.rig.until(lambda: EventKind.DOWN in it.rig.kinds, "down")
-            it.boot()
-            await it.rig.until_samples(5)
-            assert it.pulses == 1
-            assert it.told == ["reset by its line at the start"]
-
-    bench.run(body())
+@in_bench
+async def test_at_the_start_a_device_on_a_bus_is_reset_before_it_is_asked(bench: PolledBusBench) -> None:
+    async with polled(bench, at_start=True) as it:
+        await it.rig.until(lambda: it.pulses == 1, "the pulse")
+        assert it.device.transactions == 0
+        pulsed_ns = bench.clock.now_ns()
+        await it.rig.until(lambda: it.device.transactions, "the first question", 10)
+        assert 3e9 <= bench.clock.now_ns() - pulsed_ns < 3.2e9
+        await it.rig.until_samples(5)
+        it.hang()
+        await it.rig.until(lambda: EventKind.DOWN in it.rig.kinds, "down")
+        it.boot()
+        await it.rig.until_samples(5)
+        assert it.pulses == 1
+        assert it.told == ["reset by its line at the start"]
 
 
 def test_at_the_start_a_device_on_a_uart_is_reset() -> None:

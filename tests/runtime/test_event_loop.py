@@ -364,29 +364,26 @@ def send_signal(loop: SampleLoop, done: asyncio.Future[None]) -> None:
     ],
     ids=["soon", "later", "at", "future", "threadsafe", "thread", "executor", "task", "signal"],
 )
-def test_what_a_reader_gives_to_the_loop_is_done_at_once(
+@in_loop
+async def test_what_a_reader_gives_to_the_loop_is_done_at_once(
     pair: tuple[socket.socket, socket.socket], give: Callable[[SampleLoop, asyncio.Future[None]], object]
 ) -> None:
     """Nothing else ends the wait of the loop: without its turn this would take as long as the next timer."""
     ours, theirs = pair
+    loop = loop_in_use()
+    done, begun_s = loop.create_future(), loop.time()
 
-    async def main() -> None:
-        loop = loop_in_use()
-        done, begun_s = loop.create_future(), loop.time()
+    def read_and_give() -> None:
+        ours.recv(9)
+        give(loop, done)
 
-        def read_and_give() -> None:
-            ours.recv(9)
-            give(loop, done)
-
-        loop.add_reader(ours, read_and_give)
-        loop.call_later(0.05, theirs.send, b"a")
-        await asyncio.wait_for(done, 30)
-        assert loop.time() - begun_s < 20
-        loop.remove_reader(ours)
-        loop.remove_signal_handler(signal.SIGUSR1)
-
+    loop.add_reader(ours, read_and_give)
+    loop.call_later(0.05, theirs.send, b"a")
+    await asyncio.wait_for(done, 30)
+    assert loop.time() - begun_s < 20
+    loop.remove_reader(ours)
+    loop.remove_signal_handler(signal.SIGUSR1)
     was = signal.getsignal(signal.SIGUSR1)
-    run(main())
     signal.signal(signal.SIGUSR1, was)
 
 

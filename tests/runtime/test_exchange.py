@@ -14,6 +14,7 @@ from imud.errors import CommandError, LinkMissing, NoReply
 from imud.ledger import Ledger
 from imud.runtime.exchange import Exchange
 from imud.sample import Measurement
+from tests.support.event_loops import in_loop
 
 
 def request(name: str, timeout_ns: int = 10**10, *, silent: bool = False) -> Request:
@@ -35,228 +36,196 @@ def ask(*requests: Request) -> RequestScript[list[Outcome]]:
     return outcomes
 
 
-def test_requests_go_out_one_after_the_other() -> None:
-    async def story() -> None:
-        written: list[bytes] = []
-        exchange = Exchange(Ledger(), written.append, monotonic_ns)
-        task = asyncio.create_task(exchange.run(ask(request("A"), request("B"))))
+@in_loop
+async def test_requests_go_out_one_after_the_other() -> None:
+    written: list[bytes] = []
+    exchange = Exchange(Ledger(), written.append, monotonic_ns)
+    task = asyncio.create_task(exchange.run(ask(request("A"), request("B"))))
+    await asyncio.sleep(0)
+    assert written == [b"A\r\n"]
+    exchange.on_message("A=1", 0)
+    exchange.on_message("OK", 0)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert written == [b"A\r\n", b"B\r\n"]
+    exchange.on_message("ERR", 0)
+    outcomes = await task
+    assert outcomes[0] == Reply(("A=1", "OK"))
+    assert outcomes[1].lines == ("ERR",)
+
+
+@in_loop
+async def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
+    ledger = Ledger()
+    exchange = Exchange(ledger, lambda data: None, monotonic_ns)
+    assert await exchange.run(ask(request("A", timeout_ns=1))) == [Silence(())]
+    exchange.on_message("A=1", 0)
+    exchange.on_message("OK", 0)
+    assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
+    exchange.on_message("OK", 0)
+    assert ledger.replies_unsolicited == 1
+
+
+@in_loop
+async def test_request_without_reply_is_done_once_sent() -> None:
+    exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
+    assert await exchange.run(ask(request("REBOOT", silent=True))) == [Reply(())]
+
+
+@in_loop
+async def test_link_that_is_gone_ends_the_script_and_the_next_one_works() -> None:
+    gone = True
+
+    def write(data: bytes) -> None:
+        if gone:
+            raise LinkMissing("pulled out")
+
+    exchange = Exchange(Ledger(), write, monotonic_ns)
+    with pytest.raises(LinkMissing):
+        await exchange.run(ask(request("A")))
+    gone = False
+    assert await exchange.run(ask(request("B", silent=True))) == [Reply(())]
+
+
+@in_loop
+async def test_second_script_waits_for_the_first() -> None:
+    written: list[bytes] = []
+    exchange = Exchange(Ledger(), written.append, monotonic_ns)
+    first = asyncio.create_task(exchange.run(ask(request("A"))))
+    second = asyncio.create_task(exchange.run(ask(request("B"))))
+    for _ in range(5):
         await asyncio.sleep(0)
-        assert written == [b"A\r\n"]
-        exchange.on_message("A=1", 0)
-        exchange.on_message("OK", 0)
+    assert written == [b"A\r\n"]
+    exchange.on_message("OK", 0)
+    await first
+    for _ in range(5):
         await asyncio.sleep(0)
-        await asyncio.sleep(0)
-        assert written == [b"A\r\n", b"B\r\n"]
-        exchange.on_message("ERR", 0)
-        outcomes = await task
-        assert outcomes[0] == Reply(("A=1", "OK"))
-        assert outcomes[1].lines == ("ERR",)
-
-    asyncio.run(story())
+    assert written == [b"A\r\n", b"B\r\n"]
+    exchange.on_message("OK", 0)
+    await second
 
 
-def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
-    async def story() -> None:
-        ledger = Ledger()
-        exchange = Exchange(ledger, lambda data: None, monotonic_ns)
-        assert await exchange.run(ask(request("A", timeout_ns=1))) == [Silence(())]
-        exchange.on_message("A=1", 0)
-        exchange.on_message("OK", 0)
-        assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
-        exchange.on_message("OK", 0)
-        assert ledger.replies_unsolicited == 1
-
-    asyncio.run(story())
+@in_loop
+async def test_cancelled_script_leaves_the_line_free() -> None:
+    exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
+    task = asyncio.create_task(exchange.run(ask(request("A"))))
+    await asyncio.sleep(0)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    assert await exchange.run(ask(request("B", silent=True))) == [Reply(())]
 
 
-def test_request_without_reply_is_done_once_sent() -> None:
-    async def story() -> None:
-        exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
-        assert await exchange.run(ask(request("REBOOT", silent=True))) == [Reply(())]
-
-    asyncio.run(story())
-
-
-def test_link_that_is_gone_ends_the_script_and_the_next_one_works() -> None:
-    async def story() -> None:
-        gone = True
-
-        def write(data: bytes) -> None:
-            if gone:
-                raise LinkMissing("pulled out")
-
-        exchange = Exchange(Ledger(), write, monotonic_ns)
-        with pytest.raises(LinkMissing):
-            await exchange.run(ask(request("A")))
-        gone = False
-        assert await exchange.run(ask(request("B", silent=True))) == [Reply(())]
-
-    asyncio.run(story())
+@in_loop
+async def test_device_that_never_answers_is_no_reply() -> None:
+    exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
+    driver = DRIVERS["hipnuc-uart"]
+    assert isinstance(driver, StreamDriver)
+    script = driver.identify()
+    task = asyncio.create_task(exchange.run(script))
+    with pytest.raises(NoReply, match="LOG VERSION"):
+        await asyncio.wait_for(task, 5)
 
 
-def test_second_script_waits_for_the_first() -> None:
-    async def story() -> None:
-        written: list[bytes] = []
-        exchange = Exchange(Ledger(), written.append, monotonic_ns)
-        first = asyncio.create_task(exchange.run(ask(request("A"))))
-        second = asyncio.create_task(exchange.run(ask(request("B"))))
-        for _ in range(5):
-            await asyncio.sleep(0)
-        assert written == [b"A\r\n"]
-        exchange.on_message("OK", 0)
-        await first
-        for _ in range(5):
-            await asyncio.sleep(0)
-        assert written == [b"A\r\n", b"B\r\n"]
-        exchange.on_message("OK", 0)
-        await second
-
-    asyncio.run(story())
+@in_loop
+async def test_a_request_can_change_the_rate_before_it_goes_out() -> None:
+    happened: list[object] = []
+    exchange = Exchange(Ledger(), happened.append, monotonic_ns, happened.append)
+    await exchange.run(ask(request("A", silent=True), replace(request("B", silent=True), baud=9600)))
+    assert happened == [b"A\r\n", 9600, b"B\r\n"]
 
 
-def test_cancelled_script_leaves_the_line_free() -> None:
-    async def story() -> None:
-        exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
-        task = asyncio.create_task(exchange.run(ask(request("A"))))
-        await asyncio.sleep(0)
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        assert await exchange.run(ask(request("B", silent=True))) == [Reply(())]
-
-    asyncio.run(story())
+@in_loop
+async def test_a_rate_without_a_line_is_an_error() -> None:
+    written: list[bytes] = []
+    exchange = Exchange(Ledger(), written.append, monotonic_ns)
+    with pytest.raises(CommandError, match="9600 baud"):
+        await exchange.run(ask(replace(request("A"), baud=9600)))
+    assert written == []
 
 
-def test_device_that_never_answers_is_no_reply() -> None:
-    async def story() -> None:
-        exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
-        driver = DRIVERS["hipnuc-uart"]
-        assert isinstance(driver, StreamDriver)
-        script = driver.identify()
-        task = asyncio.create_task(exchange.run(script))
-        with pytest.raises(NoReply, match="LOG VERSION"):
-            await asyncio.wait_for(task, 5)
-
-    asyncio.run(story())
+@in_loop
+async def test_a_request_can_follow_a_device_to_another_number() -> None:
+    happened: list[object] = []
+    exchange = Exchange(Ledger(), happened.append, monotonic_ns, follow=happened.append)
+    await exchange.run(ask(request("A", silent=True), replace(request("B", silent=True), settings="node 9")))
+    assert happened == [b"A\r\n", "node 9", b"B\r\n"]
 
 
-def test_a_request_can_change_the_rate_before_it_goes_out() -> None:
-    async def story() -> None:
-        happened: list[object] = []
-        exchange = Exchange(Ledger(), happened.append, monotonic_ns, happened.append)
-        await exchange.run(ask(request("A", silent=True), replace(request("B", silent=True), baud=9600)))
-        assert happened == [b"A\r\n", 9600, b"B\r\n"]
-
-    asyncio.run(story())
-
-
-def test_a_rate_without_a_line_is_an_error() -> None:
-    async def story() -> None:
-        written: list[bytes] = []
-        exchange = Exchange(Ledger(), written.append, monotonic_ns)
-        with pytest.raises(CommandError, match="9600 baud"):
-            await exchange.run(ask(replace(request("A"), baud=9600)))
-        assert written == []
-
-    asyncio.run(story())
+@in_loop
+async def test_a_number_without_a_bus_is_an_error() -> None:
+    written: list[bytes] = []
+    exchange = Exchange(Ledger(), written.append, monotonic_ns)
+    with pytest.raises(CommandError, match="expected a bus"):
+        await exchange.run(ask(replace(request("A"), settings="node 9")))
+    assert written == []
 
 
-def test_a_request_can_follow_a_device_to_another_number() -> None:
-    async def story() -> None:
-        happened: list[object] = []
-        exchange = Exchange(Ledger(), happened.append, monotonic_ns, follow=happened.append)
-        await exchange.run(ask(request("A", silent=True), replace(request("B", silent=True), settings="node 9")))
-        assert happened == [b"A\r\n", "node 9", b"B\r\n"]
-
-    asyncio.run(story())
-
-
-def test_a_number_without_a_bus_is_an_error() -> None:
-    async def story() -> None:
-        written: list[bytes] = []
-        exchange = Exchange(Ledger(), written.append, monotonic_ns)
-        with pytest.raises(CommandError, match="expected a bus"):
-            await exchange.run(ask(replace(request("A"), settings="node 9")))
-        assert written == []
-
-    asyncio.run(story())
-
-
-def test_a_pause_writes_nothing() -> None:
-    async def story() -> None:
-        written: list[bytes] = []
-        assert await exchange_of(written).run(ask(pause(1_000_000))) == [Silence(())]
-        assert written == []
-
-    asyncio.run(story())
+@in_loop
+async def test_a_pause_writes_nothing() -> None:
+    written: list[bytes] = []
+    assert await exchange_of(written).run(ask(pause(1_000_000))) == [Silence(())]
+    assert written == []
 
 
 def exchange_of(written: list[bytes]) -> Exchange:
     return Exchange(Ledger(), written.append, monotonic_ns)
 
 
-def test_a_frame_is_an_answer() -> None:
-    async def story() -> None:
-        written: list[bytes] = []
-        exchange = exchange_of(written)
-        wanted = ReplyFrame(5, b"x")
-        asking = replace(request("A"), is_end=lambda message: message == wanted)
-        task = asyncio.create_task(exchange.run(ask(asking)))
-        await asyncio.sleep(0)
-        exchange.on_message(wanted, 0)
-        assert await task == [Reply((wanted,))]
-
-    asyncio.run(story())
+@in_loop
+async def test_a_frame_is_an_answer() -> None:
+    written: list[bytes] = []
+    exchange = exchange_of(written)
+    wanted = ReplyFrame(5, b"x")
+    asking = replace(request("A"), is_end=lambda message: message == wanted)
+    task = asyncio.create_task(exchange.run(ask(asking)))
+    await asyncio.sleep(0)
+    exchange.on_message(wanted, 0)
+    assert await task == [Reply((wanted,))]
 
 
 @pytest.mark.parametrize("is_there", [True, False])
-def test_a_script_given_up_is_undone_if_the_link_is_there(is_there: bool) -> None:
-    async def story() -> None:
-        written: list[bytes] = []
+@in_loop
+async def test_a_script_given_up_is_undone_if_the_link_is_there(is_there: bool) -> None:
+    written: list[bytes] = []
 
-        def write(data: bytes) -> None:
-            if not is_there and written:
-                raise LinkMissing("gone")
-            written.append(data)
+    def write(data: bytes) -> None:
+        if not is_there and written:
+            raise LinkMissing("gone")
+        written.append(data)
 
-        exchange = Exchange(Ledger(), write, monotonic_ns)
-        task = asyncio.create_task(exchange.run(with_undo(ask(request("A"), request("B")), b"UNDO")))
-        await asyncio.sleep(0)
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
-        assert written == [b"A\r\n", *[b"UNDO"] * is_there]
-
-    asyncio.run(story())
+    exchange = Exchange(Ledger(), write, monotonic_ns)
+    task = asyncio.create_task(exchange.run(with_undo(ask(request("A"), request("B")), b"UNDO")))
+    await asyncio.sleep(0)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert written == [b"A\r\n", *[b"UNDO"] * is_there]
 
 
-def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
+@in_loop
+async def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
     """Whether it returns or raises: it had its turn to leave the device in order."""
 
     def failing() -> RequestScript[None]:
         yield request("A", timeout_ns=1)
         raise NoReply("no")
 
-    async def story() -> None:
-        written: list[bytes] = []
-        exchange = Exchange(Ledger(), written.append, monotonic_ns)
-        assert await exchange.run(with_undo(ask(request("A", timeout_ns=1)), b"UNDO")) == [Silence(())]
-        with pytest.raises(NoReply):
-            await exchange.run(with_undo(failing(), b"UNDO"))
-        assert written == [b"A\r\n"] * 2
-
-    asyncio.run(story())
+    written: list[bytes] = []
+    exchange = Exchange(Ledger(), written.append, monotonic_ns)
+    assert await exchange.run(with_undo(ask(request("A", timeout_ns=1)), b"UNDO")) == [Silence(())]
+    with pytest.raises(NoReply):
+        await exchange.run(with_undo(failing(), b"UNDO"))
+    assert written == [b"A\r\n"] * 2
 
 
-def test_a_script_gets_the_measurement_that_it_waits_for() -> None:
-    async def story() -> None:
-        exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
-        assert not exchange.wants_samples
-        task = asyncio.create_task(exchange.run(ask(replace(request("A"), is_sample=lambda sample: True))))
-        await asyncio.sleep(0)
-        assert exchange.wants_samples
-        exchange.on_sample(Measurement(54, 0, 3))
-        exchange.on_sample(Measurement(54, 0, 4))
-        assert await task == [Reply((), Measurement(54, 0, 3))]
-        assert not exchange.wants_samples
-
-    asyncio.run(story())
+@in_loop
+async def test_a_script_gets_the_measurement_that_it_waits_for() -> None:
+    exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
+    assert not exchange.wants_samples
+    task = asyncio.create_task(exchange.run(ask(replace(request("A"), is_sample=lambda sample: True))))
+    await asyncio.sleep(0)
+    assert exchange.wants_samples
+    exchange.on_sample(Measurement(54, 0, 3))
+    exchange.on_sample(Measurement(54, 0, 4))
+    assert await task == [Reply((), Measurement(54, 0, 3))]
+    assert not exchange.wants_samples

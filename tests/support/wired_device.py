@@ -73,12 +73,12 @@ class WiredDevice:
         self._timer: asyncio.Handle | None = None
         self._heard = 0
 
-    def play(self, monkeypatch: pytest.MonkeyPatch, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Run the device during the story; at the end the ledger closes and the lines are released."""
-        clock = self.clock
-        monkeypatch.setattr(utc_keeper, "RMC_SOURCES", {"gpsd": lambda _settings, _context: self.source})
-        monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 0, 0))
-        run_virtually(clock, self._play(story))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(utc_keeper, "RMC_SOURCES", {"gpsd": lambda _settings, _context: self.source})
+            patch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 0, 0))
+            run_virtually(self.clock, self._play(story))
 
     async def _play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
         self.rig = self._rigs.add(self._config)
@@ -96,6 +96,8 @@ class WiredDevice:
             ticking.cancel()
         lines: Sequence[MemoryInput | MemoryOutput] = [*self.memory.inputs.values(), *self.memory.outputs.values()]
         assert not any(line.is_open for line in lines)
+        assert not any(line.active for line in self.memory.outputs.values())
+        assert self.source.closed is (self._config.rmc is not None)
 
     @property
     def samples(self) -> list[Sample]:

@@ -21,6 +21,7 @@ from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings
 from imud.sim.physics.motion import Motion, Still, Truth, tumble
 from imud.units import NS_PER_S
 from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.stories import played
 from tests.support.wired_device import WiredDevice
 
 TICK_S = 0.1
@@ -107,72 +108,51 @@ def magnetometer(rig: GuideRig, verdicts: Callable[[], Verdict], **changes: Any)
     )  # fmt: skip
 
 
-@pytest.fixture
-def rig() -> GuideRig:
-    """A guide."""
-    return GuideRig()
-
-
 # --- at rest ----------------------------------------------------------------------------------------------------------
 
 
-def test_rest_calibrated_verified_and_saved(rig: GuideRig) -> None:
-    async def story() -> None:
-        result = await rig.guide.run("gyro", gyro(rig), save=True)
-        (check,) = result.checks
-        assert check.name == "mean angular rate"
-        assert check.passed
-        assert result == CalibrationResult("gyro", True, "", "0.1, 0.2, 0.3", (check,), True, Kept.BY_SAVE)
-
-    rig.play(story)
+@played(GuideRig)
+async def test_rest_calibrated_verified_and_saved(rig: GuideRig) -> None:
+    result = await rig.guide.run("gyro", gyro(rig), save=True)
+    (check,) = result.checks
+    assert check.name == "mean angular rate"
+    assert check.passed
+    assert result == CalibrationResult("gyro", True, "", "0.1, 0.2, 0.3", (check,), True, Kept.BY_SAVE)
     assert rig.ran == ["begin", "save"]
     assert rig.phases() == ["begin", "end"]
     assert rig.events[-1].detail["saved"] is True
 
 
-def test_it_is_not_saved_unless_it_is_asked_for(rig: GuideRig) -> None:
-    async def story() -> None:
-        result = await rig.guide.run("gyro", gyro(rig), save=False)
-        assert result.verified
-        assert not result.saved
-
-    rig.play(story)
+@played(GuideRig)
+async def test_it_is_not_saved_unless_it_is_asked_for(rig: GuideRig) -> None:
+    result = await rig.guide.run("gyro", gyro(rig), save=False)
+    assert result.verified
+    assert not result.saved
     assert rig.ran == ["begin"]
 
 
-def test_a_bias_that_stays_is_told_and_not_saved(rig: GuideRig) -> None:
+@played(GuideRig)
+async def test_a_bias_that_stays_is_told_and_not_saved(rig: GuideRig) -> None:
     rig.motion = lambda _t_s: (0.0, radians(0.3), 0.0)
-
-    async def story() -> None:
-        result = await rig.guide.run("gyro", gyro(rig), save=True)
-        assert not result.verified
-        assert result.problem == "mean angular rate: expected at most 0.00175 rad/s, got 0.00524 rad/s"
-        assert not result.saved
-
-    rig.play(story)
+    result = await rig.guide.run("gyro", gyro(rig), save=True)
+    assert not result.verified
+    assert result.problem == "mean angular rate: expected at most 0.00175 rad/s, got 0.00524 rad/s"
+    assert not result.saved
     assert rig.ran == ["begin"]
 
 
-def test_what_samples_do_not_tell_is_not_verified(rig: GuideRig) -> None:
+@played(GuideRig)
+async def test_what_samples_do_not_tell_is_not_verified(rig: GuideRig) -> None:
     expectation = replace(GYRO_ZERO, value=lambda _means: None)
-
-    async def story() -> None:
-        result = await rig.guide.run("gyro", gyro(rig, expected=(expectation,)), save=False)
-        assert result.problem == "mean angular rate: the samples do not tell it"
-
-    rig.play(story)
+    result = await rig.guide.run("gyro", gyro(rig, expected=(expectation,)), save=False)
+    assert result.problem == "mean angular rate: the samples do not tell it"
 
 
-def test_motion_refuses_before_anything_is_sent(rig: GuideRig) -> None:
+@played(GuideRig)
+async def test_motion_refuses_before_anything_is_sent(rig: GuideRig) -> None:
     rig.motion = lambda _t_s: (0.0, 0.0, 0.5)
-
-    async def story() -> None:
-        with pytest.raises(
-            CommandError, match=r"expected the device at rest, got: it turns at 28\.6 °/s .* put it down"
-        ):
-            await rig.guide.run("gyro", gyro(rig), save=False)
-
-    rig.play(story)
+    with pytest.raises(CommandError, match=r"expected the device at rest, got: it turns at 28\.6 °/s .* put it down"):
+        await rig.guide.run("gyro", gyro(rig), save=False)
     assert rig.ran == []
     assert rig.phases()[-2:] == ["rest", "end"]
     assert rig.events[-1].message.startswith("calibration gyro: expected the device at rest, got: it turns at")
@@ -180,89 +160,73 @@ def test_motion_refuses_before_anything_is_sent(rig: GuideRig) -> None:
 
 
 @pytest.mark.parametrize("until_s", [19.7, 20.05])
-def test_motion_is_told_also_when_no_sample_came_since_it_was_seen(rig: GuideRig, until_s: float) -> None:
+@played(GuideRig)
+async def test_motion_is_told_also_when_no_sample_came_since_it_was_seen(rig: GuideRig, until_s: float) -> None:
     rig.motion = lambda _t_s: (0.0, 0.0, 0.5)
-
-    async def story() -> None:
-        running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
-        await asyncio.sleep(until_s - 18)
-        rig.silent = True
-        with pytest.raises(CommandError, match="expected the device at rest"):
-            await running
-
-    rig.play(story)
+    running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
+    await asyncio.sleep(until_s - 18)
+    rig.silent = True
+    with pytest.raises(CommandError, match="expected the device at rest"):
+        await running
 
 
-def test_rest_is_waited_for(rig: GuideRig) -> None:
+@played(GuideRig)
+async def test_rest_is_waited_for(rig: GuideRig) -> None:
     rig.motion = lambda t_s: (0.0, 0.0, 0.5 if t_s < 5 else 0.0)
-
-    async def story() -> None:
-        assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified
-
-    rig.play(story)
+    assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified
     assert rig.phases()[:2] == ["begin", "rest"]
 
 
-def test_motion_while_it_runs_spoils_it(rig: GuideRig) -> None:
+@played(GuideRig)
+async def test_motion_while_it_runs_spoils_it(rig: GuideRig) -> None:
     rig.motion = lambda t_s: (0.0, 0.0, 0.5 if 4 < t_s < 4.5 else 0.0)
-
-    async def story() -> None:
-        result = await rig.guide.run("gyro", gyro(rig), save=True)
-        assert result.problem.startswith("the device moved while it was calibrated: the angular rate changes by 2")
-        assert not result.saved
-
-    rig.play(story)
+    result = await rig.guide.run("gyro", gyro(rig), save=True)
+    assert result.problem.startswith("the device moved while it was calibrated: the angular rate changes by 2")
+    assert not result.saved
     assert rig.ran == ["begin"]
 
 
-def test_no_samples(rig: GuideRig) -> None:
+@played(GuideRig)
+async def test_no_samples(rig: GuideRig) -> None:
     rig.silent = True
-
-    async def story() -> None:
-        with pytest.raises(CommandError, match="gyro: expected samples of the device, got none for 20 s"):
-            await rig.guide.run("gyro", gyro(rig), save=False)
-
-    rig.play(story)
+    with pytest.raises(CommandError, match="gyro: expected samples of the device, got none for 20 s"):
+        await rig.guide.run("gyro", gyro(rig), save=False)
 
 
-def test_refusals(rig: GuideRig) -> None:
+@played(GuideRig)
+async def test_refusals(rig: GuideRig) -> None:
     async def refuse() -> None:
         raise Rejected("no")
 
-    async def story() -> None:
-        with pytest.raises(CommandError, match="heading: expected no `save`, for its result lasts until power-off"):
-            await rig.guide.run("heading", gyro(rig, kept=Kept.NEVER), save=True)
-        with pytest.raises(CommandError, match="gyro: set the mode first"):
-            await rig.guide.run("gyro", gyro(rig, unready=rig.does("ready?", "set the mode first")), save=False)
-        with pytest.raises(Rejected):
-            await rig.guide.run("gyro", gyro(rig, begin=lambda _target: refuse()), save=False)
-        first = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
-        await asyncio.sleep(1)
-        with pytest.raises(CommandError, match="another calibration of this device is running"):
-            await rig.guide.run("gyro", gyro(rig), save=False)
-        assert (await first).verified
-
-    rig.play(story)
+    with pytest.raises(CommandError, match="heading: expected no `save`, for its result lasts until power-off"):
+        await rig.guide.run("heading", gyro(rig, kept=Kept.NEVER), save=True)
+    with pytest.raises(CommandError, match="gyro: set the mode first"):
+        await rig.guide.run("gyro", gyro(rig, unready=rig.does("ready?", "set the mode first")), save=False)
+    with pytest.raises(Rejected):
+        await rig.guide.run("gyro", gyro(rig, begin=lambda _target: refuse()), save=False)
+    first = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
+    await asyncio.sleep(1)
+    with pytest.raises(CommandError, match="another calibration of this device is running"):
+        await rig.guide.run("gyro", gyro(rig), save=False)
+    assert (await first).verified
 
 
 @pytest.mark.parametrize("end", ["stop", "cancel", "close"])
-def test_it_can_be_ended(rig: GuideRig, end: str) -> None:
-    async def story() -> None:
-        running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
-        await asyncio.sleep(1)
-        getattr(rig.guide, end)()
-        with pytest.raises(CommandError, match="link ended" if end == "stop" else "was cancelled"):
-            await running
-        assert rig.phases() == ["begin", "end"], "who looks on is told, too"
-        assert rig.events[-1].message == (
-            "calibration gyro: the device's link ended during the calibration"
-            if end == "stop"
-            else "calibration gyro: it was cancelled"
-        )
-        assert not rig.guide.cancel()
-        assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified  # and begun anew
-
-    rig.play(story)
+@played(GuideRig)
+async def test_it_can_be_ended(rig: GuideRig, end: str) -> None:
+    running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
+    await asyncio.sleep(1)
+    getattr(rig.guide, end)()
+    with pytest.raises(CommandError, match="link ended" if end == "stop" else "was cancelled"):
+        await running
+    assert rig.phases() == ["begin", "end"], "who looks on is told, too"
+    assert rig.events[-1].message == (
+        "calibration gyro: the device's link ended during the calibration"
+        if end == "stop"
+        else "calibration gyro: it was cancelled"
+    )
+    assert not rig.guide.cancel()
+    assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified  # and begun anew
 
 
 # --- turned -----------------------------------------------------------------------------------------------------------
@@ -292,23 +256,21 @@ def turned_where_it_is_disturbed(rig: GuideRig) -> None:
 
 
 @pytest.mark.manual("B 8.1.1 procedure")
-def test_turning_ends_when_the_device_says_so(rig: GuideRig) -> None:
+@played(GuideRig)
+async def test_turning_ends_when_the_device_says_so(rig: GuideRig) -> None:
     turned_by_hand(rig, HARD_IRON_T)
 
     def verdict() -> Verdict:
         done = rig.clock.now_ns() > 1060 * NS_PER_S
         return Verdict(done, "bias 14.1, -2.1, -8.8 µT" if done else "bias 0, 0, 0 µT")
 
-    async def story() -> None:
-        result = await rig.guide.run("magnetometer", magnetometer(rig, verdict), save=False)
-        assert result.verified
-        assert result.saved
-        assert result.device == "bias 14.1, -2.1, -8.8 µT"
-        residual, field = result.checks
-        assert residual.value == pytest.approx(0.0, abs=1e-6)
-        assert field.value == pytest.approx(45.1e-6, rel=1e-3)
-
-    rig.play(story)
+    result = await rig.guide.run("magnetometer", magnetometer(rig, verdict), save=False)
+    assert result.verified
+    assert result.saved
+    assert result.device == "bias 14.1, -2.1, -8.8 µT"
+    residual, field = result.checks
+    assert residual.value == pytest.approx(0.0, abs=1e-6)
+    assert field.value == pytest.approx(45.1e-6, rel=1e-3)
     assert rig.clock.now_ns() > 1060 * NS_PER_S
     turning = [event.detail for event in rig.events if event.detail["phase"] == "turn"]
     assert len(turning) <= 2 * (rig.clock.now_ns() // NS_PER_S - 1000) + 2  # the first and the last one
@@ -316,14 +278,11 @@ def test_turning_ends_when_the_device_says_so(rig: GuideRig) -> None:
     assert int(str(turning[-1]["cells"]), 16).bit_count() == round(48 * float(turning[-1]["coverage"] or 0))
 
 
-def test_a_device_that_was_calibrated_before_needs_the_turning_only(rig: GuideRig) -> None:
+@played(GuideRig)
+async def test_a_device_that_was_calibrated_before_needs_the_turning_only(rig: GuideRig) -> None:
     turned_by_hand(rig)
-
-    async def story() -> None:
-        result = await rig.guide.run("magnetometer", magnetometer(rig, lambda: Verdict(True, "x")), save=False)
-        assert result.verified
-
-    rig.play(story)
+    result = await rig.guide.run("magnetometer", magnetometer(rig, lambda: Verdict(True, "x")), save=False)
+    assert result.verified
     assert 1010 * NS_PER_S < rig.clock.now_ns() < 1060 * NS_PER_S
 
 
@@ -339,18 +298,15 @@ def test_a_device_that_was_calibrated_before_needs_the_turning_only(rig: GuideRi
     ids=["no field", "at rest", "gyroscope at rest", "not accepted", "disturbed"],
 )
 @pytest.mark.manual("B 8.1.1 procedure", "B 8.1.2 disturbance")
-def test_advice(rig: GuideRig, prepare: Callable[[GuideRig], object], words: str) -> None:
+@played(GuideRig)
+async def test_advice(rig: GuideRig, prepare: Callable[[GuideRig], object], words: str) -> None:
     prepare(rig)
-
-    async def story() -> None:
-        calibration = magnetometer(rig, lambda: Verdict(False, "bias 0, 0, 0 µT"))
-        result = await rig.guide.run("magnetometer", calibration, save=False)
-        assert not result.verified
-        assert not result.saved
-        assert result.problem.startswith("the device did not end the calibration within 300 s; ")
-        assert words in result.problem
-
-    rig.play(story)
+    calibration = magnetometer(rig, lambda: Verdict(False, "bias 0, 0, 0 µT"))
+    result = await rig.guide.run("magnetometer", calibration, save=False)
+    assert not result.verified
+    assert not result.saved
+    assert result.problem.startswith("the device did not end the calibration within 300 s; ")
+    assert words in result.problem
 
 
 # --- a simulated module -----------------------------------------------------------------------------------------------
@@ -367,64 +323,55 @@ class ByHand:
         return Still(0.05, -0.03, 0.4).at(t_s) if t_s < self._from_s else tumble().at(t_s)
 
 
-def module(monkeypatch: pytest.MonkeyPatch, motion: Motion, att_mode: int, story: Callable[[WiredDevice], Any]) -> None:
-    """Run a story with a device that has a simulated module."""
+def module(motion: Motion, att_mode: int) -> WiredDevice:
+    """Return a device that has a simulated module."""
     hardware = HipnucHardware(motion=motion, hard_iron_t=HARD_IRON_T)
-    it = WiredDevice(DeviceLines(), ModuleSettings(att_mode=att_mode), hardware)
-    it.play(monkeypatch, lambda: story(it))
+    return WiredDevice(DeviceLines(), ModuleSettings(att_mode=att_mode), hardware)
 
 
 @pytest.mark.manual("B 1.1 9-axis mode")
-def test_magnetometer_of_a_module(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def story(it: WiredDevice) -> None:
-        await it.wait(2)
-        result = await it.device.calibrate("magnetometer", save=False)
-        assert result.verified, result.problem
-        assert result.device == "bias 14.14, -2.08, -8.75 µT"
-        assert any(event.kind is EventKind.CALIBRATION for event in it.events)
-
-    module(monkeypatch, ByHand(5.0), 1, story)
+@played(lambda: module(ByHand(5.0), 1))
+async def test_magnetometer_of_a_module(it: WiredDevice) -> None:
+    await it.wait(2)
+    result = await it.device.calibrate("magnetometer", save=False)
+    assert result.verified, result.problem
+    assert result.device == "bias 14.14, -2.08, -8.75 µT"
+    assert any(event.kind is EventKind.CALIBRATION for event in it.events)
 
 
-def test_six_axes_have_no_use_for_the_magnetometer(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def story(it: WiredDevice) -> None:
-        await it.wait(2)
-        with pytest.raises(CommandError, match=r"magnetometer: expected 9-axis mode, .* action mode, axes=9"):
-            await it.device.calibrate("magnetometer", save=False)
-        with pytest.raises(BadArgument, match=r"no calibration 'gyro'; there are: magnetometer, .*, heading"):
-            await it.device.calibrate("gyro", save=False)
-
-    module(monkeypatch, tumble(), 0, story)
+@played(lambda: module(tumble(), 0))
+async def test_six_axes_have_no_use_for_the_magnetometer(it: WiredDevice) -> None:
+    await it.wait(2)
+    with pytest.raises(CommandError, match=r"magnetometer: expected 9-axis mode, .* action mode, axes=9"):
+        await it.device.calibrate("magnetometer", save=False)
+    with pytest.raises(BadArgument, match=r"no calibration 'gyro'; there are: magnetometer, .*, heading"):
+        await it.device.calibrate("gyro", save=False)
 
 
 @pytest.mark.manual("B 2.2.4 YAW range")
-def test_level_and_heading_of_a_module(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def story(it: WiredDevice) -> None:
-        await it.wait(2)
-        level = await it.device.calibrate("level", save=True)
-        assert level.verified, level.problem
-        assert level.saved
-        assert [check.name for check in level.checks] == ["roll", "pitch"]
-        heading = await it.device.calibrate("heading", save=False)
-        assert heading.verified, heading.problem
-        it.module.reboot(it.clock.now_ns())
-        await it.wait(5)
-        newest = it.samples[-1].euler_rad
-        assert newest is not None
-        assert abs(newest[0]) < 0.01  # the level was saved
-        assert abs(newest[2]) > 0.3  # the heading cannot be
-
-    module(monkeypatch, Still(0.05, -0.03, 0.4), 0, story)
+@played(lambda: module(Still(0.05, -0.03, 0.4), 0))
+async def test_level_and_heading_of_a_module(it: WiredDevice) -> None:
+    await it.wait(2)
+    level = await it.device.calibrate("level", save=True)
+    assert level.verified, level.problem
+    assert level.saved
+    assert [check.name for check in level.checks] == ["roll", "pitch"]
+    heading = await it.device.calibrate("heading", save=False)
+    assert heading.verified, heading.problem
+    it.module.reboot(it.clock.now_ns())
+    await it.wait(5)
+    newest = it.samples[-1].euler_rad
+    assert newest is not None
+    assert abs(newest[0]) < 0.01  # the level was saved
+    assert abs(newest[2]) > 0.3  # the heading cannot be
 
 
 @pytest.mark.manual("B 2.2.4 rest")
-def test_a_module_that_moves_is_not_levelled(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def story(it: WiredDevice) -> None:
-        await it.wait(2)
-        before = it.module.settings.level
-        with pytest.raises(CommandError, match="expected the device at rest"):
-            await it.device.calibrate("level", save=True)
-        assert it.module.settings.level == before
-        assert not it.device.stop_calibration()
-
-    module(monkeypatch, tumble(), 0, story)
+@played(lambda: module(tumble(), 0))
+async def test_a_module_that_moves_is_not_levelled(it: WiredDevice) -> None:
+    await it.wait(2)
+    before = it.module.settings.level
+    with pytest.raises(CommandError, match="expected the device at rest"):
+        await it.device.calibrate("level", save=True)
+    assert it.module.settings.level == before
+    assert not it.device.stop_calibration()

@@ -22,6 +22,7 @@ from imud.links.memory import MemorySettings
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
 from tests.support.event_loops import VirtualClock
+from tests.support.stories import told
 
 MS = 1_000_000
 
@@ -227,11 +228,9 @@ def test_trouble_of_the_bus_is_shown_while_it_lasts() -> None:
 
 
 @pytest.mark.parametrize(("lost", "words"), [([], "nothing of imu61x-can is heard"), ([4], "no whole sample")])
-def test_silence_says_what_is_heard(lost: list[int], words: str) -> None:
-    async def story(bench: CanDeviceBench) -> None:
-        if lost:
-            bench.link.feed(bench.frames(1, lost=lost))
-        bench.rig.tick(ahead_ns=3000 * MS)
-        assert words in bench.rig.problem
-
-    play(story)
+@told(play)
+async def test_silence_says_what_is_heard(bench: CanDeviceBench, lost: list[int], words: str) -> None:
+    if lost:
+        bench.link.feed(bench.frames(1, lost=lost))
+    bench.rig.tick(ahead_ns=3000 * MS)
+    assert words in bench.rig.problem

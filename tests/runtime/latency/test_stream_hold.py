@@ -17,6 +17,7 @@ from imud.sample import Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_US
 from tests.support.device_rig import DeviceRigs
 from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.stories import played
 
 WIRE_NS = 890 * NS_PER_US
 """82 bytes at 921600 baud."""
@@ -114,36 +115,27 @@ class HoldBench:
 
 
 @pytest.mark.parametrize(("latency_ms", "rounds"), [(5, 10), (10, 5), (20, 2), (30, 1), (50, 1)])
-def test_one_message_in_50_ms_is_read_as_it_comes(latency_ms: int, rounds: int) -> None:
-    bench = HoldBench(latency_ms, waiting_bytes=1 << 16)
-
-    async def story() -> None:
-        await bench.send(200)
-        resumed, taken = len(bench.link.resumed), len(bench.link.taken)
-        await bench.send(rounds * latency_ms * 10 + 10)
-        assert len(bench.link.resumed) - resumed == pytest.approx(10, abs=1)
-        assert len(bench.link.taken) - taken == pytest.approx(10 * rounds, abs=rounds)
-        assert max(bench.waits_ns(-20)) <= latency_ms * NS_PER_MS
-
-    bench.play(story)
+@played(lambda latency_ms: HoldBench(latency_ms, waiting_bytes=1 << 16))
+async def test_one_message_in_50_ms_is_read_as_it_comes(bench: HoldBench, latency_ms: int, rounds: int) -> None:
+    await bench.send(200)
+    resumed, taken = len(bench.link.resumed), len(bench.link.taken)
+    await bench.send(rounds * latency_ms * 10 + 10)
+    assert len(bench.link.resumed) - resumed == pytest.approx(10, abs=1)
+    assert len(bench.link.taken) - taken == pytest.approx(10 * rounds, abs=rounds)
+    assert max(bench.waits_ns(-20)) <= latency_ms * NS_PER_MS
 
 
-def test_behind_a_latency_timer_one_message_of_each_round_is_read_as_it_comes() -> None:
-    bench = HoldBench(10, hold_ns=NS_PER_MS)
-
-    async def story() -> None:
-        await bench.send(200)
-        resumed, taken = len(bench.link.resumed), len(bench.link.taken)
-        await bench.send(210)
-        assert len(bench.link.resumed) - resumed == len(bench.link.taken) - taken == pytest.approx(20, abs=1)
-
-    bench.play(story)
+@played(lambda: HoldBench(10, hold_ns=NS_PER_MS))
+async def test_behind_a_latency_timer_one_message_of_each_round_is_read_as_it_comes(bench: HoldBench) -> None:
+    await bench.send(200)
+    resumed, taken = len(bench.link.resumed), len(bench.link.taken)
+    await bench.send(210)
+    assert len(bench.link.resumed) - resumed == len(bench.link.taken) - taken == pytest.approx(20, abs=1)
 
 
 @pytest.mark.parametrize("before", [80, 90, 100, 110, 120])
-def test_a_latency_that_ends_while_samples_are_published_ends_the_wait(before: int) -> None:
-    bench = HoldBench(10)
-
+@played(lambda: HoldBench(10))
+async def test_a_latency_that_ends_while_samples_are_published_ends_the_wait(bench: HoldBench, before: int) -> None:
     class Leaving(list[tuple[int, list[Sample]]]):
         """The client that lets samples wait leaves as it gets some."""
 
@@ -151,31 +143,24 @@ def test_a_latency_that_ends_while_samples_are_published_ends_the_wait(before: i
             super().append(item)
             bench.want(0, "client 2")
 
-    async def story() -> None:
-        await bench.send(before)
-        bench.rig.published = Leaving(bench.rig.published)
-        await bench.send(20)
-        assert not bench.link.paused
-        assert bench.sizes(-5) == [1] * 5
-        assert bench.device.status().hold_ns == 0
-
-    bench.play(story)
+    await bench.send(before)
+    bench.rig.published = Leaving(bench.rig.published)
+    await bench.send(20)
+    assert not bench.link.paused
+    assert bench.sizes(-5) == [1] * 5
+    assert bench.device.status().hold_ns == 0
 
 
-def test_samples_of_a_latency_are_read_and_published_together() -> None:
-    bench = HoldBench(10)
-
-    async def story() -> None:
-        since, taken = len(bench.rig.published), len(bench.link.taken)
-        await bench.send(220)
-        sizes = bench.sizes(since)
-        assert set(sizes[:-1]) <= {10, 11}
-        assert max(bench.waits_ns(since)) <= 10 * NS_PER_MS
-        assert len(bench.link.taken) - taken == len(sizes)
-        assert bench.device.status().hold_ns == 10 * NS_PER_MS
-        assert bench.device.status().hold_by == "client 1"
-
-    bench.play(story)
+@played(lambda: HoldBench(10))
+async def test_samples_of_a_latency_are_read_and_published_together(bench: HoldBench) -> None:
+    since, taken = len(bench.rig.published), len(bench.link.taken)
+    await bench.send(220)
+    sizes = bench.sizes(since)
+    assert set(sizes[:-1]) <= {10, 11}
+    assert max(bench.waits_ns(since)) <= 10 * NS_PER_MS
+    assert len(bench.link.taken) - taken == len(sizes)
+    assert bench.device.status().hold_ns == 10 * NS_PER_MS
+    assert bench.device.status().hold_by == "client 1"
 
 
 @pytest.mark.parametrize("latency_ms", [5, 10, 20])
@@ -214,68 +199,52 @@ def test_nothing_waits_before_the_fit_is_used_nor_again_after_a_restart_of_the_m
     bench.play(story, anew=True)
 
 
-def test_a_rate_at_which_fewer_than_two_would_wait_is_not_held_up() -> None:
-    bench = HoldBench(10, period_ms=6)
-
-    async def story() -> None:
-        since = len(bench.rig.published)
-        await bench.send(50)
-        assert bench.sizes(since) == [1] * 50
-        assert bench.waits_ns(since) == [0] * 50
-        assert bench.device.status().hold_ns == 0
-        assert bench.device.status().hold_wanted_ns == 10 * NS_PER_MS
-
-    bench.play(story)
+@played(lambda: HoldBench(10, period_ms=6))
+async def test_a_rate_at_which_fewer_than_two_would_wait_is_not_held_up(bench: HoldBench) -> None:
+    since = len(bench.rig.published)
+    await bench.send(50)
+    assert bench.sizes(since) == [1] * 50
+    assert bench.waits_ns(since) == [0] * 50
+    assert bench.device.status().hold_ns == 0
+    assert bench.device.status().hold_wanted_ns == 10 * NS_PER_MS
 
 
-def test_who_wants_each_sample_at_once_gets_what_waits_now() -> None:
-    bench = HoldBench(20)
-
-    async def story() -> None:
-        await bench.send(5)
-        count = len(bench.rig.samples)
-        assert bench.link.paused
-        assert count < bench.sent
-        bench.want(0)
-        assert len(bench.rig.samples) == bench.sent
-        since = len(bench.rig.published)
-        await bench.send(10)
-        assert bench.sizes(since) == [1] * 10
-        assert bench.waits_ns(since) == [0] * 10
-        assert bench.device.status().hold_ns == 0
-        bench.want(20)
-        since = len(bench.rig.published)
-        await bench.send(100)
-        assert min(bench.sizes(since)[2:]) >= 19
-
-    bench.play(story)
+@played(lambda: HoldBench(20))
+async def test_who_wants_each_sample_at_once_gets_what_waits_now(bench: HoldBench) -> None:
+    await bench.send(5)
+    count = len(bench.rig.samples)
+    assert bench.link.paused
+    assert count < bench.sent
+    bench.want(0)
+    assert len(bench.rig.samples) == bench.sent
+    since = len(bench.rig.published)
+    await bench.send(10)
+    assert bench.sizes(since) == [1] * 10
+    assert bench.waits_ns(since) == [0] * 10
+    assert bench.device.status().hold_ns == 0
+    bench.want(20)
+    since = len(bench.rig.published)
+    await bench.send(100)
+    assert min(bench.sizes(since)[2:]) >= 19
 
 
-def test_no_more_gathers_than_may_wait() -> None:
-    bench = HoldBench(50, waiting_bytes=820)
-
-    async def story() -> None:
-        since = len(bench.link.taken)
-        await bench.send(300)
-        assert max(size for _, size in bench.link.taken[since:]) <= 820 + 82
-        assert bench.device.status().hold_ns <= 11 * NS_PER_MS
-        begun = bench.sent
-        await bench.send(300, lambda number: bench.frame(number) + bytes(200))  # far more is sent now
-        assert max(size for _, size in bench.link.taken[-10:]) <= 820 + 282
-        assert begun + 300 == bench.sent
-
-    bench.play(story)
+@played(lambda: HoldBench(50, waiting_bytes=820))
+async def test_no_more_gathers_than_may_wait(bench: HoldBench) -> None:
+    since = len(bench.link.taken)
+    await bench.send(300)
+    assert max(size for _, size in bench.link.taken[since:]) <= 820 + 82
+    assert bench.device.status().hold_ns <= 11 * NS_PER_MS
+    begun = bench.sent
+    await bench.send(300, lambda number: bench.frame(number) + bytes(200))  # far more is sent now
+    assert max(size for _, size in bench.link.taken[-10:]) <= 820 + 282
+    assert begun + 300 == bench.sent
 
 
-def test_a_link_that_cannot_be_paused_is_not() -> None:
-    bench = HoldBench(50, waiting_bytes=0)
-
-    async def story() -> None:
-        await bench.send(100)
-        assert bench.link.taken == []
-        assert len(bench.rig.published) == bench.sent
-
-    bench.play(story)
+@played(lambda: HoldBench(50, waiting_bytes=0))
+async def test_a_link_that_cannot_be_paused_is_not(bench: HoldBench) -> None:
+    await bench.send(100)
+    assert bench.link.taken == []
+    assert len(bench.rig.published) == bench.sent
 
 
 def test_the_first_sample_after_silence_waits_no_longer_than_the_others() -> None:
@@ -298,67 +267,56 @@ def test_the_first_sample_after_silence_waits_no_longer_than_the_others() -> Non
     bench.play(story, anew=True)  # half a second was left out
 
 
-def test_an_incomplete_frame_that_waits_is_not_given_up() -> None:
+@played(lambda: HoldBench(MOST_NS / NS_PER_MS))
+async def test_an_incomplete_frame_that_waits_is_not_given_up(bench: HoldBench) -> None:
     """The daemon's tick finds the last read long ago: the rest of the frame waits in the kernel."""
-    bench = HoldBench(MOST_NS / NS_PER_MS)
-
-    async def story() -> None:
-        for _ in range(40):
-            bench.sent += 2
-            first, second = bench.frame(bench.sent - 1), bench.frame(bench.sent)
-            await asyncio.sleep(0.001)
-            bench.link.feed(first + second[:40], bench.clock.now_ns())
-            await asyncio.sleep(0.001)
-            bench.link.feed(second[40:], bench.clock.now_ns())
-            bench.rig.tick()
-        assert bench.rig.ledger.bytes_skipped == bench.rig.ledger.frames_bad_crc == 0
-
-    bench.play(story)
+    for _ in range(40):
+        bench.sent += 2
+        first, second = bench.frame(bench.sent - 1), bench.frame(bench.sent)
+        await asyncio.sleep(0.001)
+        bench.link.feed(first + second[:40], bench.clock.now_ns())
+        await asyncio.sleep(0.001)
+        bench.link.feed(second[40:], bench.clock.now_ns())
+        bench.rig.tick()
+    assert bench.rig.ledger.bytes_skipped == bench.rig.ledger.frames_bad_crc == 0
 
 
-def test_a_request_is_not_slowed() -> None:
+@played(lambda: HoldBench(50))
+async def test_a_request_is_not_slowed(bench: HoldBench) -> None:
     """What waits is processed when it begins, and its reply as it comes; then samples wait again."""
-    bench = HoldBench(50)
 
     def asking() -> RequestScript[int]:
         asked = Request(b"WHO\r\n", "who", of_text("OK".__eq__), never, never, 1_000 * NS_PER_MS)
         yield asked
         return bench.clock.now_ns()
 
-    async def story() -> None:
-        await bench.send(10)
-        assert bench.link.paused
-        running = asyncio.create_task(bench.device._transport.run_script(lambda _target: asking()))
-        await asyncio.sleep(0)
-        await asyncio.sleep(0)
-        assert len(bench.rig.samples) == bench.sent
-        assert bench.link.written == [b"WHO\r\n"]
-        await bench.send(5)
-        assert len(bench.rig.samples) == bench.sent
-        bench.link.feed(b"OK\r\n", bench.clock.now_ns())
-        answered_ns = bench.clock.now_ns()
-        assert await running == answered_ns
-        since = len(bench.rig.published)
-        await bench.send(120)
-        assert max(bench.sizes(since)) >= 20
-
-    bench.play(story)
+    await bench.send(10)
+    assert bench.link.paused
+    running = asyncio.create_task(bench.device._transport.run_script(lambda _target: asking()))
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert len(bench.rig.samples) == bench.sent
+    assert bench.link.written == [b"WHO\r\n"]
+    await bench.send(5)
+    assert len(bench.rig.samples) == bench.sent
+    bench.link.feed(b"OK\r\n", bench.clock.now_ns())
+    answered_ns = bench.clock.now_ns()
+    assert await running == answered_ns
+    since = len(bench.rig.published)
+    await bench.send(120)
+    assert max(bench.sizes(since)) >= 20
 
 
 @pytest.mark.parametrize("how", ["closed", "unplugged"])
-def test_at_the_end_what_was_kept_is_published(how: str) -> None:
-    bench = HoldBench(50)
-
-    async def story() -> None:
-        await asyncio.sleep(0.1)
-        assert not bench.link.paused
-        await bench.send(1)
-        assert bench.link.paused
-        if how == "unplugged":
-            bench.link.disappear()
-            await asyncio.sleep(0)
-            await asyncio.sleep(0)
-        else:
-            await bench.send(7)  # these wait in the kernel
-
-    bench.play(story)
+@played(lambda: HoldBench(50))
+async def test_at_the_end_what_was_kept_is_published(bench: HoldBench, how: str) -> None:
+    await asyncio.sleep(0.1)
+    assert not bench.link.paused
+    await bench.send(1)
+    assert bench.link.paused
+    if how == "unplugged":
+        bench.link.disappear()
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+    else:
+        await bench.send(7)  # these wait in the kernel

@@ -3,7 +3,7 @@
 import asyncio
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from time import monotonic_ns
@@ -17,7 +17,8 @@ from imud.errors import DeviceRefused, LinkError, TransferError, Trouble
 from imud.runtime.polled.bus import BusMember, PolledBuses
 from imud.runtime.polled.schedule import Deadlines, ReadySchedule
 from imud.units import NS_PER_S
-from tests.support.event_loops import VirtualClock, run_virtually, virtual_buses
+from tests.support.event_loops import VirtualClock, in_loop, run_virtually, virtual_buses
+from tests.support.stories import told
 
 ASK = Transfer((b"\x01",), 1)
 
@@ -111,17 +112,19 @@ def refusing() -> TransferScript[None]:
     raise DeviceRefused("no")
 
 
-def run(body: Any) -> None:
+def run(body: Callable[[PolledBuses], Coroutine[Any, Any, None]]) -> None:
+    """Run the body of a test with buses in virtual time."""
+    clock = VirtualClock()
+
     async def whole() -> None:
-        buses = PolledBuses(monotonic_ns)
+        buses = virtual_buses(clock)
         try:
-            await asyncio.wait_for(body(buses), 10)
+            await body(buses)
         finally:
             buses.end()
             buses.end()
-        assert [thread for thread in threading.enumerate() if thread.name == "wire"] == []
 
-    asyncio.run(whole())
+    run_virtually(clock, whole())
 
 
 def moving() -> TransferScript[None]:
@@ -131,40 +134,35 @@ def moving() -> TransferScript[None]:
     raise DeviceRefused("no")
 
 
-def test_a_script_takes_its_device_to_another_target_and_looks_at_others() -> None:
-    async def body(buses: PolledBuses) -> None:
-        wire, ended_at = Wire(), list[int]()
-        member = joined(buses, wire, Sink())
-        with pytest.raises(DeviceRefused):
-            await member.run(moving(), 5, ended_at.append)
-        assert (wire.targets, wire.selected, ended_at) == ([7, 5, 9], 9, [9])
-        await member.run(three(), 5, ended_at.append)
-        assert ended_at == [9, 5]
-        wire.fail = TransferError(Trouble.ABSENT, "no")
-        with pytest.raises(TransferError):
-            await member.run(moving(), 5)
-        assert (wire.targets[-1], wire.selected) == (7, 5)  # what is read next goes to the device
-
-    run(body)
+@told(run)
+async def test_a_script_takes_its_device_to_another_target_and_looks_at_others(buses: PolledBuses) -> None:
+    wire, ended_at = Wire(), list[int]()
+    member = joined(buses, wire, Sink())
+    with pytest.raises(DeviceRefused):
+        await member.run(moving(), 5, ended_at.append)
+    assert (wire.targets, wire.selected, ended_at) == ([7, 5, 9], 9, [9])
+    await member.run(three(), 5, ended_at.append)
+    assert ended_at == [9, 5]
+    wire.fail = TransferError(Trouble.ABSENT, "no")
+    with pytest.raises(TransferError):
+        await member.run(moving(), 5)
+    assert (wire.targets[-1], wire.selected) == (7, 5)  # what is read next goes to the device
 
 
-def test_scripts_return_raise_and_catch() -> None:
-    async def body(buses: PolledBuses) -> None:
-        wire = Wire()
-        member = joined(buses, wire, Sink())
-        assert await member.run(three(), 1) == 1 + 2 + 3
-        with pytest.raises(DeviceRefused):
-            await member.run(refusing(), 1)
-        wire.fail = TransferError(Trouble.ABSENT, "no")
-        assert await member.run(stubborn(), 1) == "after absent"
-        with pytest.raises(TransferError):
-            await member.run(three(), 1)
-        wire.fail = LinkError("gone")
-        with pytest.raises(LinkError):
-            await member.run(stubborn(), 1)
-        assert wire.threads == {"wire"}
-
-    run(body)
+@told(run)
+async def test_scripts_return_raise_and_catch(buses: PolledBuses) -> None:
+    wire = Wire()
+    member = joined(buses, wire, Sink())
+    assert await member.run(three(), 1) == 1 + 2 + 3
+    with pytest.raises(DeviceRefused):
+        await member.run(refusing(), 1)
+    wire.fail = TransferError(Trouble.ABSENT, "no")
+    assert await member.run(stubborn(), 1) == "after absent"
+    with pytest.raises(TransferError):
+        await member.run(three(), 1)
+    wire.fail = LinkError("gone")
+    with pytest.raises(LinkError):
+        await member.run(stubborn(), 1)
 
 
 def test_readings_come_in_order_with_their_times() -> None:
@@ -240,63 +238,55 @@ def test_a_failed_reading_and_those_before_it_do_not_wait() -> None:
     run_virtually(clock, body())
 
 
-def test_script_has_its_turn_on_a_bus_that_is_never_idle() -> None:
-    async def body(buses: PolledBuses) -> None:
-        wire, sink = Wire(), Sink()
-        wire.rate_hz = 1e6
-        member = joined(buses, wire, sink)
-        member.start((Poll(ASK),))
-        await sink.enough.wait()
-        assert await member.run(three(), 1) > 0
-
-    run(body)
+@told(run)
+async def test_script_has_its_turn_on_a_bus_that_is_never_idle(buses: PolledBuses) -> None:
+    wire, sink = Wire(), Sink()
+    wire.rate_hz = 1e6
+    member = joined(buses, wire, sink)
+    member.start((Poll(ASK),))
+    await sink.enough.wait()
+    assert await member.run(three(), 1) > 0
 
 
-def test_end_of_the_bus_is_told_once_and_reading_stops() -> None:
-    async def body(buses: PolledBuses) -> None:
-        wire, sink = Wire(), Sink()
-        member = joined(buses, wire, sink)
-        wire.fail = LinkError("gone")
-        member.start((Poll(ASK),))
-        await sink.enough.wait()
-        wire.fail = None
-        count = wire.count
-        assert await member.run(three(), 1) == 3 * count + 6  # nothing else was transferred meanwhile
-        assert str(sink.problem) == "gone"
-        assert sink.calls == 1
-
-    run(body)
+@told(run)
+async def test_end_of_the_bus_is_told_once_and_reading_stops(buses: PolledBuses) -> None:
+    wire, sink = Wire(), Sink()
+    member = joined(buses, wire, sink)
+    wire.fail = LinkError("gone")
+    member.start((Poll(ASK),))
+    await sink.enough.wait()
+    wire.fail = None
+    count = wire.count
+    assert await member.run(three(), 1) == 3 * count + 6  # nothing else was transferred meanwhile
+    assert str(sink.problem) == "gone"
+    assert sink.calls == 1
 
 
-def test_device_that_left_hears_nothing_and_its_link_is_closed_by_the_thread() -> None:
-    async def body(buses: PolledBuses) -> None:
-        wire, sink, other = Wire(), Sink(), Wire()
-        member, stays = joined(buses, wire, sink), joined(buses, other, Sink())
-        member.start((Poll(ASK),))
-        await sink.enough.wait()
-        member.leave()
-        member.leave()
-        calls = sink.calls
-        await stays.run(three(), 1)
-        assert sink.calls == calls
-        assert wire.closed == 1
-        assert other.closed == 0
-
-    run(body)
+@told(run)
+async def test_device_that_left_hears_nothing_and_its_link_is_closed_by_the_thread(buses: PolledBuses) -> None:
+    wire, sink, other = Wire(), Sink(), Wire()
+    member, stays = joined(buses, wire, sink), joined(buses, other, Sink())
+    member.start((Poll(ASK),))
+    await sink.enough.wait()
+    member.leave()
+    member.leave()
+    calls = sink.calls
+    await stays.run(three(), 1)
+    assert sink.calls == calls
+    assert wire.closed == 1
+    assert other.closed == 0
 
 
-def test_targets_are_taken_once() -> None:
-    async def body(buses: PolledBuses) -> None:
-        a, b = joined(buses, Wire(), Sink()), joined(buses, Wire(), Sink())
-        assert a.claim(0x18)
-        assert a.claim(0x18)
-        assert not b.claim(0x18)
-        a.release()
-        assert b.claim(0x18)
-        b.leave()
-        assert a.claim(0x18)
-
-    run(body)
+@told(run)
+async def test_targets_are_taken_once(buses: PolledBuses) -> None:
+    a, b = joined(buses, Wire(), Sink()), joined(buses, Wire(), Sink())
+    assert a.claim(0x18)
+    assert a.claim(0x18)
+    assert not b.claim(0x18)
+    a.release()
+    assert b.claim(0x18)
+    b.leave()
+    assert a.claim(0x18)
 
 
 def holding(log: list[int], wire: Wire) -> TransferScript[None]:
@@ -307,70 +297,68 @@ def holding(log: list[int], wire: Wire) -> TransferScript[None]:
     yield ASK
 
 
-def test_a_script_can_keep_its_device_from_being_read() -> None:
-    async def body(buses: PolledBuses) -> None:
-        wire, log = Wire(), list[int]()
-        wire.rate_hz = 0.0  # a read is due at any time
-        member = joined(buses, wire, Sink())
-        member.start([Poll(ASK)])
-        while wire.count < 20:
-            await asyncio.sleep(0)
-        await member.run(holding(log, wire), 5)
-        assert log == [1]  # the script's own
-        read = wire.count
-        while wire.count < read + 20:
-            await asyncio.sleep(0)
-        member.leave()
-
-    run(body)
+@told(run)
+async def test_a_script_can_keep_its_device_from_being_read(buses: PolledBuses) -> None:
+    wire, log = Wire(), list[int]()
+    wire.rate_hz = 0.0  # a read is due at any time
+    member = joined(buses, wire, Sink())
+    member.start([Poll(ASK)])
+    while wire.count < 20:
+        await asyncio.sleep(0)
+    await member.run(holding(log, wire), 5)
+    assert log == [1]  # the script's own
+    read = wire.count
+    while wire.count < read + 20:
+        await asyncio.sleep(0)
+    member.leave()
 
 
-def test_an_edge_is_read_while_the_loop_is_busy() -> None:
+@pytest.mark.live
+@in_loop
+async def test_an_edge_is_read_while_the_loop_is_busy() -> None:
     """The thread waits for the line: nothing is read from the descriptor here, and the loop does not run."""
-
-    async def body() -> None:
-        edges, device = os.pipe2(os.O_NONBLOCK)
-        buses, wire, read = PolledBuses(monotonic_ns), Wire(), threading.Event()
-        wire.takes_time = read.set
-        member = joined(buses, wire, Sink())
-        schedule = ReadySchedule(1.0, monotonic_ns(), Deadlines())
-        assert not member.watch(-1, lambda: None)
-        assert member.watch(edges, lambda: schedule.noticed(monotonic_ns()))
-        try:
-            member.start((Poll(ASK),), schedule)
-            for number in range(1, 51):
-                assert read.wait(10)  # in the loop's thread
-                assert wire.count == number
-                read.clear()
-                os.write(device, b"x")
-            assert read.wait(10)
-            member.unwatch(edges)
-            member.unwatch(edges)
+    edges, device = os.pipe2(os.O_NONBLOCK)
+    buses, wire, read = PolledBuses(monotonic_ns), Wire(), threading.Event()
+    wire.takes_time = read.set
+    member = joined(buses, wire, Sink())
+    schedule = ReadySchedule(1.0, monotonic_ns(), Deadlines())
+    assert not member.watch(-1, lambda: None)
+    assert member.watch(edges, lambda: schedule.noticed(monotonic_ns()))
+    try:
+        member.start((Poll(ASK),), schedule)
+        for number in range(1, 51):
+            assert read.wait(60)  # in the loop's thread
+            assert wire.count == number
+            read.clear()
             os.write(device, b"x")
-        finally:
-            buses.end()
-            os.close(edges)
-            os.close(device)
-        assert wire.count == 51
+        assert read.wait(60)
+        member.unwatch(edges)
+        member.unwatch(edges)
+        os.write(device, b"x")
+        await member.run(three(), 1)  # in the next turns of the thread, which would read for the edge first
+    finally:
+        buses.end()
+        os.close(edges)
+        os.close(device)
+    assert wire.count == 51 + 3
+    assert wire.threads == {"wire"}
+    assert [thread for thread in threading.enumerate() if thread.name == "wire"] == []
 
-    asyncio.run(body())
 
-
-def test_a_watched_line_does_not_keep_others_from_their_deadlines() -> None:
-    async def body() -> None:
-        edges, device = os.pipe2(os.O_NONBLOCK)
-        buses, wire, sink = PolledBuses(monotonic_ns), Wire(), Sink()
-        member = joined(buses, wire, sink)
-        assert member.watch(edges, lambda: None)
-        try:
-            member.start((Poll(ASK),))
-            await sink.enough.wait()
-        finally:
-            buses.end()
-            os.close(edges)
-            os.close(device)
-        starts = [reading.start_ns for reading in sink.readings]
-        assert min(b - a for a, b in pairwise(starts)) > 0
-        assert starts[-1] - starts[0] >= 0.9 * (len(starts) - 1) * NS_PER_S / wire.rate_hz - NS_PER_S / wire.rate_hz
-
-    asyncio.run(body())
+@pytest.mark.live
+@in_loop
+async def test_a_watched_line_does_not_keep_others_from_their_deadlines() -> None:
+    edges, device = os.pipe2(os.O_NONBLOCK)
+    buses, wire, sink = PolledBuses(monotonic_ns), Wire(), Sink()
+    member = joined(buses, wire, sink)
+    assert member.watch(edges, lambda: None)
+    try:
+        member.start((Poll(ASK),))
+        await sink.enough.wait()
+    finally:
+        buses.end()
+        os.close(edges)
+        os.close(device)
+    starts = [reading.start_ns for reading in sink.readings]
+    assert min(b - a for a, b in pairwise(starts)) > 0
+    assert starts[-1] - starts[0] >= 0.9 * (len(starts) - 1) * NS_PER_S / wire.rate_hz - NS_PER_S / wire.rate_hz

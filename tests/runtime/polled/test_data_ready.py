@@ -26,6 +26,7 @@ from imud.units import NS_PER_S
 from tests.support.device_rig import DeviceRig
 from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.polled_bus_bench import PolledBusBench
+from tests.support.stories import in_bench
 
 MS = 1_000_000
 EVERY_NS = 2 * MS
@@ -120,26 +121,25 @@ async def scene(bench: PolledBusBench, **more: Any) -> AsyncIterator[Scene]:
             task.cancel()
 
 
-def test_every_edge_is_a_sample_of_its_own_instant(bench: PolledBusBench) -> None:
-    async def body() -> None:
-        async with scene(bench) as it:
-            await it.rig.until_samples(200)
-            status = it.rig.device.status()
-            assert status.expected_rate_hz == 500
-            assert status.clock.sync is Sync.EDGE
-            assert status.lines is not None
-            assert status.lines.edges["data_ready"] >= 199
-            assert status.lines.edges_lost == {"data_ready": 0}
-            numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
-            assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-            assert all(sample.t_err_ns < 62_000 for sample in it.rig.samples[1:])  # 100 µs / √3 and 3 µs
-            assert it.missed == it.rig.device.ledger.lost_queue == 0
-            assert EventKind.LINK not in it.rig.kinds
-
-    bench.run(body())
+@in_bench
+async def test_every_edge_is_a_sample_of_its_own_instant(bench: PolledBusBench) -> None:
+    async with scene(bench) as it:
+        await it.rig.until_samples(200)
+        status = it.rig.device.status()
+        assert status.expected_rate_hz == 500
+        assert status.clock.sync is Sync.EDGE
+        assert status.lines is not None
+        assert status.lines.edges["data_ready"] >= 199
+        assert status.lines.edges_lost == {"data_ready": 0}
+        numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        assert all(sample.t_err_ns < 62_000 for sample in it.rig.samples[1:])  # 100 µs / √3 and 3 µs
+        assert it.missed == it.rig.device.ledger.lost_queue == 0
+        assert EventKind.LINK not in it.rig.kinds
 
 
-def test_falling_edges_of_an_inverted_line_are_those_of_the_line_as_it_is(bench: PolledBusBench) -> None:
+@in_bench
+async def test_falling_edges_of_an_inverted_line_are_those_of_the_line_as_it_is(bench: PolledBusBench) -> None:
     asked: list[Any] = []
     make = bench.lines.input
 
@@ -148,36 +148,29 @@ def test_falling_edges_of_an_inverted_line_are_those_of_the_line_as_it_is(bench:
         return make(settings, purpose, rising_only)
 
     bench.lines.maker = replace(bench.lines.maker, make_input=keep)
-
-    async def body() -> None:
-        for edge, active_low in (("falling", False), ("falling", True), ("rising", True)):
-            async with bench.running(with_line(bench, edge=edge, active_low=active_low)):
-                pass
-
-    bench.run(body())
+    for edge, active_low in (("falling", False), ("falling", True), ("rising", True)):
+        async with bench.running(with_line(bench, edge=edge, active_low=active_low)):
+            pass
     assert asked == [("rising", True, True), ("rising", False, True), ("rising", True, True)]
 
 
-def test_the_edges_of_a_loop_that_stalls_are_missed(bench: PolledBusBench) -> None:
+@in_bench
+async def test_the_edges_of_a_loop_that_stalls_are_missed(bench: PolledBusBench) -> None:
     """The kernel has ten more edges when the loop comes back: one read, of the newest."""
-
-    async def body() -> None:
-        async with scene(bench) as it:
-            await it.rig.until_samples(20)
-            newest = len(it.signal.stamps)
-            for _ in range(10):
-                bench.clock.advance(EVERY_NS)
-                it.signal.at_once(it.signal.stamps[-1] + EVERY_NS)
-            await it.rig.until_samples(20)
-            numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
-            gaps = [b for a, b in pairwise(numbers) if b != a + 1]
-            assert gaps == [newest + 10]
-            lost = numbers[-1] - numbers[0] + 1 - len(numbers)
-            assert lost in (9, 10)
-            assert it.missed == it.rig.device.ledger.lost_queue == lost
-            await it.rig.until(lambda: EventKind.LOSS in it.rig.kinds, "told")
-
-    bench.run(body())
+    async with scene(bench) as it:
+        await it.rig.until_samples(20)
+        newest = len(it.signal.stamps)
+        for _ in range(10):
+            bench.clock.advance(EVERY_NS)
+            it.signal.at_once(it.signal.stamps[-1] + EVERY_NS)
+        await it.rig.until_samples(20)
+        numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
+        gaps = [b for a, b in pairwise(numbers) if b != a + 1]
+        assert gaps == [newest + 10]
+        lost = numbers[-1] - numbers[0] + 1 - len(numbers)
+        assert lost in (9, 10)
+        assert it.missed == it.rig.device.ledger.lost_queue == lost
+        await it.rig.until(lambda: EventKind.LOSS in it.rig.kinds, "told")
 
 
 class Unheard(MemoryInput):
@@ -187,113 +180,101 @@ class Unheard(MemoryInput):
         super().start(on_edges, on_end, watch=False)
 
 
-def test_an_edge_that_the_loop_did_not_hear_of_dates_the_read_all_the_same(bench: PolledBusBench) -> None:
+@in_bench
+async def test_an_edge_that_the_loop_did_not_hear_of_dates_the_read_all_the_same(bench: PolledBusBench) -> None:
     """It is in the kernel when the read for the edge before begins; it is not read a second time."""
 
     def make(_settings: Any, purpose: str, rising_only: bool = False) -> MemoryInput:
         return bench.lines.inputs.setdefault(purpose, Unheard(purpose, rising_only))
 
     bench.lines.maker = replace(bench.lines.maker, make_input=make)
+    async with scene(bench) as it:
+        await it.rig.until_samples(20)
+        it.signal.quiet = True
+        await asyncio.sleep(0.01)
+        before = it.rig.device.status().polling
+        stamp_ns = it.signal.newest_ns
 
-    async def body() -> None:
-        async with scene(bench) as it:
-            await it.rig.until_samples(20)
-            it.signal.quiet = True
-            await asyncio.sleep(0.01)
-            before = it.rig.device.status().polling
-            stamp_ns = it.signal.newest_ns
+        def at_the_beginning_of_the_read() -> None:
+            bench.clock.advance(EVERY_NS)
+            it.signal.at_once(stamp_ns + EVERY_NS, heard=False)
 
-            def at_the_beginning_of_the_read() -> None:
-                bench.clock.advance(EVERY_NS)
-                it.signal.at_once(stamp_ns + EVERY_NS, heard=False)
-
-            it.signal.at_once(stamp_ns)
-            bench.before_next_time = at_the_beginning_of_the_read
-            await asyncio.sleep(0.01)
-            assert bench.before_next_time is None
-            after = it.rig.device.status().polling
-            assert before is not None
-            assert after is not None
-            assert it.dated(it.rig.samples[-1]) == len(it.signal.stamps)
-            assert (after.polls - before.polls, after.missed - before.missed) == (1, 1)
-            assert after.stale == before.stale
-
-    bench.run(body())
+        it.signal.at_once(stamp_ns)
+        bench.before_next_time = at_the_beginning_of_the_read
+        await asyncio.sleep(0.01)
+        assert bench.before_next_time is None
+        after = it.rig.device.status().polling
+        assert before is not None
+        assert after is not None
+        assert it.dated(it.rig.samples[-1]) == len(it.signal.stamps)
+        assert (after.polls - before.polls, after.missed - before.missed) == (1, 1)
+        assert after.stale == before.stale
 
 
-def test_no_edges_any_more_and_edges_again(bench: PolledBusBench) -> None:
-    async def body() -> None:
-        async with scene(bench) as it:
-            await it.rig.until_samples(20)
-            it.signal.quiet = True
-            await it.rig.until(it.told("no edges: read at 100 Hz instead"), "told")
-            count = len(it.rig.samples)
-            await it.rig.until_samples(50)
-            assert it.rig.device.status().expected_rate_hz == RATE_HZ
-            by_deadlines = it.rig.samples[count + 1 :]
-            assert {sample.sync for sample in by_deadlines} == {Sync.ARRIVAL}
-            assert {sample.edge_seq for sample in by_deadlines} == {None}
-            steps = [b.t_ns - a.t_ns for a, b in pairwise(by_deadlines)]
-            assert sum(steps) / len(steps) == pytest.approx(10 * MS, rel=0.01)
-            it.signal.quiet = False
-            await it.rig.until(it.told("edges are back"), "told")
-            count = len(it.rig.samples)
-            await it.rig.until_samples(50)
-            numbers = [it.dated(sample) for sample in it.rig.samples[count:]]
-            assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-            assert it.rig.state is DeviceState.RUNNING
-            assert EventKind.DOWN not in it.rig.kinds
-            assert it.missed <= 1
-            stamps = [sample.t_ns for sample in it.rig.samples]
-            assert stamps == sorted(set(stamps))
-
-    bench.run(body())
+@in_bench
+async def test_no_edges_any_more_and_edges_again(bench: PolledBusBench) -> None:
+    async with scene(bench) as it:
+        await it.rig.until_samples(20)
+        it.signal.quiet = True
+        await it.rig.until(it.told("no edges: read at 100 Hz instead"), "told")
+        count = len(it.rig.samples)
+        await it.rig.until_samples(50)
+        assert it.rig.device.status().expected_rate_hz == RATE_HZ
+        by_deadlines = it.rig.samples[count + 1 :]
+        assert {sample.sync for sample in by_deadlines} == {Sync.ARRIVAL}
+        assert {sample.edge_seq for sample in by_deadlines} == {None}
+        steps = [b.t_ns - a.t_ns for a, b in pairwise(by_deadlines)]
+        assert sum(steps) / len(steps) == pytest.approx(10 * MS, rel=0.01)
+        it.signal.quiet = False
+        await it.rig.until(it.told("edges are back"), "told")
+        count = len(it.rig.samples)
+        await it.rig.until_samples(50)
+        numbers = [it.dated(sample) for sample in it.rig.samples[count:]]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        assert it.rig.state is DeviceState.RUNNING
+        assert EventKind.DOWN not in it.rig.kinds
+        assert it.missed <= 1
+        stamps = [sample.t_ns for sample in it.rig.samples]
+        assert stamps == sorted(set(stamps))
 
 
-def test_without_the_line_deadlines_serve_until_it_comes(bench: PolledBusBench) -> None:
+@in_bench
+async def test_without_the_line_deadlines_serve_until_it_comes(bench: PolledBusBench) -> None:
     bench.lines.input(ReadySettings(line="Y"), "imu data_ready", True).open_error = LinkMissing("no such line")
-
-    async def body() -> None:
-        async with scene(bench) as it:
-            await it.rig.until(it.told("line data_ready: no such line"), "told")
-            await it.rig.until(it.told("no edges"), "told")
-            await it.rig.until_samples(20)
-            status = it.rig.device.status()
-            assert status.lines is not None
-            assert status.lines.problems == {"data_ready": "no such line"}
-            it.signal.line.open_error = None
-            await it.rig.until(it.told("edges are back"), "told")
-            await it.rig.until_samples(20)
-            it.dated(it.rig.samples[-1])
-
-    bench.run(body())
+    async with scene(bench) as it:
+        await it.rig.until(it.told("line data_ready: no such line"), "told")
+        await it.rig.until(it.told("no edges"), "told")
+        await it.rig.until_samples(20)
+        status = it.rig.device.status()
+        assert status.lines is not None
+        assert status.lines.problems == {"data_ready": "no such line"}
+        it.signal.line.open_error = None
+        await it.rig.until(it.told("edges are back"), "told")
+        await it.rig.until_samples(20)
+        it.dated(it.rig.samples[-1])
 
 
-def test_what_came_while_the_device_was_not_believed_is_not_missed(bench: PolledBusBench) -> None:
-    async def body() -> None:
-        async with scene(bench) as it:
-            await it.rig.until_samples(20)
-            it.device.faults.line = 0xFF
-            await it.rig.until(lambda: EventKind.DOWN in it.rig.kinds, "down")
-            await asyncio.sleep(0.5)
-            it.device.faults.line = None
-            await it.rig.until_samples(20)
-            numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
-            assert max(b - a for a, b in pairwise(numbers)) > 200
-            assert it.missed == 0
-
-    bench.run(body())
+@in_bench
+async def test_what_came_while_the_device_was_not_believed_is_not_missed(bench: PolledBusBench) -> None:
+    async with scene(bench) as it:
+        await it.rig.until_samples(20)
+        it.device.faults.line = 0xFF
+        await it.rig.until(lambda: EventKind.DOWN in it.rig.kinds, "down")
+        await asyncio.sleep(0.5)
+        it.device.faults.line = None
+        await it.rig.until_samples(20)
+        numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
+        assert max(b - a for a, b in pairwise(numbers)) > 200
+        assert it.missed == 0
 
 
-def test_the_line_is_let_go_of_at_the_end(bench: PolledBusBench) -> None:
-    async def body() -> None:
-        async with scene(bench) as it:
-            await it.rig.until_samples(3)
-            rig = it.rig
-        rig.device.tick(bench.clock.now_ns())
-        assert not it.signal.line.is_open
-
-    bench.run(body())
+@in_bench
+async def test_the_line_is_let_go_of_at_the_end(bench: PolledBusBench) -> None:
+    async with scene(bench) as it:
+        await it.rig.until_samples(3)
+        rig = it.rig
+    rig.device.tick(bench.clock.now_ns())
+    assert not it.signal.line.is_open
 
 
 class DescriptorLine(MemoryInput):

@@ -13,6 +13,7 @@ from imud.config import Config
 from imud.daemon import Daemon
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.worker import SWITCH_INTERVAL_S, BusThread
+from tests.support.event_loops import in_loop
 from tests.support.polled_bus_bench import PolledBusBench
 
 
@@ -30,17 +31,14 @@ def wait_until_running(daemon: Daemon, then: Callable[[], None]) -> Coroutine[An
     return watch()
 
 
-def test_daemon_serves_a_polled_device(bench: PolledBusBench) -> None:
+@in_loop
+async def test_daemon_serves_a_polled_device(bench: PolledBusBench) -> None:
     bench.spi.device = Imu61xRegisters(monotonic_ns).spi
-
-    async def body() -> None:
-        daemon = Daemon(Config("info", "", {}, (bench.on_spi(),)))
-        watching = asyncio.create_task(wait_until_running(daemon, daemon.stop))
-        await asyncio.wait_for(daemon.run(), 10)
-        await watching
-        assert daemon.status()[0].driver == "imu61x-spi"
-
-    asyncio.run(body())
+    daemon = Daemon(Config("info", "", {}, (bench.on_spi(),)))
+    watching = asyncio.create_task(wait_until_running(daemon, daemon.stop))
+    await asyncio.wait_for(daemon.run(), 10)
+    await watching
+    assert daemon.status()[0].driver == "imu61x-spi"
     assert not bench.spi.opened
 
 

@@ -1,10 +1,10 @@
 """When a device is read: deadlines without drift, turns on a line that is never idle, edges of a data-ready line."""
 
 from imud.contracts.polling import Poll
-from imud.runtime.polled.bus import PolledBuses
 from imud.runtime.polled.schedule import Deadlines, ReadySchedule, RoundRobin, Schedule
 from imud.signals.ready_edges import QUIET_NS
-from tests.runtime.polled.test_bus import ASK, Sink, Wire, run
+from tests.runtime.polled.test_bus import ASK, Sink, Wire
+from tests.support.event_loops import VirtualClock, run_virtually, virtual_buses
 
 MS = 1_000_000
 BEGIN = 1000 * MS
@@ -91,19 +91,20 @@ def test_who_comes_back_waits_for_its_turn() -> None:
 
 def test_on_a_bus_every_reading_is_handed_over_at_once() -> None:
     """Something is always due there, so that no idle moment comes to do it in."""
+    clock = VirtualClock()
 
-    async def body(buses: PolledBuses) -> None:
-        wires = [Wire(), Wire()]
-        sinks = [Sink(), Sink()]
-        for wire, sink in zip(wires, sinks, strict=True):
-            wire.rate_hz = 0.0
+    async def body() -> None:
+        buses, sinks = virtual_buses(clock), [Sink(), Sink()]
+        for sink in sinks:
+            wire = Wire()
+            wire.rate_hz, wire.takes_time = 0.0, lambda: clock.advance(1000)
             buses.get("wire").join(wire, Deadlines(), sink.on_readings).start((Poll(ASK),))
         for sink in sinks:
             await sink.enough.wait()
-        for sink in sinks:
             assert sink.calls == len(sink.readings) > 20
+        buses.end()
 
-    run(body)
+    run_virtually(clock, body())
 
 
 # --- edges ------------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@
 """
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
@@ -40,36 +41,35 @@ def bench(tmp_path: Path, recorded: pytest.MonkeyPatch) -> PolledBusBench:
     return PolledBusBench(tmp_path, recorded, VirtualClock())
 
 
-def test_uart_with_edges_on_sout(recorded: pytest.MonkeyPatch) -> None:
-    signals.test_every_sample_has_its_edge(recorded, None)
-
-
-def test_uart_with_triggers_and_lost_frames(recorded: pytest.MonkeyPatch) -> None:
-    signals.test_frames_answer_the_triggers_on_sin(recorded)
-
-
-def test_uart_with_an_alarm(recorded: pytest.MonkeyPatch) -> None:
-    signals.test_an_alarm_is_an_event_and_shown_in_the_samples(recorded)
-
-
 @pytest.mark.usefixtures("recorded")
-def test_uart_whose_samples_wait() -> None:
-    waiting.test_a_link_that_cannot_be_paused_is_not()
+@pytest.mark.parametrize(
+    "run",
+    [
+        lambda: signals.test_every_sample_has_its_edge(settings=None),
+        signals.test_frames_answer_the_triggers_on_sin,
+        signals.test_an_alarm_is_an_event_and_shown_in_the_samples,
+        waiting.test_a_link_that_cannot_be_paused_is_not,
+        can.test_losses_by_cause,
+        can.test_frames_from_before_a_loss_are_not_mixed_with_those_after,
+        can.test_bus_down_and_up,
+    ],
+    ids=["edges", "triggers", "alarm", "held samples", "losses on CAN", "loss within a sample", "bus down"],
+)
+def test_a_run_on_a_line_or_can_bus_is_replayed(run: Callable[[], None]) -> None:
+    """`check_replay` compares the samples and the ledger at the end of each run."""
+    run()
 
 
-@pytest.mark.usefixtures("recorded")
-def test_can_with_losses() -> None:
-    can.test_losses_by_cause()
-    can.test_frames_from_before_a_loss_are_not_mixed_with_those_after()
-    can.test_bus_down_and_up()
-
-
-def test_polled_with_a_data_ready_line(bench: PolledBusBench) -> None:
-    data_ready.test_every_edge_is_a_sample_of_its_own_instant(bench)
-
-
-def test_polled_that_vanishes_and_is_damaged(bench: PolledBusBench) -> None:
-    polled.test_single_damage_costs_its_sample_and_nothing_else(bench)
+@pytest.mark.parametrize(
+    "run",
+    [
+        data_ready.test_every_edge_is_a_sample_of_its_own_instant,
+        polled.test_single_damage_costs_its_sample_and_nothing_else,
+    ],
+    ids=["edges", "damage"],
+)
+def test_a_run_of_a_polled_device_is_replayed(bench: PolledBusBench, run: Callable[..., None]) -> None:
+    run(bench=bench)
 
 
 # --- from the middle of a run -----------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from tests.support.device_rig import DeviceRig, DeviceRigs, device_config, runni
 from tests.support.event_loops import VirtualClock, run_virtually
 from tests.support.pty_port import plugged
 from tests.support.simulated_modules import done, every_variant, imu61x_hardware
+from tests.support.stories import played
 from tests.support.wired_device import Imu61xLine
 
 UPTIME_US = 20_000_000
@@ -65,64 +66,52 @@ class VariantBench:
 
 
 @every_variant
-def test_actions_are_followed_and_settings_shown_are_read_again(variant: str) -> None:
-    bench = VariantBench(VARIANTS[variant])
-
-    async def story() -> None:
-        device = bench.device
-        assert device.status().identity["model_number"] == "614"
-        await device.act("rate", {"rate_hz": 200})
-        assert device.status().settings["output_rate_hz"] == "200"
-        with pytest.raises(BadArgument, match="rate_hz: expected at most 200 Hz at 115200 baud"):
-            await device.act("rate", {"rate_hz": 400})
-        await bench.samples()
-        await device.act("baud", {"baud": 460800})
-        assert device.status().settings["baud"] == "460800"
-        assert bench.line.baud == bench.module.baud == 460800
-        await bench.samples()
-        sample = await device.act("sample_once", {})
-        assert isinstance(sample, dict)
-        assert sample["accel_m_s2"][2] == pytest.approx(9.8, abs=0.1)
-        await device.act("restart", {})
-        await bench.samples()
-        await device.act("factory_reset", {})
-        assert (bench.line.baud, bench.module.flash) == (115200, Imu61xSettings())
-        await bench.samples()
-
-    bench.play(story)
+@played(lambda variant: VariantBench(VARIANTS[variant]))
+async def test_actions_are_followed_and_settings_shown_are_read_again(bench: VariantBench, variant: str) -> None:
+    device = bench.device
+    assert device.status().identity["model_number"] == "614"
+    await device.act("rate", {"rate_hz": 200})
+    assert device.status().settings["output_rate_hz"] == "200"
+    with pytest.raises(BadArgument, match="rate_hz: expected at most 200 Hz at 115200 baud"):
+        await device.act("rate", {"rate_hz": 400})
+    await bench.samples()
+    await device.act("baud", {"baud": 460800})
+    assert device.status().settings["baud"] == "460800"
+    assert bench.line.baud == bench.module.baud == 460800
+    await bench.samples()
+    sample = await device.act("sample_once", {})
+    assert isinstance(sample, dict)
+    assert sample["accel_m_s2"][2] == pytest.approx(9.8, abs=0.1)
+    await device.act("restart", {})
+    await bench.samples()
+    await device.act("factory_reset", {})
+    assert (bench.line.baud, bench.module.flash) == (115200, Imu61xSettings())
+    await bench.samples()
 
 
 @every_variant
-def test_settings_are_applied_in_an_order_that_keeps_the_device(variant: str) -> None:
-    bench = VariantBench(VARIANTS[variant])
+@played(lambda variant: VariantBench(VARIANTS[variant]))
+async def test_settings_are_applied_in_an_order_that_keeps_the_device(bench: VariantBench, variant: str) -> None:
     wanted: dict[str, Any] = {"baud": 460800, "output_rate_hz": 400, "gyro_filter": "10 Hz", "i2c_address": "0x1a"}
-
-    async def story() -> None:
-        applied = await bench.device.settings_apply(wanted, save=variant != "no K1")
-        assert {step.name for step in applied.steps} == set(wanted)
-        assert {step.outcome for step in applied.steps} == {StepOutcome.DONE}
-        assert (applied.problem, applied.differences) == ("", {})
-        assert applied.steps[-1].name == "baud"
-        settings = bench.module.settings
-        assert (settings.rate_hz, settings.filter_control, settings.i2c_address) == (400, 0xB4, 0x1A)
-        assert bench.line.baud == bench.module.baud == 460800
-        if variant != "no K1":
-            assert applied.saved
-            assert bench.module.flash == settings
-        await bench.samples()
-
-    bench.play(story)
+    applied = await bench.device.settings_apply(wanted, save=variant != "no K1")
+    assert {step.name for step in applied.steps} == set(wanted)
+    assert {step.outcome for step in applied.steps} == {StepOutcome.DONE}
+    assert (applied.problem, applied.differences) == ("", {})
+    assert applied.steps[-1].name == "baud"
+    settings = bench.module.settings
+    assert (settings.rate_hz, settings.filter_control, settings.i2c_address) == (400, 0xB4, 0x1A)
+    assert bench.line.baud == bench.module.baud == 460800
+    if variant != "no K1":
+        assert applied.saved
+        assert bench.module.flash == settings
+    await bench.samples()
 
 
-def test_settings_that_do_not_go_together_are_not_applied() -> None:
-    bench = VariantBench(Imu61xBehaviour())
-
-    async def story() -> None:
-        with pytest.raises(BadArgument, match="output_rate_hz and baud: expected at most 200 Hz at 115200 baud"):
-            await bench.device.settings_apply({"output_rate_hz": 400}, save=False)
-        assert bench.module.settings == Imu61xSettings()
-
-    bench.play(story)
+@played(lambda: VariantBench(Imu61xBehaviour()))
+async def test_settings_that_do_not_go_together_are_not_applied(bench: VariantBench) -> None:
+    with pytest.raises(BadArgument, match="output_rate_hz and baud: expected at most 200 Hz at 115200 baud"):
+        await bench.device.settings_apply({"output_rate_hz": 400}, save=False)
+    assert bench.module.settings == Imu61xSettings()
 
 
 def test_a_device_that_refuses_all_orders_is_left_as_it_was() -> None:

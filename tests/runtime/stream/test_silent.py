@@ -21,6 +21,7 @@ from imud.sim.hipnuc.uart.simulator import HipnucModule
 from tests.support.device_rig import device_config, running
 from tests.support.pty_port import plugged
 from tests.support.simulated_modules import hardware_of
+from tests.support.stories import told
 from tests.support.wired_device import LinkedDevice, play_linked
 
 NO_RATE = ModuleSettings(hi91=Output())
@@ -67,17 +68,15 @@ def test_a_module_that_is_silent_by_its_settings_is_known_and_left_so(
     play_linked(story, settings, **link)
 
 
-def test_commands_are_accepted_as_soon_as_it_has_answered() -> None:
-    async def story(device: LinkedDevice) -> None:
-        await device.until(lambda: device.device.actions, limit_s=0.1)
-        with pytest.raises(CommandError, match="bow is searching"):
-            await device.device.act("wake", {})
-        await device.until(lambda: device.device.status().settings, limit_s=1.9)
-        assert device.rig.is_in(DeviceState.SEARCHING)
-        await device.act("output", message="HI91", rate_hz=50)
-        await device.until(lambda: device.samples)
-
-    play_linked(story, NO_RATE)
+@told(play_linked, NO_RATE)
+async def test_commands_are_accepted_as_soon_as_it_has_answered(device: LinkedDevice) -> None:
+    await device.until(lambda: device.device.actions, limit_s=0.1)
+    with pytest.raises(CommandError, match="bow is searching"):
+        await device.device.act("wake", {})
+    await device.until(lambda: device.device.status().settings, limit_s=1.9)
+    assert device.rig.is_in(DeviceState.SEARCHING)
+    await device.act("output", message="HI91", rate_hz=50)
+    await device.until(lambda: device.samples)
 
 
 @every_link
@@ -113,29 +112,26 @@ def test_a_module_that_was_silenced_stays_so_and_is_asked_at_its_own_rate(link: 
     play_linked(story, **link)
 
 
-def test_while_a_lost_module_is_searched_for_no_command_goes_out() -> None:
+@told(play_linked, baud="auto")
+async def test_while_a_lost_module_is_searched_for_no_command_goes_out(device: LinkedDevice) -> None:
     """It is switched off: the search asks at all rates, and nothing else does."""
-
-    async def story(device: LinkedDevice) -> None:
-        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
-        device.module.receive(b"UNLOGALL\r\n", device.clock.now_ns())
-        await device.wait(0.1)
-        device.link.module_is_on = False
-        await device.until(lambda: device.rig.is_in(DeviceState.SEARCHING), limit_s=60)
-        bauds, refused = set(), 0
-        for _ in range(200):
-            bauds.add(device.link.baud)
-            try:
-                await device.device.act("output", {"message": "HI91", "rate_hz": 50})
-            except CommandError:
-                refused += 1
-            await device.wait(0.05)
-        assert refused == 200
-        assert len(bauds) > 4
-        assert {data for _, data in device.link.sent_at if data.startswith(b"LOG HI91")} == set()
-        assert turns(device) == [EventKind.UP, EventKind.DOWN]
-
-    play_linked(story, baud="auto")
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    device.module.receive(b"UNLOGALL\r\n", device.clock.now_ns())
+    await device.wait(0.1)
+    device.link.module_is_on = False
+    await device.until(lambda: device.rig.is_in(DeviceState.SEARCHING), limit_s=60)
+    bauds, refused = set(), 0
+    for _ in range(200):
+        bauds.add(device.link.baud)
+        try:
+            await device.device.act("output", {"message": "HI91", "rate_hz": 50})
+        except CommandError:
+            refused += 1
+        await device.wait(0.05)
+    assert refused == 200
+    assert len(bauds) > 4
+    assert {data for _, data in device.link.sent_at if data.startswith(b"LOG HI91")} == set()
+    assert turns(device) == [EventKind.UP, EventKind.DOWN]
 
 
 def test_a_script_under_way_ends_when_a_search_begins_under_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,51 +175,44 @@ def test_every_variant_is_followed_to_another_rate_and_back(behaviour: Behaviour
     play_linked(story, hardware=hardware_of(behaviour), **link)
 
 
-def test_settings_are_read_again_after_each_action() -> None:
-    async def story(device: LinkedDevice) -> None:
-        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
-        await device.act("pin", function="led", pin=7)
-        await device.act("mounting", turned="y_up")
-        await device.act("output", message="HI91", rate_hz=25)
-        settings = device.device.status().settings
-        assert (settings["pins.led"], settings["mounting"]) == ("IO7", "y_up")
-        assert settings["output.hi91"] == "25 Hz"
-        assert "settings of the device changed: pins.led is IO7, was IO5" in device.messages
-
-    play_linked(story)
+@told(play_linked)
+async def test_settings_are_read_again_after_each_action(device: LinkedDevice) -> None:
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    await device.act("pin", function="led", pin=7)
+    await device.act("mounting", turned="y_up")
+    await device.act("output", message="HI91", rate_hz=25)
+    settings = device.device.status().settings
+    assert (settings["pins.led"], settings["mounting"]) == ("IO7", "y_up")
+    assert settings["output.hi91"] == "25 Hz"
+    assert "settings of the device changed: pins.led is IO7, was IO5" in device.messages
 
 
-def test_after_an_action_that_fails_the_settings_are_what_the_module_has() -> None:
-    async def story(device: LinkedDevice) -> None:
-        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
-        device.module.receive(b"CONFIG ATT MODE 1\r\n", device.clock.now_ns())  # by somebody else
-        await device.wait(0.1)
-        with pytest.raises(CommandError, match="the module refused"):
-            await device.act("level", level="automatic")
-        assert device.device.status().settings["mode"] == "9-axis"
-
-    play_linked(story, hardware=hardware_of(Behaviour(refuses=("CONFIG ATT RST",))))
+@told(play_linked, hardware=hardware_of(Behaviour(refuses=("CONFIG ATT RST",))))
+async def test_after_an_action_that_fails_the_settings_are_what_the_module_has(device: LinkedDevice) -> None:
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    device.module.receive(b"CONFIG ATT MODE 1\r\n", device.clock.now_ns())  # by somebody else
+    await device.wait(0.1)
+    with pytest.raises(CommandError, match="the module refused"):
+        await device.act("level", level="automatic")
+    assert device.device.status().settings["mode"] == "9-axis"
 
 
-def test_status_bits_and_settings_are_shown_by_name() -> None:
+@told(play_linked, hardware=hardware_of(Behaviour(), firmware=169))
+async def test_status_bits_and_settings_are_shown_by_name(device: LinkedDevice) -> None:
     """Firmware 1.6.9 and newer sends MAIN_STATUS; the simulated module converges within 5 s."""
-
-    async def story(device: LinkedDevice) -> None:
-        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
-        status = device.device.status()
-        assert status.status_words == (
-            "gyroscope bias not converged", "attitude not converged", "at rest", "time not UTC", "frame with SOUT pulse"
-        )  # fmt: skip
-        assert status.status_bit_names["4"] == "magnetic disturbance"
-        assert status.settings["output.hi91"] == "100 Hz"
-        assert status.settings["magnetometer_bias"] == "0, 0, 0 µT: not calibrated"
-        await device.wait(10)
-        assert device.device.status().status_words == ("at rest", "time not UTC", "frame with SOUT pulse")
-        alarms = [event.message for event in device.events if event.kind is EventKind.ALARM]
-        assert alarms[0] == "status: gyroscope bias not converged, attitude not converged"
-        assert alarms[-1] == "status: cleared: gyroscope bias not converged"
-
-    play_linked(story, hardware=hardware_of(Behaviour(), firmware=169))
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    status = device.device.status()
+    assert status.status_words == (
+        "gyroscope bias not converged", "attitude not converged", "at rest", "time not UTC", "frame with SOUT pulse"
+    )  # fmt: skip
+    assert status.status_bit_names["4"] == "magnetic disturbance"
+    assert status.settings["output.hi91"] == "100 Hz"
+    assert status.settings["magnetometer_bias"] == "0, 0, 0 µT: not calibrated"
+    await device.wait(10)
+    assert device.device.status().status_words == ("at rest", "time not UTC", "frame with SOUT pulse")
+    alarms = [event.message for event in device.events if event.kind is EventKind.ALARM]
+    assert alarms[0] == "status: gyroscope bias not converged, attitude not converged"
+    assert alarms[-1] == "status: cleared: gyroscope bias not converged"
 
 
 def test_lines_that_the_module_contradicts_are_events_and_shown() -> None:

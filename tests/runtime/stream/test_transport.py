@@ -24,8 +24,9 @@ from imud.runtime import device as device_module
 from imud.runtime.detection.remembered import RememberedDevice
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
-from tests.support.event_loops import VirtualClock
+from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.files import hi91
+from tests.support.stories import played, told
 
 MS = 1_000_000
 LIMIT_S = 5.0
@@ -62,49 +63,45 @@ def _no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_module, "RETRY_S", 0.0)
 
 
-def test_samples_flow_and_the_device_is_up() -> None:
-    async def story(rig: DeviceRig) -> None:
-        assert rig.is_in(DeviceState.SEARCHING)
-        for i in range(5):
-            feed(rig, hi91(1000 + 10 * i))
-        rig.tick()
-        assert rig.is_in(DeviceState.RUNNING)
-        assert [s.seq for s in rig.samples] == [1, 2, 3, 4, 5]
-        assert [s.t_dev_ns for s in rig.samples] == [(1000 + 10 * i) * MS for i in range(5)]
-        assert rig.kinds == [EventKind.UP]
-        status = rig.device.status()
-        assert (status.newest_seq, status.driver, status.connects) == (5, "hipnuc-uart", 1)
-        assert sum(status.latency_buckets) == 5
-        assert status.temperature_c == 20.0
-
-    play(story)
+@told(play)
+async def test_samples_flow_and_the_device_is_up(rig: DeviceRig) -> None:
+    assert rig.is_in(DeviceState.SEARCHING)
+    for i in range(5):
+        feed(rig, hi91(1000 + 10 * i))
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert [s.seq for s in rig.samples] == [1, 2, 3, 4, 5]
+    assert [s.t_dev_ns for s in rig.samples] == [(1000 + 10 * i) * MS for i in range(5)]
+    assert rig.kinds == [EventKind.UP]
+    status = rig.device.status()
+    assert (status.newest_seq, status.driver, status.connects) == (5, "hipnuc-uart", 1)
+    assert sum(status.latency_buckets) == 5
+    assert status.temperature_c == 20.0
 
 
-def test_unplugged_and_back_the_count_goes_on_and_time_rises() -> None:
-    async def story(rig: DeviceRig) -> None:
-        for i in range(5):
-            feed(rig, hi91(5000 + 10 * i))
-        feed(rig, hi91(5050)[:40])  # the cable goes in the middle of a frame
-        rig.tick()
-        rig.link.disappear()
-        await rig.turn(lambda: rig.state is DeviceState.MISSING)
-        assert rig.ledger.bytes_pending == 0
-        assert rig.ledger.bytes_skipped == 40
-        assert "gone" in rig.problem
-        rig.link.appear()
-        await rig.turn(lambda: rig.state is not DeviceState.MISSING)
-        for i in range(3):
-            feed(rig, hi91(10 * i))  # the device was without power: its clock starts again
-        rig.tick()
-        assert rig.is_in(DeviceState.RUNNING)
-        assert [s.seq for s in rig.samples] == list(range(1, 9))
-        times = [s.t_ns for s in rig.samples]
-        assert times == sorted(set(times))
-        assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
-        assert rig.device.status().connects == 2
-        assert rig.ledger.lost() == 0
-
-    play(story)
+@told(play)
+async def test_unplugged_and_back_the_count_goes_on_and_time_rises(rig: DeviceRig) -> None:
+    for i in range(5):
+        feed(rig, hi91(5000 + 10 * i))
+    feed(rig, hi91(5050)[:40])  # the cable goes in the middle of a frame
+    rig.tick()
+    rig.link.disappear()
+    await rig.turn(lambda: rig.state is DeviceState.MISSING)
+    assert rig.ledger.bytes_pending == 0
+    assert rig.ledger.bytes_skipped == 40
+    assert "gone" in rig.problem
+    rig.link.appear()
+    await rig.turn(lambda: rig.state is not DeviceState.MISSING)
+    for i in range(3):
+        feed(rig, hi91(10 * i))  # the device was without power: its clock starts again
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert [s.seq for s in rig.samples] == list(range(1, 9))
+    times = [s.t_ns for s in rig.samples]
+    assert times == sorted(set(times))
+    assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+    assert rig.device.status().connects == 2
+    assert rig.ledger.lost() == 0
 
 
 def test_identity_is_asked_and_a_changed_setting_is_told_after_a_replug() -> None:
@@ -142,32 +139,30 @@ def test_identity_is_asked_and_a_changed_setting_is_told_after_a_replug() -> Non
     play(story, configured(identify=True))
 
 
-def test_device_that_does_not_answer_streams_all_the_same(caplog: pytest.LogCaptureFixture) -> None:
-    async def story(rig: DeviceRig) -> None:
-        await rig.turn(lambda: rig.link.written)
-        feed(rig, hi91(10) + hi91(20))
-        rig.tick()
-        assert rig.is_in(DeviceState.RUNNING)
-        assert len(rig.samples) == 2
+@told(play, configured(identify=True))
+async def test_device_that_does_not_answer_streams_all_the_same(
+    rig: DeviceRig, caplog: pytest.LogCaptureFixture
+) -> None:
+    await rig.turn(lambda: rig.link.written)
+    feed(rig, hi91(10) + hi91(20))
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert len(rig.samples) == 2
 
-    play(story, configured(identify=True))
 
-
-def test_device_that_falls_silent_is_told_once_and_comes_up_again() -> None:
-    async def story(rig: DeviceRig) -> None:
-        for i in range(3):
-            feed(rig, hi91(10 * i))
-        rig.tick()
-        rig.tick(ahead_ns=1500 * MS)
-        rig.tick(ahead_ns=1600 * MS)
-        assert rig.is_in(DeviceState.SILENT)
-        assert rig.kinds == [EventKind.UP, EventKind.DOWN]
-        feed(rig, hi91(1_500))
-        rig.tick()
-        assert rig.is_in(DeviceState.RUNNING)
-        assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
-
-    play(story)
+@told(play)
+async def test_device_that_falls_silent_is_told_once_and_comes_up_again(rig: DeviceRig) -> None:
+    for i in range(3):
+        feed(rig, hi91(10 * i))
+    rig.tick()
+    rig.tick(ahead_ns=1500 * MS)
+    rig.tick(ahead_ns=1600 * MS)
+    assert rig.is_in(DeviceState.SILENT)
+    assert rig.kinds == [EventKind.UP, EventKind.DOWN]
+    feed(rig, hi91(1_500))
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
 
 
 def test_port_that_is_busy_is_tried_again_and_says_why() -> None:
@@ -189,96 +184,84 @@ def test_port_that_is_busy_is_tried_again_and_says_why() -> None:
     play(story, link=Busy(MemorySettings(baud=115200)))
 
 
-def test_end_of_a_replay_finishes_the_runner() -> None:
-    async def story() -> None:
-        rig = DeviceRigs().add(configured(writable=False))
-        task = asyncio.create_task(rig.device.run())
-        await rig.turn(lambda: rig.link.listening)
-        feed(rig, hi91(10))
-        rig.link.end(None)
-        await asyncio.wait_for(task, LIMIT_S)
-        assert rig.is_in(DeviceState.FINISHED)
-        assert len(rig.samples) == 1
-
-    asyncio.run(story())
+@in_loop
+async def test_end_of_a_replay_finishes_the_runner() -> None:
+    rig = DeviceRigs().add(configured(writable=False))
+    task = asyncio.create_task(rig.device.run())
+    await rig.turn(lambda: rig.link.listening)
+    feed(rig, hi91(10))
+    rig.link.end(None)
+    await asyncio.wait_for(task, LIMIT_S)
+    assert rig.is_in(DeviceState.FINISHED)
+    assert len(rig.samples) == 1
 
 
-def test_missing_samples_are_put_to_their_cause() -> None:
-    async def story(rig: DeviceRig) -> None:
-        for i in range(20):
-            feed(rig, hi91(10 * i))
-        damaged = bytearray(hi91(200))
-        damaged[50] ^= 1
-        feed(rig, bytes(damaged))
-        feed(rig, hi91(210))
-        assert rig.ledger.lost_crc == 1
-        rig.link.counters = KernelCounters(overrun=1)
-        feed(rig, hi91(240))  # 220 and 230 are missing
-        assert rig.ledger.lost_overrun == 2
-        feed(rig, hi91(260))
-        assert rig.ledger.lost_gap_device == 1
-        rig.tick()
-        assert EventKind.LOSS in rig.kinds
-        assert EventKind.BAD_FRAME in rig.kinds
-
-    play(story)
+@told(play)
+async def test_missing_samples_are_put_to_their_cause(rig: DeviceRig) -> None:
+    for i in range(20):
+        feed(rig, hi91(10 * i))
+    damaged = bytearray(hi91(200))
+    damaged[50] ^= 1
+    feed(rig, bytes(damaged))
+    feed(rig, hi91(210))
+    assert rig.ledger.lost_crc == 1
+    rig.link.counters = KernelCounters(overrun=1)
+    feed(rig, hi91(240))  # 220 and 230 are missing
+    assert rig.ledger.lost_overrun == 2
+    feed(rig, hi91(260))
+    assert rig.ledger.lost_gap_device == 1
+    rig.tick()
+    assert EventKind.LOSS in rig.kinds
+    assert EventKind.BAD_FRAME in rig.kinds
 
 
-def test_frame_held_by_a_lying_length_is_delivered_when_the_line_is_idle() -> None:
-    async def story(rig: DeviceRig) -> None:
-        feed(rig, b"\x5a\xa5\xff\x01" + hi91(10))
-        assert rig.samples == []
-        rig.tick(ahead_ns=100 * MS)
-        assert len(rig.samples) == 1
-
-    play(story)
+@told(play)
+async def test_frame_held_by_a_lying_length_is_delivered_when_the_line_is_idle(rig: DeviceRig) -> None:
+    feed(rig, b"\x5a\xa5\xff\x01" + hi91(10))
+    assert rig.samples == []
+    rig.tick(ahead_ns=100 * MS)
+    assert len(rig.samples) == 1
 
 
-def test_detection_locks_counts_every_byte_and_is_remembered() -> None:
-    async def story(rig: DeviceRig) -> None:
-        noise = bytes(range(200, 250))
-        feed(rig, noise)
-        first = rig.link.baud
-        await rig.turn(lambda: rig.link.bauds and rig.link.baud != first)
-        right = rig.link.baud
-        stream = hi91(10) + hi91(20) + hi91(30)
-        feed(rig, stream[:100])
-        feed(rig, stream[100:])
-        await rig.turn(lambda: rig.ledger.frames_good)
-        rig.tick()
-        assert rig.is_in(DeviceState.RUNNING)
-        assert len(rig.samples) == 3
-        assert rig.ledger.bytes_in == len(noise) + len(stream)
-        assert rig.ledger.bytes_skipped == len(noise)
-        rig.link.disappear()
-        await rig.turn(lambda: rig.state is DeviceState.MISSING)
-        rig.link.appear()
-        await rig.turn(lambda: rig.state is not DeviceState.MISSING)
-        feed(rig, hi91(1000) + hi91(1010))
-        await rig.turn(lambda: len(rig.samples) == 5)
-        assert rig.link.baud == right
-
-    play(story, configured(baud="auto", driver="auto"))
+@told(play, configured(baud="auto", driver="auto"))
+async def test_detection_locks_counts_every_byte_and_is_remembered(rig: DeviceRig) -> None:
+    noise = bytes(range(200, 250))
+    feed(rig, noise)
+    first = rig.link.baud
+    await rig.turn(lambda: rig.link.bauds and rig.link.baud != first)
+    right = rig.link.baud
+    stream = hi91(10) + hi91(20) + hi91(30)
+    feed(rig, stream[:100])
+    feed(rig, stream[100:])
+    await rig.turn(lambda: rig.ledger.frames_good)
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert len(rig.samples) == 3
+    assert rig.ledger.bytes_in == len(noise) + len(stream)
+    assert rig.ledger.bytes_skipped == len(noise)
+    rig.link.disappear()
+    await rig.turn(lambda: rig.state is DeviceState.MISSING)
+    rig.link.appear()
+    await rig.turn(lambda: rig.state is not DeviceState.MISSING)
+    feed(rig, hi91(1000) + hi91(1010))
+    await rig.turn(lambda: len(rig.samples) == 5)
+    assert rig.link.baud == right
 
 
-def test_nothing_heard_says_what_to_look_at() -> None:
-    async def story(rig: DeviceRig) -> None:
-        rig.tick(ahead_ns=3000 * MS)
-        assert rig.problem.startswith("nothing is heard on memory at 115200 baud")
-        rig.device.tick(monotonic_ns())
-
-    play(story)
+@told(play)
+async def test_nothing_heard_says_what_to_look_at(rig: DeviceRig) -> None:
+    rig.tick(ahead_ns=3000 * MS)
+    assert rig.problem.startswith("nothing is heard on memory at 115200 baud")
+    rig.device.tick(monotonic_ns())
 
 
-def test_a_device_that_has_just_been_opened_is_given_time() -> None:
-    async def story(rig: DeviceRig) -> None:
-        rig.tick()
-        assert rig.problem == "no sample has come yet: wait until the search has listened for a while"
-        feed(rig, hi91(10))
-        rig.tick()
-        assert rig.problem == ""
-
-    play(story)
+@told(play)
+async def test_a_device_that_has_just_been_opened_is_given_time(rig: DeviceRig) -> None:
+    rig.tick()
+    assert rig.problem == "no sample has come yet: wait until the search has listened for a while"
+    feed(rig, hi91(10))
+    rig.tick()
+    assert rig.problem == ""
 
 
 class DeafModule:
@@ -329,65 +312,51 @@ class DeafModule:
 
 
 @pytest.mark.parametrize("deaf_to", [3, 5, 6, 9])
-def test_a_device_that_streams_and_did_not_answer_is_asked_until_it_does(deaf_to: int) -> None:
+@played(DeafModule)
+async def test_a_device_that_streams_and_did_not_answer_is_asked_until_it_does(
+    module: DeafModule, deaf_to: int
+) -> None:
     """Three tries, then one after 5, 30 and 120 s, then every five minutes."""
-    module = DeafModule(deaf_to)
-
-    async def story() -> None:
-        await module.pass_s(2000)
-        assert len(module.asked_ns) == deaf_to + 1
-        assert module.product == "HI14R3"
-
-    module.play(story)
+    await module.pass_s(2000)
+    assert len(module.asked_ns) == deaf_to + 1
+    assert module.product == "HI14R3"
 
 
-def test_a_device_that_never_answers_gets_a_request_in_five_minutes() -> None:
-    module = DeafModule(1_000_000)
-
-    async def story() -> None:
-        await module.pass_s(3600)
-        pauses_s = [(after - before) / 1e9 for before, after in pairwise(module.asked_ns)]
-        for pause_s, wanted_s in zip(pauses_s[2:5], (5, 30, 120), strict=True):
-            assert wanted_s <= pause_s < wanted_s + 3  # a request waits for its reply before the pause
-        assert len(pauses_s[5:]) == 11
-        assert all(300 <= pause_s < 303 for pause_s in pauses_s[5:])
-        assert module.product is None
-
-    module.play(story)
+@played(lambda: DeafModule(1_000_000))
+async def test_a_device_that_never_answers_gets_a_request_in_five_minutes(module: DeafModule) -> None:
+    await module.pass_s(3600)
+    pauses_s = [(after - before) / 1e9 for before, after in pairwise(module.asked_ns)]
+    for pause_s, wanted_s in zip(pauses_s[2:5], (5, 30, 120), strict=True):
+        assert wanted_s <= pause_s < wanted_s + 3  # a request waits for its reply before the pause
+    assert len(pauses_s[5:]) == 11
+    assert all(300 <= pause_s < 303 for pause_s in pauses_s[5:])
+    assert module.product is None
 
 
-def test_a_device_that_is_silent_for_a_moment_before_it_has_answered_is_asked_on() -> None:
+@played(lambda: DeafModule(5))
+async def test_a_device_that_is_silent_for_a_moment_before_it_has_answered_is_asked_on(module: DeafModule) -> None:
     """The request at its silence is lost, too, and its samples come back meanwhile: no search, and no last request."""
-    module = DeafModule(5)
-
-    async def story() -> None:
-        await module.pass_s(12)
-        assert len(module.asked_ns) == 4  # the next pause is of 30 s
-        module.paused = True
-        await module.rig.until(lambda: len(module.asked_ns) == 5, step=module.step, step_s=0.25)
-        assert module.rig.is_in(DeviceState.SILENT)
-        module.paused = False
-        module.step()  # within the time of that request
-        await module.pass_s(2)
-        assert module.rig.is_in(DeviceState.RUNNING)
-        assert module.product is None
-        await module.pass_s(200)
-        assert module.product == "HI14R3"
-
-    module.play(story)
+    await module.pass_s(12)
+    assert len(module.asked_ns) == 4  # the next pause is of 30 s
+    module.paused = True
+    await module.rig.until(lambda: len(module.asked_ns) == 5, step=module.step, step_s=0.25)
+    assert module.rig.is_in(DeviceState.SILENT)
+    module.paused = False
+    module.step()  # within the time of that request
+    await module.pass_s(2)
+    assert module.rig.is_in(DeviceState.RUNNING)
+    assert module.product is None
+    await module.pass_s(200)
+    assert module.product == "HI14R3"
 
 
-def test_a_device_whose_settings_are_lost_has_told_its_product_already() -> None:
-    module = DeafModule(0, deaf_to_settings=4)
-
-    async def story() -> None:
-        await module.pass_s(4)
-        assert module.product == "HI14R3"
-        assert not module.rig.device.status().settings
-        await module.pass_s(60)
-        assert module.rig.device.status().settings
-
-    module.play(story)
+@played(lambda: DeafModule(0, deaf_to_settings=4))
+async def test_a_device_whose_settings_are_lost_has_told_its_product_already(module: DeafModule) -> None:
+    await module.pass_s(4)
+    assert module.product == "HI14R3"
+    assert not module.rig.device.status().settings
+    await module.pass_s(60)
+    assert module.rig.device.status().settings
 
 
 @pytest.mark.parametrize("baud", [115200, "auto"])
@@ -459,25 +428,21 @@ def test_a_port_that_another_device_of_the_configuration_has_names_it() -> None:
     play_rigs(rigs, story)
 
 
-def test_bytes_without_frames_say_so() -> None:
-    async def story(rig: DeviceRig) -> None:
-        later_ns = monotonic_ns() + 2500 * MS
-        rig.link.feed(b"\x00" * 100, later_ns)
-        rig.device.tick(later_ns + 100 * MS)
-        assert rig.problem.startswith("bytes come on memory at 115200 baud, but no valid frame")
-
-    play(story)
+@told(play)
+async def test_bytes_without_frames_say_so(rig: DeviceRig) -> None:
+    later_ns = monotonic_ns() + 2500 * MS
+    rig.link.feed(b"\x00" * 100, later_ns)
+    rig.device.tick(later_ns + 100 * MS)
+    assert rig.problem.startswith("bytes come on memory at 115200 baud, but no valid frame")
 
 
-def test_error_of_the_link_is_a_failed_device_and_tried_again() -> None:
-    async def story(rig: DeviceRig) -> None:
-        rig.link.end(LinkError("input/output error: the adapter stopped answering"))
-        await rig.turn(lambda: rig.device.status().connects == 2)
-        feed(rig, hi91(10))
-        rig.tick()
-        assert rig.is_in(DeviceState.RUNNING)
-
-    play(story)
+@told(play)
+async def test_error_of_the_link_is_a_failed_device_and_tried_again(rig: DeviceRig) -> None:
+    rig.link.end(LinkError("input/output error: the adapter stopped answering"))
+    await rig.turn(lambda: rig.device.status().connects == 2)
+    feed(rig, hi91(10))
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
 
 
 def test_an_action_that_changes_the_rate_takes_port_and_memory_along(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -507,20 +472,17 @@ def test_an_action_that_changes_the_rate_takes_port_and_memory_along(monkeypatch
     play_rigs(rigs, told)
 
 
-def test_a_device_that_is_back_counts_as_found_by_its_new_samples_only() -> None:
+@told(play, configured(baud="auto"))
+async def test_a_device_that_is_back_counts_as_found_by_its_new_samples_only(rig: DeviceRig) -> None:
     """While a line is searched, samples of before do not make it run."""
-
-    async def story(rig: DeviceRig) -> None:
-        for ms in range(0, 400, 10):
-            feed(rig, hi91(ms))
-        rig.tick()
-        assert rig.is_in(DeviceState.RUNNING)
-        rig.link.disappear()
-        await rig.turn(lambda: rig.state is DeviceState.MISSING)
-        rig.link.appear()
-        await rig.turn(lambda: rig.state is DeviceState.SEARCHING)
-        rig.tick()
-        assert rig.is_in(DeviceState.SEARCHING)
-        assert rig.kinds == [EventKind.UP, EventKind.DOWN]
-
-    play(story, configured(baud="auto"))
+    for ms in range(0, 400, 10):
+        feed(rig, hi91(ms))
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    rig.link.disappear()
+    await rig.turn(lambda: rig.state is DeviceState.MISSING)
+    rig.link.appear()
+    await rig.turn(lambda: rig.state is DeviceState.SEARCHING)
+    rig.tick()
+    assert rig.is_in(DeviceState.SEARCHING)
+    assert rig.kinds == [EventKind.UP, EventKind.DOWN]
