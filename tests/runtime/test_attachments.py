@@ -5,7 +5,6 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -110,30 +109,6 @@ async def test_a_device_that_hangs_is_reset_and_set_up_again(bench: PolledBusBen
         assert it.rig.kinds.count(EventKind.UP) == 2
         assert (it.device.extended, it.device.filter & 0x0F) == (1, 2)
         assert bench.clock.now_ns() - up_ns < 4e9
-
-
-@in_bench
-async def test_a_device_that_comes_back_by_itself_is_not_reset(bench: PolledBusBench) -> None:
-    async with polled(bench) as it:
-        for _ in range(5):
-            await it.rig.until_samples(5, 20)
-            it.hang()
-            await asyncio.sleep(3.5)
-            it.boot()
-        await it.rig.until_samples(5, 20)
-        assert it.pulses == 0
-        assert it.rig.kinds.count(EventKind.UP) == 6
-
-
-@in_bench
-async def test_a_device_that_is_not_there_is_reset_once_a_minute(bench: PolledBusBench) -> None:
-    async with polled(bench) as it:
-        it.device.faults.line = 0
-        it.dead = True
-        await it.rig.until(lambda: it.pulses == 3, "three", 200)
-        times_ns = [t_ns for t_ns, active in it.line.history if active]
-        assert all(60e9 <= b - a < 61e9 for a, b in pairwise(times_ns))
-        assert "only 0x00" in it.rig.device.status().problem
 
 
 @in_bench

@@ -3,6 +3,7 @@
 import asyncio
 from dataclasses import replace
 from time import monotonic_ns
+from typing import Any
 
 import pytest
 
@@ -36,10 +37,15 @@ def ask(*requests: Request) -> RequestScript[list[Outcome]]:
     return outcomes
 
 
+def made() -> tuple[Exchange, list[bytes]]:
+    """Return an exchange, and what it writes."""
+    written: list[bytes] = []
+    return Exchange(Ledger(), written.append, monotonic_ns), written
+
+
 @in_loop
 async def test_requests_go_out_one_after_the_other() -> None:
-    written: list[bytes] = []
-    exchange = Exchange(Ledger(), written.append, monotonic_ns)
+    exchange, written = made()
     task = asyncio.create_task(exchange.run(ask(request("A"), request("B"))))
     await asyncio.sleep(0)
     assert written == [b"A\r\n"]
@@ -67,12 +73,6 @@ async def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
 
 
 @in_loop
-async def test_request_without_reply_is_done_once_sent() -> None:
-    exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
-    assert await exchange.run(ask(request("REBOOT", silent=True))) == [Reply(())]
-
-
-@in_loop
 async def test_link_that_is_gone_ends_the_script_and_the_next_one_works() -> None:
     gone = True
 
@@ -89,8 +89,7 @@ async def test_link_that_is_gone_ends_the_script_and_the_next_one_works() -> Non
 
 @in_loop
 async def test_second_script_waits_for_the_first() -> None:
-    written: list[bytes] = []
-    exchange = Exchange(Ledger(), written.append, monotonic_ns)
+    exchange, written = made()
     first = asyncio.create_task(exchange.run(ask(request("A"))))
     second = asyncio.create_task(exchange.run(ask(request("B"))))
     for _ in range(5):
@@ -107,7 +106,7 @@ async def test_second_script_waits_for_the_first() -> None:
 
 @in_loop
 async def test_cancelled_script_leaves_the_line_free() -> None:
-    exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
+    exchange, _ = made()
     task = asyncio.create_task(exchange.run(ask(request("A"))))
     await asyncio.sleep(0)
     task.cancel()
@@ -117,7 +116,7 @@ async def test_cancelled_script_leaves_the_line_free() -> None:
 
 @in_loop
 async def test_device_that_never_answers_is_no_reply() -> None:
-    exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
+    exchange, _ = made()
     driver = DRIVERS["hipnuc-uart"]
     assert isinstance(driver, StreamDriver)
     script = driver.identify()
@@ -127,54 +126,15 @@ async def test_device_that_never_answers_is_no_reply() -> None:
 
 
 @in_loop
-async def test_a_request_can_change_the_rate_before_it_goes_out() -> None:
-    happened: list[object] = []
-    exchange = Exchange(Ledger(), happened.append, monotonic_ns, happened.append)
-    await exchange.run(ask(request("A", silent=True), replace(request("B", silent=True), baud=9600)))
-    assert happened == [b"A\r\n", 9600, b"B\r\n"]
-
-
-@in_loop
-async def test_a_rate_without_a_line_is_an_error() -> None:
-    written: list[bytes] = []
-    exchange = Exchange(Ledger(), written.append, monotonic_ns)
-    with pytest.raises(CommandError, match="9600 baud"):
-        await exchange.run(ask(replace(request("A"), baud=9600)))
-    assert written == []
-
-
-@in_loop
-async def test_a_request_can_follow_a_device_to_another_number() -> None:
-    happened: list[object] = []
-    exchange = Exchange(Ledger(), happened.append, monotonic_ns, follow=happened.append)
-    await exchange.run(ask(request("A", silent=True), replace(request("B", silent=True), settings="node 9")))
-    assert happened == [b"A\r\n", "node 9", b"B\r\n"]
-
-
-@in_loop
-async def test_a_number_without_a_bus_is_an_error() -> None:
-    written: list[bytes] = []
-    exchange = Exchange(Ledger(), written.append, monotonic_ns)
-    with pytest.raises(CommandError, match="expected a bus"):
-        await exchange.run(ask(replace(request("A"), settings="node 9")))
-    assert written == []
-
-
-@in_loop
 async def test_a_pause_writes_nothing() -> None:
-    written: list[bytes] = []
-    assert await exchange_of(written).run(ask(pause(1_000_000))) == [Silence(())]
+    exchange, written = made()
+    assert await exchange.run(ask(pause(1_000_000))) == [Silence(())]
     assert written == []
-
-
-def exchange_of(written: list[bytes]) -> Exchange:
-    return Exchange(Ledger(), written.append, monotonic_ns)
 
 
 @in_loop
 async def test_a_frame_is_an_answer() -> None:
-    written: list[bytes] = []
-    exchange = exchange_of(written)
+    exchange, _ = made()
     wanted = ReplyFrame(5, b"x")
     asking = replace(request("A"), is_end=lambda message: message == wanted)
     task = asyncio.create_task(exchange.run(ask(asking)))
@@ -210,8 +170,7 @@ async def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
         yield request("A", timeout_ns=1)
         raise NoReply("no")
 
-    written: list[bytes] = []
-    exchange = Exchange(Ledger(), written.append, monotonic_ns)
+    exchange, written = made()
     assert await exchange.run(with_undo(ask(request("A", timeout_ns=1)), b"UNDO")) == [Silence(())]
     with pytest.raises(NoReply):
         await exchange.run(with_undo(failing(), b"UNDO"))
@@ -220,7 +179,7 @@ async def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
 
 @in_loop
 async def test_a_script_gets_the_measurement_that_it_waits_for() -> None:
-    exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
+    exchange, _ = made()
     assert not exchange.wants_samples
     task = asyncio.create_task(exchange.run(ask(replace(request("A"), is_sample=lambda sample: True))))
     await asyncio.sleep(0)
@@ -229,3 +188,24 @@ async def test_a_script_gets_the_measurement_that_it_waits_for() -> None:
     exchange.on_sample(Measurement(54, 0, 4))
     assert await task == [Reply((), Measurement(54, 0, 3))]
     assert not exchange.wants_samples
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"baud": 9600}, "9600 baud"), ({"settings": "node 9"}, "expected a bus"), ({"also": ["id"]}, "a CAN bus")],
+    ids=["rate", "number", "other frames"],
+)
+@in_loop
+async def test_a_request_can_change_how_the_device_is_heard(change: dict[str, Any], words: str) -> None:
+    """It does so before it goes out, and undoes what holds for one request only; without such a link it is an error."""
+    happened: list[object] = []
+    note = happened.append
+    exchange = Exchange(Ledger(), note, monotonic_ns, set_baud=note, follow=note, listen=note)
+    silent = request("B", silent=True)
+    assert await exchange.run(ask(request("A", silent=True), replace(silent, **change))) == [Reply(())] * 2
+    after = [()] if "also" in change else []
+    assert happened == [b"A\r\n", *change.values(), b"B\r\n", *after]
+    exchange, written = made()
+    with pytest.raises(CommandError, match=words):
+        await exchange.run(ask(replace(silent, **change)))
+    assert written == []

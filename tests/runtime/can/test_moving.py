@@ -2,13 +2,17 @@
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import replace
 from typing import Any
 
+import msgspec
 import pytest
 
 from imud.config import DeviceConfig
+from imud.contracts.device_settings import OnDifference, SettingsState
 from imud.contracts.settings import Settings
 from imud.contracts.status import DeviceState
+from imud.devices import DRIVERS
 from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
 from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, CanFrame
@@ -27,12 +31,22 @@ BIT_RATE = 500_000
 class BusInProcess:
     """Modules, and a device of the daemon that is the first of them, in virtual time."""
 
-    def __init__(self, clock: VirtualClock, driver: str, options: Settings, *modules: CanModule) -> None:
+    def __init__(
+        self, clock: VirtualClock, driver: str, options: Settings, *modules: CanModule, **declared: object
+    ) -> None:
+        """`declared` are settings that the daemon applies and saves by itself."""
         self.clock = clock
         self.modules = CanModules(modules)
         self.rigs = DeviceRigs(HostClock(clock.now_ns, clock.realtime_ns, clock.now_ns))
         link = MemorySettings(baud=BIT_RATE, name="can0")
-        self.rig: DeviceRig = self.rigs.add(DeviceConfig("bow", driver, options, True, "memory", link))
+        config = DeviceConfig("bow", driver, options, True, "memory", link)
+        if declared:
+            table = DRIVERS[driver].device_settings
+            assert table is not None
+            config = replace(
+                config, declared=msgspec.convert(declared, table.declarable), on_difference=OnDifference.APPLY_AND_SAVE
+            )
+        self.rig: DeviceRig = self.rigs.add(config)
         self._passed_on = 0
 
     def step(self) -> None:
@@ -116,3 +130,23 @@ def test_a_j1939_module_is_made_as_declared(variant: str) -> None:
     assert (module.flash.intervals_ms[0xFF37], module.flash.y_reversed, module.flash.address) == (50, 1, 9)
     assert module.writes_to_flash == 1
     assert beside.settings == J1939Settings(address=12)
+
+
+def test_a_node_is_set_as_declared_and_followed() -> None:
+    clock = VirtualClock()
+    module = HipnucCanopenModule(clock.now_ns(), HipnucCanopenHardware(boot_ms=0))
+    bus = BusInProcess(
+        clock, "hipnuc-canopen", HipnucCanopenSettings(), module, tpdo1_interval_ms=20, tpdo2_interval_ms=20, node=9
+    )
+
+    async def story() -> None:
+        rig = bus.rig
+        saved = "; saved to flash; restarted"
+        await bus.until(lambda: any(saved in event.message for event in rig.events), saved)
+        count = len(rig.samples)
+        await bus.until(lambda: len(rig.samples) > count + 20, "samples afterwards")
+        declared = rig.device.status().declared
+        assert declared is not None
+        assert (module.node, declared.repairs, declared.state) == (9, 1, SettingsState.AGREE)
+
+    bus.play(story)

@@ -1,7 +1,7 @@
 """The life of a device on a CAN bus inside the process: streams, loses frames by cause, bus down and up."""
 
 from collections.abc import Callable, Coroutine, Sequence
-from itertools import pairwise
+from itertools import count, pairwise
 from random import Random
 from time import monotonic_ns
 from typing import Any
@@ -18,7 +18,9 @@ from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
 from imud.devices.imu61x.can.codec import Imu61xCanSettings, encode_set
 from imud.event import EventKind
 from imud.formats.can import CanFrame
+from imud.host_clock import HostClock
 from imud.links.memory import MemorySettings
+from imud.units import NS_PER_S
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
 from tests.support.event_loops import VirtualClock
@@ -184,6 +186,34 @@ def test_a_device_that_has_not_answered_is_asked_on() -> None:
         tries = [after - before for before, after in pairwise(counts)]
         assert tries[1] == tries[2] == tries[3] > 0
         assert tries[0] > tries[1]
+
+    play_rigs(rigs, story, clock)
+
+
+def test_what_a_device_measured_while_the_host_was_suspended_is_a_gap_of_unknown_size() -> None:
+    clock, asleep_ns, index = VirtualClock(), 0, count()
+    now_ns = clock.now_ns
+    host = HostClock(now_ns, clock.realtime_ns, now_ns, lambda: now_ns() + asleep_ns)
+    rigs = DeviceRigs(host)
+    rig = rigs.add(configured())
+
+    def send() -> None:
+        made = encode_set(
+            index=next(index), accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), euler_rad=(0, 0, 0), temperature_c=20,
+            base_id=101,
+        )  # fmt: skip
+        rig.can_link.feed([CanFrame(can_id, False, data, now_ns()) for can_id, data in made])
+
+    async def story(_made: list[DeviceRig]) -> None:
+        nonlocal asleep_ns
+        await rig.until(lambda: rig.can_link.listening)
+        await rig.until(lambda: len(rig.samples) > 200, step=send, step_s=0.01)
+        before = rig.ledger.lost_unknown
+        for suspends in (1, 2):
+            asleep_ns += 2 * NS_PER_S
+            samples = len(rig.samples)
+            await rig.until(lambda: len(rig.samples) > samples + 200, step=send, step_s=0.01)  # noqa: B023
+            assert (host.suspends, rig.ledger.lost_unknown) == (suspends, before + suspends)
 
     play_rigs(rigs, story, clock)
 

@@ -6,27 +6,15 @@ from random import Random
 import pytest
 
 from imud.contracts.codec import CodecEvent
-from imud.devices.hipnuc.uart.driver import DRIVER as HIPNUC
 from imud.ledger import Ledger
-from imud.runtime.detection import ASK_TRIES, QUIET_NS, GaveUp, Listen, Search, Step, StreamFound
+from imud.runtime.detection import QUIET_NS, GaveUp, Listen, Search, Step, StreamFound
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.fake_drivers import BAUD_RATES, FAKE_DRIVER, QUERY, REPLY, SYNC, fake_frame
 from tests.support.uart_wire import FakeDevice, received, run_search
 
-HIPNUC_REPLY = b"PNAME=HI14R3\r\nBUILD=Oct 15 2024\r\nUUID=043995698D6E1708\r\nAPP_VER=156\r\nBL_VER=109\r\nOK\r\n"
-
 
 def device(baud: int, rate_hz: float, phase_ns: int = 0, poll_ns: int = NS_PER_MS) -> FakeDevice:
     return FakeDevice(FAKE_DRIVER, baud, rate_hz, phase_ns, poll_ns, REPLY, QUERY, random=Random(baud + phase_ns))
-
-
-def frames_in(found: StreamFound) -> int:
-    """Frames that the device's own codec makes of what was kept."""
-    ledger = Ledger()
-    codec = FAKE_DRIVER.make_codec(ledger, FAKE_DRIVER.settings())
-    for data, _ in found.chunks:
-        codec.feed(data)
-    return ledger.frames_in_samples
 
 
 def test_the_line_model_gives_the_bytes_at_the_right_rate_and_others_at_wrong_ones() -> None:
@@ -36,31 +24,6 @@ def test_the_line_model_gives_the_bytes_at_the_right_rate_and_others_at_wrong_on
     assert [value for _, value in received(b"\x00", 9600, 115200)] == [0]
     # 0x55 at half the rate: start low 2 bits, then pairs 11 00 11 00: sampled 0 11 00 11 0
     assert received(b"\x55", 115200, 230400)[0][1] == 0b01100110
-
-
-@pytest.mark.parametrize("baud", BAUD_RATES)
-@pytest.mark.parametrize("poll_ms", [1, 16])
-def test_a_100_hz_device_is_found_cold_at_every_rate(baud: int, poll_ms: int) -> None:
-    random = Random(baud)
-    for _ in range(10):
-        search = Search([FAKE_DRIVER], hold_ns=poll_ms * NS_PER_MS if poll_ms > 1 else 0, may_ask=True)
-        far = device(baud, 100, random.randrange(NS_PER_S), poll_ms * NS_PER_MS)
-        found, took_ns, _ = run_search(search, far, start_ns=5 * NS_PER_S)
-        assert isinstance(found, StreamFound)
-        assert found.baud == baud
-        assert took_ns < 1.5 * NS_PER_S
-        assert frames_in(found) >= 2
-        assert far.sent_to == []
-
-
-@pytest.mark.parametrize("baud", BAUD_RATES)
-def test_the_remembered_rate_comes_first(baud: int) -> None:
-    search = Search([FAKE_DRIVER], remembered=("fake-uart", baud))
-    found, took_ns, listens = run_search(search, device(baud, 100, 1_234_567), start_ns=NS_PER_S)
-    assert isinstance(found, StreamFound)
-    assert {listen.baud for listen in listens} == {baud}
-    assert took_ns < 0.3 * NS_PER_S
-    assert found.wasted_bytes == 0
 
 
 def test_a_remembered_rate_that_is_wrong_costs_little_and_its_bytes_are_reported() -> None:
@@ -125,14 +88,6 @@ def test_nothing_is_sent_without_leave() -> None:
     assert {listen.baud for listen in listens} == set(BAUD_RATES)
     assert "heard nothing at 115200" in result.summary
     assert "query" not in result.summary
-
-
-def test_each_rate_is_asked_as_often_as_said_and_the_error_says_so() -> None:
-    far = device(57600, 0)
-    result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far)
-    assert isinstance(result, GaveUp)
-    assert far.sent_to == [(baud, QUERY) for baud in BAUD_RATES for _ in range(ASK_TRIES)]
-    assert "no answer to a query" in result.summary
 
 
 def test_another_kind_of_device_is_never_written_to_and_is_described() -> None:
@@ -302,19 +257,6 @@ def test_cut_frames_and_random_bytes_are_no_device() -> None:
         result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far, start_ns=NS_PER_S)
         assert isinstance(result, GaveUp)
         assert far.sent_to == []
-
-
-@pytest.mark.parametrize("baud", HIPNUC.baud_rates)
-def test_a_hipnuc_module_is_found_by_its_frames_and_when_silent_by_its_reply(baud: int) -> None:
-    far = FakeDevice(HIPNUC, baud, 100, 1_000_000, random=Random(baud))
-    found, _, _ = run_search(Search([HIPNUC], may_ask=True), far, start_ns=NS_PER_S)
-    assert isinstance(found, StreamFound)
-    assert (found.driver.name, found.baud) == ("hipnuc-uart", baud)
-    far = replace(far, rate_hz=0, query=b"LOG VERSION\r\n", reply=HIPNUC_REPLY)
-    found, took_ns, _ = run_search(Search([HIPNUC], may_ask=True), far, start_ns=NS_PER_S)
-    assert isinstance(found, StreamFound)
-    assert found.baud == baud
-    assert took_ns < 4 * NS_PER_S
 
 
 def test_a_search_needs_drivers() -> None:

@@ -11,6 +11,7 @@ from imud.devices.imu61x.uart.codec import encode_acknowledgement, encode_status
 from imud.devices.imu61x.uart.commands import ask_status
 from imud.devices.imu61x.uart.driver import DRIVER as IMU61X
 from imud.devices.imu61x.uart.replies import Status
+from imud.ledger import Ledger
 from imud.runtime.detection import ASK_TRIES, GaveUp, Search, StreamFound
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.uart_wire import FakeDevice, run_search
@@ -45,6 +46,11 @@ def test_a_streaming_device_is_found_cold_among_all(driver: StreamDriver, baud: 
         assert (found.driver.name, found.baud) == (driver.name, baud)
         assert took_ns < 2 * NS_PER_S
         assert far.sent_to == []
+        ledger = Ledger()
+        codec = driver.make_codec(ledger, driver.settings())
+        for data, _ in found.chunks:  # the device's own codec gets whole frames
+            codec.feed(data)
+        assert ledger.frames_in_samples >= 2
 
 
 @every_rate
@@ -54,6 +60,7 @@ def test_a_remembered_device_is_found_at_once(driver: StreamDriver, baud: int) -
     assert isinstance(found, StreamFound)
     assert found.driver is driver
     assert {listen.baud for listen in listens} == {baud}
+    assert found.wasted_bytes == 0
     assert took_ns < (0.3 if baud > 9600 else 0.4) * NS_PER_S  # two frames of 136 bytes take 283 ms at 9600 baud
 
 
@@ -76,22 +83,11 @@ def test_a_silent_device_is_found_by_its_answer(driver: StreamDriver, baud: int)
     assert took_ns < 8 * NS_PER_S
 
 
-@pytest.mark.parametrize("rate_hz", [1, 10])
-@pytest.mark.parametrize("driver", FAMILIES, ids=lambda driver: driver.name)
-def test_a_slow_device_is_found(driver: StreamDriver, rate_hz: int) -> None:
-    for phase_ns in range(0, NS_PER_S, NS_PER_S // 4):
-        far = device(driver, 115200, rate_hz, phase_ns)
-        found, took_ns, _ = run_search(Search(FAMILIES, may_ask=True), far, start_ns=9 * NS_PER_S)
-        assert isinstance(found, StreamFound)
-        assert found.driver is driver
-        assert took_ns < 15 * NS_PER_S
-        assert far.sent_to == []
-
-
 def test_every_driver_is_asked_as_often_at_the_rates() -> None:
     far = device(HIPNUC, 57600, 0)
     result, _, _ = run_search(Search(FAMILIES, may_ask=True), far)
     assert isinstance(result, GaveUp)
+    assert "no answer to a query" in result.summary
     bauds = {baud for driver in FAMILIES for baud in driver.baud_rates}
     for query, _ in ANSWERS.values():
         asked = [baud for baud, sent in far.sent_to if sent == query]

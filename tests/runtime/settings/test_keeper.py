@@ -15,23 +15,19 @@ from imud.config import DeviceConfig
 from imud.contracts.device_settings import AppliedSettings, OnDifference, SettingsState, SettingsStatus, StepOutcome
 from imud.contracts.status import DeviceState
 from imud.devices import DRIVERS
-from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
 from imud.errors import BadArgument, CommandError
 from imud.event import Event, EventKind
-from imud.formats.can import CanFrame
-from imud.links.memory import MemoryCanLink, MemorySettings
+from imud.links.memory import MemorySettings
 from imud.runtime.identity import IDENTIFY_AGAIN_S
 from imud.runtime.settings.flash import LIMIT_ASKED, LIMIT_ITSELF
 from imud.runtime.settings.keeper import READ_TRIES
 from imud.runtime.stream import transport as stream_transport
-from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule
 from imud.units import NS_PER_S
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
 from tests.support.event_loops import VirtualClock
 from tests.support.fake_drivers import FACTORY, FAKE_MODULE_DRIVER, FAKE_SETTINGS, FakeModule
 from tests.support.polled_bus_bench import PolledBusBench, on_i2c
-from tests.support.simulated_modules import unpack
 from tests.support.stories import played
 
 STEP_S, LONG_STEP_S = 0.05, 0.5
@@ -658,46 +654,3 @@ def compared(rig: DeviceRig) -> SettingsState | None:
 def repairs(rig: DeviceRig) -> int:
     found = rig.device.status().declared
     return found.repairs if found is not None else 0
-
-
-def test_a_node_on_a_can_bus_is_set_and_followed() -> None:
-    clock = VirtualClock()
-    module = HipnucCanopenModule(clock.now_ns(), HipnucCanopenHardware(boot_ms=0))
-    link_settings = MemorySettings(name="can0", baud=500_000)
-    options = HipnucCanopenSettings(node=module.node)
-    plain = DeviceConfig("mast", "hipnuc-canopen", options, True, "memory", link_settings)
-    config = declaring(plain, OnDifference.APPLY_AND_SAVE, tpdo1_interval_ms=20, tpdo2_interval_ms=20, node=9)
-    rigs = DeviceRigs(clock.host)
-    link = CanLine(link_settings, module, clock)
-    rig = rigs.add(config, link)
-
-    async def story(_made: list[DeviceRig]) -> None:
-        carrying = asyncio.ensure_future(link.carry())
-        saved = "; saved to flash; restarted"
-        await rig.until(lambda: any(saved in event.message for event in rig.events), saved, 60)
-        await rig.until_samples(5)
-        assert (module.node, repairs(rig), compared(rig)) == (9, 1, SettingsState.AGREE)
-        carrying.cancel()
-
-    play_rigs(rigs, story, clock)
-
-
-class CanLine(MemoryCanLink):
-    """A CAN bus with a simulated node."""
-
-    def __init__(self, settings: MemorySettings, module: HipnucCanopenModule, clock: VirtualClock) -> None:
-        super().__init__(settings)
-        self.module = module
-        self.clock = clock
-
-    def write(self, data: bytes) -> None:
-        super().write(data)
-        can_id, payload = unpack(data)
-        self.module.receive(can_id, False, payload, self.clock.now_ns())
-
-    async def carry(self) -> None:
-        """What the node sends."""
-        while True:
-            sent = self.module.advance(self.clock.now_ns())
-            self.feed([CanFrame(one.can_id, one.extended, one.data, one.due_ns) for one in sent])
-            await asyncio.sleep(0.001)
