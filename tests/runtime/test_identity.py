@@ -9,7 +9,7 @@ from imud.runtime.identity import KnownIdentity, identity_words
 from imud.runtime.notices import Notices
 
 
-def test_only_differences_are_reported() -> None:
+def test_only_differences_to_a_known_device_are_reported() -> None:
     events: list[Event] = []
     times_ns = iter((3, 4))  # one for each event
     known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: next(times_ns))
@@ -23,17 +23,14 @@ def test_only_differences_are_reported() -> None:
         (4, EventKind.CONFIGURATION, "another device: serial number B2, was A1"),
     ]
     assert (known.identity.serial_number, known.settings) == ("B2", {"ATT_MODE": "1"})
-
-
-def test_a_device_that_never_said_its_number_is_no_other() -> None:
-    events: list[Event] = []
+    events = []
     known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: 5)
     known.update(Identity("HI14"), {})
     known.update(Identity("HI14", "B2"), {})
     assert not events
 
 
-def test_what_an_answer_lost_is_known_from_before() -> None:
+def test_what_an_answer_lost_is_known_from_before_of_the_same_device() -> None:
     """An adapter that was just plugged in: the first answers have lost bytes."""
     events: list[Event] = []
     known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: 5)
@@ -45,10 +42,7 @@ def test_what_an_answer_lost_is_known_from_before() -> None:
     assert not events
     known.update(Identity("HI14", "A1", "1.6.9", {"BUILD": "y"}), {})
     assert known.identity == Identity("HI14", "A1", "1.6.9", {"BUILD": "y"})
-
-
-def test_nothing_is_taken_from_another_device() -> None:
-    events: list[Event] = []
+    events = []
     known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: 5)
     known.update(Identity("HI14", "A1", "1.5.6"), {})
     known.update(Identity("", "B2"), {})

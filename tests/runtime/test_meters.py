@@ -8,22 +8,19 @@ from imud.sample import Sample, Sync
 S = 1_000_000_000
 
 
-def test_rate_over_the_window() -> None:
+def test_rate_over_the_window_falls_to_zero_when_samples_stop() -> None:
     meter = RateMeter()
     assert meter.rate_hz() == 0.0
     for tenth in range(31):  # 3 s at 100 Hz
         meter.mark(tenth * S // 10, tenth * 10)
     assert meter.rate_hz() == 100.0
-
-
-def test_rate_falls_to_zero_when_samples_stop() -> None:
     meter = RateMeter()
     for tenth in range(50):
         meter.mark(tenth * S // 10, min(tenth, 10) * 10)
     assert meter.rate_hz() == 0.0
 
 
-def test_latency_goes_into_the_bucket_whose_bound_it_does_not_exceed() -> None:
+def test_latencies_go_into_the_buckets_whose_bounds_they_do_not_exceed() -> None:
     meter = LatencyMeter()
     for latency_ns in (50_000, 50_001, 10**12):
         meter.add(2 * 10**12, published_after(latency_ns))
@@ -31,9 +28,6 @@ def test_latency_goes_into_the_bucket_whose_bound_it_does_not_exceed() -> None:
     assert meter.buckets[1] == 1
     assert meter.buckets[len(LATENCY_BOUNDS_NS)] == 1
     assert meter.sum_ns == 100_001 + 10**12
-
-
-def test_a_batch_goes_into_the_same_buckets_as_its_samples_alone() -> None:
     latencies = [10**12, 50_000_001, 50_000_000, 20_000_000, 20_000_000, 5_000_001, 49_999, 7]
     together, alone = LatencyMeter(), LatencyMeter()
     together.add(2 * 10**12, published_after(*latencies))

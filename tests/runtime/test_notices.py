@@ -19,14 +19,19 @@ def make() -> tuple[Notices, Ledger, list[Event]]:
     return Notices("bow", ledger, events.append), ledger, events
 
 
-def test_nothing_happened_nothing_is_told() -> None:
+def test_only_a_change_of_sync_is_told() -> None:
     notices, _, events = make()
     for t in range(5):
         notices.tick(t * S, Sync.ARRIVAL)
     assert events == []
+    notices, _, events = make()
+    notices.tick(0, Sync.ARRIVAL)
+    notices.tick(1, Sync.ARRIVAL)
+    notices.tick(2, Sync.REGRESSION)
+    assert [(e.kind, e.detail) for e in events] == [(EventKind.SYNC, {"sync": "regression", "before": "arrival"})]
 
 
-def test_loss_is_told_once_a_second_with_causes() -> None:
+def test_losses_are_told_once_a_second_with_causes_and_bad_frames_with_the_last() -> None:
     notices, ledger, events = make()
     ledger.lost_crc = 2
     notices.tick(10 * S, None)
@@ -37,23 +42,12 @@ def test_loss_is_told_once_a_second_with_causes() -> None:
     assert [e.message for e in events] == ["2 samples lost", "5 samples lost"]
     assert events[1].kind is EventKind.LOSS
     assert events[1].detail == {"gap_device": 5, "crc": 2, "overrun": 0, "queue": 0}
-
-
-def test_bad_frames_are_counted_and_the_last_is_shown() -> None:
     notices, ledger, events = make()
     ledger.frames_bad_crc = 3
     notices.bad_frame(BadFrame(BadReason.CRC, b"\x5a\xa5\x01"))
     notices.tick(S, None)
     assert events[0].kind is EventKind.BAD_FRAME
     assert events[0].message == "3 bad frames, the last by crc: 5a a5 01"
-
-
-def test_change_of_sync_is_told_but_not_the_first_one() -> None:
-    notices, _, events = make()
-    notices.tick(0, Sync.ARRIVAL)
-    notices.tick(1, Sync.ARRIVAL)
-    notices.tick(2, Sync.REGRESSION)
-    assert [(e.kind, e.detail) for e in events] == [(EventKind.SYNC, {"sync": "regression", "before": "arrival"})]
 
 
 def test_texts_of_an_event_are_printable_and_bounded() -> None:

@@ -135,7 +135,7 @@ def test_the_better_of_two_references_counts(bench: KeeperBench) -> None:
     assert by_pulses.offset_ns != good.offset_ns
 
 
-def test_the_reference_is_updated_once_a_second_and_dropped_when_there_is_none() -> None:
+def test_a_clock_has_the_reference_of_each_second_from_its_start_to_the_end_of_the_link() -> None:
     bench = KeeperBench(source=False, system=UtcReference(5, 5))
     bench.keeper.tick(BEGIN_NS, None)
     assert bench.clock.utc_reference == UtcReference(5, 5)
@@ -144,9 +144,6 @@ def test_the_reference_is_updated_once_a_second_and_dropped_when_there_is_none()
     assert bench.clock.utc_reference == UtcReference(5, 5)
     bench.keeper.tick(BEGIN_NS + NS_PER_S, None)
     assert bench.clock.utc_reference is None
-
-
-def test_a_clock_has_the_reference_from_its_start_and_none_after_the_end_of_the_link() -> None:
     bench = KeeperBench(source=False, system=UtcReference(5, 5))
     bench.keeper.tick(BEGIN_NS, None)
     other = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
@@ -161,7 +158,7 @@ def test_a_clock_has_the_reference_from_its_start_and_none_after_the_end_of_the_
     assert other.utc_reference == UtcReference(6, 6)
 
 
-def test_close_releases_source_and_socket_and_nothing_starts_again() -> None:
+def test_close_releases_source_and_socket_and_nothing_starts_again_or_at_all() -> None:
     bench = KeeperBench()
     bench.keeper.close()
     bench.keeper.close()
@@ -171,9 +168,6 @@ def test_close_releases_source_and_socket_and_nothing_starts_again() -> None:
     bench.keeper.tick(BEGIN_NS, None)
     assert bench.source.started == 0
     UtcKeeper(None, None, lambda: None, lambda: 0).close()
-
-
-def test_a_keeper_that_was_closed_before_its_first_tick_starts_no_source() -> None:
     source = FakeSource()
     keeper = UtcKeeper(source, None, lambda: None, lambda: 0)
     keeper.close()

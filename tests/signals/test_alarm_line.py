@@ -23,19 +23,19 @@ def signals() -> SignalBench:
     return SignalBench()
 
 
-def test_no_alarm_at_the_beginning_is_no_news(signals: SignalBench) -> None:
+def test_at_the_beginning_only_an_alarm_is_news_and_once(signals: SignalBench) -> None:
     line = AlarmLine(signals.raise_event)
     line.on_level(5, False)
     assert (line.active, line.raised, len(signals.events)) == (False, 0, 0)
-
-
-def test_an_alarm_at_the_beginning_is(signals: SignalBench) -> None:
     line = AlarmLine(signals.raise_event)
     line.on_level(5, True)
     assert (line.active, line.raised) == (True, 1)
     (event,) = signals.events
     assert (event.t_ns, event.kind, event.message) == (5, EventKind.ALARM, "alarm")
     assert event.detail == {"active": True, "raised": 1, "changes": 1}
+    # The edge that came between opening the line and reading its level
+    line.on_edges([Edge(10 * NS_PER_S, True, 1)])
+    assert (len(signals.events), line.raised) == (1, 1)
 
 
 def test_edges_are_events_at_their_own_time(signals: SignalBench) -> None:
@@ -49,7 +49,7 @@ def test_edges_are_events_at_their_own_time(signals: SignalBench) -> None:
     assert (line.active, line.raised) == (False, 1)
 
 
-def test_a_line_that_chatters_makes_one_event_a_second(signals: SignalBench) -> None:
+def test_a_chattering_line_makes_one_event_a_second_and_the_last_state_is_reported(signals: SignalBench) -> None:
     line = AlarmLine(signals.raise_event)
     line.on_level(0, False)
     line.on_edges([Edge(NS_PER_S + n * NS_PER_MS, n % 2 == 0, n + 1) for n in range(1500)])
@@ -57,9 +57,7 @@ def test_a_line_that_chatters_makes_one_event_a_second(signals: SignalBench) -> 
     assert signals.events[1].message == "alarm (the line changed 1000 times)"
     assert signals.events[1].detail == {"active": True, "raised": 501, "changes": 1000}
     assert line.raised == 750
-
-
-def test_the_last_state_is_always_reported(signals: SignalBench) -> None:
+    signals.events.clear()
     line = AlarmLine(signals.raise_event)
     line.on_level(0, True)
     line.on_edges([Edge(NS_PER_MS, False, 1)])
@@ -68,14 +66,6 @@ def test_the_last_state_is_always_reported(signals: SignalBench) -> None:
     line.tick(NS_PER_S)
     line.tick(3 * NS_PER_S)
     assert signals.messages() == ["alarm", "no alarm any more"]
-
-
-def test_what_is_known_already_is_nothing_new(signals: SignalBench) -> None:
-    """The edge that came between opening the line and reading its level."""
-    line = AlarmLine(signals.raise_event)
-    line.on_level(0, True)
-    line.on_edges([Edge(10 * NS_PER_S, True, 1)])
-    assert (len(signals.events), line.raised) == (1, 1)
 
 
 def test_a_line_that_went_away_and_came_back(signals: SignalBench) -> None:

@@ -28,20 +28,14 @@ def read(made: ReadyEdges, start_ms: float, end_ms: float) -> tuple[int, int] | 
     return (stamp.number, stamp.t_ns) if stamp is not None else None
 
 
-def test_a_read_is_of_the_newest_edge_before_it() -> None:
+def test_a_read_is_of_the_newest_edge_before_it_and_the_others_are_missed() -> None:
     made = edges(1, 2, 3)
     assert [read(made, at, at + 0.2) for at in (1.1, 2.0, 3.3)] == [(1, MS), (2, 2 * MS), (3, 3 * MS)]
     assert made.missed == 0
-
-
-def test_of_two_edges_before_one_read_the_older_is_missed() -> None:
     made = edges(1, 2, 3, 4)
     assert read(made, 1.1, 1.2) == (1, MS)
     assert read(made, 4.2, 4.3) == (4, 4 * MS)
     assert made.missed == 2
-
-
-def test_edges_that_the_kernel_dropped_are_missed() -> None:
     made = edges(1, 5)
     assert read(made, 1.1, 1.2) == (1, MS)
     assert read(made, 5.1, 5.2) == (5, 5 * MS)
@@ -49,13 +43,10 @@ def test_edges_that_the_kernel_dropped_are_missed() -> None:
     assert made.interval_ns == MS
 
 
-def test_an_edge_that_was_read_twice_is_not_missed() -> None:
+def test_edges_read_twice_or_before_a_restart_are_not_missed() -> None:
     made = edges(1, 2)
     assert [read(made, at, at + 0.1) for at in (1.1, 1.5, 2.1)] == [(1, MS), (1, MS), (2, 2 * MS)]
     assert made.missed == 0
-
-
-def test_after_a_restart_nothing_was_missed() -> None:
     made = edges(1, 2, 3, 4)
     read(made, 1.1, 1.2)
     made.restart()

@@ -64,38 +64,29 @@ class Round:
         return step.summary
 
 
-def test_one_device_is_found_at_the_end_of_the_round() -> None:
+def test_one_device_is_found_beside_strangers_and_several_are_named() -> None:
     heard = Round().hear(fake_can_frame(8), fake_can_frame(8, 1))
     assert heard.early is None
     assert heard.search.on_time(LISTEN_NS - 1) is None
     assert heard.found() == "fake-can node 8"
     assert heard.until_ns == LISTEN_NS
     assert Round().hear(*imu61x(1), *imu61x(2)).found() == "imu61x-can base_id 101"
-
-
-def test_strangers_beside_it_do_not_matter() -> None:
     random = Random(7)
     strangers = [CanFrame(0x400 + random.randrange(100), False, random.randbytes(3), 0) for _ in range(50)]
     assert Round().hear(*strangers, fake_can_frame(8), *strangers, fake_can_frame(8, 1)).found() == "fake-can node 8"
-
-
-def test_of_several_every_one_is_named() -> None:
     frames = [f for n in (1, 2) for f in (fake_can_frame(8, n), fake_can_frame(9, n), *imu61x(n))]
     assert Round().hear(*frames).complaint() == (
         "3 devices are heard on can0, fake-can node 8, fake-can node 9, imu61x-can base_id 101: name driver and options"
     )
 
 
-def test_one_measurement_is_too_few_and_waited_for() -> None:
+def test_samples_that_are_not_whole_are_waited_for_and_told() -> None:
     heard = Round().hear(*imu61x(1))
     step = heard.search.on_time(heard.until_ns)
     assert isinstance(step, Listen)
     heard.until_ns = step.until_ns
     heard.hear(*imu61x(2))
     assert heard.found() == "imu61x-can base_id 101"
-
-
-def test_frames_without_samples_are_waited_for_and_told() -> None:
     heard = Round().hear(*imu61x(1)[:3], *imu61x(2)[:3])
     assert heard.complaint() == (
         "frames as of imu61x-can base_id 101 come on can0, but no whole sample: name driver and options"
@@ -103,16 +94,13 @@ def test_frames_without_samples_are_waited_for_and_told() -> None:
     assert PATIENCE_NS <= heard.until_ns < PATIENCE_NS + 2 * LISTEN_NS
 
 
-def test_unknown_frames_are_shown_by_their_identifiers() -> None:
+def test_unknown_frames_are_shown_by_their_identifiers_and_silence_as_such() -> None:
     frames = [CanFrame(0x18FEE9AA, True, bytes(8), 0), CanFrame(0x65, True, bytes(8), 0), CanFrame(0x7, False, b"", 0)]
     assert Round().hear(*frames).complaint() == (
         "frames come on can0 that no driver knows (0x007, 0x00000065, 0x18FEE9AA): name driver and options"
     )
     many = [CanFrame(number, False, b"", 0) for number in range(12)]
     assert "0x007 and 4 more" in Round().hear(*many).complaint()
-
-
-def test_silence() -> None:
     assert "nothing is heard on can0" in Round().complaint()
 
 
@@ -125,22 +113,19 @@ def test_devices_of_others_are_left_to_them() -> None:
     assert "only frames of other configured devices" in heard.complaint()
 
 
-def test_the_remembered_device_is_taken_at_once() -> None:
+def test_the_remembered_device_is_taken_at_once_if_it_is_free() -> None:
     heard = Round(remembered=("fake-can", 9))
     heard.hear(fake_can_frame(8, 1), fake_can_frame(9, 1), fake_can_frame(8, 2))
     assert heard.early is None
     heard.hear(fake_can_frame(9, 2))
     assert heard.early is not None
     assert heard.early.device.title == "fake-can node 9"
-
-
-def test_a_remembered_device_that_another_one_has_is_not() -> None:
     heard = Round(remembered=("fake-can", 9), claimed=lambda can_id, _: can_id == BASE + 9)
     heard.hear(*(fake_can_frame(9, n) for n in range(5)))
     assert heard.early is None
 
 
-def test_a_protocol_that_only_seems_so_does_not_delay_the_right_one() -> None:
+def test_only_protocols_that_yield_samples_are_named() -> None:
     """A second driver names the same frames as those of its own device, and gets no samples out of them."""
     search = CanSearch([fake_can_driver("wrong", BASE - 1), FAKE], "can0")
     search.start(0)
@@ -148,9 +133,6 @@ def test_a_protocol_that_only_seems_so_does_not_delay_the_right_one() -> None:
     step = search.on_time(LISTEN_NS)
     assert isinstance(step, CanFound)
     assert step.device.title == "fake-can node 8"
-
-
-def test_two_protocols_that_both_understand_are_both_named() -> None:
     search = CanSearch([fake_can_driver("twin"), FAKE], "can0")
     search.start(0)
     search.on_frames([fake_can_frame(8, 1), fake_can_frame(8, 2)])

@@ -26,21 +26,15 @@ def recalled(folder: Path, device: str) -> RememberedDevice | None:
         return memory.get(device)
 
 
-def test_survives_a_restart(tmp_path: Path) -> None:
+def test_the_newest_findings_survive_a_restart_and_are_written_once(tmp_path: Path) -> None:
     remember(tmp_path, bow=RememberedDevice("hipnuc-uart", 921600))
     assert recalled(tmp_path, "bow") == RememberedDevice("hipnuc-uart", 921600)
     assert recalled(tmp_path, "stern") is None
     assert [file.name for file in tmp_path.iterdir()] == [FILE_NAME]
-
-
-def test_unchanged_finding_does_not_write(tmp_path: Path) -> None:
     remember(tmp_path, bow=FOUND)
     written = (tmp_path / FILE_NAME).stat()
     remember(tmp_path, bow=FOUND)
     assert (tmp_path / FILE_NAME).stat().st_ino == written.st_ino
-
-
-def test_the_newest_of_many_findings_is_written(tmp_path: Path) -> None:
     with closing(Remembered(tmp_path)) as memory:
         for number in range(500):
             memory.put(f"d{number % 7}", RememberedDevice("hipnuc-uart", number))
@@ -129,15 +123,14 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_unwritable_folder_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_without_a_folder_or_the_right_to_write_it_the_memory_lasts_for_the_run(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with closing(Remembered(None)) as memory:
+        memory.put("bow", FOUND)
+        assert memory.get("bow") == FOUND
     (tmp_path / "taken").touch()
     with closing(Remembered(tmp_path / "taken" / "imud")) as memory:
         memory.put("bow", FOUND)
         assert memory.get("bow") == FOUND
     assert "cannot be written" in caplog.text
-
-
-def test_no_folder_remembers_in_memory_only() -> None:
-    with closing(Remembered(None)) as memory:
-        memory.put("bow", FOUND)
-        assert memory.get("bow") == FOUND

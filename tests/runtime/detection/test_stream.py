@@ -26,7 +26,7 @@ def test_the_line_model_gives_the_bytes_at_the_right_rate_and_others_at_wrong_on
     assert received(b"\x55", 115200, 230400)[0][1] == 0b01100110
 
 
-def test_a_remembered_rate_that_is_wrong_costs_little_and_its_bytes_are_reported() -> None:
+def test_a_remembered_rate_that_is_wrong_costs_little_and_one_that_no_longer_exists_nothing() -> None:
     search = Search([FAKE_DRIVER], remembered=("fake-uart", 9600))
     found, took_ns, listens = run_search(search, device(921600, 100, 777), start_ns=NS_PER_S)
     assert isinstance(found, StreamFound)
@@ -34,6 +34,9 @@ def test_a_remembered_rate_that_is_wrong_costs_little_and_its_bytes_are_reported
     assert listens[0].baud == 9600
     assert found.wasted_bytes > 0
     assert took_ns < 0.8 * NS_PER_S  # garbage ends the long wait for silence
+    assert first_baud(Search([FAKE_DRIVER], remembered=("gone-uart", 9600))) == BAUD_RATES[0]
+    assert first_baud(Search([FAKE_DRIVER], remembered=("fake-uart", 57600))) == BAUD_RATES[0]
+    assert first_baud(Search([FAKE_DRIVER], bauds=(9600,), remembered=("fake-uart", 115200))) == 9600
 
 
 def test_an_adapter_that_holds_bytes_back_gets_as_much_more_time() -> None:
@@ -43,12 +46,6 @@ def test_an_adapter_that_holds_bytes_back_gets_as_much_more_time() -> None:
         assert isinstance(step, Listen)
         until_ns.append(step.until_ns)
     assert until_ns[1] - until_ns[0] == 16 * NS_PER_MS
-
-
-def test_a_remembered_driver_or_rate_that_no_longer_exists_is_ignored() -> None:
-    assert first_baud(Search([FAKE_DRIVER], remembered=("gone-uart", 9600))) == BAUD_RATES[0]
-    assert first_baud(Search([FAKE_DRIVER], remembered=("fake-uart", 57600))) == BAUD_RATES[0]
-    assert first_baud(Search([FAKE_DRIVER], bauds=(9600,), remembered=("fake-uart", 115200))) == 9600
 
 
 def first_baud(search: Search) -> int:
@@ -80,7 +77,7 @@ def test_a_silent_device_is_asked_after_the_quiet_time_only(baud: int) -> None:
     assert b"".join(data for data, _ in found.chunks) == REPLY
 
 
-def test_nothing_is_sent_without_leave() -> None:
+def test_nothing_is_sent_without_leave_or_to_another_kind_of_device() -> None:
     far = device(115200, 0)
     result, _, listens = run_search(Search([FAKE_DRIVER]), far)
     assert isinstance(result, GaveUp)
@@ -88,9 +85,6 @@ def test_nothing_is_sent_without_leave() -> None:
     assert {listen.baud for listen in listens} == set(BAUD_RATES)
     assert "heard nothing at 115200" in result.summary
     assert "query" not in result.summary
-
-
-def test_another_kind_of_device_is_never_written_to_and_is_described() -> None:
     far = replace(device(115200, 10), noise=b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
     result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far)
     assert isinstance(result, GaveUp)
@@ -98,6 +92,9 @@ def test_another_kind_of_device_is_never_written_to_and_is_described() -> None:
     assert "115200: " in result.summary
     assert "0 valid frames" in result.summary
     assert result.wasted_bytes > 0
+    far = replace(device(115200, 0), reply=b"OK\r\n")
+    result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far)
+    assert isinstance(result, GaveUp)
 
 
 def test_noise_stops_the_questions() -> None:
@@ -119,22 +116,13 @@ def test_noise_stops_the_questions() -> None:
     assert sent == 0
 
 
-def test_an_end_line_alone_is_no_answer() -> None:
-    far = replace(device(115200, 0), reply=b"OK\r\n")
-    result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far)
-    assert isinstance(result, GaveUp)
-
-
-def test_one_valid_frame_is_no_lock() -> None:
+def test_two_valid_frames_are_a_lock_if_few_are_damaged() -> None:
     search = Search([FAKE_DRIVER], bauds=(115200,))
     search.start(0)
     step = search.on_data(fake_frame(b"x" * 76), 1)
     assert isinstance(step, Listen)  # a longer stay
     assert step.until_ns > NS_PER_S
     assert isinstance(search.on_data(fake_frame(b"y" * 76), 2), StreamFound)
-
-
-def test_damaged_frames_must_be_fewer_unless_many_are_good() -> None:
     bad = fake_frame(b"x" * 76)[:-1] + b"y"
     good = fake_frame(b"z" * 76)
     search = Search([FAKE_DRIVER], bauds=(115200,))
@@ -144,14 +132,11 @@ def test_damaged_frames_must_be_fewer_unless_many_are_good() -> None:
     assert isinstance(search.on_data(good, 9), StreamFound)
 
 
-def test_a_noisy_line_still_locks() -> None:
+def test_a_noisy_line_still_locks_also_on_frames_inside_a_false_long_one() -> None:
     far = replace(device(460800, 100, 4_000_000), damage=0.4)
     found, took_ns, _ = run_search(Search([FAKE_DRIVER]), far, start_ns=NS_PER_S)
     assert isinstance(found, StreamFound)
     assert took_ns < 2 * NS_PER_S
-
-
-def test_a_frame_inside_a_false_long_one_counts_when_the_line_is_idle() -> None:
     search = Search([FAKE_DRIVER], bauds=(115200,))
     step = search.start(0)
     assert isinstance(step, Listen)
@@ -206,14 +191,11 @@ def test_a_port_that_can_do_no_rate_is_given_up_at_once() -> None:
     assert "9600: not to be had" in step.summary
 
 
-def test_early_time_is_no_step() -> None:
+def test_a_visit_ends_at_its_time_or_by_a_flood() -> None:
     search = Search([FAKE_DRIVER])
     step = search.start(0)
     assert isinstance(step, Listen)
     assert search.on_time(step.until_ns - 1) is None
-
-
-def test_a_flood_ends_a_visit() -> None:
     search = Search([FAKE_DRIVER])
     step = search.start(0)
     assert isinstance(step, Listen)

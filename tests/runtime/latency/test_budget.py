@@ -19,7 +19,7 @@ class Told:
         return self.needs[-1].latency_ns / NS_PER_MS, self.needs[-1].who
 
 
-def test_the_strictest_of_those_that_concern_a_device_decides() -> None:
+def test_the_strictest_request_for_a_device_decides_whenever_it_appears() -> None:
     budget = LatencyBudget()
     bow, stern = Told(budget, "bow"), Told(budget, "stern")
     assert bow.needs == [NOBODY]
@@ -35,9 +35,18 @@ def test_the_strictest_of_those_that_concern_a_device_decides() -> None:
     assert bow.now == (50, "")
     assert stern.now == (2, "client 1")
     assert budget.need("stern") == Need(2 * NS_PER_MS, "client 1")
+    budget = LatencyBudget()
+    budget.ask("all", 9 * NS_PER_MS)
+    budget.ask("named", 4 * NS_PER_MS, ["bow"])
+    assert Told(budget, "bow").now == (4, "named")
+    assert Told(budget, "stern").now == (9, "all")
+    budget.remove_device("bow")
+    budget.remove_device("bow")
+    budget.ask("named", 3 * NS_PER_MS, ["bow"])
+    assert Told(budget, "bow").now == (3, "named")
 
 
-def test_a_device_is_told_changes_only() -> None:
+def test_a_device_is_told_changes_within_the_limits_only() -> None:
     budget = LatencyBudget()
     bow = Told(budget, "bow")
     budget.ask("client 1", 5 * NS_PER_MS)
@@ -49,18 +58,12 @@ def test_a_device_is_told_changes_only() -> None:
     assert bow.needs == [NOBODY, Need(5 * NS_PER_MS, "client 1")]
     budget.release("client 1")
     assert bow.needs[2:] == [Need(5 * NS_PER_MS, "client 2")]
-
-
-def test_a_device_that_appears_is_told_what_holds_already() -> None:
     budget = LatencyBudget()
-    budget.ask("all", 9 * NS_PER_MS)
-    budget.ask("named", 4 * NS_PER_MS, ["bow"])
-    assert Told(budget, "bow").now == (4, "named")
-    assert Told(budget, "stern").now == (9, "all")
-    budget.remove_device("bow")
-    budget.remove_device("bow")
-    budget.ask("named", 3 * NS_PER_MS, ["bow"])
-    assert Told(budget, "bow").now == (3, "named")
+    bow = Told(budget, "bow")
+    budget.ask("patient", 10 * MOST_NS)
+    assert bow.needs == [NOBODY]
+    budget.ask("hasty", -1)
+    assert bow.now == (0, "hasty")
 
 
 def test_any_order_of_requests_comes_to_the_strictest_of_those_that_stand() -> None:
@@ -104,12 +107,3 @@ def test_a_client_that_goes_costs_no_look_at_the_others() -> None:
         budget.release(name)
     assert bow.now == (50, "")
     assert compared < 1000 * 2 * 40, "a search of the list for each, and no more"
-
-
-def test_nothing_waits_longer_than_the_most_and_no_latency_is_negative() -> None:
-    budget = LatencyBudget()
-    bow = Told(budget, "bow")
-    budget.ask("patient", 10 * MOST_NS)
-    assert bow.needs == [NOBODY]
-    budget.ask("hasty", -1)
-    assert bow.now == (0, "hasty")

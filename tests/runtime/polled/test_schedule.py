@@ -25,15 +25,12 @@ def test_deadlines_do_not_drift_with_late_reads() -> None:
     assert one.counts.worst_ns == 200_000
 
 
-def test_later_than_a_quarter_of_the_period_is_late() -> None:
+def test_late_and_missed_deadlines_are_counted_and_the_rest_stays_in_step() -> None:
     one = schedule()
     for late_ns in (250_000, 250_001, 999_999):
         one.begun(one.due_ns + late_ns)
         one.done(one.due_ns + late_ns)
     assert one.counts.late == 2
-
-
-def test_missed_deadlines_are_counted_and_the_rest_stays_in_step() -> None:
     one = schedule()
     one.begun(5 * MS)
     one.done(5 * MS + 3_400_000)  # 6 and 7 passed and their whole periods with them; 8 is 0.4 ms late
@@ -43,9 +40,6 @@ def test_missed_deadlines_are_counted_and_the_rest_stays_in_step() -> None:
     one.done(8 * MS + 500_000)
     assert one.due_ns == 9 * MS
     assert one.counts.missed == 2
-
-
-def test_read_that_ends_right_at_a_deadline_misses_none() -> None:
     one = schedule()
     one.done(6 * MS + 999_999)
     assert (one.due_ns, one.counts.missed) == (6 * MS, 0)
@@ -65,7 +59,7 @@ def test_counts_go_on_over_schedules() -> None:
 # --- turns ------------------------------------------------------------------------------------------------------------
 
 
-def test_all_take_turns_whatever_a_turn_takes() -> None:
+def test_all_take_turns_also_with_one_that_comes_back() -> None:
     counts = [Deadlines() for _ in range(3)]
     turns = [RoundRobin(100, one) for one in counts]
     now_ns, order = 100, []
@@ -79,9 +73,6 @@ def test_all_take_turns_whatever_a_turn_takes() -> None:
     assert order == [0, 1, 2] * 10
     assert [one.polls for one in counts] == [10] * 3
     assert [one.late + one.missed + one.worst_ns for one in counts] == [0] * 3
-
-
-def test_who_comes_back_waits_for_its_turn() -> None:
     busy, back = RoundRobin(0, Deadlines()), RoundRobin(50, Deadlines())
     busy.done(49)
     assert busy.due_ns < back.due_ns
@@ -123,7 +114,7 @@ def read(made: ReadySchedule, start_ns: int, takes_ns: int = MS // 5) -> None:
     made.done(start_ns + takes_ns)
 
 
-def test_an_edge_is_due_at_once_and_nothing_without_one() -> None:
+def test_an_edge_is_due_at_once_and_late_after_a_quarter_of_the_interval() -> None:
     made = by_edges()
     assert made.due_ns == BEGIN + QUIET_NS
     for number in range(1, 100):
@@ -135,9 +126,6 @@ def test_an_edge_is_due_at_once_and_nothing_without_one() -> None:
     assert (made.counts.polls, made.counts.late, made.counts.missed) == (100, 0, 0)
     assert made.counts.sum_late_ns == 99 * 100_000
     assert made.counts.worst_ns == 100_000
-
-
-def test_later_than_a_quarter_of_the_interval_is_late() -> None:
     made = by_edges()
     for number, late_ns in enumerate((250_000, 250_001, 900_000), 1):
         made.on_edges([BEGIN + number * MS], MS)
@@ -208,7 +196,7 @@ def test_noticed_edges_end_and_come_back_as_others() -> None:
     assert made.due_ns == BEGIN + 602 * MS
 
 
-def test_without_edges_deadlines_come_again() -> None:
+def test_without_edges_deadlines_come_again_after_a_time_by_their_interval() -> None:
     made = by_edges(100.0)
     at_ns = made.due_ns + 7
     read(made, at_ns)
@@ -219,13 +207,13 @@ def test_without_edges_deadlines_come_again() -> None:
     assert made.period_ns == 10 * MS
     assert made.counts.polls == 6
     assert made.counts.worst_ns == 0
-
-
-def test_rare_edges_are_waited_for_longer() -> None:
     made = by_edges()
     made.on_edges([BEGIN + 400 * MS], 400 * MS)
     read(made, BEGIN + 400 * MS)
     assert made.due_ns == BEGIN + 1600 * MS
+    made = by_edges(100.0)
+    read(made, made.due_ns, 35 * MS)
+    assert made.counts.missed == 2
 
 
 def test_one_edge_is_no_return_two_are() -> None:
@@ -239,9 +227,3 @@ def test_one_edge_is_no_return_two_are() -> None:
     assert not made.by_edges
     made.on_edges([t_ns + QUIET_NS + MS], MS)
     assert (made.by_edges, made.due_ns) == (True, t_ns + QUIET_NS + MS)
-
-
-def test_deadlines_without_a_read_are_missed() -> None:
-    made = by_edges(100.0)
-    read(made, made.due_ns, 35 * MS)
-    assert made.counts.missed == 2
