@@ -44,7 +44,7 @@ def made() -> tuple[Exchange, list[bytes]]:
 
 
 @in_loop
-async def test_requests_go_out_one_after_the_other() -> None:
+async def test_requests_and_scripts_go_out_one_after_the_other() -> None:
     exchange, written = made()
     task = asyncio.create_task(exchange.run(ask(request("A"), request("B"))))
     await asyncio.sleep(0)
@@ -58,37 +58,6 @@ async def test_requests_go_out_one_after_the_other() -> None:
     outcomes = await task
     assert outcomes[0] == Reply(("A=1", "OK"))
     assert outcomes[1].lines == ("ERR",)
-
-
-@in_loop
-async def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
-    ledger = Ledger()
-    exchange = Exchange(ledger, lambda data: None, monotonic_ns)
-    assert await exchange.run(ask(request("A", timeout_ns=1))) == [Silence(())]
-    exchange.on_message("A=1", 0)
-    exchange.on_message("OK", 0)
-    assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
-    exchange.on_message("OK", 0)
-    assert ledger.replies_unsolicited == 1
-
-
-@in_loop
-async def test_link_that_is_gone_ends_the_script_and_the_next_one_works() -> None:
-    gone = True
-
-    def write(data: bytes) -> None:
-        if gone:
-            raise LinkMissing("pulled out")
-
-    exchange = Exchange(Ledger(), write, monotonic_ns)
-    with pytest.raises(LinkMissing):
-        await exchange.run(ask(request("A")))
-    gone = False
-    assert await exchange.run(ask(request("B", silent=True))) == [Reply(())]
-
-
-@in_loop
-async def test_second_script_waits_for_the_first() -> None:
     exchange, written = made()
     first = asyncio.create_task(exchange.run(ask(request("A"))))
     second = asyncio.create_task(exchange.run(ask(request("B"))))
@@ -105,7 +74,30 @@ async def test_second_script_waits_for_the_first() -> None:
 
 
 @in_loop
-async def test_cancelled_script_leaves_the_line_free() -> None:
+async def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
+    ledger = Ledger()
+    exchange = Exchange(ledger, lambda data: None, monotonic_ns)
+    assert await exchange.run(ask(request("A", timeout_ns=1))) == [Silence(())]
+    exchange.on_message("A=1", 0)
+    exchange.on_message("OK", 0)
+    assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
+    exchange.on_message("OK", 0)
+    assert ledger.replies_unsolicited == 1
+
+
+@in_loop
+async def test_a_script_that_is_cancelled_or_whose_link_is_gone_leaves_the_line_free() -> None:
+    gone = True
+
+    def write(data: bytes) -> None:
+        if gone:
+            raise LinkMissing("pulled out")
+
+    exchange = Exchange(Ledger(), write, monotonic_ns)
+    with pytest.raises(LinkMissing):
+        await exchange.run(ask(request("A")))
+    gone = False
+    assert await exchange.run(ask(request("B", silent=True))) == [Reply(())]
     exchange, _ = made()
     task = asyncio.create_task(exchange.run(ask(request("A"))))
     await asyncio.sleep(0)

@@ -89,9 +89,6 @@ def test_exchanged_axes_are_distinguished_from_a_line_that_is_not_connected() ->
     assert run(levels_of_y=True) is AlarmVerdict.RIGHT
     assert run(levels_of_y=False) is AlarmVerdict.OTHER_AXIS
     assert run(levels_of_y=True, stuck=True) is AlarmVerdict.STUCK_LOW
-
-
-def test_a_line_that_never_changed_is_not_blamed_on_the_axes() -> None:
     check = AlarmCheck(ONLY_Y)
     for number in range(1000):
         check.add_sample(number * 10 * NS_PER_MS, angles(0, 9), level=False)

@@ -19,7 +19,7 @@ SETTINGS = ResetSettings(line="RESET", hold_ms=20)
 
 @in_loop
 @pytest.mark.manual("A 2.2 reset")
-async def test_the_line_is_held_and_then_the_device_has_its_time() -> None:
+async def test_the_line_is_held_then_the_device_has_its_time_unless_the_line_is_gone() -> None:
     story: list[object] = []
     line = MemoryOutput(on_change=lambda _t_ns, active: story.append(active))
     line.open()
@@ -29,6 +29,11 @@ async def test_the_line_is_held_and_then_the_device_has_its_time() -> None:
 
     await reset(line, SETTINGS, sleep)
     assert story == [True, 0.02, False, 3.0]
+    line = MemoryOutput()
+    line.open()
+    line.set_error = LinkMissing("gone")
+    with pytest.raises(LinkMissing):
+        await reset(line, SETTINGS)
 
 
 @in_loop
@@ -48,15 +53,6 @@ async def test_cancelled_while_it_is_held() -> None:
     with pytest.raises(asyncio.CancelledError):
         await task
     assert [active for _, active in line.history] == [True, False]
-
-
-@in_loop
-async def test_a_line_that_is_gone() -> None:
-    line = MemoryOutput()
-    line.open()
-    line.set_error = LinkMissing("gone")
-    with pytest.raises(LinkMissing):
-        await reset(line, SETTINGS)
 
 
 class Scene:

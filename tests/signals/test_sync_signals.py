@@ -112,7 +112,7 @@ async def test_the_alarm_is_in_the_samples_of_whatever_clock() -> None:
 
 
 @in_loop
-async def test_one_edge_by_command() -> None:
+async def test_one_edge_by_command_where_there_is_sin() -> None:
     bench = SyncBench()
     assert bench.signals.can_trigger
     with pytest.raises(CommandError, match="trigger: bow sin is not driven"):
@@ -133,10 +133,6 @@ async def test_one_edge_by_command() -> None:
     assert (status.sin, status.triggers, bench.sample_clock.status().edges) == (True, 1, 1)
     bench.signals.close()
     assert not bench.output("sin").is_open
-
-
-@in_loop
-async def test_without_sin_there_is_nothing_to_trigger() -> None:
     bench = SyncBench(DeviceLines(sout=SoutSettings(line="A")))
     assert not bench.signals.can_trigger
     with pytest.raises(CommandError, match="expected the key sin"):
@@ -145,7 +141,7 @@ async def test_without_sin_there_is_nothing_to_trigger() -> None:
 
 
 @in_loop
-async def test_sin_that_cannot_be_had_is_reported_once_and_tried_again() -> None:
+async def test_sin_that_cannot_be_had_or_breaks_is_reported_once_and_tried_again() -> None:
     bench = SyncBench()
     bench.output("sin").open_error = LinkBusy("line 5 is in use")
     bench.start()
@@ -158,10 +154,6 @@ async def test_sin_that_cannot_be_had_is_reported_once_and_tried_again() -> None
     assert bench.signals.status().problems == {}
     bench.signals.trigger_once()
     bench.signals.close()
-
-
-@in_loop
-async def test_sin_that_breaks_while_driven_is_driven_again() -> None:
     bench = SyncBench()
     bench.start()
     output = bench.output("sin")
@@ -181,7 +173,7 @@ async def test_sin_that_breaks_while_driven_is_driven_again() -> None:
 
 
 @in_loop
-async def test_at_the_end_of_the_link_sin_is_released_and_edges_are_dropped() -> None:
+async def test_at_the_end_of_the_link_sin_is_released_and_closed_lines_stay_closed() -> None:
     bench = SyncBench()
     bench.start()
     bench.signals.stop()
@@ -195,11 +187,7 @@ async def test_at_the_end_of_the_link_sin_is_released_and_edges_are_dropped() ->
     bench.start()
     assert bench.output("sin").is_open
     bench.signals.close()
-
-
-@in_loop
-async def test_closed_lines_stay_closed() -> None:
-    """A replay that came to its end is ticked ten times a second as before."""
+    # A replay that came to its end is ticked ten times a second as before
     bench = SyncBench()
     bench.start()
     bench.signals.close()

@@ -74,7 +74,7 @@ def test_a_pulse_is_a_millisecond_or_half_a_period(rate_hz: float, pulse_ns: int
     assert all(pulse_ns <= width_ns < pulse_ns + 10 * CALL_NS for width_ns in widths_ns)
 
 
-def test_a_stamp_is_the_middle_of_the_call_and_says_how_long_it_was() -> None:
+def test_stamps_are_numbered_and_each_is_the_middle_of_the_call() -> None:
     bench = SquareWaveBench(100.0)
 
     class Slow(MemoryOutput):
@@ -93,9 +93,6 @@ def test_a_stamp_is_the_middle_of_the_call_and_says_how_long_it_was() -> None:
     assert stamp.err_ns == (100_000 + CALL_NS) // 2
     assert stamp.t_ns - stamp.err_ns == edge_ns - 30_000
     assert stamp.t_ns + stamp.err_ns == edge_ns + 70_000 + CALL_NS
-
-
-def test_stamps_are_numbered() -> None:
     bench = SquareWaveBench(100.0)
     bench.run(NS_PER_S)
     assert [stamp.number for stamp in bench.wave.stamps] == list(range(1, len(bench.rises_ns) + 1))
@@ -129,7 +126,7 @@ def test_a_pulse_that_lasted_too_long_gets_its_pause() -> None:
     assert bench.counts.missed == 1
 
 
-def test_without_a_rate_there_are_only_the_edges_requested() -> None:
+def test_single_edges_without_a_rate_and_between_those_of_the_rate() -> None:
     bench = SquareWaveBench(0.0)
     assert bench.wave.work() > IDLE_NS - NS_PER_MS
     bench.wave.once()
@@ -139,9 +136,6 @@ def test_without_a_rate_there_are_only_the_edges_requested() -> None:
     assert second_ns - first_ns >= 2 * PULSE_NS
     assert (bench.counts.edges, bench.counts.singles, bench.counts.missed) == (2, 2, 0)
     assert bench.counts.mean_late_ns == 0
-
-
-def test_a_single_edge_between_those_of_the_rate() -> None:
     bench = SquareWaveBench(10.0)
     bench.run(50 * NS_PER_MS)
     bench.time.t_ns = bench.begin_ns + 50 * NS_PER_MS
@@ -199,7 +193,7 @@ async def test_the_loop_is_woken_for_many_stamps_at_a_time() -> None:
 
 
 @in_loop
-async def test_drain_delivers_at_once_and_each_stamp_once() -> None:
+async def test_drain_delivers_at_once_and_a_single_edge_does_not_wait_for_more() -> None:
     rig = TriggerBench(1.0)
     rig.trigger.drain()
     rig.start()
@@ -209,10 +203,6 @@ async def test_drain_delivers_at_once_and_each_stamp_once() -> None:
     rig.trigger.drain()
     assert [[stamp.number for stamp in batch] for batch in rig.batches] == [[1]]
     rig.trigger.stop()
-
-
-@in_loop
-async def test_a_single_edge_is_delivered_without_waiting_for_more() -> None:
     rig = TriggerBench(0.0)
     with pytest.raises(LinkError, match="is not driven"):
         rig.trigger.once()
@@ -244,7 +234,7 @@ async def test_stop_leaves_the_line_inactive_and_delivers_the_rest() -> None:
 
 
 @in_loop
-async def test_a_line_that_vanishes_ends_the_trigger_once() -> None:
+async def test_a_line_that_vanishes_ends_this_start_of_the_trigger_once() -> None:
     rig = TriggerBench(100.0)
     rig.start()
     await rig.run(15 * NS_PER_MS)
@@ -258,10 +248,6 @@ async def test_a_line_that_vanishes_ends_the_trigger_once() -> None:
     assert rig.ends == [gone]
     assert rig.workers[0].ended
     rig.trigger.stop()
-
-
-@in_loop
-async def test_a_failure_of_an_earlier_start_does_not_stop_a_new_start() -> None:
     rig = TriggerBench(100.0)
     rig.start()
     rig.line.set_error = LinkMissing("pulled out")

@@ -26,7 +26,7 @@ class Watched:
 
 
 @in_loop
-async def test_it_is_opened_at_once_and_its_level_read() -> None:
+async def test_it_is_opened_at_once_and_its_level_read_again_after_lost_edges() -> None:
     it = Watched()
     it.watched.drain()  # before it is open there is nothing
     it.watched.tick(0)
@@ -40,6 +40,13 @@ async def test_it_is_opened_at_once_and_its_level_read() -> None:
     assert (it.watched.edges, it.reports, it.watched.problem) == (2, [], "")
     it.watched.tick(1)
     assert it.levels == [False]  # edges say the rest
+    it = Watched()
+    it.watched.tick(0)
+    it.line.edge(5, True)
+    it.line.lose(3)
+    it.watched.tick(1)
+    it.watched.tick(2)
+    assert it.levels == [False, True]
 
 
 @in_loop
@@ -82,17 +89,6 @@ async def test_a_line_that_goes_has_no_level_and_comes_back() -> None:
     assert it.edges == [Edge(30, False, 2)]  # numbers go on; the one that was not delivered shows
 
 
-@in_loop
-async def test_after_lost_edges_the_level_is_read_once() -> None:
-    it = Watched()
-    it.watched.tick(0)
-    it.line.edge(5, True)
-    it.line.lose(3)
-    it.watched.tick(1)
-    it.watched.tick(2)
-    assert it.levels == [False, True]
-
-
 class Blind(MemoryInput):
     """Its level cannot be read."""
 
@@ -101,16 +97,12 @@ class Blind(MemoryInput):
 
 
 @in_loop
-async def test_a_level_that_cannot_be_read_ends_it() -> None:
+async def test_a_level_that_cannot_be_read_ends_it_and_closing_is_no_failure() -> None:
     it = Watched(Blind())
     it.watched.tick(it.clock.now_ns())
     assert not it.line.is_open
     assert it.watched.problem == "no level"
     assert it.levels == [None]
-
-
-@in_loop
-async def test_closing_is_no_failure_and_the_next_look_opens_again() -> None:
     it = Watched()
     it.watched.tick(0)
     it.watched.close()

@@ -56,7 +56,7 @@ def test_motion(samples: list[Sample], words: str) -> None:
     assert window(*samples).motion() == words
 
 
-def test_the_newest_samples_count() -> None:
+def test_the_newest_samples_count_and_have_means() -> None:
     moved = window(sample(gyro=(1.0, 0, 0)), *[sample()] * (WINDOW_SAMPLES - 1))
     assert moved.full
     assert moved.motion()
@@ -65,9 +65,6 @@ def test_the_newest_samples_count() -> None:
     moved.clear()
     assert not moved.full
     assert moved.means().gyro_rad_s is None
-
-
-def test_means() -> None:
     means = window(
         sample((1.0, 0.0, 9.0), (0.1, 0.0, 0.0), (0.1, 0.0, pi - 0.1), (0.2, pi)),
         sample((3.0, 0.0, 10.0), (0.3, 0.0, 0.0), (0.3, 0.0, -pi + 0.3), (0.4, -pi)),

@@ -85,7 +85,7 @@ def test_coverage_is_seen_from_the_centre() -> None:
     assert not turning.has_field
 
 
-def test_turns() -> None:
+def test_turns_and_bounded_memory() -> None:
     turning = Turning()
     for number in range(11):
         turning.add(sample(number * 100 * NS_PER_MS, None, (pi, -pi / 2, 0.0)))
@@ -93,10 +93,7 @@ def test_turns() -> None:
     turning.add(sample(5 * NS_PER_S, None, (pi, pi, pi)))  # four seconds without samples are not integrated
     assert turning.turned_rad == pytest.approx((pi, pi / 2, 0.0))
     assert not turning.has_field
-
-
-def test_memory_is_bounded() -> None:
-    """Two opposite directions are one after the other as often as points are kept; a third comes too late."""
+    # Two opposite directions are one after the other as often as points are kept; a third comes too late
     turning = of([(4e-5, 2e-5, 1e-5), (-4e-5, -2e-5, -1e-5)] * (POINTS_MAX // 2))
     turning.add(sample(10**12, (1e-5, 2e-5, 4e-5)))
     assert turning.cells(None).bit_count() == 2

@@ -24,7 +24,7 @@ def test_frames_of_others_on_the_same_bus_are_claimed() -> None:
     assert not claimed(0x181, False)
 
 
-def test_of_two_that_want_the_same_cyclic_frame_the_second_is_refused_with_both_names() -> None:
+def test_of_two_that_want_the_same_frames_the_second_is_refused_with_both_names() -> None:
     buses = CanBuses()
     buses.join("front", "can0", (), [SYNC])
     buses.join("rear", "can0", (), [CyclicFrame(0x80, False, b"", 20_000_000)])
@@ -36,9 +36,6 @@ def test_of_two_that_want_the_same_cyclic_frame_the_second_is_refused_with_both_
     assert "far and more would both send 0x00000080" in buses.conflict("more")
     buses.leave("front")
     assert buses.conflict("rear") == ""
-
-
-def test_of_two_that_are_the_same_device_the_second_is_refused_with_both_names() -> None:
     buses = CanBuses()
     buses.join("found", "can0", filters(0x181, 0x281), ())
     buses.join("named", "can0", filters(0x381, 0x281), ())

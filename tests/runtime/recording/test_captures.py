@@ -41,7 +41,7 @@ def stamped(count: int = 300, details: dict[str, str | int] | None = None) -> By
     return out
 
 
-def test_a_stamped_capture_has_the_times_of_its_reads() -> None:
+def test_a_stamped_capture_has_the_times_of_its_reads_and_utc_if_it_says_when_it_began() -> None:
     played = Played("hipnuc-uart")
     played.player.play_bytes(CaptureReader(stamped()), 0)
     assert played.player.times is KnownTimes.MONOTONIC
@@ -52,9 +52,6 @@ def test_a_stamped_capture_has_the_times_of_its_reads() -> None:
     assert 0 < read_ns - last.t_ns < 8 * NS_PER_MS  # 82 bytes at 115200 baud are 7.1 ms
     assert last.utc_ns - last.t_ns == -(BEGIN_NS + 8 * NS_PER_MS)
     assert played.player.device.ledger.closes()
-
-
-def test_a_capture_that_says_when_it_began_has_utc() -> None:
     played = Played("hipnuc-uart")
     played.player.play_bytes(CaptureReader(stamped(details={"start_utc_ns": 1_763_717_507 * NS_PER_S})), 0)
     assert played.player.times is KnownTimes.HOST
@@ -62,7 +59,7 @@ def test_a_capture_that_says_when_it_began_has_utc() -> None:
     assert sample.utc_ns - sample.t_ns == 1_763_717_507 * NS_PER_S - (BEGIN_NS + 8 * NS_PER_MS)
 
 
-def test_a_raw_capture_has_the_time_of_the_device_and_no_error_of_it() -> None:
+def test_a_raw_capture_has_the_time_of_the_device_and_an_empty_one_no_sample() -> None:
     played = Played("hipnuc-uart")
     played.player.play_bytes(CaptureReader(BytesIO(b"".join(hi91(10 * i + 70) for i in range(50)))), 115200)
     assert played.player.times is KnownTimes.NONE
@@ -72,6 +69,10 @@ def test_a_raw_capture_has_the_time_of_the_device_and_no_error_of_it() -> None:
         assert (sample.t_ns, sample.utc_ns, sample.t_rx_ns, sample.t_dev_ns) == (t_ns, t_ns, t_ns, t_ns)
         assert sample.t_err_ns == T_ERR_MOST
     assert len(played.samples) == 50
+    played = Played("hipnuc-uart")
+    played.player.play_bytes(CaptureReader(BytesIO()), 115200)
+    assert played.samples == []
+    assert played.player.device.path is None
 
 
 def test_a_log_of_a_can_bus_has_the_wall_clock_and_frames_of_others_are_left_out() -> None:
@@ -84,13 +85,6 @@ def test_a_log_of_a_can_bus_has_the_wall_clock_and_frames_of_others_are_left_out
     assert played.samples[-1].utc_ns == played.samples[-1].t_ns
     assert abs(played.samples[-1].t_ns - (LOG_NS + 599 * 10 * NS_PER_MS)) < NS_PER_MS
     assert played.player.device.ledger.bytes_skipped == 0
-
-
-def test_an_empty_capture_has_no_sample() -> None:
-    played = Played("hipnuc-uart")
-    played.player.play_bytes(CaptureReader(BytesIO()), 115200)
-    assert played.samples == []
-    assert played.player.device.path is None
 
 
 def test_a_polled_device_cannot_be_captured(tmp_path: Path) -> None:

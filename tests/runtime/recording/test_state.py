@@ -46,17 +46,11 @@ def test_values_come_back(value: object) -> None:
     assert type(there_and_back(value)) is type(value)
 
 
-def test_a_queue_keeps_its_bound() -> None:
+def test_objects_come_back_with_what_belongs_to_the_daemon() -> None:
     assert there_and_back(deque([1], maxlen=7)).maxlen == 7
-
-
-def test_what_was_one_object_is_one_again() -> None:
     shared = [1]
     first, second = there_and_back([shared, shared])
     assert first is second
-
-
-def test_objects_methods_and_partials_come_back_with_what_belongs_to_the_daemon() -> None:
     ledger = Ledger()
     meter = there_and_back(LossMeter(ledger), {"ledger": ledger})
     meter.missed(2, 0)
@@ -65,9 +59,6 @@ def test_objects_methods_and_partials_come_back_with_what_belongs_to_the_daemon(
     assert ledger.lost_unknown == 1
     made = there_and_back(partial(JumpDetector))()
     assert type(made) is JumpDetector
-
-
-def test_a_method_that_a_tap_replaced_is_no_part_of_the_state() -> None:
     ledger = Ledger()
     meter = LossMeter(ledger)
     setattr(meter, "missed", print)  # noqa: B010 - as the tap does

@@ -47,7 +47,7 @@ class TappedPath:
         }
 
 
-def test_while_nobody_listens_path_and_clock_are_as_their_classes_have_them() -> None:
+def test_all_is_heard_in_its_order_while_somebody_listens() -> None:
     one = TappedPath()
     assert one.replaced() == set()
     one.begin()
@@ -56,9 +56,6 @@ def test_while_nobody_listens_path_and_clock_are_as_their_classes_have_them() ->
     assert one.replaced() == set()
     one.path.on_data(hi91(0), 1)
     assert one.kinds() == [Kind.DEVICE, Kind.PATH]
-
-
-def test_data_and_calls_are_heard_in_their_order_and_calls_of_calls_once() -> None:
     one = TappedPath()
     one.begin()
     one.path.clock.link_changed(byte_ns=86_806, hold_ns=0)
@@ -67,7 +64,7 @@ def test_data_and_calls_are_heard_in_their_order_and_calls_of_calls_once() -> No
     assert one.kinds() == [Kind.DEVICE, Kind.PATH, Kind.CALL, Kind.DATA, Kind.CALL]
 
 
-def test_two_recorders_hear_the_same_and_one_that_leaves_nothing_more() -> None:
+def test_two_recorders_hear_the_same_and_another_path_is_described() -> None:
     one, other = TappedPath(), list[bytes]()
     one.begin()
     one.tap.begin(other.append, "", {}, {})
@@ -76,9 +73,6 @@ def test_two_recorders_hear_the_same_and_one_that_leaves_nothing_more() -> None:
     one.path.on_data(hi91(10), 6)
     assert one.heard[-1] == other[-2]
     assert len(other) == 4
-
-
-def test_another_path_is_described_and_heard() -> None:
     one = TappedPath()
     one.begin()
     before = one.path

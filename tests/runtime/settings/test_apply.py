@@ -71,7 +71,7 @@ def applied(device: TableOfOne, *, save: bool = True, flash: Unlimited | None = 
     return asyncio.run(applying.carry_out(plan))
 
 
-def test_written_read_back_saved_in_this_order() -> None:
+def test_values_are_written_read_back_saved_and_judged_after_a_restart() -> None:
     device, flash = TableOfOne(None), Unlimited()
     found = applied(device, flash=flash)
     assert device.done == ["x=2", "read", "save"]
@@ -82,16 +82,10 @@ def test_written_read_back_saved_in_this_order() -> None:
         {},
     )
     assert flash.counted == 1
-
-
-def test_what_the_table_says_needs_a_restart_is_judged_after_it() -> None:
     device = TableOfOne(Written.PENDING, effect=Effect.AFTER_RESTART)
     found = applied(device)
     assert device.done == ["x=2", "read", "save", "restart", "read"]
     assert (found.steps[0].outcome, found.restarted) == (StepOutcome.DONE, True)
-
-
-def test_what_a_script_says_needs_a_restart_gets_one_where_it_was_saved() -> None:
     device = TableOfOne(Written.PENDING)
     found = applied(device)
     assert device.done == ["x=2", "read", "save", "restart", "read"]
@@ -104,13 +98,10 @@ def test_what_a_script_says_needs_a_restart_gets_one_where_it_was_saved() -> Non
 
 
 @pytest.mark.parametrize("result", [Written.UNVERIFIED, Written.UNVERIFIED_PENDING])
-def test_a_device_that_ignores_reads_has_taken_the_value(result: Written) -> None:
+def test_a_device_that_ignores_reads_has_taken_the_value_and_one_that_tells_another_has_not(result: Written) -> None:
     found = applied(TableOfOne(result, readable=False))
     assert found.steps[0].outcome is StepOutcome.NOT_VERIFIED
     assert (found.saved, found.problem, found.differences) == (True, "", {})
-
-
-def test_a_device_that_tells_another_value_has_not_whatever_its_script_says() -> None:
     found = applied(TableOfOne(Written.UNVERIFIED))
     assert found.steps[0].message == "wrote 2, read back 1"
 

@@ -23,7 +23,7 @@ def test_a_backup_has_identity_time_and_settings() -> None:
     assert text.startswith("# Settings of bow as the device reported them. `imud settings bow --restore FILE`")
 
 
-def test_the_newest_of_each_device_are_kept(tmp_path: Path) -> None:
+def test_the_newest_of_each_device_are_kept_in_the_state_directory(tmp_path: Path) -> None:
     folder = BackupFolder(tmp_path)
     other = folder.write("bow-2", "x", T_NS)
     files = [folder.write("bow", str(number), T_NS + number * NS_PER_S) for number in range(BACKUPS_MAX + 3)]
@@ -34,7 +34,4 @@ def test_the_newest_of_each_device_are_kept(tmp_path: Path) -> None:
     assert files[-1] is not None
     assert (files[-1].name, files[-1].read_text()) == ("bow.20261118T110652.000000Z.yaml", "12")
     assert files[-1].stat().st_mode & 0o007 == 0
-
-
-def test_without_a_state_directory_there_are_none() -> None:
     assert BackupFolder(None).write("bow", "x", T_NS) is None

@@ -24,34 +24,25 @@ def differing(
     return list(differences(FAKE_SETTINGS, wanted, actual, unreadable or {}))
 
 
-def test_the_table_says_what_agrees() -> None:
+def test_the_table_says_what_agrees_and_what_cannot_be_read_differs_unless_it_was_written() -> None:
     assert differing({"mode": "6-axis", "output": {"a": 100}, "offset_deg": 0.009}) == []
     assert differing({"offset_deg": 0.02, "output": {"a": 100, "b": 1}, "mode": "9-axis"}) == [
         "mode", "output", "offset_deg",
     ]  # fmt: skip
-
-
-def test_what_cannot_be_read_back_differs_unless_it_was_written() -> None:
     found = differences(FAKE_SETTINGS, {"mode": "6-axis"}, {}, {})
     assert found == {"mode": SettingDifference("6-axis", None)}
     assert words(found) == 'mode is not reported, declared "6-axis"'
     assert differing({"mode": "6-axis"}, {}, {"mode": "6-axis"}) == []
     assert differing({"mode": "6-axis"}, {"mode": "9-axis"}, {"mode": "6-axis"}) == ["mode"]  # what it says counts
-
-
-def test_what_cannot_be_read_never_differs_and_is_unverified() -> None:
     assert differing({"secret": 5}) == []
     assert unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, ACTUAL) == ("secret",)
     assert unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, {}) == ("mode", "secret")
 
 
-def test_words_name_both_values() -> None:
+def test_words_name_both_values_and_given_values_get_the_types_of_the_table() -> None:
     assert words({"mode": SettingDifference("6-axis", "9-axis"), "n": SettingDifference(1, 2)}) == (
         'mode is "9-axis", declared "6-axis", n is 2, declared 1'
     )
-
-
-def test_given_values_get_the_types_and_the_order_of_the_table() -> None:
     made = wanted_values(FAKE_SETTINGS, {"offset_deg": 5, "mode": "9-axis"})
     assert list(made.items()) == [("mode", "9-axis"), ("offset_deg", 5.0)]
     assert type(made["offset_deg"]) is float

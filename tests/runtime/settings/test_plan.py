@@ -23,7 +23,7 @@ def names(plan: SettingsPlan) -> list[str]:
     return [step.name for step in plan.steps]
 
 
-def test_only_what_differs_is_written_and_flash_only_then() -> None:
+def test_only_what_differs_or_cannot_be_read_back_is_written_and_flash_only_then() -> None:
     assert planned({"mode": "6-axis", "output": {"a": 100}}) == SettingsPlan()
     assert planned({"mode": "6-axis"}).empty
     plan = planned({"mode": "9-axis", "output": {"a": 100}})
@@ -31,6 +31,9 @@ def test_only_what_differs_is_written_and_flash_only_then() -> None:
     assert not planned({"mode": "9-axis"}, save=False).save
     assert planned({"mode": "6-axis"}, unsaved=True).save  # written before and not saved
     assert not planned({"mode": "6-axis"}, save=False, unsaved=True).save
+    assert names(planned({"secret": 5})) == ["secret"]
+    assert names(planned({"secret": 5}, secret=5)) == []
+    assert names(planned({"secret": 5}, secret=4)) == ["secret"]
 
 
 def test_the_order_is_that_of_the_table_and_what_changes_the_connection_comes_last() -> None:
@@ -39,9 +42,6 @@ def test_the_order_is_that_of_the_table_and_what_changes_the_connection_comes_la
     assert plan.risk is Risk.CONNECTION
     assert (plan.save, plan.restart) == (False, False)  # the step for the rate does both
     assert planned({"mode": "9-axis"}).risk is Risk.NONE
-
-
-def test_what_changes_the_connection_comes_last_wherever_it_stands_in_the_table() -> None:
     baud = replace(FAKE_SETTINGS.table["baud"], saves=False)
     table = replace(FAKE_SETTINGS, table={**FAKE_SETTINGS.table, "baud": baud})
     assert next(iter(table.table)) == "baud"
@@ -49,7 +49,7 @@ def test_what_changes_the_connection_comes_last_wherever_it_stands_in_the_table(
     assert (names(plan), plan.save) == (["mode", "baud"], True)
 
 
-def test_what_needs_a_restart_is_left_out_where_nothing_is_saved() -> None:
+def test_what_needs_a_restart_is_left_out_where_nothing_is_or_can_be_saved() -> None:
     wanted = {"mounting": "x_up", "mode": "9-axis", "baud": 921600}
     plan = planned(wanted, save=False)
     assert names(plan) == ["mode"]
@@ -57,21 +57,12 @@ def test_what_needs_a_restart_is_left_out_where_nothing_is_saved() -> None:
     assert not plan.restart
     saving = planned({"mounting": "x_up"})
     assert (names(saving), saving.save, saving.restart) == (["mounting"], True, True)
-
-
-def test_a_driver_that_cannot_save_or_restart() -> None:
     table = replace(FAKE_SETTINGS, save=None)
     plan = make_plan(table, TARGET, {"mounting": "x_up", "mode": "9-axis"}, ACTUAL, {}, save=True, unsaved=False)
     assert (names(plan), plan.left_out, plan.save) == (["mode"], {"mounting": CANNOT_SAVE}, False)
     table = replace(FAKE_SETTINGS, restart=None)
     plan = make_plan(table, TARGET, {"mounting": "x_up"}, ACTUAL, {}, save=True, unsaved=False)
     assert (names(plan), plan.save, plan.restart) == (["mounting"], True, False)
-
-
-def test_what_cannot_be_read_back_is_written_unless_it_was() -> None:
-    assert names(planned({"secret": 5})) == ["secret"]
-    assert names(planned({"secret": 5}, secret=5)) == []
-    assert names(planned({"secret": 5}, secret=4)) == ["secret"]
 
 
 def test_values_are_checked_together_with_the_present_ones() -> None:

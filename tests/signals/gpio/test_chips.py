@@ -22,16 +22,10 @@ def test_by_chip(gpiod: FakeGpiod, tmp_path: Path, chip: str, line: int | str, o
     assert place == LineLocation(str(tmp_path / "gpiochip0"), offset, name)
 
 
-def test_by_path(gpiod: FakeGpiod, tmp_path: Path) -> None:
+def test_by_path_or_by_name_alone_whatever_other_names_a_chip_has(gpiod: FakeGpiod, tmp_path: Path) -> None:
     place = find_line(gpiod, LineSettings(line="TWIN", chip=str(tmp_path / "gpiochip10")))
     assert str(place) == "gpiochip10 line 1 (TWIN)"
-
-
-def test_by_name_alone(gpiod: FakeGpiod, tmp_path: Path) -> None:
     assert str(find_line(gpiod, LineSettings(line="RESET"), tmp_path)) == "gpiochip10 line 0 (RESET)"
-
-
-def test_another_name_of_a_chip_is_not_another_chip(gpiod: FakeGpiod, tmp_path: Path) -> None:
     (tmp_path / "gpiochip4").symlink_to(tmp_path / "gpiochip0")
     assert find_line(gpiod, LineSettings(line="SOUT"), tmp_path).path == str(tmp_path / "gpiochip0")
 
@@ -80,14 +74,13 @@ def test_a_chip_that_may_not_be_opened_matters_only_if_the_line_is_not_elsewhere
             find_line(gpiod, settings, tmp_path)
 
 
-def test_a_chip_that_goes_away_meanwhile(gpiod: FakeGpiod, tmp_path: Path) -> None:
+def test_a_chip_that_goes_away_or_is_none_matters_only_if_the_line_is_not_elsewhere(
+    gpiod: FakeGpiod, tmp_path: Path
+) -> None:
     gpiod.errors["gpiochip0"] = errno.ENODEV
     assert find_line(gpiod, LineSettings(line="RESET"), tmp_path).offset == 0
     with pytest.raises(LinkMissing, match="gpiochip0 is gone, or is no GPIO chip: No such device"):
         find_line(gpiod, LineSettings(line=0, chip="gpiochip0"), tmp_path)
-
-
-def test_a_node_that_is_no_chip(gpiod: FakeGpiod, tmp_path: Path) -> None:
     (tmp_path / "ttyS0").touch()
     with pytest.raises(LinkError, match="ttyS0 cannot be used as a GPIO chip"):
         find_line(gpiod, LineSettings(line=0, chip="ttyS0"), tmp_path)
@@ -119,13 +112,10 @@ def test_a_holder_without_a_name(gpiod: FakeGpiod, tmp_path: Path) -> None:
     assert isinstance(request_error(gpiod, OSError(errno.EBUSY, ""), place), LinkBusy)
 
 
-def test_gpiod_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gpiod_is_missing_or_that_of_libgpiod_1(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gpiod", None)
     with pytest.raises(LinkError, match="need the Python package gpiod, got none: `pip install"):
         load_gpiod()
-
-
-def test_gpiod_of_libgpiod_1(monkeypatch: pytest.MonkeyPatch) -> None:
     old = ModuleType("gpiod")
     old.__file__ = "/usr/lib/python3/dist-packages/gpiod.so"
     monkeypatch.setitem(sys.modules, "gpiod", old)

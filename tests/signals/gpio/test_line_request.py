@@ -66,7 +66,7 @@ def test_an_input_asks_for_both_edges_and_a_large_buffer(gpiod: FakeGpiod, tmp_p
 
 
 @in_loop
-async def test_edges_come_by_the_loop_and_by_drain(gpiod: FakeGpiod, tmp_path: Path) -> None:
+async def test_edges_come_by_the_loop_and_by_drain_and_lost_ones_are_counted(gpiod: FakeGpiod, tmp_path: Path) -> None:
     line, sink = GpioInput(SOUT, devices=tmp_path), Sink()
     line.open()
     (request,) = gpiod.requests
@@ -82,10 +82,6 @@ async def test_edges_come_by_the_loop_and_by_drain(gpiod: FakeGpiod, tmp_path: P
     assert sink.edges[1:] == [Edge(200, False, 2), Edge(300, True, 3)]
     assert line.edges_lost == 0
     line.close()
-
-
-@in_loop
-async def test_lost_edges_are_counted_and_numbers_go_on_after_a_reopen(gpiod: FakeGpiod, tmp_path: Path) -> None:
     line, sink = GpioInput(SOUT, devices=tmp_path), Sink()
     for seqnos in ((3, 4), (1, 7)):
         line.open()
