@@ -14,15 +14,16 @@ BUSY = LinkBusy("gpiochip0 line 3 is in use by gpiomon: stop that")
 class Watched:
     """One watched line and everything it delivers and reports."""
 
-    def __init__(self, line: MemoryInput | None = None) -> None:
+    def __init__(self, line: MemoryInput | None = None, *, watch: bool = True) -> None:
         self.clock = VirtualClock()
         self.line = line or MemoryInput()
         self.edges: list[Edge] = []
         self.levels: list[bool | None] = []
         self.reports: list[str] = []
         self.watched = WatchedLine(
-            self.line, self.edges.extend, self.levels.append, self.reports.append, self.clock.now_ns
-        )
+            self.line, self.edges.extend, self.levels.append, self.reports.append, self.clock.now_ns,
+            watch=watch,
+        )  # fmt: skip
 
 
 @in_loop
@@ -87,6 +88,17 @@ async def test_a_line_that_goes_has_no_level_and_comes_back() -> None:
     it.line.edge(30, False)
     it.watched.drain()
     assert it.edges == [Edge(30, False, 2)]  # numbers go on; the one that was not delivered shows
+
+
+@in_loop
+async def test_edges_of_a_line_that_is_not_watched_are_delivered_by_the_tick() -> None:
+    it = Watched(watch=False)
+    it.watched.tick(0)
+    it.line.edge(10, True)
+    await asyncio.sleep(0)
+    assert it.edges == []
+    it.watched.tick(1)
+    assert it.edges == [Edge(10, True, 1)]
 
 
 class Blind(MemoryInput):

@@ -200,6 +200,8 @@ class DeviceRigs:
         rig.samples += batch.samples
 
     def _send_event(self, event: Event) -> None:
+        assert isinstance(event.kind, EventKind)
+        assert isinstance(event.t_ns, int)
         self.rigs[event.device].events.append(event)
 
 

@@ -58,6 +58,9 @@ class SignalBench:
     def raise_event(
         self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
     ) -> None:
+        """As `RaiseEvent`."""
+        assert isinstance(kind, EventKind)
+        assert now_ns >= 0
         self.events.append(Event(now_ns, DEVICE, kind, message, dict(detail)))
 
     def messages(self, kind: EventKind | None = None) -> list[str]:

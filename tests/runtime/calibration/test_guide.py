@@ -191,6 +191,7 @@ async def test_no_samples(rig: GuideRig) -> None:
     rig.silent = True
     with pytest.raises(CommandError, match="gyro: expected samples of the device, got none for 20 s"):
         await rig.guide.run("gyro", gyro(rig), save=False)
+    assert rig.clock.now_ns() >= 1020 * NS_PER_S
 
 
 @played(GuideRig)

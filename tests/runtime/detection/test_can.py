@@ -8,7 +8,8 @@ from imud.devices.imu61x.can.codec import encode_set
 from imud.devices.imu61x.can.driver import DRIVER as IMU61X
 from imud.formats.can import CanFrame
 from imud.runtime.detection import CanFound, CanSearch, CanStep, CanSurvey, GaveUp, Listen
-from imud.runtime.detection.can import DEVICES_MAX, IDENTIFIERS_MAX, LISTEN_NS, PATIENCE_NS
+from imud.runtime.detection.can import DEVICES_MAX, IDENTIFIERS_MAX, LISTEN_NS
+from imud.units import NS_PER_S
 from tests.support.fake_drivers import BASE, fake_can_driver, fake_can_frame
 
 FAKE = fake_can_driver()
@@ -91,7 +92,7 @@ def test_samples_that_are_not_whole_are_waited_for_and_told() -> None:
     assert heard.complaint() == (
         "frames as of imu61x-can base_id 101 come on can0, but no whole sample: name driver and options"
     )
-    assert PATIENCE_NS <= heard.until_ns < PATIENCE_NS + 2 * LISTEN_NS
+    assert 6 * NS_PER_S <= heard.until_ns < 6 * NS_PER_S + 2 * LISTEN_NS
 
 
 def test_unknown_frames_are_shown_by_their_identifiers_and_silence_as_such() -> None:

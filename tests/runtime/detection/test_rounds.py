@@ -121,6 +121,9 @@ async def test_a_device_that_is_given_another_number_is_followed(bus: Bus, drive
     bench = bus.add(driver=driver, options=FakeCanSettings(node=8, sync_ms=10) if driver != "auto" else None)
     other = bus.add("bow")
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 8)
+    path = bench.device._transport.path
+    await bench.device.act("renumber", {"node": 8})
+    assert bench.device._transport.path is path  # it has this number already
     await bench.device.act("renumber", {"node": 9})
     assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 9]
     words = "change options.node to 9 in the configuration"

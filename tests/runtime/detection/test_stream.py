@@ -244,3 +244,23 @@ def test_cut_frames_and_random_bytes_are_no_device() -> None:
 def test_a_search_needs_drivers() -> None:
     with pytest.raises(ValueError, match="at least one driver"):
         Search([])
+
+
+def test_a_reply_behind_other_frames_and_frames_of_several_visits_count() -> None:
+    search = Search([FAKE_DRIVER], bauds=(115200,), may_ask=True)
+    step: Step | None = search.start(0)
+    while isinstance(step, Listen) and not step.send:
+        step = search.on_time(step.until_ns)
+    assert isinstance(step, Listen)
+    found = search.on_data(fake_frame(b"x" * 76) + REPLY, step.until_ns - 1)  # one frame is no lock
+    assert isinstance(found, StreamFound)
+    search = Search([FAKE_DRIVER], bauds=(115200, 9600))
+    step, visits = search.start(0), 0
+    while isinstance(step, Listen):
+        if step.baud == 9600:
+            visits += 1
+            step = search.on_data(fake_frame(b"x" * 76), step.until_ns - 1) or step
+        step = search.on_time(step.until_ns) if isinstance(step, Listen) else step
+    assert isinstance(step, GaveUp)
+    assert visits > 1
+    assert f"9600: {visits * 82} bytes, {visits} valid frames, 0 damaged" in step.summary

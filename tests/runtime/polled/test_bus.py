@@ -278,6 +278,21 @@ async def test_device_that_left_hears_nothing_and_its_link_is_closed_by_the_thre
 
 
 @told(run)
+async def test_a_script_that_is_given_up_ends_without_a_result(buses: PolledBuses) -> None:
+    failed, wire = list[object](), Wire()
+    asyncio.get_running_loop().set_exception_handler(lambda _loop, context: failed.append(context))
+    member = joined(buses, wire, Sink())
+    for script in (three(), refusing()):
+        running = asyncio.create_task(member.run(script, 1))  # type: ignore[arg-type]  # either
+        await asyncio.sleep(0)
+        running.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await running
+    assert await member.run(three(), 1) == 5 + 6 + 7  # after their transfers
+    assert failed == []
+
+
+@told(run)
 async def test_targets_are_taken_once(buses: PolledBuses) -> None:
     a, b = joined(buses, Wire(), Sink()), joined(buses, Wire(), Sink())
     assert a.claim(0x18)

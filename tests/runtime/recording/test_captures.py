@@ -14,6 +14,7 @@ from imud.formats.capture import CaptureReader
 from imud.runtime.recording.captures import CapturePlayer, KnownTimes
 from imud.sample import T_ERR_MOST, Sample
 from imud.units import NS_PER_MS, NS_PER_S
+from tests.support.fake_drivers import FAKE_DRIVER, fake_frame
 from tests.support.files import BEGIN_NS as LOG_NS
 from tests.support.files import CaptureWriter, candump_line, hi91, imu61x_log
 
@@ -73,6 +74,16 @@ def test_a_raw_capture_has_the_time_of_the_device_and_an_empty_one_no_sample() -
     played.player.play_bytes(CaptureReader(BytesIO()), 115200)
     assert played.samples == []
     assert played.player.device.path is None
+
+
+def test_a_raw_capture_of_a_device_without_time_has_the_time_of_the_bytes_on_the_wire() -> None:
+    samples: list[Sample] = []
+    player = CapturePlayer(lambda batch: samples.extend(batch.samples), FAKE_DRIVER, FAKE_DRIVER.settings(), "file")
+    frame = fake_frame(bytes(94))
+    player.play_bytes(CaptureReader(BytesIO(frame * 200)), 100_000)  # 10 ms each
+    assert len(samples) == 200
+    assert samples[-1].t_ns == pytest.approx(2 * NS_PER_S, abs=20 * NS_PER_MS)
+    assert samples[100].t_ns == pytest.approx(samples[0].t_ns + NS_PER_S, rel=0.05)
 
 
 def test_a_log_of_a_can_bus_has_the_wall_clock_and_frames_of_others_are_left_out() -> None:

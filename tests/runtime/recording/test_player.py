@@ -4,6 +4,7 @@
 """
 
 import asyncio
+import errno
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
@@ -15,9 +16,11 @@ from imud.devices import DRIVERS
 from imud.errors import ImudError
 from imud.formats.recording import records
 from imud.formats.recording.records import CheckRecord, Kind, PathRecord, Record, records_of
+from imud.host_clock import HostClock
 from imud.links.memory import MemoryLink
-from imud.runtime.recording.player import Player
+from imud.runtime.recording.player import Player, _reading
 from imud.sample import Sample
+from imud.units import NS_PER_S
 from tests.runtime.can import test_transport as can
 from tests.runtime.latency import test_stream_hold as waiting
 from tests.runtime.polled import test_data_ready as data_ready
@@ -52,8 +55,18 @@ def bench(tmp_path: Path, recorded: pytest.MonkeyPatch) -> PolledBusBench:
         can.test_losses_by_cause,
         can.test_frames_from_before_a_loss_are_not_mixed_with_those_after,
         can.test_bus_down_and_up,
+        can.test_what_a_device_measured_while_the_host_was_suspended_is_a_gap_of_unknown_size,
     ],
-    ids=["edges", "triggers", "alarm", "held samples", "losses on CAN", "loss within a sample", "bus down"],
+    ids=[
+        "edges",
+        "triggers",
+        "alarm",
+        "held samples",
+        "losses on CAN",
+        "loss within a sample",
+        "bus down",
+        "suspended",
+    ],
 )
 def test_a_run_on_a_line_or_can_bus_is_replayed(run: Callable[[], None]) -> None:
     """`check_replay` compares the samples and the ledger at the end of each run."""
@@ -65,8 +78,11 @@ def test_a_run_on_a_line_or_can_bus_is_replayed(run: Callable[[], None]) -> None
     [
         data_ready.test_every_edge_is_a_sample_of_its_own_instant,
         polled.test_single_damage_costs_its_sample_and_nothing_else,
+        lambda bench: polled.test_vanished_device_is_not_believed_before_it_is_identified(
+            bench=bench, fault={"error": errno.EIO}, why="transfer failed"
+        ),
     ],
-    ids=["edges", "damage"],
+    ids=["edges", "damage", "failed transfers"],
 )
 def test_a_run_of_a_polled_device_is_replayed(bench: PolledBusBench, run: Callable[..., None]) -> None:
     run(bench=bench)
@@ -75,16 +91,26 @@ def test_a_run_of_a_polled_device_is_replayed(bench: PolledBusBench, run: Callab
 # --- from the middle of a run -----------------------------------------------------------------------------------------
 
 
-def run_of(driver: str, rigs: DeviceRigs, clock: VirtualClock, middle: int) -> DeviceRig:
-    """A stream of frames with jitter; what was recorded up to `middle` of them is forgotten, and begins anew there."""
-    row = DRIVERS[driver]
+def run_of(driver: str, middle: int) -> DeviceRig:
+    """A stream of frames with jitter; what was recorded up to `middle` of them is forgotten, and begins anew there.
+
+    The host is suspended before the first frame and shortly before the last.
+    """
+    row, clock, asleep_ns = DRIVERS[driver], VirtualClock(), 0
+    now_ns = clock.now_ns
+    host = HostClock(now_ns, clock.realtime_ns, now_ns, lambda: now_ns() + asleep_ns)
+    rigs = DeviceRigs(host, start_worker=LoopWorker)
     random = Random(driver)
     config = device_config("imu", driver, "memory", {"baud": 115200})
     link = MemoryLink(config.link_settings)  # type: ignore[arg-type]  # those of its row
     rig = rigs.add(config, link)
 
     async def story(_rigs: list[DeviceRig]) -> None:
+        nonlocal asleep_ns
         for number in range(SAMPLES):
+            asleep_ns += 2 * NS_PER_S * (number in (0, SAMPLES - 20))
+            if number % 10 == 0:
+                host.utc_offset_ns()
             if number == middle:
                 rig.recorded.clear()
                 rig.samples.clear()
@@ -106,15 +132,13 @@ def run_of(driver: str, rigs: DeviceRigs, clock: VirtualClock, middle: int) -> D
 def test_a_recording_that_begins_in_the_middle_has_the_stamps_and_numbers_of_the_run(
     recorded: pytest.MonkeyPatch, driver: str, middle: int
 ) -> None:
-    clock = VirtualClock()
-    rig = run_of(driver, DeviceRigs(clock.host, start_worker=LoopWorker), clock, middle)
+    rig = run_of(driver, middle)
     assert rig.samples
     assert rig.samples[0].seq > 1 or middle == 1
 
 
 def test_without_the_state_the_clock_begins_anew_and_says_so(recorded: pytest.MonkeyPatch) -> None:
-    clock = VirtualClock()
-    rig = run_of("hipnuc-uart", DeviceRigs(clock.host, start_worker=LoopWorker), clock, 30)
+    rig = run_of("hipnuc-uart", 30)
     samples: list[Sample] = []
     player = Player(lambda batch: samples.extend(batch.samples))
     player.play(without_state(record) for one in rig.recorded for record in records_of(one))
@@ -136,8 +160,7 @@ def without_state(record: Record) -> Record:
 
 
 def recorded_run() -> list[Record]:
-    clock = VirtualClock()
-    rig = run_of("hipnuc-uart", DeviceRigs(clock.host, start_worker=LoopWorker), clock, SAMPLES + 1)
+    rig = run_of("hipnuc-uart", SAMPLES + 1)
     return [record for one in rig.recorded for record in records_of(one)]
 
 
@@ -180,3 +203,21 @@ def test_records_that_make_no_sense_are_an_error_and_no_crash(recorded: pytest.M
             Player(lambda _batch: None).play([*found[:at], Record(kind, device, damaged), *found[at + 1 :]])
         except ImudError:
             continue
+
+
+def test_lost_records_and_events_are_passed_on_and_an_unknown_trouble_is_the_last_known() -> None:
+    told: list[tuple[str, int]] = []
+    player = Player(lambda _batch: None, on_event=lambda event, utc_ns: told.append((event.message, utc_ns)))
+    recorded_event = {"t_ns": 7, "device": "bow", "kind": "up", "message": "hello"}
+    player.play(
+        record
+        for data in (
+            records.encode_clocks(records.ClocksRecord(5, 5, 5, 1, 1000, 0)),
+            records.encode_lost(records.LostRecord(2, 99, 5)),
+            records.encode_lost(records.LostRecord(3, 99, 6)),
+            records.encode_object(Kind.EVENT, records.NO_DEVICE, recorded_event),
+        )
+        for record in records_of(data)
+    )
+    assert (player.lost, told) == (5, [("hello", 1007)])
+    assert _reading(records.ReadingRecord(0, 1, 2, 99, b"new kind")).error is not None

@@ -15,7 +15,7 @@ from imud.contracts.lines import Edge
 from imud.host_clock import SteadyTime
 from imud.ledger import Ledger
 from imud.runtime.meters import LossMeter
-from imud.runtime.recording.state import StateError, StateReader, StateWriter
+from imud.runtime.recording.state import StateError, StateReader, StateWriter, attributes
 from imud.sample import Sync
 
 
@@ -46,7 +46,18 @@ def test_values_come_back(value: object) -> None:
     assert type(there_and_back(value)) is type(value)
 
 
+class Slotted:
+    """An object with an attribute that was never set."""
+
+    __slots__ = ("set", "unset")
+    set: int
+    unset: int
+
+
 def test_objects_come_back_with_what_belongs_to_the_daemon() -> None:
+    slotted = Slotted()
+    slotted.set = 1
+    assert attributes(slotted) == {"set": 1}
     assert there_and_back(deque([1], maxlen=7)).maxlen == 7
     shared = [1]
     first, second = there_and_back([shared, shared])

@@ -3,7 +3,7 @@
 from imud.config import DeviceConfig
 from imud.contracts.settings import NoSettings
 from imud.devices.hipnuc.uart.driver import DRIVER
-from imud.formats.recording.records import Kind, records_of
+from imud.formats.recording.records import CheckRecord, Kind, decode_object, records_of
 from imud.ledger import Ledger
 from imud.runtime.path import PathContext, StreamPath, make_clock
 from imud.runtime.recording.tap import DeviceTap, HostTap, PathParts
@@ -97,3 +97,17 @@ def test_readings_of_the_clocks_are_heard() -> None:
     clock.advance(2_000_000_000)
     host.utc_offset_ns()
     assert len(heard) == 2
+
+
+def test_a_check_has_the_newest_sample_if_there_is_one() -> None:
+    one, put = TappedPath(), list[bytes]()
+    one.tap.check(put.append)
+    one.path.on_data(hi91(0), 5)
+    one.tap.check(put.append)
+    newest = one.path.newest
+    assert newest is not None
+    found = [decode_object(record, CheckRecord) for data in put for record in records_of(data)]
+    assert [(check.seq, check.sample_t_ns, check.sample_t_err_ns) for check in found] == [
+        (0, 0, 0), (newest.seq, newest.t_ns, newest.t_err_ns)
+    ]  # fmt: skip
+    assert found[1].ledger == one.ledger.snapshot()

@@ -13,10 +13,11 @@ import pytest
 
 from imud.config import DeviceConfig
 from imud.contracts.action import Action
+from imud.contracts.link import OnData, OnEnd
 from imud.contracts.session import Request, RequestScript, never
 from imud.contracts.status import DeviceState, KernelCounters
 from imud.devices.hipnuc.uart import driver
-from imud.errors import LinkBusy, LinkError
+from imud.errors import LinkBusy, LinkError, Rejected
 from imud.event import EventKind
 from imud.links import LINKS
 from imud.links.memory import MemoryLink, MemorySettings
@@ -357,6 +358,44 @@ async def test_a_device_whose_settings_are_lost_has_told_its_product_already(mod
     assert not module.rig.device.status().settings
     await module.pass_s(60)
     assert module.rig.device.status().settings
+
+
+def test_a_device_that_refuses_to_stream_is_told_again_and_of_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    module, told = DeafModule(0), list[int]()
+    module.paused = True
+
+    def wake() -> RequestScript[bool]:
+        told.append(module.clock.now_ns())
+        yield Request(b"wake", "wake", never, never, never, silent=True)
+        if len(told) < 3:
+            raise Rejected("not now")
+        return True
+
+    monkeypatch.setattr(driver, "DRIVER", replace(driver.DRIVER, wake=wake))
+
+    async def story() -> None:
+        await module.pass_s(20)
+        assert len(told) >= 5
+        assert min(after - before for before, after in pairwise(told)) >= 2e9
+        assert sum("commanded to stream" in event.message for event in module.rig.events) == 1
+
+    module.play(story)
+
+
+def test_bytes_that_come_before_the_search_begins_are_counted() -> None:
+    class Early(MemoryLink):
+        """A link that delivers while it starts."""
+
+        def start(self, on_data: OnData, on_end: OnEnd) -> None:
+            super().start(on_data, on_end)
+            for size in (3, 5):
+                self.feed(bytes(size), monotonic_ns())
+
+    async def story(rig: DeviceRig) -> None:
+        feed(rig, hi91(10))
+        assert (rig.ledger.bytes_in, rig.ledger.bytes_skipped, len(rig.samples)) == (8 + 82, 8, 1)
+
+    play(story, link=Early(MemorySettings(baud=115200)))
 
 
 @pytest.mark.parametrize("baud", [115200, "auto"])
