@@ -170,6 +170,19 @@ async def test_motion_is_told_also_when_no_sample_came_since_it_was_seen(rig: Gu
         await running
 
 
+@pytest.mark.parametrize(
+    ("rate_rad_s", "words"), [(0.5, "it turns at 28.6 °/s"), (0.0, "only 11 samples came")], ids=["moved", "at rest"]
+)
+@played(GuideRig)
+async def test_too_few_samples_say_what_they_show(rig: GuideRig, rate_rad_s: float, words: str) -> None:
+    rig.motion, rig.silent = lambda _t_s: (0.0, 0.0, rate_rad_s), True
+    running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
+    await asyncio.sleep(19.05)
+    rig.silent = False
+    with pytest.raises(CommandError, match=f"expected the device at rest, got: {words}"):
+        await running
+
+
 @played(GuideRig)
 async def test_rest_is_waited_for(rig: GuideRig) -> None:
     rig.motion = lambda t_s: (0.0, 0.0, 0.5 if t_s < 5 else 0.0)
@@ -302,8 +315,14 @@ async def test_a_device_that_was_calibrated_before_needs_the_turning_only(rig: G
 @played(GuideRig)
 async def test_advice(rig: GuideRig, prepare: Callable[[GuideRig], object], words: str) -> None:
     prepare(rig)
-    calibration = magnetometer(rig, lambda: Verdict(False, "bias 0, 0, 0 µT"))
-    result = await rig.guide.run("magnetometer", calibration, save=False)
+    asked: list[int] = []
+
+    def verdict() -> Verdict:
+        asked.append(rig.clock.now_ns())
+        return Verdict(False, "bias 0, 0, 0 µT")
+
+    result = await rig.guide.run("magnetometer", magnetometer(rig, verdict), save=False)
+    assert 98 <= len(asked) <= 101  # every 3 s
     assert not result.verified
     assert not result.saved
     assert result.problem.startswith("the device did not end the calibration within 300 s; ")

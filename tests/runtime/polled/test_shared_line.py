@@ -3,6 +3,7 @@
 from collections.abc import AsyncIterator, Coroutine, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from math import dist
 from pathlib import Path
@@ -169,8 +170,14 @@ async def test_noise_costs_one_sample_and_no_more(bench: LineBench) -> None:
         await rig.until_samples(10)
         module.bad_crc = 1
         await rig.until(lambda: rig.device.ledger.lost_crc == 1, "damage counted")
-        module.mute = 1
-        await rig.until(lambda: rig.device.ledger.lost_gap_device == 1, "silence counted")
+        for silences in (1, 2):
+            module.mute = 1
+            await rig.until(
+                partial(lambda count: rig.device.ledger.lost_gap_device == count, silences), "silence counted"
+            )
+            polling = rig.device.status().polling
+            assert polling is not None
+            assert polling.failed == silences
         await rig.until_samples(10)
         assert rig.kinds.count(EventKind.DOWN) == 0
 

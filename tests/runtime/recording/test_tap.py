@@ -1,6 +1,7 @@
 """Taps: nothing is different on path and clock while nobody listens, and everything is heard while somebody does."""
 
 from imud.config import DeviceConfig
+from imud.contracts.lines import Edge
 from imud.contracts.settings import NoSettings
 from imud.devices.hipnuc.uart.driver import DRIVER
 from imud.formats.recording.records import CheckRecord, Kind, decode_object, records_of
@@ -82,6 +83,10 @@ def test_two_recorders_hear_the_same_and_another_path_is_described() -> None:
     assert one.kinds() == [Kind.DEVICE, Kind.PATH, Kind.PATH]
     two.path.on_data(hi91(0), 6)
     assert one.kinds()[-1] == Kind.DATA
+    for path in (two.path, TappedPath().path):  # edges reach the clock of the present path, and are heard
+        one.tap.path_made(PathParts(path, DRIVER.name, None))
+        path.clock.aiding.on_sout_edges([Edge(7, True, 1)])
+        assert (path.clock.status().edges, one.kinds()[-1]) == (1, Kind.EDGES)
 
 
 def test_readings_of_the_clocks_are_heard() -> None:

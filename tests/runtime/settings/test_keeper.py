@@ -182,6 +182,10 @@ async def test_compared_again_after_a_replug_a_restart_and_a_command(bench: Modu
     await bench.until(lambda: bench.is_in(SettingsState.DIFFER), "after a command")
     await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
     await bench.until(lambda: bench.is_in(SettingsState.AGREE), "after another one")
+    await bench.pass_s(2.2)  # a restart by imud's own script would have shown by now
+    asked = bench.module.commands.count("GET")
+    bench.module.restart()
+    await bench.until(lambda: bench.module.commands.count("GET") > asked, limit_s=3)
     differ = 'settings are not as declared: mode is "9-axis", declared "6-axis"'
     assert bench.messages == [differ, differ, "settings are as declared again"]
 
@@ -297,6 +301,19 @@ def test_what_is_saved_and_not_told_is_not_written_again_in_the_next_run(tmp_pat
         bench.play(story)
         modules.append(bench.module)
     assert [module.saves for module in modules] == [1, 0]
+
+
+@played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis"}))
+async def test_what_a_command_could_not_save_is_saved_later(bench: ModuleBench) -> None:
+    bench.module.silent = {"SAVE"}
+    await bench.until(lambda: "not saved" in bench.status.problem)
+    with pytest.raises(CommandError, match="SAVE: expected OK, got nothing"):
+        await bench.doing(bench.device.act("save", {}))
+    assert bench.module.flash == FACTORY
+    bench.module.silent = set()
+    await bench.until(lambda: bench.module.flash["mode"] == "9-axis", limit_s=90)
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    assert bench.status.problem == ""
 
 
 @played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis", "secret": 5}))
