@@ -6,15 +6,12 @@ import pytest
 
 from imud.contracts.lines import AlarmRange
 from imud.sample import Vector3
-from imud.signals.alarm_check import (
-    FAULT_NS,
-    MARGIN_DEG,
-    SETTLE_NS,
-    AlarmCheck,
-    AlarmVerdict,
-    judge,
-)
+from imud.signals.alarm_check import AlarmCheck, AlarmVerdict, judge
 from imud.units import NS_PER_MS
+
+FAULT_NS = 2 * 10**9
+MARGIN_DEG = 0.5
+SETTLE_NS = 200 * 10**6
 
 ROLL, PITCH = 0, 1
 BOTH = {"X": AlarmRange(PITCH, -10, 10, True), "Y": AlarmRange(ROLL, -5, 5, True)}

@@ -8,9 +8,11 @@ import pytest
 from imud.contracts.lines import AlarmRange, AlarmRanges, Edge
 from imud.event import EventKind
 from imud.sample import Sample, Sync
-from imud.signals.alarm_line import FRESH_NS, AlarmLine, AlarmMonitor
+from imud.signals.alarm_line import AlarmLine, AlarmMonitor
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.signal_bench import SignalBench
+
+FRESH_NS = 150 * 10**6
 
 TICK_NS = 100 * NS_PER_MS
 X_OFF = AlarmRange(1, -10, 10, False)

@@ -5,7 +5,9 @@ from math import sqrt
 import pytest
 
 from imud.contracts.lines import Edge, ReadySettings
-from imud.signals.ready_edges import KEPT, ReadyEdges
+from imud.signals.ready_edges import ReadyEdges
+
+KEPT = 1024
 
 MS = 1_000_000
 EXACT = ReadySettings(line="Y", bias_us=0)

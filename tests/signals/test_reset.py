@@ -7,12 +7,14 @@ import pytest
 
 from imud.contracts.lines import DeviceLines, ResetSettings
 from imud.errors import CommandError, LinkBusy, LinkMissing
-from imud.signals.reset import AGAIN_NS, ResetLine, make_reset, reset
-from imud.signals.watched_line import RETRY_NS
+from imud.signals.reset import ResetLine, make_reset, reset
 from imud.sim.ports.lines import MemoryOutput
 from imud.units import NS_PER_S
 from tests.support.event_loops import in_loop, run_virtually
 from tests.support.signal_bench import DEVICE, SignalBench
+
+AGAIN_NS = 60 * 10**9
+RETRY_NS = 5 * 10**9
 
 SETTINGS = ResetSettings(line="RESET", hold_ms=20)
 

@@ -18,10 +18,11 @@ from imud.errors import CommandError, LinkBusy, LinkError
 from imud.event import EventKind
 from imud.sample import Measurement
 from imud.signals.sync_signals import ALARM_STATUS, SyncSignals
-from imud.signals.watched_line import RETRY_NS
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.event_loops import in_loop
 from tests.support.signal_bench import DEVICE, SignalBench
+
+RETRY_NS = 5 * 10**9
 
 ALL = DeviceLines(
     sout=SoutSettings(line="A"),

@@ -8,11 +8,15 @@ import pytest
 
 from imud.contracts.timing import TriggerStamp
 from imud.errors import LinkError, LinkMissing
-from imud.signals.trigger import IDLE_NS, PULSE_NS, STAMPS_MAX, SquareWave, Trigger, TriggerCounts
+from imud.signals.trigger import SquareWave, Trigger, TriggerCounts
 from imud.sim.ports.lines import MemoryOutput
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.event_loops import in_loop
 from tests.support.signal_bench import SignalBench
+
+IDLE_NS = 60 * 10**9
+PULSE_NS = 1 * 10**6
+STAMPS_MAX = 10_000
 
 LIMIT_S = 10
 CALL_NS = 2_000

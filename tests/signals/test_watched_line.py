@@ -4,9 +4,11 @@ import asyncio
 
 from imud.contracts.lines import Edge, InputSettings
 from imud.errors import LinkBusy, LinkError, LinkMissing
-from imud.signals.watched_line import RETRY_NS, WatchedLine, watching
+from imud.signals.watched_line import WatchedLine, watching
 from imud.sim.ports.lines import MemoryInput, MemoryLines
 from tests.support.event_loops import VirtualClock, in_loop
+
+RETRY_NS = 5 * 10**9
 
 BUSY = LinkBusy("gpiochip0 line 3 is in use by gpiomon: stop that")
 

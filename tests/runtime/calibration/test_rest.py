@@ -4,8 +4,10 @@ from math import pi, radians
 
 import pytest
 
-from imud.runtime.calibration.rest import WINDOW_SAMPLES, RestWindow
+from imud.runtime.calibration.rest import RestWindow
 from imud.sample import Pair, Sample, Sync, Vector3
+
+WINDOW_SAMPLES = 20
 
 UP: Vector3 = (0.0, 0.0, 9.80665)
 STILL: Vector3 = (0.0, 0.0, 0.0)

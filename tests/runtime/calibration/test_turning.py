@@ -5,10 +5,12 @@ from math import pi
 
 import pytest
 
-from imud.runtime.calibration.turning import CELLS, POINTS_MAX, Turning, cell_of, coverage
+from imud.runtime.calibration.turning import CELLS, Turning, cell_of, coverage
 from imud.sample import Sample, Sync, Vector3
 from imud.sim.physics.motion import tumble
 from imud.units import NS_PER_MS, NS_PER_S
+
+POINTS_MAX = 1024
 
 CENTRE: Vector3 = (14e-6, -2e-6, -9e-6)
 

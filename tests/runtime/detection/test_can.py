@@ -8,9 +8,12 @@ from imud.devices.imu61x.can.codec import encode_set
 from imud.devices.imu61x.can.driver import DRIVER as IMU61X
 from imud.formats.can import CanFrame
 from imud.runtime.detection import CanFound, CanSearch, CanStep, CanSurvey, GaveUp, Listen
-from imud.runtime.detection.can import DEVICES_MAX, IDENTIFIERS_MAX, LISTEN_NS
 from imud.units import NS_PER_S
 from tests.support.fake_drivers import BASE, fake_can_driver, fake_can_frame
+
+DEVICES_MAX = 128
+IDENTIFIERS_MAX = 4096
+LISTEN_NS = 1500 * 10**6
 
 FAKE = fake_can_driver()
 DRIVERS = (FAKE, IMU61X)

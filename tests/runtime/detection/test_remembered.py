@@ -1,6 +1,7 @@
 """What was found is there after a restart; a bad file costs nothing but the memory."""
 
 import os
+import threading
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -18,6 +19,7 @@ def remember(folder: Path, **found: RememberedDevice) -> None:
     with closing(Remembered(folder)) as memory:
         for name, one in found.items():
             memory.put(name, one)
+    assert "remembered" not in {thread.name for thread in threading.enumerate()}
 
 
 def recalled(folder: Path, device: str) -> RememberedDevice | None:

@@ -19,13 +19,14 @@ from imud.links.memory import MemoryCanLink, MemorySettings
 from imud.runtime.can import transport as can_transport
 from imud.runtime.detection import can as detection
 from imud.runtime.detection.remembered import Remembered, RememberedDevice
-from imud.runtime.transport import SILENT_SEARCH_NS
 from imud.sample import Sample
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.event_loops import VirtualClock, run_virtually
 from tests.support.fake_drivers import BASE, SYNC_ID, FakeCanSettings, fake_can_driver, fake_can_frame
 from tests.support.stories import played
+
+SILENT_SEARCH_NS = 15 * 10**9
 
 
 @pytest.fixture(autouse=True)

@@ -7,10 +7,12 @@ import pytest
 
 from imud.contracts.codec import CodecEvent
 from imud.ledger import Ledger
-from imud.runtime.detection import QUIET_NS, GaveUp, Listen, Search, Step, StreamFound
+from imud.runtime.detection import GaveUp, Listen, Search, Step, StreamFound
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.fake_drivers import BAUD_RATES, FAKE_DRIVER, QUERY, REPLY, SYNC, fake_frame
 from tests.support.uart_wire import FakeDevice, received, run_search
+
+QUIET_NS = 1200 * 10**6
 
 
 def device(baud: int, rate_hz: float, phase_ns: int = 0, poll_ns: int = NS_PER_MS) -> FakeDevice:

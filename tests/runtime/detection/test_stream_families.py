@@ -12,9 +12,11 @@ from imud.devices.imu61x.uart.commands import ask_status
 from imud.devices.imu61x.uart.driver import DRIVER as IMU61X
 from imud.devices.imu61x.uart.replies import Status
 from imud.ledger import Ledger
-from imud.runtime.detection import ASK_TRIES, GaveUp, Search, StreamFound
+from imud.runtime.detection import GaveUp, Search, StreamFound
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.uart_wire import FakeDevice, run_search
+
+ASK_TRIES = 2
 
 FAMILIES = [HIPNUC, IMU61X]
 STATUS = encode_status(Status(10203, 2, 614, (1, 2, 3), 0, 0, 0, 0, 0, 0, 0, bytes(32)))

@@ -4,8 +4,10 @@ from pathlib import Path
 
 import yaml
 
-from imud.runtime.settings.backup import BACKUPS_MAX, BackupFolder, backup_text
+from imud.runtime.settings.backup import BackupFolder, backup_text
 from imud.units import NS_PER_S
+
+BACKUPS_MAX = 10
 
 T_NS = 1_795_000_000 * NS_PER_S
 """2026-11-18T11:06:40Z."""

@@ -5,16 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from imud.runtime.settings.flash import (
-    DAY_S,
-    FILE_NAME,
-    LIMIT_ASKED,
-    LIMIT_ITSELF,
-    MODULES_MAX,
-    FlashWrites,
-    ModuleFlash,
-)
+from imud.runtime.settings.flash import FILE_NAME, FlashWrites, ModuleFlash
 from imud.units import NS_PER_S
+
+DAY_S = 86_400
+LIMIT_ASKED = 40
+LIMIT_ITSELF = 4
+MODULES_MAX = 1024
 
 BEGIN_S = 1_800_000_000
 

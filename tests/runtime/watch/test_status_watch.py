@@ -8,8 +8,11 @@ from imud.devices import DRIVERS
 from imud.event import Event, EventKind
 from imud.ledger import Ledger
 from imud.runtime.notices import Notices
-from imud.runtime.watch.status_watch import CLEAR_NS, INTERVAL_NS, StatusWatch
+from imud.runtime.watch.status_watch import StatusWatch
 from imud.units import NS_PER_MS, NS_PER_S
+
+CLEAR_NS = 1 * 10**9
+INTERVAL_NS = 1 * 10**9
 
 TICK_NS = 100 * NS_PER_MS
 OVER_RANGE, DISTURBED, AT_REST = 1 << 5, 1 << 4, 1 << 9
