@@ -199,12 +199,13 @@ class Device:
         self._connects += 1
         self._health.link_opened()
         ended = self._ended = asyncio.get_running_loop().create_future()
-        transport.start(self._on_end)
-        tasks = [
-            asyncio.create_task(transport.work(), name=f"{self.config.name} work"),
-            asyncio.create_task(self._settings.run(), name=f"{self.config.name} settings"),
-        ]
+        tasks: list[asyncio.Task[None]] = []
         try:
+            transport.start(self._on_end)
+            tasks = [
+                asyncio.create_task(transport.work(), name=f"{self.config.name} work"),
+                asyncio.create_task(self._settings.run(), name=f"{self.config.name} settings"),
+            ]
             await asyncio.wait({*tasks, ended}, return_when=asyncio.FIRST_COMPLETED)
             if not ended.done():
                 for task in tasks:

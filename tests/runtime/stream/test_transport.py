@@ -382,6 +382,30 @@ def test_a_device_that_refuses_to_stream_is_told_again_and_of_once(monkeypatch: 
     module.play(story)
 
 
+def test_a_link_that_cannot_start_is_closed_before_it_is_opened_again() -> None:
+    class Failing(MemoryLink):
+        starts = 0
+
+        def open(self) -> None:
+            assert not self.is_open
+            super().open()
+
+        def start(self, on_data: OnData, on_end: OnEnd) -> None:
+            self.starts += 1
+            if self.starts < 3:
+                raise LinkError("it does not start")
+            super().start(on_data, on_end)
+
+    async def story(rig: DeviceRig) -> None:
+        await rig.turn(lambda: rig.link.listening)
+        feed(rig, hi91(10))
+        rig.tick()
+        assert rig.is_in(DeviceState.RUNNING)
+        assert rig.device.status().connects == 3
+
+    play(story, link=Failing(MemorySettings(baud=115200)))
+
+
 def test_bytes_that_come_before_the_search_begins_are_counted() -> None:
     class Early(MemoryLink):
         """A link that delivers while it starts."""
