@@ -36,6 +36,8 @@ from tests.support.event_loops import VirtualClock, run_virtually
 LIMIT_S = 60.0
 """Deadline of a wait, s: of a real device on a loaded host. Virtual time passes at once."""
 STEP_S = 0.002
+TURN_S = 0.0005
+"""Pause between two looks at a condition, s: timers have their turn, also in virtual time."""
 
 
 class DeviceRig:
@@ -109,7 +111,7 @@ class DeviceRig:
         end = asyncio.get_running_loop().time() + LIMIT_S
         while not holds():
             assert asyncio.get_running_loop().time() < end, f"does not come true: {self.device.status()}"
-            await asyncio.sleep(0)
+            await asyncio.sleep(TURN_S)
 
     async def until_samples(self, more: int, limit_s: float = LIMIT_S) -> None:
         """Wait for more samples, and until the state says so."""

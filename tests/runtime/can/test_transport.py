@@ -3,7 +3,6 @@
 from collections.abc import Callable, Coroutine, Sequence
 from itertools import count
 from random import Random
-from time import monotonic_ns
 from typing import Any
 
 import pytest
@@ -40,12 +39,12 @@ def configured(
 class Frames:
     """Samples of a module, whose frames are 1 ms apart."""
 
-    def __init__(self) -> None:
-        self._now_ns = monotonic_ns()
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self._clock, self._now_ns = now_ns, now_ns()
 
     def of(self, index: int, *, base_id: int = 101, lost: Sequence[int] = ()) -> list[CanFrame]:
         """The frames of one sample."""
-        self._now_ns = max(self._now_ns, monotonic_ns() - 10 * MS)
+        self._now_ns = max(self._now_ns, self._clock() - 10 * MS)
         made = []
         for place, (can_id, data) in enumerate(
             encode_set(
@@ -65,7 +64,7 @@ class CanDeviceBench:
     def __init__(self, rig: DeviceRig) -> None:
         self.rig = rig
         self.link = rig.can_link
-        self.frames = Frames().of
+        self.frames = Frames(rig.now_ns).of
 
     def feed(self, *indices: int) -> None:
         """Whole samples, in one read."""
@@ -74,14 +73,15 @@ class CanDeviceBench:
 
 def play(story: Callable[[CanDeviceBench], Coroutine[Any, Any, None]], config: DeviceConfig | None = None) -> DeviceRig:
     """Run the device while the story is told; at the end the ledger closes and the link is released."""
-    rigs = DeviceRigs()
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host)
     rig = rigs.add(config or configured())
 
     async def told(_made: list[DeviceRig]) -> None:
         await rig.turn(lambda: rig.can_link.listening)
         await story(CanDeviceBench(rig))
 
-    play_rigs(rigs, told)
+    play_rigs(rigs, told, clock)
     assert rig.ledger.frames_pending == 0
     return rig
 
@@ -110,7 +110,7 @@ def delay_ns(name: str, settings: Settings, bitrate: int) -> int:
     burst = driver.example_frames(Random(1))
 
     async def story(bench: CanDeviceBench) -> None:
-        begin_ns = monotonic_ns() - 300 * MS
+        begin_ns = bench.rig.now_ns() - 300 * MS
         for number in range(20):
             t_ns = begin_ns + number * 10 * MS
             assert bench.link.feed([f._replace(t_rx_ns=t_ns + place * 300_000) for place, f in enumerate(burst)])

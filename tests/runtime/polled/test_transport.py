@@ -298,6 +298,7 @@ async def test_missing_bus_is_waited_for_and_one_that_may_not_be_opened_is_tried
     async with bench.running(bench.on_spi()) as (rig,):
         await asyncio.sleep(0)
         assert rig.state is DeviceState.MISSING
+        assert str(bench.node) in rig.problem
         plug()
         await rig.until_samples(3)
         unplug()
