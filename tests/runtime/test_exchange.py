@@ -15,7 +15,7 @@ from imud.errors import CommandError, LinkMissing, NoReply
 from imud.ledger import Ledger
 from imud.runtime.exchange import Exchange
 from imud.sample import Measurement
-from tests.support.event_loops import in_loop
+from tests.support.event_loops import VirtualClock, in_loop, run_virtually
 
 
 def request(name: str, timeout_ns: int = 10**10, *, silent: bool = False) -> Request:
@@ -106,15 +106,16 @@ async def test_a_script_that_is_cancelled_or_whose_link_is_gone_leaves_the_line_
     assert await exchange.run(ask(request("B", silent=True))) == [Reply(())]
 
 
-@in_loop
-async def test_device_that_never_answers_is_no_reply() -> None:
-    exchange, _ = made()
-    driver = DRIVERS["hipnuc-uart"]
+def test_device_that_never_answers_is_no_reply() -> None:
+    clock, driver = VirtualClock(), DRIVERS["hipnuc-uart"]
     assert isinstance(driver, StreamDriver)
     script = driver.identify()
-    task = asyncio.create_task(exchange.run(script))
-    with pytest.raises(NoReply, match="LOG VERSION"):
-        await asyncio.wait_for(task, 5)
+
+    async def body() -> None:
+        with pytest.raises(NoReply, match="LOG VERSION"):
+            await Exchange(Ledger(), lambda _data: None, clock.now_ns).run(script)
+
+    run_virtually(clock, body())
 
 
 @in_loop

@@ -211,8 +211,11 @@ WITHOUT_S = 30
 """So long no pulse comes. What the device's crystal gathers meanwhile, the device itself takes back at once."""
 
 
-@pytest.mark.parametrize("skew_ppm", [30.0, -30.0])
-@pytest.mark.parametrize("lines", [PPS, DeviceLines(pps=PPS.pps, sout=SOUT.sout)], ids=["pps", "pps and sout"])
+@pytest.mark.parametrize(
+    ("lines", "skew_ppm"),
+    [(PPS, 30.0), (DeviceLines(pps=PPS.pps, sout=SOUT.sout), -30.0)],
+    ids=["pps", "pps and sout"],
+)
 @pytest.mark.manual("B 1.2.1 UTC by PPS and RMC")
 @played(
     lambda lines, skew_ppm: WiredDevice(lines, None, HipnucHardware(skew_ppm=skew_ppm), rmc=RmcSettings(source="gpsd"))

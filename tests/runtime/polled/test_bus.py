@@ -283,7 +283,7 @@ async def test_a_script_that_is_given_up_ends_without_a_result(buses: PolledBuse
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: failed.append(context))
     member = joined(buses, wire, Sink())
     for script in (three(), refusing()):
-        running = asyncio.create_task(member.run(script, 1))  # type: ignore[arg-type]  # either
+        running = asyncio.create_task(member.run(script, 1))
         await asyncio.sleep(0)
         running.cancel()
         with pytest.raises(asyncio.CancelledError):

@@ -16,6 +16,9 @@ from imud.worker import SWITCH_INTERVAL_S, BusThread
 from tests.support.event_loops import in_loop
 from tests.support.polled_bus_bench import PolledBusBench
 
+pytestmark = pytest.mark.live
+LIMIT_S = 60
+
 
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PolledBusBench:
@@ -36,7 +39,7 @@ async def test_daemon_serves_a_polled_device(bench: PolledBusBench) -> None:
     bench.spi.device = Imu61xRegisters(monotonic_ns).spi
     daemon = Daemon(Config("info", "", {}, (bench.on_spi(),)))
     watching = asyncio.create_task(wait_until_running(daemon, daemon.stop))
-    await asyncio.wait_for(daemon.run(), 10)
+    await asyncio.wait_for(daemon.run(), LIMIT_S)
     await watching
     assert daemon.status()[0].driver == "imu61x-spi"
     assert not bench.spi.opened
@@ -49,7 +52,7 @@ def test_mistake_in_the_bus_thread_ends_the_daemon(bench: PolledBusBench) -> Non
     bench.spi.device = mistake
 
     async def body() -> None:
-        await asyncio.wait_for(Daemon(Config("info", "", {}, (bench.on_spi(),))).run(), 10)
+        await asyncio.wait_for(Daemon(Config("info", "", {}, (bench.on_spi(),))).run(), LIMIT_S)
 
     with pytest.raises(ZeroDivisionError, match="a mistake"):
         asyncio.run(body())

@@ -308,24 +308,25 @@ class DeafModule:
         play_rigs(self.rigs, told, self.clock)
 
 
-@pytest.mark.parametrize("deaf_to", [3, 5, 6, 9])
+@pytest.mark.parametrize("deaf_to", [3, 5, 9])
 @played(DeafModule)
 async def test_a_device_that_streams_and_did_not_answer_is_asked_until_it_does(
     module: DeafModule, deaf_to: int
 ) -> None:
     """Three tries, then one after 5, 30 and 120 s, then every five minutes."""
-    await module.pass_s(2000)
+    await module.rig.until(lambda: module.product, limit_s=2000, step=module.step, step_s=0.25)
+    await module.pass_s(310)
     assert len(module.asked_ns) == deaf_to + 1
     assert module.product == "HI14R3"
 
 
 @played(lambda: DeafModule(1_000_000))
 async def test_a_device_that_never_answers_gets_a_request_in_five_minutes(module: DeafModule) -> None:
-    await module.pass_s(3600)
+    await module.pass_s(1500)
     pauses_s = [(after - before) / 1e9 for before, after in pairwise(module.asked_ns)]
     for pause_s, wanted_s in zip(pauses_s[2:5], (5, 30, 120), strict=True):
         assert wanted_s <= pause_s < wanted_s + 3  # a request waits for its reply before the pause
-    assert len(pauses_s[5:]) == 11
+    assert len(pauses_s[5:]) == 4
     assert all(300 <= pause_s < 303 for pause_s in pauses_s[5:])
     assert module.product is None
 

@@ -19,7 +19,7 @@ from tests.support.event_loops import in_loop
 from tests.support.signal_bench import FakeGpiod
 
 SOUT = InputSettings(line="SOUT")
-LIMIT_S = 10
+LIMIT_S = 60
 
 
 class Sink:
