@@ -139,6 +139,7 @@ async def test_reset_is_offered_with_a_line_only_and_also_while_no_device_is_fou
         with pytest.raises(BadArgument, match="no action 'reset'"):
             await rig.device.act("reset", {})
     async with polled(bench) as it:
+        assert "trigger" not in it.rig.device.actions  # it has lines, and no SIN
         it.hang()
         await it.rig.until(lambda: "only 0xFF" in it.rig.device.status().problem, "searching")
         with pytest.raises(BadArgument, match="hard"):

@@ -156,7 +156,8 @@ def test_an_edge_that_is_noticed_is_read_at_once_and_counted_by_its_stamp() -> N
             made.on_edges([t_ns], MS)
             assert made.due_ns == t_ns
         read(made, t_ns + 100_000)
-        assert made.has_read(t_ns)
+        assert made.has_read(t_ns + 100_000)
+        assert not made.has_read(t_ns + 100_001)
         assert made.due_ns == t_ns + (0 if told_first else 30_000) + QUIET_NS
         if not told_first:
             made.on_edges([t_ns], MS)

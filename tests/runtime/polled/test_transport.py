@@ -15,6 +15,7 @@ from imud.devices.imu61x.spi import codec
 from imud.devices.imu61x.spi.words import READ_STATE
 from imud.errors import DeviceRefused
 from imud.event import EventKind
+from imud.runtime.latency.budget import Need
 from imud.sim.imu61x.behaviour import REGISTER_VARIANTS
 from tests.support.device_rig import device_config
 from tests.support.event_loops import VirtualClock
@@ -241,6 +242,30 @@ async def test_auto_finds_driver_and_address_and_does_not_take_one_twice(bench: 
         (left,) = (rig for rig in rigs if rig not in there)
         await left.until(lambda: "another device of this configuration" in left.device.status().problem, "told")
         assert {rig.device.status().identity["product"] for rig in there} == {"IMU612", "IMU618"}
+
+
+@in_bench
+async def test_a_stuck_bus_is_tried_once_in_a_round(bench: PolledBusBench) -> None:
+    devices = [bench.registers() for _ in range(4)]
+    bench.i2c.devices.update(dict(zip(range(0x18, 0x1C), devices, strict=True)))
+    for device in devices:
+        device.faults.error = errno.ETIMEDOUT
+    async with bench.running(on_i2c()) as (rig,):
+        await asyncio.sleep(2.2)  # a round every 0.5 s
+        assert rig.is_in(DeviceState.SEARCHING)
+        assert sum(device.transactions for device in devices) == 5
+
+
+@in_bench
+async def test_readings_are_held_if_two_of_them_fit(bench: PolledBusBench) -> None:
+    bench.spi.device = bench.registers().spi
+    async with bench.running(bench.on_spi()) as (rig,):
+        for latency_ns, hold_ns in ((8_000_000, 8_000_000), (7_999_999, 0)):  # a period is 4 ms
+            rig.device.set_need(Need(latency_ns, "client"))
+            before, batches = len(rig.samples), rig.batches
+            await rig.until_samples(20)
+            assert rig.device.status().hold_ns == hold_ns
+            assert (rig.batches - batches < len(rig.samples) - before) is (hold_ns > 0)
 
 
 @in_bench

@@ -94,11 +94,11 @@ def test_a_run_of_a_polled_device_is_replayed(bench: PolledBusBench, run: Callab
 def run_of(driver: str, middle: int) -> DeviceRig:
     """A stream of frames with jitter; what was recorded up to `middle` of them is forgotten, and begins anew there.
 
-    The host is suspended before the first frame and shortly before the last.
+    The host's time is slewed by 100 ppm. The host is suspended before the first frame and shortly before the last.
     """
     row, clock, asleep_ns = DRIVERS[driver], VirtualClock(), 0
     now_ns = clock.now_ns
-    host = HostClock(now_ns, clock.realtime_ns, now_ns, lambda: now_ns() + asleep_ns)
+    host = HostClock(now_ns, clock.realtime_ns, lambda: now_ns() + now_ns() // 10_000, lambda: now_ns() + asleep_ns)
     rigs = DeviceRigs(host, start_worker=LoopWorker)
     random = Random(driver)
     config = device_config("imu", driver, "memory", {"baud": 115200})
@@ -109,8 +109,8 @@ def run_of(driver: str, middle: int) -> DeviceRig:
         nonlocal asleep_ns
         for number in range(SAMPLES):
             asleep_ns += 2 * NS_PER_S * (number in (0, SAMPLES - 20))
-            if number % 10 == 0:
-                host.utc_offset_ns()
+            host.utc_offset_ns()
+            rig.tick()
             if number == middle:
                 rig.recorded.clear()
                 rig.samples.clear()
