@@ -25,6 +25,7 @@ from tests.support.stories import played
 from tests.support.wired_device import Imu61xLine
 
 UPTIME_US = 20_000_000
+SLOW = Imu61xSettings(rate_hz=50)
 
 
 class VariantBench:
@@ -67,7 +68,9 @@ class VariantBench:
 
 @every_variant
 @played(lambda variant: VariantBench(VARIANTS[variant]))
-async def test_actions_are_followed_and_settings_shown_are_read_again(bench: VariantBench, variant: str) -> None:
+async def test_actions_are_followed_and_settings_applied_in_an_order_that_keeps_the_device(
+    bench: VariantBench, variant: str
+) -> None:
     device = bench.device
     assert device.status().identity["model_number"] == "614"
     await device.act("rate", {"rate_hz": 200})
@@ -87,13 +90,11 @@ async def test_actions_are_followed_and_settings_shown_are_read_again(bench: Var
     await device.act("factory_reset", {})
     assert (bench.line.baud, bench.module.flash) == (115200, Imu61xSettings())
     await bench.samples()
-
-
-@every_variant
-@played(lambda variant: VariantBench(VARIANTS[variant]))
-async def test_settings_are_applied_in_an_order_that_keeps_the_device(bench: VariantBench, variant: str) -> None:
+    with pytest.raises(BadArgument, match="output_rate_hz and baud: expected at most 200 Hz at 115200 baud"):
+        await device.settings_apply({"output_rate_hz": 400}, save=False)
+    assert bench.module.settings == Imu61xSettings()
     wanted: dict[str, Any] = {"baud": 460800, "output_rate_hz": 400, "gyro_filter": "10 Hz", "i2c_address": "0x1a"}
-    applied = await bench.device.settings_apply(wanted, save=variant != "no K1")
+    applied = await device.settings_apply(wanted, save=variant != "no K1")
     assert {step.name for step in applied.steps} == set(wanted)
     assert {step.outcome for step in applied.steps} == {StepOutcome.DONE}
     assert (applied.problem, applied.differences) == ("", {})
@@ -107,28 +108,16 @@ async def test_settings_are_applied_in_an_order_that_keeps_the_device(bench: Var
     await bench.samples()
 
 
-@played(lambda: VariantBench(Imu61xBehaviour()))
-async def test_settings_that_do_not_go_together_are_not_applied(bench: VariantBench) -> None:
-    with pytest.raises(BadArgument, match="output_rate_hz and baud: expected at most 200 Hz at 115200 baud"):
-        await bench.device.settings_apply({"output_rate_hz": 400}, save=False)
-    assert bench.module.settings == Imu61xSettings()
-
-
-def test_a_device_that_refuses_all_orders_is_left_as_it_was() -> None:
-    settings = Imu61xSettings(rate_hz=50)
-    bench = VariantBench(REFUSING, settings)
-
-    async def story() -> None:
-        for name in ("save", "restart", "factory_reset", "stop_streaming"):
-            with pytest.raises(CommandError):
-                await bench.device.act(name, {})
-        applied = await bench.device.settings_apply({"output_rate_hz": 10}, save=True)
-        assert [step.outcome for step in applied.steps] == [StepOutcome.FAILED]
-        assert "reads back as 50" in applied.problem
-        assert (bench.module.settings, bench.module.flash) == (settings, settings)
-        await bench.samples()
-
-    bench.play(story)
+@played(lambda: VariantBench(REFUSING, SLOW))
+async def test_a_device_that_refuses_all_orders_is_left_as_it_was(bench: VariantBench) -> None:
+    for name in ("save", "restart", "factory_reset", "stop_streaming"):
+        with pytest.raises(CommandError):
+            await bench.device.act(name, {})
+    applied = await bench.device.settings_apply({"output_rate_hz": 10}, save=True)
+    assert [step.outcome for step in applied.steps] == [StepOutcome.FAILED]
+    assert "reads back as 50" in applied.problem
+    assert (bench.module.settings, bench.module.flash) == (SLOW, SLOW)
+    await bench.samples()
 
 
 # --- on a real port ---------------------------------------------------------------------------------------------------
