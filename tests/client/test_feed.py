@@ -125,5 +125,5 @@ def test_the_time_of_the_news_is_that_of_the_daemons_machine(tmp_path: Path) -> 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_clocks_that_are_near_are_one_clock(monkeypatch: pytest.MonkeyPatch, sign: int) -> None:
     monkeypatch.setattr("imud.client.feed.monotonic_ns", lambda: NOW_NS)
-    assert clock_ahead_ns(NOW_NS + sign * SAME_CLOCK_NS) == 0  # an answer that came late
+    assert clock_ahead_ns(NOW_NS + sign * SAME_CLOCK_NS) == 0  # the answer may be late
     assert clock_ahead_ns(NOW_NS + sign * (SAME_CLOCK_NS + 1)) == sign * (SAME_CLOCK_NS + 1)

@@ -242,7 +242,7 @@ def test_numbers_with_a_gap_and_numbers_that_begin_anew(board: Board, ring: Ring
     assert numbers(ring) == ([5000, 5001], 4999)
     board.publish([1, 2])
     assert numbers(ring) == ([1, 2], 0)
-    # the first number is seen before the newest one that it belongs to
+    # the reader sees the new first number before the new newest number
     board.poke(OFFSETS["first_seq"], struct.pack("<Q", 5000))
     board.publish([3])
     assert numbers(ring) == ([3], 0)

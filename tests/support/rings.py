@@ -48,7 +48,7 @@ TORN = {
     "whole, but of another round": _reseal(WHOLE, 2 + SLOTS),
     "never written": bytes(SLOT_BYTES),
 }
-"""Slots of sample 2 that a reader must not take, by what is wrong."""
+"""Slots of sample 2 that a reader must refuse, by the kind of damage."""
 
 
 class Board:

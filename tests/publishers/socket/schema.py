@@ -56,7 +56,7 @@ def socket_document() -> Schema:
 
 
 def socket_schema() -> str:
-    """The file as it stands in docs/."""
+    """Return the text of docs/socket.schema.json."""
     return json.dumps(socket_document(), indent=1, ensure_ascii=False) + "\n"
 
 
@@ -65,7 +65,7 @@ class MessageChecker:
 
     def __init__(self) -> None:
         self.checked: dict[str, int] = {}
-        """How many messages were checked, by name."""
+        """Number of checked messages, by name."""
         self._whole = socket_document()
         _close(self._whole)
         self._validators: dict[str, Any] = {}

@@ -65,7 +65,7 @@ async def test_reading_is_not_enough(server: SocketServer, monkeypatch: pytest.M
     assert code == -32001
     assert message.startswith("command: expected root or a member of group 'imud-test-control', which does not")
     assert "`sudo groupadd --system imud-test-control` makes it" in message
-    # what a device was last told is for readers, everything else needs control
+    # readers may read the last known settings; all other requests need the right to control
     found = await peer.result("settings.get", device="imu0")
     assert found["settings"][0]["actual"] == "6-axis"
     for method, more in (("settings.get", {"fresh": True}), ("settings.plan", {}), ("settings.apply", {})):

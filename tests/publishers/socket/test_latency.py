@@ -31,7 +31,7 @@ class Latencies:
 
 @asynccontextmanager
 async def listening(directory: Path) -> AsyncIterator[tuple[SocketServer, Asked, Peer]]:
-    """A server, what its clients ask for at any time, and one client."""
+    """Start a server with one client; give the latencies that its clients ask for, too."""
     latencies = Latencies()
     async with serving(directory, latencies=latencies) as server:
         yield server, latencies.asked, await Peer.greeted(server)

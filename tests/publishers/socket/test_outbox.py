@@ -121,29 +121,6 @@ async def test_the_queue_is_bounded_in_bytes_too(server: SocketServer) -> None:
     assert_accounted(await read_samples(peer, {"imu0": 1000}), ("imu0",))
 
 
-@pytest.mark.parametrize("seed", range(3))
-@in_server(queue_samples=50)
-async def test_any_pattern_of_reading_accounts_for_every_sample(server: SocketServer, seed: int) -> None:
-    """Publishing and reading a little, in any order: the order is kept, nothing is unaccounted for."""
-    rng = random.Random(seed)
-    peer = await Peer.greeted(server)
-    encoding = rng.choice(["json", "binary"])
-    await peer.result("watch", encoding=encoding)
-    peer.framed = encoding == "binary"
-    seq = 0
-    loop = asyncio.get_running_loop()
-    for _ in range(60):
-        count = rng.choice([1, 1, 2, 40])
-        server.publish(batch("imu0", seq + 1, count))
-        seq += count
-        if rng.random() < 0.3:
-            peer.buffer += await loop.sock_recv(peer.sock, rng.choice([1, 100, 70_000]))
-        if rng.random() < 0.2:
-            await asyncio.sleep(0)
-    assert_accounted(await read_samples(peer, {"imu0": seq}), ("imu0",))
-    assert len(await peer.result("devices")) == 2
-
-
 @in_server(queue_samples=5)
 async def test_replies_keep_their_place_and_are_never_dropped(server: SocketServer) -> None:
     peer = await Peer.greeted(server)

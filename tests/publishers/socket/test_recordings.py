@@ -174,7 +174,7 @@ async def test_the_maximum_counts_recordings_that_run_and_those_that_still_send(
         await peer.result("record.start")
     full = (-32004, f"record.start: {RECORDINGS_MAX} recordings run already, as many as there may be at a time")
     assert await peers[-1].error("record.start") == full
-    peers[0].close()  # ends at once
+    peers[0].close()  # ends its recording immediately
     await until(lambda: len(server.hub.connections) == RECORDINGS_MAX)
     await peers[-1].result("record.start")
     for peer in peers[1:3]:  # end with the next tick
