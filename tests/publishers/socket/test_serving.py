@@ -202,7 +202,7 @@ async def test_a_client_that_waited_long_is_ahead_for_a_millisecond(rig: Schedul
     idle.line_up()
     await until(lambda: len(rig.log) >= count + 12)
     later = rig.log[count:]
-    assert later[:4] == ["idle"] * 4
+    assert later.index("busy") in (4, 5)
     assert 2 <= later[4:12].count("busy") <= 6
 
 
