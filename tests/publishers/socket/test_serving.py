@@ -224,6 +224,21 @@ async def test_when_the_time_for_serving_is_used_up_only_light_clients_are_serve
 
 
 @in_context("rig", scheduling)
+async def test_without_time_for_serving_all_clients_are_served_every_10_ms(rig: SchedulerBench) -> None:
+    rig.add("heavy", 1, 10_000, MS // 2)[1].line_up()
+    await until(lambda: bool(rig.log))
+    rig.scheduler.serving_time.use(2_000 * MS)
+    for _ in range(2):
+        rig.clock.ns += 10 * MS
+        count = len(rig.log)
+        await until(lambda count=count: len(rig.log) > count)  # type: ignore[misc]
+        count = len(rig.log)
+        rig.clock.ns += 8 * MS  # the turn itself took 1 ms
+        await asyncio.sleep(0.01)  # several pauses of 2 ms
+        assert len(rig.log) == count
+
+
+@in_context("rig", scheduling)
 async def test_an_error_ends_that_client_and_no_other(rig: SchedulerBench, caplog: pytest.LogCaptureFixture) -> None:
     bad, place = rig.add("bad", 1, 2, 1000)
     bad.error = RecursionError("deep")
