@@ -78,6 +78,7 @@ def examples(driver: str, name: str) -> list[Any]:
 
 @every_table
 def test_tables_can_do_what_their_settings_need(name: str) -> None:
+    """With nothing told by the device all that can be read differs, and nothing else."""
     table = table_of(name)
     assert table.table
     settings = table.table.values()
@@ -89,6 +90,13 @@ def test_tables_can_do_what_their_settings_need(name: str) -> None:
     assert fields == {one for one, setting in table.table.items() if setting.write is not None}
     order = [setting.connection for setting in settings]
     assert order == sorted(order), "settings that change the connection stand last"
+
+    table = table_of(name)
+    settable = [one for one, setting in table.table.items() if setting.write is not None]
+    declared = msgspec.convert({one: examples(name, one)[1] for one in settable}, table.declarable)
+    values = declared_values(declared)
+    assert list(values) == settable
+    assert set(differences(table, values, {}, {})) == {one for one in settable if table.table[one].readable}
 
 
 @every_setting
@@ -135,17 +143,6 @@ def errors_but_of_the_link(device: str, link: str) -> list[str]:
     except ConfigError as error:
         return [line for line in str(error).splitlines() if ".settings" in line and "where imud is told" not in line]
     return []
-
-
-@every_table
-def test_declarations_of_everything_are_compared(name: str) -> None:
-    """With nothing told by the device all that can be read differs, and nothing else."""
-    table = table_of(name)
-    settable = [one for one, setting in table.table.items() if setting.write is not None]
-    declared = msgspec.convert({one: examples(name, one)[1] for one in settable}, table.declarable)
-    values = declared_values(declared)
-    assert list(values) == settable
-    assert set(differences(table, values, {}, {})) == {one for one in settable if table.table[one].readable}
 
 
 LINK_OF = {"hipnuc-uart": "uart", "hipnuc-modbus": "rs485", "imu61x-uart": "uart"}

@@ -1,6 +1,7 @@
 """Several simulated devices as one, and their way into the kernel."""
 
 import socket
+from typing import Any
 
 import pytest
 
@@ -103,3 +104,18 @@ def test_a_frame_takes_its_time(extended: bool, bits: int) -> None:
     wire = FrameWire(500_000, 0)
     wire.send(1000, 1, extended, bytes(8))
     assert wire.next_ns() == 1000 + bits * 2000
+
+
+IMPOSSIBLE: dict[str, list[dict[str, Any]]] = {
+    "hipnuc-canopen": [{"rate_hz": 0.5}, {"rate_hz": 150}, {"message": "x"}, {"motion": "none"}, {"node": 128}],
+    "hipnuc-j1939": [{"rate_hz": 0.5}, {"rate_hz": 500.0}, {"message": "x"}, {"motion": "none"}, {"node": 129}],
+    "hipnuc-nmea2000": [{"rate_hz": 0.5}, {"rate_hz": 101.0}, {"message": "x"}, {"motion": "none"}, {"node": 254}],
+    "imu61x-can": [{"rate_hz": 0.5}, {"rate_hz": 401}, {"message": "x"}, {"motion": "none"}, {"node": 2045}],
+}
+
+
+@pytest.mark.parametrize("name", CAN_SIMULATORS)
+def test_impossible_options_are_refused(name: str) -> None:
+    for options in IMPOSSIBLE[name]:
+        with pytest.raises(ValueError, match=next(iter(options)).removesuffix("_hz")):
+            CAN_SIMULATORS[name].make(SimulatorOptions(**options), 0)

@@ -272,11 +272,3 @@ def test_zero_and_directions_of_the_inclinometer() -> None:
     assert shown() == (0.0, 0.0)
     bench.talk(lambda peer: session.zero(peer, session.Zero.CANCEL))
     assert shown() == (-10.0, -20.28)
-
-
-@pytest.mark.parametrize(
-    "options", [{"rate_hz": 0.5}, {"rate_hz": 500.0}, {"message": "x"}, {"motion": "none"}, {"node": 129}]
-)
-def test_options_that_it_cannot_have(options: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=next(iter(options)).removesuffix("_hz")):
-        made(**options)

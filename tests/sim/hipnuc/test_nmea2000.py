@@ -61,11 +61,3 @@ def test_the_wire_the_crystal_and_power() -> None:
     due_ns = module.next_ns()
     assert due_ns is not None
     assert module.advance(due_ns)[0].data[0] == 0
-
-
-@pytest.mark.parametrize(
-    "options", [{"rate_hz": 0.5}, {"rate_hz": 101.0}, {"message": "x"}, {"motion": "none"}, {"node": 254}]
-)
-def test_options_that_it_cannot_have(options: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=next(iter(options)).removesuffix("_hz")):
-        made(**options)

@@ -9,8 +9,7 @@ from imud.devices.imu61x.can.codec import Imu61xCanCodec, Imu61xCanSettings
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim.can_module import SentFrame
-from imud.sim.imu61x.can import SIMULATOR, Imu61xCanHardware, Imu61xCanModule
-from imud.sim.simulator import SimulatorOptions
+from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
 
 BEGIN_NS = 5_000_000_000
 SECOND_NS = 1_000_000_000
@@ -68,9 +67,3 @@ def test_frames_take_their_time_on_the_wire_and_the_crystal_runs_fast() -> None:
         now_ns = due_ns
         seen += len(module.advance(now_ns))
     assert seen == 50
-
-
-@pytest.mark.parametrize("options", [{"rate_hz": 0.5}, {"rate_hz": 401}, {"message": "x"}, {"motion": "none"}])
-def test_options_that_it_cannot_have(options: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=next(iter(options)).removesuffix("_hz")):
-        SIMULATOR.make(SimulatorOptions(**options), BEGIN_NS)  # type: ignore[arg-type]  # a mapping of options

@@ -18,6 +18,7 @@ TPDO_OBJECTS = {1: "00", 2: "01", 3: "02", 4: "03", 6: "04", 7: "05"}
 PERIODS = {0: "00", 5: "05", 10: "0A", 20: "14", 50: "32", 100: "64"}
 
 
+@pytest.mark.manual("B 5.4.1 signs of the inclinometer")
 def test_a_restart_a_slow_save_and_a_refused_write() -> None:
     for period_ms in (1, 4):
         with pytest.raises(BadArgument, match="expected 0 or 5 … 1000"):
@@ -30,6 +31,11 @@ def test_a_restart_a_slow_save_and_a_refused_write() -> None:
     with pytest.raises(Aborted, match="invalid value"):
         bench.run_script(cia301.write_object(8, 0x20A0, 0, 200, 4))
 
+    for invert in (False, True):
+        bench = CanopenBench()
+        bench.run_script(session.set_inclinometer_signs(8, invert_x=False, invert_y=invert))
+        assert (0x608, bytes([0x23, 0x9F, 0x20, 0, invert, 0, 0, 0])) in bench.sent
+
 
 @pytest.mark.parametrize("tpdo", TPDO_OBJECTS)
 @pytest.mark.manual("B 5.4.1 output rates")
@@ -37,14 +43,6 @@ def test_rate_commands_of_the_manual(tpdo: TpdoNumber) -> None:
     for period_ms, digits in PERIODS.items():
         text = f"2B {TPDO_OBJECTS[tpdo]} 18 05 {digits} 00 00 00"
         assert unpack(next(session.set_tpdo_period(8, tpdo, period_ms)).payload) == (0x608, bytes.fromhex(text))
-
-
-@pytest.mark.manual("B 5.4.1 signs of the inclinometer")
-def test_the_sign_of_y_has_its_own_object() -> None:
-    for invert in (False, True):
-        bench = CanopenBench()
-        bench.run_script(session.set_inclinometer_signs(8, invert_x=False, invert_y=invert))
-        assert (0x608, bytes([0x23, 0x9F, 0x20, 0, invert, 0, 0, 0])) in bench.sent
 
 
 def test_identify_and_read_settings() -> None:

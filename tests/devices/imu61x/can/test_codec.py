@@ -91,13 +91,12 @@ def test_golden_set_in_si_units_and_back() -> None:
         msgspec.convert({"base_id": 2044}, Imu61xCanSettings)
 
 
-@pytest.mark.parametrize(("raw", "expected"), [("0000", 0.0), ("9cff", -1.0), ("ff7f", 327.67), ("0080", -327.68)])
 @pytest.mark.manual("A 4.2 temperature")
-def test_temperature_is_in_hundredths(raw: str, expected: float) -> None:
-    frames = [*GOLDEN[:4], (105, F_M1 + bytes.fromhex(raw) + b"\0\0")]
-    (measured,) = feed(make(), frames)
-    assert isinstance(measured, Measurement)
-    assert measured.temperature_c == pytest.approx(expected)
+def test_temperature_is_in_hundredths() -> None:
+    for raw, expected in (("0000", 0.0), ("9cff", -1.0), ("ff7f", 327.67), ("0080", -327.68)):
+        (measured,) = feed(make(), [*GOLDEN[:4], (105, F_M1 + bytes.fromhex(raw) + b"\0\0")])
+        assert isinstance(measured, Measurement)
+        assert measured.temperature_c == pytest.approx(expected)
 
 
 def test_incomplete_mixed_and_disordered_sets() -> None:
