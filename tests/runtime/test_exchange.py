@@ -119,14 +119,7 @@ def test_device_that_never_answers_is_no_reply() -> None:
 
 
 @in_loop
-async def test_a_pause_writes_nothing() -> None:
-    exchange, written = made()
-    assert await exchange.run(ask(pause(1_000_000))) == [Silence(())]
-    assert written == []
-
-
-@in_loop
-async def test_a_frame_is_an_answer() -> None:
+async def test_a_script_gets_the_reply_frame_or_measurement_that_it_waits_for_and_pauses_write_nothing() -> None:
     exchange, _ = made()
     wanted = ReplyFrame(5, b"x")
     asking = replace(request("A"), is_end=lambda message: message == wanted)
@@ -134,6 +127,18 @@ async def test_a_frame_is_an_answer() -> None:
     await asyncio.sleep(0)
     exchange.on_message(wanted, 0)
     assert await task == [Reply((wanted,))]
+    exchange, _ = made()
+    assert not exchange.wants_samples
+    task = asyncio.create_task(exchange.run(ask(replace(request("A"), is_sample=lambda sample: True))))
+    await asyncio.sleep(0)
+    assert exchange.wants_samples
+    exchange.on_sample(Measurement(54, 0, 3))
+    exchange.on_sample(Measurement(54, 0, 4))
+    assert await task == [Reply((), Measurement(54, 0, 3))]
+    assert not exchange.wants_samples
+    exchange, written = made()
+    assert await exchange.run(ask(pause(1_000_000))) == [Silence(())]
+    assert written == []
 
 
 @pytest.mark.parametrize("is_there", [True, False])
@@ -168,19 +173,6 @@ async def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
     with pytest.raises(NoReply):
         await exchange.run(with_undo(failing(), b"UNDO"))
     assert written == [b"A\r\n"] * 2
-
-
-@in_loop
-async def test_a_script_gets_the_measurement_that_it_waits_for() -> None:
-    exchange, _ = made()
-    assert not exchange.wants_samples
-    task = asyncio.create_task(exchange.run(ask(replace(request("A"), is_sample=lambda sample: True))))
-    await asyncio.sleep(0)
-    assert exchange.wants_samples
-    exchange.on_sample(Measurement(54, 0, 3))
-    exchange.on_sample(Measurement(54, 0, 4))
-    assert await task == [Reply((), Measurement(54, 0, 3))]
-    assert not exchange.wants_samples
 
 
 @pytest.mark.parametrize(

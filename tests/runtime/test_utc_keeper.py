@@ -108,13 +108,6 @@ def test_a_sentence_for_a_busy_or_wrong_second_is_refused_and_counted(bench: Kee
     assert len(bench.written) == 4
 
 
-def test_before_anything_is_known_of_utc_the_pulse_says_what_is_too_late(bench: KeeperBench) -> None:
-    bench.second(0, sentence=False)
-    bench.now_ns = BEGIN_NS + NS_PER_S - 25 * NS_PER_MS  # 6 ms on the wire, and 20 ms before the next second at least
-    bench.source.give(build(UTC_S * NS_PER_S), bench.now_ns)
-    assert bench.keeper.status().refused == {"stale": 1}
-
-
 def test_the_better_of_two_references_counts(bench: KeeperBench) -> None:
     good, bad = UtcReference(OFFSET_NS + 77, 10), UtcReference(OFFSET_NS + 55, 10**9)
     bench.system = bad
@@ -175,12 +168,16 @@ def test_close_releases_source_and_socket_and_nothing_starts_again_or_at_all() -
     assert source.started == 0
 
 
-def test_problems_of_source_and_chrony_show(bench: KeeperBench) -> None:
+def test_problems_show_and_a_sentence_that_is_too_late_for_its_pulse_is_refused(bench: KeeperBench) -> None:
     assert bench.keeper.status().problem == ""
     bench.chrony.problem = "no chronyd"
     assert bench.keeper.status().problem == "no chronyd"
     bench.source.problem = "no gpsd"
     assert bench.keeper.status().problem == "no gpsd"
+    bench.second(0, sentence=False)
+    bench.now_ns = BEGIN_NS + NS_PER_S - 25 * NS_PER_MS  # 6 ms on the wire, and 20 ms before the next second at least
+    bench.source.give(build(UTC_S * NS_PER_S), bench.now_ns)
+    assert bench.keeper.status().refused == {"stale": 1}
 
 
 def test_the_system_clock_counts_only_while_something_keeps_it(monkeypatch: pytest.MonkeyPatch) -> None:

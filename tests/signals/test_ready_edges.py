@@ -56,12 +56,22 @@ def test_edges_read_twice_or_before_a_restart_are_not_missed() -> None:
     assert made.missed == 0
 
 
-def test_a_read_before_all_edges_and_one_long_after_them_are_of_none() -> None:
+def test_reads_without_an_edge_or_too_late_for_it_are_of_none() -> None:
     made = edges(2, 3)
     assert read(made, 1.9, 1.95) is None
     assert read(made, 4.5, 4.6) == (3, 3 * MS)
     assert read(made, 4.6, 4.7) is None
     assert read(ReadyEdges(EXACT, MS), 1, 2) is None
+    made = edges(1, 2, 3)
+    assert read(made, 1.1, 1.2) == (1, MS)
+    assert read(made, 400, 401) == (3, 3 * MS)
+    assert read(made, 402, 403) is None
+    made.on_edges([edge(4, 500 * MS)])
+    assert read(made, 1300, 1301) is None
+    made = edges(*range(1, 3 * KEPT))
+    assert read(made, 2 * KEPT - 0.5, 2 * KEPT - 0.4) is None
+    assert read(made, 2 * KEPT + 0.1, 2 * KEPT + 0.2) == (2 * KEPT, 2 * KEPT * MS)
+    assert read(made, 3 * KEPT - 0.9, 3 * KEPT - 0.8) == (3 * KEPT - 1, (3 * KEPT - 1) * MS)
 
 
 def test_the_error_is_that_of_the_stamp_and_of_the_assumption() -> None:
@@ -85,19 +95,3 @@ def test_the_offset_moves_the_stamp_but_not_behind_the_read(offset_us: float, t_
     stamp = edges(1, settings=ReadySettings(line="Y", offset_us=offset_us)).match(round(1.1 * MS), 2 * MS)
     assert stamp is not None
     assert stamp.t_ns == t_ns
-
-
-def test_edges_without_a_read_are_dropped_oldest_first() -> None:
-    made = edges(*range(1, 3 * KEPT))
-    assert read(made, 2 * KEPT - 0.5, 2 * KEPT - 0.4) is None
-    assert read(made, 2 * KEPT + 0.1, 2 * KEPT + 0.2) == (2 * KEPT, 2 * KEPT * MS)
-    assert read(made, 3 * KEPT - 0.9, 3 * KEPT - 0.8) == (3 * KEPT - 1, (3 * KEPT - 1) * MS)
-
-
-def test_a_late_first_read_of_an_edge_is_of_it_up_to_half_a_second() -> None:
-    made = edges(1, 2, 3)
-    assert read(made, 1.1, 1.2) == (1, MS)
-    assert read(made, 400, 401) == (3, 3 * MS)
-    assert read(made, 402, 403) is None
-    made.on_edges([edge(4, 500 * MS)])
-    assert read(made, 1300, 1301) is None

@@ -119,7 +119,7 @@ def test_deadlines_that_cannot_be_kept_are_counted_and_the_grid_stays(stall_ms: 
     assert slots[-1] + 1 == counts.edges + counts.missed
 
 
-def test_a_pulse_that_lasted_too_long_gets_its_pause() -> None:
+def test_a_long_pulse_gets_its_pause_and_old_stamps_are_dropped() -> None:
     bench = SquareWaveBench(1000.0)
     bench.wave.work()
     bench.time.t_ns += 1_150_000  # asleep over the next deadline
@@ -128,6 +128,10 @@ def test_a_pulse_that_lasted_too_long_gets_its_pause() -> None:
     lows_ns = [up - down for (down, _), (up, _) in zip(history[1::2], history[2::2], strict=False)]
     assert min(lows_ns) >= 250_000
     assert bench.counts.missed == 1
+    bench = SquareWaveBench(1000.0)
+    bench.run((STAMPS_MAX + 50) * NS_PER_MS)
+    assert len(bench.wave.stamps) == STAMPS_MAX
+    assert bench.wave.stamps[-1].number == bench.counts.edges > STAMPS_MAX
 
 
 def test_single_edges_without_a_rate_and_between_those_of_the_rate() -> None:
@@ -148,13 +152,6 @@ def test_single_edges_without_a_rate_and_between_those_of_the_rate() -> None:
     assert bench.rises_ns[1] == pytest.approx(50 * NS_PER_MS, abs=10 * CALL_NS)
     assert (bench.counts.singles, bench.counts.missed) == (1, 0)
     assert bench.counts.worst_late_ns < 10 * CALL_NS
-
-
-def test_stamps_that_are_not_fetched_are_dropped_oldest_first() -> None:
-    bench = SquareWaveBench(1000.0)
-    bench.run((STAMPS_MAX + 50) * NS_PER_MS)
-    assert len(bench.wave.stamps) == STAMPS_MAX
-    assert bench.wave.stamps[-1].number == bench.counts.edges > STAMPS_MAX
 
 
 # --- the thread and the loop ------------------------------------------------------------------------------------------

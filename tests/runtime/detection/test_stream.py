@@ -181,9 +181,6 @@ def test_a_rate_that_the_port_cannot_do_is_left_out_and_named() -> None:
     assert isinstance(step, GaveUp)
     assert seen.count(921600) == 1
     assert "921600: the port cannot do it" in step.summary
-
-
-def test_a_port_that_can_do_no_rate_is_given_up_at_once() -> None:
     search = Search([FAKE_DRIVER], may_ask=True)
     step = search.start(0)
     for number in range(len(BAUD_RATES)):

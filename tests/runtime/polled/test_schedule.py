@@ -15,7 +15,7 @@ def schedule(rate_hz: float = 1000.0, begin_ns: int = 5 * MS) -> Schedule:
     return Schedule(rate_hz, begin_ns, Deadlines())
 
 
-def test_deadlines_do_not_drift_with_late_reads() -> None:
+def test_deadlines_do_not_drift_and_their_counts_go_on_over_schedules() -> None:
     one = schedule()
     for number in range(1000):
         assert one.due_ns == 5 * MS + number * MS
@@ -24,6 +24,12 @@ def test_deadlines_do_not_drift_with_late_reads() -> None:
     assert (one.counts.polls, one.counts.late, one.counts.missed) == (1000, 0, 0)
     assert one.counts.sum_late_ns == 1000 * 200_000
     assert one.counts.worst_ns == 200_000
+    counts = Deadlines()
+    for _ in range(2):
+        one = Schedule(50.0, 0, counts)
+        one.begun(0)
+        one.done(1)
+    assert counts.polls == 2
 
 
 def test_late_and_missed_deadlines_are_counted_and_the_rest_stays_in_step() -> None:
@@ -46,15 +52,6 @@ def test_late_and_missed_deadlines_are_counted_and_the_rest_stays_in_step() -> N
     assert (one.due_ns, one.counts.missed) == (6 * MS, 0)
     one.done(8 * MS)
     assert (one.due_ns, one.counts.missed) == (8 * MS, 1)
-
-
-def test_counts_go_on_over_schedules() -> None:
-    counts = Deadlines()
-    for _ in range(2):
-        one = Schedule(50.0, 0, counts)
-        one.begun(0)
-        one.done(1)
-    assert counts.polls == 2
 
 
 # --- turns ------------------------------------------------------------------------------------------------------------
@@ -134,7 +131,7 @@ def test_an_edge_is_due_at_once_and_late_after_a_quarter_of_the_interval() -> No
     assert made.counts.late == 2
 
 
-def test_an_edge_that_was_read_already_is_not_read_again() -> None:
+def test_edges_that_were_read_are_counted_by_their_stamps_and_not_read_again() -> None:
     """It was told late: a read that began after it had its values."""
     made = by_edges()
     made.on_edges([BEGIN + MS], MS)
@@ -143,9 +140,6 @@ def test_an_edge_that_was_read_already_is_not_read_again() -> None:
     assert made.due_ns == BEGIN + 2 * MS + QUIET_NS
     made.on_edges([BEGIN + 2 * MS + 100_001], MS)
     assert made.due_ns == BEGIN + 2 * MS + 100_001
-
-
-def test_an_edge_that_is_noticed_is_read_at_once_and_counted_by_its_stamp() -> None:
     made = by_edges()
     for number in range(1, 100):
         t_ns = BEGIN + number * MS
@@ -166,9 +160,6 @@ def test_an_edge_that_is_noticed_is_read_at_once_and_counted_by_its_stamp() -> N
     assert (made.counts.polls, made.counts.late, made.counts.missed) == (100, 0, 0)
     assert made.counts.sum_late_ns == 99 * 100_000
     assert made.counts.worst_ns == 100_000
-
-
-def test_stamps_that_are_told_together_or_late_are_matched_with_their_reads() -> None:
     made = by_edges()
     for number in range(1, 6):
         made.noticed(BEGIN + number * MS + 10_000)
@@ -182,7 +173,7 @@ def test_stamps_that_are_told_together_or_late_are_matched_with_their_reads() ->
     assert (made.counts.polls, made.counts.sum_late_ns) == (7, 4 * 20_000 + 300_000 + 20_000)
 
 
-def test_noticed_edges_end_and_come_back_as_others() -> None:
+def test_edges_end_and_come_back_by_two_of_them() -> None:
     made = by_edges()
     made.noticed(BEGIN + MS)
     read(made, BEGIN + MS)
@@ -196,6 +187,16 @@ def test_noticed_edges_end_and_come_back_as_others() -> None:
     assert made.by_edges
     made.noticed(BEGIN + 602 * MS)
     assert made.due_ns == BEGIN + 602 * MS
+    made = by_edges()
+    read(made, made.due_ns)
+    t_ns = made.due_ns + 3 * MS
+    deadline_ns = made.due_ns
+    made.on_edges([t_ns], QUIET_NS)
+    assert (made.by_edges, made.due_ns) == (False, deadline_ns)
+    made.on_edges([t_ns + QUIET_NS + 1], QUIET_NS)
+    assert not made.by_edges
+    made.on_edges([t_ns + QUIET_NS + MS], MS)
+    assert (made.by_edges, made.due_ns) == (True, t_ns + QUIET_NS + MS)
 
 
 def test_without_edges_deadlines_come_again_after_a_time_by_their_interval() -> None:
@@ -216,16 +217,3 @@ def test_without_edges_deadlines_come_again_after_a_time_by_their_interval() -> 
     made = by_edges(100.0)
     read(made, made.due_ns, 35 * MS)
     assert made.counts.missed == 2
-
-
-def test_one_edge_is_no_return_two_are() -> None:
-    made = by_edges()
-    read(made, made.due_ns)
-    t_ns = made.due_ns + 3 * MS
-    deadline_ns = made.due_ns
-    made.on_edges([t_ns], QUIET_NS)
-    assert (made.by_edges, made.due_ns) == (False, deadline_ns)
-    made.on_edges([t_ns + QUIET_NS + 1], QUIET_NS)
-    assert not made.by_edges
-    made.on_edges([t_ns + QUIET_NS + MS], MS)
-    assert (made.by_edges, made.due_ns) == (True, t_ns + QUIET_NS + MS)

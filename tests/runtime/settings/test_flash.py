@@ -56,7 +56,7 @@ def test_counts_survive_a_restart_of_imud(tmp_path: Path) -> None:
         assert (writes.writes("B"), writes.unreadable("B")) == (0, {})
 
 
-def test_a_clock_that_was_wrong_does_not_forbid_writes_for_years() -> None:
+def test_a_wrong_clock_does_not_forbid_writes_and_the_modules_written_last_are_remembered() -> None:
     days = Days()
     days.now_s += 10 * 365 * DAY_S
     writes = FlashWrites(None, days.utc_ns)
@@ -66,9 +66,6 @@ def test_a_clock_that_was_wrong_does_not_forbid_writes_for_years() -> None:
     assert writes.writes_day("A") == LIMIT_ITSELF
     days.now_s += DAY_S
     assert writes.writes_day("A") == 0
-
-
-def test_the_modules_written_last_are_remembered() -> None:
     writes = FlashWrites(None, Days().utc_ns)
     for number in range(MODULES_MAX):
         writes.count(str(number))

@@ -57,10 +57,17 @@ class ModuleBench:
     """One module with what is declared for it, and all that is told of it."""
 
     def __init__(
-        self, on_difference: str = "report", declared: dict[str, Any] | None = None, state_dir: Path | None = None
+        self,
+        on_difference: str = "report",
+        declared: dict[str, Any] | None = None,
+        state_dir: Path | None = None,
+        **module: Any,
     ) -> None:
+        """`module` are attributes of the module from its start on."""
         self.clock = VirtualClock()
         self.module = FakeModule(self.clock.now_ns)
+        for name, value in module.items():
+            setattr(self.module, name, value)
         self.rigs = DeviceRigs(self.clock.host, state_dir=state_dir)
         config = DeviceConfig(
             "bow", "fake-module", None, True, "memory", MemorySettings(name="/dev/fake", baud=115200),
@@ -191,9 +198,8 @@ async def test_compared_again_after_a_replug_a_restart_and_a_command(bench: Modu
     assert bench.messages == [differ, differ, "settings are as declared again"]
 
 
-@played(lambda: ModuleBench(declared={"mode": "6-axis"}))
+@played(lambda: ModuleBench(declared={"mode": "6-axis"}, pauses_clock=True))
 async def test_a_device_whose_clock_begins_anew_by_the_question_is_asked_once(bench: ModuleBench) -> None:
-    bench.module.pauses_clock = True
     await bench.until(lambda: bench.is_in(SettingsState.AGREE))
     asked = bench.module.commands.count("GET")
     await bench.pass_s(50)
@@ -203,9 +209,8 @@ async def test_a_device_whose_clock_begins_anew_by_the_question_is_asked_once(be
     await bench.until(lambda: bench.module.commands.count("GET") == asked + 1)
 
 
-@played(lambda: ModuleBench(declared={"mode": "6-axis"}))
+@played(lambda: ModuleBench(declared={"mode": "6-axis"}, silent={"GET"}))
 async def test_a_device_that_does_not_tell_its_settings_is_asked_ever_more_seldom(bench: ModuleBench) -> None:
-    bench.module.silent = {"GET"}
     await bench.until(lambda: bench.messages)
     assert bench.messages == ["settings could not be read, asked 3 times: GET: expected OK, got nothing"]
     await bench.pass_s(sum(IDENTIFY_AGAIN_S) + 10)  # the identity is asked for with them, four times more
@@ -342,9 +347,8 @@ async def test_each_module_that_takes_the_place_of_another_is_set_at_once(bench:
         await bench.until(partial(bench.repaired, number), limit_s=10)
 
 
-@played(lambda: ModuleBench("apply", {"mode": "9-axis"}))
+@played(lambda: ModuleBench("apply", {"mode": "9-axis"}, forgets={"mode"}))
 async def test_a_device_that_forgets_is_set_again_after_growing_pauses(bench: ModuleBench) -> None:
-    bench.module.forgets = {"mode"}
     await bench.until(lambda: bench.status.repairs == 1)
     assert bench.messages[-1].endswith(
         'mode: wrote "9-axis", read back "6-axis"; what was written before holds until the device restarts'
@@ -475,7 +479,7 @@ def outcomes(applied: AppliedSettings) -> Outcomes:
 WANTED = {"mode": "9-axis", "output": {"a": 10}, "mounting": "x_up", "offset_deg": 1.5}
 
 
-def test_a_refused_step_ends_it_and_nothing_is_saved() -> None:
+def test_a_step_that_fails_ends_the_plan_and_nothing_is_saved() -> None:
     bench, applied = applied_with(WANTED, lambda module: module.refuses.add("output"))
     assert outcomes(applied) == {
         "mode": StepOutcome.DONE, "output": StepOutcome.FAILED, "mounting": StepOutcome.NOT_DONE,
@@ -489,15 +493,9 @@ def test_a_refused_step_ends_it_and_nothing_is_saved() -> None:
     assert list(applied.differences) == ["output", "mounting", "offset_deg"]  # how it is now
     assert bench.module.flash == FACTORY
     assert bench.module.set == {**FACTORY, "mode": "9-axis"}
-
-
-def test_a_refused_first_step_leaves_all_as_it_was() -> None:
     bench, applied = applied_with(WANTED, lambda module: module.refuses.add("mode"))
     assert applied.problem == 'mode: SET mode="9-axis": the module refused; nothing else was written'
     assert bench.module.set == FACTORY
-
-
-def test_a_step_that_reads_back_another_value_has_failed() -> None:
     _bench, applied = applied_with(WANTED, lambda module: module.forgets.add("offset_deg"))
     assert outcomes(applied)["offset_deg"] is StepOutcome.FAILED
     assert applied.steps[-1].message == "wrote 1.5, read back 0.0"
@@ -522,24 +520,25 @@ def test_a_device_that_falls_silent_in_the_middle() -> None:
     assert applied.problem == 'output: SET output={"a":10}: expected OK, got nothing; what it has now is not known'
 
 
-def test_a_setting_that_does_not_come_into_force_by_the_restart_has_failed() -> None:
+def test_a_restart_or_a_save_that_fails_says_what_is_set() -> None:
     _bench, applied = applied_with(
         {"mounting": "x_up", "mode": "9-axis"}, lambda module: module.forgets.add("mounting")
     )
     assert outcomes(applied) == {"mode": StepOutcome.DONE, "mounting": StepOutcome.FAILED}
     assert applied.problem == 'mounting: wrote "x_up", read back "level"'
     assert (applied.saved, applied.restarted) == (True, True)
-
-
-def test_a_save_that_fails_says_that_all_is_set_and_not_saved() -> None:
     _bench, applied = applied_with({"mode": "9-axis"}, lambda module: module.silent.add("SAVE"))
     assert outcomes(applied) == {"mode": StepOutcome.DONE}
     assert applied.problem == (
         "not saved: SAVE: expected OK, got nothing; what was written before holds until the device restarts"
     )
+    bench, applied = applied_with({"baud": 921600, "mounting": "x_up", "mode": "9-axis"}, lambda _: None, save=False)
+    assert list(applied.left_out) == ["baud", "mounting"]
+    assert outcomes(applied) == {"mode": StepOutcome.DONE}
+    assert bench.module.flash == FACTORY
 
 
-def test_another_rate_is_followed() -> None:
+def test_another_rate_is_followed_unless_the_device_is_not_heard_at_it() -> None:
     bench, applied = applied_with({"baud": 921600, "mode": "9-axis"}, lambda _module: None)
     assert outcomes(applied) == {"mode": StepOutcome.DONE, "baud": StepOutcome.DONE}
     assert (bench.module.baud, bench.module.set["baud"], bench.module.saves) == (921600, 921600, 1)
@@ -549,22 +548,12 @@ def test_another_rate_is_followed() -> None:
     )
     assert bench.status.flash_writes == 1
     assert bench.rig.kinds.count(EventKind.UP) == 1
-
-
-def test_a_rate_at_which_the_device_is_not_heard_is_left_again() -> None:
     bench, applied = applied_with({"baud": 921600, "mode": "9-axis"}, lambda module: module.forgets.add("baud"))
     assert outcomes(applied) == {"mode": StepOutcome.DONE, "baud": StepOutcome.FAILED}
     assert "is not heard at 921600 baud; the line is at 115200 again" in applied.problem
     assert bench.module.baud == 115200
     assert list(applied.differences) == ["baud"]  # it was asked after it, and told
     assert bench.status.flash_writes == 1  # the attempt counts
-
-
-def test_without_saving_nothing_is_written_that_saves() -> None:
-    bench, applied = applied_with({"baud": 921600, "mounting": "x_up", "mode": "9-axis"}, lambda _: None, save=False)
-    assert list(applied.left_out) == ["baud", "mounting"]
-    assert outcomes(applied) == {"mode": StepOutcome.DONE}
-    assert bench.module.flash == FACTORY
 
 
 @played(ModuleBench)

@@ -146,16 +146,13 @@ def test_a_module_in_any_mounting_shows_the_attitude_of_the_body(name: str) -> N
     assert made.status.problem == ""
 
 
-def test_the_same_body_in_ned_frd() -> None:
+def test_the_same_body_in_ned_frd_and_without_the_keys() -> None:
     frame = MOUNTINGS["on its side"]
     made = played("hipnuc-uart", in_body(frame), 2.0, frame=frame, convention=Convention.NED_FRD)
     assert made.euler_deg == pytest.approx((5.0, 10.0, 60.0), abs=1e-3), "nose up, and 60° clockwise from north"
     assert (made.status.convention, made.status.navigation_frame) == ("ned-frd", "NED")
     assert "z down" in made.status.frame
-
-
-def test_without_the_keys_nothing_changes() -> None:
-    """Bit for bit: the published samples are those that the path without any rotation makes."""
+    # Bit for bit: the published samples are those that the path without any rotation makes
     motion = in_body(FrameSettings())
     made = played("hipnuc-uart", motion, 2.0)
     truth = motion.at(0.0)
@@ -186,7 +183,7 @@ def test_a_declination_and_what_the_heading_counts_from() -> None:
 # --- the event --------------------------------------------------------------------------------------------------------
 
 
-def test_z_down_is_found_and_cured() -> None:
+def test_z_down_is_found_and_cured_either_way() -> None:
     """The axes of an IMU61x are not settled: with z down the event says what to set, and setting it is right."""
     motion = ZDown(in_body(FrameSettings(), device=FLU_LEVEL))
     wrong = played("imu61x-uart", motion, 20.0)
@@ -198,9 +195,6 @@ def test_z_down_is_found_and_cured() -> None:
     right = played("imu61x-uart", motion, 20.0, frame=FrameSettings(z_down=True))
     assert (right.events, right.status.problem) == ([], "")
     assert right.euler_deg == pytest.approx(BODY_DEG, abs=1e-3)
-
-
-def test_z_down_of_a_device_whose_axis_points_up_is_found() -> None:
     made = played("imu61x-uart", in_body(FrameSettings(), device=FLU_LEVEL), frame=FrameSettings(z_down=True))
     (event,) = made.events
     assert "take z_down out of frame" in event.message

@@ -53,7 +53,7 @@ class WatchBench:
         return [event.message for event in self.events[before:]]
 
 
-def test_a_bit_of_one_sample_is_an_event_and_so_is_its_end() -> None:
+def test_bits_are_events_when_they_are_set_and_cleared_but_not_by_silence() -> None:
     bench = WatchBench()
     assert bench.step(AT_REST, 20) == []
     assert bench.step(OVER_RANGE) == ["status: accelerometer over range"]
@@ -62,6 +62,11 @@ def test_a_bit_of_one_sample_is_an_event_and_so_is_its_end() -> None:
     assert bench.step(0, CLEAR_NS // TICK_NS) == []
     assert bench.step(0, 3) == ["status: cleared: accelerometer over range"]
     assert bench.step(0, 100) == []
+    bench = WatchBench()
+    bench.step(DISTURBED)
+    assert bench.step(None, 50) == []
+    assert bench.step(DISTURBED, 5) == []
+    assert bench.step(0, 12) == ["status: cleared: magnetic disturbance"]
 
 
 def test_events_are_one_a_second_with_all_that_changed() -> None:
@@ -76,14 +81,6 @@ def test_events_are_one_a_second_with_all_that_changed() -> None:
     assert other.step(0) == ["status: cleared: accelerometer over range"]
     assert other.step(OVER_RANGE) == []
     assert other.step(0, 9) == ["status: accelerometer over range, cleared: magnetic disturbance"]
-
-
-def test_silence_is_no_end() -> None:
-    bench = WatchBench()
-    bench.step(DISTURBED)
-    assert bench.step(None, 50) == []
-    assert bench.step(DISTURBED, 5) == []
-    assert bench.step(0, 12) == ["status: cleared: magnetic disturbance"]
 
 
 def test_the_bits_of_another_device_are_events_again() -> None:

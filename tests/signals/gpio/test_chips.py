@@ -49,16 +49,13 @@ def test_what_is_not_there(
     assert message in str(caught.value)
 
 
-def test_no_chip_at_all(tmp_path: Path, gpiod: FakeGpiod) -> None:
+def test_no_chip_at_all_or_two_of_a_label(tmp_path: Path, gpiod: FakeGpiod) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(LinkMissing, match="on any chip, as there is none"):
         find_line(gpiod, LineSettings(line="SOUT"), empty)
     with pytest.raises(LinkMissing, match="there are: none"):
         find_line(gpiod, LineSettings(line=0, chip="gpiochip0"), empty)
-
-
-def test_a_label_on_two_chips(gpiod: FakeGpiod, tmp_path: Path) -> None:
     gpiod.chips["gpiochip10"] = gpiod.chips["gpiochip0"]
     with pytest.raises(LinkError, match=r"on one GPIO chip, got it on gpiochip0 \(.*\) and gpiochip10 \("):
         find_line(gpiod, LineSettings(line=0, chip="pinctrl-bcm2711"), tmp_path)

@@ -192,7 +192,7 @@ def test_an_output_is_inactive_from_its_first_moment_to_its_last(gpiod: FakeGpio
     assert request.released
 
 
-def test_an_output_whose_chip_vanishes(gpiod: FakeGpiod, tmp_path: Path) -> None:
+def test_an_output_whose_chip_vanishes_or_that_is_no_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
     def gone(_fd: int, _active: bool) -> None:
         raise OSError(errno.ENODEV, "by the test")
 
@@ -203,12 +203,8 @@ def test_an_output_whose_chip_vanishes(gpiod: FakeGpiod, tmp_path: Path) -> None
     line.close()
     assert gpiod.requests[0].released
     assert gpiod.requests[0].settings.drive is Drive.PUSH_PULL
-
-
-def test_driving_what_is_no_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
-    """The kernel's own answer to the ioctl on a pipe."""
-    line = GPIO_LINES.make_output(OutputSettings(line="RESET"), "x")
-    assert isinstance(line, GpioOutput)
+    # The kernel's own answer to the ioctl on a pipe
+    assert isinstance(GPIO_LINES.make_output(OutputSettings(line="RESET"), "x"), GpioOutput)
     line = GpioOutput(OutputSettings(line="RESET"), devices=tmp_path)
     line.open()
     with pytest.raises(LinkError, match="cannot be used: Inappropriate ioctl"):
