@@ -74,10 +74,13 @@ async def test_spi_samples_are_the_truth_of_the_latched_instant(
     assert not bench.spi.opened
 
 
+@pytest.mark.parametrize("options", [{}, {"update_hz": 100}], ids=["unknown", "slower than the reads"])
 @in_bench
-async def test_without_a_known_update_rate_the_error_is_the_time_since_the_last_read(bench: PolledBusBench) -> None:
+async def test_without_a_known_update_rate_the_error_is_the_time_since_the_last_read(
+    bench: PolledBusBench, options: dict[str, Any]
+) -> None:
     bench.spi.device = bench.registers().spi
-    async with bench.running(bench.on_spi()) as (rig,):
+    async with bench.running(bench.on_spi(**options)) as (rig,):
         await rig.until_samples(20)
     bursts = [mosi for mosi, _, _ in bench.spi.messages if mosi[0][:1] == b"\x80"]
     assert len(bursts) >= 20
