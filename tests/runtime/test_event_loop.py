@@ -309,7 +309,7 @@ def send_signal(loop: SampleLoop, done: asyncio.Future[None]) -> None:
 
 
 def add_writer(loop: SampleLoop, done: asyncio.Future[None]) -> None:
-    """A descriptor that can be written to at once."""
+    """Watch a descriptor that accepts data immediately."""
     ours, theirs = socket.socketpair()
 
     def write() -> None:

@@ -38,7 +38,7 @@ def ask(*requests: Request) -> RequestScript[list[Outcome]]:
 
 
 def made() -> tuple[Exchange, list[bytes]]:
-    """Return an exchange, and what it writes."""
+    """Return an exchange and the list of its writes."""
     written: list[bytes] = []
     return Exchange(Ledger(), written.append, monotonic_ns), written
 
@@ -182,7 +182,7 @@ async def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
 )
 @in_loop
 async def test_a_request_can_change_how_the_device_is_heard(change: dict[str, Any], words: str) -> None:
-    """It does so before it goes out, and undoes what holds for one request only; without such a link it is an error."""
+    """The change is made before the request is written. A link without the setting is an error."""
     happened: list[object] = []
     note = happened.append
     exchange = Exchange(Ledger(), note, monotonic_ns, set_baud=note, follow=note, listen=note)

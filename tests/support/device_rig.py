@@ -34,7 +34,7 @@ from imud.worker import BusThread, StartWatchingWorker
 from tests.support.event_loops import VirtualClock, run_virtually
 
 LIMIT_S = 60.0
-"""Deadline of a wait, s: of a real device on a loaded host. Virtual time passes at once."""
+"""Deadline of a wait, s. A loaded host delays a real device; virtual time does not wait."""
 STEP_S = 0.002
 TURN_S = 0.0005
 """Pause between two looks at a condition, s: timers have their turn, also in virtual time."""

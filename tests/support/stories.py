@@ -70,7 +70,7 @@ def in_bench(test: Callable[P, Story]) -> Callable[P, None]:
 
 
 def _without_first_argument(run: Callable[P, None], test: Callable[..., Story]) -> Callable[P, None]:
-    """Give `run` the name and the marks of a test, and its arguments but for the first, which is no fixture."""
+    """Give `run` the name and the marks of a test, and its arguments without the first: that is not a fixture."""
     made = wraps(test)(run)
     del made.__wrapped__
     _, *rest = inspect.signature(test).parameters.values()

@@ -251,7 +251,7 @@ def test_a_reply_behind_other_frames_and_frames_of_several_visits_count() -> Non
     while isinstance(step, Listen) and not step.send:
         step = search.on_time(step.until_ns)
     assert isinstance(step, Listen)
-    found = search.on_data(fake_frame(b"x" * 76) + REPLY, step.until_ns - 1)  # one frame is no lock
+    found = search.on_data(fake_frame(b"x" * 76) + REPLY, step.until_ns - 1)  # one frame does not suffice
     assert isinstance(found, StreamFound)
     deaf = replace(FAKE_DRIVER, name="other-uart", make_codec=lambda ledger, options: DeafCodec(ledger))
     search = Search([deaf, FAKE_DRIVER], bauds=(115200, 9600))

@@ -41,24 +41,24 @@ class VirtualLine:
 
     @property
     def counted(self) -> "VirtualLine":
-        """What the kernel counts."""
+        """Return the counters of the kernel."""
         return self
 
     def read(self) -> KernelCounters:
-        """As `TtyCounters`: the kernel finds no errors."""
+        """Return no errors."""
         return KernelCounters()
 
     def share(self, *_where: object) -> "VirtualLine":
-        """As `SharedPorts`."""
+        """Add a user, as `SharedPorts` does."""
         self.users += 1
         return self
 
     def release(self, _line: object) -> None:
-        """As `SharedPorts`."""
+        """Remove a user, as `SharedPorts` does."""
         self.users -= 1
 
     def transfer(self, target: int, request: bytes, reply_bytes: int, reply_ns: int) -> bytes:
-        """As `Rs485Line`."""
+        """Make a transfer, as `Rs485Line` does."""
         bench, begin_ns = self.bench, self._clock.now_ns()
         bench.now_ns = begin_ns
         try:

@@ -169,7 +169,7 @@ async def test_single_damage_costs_its_sample_and_nothing_else(bench: PolledBusB
         assert rig.device.ledger.lost_crc == 2
         assert EventKind.DOWN not in rig.kinds
         assert EventKind.BAD_FRAME in rig.kinds
-        device.faults.flips = 3  # so many in a row that the device is looked for, and found again at once
+        device.faults.flips = 3  # three damaged frames in a row: imud identifies the device again
         await rig.until(lambda: EventKind.DOWN in rig.kinds, "gone")
         await rig.until_samples(5)
         assert (rig.ledger.lost_crc, rig.ledger.lost(), rig.ledger.lost_unknown) == (5, 5, 0)

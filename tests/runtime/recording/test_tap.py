@@ -83,7 +83,7 @@ def test_two_recorders_hear_the_same_and_another_path_is_described() -> None:
     assert one.kinds() == [Kind.DEVICE, Kind.PATH, Kind.PATH]
     two.path.on_data(hi91(0), 6)
     assert one.kinds()[-1] == Kind.DATA
-    for path in (two.path, TappedPath().path):  # edges reach the clock of the present path, and are heard
+    for path in (two.path, TappedPath().path):  # the clock of the present path gets the edges, and the recording too
         one.tap.path_made(PathParts(path, DRIVER.name, None))
         path.clock.aiding.on_sout_edges([Edge(7, True, 1)])
         assert (path.clock.status().edges, one.kinds()[-1]) == (1, Kind.EDGES)
