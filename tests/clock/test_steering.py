@@ -68,11 +68,10 @@ def model(profile: ArrivalProfile, rate_hz: int = 100, seed: int = 1, crystal: C
 
 
 @pytest.mark.parametrize(
-    ("profile", "rate_hz", "seconds"),
-    [(BARE_UART, 1000, 2), (USB_16MS, 100, 10), (LOADED, 100, 10), (LOADED, 1000, 3)],
+    ("profile", "rate_hz", "seconds", "rising_only"),
+    [(BARE_UART, 1000, 2, False), (USB_16MS, 100, 10, True), (LOADED, 100, 10, False), (LOADED, 1000, 3, True)],
     ids=lambda value: getattr(value, "name", None),
 )
-@pytest.mark.parametrize("rising_only", [False, True])
 def test_every_pair_is_right_under_loss_on_either_side(
     profile: ArrivalProfile, rate_hz: int, seconds: int, rising_only: bool
 ) -> None:
