@@ -22,6 +22,7 @@ from tests.lab_debian.guest.system import (
     background,
     configure,
     device,
+    ensure_running,
     must,
     run,
     shown,
@@ -57,9 +58,7 @@ class AdapterNow(NamedTuple):
 
 def check_doctor(checks: Checks, host: Host) -> None:
     """Daemon up, adapter pulled, daemon down."""
-    configure(USB + CAN)
-    start_service()
-    wait_streaming("usb")
+    ensure_running(USB + CAN)
     wait_streaming("can")
     with checks("imud doctor finds no error while everything runs"):
         # on a busy host a simulator stands still for a second, which is an error while it lasts
@@ -83,9 +82,7 @@ def check_doctor(checks: Checks, host: Host) -> None:
 
 def check_complaints(checks: Checks, _host: Host) -> None:
     """What keeps the daemon from its port or its boot; the next step that is advised is taken, and helps."""
-    configure(USB + CAN)
-    start_service()
-    wait_streaming("usb")
+    ensure_running(USB + CAN)
     with checks("imud doctor names the program that has the port, and the daemon gets it afterwards"):
         must("systemctl", "stop", UNIT)
         background(HOLDER, PYTHON, "-c", HOLD_PORT)
@@ -130,14 +127,12 @@ def open_files() -> list[str]:
 
 @contextmanager
 def drop_in() -> Iterator[None]:
-    """Settings of the unit may be added (`allow`) until the end of the block; then it runs without them."""
+    """Settings of the unit may be added (`allow`) until the end of the block; its next start is without them."""
     try:
         yield
     finally:
         shutil.rmtree(DROP_IN.parent, ignore_errors=True)
         must("systemctl", "daemon-reload")
-        start_service()
-        wait_streaming("usb")
 
 
 def allow(*entries: str) -> None:

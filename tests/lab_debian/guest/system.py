@@ -123,6 +123,14 @@ def start_service() -> None:
     must("systemctl", "restart", UNIT, limit_s=400)
 
 
+def ensure_running(text: str) -> None:
+    """Let the service run with this configuration. An emulated start takes long, so restart only if needed."""
+    if CONFIG.read_text(encoding="utf-8") != text or shown("ActiveState") != "active":
+        configure(text)
+        start_service()
+    wait_streaming("usb")
+
+
 class Host:
     """The program on the host that has the adapter's cable in its hand."""
 
