@@ -52,6 +52,7 @@ def test_the_zero_of_an_inclinometer(vcan: CanInterface, make: Callable[[str, Mo
     assert any(event.kind is EventKind.CALIBRATION for event in rig.events)
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(300)
 def test_a_node_that_moves_gets_no_zero(vcan: CanInterface) -> None:
     rig = canopen(vcan.name, swing())

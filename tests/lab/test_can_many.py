@@ -74,6 +74,7 @@ def losses(status: DeviceStatus) -> int:
     return sum(status.ledger[name] for name in LOSSES)
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(1800)
 def test_nine_devices_on_one_bus(vcan: CanInterface, tmp_path: Path) -> None:
     modules = fleet()

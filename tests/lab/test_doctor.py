@@ -187,6 +187,7 @@ def test_mistakes_and_a_port_that_is_the_console(tmp_path: Path) -> None:
     found.has("stale configuration", "not checked", "no configuration that can be compared")
 
 
+@pytest.mark.thorough
 def test_serial_ports(uarts: tuple[Path, Path], tmp_path: Path) -> None:
     """On one daemon: silence, noise, a wrong rate, a held port, wires of one direction, RS-485 without its module."""
     near, far = uarts
@@ -370,6 +371,7 @@ def exchanged(answer: Callable[[SpiTransfer], bytes]) -> Callable[[SpiTransfer],
     return device
 
 
+@pytest.mark.thorough
 def test_lines_and_restarts(gpio_chip: GpioChip, tmp_path: Path) -> None:
     """SOUT, PPS and ALARM are not wired; the module restarts by itself."""
     lines = {"sout": {"line": "SOUT"}, "pps": {"line": "PPS"}, "alarm": {"line": "ALARM"}}

@@ -24,7 +24,6 @@ from imud.sample import Sample
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
 from imud.sim.ports.can_port import CanPort
 from tests.lab.can_interface import CanInterface
-from tests.lab.demo import demo
 from tests.lab.tool import tool
 
 LIMIT_S = 20.0
@@ -359,12 +358,3 @@ def test_the_simulator_as_a_process_of_its_own(vcan: CanInterface) -> None:
         process.stdin.close()
         assert json.loads(process.stdout.read())["frames_refused"] == 0
     assert rig.runner.ledger.lost() == 0
-
-
-@pytest.mark.timeout(240)
-def test_demo_to_its_end(vcan: CanInterface) -> None:
-    """`imud demo` with daemon and simulator as processes, on a bus that it finds by itself."""
-    printed = demo("--device", "imu61x-can", "--rate", "20", "--duration", "5")
-    assert f"link      {vcan.name}, driver imu61x-can" in printed
-    assert "lost 0 (device 0, damaged 0, overrun 0, queue 0)" in printed
-    assert printed.rstrip().endswith("the ledger closes to zero")

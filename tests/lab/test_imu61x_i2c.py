@@ -13,6 +13,7 @@ from tests.lab.bus import Bus
 from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_i2c, physics_holds, registers, vanishes
 from tests.lab.register_device import RegisterDevice
+from tests.lab.short_form import cases
 from tests.lab.wire import I2cTransfer
 from tests.support.device_rig import device_config, running
 
@@ -58,7 +59,7 @@ FAULTS: dict[str, tuple[dict[str, object], str]] = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", cases(FAULTS, "bus stuck", "line high", "wrong id"))
 def test_vanishes_and_is_identified_before_it_is_believed(
     i2c: Bus[I2cTransfer], fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,6 +13,7 @@ from imud.sim.imu61x.behaviour import REGISTER_VARIANTS
 from tests.lab.bus import Bus
 from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_spi, physics_holds, registers, vanishes
+from tests.lab.short_form import cases
 from tests.lab.wire import SpiTransfer
 from tests.support.device_rig import DeviceRig, device_config, running
 
@@ -60,7 +61,7 @@ def test_streams_the_truth(bus: tuple[Bus[SpiTransfer], str], burst: str) -> Non
         assert not any(t.stays_selected for t in bursts)
 
 
-@pytest.mark.parametrize("variant", REGISTER_VARIANTS)
+@pytest.mark.parametrize("variant", cases(REGISTER_VARIANTS, "BURST_CTRL reads zero"))
 @pytest.mark.parametrize("burst", ["standard", "extended"])
 def test_kind_of_burst_in_every_variant(spi8: Bus[SpiTransfer], variant: str, burst: str) -> None:
     """Wherever BURST_CTRL reads back, and whatever the undefined bits of WIN_CTRL are, the burst decides."""
@@ -93,7 +94,7 @@ FAULTS: dict[str, tuple[dict[str, object], str]] = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", cases(FAULTS, "unplugged, line high", "wrong id"))
 def test_vanishes_and_is_identified_before_it_is_believed(
     bus: tuple[Bus[SpiTransfer], str], fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -171,6 +172,7 @@ def test_bus_that_goes_is_noticed(spi8: Bus[SpiTransfer]) -> None:
     asyncio.run(body())
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(240)
 def test_demo_on_a_bus_that_exists(spi8: Bus[SpiTransfer]) -> None:
     """Daemon and command are processes of their own; the far end of the bus is the device of this test."""

@@ -77,8 +77,10 @@ def collect(made: RunningDaemon, enough: Callable[[list[Sample]], bool]) -> list
 
 @pytest.mark.parametrize(
     "losses",
-    [("--pin-faults", "lose_pulse=0.1"), ("--faults", "lose=0.1")],
-    ids=["pulses", "frames"],
+    [
+        pytest.param(("--pin-faults", "lose_pulse=0.1"), id="pulses"),
+        pytest.param(("--faults", "lose=0.1"), id="frames", marks=pytest.mark.thorough),
+    ],
 )
 def test_every_sample_gets_its_own_pulse(gpio_chip: GpioChip, tmp_path: Path, losses: tuple[str, str]) -> None:
     with daemon(tmp_path, {"sout": {"line": "SOUT"}}) as made:
@@ -123,6 +125,7 @@ def instant(truth: Mapping[int, int], sample: Sample) -> int:
     return truth[sample.t_dev_ns // NS_PER_MS]
 
 
+@pytest.mark.thorough
 def test_the_alarm_is_seen(gpio_chip: GpioChip, tmp_path: Path) -> None:
     """The module turns by 25° to either side; its alarm is set to 5°."""
     with running_imu(tmp_path, gpio_chip, {"alarm": "ALARM"}, "--rate", "20", "--no-noise"):
@@ -197,6 +200,7 @@ class Mirror:
                 self._chip.drive("PPS", level)
 
 
+@pytest.mark.thorough
 def test_frames_answer_the_triggers_on_sin(gpio_chip: GpioChip, tmp_path: Path) -> None:
     sin = {"line": "SIN", "rate_hz": 5, "pulse_ms": 80}
     with running_imu(tmp_path, gpio_chip, {}, "--rate", "10", "--sin", str(gpio_chip.value("SIN"))) as imu:

@@ -55,6 +55,7 @@ EDGES = 10
 # --- all links --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_every_link_is_replayed_as_it_ran(tmp_path: Path) -> None:
     directory, asked_for = tmp_path / "recordings", tmp_path / "asked.imudrec"
     far = FarSide(tmp_path, 15)

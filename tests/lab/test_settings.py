@@ -15,6 +15,7 @@ from imud.sim.hipnuc.canopen import NODE_VARIANTS, HipnucCanopenHardware, Hipnuc
 from imud.sim.hipnuc.j1939 import J1939_VARIANTS, HipnucJ1939Module, J1939Hardware, J1939Settings
 from tests.lab.can_device import BusRig
 from tests.lab.can_interface import CanInterface
+from tests.lab.short_form import cases
 
 
 async def made_so(rig: BusRig, wanted: Mapping[str, object], *, verified: bool) -> None:
@@ -32,7 +33,7 @@ async def made_so(rig: BusRig, wanted: Mapping[str, object], *, verified: bool) 
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("variant", NODE_VARIANTS)
+@pytest.mark.parametrize("variant", cases(NODE_VARIANTS, "manual"))
 def test_a_canopen_node_is_made_as_declared(vcan: CanInterface, variant: str) -> None:
     now_ns, kind = monotonic_ns(), NODE_VARIANTS[variant]
     slow = NodeSettings(bit_rate=0, periods_ms={1: 100, 2: 100, 3: 100, 4: 100, 6: 0, 7: 0})
@@ -56,7 +57,7 @@ def test_a_canopen_node_is_made_as_declared(vcan: CanInterface, variant: str) ->
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("variant", J1939_VARIANTS)
+@pytest.mark.parametrize("variant", cases(J1939_VARIANTS, "real"))
 def test_a_j1939_module_is_made_as_declared(vcan: CanInterface, variant: str) -> None:
     now_ns, kind = monotonic_ns(), J1939_VARIANTS[variant]
     module = HipnucJ1939Module(now_ns, J1939Settings(), J1939Hardware(bitrate=0, boot_ms=200, variant=kind))

@@ -101,6 +101,7 @@ class Device:
         raise AssertionError(f"no reading around {raw}")
 
 
+@pytest.mark.thorough
 def test_stamps_stay_right_while_the_kernel_steers(pty: PseudoTerminal) -> None:
     samples: list[Sample] = []
     host = HostClock()
