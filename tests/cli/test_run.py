@@ -77,7 +77,7 @@ def test_an_invalid_address_is_named(text: str, place: str, tmp_path: Path, cli:
 
 
 def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
-    """A misspelled name is no mistake, since the device may come later; nothing is recorded or sent until then."""
+    """imud check accepts a misspelled name, because the device may be added later. Until then nothing is recorded or sent."""
     there, file = tmp_path / "a.cap", tmp_path / "imud.yaml"
     there.touch()
     file.write_text(

@@ -93,7 +93,7 @@ def test_processes_with_a_full_disk_or_without_a_reader(folder: Path, tmp_path: 
     argv = ["bash", "-c", script, sys.executable, str(capture)]
     done = subprocess.run(argv, capture_output=True, timeout=LIMIT_S, check=True)
     assert (done.stdout, done.stderr) == (b'{"text":"A"}\n0\n', b"")
-    with pipe(full=True) as (_, writer):  # an error that nobody reads does not keep the command
+    with pipe(full=True) as (_, writer):  # the command ends although no program reads its error
         assert imud("run", "--config", tmp_path / "none", stderr=writer).returncode == 78
 
 

@@ -1,4 +1,4 @@
-"""`imud probe` on serial ports in virtual time: detection, and queries only where they are permitted."""
+"""`imud probe` on serial ports in virtual time: detection, and queries only if they are permitted."""
 
 import asyncio
 import json
