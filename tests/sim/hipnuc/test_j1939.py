@@ -272,3 +272,11 @@ def test_zero_and_directions_of_the_inclinometer() -> None:
     assert shown() == (0.0, 0.0)
     bench.talk(lambda peer: session.zero(peer, session.Zero.CANCEL))
     assert shown() == (-10.0, -20.28)
+
+
+def test_the_time_of_day_starts_again_after_a_day() -> None:
+    """The module boots for a day and 5 s, and sends UTC each second of its own crystal."""
+    hardware = J1939Hardware(boot_ms=86_405_000, skew_ppm=0)
+    module = HipnucJ1939Module(BEGIN_NS, J1939Settings(intervals_ms={messages.UTC: 1000}), hardware)
+    frames = [f for f in module.advance(BEGIN_NS + 86_407 * SECOND_NS) if split(f.can_id).pgn == messages.UTC]
+    assert [tuple(frame.data[3:6]) for frame in frames][:1] == [(0, 0, 5)]  # hour, minute, second

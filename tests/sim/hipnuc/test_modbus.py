@@ -10,7 +10,7 @@ from imud.devices.hipnuc.modbus.frames import randomise_ids, read_registers, set
 from imud.formats.modbus import framed, is_exception, is_whole
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from imud.sim.hipnuc.modbus import ModbusLine, Slave, make
+from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveVariant, make
 from imud.sim.simulator import Burst, SimulatorOptions
 from imud.units import NS_PER_S
 from tests.support.pty_port import serial_of, slave
@@ -143,3 +143,11 @@ def test_ids_exceptions_and_common_options() -> None:
     for wrong in ({"message": "1,x"}, {"message": "0"}, {"message": "248"}, {"baud": 12345}, {"motion": "none"}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             make(SimulatorOptions(**wrong), BEGIN_NS)
+
+
+def test_an_ignored_write_is_confirmed_and_changes_nothing() -> None:
+    request = write_register(6, 1).sends[0]
+    for ignores, mode in ((frozenset({"HEADING_MODE"}), 0), (frozenset({"MD_ID"}), 1)):
+        rig = ModbusMaster(here(1, variant=SlaveVariant(ignores=ignores)))
+        assert rig.ask(1, request) == framed(1, request)
+        assert rig.line.slaves[0].settings.heading_mode == mode

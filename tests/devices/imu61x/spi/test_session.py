@@ -74,6 +74,10 @@ def test_window_is_closed_after_a_failure(fail_at: int) -> None:
         run_transfer_script(set_up(SpiDeviceSettings(gyro_filter=1)), wire.transfer)
     assert wire.sent[-1] == "fe00 7e00 7e00"
     assert wire.device.window == 0
+    wire = Wire(fail_at=3)  # the burst that shows its kind
+    with pytest.raises(TransferError):
+        run_transfer_script(set_up(SpiDeviceSettings(gyro_filter=1)), wire.transfer)
+    assert len(wire.sent) == 4
 
 
 def test_setting_that_does_not_take_is_refused() -> None:

@@ -91,6 +91,23 @@ def test_identity_settings_and_modes(variant: str) -> None:
     assert words == (head if variant == "short status" else head | rest)
 
 
+@pytest.mark.parametrize(
+    ("parameter", "value"),
+    [
+        (Parameter.AHRS_RATE, 200),
+        (Parameter.BUS_MODE, BusMode.I2C),
+        (Parameter.I2C_ADDRESS, 0x1B),
+        (Parameter.FILTER, 0xF0),
+    ],
+)
+def test_a_parameter_is_set_and_not_saved(parameter: Parameter, value: int | BusMode) -> None:
+    far = imu61x_bench()
+    far.run(session.write_parameter(parameter, value))
+    assert far.module.settings.value(parameter) == (value.value if isinstance(value, BusMode) else value)
+    assert far.module.flash == Imu61xSettings()
+    assert streams(far)
+
+
 def test_modes_at_any_rate_words_of_unusual_values_and_questions_only() -> None:
     for rate_hz in (1, 400):
         far = imu61x_bench(Imu61xSettings(baud=921600, rate_hz=rate_hz))
