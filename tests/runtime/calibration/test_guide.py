@@ -322,7 +322,7 @@ async def test_advice(rig: GuideRig, prepare: Callable[[GuideRig], object], word
 
     def verdict() -> Verdict:
         asked.append(rig.clock.now_ns())
-        return Verdict(rig.clock.now_ns() > 1060 * NS_PER_S, "bias 0, 0, 0 µT")  # done with the result of before
+        return Verdict(rig.clock.now_ns() > 1290 * NS_PER_S, "bias 0, 0, 0 µT")  # done, with the result of before
 
     result = await rig.guide.run("magnetometer", magnetometer(rig, verdict), save=False)
     assert 98 <= len(asked) <= 101  # every 3 s

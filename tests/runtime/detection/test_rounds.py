@@ -218,6 +218,12 @@ async def test_the_bus_goes_down_while_searching_and_comes_back(bus: Bus) -> Non
     await bench.until(lambda: bench.device.state is DeviceState.MISSING)
     bench.link.appear()
     await bench.until(lambda: bench.samples, 8)
+    path = bench.device._transport.path
+    bench.link.disappear()
+    await bench.until(lambda: bench.rig.is_in(DeviceState.MISSING))
+    bench.link.appear()
+    await bench.until(lambda: bench.rig.is_in(DeviceState.RUNNING), 8)
+    assert bench.device._transport.path is path  # it is the same device
 
 
 @played(Bus)
