@@ -2,7 +2,7 @@
 
 import asyncio
 
-from imud.contracts.lines import Edge, InputSettings
+from imud.contracts.lines import Edge, InputSettings, OnEdges, OnLineEnd
 from imud.errors import LinkBusy, LinkError, LinkMissing
 from imud.signals.watched_line import WatchedLine, watching
 from imud.sim.ports.lines import MemoryInput, MemoryLines
@@ -101,6 +101,22 @@ async def test_edges_of_a_line_that_is_not_watched_are_delivered_by_the_tick() -
     assert it.edges == []
     it.watched.tick(1)
     assert it.edges == [Edge(10, True, 1)]
+
+
+class Unstartable(MemoryInput):
+    """A line that opens and cannot start."""
+
+    def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
+        raise LinkError("it does not start")
+
+
+@in_loop
+async def test_a_line_that_cannot_start_is_closed_and_tried_again() -> None:
+    it = Watched(Unstartable())
+    for now_ns in (0, RETRY_NS):
+        it.watched.tick(now_ns)
+        assert not it.line.is_open
+    assert (it.reports, it.levels) == (["it does not start"], [])
 
 
 class Blind(MemoryInput):
