@@ -164,7 +164,8 @@ def test_simulated_modules_in_bodies_of_known_attitude(tmp_path: Path) -> None:
                 first, down = next(as_configured), next(asked)
                 with Ring(tmp_path / f"imud.{name}") as ring:
                     wait_until(lambda: ring.newest_seq >= 90, "the ring has what was sent")
-                    by_shm = ring.read().samples[0]
+                    by_shm = ring.latest()
+                    assert by_shm is not None
                 (polled,) = other.poll([name], convention="ned-frd")
                 schema = plain.schema()["devices"][name]
                 status = daemon.statuses()[name]
