@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from imud.cli.arguments import argument, chosen_fields, confirmed, duration_s
+from imud.cli.arguments import argument, check_port, chosen_fields, confirmed, duration_s
 from imud.errors import BadArgument
 from tests.cli.conftest import Cli
 from tests.cli.test_decode import MANUAL_FRAME
@@ -23,6 +23,14 @@ from tests.support.files import imu61x_log
 )  # fmt: skip
 def test_an_option_that_is_not_a_finite_number_is_refused(command: str, option: str, value: str, cli: Cli) -> None:
     cli.refuses(f"argument {option}: expected a number, got '{value}'", command, f"{option}={value}")
+
+
+def test_a_port_is_0_to_65535() -> None:
+    for port in (0, 65535):
+        check_port(port)
+    for port in (-1, 65536):
+        with pytest.raises(BadArgument, match=f"--port: expected 0 to 65535, got {port}"):
+            check_port(port)
 
 
 def test_durations() -> None:

@@ -3,19 +3,21 @@
 import subprocess
 import sys
 from fcntl import F_GETPIPE_SZ, fcntl
+from io import BytesIO
 from pathlib import Path
 
 import pytest
 
 from imud.bridges.channel import LossCounts, StampedEvent
 from imud.cli.export import playing
-from imud.cli.export.playing import play_beside, play_here
+from imud.cli.export.playing import SAMPLES, PipeSink, play_beside, play_here
 from imud.contracts.publisher import Batch
 from imud.errors import ImudError
 from imud.frames.conventions import Convention
 from imud.sample import Sample
 from tests.cli.conftest import Cli
 from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
+from tests.support.socket_rig import batch
 
 
 class KeepingSink:
@@ -56,6 +58,18 @@ def test_both_ways_give_the_same_in_the_same_order(file: Path) -> None:
         assert 1 < beside.largest < 2000
         assert positions == sorted(positions)
         assert 0 < positions[-1] <= file.stat().st_size
+
+
+def test_a_full_message_is_written_at_once() -> None:
+    pipe = BytesIO()
+    sink = PipeSink(pipe, lambda: 0)
+    sink.samples(batch(count=SAMPLES - 1))
+    head_only = pipe.tell()
+    sink.samples(batch(first=SAMPLES))
+    assert pipe.tell() > head_only
+    written = pipe.tell()
+    sink.finish()
+    assert pipe.tell() == written
 
 
 def test_the_pipe_is_as_large_as_the_kernel_allows(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:

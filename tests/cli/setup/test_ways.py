@@ -72,6 +72,7 @@ def test_networkd_is_enabled_beside_others_and_that_is_said(bus: LivingMachine, 
     changes, notes = raise_can(bus.surroundings(), "can0", 500_000)
     assert commands(changes)[0] == "systemctl enable --now systemd-networkd.service"
     assert commands(changes)[1] == "systemctl disable systemd-networkd-wait-online.service"
+    assert [one.optional for one in changes if isinstance(one, CommandChange)] == [False, True, False]
     assert notes[0].startswith(f"{name} manages the network here")
 
 
