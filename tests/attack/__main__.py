@@ -27,8 +27,6 @@ HEAD = (
 
 @dataclass
 class Peak:
-    """The highest memory and count of descriptors while an attack runs."""
-
     rss_mb: float = 0.0
     fds: int = 0
 
@@ -97,7 +95,6 @@ def row(name: str, seen: Measured) -> str:
 def attack(
     name: str, entry: Attack, stage: AttackedDaemon, seconds: float, idle_mb: float, *, delays: bool
 ) -> list[str]:
-    """Run one attack, print its row, return the bounds that were exceeded."""
     try:
         seen, done = measure(entry, stage, seconds, idle_mb)
     except OSError:
@@ -109,7 +106,6 @@ def attack(
 
 
 def describe(stage: AttackedDaemon, idle_mb: float, *, delays: bool) -> str:
-    """How the daemon runs, who is who, and what is judged."""
     if stage.scheduling is Scheduling.UNIT:
         how = "default policy at nice 0 on any core, as the unit has it; hostile clients the same"
     else:

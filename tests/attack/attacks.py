@@ -29,8 +29,6 @@ LINE_BYTES = 512
 
 @dataclass
 class Done:
-    """What came of an attack."""
-
     problems: list[str] = field(default_factory=list)
     deeds: Deeds = field(default_factory=Deeds)
     stops: int = 0
@@ -55,7 +53,6 @@ def start(stage: AttackedDaemon, seconds: float, kind: str) -> list[subprocess.P
 
 
 def end(children: list[subprocess.Popen[str]], seconds: float) -> Done:
-    """Wait for hostile clients; what they did."""
     done = Done()
     for child in children:
         out, _ = child.communicate(timeout=seconds + 30)
@@ -147,8 +144,6 @@ def calm(_stage: AttackedDaemon, seconds: float) -> Done:
 
 @dataclass(frozen=True)
 class Attack:
-    """A row of the table."""
-
     run: Callable[[AttackedDaemon, float], Done]
     """Attacks for so many seconds."""
     short: bool = True

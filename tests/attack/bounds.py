@@ -27,8 +27,6 @@ LEDGER_TOLERANCE: Final = 1
 
 @dataclass
 class Measured:
-    """What happened while one attack ran."""
-
     deeds: Deeds
     samples: int = 0
     """Of the good client."""

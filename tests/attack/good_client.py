@@ -23,8 +23,6 @@ ASK_S = 0.01
 
 @dataclass
 class Figures:
-    """What happened since the last report."""
-
     samples: int = 0
     lost: int = 0
     dropped: int = 0
@@ -46,8 +44,6 @@ def quantile(values: list[float], share: float) -> float:
 
 
 class Watcher:
-    """Reads frames of samples."""
-
     def __init__(self, path: str) -> None:
         self.sock = connect(path)
         self.sock.sendall(line_of(encode_request("watch", {"devices": ["d0"], "encoding": "binary"}, 1)))

@@ -23,8 +23,6 @@ LOOPBACK = "127.0.0.1"
 
 
 class Reading(Enum):
-    """How a client reads what it gets."""
-
     ALL = auto()
     SLOWLY = auto()
     NEVER = auto()
@@ -32,8 +30,6 @@ class Reading(Enum):
 
 @dataclass(frozen=True)
 class Kind:
-    """What clients of one kind do."""
-
     sends: Callable[[random.Random], bytes]
     """What a client sends next; empty for nothing more."""
     reading: Reading = Reading.ALL
@@ -47,8 +43,6 @@ class Kind:
 
 @dataclass
 class Deeds:
-    """What hostile clients, or another attack, did."""
-
     clients: int = 0
     """At the same time."""
     connections: int = 0
@@ -124,8 +118,6 @@ KINDS: dict[str, Kind] = {
 
 
 class Hostile:
-    """One hostile client."""
-
     def __init__(self, path: str, metrics_port: int, kind: Kind, rng: random.Random, deeds: Deeds) -> None:
         self._path, self._port, self._kind, self._rng, self._deeds = path, metrics_port, kind, rng, deeds
         self._left = b""
@@ -133,7 +125,6 @@ class Hostile:
         self.sock: socket.socket | None = None
 
     def connect(self) -> socket.socket | None:
-        """Connect; None when that was refused at once."""
         sock = socket.socket(socket.AF_INET if self._kind.scrapes else socket.AF_UNIX)
         sock.setblocking(False)
         try:
@@ -150,7 +141,6 @@ class Hostile:
         return sock
 
     def write(self) -> bool:
-        """Send some; False when the connection is to end."""
         assert self.sock is not None
         if not self._left:
             if self._sent and self._kind.once:
@@ -168,7 +158,6 @@ class Hostile:
         return True
 
     def read(self) -> bool:
-        """Read as the kind does; False when the connection has ended."""
         assert self.sock is not None
         try:
             data, fds, _flags, _address = socket.recv_fds(self.sock, 512 if self._slow else 1 << 18, 8)
@@ -186,7 +175,6 @@ class Hostile:
 
     @property
     def events(self) -> int:
-        """What to wait for."""
         reads = 0 if self._kind.reading is Reading.NEVER else selectors.EVENT_READ
         done = self._sent and self._kind.once and not self._left and not self._kind.leaves
         writes = 0 if done else selectors.EVENT_WRITE

@@ -165,8 +165,6 @@ class LogPipe:
 
 
 class Daemon(Process):
-    """`imud run`, with its log in a pipe."""
-
     def __init__(self, cores: set[int], file: Path, log: LogPipe) -> None:
         self.popen = subprocess.Popen(
             [sys.executable, "-m", "imud", "run", "-c", str(file)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -244,7 +242,6 @@ class AttackedDaemon:
         return cpu_ns(self.pid)
 
     def figures(self) -> dict[str, Any]:
-        """What the good client saw since the last call."""
         self.good.say("report")
         found = json.loads(self.good.line())
         assert isinstance(found, dict)

@@ -16,7 +16,6 @@ ITEMS = {item.key: item for item in (*MANUAL_A, *MANUAL_B)}
 
 
 def report(marked: dict[str, list[str]]) -> Iterator[str]:
-    """The lines of the report."""
     section, by_section = "", described()
     for item in ITEMS.values():
         if item.section != section:
@@ -45,7 +44,6 @@ def _left(left: list[Item]) -> str:
 
 
 def main() -> int:
-    """Print the report, the counts, and what is wrong."""
     marked = marks()
     print("\n".join(report(marked)))
     print()

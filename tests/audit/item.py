@@ -18,8 +18,6 @@ MARK: Final = "manual"
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One thing that a manual says."""
-
     key: str
     """Letter of the manual, section, and a short name; as in the marks."""
     words: str

@@ -28,7 +28,6 @@ OUTPUT = Path("build/bench.json")
 
 
 def measure(parts: Iterable[str], quick: bool) -> list[Row]:
-    """Run the parts in order, printing each row as it is known."""
     rows: list[Row] = []
     for part in parts:
         print(f"# {part}", flush=True)
@@ -41,12 +40,10 @@ def measure(parts: Iterable[str], quick: bool) -> list[Row]:
 
 
 def parts_of(*, short: bool) -> tuple[str, ...]:
-    """Parts of a run in which none is named."""
     return tuple(part for part in PARTS if not (short and part in LAB_PARTS))
 
 
 def main() -> int:
-    """Run as `python -m tests.bench`."""
     parser = argparse.ArgumentParser(prog="make bench")
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}")
     parser.add_argument("--short", "--quick", action="store_true", help="shorter runs, rougher figures")

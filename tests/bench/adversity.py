@@ -49,7 +49,6 @@ class Machine(NamedTuple):
     skew_ppm: float
 
     def profile(self, link: "Link", name: str) -> ArrivalProfile:
-        """Return its delays on a link."""
         poll = POLL_NS if link.timer_ns else 0
         return ArrivalProfile(
             name, timer_ns=link.timer_ns, timer_ppm=self.timer_ppm, packet_bytes=link.packet_bytes, poll_ns=poll,
@@ -81,8 +80,6 @@ def machine_of(seed: int) -> Machine:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Wire and adapter, and what the system says of it."""
-
     name: str
     baud: int = 115_200
     """0: a CAN bus, where the kernel stamps the first frame."""
@@ -93,7 +90,6 @@ class Link:
 
     @property
     def hold_ns(self) -> int:
-        """Latency timer as the link reports it."""
         return self.timer_ns if self.told_hold_ns is None else self.told_hold_ns
 
 
@@ -145,15 +141,12 @@ class Stalls:
     from_ns: int = 0
 
     def end_of(self, since_ns: float) -> float:
-        """When what comes `since_ns` after the begin is handed over."""
         at = (since_ns - self.from_ns) % self.every_ns
         return since_ns - at + self.for_ns if since_ns >= self.from_ns and at < self.for_ns else since_ns
 
 
 @dataclass(frozen=True, slots=True)
 class HostClocks:
-    """What happens to the clocks of a host, in seconds from the first sample on."""
-
     name: str
     slews: tuple[tuple[float, float], ...] = ()
     """(from then on, CLOCK_MONOTONIC runs so many ppm fast)."""
@@ -166,7 +159,6 @@ class HostClocks:
     that time is lost."""
 
     def stepped_ns(self, since_ns: int) -> int:
-        """How far CLOCK_REALTIME has been set forward by then: by steps, or by the time of a suspend."""
         steps = (*self.steps, self.suspend_s) if self.suspend_s else self.steps
         return sum(int(step_s * NS_PER_S) for at_s, step_s in steps if since_ns >= at_s * NS_PER_S)
 
@@ -180,8 +172,6 @@ WAITING_BYTES: Final = 256
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """What sends, and what its messages say of time."""
-
     says: str = "time"
     """`time`: ms (HI91); `stamp`: ms modulo 8192 (HI92); `number`: of the sample, 8 bits; `trigger`: that there was
     one (HI92 on mark); `nothing`."""
@@ -211,8 +201,6 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """An adversity on a link."""
-
     adversity: str
     link: Link
     device: Device = field(default_factory=Device)
@@ -223,11 +211,9 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name in the table."""
         return f"{self.adversity}, {self.link.name}"
 
     def on(self, link: Link) -> "Cell":
-        """The same on another link."""
         return replace(self, link=link)
 
 
@@ -271,7 +257,6 @@ class _AdverseModel(ArrivalModel):
         return [stalls.end_of(t - begin_ns) + begin_ns for t in handed] if stalls else handed
 
     def run(self, count: int) -> Iterator[Arrival]:
-        """As `ArrivalModel.run`, with the cell's own way of waking up."""
         random = Random(f"{self.cell.name} {self.seed}")
         truth = list(self._truth(count, random))
         begins = self._on_wire([t for t, _ in truth])

@@ -24,12 +24,10 @@ JSON = msgspec.json.Encoder()
 
 
 def binary(device: int, seq: int, now_ns: int, v: tuple[float, ...]) -> bytes:
-    """One length-prefixed slot."""
     return OUT.pack(256, seq, now_ns, now_ns, now_ns, 0, 0, 0, 0, 0, device, 0, *v[5:21], v[2], v[3], 0.0, 0.0)
 
 
 def as_json(device: int, seq: int, now_ns: int, v: tuple[float, ...]) -> bytes:
-    """One notification line."""
     params = {"device": str(device), "seq": seq, "t_ns": now_ns, "accel": v[5:8], "gyro": v[8:11], "mag": v[11:14],
               "euler": v[14:17], "quat": v[17:21], "temperature": v[2], "pressure_pa": v[3]}  # fmt: skip
     return JSON.encode({"jsonrpc": "2.0", "method": "sample", "params": params}) + b"\n"

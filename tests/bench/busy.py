@@ -54,8 +54,6 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class Setting:
-    """What a unit can say of its scheduling, by its directives' names."""
-
     name: str
     nice: int = 0
     policy: int = os.SCHED_OTHER
@@ -83,8 +81,6 @@ SETTINGS = (
 
 @dataclass(frozen=True)
 class Seen:
-    """Latency of one run, µs."""
-
     p50_us: float
     p99_us: float
     max_us: float
@@ -114,7 +110,6 @@ def timer(seconds: float) -> Seen:
 
 
 def run(setting: Setting, load: Load) -> Seen:
-    """One run of writer, daemon and reader under one setting."""
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-busy-") as name, ExitStack() as stack:
         folder = Path(name)
         writer = start_writer(stack, folder, load, cores=set(CORES))
@@ -183,7 +178,6 @@ def preemption() -> str:
 
 
 def main() -> None:
-    """Print the latency with each setting."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.busy")
     parser.add_argument("rounds", nargs="?", type=int, default=ROUNDS)
     parser.add_argument("--short", action="store_true")

@@ -31,7 +31,6 @@ LAB_LIMIT_S = 600.0
 
 
 def measure(interface: str, waiting: int, frames: int) -> tuple[float, float]:
-    """CPU time per frame in µs, ours and python-can's, both of the same frames."""
     with (
         socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW) as ours,
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as far,
@@ -73,7 +72,6 @@ def _ip(*arguments: str) -> None:
 
 
 def here(*, quick: bool) -> list[Row]:
-    """The figures of this machine. Raises CalledProcessError or OSError without a virtual bus."""
     found: list[Row] = []
     with virtual_bus() as bus:
         for words, waiting in BATCHES.items():
@@ -102,7 +100,6 @@ def in_lab(why: str, *, quick: bool) -> list[Row]:
 
 
 def rows(*, quick: bool = False) -> list[Row]:
-    """The figures."""
     try:
         return here(quick=quick)
     except subprocess.CalledProcessError as error:

@@ -32,8 +32,6 @@ CPU_SHARE_MOST = 0.5
 
 
 class Device:
-    """One device's way from a socket to a slot."""
-
     def __init__(self, module: Module, stack: ExitStack) -> None:
         driver = DRIVERS[module.driver]
         assert isinstance(driver, CanDriver)
@@ -65,19 +63,16 @@ class Device:
         return process_time_ns() - taken_ns + read_ns - begin_ns
 
     def wants(self, raw: bytes) -> bool:
-        """Whether the kernel's filters would pass the frame."""
         can_id = RAW_FRAME.unpack(raw)[0] & 0x1FFF_FFFF
         return any(can_id & f.mask == f.can_id & f.mask for f in self.filters)
 
 
 def _publish(batch: Batch) -> None:
-    """As the socket does it, but for the sending."""
     for sample in batch.samples:
         encode_slot(sample, batch.device_id)
 
 
 def measure(waiting: int, samples: int) -> float:
-    """CPU time per sample, µs."""
     modules = fleet()
     played = loop([f"{module.driver}:{module.node}" for module in modules], RATE_HZ)
     with ExitStack() as stack:
@@ -111,7 +106,6 @@ def measure(waiting: int, samples: int) -> float:
 
 
 def rows(*, quick: bool = False) -> list[Row]:
-    """The figures."""
     found: list[Row] = []
     for words, waiting in WAITING.items():
         each_us = measure(waiting, 200 if quick else 1000)

@@ -19,15 +19,12 @@ BAUD: Final = 921_600
 
 
 class Source(NamedTuple):
-    """A simulated device."""
-
     driver: str
     rate_hz: int
     make: Callable[[], StreamModule]
 
 
 def hi91_module(rate_hz: int) -> HipnucModule:
-    """Make a HiPNUC module that sends HI91 frames."""
     return HipnucModule(BEGIN_NS, ModuleSettings(baud=BAUD, hi91=Output(period_ms=1000 // rate_hz)), HipnucHardware())
 
 

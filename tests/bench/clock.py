@@ -37,8 +37,6 @@ CRYSTALS = {
 
 
 class Point(NamedTuple):
-    """One sample beside its truth."""
-
     off_ns: int
     """t_ns - truth."""
     t_err_ns: int
@@ -48,8 +46,6 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """Errors of `t_ns` against the truth."""
-
     rms_ns: float
     """About the truth: a constant bias is in it."""
     sigma_ns: float
@@ -64,14 +60,12 @@ class Accuracy:
 
 
 def clock_for(model: ArrivalModel) -> SampleClock:
-    """A clock as the pipeline would set it up for the model's link."""
     return SampleClock(
         "bench", tick_ns=TICK_NS, tick_modulus=TICK_MODULUS, byte_ns=model.byte_ns, hold_ns=model.profile.hold_ns
     )
 
 
 def run(model: ArrivalModel, count: int) -> list[Point]:
-    """The first `count` samples of a model through a new clock."""
     clock = clock_for(model)
     points = []
     for a in model.run(count):
@@ -82,7 +76,6 @@ def run(model: ArrivalModel, count: int) -> list[Point]:
 
 
 def accuracy(points: Sequence[Point], settle_ns: int = SETTLED_NS) -> Accuracy:
-    """Figures of one run, split at `settle_ns` after its first sample."""
     begin = points[0].truth_ns
     return summary(
         [p for p in points if p.truth_ns - begin > settle_ns], [p for p in points if p.truth_ns - begin <= settle_ns]
@@ -90,7 +83,6 @@ def accuracy(points: Sequence[Point], settle_ns: int = SETTLED_NS) -> Accuracy:
 
 
 def summary(settled: Sequence[Point], settling: Sequence[Point]) -> Accuracy:
-    """Figures of the settled samples, and the share of the others."""
     n = len(settled)
     mean = sum(p.off_ns for p in settled) / n
     return Accuracy(
@@ -108,7 +100,6 @@ def _share(points: Sequence[Point]) -> float:
 
 
 def over_seeds(profile: ArrivalProfile, rate_hz: int, crystal: Crystal, seeds: Sequence[int]) -> Accuracy:
-    """Figures of several runs together."""
     settled: list[Point] = []
     settling: list[Point] = []
     for seed in seeds:
@@ -140,7 +131,6 @@ def speed_ns(profile: ArrivalProfile, rate_hz: int = 1000, count: int = 20_000) 
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
-    """The rows of `make bench`: speed, and accuracy at 100 Hz behind each profile."""
     for profile in (BARE_UART, USB_16MS):
         yield at_most(f"clock: one sample at 1 kHz, {profile.name}", speed_ns(profile), "ns", 3000)
     for profile in (BARE_UART, USB_1MS, USB_16MS, LOADED):
@@ -156,7 +146,6 @@ FIGURES = ("sigma_ns", "rms_ns", "p999_ns", "mean_t_err_ns")
 
 
 def _spread_us(values: Sequence[float]) -> Spread:
-    """Least and greatest of some figures, whole µs."""
     return float(round(min(values) / 1000)), float(round(max(values) / 1000))
 
 
@@ -171,7 +160,6 @@ def table(seeds: Sequence[int], rates: Sequence[int]) -> Iterator[ArrivalFigures
 
 
 def main() -> None:
-    """Print the table as Markdown; `--keep`: for docs/clock.md."""
     quick = "--quick" in sys.argv
     print(ARRIVAL_HEAD)
     found = []

@@ -26,8 +26,6 @@ Spread = tuple[float, float]
 
 
 class ArrivalFigures(msgspec.Struct, frozen=True):
-    """A profile of arrivals at one rate, over all crystals; µs."""
-
     arrival: str
     rate_hz: int
     sigma_us: Spread
@@ -39,14 +37,11 @@ class ArrivalFigures(msgspec.Struct, frozen=True):
     settling: float
 
     def row(self) -> str:
-        """The row of the table."""
         micro = " | ".join(map(spread, (self.sigma_us, self.rms_us, self.p999_us, self.mean_t_err_us)))
         return f"| {self.arrival} | {self.rate_hz} | {micro} | {self.share:.3f} | {self.settling:.3f} |"
 
 
 class LineFigures(msgspec.Struct, frozen=True):
-    """A source of time at a line, over one link; µs."""
-
     source: str
     over: str
     rate_hz: int
@@ -60,26 +55,21 @@ class LineFigures(msgspec.Struct, frozen=True):
     """Share of samples with this source or a better one."""
 
     def row(self) -> str:
-        """The row of the table."""
         micro = " | ".join(map(microseconds, (self.sigma_us, self.mean_us, self.p999_us, self.mean_t_err_us)))
         shares = f"{self.share:.3f} | {self.settling:.3f} | {self.by_it:.3f}"
         return f"| {self.source} | {self.over} | {self.rate_hz} | {micro} | {shares} |"
 
 
 class ClockFigures(msgspec.Struct, frozen=True):
-    """The file."""
-
     arrivals: tuple[ArrivalFigures, ...] = ()
     lines: tuple[LineFigures, ...] = ()
 
 
 def kept() -> ClockFigures:
-    """The figures in the tree."""
     return msgspec.json.decode(FILE.read_bytes(), type=ClockFigures)
 
 
 def keep(*, arrivals: Sequence[ArrivalFigures] | None = None, lines: Sequence[LineFigures] | None = None) -> None:
-    """Replace one of the two tables of the file."""
     old = kept() if FILE.exists() else ClockFigures()
     new = ClockFigures(
         old.arrivals if arrivals is None else tuple(arrivals), old.lines if lines is None else tuple(lines)
@@ -94,12 +84,10 @@ def spread(values: Spread) -> str:
 
 
 def microseconds(value: float) -> str:
-    """Format µs as the table of lines has them."""
     return f"{value:.0f}" if abs(value) > WHOLE_FROM_US else f"{value:.1f}"
 
 
 def markdown(head: str, found: Iterable[ArrivalFigures | LineFigures]) -> Iterator[str]:
-    """A table, line by line."""
     yield head
     for one in found:
         yield one.row()

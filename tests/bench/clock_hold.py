@@ -26,8 +26,6 @@ SECONDS = 150
 
 
 class TimedRead(NamedTuple):
-    """A message as it was read."""
-
     arrival: Arrival
     t_rx_ns: int
     trailing_bytes: int
@@ -36,12 +34,10 @@ class TimedRead(NamedTuple):
 
 
 def at_once(arrivals: Sequence[Arrival], _hold_ns: int, _byte_ns: int, _watch_ns: int) -> Iterator[TimedRead]:
-    """Every message as it comes."""
     return (TimedRead(a, a.t_rx_ns, a.trailing_bytes, 0) for a in arrivals)
 
 
 def one_in_time(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int, watch_ns: int) -> Iterator[TimedRead]:
-    """One read as it comes, then one of all that has gathered."""
     at = 0
     while at < len(arrivals):
         begun_ns = arrivals[at].t_rx_ns
@@ -60,7 +56,6 @@ def one_in_time(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int, watch_n
 
 
 def by_timer(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int, _watch_ns: int) -> Iterator[TimedRead]:
-    """All that has gathered, at even times."""
     at, end_ns = 0, arrivals[0].t_rx_ns
     while at < len(arrivals):
         end = at
@@ -89,7 +84,6 @@ WAYS: dict[str, Way] = {"at once": at_once, "one in time": one_in_time, "by time
 
 
 def run(way: str, model: ArrivalModel, seconds: int, hold_ns: int) -> list[Point]:
-    """A model's samples through a new clock, in one of the ways."""
     arrivals = list(model.run(int(model.rate_hz) * seconds))
     told_ns = model.profile.hold_ns + hold_ns * (way == "by timer")
     clock = SampleClock("bench", tick_ns=TICK_NS, tick_modulus=TICK_MODULUS, byte_ns=model.byte_ns, hold_ns=told_ns)
@@ -108,13 +102,11 @@ def run(way: str, model: ArrivalModel, seconds: int, hold_ns: int) -> list[Point
 
 
 def measure(way: str, profile: ArrivalProfile, rate_hz: int, crystal: Crystal, hold_ms: int) -> Accuracy:
-    """Figures of one cell."""
     model = ArrivalModel(profile, rate_hz, 1, crystal, BAUD_OF_RATE[rate_hz])
     return accuracy(run(way, model, SECONDS, hold_ms * NS_PER_MS))
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
-    """The rows of `make bench`: σ with a wait of 10 ms beside that without."""
     for profile in PROFILES[:1] if quick else PROFILES:
         plain, held = (
             measure(way, profile, 1000, CRYSTALS["+50 ppm"], 10).sigma_ns for way in ("at once", "one in time")
@@ -123,7 +115,6 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
 
 
 def main() -> None:
-    """Print the table, as Markdown."""
     print("| arrival | rate, Hz | latency, ms | way | σ, µs | rms, µs | mean t_err, µs | in 2 t_err | settling |")
     print("|---|---|---|---|---|---|---|---|---|")
     for profile in PROFILES:

@@ -47,12 +47,10 @@ Case = tuple[str, str, int, Callable[[], list[DatedSample]]]
 
 
 def model(profile: ArrivalProfile, rate_hz: int, crystal: Crystal, seed: int = 1) -> ArrivalModel:
-    """A device behind a link."""
     return ArrivalModel(profile, rate_hz, seed, crystal, BAUD_OF_RATE[rate_hz])
 
 
 def sout_cases(rate_hz: int) -> Iterator[Case]:
-    """SOUT behind each link, with each crystal, with each fault, and a device that restarts."""
     plain = CRYSTALS["+50 ppm"]
 
     def case(profile: ArrivalProfile, crystal: Crystal, faults: LineFaults) -> Callable[[], list[DatedSample]]:
@@ -74,7 +72,6 @@ def sout_cases(rate_hz: int) -> Iterator[Case]:
 
 
 def other_cases() -> Iterator[Case]:
-    """Triggers, the pulse per second, and a device on UTC."""
     for profile, rate_hz in ((BARE_UART, 100), (USB_16MS, 100), (USB_16MS_PACKET, 100), (USB_16MS_PACKET, 1)):
         for ppm in (0.0, 50.0):
             crystal = Crystal(ppm)
@@ -102,13 +99,11 @@ def other_cases() -> Iterator[Case]:
 
 
 def sigma_ns(offs: Sequence[int]) -> float:
-    """About their mean."""
     mean = sum(offs) / len(offs)
     return sqrt(sum((off - mean) ** 2 for off in offs) / len(offs))
 
 
 def table() -> Iterator[LineFigures]:
-    """The rows of the table of docs/clock.md for lines and UTC."""
     for source, over, rate_hz, run in (*sout_cases(100), *sout_cases(1000), *other_cases()):
         dated = run()
         settled = after(dated, SETTLED_S)
@@ -126,7 +121,6 @@ def table() -> Iterator[LineFigures]:
 
 
 def main() -> None:
-    """Print the table as Markdown; `--keep`: for docs/clock.md."""
     print(LINE_HEAD)
     found = []
     for one in table():
@@ -165,7 +159,6 @@ def speed_ns(*, edges: bool, count: int = 20_000) -> float:
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
-    """The rows of `make bench`."""
     seconds = 10 if quick else 30
     plain, with_edges = speed_ns(edges=False), speed_ns(edges=True)
     yield at_most("clock: what SOUT adds to one sample at 1 kHz", with_edges - plain, "ns", 4000)

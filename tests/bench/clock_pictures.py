@@ -23,7 +23,6 @@ ROW_INCHES: Final = 0.19
 
 
 def arrivals_figure(found: Sequence[ArrivalFigures]) -> Figure:
-    """Error of stamps by arrival and rate: what it is, and what is stated."""
     figure = Figure(figsize=(8.2, 4.6), layout="constrained")
     axes = figure.subplots()
     names = list(dict.fromkeys(one.arrival for one in found))
@@ -44,7 +43,6 @@ def arrivals_figure(found: Sequence[ArrivalFigures]) -> Figure:
 
 
 def lines_figure(found: Sequence[LineFigures]) -> Figure:
-    """Error of stamps with lines and UTC, a row for each of the table."""
     figure = Figure(figsize=(8.2, ROW_INCHES * len(found) + 1.2), layout="constrained")
     axes = figure.subplots()
     for place, one in enumerate(found):

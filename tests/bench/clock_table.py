@@ -78,8 +78,6 @@ WORSE_MOST: Final = 1.02
 
 
 class CellFigures(msgspec.Struct, frozen=True):
-    """Of a cell, over all its machines."""
-
     sigma_us: float
     settling: float
     settled: float
@@ -88,7 +86,6 @@ class CellFigures(msgspec.Struct, frozen=True):
     """None in figures that were kept before there was one."""
 
     def short_of(self, base: "CellFigures | None") -> list[str]:
-        """What was aimed at and is not reached."""
         missed = []
         if self.settling < SETTLING_LEAST:
             missed.append("settling")
@@ -105,8 +102,6 @@ Figures = Mapping[str, CellFigures]
 
 
 class Dated(NamedTuple):
-    """A sample beside its truth."""
-
     off_ns: int
     t_err_ns: int
     settling: bool
@@ -121,7 +116,6 @@ TIMELESS: Final = Device(says="nothing")
 
 
 def cells() -> Iterator[Cell]:
-    """All cells of the table."""
     for adversity in _everywhere():
         for link in LINKS:
             yield adversity.on(link)
@@ -148,7 +142,6 @@ def cells() -> Iterator[Cell]:
 
 
 def _everywhere() -> Iterator[Cell]:
-    """Adversities for every link."""
     yield Cell("plain", UART)
     yield Cell("loaded host", UART, wake=LOADED)
     yield Cell("Pareto wake-ups", UART, wake=PARETO)
@@ -163,7 +156,6 @@ def _everywhere() -> Iterator[Cell]:
 
 
 def _timeless() -> Iterator[Cell]:
-    """Messages without device time."""
     for host, wake in (("", PARETO), (", loaded host", LOADED)):
         yield Cell(f"HI92{host}", UART, Device(says="stamp", size_bytes=54), wake)
         yield Cell(f"HI92 on mark{host}", UART, Device(says="trigger", size_bytes=54), wake)
@@ -186,7 +178,6 @@ HOST_CLOCKS: Final = (
 
 
 def _host_clocks() -> Iterator[Cell]:
-    """Hosts whose clocks are steered, stepped or stopped."""
     if "host" not in signature(SampleClock).parameters:
         return  # a base that knows no such host
     for host in HOST_CLOCKS:
@@ -199,7 +190,6 @@ def _host_clocks() -> Iterator[Cell]:
 
 
 def clock_of(cell: Cell, host: "SteadyTime | None" = None) -> SampleClock:
-    """A clock as the daemon sets it up for the cell's device and link, on a host that is steered if that is given."""
     says = cell.device.says
     clock = partial(
         SampleClock, "bench", tick_ns=0 if says == "number" else NS_PER_MS,
@@ -210,7 +200,6 @@ def clock_of(cell: Cell, host: "SteadyTime | None" = None) -> SampleClock:
 
 
 def dated(cell: Cell, seed: int, seconds: int = SECONDS) -> Iterator[Dated]:
-    """The samples of one machine."""
     if cell.host is not None:
         yield from _dated_on(cell.host, cell, seed, seconds)
         return
@@ -222,7 +211,6 @@ def dated(cell: Cell, seed: int, seconds: int = SECONDS) -> Iterator[Dated]:
 
 
 def _dated_on(clocks: HostClocks, cell: Cell, seed: int, seconds: int) -> Iterator[Dated]:
-    """The same on a host with such clocks."""
     from tests.bench.host_clocks import BEGIN_NS, DECODE_NS, UTC_AHEAD_NS, SteeredHost, Steering
 
     host = SteeredHost(Steering(clocks.name, clocks.slews))
@@ -241,7 +229,6 @@ def _dated_on(clocks: HostClocks, cell: Cell, seed: int, seconds: int) -> Iterat
 
 
 def figures_of(cell: Cell, seeds: Sequence[int], seconds: int = SECONDS) -> CellFigures:
-    """Figures of a cell over machines."""
     samples = [d for seed in seeds for d in dated(cell, seed, seconds)]
     settled = [d for d in samples if not d.settling]
     settling = [d for d in samples if d.settling]
@@ -260,7 +247,6 @@ def _share(samples: Sequence[Dated]) -> float:
 
 
 def table(seeds: Sequence[int], only: str = "") -> Iterator[tuple[str, CellFigures]]:
-    """Name and figures of each cell."""
     for cell in cells():
         if only in cell.name:
             yield cell.name, figures_of(cell, seeds)
@@ -270,14 +256,11 @@ def table(seeds: Sequence[int], only: str = "") -> Iterator[tuple[str, CellFigur
 
 
 class Base(msgspec.Struct, frozen=True):
-    """Figures of another commit, all of the first six machines."""
-
     commit: str
     cells: dict[str, CellFigures]
 
 
 def kept_base() -> Base:
-    """The figures kept in the tree."""
     return msgspec.json.decode(FILE.read_bytes(), type=Base)
 
 
@@ -294,7 +277,6 @@ def base_of(commit: str, arguments: Sequence[str]) -> Base:
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
-    """The rows of `make bench`; the short form has the cells of a loaded host, on two machines."""
     for name, got in table(QUICK, "loaded host") if quick else table(range(MACHINES)):
         yield Row(f"clock table: {name}, sigma", got.sigma_us, "us")
         yield at_least(f"clock table: {name}, share settled", got.settled, "", SETTLED_LEAST)
@@ -324,7 +306,6 @@ def _cells_of(got: CellFigures) -> str:
 
 
 def main() -> int:
-    """Run as `python -m tests.bench.clock_table`."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.clock_table")
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--only", default="", metavar="TEXT")

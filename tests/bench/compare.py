@@ -26,8 +26,6 @@ LIMIT_S: Final = 3600.0
 
 
 class _Named(msgspec.Struct):
-    """What is needed of a row, in any version."""
-
     name: str
     value: float
 
@@ -36,8 +34,6 @@ Figures = Mapping[str, float]
 
 
 class Compared(NamedTuple):
-    """One figure of both checkouts, the medians of their rounds."""
-
     name: str
     base: float
     here: float
@@ -48,7 +44,6 @@ class Compared(NamedTuple):
 
 
 def compare(base: Sequence[Figures], here: Sequence[Figures]) -> list[Compared]:
-    """The figures that every round of both has, in the order of `here`."""
     names = [name for name in here[0] if all(name in figures for figures in (*base, *here))]
     return [Compared(name, median(f[name] for f in base), median(f[name] for f in here)) for name in names]
 
@@ -66,7 +61,6 @@ def checked_out(commit: str) -> Iterator[Path]:
 
 
 def measure(tree: Path, parts: Sequence[str]) -> Figures:
-    """One round of a checkout."""
     program = [sys.executable, "-m", "tests.bench", *parts, "--quick"]
     subprocess.run(program, cwd=tree, stdout=subprocess.DEVNULL, timeout=LIMIT_S, check=True)
     rows = msgspec.json.decode((tree / OUTPUT).read_bytes(), type=list[_Named])
@@ -74,7 +68,6 @@ def measure(tree: Path, parts: Sequence[str]) -> Figures:
 
 
 def main() -> int:
-    """Run as `python -m tests.bench.compare`."""
     parser = argparse.ArgumentParser(prog="make bench-compare")
     parser.add_argument("parts", nargs="+", metavar="PART", help=f"of {', '.join(PARTS)}")
     parser.add_argument("--base", required=True, metavar="COMMIT")

@@ -84,7 +84,6 @@ def _ahrs_floor(stream: bytes) -> None:
 
 
 def _decoder(reads: list[bytes], codec: StreamCodec | None = None) -> Callable[[], None]:
-    """What feeds `reads` to one codec; events are dropped as they come."""
     codec = codec or HipnucCodec(Ledger(), HipnucSettings())
 
     def run() -> None:
@@ -115,7 +114,6 @@ def _good(events: list[CodecEvent]) -> int:
 
 
 def rows(*, quick: bool = False) -> list[Row]:
-    """Cost per frame of each way to decode, and the ratio that is aimed at."""
     random = Random(1)
     frames = _frames(random)
     clean, noisy = b"".join(frames), _noisy(frames, random)

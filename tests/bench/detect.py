@@ -28,8 +28,6 @@ HOLDS_MS = (0, 16)
 
 
 def random_hi91(random: Random) -> bytes:
-    """The frame that the module sends as delivered, 82 bytes, at rest within its noise."""
-
     def three(scale: float) -> tuple[float, float, float]:
         return (random.gauss(0, scale), random.gauss(0, scale), random.gauss(0, scale))
 

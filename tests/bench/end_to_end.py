@@ -14,7 +14,6 @@ RSS_LIMIT_MB = 45.0
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
-    """All figures of the whole path."""
     seconds = 2.0 if quick else 6.0
     for encoding in ("binary", "json"):
         for clients in (1, 10) if quick else (1, 10, 100):
@@ -23,7 +22,6 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
 
 
 def compare(load: Load, rounds: int) -> Iterator[Row]:
-    """The daemon and the bare loop in turns, the best round of each: other programs share the machine."""
     pairs = [(run(load), run(replace(load, bare=True))) for _ in range(rounds)]
     imud = min((a for a, _ in pairs), key=lambda o: o.cpu_us_per_sample)
     bare = min((b for _, b in pairs), key=lambda o: o.cpu_us_per_sample)
@@ -42,7 +40,6 @@ def compare(load: Load, rounds: int) -> Iterator[Row]:
 
 
 def many(devices: int, seconds: float) -> tuple[Outcome, Outcome]:
-    """The daemon and the bare loop with many devices and one client."""
     load = Load(devices=devices, seconds=seconds, phases=4)
     return run(load), run(replace(load, bare=True))
 

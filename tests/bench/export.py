@@ -45,7 +45,6 @@ SOURCES: Final = {
 
 
 def rows(*, quick: bool = False, folder: Path | None = None) -> Iterator[Row]:
-    """All figures."""
     samples = (QUICK_SECONDS if quick else SECONDS) * RATE_HZ
     with tempfile.TemporaryDirectory() as scratch:
         kept = folder or Path(scratch)
@@ -58,7 +57,6 @@ def rows(*, quick: bool = False, folder: Path | None = None) -> Iterator[Row]:
 
 
 def export_rows(name: str, recording: Path, samples: int, folder: Path, limit_s: float | None) -> Iterator[Row]:
-    """Time and CPU of the export of one recording in each format."""
     yield Row(f"{name}: recording", recording.stat().st_size / 1e6, "MB")
     for words, options in FORMATS.items():
         out, begin_s = folder / "out", monotonic()
@@ -81,7 +79,6 @@ def export_rows(name: str, recording: Path, samples: int, folder: Path, limit_s:
 
 
 def main(words: list[str]) -> None:
-    """Print the figures, and how busy the machine is beside them."""
     folder = Path(words[words.index("--keep") + 1]) if "--keep" in words else None
     for row in rows(quick="--quick" in words, folder=folder):
         load = f"load {os.getloadavg()[0]:.1f}"

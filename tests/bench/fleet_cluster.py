@@ -35,8 +35,6 @@ ACCOUNT_WORDS: Final = ("p50_ms", "p99_ms", "max_ms", "duplicates", "missing", "
 
 
 class Cluster:
-    """The servers."""
-
     def __init__(self, folder: Path) -> None:
         self.ports = [free_port() for _ in range(SERVERS)]
         self.monitors = [free_port() for _ in range(SERVERS)]
@@ -55,12 +53,10 @@ class Cluster:
             time.sleep(0.2)
 
     def kill(self, at: int) -> None:
-        """With SIGKILL."""
         self.processes[at].send_signal(signal.SIGKILL)
         self.processes[at].wait(10)
 
     def close(self) -> None:
-        """End all."""
         for process in self.processes:
             if process.poll() is None:
                 process.kill()
@@ -68,7 +64,6 @@ class Cluster:
 
 
 def configuration(at: int, folder: Path, port: int, monitor: int, routes: Sequence[int]) -> str:
-    """The configuration of one server."""
     others = ", ".join(f'"nats://127.0.0.1:{route}"' for route in routes)
     return f"""server_name: n{at}
 listen: "127.0.0.1:{free_port()}"
@@ -89,7 +84,6 @@ def is_healthy(monitor: int) -> bool:
 
 
 def main() -> int:
-    """Run it."""
     parser = argparse.ArgumentParser(prog="make fleet-cluster")
     parser.add_argument("--gateways", type=int, default=200)
     parser.add_argument("--outputs", type=int, default=3, help="gateways that are the output mqtt")
@@ -116,8 +110,6 @@ def main() -> int:
 
 
 class Output:
-    """A gateway that is the output `mqtt` itself."""
-
     def __init__(self, spool: Path, ports: Sequence[int], name: str) -> None:
         self._spool = spool
         self.gateway = KilledGateway(ports, spool, 1, name=name, version="3.1.1")

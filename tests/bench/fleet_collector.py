@@ -37,12 +37,10 @@ class MeasuredStore:
         self._to = to
 
     def restore(self, ledger: FleetLedger) -> None:
-        """As the store behind does."""
         if self._to is not None:
             self._to.restore(ledger)
 
     def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
-        """Write, then count."""
         if self._to is not None:
             self._to.write(batches, accounts, offsets)
         now_ns = time_ns()
@@ -50,14 +48,11 @@ class MeasuredStore:
         self.delays_ms += [(now_ns - one.message.utc_ns) / NS_PER_MS for one in batches]
 
     def close(self) -> None:
-        """End."""
         if self._to is not None:
             self._to.close()
 
 
 class CollectorProcess:
-    """The process, seen from outside."""
-
     def __init__(self, ports: Sequence[int], *, version: str, to: str = "") -> None:
         words = [sys.executable, "-m", "tests.bench.fleet_collector", "--version", version, "--to", to]
         urls = [f"mqtt://127.0.0.1:{port}" for port in ports]
@@ -98,7 +93,6 @@ async def collect(urls: Sequence[str], version: str, to: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run the process."""
     parser = argparse.ArgumentParser()
     parser.add_argument("urls", nargs="+")
     parser.add_argument("--version", choices=VERSIONS, default=VERSIONS[0])

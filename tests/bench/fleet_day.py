@@ -39,7 +39,6 @@ NOW: Final = {"whole": "slots", "rate_hz": None, "batch_s": 1}
 
 
 def fill(folder: Path, hours: float, devices: int) -> tuple[int, int]:
-    """Write what so many hours make; return messages, and bytes of the spool."""
     spool = Spool(folder, SPOOL_BYTES, 1 << 62)
     spool.open()
     streams = [DeviceStreams(Gateway("default", "gw", "1"), f"d{one}", one, DeviceSending()) for one in range(devices)]
@@ -56,7 +55,6 @@ def fill(folder: Path, hours: float, devices: int) -> tuple[int, int]:
 
 
 def samples(device: int, begin_s: int, end_s: int) -> Iterator[Sample]:
-    """Samples of a time, numbered on from its begin."""
     for at in range(begin_s * RATE_HZ, end_s * RATE_HZ):
         t_ns = (at + 1) * NS_PER_S // RATE_HZ
         value = (at % 977) / 977
@@ -67,8 +65,6 @@ def samples(device: int, begin_s: int, end_s: int) -> Iterator[Sample]:
 
 
 class LiveData:
-    """Samples of the present, and how late their messages arrive."""
-
     def __init__(self, rate_hz: float) -> None:
         self.delays_s: list[float] = []
         """From the newest sample of a message to its arrival, in the order of arrivals, within the 20 ms of a look."""
@@ -76,7 +72,6 @@ class LiveData:
         self._rate_hz, self._begin_s, self._seq = rate_hz, monotonic(), 0
 
     def publish(self, gateway: LiveGateway) -> None:
-        """Give what has become due."""
         made = []
         while (self._seq + 1) / self._rate_hz < monotonic() - self._begin_s:
             self._seq += 1
@@ -95,13 +90,11 @@ class LiveData:
 
 
 def has_all(collector: Collector, devices: int, last: int) -> bool:
-    """Whether everything of the day has come."""
     newest = {key.device: one.newest for key, one in list(collector.ledger.counts.items()) if key.device != LIVE}
     return len(newest) == devices and all(one == last for one in newest.values())
 
 
 def replay(args: argparse.Namespace, spool: Path, port: int, messages: int) -> int:
-    """Send it all, print how long that took and the account; 1 where it does not close."""
     data = LiveData(args.live_hz or 1.0)
     collector = Collector(port)
     begin_s, last = monotonic(), round(args.hours * 3600) * RATE_HZ
@@ -144,7 +137,6 @@ def report(args: argparse.Namespace, collector: Collector, data: LiveData, messa
 
 
 def main() -> int:
-    """Run it."""
     parser = argparse.ArgumentParser(prog="make fleet-day")
     parser.add_argument("--hours", type=float, default=24.0)
     parser.add_argument("--devices", type=int, default=2)

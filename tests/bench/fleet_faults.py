@@ -39,8 +39,6 @@ SMALL_MB: Final = 1.0
 
 
 class Scene:
-    """A broker, a proxy before it, a collector at the broker, and a gateway that speaks through the proxy."""
-
     def __init__(
         self, folder: Path, *lines: str, spool_mb: float = 256.0, tls: bool = False, database: str = ""
     ) -> None:
@@ -67,7 +65,6 @@ class Scene:
         self.start_gateway()
 
     def _prepare(self, client: Any) -> None:
-        """Let the collector be held up."""
         take = client.on_message
 
         def slowly(*args: object) -> None:
@@ -78,7 +75,6 @@ class Scene:
         client.on_message = slowly
 
     def start_gateway(self) -> None:
-        """Start the gateway, with another boot."""
         self.epoch += 1
         self.gateway = KilledGateway(self.proxy.port, self.spool, self.epoch, self.spool_mb, self.authority)
 
@@ -95,14 +91,12 @@ class Scene:
         return monotonic() - begin
 
     def catch_up(self) -> float:
-        """Wait until the gateway is up to date."""
         took = self.watch(LIMIT_S, lambda waiting: waiting <= CAUGHT_UP)
         if took >= LIMIT_S:
             raise TimeoutError(f"still not up to date after {LIMIT_S:g} s")
         return took
 
     def close(self) -> None:
-        """End all of it."""
         self.gateway.kill()
         self.collector.close()
         if self.rows is not None:
@@ -232,8 +226,6 @@ FAULTS: Final[Mapping[str, tuple[Fault, str]]] = {
 
 
 class Result(NamedTuple):
-    """A line of the table, in samples."""
-
     numbered: int
     whole: int
     thinned: int
@@ -248,7 +240,6 @@ class Result(NamedTuple):
 
     @property
     def closes(self) -> bool:
-        """Whether every number is accounted for, and is in the database once."""
         came = self.whole + self.thinned + self.dropped + self.waiting
         return not self.missing and self.numbered == came and self.rows in (None, self.whole)
 
@@ -290,7 +281,6 @@ def last_numbers(spool: Path) -> int:
 
 
 def main() -> int:
-    """Play the faults that the command line names, or all."""
     parser = argparse.ArgumentParser(prog="make fleet-faults")
     parser.add_argument("faults", nargs="*", choices=[[], *FAULTS], metavar="FAULT", help=", ".join(FAULTS))
     parser.add_argument("--seconds", type=float, default=20.0, help="how long each fault lasts (default: %(default)g)")

@@ -34,8 +34,6 @@ INTERVALS: Final = 10
 
 
 class SimulatedGateway:
-    """A gateway: what it sends, and its connection."""
-
     def __init__(self, number: int, ports: Sequence[int], due_s: float) -> None:
         self.name = f"gw-{number}"
         self.client = MqttClient(self.name, ports, first=number)
@@ -43,7 +41,6 @@ class SimulatedGateway:
         self.seq = 0
 
     def second(self) -> None:
-        """Number and give what one second of both devices makes."""
         first, last = self.seq + 1, self.seq + SAMPLES
         self.seq = last
         for device in DEVICES:
@@ -81,8 +78,6 @@ def _interval(first: int, last: int) -> Interval:
 
 
 class GatewayFleet:
-    """All gateways, in this process."""
-
     def __init__(self, number: int, ports: Sequence[int]) -> None:
         begin_s = monotonic() + 5.0
         self.gateways = [SimulatedGateway(one, ports, begin_s + one / number) for one in range(number)]
@@ -106,7 +101,6 @@ class GatewayFleet:
                         self.clients.write(gateway.client)
 
     def drain(self) -> float:
-        """Wait until everything is acknowledged; return how long that took, s."""
         begin_s = monotonic()
         while self.waiting and monotonic() - begin_s < END_S:
             self.clients.round(0.02)
@@ -114,17 +108,14 @@ class GatewayFleet:
 
     @property
     def waiting(self) -> int:
-        """Messages without an acknowledgement."""
         return sum(len(one.client.waiting) for one in self.gateways)
 
     @property
     def numbered(self) -> int:
-        """Samples that have a number, of both devices."""
         return len(DEVICES) * sum(one.seq for one in self.gateways)
 
 
 def measure(number: int, seconds: float, *, to: str = "") -> Iterator[tuple[str, float, str]]:
-    """Figures of a fleet on one mosquitto."""
     with tempfile.TemporaryDirectory(prefix="imud-load-") as folder, running_broker(
         Path(folder) / "broker", "allow_anonymous true", "log_type error", "log_type information"
     ) as broker:  # fmt: skip
@@ -155,12 +146,10 @@ def measure(number: int, seconds: float, *, to: str = "") -> Iterator[tuple[str,
 
 
 def acknowledged_by(fleet: GatewayFleet) -> int:
-    """Messages that the broker has taken."""
     return sum(one.client.acknowledged for one in fleet.gateways)
 
 
 def main() -> int:
-    """Run one load, or the collector of one."""
     parser = argparse.ArgumentParser(prog="make fleet-load")
     parser.add_argument("--gateways", type=int, default=1000)
     parser.add_argument("--seconds", type=float, default=30.0)

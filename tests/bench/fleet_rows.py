@@ -23,12 +23,10 @@ class RowCollector:
         self.start()
 
     def start(self) -> None:
-        """Start it; it goes on with the session that the broker has kept."""
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(self._words, stdout=log, stderr=log)
 
     def end(self, number: int = signal.SIGTERM) -> None:
-        """End it; no-op where it does not run."""
         process, self._process = self._process, None
         if process is not None:
             process.send_signal(number)
@@ -42,7 +40,6 @@ class RowCollector:
         return found
 
     def missing(self) -> int:
-        """Samples that its ledger misses."""
         return self._number(
             "SELECT COALESCE(sum((account->'counts'->>'missing')::bigint), 0) FROM imud_ledger WHERE stream = 'samples'"
         )

@@ -46,7 +46,6 @@ def noisy_values() -> list[tuple[Vector3, Vector3]]:
 
 
 def hi91_frames(rate_hz: float) -> Callable[[int], bytes]:
-    """Frames of a HiPNUC module by number."""
     frame = template()
     head = binascii.crc_hqx(bytes(frame[:4]), 0)
     values = [
@@ -64,7 +63,6 @@ def hi91_frames(rate_hz: float) -> Callable[[int], bytes]:
 
 
 def ahrs_frames(rate_hz: float) -> Callable[[int], bytes]:
-    """Frames of an IMU61x by number."""
     values = noisy_values()
 
     def make(number: int) -> bytes:
@@ -81,8 +79,6 @@ FRAMES: Final = {"hipnuc-uart": hi91_frames, "imu61x-uart": ahrs_frames}
 
 
 class Player:
-    """One module."""
-
     def __init__(self, name: str, master: int) -> None:
         driver, _, rate = name.partition(":")
         self.taken = self.refused = 0
@@ -92,7 +88,6 @@ class Player:
         self._sent = self._refused_since = 0
 
     def send(self) -> None:
-        """The next frame."""
         data = self._make(self._sent)
         self._sent += 1
         try:
@@ -124,7 +119,6 @@ def play(players: list[Player], seconds: float) -> None:
 
 
 def main() -> None:
-    """Run as `python -m tests.bench.fleet_writer`."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--seconds", type=float, required=True)
     parser.add_argument("devices", nargs="+", metavar="DRIVER:HZ")

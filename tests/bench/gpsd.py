@@ -68,7 +68,6 @@ def gpsd_us(program: str, load: Load) -> float:
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
-    """CPU per sample of both, and the medians of the ratios of all rounds."""
     program = shutil.which("gpsd", path="/usr/sbin:/usr/local/sbin:/usr/bin")
     if program is None:
         print("# gpsd is not installed: `make bench-deps` installs it, as root", flush=True)

@@ -26,8 +26,6 @@ BEGIN_NS: Final = 1000 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Steering:
-    """How CLOCK_MONOTONIC is slewed: from so many seconds of a run on, so many ppm fast."""
-
     name: str
     changes: tuple[tuple[float, float], ...] = ()
 
@@ -64,7 +62,6 @@ class SteeredHost:
         self.clock = HostClock(self.monotonic_ns, lambda: self.monotonic_ns() + self.ahead_ns, lambda: self.now_ns)
 
     def monotonic_ns(self) -> int:
-        """CLOCK_MONOTONIC."""
         return self.steering.monotonic_ns(self.now_ns)
 
     def at(self, steady_ns: int) -> int:
@@ -74,20 +71,16 @@ class SteeredHost:
 
 
 class DatedArrival(NamedTuple):
-    """A sample beside its truth."""
-
     sample: Sample
     truth_ns: int
     """CLOCK_MONOTONIC at the measurement."""
 
     @property
     def point(self) -> Point:
-        """As the table of `clock` has it."""
         return Point(self.sample.t_ns - self.truth_ns, self.sample.t_err_ns, True, self.truth_ns)
 
 
 def clock_on(host: SteeredHost, model: ArrivalModel, *, unseen: bool = False) -> SampleClock:
-    """A clock as the pipeline would set it up for the model's link, on that host."""
     return SampleClock(
         "bench", tick_ns=TICK_NS, tick_modulus=TICK_MODULUS, byte_ns=model.byte_ns, hold_ns=model.profile.hold_ns,
         host=UNSTEERED if unseen else host.clock.steady,
@@ -95,7 +88,6 @@ def clock_on(host: SteeredHost, model: ArrivalModel, *, unseen: bool = False) ->
 
 
 def date(clock: SampleClock, host: SteeredHost, a: Arrival) -> DatedArrival:
-    """One message through the clock; the host's clocks are read when its decoding is done."""
     offset_ns = host.at(a.t_rx_ns + DECODE_NS)
     monotonic_ns = host.steering.monotonic_ns
     m = Measurement(a.size_bytes, a.trailing_bytes, a.dev_ns // TICK_NS % TICK_MODULUS)
@@ -103,7 +95,6 @@ def date(clock: SampleClock, host: SteeredHost, a: Arrival) -> DatedArrival:
 
 
 def run(model: ArrivalModel, steering: Steering, count: int, *, unseen: bool = False) -> list[DatedArrival]:
-    """The first samples of a model on a host that is steered."""
     host = SteeredHost(steering)
     host.at(model.begin_ns)
     clock = clock_on(host, model, unseen=unseen)
@@ -118,7 +109,6 @@ def rises(dated: Sequence[DatedArrival]) -> bool:
 
 
 def figures(profile: ArrivalProfile, rate_hz: int, steering: Steering, seconds: int, *, unseen: bool) -> Accuracy:
-    """One cell."""
     model = ArrivalModel(profile, rate_hz, 1, Crystal(50.0), BAUD_OF_RATE[rate_hz])
     dated = run(model, steering, rate_hz * seconds, unseen=unseen)
     assert rises(dated)
@@ -126,7 +116,6 @@ def figures(profile: ArrivalProfile, rate_hz: int, steering: Steering, seconds: 
 
 
 def print_table(*, unseen: bool) -> None:
-    """The table of docs/clock.md, as Markdown."""
     print(
         "| host's clock | arrival | rate, Hz | σ, µs | rms, µs | p99.9, µs | mean t_err, µs | in 2 t_err | settling |"
     )

@@ -23,7 +23,6 @@ started modules are found one after another, too."""
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
-    """Cost per sample with a latency, then how many devices one core serves."""
     seconds, rounds = (2.0, 1) if quick else (4.0, 5)
     for encoding in ("binary", "json"):
         yield from compare(encoding, seconds, rounds)
@@ -31,7 +30,6 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
 
 
 def compare(encoding: str, seconds: float, rounds: int) -> Iterator[Row]:
-    """Ten clients of one device at 1 kHz."""
     at_once = Load(clients=10, encoding=encoding, seconds=seconds)
     loads = {
         "bare loop": replace(at_once, bare=True),

@@ -27,8 +27,6 @@ STALL_NS = 200 * NS_PER_US
 
 @dataclass(frozen=True, slots=True)
 class LineFaults:
-    """What goes wrong; shares of 1."""
-
     pulse_loss: float = 0.0
     """Pulses of which nothing is seen."""
     edge_loss: float = 0.0
@@ -40,8 +38,6 @@ class LineFaults:
 
 
 class LineRead(NamedTuple):
-    """One read: what the line gave before it, then the messages."""
-
     edges: list[Edge]
     arrivals: list[Arrival]
     numbers: list[int]
@@ -56,7 +52,6 @@ def measured_ns(arrival: Arrival) -> int:
 
 
 def simulate_reads(arrivals: Iterable[Arrival], seed: int, faults: LineFaults) -> list[LineRead]:
-    """All reads of a run, with the edges that the kernel had by then."""
     random = Random(f"lines {seed}")
     all_of = list(arrivals)
     pulses = [(measured_ns(a), i) for i, a in enumerate(all_of)]

@@ -26,8 +26,6 @@ REFERENCE = UtcReference(UTC_OFFSET_NS, 20_000)
 
 
 class DatedSample(NamedTuple):
-    """One sample beside its truth."""
-
     sample: Sample
     truth_ns: int
     number: int
@@ -37,23 +35,19 @@ class DatedSample(NamedTuple):
 
     @property
     def off_ns(self) -> int:
-        """How much too late it is dated."""
         return self.sample.t_ns - self.truth_ns
 
 
 def measurement(a: Arrival, ticks: int | None = None, pps_age: int | None = None) -> Measurement:
-    """The message of an arrival."""
     ticks = (a.dev_ns // TICK_NS if ticks is None else ticks) % TICK_MODULUS
     return Measurement(a.size_bytes, a.trailing_bytes, ticks, pps_age_ms=pps_age)
 
 
 def begun_ns(model: ArrivalModel, a: Arrival) -> int:
-    """Arrival less the time on the wire."""
     return a.t_rx_ns - (a.size_bytes + a.trailing_bytes) * model.byte_ns
 
 
 def sout_clock(model: ArrivalModel, timing: SoutTiming | None = None) -> SampleClock:
-    """A clock of a device with SOUT."""
     return SampleClock(
         "bench", tick_ns=TICK_NS, tick_modulus=TICK_MODULUS, byte_ns=model.byte_ns, hold_ns=model.profile.hold_ns,
         sout=timing,
@@ -74,7 +68,6 @@ def with_sout(clock: SampleClock, reads: Sequence[LineRead], *, silent: range = 
 def run_sout(
     model: ArrivalModel, seconds: int, faults: LineFaults, timing: SoutTiming | None = None
 ) -> list[DatedSample]:
-    """A device with SOUT."""
     reads = simulate_reads(model.run(int(model.rate_hz) * seconds), model.seed, faults)
     return with_sout(sout_clock(model, timing), reads)
 
@@ -127,12 +120,10 @@ def run_triggers(model: ArrivalModel, seconds: int, answered: float) -> tuple[li
 
 
 def after(dated: Sequence[DatedSample], seconds: float) -> list[DatedSample]:
-    """Without the beginning."""
     return [t for t in dated if t.truth_ns - dated[0].truth_ns > seconds * NS_PER_S]
 
 
 def share_honest(dated: Sequence[DatedSample]) -> float:
-    """Of the samples, those within twice their stated error."""
     return sum(abs(t.off_ns) <= 2 * t.sample.t_err_ns for t in dated) / len(dated)
 
 
@@ -144,5 +135,4 @@ def steepest(dated: Sequence[DatedSample]) -> float:
 
 
 def syncs(dated: Sequence[DatedSample]) -> set[Sync]:
-    """All sources that occur."""
     return {t.sample.sync for t in dated}

@@ -22,8 +22,6 @@ FIONREAD = 0x541B
 
 
 class PipeLine:
-    """An output whose level nobody sees: an ioctl on a pipe."""
-
     title = "pipe"
 
     def __init__(self, ioctl: Callable[..., int]) -> None:
@@ -102,7 +100,6 @@ def _compute(stop: threading.Event) -> None:
 
 
 def rows(*, quick: bool = False) -> list[Row]:
-    """The figures."""
     seconds = 2.0 if quick else 10.0
     found = _reading(quick)
     for rate_hz in (100.0, 1000.0):

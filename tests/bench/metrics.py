@@ -59,14 +59,12 @@ async def stalls_ms(work: Callable[[], object], repeats: int) -> list[float]:
 
 
 def wall_ms(renderer: Renderer, shown: Snapshot) -> float:
-    """Time of one rendering with its pauses on an idle machine."""
     begin_ns = time.perf_counter_ns()
     renderer.render(shown, "")
     return (time.perf_counter_ns() - begin_ns) / 1e6
 
 
 def motion_slots() -> bytes:
-    """As many slots as are read of one device."""
     return b"".join(
         encode_slot(
             Sample("bow", n, n * NS_PER_MS, 1, Sync.ARRIVAL, 0, 0, accel_m_s2=(0.1 * (n % 7), 0.2, 9.8)), 0
@@ -86,14 +84,12 @@ def motion_ms(slots: bytes, repeats: int) -> float:
 
 
 def stall_rows(name: str, stalls: list[float], limit_ms: float | None = None) -> Iterator[Row]:
-    """The quietest run, which other programs disturbed least, and the median."""
     best, median = stalls[0], stalls[len(stalls) // 2]
     yield at_most(f"{name}, best run", best, "ms", limit_ms) if limit_ms else Row(f"{name}, best run", best, "ms")
     yield Row(f"{name}, median run", median, "ms")
 
 
 def rows(quick: bool = False) -> Iterator[Row]:
-    """Figures for 1 and 16 devices."""
     repeats = 10 if quick else 60
     yield from stall_rows(
         "metrics: loop stall without scrape", asyncio.run(stalls_ms(lambda: time.sleep(0.01), repeats))

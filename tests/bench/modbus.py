@@ -26,8 +26,6 @@ LIMIT_HZ = NS_PER_S / ((REQUEST_BYTES + REPLY_BYTES) * uart_byte_ns(BAUD) + 2 * 
 
 
 class Outcome(NamedTuple):
-    """What came of one run."""
-
     rates_hz: list[float]
     """Samples per second of each module that lives."""
     cpu_us_per_sample: float
@@ -72,7 +70,6 @@ def measured(seconds: float, alive: int, configured: int) -> Outcome:
 
 
 def rows(*, quick: bool = False) -> list[Row]:
-    """The figures."""
     seconds = 5.0 if quick else 20.0
     all_eight = measured(seconds, MODULES, MODULES)
     seven = measured(seconds, MODULES - 1, MODULES - 1)

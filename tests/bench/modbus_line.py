@@ -16,7 +16,6 @@ from imud.sim.simulator import SimulatorOptions
 
 
 def main() -> None:
-    """Play the line."""
     baud, *addresses = map(int, sys.argv[1:])
     now_ns = time.monotonic_ns()
     line = ModbusLine(now_ns, slaves_at(addresses, SimulatorOptions(baud=baud)), chunk_bytes=1)

@@ -36,25 +36,20 @@ Place = Callable[[Path], AbstractContextManager[int]]
 
 
 class Pair(NamedTuple):
-    """A measurement with the output, and those without it right before and after."""
-
     outcome: Outcome
     before: Outcome
     after: Outcome
 
     def ratio(self, part: str) -> float:
-        """Of a figure of `Outcome`, to the mean without the output."""
         without = (getattr(self.before, part) + getattr(self.after, part)) / 2
         return float(getattr(self.outcome, part) / without)
 
 
 def middle(outcomes: Sequence[Outcome], part: str) -> float:
-    """The median of a figure of `Outcome`."""
     return float(median(getattr(one, part) for one in outcomes))
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
-    """All figures."""
     if NO_MOSQUITTO:
         print(f"skipped: {NO_MOSQUITTO}")
         return
@@ -95,7 +90,6 @@ def wear_rows(seconds: float, brokers: Sequence[str]) -> Iterator[Row]:
 
 
 def run_with(place: Place, load: Load, sending: Mapping[str, object]) -> Outcome:
-    """One measurement with the output, whose spool is on a disk."""
     with tempfile.TemporaryDirectory(dir=".", prefix=".imud-bench-") as name, place(Path(name) / "broker") as port:
         settings = {
             "enabled": True, "brokers": [f"mqtt://127.0.0.1:{port}"], "gateway": "bench", "retry_max_s": 1,
@@ -106,14 +100,12 @@ def run_with(place: Place, load: Load, sending: Mapping[str, object]) -> Outcome
 
 @contextmanager
 def present(folder: Path) -> Iterator[int]:
-    """A broker that takes everything."""
     with running_broker(folder) as broker:
         yield broker.port
 
 
 @contextmanager
 def gone(_folder: Path) -> Iterator[int]:
-    """Nobody listens."""
     yield free_port()
 
 

@@ -45,7 +45,6 @@ class MqttClient:
         """Packet identifier of the newest message; those of a connection follow on each other."""
 
     def give(self, topic: str, payload: bytes) -> None:
-        """Have a message sent."""
         self.waiting.append((topic, payload))
 
 
@@ -77,7 +76,6 @@ class Clients:
                 self._look_after(client, now_s)
 
     def write(self, client: MqttClient) -> None:
-        """Write what the window has room for."""
         try:
             self._write(client)
         except OSError:
@@ -100,7 +98,6 @@ class Clients:
             self._selector.modify(client.socket, events, client)
 
     def close(self) -> None:
-        """Disconnect all."""
         for client in self.clients:
             if client.socket is not None:
                 with suppress(OSError):

@@ -50,7 +50,6 @@ class Stub:
         return bytes(PIPELINE_BYTES) + spi.encode_standard(accel_m_s2=(x, -x, 9.8), gyro_rad_s=(x, 0.0, -x))
 
     def ioctl(self, _fd: int, request: int, argument: bytes) -> int:
-        """One message; others go well."""
         if request == spi_link.WR_BITS_PER_WORD and argument[0] > 8:
             raise OSError(errno.EINVAL, "8-bit words only, as on a Raspberry Pi")
         if len(argument) < spi_link.ROW.size:
@@ -68,7 +67,6 @@ class Stub:
         return 0
 
     def make(self, settings: SpiSettings) -> SpiLink:
-        """A link on it, as the row of LINKS makes one."""
         return SpiLink(settings, ioctl=self.ioctl, open_node=lambda _path, _flags: 0, close_node=lambda _fd: None)
 
 
@@ -117,7 +115,6 @@ def _busy(milliseconds: float) -> float:
 
 
 def rows(*, quick: bool = False) -> list[Row]:
-    """The figures."""
     seconds = 3.0 if quick else 20.0
     found: list[Row] = []
     for name, wire_s, busy_ms, by_edges in (

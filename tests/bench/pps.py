@@ -8,7 +8,6 @@ PULSES = 500
 
 
 def row(late_ns: float) -> str:
-    """One line of the table."""
     receiver, errors, told = Receiver(50.0, late_ns), list[float](), list[int]()
     receiver.go(20)
     for _ in range(PULSES):

@@ -31,8 +31,6 @@ PARTS = 5
 
 
 class Seen:
-    """Samples of a client, gaps in `seq`, and times from the write into the pty to the receive."""
-
     def __init__(self, times: mmap.mmap | None = None, skip: int = 0) -> None:
         self.times = times
         self.skip = skip
@@ -55,7 +53,6 @@ Take = Callable[[bytearray, Seen, int], None]
 
 
 def take_binary(buffer: bytearray, seen: Seen, now_ns: int) -> None:
-    """Take length-prefixed messages."""
     at = 0
     while len(buffer) - at >= LENGTH.size:
         (length,) = LENGTH.unpack_from(buffer, at)
@@ -71,7 +68,6 @@ def take_binary(buffer: bytearray, seen: Seen, now_ns: int) -> None:
 
 
 def take_json(buffer: bytearray, seen: Seen, now_ns: int) -> None:
-    """Take lines."""
     end = buffer.rfind(b"\n") + 1
     for line in bytes(buffer[:end]).splitlines():
         params = msgspec.json.decode(line).get("params", {})
@@ -81,7 +77,6 @@ def take_json(buffer: bytearray, seen: Seen, now_ns: int) -> None:
 
 
 def take_attitudes(buffer: bytearray, seen: Seen, now_ns: int) -> None:
-    """Take lines of gpsd."""
     end = buffer.rfind(b"\n") + 1
     for _ in range(buffer.count(b'"class":"ATT"', 0, end)):
         seen.add("gpsd", seen.samples, 0.0, now_ns)
@@ -92,15 +87,12 @@ TAKES: dict[str, Take] = {"binary": take_binary, "json": take_json}
 
 
 class Client(NamedTuple):
-    """A connection that is subscribed."""
-
     socket: socket.socket
     buffer: bytearray
     """Received bytes that were not taken yet."""
 
 
 def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -> Client:
-    """Connect and ask for samples, as `wanted`."""
     sock = socket.socket(socket.AF_UNIX)
     sock.connect(path)
     if bare:
@@ -116,7 +108,6 @@ def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -
 
 
 def subscribe_to_gpsd(port: int) -> Client:
-    """Connect to gpsd and ask for all its reports."""
     sock = socket.create_connection(("127.0.0.1", port))
     sock.sendall(b'?WATCH={"enable":true,"json":true};\n')
     got = b""
@@ -157,7 +148,6 @@ def percentile(ordered: list[int], share: float) -> float:
 
 
 def figures(seen: list[Seen]) -> dict[str, float]:
-    """Return the figures of the clients that counted, and the latencies of the first."""
     ordered = sorted(seen[0].latencies_ns)
     shares = {"p50_us": 0.5, "p99_us": 0.99}
     found = {name: percentile(ordered, share) / 1e3 for name, share in shares.items()}
@@ -166,7 +156,6 @@ def figures(seen: list[Seen]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Run as `python -m tests.bench.readers`."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--socket", default="")
     parser.add_argument("--gpsd", type=int, metavar="PORT", help="clients of gpsd instead")

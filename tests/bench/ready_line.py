@@ -34,7 +34,6 @@ class PipeInput:
         self._on_edges: OnEdges | None = None
 
     def open(self) -> None:
-        """Edges come from now on."""
         command = (sys.executable, "-c", MAKE_EDGES, str(self._every_ns))
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE)
         assert self._process.stdout is not None
@@ -42,17 +41,14 @@ class PipeInput:
         os.set_blocking(self._fd, False)
 
     def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
-        """Deliver them."""
         assert watch
         self._on_edges = on_edges
         asyncio.get_running_loop().add_reader(self._fd, self.drain)
 
     def fileno(self) -> int:
-        """The pipe, on which something comes with each edge."""
         return self._fd
 
     def drain(self) -> None:
-        """Deliver what there is."""
         if self._on_edges is None:
             return
         try:
@@ -67,7 +63,6 @@ class PipeInput:
             self._on_edges(edges)
 
     def level(self) -> bool:
-        """A pulse is over as soon as it is seen."""
         return False
 
     def close(self) -> None:

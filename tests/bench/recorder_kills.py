@@ -33,7 +33,6 @@ SECONDS = 5
 
 
 def capture(file: Path) -> None:
-    """A module at 1 kHz; the daemon plays it again and again."""
     with file.open("wb") as out:
         writer = CaptureWriter(out, driver="hipnuc-uart", baud=921600)
         for number in range(RATE_HZ * SECONDS):
@@ -41,7 +40,6 @@ def capture(file: Path) -> None:
 
 
 def configured(folder: Path) -> Path:
-    """The configuration of the daemon."""
     file = folder / "imud.yaml"
     file.write_text(f"""
 state_dir: {folder / "state"}
@@ -56,7 +54,6 @@ devices:
 
 
 def new_files(folder: Path, before: set[Path], least_bytes: int) -> list[Path]:
-    """Files that have begun since, and have that size."""
     found = (one for one in (folder / "recordings").glob("*") if one not in before)
     return [one for one in found if one.stat().st_size >= least_bytes]
 
@@ -103,7 +100,6 @@ def look_at(file: Path, killed_ns: int) -> tuple[int, float]:
 
 
 def write_for_ever(file: Path) -> None:
-    """Give a writer numbered records, in a child that is killed."""
     queue = RecordQueue[Path]()
     writer = RecordingWriter(queue, time.monotonic_ns, BusThread)
     queue.mark(file)
@@ -143,7 +139,6 @@ def kill_writer(file: Path, after_s: float) -> tuple[int, bool]:
 
 
 def kill_writers(kills: int) -> None:
-    """Kill that many and print what was left."""
     random, left, cut = Random(2), 0, 0
     with tempfile.TemporaryDirectory() as name:
         for number in range(kills):
@@ -155,7 +150,6 @@ def kill_writers(kills: int) -> None:
 
 
 def main() -> int:
-    """Run as a program."""
     kill_writers(int(sys.argv[1]) if len(sys.argv) > 1 else 100)
     daemons = int(sys.argv[2]) if len(sys.argv) > 2 else 10
     if daemons:
@@ -164,7 +158,6 @@ def main() -> int:
 
 
 def kill_daemons(kills: int) -> None:
-    """Kill that many and print what was left."""
     random, samples, missing = Random(1), 0, list[float]()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

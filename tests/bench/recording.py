@@ -37,14 +37,12 @@ HI91_1_KHZ = Source("hipnuc-uart", 1000, lambda: hi91_module(1000))
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
-    """All figures."""
     yield from size_rows()
     yield from cpu_rows(rounds=1 if quick else 3, seconds=2.0 if quick else 6.0)
     yield from replay_rows(REPLAY_QUICK_SECONDS)
 
 
 def chosen_rows(words: list[str]) -> Iterator[Row]:
-    """Those that the command line names."""
     quick = "--quick" in words
     if not {"size", "cpu", "replay"} & set(words):
         yield from rows(quick=quick)
@@ -78,7 +76,6 @@ def size_rows() -> Iterator[Row]:
 
 
 def cpu_rows(rounds: int, seconds: float) -> Iterator[Row]:
-    """CPU of the daemon per sample at 1 kHz with a client, with and without recording."""
     with tempfile.TemporaryDirectory() as folder:
         without = Load(seconds=seconds)
         pairs = [(run(without), run(replace(without, record_to=str(Path(folder))))) for _ in range(rounds)]
@@ -99,7 +96,6 @@ class Digest:
         self.sha256 = hashlib.sha256()
 
     def publish(self, batch: Batch) -> None:
-        """Count and hash."""
         self.count += len(batch.samples)
         for sample in batch.samples:
             self.sha256.update(msgspec.msgpack.encode(sample))

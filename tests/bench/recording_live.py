@@ -74,7 +74,6 @@ class Receiver:
 
 @contextmanager
 def module(port: Path) -> Iterator[None]:
-    """A simulated module that moves, with noise."""
     argv = [sys.executable, "-m", "imud.sim", "--rate", str(RATE_HZ), "--baud", "921600", "--path", str(port)]
     with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -120,7 +119,6 @@ def differing(file: Path, slots: Path) -> tuple[Player, int]:
 
 
 def live_rows(seconds: float = SECONDS) -> Iterator[Row]:
-    """Record a live device, replay, and compare."""
     name = f"{seconds:g} s live at 1 kHz"
     with tempfile.TemporaryDirectory(prefix="imud-bench-") as made:
         folder = Path(made)

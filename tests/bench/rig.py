@@ -29,8 +29,6 @@ wake late."""
 
 @dataclass(frozen=True)
 class Load:
-    """What to run."""
-
     devices: int = 1
     clients: int = 1
     encoding: str = "binary"
@@ -58,14 +56,11 @@ class Load:
 
     @property
     def frames(self) -> int:
-        """Frames per device."""
         return int((self.warm_s + self.seconds) * self.rate_hz)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of it."""
-
     cpu_us_per_sample: float
     loop_us_per_sample: float
     """Of that, the thread of the event loop."""
@@ -92,8 +87,6 @@ class Outcome:
 
 
 class Process:
-    """A child that speaks in lines."""
-
     def __init__(self, cores: set[int], *argv: str) -> None:
         self.popen = subprocess.Popen(
             [sys.executable, *argv],
@@ -105,7 +98,6 @@ class Process:
         os.sched_setaffinity(self.popen.pid, cores)
 
     def line(self) -> str:
-        """The next line it prints."""
         assert self.popen.stdout is not None
         text = self.popen.stdout.readline()
         if not text:
@@ -113,7 +105,6 @@ class Process:
         return text.strip()
 
     def say(self, text: str) -> None:
-        """One line to it."""
         assert self.popen.stdin is not None
         self.popen.stdin.write(text + "\n")
         self.popen.stdin.flush()
@@ -127,7 +118,6 @@ class Process:
 
 
 def cpu_ns(pid: int) -> int:
-    """CPU time of all threads of a process so far, by the scheduler's own account."""
     total = 0
     for task in Path(f"/proc/{pid}/task").iterdir():
         total += int((task / "schedstat").read_text().split()[0])
@@ -135,7 +125,6 @@ def cpu_ns(pid: int) -> int:
 
 
 def loop_ns(pid: int) -> int:
-    """CPU time of the main thread of a process so far."""
     return int(Path(f"/proc/{pid}/task/{pid}/schedstat").read_text().split()[0])
 
 
@@ -146,12 +135,10 @@ def written_bytes(pid: int) -> int:
 
 
 def rss_mb(pid: int) -> float:
-    """Resident memory of a process in MB (10⁶ bytes)."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
 
 
 def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
-    """An imud configuration for these ports."""
     devices = {
         f"d{i}": {
             "driver": "hipnuc-uart",
@@ -179,7 +166,6 @@ def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
 
 
 def wait_for(path: Path) -> None:
-    """Wait until a file is there."""
     end = monotonic() + START_LIMIT_S
     while not path.exists():
         if monotonic() > end:
@@ -188,7 +174,6 @@ def wait_for(path: Path) -> None:
 
 
 def start_server(stack: ExitStack, folder: Path, ports: Sequence[str], load: Load) -> Process:
-    """The daemon or the bare loop, ready for clients."""
     path = folder / "s"
     if load.bare:
         args = [str(path), load.encoding, str(load.latency_ms or 0.0), *ports]
@@ -217,7 +202,6 @@ def start_writer(stack: ExitStack, folder: Path, load: Load, *options: str, core
 
 
 def start_readers(stack: ExitStack, folder: Path, load: Load, cores: set[int] = REST_CORES) -> Process:
-    """The client process, subscribed."""
     args = ["--socket", str(folder / "s"), "--clients", str(load.clients), "--encoding", load.encoding]
     args += ["--times", str(folder / "times"), "--frames", str(load.frames)]
     args += ["--skip", str(int(load.warm_s * load.rate_hz))]
@@ -230,8 +214,6 @@ def start_readers(stack: ExitStack, folder: Path, load: Load, cores: set[int] = 
 
 
 class Used(NamedTuple):
-    """What a process used within a time."""
-
     cpu_ns: int
     loop_ns: int
     written_bytes: int
@@ -254,7 +236,6 @@ def measure_cpu(load: Load, writer: Process, pid: int) -> Used:
 
 
 def run(load: Load) -> Outcome:
-    """One measurement from start to end."""
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as name, ExitStack() as stack:
         folder = Path(name)
         if load.sout:
@@ -288,6 +269,5 @@ def run(load: Load) -> Outcome:
 
 
 def ask(path: Path) -> list[DeviceStatus]:
-    """The daemon's own account."""
     with Client(str(path)) as client:
         return statuses(client)

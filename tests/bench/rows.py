@@ -13,16 +13,13 @@ class Row(NamedTuple):
     reached: bool | None = None
 
     def __str__(self) -> str:
-        """Return the line of the printed table."""
         mark = {True: "reached", False: "NOT REACHED", None: ""}[self.reached]
         return f"{self.name:64} {self.value:12.3f} {self.unit:12} {self.reach:10} {mark}".rstrip()
 
 
 def at_most(name: str, value: float, unit: str, limit: float) -> Row:
-    """A figure that should not exceed `limit`."""
     return Row(name, value, unit, f"<= {limit:g}", value <= limit)
 
 
 def at_least(name: str, value: float, unit: str, limit: float) -> Row:
-    """A figure that should not fall below `limit`."""
     return Row(name, value, unit, f">= {limit:g}", value >= limit)

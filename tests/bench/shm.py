@@ -41,7 +41,6 @@ int main(int argc, char **argv)
 
 
 def samples() -> Iterator[Sample]:
-    """Samples as a HI91 stream makes them."""
     for seq in range(1, SAMPLES + 1):
         t_ns = seq * 1_000_000
         yield Sample(

@@ -67,21 +67,17 @@ LOST_TOLERANCE: Final = 1
 
 @dataclass(frozen=True)
 class Fleet:
-    """The devices of a run."""
-
     written: tuple[str, ...]
     """Names of those behind ptys that `fleet_writer` plays."""
     configuration: Path
 
 
 def written_devices() -> tuple[str, ...]:
-    """DRIVER:HZ of each pty."""
     rates = [rate for rate, count in RATES for _ in range(count)]
     return tuple(f"{('hipnuc-uart', 'imu61x-uart')[n % 2]}:{rate:g}" for n, rate in enumerate(rates))
 
 
 def write_capture(path: Path, seconds: float) -> None:
-    """A capture of a HiPNUC module for so long."""
     make = hi91_frames(REPLAY_HZ)
     with path.open("wb") as file:
         capture = CaptureWriter(file, driver="hipnuc-uart", baud=921600)
@@ -90,7 +86,6 @@ def write_capture(path: Path, seconds: float) -> None:
 
 
 def write_configuration(folder: Path, ports: list[str], line: str, port: int) -> Fleet:
-    """The configuration of everything below `folder`; `line` is the port of the Modbus modules."""
     written = written_devices()
     devices: dict[str, Any] = {
         f"{name.partition(':')[0]}-{n}": {
@@ -121,8 +116,6 @@ def write_configuration(folder: Path, ports: list[str], line: str, port: int) ->
 
 
 class Watched:
-    """The daemon's figures while it runs."""
-
     def __init__(self, pid: int, socket: Path, metrics_port: int) -> None:
         self.points: list[tuple[float, float]] = []
         """Seconds, and resident anonymous memory in MB, at every scrape."""
@@ -135,7 +128,6 @@ class Watched:
         self._cpu_ns, self._samples = cpu_ns(pid), 0
 
     def scrape(self, elapsed_s: float) -> None:
-        """One scrape, as a monitoring system does it."""
         proc = Path(f"/proc/{self._pid}")
         self.usage.append((len(os.listdir(proc / "fd")), len(os.listdir(proc / "task"))))
         begin = monotonic()
@@ -149,7 +141,6 @@ class Watched:
         self.points.append((elapsed_s, anonymous_mb))
 
     def minute(self, elapsed_s: float, over_s: float) -> None:
-        """Print the figures of the last minute, or of what there was of it."""
         try:
             statuses, dropped = ask_all(self._socket)
         except TimeoutError:  # what counts is asked at the end, however busy the machine was meanwhile
@@ -178,7 +169,6 @@ def resident_mb(pid: int) -> tuple[float, float]:
 
 
 def ask_all(path: Path) -> tuple[dict[str, DeviceStatus], int]:
-    """Every device's state, and how many samples clients dropped."""
     with Client(path, timeout_s=START_LIMIT_S) as client:
         status = client.status()
     devices = msgspec.convert(status["devices"], list[DeviceStatus])
@@ -188,7 +178,6 @@ def ask_all(path: Path) -> tuple[dict[str, DeviceStatus], int]:
 def judge(
     fleet: Fleet, counts: list[tuple[int, int]], statuses: Mapping[str, DeviceStatus], dropped: int, gaps: int
 ) -> list[str]:
-    """What is wrong with the ledgers."""
     found = []
     for name, (taken, refused) in zip(fleet.written, counts, strict=True):
         ledger = statuses[name].ledger
@@ -208,7 +197,6 @@ def judge(
 
 
 def start_line(stack: ExitStack) -> Process:
-    """The Modbus modules, which print their port."""
     addresses = ",".join(map(str, range(1, MODULES + 1)))
     argv = ["--device", "hipnuc-modbus", "--message", addresses, "--baud", str(MODULE_BAUD), "--seed", str(LINE_SEED)]
     return stack.enter_context(Process(REST_CORES, "-m", "imud.sim", *argv))
@@ -216,8 +204,6 @@ def start_line(stack: ExitStack) -> Process:
 
 @dataclass(frozen=True)
 class LineState:
-    """What imud says of the Modbus modules, and what they say."""
-
     asked_s: float
     """CLOCK_MONOTONIC before …"""
     answered_s: float
@@ -230,7 +216,6 @@ class LineState:
 
 
 def ask_line(path: Path, line: Process) -> LineState:
-    """The state now."""
     asked_s, statuses, answered_s = monotonic(), ask_all(path)[0], monotonic()
     modules = {name: status for name, status in statuses.items() if name.startswith("modbus")}
     failed = {name: status.polling.failed if status.polling else 0 for name, status in modules.items()}
@@ -348,7 +333,6 @@ def run_fleet(seconds: float, metrics_port: int) -> int:
 
 
 def wait_open(path: Path, fleet: Fleet) -> None:
-    """Wait until every pty is open and every module of the line was found. Raises TimeoutError."""
     end = monotonic() + START_LIMIT_S
     while True:
         states = {name: status.state for name, status in ask_all(path)[0].items()}
@@ -361,7 +345,6 @@ def wait_open(path: Path, fleet: Fleet) -> None:
 
 
 def main() -> int:
-    """Run as `python -m tests.bench.soak --seconds 3600`."""
     parser = argparse.ArgumentParser(prog="make soak")
     parser.add_argument("--seconds", type=float, help="how long (3600; with --single 600)")
     parser.add_argument("--metrics-port", type=int, default=19399, help="for the scrapes (%(default)d)")

@@ -29,14 +29,11 @@ CLOSE_LIMIT_S: Final = 20.0
 
 
 def settings(directory: Path) -> dict[str, object]:
-    """The recorder's part of the configuration."""
     return {"enabled": True, "directory": str(directory), "file_mb": FILE_MB, "keep_gb": KEEP_MB / 1000}
 
 
 @dataclass
 class Count:
-    """What is in one file, or in several."""
-
     records: int = 0
     lost: int = 0
     bytes: int = 0
@@ -44,8 +41,6 @@ class Count:
 
 @dataclass
 class Recordings:
-    """Reader of all files of a recorder."""
-
     directory: Path
     problems: list[str] = field(default_factory=list)
     """What is wrong with files."""
@@ -147,7 +142,6 @@ def _compare(counts: list[Count], before: Mapping[str, int], after: Mapping[str,
 
 
 def count_of(file: BinaryIO, name: str) -> tuple[Count, list[str]]:
-    """What is in a file, and what is wrong with it."""
     count, reader = Count(), RecordingReader(file, name)
     try:
         for record in reader:
@@ -161,7 +155,6 @@ def count_of(file: BinaryIO, name: str) -> tuple[Count, list[str]]:
 
 
 def recorder_metrics(port: int) -> dict[str, int]:
-    """The recorder's metrics, by the part of their names that tells them apart."""
     with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=SCRAPE_LIMIT_S) as answer:
         lines = answer.read().decode().splitlines()
     found = {}

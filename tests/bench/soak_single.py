@@ -21,7 +21,6 @@ def slope_mb_per_h(points: list[tuple[float, float]]) -> float:
 
 
 def run_single(seconds: float, encoding: str) -> int:
-    """Run for so long; 0 when nothing was lost and memory stayed flat."""
     load = Load(clients=10, seconds=seconds, encoding=encoding, stuck=True)
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-soak-") as name, ExitStack() as stack:
         folder = Path(name)

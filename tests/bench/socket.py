@@ -29,7 +29,6 @@ OWN_LIMIT_NS = 300.0
 
 
 def make_batch(seq: int) -> Batch:
-    """One sample with the values of a whole HI91 message."""
     t_ns = 80_000_000_000_000 + seq * 1_000_000
     sample = Sample(
         "imu0", seq, t_ns, 11_873, Sync.REGRESSION, t_ns + 913_201, 1_790_000_000_000_000_000 + t_ns,
@@ -114,7 +113,6 @@ async def measure(directory: str, clients: int, encoding: str, rate_hz: float, r
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """All figures."""
     found: list[Row] = []
     with tempfile.TemporaryDirectory() as directory:
         for encoding in ("json", "binary"):

@@ -18,8 +18,6 @@ from imud.signals.gpio import GpioInput, GpioOutput
 
 
 class FifoInput(GpioInput):
-    """An input whose events somebody writes into a FIFO."""
-
     path = ""
 
     def __init__(self, settings: InputSettings, purpose: str, rising_only: bool = False) -> None:
@@ -38,7 +36,6 @@ class FifoInput(GpioInput):
 
 
 def main() -> None:
-    """Run until SIGTERM."""
     file = Path(sys.argv[1])
     FifoInput.path = str(file.parent / "edges")
     settings = config.load(file)

@@ -57,7 +57,6 @@ def _children_cpu_ms() -> float:
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
-    """The rows of `make bench`; ten starts each in the short form too: they take seconds."""
     yield from start_rows("the interpreter alone", "-c", "pass")
     yield from start_rows("import imud", "-c", "import imud")
     yield from start_rows("imud --help", "-m", "imud", "--help")

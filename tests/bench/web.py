@@ -69,13 +69,11 @@ async def share(url: str, browsers: int, pids: Sequence[int], seconds: float) ->
 
 
 def end(process: subprocess.Popen[str]) -> None:
-    """Stop a child, and take what it still prints."""
     process.terminate()
     process.communicate()
 
 
 def start(stack: ExitStack, folder: Path) -> tuple[RunningDaemon, str, int]:
-    """Start simulator, daemon and `imud web`; the address and the process of the last."""
     port = str(folder / "port")
     simulator = [sys.executable, "-m", "imud.sim", "--path", port, "--rate", str(RATE_HZ)]
     module = stack.enter_context(subprocess.Popen(simulator, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
@@ -94,7 +92,6 @@ def start(stack: ExitStack, folder: Path) -> tuple[RunningDaemon, str, int]:
 
 
 def rows(*, quick: bool) -> Iterator[Row]:
-    """Every figure in its order."""
     seconds = QUICK_SECONDS if quick else SECONDS
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-bench-")))

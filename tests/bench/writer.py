@@ -65,7 +65,6 @@ def template() -> bytearray:
 
 
 def hi91_frames(rate_hz: float) -> MakeFrame:
-    """Return what makes frame i."""
     frame = template()
     crc, pack = binascii.crc_hqx, struct.pack_into
     head = crc(bytes(frame[:4]), 0)
@@ -133,13 +132,11 @@ def _takes(master: int, frame: bytes | bytearray) -> bool:
 
 
 def mapped(path: str, size_bytes: int) -> mmap.mmap:
-    """A file of that size that others read."""
     with open(path, "r+b") as file:
         return mmap.mmap(file.fileno(), size_bytes)
 
 
 def main() -> None:
-    """Run as `python -m tests.bench.writer`."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--devices", type=int, default=1)
     parser.add_argument("--rate", type=float, default=1000.0)

@@ -15,15 +15,11 @@ from tests.support.daemon_process import LIMIT_S
 
 
 class Printed(NamedTuple):
-    """The output of a command."""
-
     out: str
     err: str
 
 
 class Cli:
-    """Runs `imud` in this process."""
-
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         self._capsys = capsys
 
@@ -50,8 +46,6 @@ def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
 
 
 class ImudProcess:
-    """A running `imud` with its output in pipes."""
-
     def __init__(self, process: "subprocess.Popen[str]") -> None:
         assert process.stderr is not None
         self.process = process
@@ -69,7 +63,6 @@ class ImudProcess:
 
 @contextmanager
 def imud_process(*words: object, python: tuple[str, ...] = (), **options: Any) -> Iterator[ImudProcess]:
-    """Start `imud` as a process; kill it at the end if it still runs."""
     argv = [sys.executable, *python, "-m", "imud", *map(str, words)]
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
     with subprocess.Popen(argv, text=True, **options) as process:

@@ -63,7 +63,6 @@ def modules() -> Iterator[dict[str, dict[str, object]]]:
 
 
 def renamed(words: str, devices: dict[str, dict[str, object]]) -> str:
-    """With the ports of a gateway in place of those of this run."""
     for name, device in devices.items():
         port = msgspec.convert(device["uart"], dict[str, str | int])["port"]
         words = words.replace(str(port), MODULES[name][1])
@@ -71,7 +70,6 @@ def renamed(words: str, devices: dict[str, dict[str, object]]) -> str:
 
 
 async def screens(daemon: RunningDaemon) -> tuple[str, str]:
-    """Both screens of `imud top`, after it has looked for a while."""
     app = TopApp(lambda on_news: TopFeed(str(daemon.socket), on_news))
     async with app.run_test(size=SIZE) as pilot:
         await pilot.pause(RUN_S / 2)
@@ -120,8 +118,6 @@ HIT_M_S2, DECAY_S, RING_RAD_S = 75.0, 0.4, 70.0
 
 @dataclass
 class Flight:
-    """What came of the run; times are CLOCK_MONOTONIC."""
-
     sent: list[Sample] = field(default_factory=list)
     saved: list[Sample] = field(default_factory=list)
     begins_ns: list[int] = field(default_factory=list)
@@ -179,7 +175,6 @@ def flight() -> Flight:
 
 
 def read_snapshot(file: Path, found: Flight) -> None:
-    """Replay it; a segment begins where the state of the device is written."""
     segment_begins = False
 
     def publish(batch: Batch) -> None:
@@ -198,8 +193,6 @@ def read_snapshot(file: Path, found: Flight) -> None:
 
 @dataclass(frozen=True)
 class Scale:
-    """Seconds from the hit, and m/s², on the page."""
-
     zero_ns: int
     left: float = 56.0
     width: float = 680.0

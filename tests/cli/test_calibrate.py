@@ -68,8 +68,6 @@ def test_a_module_on_rs485_is_levelled(tmp_path: Path, cli: Cli) -> None:
 
 
 class Asked:
-    """A daemon whose device is calibrated until `events` end."""
-
     stopped = False
     verified = True
     interrupts = False

@@ -41,8 +41,6 @@ _HEADINGS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What came of one target."""
-
     target: str
     engine: str
     executions: int
@@ -55,7 +53,6 @@ class Result:
     """Whether the process ended with an error."""
 
     def __str__(self) -> str:
-        """One line of the table."""
         per_s = self.executions / self.seconds if self.seconds else 0
         found = ", ".join(map(str, self.findings)) or (f"FAILED, see {_log(self.target)}" if self.failed else "none")
         return (
@@ -137,7 +134,6 @@ def plan(wanted: Sequence[str], engine: str) -> list[tuple[str, str]]:
 
 
 def replay(path: Path, wanted: Sequence[str]) -> int:
-    """Run one input through every target that is wanted."""
     for name in all_names():
         if any(part in name for part in wanted):
             print(f"{name}: {path}", flush=True)
@@ -146,7 +142,6 @@ def replay(path: Path, wanted: Sequence[str]) -> int:
 
 
 def main() -> int:
-    """Run as `python -m tests.fuzz`."""
     parser = argparse.ArgumentParser(prog="make fuzz")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="for each target (default %(default)s)")
     parser.add_argument("--target", action="append", default=[], help="part of a target's name; may be given again")

@@ -60,18 +60,14 @@ CALLS: Final = len(USES)
 
 
 def names() -> Sequence[str]:
-    """The one target."""
     return ["answers"]
 
 
 def make(_name: str) -> Target:
-    """The blocking client, and the calls of `imud web`."""
     return Target(run, seeds, words=words)
 
 
 class _Daemon:
-    """Sends an input to a client, and ends its side."""
-
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="imud-fuzz-")
         self.path = str(Path(self._folder.name) / "s")
@@ -152,7 +148,6 @@ def seeds() -> list[bytes]:
 
 
 def words() -> list[bytes]:
-    """Names of members and methods."""
     own = ["jsonrpc", "2.0", "id", "method", "params", "result", "error", "code", "message", "devices", "samples"]
     own += ["sample", "device", "device_id", "dropped", "event", "hello", "seconds", "records_dropped", "kind"]
     return [f'"{word}"'.encode() for word in own]

@@ -19,7 +19,6 @@ SETTINGS: Final = (MqttSettings(site="site", version="3.1.1"), MqttSettings(site
 
 
 def names() -> Sequence[str]:
-    """The one target."""
     return ["broker"]
 
 

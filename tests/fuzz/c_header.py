@@ -40,7 +40,6 @@ def is_needed() -> bool:
 
 
 def command(seconds: float, seed: int, folder: Path, grown: Path, inputs: Sequence[str]) -> list[str]:
-    """The command that fuzzes."""
     options = libfuzzer_options(seconds, seed, folder, inputs)
     return [
         str(folder.parent / _PROGRAM), f"-max_len={INPUT_BYTES_MAX}", f"-timeout={INPUT_S_MAX}", *options, str(grown),

@@ -23,12 +23,10 @@ EXTENDED_BIT = 1 << 31
 
 
 def names() -> Sequence[str]:
-    """The CAN drivers."""
     return names_of(CanDriver)
 
 
 def make(name: str) -> Target:
-    """The codec of one driver."""
     driver = row(name, CanDriver)
     choices = variants(driver.settings)
     own = own_identifiers(driver)

@@ -32,12 +32,10 @@ ACTIONS: Final = DRIVERS["hipnuc-uart"].actions
 
 
 def names() -> Sequence[str]:
-    """The one target."""
     return ["request"]
 
 
 def make(_name: str) -> Target:
-    """The channel with all that it takes apart."""
     return Target(run, seeds, words=words)
 
 
@@ -124,6 +122,5 @@ def seeds() -> list[bytes]:
 
 
 def words() -> list[bytes]:
-    """Names of members and actions."""
     own = ["v", "id", "action", "arguments", "issued_utc_ns", *ACTIONS]
     return [TOPIC.encode(), OWN.encode(), SEPARATOR, str(UTC_NS + AGE_NS).encode(), *(f'"{w}"'.encode() for w in own)]

@@ -22,12 +22,10 @@ _CONTROL: Final = re.compile(r"\\x[0189][0-9a-f]|\\x7f|\\[nrt]|\\u202[89]")
 
 
 def names() -> Sequence[str]:
-    """The one target."""
     return ["yaml"]
 
 
 def make(_name: str) -> Target:
-    """`parse`, which `load` gives the bytes of a file to."""
     return Target(run, seeds, words=words, bytes_max=16384)
 
 
@@ -64,7 +62,6 @@ def seeds() -> list[bytes]:
 
 
 def words() -> list[bytes]:
-    """Every word of the shipped file that could be a key or a value."""
     text = re.sub(r"^ *# .*", "", (ROOT / "etc/imud.yaml").read_text(), flags=re.MULTILINE)
     return sorted({word.encode() for word in re.findall(r"[a-z_0-9/.-]{2,24}:?", text)})
 

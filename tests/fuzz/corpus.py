@@ -19,7 +19,6 @@ def folder_of(target: str) -> Path:
 
 
 def inputs_of(target: str) -> list[Path]:
-    """The inputs of a target."""
     return sorted(folder_of(target).glob("*"))
 
 

@@ -18,12 +18,10 @@ EXAMPLES: Final = 12
 
 
 def names_of(kind: type[Driver]) -> list[str]:
-    """Names of the drivers of one kind."""
     return [driver.name for driver in of_kind(devices.DRIVERS.values(), kind)]
 
 
 def row(name: str, kind: type[D]) -> D:
-    """The row of a driver."""
     driver = devices.DRIVERS[name]
     assert isinstance(driver, kind)
     return driver

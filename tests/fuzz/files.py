@@ -36,7 +36,6 @@ class ShortReads(io.RawIOBase):
         self._random = random
 
     def readable(self) -> bool:
-        """Yes."""
         return True
 
     def readinto(self, buffer: bytearray) -> int:  # type: ignore[override]  # any writable buffer
@@ -48,12 +47,10 @@ class ShortReads(io.RawIOBase):
 
 
 def names() -> Sequence[str]:
-    """The formats."""
     return ["capture", "candump", "recording"]
 
 
 def make(name: str) -> Target:
-    """The reader of one format."""
     if name == "capture":
         return Target(run_capture, capture_seeds, words=lambda: [MAGIC, b"driver=", b"baud=", b"hold_ns=", b"1 "])
     if name == "recording":

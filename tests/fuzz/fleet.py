@@ -35,12 +35,10 @@ SEVERAL: Final = b"\2"
 
 
 def names() -> Sequence[str]:
-    """Of a message, and of its topic."""
     return ["message", "topic"]
 
 
 def make(name: str) -> Target:
-    """What a reader does with a message, or with its topic."""
     if name == "topic":
         return Target(run_topic, topic_seeds)
     return Target(run_message, message_seeds)

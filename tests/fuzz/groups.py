@@ -26,16 +26,13 @@ GROUPS: Final = {
 
 
 def group(name: str) -> TargetGroup:
-    """The module of a group."""
     return cast(TargetGroup, import_module(GROUPS[name]))
 
 
 def all_names() -> list[str]:
-    """Every target that runs in Python, as `group/name`."""
     return [f"{kind}/{name}" for kind in GROUPS for name in group(kind).names()]
 
 
 def load(name: str) -> Target:
-    """The target `group/name`."""
     kind, _, rest = name.partition("/")
     return group(kind).make(rest)

@@ -22,12 +22,10 @@ TRANSFERS_MAX = 20
 
 
 def names() -> Sequence[str]:
-    """The polled drivers."""
     return names_of(PolledDriver)
 
 
 def make(name: str) -> Target:
-    """The codec of one driver and its conversations."""
     driver = row(name, PolledDriver)
     choices = variants(driver.settings)
 

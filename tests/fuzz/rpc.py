@@ -37,12 +37,10 @@ ACTIONS: Final = DRIVERS["hipnuc-uart"].actions
 
 
 def names() -> Sequence[str]:
-    """A line, and a connection."""
     return ["line", "connection"]
 
 
 def make(name: str) -> Target:
-    """The target of that name."""
     return Target({"line": run_line, "connection": run_connection}[name], seeds, words=words, bytes_max=8192)
 
 
@@ -193,7 +191,6 @@ def seeds() -> list[bytes]:
 
 
 def words() -> list[bytes]:
-    """Names of members, methods, devices, fields and actions."""
     own = ["jsonrpc", "2.0", "id", "method", "params", "devices", "fields", "rate_hz", "encoding", "binary", "json"]
     known = [*own, "enable", "device", "name", "arguments", *METHODS, *DEVICES, *SAMPLE_FIELDS, *ACTIONS]
     return [json.dumps(word).encode() for word in known]

@@ -20,7 +20,6 @@ TYPES: Final = ("text/plain", "application/openmetrics-text", "application/vnd.g
 
 
 def names() -> Sequence[str]:
-    """The one target."""
     return ["request"]
 
 
@@ -122,7 +121,6 @@ def seeds() -> list[bytes]:
 
 
 def words() -> list[bytes]:
-    """Words of requests."""
     media = [b"application/openmetrics-text", b"text/plain", b";version=1.0.0", b";escaping=allow-utf-8", b";q=0.5"]
     return [
         b"GET ",

@@ -27,7 +27,6 @@ Script = Callable[[], RequestScript[Any]]
 
 
 def names() -> Sequence[str]:
-    """The stream and CAN drivers that ask anything."""
     drivers = [*names_of(StreamDriver), *names_of(CanDriver)]
     return [name for name in drivers if any(map(_asks, _scripts(row(name, Driver))))]
 
@@ -37,7 +36,6 @@ def _asks(begin: Script) -> bool:
 
 
 def make(name: str) -> Target:
-    """The scripts of one driver."""
     driver = row(name, Driver)
     messages = _stream_messages(driver) if isinstance(driver, StreamDriver) else _can_messages(row(name, CanDriver))
     scripts = _scripts(driver)

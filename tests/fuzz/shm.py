@@ -51,12 +51,10 @@ READ, LATEST, LEDGER, HEALTH, WRITE, MEND_SLOT, MEND_LEDGER, REPLACE = range(8)
 
 
 def names() -> Sequence[str]:
-    """A slot, and a ring."""
     return ["slot", "ring"]
 
 
 def make(name: str) -> Target:
-    """The target of that name."""
     if name == "slot":
         return Target(run_slot, slot_seeds, mend_slot, bytes_max=2 * SLOT_BYTES)
     return Target(run_ring, ring_seeds, bytes_max=512)
@@ -81,7 +79,6 @@ def _comparable(sample: Sample) -> str:
 
 
 def mend_slot(data: bytes, _random: Random) -> bytes:
-    """A slot of the right size with a right CRC."""
     body = data[:CRC_OFFSET].ljust(CRC_OFFSET, b"\0")
     return body + zlib.crc32(body).to_bytes(4, "little")
 
@@ -115,8 +112,6 @@ def _slot_at(number: int) -> int:
 
 
 class RingFile:
-    """The file that a program writes."""
-
     def __init__(self, path: Path, size_bytes: int) -> None:
         self.path = path
         self.image = bytearray(base()[:size_bytes])
@@ -130,12 +125,10 @@ class RingFile:
         os.pwrite(self._fd, data, at)
 
     def mend_slot(self, number: int) -> None:
-        """Make the CRC of a slot right."""
         at = _slot_at(number)
         self.write(at + CRC_OFFSET, zlib.crc32(self.image[at : at + CRC_OFFSET]).to_bytes(4, "little"))
 
     def mend_ledger(self) -> None:
-        """Make the CRC of the ledger block right."""
         block = self.image[LEDGER_BLOCK_OFFSET:LEDGER_CRC_OFFSET]
         self.write(LEDGER_CRC_OFFSET, zlib.crc32(block).to_bytes(4, "little"))
 
@@ -148,7 +141,6 @@ class RingFile:
         self._fd = os.open(self.path, os.O_RDWR)
 
     def close(self) -> None:
-        """Close the descriptor."""
         os.close(self._fd)
 
 
@@ -248,5 +240,4 @@ def ring_seeds() -> list[bytes]:
 
 
 def written(at: int, data: bytes) -> bytes:
-    """The step that writes `data` at `at`."""
     return struct.pack("<BHB", WRITE, at, len(data)) + data

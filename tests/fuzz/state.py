@@ -21,12 +21,10 @@ MODULE: Final = "hipnuc 0123"
 
 
 def names() -> Sequence[str]:
-    """The one target."""
     return ["json"]
 
 
 def make(_name: str) -> Target:
-    """Both files, as the daemon reads, changes and writes them."""
     return Target(run, seeds, words=words)
 
 
@@ -76,5 +74,4 @@ def seeds() -> list[bytes]:
 
 
 def words() -> list[bytes]:
-    """Names of members."""
     return [f'"{word}"'.encode() for word in (MODULE, "writes", "times_s", "told", "bow", "driver", "baud", "node")]

@@ -16,12 +16,10 @@ SPLICE_SHARE = 0.1
 
 
 def names() -> Sequence[str]:
-    """The stream drivers."""
     return names_of(StreamDriver)
 
 
 def make(name: str) -> Target:
-    """The codec of one driver; an input is what came over the line."""
     driver = row(name, StreamDriver)
     choices = variants(driver.settings)
     mend = mender(name)

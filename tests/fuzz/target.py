@@ -10,7 +10,6 @@ INPUT_BYTES_MAX: Final = 4096
 
 
 def as_it_is(data: bytes, _random: Random) -> bytes:
-    """The input, unchanged."""
     return data
 
 
@@ -20,8 +19,6 @@ FRAMES_BYTES_MAX: Final = 2048
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Code that is given bytes from outside, with what must hold for any bytes."""
-
     run: Callable[[bytes], None]
     """Raises for an input that violates an invariant; whatever it raises is a finding."""
     seeds: Callable[[], Sequence[bytes]]
@@ -39,11 +36,7 @@ def check_printable(text: str) -> None:
 
 
 class TargetGroup(Protocol):
-    """A module with targets of one kind."""
-
-    def names(self) -> Sequence[str]:
-        """Names of its targets."""
-        ...
+    def names(self) -> Sequence[str]: ...
 
     def make(self, name: str) -> Target:
         """Make the target of that name. Imports what it tests no earlier than here."""

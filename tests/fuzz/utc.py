@@ -24,12 +24,10 @@ STREAM_BYTES_MAX: Final = 2 * LINE_BYTES_MAX
 
 
 def names() -> Sequence[str]:
-    """A sentence, a stream."""
     return ["rmc", "sentences"]
 
 
 def make(name: str) -> Target:
-    """The target of that name."""
     if name == "rmc":
         return Target(run_rmc, rmc_seeds, mend, words=words, bytes_max=2 * SENTENCE_BYTES_MAX)
     return Target(run_sentences, stream_seeds, mend, words=words, bytes_max=STREAM_BYTES_MAX)
@@ -118,5 +116,4 @@ def stream_seeds() -> list[bytes]:
 
 
 def words() -> list[bytes]:
-    """Parts of sentences."""
     return [b"$GPRMC,", b"$GNRMC,", b",A,", b",V,", b"*00\r\n", b"235960", b"311279", b",,,,,,,", b"\r\n", b'{"class":']

@@ -27,8 +27,6 @@ MEND_SHARE: Final = 0.5
 
 
 class Atheris(Protocol):
-    """What is used of atheris, which has no type hints."""
-
     def instrument_imports(self, include: Sequence[str]) -> AbstractContextManager[None]:
         """Count coverage of the packages that are imported inside."""
         ...
@@ -37,16 +35,11 @@ class Atheris(Protocol):
         self, args: Sequence[str], run: Callable[[bytes], None],
         custom_mutator: Callable[[bytes, int, int], bytes],
     ) -> object:  # fmt: skip
-        """Take the options of libFuzzer."""
         ...
 
-    def Fuzz(self) -> None:
-        """Fuzz; ends the process."""
-        ...
+    def Fuzz(self) -> None: ...
 
-    def Mutate(self, data: bytes, size: int) -> bytes:
-        """libFuzzer's own mutation."""
-        ...
+    def Mutate(self, data: bytes, size: int) -> bytes: ...
 
 
 def fuzz_with_atheris(name: str, seconds: float, seed: int, folder: Path, grown: Path, inputs: Sequence[str]) -> None:
@@ -148,7 +141,6 @@ def escaped(word: bytes) -> str:
 
 
 def main() -> int:
-    """Run as `python -m tests.fuzz.worker`."""
     logging.disable()  # what targets report of bad input, thousands of times a second
     engine, name, seconds, seed, folder, grown, *inputs = sys.argv[1:]
     if engine == "atheris":

@@ -56,7 +56,6 @@ class Bus(Generic[OneTransfer]):
             return list(self._transfers)
 
     def close(self) -> None:
-        """Takes the simulator off the bus (every transfer then fails with ENXIO); may be called twice."""
         if self._file < 0:
             return
         os.eventfd_write(self._stop, 1)
@@ -71,11 +70,9 @@ class Bus(Generic[OneTransfer]):
             raise self._failure
 
     def __enter__(self) -> Self:
-        """The bus itself; it serves since it was made."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Closes."""
         self.close()
 
     def _serve(self) -> None:
@@ -111,7 +108,6 @@ class Bus(Generic[OneTransfer]):
 
 
 def _served(transfer: OneTransfer, device: Callable[[OneTransfer], bytes] | None) -> bytes:
-    """The answer of a device, or of a bus without one."""
     if device is not None:
         return wire.answer(transfer, device(transfer))
     if isinstance(transfer, wire.I2cTransfer):
@@ -120,7 +116,6 @@ def _served(transfer: OneTransfer, device: Callable[[OneTransfer], bytes] | None
 
 
 def i2c_bus(number: int = 0) -> Bus[wire.I2cTransfer]:
-    """The devices behind /dev/i2c-<number>, by address."""
     return Bus(Path(f"/dev/imud-lab-i2c{number}"), lambda transfer: transfer.segments[0].address)
 
 

@@ -41,14 +41,11 @@ class BusRig:
             await asyncio.sleep(0.002)
 
     async def done(self, work: Coroutine[Any, Any, Any]) -> Any:
-        """What comes of something that the device does, while the modules go on."""
         task = asyncio.create_task(work)
         await self.until(task.done, "its end")
         return task.result()
 
     def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Run the device while the story is told."""
-
         async def both() -> None:
             task = asyncio.create_task(self.device.run())
             try:

@@ -16,12 +16,9 @@ MODE_RESET = b"\x01"
 
 @dataclass(frozen=True)
 class CanInterface:
-    """A CAN network interface."""
-
     name: str
 
     def up(self) -> None:
-        """Takes it into operation."""
         tool("ip", "link", "set", self.name, "up")
 
     def down(self) -> None:

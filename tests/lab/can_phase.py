@@ -11,8 +11,6 @@ PHASE_S: Final = 7.3
 
 
 class Phased:
-    """The motion of a module, by its number."""
-
     def __init__(self, number: int, gravity_m_s2: float = GRAVITY_M_S2) -> None:
         self._motion = MOTIONS["swing"](gravity_m_s2)
         self._phase_s = PHASE_S * number

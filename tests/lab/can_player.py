@@ -50,14 +50,12 @@ class Played:
     """Where in them an INDEX is."""
 
     def count_on(self, samples: int) -> None:
-        """So many samples later."""
         for at in self.indices:
             (index,) = INDEX.unpack_from(self.frames, at)
             INDEX.pack_into(self.frames, at, (index + samples) % INDEX_MODULUS)
 
 
 def loop(names: list[str], rate_hz: float) -> list[Played]:
-    """The bursts of LOOP_S seconds."""
     modules, closing = [], set()
     for number, name in enumerate(names):
         driver, _, node = name.partition(":")
@@ -82,8 +80,6 @@ def loop(names: list[str], rate_hz: float) -> list[Played]:
 
 
 class Sender:
-    """Sends a burst from buffers made once."""
-
     def __init__(self, interface: str) -> None:
         self.refused = 0
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
@@ -97,7 +93,6 @@ class Sender:
             message.header.vector, message.header.vector_count = ctypes.addressof(vector), 1
 
     def send(self, frames: bytearray) -> None:
-        """All frames of a burst."""
         count = len(frames) // RAW_FRAME.size
         self._frames[: len(frames)] = frames
         sent = libc.sendmmsg(self._socket.fileno(), self._messages, count, 0)
@@ -105,7 +100,6 @@ class Sender:
 
 
 def main(interface: str, rate: str, seconds: str, *names: str) -> int:
-    """Run."""
     played, samples = loop(list(names), float(rate)), round(float(rate) * LOOP_S)
     sender = Sender(interface)
     gc.freeze()

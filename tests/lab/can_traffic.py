@@ -36,11 +36,9 @@ class Module:
 
     @property
     def name(self) -> str:
-        """For example `imu61x-can-101`."""
         return f"{self.driver}-{self.node}"
 
     def config(self, interface: str) -> dict[str, object]:
-        """The device's keys."""
         driver = DRIVERS[self.driver]
         assert isinstance(driver, CanDriver)
         options = msgspec.to_builtins(driver.node_settings(self.node))
@@ -63,21 +61,17 @@ def fleet() -> list[Module]:
 
 
 class Traffic:
-    """The process that plays them."""
-
     def __init__(self, process: "subprocess.Popen[str]") -> None:
         self._process = process
         self.pid = process.pid
 
     def begin(self) -> int:
-        """Begin; return the instant of the first sample, CLOCK_MONOTONIC."""
         assert self._process.stdin is not None
         self._process.stdin.write("go\n")
         self._process.stdin.flush()
         return self._read()
 
     def end(self) -> int:
-        """End; return how many frames the interface refused."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         return self._read()

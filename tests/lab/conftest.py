@@ -28,7 +28,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 def pytest_runtest_logstart() -> None:
-    """Marks the first test for the runner's timing."""
     if SHARE:
         mark = Path(SHARE) / "first-test"
         if not mark.exists():
@@ -56,14 +55,12 @@ def _open_descriptors() -> dict[str, str]:
 
 @pytest.fixture
 def vcan() -> Iterator[CanInterface]:
-    """A virtual CAN interface, up. For more than one: can_interface.virtual_can(name)."""
     with virtual_can("vcan0") as interface:
         yield interface
 
 
 @pytest.fixture
 def can_pair() -> Iterator[tuple[CanInterface, CanInterface]]:
-    """Two emulated CAN controllers on one bus, up at 500 kbit/s."""
     with controller_pair() as pair:
         yield pair
 
@@ -77,7 +74,6 @@ def gpio_chip() -> Iterator[GpioChip]:
 
 @pytest.fixture
 def i2c() -> Iterator[Bus[I2cTransfer]]:
-    """The far end of /dev/i2c-0: attach simulated devices by address."""
     with i2c_bus(0) as bus:
         yield bus
 
@@ -98,12 +94,10 @@ def spi16() -> Iterator[Bus[SpiTransfer]]:
 
 @pytest.fixture
 def pty() -> Iterator[PseudoTerminal]:
-    """A raw pseudo terminal."""
     with pseudo_terminal() as terminal:
         yield terminal
 
 
 @pytest.fixture
 def uarts() -> tuple[Path, Path]:
-    """Two real UARTs wired to each other."""
     return uart_pair()

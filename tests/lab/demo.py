@@ -14,7 +14,6 @@ LIMIT_S = 200.0
 
 
 def demo(*words: str) -> str:
-    """What it printed; it must end well."""
     argv = [sys.executable, "-c", PATIENT, *words]
     ended = subprocess.run(argv, capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr

@@ -18,23 +18,17 @@ ORDINARY_USER: Final = (
 
 
 class Found(msgspec.Struct, frozen=True):
-    """One finding."""
-
     severity: str
     seen: str
     advice: str
 
 
 class CheckOutcome(msgspec.Struct, frozen=True):
-    """A check with its findings."""
-
     name: str
     findings: list[Found]
 
 
 class Diagnosis(msgspec.Struct, frozen=True):
-    """What `imud doctor --json` prints."""
-
     status: int
     complete: bool
     verdict: str
@@ -54,7 +48,6 @@ class Diagnosis(msgspec.Struct, frozen=True):
         return fitting[0].advice
 
     def has(self, check: str, severity: str, seen: str, advice: str = "") -> None:
-        """Check that the check has a finding with this severity and these words, also in its advice."""
         self.advice(check, severity, seen, advice)
 
 

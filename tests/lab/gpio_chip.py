@@ -15,8 +15,6 @@ _numbers = itertools.count()
 
 @dataclass(frozen=True)
 class GpioChip:
-    """A live chip; lines are addressed by name or offset."""
-
     path: Path
     """Its character device, such as /dev/gpiochip0."""
     names: tuple[str, ...]
@@ -26,23 +24,18 @@ class GpioChip:
     """Its folder in configfs."""
 
     def drive(self, line: str | int, level: bool) -> None:
-        """Sets the level that an input reads, as a circuit outside would; a change is an edge."""
         self._attribute(line, "pull").write_text("pull-up" if level else "pull-down", encoding="ascii")
 
     def level(self, line: str | int) -> bool:
-        """The level of the line now, whoever drives it."""
         return self._attribute(line, "value").read_text(encoding="ascii").strip() == "1"
 
     def pull(self, line: str) -> Path:
-        """The file that `drive` writes to, for another program."""
         return self._attribute(line, "pull")
 
     def value(self, line: str) -> Path:
-        """The file that `level` reads, for another program."""
         return self._attribute(line, "value")
 
     def unplug(self) -> None:
-        """Removes the chip, whoever uses its lines."""
         _set(self.device / "live", "0")
 
     def plug_in(self) -> None:

@@ -14,8 +14,6 @@ LIMIT_S = 40.0
 
 
 def on_spi(device: Imu61xRegisters) -> Callable[[SpiTransfer], bytes]:
-    """The device as the lab's SPI buses have it."""
-
     def answer(transfer: SpiTransfer) -> bytes:
         selections = [b"".join(segment.mosi for segment in group) for group in transfer.selections]
         try:
@@ -27,8 +25,6 @@ def on_spi(device: Imu61xRegisters) -> Callable[[SpiTransfer], bytes]:
 
 
 def on_i2c(device: Imu61xRegisters) -> Callable[[I2cTransfer], bytes]:
-    """The device as the lab's I2C bus has it."""
-
     def answer(transfer: I2cTransfer) -> bytes:
         try:
             return device.i2c([segment.length if segment.reads else segment.data for segment in transfer.segments])
@@ -39,7 +35,6 @@ def on_i2c(device: Imu61xRegisters) -> Callable[[I2cTransfer], bytes]:
 
 
 def registers(**more: object) -> Imu61xRegisters:
-    """A device on this machine's clock."""
     return Imu61xRegisters(monotonic_ns, **more)  # type: ignore[arg-type]  # passed on as given
 
 

@@ -18,8 +18,6 @@ SETTLE_MS = 12.0
 
 
 class Pulse(NamedTuple):
-    """One pulse of a pin."""
-
     sample_ns: int
     """Instant of measurement of its sample."""
     late_ns: int
@@ -27,8 +25,6 @@ class Pulse(NamedTuple):
 
 
 class Imu(NamedTuple):
-    """What a running module can be asked for."""
-
     process: "subprocess.Popen[str]"
     folder: Path
 
@@ -45,18 +41,15 @@ class Imu(NamedTuple):
         return [Pulse(int(row["sample_ns"]), int(row["step_ns"]) - int(row["due_ns"])) for row in rows]
 
     def stop(self) -> None:
-        """End it; what it writes is complete then."""
         self.process.communicate(timeout=LIMIT_S)
 
 
 def tty(folder: Path) -> Path:
-    """Where the module in that folder is, or will be."""
     return folder / "imu"
 
 
 @contextmanager
 def running_imu(folder: Path, chip: GpioChip, pins: Mapping[str, str], *more: str) -> Iterator[Imu]:
-    """Start it; `pins` are names of the chip's lines by pin."""
     lines = ",".join(f"{pin}={chip.pull(line)}" for pin, line in pins.items())
     command = [
         sys.executable, "-m", "imud.sim", "--boot", "0", "--path", str(tty(folder)), "--truth",

@@ -4,8 +4,6 @@ from tests.lab import wire
 
 
 class RegisterDevice:
-    """A write sets the pointer and then registers; a read takes registers from the pointer on."""
-
     def __init__(self, contents: dict[int, int] | None = None) -> None:
         """Registers not in `contents` are 0."""
         self.registers = bytearray(256)
@@ -14,7 +12,6 @@ class RegisterDevice:
             self.registers[register] = value
 
     def __call__(self, transfer: wire.I2cTransfer) -> bytes:
-        """One transfer."""
         return b"".join(self._segment(segment) for segment in transfer.segments)
 
     def _segment(self, segment: wire.I2cSegment) -> bytes:

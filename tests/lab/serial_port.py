@@ -10,14 +10,11 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class PseudoTerminal:
-    """A raw pty: the device under test opens `path`, the test is the far end."""
-
     path: Path
     far_fd: int
     """The controlling end, blocking."""
 
     def write(self, data: bytes) -> None:
-        """Sends all of `data` to the device under test."""
         while data:
             data = data[os.write(self.far_fd, data) :]
 

@@ -99,7 +99,6 @@ def test_pty_carries_every_byte_both_ways(pty: PseudoTerminal) -> None:
 
 
 def counters(port: serial.Serial) -> dict[str, int]:
-    """Return counters of the kernel for a UART."""
     values = COUNTERS.unpack(fcntl.ioctl(port.fileno(), TIOCGICOUNT, bytes(COUNTERS.size)))
     return {name: values[place] for name, place in COUNTERS_USED.items()}
 

@@ -21,13 +21,11 @@ SLOW = NodeSettings(bit_rate=0, periods_ms={1: 50, 2: 50, 3: 50, 4: 0, 6: 0, 7: 
 
 
 def canopen(interface: str, motion: Motion) -> BusRig:
-    """A node with an inclinometer."""
     hardware = HipnucCanopenHardware(factory=SLOW, boot_ms=0, motion=motion)
     return BusRig(interface, "hipnuc-canopen", HipnucCanopenSettings(), HipnucCanopenModule(monotonic_ns(), hardware))
 
 
 def j1939(interface: str, motion: Motion) -> BusRig:
-    """A module with an inclinometer."""
     hardware = J1939Hardware(bitrate=0, boot_ms=0, motion=motion)
     settings = J1939Settings(intervals_ms={**J1939Settings().intervals_ms, 0xFF4A: 100})
     module = HipnucJ1939Module(monotonic_ns(), settings, hardware)

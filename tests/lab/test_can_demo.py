@@ -23,7 +23,6 @@ EVERY_PROTOCOL = {
 
 @contextmanager
 def simulators(names: Sequence[str]) -> Iterator[None]:
-    """Simulated devices on the interface that is up, until the end."""
     argv = [sys.executable, "-m", "imud.sim", "--at-once", "--boot", "0", "--rate", "10"]
     argv += [word for name in names for word in ("--device", name)]
     with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:

@@ -65,7 +65,6 @@ def closes(status: DeviceStatus) -> bool:
 
 
 def cpu_s(pid: int) -> float:
-    """CPU time that a process has used, s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -128,7 +127,6 @@ def show(
     after: dict[str, DeviceStatus],
     found: dict[str, list[Sample]],
 ) -> None:
-    """The figures of the run."""
     print(f"\n{len(modules)} devices at {RATE_HZ:g} Hz for {SECONDS:g} s")
     for module in modules:
         was, now, samples = before[module.name].ledger, after[module.name].ledger, found[module.name]

@@ -13,18 +13,15 @@ REMEMBERED = list(range(KNOWN))
 
 
 def received(numbers: Sequence[int], first_seq: int = 1) -> list[Sample]:
-    """Return samples whose time is their true number."""
     times = ((seq, number * PERIOD_NS) for seq, number in enumerate(numbers, first_seq))
     return [Sample("imu", seq, t_ns, 1, Sync.ARRIVAL, t_ns + 1, t_ns) for seq, t_ns in times]
 
 
 def away(begin: float, end: float) -> Interval:
-    """Return an outage between two times in periods."""
     return Interval(round(begin * PERIOD_NS), round(end * PERIOD_NS))
 
 
 def restart(begin: float, end: float) -> Interval:
-    """Return an outage in which the device restarts."""
     return away(begin, end)._replace(restarts=True)
 
 

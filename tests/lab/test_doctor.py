@@ -68,7 +68,6 @@ def wait_running(made: RunningDaemon, *names: str) -> None:
 
 @contextmanager
 def simulator(*options: str) -> Iterator["subprocess.Popen[str]"]:
-    """A simulated device in a process of its own, ready; its commands are written to its stdin."""
     command = [sys.executable, "-m", "imud.sim", "--boot", "0", *options]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -81,7 +80,6 @@ def simulator(*options: str) -> Iterator["subprocess.Popen[str]"]:
 
 @contextmanager
 def working(step: Callable[[Event], None]) -> Iterator[None]:
-    """A thread that runs `step` with the event that ends it."""
     ended = Event()
     thread = Thread(target=step, args=(ended,))
     thread.start()

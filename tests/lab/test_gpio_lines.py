@@ -31,8 +31,6 @@ TRIGGERS = 20
 
 
 class Watcher:
-    """An open input that is watched, and what it delivered."""
-
     def __init__(self, settings: InputSettings, purpose: str = "lab") -> None:
         self.line = GpioInput(settings, purpose)
         self.edges: list[Edge] = []
@@ -52,7 +50,6 @@ class Watcher:
         self._news.set()
 
     async def wait_for(self, count: int) -> None:
-        """Until so many edges came, or the end."""
         async with asyncio.timeout(LIMIT_S):
             while len(self.edges) < count and not self.ends:
                 self._news.clear()
@@ -244,8 +241,6 @@ async def test_reset(gpio_chip: GpioChip) -> None:
 
 
 class WiredOutput(GpioOutput):
-    """An output with a wire from it to the input PPS."""
-
     def __init__(self, chip: GpioChip, settings: OutputSettings) -> None:
         super().__init__(settings, "bow sin")
         self._chip = chip

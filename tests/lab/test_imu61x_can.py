@@ -31,8 +31,6 @@ BUS_OFF, CONTROLLER = 0x2000_0040, 0x2000_0004
 
 
 class Rig:
-    """A device on an interface, and a raw socket at the far end of the bus."""
-
     def __init__(self, near: str, far: str, *, base_id: int = 101, **link: Any) -> None:
         settings = SocketCanSettings(interface=near, **link)
         config = DeviceConfig("mast", "imu61x-can", Imu61xCanSettings(base_id=base_id), True, "socketcan", settings)
@@ -53,7 +51,6 @@ class Rig:
                 self.far.send(pack_frame(can_id, False, data))
 
     def send_part(self, index: int) -> None:
-        """The first three frames of a sample."""
         for can_id, data in encode_set(
             index=index, accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), euler_rad=(0, 0, 0), temperature_c=25
         )[:3]:
@@ -75,12 +72,9 @@ class Rig:
             await asyncio.sleep(0.01)
 
     async def running(self) -> None:
-        """Wait until its socket is open, so that frames sent from now on are its."""
         await self.until(lambda: self.runner.state is not DeviceState.MISSING, "the bus is open")
 
     def play(self, story: Callable[["Rig"], Awaitable[None]]) -> None:
-        """Run the device while the story is told."""
-
         async def both() -> None:
             task = asyncio.create_task(self.runner.run())
             try:

@@ -38,8 +38,6 @@ FALLBACK_HZ = 10.0
 
 
 class WiredReset(GpioOutput):
-    """nRST with a wire from it to the device and to the input PPS, which gpiomon reads."""
-
     def __init__(self, chip: GpioChip, boot: Callable[[], None], settings: OutputSettings, purpose: str) -> None:
         super().__init__(settings, purpose)
         self._chip, self._boot = chip, boot
@@ -111,7 +109,6 @@ class Stepped:
         """Before and after each edge."""
 
     def renew(self) -> None:
-        """The next values."""
         self._chip.drive("SOUT", False)
         with self._lock:
             self.t_ns += STEP_NS
@@ -148,7 +145,6 @@ class Stepped:
 
 @pytest.fixture(params=["i2c", "spi8"])
 def stepped(request: pytest.FixtureRequest, gpio_chip: GpioChip) -> tuple[Stepped, DeviceConfig]:
-    """The device on either bus, and its configuration."""
     far = request.getfixturevalue(request.param)
     it = Stepped(gpio_chip)
     if request.param == "i2c":

@@ -23,7 +23,6 @@ PORTS = {"spi8": "/dev/spidev0.0", "spi16": "/dev/spidev1.0"}
 
 @pytest.fixture(params=list(PORTS))
 def bus(request: pytest.FixtureRequest) -> tuple[Bus[SpiTransfer], str]:
-    """Either controller, with the port of its first chip select."""
     return request.getfixturevalue(request.param), PORTS[request.param]
 
 

@@ -49,8 +49,6 @@ def say(end: socket.socket, interface: str, pgn: int, data: bytes, address: int 
 
 
 class Rig:
-    """A device of the daemon on an interface."""
-
     def __init__(self, interface: str, driver: str, options: Settings) -> None:
         config = DeviceConfig("bow", driver, options, True, "socketcan", SocketCanSettings(interface=interface))
         self.samples: list[Sample] = []
@@ -67,8 +65,6 @@ class Rig:
             await asyncio.sleep(0.002)
 
     def play(self, story: Callable[[], Awaitable[None]]) -> None:
-        """Run the device while the story is told."""
-
         async def both() -> None:
             task = asyncio.create_task(self.runner.run())
             try:

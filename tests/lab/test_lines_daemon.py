@@ -40,7 +40,6 @@ LATE_NS = 25 * NS_PER_MS
 
 @contextmanager
 def daemon(folder: Path, lines: Mapping[str, object], **more: object) -> Iterator[RunningDaemon]:
-    """One device `bow` on the module's pty, whether that is there or not."""
     device = {"driver": "hipnuc-uart", "uart": {"port": str(tty(folder)), "baud": 115200}, "lines": lines, **more}
     metrics = {"port": METRICS_PORT}
     with running_daemon(folder, {"bow": device}, limit_s=LIMIT_S, python=(), metrics=metrics) as made:
@@ -58,7 +57,6 @@ def wait_for(made: RunningDaemon, holds: Callable[[DeviceStatus], object], what:
 
 
 def wait_open(made: RunningDaemon, chip: GpioChip, *keys: str) -> None:
-    """Until the daemon has these lines."""
     wait_until(
         lambda: all(f'"imud bow {key}"' in tool("gpioinfo", chip.path.name) for key in keys), "the lines", LIMIT_S
     )

@@ -101,7 +101,6 @@ def living(folder: Path, file: Path) -> Iterator[Life]:
 
 
 def record(life: Life, file: Path) -> None:
-    """`imud record` of two of the devices that run."""
     devices = ("--device", "serial", "--device", "vcan")
     command = ("-m", "imud", "record", "--socket", str(life.socket), *devices, "--for", f"{REQUEST_S}s", str(file))
     subprocess.run([sys.executable, *command], check=True, timeout=SLOW_S)
@@ -117,7 +116,6 @@ def received(life: Life) -> dict[str, list[Sample]]:
 
 
 def at_rest(life: Life) -> Snapshot:
-    """The state once no device runs."""
     found: list[Snapshot] = []
 
     def none_runs() -> bool:
@@ -146,7 +144,6 @@ def replayed(file: Path) -> dict[str, list[Sample]]:
 
 
 def ledgers(file: Path) -> Mapping[str, Mapping[str, int]]:
-    """The ledger of each device after a replay."""
     player = Player(lambda _batch: None)
     with file.open("rb") as opened:
         play(opened, file.name, player)
@@ -154,7 +151,6 @@ def ledgers(file: Path) -> Mapping[str, Mapping[str, int]]:
 
 
 def differing(found: list[Sample], live: list[Sample]) -> str:
-    """What to look at."""
     pairs = [(a, b) for a, b in zip(found, live, strict=False) if a != b]
     return f"{len(found)} and {len(live)} samples, {len(pairs)} of them differ: {pairs[:1]}"
 
@@ -191,7 +187,6 @@ def test_samples_of_a_data_ready_line_are_replayed(i2c: Bus[I2cTransfer], gpio_c
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """A small file system of its own."""
     folder = tmp_path / "disk"
     folder.mkdir()
     tool("mount", "-t", "tmpfs", "-o", f"size={DISK}", "imud-disk", str(folder))
@@ -200,7 +195,6 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def fill(file: Path) -> None:
-    """Take all room that is left."""
     with file.open("wb", buffering=0) as out, suppress(OSError):
         while True:
             out.write(bytes(4096))
@@ -211,7 +205,6 @@ def fill(file: Path) -> None:
 
 @contextmanager
 def recording_daemon(folder: Path, disk: Path) -> Iterator[RunningDaemon]:
-    """One module, which is recorded always and by the flight recorder, with its line."""
     flight = {"enabled": True, "minutes": 0.2, "after_s": 2, "memory_mb": 4, "line": {"line": "PPS"}}
     recorder = {"enabled": True, "directory": str(disk), "file_mb": 1, "keep_gb": 0.01, "flight": flight}
     device = {"driver": "hipnuc-uart", "uart": {"port": str(tty(folder)), "baud": 115200}}
@@ -223,7 +216,6 @@ def recording_daemon(folder: Path, disk: Path) -> Iterator[RunningDaemon]:
 
 
 def told(events: Iterator[Event], words: str) -> Event:
-    """The next event of the recorder with these words."""
     return next(event for event in events if event.kind is EventKind.RECORDER and words in event.message)
 
 

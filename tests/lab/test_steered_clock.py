@@ -39,7 +39,6 @@ STEPS = (
 
 
 def steer(ppm: float, tick_us: int) -> None:
-    """Let the system clock run so. CLOCK_MONOTONIC runs with it. Raises OSError."""
     timex = Timex(modes=ADJ_FREQUENCY | ADJ_TICK, freq=round(ppm * 65536), tick=tick_us)
     if ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex)) < 0:
         raise OSError(ctypes.get_errno(), "adjtimex")
@@ -55,7 +54,6 @@ def steering() -> Iterator[None]:
 
 
 def raw_ns() -> int:
-    """CLOCK_MONOTONIC_RAW."""
     return clock_gettime_ns(CLOCK_MONOTONIC_RAW)
 
 
@@ -71,8 +69,6 @@ def tight_pair() -> tuple[int, int]:
 
 
 class Device:
-    """Sends a frame for each period of CLOCK_MONOTONIC_RAW since it was made."""
-
     def __init__(self, pty: PseudoTerminal) -> None:
         self._pty = pty
         self._begin_ns = raw_ns() - 1000 * PERIOD_NS
@@ -80,7 +76,6 @@ class Device:
         self.pairs: list[tuple[int, int]] = [tight_pair()]
 
     def step(self) -> None:
-        """Take the sample that is due, if any, and send it."""
         number = (raw_ns() - self._begin_ns - WIRE_NS) // PERIOD_NS
         if number <= self._number:
             return

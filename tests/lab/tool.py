@@ -22,7 +22,6 @@ def tool(*command: str, data: bytes | None = None) -> str:
 
 @contextmanager
 def running(*command: str) -> Iterator[subprocess.Popen[str]]:
-    """A program in the background, killed at the end if it still runs; its output is a pipe, line by line."""
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=sys.stderr.fileno(), text=True)
     assert process.stdout is not None
     try:

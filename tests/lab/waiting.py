@@ -8,7 +8,6 @@ PAUSE_S = 0.01
 
 
 def wait_until(holds: Callable[[], bool], what: str, limit_s: float = LIMIT_S) -> None:
-    """Returns once `holds()` is true; AssertionError naming `what` after `limit_s`."""
     give_up_s = time.monotonic() + limit_s
     while not holds():
         assert time.monotonic() < give_up_s, f"{what}: not within {limit_s} s"

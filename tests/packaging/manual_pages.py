@@ -79,7 +79,6 @@ def bold(text: str) -> str:
 
 
 def italic(text: str) -> str:
-    """Text in italics: what the user replaces."""
     return f"\\fI{inside(text)}\\fR"
 
 
@@ -117,7 +116,6 @@ def sentence(text: str) -> str:
 
 
 def values_of(action: argparse.Action) -> str:
-    """What stands behind an option, or in the place of a positional argument."""
     if action.nargs == 0:
         return ""
     word = action.metavar

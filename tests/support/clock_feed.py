@@ -20,7 +20,6 @@ def make_clock(*, tick_modulus: int = MODULUS, byte_ns: int = 10_850, hold_ns: i
 
 
 def message(ticks: int | None, trailing_bytes: int = 0) -> Measurement:
-    """An HI91 frame with nothing in it but its device time."""
     return Measurement(82, trailing_bytes, ticks)
 
 

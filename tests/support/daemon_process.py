@@ -29,8 +29,6 @@ def wait_until(condition: Callable[[], object], what: str, limit_s: float = LIMI
 
 
 class RunningDaemon:
-    """`imud run` on a configuration in `folder`."""
-
     def __init__(self, folder: Path, process: subprocess.Popen[str]) -> None:
         self.folder = folder
         self.process = process
@@ -53,7 +51,6 @@ class RunningDaemon:
 
 
 def write_config(folder: Path, devices: Mapping[str, Any], **more: Any) -> Path:
-    """A configuration with everything below `folder`."""
     tree = {
         "log_level": "debug",
         "state_dir": str(folder),

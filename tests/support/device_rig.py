@@ -41,8 +41,6 @@ TURN_S = 0.0005
 
 
 class DeviceRig:
-    """One device with what came out of it."""
-
     def __init__(self, now_ns: Callable[[], int]) -> None:
         self.samples: list[Sample] = []
         self.batches = 0
@@ -154,7 +152,6 @@ class DeviceRigs:
         )
 
     def add(self, config: DeviceConfig, link: MemoryLink | MemoryCanLink | None = None) -> DeviceRig:
-        """A device as configured; on `link` in place of the configured one if it is given."""
         rig = self.rigs[config.name] = DeviceRig(self.host.now_ns)
         number = len(self.rigs) - 1
         if link is None:

@@ -53,8 +53,6 @@ def fake_frame(payload: bytes) -> bytes:
 
 
 class FakeCodec:
-    """A `StreamCodec` without the accounting of bytes that a real one has."""
-
     def __init__(self, ledger: Ledger) -> None:
         self.ledger = ledger
         self._pending = bytearray()
@@ -314,7 +312,6 @@ class FakeModule(MemoryLink):
         self._send(f"S {(self._now_ns() - self._boot_ns) // 1_000_000}")
 
     def write(self, data: bytes) -> None:
-        """Take commands that come at its rate."""
         super().write(data)
         if self.baud == self.set["baud"]:
             for line in data.decode().splitlines():

@@ -39,13 +39,11 @@ COMMANDS = ("devices", "status", "watch --rate 5 --count 6")
 
 
 def svg(width: int, height: int, title: str, parts: Sequence[str]) -> str:
-    """A whole picture."""
     head = f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {width} {height}' width='{width}' height='{height}'>"
     return "\n".join([head, f"<title>{escape(title)}</title>", *parts, "</svg>", ""])
 
 
 def text(x: float, y: float, words: str, more: str = "") -> str:
-    """A line of text that begins at a point."""
     return f"<text x='{x:.1f}' y='{y:.1f}' {NAMES} font-size='13' fill='#333' {more}>{escape(words)}</text>"
 
 
@@ -101,8 +99,6 @@ def session() -> list[str]:
 
 
 class Stamp(NamedTuple):
-    """One sample beside its truth, ms."""
-
     t_s: float
     """Since the first sample."""
     arrival_ms: float
@@ -114,7 +110,6 @@ class Stamp(NamedTuple):
 
 
 def stamps(seconds: int = SECONDS) -> list[Stamp]:
-    """The samples of a simulation."""
     model = ArrivalModel(USB_16MS, RATE_HZ, SEED, Crystal(50.0), 115_200)
     arrivals = list(model.run(seconds * RATE_HZ))
     points = run(ArrivalModel(USB_16MS, RATE_HZ, SEED, Crystal(50.0), 115_200), seconds * RATE_HZ)
@@ -132,8 +127,6 @@ def stamps(seconds: int = SECONDS) -> list[Stamp]:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A diagram of milliseconds over seconds."""
-
     top: float
     low_ms: float
     high_ms: float
@@ -144,16 +137,13 @@ class Panel:
     seconds: float = SECONDS
 
     def x(self, t_s: float) -> float:
-        """Where an instant is."""
         return self.left + self.width * t_s / self.seconds
 
     def y(self, value_ms: float) -> float:
-        """Where a value is, at the edge where it lies outside."""
         inside = min(max(value_ms, self.low_ms), self.high_ms)
         return self.top + self.height * (self.high_ms - inside) / (self.high_ms - self.low_ms)
 
     def axes(self, title: str) -> Iterator[str]:
-        """Frame, grid, numbers and title."""
         yield text(self.left, self.top - 10, title, "font-weight='bold'")
         for number in range(round((self.high_ms - self.low_ms) / self.step_ms) + 1):
             value = self.low_ms + number * self.step_ms
@@ -164,12 +154,10 @@ class Panel:
             yield text(self.x(t_s), self.top + self.height + 18, f"{t_s} s", "text-anchor='middle'")
 
     def dots(self, points: Sequence[tuple[float, float]], fill: str) -> str:
-        """One dot per point."""
         moves = "".join(f"M{self.x(t):.1f} {self.y(v):.1f}h0" for t, v in points)
         return f"<path d='{moves}' stroke='{fill}' stroke-width='1.7' stroke-linecap='round'/>"
 
     def band(self, points: Sequence[tuple[float, float]], fill: str) -> str:
-        """The area within plus and minus a value."""
         upper = [f"{self.x(t):.1f} {self.y(v):.1f}" for t, v in points]
         lower = [f"{self.x(t):.1f} {self.y(-v):.1f}" for t, v in reversed(points)]
         return f"<path d='M{' L'.join([*upper, *lower])}z' fill='{fill}'/>"
@@ -212,7 +200,6 @@ def on_page(vector: Vector3, scale: float) -> tuple[float, float]:
 
 
 def arrow(centre: tuple[float, float], vector: Vector3, scale: float, label: str, fill: str) -> Iterator[str]:
-    """An arrow from the centre along a vector of the body, with a label at its head."""
     dx, dy = on_page(vector, scale)
     x, y = centre[0] + dx, centre[1] + dy
     length = hypot(dx, dy)
@@ -262,7 +249,6 @@ def columns(matrix: Matrix3) -> Matrix3:
 
 
 def axes_panel(left: float, title: str, lines: Sequence[str], to_body: Matrix3) -> Iterator[str]:
-    """A body that points forward, with the axes of vectors in it."""
     centre = (left + BODY_PANEL[0] / 2, 132.0)
     yield text(left + 12, 24, title, "style='font-weight:bold'")
     yield from block(centre, IDENTITY, (0.45, 0.28, 0.12), 70, "#e8edf3")

@@ -208,7 +208,6 @@ class ModbusBench:
 
 
 def modbus_slave(address: int = 7, serial: int = 0, variant: SlaveVariant | None = None, **more: Any) -> Slave:
-    """A module; its serial number ends with its first address."""
     number = (0xA000_0000_0000_0000 + (serial or address)).to_bytes(8, "big")
     return Slave(number, SlaveSettings(address, LINE_BAUD), variant=variant or SlaveVariant(), **more)
 

@@ -74,7 +74,6 @@ LINE_TITLES = {name: text.rstrip(".") for name, text in docs_of(DeviceLines).ite
 
 
 def settings_parts() -> Iterator[tuple[str, str, type[Settings]]]:
-    """Title, path in the file, and schema of every part."""
     yield "The daemon", "", General
     for name, publisher in TABLES.publishers.items():
         yield f"Output `{name}`", f"{name}.", publisher.settings
@@ -108,7 +107,6 @@ def default_of(field: msgspec.structs.FieldInfo) -> str:
 
 
 def settings_tables() -> str:
-    """The whole generated part."""
     text = []
     for title, path, schema in settings_parts():
         text += [f"### {title}", "", "| key | expected | default | meaning |", "|---|---|---|---|"]
@@ -134,7 +132,6 @@ def cell(text: str) -> str:
 
 
 def meanings_of(action: Action) -> dict[str, str]:
-    """Meaning of each argument: description and unit of its annotation."""
     found = {}
     for field in msgspec.structs.fields(action.parameters):
         info = msgspec.inspect.type_info(field.type)
@@ -157,7 +154,6 @@ def arguments_of(action: Action) -> str:
 
 
 def actions_table(actions: Actions) -> Iterator[str]:
-    """The lines of a driver's actions_table."""
     yield "| action | arguments | what it does |"
     yield "|---|---|---|"
     for name, action in actions.items():
@@ -165,13 +161,11 @@ def actions_table(actions: Actions) -> Iterator[str]:
 
 
 def actions_part(driver: Driver) -> list[str]:
-    """Title and actions_table of a driver."""
     lines = list(actions_table(driver.actions)) if driver.actions else ["No actions."]
     return [f"### `{driver.name}`: {driver.title}", "", *lines, ""]
 
 
 def actions_tables() -> str:
-    """The whole generated actions_part."""
     lines = [line for driver in DRIVERS.values() for line in actions_part(driver)]
     by_lines = ["### Any device whose `lines` have it", "", *actions_table({"reset": RESET, "trigger": TRIGGER}), ""]
     return "\n".join([*lines, *by_lines])
@@ -208,7 +202,6 @@ def device_settings_part(driver: Driver) -> list[str]:
 
 
 def device_settings_tables() -> str:
-    """The whole generated part."""
     return "\n".join(line for driver in DRIVERS.values() for line in device_settings_part(driver))
 
 
@@ -220,7 +213,6 @@ C_TYPES = {
 
 
 def layout(fields: Sequence[SlotField]) -> str:
-    """Rows of offset, type and name; reserved bytes are left out."""
     rows = ["| offset | type | field |", "|---|---|---|"]
     for field in fields:
         if not field.name.startswith("reserved"):
@@ -246,7 +238,6 @@ def constants() -> str:
 
 
 def layout_tables() -> dict[str, str]:
-    """Every generated part of the page by its name."""
     return {
         "constants": constants(),
         "header": layout(HEADER_FIELDS),
@@ -277,7 +268,6 @@ def current(page: str) -> str:
 
 
 def generated(page: str) -> str:
-    """The text of a page with every part between its marks made anew."""
     text = current(page)
     for name, content in PAGES[page]().items():
         text = _replaced(text, name, content)

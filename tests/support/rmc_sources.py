@@ -9,8 +9,6 @@ LIMIT_S = 60.0
 
 
 class Sentences:
-    """What came so far, and a way to wait for more."""
-
     def __init__(self) -> None:
         self.got: list[tuple[bytes, int]] = []
         self._arrived = asyncio.Event()
@@ -36,8 +34,6 @@ async def soon(_seconds: float) -> None:
 
 
 class FakeSource:
-    """An RMC source whose sentences are the test's."""
-
     title = "test"
     problem = ""
 

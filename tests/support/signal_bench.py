@@ -36,8 +36,6 @@ class HandWorker:
 
 
 class SignalBench:
-    """The surroundings of the lines of one device."""
-
     def __init__(self) -> None:
         self.clock = VirtualClock()
         self.memory = MemoryLines(self.clock.now_ns)
@@ -58,13 +56,11 @@ class SignalBench:
     def raise_event(
         self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
     ) -> None:
-        """As `RaiseEvent`."""
         assert isinstance(kind, EventKind)
         assert now_ns >= 0
         self.events.append(Event(now_ns, DEVICE, kind, message, dict(detail)))
 
     def messages(self, kind: EventKind | None = None) -> list[str]:
-        """Messages of the events so far, of one kind or of all."""
         return [event.message for event in self.events if kind in (None, event.kind)]
 
 

@@ -62,8 +62,6 @@ def run_script(script: RequestScript[T], ask: Callable[[Request], Outcome]) -> T
 
 
 class SerialModule(Protocol):
-    """A simulated module behind a UART."""
-
     @property
     def baud(self) -> int: ...
 
@@ -158,8 +156,6 @@ def unpack_hi91(data: bytes) -> Hi91:
 
 
 class HipnucUartBench:
-    """A module that has booted, and the time."""
-
     def __init__(self, settings: ModuleSettings | None = None, hardware: HipnucHardware | None = None) -> None:
         self.now_ns = BEGIN_NS
         self.module = HipnucModule(BEGIN_NS, settings, hardware)
@@ -193,8 +189,6 @@ def hardware_of(behaviour: Behaviour, **hardware: Any) -> HipnucHardware:
 
 
 class HipnucLine(SerialLine[HipnucModule]):
-    """A HiPNUC module on its line."""
-
     def __init__(self, settings: ModuleSettings | None = None, hardware: HipnucHardware = HIPNUC_STILL) -> None:
         ledger = Ledger()
         super().__init__(HipnucModule(BEGIN_NS, settings, hardware), HipnucCodec(ledger, HipnucSettings()), ledger)
@@ -314,8 +308,6 @@ class CanBench:
 
 
 class CanopenBench(CanBench):
-    """A CANopen node."""
-
     def __init__(
         self,
         factory: NodeSettings | None = None,
@@ -323,7 +315,6 @@ class CanopenBench(CanBench):
         variant: NodeVariant | None = None,
         others: tuple[int, ...] = (),
     ) -> None:
-        """`others`: numbers of other nodes, which send."""
         made = NodeVariant() if variant is None else variant
         hardware = HipnucCanopenHardware(factory=factory or QUIET, boot_ms=boot_ms, skew_ppm=0, variant=made)
         self.module = HipnucCanopenModule(BEGIN_NS, hardware)
@@ -336,8 +327,6 @@ class CanopenBench(CanBench):
 
 
 class J1939Bench(CanBench):
-    """A module on J1939."""
-
     def __init__(
         self,
         settings: J1939Settings | None = None,
@@ -345,7 +334,6 @@ class J1939Bench(CanBench):
         variant: J1939Variant | None = None,
         others: tuple[int, ...] = (),
     ) -> None:
-        """`others`: addresses of other modules, which send."""
         hardware = J1939Hardware(boot_ms=boot_ms, skew_ppm=0, variant=variant or J1939Variant())
         flash = settings or J1939Settings()
         self.module = HipnucJ1939Module(BEGIN_NS, flash, hardware)
@@ -359,8 +347,6 @@ IMU61X_STILL = Imu61xHardware(motion=AT_REST, skew_ppm=0)
 
 
 class Imu61xBench(SerialLine[Imu61xModule]):
-    """An IMU61x on its line."""
-
     def __init__(self, settings: Imu61xSettings | None = None, hardware: Imu61xHardware = IMU61X_STILL) -> None:
         ledger = Ledger()
         super().__init__(Imu61xModule(BEGIN_NS, settings, hardware), Imu61xCodec(ledger), ledger)

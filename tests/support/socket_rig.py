@@ -272,8 +272,6 @@ def in_context(
 
 
 def alone() -> Callable[[Callable[..., Awaitable[None]]], Callable[..., None]]:
-    """Run a test in a loop of its own."""
-
     @asynccontextmanager
     async def nothing(_folder: Path) -> AsyncIterator[None]:
         yield
@@ -302,8 +300,6 @@ class Daemon:
         self._stop = asyncio.Event()
 
     def do(self, work: Callable[[SocketServer], T]) -> T:
-        """`work(server)` in the loop's thread; its result."""
-
         async def called(server: SocketServer) -> T:
             return work(server)
 

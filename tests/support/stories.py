@@ -16,9 +16,7 @@ Story = Coroutine[Any, Any, None]
 class Bench(Protocol):
     """The surroundings of a test, which run its story in their own time."""
 
-    def play(self, story: Callable[[], Story], /) -> object:
-        """Run the story to its end, and check that nothing is left behind."""
-        ...
+    def play(self, story: Callable[[], Story], /) -> object: ...
 
 
 B = TypeVar("B", bound=Bench)

@@ -126,7 +126,6 @@ class Machine:
         """What happens while a check waits."""
 
     def write(self, path: str, text: str = "") -> Path:
-        """Make a file, and the folders that it is in."""
         file = self.root / path.lstrip("/")
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text)

@@ -41,8 +41,6 @@ EDGE_LATE_NS = 45_000
 
 
 class WiredDevice:
-    """The module, the runner, and the lines between them."""
-
     def __init__(
         self,
         lines: DeviceLines,
@@ -74,7 +72,6 @@ class WiredDevice:
         self._heard = 0
 
     def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Run the device during the story; at the end the ledger closes and the lines are released."""
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(utc_keeper, "RMC_SOURCES", {"gpsd": lambda _settings, _context: self.source})
             patch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 0, 0))
@@ -115,7 +112,6 @@ class WiredDevice:
         return self.samples[before:]
 
     def power_on(self) -> None:
-        """A module that begins anew on the same lines."""
         self.module = HipnucModule(self.clock.now_ns(), self._settings, self._hardware)
         on_edge: Mapping[Pin, OnEdge] = {pin: partial(self._on_edge, pin) for pin in Pin}
         self.pins = Pins(self.module, on_edge, self._pin_faults)
@@ -154,7 +150,6 @@ class WiredDevice:
     # --- the machinery -----------------------------------------------------------------------------------------------
 
     def run_module(self) -> None:
-        """Move bytes and edges that are due; again when there are more."""
         if self._timer is not None:
             self._timer.cancel()
         now_ns, module = self.clock.now_ns(), self.module
@@ -207,8 +202,6 @@ class WiredDevice:
 
 
 class LinkedModule(MemoryLink):
-    """A link of the daemon with a module at its far end."""
-
     def __init__(self, settings: MemorySettings, module: HipnucModule, clock: VirtualClock) -> None:
         super().__init__(settings)
         self.module = module
@@ -233,8 +226,6 @@ class LinkedModule(MemoryLink):
 
 
 class LinkedDevice:
-    """A device of the daemon whose module is simulated."""
-
     def __init__(
         self, clock: VirtualClock, settings: ModuleSettings | None, hardware: HipnucHardware, **config: Any
     ) -> None:

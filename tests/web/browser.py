@@ -43,7 +43,6 @@ class Page:
         return answer[0]
 
     def until(self, script: str, *arguments: object, what: str = "") -> Any:
-        """Look again until a script returns something that is true; return it. While the page loads it may fail."""
         wait = WebDriverWait(self.driver, LIMIT_S, LOOK_S, ignored_exceptions=(JavascriptException,))
         return wait.until(lambda _driver: self.js(script, *arguments), what or script)
 

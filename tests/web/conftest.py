@@ -36,7 +36,6 @@ def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 @pytest.fixture
 def page(window: Page) -> Page:
-    """Its tab, with no page open, without a cookie, and with nothing in its log."""
     window.driver.delete_all_cookies()
     window.driver.get("about:blank")
     window.problems()
@@ -45,7 +44,6 @@ def page(window: Page) -> Page:
 
 @pytest.fixture(scope="session")
 def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Address of `imud web` without a daemon, for scripts of the page."""
     with serving_web(tmp_path_factory.mktemp("still") / "none") as url:
         yield url
 
@@ -71,7 +69,6 @@ def phone(tmp_path: Path) -> Iterator[Page]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
-    """Keep the picture of a page whose test failed, while it is still open."""
     report: pytest.TestReport = yield  # type: ignore[assignment]  # a wrapper is sent the result
     given = getattr(item, "funcargs", {})
     pages = [one for name, one in given.items() if name in ("page", "phone")]
@@ -81,7 +78,6 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 def keep_picture(page: Page, name: str) -> str:
-    """Save what the browser shows; return where, or why not."""
     file = PICTURES / f"{''.join(one if one.isalnum() else '_' for one in name)}.png"
     PICTURES.mkdir(parents=True, exist_ok=True)
     try:

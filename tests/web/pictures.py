@@ -53,13 +53,11 @@ class Module:
         return configuration(self.name, MODULES[self.name][0])
 
     def unplug(self, seconds: float) -> None:
-        """Pull its cable for so long."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"unplug {seconds}\n")
         self._process.stdin.flush()
 
     def stand_still(self) -> None:
-        """Send nothing more, with the port still there."""
         self._process.send_signal(signal.SIGSTOP)
 
     def end(self) -> None:
@@ -149,7 +147,6 @@ def desktop(folder: Path, url: str, bow: Module, daemon: RunningDaemon) -> None:
 
 
 def phone(folder: Path, url: str) -> None:
-    """The page of a device on a telephone."""
     with browser(folder / "phone", phone=True) as page:
         page.driver.get(f"{url}#/device/mast")
         page.until("return Boolean(window.imud?.view?.plots)")

@@ -12,7 +12,6 @@ MS = 1_000_000
 
 
 def at(ms: float, seq: int = 1, z: float = 9.75) -> Sample:
-    """A sample at a time, ms after 80 000 s."""
     made = sample("bow", seq)
     t_ns = 80_000_000_000_000 + round(ms * MS)
     return msgspec.structs.replace(made, t_ns=t_ns, t_rx_ns=t_ns + 300_000, accel_m_s2=(0.5, -0.5, z))

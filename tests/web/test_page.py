@@ -32,7 +32,6 @@ TURNING = {
 
 
 def peaks(number: int) -> float:
-    """9.5 m/s², and now and then one sample with a value that no other has."""
     return 9.5 if number % PEAK_EVERY else 20.0 + number / PEAK_EVERY / 8
 
 

@@ -25,7 +25,6 @@ SEGMENTS = "return window.imud.view.spectrum.spectrum.segments.length >= argumen
 
 
 def wave(number: int) -> float:
-    """Vibration of 2 m/s² at WAVE_HZ, in messages at RATE_HZ."""
     return 9.8 + 2.0 * math.sin(2 * math.pi * WAVE_HZ * number / RATE_HZ)
 
 

@@ -18,7 +18,6 @@ EAST_M_S2: Final = 0.15
 
 
 def shaking(amplitude_m_s2: float, frequency_hz: float) -> Sine:
-    """The position whose acceleration is a sine of this amplitude."""
     return Sine(amplitude_m_s2 / (2 * pi * frequency_hz) ** 2, frequency_hz)
 
 

@@ -33,7 +33,6 @@ class MeasurementError(Exception):
 
 
 def total(dump: str) -> int:
-    """The instructions of one dump of callgrind. Raises MeasurementError."""
     found = re.search(r"^totals: (\d+)$", dump, re.MULTILINE)
     if found is None:
         raise MeasurementError("a dump of callgrind without totals; was it interrupted?")
@@ -75,7 +74,6 @@ def measure(words: Sequence[str]) -> dict[str, int]:
 
 
 def main() -> int:
-    """Run as `python -m tests.bench.instructions`."""
     parser = argparse.ArgumentParser(prog="make bench-instructions")
     parser.add_argument("words", nargs="*", metavar="WORD", help="stages with a WORD in their names; all without any")
     parser.add_argument("--update", action="store_true", help="keep what is counted as the figures of this Python")

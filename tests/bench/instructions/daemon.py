@@ -44,7 +44,6 @@ class _Feeder:
         self.wakes = 0
 
     def poll(self, timeout: float | None, maxevents: int) -> list[tuple[int, int]]:
-        """As that of an epoll, of a time that passes at once."""
         if timeout is None or timeout > 0:
             read = next(self.reads, None)
             if read is None:
@@ -63,7 +62,6 @@ class _Feeder:
             self.drain()
 
     def drain(self) -> None:
-        """Read what the clients have got."""
         for client in self.clients:
             client.recv_into(BUFFER)
 
@@ -83,7 +81,6 @@ class VirtualDaemon:
         self.process(self._module.first_minute())
 
     def connect(self, clients: int, encoding: str) -> None:
-        """Have so many clients that get every sample."""
         watch = line_of(encode_request("watch", {"encoding": encoding}, 1))
         for _ in range(clients):
             client = socket.socket(socket.AF_UNIX)
@@ -97,11 +94,9 @@ class VirtualDaemon:
         self.process(self._module.reads(SETTLE_READS))
 
     def prepare(self, count: int, frames: int) -> list[Read]:
-        """`count` reads of so many frames each, for `process`."""
         return self._module.reads(count, frames)
 
     def process(self, reads: list[Read]) -> None:
-        """Have the daemon read, process and publish; a wake-up each."""
         self._run(iter(reads))
 
     def _run(self, reads: Iterator[Read]) -> None:
@@ -111,7 +106,6 @@ class VirtualDaemon:
             self._running.result()
 
     def _pass_time(self, duration_ms: int) -> None:
-        """Have the daemon do what it does without data."""
         for _ in range(duration_ms):
             virtual_time.set_now(virtual_time.now_ns() + NS_PER_MS)
             self._run(iter(()))

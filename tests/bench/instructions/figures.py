@@ -21,8 +21,6 @@ Figures = dict[str, int]
 
 
 class Line(NamedTuple):
-    """One stage of a measurement."""
-
     stage: str
     now: int
     kept: int | None
@@ -35,7 +33,6 @@ class Line(NamedTuple):
 
     @property
     def is_good(self) -> bool:
-        """Whether there is a figure, and it is not exceeded."""
         return self.kept is not None and self.now <= self.kept * (1 + GROWTH_MOST)
 
     def __str__(self) -> str:
@@ -46,13 +43,11 @@ class Line(NamedTuple):
 
 
 def python_build() -> str:
-    """What figures depend on beside our own code."""
     python = f"{platform.python_implementation()} {platform.python_version()}"
     return f"{python}, {platform.python_compiler()}, {platform.machine()}"
 
 
 def load() -> dict[str, Figures]:
-    """All figures, by build of Python."""
     return msgspec.json.decode(FILE.read_bytes(), type=dict[str, Figures])
 
 
@@ -71,5 +66,4 @@ def is_same_build(kept: Figures | None, measured: Mapping[str, int]) -> bool:
 
 
 def compare(kept: Figures, measured: Mapping[str, int]) -> list[Line]:
-    """Each stage that was measured beside its figure."""
     return [Line(stage, now, kept.get(stage)) for stage, now in measured.items()]

@@ -21,7 +21,6 @@ MARKS = 3
 
 
 def mark() -> None:
-    """Begin a new dump."""
     os.getpgid(0)
 
 
@@ -44,7 +43,6 @@ def main(directory: str, words: Sequence[str]) -> int:
 
 
 def run(stage: Any, directory: str) -> None:
-    """Run one stage, and end the process."""
     status = 1
     try:
         os.mkdir(directory)

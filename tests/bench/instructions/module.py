@@ -32,28 +32,22 @@ HI91: Final = encode_hi91(
 
 
 class Read(NamedTuple):
-    """Bytes that are there at one time."""
-
     data: bytes
     t_rx_ns: int
 
 
 def hi91(time_ms: int) -> bytes:
-    """The frame of this time."""
     payload = bytearray(HI91[HEADER_BYTES:])
     struct.pack_into("<I", payload, TIME_AT, time_ms)
     return encode_frame(bytes(payload))
 
 
 def arrival_ns(time_ms: int, number: int) -> int:
-    """When the last byte of the frame of this time is read."""
     true_ns = time_ms * NS_PER_MS + time_ms * PPM
     return BEGIN_NS + true_ns + len(HI91) * uart_byte_ns(BAUD) + DELAY_NS[number % len(DELAY_NS)]
 
 
 class Module:
-    """Makes the reads of a port in the order of time."""
-
     def __init__(self) -> None:
         self._time_ms = 1000
 
@@ -66,7 +60,6 @@ class Module:
         return found + self.reads(SETTLE_READS)
 
     def skip(self, duration_ms: int) -> None:
-        """Lose the frames of this time."""
         self._time_ms += duration_ms
 
     def reads(self, count: int, frames: int = 1) -> list[Read]:

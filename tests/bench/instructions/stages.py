@@ -47,8 +47,6 @@ WARM_LEAST: Final = 20
 
 @dataclass(frozen=True, slots=True)
 class CountedStage:
-    """A part of the way of a sample."""
-
     name: str
     make: Callable[[int, str], Run]
     """Makes `run` for so many operations in all; its files go into the directory."""
@@ -59,7 +57,6 @@ class CountedStage:
 
     @property
     def total(self) -> int:
-        """Operations in all."""
         return self.warm + 3 * self.count
 
     @property
@@ -69,7 +66,6 @@ class CountedStage:
 
 
 def _taking(operations: Sequence[Callable[[], object]]) -> Run:
-    """Carries out operations, each once."""
     left = iter(operations)
 
     def run(count: int) -> None:
@@ -80,8 +76,6 @@ def _taking(operations: Sequence[Callable[[], object]]) -> Run:
 
 
 def _interpreter(total: int, _directory: str) -> Run:
-    """What depends on how Python was built, and on nothing else: calls, a dictionary, integers and floats."""
-
     def loop(count: int) -> float:
         seen: dict[int, float] = {}
         for number in range(count):

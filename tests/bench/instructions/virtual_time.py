@@ -27,12 +27,10 @@ def install() -> None:
 
 
 def now_ns() -> int:
-    """CLOCK_MONOTONIC as it was set."""
     return _ns[0]
 
 
 def set_now(now_ns: int) -> None:
-    """Set all clocks."""
     _ns[:] = now_ns, now_ns + UTC_AHEAD_NS
     _by_clock[time.CLOCK_MONOTONIC_RAW] = _by_clock[time.CLOCK_BOOTTIME] = now_ns
     _s[0] = now_ns / NS_PER_S

@@ -21,7 +21,6 @@ from tests.support.daemon_process import LIMIT_S, wait_until
 
 @contextmanager
 def demo(*words: str) -> Iterator[tuple[ImudProcess, Path]]:
-    """The command as a process, and the folder of its daemon."""
     with imud_process("demo", "--plain", *words, start_new_session=True) as process:
         found = re.match(r"daemon at (\S+)/imud.sock", process.out.readline())
         assert found is not None
@@ -70,7 +69,6 @@ def test_the_commands_it_prints_reach_it_from_another_directory_until_its_durati
 
 
 def pasted(*lines: str) -> str:
-    """The output of a shell that does not know this directory and this environment."""
     script = "\n".join(["set -e", *lines])
     return subprocess.run(
         ["/bin/sh", "-c", script], cwd="/", env={}, capture_output=True, text=True, timeout=LIMIT_S, check=True

@@ -18,8 +18,6 @@ pytestmark = pytest.mark.live
 
 
 class Echo:
-    """A server that repeats what comes, and closes when the other end has."""
-
     def __init__(self) -> None:
         self.socket = socket.create_server(("127.0.0.1", 0))
         self.ended = 0
@@ -141,7 +139,6 @@ def test_a_head_without_end_and_one_that_does_not_come(echo: Echo, monkeypatch: 
 
 
 def is_closed(connection: socket.socket) -> bool:
-    """Wait for the end, which is a reset where bytes were not read."""
     try:
         return connection.recv(100) == b""
     except ConnectionResetError:

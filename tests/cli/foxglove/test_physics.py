@@ -58,7 +58,6 @@ def served(daemon: RunningDaemon) -> Iterator[str]:
 
 
 async def look(client: ProtocolClient, messages: Messages) -> None:
-    """Subscribe to everything, and take messages until there are enough of each kind."""
     for topic, schema in TOPICS.items():
         await client.subscribe(topic)
         assert client.channels[topic]["schemaName"] == schema
@@ -70,7 +69,6 @@ async def look(client: ProtocolClient, messages: Messages) -> None:
 
 
 async def watch(url: str, daemon: RunningDaemon) -> tuple[Messages, Any]:
-    """Look while the daemon runs, and see its end."""
     messages: Messages = {}
     async with connected(url) as client:
         await look(client, messages)
@@ -108,7 +106,6 @@ def forward_left_up(sensor: tuple[float, float, float]) -> tuple[float, float, f
 
 
 def turned(quaternion: Any, vector: Any) -> tuple[float, float, float]:
-    """A vector of the body in the navigation frame, by the matrix of the quaternion."""
     w, (x, y, z), (a, b, c) = quaternion.w, xyz(quaternion), xyz(vector)
     return (
         (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - w * z) * b + 2 * (x * z + w * y) * c,

@@ -168,7 +168,6 @@ def test_the_topic_of_transforms_stays_while_another_device_has_it(
     viewer = FakeViewer()
 
     def until(topic: str) -> list[str]:
-        """Topics of all that the viewer is given until this one comes."""
         topics: list[str] = []
         while topic not in topics:
             topics.append(viewer.said.get(timeout=LIMIT_S).topic)

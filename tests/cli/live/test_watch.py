@@ -30,7 +30,6 @@ def publishing(sent: Batch, server: SocketServer) -> None:
 
 @contextmanager
 def samples_of(served: Daemon, devices: Sequence[str] = ("imu0",)) -> Iterator[None]:
-    """Samples of devices again and again, as at 100 Hz by their stamps."""
     ended = Event()
 
     def publish() -> None:
@@ -51,7 +50,6 @@ def samples_of(served: Daemon, devices: Sequence[str] = ("imu0",)) -> Iterator[N
 
 @pytest.fixture(scope="module")
 def words(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[object, ...]]:
-    """The command for a daemon with two devices that send."""
     with daemon(tmp_path_factory.mktemp("watch")) as served, samples_of(served, ("imu0", "imu1")):
         yield "watch", "--socket", served.path
 

@@ -28,8 +28,6 @@ class PortSettings(Settings, frozen=True, kw_only=True):
 
 
 class Port(LinkedModule):
-    """A serial port with a module. It carries bytes while it is open."""
-
     def __init__(self, baud: int = 460_800, hardware: HipnucHardware = HIPNUC_STILL) -> None:
         clock = VirtualClock()
         module = HipnucModule(clock.now_ns(), ModuleSettings(baud=baud), hardware)
@@ -64,8 +62,6 @@ Ports = Callable[[Port], Port]
 
 @pytest.fixture
 def ports(monkeypatch: pytest.MonkeyPatch) -> Ports:
-    """Puts a port into the host, whose loop runs in virtual time."""
-
     def use(port: Port) -> Port:
         def run(body: object) -> object:
             with asyncio.Runner(loop_factory=lambda: VirtualLoop(port.clock)) as runner:

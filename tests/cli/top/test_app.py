@@ -44,8 +44,6 @@ def lines(app: TopApp) -> list[str]:
 
 
 class SilentFeed:
-    """A feed that gives no news, and notes what it is to look at."""
-
     looked_at: ClassVar[list[str | None]] = []
 
     def start(self) -> None:
@@ -61,8 +59,6 @@ class SilentFeed:
 def played(
     steps: Steps, make_feed: Callable[[Callable[[News], None]], Any] = lambda _: SilentFeed()
 ) -> Callable[[], None]:
-    """A test of the program."""
-
     def test() -> None:
         async def run() -> None:
             app = TopApp(make_feed)
@@ -87,7 +83,6 @@ async def press(pilot: Pilot[None], app: TopApp, *keys: str) -> list[str]:
 
 
 async def settled(pilot: Pilot[None], app: TopApp) -> list[str]:
-    """What is shown once nothing changes any more."""
     before: list[str] = []
     for _ in range(LOOKS):
         await pilot.pause(LOOK_S)

@@ -42,8 +42,6 @@ SPARE: Final = {"driver": "hipnuc-uart", "uart": {"port": "/dev/imud-chaos-nothi
 
 
 class Chaos:
-    """One run (`Scene` of the faults)."""
-
     def __init__(self, far: FarSide, folder: Path, state: Path) -> None:
         self.far, self.state = far, state
         self.violations: list[str] = []
@@ -71,22 +69,18 @@ class Chaos:
         self.life = self._born()
 
     def begin(self, item: Planned) -> None:
-        """Make a fault."""
         self.outage_begins(item.fault)
         item.fault.begin(self, item.lasts_s)
 
     def end(self, fault: Fault) -> None:
-        """Take a fault back."""
         fault.end(self)
         self.outage_ends(fault)
 
     def outage_begins(self, fault: Fault) -> None:
-        """Note it for the devices that it concerns."""
         for name in fault.outage:
             self._outages[name].append(Interval(monotonic_ns(), NEVER_NS, fault.restarts))
 
     def outage_ends(self, fault: Fault) -> None:
-        """The same."""
         for name in fault.outage:
             begin = self._outages[name].pop()
             self._outages[name].append(begin._replace(end_ns=monotonic_ns()))
@@ -243,7 +237,6 @@ class Chaos:
 
 @contextmanager
 def small_disk(folder: Path) -> Iterator[Path]:
-    """A file system of STATE_SIZE."""
     folder.mkdir()
     tool("mount", "-t", "tmpfs", "-o", f"size={STATE_SIZE}", "tmpfs", str(folder))
     try:
@@ -253,7 +246,6 @@ def small_disk(folder: Path) -> Iterator[Path]:
 
 
 def show(chaos: Chaos, made: Counter[str], faults: list[Fault]) -> None:
-    """The tables."""
     print("\nfault                             times")
     for fault in faults:
         print(f"  {fault.name:32}{made[fault.name]:5}")
@@ -268,7 +260,6 @@ def show(chaos: Chaos, made: Counter[str], faults: list[Fault]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run; return the exit status."""
     parser = argparse.ArgumentParser(prog="make chaos", description=__doc__.partition("\n")[0] if __doc__ else None)
     parser.add_argument("--seed", type=int, default=time.time_ns() % 1_000_000, help="of the plan (by the clock)")
     parser.add_argument(

@@ -63,8 +63,6 @@ class Hole(NamedTuple):
 
 
 class Account(NamedTuple):
-    """What one device did in one life, or in several together."""
-
     samples: int = 0
     lost: int = 0
     """Losses of the ledger."""
@@ -132,7 +130,6 @@ def find_holes(
 
 
 def account(samples: int, holes: Sequence[Hole], lost: int, unknown: int, outages: int) -> Account:
-    """Hold losses and unknown gaps of a ledger against the true holes."""
     true = sum(hole.missing for hole in holes if not hole.is_open)
     uncertain = sorted((hole for hole in holes if not hole.is_certain and not hole.is_open), reverse=True)
     least = true - sum(hole.missing for hole in uncertain[:unknown]) - sum(h.missing > 0 for h in uncertain[unknown:])

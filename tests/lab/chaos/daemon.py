@@ -32,8 +32,6 @@ ID_AT: Final = next(field.offset for field in SLOT_FIELDS if field.name == "devi
 
 
 class Snapshot(NamedTuple):
-    """Every device at one moment."""
-
     devices: Mapping[str, DeviceStatus]
     at_ns: int
     """CLOCK_MONOTONIC, right before it was asked for."""
@@ -60,7 +58,6 @@ class Recorder:
         self._thread.start()
 
     def samples(self) -> dict[str, list[Sample]]:
-        """All samples so far, by device, and the newest of the time before."""
         names = {status.device_id: name for name, status in self.begin.devices.items()}
         found: dict[str, list[Sample]] = {name: [] for name in names.values()}
         for slots in list(self._slots):
@@ -81,7 +78,6 @@ class Recorder:
         return [message for message in self._others if isinstance(message, dict) and message.get("method") == "dropped"]
 
     def close(self) -> None:
-        """Wait for the daemon's end of the connection, which must be dead or about to die."""
         self._thread.join(ANSWER_LIMIT_S)
         assert not self._thread.is_alive(), "the recorder's connection did not end"
         self._client.close()
@@ -105,8 +101,6 @@ def _first_samples(rings: Path, name: str, newest_seq: int) -> list[Sample]:
 
 
 class Life:
-    """One process of the daemon from its start to its end."""
-
     def __init__(self, folder: Path, config: Path) -> None:
         self.socket = folder / "imud.sock"
         self.socket.unlink(missing_ok=True)
@@ -141,20 +135,16 @@ class Life:
             sleep(0.5)
 
     def usage(self) -> tuple[int, int]:
-        """Descriptors and threads of the process."""
         proc = Path(f"/proc/{self.process.pid}")
         return len(os.listdir(proc / "fd")), len(os.listdir(proc / "task"))
 
     def rss_kb(self) -> int:
-        """Resident memory."""
         return int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") // 1024
 
     def signal(self, number: signal.Signals) -> None:
-        """Send a signal."""
         self.process.send_signal(number)
 
     def kill(self) -> None:
-        """End it at once."""
         self.process.kill()
         self._gone(-signal.SIGKILL)
 
@@ -168,13 +158,11 @@ class Life:
             (CGROUP / "memory.max").write_text("max")
 
     def terminate(self) -> None:
-        """End it in order."""
         self.process.terminate()
         self._gone(0)
         assert not self.socket.exists(), "the socket was left behind"
 
     def destroy(self) -> None:
-        """End whatever is left of it; may be called twice."""
         self.process.kill()
         self.process.wait(START_LIMIT_S)
         self.recorder.close()

@@ -63,24 +63,20 @@ class UartNode(PtyNode):
         self._baud = BAUD
 
     def plug(self, baud: int) -> None:
-        """Set the rate."""
         self._baud = baud
         set_baud(self._fd, baud)
 
     def unplug(self) -> None:
-        """Close the port; may be called twice."""
         if self._fd >= 0:
             termios.tcflush(self._fd, termios.TCIOFLUSH)
             os.close(self._fd)
             self._fd = -1
 
     def fileno(self) -> int:
-        """The descriptor."""
         return self._fd
 
     @property
     def is_open(self) -> bool:
-        """A wire carries what is sent, whether anyone listens or not."""
         return True
 
     @property
@@ -89,7 +85,6 @@ class UartNode(PtyNode):
         return self._baud
 
     def read(self) -> bytes:
-        """What the host sent."""
         try:
             return os.read(self._fd, 4096)
         except BlockingIOError:
@@ -116,11 +111,9 @@ class PortThread:
         self._thread = threading.Thread(target=self._run, name="ports")
 
     def add(self, port: Port, lines: SimulatedLines | None = None) -> None:
-        """Add a port before the start."""
         self._ports.append((port, lines))
 
     def start(self) -> None:
-        """Begin."""
         self._thread.start()
 
     def check(self) -> None:
@@ -129,7 +122,6 @@ class PortThread:
             raise self._failure
 
     def close(self) -> None:
-        """End; raises what the thread died of."""
         self._stop.set()
         self._thread.join()
         for port, _ in self._ports:
@@ -160,8 +152,6 @@ class PortThread:
 
 
 class FarSide:
-    """All devices and what can be done to them. Use as a context manager."""
-
     def __init__(self, folder: Path, seed: int) -> None:
         self._stack = ExitStack()
         self._seed = seed
@@ -200,7 +190,6 @@ class FarSide:
         self._stack.close()
 
     def devices(self) -> Mapping[str, Mapping[str, object]]:
-        """Their configuration, by name."""
         uart: dict[str, object] = {"port": str(self.uart), "baud": BAUD}
         return {
             "serial": {

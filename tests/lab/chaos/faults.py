@@ -29,17 +29,11 @@ PAUSE_S: Final = 0.3
 
 
 class Scene(Protocol):
-    """What faults act on."""
+    @property
+    def far(self) -> FarSide: ...
 
     @property
-    def far(self) -> FarSide:
-        """The simulated devices."""
-        ...
-
-    @property
-    def life(self) -> Life:
-        """The daemon of the moment."""
-        ...
+    def life(self) -> Life: ...
 
     @property
     def state(self) -> Path:
@@ -57,8 +51,6 @@ class Scene(Protocol):
 
 @dataclass(frozen=True)
 class Fault:
-    """One kind of fault."""
-
     name: str
     resources: frozenset[str]
     """No other fault that has one of these goes on at the same time."""
@@ -75,8 +67,6 @@ class Fault:
 
 
 class Planned(NamedTuple):
-    """One fault of a plan."""
-
     begin_s: float
     """Since the beginning of its round."""
     fault: Fault
@@ -171,8 +161,6 @@ def slew(ppm: float) -> None:
 
 @dataclass
 class _Clock:
-    """Steps of CLOCK_REALTIME, forward and back in turns."""
-
     by_s: float = STEP_MOST_S
     moved_s: float = field(default=0.0)
 

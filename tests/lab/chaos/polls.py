@@ -27,8 +27,6 @@ BLOCK_REPLY_BYTES: Final = READ_OVERHEAD_BYTES + 2 * BLOCK_REGISTERS
 
 
 class Answer(Enum):
-    """What the host got."""
-
     GOOD = "good"
     DAMAGED = "damaged"
     """With a wrong bit."""
@@ -39,8 +37,6 @@ class Answer(Enum):
 
 
 class Asked(NamedTuple):
-    """One transfer."""
-
     t_ns: int
     """CLOCK_MONOTONIC, between its begin and its end."""
     answer: Answer
@@ -54,18 +50,15 @@ class PollLog:
     """All transfers, in order. Synchronization: one thread adds, another one reads."""
 
     def __init__(self, period_ns: int) -> None:
-        """`period_ns` is the time between two deadlines."""
         self.period_ns = period_ns
         self._asked: list[Asked] = []
         self._lock = threading.Lock()
 
     def add(self, asked: Asked) -> None:
-        """Add the next transfer."""
         with self._lock:
             self._asked.append(asked)
 
     def between(self, begin_ns: int, end_ns: int) -> list[Asked]:
-        """Transfers after `begin_ns`, `end_ns` included."""
         with self._lock:
             first = bisect_right(self._asked, begin_ns, key=_time)
             return self._asked[first : bisect_right(self._asked, end_ns, key=_time)]
@@ -113,8 +106,6 @@ class PollLog:
 
 
 class LoggedRegisters:
-    """A device on a polled bus, whose transfers are logged."""
-
     def __init__(self, period_ns: int) -> None:
         self.device = Imu61xRegisters(monotonic_ns)
         self.log = PollLog(period_ns)

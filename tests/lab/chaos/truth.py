@@ -23,8 +23,6 @@ STEP_M_S2: Final = 0.01
 
 
 class Measured(NamedTuple):
-    """One sample as the device took it."""
-
     sample_ns: int
     """CLOCK_MONOTONIC of the instant."""
     key: int
@@ -42,7 +40,6 @@ class TruthLog:
         self._tolerance = tolerance
 
     def add(self, sample_ns: int, key: int) -> None:
-        """Add the next sample."""
         with self._lock:
             self._measured.append(Measured(sample_ns, key))
 
@@ -76,7 +73,6 @@ def _instant(measured: Measured) -> int:
 
 
 def time_key(sample: Sample) -> int:
-    """The device time of a sample, ns."""
     assert sample.t_dev_ns is not None
     return sample.t_dev_ns
 
@@ -87,7 +83,6 @@ def encoded(number: int) -> Vector3:
 
 
 def decoded(sample: Sample) -> int:
-    """The number in an acceleration."""
     assert sample.accel_m_s2 is not None
     x, y, _ = sample.accel_m_s2
     return round(x / STEP_M_S2) + BASE * round(y / STEP_M_S2)
@@ -103,11 +98,9 @@ class LoggedModule:
 
     @property
     def baud(self) -> int:
-        """Rate in force."""
         return self._module.baud
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Pass bytes of the host on."""
         self._module.receive(data, now_ns)
 
     def advance(self, now_ns: int) -> list[Burst]:
@@ -120,15 +113,12 @@ class LoggedModule:
         return bursts
 
     def next_ns(self) -> int | None:
-        """When `advance` has something next."""
         return self._module.next_ns()
 
     def counters(self) -> dict[str, int]:
-        """Those of the module."""
         return self._module.counters()
 
     def mark(self, now_ns: int) -> None:
-        """Pass the edge on."""
         self._module.mark(now_ns)
 
     def power_off(self, now_ns: int) -> None:

@@ -31,12 +31,10 @@ class Parser(argparse.ArgumentParser):
     """Bad options are a LabError: one line, like every other failure."""
 
     def error(self, message: str) -> NoReturn:
-        """Raises instead of printing the usage."""
         raise LabError(f"{message} (tests/lab/run --help)")
 
 
 def parser() -> Parser:
-    """The options; everything after `--` is pytest's."""
     options = Parser(prog="tests/lab/run", allow_abbrev=False, description="Runs tests/lab in a kernel under QEMU.")
     options.add_argument("--ci", action="store_true", help="without QEMU say so and succeed")
     options.add_argument("--build-only", action="store_true", help="build the kernel and the module, do not boot")
@@ -52,12 +50,10 @@ def parser() -> Parser:
 
 
 def say(line: str) -> None:
-    """One line about the lab itself; standard output belongs to the guest."""
     print(f"lab: {line}", file=sys.stderr, flush=True)
 
 
 def boot(options: argparse.Namespace, python: environment.Python, built: Path) -> int:
-    """One run of the guest: prepares its folder, runs it, keeps its results; returns its status."""
     command = ["sh", "-c", options.exec] if options.exec else environment.pytest_command(python, options.arguments)
     silence_s = guest.STEADY_SILENCE_S if options.steady else guest.Limits.silence_s
     limits = guest.Limits(total_s=options.limit, silence_s=silence_s)
@@ -107,7 +103,6 @@ def check(options: argparse.Namespace) -> None:
 
 
 def lab(arguments: list[str]) -> int:
-    """Everything; LabError for what is the lab's own failure."""
     options = parser().parse_args(arguments)
     if options.ci and shutil.which(QEMU) is None:
         say(f"left out: {QEMU} is not installed (make lab-deps installs it)")
@@ -131,7 +126,6 @@ def terminate(number: int, _frame: object) -> NoReturn:
 
 
 def run_program(lab: Callable[[list[str]], int], say: Callable[[str], None]) -> int:
-    """Run `lab` with the arguments of the command line, and return the exit status of the process."""
     signal.signal(signal.SIGTERM, terminate)
     try:
         return lab(sys.argv[1:])
@@ -144,7 +138,6 @@ def run_program(lab: Callable[[list[str]], int], say: Callable[[str], None]) -> 
 
 
 def main() -> int:
-    """The program."""
     return run_program(lab, say)
 
 

@@ -18,7 +18,6 @@ KILLED = re.compile(r"Out of memory: Killed process")
 
 
 def cause(console: str) -> str | None:
-    """The most telling cause with the line that shows it, or None."""
     for pattern, meaning in CAUSES:
         line = next((line for line in console.splitlines() if re.search(pattern, line)), None)
         if line is not None:
@@ -32,7 +31,6 @@ def out_of_memory(console: str) -> bool:
 
 
 def last_line(console: str) -> str:
-    """The last thing the console said, for a guest that just stopped."""
     lines = [line for line in console.splitlines() if line.strip()]
     return _bare(lines[-1]) if lines else "nothing on the console"
 

@@ -25,8 +25,6 @@ COMPILED = ("imud", "tests/conftest.py", "tests/lab", "tests/support")
 
 @dataclass(frozen=True)
 class Python:
-    """A virtual environment with pytest, and the installation it was made from."""
-
     venv: Path
     base: Path
 

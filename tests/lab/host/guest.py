@@ -41,19 +41,15 @@ class Limits:
 
 @dataclass(frozen=True)
 class Folder:
-    """The files of one run, on the host and in the guest's /run/lab."""
-
     path: Path
 
     def read(self, name: str) -> str:
-        """A file's text; empty if it is not there."""
         try:
             return (self.path / name).read_text(encoding="utf-8", errors="replace")
         except FileNotFoundError:
             return ""
 
     def age_s(self, name: str) -> float | None:
-        """Seconds since a file was written, None if it is not there."""
         try:
             return time.time() - (self.path / name).stat().st_mtime
         except FileNotFoundError:
@@ -164,6 +160,5 @@ def _status(folder: Folder, qemu_status: int) -> int:
 
 
 def to_terminal(data: bytes) -> None:
-    """Writes the guest's output to standard output, at once."""
     sys.stdout.buffer.write(data)
     sys.stdout.buffer.flush()

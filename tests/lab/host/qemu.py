@@ -55,11 +55,9 @@ class Machine:
         ]
 
     def kernel_arguments(self) -> str:
-        """The kernel's command line."""
         root = f'root=hostroot rootfstype=9p rootflags={ROOT_FLAGS} ro init="{INIT}"'
         return f"console=ttyS0 panic=-1 {PANIC_BY_NMI} tsc=reliable {root}"
 
 
 def _escaped(path: Path) -> str:
-    """QEMU's option syntax doubles commas inside values."""
     return str(path).replace(",", ",,")

@@ -51,7 +51,6 @@ RUNS = {
 
 
 def main(arguments: list[str]) -> int:
-    """The program."""
     parser = argparse.ArgumentParser()
     parser.add_argument("architecture", choices=list(RUNS))
     parser.add_argument("groups", nargs="*", metavar="GROUP")

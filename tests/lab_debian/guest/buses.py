@@ -86,7 +86,6 @@ def is_there(checks: Checks, pattern: str, what: str) -> bool:
 
 
 def check(checks: Checks, _host: Host) -> None:
-    """Each bus that is there, and chronyd."""
     make_nodes()
     check_i2c(checks)
     check_gpio(checks)

@@ -26,8 +26,6 @@ class Failed(Exception):
 
 
 class Checks:
-    """The checks of one run, in their order."""
-
     def __init__(self, results: Path) -> None:
         self._results = results
         self._rows: list[dict[str, object]] = []
@@ -35,7 +33,6 @@ class Checks:
         self._group = ""
 
     def begin(self, group: str) -> None:
-        """Name the group that the next checks belong to."""
         self._group = group
 
     @contextlib.contextmanager
@@ -57,26 +54,21 @@ class Checks:
         self._save()
 
     def figure(self, name: str, value: float, unit: str) -> None:
-        """Keep and print a figure that was measured."""
         print(f"     {value:8.2f} {unit}  {self._group}: {name}", flush=True)
         self._figures.append({"group": self._group, "name": name, "value": value, "unit": unit})
         self._save()
 
     def note(self, text: str) -> None:
-        """Print what was found beside a check."""
         print(f"       {text.strip()[:110]}", flush=True)
 
     def skip(self, name: str, why: str) -> None:
-        """Say that something is not checked, and why."""
         print(f"SKIP           {self._group}: {name}: {why}", flush=True)
 
     @property
     def failed(self) -> list[str]:
-        """Names of the checks that failed."""
         return [f"{row['group']}: {row['name']}" for row in self._rows if row["why"]]
 
     def summary(self) -> str:
-        """One line about the run."""
         failed = self.failed
         return f"{len(self._rows)} checks, {len(failed)} failed{': ' if failed else ''}{'; '.join(failed)}"
 

@@ -81,7 +81,6 @@ def check_doctor(checks: Checks, host: Host) -> None:
 
 
 def check_complaints(checks: Checks, _host: Host) -> None:
-    """What keeps the daemon from its port or its boot; the next step that is advised is taken, and helps."""
     ensure_running(USB + CAN)
     with checks("imud doctor names the program that has the port, and the daemon gets it afterwards"):
         must("systemctl", "stop", UNIT)
@@ -117,7 +116,6 @@ def check_complaints(checks: Checks, _host: Host) -> None:
 
 
 def open_files() -> list[str]:
-    """What the holder of the port has open."""
     holder = int(shown("MainPID", HOLDER))
     found: list[str] = []
     with suppress(FileNotFoundError):  # one was closed meanwhile, or the holder is no more

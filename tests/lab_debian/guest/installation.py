@@ -11,7 +11,6 @@ LEFT_OUT = re.compile(r"^missing +/usr/share/(doc|man)\b")
 
 
 def check(checks: Checks, _host: Host) -> None:
-    """Boot and installation. What cannot go on without them ends the run."""
     with checks("the system is up, with no failed unit"):
         state = run("systemctl", "is-system-running", "--wait").stdout.strip()
         if state != "running":

@@ -26,7 +26,6 @@ REALTIME = "[Service]\nCPUSchedulingPolicy=rr\nCPUSchedulingPriority=10\n"
 
 
 def check(checks: Checks, _host: Host) -> None:
-    """Each with the daemon's own configuration for it."""
     with checks("metrics on all addresses and another port"):
         configure(f"metrics: {{address: 0.0.0.0, port: {METRICS_PORT}}}\n{USB}{CAN}")
         start_service()

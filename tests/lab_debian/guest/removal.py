@@ -15,7 +15,6 @@ SETUP_LOCK = "/run/imud-setup.lock"
 
 
 def check(checks: Checks, _host: Host) -> None:
-    """The end of the package's life."""
     CONFIG.write_text(f"# mine\n{USB}{CAN}")
     start_service()
     wait_streaming("usb")

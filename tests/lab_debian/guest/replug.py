@@ -10,7 +10,6 @@ ROUNDS_SHORT = 2
 
 
 def check(checks: Checks, host: Host) -> None:
-    """All rounds; each has its figure."""
     wait_streaming("usb")
     product = wait_until(lambda: (device("usb") or {})["identity"].get("product"), "the product before")
     taken: list[float] = []

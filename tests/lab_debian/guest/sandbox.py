@@ -97,7 +97,6 @@ except OSError as error:
 
 
 def check(checks: Checks, _host: Host) -> None:
-    """Everything under the settings of the unit as it is installed."""
     with checks(f"systemd-analyze security gives at most {SCORE_MAX}"):
         said = must("systemd-analyze", "security", "--no-pager", "imud.service")
         found = re.search(r"Overall exposure level for imud\.service: ([\d.]+)", said)

@@ -46,7 +46,6 @@ START_LIMIT_S = 400
 
 
 def check(checks: Checks, host: Host) -> None:
-    """All of it."""
     check_streaming(checks, host)
     check_reload(checks)
     check_ends(checks)
@@ -89,7 +88,6 @@ def check_reload(checks: Checks) -> None:
 
 
 def check_ends(checks: Checks) -> None:
-    """The ends of a daemon: hung, killed, stopped."""
     with checks("a daemon that hangs is killed by the watchdog and started again"):
         before, restarts, said = pid(), int(shown("NRestarts")), len(console())
         os.kill(before, signal.SIGSTOP)
@@ -176,7 +174,6 @@ def check_streaming(checks: Checks, _host: Host) -> None:
 
 
 def newest(name: str) -> int:
-    """Sequence number of the newest sample."""
     return int(ask("poll", devices=[name])["samples"][0]["seq"])
 
 

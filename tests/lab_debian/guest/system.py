@@ -42,7 +42,6 @@ def must(*command: str, limit_s: float = LIMIT_S) -> str:
 
 
 def shown(name: str, unit: str = UNIT) -> str:
-    """A property of a unit."""
     return must("systemctl", "show", "--value", "--property", name, unit).strip()
 
 
@@ -52,7 +51,6 @@ def pid() -> int:
 
 
 def configure(text: str) -> None:
-    """Write the daemon's configuration."""
     CONFIG.write_text(text, encoding="utf-8")
 
 
@@ -138,7 +136,6 @@ class Host:
         self._port: IO[bytes] = open(REQUESTS, "r+b", buffering=0)  # noqa: SIM115 - open as long as the run
 
     def ask(self, word: str) -> None:
-        """Have it done. Failed with its reason if it was not."""
         self._port.write(f"{word}\n".encode())
         reply = b""
         while not reply.endswith(b"\n"):
@@ -196,7 +193,6 @@ def confined(code: str, *properties: str, user: str = "imud") -> str:
 
 
 def add_user(name: str, *groups: str) -> None:
-    """A user for the checks."""
     if run("id", name).returncode:
         must("useradd", "--create-home", name)
     for group in groups:
@@ -204,5 +200,4 @@ def add_user(name: str, *groups: str) -> None:
 
 
 def uptime_s() -> float:
-    """Seconds since the guest's kernel started."""
     return float(Path("/proc/uptime").read_text().split()[0])

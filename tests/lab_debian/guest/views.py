@@ -71,7 +71,6 @@ def fetch(path: str, address: str = "127.0.0.1", token: str = "", body: str = ""
 
 
 def check(checks: Checks, _host: Host) -> None:
-    """Both."""
     configure(USB + CAN)
     start_service()
     wait_streaming("usb")
@@ -105,7 +104,6 @@ def check_page(checks: Checks) -> None:
 
 
 def check_confinement(checks: Checks) -> None:
-    """Exposure; a restart of the daemon beside it; stop."""
     with checks(f"systemd-analyze security gives imud-web at most {SCORE_MAX}"):
         said = must("systemd-analyze", "security", "--no-pager", UNIT)
         found = re.search(r"Overall exposure level for imud-web\.service: ([\d.]+)", said)
@@ -126,7 +124,6 @@ def check_confinement(checks: Checks) -> None:
 
 
 def check_token(checks: Checks) -> None:
-    """With a token on all addresses."""
     with checks("on all addresses imud-web needs its token, and with it a module is asked"):
         TOKEN_FILE.write_text(f"{TOKEN}\n")
         TOKEN_FILE.chmod(0o600)

@@ -33,7 +33,6 @@ BYTECODE = "__pycache__"
 
 
 def parser() -> argparse.ArgumentParser:
-    """The options."""
     options = Parser(prog="tests/lab_debian/run", allow_abbrev=False, description="Checks the package on Debian.")
     options.add_argument("--ci", action="store_true", help="where it cannot run say so and succeed")
     options.add_argument("--arm64", action="store_true", help="arm64, with unit tests, instead of amd64")
@@ -49,7 +48,6 @@ def parser() -> argparse.ArgumentParser:
 
 
 def say(line: str) -> None:
-    """One line about the rig itself; standard output belongs to the guest."""
     print(f"lab-debian: {line}", file=sys.stderr, flush=True)
 
 
@@ -93,7 +91,6 @@ def simulator(python: Path, node: Path) -> Iterator[int]:
 
 
 def fill(folder: Path, release: Release, package: Path, script: str) -> None:
-    """Put into the run's folder what the guest takes from there."""
     shutil.copytree(GUEST, folder / GUEST.relative_to(ROOT), ignore=shutil.ignore_patterns(BYTECODE))
     shutil.copy(package, folder / "imud.deb")
     packages.next_version(package, folder)
@@ -102,7 +99,6 @@ def fill(folder: Path, release: Release, package: Path, script: str) -> None:
 
 
 def boot(options: argparse.Namespace, release: Release, groups: list[str], made: image.Image, package: Path) -> int:
-    """One run of one guest; its status."""
     output = options.output / release.name
     failed, start_s = True, time.monotonic()
     with results.run_folder(output) as folder, contextlib.ExitStack() as stack:
@@ -139,7 +135,6 @@ def keep(folder: Path, output: Path, failed: bool) -> str:
 
 
 def lab(arguments: Sequence[str]) -> int:
-    """Everything; LabError for what is the rig's own failure."""
     options = parser().parse_args(arguments)
     releases = chosen(options)
     for release in releases:
@@ -181,7 +176,6 @@ def run_release(options: argparse.Namespace, release: Release) -> int:
 
 
 def main() -> int:
-    """The program."""
     return run_program(lab, say)
 
 

@@ -67,8 +67,6 @@ exec /bin/busybox switch_root /new /lib/systemd/systemd
 
 @dataclass(frozen=True)
 class Image:
-    """What QEMU boots."""
-
     disk: Path
     kernel: Path
     initramfs: Path
@@ -86,7 +84,6 @@ def built(release: Release, say: Callable[[str], None]) -> Image:
 
 
 def key(release: Release) -> str:
-    """Changes with everything that shapes an image: its recipe, its lists, the files that are copied into it."""
     files = sorted(path for path in ROOT_FILES.rglob("*") if path.is_file())
     parts = [part for path in files for part in (str(path.relative_to(ROOT_FILES)).encode(), path.read_bytes())]
     recipe = [Path(path).read_bytes() for path in (__file__, release_module.__file__)]
@@ -94,7 +91,6 @@ def key(release: Release) -> str:
 
 
 def make_image(release: Release, folder: Path) -> None:
-    """Fill `folder` with disk, kernel and initramfs."""
     root, tree, log = folder / "root", folder / "tree", folder / "build.log"
     try:
         bootstrap(replace(release, architecture=HOST), root, log, "minbase", SYSTEM)
@@ -242,7 +238,6 @@ def prepare_root(root: Path) -> None:
 
 
 def make_disk(root: Path, disk: Path, log: Path) -> None:
-    """Write the root file system into a sparse ext4 image, without mounting it."""
     with open(disk, "wb") as file:
         file.truncate(DISK_BYTES)
     options = ["-t", "ext4", "-O", "^has_journal", "-E", "lazy_itable_init=1,root_owner=0:0"]

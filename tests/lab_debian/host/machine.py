@@ -45,8 +45,6 @@ POLL_S = 0.05
 
 @dataclass(frozen=True)
 class DebianMachine:
-    """What differs from run to run."""
-
     release: Release
     image: Image
     share: Path

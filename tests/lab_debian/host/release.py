@@ -25,8 +25,6 @@ amd64 (machine.py)."""
 
 @dataclass(frozen=True)
 class Release:
-    """One Debian that the rig boots."""
-
     suite: str
     architecture: str
 
@@ -37,12 +35,10 @@ class Release:
 
     @property
     def foreign(self) -> bool:
-        """Whether the host has another architecture."""
         return self.architecture != "amd64"
 
     @property
     def qemu(self) -> str:
-        """The program that emulates it."""
         return {"amd64": "qemu-system-x86_64", "arm64": "qemu-system-aarch64"}[self.architecture]
 
 

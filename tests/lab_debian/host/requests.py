@@ -60,7 +60,6 @@ def serve(guest: socket.socket, actions: Mapping[str, Callable[[], None]]) -> No
 
 
 def answer(word: str, actions: Mapping[str, Callable[[], None]]) -> str:
-    """Carry out one request: `ok`, or why not."""
     action = actions.get(word)
     if action is None:
         return f"expected one of {', '.join(sorted(actions))}, got {word!r}"

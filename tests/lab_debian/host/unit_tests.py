@@ -44,8 +44,6 @@ LINES_SHOWN = 12
 
 @dataclass
 class Tally:
-    """The results of one part."""
-
     passed: int = 0
     skipped: int = 0
     seconds: float = 0.0

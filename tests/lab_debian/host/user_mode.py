@@ -64,12 +64,10 @@ def built(release: Release, python: Path, say: Callable[[str], None]) -> Path:
 
 
 def key(release: Release) -> str:
-    """Changes with the recipe and its lists."""
     return cache.key_of(release.name.encode(), Path(__file__).read_bytes())
 
 
 def make_root(release: Release, python: Path, folder: Path) -> None:
-    """Fill `folder` with the root file system and a place for bytecode."""
     root = folder / ROOT_NAME
     bootstrap(release, root, folder / "build.log", "extract", PACKAGES)
     for name in ("passwd", "group"):
