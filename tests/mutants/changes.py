@@ -10,10 +10,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from difflib import unified_diff
 from functools import cache
+from itertools import accumulate, chain
 from pathlib import Path
 from random import Random
 from typing import Any, Final
 
+Change = tuple[str, int, int, str]
+"""Kind, start, end and new text."""
 ROOT: Final = Path(__file__).parent.parent.parent
 OPERATORS: Final = {
     "<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "==", "is": "is not", "is not": "is",
@@ -50,11 +53,9 @@ class Mutant:
     new: str
 
     def apply(self, source: bytes) -> bytes:
-        """Return the changed source."""
         return source[: self.start] + self.new.encode() + source[self.end :]
 
     def diff(self) -> list[str]:
-        """Return the lines of a diff, without context."""
         old = source_of(self.path)
         sides = old.decode().splitlines(), self.apply(old).decode().splitlines()
         return list(unified_diff(*sides, self.path, self.path, lineterm="", n=0))
@@ -67,18 +68,12 @@ class Mutant:
         return f"{self.path}:{self.line}  {self.kind}  {before}  ->  {new[0] if new else ''}"
 
 
-# --- which changes are possible ---------------------------------------------------------------------------------------
-
-
 class Finder:
     """All mutants of one file, by unit. A unit is a function, a method, or a constant."""
 
     def __init__(self, path: str) -> None:
-        self.path = path
-        self.source = source_of(path)
-        self.starts = [0]
-        for line in self.source.splitlines(keepends=True):
-            self.starts.append(self.starts[-1] + len(line))
+        self.path, self.source = path, source_of(path)
+        self.starts = [0, *accumulate(len(line) for line in self.source.splitlines(keepends=True))]
         self.mutants: dict[str, list[Mutant]] = defaultdict(list)
         self.weights: Counter[str] = Counter()
         self._visit_body(ast.parse(self.source).body, "")
@@ -97,60 +92,40 @@ class Finder:
         assert node.end_lineno
         self.weights[unit] = min(self.weights[unit] + node.end_lineno - node.lineno + 1, LINES_MAX)
         for changed, parent in walk(node):
-            for kind, start, end, new in self._changes(changed, parent):
-                self.mutants[unit].append(Mutant(self.path, changed.lineno, unit, kind, start, end, new))
+            for change in chain(self._values(changed, parent), self._operators(changed), self._statements(changed)):
+                self.mutants[unit].append(Mutant(self.path, changed.lineno, unit, *change))
 
     def _at(self, node: ast.expr | ast.stmt) -> tuple[int, int]:
-        assert node.end_lineno
-        assert node.end_col_offset is not None
-        return self.starts[node.lineno - 1] + node.col_offset, self.starts[node.end_lineno - 1] + node.end_col_offset
+        end = self.starts[(node.end_lineno or 0) - 1] + (node.end_col_offset or 0)
+        return self.starts[node.lineno - 1] + node.col_offset, end
 
     def _text(self, node: ast.expr | ast.stmt) -> str:
-        start, end = self._at(node)
-        return self.source[start:end].decode()
+        return self.source[slice(*self._at(node))].decode()
 
     def _operator(self, left: ast.expr, right: ast.expr) -> tuple[int, int, str]:
-        start, end = self._at(left)[1], self._at(right)[0]
-        found = OPERATOR.search(self.source, start, end)
+        found = OPERATOR.search(self.source, self._at(left)[1], self._at(right)[0])
         assert found
         return *found.span(), OPERATORS[found.group().decode()]
 
-    def _changes(self, node: Any, parent: ast.AST) -> Iterator[tuple[str, int, int, str]]:
-        """Generate kind, start, end and new text of each change of one node."""
-        match node:
-            case ast.Constant() | ast.Name():
-                yield from self._other_values(node, parent)
-            case ast.Compare() | ast.BoolOp() | ast.BinOp():
-                yield from self._other_operators(node)
-            case ast.Call() | ast.Slice():
-                yield from self._other_bounds(node)
-            case ast.Expr() | ast.AugAssign() if kind := lost(node):
-                yield kind, *self._at(node), "pass"
-            case ast.If() | ast.IfExp():
-                if is_check(node) and not self._text(node).startswith("elif"):
-                    yield "removed check", *self._at(node), "pass"
-                yield "negated condition", *self._at(node.test), f"(not ({self._text(node.test)}))"
-            case ast.Return(value=ast.expr() as value) if new := other_result(value, self._text(value)):
-                yield "changed result", *self._at(value), new
-
-    def _other_values(self, node: ast.Constant | ast.Name, parent: ast.AST) -> Iterator[tuple[str, int, int, str]]:
-        at, text = self._at(node), self._text(node)
+    def _values(self, node: Any, parent: ast.AST) -> Iterator[Change]:
         match node:
             case ast.Constant(value=bool()):
                 if isinstance(parent, ast.Call | ast.keyword | ast.arguments | ast.Return):
-                    yield "inverted flag", *at, str(not node.value)
-            case ast.Constant(value=int() | float()):
-                if node.value and is_quantity(node, parent):
-                    yield "wrong scale", *at, f"({text} * 2)"
+                    yield "inverted flag", *self._at(node), str(not node.value)
+            case ast.Constant(value=int() | float()) if node.value and is_quantity(node, parent):
+                yield "wrong scale", *self._at(node), f"({self._text(node)} * 2)"
             case ast.Constant(value="little" | "big"):
-                yield "swapped bytes", *at, '"big"' if node.value == "little" else '"little"'
+                yield "swapped bytes", *self._at(node), '"big"' if node.value == "little" else '"little"'
             case ast.Constant(value=str() as layout):
-                if LAYOUT.fullmatch(layout) and text[1] == layout[0]:
-                    yield "swapped bytes", at[0] + 1, at[0] + 2, ">" if text[1] == "<" else "<"
-            case ast.Name() if node.id.isupper() and len(node.id) > 1 and is_product(parent):
-                yield "wrong scale", *at, f"(2 * {text})"
+                if LAYOUT.fullmatch(layout) and self._text(node)[1] == layout[0]:
+                    at = self._at(node)[0] + 1
+                    yield "swapped bytes", at, at + 1, ">" if layout[0] == "<" else "<"
+            case ast.Name() if node.id.isupper() and len(node.id) > 1 and isinstance(parent, ast.BinOp):
+                if isinstance(parent.op, ast.Mult | ast.Div | ast.FloorDiv | ast.Mod):
+                    yield "wrong scale", *self._at(node), f"(2 * {node.id})"
 
-    def _other_operators(self, node: ast.Compare | ast.BoolOp | ast.BinOp) -> Iterator[tuple[str, int, int, str]]:
+    def _operators(self, node: Any) -> Iterator[Change]:
+        bounds: list[tuple[ast.expr | None, str]] = []
         match node:
             case ast.Compare():
                 for left, right, one in zip([node.left, *node.comparators], node.comparators, node.ops, strict=False):
@@ -160,16 +135,25 @@ class Finder:
                 yield "and/or", *self._operator(left, right)
             case ast.BinOp(op=ast.Add() | ast.Sub(), right=ast.Constant(value=1)):
                 yield "off by one", *self._at(node.right), "0"
-
-    def _other_bounds(self, node: ast.Call | ast.Slice) -> Iterator[tuple[str, int, int, str]]:
-        bounds: list[tuple[ast.expr | None, str]] = []
-        if isinstance(node, ast.Slice):
-            bounds = [(node.lower, "+ 1"), (node.upper, "- 1")]
-        elif ast.unparse(node.func) == "range":
-            bounds = [(node.args[min(1, len(node.args) - 1)], "- 1")]
+            case ast.Slice():
+                bounds = [(node.lower, "+ 1"), (node.upper, "- 1")]
+            case ast.Call(func=ast.Name(id="range")):
+                bounds = [(node.args[min(1, len(node.args) - 1)], "- 1")]
         for bound, shift in bounds:
             if bound:
                 yield "off by one", *self._at(bound), f"({self._text(bound)}) {shift}"
+
+    def _statements(self, node: Any) -> Iterator[Change]:
+        match node:
+            case ast.Expr() | ast.AugAssign() if kind := lost(node):
+                yield kind, *self._at(node), "pass"
+            case ast.If() | ast.IfExp():
+                leaves = isinstance(node, ast.If) and not node.orelse and isinstance(node.body[-1], LEAVING)
+                if leaves and not self._text(node).startswith("elif"):
+                    yield "removed check", *self._at(node), "pass"
+                yield "negated condition", *self._at(node.test), f"(not ({self._text(node.test)}))"
+            case ast.Return(value=ast.expr() as value) if new := other_result(value, self._text(value)):
+                yield "changed result", *self._at(value), new
 
 
 def walk(node: ast.AST) -> Iterator[tuple[ast.expr | ast.stmt, ast.AST]]:
@@ -206,16 +190,6 @@ def is_quantity(node: ast.Constant, parent: ast.AST) -> bool:
     return not isinstance(parent, ast.Subscript | ast.Slice | ast.UnaryOp | ast.pattern | ast.Return)
 
 
-def is_product(parent: ast.AST) -> bool:
-    """Return whether the operands of a node are factors."""
-    return isinstance(parent, ast.BinOp) and isinstance(parent.op, ast.Mult | ast.Div | ast.FloorDiv | ast.Mod)
-
-
-def is_check(node: ast.If | ast.IfExp) -> bool:
-    """Return whether a node is an `if` without `else` that leaves the present path."""
-    return isinstance(node, ast.If) and not node.orelse and isinstance(node.body[-1], LEAVING)
-
-
 def lost(node: ast.Expr | ast.AugAssign) -> str:
     """Return the kind of change if a statement is removed; empty if the statement stays."""
     value = node.value.value if isinstance(node.value, ast.Await) else node.value
@@ -241,9 +215,6 @@ def other_result(value: ast.expr, text: str) -> str:
         case ast.Dict() | ast.DictComp():
             return "{}" if text != "{}" else ""
     return "None"
-
-
-# --- which mutants are chosen -----------------------------------------------------------------------------------------
 
 
 def choose(seed: int, number: int, only: str) -> list[Mutant]:

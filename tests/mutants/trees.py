@@ -19,6 +19,8 @@ from typing import Final
 from tests.mutants.changes import ROOT
 
 DOCUMENT_TESTS: Final = {"tests/test_docs.py", "tests/test_architecture.py"}
+LIMIT_S: Final = 600
+"""Maximum time of one run of pytest."""
 NO_MIRROR: Final = {
     "audit", "bench", "lab", "lab_host", "lab_debian", "fuzz", "attack", "support", "packaging", "monitoring",
 }  # fmt: skip
@@ -26,12 +28,8 @@ NO_MIRROR: Final = {
 
 def tests_in(folder: Path) -> list[str]:
     """Return the test modules of a folder, without its subfolders and without tests of documents."""
-    return [test for path in sorted(folder.glob("test_*.py")) if (test := named(path)) not in DOCUMENT_TESTS]
-
-
-def named(path: Path) -> str:
-    """Return a path in the tree."""
-    return path.relative_to(ROOT).as_posix()
+    tests = [path.relative_to(ROOT).as_posix() for path in sorted(folder.glob("test_*.py"))]
+    return [test for test in tests if test not in DOCUMENT_TESTS]
 
 
 @cache
@@ -43,12 +41,6 @@ def tested_in() -> dict[str, str]:
     return {}
 
 
-def importers(module: str) -> list[str]:
-    """Return the test modules that name a module."""
-    tests = [path for path in sorted((ROOT / "tests").rglob("test_*.py")) if path.parts[-2] not in NO_MIRROR]
-    return [named(path) for path in tests if module in path.read_text()]
-
-
 def stages(path: str) -> list[list[str]]:
     """Return the test modules for a module of imud: its own, then its folder, then the folders above.
 
@@ -57,22 +49,22 @@ def stages(path: str) -> list[list[str]]:
     module = Path(path).with_suffix("")
     dotted = ".".join(module.parts)
     folders = [ROOT / "tests" / folder for folder in module.relative_to("imud").parents]
-    own = folders[0] / f"test_{module.name.strip('_')}.py"
-    first = [named(own)] if own.exists() else [f"tests/{tested_in()[dotted]}"] if dotted in tested_in() else []
+    own = [test for test in tests_in(folders[0]) if test.endswith(f"/test_{module.name.strip('_')}.py")]
+    first = own or ([f"tests/{tested_in()[dotted]}"] if dotted in tested_in() else [])
     found = [first, *map(tests_in, folders[:-1] or folders)]
     if not first:
-        found.append(importers(dotted))
+        tests = [path for path in sorted((ROOT / "tests").rglob("test_*.py")) if path.parts[-2] not in NO_MIRROR]
+        found.append([path.relative_to(ROOT).as_posix() for path in tests if dotted in path.read_text()])
     stage_of = {test: number for number, stage in reversed(list(enumerate(found))) for test in stage}
     return [new for number, stage in enumerate(found) if (new := [test for test in stage if stage_of[test] == number])]
 
 
 @dataclass
 class Run:
-    """The result of pytest: its exit status (None after a time-out), output, failed test and duration."""
+    """The result of pytest: its exit status (None after a time-out), and output."""
 
     status: int | None
     output: str
-    seconds: float
 
     @property
     def passed(self) -> bool:
@@ -81,7 +73,6 @@ class Run:
 
     @property
     def failed(self) -> list[str]:
-        """The identifiers of the failed tests."""
         return re.findall(r"^(?:FAILED|ERROR) (\S+?(?:\[.*?\])?)(?: - .*)?$", self.output, re.MULTILINE)
 
 
@@ -129,7 +120,6 @@ class Tree:
 
     @contextmanager
     def changed(self, name: str, original: bytes, changed: bytes) -> Iterator[None]:
-        """Change a file for a while."""
         self._write(name, changed)
         try:
             yield
@@ -142,23 +132,23 @@ class Tree:
         path.write_bytes(content)
         os.utime(path, (seconds := next(self.mtime), seconds))
 
-    def pytest(self, *arguments: str, limit_s: float) -> Run:
+    def pytest(self, *arguments: str) -> Run:
         """Run pytest in a process group of its own, then kill all processes that the tests left."""
-        options = ["-q", "-p", "no:cacheprovider", "-rfE", "--tb=short", f"--basetemp={self.folder / 'tmp'}"]
-        start, output = time.monotonic(), self.folder / "output"
+        options = ["-x", "-q", "-p", "no:cacheprovider", "-rfE", "--tb=short", f"--basetemp={self.folder / 'tmp'}"]
+        output = self.folder / "output"
         with output.open("wb") as file:
             process = subprocess.Popen(
                 [self.python, "-m", "pytest", *options, *arguments], cwd=self.root, env=self.environment,
                 stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, start_new_session=True,
             )  # fmt: skip
             try:
-                status: int | None = process.wait(limit_s)
+                status: int | None = process.wait(LIMIT_S)
             except subprocess.TimeoutExpired:
                 status = None
             finally:
                 self._kill_children(process.pid)
                 process.wait()
-        return Run(status, output.read_text(errors="replace"), time.monotonic() - start)
+        return Run(status, output.read_text(errors="replace"))
 
     def _kill_children(self, group: int) -> None:
         with suppress(ProcessLookupError):
