@@ -32,7 +32,6 @@ class Done:
     problems: list[str] = field(default_factory=list)
     deeds: Deeds = field(default_factory=Deeds)
     stops: int = 0
-    """How often the daemon was stopped."""
 
 
 def start(stage: AttackedDaemon, seconds: float, kind: str) -> list[subprocess.Popen[str]]:
@@ -145,11 +144,8 @@ def calm(_stage: AttackedDaemon, seconds: float) -> Done:
 @dataclass(frozen=True)
 class Attack:
     run: Callable[[AttackedDaemon, float], Done]
-    """Attacks for so many seconds."""
     short: bool = True
-    """Whether it is in the short form."""
     devices: int = 0
-    """Devices beside the usual four."""
 
 
 ATTACKS: dict[str, Attack] = {

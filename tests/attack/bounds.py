@@ -29,9 +29,7 @@ LEDGER_TOLERANCE: Final = 1
 class Measured:
     deeds: Deeds
     samples: int = 0
-    """Of the good client."""
     lost: int = 0
-    """Missing at the good client."""
     dropped: int = 0
     """Of these, what the daemon says that it dropped."""
     reply_p50_ms: float = 0.0
@@ -40,21 +38,17 @@ class Measured:
     sample_p99_ms: float = 0.0
     above_mb: float = 0.0
     fds: int = 0
-    """The most there were, above idle."""
     fds_left: int = 0
-    """Above those of before the attack, when it was over."""
     cpu_share: float = 0.0
     refused: int = 0
     evicted: int = 0
     failed: int = 0
-    """Errors in the daemon while a client was served."""
     port_refused: int = 0
     """Frames that the device's port had no room for: the true losses."""
     ledger_lost: int = 0
     ledger_unknown: int = 0
     """Gaps of unknown size in the ledger."""
     stops: int = 0
-    """How often the attack stopped the daemon."""
 
 
 def exceeded(seen: Measured, *, delays: bool = True) -> list[str]:

@@ -38,13 +38,11 @@ class Kind:
     leaves: bool = False
     """Whether it disconnects as soon as it has sent."""
     scrapes: bool = False
-    """Whether it is a client of the metrics page, and not of the socket."""
 
 
 @dataclass
 class Deeds:
     clients: int = 0
-    """At the same time."""
     connections: int = 0
     requests: int = 0
     """Lines that were sent to the socket, scrapes, signals, acts on files."""

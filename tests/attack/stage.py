@@ -35,7 +35,6 @@ RATE_HZ = 1000
 PRIORITY = 10
 """Real-time; above that of programs that ask for the least, with which it would take turns of 100 ms."""
 SETTLE_S = 3.0
-"""The clock's first fits, and caches."""
 IDLE_DEVICES = 3
 REPLUG_LIMIT_S = 5.0
 CLIENTS_MAX = 320
@@ -53,9 +52,7 @@ QUIET_LIMIT_S = 10.0
 LOG_SPOILT = b"the configuration stays as it was"
 LOG_FILLER = b"-" * 63
 LOG_EXPECTED = (b"nothing is heard on", LOG_SPOILT, LOG_FILLER, b" is gone (hung up)")
-"""Of idle devices, and of what attacks put into the log: not shown."""
 PROBLEMS = 20
-"""As many of a configuration as the log has."""
 
 
 class Scheduling(Enum):

@@ -21,7 +21,6 @@ class Item:
     key: str
     """Letter of the manual, section, and a short name; as in the marks."""
     words: str
-    """What is to work, for people."""
     code: str = ""
     """`module:name` below `imud`, where the work is done; empty for what is left."""
     left: str = ""

@@ -22,10 +22,8 @@ from tests.bench.rows import Row, at_least
 
 BUS = "vcanbench"
 BATCHES = {"one at a time": 1, "ten waiting": 10, "a batch waiting": BATCH_FRAMES}
-"""Frames that wait when the program gets to read."""
 FRAMES = 6000
 RATIOS_REACHED = {1: 2.0, BATCH_FRAMES: 4.0}
-"""Of python-can to imud, by the number of frames that wait."""
 ROOT = Path(__file__).parents[2]
 LAB_LIMIT_S = 600.0
 

@@ -25,9 +25,7 @@ from tests.lab.can_traffic import Module, fleet
 RATE_HZ = 100.0
 PERIOD_NS = round(1e9 / RATE_HZ)
 WAITING = {"read one by one": 1, "gathered for 50 ms": 5}
-"""Samples of a device that wait when it is read."""
 LEARNING = 40
-"""Samples until the assemblies have learned what belongs together."""
 CPU_SHARE_MOST = 0.5
 
 

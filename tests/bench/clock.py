@@ -23,7 +23,6 @@ TICK_NS = NS_PER_MS
 TICK_MODULUS = 1 << 32
 SETTLED_NS = 70 * NS_PER_S
 SECONDS = {1: 240, 100: 150, 200: 150, 400: 120, 1000: 120}
-"""Simulated time for each rate."""
 BAUD_OF_RATE = {1: 115_200, 100: 115_200, 200: 460_800, 400: 921_600, 1000: 921_600}
 CRYSTALS = {
     "0 ppm": Crystal(0.0),
@@ -38,7 +37,6 @@ CRYSTALS = {
 
 class Point(NamedTuple):
     off_ns: int
-    """t_ns - truth."""
     t_err_ns: int
     fitted: bool
     truth_ns: int
@@ -51,12 +49,9 @@ class Accuracy:
     sigma_ns: float
     """About their own mean: what is left when the bias is calibrated away."""
     p999_ns: float
-    """99.9 of 100 are smaller."""
     mean_t_err_ns: float
     share: float
-    """Within twice their stated error, settled."""
     share_settling: float
-    """The same from the first sample until settled."""
 
 
 def clock_for(model: ArrivalModel) -> SampleClock:

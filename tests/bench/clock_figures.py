@@ -19,7 +19,6 @@ LINE_HEAD: Final = (
     + "---|" * 10
 )
 WHOLE_FROM_US: Final = 10.0
-"""Above this, µs without decimals."""
 
 Spread = tuple[float, float]
 """The best and the worst of all crystals."""
@@ -52,7 +51,6 @@ class LineFigures(msgspec.Struct, frozen=True):
     share: float
     settling: float
     by_it: float
-    """Share of samples with this source or a better one."""
 
     def row(self) -> str:
         micro = " | ".join(map(microseconds, (self.sigma_us, self.mean_us, self.p999_us, self.mean_t_err_us)))

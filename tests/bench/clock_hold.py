@@ -30,7 +30,6 @@ class TimedRead(NamedTuple):
     t_rx_ns: int
     trailing_bytes: int
     waited_ns: int
-    """How long nothing had been read."""
 
 
 def at_once(arrivals: Sequence[Arrival], _hold_ns: int, _byte_ns: int, _watch_ns: int) -> Iterator[TimedRead]:

@@ -7,7 +7,6 @@ from tests.bench.rig import Load, Outcome, run
 from tests.bench.rows import Row, at_least, at_most
 
 CPU_LIMITS = {1: 1.6, 10: 1.5, 100: 2.0}
-"""By the number of clients."""
 P99_LIMIT = 2.0
 DEVICES_AIM = 32
 RSS_LIMIT_MB = 45.0

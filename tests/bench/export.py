@@ -27,7 +27,6 @@ SECONDS: Final = 3600
 QUICK_SECONDS: Final = 120
 RATE_HZ: Final = 400
 LIMIT_S: Final = 20.0
-"""For an hour at RATE_HZ."""
 FORMATS: Final = {
     "CSV": ("--to", "csv"),
     "MCAP, JSON": ("--to", "mcap", "--schema", "json"),

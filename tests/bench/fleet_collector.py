@@ -24,7 +24,6 @@ from imud.units import NS_PER_MS
 from imud.worker import rare_garbage_collection
 
 END_S: Final = 180.0
-"""How long the rest may take to arrive."""
 LOOK_S: Final = 0.05
 
 

@@ -29,11 +29,9 @@ from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, running_bro
 RATE_HZ: Final = 4
 """Samples a second: a message of statistics has the same size for any rate."""
 TOGETHER_S: Final = 60
-"""Seconds that are written in one transaction."""
 LIMIT_S: Final = 1800.0
 SPOOL_BYTES: Final = 4 << 30
 LIVE: Final = "bow"
-"""The device whose samples come meanwhile."""
 DAY: Final = {"whole": "none", "rate_hz": 1, "batch_s": 1}
 NOW: Final = {"whole": "slots", "rate_hz": None, "batch_s": 1}
 

@@ -109,33 +109,28 @@ Fault = Callable[[Scene, float], None]
 
 
 def nothing(scene: Scene, seconds: float) -> None:
-    """Nothing happens."""
     scene.watch(seconds)
 
 
 def restart(scene: Scene, seconds: float) -> None:
-    """The broker is ended and comes back."""
     scene.broker.stop()
     scene.watch(seconds)
     scene.broker.start()
 
 
 def kill_broker(scene: Scene, seconds: float) -> None:
-    """The broker is ended three times, for a third of the time each."""
     for _ in range(3):
         restart(scene, seconds / 3)
         scene.watch(UP_S)
 
 
 def freeze(scene: Scene, seconds: float) -> None:
-    """The broker's process is stopped, and goes on."""
     scene.broker.freeze()
     scene.watch(seconds)
     scene.broker.thaw()
 
 
 def refuse(scene: Scene, seconds: float) -> None:
-    """The broker's rights do not let the gateway write."""
     rights = scene.folder / "rights"
     rights.write_text("topic read #\n")
     scene.broker.reload()
@@ -145,35 +140,30 @@ def refuse(scene: Scene, seconds: float) -> None:
 
 
 def half_open(scene: Scene, seconds: float) -> None:
-    """Nothing passes any more, and no end learns of it."""
     scene.proxy.stall()
     scene.watch(seconds)
     scene.proxy.restore()
 
 
 def cut(scene: Scene, seconds: float) -> None:
-    """Connections are broken, and refused."""
     scene.proxy.cut()
     scene.watch(seconds)
     scene.proxy.restore()
 
 
 def slow_network(scene: Scene, seconds: float) -> None:
-    """20 kB a second pass."""
     scene.proxy.bytes_s = 20_000.0
     scene.watch(seconds)
     scene.proxy.bytes_s = None
 
 
 def slow_collector(scene: Scene, seconds: float) -> None:
-    """The collector takes five messages a second, where some twenty come."""
     scene.held.set()
     scene.watch(seconds)
     scene.held.clear()
 
 
 def kill_gateway(scene: Scene, seconds: float) -> None:
-    """The gateway is killed with SIGKILL three times while it cannot send."""
     scene.proxy.cut()
     for _ in range(3):
         scene.watch(seconds / 3)
@@ -183,7 +173,6 @@ def kill_gateway(scene: Scene, seconds: float) -> None:
 
 
 def kill_full(scene: Scene, seconds: float) -> None:
-    """The same with a spool of 1 MB, which is full."""
     scene.proxy.cut()
     full = round(SMALL_MB * 950_000)
     end = monotonic() + LIMIT_S
@@ -199,7 +188,6 @@ def kill_full(scene: Scene, seconds: float) -> None:
 
 
 def kill_collector(scene: Scene, seconds: float) -> None:
-    """The collector that writes rows is killed with SIGKILL three times, and is away for a while."""
     for _ in range(3):
         scene.watch(seconds / 6)
         if scene.rows is not None:

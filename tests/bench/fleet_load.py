@@ -29,7 +29,6 @@ from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, running_broker
 
 DEVICES: Final = ("bow", "mast")
 SAMPLES: Final = 100
-"""Of a device in a second."""
 INTERVALS: Final = 10
 
 
@@ -83,7 +82,6 @@ class GatewayFleet:
         self.gateways = [SimulatedGateway(one, ports, begin_s + one / number) for one in range(number)]
         self.clients = Clients([one.client for one in self.gateways])
         self.late_s = 0.0
-        """How late the latest second was given."""
 
     def run(self, seconds: float, tick: Callable[[float], None] = lambda _at_s: None) -> None:
         """Send for so long; `tick` is called with the time since the begin."""

@@ -30,7 +30,6 @@ SEED: Final = 25
 VALUES: Final = 997
 """Different values that follow one another again and again: a recording cannot compress them away."""
 ACCEL_AND_GYRO: Final = slice(18, 42)
-"""Of a HI91 frame, in g and °/s."""
 
 
 def noisy_values() -> list[tuple[Vector3, Vector3]]:

@@ -19,9 +19,7 @@ from tests.bench.clock import BAUD_OF_RATE, TICK_MODULUS, TICK_NS, Accuracy, Poi
 
 UTC_AHEAD_NS: Final = 1_795_000_000 * NS_PER_S
 DECODE_NS: Final = 20 * NS_PER_US
-"""From a read to its decoding, when the clocks are read."""
 BEGIN_NS: Final = 1000 * NS_PER_S
-"""The models begin here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +55,6 @@ class SteeredHost:
     def __init__(self, steering: Steering) -> None:
         self.steering = steering
         self.now_ns = BEGIN_NS
-        """Steady time."""
         self.ahead_ns = UTC_AHEAD_NS
         self.clock = HostClock(self.monotonic_ns, lambda: self.monotonic_ns() + self.ahead_ns, lambda: self.now_ns)
 
@@ -73,7 +70,6 @@ class SteeredHost:
 class DatedArrival(NamedTuple):
     sample: Sample
     truth_ns: int
-    """CLOCK_MONOTONIC at the measurement."""
 
     @property
     def point(self) -> Point:

@@ -28,9 +28,7 @@ STALL_NS = 200 * NS_PER_US
 @dataclass(frozen=True, slots=True)
 class LineFaults:
     pulse_loss: float = 0.0
-    """Pulses of which nothing is seen."""
     edge_loss: float = 0.0
-    """Single edges lost."""
     frame_loss: float = 0.0
     extra: float = 0.0
     """Pulses that are no pulses, per true one, at any time."""
@@ -41,9 +39,7 @@ class LineRead(NamedTuple):
     edges: list[Edge]
     arrivals: list[Arrival]
     numbers: list[int]
-    """The number of the rising edge of each message."""
     stamps_ns: list[int]
-    """What the kernel said of it, or would have."""
 
 
 def measured_ns(arrival: Arrival) -> int:

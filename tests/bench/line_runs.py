@@ -29,7 +29,6 @@ class DatedSample(NamedTuple):
     sample: Sample
     truth_ns: int
     number: int
-    """Of the event that belongs to it."""
     begun_ns: int = 0
     """Latest time that its message can have begun, by its arrival."""
 

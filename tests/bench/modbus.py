@@ -22,12 +22,10 @@ BAUD = 115200
 MODULES = 8
 REQUEST_BYTES, REPLY_BYTES = 8, 57
 LIMIT_HZ = NS_PER_S / ((REQUEST_BYTES + REPLY_BYTES) * uart_byte_ns(BAUD) + 2 * frame_gap_ns(BAUD))
-"""Samples per second of a whole line."""
 
 
 class Outcome(NamedTuple):
     rates_hz: list[float]
-    """Samples per second of each module that lives."""
     cpu_us_per_sample: float
     lost: int
 

@@ -30,7 +30,6 @@ LOOP_RATIO_LIMIT: Final = 1.05
 SAMPLES: Final[Mapping[str, object]] = {"whole": "slots", "rate_hz": 1}
 READ_BYTES: Final = 1000
 QUICK: Final = ("present", "gone", "stopped")
-"""Brokers of the short form."""
 HOUR_S: Final = 3600
 Place = Callable[[Path], AbstractContextManager[int]]
 

@@ -35,7 +35,6 @@ class MqttClient:
         self.waiting: deque[tuple[str, bytes]] = deque()
         """Messages that the broker has not acknowledged, those that were sent first."""
         self.sent = 0
-        """How many of them were sent on this connection."""
         self.acknowledged = self.connects = 0
         self.retry_s = 0.0
         self.heard_s = self.wrote_s = 0.0

@@ -24,10 +24,8 @@ from tests.bench.writer import FIRST_PA
 
 LENGTH = struct.Struct("<I")
 SEQ_DEVICE_AND_PRESSURE = struct.Struct("<Q52xH138xd")
-"""Members of a slot."""
 CHUNK = 1 << 18
 PARTS = 5
-"""With `--devices` every client watches each PARTS-th device."""
 
 
 class Seen:
@@ -49,7 +47,6 @@ class Seen:
 
 
 Take = Callable[[bytearray, Seen, int], None]
-"""Removes whole messages from the front of a buffer and counts their samples."""
 
 
 def take_binary(buffer: bytearray, seen: Seen, now_ns: int) -> None:
@@ -89,7 +86,6 @@ TAKES: dict[str, Take] = {"binary": take_binary, "json": take_json}
 class Client(NamedTuple):
     socket: socket.socket
     buffer: bytearray
-    """Received bytes that were not taken yet."""
 
 
 def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -> Client:

@@ -31,7 +31,6 @@ RATE_HZ = 1000
 SECONDS = 30.0
 START_S = 60.0
 STILL_S = 1.0
-"""After the module's end; what is on its way arrives."""
 
 
 class Receiver:

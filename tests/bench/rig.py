@@ -34,7 +34,6 @@ class Load:
     encoding: str = "binary"
     rate_hz: float = 1000.0
     seconds: float = 5.0
-    """Time that counts."""
     warm_s: float = 3.0
     """Time before it that does not: the clock's first fits, and caches."""
     bare: bool = False
@@ -48,7 +47,6 @@ class Load:
     """Frames after which the next device begins: 0 lets all begin at once."""
     shm: bool = True
     sout: bool = False
-    """Whether the first device's SOUT is on a line."""
     record_to: str = ""
     """Directory that the daemon records to; empty for no recording."""
     mqtt: Mapping[str, object] = field(default_factory=dict)
@@ -63,9 +61,7 @@ class Load:
 class Outcome:
     cpu_us_per_sample: float
     loop_us_per_sample: float
-    """Of that, the thread of the event loop."""
     written_bytes_s: float
-    """What the process gave the disk, bytes a second."""
     cpu_share: float
     p50_us: float
     p99_us: float
@@ -219,7 +215,6 @@ class Used(NamedTuple):
     written_bytes: int
     elapsed_s: float
     refused: int
-    """Frames that the writer could not write."""
 
 
 def measure_cpu(load: Load, writer: Process, pid: int) -> Used:

@@ -55,7 +55,6 @@ SLOPE_MIN_S: Final = 600.0
 """A slope over less is that of the noise."""
 SLOPE_LIMIT_MB_PER_H: Final = 1.0
 GROWTH_LIMIT_MB: Final = 1.0
-"""In the second half of a run that is too short for a slope."""
 BEHIND_AT_S: Final = 60.0
 BEHIND_S: Final = 10.0
 """Clients do not read for so long, until more waits for some than may."""
@@ -68,7 +67,6 @@ LOST_TOLERANCE: Final = 1
 @dataclass(frozen=True)
 class Fleet:
     written: tuple[str, ...]
-    """Names of those behind ptys that `fleet_writer` plays."""
     configuration: Path
 
 
@@ -120,7 +118,6 @@ class Watched:
         self.points: list[tuple[float, float]] = []
         """Seconds, and resident anonymous memory in MB, at every scrape."""
         self.usage: list[tuple[int, int]] = []
-        """Descriptors and threads before every scrape."""
         self.unanswered = 0
         """Scrapes without a page, where a starved daemon says 503, and questions without an answer in time."""
         self._pid, self._socket, self._port = pid, socket, metrics_port
@@ -205,9 +202,7 @@ def start_line(stack: ExitStack) -> Process:
 @dataclass(frozen=True)
 class LineState:
     asked_s: float
-    """CLOCK_MONOTONIC before …"""
     answered_s: float
-    """… and after imud was asked."""
     ledgers: Mapping[str, Mapping[str, int]]
     failed: Mapping[str, int]
     """Polls without a sample, by module: a loss after one of them is known within one."""

@@ -43,9 +43,7 @@ class Count:
 class Recordings:
     directory: Path
     problems: list[str] = field(default_factory=list)
-    """What is wrong with files."""
     read: dict[str, Count] = field(default_factory=dict)
-    """Files that have ended, by name."""
 
     def look(self) -> None:
         """Read the files that ended since; called more often than files begin."""

@@ -23,12 +23,10 @@ from tests.bench.rows import Row, at_most
 ROOT: Final = Path(__file__).parents[2]
 STARTS: Final = 10
 LIMIT_MS: Final = 150.0
-"""What a person takes for at once."""
 TIMEOUT_S: Final = 60.0
 NO_DAEMON: Final = 2
 """Exit status of `imud status` without a daemon."""
 NOT_STREAMING: Final = 1
-"""The same with a device that sends nothing."""
 
 
 def start_rows(name: str, *arguments: str, status: int = 0) -> Iterator[Row]:

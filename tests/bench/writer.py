@@ -29,7 +29,6 @@ LATE_LIMIT_NS = 50_000_000
 """A writer this late has lost its deadlines: it counts them and starts anew."""
 
 MakeFrame = Callable[[int], bytes | bytearray]
-"""Makes frame i."""
 
 FIRST_PA = 2000
 """Of frame 0: imud takes what is below 1000 Pa or above 120 kPa for no pressure."""

@@ -38,7 +38,6 @@ MODULES = {
     "bow": ("hipnuc-uart", "/dev/ttyUSB0", "--rate", "100"),
     "mast": ("imu61x-uart", "/dev/ttyUSB1", "--rate", "100", "--faults", "cut=0.002,flip=0.002"),
 }
-"""Name → driver, port that the pictures show, options of the simulator."""
 RUN_S, LIMIT_S = 20.0, 60.0
 SIZE = (80, 24)
 
@@ -121,9 +120,7 @@ class Flight:
     sent: list[Sample] = field(default_factory=list)
     saved: list[Sample] = field(default_factory=list)
     begins_ns: list[int] = field(default_factory=list)
-    """Of the segments in the snapshot."""
     words: str = ""
-    """The event."""
 
 
 def magnitude(sample: Sample) -> float:

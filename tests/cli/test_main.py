@@ -64,7 +64,6 @@ CALLS: dict[str, tuple[list[str], set[str]]] = {
     "help": (["--help"], set()),
     "status": (["status", "--socket", "/nonexistent/socket"], {"msgspec", "typing_extensions"}),
 }
-"""Commands that are called often, and the packages besides imud that each loads."""
 
 
 @pytest.mark.live

@@ -47,7 +47,6 @@ COMMANDS: dict[str, Callable[[Path], list[str]]] = {
     "help": lambda _: ["run", "--help"],
     "version": lambda _: ["--version"],
 }
-"""A call of each command that prints without a daemon."""
 
 
 def ended(words: list[str], output: int, monkeypatch: pytest.MonkeyPatch) -> object:

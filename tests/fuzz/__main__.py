@@ -50,7 +50,6 @@ class Result:
     inputs: str
     findings: tuple[Path, ...]
     failed: bool
-    """Whether the process ended with an error."""
 
     def __str__(self) -> str:
         per_s = self.executions / self.seconds if self.seconds else 0

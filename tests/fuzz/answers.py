@@ -22,7 +22,6 @@ from imud.web.calls import Calls
 from tests.fuzz.target import Target
 
 ITEMS: Final = 8
-"""Samples or events that are read: more than most inputs hold."""
 WAIT_S: Final = 60.0
 """The server ends the connection after the input: nobody waits so long."""
 HELLO: Final = line_of(
@@ -56,7 +55,6 @@ USES: Final[Sequence[Callable[[Client], None]]] = (
     _descriptors,
 )  # fmt: skip
 CALLS: Final = len(USES)
-"""First byte, modulo one more than the uses of a client: how `imud web` calls."""
 
 
 def names() -> Sequence[str]:

@@ -14,7 +14,6 @@ from tests.fuzz.target import as_it_is
 D = TypeVar("D", bound=Driver)
 Mend = Callable[[bytes, Random], bytes]
 EXAMPLES: Final = 12
-"""Seeds made of a driver's own examples."""
 
 
 def names_of(kind: type[Driver]) -> list[str]:

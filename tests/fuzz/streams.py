@@ -12,7 +12,6 @@ from tests.fuzz.target import FRAMES_BYTES_MAX, Target
 from tests.support.codec_invariants import check_closed, check_counted, cut, feed_stream, untimed
 
 SPLICE_SHARE = 0.1
-"""One in so many mutations puts a frame in."""
 
 
 def names() -> Sequence[str]:

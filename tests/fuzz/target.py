@@ -14,7 +14,6 @@ def as_it_is(data: bytes, _random: Random) -> bytes:
 
 
 FRAMES_BYTES_MAX: Final = 2048
-"""The same for frames: three of the longest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +25,6 @@ class Target:
     mend: Callable[[bytes, Random], bytes] = as_it_is
     """Makes check values right after a mutation, so that what stands behind them is reached too."""
     words: Callable[[], Sequence[bytes]] = tuple
-    """Words of the format, for inputs that are text."""
     bytes_max: int = INPUT_BYTES_MAX
 
 

@@ -21,9 +21,7 @@ from tests.fuzz.target import Target
 INPUT_S_MAX: Final = 120
 """Maximum time for one input, s. An input needs milliseconds, but a busy host gives a nice process little time."""
 MEMORY_MB_MAX: Final = 1024
-"""A process that takes more is a finding."""
 MEND_SHARE: Final = 0.5
-"""One in so many mutations gets right check values."""
 
 
 class Atheris(Protocol):

@@ -28,11 +28,9 @@ from imud.sim.simulator import SimulatorOptions
 from tests.lab.can_phase import LOOP_S, Phased
 
 BURST_NS = 2_000_000
-"""Frames that leave within this time of each other leave together."""
 AHEAD_NS = 300_000_000
 FRAMES_MAX = 256
 BEGIN_NS = 1_000_000_000
-"""In the modules' own time: they have said by then what they say once."""
 LOOP_NS = round(LOOP_S * 1e9)
 INDEX = struct.Struct("<H")
 INDEX_AT = 8 + 6
@@ -44,10 +42,8 @@ class Played:
     """Frames that leave together."""
 
     offset_ns: int
-    """From the instant of the loop's first sample."""
     frames: bytearray
     indices: list[int] = field(default_factory=list)
-    """Where in them an INDEX is."""
 
     def count_on(self, samples: int) -> None:
         for at in self.indices:

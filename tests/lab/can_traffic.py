@@ -22,7 +22,6 @@ ACCEL_M_S2: Final = 0.02
 ANGLE_RAD: Final = 0.002
 """Some counts of the coarsest protocol, and less than the motion `swing` changes between two samples at 100 Hz."""
 BEGIN_S: Final = 1.0
-"""Of the loop that is played, in the modules' own time."""
 LATE_SAMPLES: Final = 12
 """So late may the first sample be, where the guest has stalled."""
 

@@ -14,7 +14,6 @@ from tests.lab.serial_port import PseudoTerminal, pseudo_terminal, uart_pair
 from tests.lab.wire import I2cTransfer, SpiTransfer
 
 SHARE = os.environ.get("IMUD_LAB")
-"""The run's folder on the host; set by tests/lab/run in the guest only."""
 
 GPIO_LINES = ("SOUT", "SIN", "PPS", "ALARM", "", "RESET")
 

@@ -21,7 +21,6 @@ class GpioChip:
     sysfs: Path
     """Folder with one sim_gpio<offset> per line."""
     device: Path
-    """Its folder in configfs."""
 
     def drive(self, line: str | int, level: bool) -> None:
         self._attribute(line, "pull").write_text("pull-up" if level else "pull-down", encoding="ascii")

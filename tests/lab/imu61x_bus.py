@@ -10,7 +10,6 @@ from tests.lab.wire import I2cTransfer, Refuse, SpiTransfer
 from tests.support.device_rig import DeviceRig
 
 LIMIT_S = 40.0
-"""The guest's processor is emulated."""
 
 
 def on_spi(device: Imu61xRegisters) -> Callable[[SpiTransfer], bytes]:

@@ -24,7 +24,6 @@ ASK_S = 0.5
 EDGE_S = 0.5
 """By so much may the time of reading begin or end late; none of the samples in it may be missing."""
 SPARE_S = 120.0
-"""For the daemon to find its devices, and for the second part."""
 ID_AT = next(field.offset for field in SLOT_FIELDS if field.name == "device_id")
 LOSSES = ("lost_gap_device", "lost_crc", "lost_overrun", "lost_queue")
 

@@ -9,7 +9,6 @@ from tests.lab.chaos.account import KNOWN, Hole, Interval, account, find_holes, 
 
 PERIOD_NS = 100_000_000
 REMEMBERED = list(range(KNOWN))
-"""Numbers of the samples after which the daemon knows a counter."""
 
 
 def received(numbers: Sequence[int], first_seq: int = 1) -> list[Sample]:

@@ -44,7 +44,6 @@ DEAF_RATE_HZ = 10
 ANSWERED_AFTER_S = 60
 """Of imud.cli.doctor.traffic: a device that was silent on requests for so long does not hear them."""
 DIALOUT = 20
-"""Debian's group of serial ports."""
 
 
 @contextmanager

@@ -31,7 +31,6 @@ from tests.support.device_rig import DeviceRig, device_config, running
 INTERRUPTS = Path("/proc/interrupts")
 HOLD_MS, WAIT_S = 50.0, 1.0
 STEP_NS = 50_000_000
-"""Of the time in which the device moves, from one renewal to the next."""
 EDGES = 20
 RESOLUTION_M_S2 = 1e-3
 FALLBACK_HZ = 10.0
@@ -106,7 +105,6 @@ class Stepped:
         self._lock = threading.Lock()
         self.device = Imu61xRegisters(self._now_ns, update_ns=1, **more)
         self.stamps_ns: list[tuple[int, int]] = []
-        """Before and after each edge."""
 
     def renew(self) -> None:
         self._chip.drive("SOUT", False)

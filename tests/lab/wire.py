@@ -37,7 +37,6 @@ class I2cSegment:
     flags: int
     length: int
     data: bytes
-    """What the host writes; empty if it reads."""
 
     @property
     def reads(self) -> bool:
@@ -72,7 +71,6 @@ class SpiSegment:
     """One spi_ioc_transfer."""
 
     mosi: bytes
-    """Bytes on the wire, in their order there; zeros if the host sends nothing."""
     speed_hz: int
     bits_per_word: int
     cs_change: bool

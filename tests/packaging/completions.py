@@ -13,7 +13,6 @@ from typing import Final
 from imud.cli import build_parser
 
 FILES: Final = {"bash": "bash/imud", "zsh": "zsh/_imud", "fish": "fish/imud.fish"}
-"""File of each shell."""
 PATHS: Final = ("FILE", "PATH", "PORT", "CAPTURE")
 """Names of arguments in the help that are completed with names of files; a port is a node below /dev."""
 

@@ -44,7 +44,6 @@ OWN_STATUS: Final = {
         ("2", "It could not run, or a change failed; the reason is on standard error."),
     ),
 }
-"""Of the commands whose exit status says more than that of the others."""
 ENVIRONMENT: Final = (
     ("IMUD_SOCKET", f"The daemon's socket, instead of {DEFAULT_PATH}."),
     ("IMUD_SHM", "The folder of the rings of shared memory."),

@@ -289,13 +289,11 @@ class FakeModule(MemoryLink):
         self.set = dict(FACTORY)
         self.flash = dict(FACTORY)
         self.mounting = "level"
-        """The mounting in force."""
         self.refuses: set[str] = set()
         """Names of settings that it answers with ERR."""
         self.forgets: set[str] = set()
         """Names of settings that it confirms and does not keep."""
         self.silent: set[str] = set()
-        """Commands that it does not answer."""
         self.commands: list[str] = []
         self.saves = 0
         self.pauses_clock = False
@@ -461,7 +459,6 @@ FAKE_SETTINGS: Final = DeviceSettings(
     },
     read=_get_values, save=_save_all, restart=_restart, check=_carried,
 )  # fmt: skip
-"""Settings of every kind."""
 
 
 ZERO: Final = Calibration(

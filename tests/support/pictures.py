@@ -35,7 +35,6 @@ NAMES = "font-family='DejaVu Sans, Verdana, sans-serif'"
 RATE_HZ, SECONDS, SEED = 100, 60, 7
 PORT = "/dev/ttyUSB0"
 COMMANDS = ("devices", "status", "watch --rate 5 --count 6")
-"""What the terminal shows."""
 
 
 def svg(width: int, height: int, title: str, parts: Sequence[str]) -> str:
@@ -100,13 +99,10 @@ def session() -> list[str]:
 
 class Stamp(NamedTuple):
     t_s: float
-    """Since the first sample."""
     arrival_ms: float
     """Arrival of its last byte - truth."""
     off_ms: float
-    """`t_ns` - truth."""
     error_ms: float
-    """`t_err_ns`."""
 
 
 def stamps(seconds: int = SECONDS) -> list[Stamp]:
@@ -184,7 +180,6 @@ def time_stamps(samples: Sequence[Stamp]) -> str:
 # --- axes and mountings -----------------------------------------------------------------------------------------------
 
 COLOURS = ("#c0392b", "#2e8b57", "#1f5fa8")
-"""Of x, y, z."""
 FORWARD, LEFT, UP = (0.80, -0.42), (-0.76, -0.34), (0.0, -0.95)
 """Where the body's axes point on the page, per unit of length."""
 BODY_PANEL, MOUNTING_PANEL = (250, 275), (250, 260)

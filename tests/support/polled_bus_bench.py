@@ -32,7 +32,6 @@ class PolledBusBench:
         self.clock = clock or VirtualClock()
         self.is_virtual = clock is not None
         self.node = folder / "spidev0.0"
-        """What stands for the node of the SPI bus in /dev."""
         self.node.touch()
         self.spi = InProcessSpi()
         """A device is put on it by `spi.device = …`."""

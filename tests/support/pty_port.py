@@ -94,7 +94,6 @@ def unprivileged() -> Iterator[None]:
 
 LIMIT_S = 60.0
 BAUD = 921600
-"""The fastest, so that tests are."""
 
 
 def serial_of(number: int) -> bytes:
@@ -163,7 +162,6 @@ class ModbusBench:
         self.at = at
         self.baud = baud
         self.sent: list[tuple[int, bytes]] = []
-        """Address and request of each transfer."""
 
     @property
     def slave(self) -> Slave:

@@ -259,7 +259,6 @@ PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
     "docs/monitoring.md": lambda: {"alerts": alert_table()},
     "docs/clock.md": clock_figures.tables,
 }
-"""The generated parts of each page by the name that their marks have."""
 
 
 def current(page: str) -> str:
@@ -283,7 +282,6 @@ def _replaced(text: str, name: str, content: str) -> str:
 
 
 WHOLE_FILES: Final[Mapping[str, Callable[[], str]]] = {"docs/socket.schema.json": socket_schema}
-"""Files that are generated as a whole."""
 
 
 if __name__ == "__main__":

@@ -73,7 +73,6 @@ class FakeRequest:
         self.released = False
         self.value = False
         self.error = 0
-        """The errno that `get_value` fails with."""
 
     def feed(self, *events: tuple[int, int, int]) -> None:
         """Time, id and line_seqno of each."""
@@ -100,13 +99,10 @@ class FakeGpiod:
     def __init__(self, devices: Path, **chips: tuple[str, tuple[str, ...]]) -> None:
         self.chips = chips
         self.errors: dict[str, int] = {}
-        """The errno that opening a chip fails with."""
         self.refusal = 0
-        """The errno that a request fails with."""
         self.holder = ""
         self.requests: list[FakeRequest] = []
         self.asked: list[tuple[str, int, str, int | None]] = []
-        """Chip, offset, consumer and buffer of every request."""
         for name in chips:
             (devices / name).touch()
 

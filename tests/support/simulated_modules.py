@@ -47,7 +47,6 @@ T = TypeVar("T")
 
 BEGIN_NS = 1_234_567_890_123
 UART_STEP_MS = 2
-"""How often the host looks."""
 AT_REST = Still(radians(2), radians(-3), radians(40))
 
 
@@ -80,14 +79,12 @@ class SerialLine(Generic[M]):
         self.now_ns = BEGIN_NS
         self.module = module
         self.baud = module.baud
-        """Rate of the host's end."""
         self.connected = True
         """Whether the host's transmit line reaches the module."""
         self.ledger = ledger
         self.codec = codec
         self.session = Session(ledger)
         self.asked: list[str] = []
-        """Names of the requests sent, pauses left out."""
 
     def wait(self, duration_ms: float) -> list[CodecEvent]:
         """Let time pass; return what the host heard."""
@@ -224,9 +221,7 @@ class CanBench:
         self.codec: CanCodec = driver.make_codec(Ledger(), settings)
         self.session = Session(self.codec.ledger)
         self.sent: list[tuple[int, bytes]] = []
-        """What the host sent."""
         self.heard: list[tuple[int, bytes]] = []
-        """What the module sent."""
         self.measured: list[Measurement] = []
         self._also: tuple[CanFilter, ...] = ()
 

@@ -348,7 +348,6 @@ class Peer:
         self.buffer = b""
         self.ids = 0
         self._methods: dict[str, str] = {}
-        """Method of each request by its id, as JSON."""
 
     @classmethod
     async def connect(cls, server: SocketServer) -> Self:
@@ -441,7 +440,6 @@ class Peer:
 
 
 _peers: list[Peer] = []
-"""Clients of the running test."""
 
 
 def _refuse(word: str) -> None:

@@ -113,7 +113,6 @@ class Machine:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.outputs: dict[str, CommandOutput | OSError] = {}
-        """By the first words of a command."""
         self.status: list[DeviceStatus] | Exception = LinkMissing("no daemon at /run/imud/imud.sock")
         self.pages: dict[tuple[str, int, str], str] = {}
         self.clock = KernelClock(True, 50, 1000)
@@ -123,7 +122,6 @@ class Machine:
         self.gids: frozenset[int] = frozenset({1000})
         self.boot_utc_ns = 0
         self.on_pause: Callable[[], None] = lambda: None
-        """What happens while a check waits."""
 
     def write(self, path: str, text: str = "") -> Path:
         file = self.root / path.lstrip("/")

@@ -71,12 +71,10 @@ class FakeDevice:
     make_frame: Callable[[Random], bytes] | None = None
     """What it sends; the driver's example frames by default."""
     noise: bytes = b""
-    """Sent in place of frames."""
     damage: float = 0.0
     """Share of frames with one bit flipped."""
     random: Random = field(default_factory=lambda: Random(1))
     sent_to: list[tuple[int, bytes]] = field(default_factory=list)
-    """Every write: rate of the host, bytes."""
 
     def __post_init__(self) -> None:
         make = self.make_frame or self.driver.example_frame

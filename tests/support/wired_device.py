@@ -56,11 +56,9 @@ class WiredDevice:
         self.source = FakeSource()
         self.memory = MemoryLines(self.clock.now_ns)
         self.cut: set[Pin] = set()
-        """Pins whose wire is cut now."""
         self.instants: dict[int, int] = {}
         """Instant of measurement by device time (ms) of the frames that arrived."""
         self.frames: list[int] = []
-        """Instant of measurement of each frame that arrived, in order."""
         self._config = DeviceConfig(
             "bow", "hipnuc-uart", None, identify, "memory", MemorySettings(baud=BAUD), lines=lines, rmc=rmc
         )
@@ -207,7 +205,6 @@ class LinkedModule(MemoryLink):
         self.module = module
         self.clock = clock
         self.sent_at: list[tuple[int, bytes]] = []
-        """Rate of the line, and the bytes sent at it."""
         self.module_is_on = True
 
     def write(self, data: bytes) -> None:

@@ -120,7 +120,6 @@ class Sender:
     def __init__(self, cable: Cable, frame_of: Callable[[int], bytes]) -> None:
         """`frame_of` makes the bytes of a measurement, from its number; none: its frame is lost."""
         self.measured = 0
-        """Measurements since the first, number 0."""
         self._cable = cable
         self._frame_of = frame_of
         self._stopped = threading.Event()

@@ -26,14 +26,12 @@ from tests.web.turned import turned_module
 
 FOLDER = ROOT / "docs/pictures"
 PORTS: Final = Path("/tmp/serial/by-id")
-"""Names of the ports, the same in every picture."""
 MODULES: Final = {
     "bow": ("hipnuc-uart", "--rate", "200", "--motion", "engine", "--faults", "lose=0.0004,flip=0.0002"),
     "mast": ("imu61x-uart", "--rate", "100", "--faults", "cut=0.01,flip=0.01"),
     "crane": ("hipnuc-uart", "--rate", "100", "--motion", "still"),
 }
 DECLARED: Final = {"bow": {"mode": "9-axis", "magnetic_calibration": True, "output": {"hi91": 200}, "sout_divisor": 8}}
-"""What the settings should be; the mode is another one."""
 ABSENT: Final = "stern"
 STATES: Final = {"bow": "running", "mast": "running", "crane": "silent", ABSENT: "missing"}
 COLOURS_MAX: Final = 256

@@ -19,7 +19,6 @@ PEAK_EVERY = 40
 POINTS = "return window.imud.view.plots?.get('accel_m_s2').data[0].length >= arguments[0]"
 PLOTTED = """const plot = window.imud.view.plots.get('accel_m_s2');
     return [plot.plot.data[0].map((x) => x - plot.offset_s), plot.plot.data[6], plot.plot.data[5]]"""
-"""Times, least and greatest acceleration along z, as uPlot has them."""
 
 
 DIRECTIONS = [(x, y, z) for x in (-0.9, 0.1, 0.5) for y in (-0.2, 0.3) for z in (-0.6, 0.4, 1.0)]

@@ -19,7 +19,6 @@ RATE_HZ = 200
 LOST = (7, 20, 21, 33)
 """Of each 40 measurements, those whose frame is lost: one in ten, never more than two in a row."""
 PAUSE = range(900, 930)
-"""Measurements that are lost in a row, once: more than are filled."""
 GRID_OF = "const { gridOf } = await import('/static/grid.js'); return gridOf(args[0], args[1])"
 SEGMENTS = "return window.imud.view.spectrum.spectrum.segments.length >= arguments[0]"
 

@@ -16,7 +16,6 @@ SPEED: Final = 8
 """So many times faster than a hand: all directions within some seconds."""
 HARD_IRON_T: Final = (14.14e-6, -2.08e-6, -8.75e-6)
 BIAS: Final = "bias 14.14, -2.08, -8.75 µT"
-"""What the module says when it has found that."""
 
 
 @contextmanager

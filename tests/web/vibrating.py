@@ -12,9 +12,7 @@ from imud.sim.physics.motion import MOTIONS, Motion, Sine, Swing
 
 ENGINE_HZ: Final = 31.0
 UP_M_S2: Final = 0.6
-"""Amplitude of the vertical vibration."""
 EAST_M_S2: Final = 0.15
-"""That of the horizontal one, at twice the frequency."""
 
 
 def shaking(amplitude_m_s2: float, frequency_hz: float) -> Sine:

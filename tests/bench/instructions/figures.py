@@ -17,14 +17,12 @@ INTERPRETER: Final = "interpreter: a loop without imud"
 """The stage that shows how Python itself was built."""
 
 Figures = dict[str, int]
-"""Instructions per sample or frame, by stage."""
 
 
 class Line(NamedTuple):
     stage: str
     now: int
     kept: int | None
-    """None where there is no figure."""
 
     @property
     def growth(self) -> float:

@@ -41,7 +41,6 @@ Run = Callable[[int], None]
 
 READ_BYTES: Final = 4096
 WARM: Final = 200
-"""Samples or frames before the first that is counted."""
 WARM_LEAST: Final = 20
 
 
@@ -51,9 +50,7 @@ class CountedStage:
     make: Callable[[int, str], Run]
     """Makes `run` for so many operations in all; its files go into the directory."""
     count: int
-    """Operations that are counted; twice as many the second time."""
     per: int = 1
-    """Samples, or frames, of an operation."""
 
     @property
     def total(self) -> int:

@@ -18,7 +18,6 @@ from tests.support.surroundings import Machine
 UP, STATE, RATE = DoctorCheck("u", can_up), DoctorCheck("s", can_state), DoctorCheck("r", can_bitrate)
 
 RECORDED: dict[str, Any] = json.loads((ROOT / "tests/cli/doctor/ip_link_can0.json").read_text())
-"""What `ip` printed of can0 by its state; `recorded` says where."""
 COMMAND = "ip -json -details -statistics link show can0"
 
 

@@ -76,7 +76,6 @@ MISSING = {
     "journalctl": {"kernel log"}, "systemctl": {"service", "ModemManager"}, "ip": {"CAN state", "CAN bit rate"},
     "vcgencmd": {"power"},
 }  # fmt: skip
-"""Checks that need a program."""
 
 
 def test_an_empty_machine_ends_no_check(machine: Machine) -> None:

@@ -24,7 +24,6 @@ pytestmark = pytest.mark.live
 
 SAMPLES = 100
 ENOUGH = 50
-"""That are compared: topics are subscribed one after the other, and end in the middle of a sample."""
 TOPICS = {
     "/bow/imu/data": "sensor_msgs/msg/Imu",
     "/bow/imu/mag": "sensor_msgs/msg/MagneticField",
@@ -41,11 +40,8 @@ Messages = dict[str, list[tuple[int, Any]]]
 
 class Seen(NamedTuple):
     messages: Messages
-    """By topic: the time in the protocol, and the message."""
     stale: Any
-    """The diagnostics after the daemon had ended."""
     truth: dict[int, Truth]
-    """Ideal measurements by the time of the module, ms."""
 
 
 @contextmanager

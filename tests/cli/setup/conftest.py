@@ -25,14 +25,10 @@ class LivingMachine(Machine):
         super().__init__(root)
         self.uid = 0
         self.units: dict[str, list[str]] = {"imud.service": ["disabled", "inactive"]}
-        """Of each unit whether it is enabled, and whether it is active."""
         self.started = "/usr/bin/imud run --config /etc/imud.yaml"
-        """Command line of the service."""
         self.ran: list[str] = []
         self.failing: dict[str, str] = {}
-        """What a command complains of, by its first words."""
         self.missing: set[str] = set()
-        """Programs that are not installed."""
         for folder in ("/run/systemd/system", "/run/udev", "/etc/udev/rules.d", "/dev", "/proc", "/sys/class/tty"):
             (self.root / folder[1:]).mkdir(parents=True)
         self.write("/etc/group", GROUPS)
@@ -146,7 +142,6 @@ class LivingMachine(Machine):
 class Attachments:
     def __init__(self) -> None:
         self.heard: dict[str, list[ProbeReport]] = {}
-        """By port or interface; others are silent."""
         self.listened: list[str] = []
         self.active: set[str] = set()
         self.lines: dict[str, list[Attached]] = {}

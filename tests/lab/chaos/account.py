@@ -53,7 +53,6 @@ class Hole(NamedTuple):
     """What is between two samples that the daemon received one after the other."""
 
     missing: int
-    """True samples."""
     is_certain: bool
     """Whether the daemon can know how many."""
     unknown_most: int = 1
@@ -65,14 +64,11 @@ class Hole(NamedTuple):
 class Account(NamedTuple):
     samples: int = 0
     lost: int = 0
-    """Losses of the ledger."""
     holes: int = 0
-    """True samples between received ones."""
     least: int = 0
     most: int = 0
     """Bounds of `lost` by the rule."""
     unknown: int = 0
-    """Unknown gaps of the ledger."""
     unknown_most: int = 0
     """Their number by the rule."""
     outages: int = 0

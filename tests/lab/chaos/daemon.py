@@ -27,7 +27,6 @@ BACK_LIMIT_S: Final = 120.0
 ANSWER_LIMIT_S: Final = 30.0
 CGROUP: Final = Path("/sys/fs/cgroup/imud-chaos")
 TOO_LITTLE: Final = "4M"
-"""Memory in which no interpreter lives."""
 ID_AT: Final = next(field.offset for field in SLOT_FIELDS if field.name == "device_id")
 
 
@@ -47,11 +46,9 @@ class Recorder:
         self._client = Client(path, timeout_s=ANSWER_LIMIT_S)
         self._watch = self._client.watch(encoding="binary")
         self._newest = self._client.poll()
-        """The sample before the first that is received, of each device that had one."""
         self.begin = _snapshot(self._client)
         """The state at a moment from which on every sample is received."""
         self.before: Final = {name: _first_samples(rings, name, d.newest_seq) for name, d in self.begin.devices.items()}
-        """The samples of each device up to then."""
         self._slots: list[bytes] = []
         self._others: list[object] = []
         self._thread = threading.Thread(target=self._run, name="recorder")
@@ -114,7 +111,6 @@ class Life:
         assert self.process.poll() is None, "the daemon ended at its start"
         self.recorder = Recorder(self.socket, folder)
         self.descriptors = self.threads = 0
-        """When all devices ran for the first time; 0 before."""
 
     def snapshot(self) -> Snapshot:
         """The state of every device now. Raises ImudError, TimeoutError."""

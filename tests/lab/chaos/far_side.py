@@ -45,11 +45,9 @@ BAUD: Final = 115200
 PERIOD_NS: Final = round(1e9 / RATE_HZ)
 MODBUS_HZ: Final = 5.0
 SETTLE_S: Final = 0.012
-"""After a rising edge, as in tests/lab/imu_process.py."""
 LOOK_S: Final = 0.02
 I2C_BURST: Final = b"\x12"
 SPI_BURST: Final = b"\x80\x00"
-"""What the reading of a sample begins with on either bus."""
 Port = SimulatedPort | CanPort
 
 

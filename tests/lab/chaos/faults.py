@@ -19,13 +19,9 @@ from tests.lab.chaos.daemon import Life
 from tests.lab.chaos.far_side import STUCK, FarSide
 
 DAEMON: Final = "daemon"
-"""Resource of all that needs a living daemon."""
 EVERY_S: Final = 0.8
-"""Mean time between two faults."""
 ROUND_S: Final = 15.0
-"""Of faults, then everything must be well."""
 PAUSE_S: Final = 0.3
-"""Between two faults of one resource."""
 
 
 class Scene(Protocol):
@@ -68,7 +64,6 @@ class Fault:
 
 class Planned(NamedTuple):
     begin_s: float
-    """Since the beginning of its round."""
     fault: Fault
     lasts_s: float
 

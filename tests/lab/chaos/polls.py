@@ -29,9 +29,7 @@ BLOCK_REPLY_BYTES: Final = READ_OVERHEAD_BYTES + 2 * BLOCK_REGISTERS
 class Answer(Enum):
     GOOD = "good"
     DAMAGED = "damaged"
-    """With a wrong bit."""
     REFUSED = "refused"
-    """The transfer failed."""
     ABSENT = "absent"
     """The level of a line that no device drives."""
 

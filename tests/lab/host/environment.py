@@ -20,7 +20,6 @@ ROOT = Path(__file__).resolve().parents[3]
 TEST_LIMIT_S = 120  # per test: twice the ordinary limit, for a guest several times slower than the host
 PROBE_LIMIT_S = 300
 COMPILED = ("imud", "tests/conftest.py", "tests/lab", "tests/support")
-"""Files that the guest imports."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,6 @@ PACKAGES = {
     "gpsd": "independent peer of the tests, also outside of the lab",
     "chrony": "independent peer of the tests, also outside of the lab",
 }
-"""Package name to what the lab does with it."""
 
 
 def installed_versions(names: list[str]) -> dict[str, str]:

@@ -22,7 +22,6 @@ class Machine:
     share: Path
     """Folder the guest may write, its /run/lab."""
     console: Path
-    """File that receives the kernel's console."""
     memory_mb: int
     processors: int
     uart_fds: tuple[int, int]

@@ -46,7 +46,6 @@ CHRONY_FILES = {
     "/etc/systemd/system/chrony.service.d/imud.conf": f"[Service]\nExecStartPost=+/bin/chown imud {CHRONY_SOCKET}\n",
     "/etc/default/chrony": 'DAEMON_OPTS="-F 1 -x"\n',  # -x: the guest's clock stays as it is
 }
-"""As docs/time.md has them."""
 PULSES = 12
 FEED = f"""
 import sys, time

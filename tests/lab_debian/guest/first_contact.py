@@ -32,13 +32,10 @@ from tests.lab_debian.guest.system import (
 
 ERROR = 2
 STATUS = {"warning": 1, "error": ERROR}
-"""Exit status of `imud doctor` by its worst finding."""
 HOLDER = "imud-lab-holder.service"
 HOLD_PORT = f"import serial, time; port = serial.Serial('{NODE}', exclusive=True); time.sleep(3600)"
-"""Has the port for itself, as terminal programs do."""
 DROP_IN = Path("/run/systemd/system/imud.service.d/90-lab.conf")
 OPERATOR = "skipper"
-"""Runs sudo, of which the rig has only the variable."""
 SETUP = ("env", f"SUDO_USER={OPERATOR}", "imud", "setup")
 RULES = Path("/etc/udev/rules.d/61-imud-setup.rules")
 JOURNAL = Path("/var/lib/imud-setup/journal.json")

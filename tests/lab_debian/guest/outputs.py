@@ -21,7 +21,6 @@ from tests.lab_debian.guest.system import (
 METRICS_PORT = 9400
 GPSD_PORT = 2947
 NOTHING_YET = "has no sentences yet"
-"""What the daemon says of a gpsd that answers and has no receiver."""
 REALTIME = "[Service]\nCPUSchedulingPolicy=rr\nCPUSchedulingPriority=10\n"
 
 

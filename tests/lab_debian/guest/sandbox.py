@@ -24,7 +24,6 @@ SCORE_MAX = 2.0
 PUBLIC, PRIVATE = "192.0.2.1", "10.9.8.7"
 """Addresses that the guest gives itself; the first is of TEST-NET-1 (RFC 5737), outside of every private network."""
 INIT_MODULE = {"x86_64": 175, "aarch64": 105}[platform.machine()]
-"""Number of the system call."""
 FORBIDDEN = {
     "write to /usr": "open('/usr/probe', 'w')",
     "write to /etc": "open('/etc/probe', 'w')",
@@ -50,7 +49,6 @@ FORBIDDEN = {
 }
 """What the confined user must not be able to do, as Python that raises when it is refused."""
 LEFT = ("/usr/probe", "/etc/probe", "/dev/shm/n", "/dev/shm/s")
-"""Files that those leave who can."""
 FREE_FOR_ROOT = {"see other users' processes"}
 """hidepid= of /proc, by which ProtectProc= works, leaves members of group root alone (proc(5), `gid=`)."""
 NOT_FOR_ROOT = "StateDirectory"

@@ -13,7 +13,6 @@ from tests.lab_debian.guest.checks import LIMIT_S, Failed, wait_until
 SHARE = Path("/run/lab")
 CONFIG = Path("/etc/imud.yaml")
 EXAMPLE = Path("/run/example.yaml")
-"""The configuration as the package brought it."""
 SOCKET = "/run/imud/imud.sock"
 RINGS = Path("/run/imud/shm")
 PYTHON = "/usr/lib/imud/bin/python3"
@@ -22,7 +21,6 @@ UNIT = "imud.service"
 NODE = Path("/dev/ttyUSB0")
 REQUESTS = "/dev/virtio-ports/requests"
 FRESH_NS = 1_000_000_000
-"""A sample that is younger was made just now."""
 
 
 def run(*command: str, limit_s: float = LIMIT_S, user: str = "", text: str = "") -> subprocess.CompletedProcess[str]:

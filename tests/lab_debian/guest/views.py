@@ -34,7 +34,6 @@ ExecStart=
 ExecStart=/usr/bin/imud web --address 0.0.0.0 --token-file ${{CREDENTIALS_DIRECTORY}}/token
 SupplementaryGroups=imud-control
 """
-"""As the unit's own comment has it, on all addresses."""
 FETCH = """
 import sys, urllib.error, urllib.request
 url, token, body = sys.argv[1:]
@@ -59,7 +58,6 @@ CHANGE = json.dumps(
     }
 )
 NO_BROKER = "mqtt: {enabled: true, brokers: ['mqtt://127.0.0.1:1']}\n"
-"""Nobody listens there."""
 STAYS_S = 30.0
 
 

@@ -20,7 +20,6 @@ from tests.lab_debian.host import release as release_module
 from tests.lab_debian.host.release import BOOT_MODULES, MODULES, SYSTEM, Release
 
 ROOT_FILES = Path(__file__).resolve().parents[1] / "root"
-"""Copied over the guest's root."""
 DISK = "disk.ext4"
 KERNEL = "kernel"
 INITRAMFS = "initramfs.gz"
@@ -32,9 +31,7 @@ CLEAN = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root", "LC_ALL": "C"
 """The environment of every step: the host's own settings (of pip, of apt) stay out of the guest."""
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 HOST = "amd64"
-"""Debian's name of the host's architecture."""
 TRIPLETS = {"amd64": "x86_64-linux-gnu", "arm64": "aarch64-linux-gnu"}
-"""Names of the folders that libraries are in."""
 FOREIGN = {"arm64": "qemu-aarch64"}
 """Architectures that the host has not, and the names under which its kernel knows their emulation."""
 

@@ -34,9 +34,7 @@ SPI."""
 REQUESTS = "requests"
 """Socket: what the guest asks the rig for, one line each."""
 QMP = "qmp"
-"""Socket: QEMU's control."""
 SENSOR = "sensor"
-"""Node of the simulated sensor that is behind the USB adapter."""
 CONSOLE_OPTIONS = "systemd.show_status=yes systemd.log_target=console"
 CONNECT_LIMIT_S = 60.0
 ANSWER_LIMIT_S = 60.0

@@ -14,7 +14,6 @@ from tests.lab.host.packages import install, installed_versions
 from tests.lab_debian.host.release import AMD64, ARM64, Release
 
 NEEDED = ("mmdebstrap", "e2fsprogs", "kmod", "cpio", "debhelper")
-"""Root file system, disk, the kernel's modules, initramfs, package."""
 EMULATORS = {
     "amd64": ("qemu-system-x86",),
     "arm64": ("qemu-system-arm", "qemu-user-static", "binfmt-support", "arch-test"),
@@ -24,7 +23,6 @@ BUILD = ROOT / "packaging" / "debian" / "build"
 BUILT = ROOT / "build" / "deb"
 BUILD_LIMIT_S = 30 * 60
 NEXT = "+lab1"
-"""Added to the version for the package that the upgrade goes to."""
 
 
 def missing(release: Release) -> list[str]:

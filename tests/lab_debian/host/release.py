@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 PYTHONS = {"bookworm": "3.11", "trixie": "3.13"}
-"""Python of each release, the one that its package of imud is for."""
 
 SYSTEM = (
     *("systemd", "systemd-sysv", "dbus", "udev", "kmod", "iproute2", "procps", "python3"),

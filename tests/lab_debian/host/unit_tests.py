@@ -19,7 +19,6 @@ from tests.lab_debian.host import user_mode
 from tests.lab_debian.host.release import PYTHONS, Release
 
 NAME = "unit-tests"
-"""As a group of checks."""
 CLOCK = ("arrival_fit", "arrival_time", "device_utc", "edge_pairing", "even_arrivals", "even_run", "intervals",
          "link_delay", "stamp_time")  # fmt: skip
 """Tests of the clock but for those that play hours of arrivals: several minutes each where they are emulated."""

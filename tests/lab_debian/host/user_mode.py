@@ -17,15 +17,12 @@ from tests.lab_debian.host.image import CLEAN, bootstrap, enable_emulation
 from tests.lab_debian.host.release import PYTHONS, Release
 
 PACKAGES = ("base-files", "base-passwd", "dash", "coreutils", "python3", "gcc", "g++", "libc6-dev")
-"""Debian's: what the tests' Python and their compiler need."""
 WHEELS = ("pytest>=8.2", "pytest-timeout>=2.3", "hypothesis>=6.100", "canopen>=2.3", "cantools>=39", "pynmea2>=1.19")
 """Of the Python Package Index: what the tests import beside imud and what its package has."""
 MACHINES = {"arm64": "aarch64"}
-"""Names of architectures in the tags of wheels."""
 TAGS = ("manylinux_2_17", "manylinux2014", "manylinux_2_28")
 ROOT_NAME = "root"
 SITE = "/opt/site"
-"""Where WHEELS are, as programs see it."""
 PYCACHE = "pycache"
 """Bytecode of later runs: compiling takes longer than the tests."""
 NEEDED_BYTES = 2 << 30
