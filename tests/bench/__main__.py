@@ -1,6 +1,6 @@
 """`make bench`: every measurement in one run, side by side, and in build/bench.json.
 
-`make bench ARGS="decode clock"` runs some parts. `make bench ARGS=--short` runs all of them with fewer and shorter
+`make bench ARGS="clock socket"` runs some parts. `make bench ARGS=--short` runs all of them with fewer and shorter
 rounds, in SHORT_LIMIT_S at most on a machine that does nothing else; what may boot the lab's kernel is left out there.
 """
 
@@ -17,7 +17,7 @@ import msgspec
 from tests.bench.rows import Row
 
 PARTS = (
-    "decode", "clock", "clock_table", "clock_lines", "lines", "polling", "modbus", "can", "can_devices", "detect",
+    "clock", "clock_table", "clock_lines", "lines", "polling", "modbus", "can", "can_devices", "detect",
     "shm", "socket", "metrics", "end_to_end", "latency", "clock_hold", "gpsd", "sout", "recording", "mqtt", "web",
     "start",
 )  # fmt: skip

@@ -1,13 +1,10 @@
-"""Shared memory: what one sample costs the writer, and the Python and the C reader.
-
-Batches of one sample, as at 1 kHz: nothing is shared between samples.
-"""
+"""Shared memory: what one sample costs the Python and the C reader. `make bench-instructions` has the writer's part."""
 
 import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from imud.client.ring import Ring
@@ -58,34 +55,11 @@ def rows(quick: bool = False) -> Iterable[Row]:
         publisher = ShmPublisher(ShmSettings(directory=folder, slots=SAMPLES, group=""), context)
         publisher.add_device("bench", 0)
         given = list(samples())
-        encode = min(_encode_ns(given) for _ in range(rounds))
-        write = min(_publish_ns(publisher.publish, given) for _ in range(rounds))
-        yield Row("shm: encode one slot (shared by all outputs)", encode, "ns/sample")
-        yield Row("shm: publish() of a batch of one, slot encoded before", write, "ns/sample")
-        yield Row("shm: encode and publish", encode + write, "ns/sample")
         read = min(_read_ns(publisher, folder, given) for _ in range(rounds))
         yield Row("shm: Python reader, Ring.read()", read, "ns/sample")
         if shutil.which("cc") is not None:
             yield Row("shm: C reader, imud_next()", _c_reader_ns(Path(folder)), "ns/sample")
         publisher.close()
-
-
-def _encode_ns(given: list[Sample]) -> float:
-    batches = [Batch("bench", 0, [sample]) for sample in given]
-    start = time.perf_counter_ns()
-    for batch in batches:
-        batch.slots()
-    return (time.perf_counter_ns() - start) / len(batches)
-
-
-def _publish_ns(publish: Callable[[Batch], None], given: list[Sample]) -> float:
-    batches = [Batch("bench", 0, [sample]) for sample in given]
-    for batch in batches:
-        batch.slots()
-    start = time.perf_counter_ns()
-    for batch in batches:
-        publish(batch)
-    return (time.perf_counter_ns() - start) / len(batches)
 
 
 def _read_ns(publisher: ShmPublisher, folder: str, given: list[Sample]) -> float:

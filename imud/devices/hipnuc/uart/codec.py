@@ -15,7 +15,7 @@ incomplete everything waits, at most FRAME_BYTES_MAX; `flush` ends the wait when
 At 1 kHz the decoder is on the sample path, so HI91 frames back to back, which is what a stream consists of, are decoded
 by `_decode_run`: one match finds them, the CRC starts from that of the header, NaN is looked for in the high bytes of
 all floats of all frames at once, and one `iter_unpack` goes through all payloads. Everything else goes one by one.
-`tests/bench/decode.py` measures it.
+`make bench-instructions` measures it.
 """
 
 import re

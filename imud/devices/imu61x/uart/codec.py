@@ -9,7 +9,7 @@ The timer counts µs and wraps after 71.6 minutes.
 
 Strategy. A read is one AHRS frame, or several back to back, nearly always: `feed` itself and `_decode_run` take those
 whose values are finite. NaN and infinity are looked for in the high bytes of all floats at once. All else goes through
-`framing.FrameFinder`. `tests/bench/decode.py` measures it.
+`framing.FrameFinder`. `make bench-instructions` measures it.
 """
 
 import re
