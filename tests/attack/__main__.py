@@ -53,7 +53,6 @@ def watching(stage: AttackedDaemon) -> Iterator[Peak]:
 
 
 def measure(entry: Attack, stage: AttackedDaemon, seconds: float, idle_mb: float) -> tuple[Measured, Done]:
-    """Run one attack. Raises OSError when the daemon ends by it."""
     if entry.devices:
         stage.change(devices=entry.devices)
         idle_mb = stage.rss_mb

@@ -35,7 +35,6 @@ class Done:
 
 
 def start(stage: AttackedDaemon, seconds: float, kind: str) -> list[subprocess.Popen[str]]:
-    """Hostile clients, half of them of one user and half of another where this process may become others."""
     children = []
     for number, uid in enumerate(HOSTILE_UIDS):
         argv = [
@@ -102,7 +101,6 @@ def event_flood(stage: AttackedDaemon, seconds: float) -> Done:
 
 
 def unread_log(stage: AttackedDaemon, seconds: float) -> Done:
-    """Nobody reads the log, which is full, while there is something to write into it: each reload is refused."""
     seen = stage.log.spoilt
     stage.spoil_configuration()
     stage.log.stop_reading()
@@ -118,7 +116,6 @@ def unread_log(stage: AttackedDaemon, seconds: float) -> Done:
 
 
 def shared_memory(stage: AttackedDaemon, seconds: float, sticky: bool) -> Done:
-    """Another user in the directory of the rings; left out, and said so, where this process may not become one."""
     if os.geteuid():
         print("shared memory: left out, only root can act as another user", flush=True)
         sleep(seconds)
@@ -128,7 +125,6 @@ def shared_memory(stage: AttackedDaemon, seconds: float, sticky: bool) -> Done:
 
 
 def starved(stage: AttackedDaemon, seconds: float) -> Done:
-    """SIGSTOP and CPU hogs: samples are lost then, as many as the port refused."""
     before = stage.port_refused
     stops = starvation.attack(stage.pid, max(seconds, STARVE_S), STARVE_SEED)
     problems = [] if stops and stage.port_refused > before else ["the daemon was never stopped for long enough"]
@@ -136,7 +132,6 @@ def starved(stage: AttackedDaemon, seconds: float) -> Done:
 
 
 def calm(_stage: AttackedDaemon, seconds: float) -> Done:
-    """No attack: what the machine itself does."""
     sleep(seconds)
     return Done()
 

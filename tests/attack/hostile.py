@@ -65,7 +65,6 @@ def padded_line(_rng: random.Random) -> bytes:
 
 
 def any_watch(rng: random.Random) -> bytes:
-    """A watch of some fields in any order."""
     fields = rng.sample(SAMPLE_FIELDS, rng.randrange(1, len(SAMPLE_FIELDS)))
     return request("watch", fields=fields)
 
@@ -79,7 +78,6 @@ def many_names(_rng: random.Random) -> bytes:
 
 
 def deep_arguments(_rng: random.Random) -> bytes:
-    """A command whose arguments are nested 974 deep."""
     inner = b'{"a":' * 974 + b"1" + b"}" * 974
     head = b'{"jsonrpc":"2.0","id":1,"method":"command","params":{"device":"d0","name":"x","arguments":'
     return head + inner + b"}}\n"

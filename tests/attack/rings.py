@@ -36,8 +36,6 @@ print(attack(Path(sys.argv[1]), int(sys.argv[2]), lambda: time.monotonic() > end
 
 @dataclass
 class Witness:
-    """Reads the ring of `d0` all the time, and tries to open what the hostile user made."""
-
     stage: AttackedDaemon
     samples: int = 0
     missed: int = 0

@@ -80,7 +80,6 @@ class Attacker:
         os.mknod(path, stat.S_IFSOCK | 0o666)
 
     def _forge(self, path: Path) -> None:
-        """A ring that seems to be a living daemon's, and of the newest samples there can be."""
         pid = self._random.choice([1, os.getpid(), os.getppid()])
         header = RingHeader(5, pid, STATE_LIVE, path.name[5:][:63], 0, SLOTS, (1 << 64) - 2, 1, (1 << 63) - 1)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
@@ -125,7 +124,6 @@ class Attacker:
             os.close(descriptor)
 
     def _watch(self, path: Path) -> None:
-        """Map what may be read, and ask for a mapping that could write."""
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
         self._hold(descriptor)
         with mmap.mmap(descriptor, HEADER_BYTES, prot=mmap.PROT_READ | mmap.PROT_WRITE) as memory:

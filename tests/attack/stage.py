@@ -150,7 +150,6 @@ class LogPipe:
         os.close(self._reader)
 
     def _pass_on(self) -> None:
-        """Print what is read, but for what is expected."""
         rest = b""
         while data := os.read(self._reader, 65536):
             *lines, rest = (rest + data).split(b"\n")
@@ -246,7 +245,6 @@ class AttackedDaemon:
 
     @property
     def port_refused(self) -> int:
-        """Frames so far that the device's port had no room for."""
         return int.from_bytes((self.folder / "refused").read_bytes(), sys.byteorder)
 
     def losses(self) -> tuple[int, int]:
@@ -291,7 +289,6 @@ class AttackedDaemon:
         return found
 
     def replug(self) -> bool:
-        """Unplug an idle device and plug it in again; whether the daemon opens it."""
         port = self.idle[0]
         port.unplug()
         gone = self._reaches("d1", "missing")
@@ -340,6 +337,5 @@ class AttackedDaemon:
 
 
 def raise_descriptors() -> None:
-    """Let this process, and the daemon, have as many as LimitNOFILE of the unit allows."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(FDS_MAX, hard), hard))

@@ -16,10 +16,6 @@ HOG: Final = "while True: pass"
 
 
 def attack(pid: int, seconds: float, seed: int = 1) -> int:
-    """Stop and continue process `pid` in turn beside CPU hogs on its processors, for `seconds`; return the stops.
-
-    The process runs when this returns, also by an exception. Raises ProcessLookupError when it is gone.
-    """
     random, end, stops = Random(seed), monotonic() + seconds, 0
     hogs = [_hog(cpu) for cpu in os.sched_getaffinity(pid)]
     try:
@@ -41,7 +37,6 @@ def attack(pid: int, seconds: float, seed: int = 1) -> int:
 
 
 def _hog(cpu: int) -> subprocess.Popen[bytes]:
-    """A process that does nothing but run, on one processor."""
     hog = subprocess.Popen([sys.executable, "-S", "-c", HOG], stdin=subprocess.DEVNULL)
     os.sched_setaffinity(hog.pid, {cpu})
     return hog

@@ -32,7 +32,6 @@ def report(marked: dict[str, list[str]]) -> Iterator[str]:
 
 
 def count(letter: str, marked: dict[str, list[str]]) -> str:
-    """How many items of a manual have code and a test."""
     own = [item for item in ITEMS.values() if item.key.startswith(letter)]
     done = [item for item in own if not item.left and item.code_exists and item.key in marked]
     left = [item for item in own if item.left]

@@ -38,7 +38,6 @@ def _of(driver: Driver) -> Iterator[tuple[str, str]]:
 
 
 def _section(annotated: Any) -> str:
-    """The section in the annotation of a type; empty where it has none."""
     info = msgspec.inspect.type_info(annotated)
     extra = info.extra if isinstance(info, msgspec.inspect.Metadata) else None
     return str((extra or {}).get("section", ""))

@@ -134,8 +134,6 @@ LOG_NORMAL: Final[WakeLaw] = _log_normal
 
 @dataclass(frozen=True, slots=True)
 class Stalls:
-    """Times in which nothing is handed over, evenly from each other."""
-
     every_ns: int
     for_ns: int
     from_ns: int = 0
@@ -276,7 +274,6 @@ class _AdverseModel(ArrivalModel):
 
 
 def messages(cell: Cell, seed: int, seconds: int = SECONDS) -> Iterator[Message]:
-    """The messages of a run on the machine of that seed. Times are those of a clock that nothing steers."""
     device, random, machine = cell.device, Random(f"loss {cell.name} {seed}"), machine_of(seed)
     model = _AdverseModel(
         machine.profile(cell.link, cell.name), 1.0, seed, baud=cell.link.baud, size_bytes=device.size_bytes, cell=cell,
@@ -295,7 +292,6 @@ def messages(cell: Cell, seed: int, seconds: int = SECONDS) -> Iterator[Message]
 
 
 def _heard(arrivals: Iterator[tuple[int, Arrival]], cell: Cell, begin_ns: int) -> Iterator[tuple[int, Arrival]]:
-    """What a virtual machine gets that may have been stopped: the first of what came meanwhile, in one read."""
     if cell.host is None or cell.host.stop_s is None:
         yield from arrivals
         return

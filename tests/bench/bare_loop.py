@@ -34,7 +34,6 @@ def as_json(device: int, seq: int, now_ns: int, v: tuple[float, ...]) -> bytes:
 
 
 def serve(path: str, encoding: str, hold_s: float, ports: list[str]) -> None:
-    """Run for ever; data waits for `hold_s` before it is read, so that a read has many samples."""
     pack = binary if encoding == "binary" else as_json
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(path)

@@ -265,7 +265,6 @@ def kept_base() -> Base:
 
 
 def base_of(commit: str, arguments: Sequence[str]) -> Base:
-    """Figures of a commit, computed now: its clock under this table."""
     program = [sys.executable, "-P", "-m", "tests.bench.clock_table", "--json", *arguments]
     with checked_out(commit) as tree, tempfile.TemporaryDirectory(prefix="imud-clock-table-") as folder:
         (Path(folder) / "imud").symlink_to(tree / "imud")
@@ -286,7 +285,6 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
 
 
 def show(found: Iterable[tuple[str, CellFigures]], base: Figures) -> int:
-    """Print the table as Markdown, line by line; return how many cells miss something."""
     columns = "σ, µs | settling | settled | t_err/rms | rms/rms"
     print(f"| cell | {columns} | before: {columns} | missed |")
     print(f"|{12 * '---|'}")

@@ -99,7 +99,6 @@ def measure_rare(family: Family, rate_hz: float, phases: int) -> tuple[list[floa
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
-    """Median and 95th percentile of the time to lock, cold and remembered, without and with a USB adapter's 16 ms."""
     phases = 100 if quick else 1000
     failed = 0
     for family in FAMILIES:

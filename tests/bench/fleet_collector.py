@@ -28,8 +28,6 @@ LOOK_S: Final = 0.05
 
 
 class MeasuredStore:
-    """A store that counts what it is given, and how old that is when it has been written; `to` keeps it, if given."""
-
     def __init__(self, to: PostgresStore | None) -> None:
         self.came = 0
         self.delays_ms: list[float] = []

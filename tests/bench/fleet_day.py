@@ -115,7 +115,6 @@ def replay(args: argparse.Namespace, spool: Path, port: int, messages: int) -> i
 
 
 def report(args: argparse.Namespace, collector: Collector, data: LiveData, messages: int, took_s: float) -> int:
-    """Print the account; 1 where a number is missing, or came out of its order."""
     newest: dict[str, int] = {}
     out_of_order = 0
     for message in collector.fresh:

@@ -79,7 +79,6 @@ class Scene:
         self.gateway = KilledGateway(self.proxy.port, self.spool, self.epoch, self.spool_mb, self.authority)
 
     def watch(self, seconds: float, until: Callable[[int], bool] = lambda waiting: False) -> float:
-        """Read what the gateway says for so long, or until its waiting messages fulfil something; return how long."""
         begin = monotonic()
         while (rest := begin + seconds - monotonic()) > 0:
             state = self.gateway.state(rest)
@@ -233,7 +232,6 @@ class Result(NamedTuple):
 
 
 def play(name: str, folder: Path, seconds: float, *, tls: bool, database: str) -> Result:
-    """Play one fault; `database` is a PostgreSQL, empty for none. Raises AssertionError where the ledger is open."""
     fault, _ = FAULTS[name]
     rights = folder / "rights"
     rights.write_text("topic readwrite #\n")

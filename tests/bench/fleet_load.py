@@ -54,7 +54,6 @@ _MADE: dict[int, list[Interval]] = {}
 
 
 def intervals_of(first: int) -> list[Interval]:
-    """Ten intervals from a number on; those of gateways that are equally far are the same."""
     found = _MADE.get(first)
     if found is None:
         size = SAMPLES // INTERVALS
@@ -84,7 +83,6 @@ class GatewayFleet:
         self.late_s = 0.0
 
     def run(self, seconds: float, tick: Callable[[float], None] = lambda _at_s: None) -> None:
-        """Send for so long; `tick` is called with the time since the begin."""
         begin_s = monotonic()
         while (at_s := monotonic() - begin_s) < seconds:
             tick(at_s)

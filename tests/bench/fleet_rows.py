@@ -33,7 +33,6 @@ class RowCollector:
             process.wait(LIMIT_S)
 
     def rows_after(self, due: int) -> int:
-        """The number of rows of samples, once there are so many, or after LIMIT_S."""
         end_s, pause = monotonic() + LIMIT_S, threading.Event()
         while (found := self._number("SELECT count(*) FROM imud_samples")) < due and monotonic() < end_s:
             pause.wait(LOOK_S)

@@ -98,7 +98,6 @@ def run(model: ArrivalModel, steering: Steering, count: int, *, unseen: bool = F
 
 
 def rises(dated: Sequence[DatedArrival]) -> bool:
-    """Whether time rises strictly, and no sample is after its arrival."""
     return all(a.sample.t_ns < b.sample.t_ns for a, b in pairwise(dated)) and all(
         d.sample.t_ns <= d.sample.t_rx_ns for d in dated
     )

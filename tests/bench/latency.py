@@ -59,7 +59,6 @@ def compare(encoding: str, seconds: float, rounds: int) -> Iterator[Row]:
 
 
 def fleets(seconds: float) -> Iterator[Row]:
-    """Devices at 1 kHz on one core, one client of all of them."""
     most, load = 0, Load(seconds=seconds, phases=4, latency_ms=LATENCY_MS, apart=APART_FRAMES, warm_s=6.0)
     least = run(replace(load, devices=DEVICES_AIM, bare=True))
     words = f"{DEVICES_AIM} devices, bare loop that waits 10 ms before a read"

@@ -76,7 +76,6 @@ def late_ns(random: Random, *, loaded: bool) -> int:
 def _edges(
     pulses: Sequence[tuple[int, int]], random: Random, faults: LineFaults
 ) -> tuple[list[Edge], list[int], list[int]]:
-    """(edges that are seen, number of each pulse's rising edge, its stamp)."""
     both: list[tuple[int, int, int | None]] = []  # stamp of the rising edge, of the falling edge, pulse
     for t_ns, i in pulses:
         rise = t_ns + late_ns(random, loaded=faults.loaded)
@@ -107,7 +106,6 @@ def _extra(
 
 
 def _is_free(extra: tuple[int, int, int | None], pulses: Sequence[tuple[int, int, int | None]]) -> bool:
-    """Whether the line is low during an extra pulse; within another one it makes no edges of its own."""
     at = bisect_right(pulses, extra)
     return (at == 0 or pulses[at - 1][1] < extra[0]) and (at == len(pulses) or extra[1] < pulses[at][0])
 

@@ -54,7 +54,6 @@ def sout_clock(model: ArrivalModel, timing: SoutTiming | None = None) -> SampleC
 
 
 def with_sout(clock: SampleClock, reads: Sequence[LineRead], *, silent: range = range(0)) -> list[DatedSample]:
-    """Reads through a clock; those whose place is in `silent` bring no edges."""
     dated = []
     for i, read in enumerate(reads):
         if i not in silent:

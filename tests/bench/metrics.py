@@ -42,7 +42,6 @@ def render_ms(devices: int, repeats: int) -> tuple[float, int]:
 
 
 async def stalls_ms(work: Callable[[], object], repeats: int) -> list[float]:
-    """The longest time between two turns of this loop, for each run of `work` in another thread; sorted."""
     longest = []
     for _ in range(repeats):
         go = Event()

@@ -31,7 +31,6 @@ class Outcome(NamedTuple):
 
 
 def measured(seconds: float, alive: int, configured: int) -> Outcome:
-    """Run the daemon on `configured` modules of which the first `alive` are there."""
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as name, ExitStack() as stack:
         folder = Path(name)
         addresses = [str(address) for address in range(1, alive + 1)]

@@ -77,7 +77,6 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
 
 
 def wear_rows(seconds: float, brokers: Sequence[str]) -> Iterator[Row]:
-    """Bytes written in an hour, from a shorter time at a steady load."""
     for words, sending, rate_hz in (
         ("statistics of 1 Hz of 100 Hz", {"rate_hz": 1}, 100.0),
         ("statistics of 10 Hz of 1 kHz", {"rate_hz": 10}, 1000.0),

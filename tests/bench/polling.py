@@ -37,8 +37,6 @@ PREPARED = 512
 
 
 class Stub:
-    """spidev's ioctl: bursts come from memory, the rest from the simulated device."""
-
     def __init__(self, wire_s: float) -> None:
         self._device = Imu61xRegisters(time.monotonic_ns)
         self._wire_s = wire_s
@@ -107,7 +105,6 @@ async def _measured(port: Path, seconds: float, busy_ms: float, *, by_edges: boo
 
 
 def _busy(milliseconds: float) -> float:
-    """Compute for so long; returns the CPU time it took, in s."""
     begin = time.thread_time()
     while time.thread_time() - begin < milliseconds / 1e3:
         pass

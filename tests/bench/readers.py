@@ -38,7 +38,6 @@ class Seen:
         self.newest: dict[object, int] = {}
 
     def add(self, device: object, seq: int, pressure_pa: float, now_ns: int) -> None:
-        """Count one sample; its pressure has the writer's number of the frame."""
         self.samples += 1
         self.gaps += seq - self.newest.get(device, seq - 1) - 1
         self.newest[device] = seq
@@ -139,7 +138,6 @@ def receive(clients: list[Client], takes: list[tuple[Take, Seen]], seconds: floa
 
 
 def percentile(ordered: list[int], share: float) -> float:
-    """The value below which `share` of the values lie; NaN of none."""
     return float(ordered[min(len(ordered) - 1, int(share * len(ordered)))]) if ordered else float("nan")
 
 

@@ -83,7 +83,6 @@ def run_and_kill(folder: Path, after_s: float, least_bytes: int = 1) -> tuple[Pa
 
 
 def look_at(file: Path, killed_ns: int) -> tuple[int, float]:
-    """Samples in the file, and the seconds before the kill that are missing. Fails for whatever must not be."""
     player = Player(lambda _batch: None)
     newest_ns = 0
     with file.open("rb") as opened:

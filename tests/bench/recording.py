@@ -109,7 +109,6 @@ class Digest:
 
 
 def replay_rows(seconds: int) -> Iterator[Row]:
-    """Run a daemon that records, replay what it wrote, and compare."""
     with tempfile.TemporaryDirectory() as name:
         live, again = Digest(), Digest()
         file = record(HI91_1_KHZ, seconds, Path(name), extra={"live": live})

@@ -100,7 +100,6 @@ def live_run(folder: Path, seconds: float) -> tuple[Receiver, dict[str, int]]:
 
 
 def differing(file: Path, slots: Path) -> tuple[Player, int]:
-    """Replay a recording; returns the player, and how many samples are not the ones that the client received."""
     again: list[bytes] = []
     wrong = 0
 

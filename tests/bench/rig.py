@@ -190,7 +190,6 @@ def start_server(stack: ExitStack, folder: Path, ports: Sequence[str], load: Loa
 
 
 def start_writer(stack: ExitStack, folder: Path, load: Load, *options: str, cores: set[int] = REST_CORES) -> Process:
-    """The process that writes frames; its first line has the ports."""
     (folder / "times").write_bytes(bytes(8 * load.frames))
     args = ["--devices", str(load.devices), "--rate", str(load.rate_hz), "--frames", str(load.frames)]
     args += ["--phases", str(load.phases), "--apart", str(load.apart), "--times", str(folder / "times"), *options]

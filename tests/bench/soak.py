@@ -276,7 +276,6 @@ def watch_for(watched: Watched, recordings: Recordings, readers: Process, second
 
 
 def run_fleet(seconds: float, metrics_port: int) -> int:
-    """Run for so long; return the exit status."""
     written = written_devices()
     print(
         f"soak: {len(written)} devices behind ptys, {MODULES} Modbus modules on a line and {REPLAYS} replays, "

@@ -92,7 +92,6 @@ class Recordings:
         )
 
     def _files(self) -> list[Path]:
-        """Present files, oldest first."""
         return sorted(self.directory.glob("*.imudrec"))
 
     def _read(self, file: Path) -> None:

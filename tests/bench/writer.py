@@ -38,7 +38,6 @@ PULSE_NS = 82 * uart_byte_ns(921_600) + 80_000
 
 
 def open_ptys(count: int) -> list[tuple[int, int]]:
-    """`count` raw pty pairs; the slave stays open here so that a reader may come and go."""
     pairs = []
     for _ in range(count):
         master, slave = pty.openpty()

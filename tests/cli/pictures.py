@@ -81,7 +81,6 @@ async def screens(daemon: RunningDaemon) -> tuple[str, str]:
 
 
 def offline(picture: str) -> str:
-    """A screenshot of textual without the fonts that it would load from elsewhere, in lines of their own."""
     picture = re.sub(r"@font-face\s*\{.*?\}", "", picture, flags=re.DOTALL)
     assert "http" not in picture.replace("http://www.w3.org/2000/svg", "").replace("https://www.textualize.io", "")
     return picture.replace("Fira Code", "DejaVu Sans Mono")

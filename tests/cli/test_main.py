@@ -42,7 +42,6 @@ def test_no_daemon_is_one_line(command: str, tmp_path: Path, cli: Cli) -> None:
 
 
 def hang(path: str, **_more: object) -> None:
-    """Behave as a client of a stopped daemon, without the seconds of waiting."""
     raise TimeoutError(f"{path}: waited in vain for hello")
 
 

@@ -61,7 +61,6 @@ class Result:
 
 
 def fuzz(target: str, engine: str, seconds: float, seed: int) -> Result:
-    """Fuzz one target in a process of its own; with a seed above 0 begin with the inputs in the tree and no others."""
     folder = BUILD / target.replace("/", "-")
     grown = folder / ("corpus-of-seed" if seed else "corpus")
     if seed:

@@ -78,7 +78,6 @@ class _Daemon:
 
     @contextmanager
     def sending(self, data: bytes) -> Iterator[None]:
-        """A client that connects in the block gets the input. The thread ends with it."""
         thread = Thread(target=self._serve, args=(data,), name="daemon")
         thread.start()
         try:
@@ -119,7 +118,6 @@ def run(data: bytes) -> None:
 
 
 def seeds() -> list[bytes]:
-    """Good answers to each use, errors, other types in their place, and frames that are cut or too long."""
     samples = [Sample("bow", n, 1000 * n, 5, Sync.EDGE, 1000 * n, 9, accel_m_s2=(0.1, 0.2, 9.8)) for n in (1, 2)]
     slots = b"".join(encode_slots(samples, 0))
     watched = line_of(encode_result(1, {"devices": {"bow": 0}}))

@@ -50,7 +50,6 @@ def run(data: bytes) -> None:
 
 
 def _serve(listener: socket.socket, data: bytes) -> None:
-    """Answer the first packet with the input, and hang up."""
     listener.settimeout(LIMIT_S)
     with suppress(OSError), listener.accept()[0] as connection:
         connection.settimeout(LIMIT_S)
@@ -62,7 +61,6 @@ def _serve(listener: socket.socket, data: bytes) -> None:
 
 
 def seeds() -> list[bytes]:
-    """An accepted connection and one packet of each type after it, in both versions; refusals; nothing."""
     accepted = {0: bytes.fromhex("20020000"), 1: bytes.fromhex("2003000000")}
     packets = [
         bytes.fromhex("40020001"),  # PUBACK

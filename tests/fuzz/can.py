@@ -53,7 +53,6 @@ def make(name: str) -> Target:
 
 
 def own_identifiers(driver: CanDriver) -> list[tuple[int, bool]]:
-    """Identifiers that the device sends: of its example, and of the filters."""
     frames = [(frame.can_id, frame.extended) for frame in driver.example_frames(Random(1))]
     wanted = [(wanted.can_id, wanted.extended) for wanted in driver.filters(driver.settings())]
     return list(dict.fromkeys([*frames, *wanted]))
@@ -91,7 +90,6 @@ def encoded(frames: Iterable[tuple[int, CanFrame]], own: Sequence[tuple[int, boo
 
 
 def seeds(driver: CanDriver, own: Sequence[tuple[int, bool]]) -> list[bytes]:
-    """Sets of a sample with a steady period; frames missing, repeated, of others; each own identifier alone."""
     random = Random(1)
     whole = [_set(driver, random, count) for count in (1, 2, SETS)]
     missing = [row for number, row in enumerate(_set(driver, random, SETS)) if number % 5]

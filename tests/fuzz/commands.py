@@ -85,7 +85,6 @@ def run(data: bytes) -> None:
 
 
 async def _carry_out(channel: CommandChannel) -> None:
-    """Let the loop turn until nothing waits: an action here takes one turn."""
     for _ in range(2 * WAITING_MAX + 2):
         channel.run_next()
         await asyncio.sleep(0)
@@ -100,7 +99,6 @@ def _message(identifier: str, action: str, arguments: object, *, topic: str = TO
 
 
 def seeds() -> list[bytes]:
-    """Each action; a request that comes twice, many, old ones, other topics, answers elsewhere, what is none."""
     every = [_message(f"id-{n}", action, {"rate_hz": 100}) for n, action in enumerate(ACTIONS)]
     twice = _message("a", "save", {})
     odd = [

@@ -30,7 +30,6 @@ def make(_name: str) -> Target:
 
 
 def run(data: bytes) -> None:
-    """Parse; what is accepted is the same when it is read again."""
     try:
         config = parse(data, FILENAME)
     except ConfigError as error:
@@ -51,7 +50,6 @@ def _check_message(message: str) -> None:
 
 
 def seeds() -> list[bytes]:
-    """The shipped file, as it is and with its settings switched on in turn, and the examples of the documents."""
     shipped = (ROOT / "etc/imud.yaml").read_text()
     plain = "\n".join(line for line in re.sub(r" +#.*", "", shipped).split("\n") if line.strip())
     settings = re.sub(r"^( *)#(?=[a-z_0-9]+:)", r"\1", shipped, flags=re.MULTILINE)

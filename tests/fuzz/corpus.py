@@ -14,7 +14,6 @@ BY_HAND: Final = "finding-"
 
 
 def folder_of(target: str) -> Path:
-    """Where the inputs of a target are; the C readers run the programs of the Python reader."""
     return ROOT / target.replace("/", "-").replace("c-header", "shm-ring")
 
 
@@ -23,7 +22,6 @@ def inputs_of(target: str) -> list[Path]:
 
 
 def write_all() -> int:
-    """Write the seeds of all targets anew; inputs that were added by hand stay."""
     total = 0
     for target in all_names():
         folder = folder_of(target)

@@ -35,7 +35,6 @@ def variants(settings: type[Settings]) -> list[Any]:
 
 
 def mender(name: str) -> Mend:
-    """Makes the check values of a driver's frames right; leaves the input as it is where the protocol has none."""
     return _MENDERS.get(name, as_it_is)
 
 

@@ -39,7 +39,6 @@ class ShortReads(io.RawIOBase):
         return True
 
     def readinto(self, buffer: bytearray) -> int:  # type: ignore[override]  # any writable buffer
-        """Up to so many bytes."""
         size = self._random.randint(1, max(len(buffer), 1))
         part, self._data = self._data[:size], self._data[size:]
         buffer[: len(part)] = part
@@ -78,7 +77,6 @@ def run_capture(data: bytes) -> None:
 
 
 def _chunks(file: io.BytesIO | io.RawIOBase) -> list[Chunk] | None:
-    """What a reader gives; None where it refuses the file."""
     try:
         reader = CaptureReader(file)  # type: ignore[arg-type]  # a raw file has what is used of BinaryIO
     except ImudError as error:
@@ -126,7 +124,6 @@ def _records(data: bytes) -> Iterator[Record]:
 
 
 def recording_seeds() -> list[bytes]:
-    """Records of each kind, alone and in blocks, whole, cut short and damaged."""
     made = [
         records.encode_object(
             Kind.SESSION, records.NO_DEVICE, SessionRecord(records.VERSION, "0", "3", "host", 1, 0, 1, 2)
@@ -151,7 +148,6 @@ def recording_seeds() -> list[bytes]:
 
 
 def capture_seeds() -> list[bytes]:
-    """Captures of a stream, raw and stamped, whole, cut short and damaged."""
     random = Random(1)
     driver = row("hipnuc-uart", StreamDriver)
     found = [driver.example_frame(random) * count for count in (1, 3, 60)]
@@ -175,7 +171,6 @@ def capture_seeds() -> list[bytes]:
 
 
 def candump_seeds() -> list[bytes]:
-    """Logs of two drivers, and lines that are no data frame."""
     random = Random(1)
     logs = []
     for name in ("imu61x-can", "hipnuc-j1939"):

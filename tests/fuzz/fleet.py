@@ -86,7 +86,6 @@ def _message(kind: MessageKind, first: int, last: int, **more: object) -> FleetM
 
 
 def message_seeds() -> list[bytes]:
-    """A message of each kind, slots with their header, and a row of messages with gaps, overlaps and a repetition."""
     samples = [
         Sample("bow", seq, 1000 * seq, 5, Sync.EDGE, 1000 * seq + 9, 77_000 + seq, accel_m_s2=(0.1, -0.2, 9.8))
         for seq in (5, 6, 7)
@@ -112,6 +111,5 @@ def message_seeds() -> list[bytes]:
 
 
 def topic_seeds() -> list[bytes]:
-    """Topics of gateways and devices, and what is none."""
     good = [topic_of("site", "gw", "", "state"), topic_of("site", "gw", "bow", "samples")]
     return [*(topic.encode() for topic in good), b"imud/a/b/c/d/e", b"imud/+/#", b"$SYS/x", b"imud/a/b\n/state"]

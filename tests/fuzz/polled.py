@@ -39,7 +39,6 @@ def make(name: str) -> Target:
             _poll(driver, settings, data[1:])
 
     def mended(data: bytes, random: Random) -> bytes:
-        """One reading with a right check value."""
         if not data or data[0] & CONVERSATION:
             return data
         readings = _readings(data[1:])
@@ -101,7 +100,6 @@ def _record(poll: int, reading: bytes) -> bytes:
 
 
 def _seeds(driver: PolledDriver, count: int) -> list[bytes]:
-    """Readings for each variant, empty and short ones, answers to conversations."""
     random = Random(1)
     readings = [_record(0, driver.example_reading(random)) for _ in range(EXAMPLES)]
     seeds = [b"\0" + reading for reading in readings]

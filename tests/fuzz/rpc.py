@@ -164,7 +164,6 @@ def _check_received(received: bytes, data: bytes) -> None:
 
 
 def seeds() -> list[bytes]:
-    """Each method, with and without parameters; notifications; what is no request."""
     requests = [{"jsonrpc": "2.0", "id": number, "method": method} for number, method in enumerate(METHODS)]
     arguments = {"rate_hz": 100}
     params: list[tuple[str, dict[str, Any]]] = [

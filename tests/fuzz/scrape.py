@@ -40,7 +40,6 @@ def run(data: bytes) -> None:
 
 
 def look_at_page_request(data: bytes) -> None:
-    """The rules of `imud web` with these headers, as aiohttp hands them over, and its messages with this body."""
     head, _, body = data.partition(b"\r\n\r\n")
     headers = dict[str, str]()
     for line in head.decode("utf-8", "surrogateescape").split("\r\n")[1:]:
@@ -65,7 +64,6 @@ def look_at_page_request(data: bytes) -> None:
 
 
 def page_seeds() -> list[bytes]:
-    """Requests of the page: a login, questions and orders, what it looks at; of other sites; what is none."""
     session = WebGuard(TOKEN, lambda: NOW_S, reading_needs_token=True).new_session()
     heads = [
         b"Host: localhost:9322\r\nOrigin: http://localhost:9322\r\nCookie: " + session.encode(),
@@ -85,7 +83,6 @@ def page_seeds() -> list[bytes]:
 
 
 def seeds() -> list[bytes]:
-    """Requests of Prometheus, curl and people, and what is none."""
     prometheus = (
         b"GET /metrics HTTP/1.1\r\nHost: localhost:9321\r\nUser-Agent: Prometheus/2.54.1\r\nAccept: application/"
         b"openmetrics-text;version=1.0.0;escaping=allow-utf-8;q=0.6,application/openmetrics-text;version=0.0.1;q=0.5,"

@@ -96,7 +96,6 @@ def _messages(events: Sequence[CodecEvent]) -> Iterator[Message]:
 
 
 def _answer(begin: Script, messages: Iterator[Message]) -> None:
-    """Run a script with the messages as they come; when none is left, each request times out."""
     session = Session(Ledger())
     now_ns = 0
     try:

@@ -84,7 +84,6 @@ def mend_slot(data: bytes, _random: Random) -> bytes:
 
 
 def slot_seeds() -> list[bytes]:
-    """Slots of several samples, and damaged ones."""
     slots = [encode_slot(make_sample(seq), 3) for seq in (1, 2, 1 << 40, (1 << 64) - 1)]
     random = Random(1)
     bodies = [random.randbytes(62) + bytes([code]) + random.randbytes(189) for code in (*range(len(SYNC_CODES)), 9)]
@@ -119,7 +118,6 @@ class RingFile:
         self._fd = os.open(path, os.O_RDWR)
 
     def write(self, at: int, data: bytes) -> None:
-        """Overwrite bytes; what would lie behind the end is left out."""
         data = data[: max(len(self.image) - at, 0)]
         self.image[at : at + len(data)] = data
         os.pwrite(self._fd, data, at)
@@ -133,7 +131,6 @@ class RingFile:
         self.write(LEDGER_CRC_OFFSET, zlib.crc32(block).to_bytes(4, "little"))
 
     def replace(self) -> None:
-        """Put a copy in its place, as a restarted daemon does."""
         other = self.path.with_suffix(".new")
         other.write_bytes(self.image)
         os.replace(other, self.path)
@@ -166,7 +163,6 @@ def run_ring(data: bytes) -> None:
 
 
 def _step(file: RingFile, ring: Ring | None, data: bytes, at: int) -> int:
-    """Do the step at `at`; return where the next one is."""
     kind = data[at] % 8
     if kind == WRITE:
         if at + 4 > len(data):
@@ -220,7 +216,6 @@ def _folder() -> Path:
 
 
 def ring_seeds() -> list[bytes]:
-    """Programs: plain readings, each field of the header at its bounds before and after opening, torn slots."""
     readings = bytes([READ, LATEST, LEDGER, HEALTH, REPLACE, READ])
     plain = [bytes([0, 0]) + readings, bytes([0, 1]) + readings, bytes([0, 97]) + readings]
     found = [*plain, bytes([0, 0, REPLACE, READ, LATEST])]

@@ -61,7 +61,6 @@ def run(data: bytes) -> None:
 
 
 def seeds() -> list[bytes]:
-    """Both files as they are written, times of the future, numbers that are too large, what is none."""
     record = {"writes": 3, "times_s": [UTC_NS // NS_PER_S - 5, 2**40], "told": {"rate_hz": 100, "axes": [1, None]}}
     found = {"bow": {"driver": "hipnuc-uart", "baud": 921600}, "c": {"driver": "imu61x-can", "baud": 0, "node": 5}}
     trees = [

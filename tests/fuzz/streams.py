@@ -42,7 +42,6 @@ def make(name: str) -> Target:
 
 
 def seeds(driver: StreamDriver) -> list[bytes]:
-    """Frames alone and together, cut, damaged, with text between them."""
     random = Random(1)
     frames = [driver.example_frame(random) for _ in range(EXAMPLES)]
     text = [b"APP_VER=156\r\nPRODUCT=HI13\r\nOK\r\n", b"ERR\r\n"]

@@ -59,7 +59,6 @@ def _feed(reference: UtcReference | None) -> RmcFeed:
 
 
 def run_sentences(data: bytes) -> None:
-    """Any split gives the same sentences, and each of them is a line of the stream."""
     whole = SentenceSplitter().feed(data)
     splitter = SentenceSplitter()
     random = Random(zlib.crc32(data))
@@ -80,7 +79,6 @@ def mend(data: bytes, _random: Random) -> bytes:
 
 
 def rmc_seeds() -> list[bytes]:
-    """Sentences of imud and of receivers, with and without a fix, of leap seconds, too long, damaged."""
     bodies = [
         b"GPRMC,083559.00,A,4717.11437,N,00833.91522,E,0.004,77.52,091202,,,A", b"GNRMC,,V,,,,,,,,,,N",
         b"GNRMC,235960.5,A,,,,,,,311216,,,A,V", b"GPRMC,000000,A,,,,,,,010180", b"GPRMC,083559.,A,,,,,,,290299,,",
@@ -92,7 +90,6 @@ def rmc_seeds() -> list[bytes]:
 
 
 def stream_seeds() -> list[bytes]:
-    """gpsd's greeting and reports between sentences, joined lines, lines at the longest length."""
     sentences = rmc_seeds()[:6]
     gpsd = [
         b'{"class":"VERSION","release":"3.22","proto_major":3,"proto_minor":14}\r\n',

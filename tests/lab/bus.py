@@ -40,18 +40,15 @@ class Bus(Generic[OneTransfer]):
         self._thread.start()
 
     def attach(self, select: int, device: Callable[[OneTransfer], bytes]) -> None:
-        """Puts a device on the bus, in place of the one that has this address or chip select."""
         with self._lock:
             self._devices[select] = device
 
     def detach(self, select: int) -> None:
-        """Takes a device off the bus: I2C answers ENXIO for it, SPI reads zeros."""
         with self._lock:
             del self._devices[select]
 
     @property
     def transfers(self) -> list[OneTransfer]:
-        """All transfers so far, oldest first, those to absent devices included."""
         with self._lock:
             return list(self._transfers)
 

@@ -50,7 +50,6 @@ class CanInterface:
         tool("ip", "link", "set", self.name, "type", "can", "restart")
 
     def restart_by_itself(self, after_ms: int) -> None:
-        """Makes the kernel restart it after bus-off; 0 for never."""
         self.down()
         tool("ip", "link", "set", self.name, "type", "can", "restart-ms", str(after_ms))
         self.up()

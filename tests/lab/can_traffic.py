@@ -28,8 +28,6 @@ LATE_SAMPLES: Final = 12
 
 @dataclass(frozen=True)
 class Module:
-    """One simulated device and the name it gets in the configuration."""
-
     driver: str
     node: int
 

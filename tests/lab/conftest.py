@@ -86,7 +86,6 @@ def spi8() -> Iterator[Bus[SpiTransfer]]:
 
 @pytest.fixture
 def spi16() -> Iterator[Bus[SpiTransfer]]:
-    """The far end of /dev/spidev1.*, a controller with 8- and 16-bit words."""
     with spi_bus(1) as bus:
         yield bus
 

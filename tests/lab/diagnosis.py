@@ -41,7 +41,6 @@ class Diagnosis(msgspec.Struct, frozen=True):
         ]
 
     def advice(self, check: str, severity: str, seen: str, advice: str = "") -> str:
-        """Return the advice of the first finding with these words. AssertionError if there is none."""
         found = [one for each in self.checks if each.name == check for one in each.findings]
         fitting = [one for one in found if one.severity == severity and seen in one.seen and advice in one.advice]
         assert fitting, f"{check}: no {severity} with {seen!r} and the step {advice!r} among {found}"

@@ -48,7 +48,6 @@ class GpioChip:
 
 @contextmanager
 def simulated_chip(names: Sequence[str]) -> Iterator[GpioChip]:
-    """A chip with one line per name (empty: unnamed), all inputs pulled down; it is removed at the end."""
     device = CONFIGFS / f"lab{next(_numbers)}"
     bank = device / "bank0"
     lines = [bank / f"line{offset}" for offset, name in enumerate(names) if name]

@@ -38,7 +38,6 @@ def registers(**more: object) -> Imu61xRegisters:
 
 
 def physics_holds(rig: DeviceRig, device: Imu61xRegisters, resolution_m_s2: float) -> None:
-    """Time rises, and each sample is the truth of some instant within three sigma of its stamp."""
     stamps = [sample.t_ns for sample in rig.samples]
     assert stamps == sorted(set(stamps))
     assert [sample.seq for sample in rig.samples] == list(range(1, len(stamps) + 1))
@@ -52,8 +51,6 @@ def physics_holds(rig: DeviceRig, device: Imu61xRegisters, resolution_m_s2: floa
 
 
 async def vanishes(rig: DeviceRig, why: str) -> None:
-    """It is reported as gone, with its cause."""
-
     def told() -> bool:
         return any(event.kind is EventKind.DOWN and why in event.message for event in rig.events)
 
@@ -61,7 +58,6 @@ async def vanishes(rig: DeviceRig, why: str) -> None:
 
 
 async def comes_back(rig: DeviceRig) -> None:
-    """It streams again, and each DOWN has its UP."""
     await rig.until_samples(5, LIMIT_S)
     flow = [kind for kind in rig.kinds if kind in (EventKind.UP, EventKind.DOWN)]
     assert flow == [EventKind.UP, EventKind.DOWN] * (len(flow) // 2) + [EventKind.UP]

@@ -29,13 +29,11 @@ class Imu(NamedTuple):
     folder: Path
 
     def truth(self) -> dict[int, int]:
-        """Instant of measurement by device time (ms), of the frames that went out whole. After its end only."""
         with (self.folder / "truth.csv").open(encoding="ascii") as file:
             rows = csv.DictReader(line for line in file if not line.startswith("#"))
             return {int(row["device_ms"]): int(row["sample_ns"]) for row in rows}
 
     def pulses(self, pin: str) -> list[Pulse]:
-        """Each pulse that a pin made, in order. After its end only."""
         with (self.folder / "pins.csv").open(encoding="ascii") as file:
             rows = [row for row in csv.DictReader(file) if row["pin"] == pin and row["level"] == "1"]
         return [Pulse(int(row["sample_ns"]), int(row["step_ns"]) - int(row["due_ns"])) for row in rows]
@@ -67,7 +65,6 @@ def running_imu(folder: Path, chip: GpioChip, pins: Mapping[str, str], *more: st
 
 
 def tell(folder: Path, *commands: str) -> None:
-    """Commands over the module's port, each answered with OK, while nobody else has it open."""
     fd = os.open(tty(folder), os.O_RDWR | os.O_NOCTTY)
     try:
         for command in commands:

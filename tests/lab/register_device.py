@@ -5,7 +5,6 @@ from tests.lab import wire
 
 class RegisterDevice:
     def __init__(self, contents: dict[int, int] | None = None) -> None:
-        """Registers not in `contents` are 0."""
         self.registers = bytearray(256)
         self.pointer = 0
         for register, value in (contents or {}).items():

@@ -19,7 +19,6 @@ class PseudoTerminal:
             data = data[os.write(self.far_fd, data) :]
 
     def read(self, size: int) -> bytes:
-        """Exactly `size` bytes that the device under test sent; waits for them."""
         data = b""
         while len(data) < size:
             data += os.read(self.far_fd, size - len(data))
@@ -28,7 +27,6 @@ class PseudoTerminal:
 
 @contextmanager
 def pseudo_terminal() -> Iterator[PseudoTerminal]:
-    """A new pty. Its near end stays open, so that a device under test that leaves does not hang up the line."""
     far_fd, near_fd = os.openpty()
     try:
         tty.setraw(near_fd)

@@ -29,7 +29,6 @@ LOSSES = ("lost_gap_device", "lost_crc", "lost_overrun", "lost_queue")
 
 
 def collect(client: Client, seconds: float) -> dict[str, list[Sample]]:
-    """What arrives in so many seconds; it is decoded afterwards, so that reading keeps up."""
     watch = client.watch(encoding="binary", latency_ms=LATENCY_MS)
     names = {number: name for name, number in watch.device_ids.items()}
     taken: list[bytes] = []
@@ -49,7 +48,6 @@ def collect(client: Client, seconds: float) -> dict[str, list[Sample]]:
 
 
 def wait_until_all(daemon: RunningDaemon, state: DeviceState) -> None:
-    """Asks seldom: an answer costs the guest more than a burst of samples."""
     end = monotonic() + LIMIT_S
     while {status.state for status in daemon.statuses().values()} != {state}:
         assert monotonic() < end, {name: (s.state, s.problem) for name, s in daemon.statuses().items()}

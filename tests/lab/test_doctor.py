@@ -90,8 +90,6 @@ def working(step: Callable[[Event], None]) -> Iterator[None]:
 
 
 def echo(far: PseudoTerminal) -> Callable[[Event], None]:
-    """Give back what is sent, as an adapter does whose receiver stays on."""
-
     def step(ended: Event) -> None:
         while not ended.is_set():
             if select.select([far.far_fd], [], [], 0.05)[0]:
@@ -101,8 +99,6 @@ def echo(far: PseudoTerminal) -> Callable[[Event], None]:
 
 
 def one_way(path: Path) -> Callable[[Event], None]:
-    """A module whose RX is not wired: it sends, and hears nothing."""
-
     def step(ended: Event) -> None:
         number = 0
         with serial.Serial(str(path), 115200) as port:
@@ -345,7 +341,6 @@ def test_i2c_and_spi(i2c: Bus[I2cTransfer], spi8: Bus[SpiTransfer], spi16: Bus[S
 
 
 def refusing(answer: Callable[[I2cTransfer], bytes], every: int) -> Callable[[I2cTransfer], bytes]:
-    """The device, but each transfer of that number fails, as with edges that are too slow."""
     number = 0
 
     def device(transfer: I2cTransfer) -> bytes:
@@ -359,8 +354,6 @@ def refusing(answer: Callable[[I2cTransfer], bytes], every: int) -> Callable[[I2
 
 
 def exchanged(answer: Callable[[SpiTransfer], bytes]) -> Callable[[SpiTransfer], bytes]:
-    """The device behind a controller that sends and receives the bytes of each word in the wrong order."""
-
     def device(transfer: SpiTransfer) -> bytes:
         data = answer(transfer)
         return bytes(data[place ^ 1] for place in range(len(data)))

@@ -57,7 +57,6 @@ class Rig:
             self.far.send(pack_frame(can_id, False, data))
 
     def back(self) -> None:
-        """Forget that the far end's socket heard of the interface going down."""
         self.far.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
 
     def send_error(self, classes: int, status: int) -> None:

@@ -138,7 +138,6 @@ def test_two_devices_on_one_bus_are_found_by_themselves(i2c: Bus[I2cTransfer]) -
 
 @pytest.mark.timeout(240)
 def test_demo_on_a_bus_that_exists(i2c: Bus[I2cTransfer]) -> None:
-    """Daemon and command are processes of their own; the far end of the bus is the device of this test."""
     i2c.attach(ADDRESS, on_i2c(registers()))
     printed = demo("--device", "imu61x-i2c", "--bus", "0", "--rate", "20", "--duration", "5")
     assert "link      /dev/i2c-0, address 0x1a, driver imu61x-i2c" in printed

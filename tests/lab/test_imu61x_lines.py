@@ -94,11 +94,6 @@ def test_a_device_that_hangs_is_reset_by_its_line(i2c: Bus[I2cTransfer], gpio_ch
 
 
 class Stepped:
-    """A device that renews its registers when told to, and says so by an edge on SOUT in the same instant.
-
-    The values and the edge change under a lock: a transaction that sees new values ends after their edge.
-    """
-
     def __init__(self, chip: GpioChip, **more: Any) -> None:
         self._chip = chip
         self.t_ns = STEP_NS
@@ -115,7 +110,6 @@ class Stepped:
         self.stamps_ns.append((before_ns, monotonic_ns()))
 
     def has(self, sample: Sample) -> None:
-        """It is the one of its edge: values and time."""
         assert sample.edge_seq is not None
         assert sample.sync is Sync.EDGE
         before_ns, after_ns = self.stamps_ns[sample.edge_seq - 1]
@@ -125,7 +119,6 @@ class Stepped:
         assert dist(sample.accel_m_s2, truth.accel_m_s2) < RESOLUTION_M_S2
 
     def has_within_error(self, sample: Sample) -> None:
-        """It is the one of its edge, or of a later one that came while it was read; then its stated error says so."""
         assert sample.edge_seq is not None
         assert sample.accel_m_s2 is not None
         truths = [self.device.truth_at(self.device.epoch_ns + n * STEP_NS) for n in range(1, len(self.stamps_ns) + 1)]
@@ -156,7 +149,6 @@ def stepped(request: pytest.FixtureRequest, gpio_chip: GpioChip) -> tuple[Steppe
 
 
 async def first(rig: DeviceRig) -> None:
-    """The values that it has before any edge."""
     await rig.until(lambda: rig.samples, "the first", LIMIT_S)
     assert rig.samples[0].sync is Sync.ARRIVAL
 

@@ -174,7 +174,6 @@ def test_bus_that_goes_is_noticed(spi8: Bus[SpiTransfer]) -> None:
 @pytest.mark.thorough
 @pytest.mark.timeout(240)
 def test_demo_on_a_bus_that_exists(spi8: Bus[SpiTransfer]) -> None:
-    """Daemon and command are processes of their own; the far end of the bus is the device of this test."""
     spi8.attach(0, on_spi(registers()))
     printed = demo("--device", "imu61x-spi", "--port", "/dev/spidev0.0", "--rate", "20", "--duration", "5")
     assert "link      /dev/spidev0.0, mode 0, driver imu61x-spi" in printed

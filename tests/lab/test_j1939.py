@@ -80,7 +80,6 @@ class Rig:
 
 
 def burst(end: socket.socket, interface: str, number: int) -> None:
-    """One sample; its number is the roll in thousandths of a degree."""
     say(end, interface, messages.ACCEL, messages.pack_accel((0.0, 0.0, 9.8)))
     say(end, interface, messages.GYRO, messages.pack_gyro((0.1, 0.2, 0.3)))
     say(end, interface, messages.ROLL_PITCH, messages.TWO_ANGLES.pack(number, 0))

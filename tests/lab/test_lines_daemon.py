@@ -114,7 +114,6 @@ def test_every_sample_gets_its_own_pulse(gpio_chip: GpioChip, tmp_path: Path, lo
 
 
 def stalled(pulses: list[Pulse], sample_ns: int) -> bool:
-    """Whether the module's process made a pulse near that sample so late that it could be another sample's."""
     return any(pulse.late_ns > LATE_NS for pulse in pulses if abs(pulse.sample_ns - sample_ns) < 3 * 100 * NS_PER_MS)
 
 
@@ -175,8 +174,6 @@ def test_a_line_that_another_program_holds_is_taken_later(gpio_chip: GpioChip, t
 
 
 class Mirror:
-    """A wire from SIN to PPS, where an independent reader can look at it: the line itself is imud's."""
-
     def __init__(self, chip: GpioChip) -> None:
         self._chip = chip
         self._end = Flag()

@@ -91,7 +91,6 @@ def test_every_link_is_replayed_as_it_ran(tmp_path: Path) -> None:
 
 @contextmanager
 def living(folder: Path, file: Path) -> Iterator[Life]:
-    """The daemon as a process, whose samples are all received."""
     life = Life(folder, file)
     try:
         yield life
@@ -107,7 +106,6 @@ def record(life: Life, file: Path) -> None:
 
 
 def received(life: Life) -> dict[str, list[Sample]]:
-    """All samples of each device: those before the client had connected, and those that it received."""
     found: dict[str, list[Sample]] = {}
     for name, samples in life.recorder.samples().items():
         by_seq = {sample.seq: sample for sample in (*life.recorder.before[name], *samples)}
@@ -131,7 +129,6 @@ def at_rest(life: Life) -> Snapshot:
 
 
 def replayed(file: Path) -> dict[str, list[Sample]]:
-    """Samples that `imud replay` prints, by device; it says that they are the live run's."""
     command = [sys.executable, "-m", "imud", "replay", "--json", str(file)]
     done = subprocess.run(command, capture_output=True, timeout=SLOW_S, check=False)
     assert done.returncode == 0, done.stderr.decode()
@@ -260,7 +257,6 @@ def test_an_edge_saves_a_snapshot_and_a_full_disk_stops_recording_only(
 
 
 def compare_part(live: list[Sample], again: list[Sample], during_ns: int) -> None:
-    """What both have is the same, and that is the time before and after an instant."""
     known = {sample.seq: sample for sample in live}
     both = [sample for sample in again if sample.seq in known]
     assert both == [known[sample.seq] for sample in both]

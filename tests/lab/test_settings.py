@@ -19,7 +19,6 @@ from tests.lab.short_form import cases
 
 
 async def made_so(rig: BusRig, wanted: Mapping[str, object], *, verified: bool) -> None:
-    """Apply settings with saving, and judge what is said of each."""
     applied = await rig.done(rig.device.settings_apply(wanted, save=True))
     assert applied.problem == "", applied
     assert {step.name for step in applied.steps} == set(wanted)

@@ -13,7 +13,6 @@ class ToolError(Exception):
 
 
 def tool(*command: str, data: bytes | None = None) -> str:
-    """Runs a program to its end and returns its standard output. ToolError on failure, TimeoutExpired after LIMIT_S."""
     result = subprocess.run(command, input=data, capture_output=True, timeout=LIMIT_S, check=False)
     if result.returncode:
         raise ToolError(f"{' '.join(command)}: status {result.returncode}: {result.stderr.decode().strip()}")

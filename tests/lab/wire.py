@@ -53,7 +53,6 @@ class I2cTransfer:
 
     @property
     def read_length(self) -> int:
-        """Bytes that a full answer has."""
         return sum(segment.length for segment in self.segments if segment.reads)
 
     @property
@@ -62,7 +61,6 @@ class I2cTransfer:
         return len(self.segments)
 
     def payload(self, data: bytes) -> bytes:
-        """The device's bytes as the module wants them."""
         return data
 
 
@@ -88,7 +86,6 @@ class SpiTransfer:
 
     @property
     def selections(self) -> tuple[tuple[SpiSegment, ...], ...]:
-        """The segments grouped by chip-select assertion: a new group after each cs_change but the last."""
         groups: list[list[SpiSegment]] = [[]]
         for number, segment in enumerate(self.segments):
             groups[-1].append(segment)
@@ -112,7 +109,6 @@ class SpiTransfer:
         return sum(len(segment.mosi) for segment in self.segments)
 
     def payload(self, miso: bytes) -> bytes:
-        """The device's bytes, one per byte of MOSI, as the module wants them: only what the host reads."""
         kept, start = [], 0
         for segment in self.segments:
             part = miso[start : start + len(segment.mosi)]

@@ -13,7 +13,6 @@ from tests.lab_debian.host.release import AMD64, PYTHONS
 
 
 def imported(path: Path, seen: set[Path]) -> Iterator[str]:
-    """Yield the names of the modules that a test file imports at its top level, and the imports of its helpers."""
     if path in seen:
         return
     seen.add(path)

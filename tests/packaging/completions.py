@@ -26,7 +26,6 @@ def every_parser(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentP
 
 
 def completions() -> dict[str, str]:
-    """The text of each file by its name. Raises ImportError where shtab is missing."""
     import shtab
 
     parser = build_parser()

@@ -69,7 +69,6 @@ def inside(text: str) -> str:
 
 
 def escaped(text: str) -> str:
-    """Text as roff prints it, no line of which is taken for a request."""
     return "\n".join("\\&" + line if line[:1] in (".", "'") else line for line in inside(text).splitlines())
 
 
@@ -93,7 +92,6 @@ def header(name: str, section: int, summary: str) -> Iterator[str]:
 
 
 def breakable(text: str) -> str:
-    """Text with a space after each comma of its JSON: troff warns of a line with one long word, and lintian of that."""
     return re.sub(r",(?=\S)", ", ", text)
 
 

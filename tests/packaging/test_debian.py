@@ -44,7 +44,6 @@ def test_scripts_are_shell() -> None:
 
 
 def run_script(name: str, *arguments: str, root: Path) -> None:
-    """Run a maintainer script as dpkg does, with its paths below `root`."""
     text = (DEBIAN / name).read_text()
     moved = re.sub(
         r"(?<![\w/])/(usr/lib/imud|usr/lib/systemd/system|var/lib/imud|etc/imud|run/udev|run/systemd/system)",

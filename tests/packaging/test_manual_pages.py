@@ -69,7 +69,6 @@ def test_synopsis_commands_and_summary() -> None:
 
 
 def test_exit_statuses_are_those_of_each_command() -> None:
-    """Status 2 of `imud doctor` is an error that was found, not that it could not run."""
     doctor, setup = (PAGES[f"imud-{name}.1"].partition(".SH EXIT STATUS")[2] for name in ("doctor", "setup"))
     for severity, status in STATUS.items():
         assert f"\\fB{status}\\fR\nA{'n' * (severity[0] in 'aeiou')} {severity}: " in doctor

@@ -82,7 +82,6 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run(text: str, machine: Path) -> None:
-    """Run an example as it stands, with the machine's root in place of `/`."""
     moved = re.sub(r"(?<= )/(etc|var)(?=/)", rf"{machine}/\1", text)
     assert moved.count(f"{machine}/") == len(re.findall(r" /(?:etc|var)/", text)) > 0
     folder = machine.parent

@@ -29,7 +29,6 @@ def feed(clock: SampleClock, points: Iterable[Point]) -> list[Sample]:
 
 
 def steady(first_tick: int, first_ms: int, count: int, step_ms: int = 10) -> list[Point]:
-    """A device that samples every `step_ms`, whose clock agrees with the host's."""
     return [(first_tick + i * step_ms, first_ms + i * step_ms) for i in range(count)]
 
 

@@ -31,7 +31,6 @@ def in_loop(test: Callable[P, Coroutine[None, None, None]]) -> Callable[P, None]
 
 
 async def _without_readers_left(body: Coroutine[Any, Any, None]) -> None:
-    """Run a test; then the loop may watch no descriptor for it."""
     await body
     loop = asyncio.get_running_loop()
     assert isinstance(loop, event_loop.SampleLoop)
@@ -46,8 +45,6 @@ UTC_AHEAD_NS = 1_795_000_000 * NS_PER_S
 
 
 class VirtualClock:
-    """CLOCK_MONOTONIC of a test. Synchronization: one thread."""
-
     def __init__(self, begin_ns: int = 1000 * NS_PER_S) -> None:
         self._now_ns = begin_ns
 
@@ -96,7 +93,6 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         return self._clock.now_ns() / NS_PER_S
 
     async def shutdown_default_executor(self, timeout: float | None = None) -> None:  # noqa: ASYNC109
-        """Wait for the threads, which end in real time: the limit of Python 3.12 and newer is over at once here."""
         await super().shutdown_default_executor()
 
 

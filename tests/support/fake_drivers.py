@@ -402,7 +402,6 @@ def _restart(_target: Target) -> RequestScript[None]:
 
 
 def _write_baud(target: Target, baud: int) -> RequestScript[None]:
-    """Set, save, restart and follow; back where it is not heard."""
     yield from _send_command(f"SET baud={baud}")
     yield from _send_command("SAVE")
     yield from _restart(target)

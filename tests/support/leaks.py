@@ -9,7 +9,6 @@ import pytest
 
 @pytest.fixture(autouse=True)
 def _no_open_descriptor() -> Iterator[None]:
-    """Fail a test after which a descriptor is open that was not open before."""
     before = open_descriptors()
     yield
     left = [target for number, target in open_descriptors().items() if before.get(number) != target]

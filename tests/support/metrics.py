@@ -28,7 +28,6 @@ from imud.sample import Sync
 
 
 def device(name: str, number: int = 0, **changes: object) -> DeviceStatus:
-    """A running device whose ledger closes and whose counters all differ from each other and between devices."""
     ledger = {field: 1000 * (number + 1) + index for index, field in enumerate(LEDGER_FIELDS)}
     ledger["bytes_in"] = sum(
         ledger[key] for key in ("bytes_in_good_frames", "bytes_in_bad_frames", "bytes_skipped", "bytes_pending")
@@ -85,7 +84,6 @@ MOTION = MotionValues(12_500_000_000, (0.1, -0.2, 3.0), 9.81, (0.01, 0.02, 0.03)
 
 
 def equipped(name: str, number: int = 0, **changes: object) -> DeviceStatus:
-    """A device that has every part that a device can have."""
     parts = {"frame": FRAME, "clock": EDGED, "polling": POLLING, "serial_line": SERIAL_LINE, "lines": LINES, "utc": UTC}
     return device(name, number, **(parts | changes))
 

@@ -50,7 +50,6 @@ def text(x: float, y: float, words: str, more: str = "") -> str:
 
 
 def terminal(lines: Sequence[str], title: str = "imud devices, status and watch in a terminal") -> str:
-    """A terminal window with these lines; those that begin with `$ ` are what was typed."""
     step, left, top = 17, 14, 42
     width, height = left * 2 + round(max(map(len, lines)) * 7.25), top + step * len(lines)
     parts = [f"<rect width='{width}' height='{height}' rx='8' fill='#1d2430'/>"]
@@ -208,7 +207,6 @@ def arrow(centre: tuple[float, float], vector: Vector3, scale: float, label: str
 
 
 def block(centre: tuple[float, float], mounting: Matrix3, size: Vector3, scale: float, fill: str) -> Iterator[str]:
-    """A flat box in the sensor's axes as it lies in the body; the dot is on its top, at the end of its x axis."""
     corners = {
         (i, j, k): on_page(matrix_times(mounting, (i * size[0], j * size[1], k * size[2])), scale)
         for i in (-1, 1)
@@ -229,7 +227,6 @@ def block(centre: tuple[float, float], mounting: Matrix3, size: Vector3, scale: 
 
 
 def _around(axis: int, side: int) -> list[tuple[int, int, int]]:
-    """The corners of one face, around it."""
     found = []
     for a, b in ((-1, -1), (-1, 1), (1, 1), (1, -1)):
         key = [a, b]
@@ -239,7 +236,6 @@ def _around(axis: int, side: int) -> list[tuple[int, int, int]]:
 
 
 def columns(matrix: Matrix3) -> Matrix3:
-    """The sensor's x, y, z axes in the body."""
     return transposed(matrix)
 
 
@@ -256,7 +252,6 @@ def axes_panel(left: float, title: str, lines: Sequence[str], to_body: Matrix3) 
 
 
 def frame_axes() -> str:
-    """The axes of both families and of both conventions, on a body that points to the upper right."""
     panels = (
         ("HiPNUC, as sent", ("roll about y: right side down", "pitch about x: nose up", "yaw 0 north, + to the left"),
          RFU_ENU.to_body),

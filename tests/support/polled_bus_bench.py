@@ -28,7 +28,6 @@ class PolledBusBench:
     """An SPI bus and an I2C bus, which the links of the configuration open, and the time."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, clock: VirtualClock | None = None) -> None:
-        """Without `clock` time is the real one."""
         self.clock = clock or VirtualClock()
         self.is_virtual = clock is not None
         self.node = folder / "spidev0.0"

@@ -175,7 +175,6 @@ class ModbusBench:
         return _run_transfers(script, self)
 
     def transfer(self, transfer: Transfer) -> bytes:
-        """One transfer, with the time it takes. Raises TransferError where no reply comes in time."""
         address = self.at if transfer.at is None else transfer.at
         try:
             return self._ask(address, transfer)

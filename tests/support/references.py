@@ -96,7 +96,6 @@ def settings_parts() -> Iterator[tuple[str, str, type[Settings]]]:
 
 
 def default_of(field: msgspec.structs.FieldInfo) -> str:
-    """The default as one would write it; file modes in octal."""
     if field.required:
         return "needed"
     default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
@@ -175,7 +174,6 @@ def actions_tables() -> str:
 
 
 def calibrations_table() -> str:
-    """A row for each calibration of each driver."""
     rows = ["| driver | kind | effect | section of the manual | device | result lasts |", "|---|---|---|---|---|---|"]
     for driver in DRIVERS.values():
         for kind, one in driver.calibrations.items():
@@ -222,7 +220,6 @@ def layout(fields: Sequence[SlotField]) -> str:
 
 
 def constants() -> str:
-    """Rows of the numbers that a reader compares with."""
     rows = [
         ("`magic`", f"`{MAGIC[:-1].decode()}` and a zero byte"),
         ("`layout_version`", str(RING_LAYOUT_VERSION)),
@@ -262,7 +259,6 @@ PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
 
 
 def current(page: str) -> str:
-    """The text of a page as it stands."""
     return (ROOT / page).read_text()
 
 

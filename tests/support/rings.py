@@ -33,7 +33,6 @@ def make_sample(seq: int, device: str = DEVICE) -> Sample:
 
 
 def _reseal(slot: bytes, seq: int) -> bytes:
-    """Return `slot` with another number and a CRC that matches."""
     body = struct.pack("<Q", seq) + slot[8:CRC_OFFSET]
     return body + zlib.crc32(body).to_bytes(4, "little")
 
@@ -52,8 +51,6 @@ TORN = {
 
 
 class Board:
-    """A daemon's start as its shared memory sees it."""
-
     def __init__(self, folder: Path, *, epoch: int = 77, slots: int = SLOTS, now_ns: int = START_NS) -> None:
         self.path = folder / f"imud.{DEVICE}"
         self.now_ns = now_ns

@@ -29,7 +29,6 @@ class Sentences:
 
 
 async def soon(_seconds: float) -> None:
-    """A pause that is none, for `Retry`."""
     await asyncio.sleep(0)
 
 

@@ -75,7 +75,6 @@ class FakeRequest:
         self.error = 0
 
     def feed(self, *events: tuple[int, int, int]) -> None:
-        """Time, id and line_seqno of each."""
         os.write(self._far, b"".join(EVENT.pack(t_ns, kind, 0, seqno, seqno) for t_ns, kind, seqno in events))
 
     def get_value(self, _offset: int) -> bool:
@@ -91,8 +90,6 @@ class FakeRequest:
 
 
 class FakeGpiod:
-    """To stand in `sys.modules`. Chips are files of `devices`, by name: label and names of their lines."""
-
     line = real.line
     LineSettings = real.LineSettings
 

@@ -73,8 +73,6 @@ M = TypeVar("M", bound=SerialModule)
 
 
 class SerialLine(Generic[M]):
-    """A module that has booted, and the host's end of its line: requests of scripts go out, replies come in."""
-
     def __init__(self, module: M, codec: StreamCodec, ledger: Ledger) -> None:
         self.now_ns = BEGIN_NS
         self.module = module
@@ -203,7 +201,6 @@ QUIET = NodeSettings(periods_ms=dict.fromkeys((1, 2, 3, 4, 6, 7), 0))
 
 
 def unpack(payload: bytes) -> tuple[int, bytes]:
-    """Identifier and data of a packed standard frame."""
     can_id, size, data = RAW_FRAME.unpack(payload)
     assert can_id < EXTENDED_FLAG
     return can_id, data[:size]
@@ -356,7 +353,6 @@ class Imu61xBench(SerialLine[Imu61xModule]):
 
 
 def imu61x_hardware(**more: object) -> Imu61xHardware:
-    """A device at rest that differs in `more`: fields of its hardware or of its behaviour."""
     names = {field.name for field in fields(Imu61xBehaviour)}
     behaviour = {name: value for name, value in more.items() if name in names}
     hardware = {name: value for name, value in more.items() if name not in names}

@@ -118,7 +118,6 @@ def context(
     latencies: Latencies | None = None,
     recording: RecordingSource | None = None,
 ) -> PublisherContext:
-    """A daemon with the devices of `DEVICES`; its clock stands still if no other is given."""
     statuses = [device_status(*item) for item in DEVICES.items()]
     return PublisherContext(
         lambda: statuses, EPOCH, now_ns, FakeControl, latencies=latencies or NoLatencies(),
@@ -146,8 +145,6 @@ done_late = asyncio.Event()
 
 
 class FakeControl:
-    """A device that obeys `output`, waits on `wait`, and refuses everything else; so with its calibrations."""
-
     actions: Actions = ACTIONS
     calibrations: Calibrations = CALIBRATIONS
 
@@ -193,7 +190,6 @@ class FakeControl:
         return SettingsPlan(tuple(PlannedStep(name, value, "6-axis") for name, value in mode.items()), save=save)
 
     async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
-        """The same, done; `wait` waits."""
         if given and "wait" in given:
             await done_late.wait()
         plan = await self.settings_plan(given, save=save)
@@ -228,7 +224,6 @@ async def serving(
     recording: RecordingSource | None = None,
     **settings: Any,
 ) -> AsyncIterator[SocketServer]:
-    """A started server with two devices; closed at the end, and then nothing of it is left."""
     path = directory / "imud.sock"
     own_group = grp.getgrgid(os.getgid()).gr_name
     server = SocketServer(
@@ -285,7 +280,6 @@ def in_server(**settings: Any) -> Callable[[Callable[..., Awaitable[None]]], Cal
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Let the loop run until something is so; `run` limits the time."""
     while not condition():
         await asyncio.sleep(0)
 
@@ -317,7 +311,6 @@ class Daemon:
 
 @contextmanager
 def daemon(directory: Path) -> Iterator[Daemon]:
-    """A server in a thread of its own until the end of the block, for clients that block."""
     ready = threading.Event()
     found: list[Daemon] = []
 

@@ -57,8 +57,6 @@ def told(
 
 
 def in_bench(test: Callable[P, Story]) -> Callable[P, None]:
-    """Run a test by `run` of its fixture `bench`."""
-
     @wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
         bench: Any = kwargs["bench"]

@@ -168,7 +168,6 @@ class Machine:
         return self.status
 
     def pause(self, _seconds: float) -> None:
-        """Let happen at once what happens meanwhile."""
         self.on_pause()
 
     def surroundings(self) -> Surroundings:

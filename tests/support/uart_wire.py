@@ -58,8 +58,6 @@ def received(data: bytes, device_baud: int, host_baud: int) -> tuple[TimedByte, 
 
 @dataclass
 class FakeDevice:
-    """Sends frames at `rate_hz` (0: only answers), as far as the line has room."""
-
     driver: StreamDriver
     baud: int
     rate_hz: float
@@ -87,7 +85,6 @@ class FakeDevice:
         return frame[:place] + bytes([frame[place] ^ 1]) + frame[place + 1 :]
 
     def stream(self, host_baud: int, from_ns: int) -> Iterator[TimedByte]:
-        """Bytes that the host receives from `from_ns` on, without end (nothing for a silent device)."""
         if not self.rate_hz:
             return
         wire_ns = max(map(len, self.frames)) * uart_byte_ns(self.baud)
@@ -100,7 +97,6 @@ class FakeDevice:
                     yield start_ns + offset_ns, value
 
     def visit(self, step: Listen, now_ns: int) -> Iterator[tuple[int, bytes]]:
-        """Reads of the host during one visit: time and bytes, without end."""
         source = self.stream(step.baud, now_ns + SET_BAUD_NS)
         if step.send:
             self.sent_to.append((step.baud, step.send))

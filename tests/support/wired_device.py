@@ -115,19 +115,16 @@ class WiredDevice:
         self.pins = Pins(self.module, on_edge, self._pin_faults)
 
     def tell(self, command: str) -> None:
-        """A command that the module gets by another way than imud's."""
         self.module.receive(command.encode() + b"\r\n", self.clock.now_ns())
 
     def line(self, key: str) -> MemoryInput:
         return self.memory.inputs[f"bow {key}"]
 
     def pulse_per_second(self, t_ns: int) -> None:
-        """A receiver's pulse, at the module and at the host."""
         self.module.mark(t_ns)
         self.line("pps").pulse(t_ns, 5 * NS_PER_MS)
 
     def sentence(self, unix_s: int) -> None:
-        """The receiver says which second it was."""
         self.source.sentences += 1
         self.source.give(build(unix_s * NS_PER_S), self.clock.now_ns())
 
@@ -267,7 +264,6 @@ def play_linked(
     hardware: HipnucHardware = HIPNUC_STILL,
     **config: Any,
 ) -> LinkedDevice:
-    """Run a device during a story; at the end its ledger closes."""
     clock = VirtualClock()
     made: list[LinkedDevice] = []
 

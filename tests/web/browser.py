@@ -57,7 +57,6 @@ class Page:
         self.js("document.querySelector(arguments[0]).click()", selector)
 
     def problems(self) -> list[str]:
-        """What the browser's console has of errors: scripts, the policy, files that are not there."""
         return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]  # type: ignore[no-untyped-call]
 
 

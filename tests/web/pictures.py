@@ -118,7 +118,6 @@ def fit(page: Page, width: int) -> None:
 
 
 def desktop(folder: Path, url: str, bow: Module, daemon: RunningDaemon) -> None:
-    """The overview, and the page of a device, as who has logged in sees it."""
     with browser(folder / "desktop", (1320, 900)) as page:
         page.driver.get(url)
         page.until("return document.querySelectorAll('.card').length === arguments[0]", len(STATES))

@@ -48,7 +48,6 @@ def per_operation(count: int, totals: Sequence[int]) -> int:
 
 
 def measure(words: Sequence[str]) -> dict[str, int]:
-    """Count the stages whose names have one of `words`; all without any. Raises MeasurementError."""
     environment = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
     environment |= {"PYTHONHASHSEED": "0", "LC_ALL": "C.UTF-8"}
     with ExitStack() as stack:

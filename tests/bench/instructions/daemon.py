@@ -30,8 +30,6 @@ BUFFER: Final = bytearray(1 << 20)
 
 
 class _Feeder:
-    """Gives the loop its next read when it would sleep; where none is left, the loop stops. A `Poller`."""
-
     def __init__(self, master: int, slave: int) -> None:
         self.loop: asyncio.AbstractEventLoop | None = None
         self.reads: Iterator[Read] = iter(())

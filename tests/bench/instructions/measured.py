@@ -25,7 +25,6 @@ def mark() -> None:
 
 
 def main(directory: str, words: Sequence[str]) -> int:
-    """Run the stages whose names have one of `words` in them, all without any; their files go into `directory`."""
     virtual_time.install()
     stages = import_module("tests.bench.instructions.stages")
     for number, stage in enumerate(stages.STAGES):

@@ -108,7 +108,6 @@ def _hi91_bulk(total: int, _directory: str) -> Run:
 
 
 def _cut(stream: bytes, size: int) -> list[bytes]:
-    """Reads of `size` bytes, of which the first has 30 more."""
     return [stream[: size + 30], *(stream[at : at + size] for at in range(size + 30, len(stream), size))]
 
 

@@ -17,7 +17,6 @@ MESSAGE_DATA = 1
 
 
 def decoder_of(channel: dict[str, Any]) -> Callable[[bytes], Any]:
-    """What decodes the messages of an advertised channel, from its own definition and nothing else."""
     if channel["encoding"] == "json":
         assert channel["schemaEncoding"] == "jsonschema"
         return json.loads
@@ -38,7 +37,6 @@ class ProtocolClient:
         self._decoders: dict[str, Callable[[bytes], Any]] = {}
 
     async def receive(self, is_it: Callable[[str, int, Any], object]) -> tuple[str, int, Any]:
-        """The first message (topic, time, content) that is it; advertisements are noted meanwhile."""
         while True:
             got = await asyncio.wait_for(self._socket.receive(), LIMIT_S)
             if got.type is aiohttp.WSMsgType.TEXT:

@@ -80,7 +80,6 @@ class Commands:
         self.bus = Bus()
 
     def __call__(self, *words: object, status: int = 0) -> str:
-        """Run an action; return standard output, or standard error if it fails."""
         self._monkeypatch.setattr("imud.cli.modbus.line.Rs485Link", self.bus.opened)
         self._monkeypatch.setattr("imud.cli.modbus.line.sleep", self.bus.paused_s.append)
         printed = self._cli("modbus", words[0], "/dev/ttyUSB0", *words[1:], status=status)

@@ -19,8 +19,6 @@ GROUPS: Final = "root:x:0:\nimud:x:990:\nimud-control:x:991:\n"
 
 
 class LivingMachine(Machine):
-    """A machine with systemd, udev and groups. Every command that is run is in `ran`."""
-
     def __init__(self, root: Path) -> None:
         super().__init__(root)
         self.uid = 0
@@ -180,7 +178,6 @@ class Setup:
         self.slept.append(s)
 
     def said(self) -> str:
-        """The output since the last call, with single spaces."""
         return " ".join(self._capsys.readouterr().out.split())
 
 

@@ -55,7 +55,6 @@ class Chaos:
     # --- Scene -------------------------------------------------------------------------------------------------------
 
     def write_config(self, variant: int) -> None:
-        """Write the configuration: 0 the usual, 1 with another device and level, -1 a bad one."""
         spare = {"spare": SPARE} if variant == 1 else {}
         more = {"log_level": "info" if variant else "warning", "state_dir": str(self.state)}
         file = write_config(self._folder, {**self.far.devices(), **spare}, metrics={"enabled": False}, **more)
@@ -63,7 +62,6 @@ class Chaos:
             file.write_text("devices: [nothing: {here: is")
 
     def next_life(self, end: Callable[[Life], None]) -> None:
-        """Audit the daemon, end it and start another."""
         self.audit(f"before the end of life {self.lives}")
         end(self.life)
         self.life = self._born()
@@ -88,7 +86,6 @@ class Chaos:
     # --- audits ------------------------------------------------------------------------------------------------------
 
     def settle(self, what: str) -> None:
-        """Wait until every device runs, then hold the daemon to all that it promises."""
         self.far.thread.check()
         try:
             self.life.wait_running()
@@ -101,7 +98,6 @@ class Chaos:
             self._compare_usage(what)
 
     def audit(self, what: str) -> None:
-        """Add up the present life; it must be followed by another, or by the end."""
         before, now = self.life.recorder.begin, self._counted_snapshot(what)
         received = self._received(before, now, what)
         for name, samples in received.items():
@@ -176,7 +172,6 @@ class Chaos:
             self._violated(what, f"{name}: {result}, uncertain holes {uncertain}, {causes}")
 
     def _show_holes(self, name: str, samples: list[Sample], holes: list[Hole]) -> None:
-        """Print what is between samples, by the time since the first of them."""
         for sample, after, hole in zip(samples, [*samples[1:], None], holes, strict=False):
             if hole.missing or not hole.is_certain:
                 t_ns, t_dev = sample.t_ns - samples[0].t_ns, (sample.t_dev_ns, after and after.t_dev_ns)

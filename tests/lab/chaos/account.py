@@ -37,21 +37,16 @@ UNKNOWN_MOST: Final = 2
 
 
 class Interval(NamedTuple):
-    """A time in which a link was away, CLOCK_MONOTONIC in ns."""
-
     begin_ns: int
     end_ns: int
     restarts: bool = False
     """Whether the device began anew in it, or is one that is polled."""
 
     def touches(self, before: Sample, after: Sample) -> bool:
-        """Whether it has a part between two samples."""
         return self.begin_ns <= after.t_rx_ns and self.end_ns >= before.t_ns
 
 
 class Hole(NamedTuple):
-    """What is between two samples that the daemon received one after the other."""
-
     missing: int
     is_certain: bool
     """Whether the daemon can know how many."""
@@ -75,7 +70,6 @@ class Account(NamedTuple):
 
     @property
     def balanced(self) -> bool:
-        """Whether the ledger says the truth."""
         return self.least <= self.lost <= self.most and self.unknown <= self.unknown_most
 
     def __add__(self, other: tuple[object, ...]) -> "Account":

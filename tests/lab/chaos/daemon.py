@@ -71,7 +71,6 @@ class Recorder:
 
     @property
     def dropped(self) -> list[object]:
-        """Notices that the daemon dropped samples for this client."""
         return [message for message in self._others if isinstance(message, dict) and message.get("method") == "dropped"]
 
     def close(self) -> None:

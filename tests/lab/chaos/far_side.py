@@ -79,7 +79,6 @@ class UartNode(PtyNode):
 
     @property
     def baud(self) -> int:
-        """QEMU's UARTs are joined by a socket, which has no rate."""
         return self._baud
 
     def read(self) -> bytes:
@@ -89,7 +88,6 @@ class UartNode(PtyNode):
             return b""
 
     def write(self, data: bytes) -> int:
-        """Send, and return how many bytes fitted."""
         try:
             return os.write(self._fd, data)
         except BlockingIOError:
@@ -115,7 +113,6 @@ class PortThread:
         self._thread.start()
 
     def check(self) -> None:
-        """Raise what the thread died of, if it did."""
         if self._failure is not None:
             raise self._failure
 
@@ -239,18 +236,15 @@ class FarSide:
     # --- what can be done to them ------------------------------------------------------------------------------------
 
     def unplug(self, name: str, seconds: float) -> None:
-        """Pull the plug of a pseudo-terminal for so long; the module loses its power."""
         with self.thread.changing:
             self.modules[name].power_off(monotonic_ns())
             self.streams[name].unplug(monotonic_ns(), round(seconds * 1e9))
 
     def pull_data(self, name: str) -> None:
-        """Pull the plug of a pseudo-terminal whose module has power of its own."""
         with self.thread.changing:
             self.streams[name].node.unplug()
 
     def plug_data(self, name: str) -> None:
-        """Put that plug in again."""
         with self.thread.changing:
             self.streams[name].node.plug(self.modules[name].baud)
 
@@ -261,17 +255,14 @@ class FarSide:
             module.reboot(monotonic_ns())
 
     def set_noise(self, name: str, rates: FaultRates) -> None:
-        """Set what happens to the bytes of a stream."""
         with self.thread.changing:
             self.noise[name].rates = rates
 
     def set_pin_noise(self, rates: PinFaultRates) -> None:
-        """Set what happens to the edges of SOUT."""
         with self.thread.changing:
             self.pin_noise.rates = rates
 
     def set_registers(self, name: str, **values: object) -> None:
-        """Set what is wrong with a polled device."""
         for key, value in values.items():
             setattr(self.registers[name].device.faults, key, value)
 

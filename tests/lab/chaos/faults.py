@@ -40,9 +40,7 @@ class Scene(Protocol):
         """Write the configuration: a good one by number, a bad one for -1."""
         ...
 
-    def next_life(self, end: Callable[[Life], None]) -> None:
-        """Audit the daemon, end it and start another."""
-        ...
+    def next_life(self, end: Callable[[Life], None]) -> None: ...
 
 
 @dataclass(frozen=True)

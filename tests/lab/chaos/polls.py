@@ -45,8 +45,6 @@ class Asked(NamedTuple):
 
 
 class PollLog:
-    """All transfers, in order. Synchronization: one thread adds, another one reads."""
-
     def __init__(self, period_ns: int) -> None:
         self.period_ns = period_ns
         self._asked: list[Asked] = []
@@ -62,7 +60,6 @@ class PollLog:
             return self._asked[first : bisect_right(self._asked, end_ns, key=_time)]
 
     def shown(self, begin_ns: int, end_ns: int) -> str:
-        """Format transfers as `period:answer`, those that ask for no sample in brackets; the last 40."""
         words = []
         for asked in self.between(begin_ns - 1, end_ns)[-40:]:
             word = f"{(asked.t_ns - begin_ns) / self.period_ns:.2f}:{asked.answer.value}"

@@ -33,7 +33,6 @@ class TruthLog:
     """All samples that a device took, by number from 0. Synchronization: one thread adds, another one reads."""
 
     def __init__(self, key_of: Callable[[Sample], int], tolerance: int) -> None:
-        """`key_of` gives the key of a received sample; two keys that differ by no more than `tolerance` are equal."""
         self._measured: list[Measured] = []
         self._lock = threading.Lock()
         self._key_of = key_of
@@ -47,7 +46,6 @@ class TruthLog:
         return len(self._measured)
 
     def numbers_of(self, samples: Sequence[Sample]) -> list[int | None]:
-        """Return the number of each sample, which rises; None for a sample that the device did not take by then."""
         with self._lock:
             measured = list(self._measured)
         found: list[int | None] = []
@@ -92,7 +90,6 @@ class LoggedModule:
     """A device on a byte stream (`StreamModule`) whose bursts are logged as they leave it."""
 
     def __init__(self, module: StreamModule, log: Callable[[Burst, int], None], now_ns: int) -> None:
-        """`log` gets each burst and when the device was powered on; `now_ns` is when it was for the first time."""
         self._module, self._log, self._power_ns, self._is_on = module, log, now_ns, True
         self.epoch_ns = module.epoch_ns
 
@@ -104,7 +101,6 @@ class LoggedModule:
         self._module.receive(data, now_ns)
 
     def advance(self, now_ns: int) -> list[Burst]:
-        """Return what left the wire, which is in the log then."""
         bursts = self._module.advance(now_ns)
         if not self._is_on:
             return []
@@ -122,12 +118,10 @@ class LoggedModule:
         self._module.mark(now_ns)
 
     def power_off(self, now_ns: int) -> None:
-        """Take the power away until `reboot`: no sample is taken."""
         self.advance(now_ns)
         self._is_on = False
 
     def reboot(self, now_ns: int) -> None:
-        """Restart the module: its time begins at 0 again."""
         self.advance(now_ns)
         self._module.reboot(now_ns)
         self._power_ns, self._is_on = now_ns, True

@@ -81,14 +81,12 @@ def boot(options: argparse.Namespace, python: environment.Python, built: Path) -
 
 
 def timing(folder: Path, start_s: float) -> str:
-    """When the first test began (tests/lab/conftest.py leaves a mark) and how long the guest ran."""
     ran = f"guest ran {time.time() - start_s:.1f} s"
     mark = folder / "first-test"
     return f"first test after {mark.stat().st_mtime - start_s:.1f} s, {ran}" if mark.exists() else ran
 
 
 def check(options: argparse.Namespace) -> None:
-    """Refuses what cannot work before anything is built."""
     if platform.machine() != "x86_64":
         raise LabError(f"the guest shares the host's programs, which must be x86_64, not {platform.machine()}")
     if options.memory < MIN_MEMORY_MB:

@@ -83,5 +83,4 @@ def script(python: Python, command: list[str]) -> str:
 
 
 def shown_folders(python: Python) -> list[Path]:
-    """The folders that the guest needs even where it mounts memory file systems (/tmp, /run)."""
     return [ROOT, python.venv, python.base]

@@ -29,7 +29,6 @@ KEEP_FOR_MODULES = ("Makefile", "Module.symvers", ".config", "arch", "include", 
 
 
 def built(say: Callable[[str], None]) -> Path:
-    """The folder with IMAGE and MODULE, built if they are not in the cache. LabError says why not."""
     version = kernel_source_version()
     inputs = (CONFIG.read_bytes(), version.encode(), Path(__file__).read_bytes())
     module = [part for path in module_sources() for part in (path.name.encode(), path.read_bytes())]
@@ -64,7 +63,6 @@ def build_kernel(folder: Path) -> None:
 
 
 def build_module(folder: Path, kernel: Path) -> None:
-    """Compiles the module in `folder` against the kernel tree and leaves only the module and the image."""
     build = folder / "build"
     build.mkdir()
     for path in module_sources():
@@ -82,7 +80,6 @@ def module_sources() -> list[Path]:
 
 
 def jobs() -> int:
-    """Compilers at once: the processors this process may use."""
     return len(os.sched_getaffinity(0))
 
 

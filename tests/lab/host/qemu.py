@@ -32,10 +32,6 @@ class Machine:
     """Whether time in the guest is what its instructions make it, 1 ns each, and not the host's."""
 
     def command(self) -> list[str]:
-        """QEMU's argument vector. The guest's live output is QEMU's standard output.
-
-        The processors are always emulated (TCG): results must not depend on whether the host has KVM.
-        """
         first_fd, second_fd = self.uart_fds
         return [
             *(QEMU, "-nodefaults", "-no-user-config", "-no-reboot", "-display", "none"),

@@ -140,7 +140,6 @@ def check_gpio(checks: Checks) -> None:
 
 
 def check_spi(checks: Checks) -> None:
-    """A bus on which nothing answers."""
     if not is_there(checks, "spidev*", "the daemon opens an SPI bus"):
         return
     nodes = sorted(Path("/dev").glob("spidev*"))

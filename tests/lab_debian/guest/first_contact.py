@@ -221,7 +221,6 @@ def modem_manager() -> Iterator[None]:
 
 
 def replugged(host: Host) -> AdapterNow:
-    """Pull the adapter out, plug it in; what udev made of it."""
     host.unplug()
     wait_until(lambda: not NODE.exists(), f"{NODE} is gone")
     host.plug()
@@ -243,5 +242,4 @@ def properties(text: str) -> list[str]:
 
 
 def groups() -> set[str]:
-    """Groups of the user that runs sudo, by the database."""
     return set(must("id", "-nG", OPERATOR).split())

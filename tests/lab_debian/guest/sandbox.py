@@ -138,7 +138,6 @@ def judge(checks: Checks, able: dict[str, str], results: dict[str, str], of_root
 
 
 def refused(who: str, result: str) -> None:
-    """Failed unless the result is an error."""
     if "Error" not in result:
         raise Failed(f"{who}: {result or 'could'}")
 

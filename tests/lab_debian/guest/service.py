@@ -178,6 +178,5 @@ def newest(name: str) -> int:
 
 
 def metrics(where: str = "http://127.0.0.1:9321") -> bool:
-    """Whether the metrics answer and have samples of the sensor on USB."""
     code = f"import urllib.request; print(urllib.request.urlopen('{where}/metrics', timeout=20).read().decode())"
     return 'imud_samples_total{device="usb"' in run("/usr/bin/python3", "-c", code).stdout

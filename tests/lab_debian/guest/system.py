@@ -32,7 +32,6 @@ def run(*command: str, limit_s: float = LIMIT_S, user: str = "", text: str = "")
 
 
 def must(*command: str, limit_s: float = LIMIT_S) -> str:
-    """Run a program that must succeed; return its output. Failed with it otherwise."""
     result = run(*command, limit_s=limit_s)
     if result.returncode:
         raise Failed(f"{' '.join(command)} ended with {result.returncode}: {result.stdout.strip()[-1500:]}")
@@ -44,7 +43,6 @@ def shown(name: str, unit: str = UNIT) -> str:
 
 
 def pid() -> int:
-    """Main process of the service; 0 while there is none."""
     return int(shown("MainPID"))
 
 
@@ -88,7 +86,6 @@ def ask(method: str, **params: object) -> Any:
 
 
 def device(name: str) -> dict[str, Any] | None:
-    """Status of one device; None while the daemon does not answer or does not have it."""
     try:
         return next((found for found in ask("status")["devices"] if found["name"] == name), None)
     except OSError:
@@ -109,7 +106,6 @@ def streams(name: str) -> dict[str, Any] | None:
 
 
 def wait_streaming(name: str, limit_s: float = LIMIT_S) -> dict[str, Any]:
-    """Status of the device once it streams."""
     return wait_until(lambda: streams(name), f"samples of {name}: {(device(name) or {}).get('problem')}", limit_s)
 
 
@@ -142,7 +138,6 @@ class Host:
             raise Failed(f"{word}: the rig answered {reply.decode()!r}")
 
     def unplug(self) -> None:
-        """Pull the adapter out; return when its node is gone."""
         self.ask("unplug")
         wait_until(lambda: not NODE.exists(), f"{NODE} gone")
 

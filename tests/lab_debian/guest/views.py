@@ -82,7 +82,6 @@ def check(checks: Checks, _host: Host) -> None:
 
 
 def check_page(checks: Checks) -> None:
-    """It starts as the package has it: this machine only, and nothing can be changed."""
     with checks("imud-web starts, and its page answers on this machine"):
         must("systemctl", "start", UNIT)
         wait_until(lambda: fetch("/")[0] == 200, "the page")

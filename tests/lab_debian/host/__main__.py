@@ -52,7 +52,6 @@ def say(line: str) -> None:
 
 
 def chosen(options: argparse.Namespace) -> list[Release]:
-    """The releases to run. LabError if there is none of that name."""
     found = [release for release in (ARM64 if options.arm64 else AMD64) if options.suite in (None, release.suite)]
     if unit_tests.NAME in options.only and not options.arm64:
         raise LabError(f"{unit_tests.NAME} are for an architecture that the host has not: --arm64")
@@ -62,7 +61,6 @@ def chosen(options: argparse.Namespace) -> list[Release]:
 
 
 def program(options: argparse.Namespace, release: Release, groups: list[str]) -> str:
-    """What the guest runs: the command, or the groups of checks, all that are for its architecture if none is named."""
     if options.exec:
         return f"{options.exec}\n"
     words = [release.architecture, *(["--short"] if options.short else []), *groups]
@@ -147,7 +145,6 @@ def lab(arguments: Sequence[str]) -> int:
 
 
 def run_release(options: argparse.Namespace, release: Release) -> int:
-    """Everything that is asked for of one release; the worst status."""
     python = options.venv.absolute() / "bin" / "python"
     checked = [group for group in options.only if group != unit_tests.NAME]
     boots = bool(options.exec or checked or not options.only)

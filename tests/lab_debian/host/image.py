@@ -70,8 +70,6 @@ class Image:
 
 
 def built(release: Release, say: Callable[[str], None]) -> Image:
-    """The image of a release, made if it is not in the cache. LabError says why it cannot be made."""
-
     def make(folder: Path) -> None:
         say(f"{release.name}: making the image (some minutes, once)")
         make_image(release, folder)
@@ -134,7 +132,6 @@ def exchange(release: Release, root: Path, other: Path, log: Path) -> None:
 
 
 def enable_emulation(architecture: str) -> None:
-    """Let the host's kernel run programs of an architecture that it has not. LabError if it cannot."""
     name = FOREIGN.get(architecture)
     if not name or (BINFMT / name).exists():
         return

@@ -29,7 +29,6 @@ class Release:
 
     @property
     def name(self) -> str:
-        """As it stands in file names and results: trixie-arm64."""
         return f"{self.suite}-{self.architecture}"
 
     @property
