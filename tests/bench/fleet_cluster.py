@@ -1,6 +1,6 @@
 """`make fleet-cluster`: three NATS servers with JetStream and MQTT, of which one is killed while gateways send.
 
-`python -m tests.bench.fleet_cluster [--gateways 200] [--outputs 3] [--seconds 30]`. The servers are Debian's
+`python -m tests.bench.fleet_cluster [--gateways 200] [--seconds 30]`. The servers are Debian's
 nats-server, which speaks MQTT 3.1.1; sessions and messages are on three of them. Gateways are simulated, but for a few
 more that are the output `mqtt` itself, each in a process of its own, with a device at 1 kHz, every sample as a slot.
 The collector is that of the package; with --postgres it writes rows. A third of the way through the server that it is
@@ -30,6 +30,8 @@ from tests.support.surroundings import free_port
 
 PROGRAM: Final = shutil.which("nats-server") or shutil.which("nats-server", path="/usr/sbin:/sbin")
 SERVERS: Final = 3
+OUTPUTS: Final = 3
+"""Gateways that are the output `mqtt` itself."""
 LIMIT_S: Final = 60.0
 ACCOUNT_WORDS: Final = ("p50_ms", "p99_ms", "max_ms", "duplicates", "missing", "open")
 
@@ -86,7 +88,6 @@ def is_healthy(monitor: int) -> bool:
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make fleet-cluster")
     parser.add_argument("--gateways", type=int, default=200)
-    parser.add_argument("--outputs", type=int, default=3, help="gateways that are the output mqtt")
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--postgres", action="store_true", help="the collector writes into a PostgreSQL")
     args = parser.parse_args()
@@ -95,7 +96,7 @@ def main() -> int:
         print(missing)
         return 1
     print(
-        f"{args.gateways} gateways, {args.outputs} outputs, {args.seconds:g} s, load {os.getloadavg()[0]:.1f} before",
+        f"{args.gateways} gateways, {OUTPUTS} outputs, {args.seconds:g} s, load {os.getloadavg()[0]:.1f} before",
         flush=True,
     )
     with tempfile.TemporaryDirectory(prefix="imud-cluster-") as name, ExitStack() as stack:
@@ -103,7 +104,7 @@ def main() -> int:
         cluster = stack.enter_context(closing(Cluster(folder)))
         to = stack.enter_context(running_postgres()) if args.postgres else ""
         collector = CollectorProcess(cluster.ports, version="3.1.1", to=to)
-        outputs = [Output(folder / f"spool-{n}", cluster.ports, f"imud-{n}") for n in range(args.outputs)]
+        outputs = [Output(folder / f"spool-{n}", cluster.ports, f"imud-{n}") for n in range(OUTPUTS)]
         for one in outputs:
             stack.callback(one.gateway.kill)
         return play(cluster, collector, GatewayFleet(args.gateways, cluster.ports), outputs, args.seconds)

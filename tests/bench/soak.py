@@ -35,6 +35,7 @@ from tests.bench.rig import REST_CORES, SERVER_CORE, START_LIMIT_S, Process, cpu
 from tests.bench.soak_recordings import Recordings
 from tests.bench.soak_single import run_single, slope_mb_per_h
 from tests.support.files import CaptureWriter
+from tests.support.surroundings import free_port
 
 RATES: Final = ((1.0, 34), (10.0, 22), (20.0, 14), (50.0, 8), (100.0, 3), (400.0, 1))
 """Rate in Hz and how many ptys have it; every other one is an IMU61x."""
@@ -341,13 +342,11 @@ def wait_open(path: Path, fleet: Fleet) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make soak")
     parser.add_argument("--seconds", type=float, help="how long (3600; with --single 600)")
-    parser.add_argument("--metrics-port", type=int, default=19399, help="for the scrapes (%(default)d)")
     parser.add_argument("--single", action="store_true", help="one device at 1 kHz, ten clients")
-    parser.add_argument("--encoding", default="binary", choices=["json", "binary"], help="with --single")
     args = parser.parse_args()
     if args.single:
-        return run_single(args.seconds or 600.0, args.encoding)
-    return run_fleet(args.seconds or 3600.0, args.metrics_port)
+        return run_single(args.seconds or 600.0)
+    return run_fleet(args.seconds or 3600.0, free_port())
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ def slope_mb_per_h(points: list[tuple[float, float]]) -> float:
     return 3600 * sum((t - mean_t) * (m - mean_m) for t, m in points) / spread if spread else 0.0
 
 
-def run_single(seconds: float, encoding: str) -> int:
-    load = Load(clients=10, seconds=seconds, encoding=encoding, stuck=True)
+def run_single(seconds: float) -> int:
+    load = Load(clients=10, seconds=seconds, stuck=True)
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-soak-") as name, ExitStack() as stack:
         folder = Path(name)
         writer = start_writer(stack, folder, load)

@@ -14,6 +14,11 @@ from imud.cli import main
 from tests.support.daemon_process import LIMIT_S
 
 
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
 class Printed(NamedTuple):
     out: str
     err: str

@@ -12,7 +12,7 @@ import pytest
 from imud.cli.calibrate import _account, _show, progress_line
 from imud.contracts.control.calibration import CalibrationInfo, CalibrationResult, Check, Handling, Kept
 from imud.event import Event, EventKind
-from tests.cli.conftest import Cli
+from tests.cli.conftest import Cli, Terminal
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, daemon_with_module
 
 live = pytest.mark.live
@@ -117,11 +117,6 @@ def test_exit_statuses_and_an_interrupt(verified: bool, status: int, cli: Cli, m
     ENDED.clear()
     cli(*words, status=130)
     assert Made.stopped, "the device does not go on"
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
 
 
 TURN = Event(0, "bow", EventKind.CALIBRATION, "half of it", {

@@ -1,6 +1,5 @@
 """`imud settings` on a running daemon with a simulated HiPNUC module on a pseudo-terminal, to the module and back."""
 
-import io
 import json
 import sys
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ import pytest
 from imud import config
 from imud.client import Client
 from imud.contracts.device_settings import declared_values
-from tests.cli.conftest import Cli
+from tests.cli.conftest import Cli, Terminal
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, daemon_with_module
 
 pytestmark = pytest.mark.live
@@ -24,11 +23,6 @@ DECLARED = {"mode": "9-axis", "output": {"hi91": 50}}
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
     with daemon_with_module(tmp_path_factory.mktemp("settings"), settings=DECLARED) as daemon:
         yield daemon
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
 
 
 @pytest.fixture

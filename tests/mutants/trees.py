@@ -19,7 +19,7 @@ from typing import Final
 from tests.mutants.changes import ROOT
 
 DOCUMENT_TESTS: Final = {"tests/test_docs.py", "tests/test_architecture.py"}
-LIMIT_S: Final = 600
+LIMIT_S: Final = 900
 """Maximum time of one run of pytest."""
 NO_MIRROR: Final = {
     "audit", "bench", "lab", "lab_host", "lab_debian", "fuzz", "attack", "support", "packaging", "monitoring",

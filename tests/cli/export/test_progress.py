@@ -3,11 +3,7 @@
 from io import StringIO
 
 from imud.cli.export.progress import CLEAR, EVERY_S, LOOK_SAMPLES, Progress
-
-
-class Terminal(StringIO):
-    def isatty(self) -> bool:
-        return True
+from tests.cli.conftest import Terminal
 
 
 def pictures(terminal: Terminal) -> list[str]:
