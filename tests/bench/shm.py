@@ -1,4 +1,4 @@
-"""Shared memory: what one sample costs the Python and the C reader. `make bench-instructions` has the writer's part."""
+"""Time per sample of the Python and the C reader of shared memory. `make bench-instructions` measures the writer."""
 
 import shutil
 import subprocess

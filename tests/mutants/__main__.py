@@ -11,6 +11,7 @@ import resource
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Final
@@ -23,17 +24,20 @@ MEMORY_MAX_BYTES: Final = 6 << 30
 """Maximum data of one process: a mutant can append to a list without end."""
 
 
-def judge(tree: Tree, mutant: Mutant) -> tuple[str, str, str]:
+def judge(trees: SimpleQueue[Tree], mutant: Mutant) -> tuple[str, str, str]:
     """Run the tests of a mutant until one fails. Returns the result, the failed test, and the output of pytest."""
-    output = ""
-    for tests in stages(mutant.path):
-        run = run_stage(tree, mutant, tests)
-        output += run.output
-        if run.status is None:
-            return HUNG, "", output
-        if not run.passed:
-            return DETECTED, [*run.failed, "the end of pytest"][0], output
-    return MISSED, "", output
+    tree, output = trees.get(), ""
+    try:
+        for tests in stages(mutant.path):
+            run = run_stage(tree, mutant, tests)
+            output += run.output
+            if run.status is None:
+                return HUNG, "", output
+            if not run.passed:
+                return DETECTED, [*run.failed, "the end of pytest"][0], output
+        return MISSED, "", output
+    finally:
+        trees.put(tree)
 
 
 def run_stage(tree: Tree, mutant: Mutant, tests: list[str]) -> Run:
@@ -71,21 +75,14 @@ def main() -> int:
         return 0
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MAX_BYTES, MEMORY_MAX_BYTES))
     trees: SimpleQueue[Tree] = SimpleQueue()
-
-    def take_tree(mutant: Mutant) -> tuple[str, str, str]:
-        tree = trees.get()
-        try:
-            return judge(tree, mutant)
-        finally:
-            trees.put(tree)
-
     missed = 0
     with tempfile.TemporaryDirectory(prefix="mutants-", ignore_cleanup_errors=True) as folder:
         Path(folder).chmod(0o755)  # some tests run programs as another user
         for job in range(options.jobs):
             trees.put(Tree(Path(folder, str(job))))
         with ThreadPoolExecutor(options.jobs) as pool:
-            for number, (result, test, output) in zip(mutants, pool.map(take_tree, mutants.values()), strict=True):
+            verdicts = pool.map(partial(judge, trees), mutants.values())
+            for number, (result, test, output) in zip(mutants, verdicts, strict=True):
                 missed += result == MISSED
                 print(f"{number:3}  {mutants[number]}  |  {result}{' by ' if test else ''}{test}", flush=True)
                 if options.mutant:
