@@ -121,6 +121,18 @@ def test_a_device_that_was_found_meanwhile_is_not_reset() -> None:
     assert it.pulses_s == []
 
 
+def test_a_line_that_fails_in_a_search_does_not_end_it() -> None:
+    it = Scene()
+
+    async def body() -> None:
+        it.tick()
+        it.line.set_error = LinkMissing("gone")
+        await it.search(6)
+
+    run_virtually(it.clock, body())
+    assert [event.message for event in it.events] == ["not found for 4 s: reset by its line", "line reset: gone"]
+
+
 def test_a_pulse_on_request_is_at_once_and_a_search_waits_for_its_end() -> None:
     it = Scene()
 

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from imud.config import DeviceConfig
-from imud.contracts.device_settings import OnDifference, SettingsState
+from imud.contracts.device_settings import OnDifference, SettingsState, Written
 from imud.contracts.settings import Settings
 from imud.contracts.status import DeviceState
 from imud.devices import DRIVERS
@@ -17,7 +17,7 @@ from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
 from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, CanFrame
 from imud.host_clock import HostClock
-from imud.links.memory import MemorySettings
+from imud.links.memory import MemoryCanLink, MemorySettings
 from imud.sim.can_module import CanModule, CanModules
 from imud.sim.hipnuc.canopen import NODE_VARIANTS, HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
 from imud.sim.hipnuc.j1939 import J1939_VARIANTS, HipnucJ1939Module, J1939Hardware, J1939Settings
@@ -32,21 +32,27 @@ class BusInProcess:
     """Modules, and a device of the daemon that is the first of them, in virtual time."""
 
     def __init__(
-        self, clock: VirtualClock, driver: str, options: Settings, *modules: CanModule, **declared: object
+        self,
+        clock: VirtualClock,
+        driver: str,
+        options: Settings | None,
+        *modules: CanModule,
+        identify: bool = True,
+        **declared: object,
     ) -> None:
         """`declared` are settings that the daemon applies and saves by itself."""
         self.clock = clock
         self.modules = CanModules(modules)
         self.rigs = DeviceRigs(HostClock(clock.now_ns, clock.realtime_ns, clock.now_ns))
         link = MemorySettings(baud=BIT_RATE, name="can0")
-        config = DeviceConfig("bow", driver, options, True, "memory", link)
+        config = DeviceConfig("bow", driver, options, identify, "memory", link)
         if declared:
             table = DRIVERS[driver].device_settings
             assert table is not None
             config = replace(
                 config, declared=msgspec.convert(declared, table.declarable), on_difference=OnDifference.APPLY_AND_SAVE
             )
-        self.rig: DeviceRig = self.rigs.add(config)
+        self.rig: DeviceRig = self.rigs.add(config, MemoryCanLink(link))
         self._passed_on = 0
 
     def step(self) -> None:
@@ -130,6 +136,21 @@ def test_a_j1939_module_is_made_as_declared(variant: str) -> None:
     assert (module.flash.intervals_ms[0xFF37], module.flash.y_reversed, module.flash.address) == (50, 1, 9)
     assert module.writes_to_flash == 1
     assert beside.settings == J1939Settings(address=12)
+
+
+def test_a_node_that_was_found_by_listening_is_told_what_it_is_commanded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is not asked for its identity."""
+    monkeypatch.setattr("imud.runtime.detection.can.LISTEN_NS", 100_000_000)
+    clock = VirtualClock()
+    module = HipnucCanopenModule(clock.now_ns(), HipnucCanopenHardware(factory=NodeSettings(node=9), boot_ms=0))
+    bus = BusInProcess(clock, "auto", None, module, identify=False)
+
+    async def story() -> None:
+        answer = await bus.done(bus.rig.device.act("interval", {"tpdo": 1, "interval_ms": 20}))
+        assert answer is Written.VERIFIED
+        assert module.objects.settings.periods_ms[1] == 20
+
+    bus.play(story)
 
 
 def test_a_node_is_set_as_declared_and_followed() -> None:

@@ -129,6 +129,11 @@ def test_the_remembered_device_is_taken_at_once_if_it_is_free() -> None:
     assert heard.early is None
 
 
+def test_a_device_is_found_by_frames_whose_identifier_came_before_it_was_named() -> None:
+    unnamed = fake_can_frame(8)._replace(data=b"7 bytes")
+    assert Round().hear(unnamed, fake_can_frame(8), fake_can_frame(8, 1)).found() == "fake-can node 8"
+
+
 def test_only_protocols_that_yield_samples_are_named() -> None:
     """A second driver names the same frames as those of its own device, and gets no samples out of them."""
     search = CanSearch([fake_can_driver("wrong", BASE - 1), FAKE], "can0")

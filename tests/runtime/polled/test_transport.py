@@ -9,13 +9,14 @@ from typing import Any
 
 import pytest
 
-from imud.contracts.polling import Poll
+from imud.contracts.polling import Poll, Reading
 from imud.contracts.status import DeviceState
 from imud.devices.imu61x.spi import codec
 from imud.devices.imu61x.spi.words import READ_STATE
-from imud.errors import DeviceRefused
+from imud.errors import DeviceRefused, TransferError, Trouble
 from imud.event import EventKind
 from imud.runtime.latency.budget import Need
+from imud.runtime.polled.path import PolledPath
 from imud.sim.imu61x.behaviour import REGISTER_VARIANTS
 from tests.support.device_rig import device_config
 from tests.support.event_loops import VirtualClock
@@ -245,6 +246,17 @@ async def test_auto_finds_driver_and_address_and_does_not_take_one_twice(bench: 
         (left,) = (rig for rig in rigs if rig not in there)
         await left.until(lambda: "another device of this configuration" in left.device.status().problem, "told")
         assert {rig.device.status().identity["product"] for rig in there} == {"IMU612", "IMU618"}
+
+
+@in_bench
+async def test_a_failed_read_of_settings_costs_no_sample(bench: PolledBusBench) -> None:
+    bench.spi.device = bench.registers().spi
+    async with bench.running(bench.on_spi()) as (rig,):
+        await rig.until_samples(3)
+        path = rig.device._transport.path
+        assert isinstance(path, PolledPath)
+        assert path.on_readings([Reading(1, b"", TransferError(Trouble.DISTURBED, "noise"), 1, 2)]) == ""
+        assert (path.failed, rig.ledger.lost()) == (1, 0)
 
 
 @in_bench
