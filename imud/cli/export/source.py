@@ -11,7 +11,6 @@ from imud.cli.export.playing import LossWatch, play_beside, play_here
 from imud.cli.export.progress import Progress
 from imud.cli.export.sinks import Sink
 from imud.cli.output import paragraph
-from imud.cli.recording.info import INPUTS
 from imud.cli.recording.replay import block
 from imud.contracts.can import CanDriver
 from imud.contracts.driver import Driver
@@ -98,7 +97,10 @@ def export_recording(file: BinaryIO, path: Path, feed: ExportFeed, devices: Sequ
 
 
 def recorded_noise(file: BinaryIO, name: str) -> dict[str, Deviations]:
-    """Return what the configuration at the begin of a recording has of the noise of devices. Raises ImudError."""
+    """Return the configured noise of each device of a recording. Raises ImudError.
+
+    A device is described when it starts, which may be after the first samples of another device.
+    """
     found: dict[str, Deviations] = {}
     for record in RecordingReader(file, name):
         if record.kind == Kind.DEVICE:
@@ -108,8 +110,6 @@ def recorded_noise(file: BinaryIO, name: str) -> dict[str, Deviations]:
                     found[device.name] = msgspec.convert(device.configuration[NOISE], Deviations)
                 except msgspec.ValidationError as error:
                     raise ImudError(f"{name}: the noise of {device.name} cannot be read: {reason_of(error)}") from None
-        elif record.kind in INPUTS:
-            break
     file.seek(0)
     return found
 

@@ -4,7 +4,7 @@ import csv
 import json
 import sys
 from collections.abc import Iterator
-from io import StringIO
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -14,7 +14,9 @@ from rosbags.highlevel import AnyReader
 
 from imud.cli import main, replay
 from imud.cli.export import command
+from imud.cli.export.source import recorded_noise
 from imud.contracts.publisher import Batch
+from imud.contracts.sensors.deviations import Deviations
 from imud.event import Event, EventKind
 from imud.formats.recording.file import BlockGatherer, RecordingReader
 from imud.formats.recording.records import Kind, encode, encode_object
@@ -230,6 +232,18 @@ def test_covariances_come_from_the_configuration_and_from_reports(tmp_path: Path
         assert list(mast.angular_velocity_covariance) == pytest.approx([variance, 0, 0, 0, variance, 0, 0, 0, variance])
         assert mast.orientation_covariance[8] == 0.0625
         assert not any(imu["/bow/imu/data"].angular_velocity_covariance)
+
+
+def test_the_noise_of_a_device_that_is_described_after_samples_of_another_one(tmp_path: Path) -> None:
+    """The daemon describes a device when it starts. Another device may send samples before that."""
+    _, _, (file,) = run_recorded(tmp_path, more="noise: {gyro_rad_s: 0.5}")
+    with file.open("rb") as stream:
+        records = list(RecordingReader(stream, file.name))
+    late = next(one for one in records if b"gyro_rad_s" in bytes(one.body) and one.kind == Kind.DEVICE)
+    gatherer, data = BlockGatherer(), b""
+    for record in [*(one for one in records if one is not late and one.device != late.device), late]:
+        data += gatherer.add(encode(Kind(record.kind), record.device, record.body))
+    assert recorded_noise(BytesIO(data + gatherer.finish()), "a") == {"mast": Deviations(gyro_rad_s=0.5)}
 
 
 def test_fields_choose_channels_and_ned_has_frames_of_its_own(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
