@@ -78,6 +78,7 @@ def test_an_invalid_address_is_named(text: str, place: str, tmp_path: Path, cli:
 
 def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
     """A misspelled name is accepted with a note, because the device may be added later."""
+    """imud accepts a misspelled name, because the device may be added later. Until then imud records nothing of it."""
     there, file = tmp_path / "a.cap", tmp_path / "imud.yaml"
     there.touch()
     file.write_text(

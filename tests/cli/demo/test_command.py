@@ -12,6 +12,7 @@ from urllib.request import urlopen
 
 import pytest
 
+from imud.cli import main
 from imud.cli.demo import command
 from imud.client import Client
 from imud.errors import ImudError, LinkMissing
@@ -53,7 +54,7 @@ def test_samples_flow_and_the_ledger_closes(device: str, product: str) -> None:
 
 
 @pytest.mark.live
-def test_the_commands_it_prints_reach_it_from_another_directory_until_its_duration_ends() -> None:
+def test_the_commands_it_prints_reach_it_from_another_directory() -> None:
     with demo() as (process, _folder):
         export, status, watch, clock, ring, scrape = (line.strip() for line in itertools.islice(process.out, 6))
         assert clock.endswith("imud clock")
@@ -63,9 +64,16 @@ def test_the_commands_it_prints_reach_it_from_another_directory_until_its_durati
             assert words in printed
         with urlopen(scrape.removeprefix("curl ")) as answer:
             assert b'imud_samples_total{device="demo"}' in answer.read()
-    with demo("--duration", "0.2") as (process, folder):
-        assert "the ledger closes to zero" in process.end().out
-    assert not folder.exists()
+
+
+@pytest.mark.live
+def test_it_ends_after_its_duration(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--duration", "0.2", "--rate", "200", "--plain"]) == 0
+    out = capfd.readouterr().out
+    assert "the ledger closes to zero" in out
+    folder = re.search(r"daemon at (\S+)/imud.sock", out)
+    assert folder is not None
+    assert not Path(folder[1]).exists()
 
 
 def pasted(*lines: str) -> str:

@@ -47,7 +47,10 @@ def test_each_kind_of_trouble_a_quiet_log_and_other_sources(machine: Machine) ->
     machine.tells(LOG, "not checked", "Operation not permitted → run `sudo imud doctor`")
 
 
-def test_missing_programs(machine: Machine) -> None:
+def test_missing_programs_and_only_the_newest_lines(machine: Machine) -> None:
+    machine.prints("journalctl", "usb 1-1: reset full-speed USB device\n" + "usb: fine\n" * 5000)
+    machine.tells(LOG, "ok", "in 5000 lines")
+    del machine.outputs["journalctl"]
     machine.tells(LOG, "not checked", "the kernel's log cannot be read: journalctl: No such file", "join the group adm")
     machine.outputs["journalctl"] = PermissionError(13, "Permission denied", "journalctl")
     machine.tells(LOG, "not checked", "journalctl: Permission denied")

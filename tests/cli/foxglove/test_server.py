@@ -17,6 +17,7 @@ from imud.bridges.channel import MessageFrames, StampedEvent
 from imud.bridges.json_channels import JsonDialect
 from imud.cli.foxglove.origins import ViewerOrigins
 from imud.cli.foxglove.server import FoxgloveServer, hidden_address
+from imud.errors import ServerError
 from tests.bridges.samples import EVENT, FULL, UTC_NS
 from tests.cli.conftest import Cli, imud_process
 from tests.cli.foxglove.protocol_client import connected
@@ -71,7 +72,11 @@ def test_messages_reach_a_client_that_subscribed() -> None:
     assert notes == ["no daemon", "samples come again"]
 
 
-def test_the_server_behind_the_gate_is_not_found_by_trying() -> None:
+def test_the_server_behind_the_gate_is_not_found_by_trying_and_ends_if_a_port_is_taken() -> None:
+    with closing(serve([])) as server:
+        port = int(server.url.rpartition(":")[2])
+        with pytest.raises(ServerError, match=f"cannot listen on 127.0.0.1 port {port}"):
+            FoxgloveServer("127.0.0.1", port, ViewerOrigins(), note=print)
     addresses = {hidden_address() for _ in range(100)}
     assert len(addresses) >= 99, "of 16 million"
     assert all(ip_address(one).is_loopback for one in addresses)

@@ -5,6 +5,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from imud.cli.recording.replay import play
+from imud.runtime.recording.player import Player
 from tests.cli.conftest import Cli
 from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
 from tests.support.files import hi91
@@ -31,6 +33,15 @@ def test_the_samples_are_those_that_the_daemon_published(recorded: Recorded, cli
         assert f"bytes     {ledger['bytes_in']}: closed" in printed.err
     assert printed.err.count("the same as the live run") == 2
     assert "the file" not in printed.err
+
+
+def test_records_that_were_dropped_are_an_answer_of_no(recorded: Recorded) -> None:
+    for lost, status in ((0, 0), (3, 1)):
+        player = Player(lambda _batch: None)
+        player.lost = lost
+        with recorded[0].open("rb") as file:
+            report, got = play(file, "a", player)
+        assert (got, "dropped when it was written: 3" in report) == (status, lost == 3)
 
 
 def test_options_of_captures_are_refused(recorded: Recorded, cli: Cli) -> None:

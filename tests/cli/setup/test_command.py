@@ -8,7 +8,9 @@ import pytest
 
 from imud.cli.doctor.surroundings import Surroundings
 from imud.cli.setup import command
+from imud.cli.setup.attached import Wanted
 from imud.cli.setup.command import numbered, sudo_user
+from imud.cli.setup.conversation import Conversation
 from tests.cli.conftest import Cli
 
 
@@ -51,3 +53,49 @@ def test_a_look_at_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     )
     assert said == {"found": [], "changes": [], "made": False, "notes": [], "devices": []}
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "can", "options"),
+    [
+        (("--yes",), [], {"control": False, "wait_s": 30.0}),
+        (("--yes", "--control", "--wait", "5", "--can", "can0=1000000"), [("can0", 1_000_000)],
+         {"control": True, "wait_s": 5.0}),
+    ],
+)  # fmt: skip
+def test_options_have_an_effect(
+    words: tuple[str, ...], can: list[tuple[str, int]], options: dict[str, object],
+    cli: Cli, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    made: list[object] = []
+
+    class Steps:
+        def __init__(self, _look: object, talk: Conversation, *_more: object, **given: object) -> None:
+            made.extend([talk.asks, given["dry_run"], given["user"]])
+
+        def set_up(self, *given: object, **more: object) -> int:
+            made.extend([*given, more])
+            return 1
+
+        def undo(self) -> int:
+            return 0
+
+    monkeypatch.setattr(command, "SetupSteps", Steps)
+    monkeypatch.setenv("SUDO_USER", "ann")
+    places = (
+        "/dev/ttyS0",
+        "--active",
+        "/dev/ttyS1",
+        "--rs485",
+        "/dev/ttyS2=9600",
+        "--i2c",
+        "1",
+        "--spi",
+        "/dev/spidev0.0",
+    )
+    cli("setup", *places, *words, status=1)
+    wanted = Wanted(
+        ("/dev/ttyS0",), ("/dev/ttyS1",), (("/dev/ttyS2", 9600),), (("i2c", "1"), ("spi", "/dev/spidev0.0"))
+    )
+    assert made == [False, False, "ann", wanted, can, options]
+    cli("setup", "--undo")

@@ -244,6 +244,23 @@ def test_control_and_wait_have_an_effect(gateway: LivingMachine, setup: Setup) -
     assert "`sudo imud doctor` says what to do next" in said
 
 
+def test_a_file_that_is_too_large_is_not_changed(gateway: LivingMachine, setup: Setup) -> None:
+    gateway.write("/etc/udev/rules.d/61-imud-setup.rules", "#" * (1 << 20) + "\n")
+    with pytest.raises(ImudError, match="expected at most 1048576 bytes, got more: imud setup does not change it"):
+        setup.steps().set_up(PORT, ())
+    assert gateway.ran == []
+
+
+def test_undo_leaves_what_is_already_as_before(gateway: LivingMachine, setup: Setup) -> None:
+    assert setup.steps(user="ann").set_up(PORT, ()) == 0
+    gateway.units["imud.service"] = ["disabled", "inactive"]
+    gateway.ran.clear()
+    assert setup.steps().undo() == 0
+    assert not [
+        line for line in gateway.ran if line.startswith(("systemctl stop", "systemctl disable", "systemctl mask"))
+    ]
+
+
 # --- questions --------------------------------------------------------------------------------------------------------
 
 
@@ -353,6 +370,9 @@ def test_a_can_interface_is_brought_up_before_the_search(gateway: LivingMachine,
     text = (gateway.root / "etc/systemd/network/80-imud-can0.network").read_text()
     assert "[CAN]\nBitRate=250000\n" in text
     assert "can0" in setup.attachments.listened
+    setup.attachments.listened.clear()
+    setup.steps(dry_run=True).set_up(Wanted(("/dev/ttyUSB0",)), [("can0", 250000)])
+    assert setup.attachments.listened == ["can0"], "beside the ports that are named, which the daemon has"
     assert setup.steps().undo() == 0
     assert gateway.files() == before
     assert "ip link set can0 down" in gateway.ran
