@@ -1,7 +1,7 @@
 """`make chaos`: random faults of all kinds on a real daemon in the lab's kernel, from a seed, then the account.
 
     python -m tests.lab.chaos --seed N --seconds S      in the guest, as root
-    python -m tests.lab.chaos --seed N --short          one round with every kind of fault once
+    python -m tests.lab.chaos --seed N --short          two rounds with every kind of fault once each
 
 Faults come in rounds of ROUND_S. After each round every device must run again, each ledger close, the losses be the
 true ones (tests/lab/chaos/account.py has the rule), and descriptors and threads be no more than in the beginning. A
@@ -26,7 +26,7 @@ from tests.lab.chaos import account as accounts
 from tests.lab.chaos.account import Account, Hole, Interval
 from tests.lab.chaos.daemon import Life, Snapshot, memory_control
 from tests.lab.chaos.far_side import FarSide
-from tests.lab.chaos.faults import Fault, Planned, all_faults, plan, plan_each_once, play
+from tests.lab.chaos.faults import Fault, Planned, all_faults, plan, plan_short, play
 from tests.lab.chaos.polls import Answer
 from tests.lab.tool import tool
 from tests.lab.waiting import wait_until
@@ -260,7 +260,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--seconds", type=float, default=CI_SECONDS, help="of faults, in the guest's time (%(default)g)"
     )
-    parser.add_argument("--short", action="store_true", help="one round with every kind of fault once")
+    parser.add_argument("--short", action="store_true", help="two rounds with every kind of fault once each")
     options = parser.parse_args(arguments)
     how = "--short" if options.short else f"--seconds {options.seconds:g}"
     print(f'chaos: repeat with ARGS="--seed {options.seed} {how}"', flush=True)
@@ -268,8 +268,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not with_memory:
         print("chaos: no memory controller in this kernel: 'out of memory' is left out")
     faults = all_faults(with_memory=with_memory)
-    each_once = [plan_each_once(options.seed, faults)]
-    rounds = each_once if options.short else plan(options.seed, options.seconds, faults)
+    rounds = plan_short(options.seed, faults) if options.short else plan(options.seed, options.seconds, faults)
     made: Counter[str] = Counter()
     begin_s = monotonic()
     with tempfile.TemporaryDirectory(prefix="chaos-") as name, small_disk(Path(name) / "state") as state:

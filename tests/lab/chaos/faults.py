@@ -88,9 +88,15 @@ def _round(random: Random, faults: list[Fault]) -> list[Planned]:
     return planned
 
 
-def plan_each_once(seed: int, faults: list[Fault]) -> list[Planned]:
-    """Return one round in which every kind of fault happens once, as early as its resources allow."""
-    random, free_s, planned = Random(seed), dict[str, float](), list[Planned]()
+def plan_short(seed: int, faults: list[Fault]) -> list[list[Planned]]:
+    """Return two rounds. In the second round the daemon knows the counters of more devices, so its losses are exact."""
+    random = Random(seed)
+    return [_each_once(random, faults) for _ in range(2)]
+
+
+def _each_once(random: Random, faults: list[Fault]) -> list[Planned]:
+    """Return a round in which every kind of fault happens once, as early as its resources allow."""
+    free_s, planned = dict[str, float](), list[Planned]()
     for fault in random.sample(faults, len(faults)):
         begin_s = max(free_s.get(resource, random.uniform(0.0, EVERY_S)) for resource in fault.resources)
         planned.append(Planned(begin_s, fault, random.uniform(fault.shortest_s, fault.longest_s)))
