@@ -30,6 +30,15 @@ def test_a_drift_through_the_milliseconds_narrows(ppm: float, most_ns: int) -> N
         assert error == pytest.approx(289_000, rel=0.2)
 
 
+def test_the_estimate_runs_at_the_slope_of_the_intervals() -> None:
+    intervals = IntervalFit()
+    for x in range(0, 20 * NS_PER_S + 1, NS_PER_S // 10):
+        low = int(x * (1 + 50e-6))
+        intervals.add_interval(x, low, low + MS, FAR, 1.0)  # 50 ppm beside the slope that is passed
+    at, fits = 60 * NS_PER_S, int(60 * NS_PER_S * (1 + 50e-6)) + MS // 2
+    assert abs(intervals.combined(at, fits, 1e12, 0.0)[0]) < 300_000
+
+
 def test_a_better_fit_stays_within() -> None:
     intervals, x = filled(0.0)
     assert abs(intervals.combined(x, x + 50_000, 1000.0, 0.0)[0]) < 100

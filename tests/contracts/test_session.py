@@ -1,6 +1,7 @@
 """Request and reply: replies, refusals, silence, late replies, and text that answers nothing."""
 
 from dataclasses import replace
+from inspect import GEN_CLOSED, getgeneratorstate
 
 import pytest
 
@@ -12,11 +13,13 @@ from imud.contracts.session import (
     Rejection,
     Reply,
     Request,
+    RequestScript,
     Session,
     Silence,
     never,
     of_text,
     pause,
+    with_undo,
 )
 from imud.errors import CommandError
 from imud.ledger import Ledger
@@ -209,6 +212,24 @@ def test_a_pause_sends_nothing_and_late_replies_stay_late(session: Session, ledg
     assert session.on_time(TIMEOUT_NS + 50) == Silence(())
     session.on_message("OK", TIMEOUT_NS + 60)
     assert strays(ledger) == (1, 0)
+
+
+def test_a_script_with_undo_passes_requests_on_and_is_closed_with_it() -> None:
+    inner = asking()
+    outer = with_undo(inner, b"undo")
+    assert next(outer).undo == b"undo"
+    outer.close()
+    assert getgeneratorstate(inner) == GEN_CLOSED
+    outer = with_undo(asking(), b"undo")
+    next(outer)
+    with pytest.raises(StopIteration) as end:
+        outer.send(Reply(("OK",)))
+    assert end.value.value == Reply(("OK",))
+
+
+def asking() -> RequestScript[Outcome]:
+    """Ask once, and return the outcome."""
+    return (yield command("ask"))
 
 
 # --- measurements -----------------------------------------------------------------------------------------------------

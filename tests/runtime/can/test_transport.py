@@ -1,5 +1,6 @@
 """The life of a device on a CAN bus inside the process: streams, loses frames by cause, bus down and up."""
 
+import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from itertools import count
 from random import Random
@@ -22,7 +23,7 @@ from imud.links.memory import MemorySettings
 from imud.units import NS_PER_S
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
-from tests.support.event_loops import VirtualClock
+from tests.support.event_loops import VirtualClock, run_virtually
 from tests.support.stories import told
 
 MS = 1_000_000
@@ -214,6 +215,28 @@ def test_what_a_device_measured_while_the_host_was_suspended_is_a_gap_of_unknown
             assert (host.suspends, rig.ledger.lost_unknown) == (suspends, before + suspends)
 
     play_rigs(rigs, story, clock)
+
+
+@pytest.mark.parametrize("end", ["run ends", "closed"])
+def test_a_device_that_ends_leaves_its_bus(end: str) -> None:
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host)
+    rig = rigs.add(configured())
+
+    async def story() -> None:
+        running = asyncio.create_task(rig.device.run())
+        await rig.turn(lambda: rig.can_link.listening)
+        claimed = rigs.factory._can_buses.claimed("other", "can0")
+        assert claimed(101, False)
+        if end == "closed":
+            rig.device.close()
+            assert not rig.can_link.is_open
+            assert not claimed(101, False)
+        running.cancel()
+        await asyncio.wait([running])
+        assert not claimed(101, False)
+
+    run_virtually(clock, story())
 
 
 def test_bus_down_and_up() -> None:

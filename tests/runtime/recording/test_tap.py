@@ -1,5 +1,8 @@
 """Taps: nothing is different on path and clock while nobody listens, and everything is heard while somebody does."""
 
+from types import SimpleNamespace
+from typing import cast
+
 from imud.config import DeviceConfig
 from imud.contracts.lines import Edge
 from imud.contracts.settings import NoSettings
@@ -7,7 +10,7 @@ from imud.devices.hipnuc.uart.driver import DRIVER
 from imud.formats.recording.records import CheckRecord, Kind, decode_object, records_of
 from imud.ledger import Ledger
 from imud.runtime.path import PathContext, StreamPath, make_clock
-from imud.runtime.recording.tap import DeviceTap, HostTap, PathParts
+from imud.runtime.recording.tap import DeviceTap, DeviceTaps, HostTap, PathParts, RecordedDevice
 from tests.support.event_loops import VirtualClock
 from tests.support.files import hi91
 
@@ -102,6 +105,15 @@ def test_readings_of_the_clocks_are_heard() -> None:
     clock.advance(2_000_000_000)
     host.utc_offset_ns()
     assert len(heard) == 2
+
+
+def test_the_taps_of_the_devices_pass_on_what_there_is() -> None:
+    one, put = TappedPath(), list[bytes]()
+    taps = DeviceTaps({"bow": cast("RecordedDevice", SimpleNamespace(tap=one.tap))}, one.host)
+    assert taps.names() == ["bow"]
+    for name in ("stern", "bow"):
+        taps.check(name, put.append)
+    assert [record.kind for data in put for record in records_of(data)] == [Kind.CHECK]
 
 
 def test_a_check_has_the_newest_sample_if_there_is_one() -> None:

@@ -1,5 +1,6 @@
 """The arrival model keeps to what its profiles say, and its truth is a truth."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -63,6 +64,15 @@ def test_wires_timers_and_packets() -> None:
 
     got = list(ArrivalModel(PERFECT, 200, 1, baud=115_200).run(400))
     assert got[-1].t_rx_ns - got[-1].t_ns > NS_PER_S // 2
+
+
+@pytest.mark.parametrize(
+    ("profile", "newest_ms"), [(replace(USB_16MS, timer_ppm=0), 37), (USB_16MS_PACKET, 5)], ids=lambda p: str(p)[:40]
+)
+def test_a_late_read_has_what_further_rounds_of_the_timer_brought(profile: ArrivalProfile, newest_ms: int) -> None:
+    """The adapter handed over at 5 ms, the read is at 45 ms. A packet adapter begins no round before it has data."""
+    newest_ns = ArrivalModel(profile, 1000, 1)._newest_hand_over(5 * NS_PER_MS, 45 * NS_PER_MS)
+    assert newest_ns == newest_ms * NS_PER_MS
 
 
 @pytest.mark.parametrize(("skew_ppm", "drift"), [(0.0, 0.0), (50_000.0, 0.0), (-50_000.0, 0.0), (0.0, 0.1)])

@@ -75,6 +75,10 @@ def test_one_command(name: str, arguments: dict[str, Any], command: str) -> None
     assert value is None
 
 
+def test_the_actions_that_write_to_flash_say_so() -> None:
+    assert [name for name, action in ACTIONS.items() if action.saves] == ["save", "baud"]
+
+
 RATES = r"rate_hz \(one of 0, 1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100, 125, 200, 250, 500, 1000\)"
 HALF_TURN = "a number from -180 to 180"
 
