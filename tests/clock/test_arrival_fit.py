@@ -11,7 +11,6 @@ from imud.units import NS_PER_MS, NS_PER_S
 
 
 def at(fit: ArrivalFit, device_ns: int) -> float:
-    """Host time by the fit."""
     return fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
 
 

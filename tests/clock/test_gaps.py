@@ -41,7 +41,6 @@ class Device:
     """Whether a pulse per second sets the stamp to zero."""
 
     def stamp_ms(self, index: int) -> int | None:
-        """The stamp of a sample."""
         if not self.stamp_modulus:
             return None
         if self.pulses:
@@ -49,7 +48,6 @@ class Device:
         return (self.first + index * 1000 // self.rate_hz) % self.stamp_modulus
 
     def ticks(self, index: int) -> int | None:
-        """The counter of a sample."""
         if self.tick_ns < 0:
             return None
         step = NS_PER_S / self.rate_hz / self.tick_ns if self.tick_ns else 1
@@ -88,7 +86,6 @@ class Reader:
     waiting: list[int] = field(default_factory=list)
 
     def run(self, duration_ns: int) -> None:
-        """Read on time."""
         end = self.now_ns + duration_ns
         while (due := self.device.time_ns(self.made)) < end:
             self._wait(due + 150 * NS_PER_US)

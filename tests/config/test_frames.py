@@ -20,13 +20,11 @@ devices:
 
 
 def device(keys: str, driver: str = "hipnuc-uart") -> DeviceConfig:
-    """The device with more keys."""
     (made,) = config.parse(HEAD.format(driver=driver) + keys, "f.yaml").devices
     return made
 
 
 def problem(keys: str, driver: str = "hipnuc-uart") -> str:
-    """The only problem that these keys make."""
     with pytest.raises(ConfigError) as caught:
         device(keys, driver)
     (line,) = str(caught.value).splitlines()

@@ -131,7 +131,6 @@ def parse(text: str, tables: Tables = FAKE) -> Config:
 
 
 def errors(text: str, tables: Tables = FAKE) -> list[str]:
-    """The lines of the error that `text` gives."""
     with pytest.raises(ConfigError) as caught:
         parse(text, tables)
     return str(caught.value).splitlines()
@@ -308,7 +307,6 @@ def test_differences() -> None:
 
 
 def refused(content: bytes) -> list[str]:
-    """Lines of the error, none if there is no error."""
     try:
         config.parse(content, "f", FAKE)
     except ConfigError as error:

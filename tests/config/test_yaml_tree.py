@@ -20,7 +20,6 @@ def parser(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def only_problem(content: bytes | str) -> tuple[int, int, str, str]:
-    """Line, column, path and message of the one problem of `content`."""
     tree = read_yaml(content.encode() if isinstance(content, str) else content)
     assert len(tree.problems) == 1, tree.problems
     (problem,) = tree.problems
@@ -169,7 +168,6 @@ def test_whatever_comes_there_is_data_or_a_problem(content: bytes) -> None:
 
 
 def leaves(data: object) -> list[float]:
-    """Every float in `data`."""
     if isinstance(data, float):
         return [data]
     inner = data.values() if isinstance(data, dict) else data if isinstance(data, list) else ()

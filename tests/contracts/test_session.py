@@ -167,7 +167,6 @@ def test_endless_reply_is_bounded(session: Session) -> None:
 
 
 def frame_command(frame_id: int) -> Request:
-    """A request that is answered by one frame."""
     return Request(
         payload=b"?",
         name=f"frame {frame_id}",
@@ -228,7 +227,6 @@ def test_a_script_with_undo_passes_requests_on_and_is_closed_with_it() -> None:
 
 
 def asking() -> RequestScript[Outcome]:
-    """Ask once, and return the outcome."""
     return (yield command("ask"))
 
 

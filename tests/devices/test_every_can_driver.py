@@ -26,7 +26,6 @@ LEARNING_SETS = 10
 
 
 def every_driver_and_seed(test: Callable[[str, int], None]) -> Callable[..., None]:
-    """Calls a test with every driver and with seeds."""
     seeded: Callable[..., None] = every_driver(given(seed=st.integers(0, 2**32))(test))
     return seeded
 

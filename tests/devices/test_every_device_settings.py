@@ -149,7 +149,6 @@ LINK_OF = {"hipnuc-uart": "uart", "hipnuc-modbus": "rs485", "imu61x-uart": "uart
 
 
 def simulated_device(driver: str, port: Path) -> dict[str, Any]:
-    """The configuration of a simulated module."""
     link = {"uart": {"port": str(port), "baud": 115200}, "rs485": {"line": str(port), "reply_ms": 200}}
     return {"driver": driver, LINK_OF[driver]: link[LINK_OF[driver]]}
 

@@ -23,7 +23,6 @@ every_driver = pytest.mark.parametrize("name", list(DRIVERS))
 
 
 def every_driver_and_seed(test: Callable[[str, int], None]) -> Callable[..., None]:
-    """Calls a test with every driver and with seeds."""
     seeded: Callable[..., None] = every_driver(given(seed=st.integers(0, 2**32))(test))
     return seeded
 

@@ -174,7 +174,6 @@ WRONG = zyx(0, 0, z_down=True)
 
 
 def judged(samples: Iterator[Sample]) -> int:
-    """Number of windows that are judged."""
     check = GravityCheck(FLU_LEVEL)
     return sum(check.add(one) for one in samples)
 

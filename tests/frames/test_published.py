@@ -36,7 +36,6 @@ def sample(
     gyro: Vector3 | None = None,
     mag: Vector3 | None = None,
 ) -> Sample:
-    """A sample with these values."""
     euler = None if euler_deg is None else (radians(euler_deg[0]), radians(euler_deg[1]), radians(euler_deg[2]))
     times = (7, 100, 2, Sync.EDGE, 101, 102, 103)
     return Sample("bow", *times, accel, gyro, mag, quat, euler, 20.5, 1e5, (0.1, 0.2), 5, 6, 8)

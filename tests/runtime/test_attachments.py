@@ -79,7 +79,6 @@ class Scene:
 
     @property
     def told(self) -> list[str]:
-        """What was said of the line."""
         return [event.message for event in self.rig.events if event.detail.get("line") == "reset"]
 
 
@@ -166,7 +165,6 @@ async def test_the_line_is_held_from_the_beginning_to_the_end_and_its_trouble_sh
 
 
 def frame(timer_us: int) -> bytes:
-    """One of a device at rest."""
     zero = (0.0, 0.0, 0.0)
     return encode_ahrs(timer_us=timer_us, accel_m_s2=(0, 0, 9.8), gyro_rad_s=zero, euler_rad=zero, temperature_c=25)
 
@@ -184,11 +182,9 @@ class Uart:
         self.streams = False
 
     async def until(self, condition: Callable[[], object], limit_s: float = 100) -> None:
-        """Let time pass until it holds."""
         await self.rig.until(condition, limit_s=limit_s, step=self._send, step_s=0.01)
 
     async def play(self, story: Callable[["Uart"], Any]) -> None:
-        """With the device at work."""
         async with self.rigs.at_work():
             await story(self)
 

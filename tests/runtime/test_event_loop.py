@@ -38,13 +38,11 @@ def pair(pairs: list[Pair]) -> Pair:
 
 
 async def turns(count: int = TURNS) -> None:
-    """So many turns of the loop."""
     for _ in range(count):
         await asyncio.sleep(0)
 
 
 def read(sock: socket.socket, seen: list[str], word: str) -> None:
-    """Take what is there, and note that it was done."""
     sock.recv(9)
     seen.append(word)
 
@@ -275,8 +273,6 @@ def test_a_reader_may_stop_the_loop(pair: Pair) -> None:
 
 
 class CountingSelector(ReaderSelector):
-    """Counts the turns of its loop."""
-
     turns = 0
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
@@ -303,7 +299,6 @@ def test_the_loop_does_not_turn_for_readers_that_give_it_nothing(pair: Pair) -> 
 
 
 def send_signal(loop: SampleLoop, done: asyncio.Future[None]) -> None:
-    """A signal comes a little later."""
     loop.add_signal_handler(signal.SIGUSR1, done.set_result, None)
     threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGUSR1)).start()
 

@@ -38,7 +38,6 @@ def ask(*requests: Request) -> RequestScript[list[Outcome]]:
 
 
 def made() -> tuple[Exchange, list[bytes]]:
-    """Return an exchange and the list of its writes."""
     written: list[bytes] = []
     return Exchange(Ledger(), written.append, monotonic_ns), written
 

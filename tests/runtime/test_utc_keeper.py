@@ -25,8 +25,6 @@ OFFSET_NS = UTC_S * NS_PER_S - BEGIN_NS
 
 
 class FakeChrony:
-    """Keeps the pulses it is given."""
-
     problem = ""
     refused = 0
 
@@ -46,8 +44,6 @@ class FakeChrony:
 
 
 class KeeperBench:
-    """A keeper and all around it."""
-
     def __init__(self, *, source: bool = True, system: UtcReference | None = None) -> None:
         self.written: list[bytes] = []
         self.busy = False

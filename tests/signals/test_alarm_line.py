@@ -85,8 +85,6 @@ def test_a_line_that_went_away_and_came_back(signals: SignalBench) -> None:
 
 
 class Monitored:
-    """A monitored line, its time, and its events."""
-
     def __init__(self, signals: SignalBench) -> None:
         self.signals = signals
         self.monitor = AlarmMonitor(signals.raise_event)
@@ -100,7 +98,6 @@ class Monitored:
 
     @property
     def verdicts(self) -> list[tuple[str, object]]:
-        """Message and verdict of the events so far."""
         assert all(event.kind is EventKind.ALARM and event.t_ns <= self.now_ns for event in self.signals.events)
         return [(event.message, event.detail.get("verdict")) for event in self.signals.events]
 

@@ -58,8 +58,6 @@ async def test_cancelled_while_it_is_held() -> None:
 
 
 class Scene:
-    """A reset line in virtual time."""
-
     def __init__(self, settings: ResetSettings = SETTINGS) -> None:
         signals = SignalBench()
         self.clock, self.events = signals.clock, signals.events
@@ -73,7 +71,6 @@ class Scene:
         assert signals.memory.inputs == {}
 
     def tick(self, ahead_ns: int = 0) -> None:
-        """So much time passes."""
         self.clock.advance(ahead_ns)
         self.reset.tick(self.clock.now_ns(), None)
 
@@ -83,7 +80,6 @@ class Scene:
         return [t_ns / NS_PER_S - 1000 for t_ns, active in self.line.history if active]
 
     async def search(self, seconds: float, every_s: float = 0.5) -> None:
-        """Rounds that find nothing."""
         end_ns = self.clock.now_ns() + seconds * NS_PER_S
         while self.clock.now_ns() < end_ns:
             await asyncio.sleep(every_s)

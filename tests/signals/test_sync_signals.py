@@ -34,8 +34,6 @@ ALL = DeviceLines(
 
 
 class SyncBench(SignalBench):
-    """SyncSignals on a device's clock."""
-
     def __init__(self, lines: DeviceLines = ALL) -> None:
         super().__init__()
         self.pulses: list[Edge] = []

@@ -35,8 +35,6 @@ class Time:
 
 
 class SquareWaveBench:
-    """A square wave on a line in memory."""
-
     def __init__(self, rate_hz: float, pulse_ns: int = PULSE_NS) -> None:
         self.time = Time()
         self.line = MemoryOutput(now_ns=lambda: self.time.t_ns)
@@ -158,8 +156,6 @@ def test_single_edges_without_a_rate_and_between_those_of_the_rate() -> None:
 
 
 class TriggerBench:
-    """A trigger whose thread the test runs."""
-
     def __init__(self, rate_hz: float) -> None:
         self.time = Time()
         self.line = MemoryOutput(now_ns=lambda: self.time.t_ns)

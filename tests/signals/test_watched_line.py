@@ -14,8 +14,6 @@ BUSY = LinkBusy("gpiochip0 line 3 is in use by gpiomon: stop that")
 
 
 class Watched:
-    """One watched line and everything it delivers and reports."""
-
     def __init__(self, line: MemoryInput | None = None, *, watch: bool = True) -> None:
         self.clock = VirtualClock()
         self.line = line or MemoryInput()
@@ -120,8 +118,6 @@ async def test_a_line_that_cannot_start_is_closed_and_tried_again() -> None:
 
 
 class Blind(MemoryInput):
-    """Its level cannot be read."""
-
     def level(self) -> bool:
         raise LinkError("no level")
 

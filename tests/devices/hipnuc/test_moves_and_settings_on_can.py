@@ -142,17 +142,14 @@ def move(protocol: Protocol, bench: CanBench, number: int) -> object:
 
 
 def numbers(protocol: Protocol, bench: Any) -> tuple[int, int]:
-    """Number that the driver uses, and number that the module has."""
     return getattr(bench.settings, protocol.noun), protocol.number_of(bench.module)
 
 
 def is_told(variant: Any) -> bool:
-    """Return whether a module answers reads."""
     return variant.reads not in ("ignored", "aborted")
 
 
 def is_at_once(variant: Any) -> bool:
-    """Return whether a new number is in force before a restart."""
     return bool(getattr(variant, "number_at_once", False) or getattr(variant, "address_at_once", False))
 
 

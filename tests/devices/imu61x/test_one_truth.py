@@ -97,7 +97,6 @@ def only(events: Sequence[CodecEvent | PolledEvent]) -> Measurement:
 
 @cache
 def read(name: str) -> list[Measurement]:
-    """Return the measurements of a format."""
     if name in ("uart", "can"):
         return by_uart() if name == "uart" else by_can()
     if name == "i2c":

@@ -57,7 +57,6 @@ class GuideRig:
         return lambda _target: run()
 
     def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Run the story while samples come."""
         run_virtually(self.clock, self._play(story))
 
     async def _play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
@@ -85,13 +84,11 @@ class GuideRig:
             await asyncio.sleep(TICK_S)
 
     def phases(self) -> list[object]:
-        """Phases of the events."""
         assert all(event.kind is EventKind.CALIBRATION for event in self.events)
         return [event.detail["phase"] for event in self.events]
 
 
 def gyro(rig: GuideRig, **changes: Any) -> Calibration:
-    """A calibration of the gyroscope."""
     made = Calibration(
         help="measure the bias", section="1.6", handling=Handling.REST, instructions=(),
         begin=rig.does("begin", (0.1, 0.2, 0.3), 3.0), expected=(GYRO_ZERO,), kept=Kept.BY_SAVE,
@@ -101,7 +98,6 @@ def gyro(rig: GuideRig, **changes: Any) -> Calibration:
 
 
 def magnetometer(rig: GuideRig, verdicts: Callable[[], Verdict], **changes: Any) -> Calibration:
-    """A calibration by turning."""
     return gyro(
         rig, handling=Handling.TURN, begin=rig.does("begin"), expected=(), kept=Kept.BY_DEVICE, save=None,
         verdict=lambda _target: verdicts(), **changes,
@@ -248,7 +244,6 @@ async def test_it_can_be_ended(rig: GuideRig, end: str) -> None:
 
 
 def turned_by_hand(rig: GuideRig, hard_iron_t: Vector3 = (0.0, 0.0, 0.0)) -> None:
-    """Turn it in all directions."""
     a, b, c = hard_iron_t
 
     def mag_t(t_s: float) -> Vector3:
@@ -336,18 +331,14 @@ async def test_advice(rig: GuideRig, prepare: Callable[[GuideRig], object], word
 
 
 class ByHand:
-    """A module that is turned by hand from a certain time on, after resting."""
-
     def __init__(self, from_s: float) -> None:
         self._from_s = from_s
 
     def at(self, t_s: float) -> Truth:
-        """At rest, then turned."""
         return Still(0.05, -0.03, 0.4).at(t_s) if t_s < self._from_s else tumble().at(t_s)
 
 
 def module(motion: Motion, att_mode: int) -> WiredDevice:
-    """Return a device that has a simulated module."""
     hardware = HipnucHardware(motion=motion, hard_iron_t=HARD_IRON_T)
     return WiredDevice(DeviceLines(), ModuleSettings(att_mode=att_mode), hardware)
 

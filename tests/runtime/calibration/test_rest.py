@@ -19,14 +19,12 @@ def sample(
     euler: Vector3 | None = None,
     incli: Pair | None = None,
 ) -> Sample:
-    """A sample with these values."""
     return Sample(
         "bow", 1, 1, 0, Sync.ARRIVAL, 1, 1, accel_m_s2=accel, gyro_rad_s=gyro, euler_rad=euler, incli_rad=incli
     )
 
 
 def window(*samples: Sample) -> RestWindow:
-    """A window with these samples."""
     made = RestWindow()
     for one in samples:
         made.add(one)

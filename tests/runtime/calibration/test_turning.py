@@ -16,7 +16,6 @@ CENTRE: Vector3 = (14e-6, -2e-6, -9e-6)
 
 
 def sample(t_ns: int, mag: Vector3 | None = None, gyro: Vector3 | None = None) -> Sample:
-    """A sample with field and angular rate."""
     return Sample("bow", 1, t_ns, 0, Sync.ARRIVAL, t_ns, t_ns, mag_t=mag, gyro_rad_s=gyro)
 
 

@@ -65,7 +65,6 @@ class BusInProcess:
         link.feed([CanFrame(f.can_id, f.extended, f.data, f.due_ns) for f in self.modules.advance(now_ns)])
 
     async def until(self, condition: Callable[[], object], what: str) -> None:
-        """Let time pass until it holds."""
         await self.rig.until(condition, what, 120.0, step=self.step)
 
     async def done(self, work: Coroutine[Any, Any, Any]) -> Any:
@@ -75,8 +74,6 @@ class BusInProcess:
         return task.result()
 
     def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Run the device while the story is told."""
-
         async def told(_made: list[DeviceRig]) -> None:
             await self.until(lambda: self.rig.state is DeviceState.RUNNING, "samples")
             await story()

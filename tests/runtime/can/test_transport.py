@@ -32,7 +32,6 @@ MS = 1_000_000
 def configured(
     driver: str = "imu61x-can", settings: Settings | None = None, *, base_id: int = 101, bitrate: int = 0
 ) -> DeviceConfig:
-    """A device on a bus inside the process."""
     link = MemorySettings(baud=bitrate, name="can0")
     return DeviceConfig("mast", driver, settings or Imu61xCanSettings(base_id=base_id), True, "memory", link)
 
@@ -44,7 +43,6 @@ class Frames:
         self._clock, self._now_ns = now_ns, now_ns()
 
     def of(self, index: int, *, base_id: int = 101, lost: Sequence[int] = ()) -> list[CanFrame]:
-        """The frames of one sample."""
         self._now_ns = max(self._now_ns, self._clock() - 10 * MS)
         made = []
         for place, (can_id, data) in enumerate(
@@ -60,15 +58,12 @@ class Frames:
 
 
 class CanDeviceBench:
-    """One device, and the module at the other end of its bus."""
-
     def __init__(self, rig: DeviceRig) -> None:
         self.rig = rig
         self.link = rig.can_link
         self.frames = Frames(rig.now_ns).of
 
     def feed(self, *indices: int) -> None:
-        """Whole samples, in one read."""
         assert self.link.feed([frame for index in indices for frame in self.frames(index)])
 
 

@@ -20,7 +20,6 @@ DRIVERS = (FAKE, IMU61X)
 
 
 def imu61x(index: int, base_id: int = 101) -> list[CanFrame]:
-    """The frames of a sample."""
     frames = encode_set(
         index=index,
         accel_m_s2=(0, 0, 9.8),
@@ -33,21 +32,17 @@ def imu61x(index: int, base_id: int = 101) -> list[CanFrame]:
 
 
 class Round:
-    """A search, and its time."""
-
     def __init__(self, **more: object) -> None:
         self.search = CanSearch(DRIVERS, "can0", **more)  # type: ignore[arg-type]  # as the search takes them
         self.until_ns = self.search.start(0).until_ns
         self.early: CanFound | None = None
 
     def hear(self, *frames: CanFrame) -> "Round":
-        """Frames, one after the other."""
         for frame in frames:
             self.early = self.early or self.search.on_frames([frame])
         return self
 
     def end(self) -> CanStep:
-        """What is said at the end of the round."""
         step = self.search.on_time(self.until_ns)
         while isinstance(step, Listen):
             self.until_ns = step.until_ns
@@ -56,13 +51,11 @@ class Round:
         return step
 
     def found(self) -> str:
-        """The device that was found."""
         step = self.end()
         assert isinstance(step, CanFound), step
         return step.device.title
 
     def complaint(self) -> str:
-        """What is said when none was."""
         step = self.end()
         assert isinstance(step, GaveUp), step
         return step.summary

@@ -49,7 +49,6 @@ class Bus:
     def add(
         self, name: str = "mast", driver: str = "auto", options: Settings | None = None, *, writable: bool = True
     ) -> "OnBus":
-        """Add a device of the configuration."""
         settings = MemorySettings(name="can0", writable=writable)
         config = DeviceConfig(name, driver, options, True, "memory", settings)
         return OnBus(self, self.rigs.add(config, MemoryCanLink(settings)))
@@ -73,8 +72,6 @@ class Bus:
 
 
 class OnBus:
-    """One device of the bus."""
-
     def __init__(self, bus: Bus, rig: DeviceRig) -> None:
         self._bus = bus
         self.rig = rig
@@ -86,11 +83,9 @@ class OnBus:
         return self.rig.samples
 
     def hear(self, *nodes: int, number: int = 0) -> None:
-        """A frame of each node."""
         self.link.feed([fake_can_frame(node, number, self.rig.now_ns()) for node in nodes])
 
     async def until(self, condition: Callable[[], object], *nodes: int) -> None:
-        """Wait until it holds, with those nodes on the bus."""
         await self._bus.start()
         numbers = count(len(self.samples) + 1)
         await self.rig.until(condition, step=lambda: self.hear(*nodes, number=next(numbers) % 200), step_s=0.001)

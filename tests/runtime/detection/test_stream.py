@@ -216,8 +216,6 @@ def test_the_driver_is_told_apart_by_its_frames() -> None:
 
 
 class DeafCodec:
-    """Understands nothing."""
-
     def __init__(self, ledger: Ledger) -> None:
         self.ledger = ledger
 

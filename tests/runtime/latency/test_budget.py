@@ -9,8 +9,6 @@ MOST_NS = 50 * 10**6
 
 
 class Told:
-    """A device, and what it was told."""
-
     def __init__(self, budget: LatencyBudget, name: str) -> None:
         self.needs: list[Need] = []
         budget.add_device(name, self.needs.append)
@@ -92,8 +90,6 @@ def test_a_client_that_goes_costs_no_look_at_the_others() -> None:
     budget, compared = LatencyBudget(), 0
 
     class Counted(str):
-        """A name that counts how often it is compared."""
-
         __slots__ = ()
 
         def __lt__(self, other: str) -> bool:

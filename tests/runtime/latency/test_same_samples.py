@@ -30,8 +30,6 @@ TIMES = ("t_ns", "t_err_ns", "t_rx_ns", "utc_ns", "sync", "t_dev_ns")
 
 
 class Came(msgspec.Struct):
-    """What came out of a path."""
-
     samples: list[Sample]
     messages: list[object]
     ledger: dict[str, int]
@@ -53,8 +51,6 @@ def clock_of(driver: Driver) -> SampleClock:
 
 
 class Path:
-    """The path of a driver's samples, and what came out of it."""
-
     def __init__(self, make: Callable[[Ledger, PathContext], Any]) -> None:
         self.samples: list[Sample] = []
         self.messages: list[object] = []
@@ -72,7 +68,6 @@ class Path:
         self.samples += batch.samples
 
     def came(self) -> Came:
-        """All of it."""
         assert self.ledger.closes()
         return Came(self.samples, self.messages, self.ledger.snapshot())
 

@@ -28,7 +28,6 @@ FIT_MS = 400
 
 
 def hi91(time_ms: int) -> bytes:
-    """A frame of this device time."""
     return encode_hi91(
         system_time_ms=time_ms, accel_m_s2=(0.0, 0.0, 9.8), gyro_rad_s=(0.0, 0.0, 0.0), mag_t=(2e-5, 0.0, -4e-5),
         euler_rad=(0.0, 0.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0), temperature_c=20.0, pressure_pa=101_325.0,
@@ -70,7 +69,6 @@ class HoldBench:
         self._period_ms = period_ms
 
     def frame(self, number: int) -> bytes:
-        """The frame of this number."""
         return hi91(1000 + number * self._period_ms)
 
     async def send(self, count: int, make: Callable[[int], bytes] | None = None) -> None:

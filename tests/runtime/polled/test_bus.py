@@ -40,7 +40,6 @@ class Wire:
         self.takes_time: Callable[[], None] = lambda: None
 
     def absence(self) -> str:
-        """It is there."""
         return ""
 
     async def wait_present(self) -> None: ...
@@ -72,8 +71,6 @@ class Wire:
 
 
 class Sink:
-    """What the loop is given."""
-
     def __init__(self) -> None:
         self.readings: list[Reading] = []
         self.problem: LinkError | None = None
@@ -113,7 +110,6 @@ def refusing() -> TransferScript[None]:
 
 
 def run(body: Callable[[PolledBuses], Coroutine[Any, Any, None]]) -> None:
-    """Run the body of a test with buses in virtual time."""
     clock = VirtualClock()
 
     async def whole() -> None:

@@ -71,13 +71,10 @@ class Signal:
 
 
 class Scene:
-    """A device with its line, and its runner."""
-
     def __init__(self, rig: DeviceRig, signal: Signal, device: Imu61xRegisters, bench: PolledBusBench) -> None:
         self.rig, self.signal, self.device, self.bench = rig, signal, device, bench
 
     def told(self, words: str) -> Callable[[], bool]:
-        """Whether an event says so."""
         return lambda: any(e.kind is EventKind.LINK and words in e.message for e in self.rig.events)
 
     @property
@@ -278,15 +275,11 @@ async def test_the_line_is_let_go_of_at_the_end(bench: PolledBusBench) -> None:
 
 
 class DescriptorLine(MemoryInput):
-    """A line with a descriptor."""
-
     def fileno(self) -> int:
         return 77 if self.is_open else -1
 
 
 class WatchingMember:
-    """What a bus's member is asked for."""
-
     def __init__(self) -> None:
         self.watched: dict[int, Callable[[], None]] = {}
         self.noted = self.commands = 0

@@ -41,24 +41,19 @@ class VirtualLine:
 
     @property
     def counted(self) -> "VirtualLine":
-        """Return the counters of the kernel."""
         return self
 
     def read(self) -> KernelCounters:
-        """Return no errors."""
         return KernelCounters()
 
     def share(self, *_where: object) -> "VirtualLine":
-        """Add a user, as `SharedPorts` does."""
         self.users += 1
         return self
 
     def release(self, _line: object) -> None:
-        """Remove a user, as `SharedPorts` does."""
         self.users -= 1
 
     def transfer(self, target: int, request: bytes, reply_bytes: int, reply_ns: int) -> bytes:
-        """Make a transfer, as `Rs485Line` does."""
         bench, begin_ns = self.bench, self._clock.now_ns()
         bench.now_ns = begin_ns
         try:
@@ -94,7 +89,6 @@ class LineBench:
         assert self.line.users == 0
 
     def run(self, body: Coroutine[Any, Any, None]) -> None:
-        """Run the body of a test."""
         run_virtually(self.clock, body)
 
 
@@ -109,7 +103,6 @@ def on(path: Path, address: int | str, **more: Any) -> DeviceConfig:
 
 
 def told(rig: DeviceRig) -> str:
-    """Messages of the events so far."""
     return " ".join(event.message for event in rig.events)
 
 

@@ -22,8 +22,6 @@ BEGIN_NS = 5000 * NS_PER_S
 
 
 class Played:
-    """A player of a driver with what it published."""
-
     def __init__(self, driver: str) -> None:
         self.samples: list[Sample] = []
         row = DRIVERS[driver]

@@ -20,8 +20,6 @@ from imud.sample import Sync
 
 
 class Holder:
-    """A root; its attributes are what a test gives it."""
-
     def __init__(self, **parts: Any) -> None:
         self.__dict__.update(parts)
 
@@ -47,8 +45,6 @@ def test_values_come_back(value: object) -> None:
 
 
 class Slotted:
-    """An object with an attribute that was never set."""
-
     __slots__ = ("set", "unset")
     set: int
     unset: int

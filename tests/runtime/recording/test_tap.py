@@ -16,8 +16,6 @@ from tests.support.files import hi91
 
 
 class TappedPath:
-    """A path with its tap."""
-
     def __init__(self) -> None:
         self.clock = VirtualClock()
         self.host = self.clock.host

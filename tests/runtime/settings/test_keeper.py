@@ -78,8 +78,6 @@ class ModuleBench:
         self.device = self.rig.device
 
     def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Run the device while the story is told."""
-
         async def told(_made: list[DeviceRig]) -> None:
             asyncio.get_running_loop().set_default_executor(AtOnce())
             await self.rig.turn(lambda: self.module.listening)
@@ -93,7 +91,6 @@ class ModuleBench:
         await self.rig.until(holds, what, limit_s, step=self.module.sample, step_s=step_s)
 
     async def pass_s(self, duration_s: float) -> None:
-        """Let so much time pass."""
         end_ns = self.clock.now_ns() + int(duration_s * 1e9)
         await self.until(lambda: self.clock.now_ns() >= end_ns, limit_s=duration_s + 10)
 
@@ -111,7 +108,6 @@ class ModuleBench:
         return found
 
     def is_in(self, state: SettingsState) -> bool:
-        """Whether that is the state."""
         return self.status.state is state
 
     @property
@@ -129,7 +125,6 @@ class ModuleBench:
         return self.status.repairs == times
 
     def saved(self, times: int) -> bool:
-        """Whether they were saved so often."""
         return self.module.saves == times
 
     def written(self) -> list[str]:

@@ -37,12 +37,10 @@ Story = Callable[[DeviceRig], Coroutine[Any, Any, None]]
 
 
 def configured(*, identify: bool = False, baud: Any = 115200, driver: str = "hipnuc-uart", **link: Any) -> DeviceConfig:
-    """A device on a link inside the process."""
     return DeviceConfig("bow", driver, None, identify, "memory", MemorySettings(baud=baud, **link))
 
 
 def feed(rig: DeviceRig, data: bytes) -> None:
-    """Bytes come now."""
     assert rig.link.feed(data, rig.now_ns())
 
 
@@ -289,13 +287,11 @@ class DeafModule:
                 assert self.rig.link.feed(reply, self.clock.now_ns())
 
     async def pass_s(self, duration_s: float) -> None:
-        """Let time pass."""
         end_ns = self.clock.now_ns() + int(duration_s * 1e9)
         await self.rig.until(lambda: self.clock.now_ns() > end_ns, limit_s=duration_s + 1, step=self.step, step_s=0.25)
 
     @property
     def product(self) -> str | None:
-        """What is known of it."""
         return self.rig.device.status().identity.get("product")
 
     def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
@@ -405,8 +401,6 @@ def test_a_link_that_cannot_start_is_closed_before_it_is_opened_again() -> None:
 
 def test_bytes_that_come_before_the_search_begins_are_counted() -> None:
     class Early(MemoryLink):
-        """A link that delivers while it starts."""
-
         def start(self, on_data: OnData, on_end: OnEnd) -> None:
             super().start(on_data, on_end)
             for size in (3, 5):

@@ -25,8 +25,6 @@ WOKEN = "it answered and sent no samples: commanded to stream, which is not save
 
 
 class WakeBench:
-    """One device on the line."""
-
     def __init__(
         self, settings: Imu61xSettings = QUIET, *, driver: str = "imu61x-uart", identify: bool = True,
         baud: Any = 115200, **hardware: Any,
@@ -42,15 +40,12 @@ class WakeBench:
 
     @property
     def woken(self) -> list[str]:
-        """What was told of waking it."""
         return [event.message for event in self.events if "commanded to stream" in event.message]
 
     async def until(self, condition: Callable[[], object], limit_s: float = 30.0) -> None:
-        """Let time pass until it holds."""
         await self.rig.until(condition, str(self.line.written), limit_s, step_s=0.01)
 
     async def wait(self, seconds: float) -> None:
-        """Let time pass."""
         end_ns = self.clock.now_ns() + int(seconds * 1e9)
         await self.until(lambda: self.clock.now_ns() >= end_ns, seconds + 1)
 

@@ -57,7 +57,6 @@ class ZDown:
         self._motion = motion
 
     def at(self, t_s: float) -> Truth:
-        """The truth in these axes."""
         truth = self._motion.at(t_s)
         x, y, z = truth.accel_m_s2
         p, q, r = truth.gyro_rad_s
@@ -67,8 +66,6 @@ class ZDown:
 
 
 class Played:
-    """What came out of one device."""
-
     def __init__(self, rig: DeviceRig) -> None:
         self.samples = rig.samples
         self.events: list[Event] = [one for one in rig.events if one.kind is EventKind.ATTITUDE]
@@ -79,7 +76,6 @@ class Played:
 
     @property
     def euler_deg(self) -> Vector3:
-        """Published angles."""
         assert self.newest.euler_rad is not None
         roll, pitch, yaw = map(degrees, self.newest.euler_rad)
         return (roll, pitch, yaw)
@@ -117,7 +113,6 @@ def played(driver: str, motion: Motion, seconds: float = 12.0, identify: bool = 
 
 
 def axes(x: str, y: str, z: str) -> FrameSettings:
-    """A mounting by axes."""
     return FrameSettings(axes=MountingAxes(x=x, y=y, z=z))  # type: ignore[arg-type]  # names of axes
 
 
@@ -232,7 +227,6 @@ def test_a_wrong_mounting_is_found(is_so: str, said: FrameSettings) -> None:
 
 
 def replace_frame(frame: FrameSettings) -> FrameSettings:
-    """The same of a body that may have any attitude."""
     return FrameSettings(
         axes=frame.axes, euler=frame.euler, quat_wxyz=frame.quat_wxyz, level_roll_deg=frame.level_roll_deg,
         level_at_rest=False,

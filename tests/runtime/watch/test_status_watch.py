@@ -33,8 +33,6 @@ class FakePath:
 
 
 class WatchBench:
-    """A watch, a path and the time; one tick per step."""
-
     def __init__(self) -> None:
         self.events: list[Event] = []
         self.watch = StatusWatch(Notices("bow", Ledger(), self.events.append))

@@ -23,8 +23,6 @@ LIMIT_S = 60
 
 
 class Sink:
-    """What the line delivers."""
-
     def __init__(self) -> None:
         self.edges: list[Edge] = []
         self.calls = 0

@@ -54,8 +54,6 @@ def pgns(frames: Sequence[SentFrame]) -> Counter[int]:
 
 
 class J1939Host:
-    """A module and a host that talks to it."""
-
     def __init__(self, module: HipnucJ1939Module, host: int = 0x55) -> None:
         self.module = module
         self.host = host
@@ -63,14 +61,12 @@ class J1939Host:
         self.heard: list[SentFrame] = []
 
     def wait(self, duration_ns: int) -> list[SentFrame]:
-        """What is heard meanwhile."""
         self.now_ns += duration_ns
         new = self.module.advance(self.now_ns)
         self.heard += new
         return new
 
     def talk(self, begin: Callable[[J1939Node], RequestScript[object]], address: int = 8) -> object:
-        """Run a request script to its end."""
         codec = HipnucJ1939Codec(Ledger(), HipnucJ1939Settings(address=address, host_address=self.host))
 
         def ask(request: Request) -> Outcome:

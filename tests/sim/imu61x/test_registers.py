@@ -14,8 +14,6 @@ MS = 1_000_000
 
 
 class Clock:
-    """A clock that stands still until it is moved."""
-
     def __init__(self) -> None:
         self.now = 0
 

@@ -31,7 +31,6 @@ from tests.support.simulated_modules import BEGIN_NS, IMU61X_STILL, Imu61xBench,
 
 
 def acknowledged(far: Imu61xBench, request: Request) -> int:
-    """The result of an order."""
     outcome = far.ask(request)
     assert isinstance(outcome, Reply)
     reply = parse_acknowledgement(outcome.messages[-1])
@@ -202,7 +201,6 @@ def test_commands_at_another_rate_or_damaged() -> None:
 
 
 def calibration_status(far: Imu61xBench) -> int | None:
-    """What S1 says."""
     outcome = far.ask(c.ask_status())
     assert isinstance(outcome, Reply)
     status = parse_status(outcome.messages[-1])

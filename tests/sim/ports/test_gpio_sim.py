@@ -34,8 +34,6 @@ def test_other_pins_are_refused(text: str) -> None:
 
 
 class Marked:
-    """Counts its marks."""
-
     def __init__(self) -> None:
         self.marks: list[int] = []
 

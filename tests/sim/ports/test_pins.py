@@ -12,8 +12,6 @@ from tests.support.simulated_modules import FAST, HipnucUartBench
 
 
 class Line:
-    """Keeps what it is driven with."""
-
     def __init__(self) -> None:
         self.edges: list[tuple[int, bool]] = []
 

@@ -34,7 +34,6 @@ QUIET = dict.fromkeys((1, 2, 3, 4, 6, 7), 0)
 
 
 def dictionary() -> canopen.ObjectDictionary:
-    """What the tests need of a module's dictionary."""
     od = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]  # the library has it so
     od.bitrate = 500_000
     for index, name, kind in (
@@ -184,7 +183,6 @@ class Host:
         """Real time until a request is given up: their node runs in a thread."""
 
     def events(self, timeout_s: float) -> list[CodecEvent]:
-        """What comes of the next frame."""
         message = self.bus.recv(timeout_s)
         if message is None:
             return []

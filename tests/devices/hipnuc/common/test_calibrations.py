@@ -13,8 +13,6 @@ from tests.support.simulated_modules import CanopenBench
 
 @dataclass(frozen=True)
 class Began:
-    """What was begun."""
-
     name: str
     zero: str = ""
 

@@ -29,7 +29,6 @@ def make(**options: object) -> HipnucJ1939Codec:
 
 
 def feed(codec: HipnucJ1939Codec, frames: list[tuple[int, bytes]], t_ns: int) -> list[CodecEvent]:
-    """Frames 0.3 ms apart."""
     events: list[CodecEvent] = []
     for place, (can_id, data) in enumerate(frames):
         events += codec.feed_frame(can_id, True, data, t_ns + place * 300_000)

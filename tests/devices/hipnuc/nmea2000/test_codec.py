@@ -40,7 +40,6 @@ def burst(
 
 
 def feed(codec: HipnucNmea2000Codec, frames: list[Frame], t_ns: int) -> list[int]:
-    """Frames 0.5 ms apart; returns `value` of each sample."""
     events: list[CodecEvent] = []
     for place, (can_id, data) in enumerate(frames):
         events += codec.feed_frame(can_id, True, data, t_ns + place * MS // 2)

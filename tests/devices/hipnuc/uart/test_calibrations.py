@@ -14,7 +14,6 @@ OK = Reply(("OK",))
 
 
 def sent(script: RequestScript[object], *answers: Outcome) -> tuple[list[str], object]:
-    """The commands of a script, answered in turn, and its value."""
     left = list(answers)
     commands: list[str] = []
 

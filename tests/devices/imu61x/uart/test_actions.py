@@ -16,7 +16,6 @@ from tests.support.simulated_modules import Imu61xBench, done, imu61x_bench, var
 
 
 def act(far: Imu61xBench, name: str, options: Imu61xUartSettings | None = None, **arguments: Any) -> Any:
-    """Have the device do it."""
     action = ACTIONS[name]
     return far.run(action.script(Target(options, far.baud), action.arguments(arguments)))
 

@@ -8,7 +8,6 @@ from tests.support.simulated_modules import HipnucUartBench, hardware_of
 
 
 def bench_of(settings: ModuleSettings | None = None, **behaviour: object) -> HipnucUartBench:
-    """A module of a variant that has booted."""
     return HipnucUartBench(settings, hardware_of(Behaviour(**behaviour)))  # type: ignore[arg-type]  # names of fields
 
 

@@ -152,7 +152,6 @@ def test_main_status_noise_the_end_of_32_bits_and_pulses() -> None:
 
 
 def converse(bench: HipnucUartBench, script: RequestScript[T]) -> T:
-    """Run a request script against the module, frames in between."""
     ledger = Ledger()
     codec, session = DRIVER.make_codec(ledger, DRIVER.settings()), Session(ledger)
 
