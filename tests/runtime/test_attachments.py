@@ -1,7 +1,7 @@
 """Devices with a reset line: reset when they are not found by other means, and when told to."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from functools import partial
@@ -25,9 +25,9 @@ from imud.signals.sync_signals import SyncSignals
 from imud.sim.ports.lines import MemoryLines, MemoryOutput
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.device_rig import DeviceRig, DeviceRigs
-from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.event_loops import VirtualClock, in_loop, run_virtually
 from tests.support.polled_bus_bench import PolledBusBench
-from tests.support.stories import in_bench
+from tests.support.stories import in_bench, played
 
 LINES = DeviceLines(reset=ResetSettings(line="R"))
 BOOT_S = 2.9
@@ -172,8 +172,9 @@ def frame(timer_us: int) -> bytes:
 class Uart:
     """A line whose device sends nothing until it is reset."""
 
-    def __init__(self, clock: VirtualClock, lines: DeviceLines, **link: Any) -> None:
-        self.clock, self.wires = clock, MemoryLines(clock.now_ns)
+    def __init__(self, lines: DeviceLines, **link: Any) -> None:
+        clock = self.clock = VirtualClock()
+        self.wires = MemoryLines(clock.now_ns)
         reset_line(self.wires, clock.now_ns, self._boot)
         self.rigs = DeviceRigs(clock.host, lines=self.wires.maker)
         config = DeviceConfig("imu", "imu61x-uart", None, False, "memory", MemorySettings(**link), lines=lines)
@@ -184,9 +185,12 @@ class Uart:
     async def until(self, condition: Callable[[], object], limit_s: float = 100) -> None:
         await self.rig.until(condition, limit_s=limit_s, step=self._send, step_s=0.01)
 
-    async def play(self, story: Callable[["Uart"], Any]) -> None:
-        async with self.rigs.at_work():
-            await story(self)
+    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        async def whole() -> None:
+            async with self.rigs.at_work():
+                await story()
+
+        run_virtually(self.clock, whole())
 
     def _boot(self) -> None:
         self.streams = True
@@ -197,56 +201,38 @@ class Uart:
 
 
 @pytest.mark.parametrize("baud", [115200, "auto"])
-def test_a_uart_on_which_nothing_is_heard_has_its_device_reset(baud: Any) -> None:
-    clock = VirtualClock()
-
-    async def story(it: Uart) -> None:
-        await it.until(lambda: it.device.state is DeviceState.RUNNING and it.clock.now_ns() > 1015e9)
-        assert [active for _, active in it.wires.outputs["imu reset"].history] == [True, False]
-        assert sum(e.message.endswith("reset by its line") for e in it.events) == 1
-        it.streams = False
-        await it.until(lambda: it.device.state is DeviceState.SILENT)
-        it.streams = True
-        await it.until(lambda: it.device.state is DeviceState.RUNNING)
-        assert len(it.wires.outputs["imu reset"].history) == 2
-
-    async def body() -> None:
-        await Uart(clock, LINES, baud=baud).play(story)
-
-    run_virtually(clock, body())
+@played(lambda baud: Uart(LINES, baud=baud))
+async def test_a_uart_on_which_nothing_is_heard_has_its_device_reset(it: Uart, baud: Any) -> None:
+    await it.until(lambda: it.device.state is DeviceState.RUNNING and it.clock.now_ns() > 1015e9)
+    assert [active for _, active in it.wires.outputs["imu reset"].history] == [True, False]
+    assert sum(e.message.endswith("reset by its line") for e in it.events) == 1
+    it.streams = False
+    await it.until(lambda: it.device.state is DeviceState.SILENT)
+    it.streams = True
+    await it.until(lambda: it.device.state is DeviceState.RUNNING)
+    assert len(it.wires.outputs["imu reset"].history) == 2
 
 
-def test_a_uart_on_which_something_is_heard_is_left_alone() -> None:
-    clock = VirtualClock()
-
-    async def story(it: Uart) -> None:
-        for _ in range(60):
-            next_ns = clock.now_ns() + 1_000_000_000
-            await it.until(partial(lambda until_ns: clock.now_ns() > until_ns, next_ns))
-            it.link.feed(b"noise", clock.now_ns())
-        assert it.wires.outputs["imu reset"].history == []
-
-    async def body() -> None:
-        await Uart(clock, LINES, baud=115200).play(story)
-
-    run_virtually(clock, body())
+@played(lambda: Uart(LINES, baud=115200))
+async def test_a_uart_on_which_something_is_heard_is_left_alone(it: Uart) -> None:
+    for _ in range(60):
+        next_ns = it.clock.now_ns() + 1_000_000_000
+        await it.until(partial(lambda until_ns: it.clock.now_ns() > until_ns, next_ns))
+        it.link.feed(b"noise", it.clock.now_ns())
+    assert it.wires.outputs["imu reset"].history == []
 
 
-def test_a_trigger_is_offered_where_imud_drives_sin(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = VirtualClock()
-
-    async def body() -> None:
-        it = Uart(clock, DeviceLines(sin=TriggerSettings(line="S")), baud=115200)
-        assert list(it.device.actions) == ["trigger"]
-        once: list[str] = []
-        monkeypatch.setattr(SyncSignals, "trigger_once", lambda _self: once.append("edge"))
-        assert await it.device.act("trigger", {}) is None
-        assert once == ["edge"]
-        monkeypatch.undo()
-        with pytest.raises(CommandError, match="trigger"):
-            await it.device.act("trigger", {})
-
-    run_virtually(clock, body())
+@in_loop
+async def test_a_trigger_is_offered_where_imud_drives_sin(monkeypatch: pytest.MonkeyPatch) -> None:
+    it = Uart(DeviceLines(sin=TriggerSettings(line="S")), baud=115200)
+    assert list(it.device.actions) == ["trigger"]
+    once: list[str] = []
+    monkeypatch.setattr(SyncSignals, "trigger_once", lambda _self: once.append("edge"))
+    assert await it.device.act("trigger", {}) is None
+    assert once == ["edge"]
+    monkeypatch.undo()
+    with pytest.raises(CommandError, match="trigger"):
+        await it.device.act("trigger", {})
 
 
 def test_where_the_measurement_is_reaches_the_clock() -> None:
@@ -283,14 +269,9 @@ async def test_at_the_start_a_device_on_a_bus_is_reset_before_it_is_asked(bench:
         assert it.told == ["reset by its line at the start"]
 
 
-def test_at_the_start_a_device_on_a_uart_is_reset() -> None:
-    clock = VirtualClock()
-    uart = Uart(clock, DeviceLines(reset=ResetSettings(line="R", at_start=True)), baud=115200)
-
-    async def story(it: Uart) -> None:
-        begin_ns = clock.now_ns()
-        await it.until(lambda: len(it.rig.samples) > 10)
-        assert clock.now_ns() - begin_ns < 5e9  # without it: after a search of more than 4 s
-        assert [e.message for e in it.events if e.detail.get("line") == "reset"] == ["reset by its line at the start"]
-
-    run_virtually(clock, uart.play(story))
+@played(lambda: Uart(DeviceLines(reset=ResetSettings(line="R", at_start=True)), baud=115200))
+async def test_at_the_start_a_device_on_a_uart_is_reset(it: Uart) -> None:
+    begin_ns = it.clock.now_ns()
+    await it.until(lambda: len(it.rig.samples) > 10)
+    assert it.clock.now_ns() - begin_ns < 5e9  # without it: after a search of more than 4 s
+    assert [e.message for e in it.events if e.detail.get("line") == "reset"] == ["reset by its line at the start"]

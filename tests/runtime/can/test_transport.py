@@ -82,13 +82,12 @@ def play(story: Callable[[CanDeviceBench], Coroutine[Any, Any, None]], config: D
     return rig
 
 
-def test_samples_of_one_read_are_one_batch_with_their_own_times() -> None:
-    async def story(bench: CanDeviceBench) -> None:
-        bench.feed(1, 2, 3)
-        bench.rig.tick()
-        assert bench.rig.is_in(DeviceState.RUNNING)
-
-    rig = play(story, configured(bitrate=500_000))
+@told(play, configured(bitrate=500_000))
+async def test_samples_of_one_read_are_one_batch_with_their_own_times(bench: CanDeviceBench) -> None:
+    rig = bench.rig
+    bench.feed(1, 2, 3)
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
     assert rig.batches == 1
     assert [s.seq for s in rig.samples] == [1, 2, 3]
     # measured before its first frame was complete (111 bits at 500 kbit/s), known when the fifth was
@@ -126,44 +125,38 @@ def test_the_length_of_the_first_frame_is_taken_off(name: str, settings: Setting
     assert taken_ns == pytest.approx(bits * 2000, abs=2000)
 
 
-def test_only_own_identifiers_pass() -> None:
-    async def story(bench: CanDeviceBench) -> None:
-        bench.link.feed(bench.frames(1) + bench.frames(1, base_id=300))
-
-    rig = play(story, configured(base_id=300))
-    assert len(rig.samples) == 1
-    assert rig.ledger.bytes_in == 40
+@told(play, configured(base_id=300))
+async def test_only_own_identifiers_pass(bench: CanDeviceBench) -> None:
+    bench.link.feed(bench.frames(1) + bench.frames(1, base_id=300))
+    assert len(bench.rig.samples) == 1
+    assert bench.rig.ledger.bytes_in == 40
 
 
-def test_losses_by_cause() -> None:
-    async def story(bench: CanDeviceBench) -> None:
-        bench.feed(1, 2)
-        bench.link.feed(bench.frames(3, lost=[2]))  # nobody says why
-        bench.feed(4)
-        bench.link.counters = KernelCounters(overrun=7)
-        after = bench.frames(6)
-        bench.link.feed([after[0]._replace(after_loss=True), *after[1:]])  # 5 is the kernel's
-        damaged = bench.frames(7)
-        bench.link.feed([*damaged[:4], damaged[4]._replace(data=b"\0" * 7)])
-        bench.feed(8)
-        bench.rig.tick()
-
-    rig = play(story)
-    ledger = rig.ledger
+@told(play)
+async def test_losses_by_cause(bench: CanDeviceBench) -> None:
+    bench.feed(1, 2)
+    bench.link.feed(bench.frames(3, lost=[2]))  # nobody says why
+    bench.feed(4)
+    bench.link.counters = KernelCounters(overrun=7)
+    after = bench.frames(6)
+    bench.link.feed([after[0]._replace(after_loss=True), *after[1:]])  # 5 is the kernel's
+    damaged = bench.frames(7)
+    bench.link.feed([*damaged[:4], damaged[4]._replace(data=b"\0" * 7)])
+    bench.feed(8)
+    bench.rig.tick()
+    ledger = bench.rig.ledger
     assert (ledger.lost_gap_device, ledger.lost_overrun, ledger.lost_crc) == (1, 1, 1)
     assert (ledger.frames_bad_length, ledger.frames_ignored) == (1, 4 + 4)
     assert ledger.samples == 5
-    assert EventKind.LOSS in [event.kind for event in rig.events]
+    assert EventKind.LOSS in bench.rig.kinds
 
 
-def test_frames_from_before_a_loss_are_not_mixed_with_those_after() -> None:
-    async def story(bench: CanDeviceBench) -> None:
-        first, second = bench.frames(1), bench.frames(2)
-        second[2] = second[2]._replace(after_loss=True)
-        bench.link.feed(first[:2] + second[2:])
-
-    rig = play(story)
-    assert rig.samples == []
+@told(play)
+async def test_frames_from_before_a_loss_are_not_mixed_with_those_after(bench: CanDeviceBench) -> None:
+    first, second = bench.frames(1), bench.frames(2)
+    second[2] = second[2]._replace(after_loss=True)
+    bench.link.feed(first[:2] + second[2:])
+    assert bench.rig.samples == []
 
 
 def test_a_device_that_has_not_answered_is_asked_on() -> None:
@@ -234,42 +227,40 @@ def test_a_device_that_ends_leaves_its_bus(end: str) -> None:
     run_virtually(clock, story())
 
 
-def test_bus_down_and_up() -> None:
-    async def story(bench: CanDeviceBench) -> None:
-        bench.feed(1, 2)
-        bench.link.feed(bench.frames(3)[:3])
-        bench.rig.tick()
-        bench.link.disappear()
-        await bench.rig.turn(lambda: bench.rig.state is DeviceState.MISSING)
-        await bench.rig.turn(lambda: "is down" in bench.rig.problem)
-        assert bench.rig.ledger.frames_pending == 0
-        bench.link.appear()
-        await bench.rig.turn(lambda: bench.link.listening)
-        bench.feed(10)
-        bench.rig.tick()
-        assert bench.rig.is_in(DeviceState.RUNNING)
-
-    rig = play(story)
-    assert [event.kind for event in rig.events] == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+@told(play)
+async def test_bus_down_and_up(bench: CanDeviceBench) -> None:
+    rig = bench.rig
+    bench.feed(1, 2)
+    bench.link.feed(bench.frames(3)[:3])
+    rig.tick()
+    bench.link.disappear()
+    await rig.turn(lambda: rig.state is DeviceState.MISSING)
+    await rig.turn(lambda: "is down" in rig.problem)
+    assert rig.ledger.frames_pending == 0
+    bench.link.appear()
+    await rig.turn(lambda: bench.link.listening)
+    bench.feed(10)
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
     assert rig.ledger.lost() == 0
     assert rig.device.status().connects == 2
 
 
-def test_trouble_of_the_bus_is_shown_while_it_lasts() -> None:
-    async def story(bench: CanDeviceBench) -> None:
-        bench.link.news("can0 is error-passive: x", "can0 is error-passive: x")
-        bench.feed(1)
-        bench.rig.tick()
-        assert bench.rig.is_in(DeviceState.RUNNING)
-        assert bench.rig.problem == "can0 is error-passive: x"
-        bench.link.news("can0 is bus-off: y", "can0 is bus-off: y")
-        bench.rig.tick(ahead_ns=3000 * MS)
-        assert bench.rig.is_in(DeviceState.SILENT)
-        assert bench.rig.problem == "can0 is bus-off: y"
-        bench.link.news("can0 is error-active again", "")
-        assert bench.rig.problem == ""
-
-    rig = play(story)
+@told(play)
+async def test_trouble_of_the_bus_is_shown_while_it_lasts(bench: CanDeviceBench) -> None:
+    rig = bench.rig
+    bench.link.news("can0 is error-passive: x", "can0 is error-passive: x")
+    bench.feed(1)
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert rig.problem == "can0 is error-passive: x"
+    bench.link.news("can0 is bus-off: y", "can0 is bus-off: y")
+    rig.tick(ahead_ns=3000 * MS)
+    assert rig.is_in(DeviceState.SILENT)
+    assert rig.problem == "can0 is bus-off: y"
+    bench.link.news("can0 is error-active again", "")
+    assert rig.problem == ""
     assert [e.message for e in rig.events if e.kind is EventKind.LINK][-1] == "can0 is error-active again"
 
 

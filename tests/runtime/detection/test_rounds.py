@@ -92,8 +92,9 @@ class OnBus:
 
 
 @played(Bus)
-async def test_the_only_device_is_found_and_nothing_was_sent(bus: Bus) -> None:
+async def test_the_only_device_is_found_nothing_was_sent_and_commands_go_to_it(bus: Bus) -> None:
     bench = bus.add()
+    assert bench.device.actions == {}
     await bench.until(lambda: bench.link.listening)
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 8)
     status = bench.device.status()
@@ -101,13 +102,6 @@ async def test_the_only_device_is_found_and_nothing_was_sent(bus: Bus) -> None:
     assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 8]
     assert bench.device.ledger.bytes_skipped > 0  # what was heard while searching
     assert bench.link.written == []
-
-
-@played(Bus)
-async def test_commands_go_to_the_device_that_was_found(bus: Bus) -> None:
-    bench = bus.add()
-    assert bench.device.actions == {}
-    await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 8)
     assert await bench.device.act("node", {}) == 8
 
 
@@ -167,23 +161,16 @@ async def test_two_that_search_do_not_both_take_the_same_device(bus: Bus) -> Non
 
 
 def test_what_was_found_is_remembered(tmp_path: Path) -> None:
-    bus = Bus(tmp_path)
-    bench = bus.add()
+    for nodes in ((8,), (8, 9)):  # although two are heard the second time
+        bus = Bus(tmp_path)
+        bench = bus.add()
 
-    async def story() -> None:
-        await bench.until(lambda: bench.samples, 8)
+        async def story(bench: OnBus = bench, nodes: tuple[int, ...] = nodes) -> None:
+            await bench.until(lambda: bench.samples, *nodes)
+            assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 8]
 
-    bus.play(story)
-    assert Remembered(tmp_path).get("mast") == RememberedDevice("fake-can", 0, 8)
-
-    bus = Bus(tmp_path)
-    second = bus.add()
-
-    async def again() -> None:
-        await second.until(lambda: second.samples, 8, 9)  # although two are heard now
-        assert [wanted.can_id for wanted in second.link.filters] == [BASE + 8]
-
-    bus.play(again)
+        bus.play(story)
+        assert Remembered(tmp_path).get("mast") == RememberedDevice("fake-can", 0, 8)
 
 
 @played(Bus)

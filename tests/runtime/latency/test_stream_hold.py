@@ -10,13 +10,13 @@ import pytest
 
 from imud.config import DeviceConfig
 from imud.contracts.session import Request, RequestScript, never, of_text
-from imud.devices.hipnuc.uart.codec import encode_hi91
 from imud.links.memory import MemoryLink, MemorySettings
 from imud.runtime.latency.budget import Need
 from imud.sample import Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_US
 from tests.support.device_rig import DeviceRigs
 from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.files import hi91
 from tests.support.stories import played
 
 MOST_NS = 50 * 10**6
@@ -25,13 +25,6 @@ WIRE_NS = 890 * NS_PER_US
 """82 bytes at 921600 baud."""
 FIT_MS = 400
 """After this the fit is used, and rounds are as long as they may be."""
-
-
-def hi91(time_ms: int) -> bytes:
-    return encode_hi91(
-        system_time_ms=time_ms, accel_m_s2=(0.0, 0.0, 9.8), gyro_rad_s=(0.0, 0.0, 0.0), mag_t=(2e-5, 0.0, -4e-5),
-        euler_rad=(0.0, 0.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0), temperature_c=20.0, pressure_pa=101_325.0,
-    )  # fmt: skip
 
 
 class Takes(MemoryLink):

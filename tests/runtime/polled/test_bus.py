@@ -212,26 +212,18 @@ def test_readings_wait_and_their_polls_do_not(latency_ns: int, together: int) ->
     assert [after - before for before, after in pairwise(starts)] == pytest.approx([500_000] * (len(starts) - 1), abs=2)
 
 
-def test_a_failed_reading_and_those_before_it_do_not_wait() -> None:
-    clock = VirtualClock()
-    buses = virtual_buses(clock)
-    delivered: list[list[Reading]] = []
-
-    async def body() -> None:
-        wire = Wire()
-        bus = buses.get(wire.bus)
-        member = bus.join(wire, Deadlines(), lambda some, _problem: delivered.append(list(some)))
-        member.set_latency(40_000_000)
-        member.start((Poll(ASK),))
-        await asyncio.sleep(0.0024)
-        assert delivered == []
-        wire.fail = TransferError(Trouble.ABSENT, "no")
-        await asyncio.sleep(0.0005)
-        (some,) = delivered
-        assert [reading.error is not None for reading in some] == [False] * 5 + [True]
-        buses.end()
-
-    run_virtually(clock, body())
+@told(run)
+async def test_a_failed_reading_and_those_before_it_do_not_wait(buses: PolledBuses) -> None:
+    wire, delivered = Wire(), list[list[Reading]]()
+    member = buses.get(wire.bus).join(wire, Deadlines(), lambda some, _problem: delivered.append(list(some)))
+    member.set_latency(40_000_000)
+    member.start((Poll(ASK),))
+    await asyncio.sleep(0.0024)
+    assert delivered == []
+    wire.fail = TransferError(Trouble.ABSENT, "no")
+    await asyncio.sleep(0.0005)
+    (some,) = delivered
+    assert [reading.error is not None for reading in some] == [False] * 5 + [True]
 
 
 @told(run)

@@ -133,6 +133,8 @@ async def test_every_edge_is_a_sample_of_its_own_instant(bench: PolledBusBench) 
         assert all(sample.t_err_ns < 62_000 for sample in it.rig.samples[1:])  # 100 µs / √3 and 3 µs
         assert it.missed == it.rig.device.ledger.lost_queue == 0
         assert EventKind.LINK not in it.rig.kinds
+    it.rig.device.tick(bench.clock.now_ns())
+    assert not it.signal.line.is_open, "it is let go of at the end"
 
 
 @in_bench
@@ -263,15 +265,6 @@ async def test_what_came_while_the_device_was_not_believed_is_not_missed(bench: 
         numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
         assert max(b - a for a, b in pairwise(numbers)) > 200
         assert it.missed == 0
-
-
-@in_bench
-async def test_the_line_is_let_go_of_at_the_end(bench: PolledBusBench) -> None:
-    async with scene(bench) as it:
-        await it.rig.until_samples(3)
-        rig = it.rig
-    rig.device.tick(bench.clock.now_ns())
-    assert not it.signal.line.is_open
 
 
 class DescriptorLine(MemoryInput):

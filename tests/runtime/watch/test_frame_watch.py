@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from imud.attitude import (
     euler312_from_quat,
@@ -222,15 +223,8 @@ def test_a_wrong_mounting_is_found(is_so: str, said: FrameSettings) -> None:
     (event,) = made.events
     assert event.detail["contradiction"] == "mounting"
     assert made.status.problem == event.message
-    arm = played("hipnuc-uart", motion, frame=replace_frame(said))
+    arm = played("hipnuc-uart", motion, frame=replace(said, level_at_rest=False))
     assert arm.events == [], "a body that need not stand level"
-
-
-def replace_frame(frame: FrameSettings) -> FrameSettings:
-    return FrameSettings(
-        axes=frame.axes, euler=frame.euler, quat_wxyz=frame.quat_wxyz, level_roll_deg=frame.level_roll_deg,
-        level_at_rest=False,
-    )  # fmt: skip
 
 
 def test_another_device_is_checked_anew() -> None:
