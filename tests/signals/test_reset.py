@@ -1,7 +1,9 @@
 """Reset: how long, how often, and what a cancellation leaves behind; and when a device is reset automatically."""
 
 import asyncio
+from collections.abc import Callable, Coroutine
 from itertools import pairwise
+from typing import Any
 
 import pytest
 
@@ -12,6 +14,7 @@ from imud.sim.ports.lines import MemoryOutput
 from imud.units import NS_PER_S
 from tests.support.event_loops import in_loop, run_virtually
 from tests.support.signal_bench import DEVICE, SignalBench
+from tests.support.stories import played
 
 AGAIN_NS = 60 * 10**9
 RETRY_NS = 5 * 10**9
@@ -70,6 +73,9 @@ class Scene:
         self.line = signals.output("reset")
         assert signals.memory.inputs == {}
 
+    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        run_virtually(self.clock, story())
+
     def tick(self, ahead_ns: int = 0) -> None:
         self.clock.advance(ahead_ns)
         self.reset.tick(self.clock.now_ns(), None)
@@ -105,44 +111,32 @@ def test_after_three_rounds_and_the_time_a_device_needs_and_then_once_a_minute(e
     assert held == pytest.approx([20e6] * 3, abs=10)
 
 
-def test_a_device_that_was_found_meanwhile_is_not_reset() -> None:
-    it = Scene()
-
-    async def body() -> None:
-        for _ in range(10):
-            await it.search(4)
-            it.reset.found()
-
-    run_virtually(it.clock, body())
+@played(Scene)
+async def test_a_device_that_was_found_meanwhile_is_not_reset(it: Scene) -> None:
+    for _ in range(10):
+        await it.search(4)
+        it.reset.found()
     assert it.pulses_s == []
 
 
-def test_a_line_that_fails_in_a_search_does_not_end_it() -> None:
-    it = Scene()
-
-    async def body() -> None:
-        it.tick()
-        it.line.set_error = LinkMissing("gone")
-        await it.search(6)
-
-    run_virtually(it.clock, body())
+@played(Scene)
+async def test_a_line_that_fails_in_a_search_does_not_end_it(it: Scene) -> None:
+    it.tick()
+    it.line.set_error = LinkMissing("gone")
+    await it.search(6)
     assert [event.message for event in it.events] == ["not found for 4 s: reset by its line", "line reset: gone"]
 
 
-def test_a_pulse_on_request_is_at_once_and_a_search_waits_for_its_end() -> None:
-    it = Scene()
-
-    async def body() -> None:
-        it.tick()
-        begin_ns = it.clock.now_ns()
-        task = asyncio.create_task(it.reset.pulse())
-        await asyncio.sleep(0)
-        await it.reset.settled()
-        assert it.clock.now_ns() - begin_ns == pytest.approx(3.02e9, abs=1000)
-        await task
-        await it.search(3)  # not found since: it is not reset again at once
-
-    run_virtually(it.clock, body())
+@played(Scene)
+async def test_a_pulse_on_request_is_at_once_and_a_search_waits_for_its_end(it: Scene) -> None:
+    it.tick()
+    begin_ns = it.clock.now_ns()
+    task = asyncio.create_task(it.reset.pulse())
+    await asyncio.sleep(0)
+    await it.reset.settled()
+    assert it.clock.now_ns() - begin_ns == pytest.approx(3.02e9, abs=1000)
+    await task
+    await it.search(3)  # not found since: it is not reset again at once
     assert it.pulses_s == [0.0]
 
 
@@ -190,30 +184,22 @@ async def test_a_line_that_fails_when_it_is_driven() -> None:
 
 
 @pytest.mark.parametrize("at_start", [True, False])
-def test_at_the_start_it_is_pulsed_once_before_the_device_is_asked(at_start: bool) -> None:
-    scene = Scene(ResetSettings(line="RESET", hold_ms=20, at_start=at_start))
-
-    async def story() -> None:
-        scene.tick()
-        await scene.reset.settled()
-        waited_ns = scene.clock.now_ns() - 1000 * NS_PER_S
-        assert waited_ns == pytest.approx(3.02 * NS_PER_S if at_start else 0, abs=1e8)
-        await scene.reset.settled()
-        assert scene.clock.now_ns() - 1000 * NS_PER_S - waited_ns < 1e8
-
-    run_virtually(scene.clock, story())
-    assert scene.announced == len(scene.pulses_s) == at_start
-    assert [event.message for event in scene.events] == ["reset by its line at the start"] * at_start
+@played(lambda at_start: Scene(ResetSettings(line="RESET", hold_ms=20, at_start=at_start)))
+async def test_at_the_start_it_is_pulsed_once_before_the_device_is_asked(it: Scene, at_start: bool) -> None:
+    it.tick()
+    await it.reset.settled()
+    waited_ns = it.clock.now_ns() - 1000 * NS_PER_S
+    assert waited_ns == pytest.approx(3.02 * NS_PER_S if at_start else 0, abs=1e8)
+    await it.reset.settled()
+    assert it.clock.now_ns() - 1000 * NS_PER_S - waited_ns < 1e8
+    assert it.announced == len(it.pulses_s) == at_start
+    assert [event.message for event in it.events] == ["reset by its line at the start"] * at_start
 
 
-def test_a_line_that_cannot_be_driven_at_the_start_holds_nothing_up() -> None:
-    scene = Scene(ResetSettings(line="RESET", at_start=True))
-    scene.line.set_error = LinkMissing("gone")
-
-    async def story() -> None:
-        scene.tick()
-        await scene.reset.settled()
-
-    run_virtually(scene.clock, story())
-    assert scene.clock.now_ns() - 1000 * NS_PER_S < 1e8
-    assert [event.message for event in scene.events][-1] == "line reset: gone"
+@played(lambda: Scene(ResetSettings(line="RESET", at_start=True)))
+async def test_a_line_that_cannot_be_driven_at_the_start_holds_nothing_up(it: Scene) -> None:
+    it.line.set_error = LinkMissing("gone")
+    it.tick()
+    await it.reset.settled()
+    assert it.clock.now_ns() - 1000 * NS_PER_S < 1e8
+    assert [event.message for event in it.events][-1] == "line reset: gone"

@@ -221,9 +221,9 @@ class LinkedModule(MemoryLink):
 
 class LinkedDevice:
     def __init__(
-        self, clock: VirtualClock, settings: ModuleSettings | None, hardware: HipnucHardware, **config: Any
+        self, settings: ModuleSettings | None = None, hardware: HipnucHardware = HIPNUC_STILL, **config: Any
     ) -> None:
-        self.clock = clock
+        clock = self.clock = VirtualClock()
         driver, identify = config.pop("driver", "hipnuc-uart"), config.pop("identify", True)
         lines: DeviceLines | None = config.pop("lines", None)
         declared = config.pop("declared", None)
@@ -257,29 +257,23 @@ class LinkedDevice:
         await self.until(acting.done, f"the end of {name}", 60)
         return acting.result()
 
+    def play(self, story: Callable[[], Awaitable[None]]) -> None:
+        play_on_line(self.link, self.rigs, story)
 
-def play_linked(
-    story: Callable[[LinkedDevice], Awaitable[None]],
-    settings: ModuleSettings | None = None,
-    hardware: HipnucHardware = HIPNUC_STILL,
-    **config: Any,
-) -> LinkedDevice:
-    clock = VirtualClock()
-    made: list[LinkedDevice] = []
+
+def play_on_line(line: "LinkedModule | Imu61xLine", rigs: DeviceRigs, story: Callable[[], Awaitable[None]]) -> None:
+    """Run the devices during a story, while the line carries; at the end their ledgers close."""
 
     async def both() -> None:
-        one = LinkedDevice(clock, settings, hardware, **config)
-        made.append(one)
-        carrying = asyncio.create_task(one.link.carry())
+        carrying = asyncio.create_task(line.carry())
         try:
-            async with one.rigs.at_work():
-                await story(one)
+            async with rigs.at_work():
+                await story()
         finally:
             carrying.cancel()
             await asyncio.gather(carrying, return_exceptions=True)
 
-    run_virtually(clock, both())
-    return made[0]
+    run_virtually(line.clock, both())
 
 
 # --- IMU61x ----------------------------------------------------------------------------------------------------------

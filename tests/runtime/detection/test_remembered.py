@@ -48,16 +48,6 @@ def test_the_newest_findings_survive_a_restart_and_are_written_once(tmp_path: Pa
 DEEP = b'{"bow": {"driver": "x", "baud": 1, "more": ' + b"[" * 100_000
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'{"bow": {"driver": 1, "baud": "x"}}', b"\xff\xfe", DEEP])
-def test_damaged_file_is_reported_and_replaced(
-    tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
-) -> None:
-    (tmp_path / FILE_NAME).write_bytes(content)
-    remember(tmp_path, bow=FOUND)
-    assert "cannot be used" in caplog.text
-    assert recalled(tmp_path, "bow") == FOUND
-
-
 def fifo(file: Path) -> None:
     os.mkfifo(file)
 
@@ -78,10 +68,17 @@ def loop(file: Path) -> None:
     file.symlink_to(file)
 
 
-@pytest.mark.parametrize("make", [fifo, endless, terminal, loop])
+def holding(content: bytes) -> Callable[[Path], object]:
+    return lambda file: file.write_bytes(content)
+
+
+DAMAGED = [b"", b"{", b"[1]", b'{"bow": {"driver": 1, "baud": "x"}}', b"\xff\xfe", DEEP]
+
+
+@pytest.mark.parametrize("make", [fifo, endless, terminal, loop, *map(holding, DAMAGED)])
 @pytest.mark.timeout(5)
-def test_what_is_no_file_is_reported_and_replaced(
-    tmp_path: Path, make: Callable[[Path], None], caplog: pytest.LogCaptureFixture
+def test_what_is_damaged_or_no_file_is_reported_and_replaced(
+    tmp_path: Path, make: Callable[[Path], object], caplog: pytest.LogCaptureFixture
 ) -> None:
     make(tmp_path / FILE_NAME)
     remember(tmp_path, bow=FOUND)

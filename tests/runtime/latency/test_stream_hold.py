@@ -50,7 +50,10 @@ class Takes(MemoryLink):
 class HoldBench:
     """A module at 1 kHz and the device that reads it."""
 
-    def __init__(self, latency_ms: float, *, period_ms: int = 1, waiting_bytes: int = 2048, hold_ns: int = 0) -> None:
+    def __init__(
+        self, latency_ms: float, *, period_ms: int = 1, waiting_bytes: int = 2048, hold_ns: int = 0, anew: bool = False
+    ) -> None:
+        """`anew`: the module's time begins anew in the story, or part of it is left out."""
         self.clock = VirtualClock()
         settings = MemorySettings(baud=921_600, waiting_bytes=waiting_bytes, hold_ns=hold_ns)
         self.link = Takes(settings, self.clock)
@@ -58,6 +61,7 @@ class HoldBench:
         self.rig = rigs.add(DeviceConfig("bow", "hipnuc-uart", None, False, "memory", settings), self.link)
         self.device = self.rig.device
         self.latency_ms = latency_ms
+        self.anew = anew
         self.sent = 0
         self._period_ms = period_ms
 
@@ -85,11 +89,8 @@ class HoldBench:
         """Of each batch from that number on, from the arrival of its oldest sample to its publication."""
         return [at_ns - samples[0].t_rx_ns for at_ns, samples in self.rig.published[since:]]
 
-    def play(self, story: Callable[[], Awaitable[None]], *, anew: bool = False) -> None:
-        """Run the device until its fit is used, then the story; no sample may be missing at the end.
-
-        `anew`: the module's time began anew in the story, or part of it was left out.
-        """
+    def play(self, story: Callable[[], Awaitable[None]]) -> None:
+        """Run the device until its fit is used, then the story; no sample may be missing at the end."""
 
         async def whole() -> None:
             async with self.rigs.at_work():
@@ -101,7 +102,7 @@ class HoldBench:
         run_virtually(self.clock, whole())
         samples = self.rig.samples
         assert [s.seq for s in samples] == list(range(1, self.sent + 1))
-        assert anew or [s.t_dev_ns for s in samples] == [
+        assert self.anew or [s.t_dev_ns for s in samples] == [
             (1000 + number * self._period_ms) * NS_PER_MS for number in range(1, self.sent + 1)
         ]
         assert not self.link.paused
@@ -173,23 +174,19 @@ def test_stamps_are_as_good_as_without(latency_ms: float) -> None:
     assert held[-1].sync is Sync.REGRESSION
 
 
-def test_nothing_waits_before_the_fit_is_used_nor_again_after_a_restart_of_the_module() -> None:
-    bench = HoldBench(10)
-
-    async def story() -> None:
-        single = [len(samples) for _, samples in bench.rig.published[:100]]
-        assert single == [1] * 100
-        assert bench.rig.samples[99].sync is Sync.ARRIVAL
-        since, begun = len(bench.rig.samples), bench.sent
-        await bench.send(1000, lambda number: bench.frame(number - begun))  # its time begins anew
-        anew = [s for s in bench.rig.samples[since:] if s.sync is Sync.ARRIVAL]
-        assert len(anew) > 50
-        late = [s.t_rx_ns - s.t_ns - 2 * s.t_err_ns for s in anew]
-        assert max(late) < WIRE_NS + 10 * NS_PER_MS
-        assert sum(len(samples) == 1 for _, samples in bench.rig.published[-900:]) > 50
-        assert [s.seq for s in bench.rig.samples[since:]] == list(range(since + 1, len(bench.rig.samples) + 1))
-
-    bench.play(story, anew=True)
+@played(lambda: HoldBench(10, anew=True))
+async def test_nothing_waits_before_the_fit_is_used_nor_again_after_a_restart_of_the_module(bench: HoldBench) -> None:
+    single = [len(samples) for _, samples in bench.rig.published[:100]]
+    assert single == [1] * 100
+    assert bench.rig.samples[99].sync is Sync.ARRIVAL
+    since, begun = len(bench.rig.samples), bench.sent
+    await bench.send(1000, lambda number: bench.frame(number - begun))  # its time begins anew
+    anew = [s for s in bench.rig.samples[since:] if s.sync is Sync.ARRIVAL]
+    assert len(anew) > 50
+    late = [s.t_rx_ns - s.t_ns - 2 * s.t_err_ns for s in anew]
+    assert max(late) < WIRE_NS + 10 * NS_PER_MS
+    assert sum(len(samples) == 1 for _, samples in bench.rig.published[-900:]) > 50
+    assert [s.seq for s in bench.rig.samples[since:]] == list(range(since + 1, len(bench.rig.samples) + 1))
 
 
 @played(lambda: HoldBench(10, period_ms=6))
@@ -240,24 +237,20 @@ async def test_a_link_that_cannot_be_paused_is_not(bench: HoldBench) -> None:
     assert len(bench.rig.published) == bench.sent
 
 
-def test_the_first_sample_after_silence_waits_no_longer_than_the_others() -> None:
-    bench = HoldBench(20)
-
-    async def story() -> None:
-        await bench.send(30)
-        await asyncio.sleep(0.5)
-        bench.rig.tick()
-        assert len(bench.rig.samples) == bench.sent
-        assert not bench.link.paused
-        since, before_ns = len(bench.rig.published), bench.clock.now_ns()
-        bench.link.feed(hi91(1501 + bench.sent), before_ns)
-        await asyncio.sleep(0.1)
-        ((at_ns, (only,)),) = bench.rig.published[since:]
-        assert 19 * NS_PER_MS < at_ns - before_ns <= 20 * NS_PER_MS
-        assert only.t_rx_ns == before_ns
-        bench.sent += 1
-
-    bench.play(story, anew=True)  # half a second was left out
+@played(lambda: HoldBench(20, anew=True))
+async def test_the_first_sample_after_silence_waits_no_longer_than_the_others(bench: HoldBench) -> None:
+    await bench.send(30)
+    await asyncio.sleep(0.5)
+    bench.rig.tick()
+    assert len(bench.rig.samples) == bench.sent
+    assert not bench.link.paused
+    since, before_ns = len(bench.rig.published), bench.clock.now_ns()
+    bench.link.feed(hi91(1501 + bench.sent), before_ns)
+    await asyncio.sleep(0.1)
+    ((at_ns, (only,)),) = bench.rig.published[since:]
+    assert 19 * NS_PER_MS < at_ns - before_ns <= 20 * NS_PER_MS
+    assert only.t_rx_ns == before_ns
+    bench.sent += 1
 
 
 @played(lambda: HoldBench(MOST_NS / NS_PER_MS))

@@ -240,25 +240,23 @@ async def test_apply_sets_what_is_in_force_at_once_and_leaves_flash_alone(bench:
     await bench.until(lambda: bench.module.set["secret"] == 5)
 
 
-def test_apply_and_save_does_everything_once() -> None:
-    declared = {"mode": "9-axis", "mounting": "x_up", "output": {"b": 50}, "secret": 5}
-    bench = ModuleBench("apply_and_save", declared)
+EVERYTHING = {"mode": "9-axis", "mounting": "x_up", "output": {"b": 50}, "secret": 5}
 
-    async def story() -> None:
-        await bench.until(lambda: bench.status.repairs)
-        await bench.until(lambda: bench.is_in(SettingsState.AGREE))
-        assert bench.written() == [
-            'SET mode="9-axis"', 'SET output={"b":50}', 'SET mounting="x_up"', "SET secret=5", "SAVE", "RESTART",
-        ]  # fmt: skip
-        assert (bench.module.mounting, bench.module.flash["output"]) == ("x_up", {"a": 100, "b": 50})
-        await bench.pass_s(300)
-        assert bench.module.saves == bench.status.flash_writes == bench.status.repairs == 1
-        assert bench.told[-1].message.endswith("; saved to flash; restarted")
-        bench.module.restart()
-        await bench.pass_s(300)
-        assert bench.module.saves == 1
 
-    bench.play(story)
+@played(lambda: ModuleBench("apply_and_save", EVERYTHING))
+async def test_apply_and_save_does_everything_once(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.status.repairs)
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    assert bench.written() == [
+        'SET mode="9-axis"', 'SET output={"b":50}', 'SET mounting="x_up"', "SET secret=5", "SAVE", "RESTART",
+    ]  # fmt: skip
+    assert (bench.module.mounting, bench.module.flash["output"]) == ("x_up", {"a": 100, "b": 50})
+    await bench.pass_s(300)
+    assert bench.module.saves == bench.status.flash_writes == bench.status.repairs == 1
+    assert bench.told[-1].message.endswith("; saved to flash; restarted")
+    bench.module.restart()
+    await bench.pass_s(300)
+    assert bench.module.saves == 1
 
 
 @played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis"}))
@@ -637,22 +635,18 @@ def test_a_device_that_is_polled_is_set_between_its_reads_and_again_after_a_rest
     async def body() -> None:
         async with bench.running(config) as (rig,):
             await rig.until_samples(5)
-            await rig.until(lambda: compared(rig) is SettingsState.AGREE, "set", 60)
+            await rig.until(lambda: compared(rig).state is SettingsState.AGREE, "set", 60)
             assert rig.kinds.count(EventKind.UP) == 1
             device.restart()
-            await rig.until(lambda: repairs(rig) == 2, "set again", 100)
-            await rig.until(lambda: compared(rig) is SettingsState.AGREE, "as declared again")
+            await rig.until(lambda: compared(rig).repairs == 2, "set again", 100)
+            await rig.until(lambda: compared(rig).state is SettingsState.AGREE, "as declared again")
             assert rig.kinds.count(EventKind.DOWN) == 0
             await rig.until_samples(5)
 
     bench.run(body())
 
 
-def compared(rig: DeviceRig) -> SettingsState | None:
+def compared(rig: DeviceRig) -> SettingsStatus:
     found = rig.device.status().declared
-    return found.state if found is not None else None
-
-
-def repairs(rig: DeviceRig) -> int:
-    found = rig.device.status().declared
-    return found.repairs if found is not None else 0
+    assert found is not None
+    return found

@@ -18,11 +18,11 @@ from imud.sim.imu61x.behaviour import REFUSING, VARIANTS, Imu61xBehaviour
 from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import Imu61xModule
 from tests.support.device_rig import DeviceRigs, device_config, running
-from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.event_loops import VirtualClock
 from tests.support.pty_port import plugged
 from tests.support.simulated_modules import every_variant, imu61x_hardware
 from tests.support.stories import played
-from tests.support.wired_device import Imu61xLine
+from tests.support.wired_device import Imu61xLine, play_on_line
 
 UPTIME_US = 20_000_000
 SLOW = Imu61xSettings(rate_hz=50)
@@ -46,18 +46,12 @@ class VariantBench:
         """Run the device during the story, which begins with samples and identity."""
 
         async def whole() -> None:
-            carrying = asyncio.create_task(self.line.carry())
-            try:
-                async with self.rigs.at_work():
-                    await self.rig.until(
-                        lambda: self.rig.samples and self.device.status().settings, "identity", 60, step_s=0.01
-                    )
-                    await story()
-            finally:
-                carrying.cancel()
-                await asyncio.gather(carrying, return_exceptions=True)
+            await self.rig.until(
+                lambda: self.rig.samples and self.device.status().settings, "identity", 60, step_s=0.01
+            )
+            await story()
 
-        run_virtually(self.clock, whole())
+        play_on_line(self.line, self.rigs, whole)
 
     async def samples(self) -> None:
         """Some more samples come, at the latest when the device has been quiet for a while."""

@@ -21,13 +21,14 @@ from imud.sim.hipnuc.uart.simulator import HipnucModule
 from tests.support.device_rig import device_config, running
 from tests.support.pty_port import plugged
 from tests.support.simulated_modules import hardware_of
-from tests.support.stories import told
-from tests.support.wired_device import LinkedDevice, play_linked
+from tests.support.stories import played
+from tests.support.wired_device import LinkedDevice
 
 NO_RATE = ModuleSettings(hi91=Output())
 ON_MARK = ModuleSettings(hi91=Output(on_mark=True))
 FAST = ModuleSettings(baud=921600, hi91=Output())
 LINKS: list[dict[str, Any]] = [{}, {"baud": "auto"}, {"baud": "auto", "driver": "auto"}]
+OUTPUT_OFF = msgspec.convert({"output_enabled": False}, SETTINGS.declarable)
 UP_AND_DOWN = (EventKind.UP, EventKind.DOWN)
 
 every_link = pytest.mark.parametrize("link", LINKS, ids=str)
@@ -47,31 +48,29 @@ def turns(device: LinkedDevice) -> list[EventKind]:
     ],
 )
 @pytest.mark.manual("B 2.2.5 LOG DISABLE")
-def test_a_module_that_is_silent_by_its_settings_is_known_and_left_so(
-    settings: ModuleSettings, why: str, link: dict[str, Any]
+@played(lambda settings, link: LinkedDevice(settings, **link))
+async def test_a_module_that_is_silent_by_its_settings_is_known_and_left_so(
+    device: LinkedDevice, settings: ModuleSettings, why: str, link: dict[str, Any]
 ) -> None:
-    async def story(device: LinkedDevice) -> None:
-        await device.wait(35)
-        assert device.rig.is_in(DeviceState.SILENT)
-        assert device.problem == (
-            f"it answers (HI14R3, firmware 1.5.6) and sends no samples: {why}; the action wake makes it send"
-        )
-        assert device.device.status().identity["serial_number"] == "043995698D6E1708"
-        assert device.module.settings == settings
-        assert turns(device) == []
-        await device.act("mode", axes=9)
-        assert device.module.settings.att_mode == 1
-        assert device.device.status().settings["mode"] == "9-axis"
-        await device.act("wake")
-        await device.until(lambda: len(device.samples) > 20)
-        assert device.rig.is_in(DeviceState.RUNNING)
-        assert device.problem == ""
-        assert turns(device) == [EventKind.UP]
-
-    play_linked(story, settings, **link)
+    await device.wait(35)
+    assert device.rig.is_in(DeviceState.SILENT)
+    assert device.problem == (
+        f"it answers (HI14R3, firmware 1.5.6) and sends no samples: {why}; the action wake makes it send"
+    )
+    assert device.device.status().identity["serial_number"] == "043995698D6E1708"
+    assert device.module.settings == settings
+    assert turns(device) == []
+    await device.act("mode", axes=9)
+    assert device.module.settings.att_mode == 1
+    assert device.device.status().settings["mode"] == "9-axis"
+    await device.act("wake")
+    await device.until(lambda: len(device.samples) > 20)
+    assert device.rig.is_in(DeviceState.RUNNING)
+    assert device.problem == ""
+    assert turns(device) == [EventKind.UP]
 
 
-@told(play_linked, NO_RATE)
+@played(lambda: LinkedDevice(NO_RATE))
 async def test_commands_are_accepted_as_soon_as_it_has_answered(device: LinkedDevice) -> None:
     await device.until(lambda: device.device.actions, limit_s=0.1)
     with pytest.raises(CommandError, match="bow is searching"):
@@ -83,39 +82,37 @@ async def test_commands_are_accepted_as_soon_as_it_has_answered(device: LinkedDe
 
 
 @every_link
-def test_output_that_is_only_switched_off_is_switched_on(link: dict[str, Any]) -> None:
-    async def story(device: LinkedDevice) -> None:
-        device.module.receive(b"LOG DISABLE\r\n", device.clock.now_ns())
-        await device.until(lambda: len(device.samples) > 20)
-        assert "it answered and sent no samples: commanded to stream, which is not saved" in device.messages
-        assert device.module.settings == device.module.flash == ModuleSettings()
-        assert turns(device) == [EventKind.UP]
-
-    play_linked(story, hardware=hardware_of(Behaviour(), boot_ms=0), **link)
+@played(lambda link: LinkedDevice(hardware=hardware_of(Behaviour(), boot_ms=0), **link))
+async def test_output_that_is_only_switched_off_is_switched_on(device: LinkedDevice, link: dict[str, Any]) -> None:
+    device.module.receive(b"LOG DISABLE\r\n", device.clock.now_ns())
+    await device.until(lambda: len(device.samples) > 20)
+    assert "it answered and sent no samples: commanded to stream, which is not saved" in device.messages
+    assert device.module.settings == device.module.flash == ModuleSettings()
+    assert turns(device) == [EventKind.UP]
 
 
 @every_link
-def test_a_module_that_was_silenced_stays_so_and_is_asked_at_its_own_rate(link: dict[str, Any]) -> None:
-    async def story(device: LinkedDevice) -> None:
-        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
-        await device.act("output_none")
-        count, sent = len(device.samples), len(device.link.sent_at)
-        await device.wait(50)
-        assert len(device.samples) <= count + 2
-        assert device.rig.is_in(DeviceState.SILENT)
-        assert "no message has a rate" in device.problem
-        assert turns(device) == [EventKind.UP, EventKind.DOWN]
-        asked = device.link.sent_at[sent:]
-        assert {baud for baud, _ in asked} == {115200}
-        assert 2 <= sum(data.startswith(b"LOG VERSION") for _, data in asked) <= 4  # once in 15 s
-        await device.act("output", message="HI91", rate_hz=100)
-        await device.until(lambda: len(device.samples) > count + 20)
-        assert turns(device) == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+@played(lambda link: LinkedDevice(**link))
+async def test_a_module_that_was_silenced_stays_so_and_is_asked_at_its_own_rate(
+    device: LinkedDevice, link: dict[str, Any]
+) -> None:
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    await device.act("output_none")
+    count, sent = len(device.samples), len(device.link.sent_at)
+    await device.wait(50)
+    assert len(device.samples) <= count + 2
+    assert device.rig.is_in(DeviceState.SILENT)
+    assert "no message has a rate" in device.problem
+    assert turns(device) == [EventKind.UP, EventKind.DOWN]
+    asked = device.link.sent_at[sent:]
+    assert {baud for baud, _ in asked} == {115200}
+    assert 2 <= sum(data.startswith(b"LOG VERSION") for _, data in asked) <= 4  # once in 15 s
+    await device.act("output", message="HI91", rate_hz=100)
+    await device.until(lambda: len(device.samples) > count + 20)
+    assert turns(device) == [EventKind.UP, EventKind.DOWN, EventKind.UP]
 
-    play_linked(story, **link)
 
-
-@told(play_linked, baud="auto")
+@played(lambda: LinkedDevice(baud="auto"))
 async def test_while_a_lost_module_is_searched_for_no_command_goes_out(device: LinkedDevice) -> None:
     """It is switched off: the search asks at all rates, and nothing else does."""
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
@@ -137,21 +134,20 @@ async def test_while_a_lost_module_is_searched_for_no_command_goes_out(device: L
     assert turns(device) == [EventKind.UP, EventKind.DOWN]
 
 
-def test_a_script_under_way_ends_when_a_search_begins_under_it(monkeypatch: pytest.MonkeyPatch) -> None:
+@played(lambda: LinkedDevice(baud="auto", identify=False))
+async def test_a_script_under_way_ends_when_a_search_begins_under_it(
+    device: LinkedDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Even if the search did not wait for it, it would send nothing at the rates of the search."""
     monkeypatch.setattr(StreamTransport, "busy", property(lambda _transport: False))
-
-    async def story(device: LinkedDevice) -> None:
-        await device.until(lambda: len(device.samples) > 20)
-        device.link.module_is_on = False
-        acting = [asyncio.ensure_future(device.device.act("restart", {})) for _ in range(3)]
-        await device.until(lambda: all(one.done() for one in acting), limit_s=90)
-        assert all(isinstance(one.exception(), CommandError) for one in acting)
-        assert any("is searched for at all baud rates now" in str(one.exception()) for one in acting)
-        reboots = [baud for baud, data in device.link.sent_at if data.startswith(b"REBOOT")]
-        assert set(reboots) == {115200}
-
-    play_linked(story, baud="auto", identify=False)
+    await device.until(lambda: len(device.samples) > 20)
+    device.link.module_is_on = False
+    acting = [asyncio.ensure_future(device.device.act("restart", {})) for _ in range(3)]
+    await device.until(lambda: all(one.done() for one in acting), limit_s=90)
+    assert all(isinstance(one.exception(), CommandError) for one in acting)
+    assert any("is searched for at all baud rates now" in str(one.exception()) for one in acting)
+    reboots = [baud for baud, data in device.link.sent_at if data.startswith(b"REBOOT")]
+    assert set(reboots) == {115200}
 
 
 @pytest.mark.parametrize(
@@ -160,28 +156,28 @@ def test_a_script_under_way_ends_when_a_search_begins_under_it(monkeypatch: pyte
     ids=str,
 )
 @pytest.mark.manual("B 2.2.3 a wrong rate")
-def test_every_variant_is_followed_to_another_rate_and_back(variant: str, link: dict[str, Any]) -> None:
-    async def story(device: LinkedDevice) -> None:
-        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
-        answer = await device.act("baud", baud=921600)
-        assert isinstance(answer, dict)
-        assert answer["baud"] == device.link.baud == device.module.baud == device.module.flash.baud == 921600
-        assert ("configuration" in answer) is (not link)
-        count = len(device.samples)
-        await device.until(lambda: len(device.samples) > count + 20)
-        assert device.device.status().settings["baud"] == "921600 bit/s"
-        answer = await device.act("factory_reset")
-        assert answer == {"baud": 115200}
-        count = len(device.samples)
-        await device.until(lambda: len(device.samples) > count + 20)
-        assert device.device.status().settings["baud"] == "115200 bit/s"
-        assert device.module.settings == ModuleSettings()
-        assert device.device.ledger.frames_bad() < 10
+@played(lambda variant, link: LinkedDevice(hardware=hardware_of(VARIANTS[variant]), **link))
+async def test_every_variant_is_followed_to_another_rate_and_back(
+    device: LinkedDevice, variant: str, link: dict[str, Any]
+) -> None:
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    answer = await device.act("baud", baud=921600)
+    assert isinstance(answer, dict)
+    assert answer["baud"] == device.link.baud == device.module.baud == device.module.flash.baud == 921600
+    assert ("configuration" in answer) is (not link)
+    count = len(device.samples)
+    await device.until(lambda: len(device.samples) > count + 20)
+    assert device.device.status().settings["baud"] == "921600 bit/s"
+    answer = await device.act("factory_reset")
+    assert answer == {"baud": 115200}
+    count = len(device.samples)
+    await device.until(lambda: len(device.samples) > count + 20)
+    assert device.device.status().settings["baud"] == "115200 bit/s"
+    assert device.module.settings == ModuleSettings()
+    assert device.device.ledger.frames_bad() < 10
 
-    play_linked(story, hardware=hardware_of(VARIANTS[variant]), **link)
 
-
-@told(play_linked)
+@played(LinkedDevice)
 async def test_settings_are_read_again_after_each_action(device: LinkedDevice) -> None:
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
     await device.act("pin", function="led", pin=7)
@@ -193,7 +189,7 @@ async def test_settings_are_read_again_after_each_action(device: LinkedDevice) -
     assert "settings of the device changed: pins.led is IO7, was IO5" in device.messages
 
 
-@told(play_linked, hardware=hardware_of(Behaviour(refuses=("CONFIG ATT RST",))))
+@played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(refuses=("CONFIG ATT RST",)))))
 async def test_after_an_action_that_fails_the_settings_are_what_the_module_has(device: LinkedDevice) -> None:
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
     device.module.receive(b"CONFIG ATT MODE 1\r\n", device.clock.now_ns())  # by somebody else
@@ -203,7 +199,7 @@ async def test_after_an_action_that_fails_the_settings_are_what_the_module_has(d
     assert device.device.status().settings["mode"] == "9-axis"
 
 
-@told(play_linked, hardware=hardware_of(Behaviour(), firmware=169))
+@played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(), firmware=169)))
 async def test_status_bits_and_settings_are_shown_by_name(device: LinkedDevice) -> None:
     """Firmware 1.6.9 and newer sends MAIN_STATUS; the simulated module converges within 5 s."""
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
@@ -221,57 +217,47 @@ async def test_status_bits_and_settings_are_shown_by_name(device: LinkedDevice) 
     assert alarms[-1] == "status: cleared: gyroscope bias not converged"
 
 
-def test_lines_that_the_module_contradicts_are_events_and_shown() -> None:
-    lines = DeviceLines(sout_div=DividedSettings(line="A", divisor=4))
+@played(lambda: LinkedDevice(lines=DeviceLines(sout_div=DividedSettings(line="A", divisor=4))))
+async def test_lines_that_the_module_contradicts_are_events_and_shown(device: LinkedDevice) -> None:
     words = "divisor is 4 in the configuration, and the module divides SOUT by 8"
-
-    async def story(device: LinkedDevice) -> None:
-        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
-        assert device.messages.count(f"line sout_div: {words}") == 1
-        await device.act("mode", axes=9)
-        assert device.messages.count(f"line sout_div: {words}") == 1
-        await device.act("sout_divider", divisor=4)
-        await device.act("sout_divider", divisor=8)
-        assert device.messages.count(f"line sout_div: {words}") == 2
-
-    play_linked(story, lines=lines)
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    assert device.messages.count(f"line sout_div: {words}") == 1
+    await device.act("mode", axes=9)
+    assert device.messages.count(f"line sout_div: {words}") == 1
+    await device.act("sout_divider", divisor=4)
+    await device.act("sout_divider", divisor=8)
+    assert device.messages.count(f"line sout_div: {words}") == 2
 
 
-def test_output_that_is_declared_to_be_off_is_not_switched_on() -> None:
-    async def story(device: LinkedDevice) -> None:
-        device.module.receive(b"LOG DISABLE\r\n", device.clock.now_ns())
-        await device.wait(20)
-        assert device.samples == []
-        assert "its output is off (LOG DISABLE), though HI91 has 100 Hz" in device.problem
-
-    declared = msgspec.convert({"output_enabled": False}, SETTINGS.declarable)
-    play_linked(story, hardware=hardware_of(Behaviour(), boot_ms=0), declared=declared)
+@played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(), boot_ms=0), declared=OUTPUT_OFF))
+async def test_output_that_is_declared_to_be_off_is_not_switched_on(device: LinkedDevice) -> None:
+    device.module.receive(b"LOG DISABLE\r\n", device.clock.now_ns())
+    await device.wait(20)
+    assert device.samples == []
+    assert "its output is off (LOG DISABLE), though HI91 has 100 Hz" in device.problem
 
 
 @pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARIANTS)
-def test_declared_settings_reach_every_variant(behaviour: Behaviour) -> None:
+@played(lambda behaviour: LinkedDevice(hardware=hardware_of(behaviour), baud="auto"))
+async def test_declared_settings_reach_every_variant(device: LinkedDevice, behaviour: Behaviour) -> None:
     """More output than the old rate carries, with the rate that carries it."""
     wanted = {"mode": "9-axis", "mounting": "y_up", "sout_divisor": 3, "output": {"hi91": 500}, "baud": 921600}
-
-    async def story(device: LinkedDevice) -> None:
-        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
-        applying = asyncio.ensure_future(device.device.settings_apply(wanted, save=True))
-        await device.until(applying.done, "the end of the plan", 90)
-        applied = applying.result()
-        assert applied.problem == ""
-        outcomes = {step.name: step.outcome for step in applied.steps}
-        assert outcomes.pop("mounting") in (StepOutcome.DONE, StepOutcome.WRITTEN)  # in force by the restart for baud
-        assert set(outcomes.values()) == {StepOutcome.DONE}
-        assert applied.steps[-1].name == "baud"
-        flash = ModuleSettings(
-            baud=921600, att_mode=1, urfr=(1, 0, 0, 0, 0, -1, 0, 1, 0), sout_div=3, hi91=Output(2)
-        )  # fmt: skip
-        assert device.module.flash == device.module.settings == flash
-        assert device.link.baud == device.module.baud == 921600
-        count = len(device.samples)
-        await device.until(lambda: len(device.samples) > count + 100)
-
-    play_linked(story, hardware=hardware_of(behaviour), baud="auto")
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    applying = asyncio.ensure_future(device.device.settings_apply(wanted, save=True))
+    await device.until(applying.done, "the end of the plan", 90)
+    applied = applying.result()
+    assert applied.problem == ""
+    outcomes = {step.name: step.outcome for step in applied.steps}
+    assert outcomes.pop("mounting") in (StepOutcome.DONE, StepOutcome.WRITTEN)  # in force by the restart for baud
+    assert set(outcomes.values()) == {StepOutcome.DONE}
+    assert applied.steps[-1].name == "baud"
+    flash = ModuleSettings(
+        baud=921600, att_mode=1, urfr=(1, 0, 0, 0, 0, -1, 0, 1, 0), sout_div=3, hi91=Output(2)
+    )  # fmt: skip
+    assert device.module.flash == device.module.settings == flash
+    assert device.link.baud == device.module.baud == 921600
+    count = len(device.samples)
+    await device.until(lambda: len(device.samples) > count + 100)
 
 
 @pytest.mark.live

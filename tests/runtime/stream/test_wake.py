@@ -1,6 +1,5 @@
 """A simulated IMU61x on a line in virtual time: made to stream when it is silent, and never left silent."""
 
-import asyncio
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -14,10 +13,10 @@ from imud.links.memory import MemorySettings
 from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import Imu61xModule
 from tests.support.device_rig import DeviceRigs
-from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.event_loops import VirtualClock
 from tests.support.simulated_modules import imu61x_hardware
 from tests.support.stories import played
-from tests.support.wired_device import Imu61xLine
+from tests.support.wired_device import Imu61xLine, play_on_line
 
 QUIET = Imu61xSettings(mode=OutputMode.COMMAND)
 STREAMING = Imu61xSettings()
@@ -50,18 +49,7 @@ class WakeBench:
         await self.until(lambda: self.clock.now_ns() >= end_ns, seconds + 1)
 
     def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Run the device during a story; it is cancelled at the end."""
-
-        async def both() -> None:
-            carrying = asyncio.create_task(self.line.carry())
-            try:
-                async with self.rigs.at_work():
-                    await story()
-            finally:
-                carrying.cancel()
-                await asyncio.gather(carrying, return_exceptions=True)
-
-        run_virtually(self.clock, both())
+        play_on_line(self.line, self.rigs, story)
 
 
 @pytest.mark.parametrize("link", [{}, {"baud": "auto"}, {"baud": "auto", "driver": "auto"}], ids=str)
