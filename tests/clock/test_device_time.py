@@ -247,10 +247,6 @@ def run(
     return dated, lambda: clock.status().resets
 
 
-def largest_step_ns(dated: list[DatedSample]) -> int:
-    return max(abs(b.off_ns - a.off_ns) for a, b in pairwise(dated))
-
-
 CORRECTIONS_MS = (-0.9, 0.9, -30.0, 30.0)
 USUAL = {
     (-0.9, 100, False, None), (0.9, 100, False, REFERENCE), (-30.0, 100, False, REFERENCE), (30.0, 100, False, None),
@@ -272,7 +268,7 @@ def test_a_correction_is_no_step(set_ms: float, rate_hz: int, edges: bool, refer
     assert all(abs(t.off_ns) <= 2 * t.sample.t_err_ns for t in settled)
     assert rises(t.sample for t in dated)
     if edges:
-        assert largest_step_ns(settled) < JITTER_STEP_NS
+        assert max(abs(b.off_ns - a.off_ns) for a, b in pairwise(settled)) < JITTER_STEP_NS
         assert all(t.sample.edge_seq == t.number for t in settled)
         assert max(t.sample.t_err_ns for t in settled) < JITTER_STEP_NS
     else:

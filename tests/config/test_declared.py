@@ -17,12 +17,9 @@ TABLES = Tables({"fake-module": FAKE_MODULE_DRIVER, "fake-uart": FAKE_DRIVER}, {
 HEAD = "devices:\n  bow:\n    driver: {driver}\n    wire: {{port: x, baud: {baud}}}\n"
 
 
-def text(*lines: str, driver: str = "fake-module", baud: str = "115200") -> str:
-    return HEAD.format(driver=driver, baud=baud) + "".join(f"    {line}\n" for line in lines)
-
-
 def parse(*lines: str, driver: str = "fake-module", baud: str = "115200") -> Config:
-    return config.parse(text(*lines, driver=driver, baud=baud), "f", TABLES)
+    text = HEAD.format(driver=driver, baud=baud) + "".join(f"    {line}\n" for line in lines)
+    return config.parse(text, "f", TABLES)
 
 
 def test_declared_values_have_the_types_of_the_table() -> None:

@@ -344,6 +344,11 @@ class Imu61xBench(SerialLine[Imu61xModule]):
         super().__init__(Imu61xModule(BEGIN_NS, settings, hardware), Imu61xCodec(ledger), ledger)
         self.wait(hardware.boot_ms)
 
+    def streams(self) -> bool:
+        """Whether samples come at the rate of the line, at the latest when the device has been quiet for 800 ms."""
+        self.samples(800)
+        return len(self.samples(100)) >= 5
+
     def samples(self, duration_ms: float) -> list[Measurement]:
         return [event for event in self.wait(duration_ms) if isinstance(event, Measurement)]
 

@@ -26,7 +26,6 @@ from tests.support.wired_device import LinkedDevice
 
 NO_RATE = ModuleSettings(hi91=Output())
 ON_MARK = ModuleSettings(hi91=Output(on_mark=True))
-FAST = ModuleSettings(baud=921600, hi91=Output())
 LINKS: list[dict[str, Any]] = [{}, {"baud": "auto"}, {"baud": "auto", "driver": "auto"}]
 OUTPUT_OFF = msgspec.convert({"output_enabled": False}, SETTINGS.declarable)
 UP_AND_DOWN = (EventKind.UP, EventKind.DOWN)

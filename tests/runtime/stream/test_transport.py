@@ -22,14 +22,13 @@ from imud.event import EventKind
 from imud.links import LINKS
 from imud.links.memory import MemoryLink, MemorySettings
 from imud.runtime.detection.remembered import RememberedDevice
-from tests.support.device_rig import DeviceRig, DeviceRigs
+from tests.support.device_rig import LIMIT_S, DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
 from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.files import hi91
 from tests.support.stories import played, told
 
 MS = 1_000_000
-LIMIT_S = 5.0
 VERSION = b"PNAME=HI14R3\r\nBUILD=Oct 15 2024\r\nUUID=%s\r\nAPP_VER=156\r\nBL_VER=109\r\nOK\r\n"
 
 

@@ -64,10 +64,22 @@ async def test_device_saved_in_command_mode_is_made_to_stream(bench: WakeBench, 
     assert [e.kind for e in bench.events if "commanded to stream" in e.message] == [EventKind.CONFIGURATION]
 
 
-@played(lambda: WakeBench(identify=False))
-async def test_nothing_is_sent_where_it_may_not_be_asked(bench: WakeBench) -> None:
-    await bench.wait(8)
-    assert (bench.samples, bench.line.written, bench.woken) == ([], [], [])
+@pytest.mark.parametrize(
+    ("hardware", "wait_s", "woken", "writes"),
+    [
+        ({"identify": False}, 8, [], range(1)),
+        ({"boot_ms": 10**6}, 20, [], range(11, 10**6)),
+        ({"boot_ms": 0, "changes_mode": False}, 10, [WOKEN], range(1, 10**6)),  # it acknowledges and stays silent
+    ],
+    ids=["may not be asked", "never answers", "does not stream"],
+)
+@played(lambda hardware: WakeBench(**hardware))
+async def test_what_is_told_of_a_device_that_stays_silent(
+    bench: WakeBench, hardware: dict[str, Any], wait_s: float, woken: list[str], writes: range
+) -> None:
+    await bench.wait(wait_s)
+    assert (bench.samples, bench.woken) == ([], woken)
+    assert len(bench.line.written) in writes
 
 
 @played(lambda: WakeBench(STREAMING))
@@ -87,19 +99,6 @@ async def test_device_that_comes_later_is_woken_and_told_of_once(bench: WakeBenc
     await bench.until(lambda: bench.woken and len(bench.samples) > 500, 60)
     assert bench.woken == [WOKEN]
     assert [e.detail["acknowledged"] for e in bench.events if "acknowledged" in e.detail] == [False]
-
-
-@played(lambda: WakeBench(boot_ms=10**6))
-async def test_where_nothing_answers_nothing_is_told(bench: WakeBench) -> None:
-    await bench.wait(20)
-    assert (bench.samples, bench.woken) == ([], [])
-    assert len(bench.line.written) > 10
-
-
-@played(lambda: WakeBench(boot_ms=0, changes_mode=False))
-async def test_device_that_acknowledges_and_stays_silent_is_told_of_once(bench: WakeBench) -> None:
-    await bench.wait(10)
-    assert (bench.samples, bench.woken) == ([], [WOKEN])
 
 
 @pytest.mark.parametrize("cut_at", range(1, 25, 3))

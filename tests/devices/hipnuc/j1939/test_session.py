@@ -4,12 +4,10 @@ from collections.abc import Callable
 
 import pytest
 
-from imud.contracts.action import Target
 from imud.contracts.codec import ReplyFrame
 from imud.contracts.device_settings import Written
 from imud.contracts.session import Outcome, Rejection, Reply, Request, RequestScript, Session, Silence
 from imud.devices.hipnuc.j1939 import session
-from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
 from imud.devices.hipnuc.j1939.driver import DRIVER
 from imud.devices.hipnuc.j1939.session import HOST_ADDRESS, X_SIGN, Y_SIGN, J1939Node, Zero
 from imud.errors import BadArgument, NoReply, Rejected
@@ -19,7 +17,6 @@ from imud.sim.hipnuc.j1939 import J1939_VARIANTS, J1939Settings, J1939Variant
 from tests.support.simulated_modules import J1939Bench, run_script
 
 PEER = J1939Node(8)
-SET = Target(HipnucJ1939Settings(), 0)
 Frame = tuple[int, bytes]
 
 
@@ -44,12 +41,6 @@ def played(conversation: RequestScript[object], *outcomes: Outcome | bytes | Non
         return answer if isinstance(answer, Reply) else Silence(())
 
     return frames, run_script(conversation, ask)
-
-
-def of_action(name: str, **arguments: object) -> RequestScript[object]:
-    action = DRIVER.actions[name]
-    conversation: RequestScript[object] = action.script(SET, action.arguments(arguments))
-    return conversation
 
 
 ROWS: list[tuple[str, dict[str, object], str]] = [
@@ -188,7 +179,7 @@ def test_which_frames_answer_a_request() -> None:
 )
 def test_arguments_are_checked_before_anything_is_sent(name: str, arguments: dict[str, object]) -> None:
     with pytest.raises(BadArgument, match=f"arguments: {next(iter(arguments))} "):
-        next(of_action(name, **arguments))
+        DRIVER.actions[name].arguments(arguments)
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,7 @@ from imud.devices.imu61x.uart.replies import Parameter
 from imud.errors import BadArgument, NoReply, Rejected
 from imud.sim.imu61x.behaviour import REFUSING
 from imud.sim.imu61x.settings import Imu61xSettings
-from tests.support.simulated_modules import Imu61xBench, done, every_variant, imu61x_bench, variant_bench
-
-
-def streams(far: Imu61xBench) -> bool:
-    """Whether samples come at the rate of the line, at the latest when the device has been quiet after its answer."""
-    far.samples(800)
-    return len(far.samples(100)) >= 5
+from tests.support.simulated_modules import done, every_variant, imu61x_bench, variant_bench
 
 
 @every_variant
@@ -29,7 +23,7 @@ def test_restart_loses_what_was_not_saved_and_begins_the_timer_again(variant: st
     assert far.module.settings.rate_hz == 10
     assert far.run(following.restart(done=done(variant))).product == "IMU61x"
     assert far.module.settings == far.module.flash == Imu61xSettings()
-    assert streams(far)
+    assert far.streams()
 
 
 @every_variant
@@ -76,9 +70,9 @@ def test_the_baud_rate_changes_and_the_device_is_kept(variant: str, baud: int, p
     assert change.saved is (variant != "no K1")
     assert far.module.flash.baud == baud
     assert far.module.flash.mode is OutputMode.STREAM
-    assert streams(far)
+    assert far.streams()
     far.restart()
-    assert streams(far)
+    assert far.streams()
 
 
 @every_variant
@@ -112,13 +106,13 @@ def test_rates_that_are_refused_not_saved_or_lost(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(Rejected, match="stays at 115200 baud"):
         far.run(following.change_baud(921600, 115200))
     assert far.baud == 115200
-    assert streams(far)
+    assert far.streams()
 
     far = imu61x_bench(refuses=frozenset({Command.SAVE}))
     with pytest.raises(Rejected, match="save: expected result 0"):
         far.run(following.change_baud(921600, 115200))
     assert far.baud == far.module.baud == 921600
-    assert streams(far)
+    assert far.streams()
 
     far = imu61x_bench()
     wrong = lambda settings, index, value: replace(settings, baud=1500000)  # noqa: E731
@@ -127,7 +121,7 @@ def test_rates_that_are_refused_not_saved_or_lost(monkeypatch: pytest.MonkeyPatc
         far.run(following.change_baud(460800, 115200))
     assert far.baud == 115200
     far.restart()
-    assert streams(far)
+    assert far.streams()
 
 
 CHANGES: list[Callable[[], RequestScript[object]]] = [
@@ -145,7 +139,7 @@ def test_nothing_is_changed_without_contact(change: Callable[[], RequestScript[o
     assert far.baud == 115200
     assert "factory reset" not in far.asked
     assert not any(name.startswith("set parameter") for name in far.asked)
-    assert streams(far)
+    assert far.streams()
 
 
 @every_variant
@@ -157,7 +151,7 @@ def test_factory_reset_is_read_back_and_the_line_follows(variant: str, present: 
     change = far.run(following.factory_reset(present, done=done(variant)))
     assert change.baud == far.baud == far.module.baud == 115200
     assert far.module.flash == far.module.settings == Imu61xSettings()
-    assert streams(far)
+    assert far.streams()
 
 
 def test_factory_resets_that_are_refused_or_act_at_the_next_start(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,7 +160,7 @@ def test_factory_resets_that_are_refused_or_act_at_the_next_start(monkeypatch: p
     with pytest.raises(Rejected, match=words):
         far.run(following.factory_reset(115200))
     assert "restart" not in far.asked
-    assert streams(far)
+    assert far.streams()
 
     far = imu61x_bench(Imu61xSettings(filter_control=0x44), ignores=frozenset({Command.FACTORY_RESET}))
     with pytest.raises(Rejected, match="expected FILTER 187, read back FILTER 68; acknowledgement none"):
