@@ -138,6 +138,20 @@ def test_dropped_samples_are_told(served: Daemon, encoding: str) -> None:
         assert min(watch.dropped.values()) > 1000
 
 
+def test_a_snapshot_is_a_descriptor_and_its_length(served: Daemon) -> None:
+    def take(sock: socket.socket) -> float:
+        with sock:
+            sock.send(b"a snapshot")
+        return 299.5
+
+    served.do(lambda server: server.hub.context.snapshots.append(take))
+    with Client(served.path) as client:
+        fd, seconds = client.snapshot()
+        assert seconds == 299.5
+        with open(fd, "rb") as file:
+            assert file.read() == b"a snapshot"
+
+
 def test_null_is_nan(served: Daemon) -> None:
     with Client(served.path) as client:
         watch = client.watch(encoding="json", timeout_s=60)

@@ -13,7 +13,7 @@ from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim.hipnuc.uart.settings import HipnucHardware
 from imud.sim.hipnuc.uart.simulator import HipnucModule
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 from imud.utc.rmc_feed import Refusal, RmcFeed
 
 UTC_S = 1_795_000_000
@@ -109,6 +109,18 @@ def test_a_reference_finds_sentences_of_another_second_and_a_slow_port_leaves_le
         assert FeedBench().give(0, at_s) == (Refusal.AHEAD if at_s < 0 else Refusal.STALE)
     assert FeedBench(baud=9600).give(0, 0.9) == ""
     assert FeedBench(baud=9600).give(0, 0.92) == Refusal.STALE  # 73 ms on the wire
+
+
+@pytest.mark.parametrize(("reference", "doubt_ms"), [(UtcReference(OFFSET_NS, 0), 5), (None, 0)])
+def test_the_first_nanosecond_of_the_guard_is_too_late(reference: UtcReference | None, doubt_ms: int) -> None:
+    wire_ns = len(build(UTC_S * NS_PER_S)) * uart_byte_ns(115_200)
+    for early_ns, refusal in ((1, ""), (0, Refusal.STALE)):
+        limit_s = ((980 - doubt_ms) * NS_PER_MS - wire_ns - early_ns) / NS_PER_S
+        bench = FeedBench(reference=reference)
+        if reference is None:
+            assert FeedBench(reference=None).give(0, 0.1, waited_s=limit_s) == refusal, "without pulses"
+            bench.feed.on_pulse(BEGIN_NS)
+        assert bench.give(0, limit_s) == refusal
 
 
 def test_the_time_of_sending_counts_and_not_an_old_pulse() -> None:

@@ -17,13 +17,13 @@ import msgspec
 import pytest
 
 from imud.contracts.polling import Transfer
-from imud.contracts.status import SerialLineCounters
+from imud.contracts.status import KernelCounters, SerialLineCounters
 from imud.devices.hipnuc.modbus.frames import read_registers, set_id_by_serial, write_register
 from imud.errors import LinkBusy, LinkError, LinkMissing, TransferError, Trouble
 from imud.formats.modbus import framed, is_exception, is_whole
-from imud.links.rs485.line import ENABLED, RTS_ON_SEND, TIOCGRS485, TIOCSRS485, Direction, SharedPorts
+from imud.links.rs485.line import ENABLED, RTS_ON_SEND, TIOCGRS485, TIOCSRS485, Direction, Rs485Line, SharedPorts
 from imud.links.rs485.link import Rs485Link, Rs485Settings
-from imud.links.uart.serial_port import open_port
+from imud.links.uart.serial_port import TtyCounters, open_port
 from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.pty_port import BAUD, PtyPort, serial_of, slave, waiting_bytes, wired
 
@@ -293,6 +293,19 @@ def test_missing_port_and_what_a_link_cannot_do(tmp_path: Path) -> None:
     assert link.target is None
     (tmp_path / "none").touch()
     asyncio.run(asyncio.wait_for(link.wait_present(), LIMIT_S))
+
+
+def test_the_line_gets_the_longer_time_for_a_reply_and_has_the_counters_of_the_kernel(
+    pty: PtyPort, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[int] = []
+    monkeypatch.setattr(Rs485Line, "transfer", lambda *args: waits.append(args[-1]) or b"")  # type: ignore[func-returns-value]
+    monkeypatch.setattr(TtyCounters, "read", lambda _counters: KernelCounters(overrun=3))
+    with opened(pty.path, reply_ms=30) as link:
+        for reply_ms in (29, 31):
+            link.transfer(replace(SERIAL, reply_ms=reply_ms))
+        assert waits == [30_000_000, 31_000_000]
+        assert link.kernel_counters() == KernelCounters(overrun=3)
 
 
 class Driver:

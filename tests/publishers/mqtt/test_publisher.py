@@ -111,6 +111,7 @@ def test_states_are_looked_at_after_events_and_now_and_then(tmp_path: Path) -> N
     for _ in range(30):
         bench.tick()
     assert bench.asked == 3
+    assert bench.events == []
     bench.close()
 
 
@@ -181,6 +182,7 @@ def test_a_spool_that_fails_is_an_event_and_no_end(tmp_path: Path) -> None:
     messages = [event.message for event in bench.events]
     assert any("nothing is spooled" in one for one in messages), messages
     assert any("spooling again" in one for one in messages), messages
+    assert sum("the spool was damaged" in one for one in messages) == 1, messages
     assert all(event.kind is EventKind.MQTT and not event.device for event in bench.events)
     assert database.exists()
     bench.close()

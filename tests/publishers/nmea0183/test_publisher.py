@@ -135,6 +135,19 @@ async def test_each_sentence_has_its_own_rate(bench: OutputBench) -> None:
     assert len(got) == 14
 
 
+@in_loop
+async def test_each_udp_address_gets_the_sentences() -> None:
+    with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as two:
+        for receiver in (one, two):
+            receiver.bind(("127.0.0.1", 0))
+            receiver.settimeout(LIMIT_S)
+        ports = [receiver.getsockname()[1] for receiver in (one, two)]
+        bench = OutputBench(sentences={"HDT": 1.0}, udp=[f"127.0.0.1:{port}" for port in ports])
+        bench.publish()
+        assert [receiver.recv(100)[:14] for receiver in (one, two)] == [b"$HCHDT,45.0,T*"] * 2
+        bench.output.close()
+
+
 @pytest.mark.parametrize("convention", [None, *Convention])
 @in_output(sentences={"PASHR": 1.0, "HDG": 1.0, "XDR": 1.0, "ROT": 1.0})
 async def test_values_are_those_of_ships_whatever_the_axes_are(

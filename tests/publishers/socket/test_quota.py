@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 import pytest
 
 from imud.formats.jsonrpc import Code, RpcError
+from imud.publishers.socket import quota
 from imud.publishers.socket.quota import Quota, Seldom, Shares, raise_fd_limit
 from imud.publishers.socket.rights import Peer, Rights
+from imud.publishers.socket.serving import TokenBucket
 
 READ, ALL = Rights.READ, Rights.READ | Rights.CONTROL
 OWN_UID = 500
@@ -165,6 +167,22 @@ def test_connecting_again_and_again_is_limited_by_user() -> None:
     for _ in range(1000):
         assert house.connect(0) == ""
         house.clients.clear()
+
+
+def test_a_user_that_has_not_connected_lately_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[TokenBucket] = []
+
+    def make(*args: int) -> TokenBucket:
+        made.append(TokenBucket(*args))
+        return made[-1]
+
+    monkeypatch.setattr(quota, "TokenBucket", make)
+    house = House()
+    for milliseconds, buckets in ((0, 1), (15, 1), (17, 2)):  # a token takes 15.6 ms
+        house.now_ns += milliseconds * MS
+        house.quota.tick()
+        house.connect(1000)
+        assert len(made) == buckets
 
 
 def test_high_descriptors_are_kept_for_devices() -> None:
