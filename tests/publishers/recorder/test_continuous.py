@@ -98,7 +98,7 @@ def test_a_reading_of_the_clocks_stands_neither_after_the_end_of_a_file_nor_befo
             put(records.encode_clocks(records.ClocksRecord(1, 1, 1, 1, 1, 0)))
 
     bench.on_clocks_read = record_reading
-    bench.tick(61)
+    bench.tick(59.9)
     bench.recorder.close()
     assert len(list(bench.folder.iterdir())) == 2
     for number in range(2):
@@ -149,7 +149,7 @@ def test_a_full_disk_is_one_event_and_recording_goes_on_when_there_is_room(
     assert bench.source.listening == []
     assert bench.recorder.status().problem
     monkeypatch.undo()
-    bench.tick(RETRY_NS / NS_PER_S)
+    bench.tick(RETRY_NS / NS_PER_S - 0.1)  # since the second of the three ticks
     bench.tick()
     assert "recording again" in bench.events[1].message
     bench.source.deliver()

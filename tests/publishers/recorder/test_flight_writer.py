@@ -113,6 +113,27 @@ def test_clients_that_close_or_take_nothing_are_given_up(bench: FlightWriterBenc
     silent[1].close()
 
 
+def test_a_client_sees_the_end_without_descriptors_and_when_imud_stops(
+    bench: FlightWriterBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.begin()
+    for number in range(40):
+        bench.put(number, 200_000)
+    stopped, refused = stream_pair(), stream_pair()
+    bench.queue.mark(Send(stopped[0], END))
+    bench.work()
+    monkeypatch.setattr(bench.ring, "reader", lambda _ending: os.open("/none", os.O_RDONLY))
+    bench.queue.mark(Send(refused[0], END))
+    bench.work()
+    assert refused[1].recv(1) == b""
+    assert bench.writer.sends_ended == 1
+    bench.writer.close()
+    while stopped[1].recv(1 << 20):
+        pass
+    stopped[1].close()
+    refused[1].close()
+
+
 def test_a_full_disk_leaves_no_part_of_a_snapshot(bench: FlightWriterBench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.begin()
     bench.put(0)

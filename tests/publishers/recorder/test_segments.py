@@ -88,9 +88,37 @@ def test_the_oldest_go_where_the_room_is_used_up_but_never_the_newest() -> None:
     assert devices(read(bench.ring.reader(END))) == [6, 7, 8, 9]
     bench.add(20_000)
     assert devices(read(bench.ring.reader(END))) == [10]
-    for _ in range(2 * SEGMENTS_MAX):
-        bench.add(10)
-    assert len(devices(read(bench.ring.reader(END)))) <= SEGMENTS_MAX
+    bench.close()
+    small = RingBench()
+    for _ in range(SEGMENTS_MAX + 2):
+        small.add(10)
+    assert devices(read(small.ring.reader(END))) == list(range(2, SEGMENTS_MAX + 2))
+    small.close()
+    ring = SegmentRing(200)
+    for t_ns, size, kept in ((1, 100, 100), (2, 100, 200), (3, 1, 101)):
+        ring.begin(SegmentBegin(t_ns, b"", None, -1))
+        ring.append(bytes(size))
+        assert ring.bytes == kept
+    ring.clear()
+
+
+def test_a_reader_that_cannot_be_made_leaves_no_descriptor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = RingBench(folder=tmp_path)
+    for _ in range(2):
+        bench.add()
+    with pytest.raises(FileNotFoundError):
+        left_behind([*tmp_path.iterdir(), tmp_path / "none"])
+    made, dup = list[int](), os.dup
+
+    def dup_once(descriptor: int) -> int:
+        if made:
+            raise OSError(errno.EMFILE, "Too many open files")
+        made.append(dup(descriptor))
+        return made[-1]
+
+    monkeypatch.setattr(os, "dup", dup_once)
+    with pytest.raises(OSError, match="Too many open files"):
+        bench.ring.reader(END)
     bench.close()
 
 
