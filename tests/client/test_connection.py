@@ -245,7 +245,6 @@ def test_the_daemon_goes_away(tmp_path: Path) -> None:
 
 @contextmanager
 def answering(path: Path, answer: bytes) -> Iterator[None]:
-    """A server that sends this to its first client, whatever that asks."""
     done = threading.Event()
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(path))

@@ -114,7 +114,6 @@ def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> Non
 
 
 def test_the_time_of_the_news_is_that_of_the_daemons_machine(tmp_path: Path) -> None:
-    """The rig's daemon has a clock of its own, as one on another machine whose socket SSH forwards."""
     with daemon(tmp_path) as served, feeding(str(served.path), OVERVIEW) as (_, heard):
         news = heard.wait_for(lambda news: news.statuses)
         assert news.ahead_ns == pytest.approx(NOW_NS - monotonic_ns(), abs=LIMIT_S * NS_PER_S)

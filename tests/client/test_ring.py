@@ -25,7 +25,6 @@ def _ring(board: Board) -> Iterator[Ring]:
 
 
 def numbers(ring: Ring) -> tuple[list[int], int]:
-    """What one read gives, each sample checked against what was published."""
     samples, missed = ring.read()
     for sample in samples:
         assert sample == make_sample(sample.seq)
@@ -78,7 +77,6 @@ def test_permission(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @needs_root
 def test_owner(board: Board) -> None:
-    """Root's, the directory owner's and the named user's rings are believed; the mode of the directory is no matter."""
     for mode in (0o1777, 0o755):
         board.path.parent.chmod(mode)
         os.chown(board.path, HOSTILE_UID, -1)
@@ -112,7 +110,6 @@ def test_owner_of_a_ring_that_is_opened_again(board: Board) -> None:
 
 @pytest.mark.usefixtures("ring")
 def test_reader_cannot_write(board: Board) -> None:
-    """The writer's mapping and the reader's, both of this process."""
     maps = Path("/proc/self/maps").read_text().splitlines()
     assert sorted(line.split()[1] for line in maps if line.endswith(str(board.path))) == ["r--s", "rw-s"]
 
@@ -198,7 +195,6 @@ class MeanwhileMap(mmap.mmap):
 
 @contextmanager
 def mapped(board: Board) -> Iterator[tuple[Ring, MeanwhileMap]]:
-    """A reader of the board's ring, and its memory."""
     made: list[MeanwhileMap] = []
 
     def make(*arguments: Any, **options: Any) -> MeanwhileMap:

@@ -70,7 +70,6 @@ def collect(broker: Mosquitto | Proxy, store: MemoryStore, most: int) -> Fleet:
 
 
 def begin_session(broker: Mosquitto) -> None:
-    """Have the broker keep what comes for the collector."""
     fleet = Fleet(f"mqtt://127.0.0.1:{broker.port}", name="archive", retry_max_s=1.0)
 
     async def run() -> None:
@@ -150,7 +149,6 @@ class SlowStore(MemoryStore):
 
 
 def test_a_slow_store_is_given_more_at_once_and_its_ledger_closes(broker: Mosquitto, gateway: SendingGateway) -> None:
-    """Messages come faster than the store takes transactions: the rest waits at the broker, and none is lost."""
     begin_session(broker)
     number = RECEIVE_MAX + BATCHES_MAX
     store = SlowStore(is_slow=True)

@@ -68,7 +68,6 @@ STREAMS = {MessageKind.INTERVALS: Stream.STATISTICS, MessageKind.EVENTS: Stream.
 
 
 def write(url: str, *messages: FleetMessage, offsets: Offsets = NO_OFFSETS) -> FleetLedger:
-    """Write messages by a collector's store that begins anew, in one transaction."""
     from imud.fleet.postgres import PostgresStore
 
     store, ledger, clocks = PostgresStore(url), FleetLedger(), BootClocks()
@@ -115,7 +114,6 @@ LIFTED_NS = 1_750_000_000_000_000_000
 
 
 def placed(url: str) -> list[Any]:
-    """Everything that is placed, by its number in the table."""
     return query(
         url, "SELECT seq, utc_ns, extract(epoch FROM time) * 1000000, utc_set, utc_err_ns FROM imud_samples "
         "UNION ALL SELECT first, utc_ns, extract(epoch FROM time) * 1000000, utc_set, utc_err_ns FROM imud_records "
@@ -125,7 +123,6 @@ def placed(url: str) -> list[Any]:
 
 @pytest.mark.parametrize("wrong_ns", [0, LIFTED_NS])
 def test_what_comes_before_the_clock_is_set_is_placed_when_it_is(database: str, wrong_ns: int) -> None:
-    """Samples, intervals, events and what was dropped, of the device and of the device made anew; no other boot."""
     before = [
         samples_message(1, 2, utc_ns=wrong_ns), samples_message(3, 3, boot="1-2", utc_ns=wrong_ns),
         intervals_message(4, 5, utc_ns=wrong_ns), event_message(6, 6_000_000, utc_ns=wrong_ns),
@@ -287,7 +284,6 @@ class Collecting:
         self.until("SELECT count(*) FROM imud_samples", number)
 
     def settle(self, sent: int) -> None:
-        """Wait for everything, and end it."""
         self.until_rows(sent)
         self.until("SELECT max((account->'counts'->>'newest')::bigint) FROM imud_ledger", sent)
         self.kill()
@@ -335,7 +331,6 @@ def test_rows_are_exactly_once_when_the_collector_is_killed_at_random(
 def test_rows_are_exactly_once_when_the_server_is_killed_in_a_transaction(
     broker: Mosquitto, gateway: SendingGateway
 ) -> None:
-    """The collector ends, and its service manager starts it again."""
     import psycopg
 
     with running_server() as server:

@@ -50,7 +50,6 @@ async def taken(
 
 
 async def session_begun(fleet: Fleet) -> None:
-    """Connect once and leave, so that the broker keeps the session."""
     batches = fleet.watch()
     waiting = asyncio.ensure_future(anext(batches))
     await until(lambda: not waiting.done() and bool(fleet.states))
@@ -91,7 +90,6 @@ async def test_what_a_reader_had_not_taken_comes_again_and_nothing_else(
     gateway.send_state(STATE)
 
     def acknowledged() -> int:
-        """Acknowledgements that the broker has read."""
         return sum("Received PUBACK from imud-reader-archive" in line for line in broker.log)
 
     await session_begun(fleet_at(broker, "archive"))

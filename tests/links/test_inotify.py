@@ -15,7 +15,6 @@ from tests.support.event_loops import in_loop
 
 
 async def turns(count: int = 20) -> None:
-    """Give the event loop some turns: a wait then has its watch."""
     for _ in range(count):
         await asyncio.sleep(0)
 

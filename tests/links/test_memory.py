@@ -14,8 +14,6 @@ from tests.support.event_loops import in_loop
 
 
 class Listener:
-    """Keeps what it receives."""
-
     def __init__(self) -> None:
         self.chunks: list[tuple[bytes, int]] = []
         self.ends: list[LinkError | None] = []

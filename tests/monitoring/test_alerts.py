@@ -75,7 +75,6 @@ class Spare:
             return subprocess.Popen(argv, stdin=subprocess.PIPE, stderr=log)
 
     def start(self, *, devices: bool = True) -> None:
-        """Start a daemon; one that runs reads its configuration again."""
         uart = {"port": str(self.wire.name), "baud": 115200}
         entries = {"spare": {"driver": "hipnuc-uart", "identify": False, "uart": uart}} if devices else {}
         write_config(self.folder, entries, metrics={"port": self.port}, log_level="error")
@@ -94,14 +93,12 @@ class Spare:
         self.process = None
 
     def limit_files(self, spare: int) -> None:
-        """Let it open so many files more than it has."""
         assert self.process is not None
         held = len(os.listdir(f"/proc/{self.process.pid}/fd"))
         _, most = resource.prlimit(self.process.pid, resource.RLIMIT_NOFILE)
         resource.prlimit(self.process.pid, resource.RLIMIT_NOFILE, (held + spare, most))
 
     def close(self) -> None:
-        """End whatever there is."""
         for process in (*self._waiting, *([self.process] if self.process else [])):
             _end(process)
         self.wire.unplug()
@@ -126,8 +123,6 @@ def spare_daemon(folder: Path, port: int) -> Iterator[Spare]:
 
 
 class Watcher:
-    """Which alerts fire, and since when in the present phase."""
-
     def __init__(self, prometheus: RealPrometheus, expected: dict[str, tuple[str, str]]) -> None:
         self._prometheus = prometheus
         self._expected = expected
@@ -137,13 +132,11 @@ class Watcher:
         self.begin(firing=True)
 
     def begin(self, *, firing: bool) -> None:
-        """A phase in which alerts are to fire, or to clear."""
         self._firing = firing
         self._begin = time.monotonic()
         self.after_s: dict[str, float] = {}
 
     def look(self) -> set[str]:
-        """The expected alerts that fire now."""
         fire = set()
         for alert in self._prometheus.alerts():
             if alert.state == "firing" and (alert.device, alert.instance) == self._expected[alert.name]:
@@ -177,7 +170,6 @@ def wait_scraped(prometheus: RealPrometheus, watcher: Watcher, spare: Spare) -> 
 
 
 def break_spare(prometheus: RealPrometheus, watcher: Watcher, spare: Spare) -> None:
-    """Down for a while, three new starts, no devices, and few files."""
     spare.kill()
     watcher.wait("ImudDown")
     for devices in (True, True, False):
@@ -263,14 +255,12 @@ def wait_calm(prometheus: RealPrometheus) -> None:
 
 
 def unrest(prometheus: RealPrometheus) -> list[str]:
-    """What fires, and what does not run."""
     firing = [f"{alert.name} {alert.device}" for alert in prometheus.alerts() if alert.state == "firing"]
     up = {one["metric"]["device"]: one["value"][1] == "1" for one in prometheus.query("imud_device_up")}
     return firing + [f"{name} is not up" for name in (*WIRES, "boom", "module", "spare") if not up.get(name)]
 
 
 def table(fired: dict[str, float], cleared: dict[str, float], watcher: Watcher, pace: Pace) -> str:
-    """What was seen, for people."""
     rows = [f"\n{'alert':24} {'fires after':>12} {'clears after':>13}  ({pace})"]
     for name in sorted(fired):
         summary = watcher.texts[name].annotations["summary"]

@@ -60,7 +60,6 @@ def test_queries_use_metrics_that_exist() -> None:
 
 
 def without_data(prometheus: RealPrometheus) -> list[str]:
-    """Queries that give nothing, each with the title of its panel."""
     return [
         f"{title}: {expression}"
         for title, expression in dashboard.queries()
@@ -84,7 +83,6 @@ def test_every_query_has_data(tmp_path: Path) -> None:
 
 
 def assert_devices_are_told_apart(prometheus: RealPrometheus, one: Site) -> None:
-    """A query with the variable of the device filled in is of that device only."""
     for title, expression in dashboard.queries():
         if "$device" in expression:
             for series in prometheus.query(dashboard.filled_in(expression, device="quiet")):

@@ -19,7 +19,6 @@ pytestmark = pytest.mark.live
 
 
 def run(*argv: str) -> str:
-    """Run a tool; what it says."""
     done = subprocess.run(argv, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

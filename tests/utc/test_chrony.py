@@ -97,7 +97,6 @@ if not NO_CHRONY and os.geteuid() != 0:
 
 @pytest.fixture
 def chronyd(tmp_path: Path) -> Iterator[Path]:
-    """A chronyd that sets no clock, in a folder of its own; yields the folder."""
     config = tmp_path / "chrony.conf"
     config.write_text(
         f"refclock SOCK {tmp_path}/imud.sock refid IMUD poll 0 filter 1\n"

@@ -35,7 +35,6 @@ class Receiver:
         self.second = UTC_S
 
     def cycle(self) -> None:
-        """One second's sentences."""
         rmc = build(self.second * NS_PER_S)
         time = rmc.split(b",")[1].decode()
         gga = f"GPGGA,{time},0000.000,N,00000.000,E,1,08,0.9,12.0,M,0.0,M,,"
@@ -53,7 +52,6 @@ class Receiver:
 
 @contextmanager
 def gpsd(port: int, device: str, folder: Path) -> Iterator[None]:
-    """A gpsd that waits for no client and sends nothing to the receiver."""
     with (folder / "gpsd.log").open("w") as log:
         command = ["gpsd", "-N", "-n", "-b", "-D", "2", "-S", str(port), device]
         process = subprocess.Popen(command, stdout=log, stderr=log)
@@ -82,7 +80,6 @@ class Port:
         self._text = b""
 
     def lines(self, wait_s: float) -> list[bytes]:
-        """What came and is complete."""
         if select.select([self._master], [], [], wait_s)[0]:
             self._text += os.read(self._master, 4096)
         *whole, self._text = self._text.split(b"\n")

@@ -25,7 +25,6 @@ class Receiver:
         self._random = Random(1)
 
     def t_ns(self, after_s: float = 0.0) -> int:
-        """CLOCK_MONOTONIC so long after the present full second."""
         return BEGIN_NS + round((self.number + after_s) * NS_PER_S * self._rate)
 
     def go(self, seconds: int, *, pulse: bool = True, says: int | None = 0) -> None:

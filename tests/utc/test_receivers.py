@@ -136,8 +136,6 @@ def test_a_line_that_is_too_long_is_skipped() -> None:
 
 
 class Port:
-    """A link of bytes whose far end is the test."""
-
     title = "/dev/ttyGNSS"
     writable = True
     baud = 9600
@@ -153,7 +151,6 @@ class Port:
         self._refusals = refusals
 
     def absence(self) -> str:
-        """It is there."""
         return ""
 
     async def wait_present(self) -> None:

@@ -25,8 +25,6 @@ GOOD = UtcReference(OFFSET_NS, NS_PER_MS)
 
 
 class FeedBench:
-    """A feed whose port and clock are the test's."""
-
     def __init__(self, rate_hz: int = 1, reference: UtcReference | None = GOOD, baud: int = 115_200) -> None:
         self.now_ns = BEGIN_NS
         self.sent: list[bytes] = []

@@ -90,7 +90,6 @@ class SystemClockBench:
         self.source.start(lambda sentence, t_rx_ns: self.got.append((sentence, t_rx_ns)))
 
     def go(self, times: int, late_ns: int = 50_000) -> None:
-        """Wait as long as the source says, and a little more."""
         for _ in range(times):
             self.now_ns += self.source.wait_ns() + late_ns
             self.source.tick()

@@ -79,7 +79,6 @@ def test_values_that_json_does_not_have_are_left_out() -> None:
 
 
 def bomb() -> bytes:
-    """Slots whose frame says that it is far larger than any message."""
     head = msgspec.json.encode(message(MessageKind.SLOTS))
     return struct.pack("<4sBBH", MAGIC, 1, 0, len(head)) + head + zstandard.compress(bytes(256 * (SLOTS_MAX + 1)))
 
@@ -104,7 +103,6 @@ def test_anything_else_is_an_error_with_a_reason(payload: bytes) -> None:
 
 
 def fields(kind: MessageKind, **more: Any) -> dict[str, Any]:
-    """A message as its JSON."""
     found: dict[str, Any] = json.loads(encode_message(message(kind, **more)))
     return found
 
@@ -119,7 +117,6 @@ FULL = (
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where integers are, but in the version."""
     members = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for name, one in members:
         yield from places(one, (*path, name))
@@ -128,7 +125,6 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def put(value: Any, path: tuple[Any, ...], number: int) -> bytes:
-    """The JSON with another number in a place."""
     copied = copy.deepcopy(value)
     *above, name = path
     functools.reduce(lambda inner, step: inner[step], above, copied)[name] = number

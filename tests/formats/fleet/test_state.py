@@ -88,7 +88,6 @@ STATES = st.tuples(st.sampled_from(["1", "2"]), st.integers(1, 60))
 
 @given(st.lists(st.one_of(MESSAGES, STATES, st.just("restart"), st.just("killed"))))
 def test_it_closes_whatever_comes_and_however_often_the_collector_starts_anew(steps: list[object]) -> None:
-    """A killed collector has what it had stored, and the last message, which was not acknowledged, comes again."""
     ledger, positions = FleetLedger(from_begin=True), SpoolPositions(from_begin=True)
     seen: dict[str, set[int]] = {"1": set(), "2": set()}
     given_out: dict[str, list[int]] = {"1": [], "2": []}

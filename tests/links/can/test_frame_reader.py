@@ -53,7 +53,6 @@ class Wire:
         return before_ns, real_ns()
 
     def read(self) -> list[CanFrame]:
-        """Read when frames are there."""
         assert select.select([self.receiver], [], [], LIMIT_S)[0]
         self.now_ns = real_ns()
         return self.reader.read()

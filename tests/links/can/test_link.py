@@ -59,7 +59,6 @@ class Bus:
         await asyncio.wait_for(wait(), LIMIT_S)
 
     def run(self, story: Callable[["Bus"], Coroutine[None, None, None]]) -> None:
-        """Open, tell the story, close."""
 
         async def play() -> None:
             loop = asyncio.get_running_loop()
@@ -98,7 +97,6 @@ class Bus:
 
 @pytest.fixture
 def ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ends]:
-    """Two ends of a datagram path, and a made-up /sys."""
     monkeypatch.setattr(netlink, "can_details", lambda name: netlink.CanDetails(None, None))
     interface = tmp_path / "class/net/lo"
     interface.mkdir(parents=True)
@@ -115,7 +113,6 @@ def ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ends]:
 
 
 def test_frames_gather(ends: Ends) -> None:
-    """The first is read at once; those that come next are read together, when the time is over."""
 
     async def story(bus: Bus) -> None:
         bus.then = lambda: bus.send(2, 3, 4)
@@ -169,7 +166,6 @@ def test_without_it_every_frame_is_read_as_it_comes(ends: Ends) -> None:
 
 @pytest.mark.parametrize("at", ["delivery", "pause"])
 def test_closed_while_frames_gather(ends: Ends, at: str) -> None:
-    """By the one who takes the frames, or later: nothing is delivered any more, and no timer is left."""
 
     async def story(bus: Bus) -> None:
         if at == "delivery":

@@ -87,7 +87,6 @@ class Played:
 
 
 def play(path: Path, *, pieces_max: int = 1 << 30, **settings: Any) -> Played:
-    """Play a capture with these settings of the link."""
     played = Played(path, **settings)
     played.play(pieces_max)
     return played
@@ -205,8 +204,6 @@ def test_captures_that_cannot_be_played(raw: Path, tmp_path: Path, monkeypatch: 
 
 
 class BrokenFile(BytesIO):
-    """A file on a disk that cannot be read."""
-
     def read(self, size: int | None = -1) -> bytes:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 

@@ -49,7 +49,6 @@ def opened(path: Path | str, ports: SharedPorts | None = None, address: int = 1,
 
 
 def sure(link: Rs485Link, transfer: Transfer) -> bytes:
-    """The reply, however often it takes."""
     for _ in range(TRIES):
         try:
             return link.transfer(transfer)
@@ -232,7 +231,6 @@ def test_unrequested_bytes_are_discarded_and_counted(pty: PtyPort) -> None:
 
 
 def test_two_modules_of_one_address_are_detected(tmp_path: Path) -> None:
-    """They begin alike, so that their reply has its place, and is damaged."""
     twins = slave(1, serial=0x0F), slave(1, serial=0xF0)
     with wired(tmp_path, *twins) as (path, _), opened(path) as link:
         assert not is_whole(link.transfer(SERIAL))

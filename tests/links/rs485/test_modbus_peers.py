@@ -45,7 +45,6 @@ def registers(start: int, values: Sequence[int], *, readonly: bool = False) -> S
 
 
 def device(address: int, *, new: bool) -> SimDevice:
-    """The manual's own sensor values, and what newer firmware has behind them."""
     block = [*words(SENSORS[3:-2]), *(UPTIME if new else ())]
     identity = words(pack_identity("HI14R2N-485-000", 169 if new else 152, 107, serial_of(address)))
     return SimDevice(
@@ -61,7 +60,6 @@ def device(address: int, *, new: bool) -> SimDevice:
 
 @contextmanager
 def carried(one: PtyPort, other: PtyPort) -> Iterator[None]:
-    """What is sent to one comes out of the other."""
     ended = threading.Event()
 
     def carry() -> None:

@@ -33,8 +33,6 @@ def pty() -> Iterator[PtyPort]:
 
 
 class Receiver:
-    """Keeps what a link delivers."""
-
     def __init__(self) -> None:
         self.chunks: list[tuple[bytes, int]] = []
         self.ends: list[LinkError | None] = []
@@ -60,7 +58,6 @@ class Receiver:
 
 
 def play(link: UartLink, scene: Callable[[Receiver], Awaitable[None]]) -> Receiver:
-    """Run a scene on an open, started link."""
 
     async def whole() -> Receiver:
         receiver = Receiver()

@@ -42,7 +42,6 @@ Key = tuple[str, frozenset[tuple[str, str]]]
 
 
 def values(metrics: Sequence[Metric]) -> dict[Key, float]:
-    """Every line by name and labels; a line that stands twice is an error."""
     found: dict[Key, float] = {}
     for metric in metrics:
         for line in metric.samples:
@@ -370,7 +369,6 @@ def test_both_formats_say_the_same() -> None:
 
 
 def test_rendering_pauses_often() -> None:
-    """No stretch between two pauses renders more than SAMPLES_PER_TURN lines of ours."""
     pauses = 0
 
     def pause() -> None:
@@ -415,7 +413,6 @@ def test_every_metric_is_documented_and_nothing_else() -> None:
 
 
 def test_label_values_are_documented() -> None:
-    """Those of labels whose values are known ahead."""
     text = (ROOT / "docs/metrics.md").read_text()
     for values_of, kind in ((states.DeviceState, "state"), (Sync, "sync"), (EventKind, "kind"), (Refusal, "cause")):
         rows = re.findall(rf"`{kind}`: ([a-z_, -]+)", text)

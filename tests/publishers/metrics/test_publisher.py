@@ -37,7 +37,6 @@ def context(status: Callable[[], Sequence[DeviceStatus]] = lambda: DEVICES) -> P
 async def publisher(
     context: PublisherContext, snapshot_s: float = LIMIT_S, **settings: object
 ) -> AsyncIterator[MetricsPublisher]:
-    """A started publisher that leaves no thread behind."""
     made = MetricsPublisher(MetricsSettings(**{"port": 0, **settings}), context, snapshot_s=snapshot_s)  # type: ignore[arg-type]  # any key
     made.start()
     try:
@@ -167,7 +166,6 @@ async def test_a_loop_that_stood_still_is_late_though_it_ticks_while_devices_are
 
 @in_loop
 async def test_rings_of_the_daemon_are_read(board: Board) -> None:
-    """Samples that are in shared memory when the scrape comes; a device without a ring shows as such."""
     newest = device(DEVICE, newest_seq=10)
     board.now_ns = 20_000_000
     board.publish(range(1, 11))

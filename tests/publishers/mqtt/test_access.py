@@ -16,7 +16,6 @@ TLS_BROKER = BROKER._replace(tls=True)
 
 
 def of_tls(authority: Authority) -> MqttSettings:
-    """Files that are all good."""
     return MqttSettings(
         user="reader",
         ca_file=authority["ca.pem"],

@@ -33,8 +33,6 @@ DOCS = Path(__file__).parents[3] / "docs" / "fleet.md"
 
 
 class FakeDevice:
-    """Two actions of a device that notes what it did."""
-
     def __init__(self) -> None:
         self.done: list[tuple[str, Mapping[str, Any]]] = []
         self.go_on: asyncio.Event | None = None
@@ -51,8 +49,6 @@ class FakeDevice:
 
 
 class ChannelBench:
-    """A channel whose threads are called by hand."""
-
     def __init__(self, **settings: object) -> None:
         self.clock = VirtualClock()
         self.clock.advance(5 * NS_PER_S)
@@ -89,7 +85,6 @@ class ChannelBench:
         return [msgspec.json.decode(reply.payload, type=CommandAnswer) for reply in self.replies]
 
     def run(self, rounds: int = 3) -> None:
-        """What the event loop does."""
 
         async def loop() -> None:
             for _ in range(rounds):
@@ -315,8 +310,6 @@ def broker(tmp_path: Path) -> Iterator[Mosquitto]:
 
 
 class Operator:
-    """A bare client that asks and keeps what comes."""
-
     def __init__(self, port: int, user: str, *, v5: bool = True) -> None:
         from paho.mqtt.client import Client, MQTTv5, MQTTv311
         from paho.mqtt.enums import CallbackAPIVersion
@@ -356,7 +349,6 @@ class Operator:
         self.client.publish(topic, msgspec.json.encode(request), qos, properties=properties)
 
     def answer(self, number: str) -> tuple[Any, CommandAnswer]:
-        """The answer to a request, as it came and decoded."""
 
         def found() -> list[tuple[Any, CommandAnswer]]:
             answers = [
@@ -376,8 +368,6 @@ class Operator:
 
 
 class Loop:
-    """The output with an event loop of its own, in a thread."""
-
     def __init__(self, folder: Path, port: int, device: FakeDevice, version: str) -> None:
         host = HostClock()
         password = folder / "password"

@@ -36,7 +36,6 @@ BOOT = f"{7:016x}"
 
 
 def finish(gateway: LiveGateway, collector: Collector) -> StreamCounts:
-    """Let all arrive, end, and check."""
 
     def everything() -> bool:
         counts = {key.stream: one for key, one in collector.ledger.counts.items()}

@@ -295,7 +295,6 @@ def test_birth_and_messages_say_whether_the_wall_clock_is_set(tmp_path: Path) ->
 
 
 def fields_by_schema(slot: bytes, layout: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a slot that have a value, by the layout of the schema alone."""
     order = {"little-endian": "<", "big-endian": ">"}[layout["byte_order"]]
     found: dict[str, Any] = {}
     for field in layout["fields"]:

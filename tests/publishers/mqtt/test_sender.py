@@ -21,8 +21,6 @@ def row(number: int, payload: bytes = b"{}") -> Spooled:
 
 
 class SenderBench:
-    """A sender whose rounds the test calls."""
-
     def __init__(self, *hosts: str) -> None:
         self.broker, self.clock = FakeBroker(), VirtualClock()
         turn = BrokerTurn([Broker(host, 1, False, False, "") for host in hosts or ("a",)], 60.0, lambda: 0.5)

@@ -32,7 +32,6 @@ UTC_NS = CLOCK_SET_NS + 10_000 * HOUR_NS
 
 
 def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = True) -> Spooled:
-    """A message of whole samples, or of an event."""
     stream = Stream.SAMPLES if whole else Stream.EVENTS
     last = first + count - 1
     samples = [
@@ -48,8 +47,6 @@ def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = Tr
 
 
 class SpoolBench:
-    """A spool and its clocks."""
-
     def __init__(
         self, path: Path, kilobytes: int = 100_000, hours: float = 100.0, *, newest_first: bool = False
     ) -> None:

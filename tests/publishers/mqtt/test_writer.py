@@ -40,8 +40,6 @@ HOUR_NS = 3600 * NS_PER_S
 
 
 class FailingSpool(Spool):
-    """A spool whose disk fails when the test says so."""
-
     fails = False
 
     def commit(self, new: object, acknowledged: object, now_ns: int, utc_ns: int) -> None:
@@ -51,8 +49,6 @@ class FailingSpool(Spool):
 
 
 class WriterBench:
-    """Writer and sender by hand; one sample each millisecond."""
-
     def __init__(
         self, path: Path, boot: str = "1", messages_per_s: float | None = None, queue: WriterQueue | None = None,
         spool: Spool | None = None, start_worker: StartWorker | None = None, **settings: object,
@@ -91,7 +87,6 @@ class WriterBench:
         self.clock.advance(count * NS_PER_MS)
 
     def work(self, seconds: int = 1) -> None:
-        """Both threads for so many seconds."""
         for _ in range(seconds):
             self.workers[0].work()
             self.sender.work()
@@ -100,14 +95,12 @@ class WriterBench:
             self.clock.advance(COMMIT_NS)
 
     def arrived(self) -> list[bytes]:
-        """What was sent in all connections."""
         rows = []
         for connection in self.broker.connections:
             rows += [payload for topic, payload, retain in connection.sent if not retain]
         return rows
 
     def counts(self) -> StreamCounts:
-        """The ledger of a reader, of what was sent and what is in the spool."""
         ledger = FleetLedger(from_begin=True)
         self.spool.rewind()
         for payload in [*self.arrived(), *[row.payload for row in self.spool.after(1_000_000)]]:
@@ -362,7 +355,6 @@ def test_every_message_has_the_clock_as_it_was_when_it_was_made(tmp_path: Path) 
 
 
 def test_what_was_spooled_before_the_clock_was_set_is_not_old_when_it_is(tmp_path: Path) -> None:
-    """The clock is stepped by more than the spool keeps anything, and goes on when nothing keeps it any more."""
     bench = WriterBench(tmp_path)
     bench.broker.problem = "no route"
     bench.utc_offset_ns, bench.wall_clock = LIFTED_NS, GatewayClock(0, LIFTED_NS, synchronised=False)

@@ -32,8 +32,6 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 class Server(TcpOutput):
-    """A server on a free port, with a clock of its own."""
-
     def __init__(self) -> None:
         self.clock, self.clients = VirtualClock(), list[socket.socket]()
         super().__init__("127.0.0.1", 0, self.clock.now_ns)
@@ -168,8 +166,6 @@ def test_datagrams_without_a_way_are_counted_and_logged_once(caplog: pytest.LogC
 
 
 class Port:
-    """A pseudo-terminal."""
-
     def __init__(self) -> None:
         self.master, self.slave = os.openpty()
         tty.setraw(self.slave)

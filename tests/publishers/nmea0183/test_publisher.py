@@ -39,8 +39,6 @@ LEFT_45: Vector3 = (radians(10), radians(5), radians(-45))
 
 
 class Asked:
-    """Latencies that were asked for."""
-
     def __init__(self) -> None:
         self.of: dict[str, tuple[int, tuple[str, ...]]] = {}
 
@@ -52,8 +50,6 @@ class Asked:
 
 
 class OutputBench:
-    """The output with devices by hand. Use in a running loop."""
-
     def __init__(
         self, *, heading: Heading = Heading.TRUE, declination_deg: float | None = 3.0, **settings: object
     ) -> None:
@@ -96,7 +92,6 @@ class OutputBench:
         self.output.publish(Batch(device, 0, samples, frame))
 
     async def connect(self) -> None:
-        """Connect a client to the server."""
         self.reader = socket.create_connection(("127.0.0.1", self.port), timeout=LIMIT_S)
         async with asyncio.timeout(LIMIT_S):
             while not self.output.status()[0].readers:
@@ -112,7 +107,6 @@ class OutputBench:
 
 @asynccontextmanager
 async def sending(**settings: Any) -> AsyncIterator[OutputBench]:
-    """An output with one client."""
     bench = OutputBench(**settings)
     await bench.connect()
     yield bench
@@ -267,7 +261,6 @@ def test_the_usual_size_of_a_sentence_is_no_less_than_a_full_one(kind: Formatter
 
 @contextmanager
 def gpsd(port: int, source: str) -> Iterator[None]:
-    """A gpsd that waits for no client."""
     process = subprocess.Popen(["gpsd", "-N", "-n", "-b", "-S", str(port), source], stderr=subprocess.DEVNULL)
     try:
         yield

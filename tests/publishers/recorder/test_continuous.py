@@ -22,8 +22,6 @@ RETRY_NS, CHECK_NS = 60 * NS_PER_S, NS_PER_S
 
 
 class RecorderBench(RecordingBench):
-    """A recorder whose thread and time are the test's."""
-
     def __init__(self, folder: Path, **settings: object) -> None:
         super().__init__()
         self.folder = folder / "recordings"

@@ -17,7 +17,6 @@ class FeedBench(RecordingBench):
         self.feed = RecordFeed(self.context, self.queue, devices or None)
 
     def taken(self) -> list[Record]:
-        """What was put since the last call."""
         found: list[Record] = []
         while (item := self.queue.take()) is not None:
             found += records.records_of(item)

@@ -82,7 +82,6 @@ def _with_acceleration(device: str, seq: int, a_m_s2: float) -> Any:
 
 
 def span_s(path: Path) -> float:
-    """From the begin of the oldest segment to the end."""
     found = records_in(path)
     begun, end = decode_object(found[0], SessionRecord), decode_object(found[-1], EndRecord)
     return float(end.t_ns - begun.t_ns) / NS_PER_S

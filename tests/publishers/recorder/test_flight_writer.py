@@ -22,8 +22,6 @@ SESSION = records.encode_object(Kind.SESSION, NO_DEVICE, SessionRecord(1, "", ""
 
 
 class FlightWriterBench(RecordingBench):
-    """The thread, whose rounds the test calls."""
-
     def __init__(self, folder: Path, keep_bytes: int = 1 << 30) -> None:
         super().__init__()
         self.folder = folder / "recordings"

@@ -31,7 +31,6 @@ class RingBench:
         self.count = 0
 
     def add(self, size: int = 50, drop_before_ns: int = -1) -> None:
-        """A segment that begins at its number."""
         path = self.folder / f"{self.count:03d}" if self.folder is not None else None
         self.ring.begin(SegmentBegin(self.count, session(self.count), path, drop_before_ns))
         encoder = BlockEncoder()

@@ -16,8 +16,6 @@ RING_BYTES, SYNC_NS = 256 << 10, 5_000_000_000
 
 
 class WriterBench:
-    """A queue and its thread, whose rounds the test calls."""
-
     def __init__(self, bytes_max: int = 1 << 24) -> None:
         self.clock = VirtualClock()
         self.queue = RecordQueue[Path](bytes_max)

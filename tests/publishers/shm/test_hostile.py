@@ -254,7 +254,6 @@ def test_removed_ring_is_made_anew(board: Board, caplog: pytest.LogCaptureFixtur
 
 
 def test_slow_reader_of_a_removed_ring(board: Board) -> None:
-    """It misses what neither ring holds any more, exactly."""
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         board.publish([1, 2])
         board.path.unlink()
@@ -269,7 +268,6 @@ def test_slow_reader_of_a_removed_ring(board: Board) -> None:
 @pytest.mark.parametrize("size_bytes", [0, 1, HEADER_BYTES, HEADER_BYTES + SLOT_BYTES])
 @pytest.mark.parametrize("first", ["publish", "tick", "read", "close"])
 def test_cut_ring_is_made_anew(tmp_path: Path, size_bytes: int, first: str) -> None:
-    """Whoever touches it first: neither the daemon nor a reader dies by SIGBUS."""
     board = Board(tmp_path)
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         board.publish([1, 2])
@@ -293,7 +291,6 @@ def test_cut_ring_is_made_anew(tmp_path: Path, size_bytes: int, first: str) -> N
 
 
 def test_new_ring_before_its_first_sample(board: Board) -> None:
-    """What was lost with the old one is missed at once, not waited for."""
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         board.publish([1, 2])
         os.truncate(board.path, 0)
@@ -304,7 +301,6 @@ def test_new_ring_before_its_first_sample(board: Board) -> None:
 
 
 def test_ring_cut_by_a_byte(board: Board) -> None:
-    """Every sample is read or missed."""
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         board.publish([1, 2])
         os.truncate(board.path, RING_BYTES - 1)
@@ -376,7 +372,6 @@ def test_descriptors_are_given_back(tmp_path: Path) -> None:
 
 
 def test_no_descriptor_left(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """The ring waits for one; nothing ends."""
     board = Board(tmp_path)
     board.path.unlink()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -394,7 +389,6 @@ def test_no_descriptor_left(tmp_path: Path, caplog: pytest.LogCaptureFixture) ->
 
 @needs_root
 def test_full_tmpfs(tmp_path: Path) -> None:
-    """A real one, which another user fills: the first ring waits for room, and no store raises SIGBUS."""
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k,mode=1777", "x", tmp_path], check=False).returncode:
         pytest.skip("no tmpfs can be mounted here")
     try:
@@ -437,7 +431,6 @@ def test_reader_of_a_heartbeat_from_the_future(tmp_path: Path) -> None:
 
 
 def test_names_of_rings_in_a_message(tmp_path: Path) -> None:
-    """Any user may have made them."""
     for name in ("bow", "\x1b[31m", "a\nb", "c" * 100, *(f"n{i}" for i in range(100))):
         (tmp_path / f"imud.{name}").touch()
     with pytest.raises(ServerError) as caught:

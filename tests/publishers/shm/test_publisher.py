@@ -152,8 +152,6 @@ class Spy:
 
 
 class SpyMap(mmap.mmap):
-    """Notes the slices that are written."""
-
     notes: Notes | None = None
 
     def __setitem__(self, at: Any, value: Any) -> None:
@@ -341,7 +339,6 @@ def test_ring_that_another_daemon_has_taken_over_is_left_to_it(
 
 
 def test_reader_cannot_pose_as_a_daemon(tmp_path: Path) -> None:
-    """A lock that read access is enough for is none."""
     first = Board(tmp_path)
     first.die()
     with first.path.open("rb") as file:

@@ -25,7 +25,6 @@ def blocks(language: str) -> list[str]:
 
 
 def assert_like(found: Any, shown: Any) -> None:
-    """What came is what the example shows, apart from what it leaves out."""
     if shown == ANYTHING:
         return
     if isinstance(shown, dict):
@@ -44,7 +43,6 @@ def assert_like(found: Any, shown: Any) -> None:
 
 
 def happen(server: SocketServer, shown: dict[str, Any], published: list[int]) -> None:
-    """Make the daemon do what the notification of the example says."""
     if shown.get("method") == "sample":
         published.append(shown["params"]["seq"])
         server.publish(batch("imu0", published[-1]))
@@ -82,7 +80,6 @@ def test_python_example(tmp_path: Path, capsys: Any) -> None:
 
 
 async def publish_on_watch(server: SocketServer) -> None:
-    """Publish one sample as soon as a client watches."""
     await until(lambda: any(client.encoding for client in server.hub.clients()))
     server.publish(batch("imu0"))
 
@@ -105,7 +102,6 @@ def test_numbers_and_codes_of_the_text() -> None:
 
 
 def test_every_member_of_status_is_explained() -> None:
-    """Members of a device, and of its parts."""
     section = DOCUMENT.partition("\n## Status\n")[2].partition("\n## ")[0]
     rows = [row.split(" | ")[0] for row in section.splitlines() if row.startswith("| `")]
     known = {str(state) for state in states.DeviceState}

@@ -100,7 +100,6 @@ async def test_a_client_gets_what_it_asks_for_whatever_is_configured(
 
 @in_server()
 async def test_clients_side_by_side(server: SocketServer) -> None:
-    """Each has its own convention, fields and form; one that asks for none gets what is published."""
     plain, down, few = [await Peer.greeted(server) for _ in range(3)]
     assert "convention" not in await plain.result("watch")
     await down.result("watch", convention="ned-frd")

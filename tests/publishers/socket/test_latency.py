@@ -17,8 +17,6 @@ Scene = tuple[SocketServer, Asked, Peer]
 
 
 class Latencies:
-    """Who asks for what, in ms."""
-
     def __init__(self) -> None:
         self.asked: Asked = {}
 

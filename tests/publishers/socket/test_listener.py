@@ -92,7 +92,6 @@ GROUP = "no-such-group-here"
 
 
 def leave_socket(path: Path) -> None:
-    """What a daemon leaves behind that is killed."""
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(path))
 
@@ -100,7 +99,6 @@ def leave_socket(path: Path) -> None:
 def around_rename(
     monkeypatch: pytest.MonkeyPatch, before: Callable[[], object], after: Callable[[], object] = lambda: None
 ) -> None:
-    """Do something right before and right after the next rename."""
     rename = Path.rename
 
     def once(file: Path, target: Path) -> Path:

@@ -150,7 +150,6 @@ async def test_a_last_line_without_newline_is_dropped(server: SocketServer) -> N
 @needs_jsonschema
 @pytest.mark.live
 def test_every_message_of_a_real_daemon_is_of_these_types(tmp_path: Path) -> None:
-    """All methods that change nothing, and notifications; the device sends some samples meanwhile."""
     with (
         sending_daemon(tmp_path, lambda number: hi91(10 * number)) as daemon,
         socket.socket(socket.AF_UNIX) as sock,

@@ -97,7 +97,6 @@ async def test_a_client_that_does_not_read_loses_the_oldest_and_slows_nobody(
 
 
 async def read_one(peer: Peer) -> tuple[str, int]:
-    """Device and seq of the next message, a sample without drops."""
     if peer.framed:
         body = await peer.body()
         assert len(body) == SLOT_BYTES
@@ -431,8 +430,6 @@ class Blocked:
 
 
 class Evicted(Sink):
-    """An owner that closes what is too much."""
-
     def __init__(self, uid: int) -> None:
         self.uid = uid
         self.gone = False
@@ -454,7 +451,6 @@ def blocked(pool: Pool, uid: int = 1, limits: Limits = MANY) -> tuple[Evicted, O
 
 
 def waiting(pool: Pool, uid: int, size_bytes: int) -> Evicted:
-    """A client that does not read, for which so much waits."""
     owner, outbox = blocked(pool, uid)
     outbox.put_reply(bytes(size_bytes))
     return owner

@@ -18,23 +18,18 @@ MS = 1_000_000
 
 @dataclass
 class Client:
-    """What is counted of one."""
-
     peer: Peer
     wakers: list[str] = field(default_factory=list)
     reserved: bool = False
 
 
 class House:
-    """Clients that were let in."""
-
     def __init__(self, clients: int = 64, per_user: int = 20, fd_limit: int = 1024) -> None:
         self.now_ns = 0
         self.quota = Quota(Shares(clients, per_user), OWN_UID, fd_limit, lambda: self.now_ns)
         self.clients: list[Client] = []
 
     def connect(self, uid: int, rights: Rights = READ, fd: int = 50) -> str:
-        """Let one in; why not, if not."""
         peer = Peer(1, uid, frozenset())
         try:
             reserved = self.quota.admit(peer, rights, fd, self.clients)
@@ -51,7 +46,6 @@ class House:
         return len(self.clients) - before
 
     def leave(self, uid: int, count: int) -> None:
-        """Have the oldest clients of a user leave."""
         for client in [client for client in self.clients if client.peer.uid == uid][:count]:
             self.clients.remove(client)
 

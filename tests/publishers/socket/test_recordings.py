@@ -29,15 +29,12 @@ Recorded = tuple[SocketServer, HandSource]
 
 @asynccontextmanager
 async def recording(folder: Path) -> AsyncIterator[Recorded]:
-    """A server with devices whose records the test makes."""
     source = HandSource()
     async with serving(folder, recording=source) as server:
         yield server, source
 
 
 class RecordingPeer(Peer):
-    """A client that keeps the descriptors that come."""
-
     def __init__(self, sock: socket.socket) -> None:
         super().__init__(sock)
         self.fds: list[int] = []
@@ -150,7 +147,6 @@ async def test_it_ends_with_the_connection_and_with_the_descriptor(recorded: Rec
 
 @pytest.mark.parametrize("stopped", [False, True])
 def test_imud_that_stops_ends_it_regularly(tmp_path: Path, stopped: bool) -> None:
-    """Also a recording that the client stopped and has not read to its end."""
 
     async def body() -> None:
         async with recording(tmp_path) as (server, source):

@@ -17,8 +17,6 @@ MS = 1_000_000
 
 
 class Clock:
-    """A clock that moves when work is done."""
-
     def __init__(self) -> None:
         self.ns = 80_000 * MS
 
@@ -60,8 +58,6 @@ class Worker:
 
 
 class SchedulerBench:
-    """A scheduler and its clients, one socket for each."""
-
     def __init__(self) -> None:
         self.clock = Clock()
         self.log: list[str] = []
@@ -194,7 +190,6 @@ async def test_sockets_are_looked_at_again_within_a_turn(rig: SchedulerBench) ->
 @pytest.mark.parametrize("uid", [1, 2])
 @in_context("rig", scheduling)
 async def test_a_client_that_waited_long_is_ahead_for_a_millisecond(rig: SchedulerBench, uid: int) -> None:
-    """It is served before the other clients of its user, and its user before other users."""
     rig.add("busy", 1, 1000, MS // 4)[1].line_up()
     idle = rig.add("idle", uid, 1000, MS // 4)[1]
     await until(lambda: len(rig.log) >= 100)
