@@ -100,23 +100,19 @@ def test_watch_gives_whole_samples_and_questions_go_between(served: Daemon, enco
         assert list(watch) == [sample("imu0", 4)]
 
 
-def test_watch_selects(served: Daemon) -> None:
+def test_watch_selects_and_a_second_watch_ends_the_first(served: Daemon) -> None:
     with Client(served.path) as client:
         watch = client.watch(["imu0"], ["accel_m_s2"], 100, "json", timeout_s=60)
         publish(served, batch("imu1"), batch("imu0", 1, 12))
         first, second = islice(watch, 2)
         assert (first.seq, second.seq) == (1, 11)
         assert first == replace(sample("imu0"), gyro_rad_s=None, temperature_c=None, t_dev_ns=None)
-
-
-def test_a_second_watch_ends_the_first(served: Daemon) -> None:
-    with Client(served.path) as client:
-        first = client.watch(["imu0"])
+        old = client.watch(["imu0"])
         publish(served, batch("imu0"))
-        second = client.watch(["imu1"], encoding="json", timeout_s=60)
+        new = client.watch(["imu1"], encoding="json", timeout_s=60)
         publish(served, batch("imu0", 2), batch("imu1"))
-        assert next(second) == sample("imu1")
-        assert list(first) == []
+        assert next(new) == sample("imu1")
+        assert list(old) == []
 
 
 @pytest.mark.parametrize("encoding", ["json", "binary"])
@@ -214,7 +210,7 @@ def test_path_of_the_environment(served: Daemon, monkeypatch: pytest.MonkeyPatch
     assert default_path() == "/run/imud/imud.sock"
 
 
-def test_no_daemon_there(tmp_path: Path) -> None:
+def test_no_daemon_there_and_no_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "imud.sock"
     with pytest.raises(LinkMissing, match="is imud running"):
         Client(path)
@@ -223,8 +219,6 @@ def test_no_daemon_there(tmp_path: Path) -> None:
     with pytest.raises(LinkMissing, match="is imud running"):
         Client(path)
 
-
-def test_no_permission_names_the_group(monkeypatch: pytest.MonkeyPatch) -> None:
     def deny(_sock: socket.socket, _path: str) -> None:
         raise PermissionError(13, "Permission denied")
 

@@ -38,7 +38,7 @@ def test_opens_by_name(board: Board) -> None:
         assert (ring.header.device, ring.header.pid, ring.header.slot_count) == (DEVICE, os.getpid(), SLOTS)
 
 
-def test_no_such_ring(board: Board, tmp_path: Path) -> None:
+def test_no_such_ring_and_no_permission(board: Board, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ServerError, match=r"imud.imu9: no such ring; there are rings for: imu0"):
         Ring("imu9", directory=str(tmp_path))
     (tmp_path / "none").mkdir()
@@ -53,6 +53,13 @@ def test_no_such_ring(board: Board, tmp_path: Path) -> None:
     with pytest.raises(ServerError, match="expected 20480 bytes, found 20479"):
         Ring(board.path)
 
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(ServerError, match="is this user in the group"):
+        Ring(board.path)
+
 
 def test_directory_of_the_environment(board: Board, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IMUD_SHM", str(tmp_path))
@@ -64,15 +71,6 @@ def test_directory_of_the_environment(board: Board, tmp_path: Path, monkeypatch:
     assert default_directory() == "/run/imud/shm"
     monkeypatch.delenv("IMUD_SHM")
     assert default_directory() == "/run/imud/shm"
-
-
-def test_permission(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(os, "open", refuse)
-    with pytest.raises(ServerError, match="is this user in the group"):
-        Ring(board.path)
 
 
 @needs_root
@@ -340,7 +338,7 @@ def test_ledger_that_changes_while_it_is_copied(board: Board) -> None:
         assert (block.update, block.ledger["bytes_in"]) == (2, 5)
 
 
-def test_wait(ring: Ring) -> None:
+def test_wait_also_when_another_was_faster(ring: Ring, monkeypatch: pytest.MonkeyPatch) -> None:
     waker = Waker()
     fd = os.dup(waker.client_end)
     try:
@@ -358,9 +356,6 @@ def test_wait(ring: Ring) -> None:
     finally:
         waker.close()
         os.close(fd)
-
-
-def test_wait_when_another_was_faster(ring: Ring, monkeypatch: pytest.MonkeyPatch) -> None:
     waker = Waker()
     assert waker.wake()
     read = os.read

@@ -96,25 +96,22 @@ def test_sync_codes_are_in_order_of_quality() -> None:
         assert decode_slot(encode_slot(msgspec.structs.replace(BARE, sync=sync), 0), "imu0").sync is sync
 
 
-def test_any_flipped_bit_is_found() -> None:
+def test_any_flipped_bit_and_the_sync_of_a_newer_layout_are_found() -> None:
     for at in range(SLOT_BYTES):
         slot = bytearray(encode_slot(FULL, 1))
         slot[at] ^= 1 << at % 8
         assert not slot_is_whole(bytes(slot)), at
         with pytest.raises(ValueError, match="torn"):
             decode_slot(bytes(slot), "imu0")
+    raw = bytearray(encode_slot(FULL, 1)[:CRC_OFFSET])
+    raw[62] = 4
+    with pytest.raises(ValueError, match="sync 4"):
+        decode_slot(bytes(raw) + zlib.crc32(raw).to_bytes(4, "little"), "imu0")
 
 
 @pytest.mark.parametrize("slot", [b"", bytes(SLOT_BYTES), encode_slot(FULL, 1)[:-1], b"\xff" * SLOT_BYTES])
 def test_what_was_never_a_slot(slot: bytes) -> None:
     assert not slot_is_whole(slot)
-
-
-def test_sync_of_a_newer_layout() -> None:
-    raw = bytearray(encode_slot(FULL, 1)[:CRC_OFFSET])
-    raw[62] = 4
-    with pytest.raises(ValueError, match="sync 4"):
-        decode_slot(bytes(raw) + zlib.crc32(raw).to_bytes(4, "little"), "imu0")
 
 
 @pytest.mark.parametrize(

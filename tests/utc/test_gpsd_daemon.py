@@ -5,9 +5,8 @@ import select
 import shutil
 import subprocess
 import time
-import tty
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -16,6 +15,7 @@ from imud.formats.nmea0183 import checksum
 from imud.formats.rmc import Rmc, build, parse
 from imud.units import NS_PER_S
 from tests.support.daemon_process import LIMIT_S, running_daemon
+from tests.support.pty_port import PtyPort
 from tests.support.surroundings import free_port
 
 WANTED = 3
@@ -23,14 +23,11 @@ UTC_S = 1_795_000_000
 NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (Debian package gpsd)"
 
 
-class Receiver:
+class Receiver(PtyPort):
     """A GNSS receiver with a fix, on a pty: one cycle of sentences after the other."""
 
     def __init__(self) -> None:
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.path = os.ttyname(self._slave)
+        super().__init__()
         os.chmod(self.path, 0o666)  # gpsd gives its rights away
         self.second = UTC_S
 
@@ -40,14 +37,9 @@ class Receiver:
         gga = f"GPGGA,{time},0000.000,N,00000.000,E,1,08,0.9,12.0,M,0.0,M,,"
         gsa = "GPGSA,A,3,01,02,03,04,05,06,07,08,,,,,1.6,0.9,1.3"
         rest = "".join(f"${body}*{checksum(body.encode()):02X}\r\n" for body in (gga, gsa))
-        with suppress(BlockingIOError):
-            os.read(self._master, 4096)  # what gpsd asks of the receiver is not answered
-        os.write(self._master, rmc + rest.encode())
+        self.received()  # what gpsd asks of the receiver is not answered
+        self.send(rmc + rest.encode())
         self.second += 1
-
-    def close(self) -> None:
-        os.close(self._master)
-        os.close(self._slave)
 
 
 @contextmanager
@@ -67,34 +59,25 @@ def gpsd(port: int, device: str, folder: Path) -> Iterator[None]:
 def receiver() -> Iterator[Receiver]:
     made = Receiver()
     yield made
-    made.close()
+    made.unplug()
 
 
-class Port:
+class Port(PtyPort):
     """The far end of a serial port: a device that only listens."""
 
-    def __init__(self) -> None:
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        self.path = os.ttyname(self._slave)
-        self._text = b""
+    text = b""
 
     def lines(self, wait_s: float) -> list[bytes]:
-        if select.select([self._master], [], [], wait_s)[0]:
-            self._text += os.read(self._master, 4096)
-        *whole, self._text = self._text.split(b"\n")
+        select.select([self.master], [], [], wait_s)
+        *whole, self.text = (self.text + self.received()).split(b"\n")
         return [line + b"\n" for line in whole]
-
-    def close(self) -> None:
-        os.close(self._master)
-        os.close(self._slave)
 
 
 @pytest.fixture
 def port() -> Iterator[Port]:
     made = Port()
     yield made
-    made.close()
+    made.unplug()
 
 
 @pytest.mark.live

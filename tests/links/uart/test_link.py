@@ -22,6 +22,7 @@ from imud.links.uart.serial_port import baud_of
 from imud.units import NS_PER_MS
 from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.event_loops import in_loop
+from tests.support.leaks import open_descriptors
 from tests.support.pty_port import PtyPort, unprivileged, waiting_bytes
 
 
@@ -70,10 +71,6 @@ def play(link: UartLink, scene: Callable[[Receiver], Awaitable[None]]) -> Receiv
         return receiver
 
     return asyncio.run(whole())
-
-
-def descriptors() -> int:
-    return len(os.listdir("/proc/self/fd"))
 
 
 def test_bytes_pass_as_they_are(pty: PtyPort) -> None:
@@ -193,13 +190,13 @@ def test_a_spurious_wake_up_is_no_end(pty: PtyPort) -> None:
 
 
 def test_closing_releases_everything_and_may_be_repeated(pty: PtyPort) -> None:
-    before = descriptors()
+    before = open_descriptors()
     link = UartLink(UartSettings(port=pty.path))
     for _ in range(3):
         link.open()
         link.close()
         link.close()
-    assert descriptors() == before
+    assert open_descriptors() == before
     with pytest.raises(LinkError, match="not open"):
         link.write(b"x")
     with pytest.raises(LinkError, match="not open"):
@@ -271,10 +268,10 @@ def test_a_rate_that_the_driver_changes_is_refused(pty: PtyPort, monkeypatch: py
     with pytest.raises(LinkError, match="cannot do 111000"):
         link.set_baud(111_000)
     link.close()
-    before = descriptors()
+    before = open_descriptors()
     with pytest.raises(LinkError, match="cannot do 230400") as caught:
         UartLink(UartSettings(port=pty.path, baud=230400)).open()
-    assert descriptors() == before
+    assert open_descriptors() == before
     assert caught.value.__cause__ is None
 
 
@@ -303,7 +300,7 @@ def test_a_step_after_open_that_fails_releases_the_port(
     def refuse(*_arguments: object) -> None:
         raise kind(errno.EIO, "by the test")
 
-    before = descriptors()
+    before = open_descriptors()
     link = UartLink(UartSettings(port=pty.path))
     with monkeypatch.context() as patch:
         if step == "fcntl.ioctl":  # of TIOCEXCL: the library needs the others
@@ -313,7 +310,9 @@ def test_a_step_after_open_that_fails_releases_the_port(
             patch.setattr(f"imud.links.uart.serial_port.{step}", refuse)
         with pytest.raises(LinkError) as caught:
             link.open()
-    assert descriptors() == before, "the traceback keeps the port object alive: only close() releases the descriptor"
+    assert open_descriptors() == before, (
+        "the traceback keeps the port object alive: only close() releases the descriptor"
+    )
     assert "no hardware behind it" in str(caught.value)
     link.open()
     link.close()

@@ -170,13 +170,10 @@ def test_old_files_are_removed_for_new_ones(tmp_path: Path) -> None:
     assert bench.recorder.status().files_removed >= 3
 
 
-def test_a_directory_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
+def test_a_directory_that_cannot_be_made_and_a_budget_for_less_than_two_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "recordings").write_bytes(b"")
     with pytest.raises(ServerError, match="recordings"):
         RecorderBench(tmp_path)
-
-
-def test_a_budget_for_less_than_two_files_is_refused() -> None:
     with pytest.raises(ValueError, match="room for two files of file_mb"):
         RecorderSettings(keep_gb=0.1)
 

@@ -241,10 +241,14 @@ def test_where_nothing_is_kept_that_is_told_once_and_tried_again(tmp_path: Path)
     bench.flight.close()
 
 
-def test_directories_that_cannot_be_made_are_an_error(tmp_path: Path) -> None:
+def test_a_directory_that_cannot_be_made_and_a_budget_without_room_for_a_snapshot_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"")
     with pytest.raises(ServerError, match="flight recorder"):
         FlightBench(tmp_path, directory=str(tmp_path / "a" / "b"))
+    with pytest.raises(ValueError, match="room for a snapshot"):
+        RecorderSettings(keep_gb=0.25, enabled=True, flight=FlightSettings(enabled=True))
+    RecorderSettings(keep_gb=0.25, flight=FlightSettings(enabled=True))
+    assert records.VERSION == 1
 
 
 def test_a_mistake_in_the_thread_ends_the_daemon(tmp_path: Path) -> None:
@@ -253,10 +257,3 @@ def test_a_mistake_in_the_thread_ends_the_daemon(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError):
         bench.flight.tick(0)
     bench.flight.close()
-
-
-def test_a_budget_without_room_for_a_snapshot_is_refused() -> None:
-    with pytest.raises(ValueError, match="room for a snapshot"):
-        RecorderSettings(keep_gb=0.25, enabled=True, flight=FlightSettings(enabled=True))
-    RecorderSettings(keep_gb=0.25, flight=FlightSettings(enabled=True))
-    assert records.VERSION == 1

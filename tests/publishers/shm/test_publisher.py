@@ -411,12 +411,9 @@ def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: py
     assert not board.context.without_ring
 
 
-def test_directory_that_is_not_there(tmp_path: Path) -> None:
+def test_directory_that_is_not_there_or_not_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ServerError, match="expected a directory for shared memory"):
         make(tmp_path / "none").start()
-
-
-def test_directory_that_is_not_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda *_, **__: False)
     with pytest.raises(ServerError, match="may not make files there"):
         make(tmp_path).start()

@@ -534,16 +534,13 @@ def test_the_share_of_a_client_shrinks_with_each_that_waits() -> None:
     assert waiting_samples() == [3, 0, 1]
 
 
-def test_the_user_that_holds_most_loses_a_client() -> None:
+def test_the_user_that_holds_most_loses_the_client_that_does_not_move() -> None:
     pool = Pool(2_000_000)
     one = waiting(pool, 1, 300_000)
     many = [waiting(pool, 2, 100_000) for _ in range(8)]
     assert not one.gone  # the largest, but of a user that holds less
     assert sum(owner.gone for owner in many) == 1
     assert pool.held_bytes <= 1_000_000
-
-
-def test_among_a_user_s_clients_the_one_that_does_not_move_goes() -> None:
     pool = Pool(2_000_000)
     owners = [waiting(pool, 1, 300_000) for _ in range(3)]
     late = waiting(pool, 1, 400_000)

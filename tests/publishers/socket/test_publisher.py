@@ -68,7 +68,7 @@ async def test_devices_status_and_schema(server: SocketServer) -> None:
 
 
 @in_server()
-async def test_json_samples_have_the_names_of_the_design_and_no_absent_members(server: SocketServer) -> None:
+async def test_json_samples_have_the_names_of_the_design_and_only_the_selected_members(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     assert await peer.result("watch") == {"encoding": "json", "devices": DEVICES, "rate_hz": 0.0, "latency_ms": 0.0}
     server.publish(batch("imu0", 7, 2))
@@ -89,11 +89,6 @@ async def test_json_samples_have_the_names_of_the_design_and_no_absent_members(s
         "temperature_c": 31.5,
     }
     assert (second["params"]["seq"], other["params"]["device"]) == (8, "imu1")
-
-
-@in_server()
-async def test_fields_and_devices_select(server: SocketServer) -> None:
-    peer = await Peer.greeted(server)
     reply = await peer.result("watch", devices=["imu1"], fields=["gyro_rad_s", "mag_t"])
     assert reply["devices"] == {"imu1": 1}
     server.publish(batch("imu0"))
@@ -125,6 +120,15 @@ async def test_after_a_binary_watch_everything_is_framed_for_good(server: Socket
     server.publish(batch())
     assert (await peer.message())["params"]["sync"] == "regression"
     assert (await peer.error("nonsense"))[0] == -32601
+    lines, frames = await Peer.greeted(server), await Peer.greeted(server)
+    await frames.result("watch", encoding="binary")
+    frames.framed = True
+    for peer in (frames, lines):
+        await peer.result("watch")
+    server.publish(batch("imu0", 1, 2))
+    for seq in (1, 2):
+        assert (await lines.message())["params"]["seq"] == seq
+        assert (await frames.message())["params"]["seq"] == seq
 
 
 def test_framed_json_is_never_as_long_as_slots() -> None:
@@ -135,19 +139,6 @@ def test_framed_json_is_never_as_long_as_slots() -> None:
         (length,) = struct.unpack_from("<I", frame)
         assert length == len(frame) - 4
         assert length % SLOT_BYTES
-
-
-@in_server()
-async def test_the_same_samples_as_lines_and_as_frames(server: SocketServer) -> None:
-    lines, frames = await Peer.greeted(server), await Peer.greeted(server)
-    await frames.result("watch", encoding="binary")
-    frames.framed = True
-    for peer in (frames, lines):
-        await peer.result("watch")
-    server.publish(batch("imu0", 1, 2))
-    for seq in (1, 2):
-        assert (await lines.message())["params"]["seq"] == seq
-        assert (await frames.message())["params"]["seq"] == seq
 
 
 @in_server()

@@ -79,7 +79,7 @@ def test_root_and_another_member_get_in_beside_two_readers_and_a_member_that_tak
     assert [house.connect(0, ALL) for _ in range(4)] == [""] * 4
 
 
-def test_root_has_places_that_nobody_else_can_take() -> None:
+def test_root_has_places_that_nobody_else_can_take_not_even_the_daemon_s_own_user() -> None:
     house = House(clients=256, per_user=128)
     house.fill(tuple(range(1000, 1010)))
     house.fill((OWN_UID, *range(2000, 2010)), ALL)
@@ -88,9 +88,6 @@ def test_root_has_places_that_nobody_else_can_take() -> None:
     assert [house.connect(0, ALL) for _ in range(5)].count("") == 4
     assert len(house.clients) == 256  # the total is kept
     assert "socket.clients_max" in house.connect(0, ALL)
-
-
-def test_the_daemon_s_own_user_does_not_lock_out_root_and_control() -> None:
     house = House(clients=256, per_user=128)
     assert house.fill((OWN_UID,)) == 243
     assert house.connect(2000, ALL) == ""
@@ -116,14 +113,11 @@ def test_places_that_come_free_do_not_give_a_member_more_of_the_reserved_ones() 
         house.leave(0, 1)
 
 
-def test_a_member_with_many_clients_has_reserved_places_besides() -> None:
+def test_members_and_root_with_many_clients_have_their_own_places_too() -> None:
     house = House(clients=256, per_user=128)
     assert [house.connect(2000, ALL) for _ in range(20)] == [""] * 20
     house.fill((1000, 1001))
     assert house.connect(2000, ALL) == ""
-
-
-def test_root_s_own_clients_take_its_own_places_first() -> None:
     house = House(clients=256, per_user=128)
     assert [house.connect(0, ALL) for _ in range(4)] == [""] * 4
     assert house.fill((1000, 1001)) == 240

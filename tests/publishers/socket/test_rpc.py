@@ -92,10 +92,13 @@ def watching(server: SocketServer) -> set[int]:
 
 
 @in_server()
-async def test_the_limits_themselves_are_allowed(server: SocketServer) -> None:
+async def test_the_limits_themselves_are_allowed_and_unknown_members_ignored(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     for rate_hz in (0.001, 1_000_000):
         assert (await peer.result("watch", rate_hz=rate_hz))["rate_hz"] == rate_hz
+    line = b'{"later":1,"jsonrpc":"2.0","id":1,"method":"watch","params":{"later":[],"rate_hz":null}}\r\n'
+    await peer.send(line)
+    assert (await peer.message())["result"]["rate_hz"] == 0
 
 
 def test_rights_and_effects_of_the_methods() -> None:
@@ -106,14 +109,6 @@ def test_rights_and_effects_of_the_methods() -> None:
         "options", "watch", "unwatch", "events", "command", "calibrate", "settings.apply", "stop_calibration",
         "record.stop",
     }  # fmt: skip
-
-
-@in_server()
-async def test_unknown_members_are_ignored(server: SocketServer) -> None:
-    peer = await Peer.greeted(server)
-    line = b'{"later":1,"jsonrpc":"2.0","id":1,"method":"watch","params":{"later":[],"rate_hz":null}}\r\n'
-    await peer.send(line)
-    assert (await peer.message())["result"]["rate_hz"] == 0
 
 
 @in_server()
