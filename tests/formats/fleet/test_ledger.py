@@ -28,7 +28,7 @@ def counts_of(*messages: FleetMessage, stream: Stream = Stream.SAMPLES, from_beg
     return counts
 
 
-def test_each_number_counts_once() -> None:
+def test_each_number_counts_once_and_is_not_given_twice() -> None:
     dropped, intervals = MessageKind.DROPPED, MessageKind.INTERVALS
     counts = counts_of(message(1, 10), message(11, 20, intervals), message(21, 25, dropped), message(28, 30))
     assert counts == StreamCounts(1, 30, whole=13, thinned=10, dropped={"space": 5}, missing=2)
@@ -39,9 +39,6 @@ def test_each_number_counts_once() -> None:
     assert counts == StreamCounts(1, 10, whole=7, missing=3), "missing samples can arrive later"
     assert counts_of(message(7, 8), from_begin=False) == StreamCounts(7, 8, whole=2)
     assert counts_of(message(7, 8)) == StreamCounts(1, 8, whole=2, missing=6)
-
-
-def test_what_comes_again_is_a_duplicate_and_not_given_twice() -> None:
     ledger = FleetLedger()
     assert ledger.take(message(1, 10), Stream.SAMPLES) is not None
     assert ledger.take(message(1, 10), Stream.SAMPLES) is None

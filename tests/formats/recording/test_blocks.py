@@ -38,7 +38,7 @@ def some_blocks(count: int, seed: int = 1) -> list[tuple[bytes, bytes]]:
     return [(content, encoder.encode(content)) for content in contents]
 
 
-def test_the_golden_block_is_read_and_written() -> None:
+def test_the_golden_block_is_read_and_written_and_one_that_compresses_is_a_zstandard_frame() -> None:
     assert BlockEncoder().encode(b"abc") == GOLDEN
     found, reader = blocks_of(GOLDEN)
     assert found == [b"abc"]
@@ -46,9 +46,6 @@ def test_the_golden_block_is_read_and_written() -> None:
     assert is_recording(GOLDEN)
     with pytest.raises(ImudError, match=r"a\.csv is no recording of imud: expected"):
         check_begin(b"t_ns,accel", "a.csv")
-
-
-def test_a_block_that_compresses_is_a_zstandard_frame() -> None:
     block = BlockEncoder().encode(b"abcd" * 1000)
     assert block[8] == 1
     assert zstandard.ZstdDecompressor().decompress(block[HEAD.size :]) == b"abcd" * 1000

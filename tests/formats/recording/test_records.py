@@ -38,12 +38,17 @@ def only(data: bytes) -> Record:
     return record
 
 
-def test_a_data_record_by_hand() -> None:
+def test_a_data_record_by_hand_and_objects_that_come_back() -> None:
     data = records.encode_data(3, b"\x5a\xa5", 258, -1)
     assert data == b"\x05\x03\x00\x13\x00\x00\x00" + struct.pack("<qq", 258, -1) + b"\0\x5a\xa5"
     record = only(data)
     assert (record.kind, record.device) == (Kind.DATA, 3)
     assert records.decode_data(record.body) == (258, -1, b"\x5a\xa5")
+    call = CallRecord("clock", "link_changed", [], {"byte_ns": 86_806, "hold_ns": 0})
+    record = only(records.encode_object(Kind.CALL, 1, call))
+    assert records.decode_object(record, CallRecord) == call
+    with pytest.raises(ImudError, match="kind 9 cannot be read"):
+        records.decode_object(record._replace(body=b"\xc1"), CallRecord)
 
 
 FRAMES = [
@@ -72,14 +77,6 @@ def test_records_come_back(kind: Kind, data: bytes, value: object) -> None:
 def test_edges_come_back(line: str) -> None:
     edges = [EdgeRecord(-5, True, 1), EdgeRecord(1 << 60, False, 1 << 40)]
     assert records.decode_edges(only(records.encode_edges(0, line, edges)).body) == (line, edges)
-
-
-def test_objects_come_back() -> None:
-    call = CallRecord("clock", "link_changed", [], {"byte_ns": 86_806, "hold_ns": 0})
-    record = only(records.encode_object(Kind.CALL, 1, call))
-    assert records.decode_object(record, CallRecord) == call
-    with pytest.raises(ImudError, match="kind 9 cannot be read"):
-        records.decode_object(record._replace(body=b"\xc1"), CallRecord)
 
 
 def test_records_follow_one_another_and_a_cut_one_is_an_error() -> None:
