@@ -70,11 +70,16 @@ async def test_every_client_gets_every_sentence(made: Server) -> None:
 
 
 @in_context("made", serving)
-async def test_what_a_client_sends_is_ignored(made: Server) -> None:
+async def test_what_a_client_sends_is_ignored_and_it_stays_while_there_is_nothing_to_send(made: Server) -> None:
     client = await made.connected()
     client.sendall(b"?WATCH={}\r\n" * 1000)
     for _ in range(20):
         await asyncio.sleep(0)
+    made.put(ONE)
+    assert client.recv(100) == ONE
+    made.clock.advance(100 * STUCK_NS)  # a device that is away, or a sentence of 0.01 Hz
+    made.tick(made.clock.now_ns())
+    assert made.status().readers == 1
     made.put(ONE)
     assert client.recv(100) == ONE
 
@@ -104,18 +109,6 @@ async def test_a_client_that_does_not_read_loses_whole_sentences_and_is_disconne
     made.clock.advance(1)
     made.tick(made.clock.now_ns())
     assert made.status().readers == 0
-
-
-@in_context("made", serving)
-async def test_a_client_stays_while_there_is_nothing_to_send(made: Server) -> None:
-    client = await made.connected()
-    made.put(ONE)
-    assert client.recv(100) == ONE
-    made.clock.advance(100 * STUCK_NS)  # a device that is away, or a sentence of 0.01 Hz
-    made.tick(made.clock.now_ns())
-    assert made.status().readers == 1
-    made.put(ONE)
-    assert client.recv(100) == ONE
 
 
 @in_context("made", serving)
