@@ -118,6 +118,8 @@ def test_a_client_sees_the_end_without_descriptors_and_when_imud_stops(
     for number in range(40):
         bench.put(number, 200_000)
     stopped, refused = stream_pair(), stream_pair()
+    for _, theirs in (stopped, refused):
+        theirs.setblocking(False)
     bench.queue.mark(Send(stopped[0], END))
     bench.work()
     monkeypatch.setattr(bench.ring, "reader", lambda _ending: os.open("/none", os.O_RDONLY))
