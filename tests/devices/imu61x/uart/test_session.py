@@ -99,7 +99,7 @@ def test_a_parameter_is_set_and_not_saved(parameter: Parameter, value: int | Bus
     far.run(session.write_parameter(parameter, value))
     assert far.module.settings.value(parameter) == (value.value if isinstance(value, BusMode) else value)
     assert far.module.flash == Imu61xSettings()
-    assert streams(far)
+    assert far.streams()
 
 
 def test_modes_at_any_rate_words_of_unusual_values_and_questions_only() -> None:
