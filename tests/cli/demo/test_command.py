@@ -87,6 +87,7 @@ def pasted(*lines: str) -> str:
 def test_children_that_end_too_early_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(command, "START_LIMIT_S", LIMIT_S)
     simulator = command.simulator(tmp_path / "no" / "folder", [("hipnuc-uart", 0)], 100.0, "")
     with pytest.raises(ImudError, match=r"^the simulator ended with status \d+ before it had a port$"), simulator:
         pass
