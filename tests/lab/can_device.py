@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Coroutine
-from contextlib import closing
+from contextlib import closing, nullcontext
 from time import monotonic, monotonic_ns
 from typing import Any
 
@@ -22,10 +22,10 @@ LIMIT_S = 60.0
 
 
 class BusRig:
-    """Modules on an interface, and a device of the daemon that is the first of them."""
+    """A device of the daemon on an interface, with the simulated modules of the bus; the first module is the device."""
 
     def __init__(self, interface: str, driver: str, options: Settings, *modules: CanModule) -> None:
-        self.port = CanPort(CanModules(modules), interface)
+        self.port = CanPort(CanModules(modules), interface) if modules else None
         self.samples: list[Sample] = []
         self.events: list[Event] = []
         config = DeviceConfig("bow", driver, options, True, "socketcan", SocketCanSettings(interface=interface))
@@ -37,19 +37,27 @@ class BusRig:
         while not condition():
             assert monotonic() < end, f"not within {LIMIT_S} s: {what}; {self.device.status()}"
             self.device.tick(monotonic_ns())
-            self.port.step(monotonic_ns(), True)
+            if self.port is not None:
+                self.port.step(monotonic_ns(), True)
             await asyncio.sleep(0.002)
 
     async def done(self, work: Coroutine[Any, Any, Any]) -> Any:
+        """What comes of something that the device does, while the modules go on."""
         task = asyncio.create_task(work)
         await self.until(task.done, "its end")
         return task.result()
 
     def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Run the device during the story. The story starts with the first samples of the modules, if there are any."""
+
+        def is_ready() -> bool:
+            state = self.device.state
+            return state is not DeviceState.MISSING if self.port is None else state is DeviceState.RUNNING
+
         async def both() -> None:
             task = asyncio.create_task(self.device.run())
             try:
-                await self.until(lambda: self.device.state is DeviceState.RUNNING, "samples")
+                await self.until(is_ready, "samples, or an open bus")
                 await story()
             finally:
                 task.cancel()
@@ -57,6 +65,6 @@ class BusRig:
                 self.device.close()
                 self.factory.close()
 
-        with closing(self.port):
+        with closing(self.port) if self.port is not None else nullcontext():
             asyncio.run(both())
         assert self.device.ledger.closes(), self.device.ledger.snapshot()

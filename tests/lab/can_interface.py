@@ -77,7 +77,7 @@ def controller_pair(bitrate: int = BITRATE) -> Iterator[tuple[CanInterface, CanI
     pair = (CanInterface("can0"), CanInterface("can1"))
     try:
         for interface in pair:
-            tool("ip", "link", "set", interface.name, "type", "can", "bitrate", str(bitrate))
+            tool("ip", "link", "set", interface.name, "type", "can", "bitrate", str(bitrate), "restart-ms", "0")
             interface.up()
         yield pair
     finally:

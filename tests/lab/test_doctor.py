@@ -256,9 +256,10 @@ def test_can(can_pair: tuple[CanInterface, CanInterface], tmp_path: Path) -> Non
     near, _ = can_pair
     with daemon(tmp_path, {"mast": {"driver": "imu61x-can", "socketcan": {"interface": near.name}}}) as made:
         wait_for(made, "mast", lambda one: one.state is DeviceState.SEARCHING, "the interface is open")
-        doctor(made).has("CAN bit rate", "error", "mast: no frame comes at 500000", "try 125000, 250000, 1000000")
         with near.error_counters(128, 0):
-            doctor(made).has("CAN state", "error", "tx 128, rx 0", "no other node acknowledges")
+            found = doctor(made)
+            found.has("CAN bit rate", "error", "mast: no frame comes at 500000", "try 125000, 250000, 1000000")
+            found.has("CAN state", "error", "tx 128, rx 0", "no other node acknowledges")
         with near.error_counters(0, 127):
             found = doctor(made)
             found.has("CAN state", "error", "tx 0, rx 127", "a missing terminator or a wrong bit rate")
@@ -297,7 +298,6 @@ def check_states(made: RunningDaemon, near: CanInterface) -> None:
         tool(*command.split())  # the kernel refuses restart-ms while the interface is up
     wait_running(made, "mast")
     doctor(made).has("CAN state", "warning", f"{near.name} was bus-off ", "120 Ω at both ends")
-    near.restart_by_itself(0)
 
 
 def test_i2c_and_spi(i2c: Bus[I2cTransfer], spi8: Bus[SpiTransfer], spi16: Bus[SpiTransfer], tmp_path: Path) -> None:

@@ -1,11 +1,8 @@
 """IMU61x on the kernel's CAN: stream, several devices, drops, error states, interface down and up."""
 
 import asyncio
-import json
 import socket
 import struct
-import subprocess
-import sys
 from collections.abc import Awaitable, Callable
 from time import monotonic, monotonic_ns
 from typing import Any
@@ -333,21 +330,3 @@ def test_bus_off_of_a_real_controller_and_its_restart(
     assert ledger.frames_ignored == 3
     news = [event.message.partition(":")[0] for event in rig.events if event.kind is EventKind.LINK]
     assert news == ["can0 is bus-off", "can0 is error-active again"]
-
-
-def test_the_simulator_as_a_process_of_its_own(vcan: CanInterface) -> None:
-    """What `imud demo` starts; the interface is found by itself."""
-    rig = Rig(vcan.name, vcan.name)
-    argv = [sys.executable, "-m", "imud.sim", "--device", "imu61x-can", "--boot", "0", "--rate", "20"]
-
-    async def story(rig: Rig) -> None:
-        await rig.until(lambda: len(rig.samples) >= 20, "a second of samples")
-
-    with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdin is not None
-        assert process.stdout.readline().strip() == vcan.name
-        rig.play(story)
-        process.stdin.close()
-        assert json.loads(process.stdout.read())["frames_refused"] == 0
-    assert rig.runner.ledger.lost() == 0

@@ -4,27 +4,22 @@ import asyncio
 import math
 import socket
 import struct
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from time import monotonic, monotonic_ns
 
 import pytest
 
-from imud.config import DeviceConfig
-from imud.contracts.settings import Settings
 from imud.contracts.status import DeviceState
 from imud.devices.hipnuc.j1939 import messages, session
 from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
 from imud.devices.hipnuc.nmea2000.codec import HipnucNmea2000Settings
 from imud.errors import NoReply
-from imud.host_clock import HostClock
-from imud.links.can.link import SocketCanSettings
-from imud.runtime.device_factory import DeviceFactory
 from imud.sample import Sample
-from imud.sim.can_module import CanModules
 from imud.sim.hipnuc.j1939 import J1939_VARIANTS, HipnucJ1939Module, J1939Hardware, J1939Settings
 from imud.sim.hipnuc.nmea2000 import HipnucNmea2000Module, Nmea2000Hardware
 from imud.sim.ports.can_port import CanPort
+from tests.lab.can_device import BusRig
 from tests.lab.can_interface import CanInterface
 
 LIMIT_S = 30.0
@@ -48,37 +43,6 @@ def say(end: socket.socket, interface: str, pgn: int, data: bytes, address: int 
     end.sendto(data, (interface, socket.J1939_NO_NAME, pgn, address))
 
 
-class Rig:
-    def __init__(self, interface: str, driver: str, options: Settings) -> None:
-        config = DeviceConfig("bow", driver, options, True, "socketcan", SocketCanSettings(interface=interface))
-        self.samples: list[Sample] = []
-        self.runner = DeviceFactory(
-            lambda batch: self.samples.extend(batch.samples), lambda _event: None, HostClock()
-        ).make(config, 1)
-
-    async def until(self, condition: Callable[[], object], what: str, step: Callable[[], None] = lambda: None) -> None:
-        end = monotonic() + LIMIT_S
-        while not condition():
-            assert monotonic() < end, f"not within {LIMIT_S} s: {what}; {self.runner.status()}"
-            self.runner.tick(monotonic_ns())
-            step()
-            await asyncio.sleep(0.002)
-
-    def play(self, story: Callable[[], Awaitable[None]]) -> None:
-        async def both() -> None:
-            task = asyncio.create_task(self.runner.run())
-            try:
-                await self.until(lambda: self.runner.state is not DeviceState.MISSING, "the bus is open")
-                await story()
-            finally:
-                task.cancel()
-                await asyncio.gather(task, return_exceptions=True)
-                self.runner.close()
-
-        asyncio.run(both())
-        assert self.runner.ledger.closes(), self.runner.ledger.snapshot()
-
-
 def burst(end: socket.socket, interface: str, number: int) -> None:
     say(end, interface, messages.ACCEL, messages.pack_accel((0.0, 0.0, 9.8)))
     say(end, interface, messages.GYRO, messages.pack_gyro((0.1, 0.2, 0.3)))
@@ -92,7 +56,7 @@ def rolls(samples: list[Sample]) -> list[int]:
 
 def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
     """It sends samples and answers requests; another node's samples are on the bus, too."""
-    rig = Rig(vcan.name, "hipnuc-j1939", HipnucJ1939Settings())
+    rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Settings())
     requests: list[tuple[int, bytes]] = []
     intervals = {0x0137: 100, session.ADDRESS: 8}
 
@@ -117,11 +81,11 @@ def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
                     burst(other, vcan.name, 1000 + number)
                     await asyncio.sleep(0.05)
                 await rig.until(lambda: rolls(rig.samples)[-1:] == [39], "the last sample")
-                await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
-                await rig.runner.act("interval", {"pgn": "FF37", "interval_ms": 50})
+                await rig.until(lambda: rig.device.state is DeviceState.RUNNING, "running")
+                await rig.device.act("interval", {"pgn": "FF37", "interval_ms": 50})
                 assert intervals[0x0137] == 50
                 with pytest.raises(NoReply):
-                    await rig.runner.act("zero", {"zero": "here"})
+                    await rig.device.act("zero", {"zero": "here"})
             finally:
                 loop.remove_reader(end)
 
@@ -129,7 +93,7 @@ def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
     found = rolls(rig.samples)
     assert found == list(range(40 - len(found), 40))
     assert len(found) >= 30
-    assert rig.runner.ledger.lost() == 0
+    assert rig.device.ledger.lost() == 0
     sample = rig.samples[-1]
     assert sample.accel_m_s2 == pytest.approx((0, 0, 9.8), abs=0.0024)
     assert sample.gyro_rad_s == pytest.approx((0.1, 0.2, 0.3), abs=0.00054)
@@ -181,24 +145,17 @@ def test_driver_and_simulator_with_every_message_and_all_actions(vcan: CanInterf
     quiet = J1939Hardware(bitrate=0, boot_ms=0)
     module = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast), quiet)
     other = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast, address=9), quiet)
-    port = CanPort(CanModules([module, other]), vcan.name)
-    rig = Rig(vcan.name, "hipnuc-j1939", HipnucJ1939Settings())
-
-    def step() -> None:
-        port.step(monotonic_ns(), True)
-
+    rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Settings(), module, other)
     results: dict[str, object] = {}
 
     async def told(name: str, **arguments: object) -> None:
-        task = asyncio.create_task(rig.runner.act(name, arguments))
-        await rig.until(task.done, name, step)
-        results[name] = task.result()
+        results[name] = await rig.done(rig.device.act(name, arguments))
 
     async def story() -> None:
-        await rig.until(lambda: len(rig.samples) >= 20, "twenty samples", step)
+        await rig.until(lambda: len(rig.samples) >= 20, "twenty samples")
         assert rig.samples[-1].temperature_c is not None
         assert rig.samples[-1].incli_rad is not None
-        assert rig.runner.ledger.lost() == 0
+        assert rig.device.ledger.lost() == 0
         await told("direction", axis="X", reversed=True)
         await told("zero", zero="here")
         await told("bitrate", bitrate=250_000)
@@ -217,10 +174,9 @@ def test_driver_and_simulator_with_every_message_and_all_actions(vcan: CanInterf
         assert module.flash.x_reversed == 1
         assert module.settings == module.flash
         count = len(rig.samples)
-        await rig.until(lambda: len(rig.samples) >= count + 30, "faster samples", step)
+        await rig.until(lambda: len(rig.samples) >= count + 30, "faster samples")
 
-    with closing(port):
-        rig.play(story)
+    rig.play(story)
     assert other.requests == 0
     last = rig.samples[-20:]
     assert {sample.accel_m_s2 is not None for sample in last} == {True}
@@ -229,15 +185,13 @@ def test_driver_and_simulator_with_every_message_and_all_actions(vcan: CanInterf
 
 def test_nmea_2000_from_the_simulator(vcan: CanInterface) -> None:
     module = HipnucNmea2000Module(monotonic_ns(), Nmea2000Hardware(rate_hz=20, bitrate=0, boot_ms=0))
-    port = CanPort(module, vcan.name)
-    rig = Rig(vcan.name, "hipnuc-nmea2000", HipnucNmea2000Settings())
+    rig = BusRig(vcan.name, "hipnuc-nmea2000", HipnucNmea2000Settings(), module)
 
     async def story() -> None:
-        await rig.until(lambda: len(rig.samples) >= 40, "forty samples", lambda: port.step(monotonic_ns(), True))
+        await rig.until(lambda: len(rig.samples) >= 40, "forty samples")
 
-    with closing(port):
-        rig.play(story)
-    assert rig.runner.ledger.lost() == 0
+    rig.play(story)
+    assert rig.device.ledger.lost() == 0
     for sample in rig.samples:
         assert sample.euler_rad is not None
         truth = module.hardware.motion.at((sample.t_ns - module.epoch_ns) / 1e9)
