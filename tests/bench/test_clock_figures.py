@@ -1,11 +1,6 @@
 """The figures of docs/clock.md: rows by hand, kept and read back, and plots that show every one of them."""
 
-from pathlib import Path
-
-import pytest
-
-from tests.bench import clock_figures
-from tests.bench.clock_figures import ArrivalFigures, LineFigures, keep, kept, microseconds, spread
+from tests.bench.clock_figures import ArrivalFigures, LineFigures, kept, microseconds, spread
 from tests.bench.clock_pictures import LEAST_US, arrivals_figure, lines_figure
 
 ARRIVAL = ArrivalFigures("usb-1ms", 100, (6, 125), (88, 262), (110, 542), (90, 271), 1.0, 0.9985)
@@ -17,14 +12,6 @@ def test_rows_by_hand() -> None:
     assert LINE.row() == "| SOUT | loaded | 1000 | 4.3 | -7.1 | 44 | 30 | 1.000 | 0.999 | 0.840 |"
     assert spread((72, 72)) == "72"
     assert [microseconds(one) for one in (0.04, 10.0, 10.4, -158.0)] == ["0.0", "10.0", "10", "-158"]
-
-
-def test_one_table_is_replaced_and_the_other_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clock_figures, "FILE", tmp_path / "figures.json")
-    keep(arrivals=[ARRIVAL])
-    keep(lines=[LINE])
-    assert kept().arrivals == (ARRIVAL,)
-    assert kept().lines == (LINE,)
 
 
 def test_both_tables_are_long() -> None:
