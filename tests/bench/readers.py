@@ -24,11 +24,15 @@ from tests.bench.writer import FIRST_PA
 
 LENGTH = struct.Struct("<I")
 SEQ_DEVICE_AND_PRESSURE = struct.Struct("<Q52xH138xd")
+"""Members of a slot."""
 CHUNK = 1 << 18
 PARTS = 5
+"""Number of devices per watched device, with `--devices`."""
 
 
 class Seen:
+    """Samples of a client, gaps in `seq`, and times from the write into the pty to the receive."""
+
     def __init__(self, times: mmap.mmap | None = None, skip: int = 0) -> None:
         self.times = times
         self.skip = skip
@@ -38,6 +42,7 @@ class Seen:
         self.newest: dict[object, int] = {}
 
     def add(self, device: object, seq: int, pressure_pa: float, now_ns: int) -> None:
+        """Count one sample; its pressure has the writer's number of the frame."""
         self.samples += 1
         self.gaps += seq - self.newest.get(device, seq - 1) - 1
         self.newest[device] = seq
@@ -46,9 +51,11 @@ class Seen:
 
 
 Take = Callable[[bytearray, Seen, int], None]
+"""Removes whole messages from the front of a buffer and counts their samples."""
 
 
 def take_binary(buffer: bytearray, seen: Seen, now_ns: int) -> None:
+    """Take length-prefixed messages."""
     at = 0
     while len(buffer) - at >= LENGTH.size:
         (length,) = LENGTH.unpack_from(buffer, at)
@@ -64,6 +71,7 @@ def take_binary(buffer: bytearray, seen: Seen, now_ns: int) -> None:
 
 
 def take_json(buffer: bytearray, seen: Seen, now_ns: int) -> None:
+    """Take lines."""
     end = buffer.rfind(b"\n") + 1
     for line in bytes(buffer[:end]).splitlines():
         params = msgspec.json.decode(line).get("params", {})
@@ -73,6 +81,7 @@ def take_json(buffer: bytearray, seen: Seen, now_ns: int) -> None:
 
 
 def take_attitudes(buffer: bytearray, seen: Seen, now_ns: int) -> None:
+    """Take lines of gpsd."""
     end = buffer.rfind(b"\n") + 1
     for _ in range(buffer.count(b'"class":"ATT"', 0, end)):
         seen.add("gpsd", seen.samples, 0.0, now_ns)
@@ -83,11 +92,15 @@ TAKES: dict[str, Take] = {"binary": take_binary, "json": take_json}
 
 
 class Client(NamedTuple):
+    """A connection that is subscribed."""
+
     socket: socket.socket
     buffer: bytearray
+    """Received bytes that were not taken yet."""
 
 
 def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -> Client:
+    """Connect and ask for samples, as `wanted`."""
     sock = socket.socket(socket.AF_UNIX)
     sock.connect(path)
     if bare:
@@ -103,6 +116,7 @@ def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -
 
 
 def subscribe_to_gpsd(port: int) -> Client:
+    """Connect to gpsd and ask for all its reports."""
     sock = socket.create_connection(("127.0.0.1", port))
     sock.sendall(b'?WATCH={"enable":true,"json":true};\n')
     got = b""
@@ -112,7 +126,7 @@ def subscribe_to_gpsd(port: int) -> Client:
 
 
 def receive(clients: list[Client], takes: list[tuple[Take, Seen]], seconds: float) -> None:
-    """Receive for so long, or until a socket or standard input ends; the first clients count with `takes`."""
+    """Receive for `seconds`, or until a socket or standard input ends; the first clients count with `takes`."""
     poll = select.epoll()
     by_fd = {client.socket.fileno(): (client, number) for number, client in enumerate(clients)}
     for fd, (client, _) in by_fd.items():
@@ -138,10 +152,12 @@ def receive(clients: list[Client], takes: list[tuple[Take, Seen]], seconds: floa
 
 
 def percentile(ordered: list[int], share: float) -> float:
+    """The value below which `share` of the values lie; NaN of none."""
     return float(ordered[min(len(ordered) - 1, int(share * len(ordered)))]) if ordered else float("nan")
 
 
 def figures(seen: list[Seen]) -> dict[str, float]:
+    """Return the figures of the clients that counted, and the latencies of the first."""
     ordered = sorted(seen[0].latencies_ns)
     shares = {"p50_us": 0.5, "p99_us": 0.99}
     found = {name: percentile(ordered, share) / 1e3 for name, share in shares.items()}
@@ -150,6 +166,7 @@ def figures(seen: list[Seen]) -> dict[str, float]:
 
 
 def main() -> None:
+    """Run as `python -m tests.bench.readers`."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--socket", default="")
     parser.add_argument("--gpsd", type=int, metavar="PORT", help="clients of gpsd instead")

@@ -88,7 +88,7 @@ class Bus(Generic[OneTransfer]):
         try:
             os.write(self._file, answer)
         except OSError as error:
-            if error.errno != errno.ESTALE:  # the host has given up meanwhile
+            if error.errno != errno.ESTALE:  # the transfer of the host has timed out
                 self._failure = error
 
     def _answer(self, transfer: OneTransfer) -> bytes:

@@ -7,7 +7,7 @@ import pytest
 
 
 def cases(all_of: Iterable[str], *kept: str) -> list[Any]:
-    """Return parameters. The short form has only those of `kept`."""
+    """Return parameters. The short form has only the parameters in `kept`."""
     names = list(all_of)
     assert set(kept) <= set(names), f"expected names of {names}, got {kept}"
     return [pytest.param(name, marks=() if name in kept else pytest.mark.thorough) for name in names]

@@ -26,7 +26,7 @@ from tests.lab.wire import I2cTransfer, SpiTransfer
 LIMIT_S = 60.0
 ALL_BYTES = bytes(range(256))
 QUIET_S = 0.5
-"""Time without a byte after which nothing of the driver's FIFO probe is left in a UART."""
+"""Time without a byte after which a UART has delivered all bytes of the driver's FIFO probe, s."""
 TIOCGICOUNT = 0x545D
 COUNTERS = struct.Struct("=11i9i")
 COUNTERS_USED = {"rx": 4, "tx": 5, "frame": 6, "overrun": 7}

@@ -38,7 +38,7 @@ def distribution(requirement: str) -> str:
 
 
 def test_arm64_has_the_libraries_that_its_tests_import() -> None:
-    """A missing library ends pytest after 760 s under qemu-user. The libraries are WHEELS and those of the package."""
+    """A missing library ends pytest after 760 s under qemu-user. WHEELS and the package contain the libraries."""
     paths = [ROOT / name for part in unit_tests.PARTS.values() for name in part]
     assert all(path.exists() for path in paths)
     files = [one for path in paths for one in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
