@@ -86,9 +86,10 @@ def test_frames_commands_and_the_end(start: Start, tmp_path: Path) -> None:
         for _ in range(20):
             assert select.select([fd], [], [], LIMIT_S)[0], "nothing came"
             text += os.read(fd, 4096)
+    newest = read(fd, 1)[0].dev_ticks or 0
     command(process, "reboot")
-    while (read(fd, 1)[0].dev_ticks or 0) >= ticks[-1]:
-        pass
+    while (tick := read(fd, 1)[0].dev_ticks or 0) >= newest:
+        newest = tick
     command(process, "dance")
     command(process, "unplug soon")
     command(process, "stats")

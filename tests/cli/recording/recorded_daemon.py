@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from random import Random
 
+import pytest
+
 from imud import config
 from imud.contracts.publisher import Batch
 from imud.daemon import Daemon
@@ -67,5 +69,8 @@ devices:
 """
     collector = Collector()
     daemon = Daemon(config.parse(text, "imud.yaml"), extra={"test": collector}, until_finished=True)
-    event_loop.run(daemon.run())
+    with pytest.MonkeyPatch.context() as patch:
+        # On a busy host, the recorder would begin the second device at the next tick, in the middle of its replay.
+        patch.setattr("imud.publishers.recorder.feed.BEGIN_NS", NS_PER_S)
+        event_loop.run(daemon.run())
     return daemon, collector, sorted((folder / "recordings").iterdir())
