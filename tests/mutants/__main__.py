@@ -46,14 +46,16 @@ def run_stage(tree: Tree, mutant: Mutant, tests: list[str]) -> Run:
     while True:
         with tree.changed(mutant.path, original, mutant.apply(original)):
             run = tree.pytest(*tests, *options)
-            if run.passed or not run.failed:
+            if run.passed or run.status is None:
                 return run
-            test = run.failed[0].partition("[")[0]  # with all parameters: pytest does not find every identifier
-            again = tree.pytest(test)
-        if not again.passed and tree.pytest(test).passed:
+            # The failed test with all parameters: pytest does not find every identifier. If no test failed, a signal
+            # ended pytest: the mutant crashed pytest, or another program killed pytest.
+            again = [name.partition("[")[0] for name in run.failed[:1]] or tests
+            is_twice = not tree.pytest(*again).passed
+        if is_twice and tree.pytest(*again).passed:
             return run
-        print(f"fails now and then, does not count: {run.failed[0]}", file=sys.stderr, flush=True)
-        options.append(f"--deselect={run.failed[0]}")
+        print(f"fails now and then, does not count: {' '.join(run.failed or tests)}", file=sys.stderr, flush=True)
+        options += [f"--deselect={name}" for name in run.failed]
 
 
 def main() -> int:

@@ -42,7 +42,7 @@ def tested_in() -> dict[str, str]:
 
 
 def stages(path: str) -> list[list[str]]:
-    """Return the test modules for a module of imud: its own, then its folder, then the folders above.
+    """Return the test modules for a module of imud: its own, then its folder, the subfolders, the folders above.
 
     Tests of the whole daemon run for modules at the top only. Contracts have no tests of their own: their users do.
     """
@@ -51,7 +51,9 @@ def stages(path: str) -> list[list[str]]:
     folders = [ROOT / "tests" / folder for folder in module.relative_to("imud").parents]
     own = [test for test in tests_in(folders[0]) if test.endswith(f"/test_{module.name.strip('_')}.py")]
     first = own or ([f"tests/{tested_in()[dotted]}"] if dotted in tested_in() else [])
-    found = [first, *map(tests_in, folders[:-1] or folders)]
+    below = sorted(folders[0].glob("*/**/")) if len(folders) > 1 else []
+    found = [first, tests_in(folders[0]), [test for folder in below for test in tests_in(folder)]]
+    found += map(tests_in, folders[1:-1])
     if not first:
         tests = [path for path in sorted((ROOT / "tests").rglob("test_*.py")) if path.parts[-2] not in NO_MIRROR]
         found.append([path.relative_to(ROOT).as_posix() for path in tests if dotted in path.read_text()])
