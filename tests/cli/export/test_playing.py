@@ -10,7 +10,7 @@ import pytest
 
 from imud.bridges.channel import LossCounts, StampedEvent
 from imud.cli.export import playing
-from imud.cli.export.playing import SAMPLES, PipeSink, play_beside, play_here
+from imud.cli.export.playing import EVENT, HEAD, SAMPLES, PipeSink, play_beside, play_here
 from imud.contracts.publisher import Batch
 from imud.errors import ImudError
 from imud.frames.conventions import Convention
@@ -98,8 +98,21 @@ def test_an_error_of_the_player_comes_out(tmp_path: Path) -> None:
         play_beside(tmp_path / "a", KeepingSink(), [], lambda _at: None)
 
 
-def test_a_player_that_ends_early_is_an_error(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "executable", "/bin/true")
+WHOLE = HEAD.pack(EVENT, 4, 0)
+"""Head of a message with four bytes of data."""
+
+
+@pytest.mark.parametrize(
+    "sent", [b"", WHOLE[:-1], WHOLE, WHOLE + b"abc"], ids=["nothing", "in a head", "head", "in data"]
+)
+def test_a_player_that_ends_early_is_an_error(
+    sent: bytes, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "sent").write_bytes(sent)
+    player = tmp_path / "player"
+    player.write_text(f"#!/bin/sh\ncat {tmp_path}/sent\n")
+    player.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(player))
     with pytest.raises(ImudError, match="ended before its end"):
         play_beside(file, KeepingSink(), [], lambda _at: None)
 
