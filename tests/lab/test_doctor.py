@@ -121,6 +121,7 @@ def test_the_package_is_that_of_this_tree() -> None:
     assert Path(imud.__file__).is_relative_to(ROOT)
 
 
+@pytest.mark.thorough
 def test_healthy_devices_then_a_newer_file_then_no_daemon(
     can_pair: tuple[CanInterface, CanInterface], i2c: Bus[I2cTransfer], spi8: Bus[SpiTransfer], tmp_path: Path
 ) -> None:
@@ -168,6 +169,7 @@ def test_healthy_devices_then_a_newer_file_then_no_daemon(
     assert not found.complete
 
 
+@pytest.mark.thorough
 def test_mistakes_and_a_port_that_is_the_console(tmp_path: Path) -> None:
     """No daemon runs: none is to open that port."""
     config = write_config(tmp_path, {"bow": uart("/dev/ttyS0")})
@@ -300,6 +302,7 @@ def check_states(made: RunningDaemon, near: CanInterface) -> None:
     doctor(made).has("CAN state", "warning", f"{near.name} was bus-off ", "120 Ω at both ends")
 
 
+@pytest.mark.thorough
 def test_i2c_and_spi(i2c: Bus[I2cTransfer], spi8: Bus[SpiTransfer], spi16: Bus[SpiTransfer], tmp_path: Path) -> None:
     """Silent addresses and chip selects, failing and damaged transfers, exchanged bytes, a wrong mode, absent nodes."""
     damaged = registers()
@@ -387,6 +390,7 @@ def test_lines_and_restarts(gpio_chip: GpioChip, tmp_path: Path) -> None:
         doctor(made).has("restarts", "warning", "bow began its clock anew 3 times", "brown-out?")
 
 
+@pytest.mark.thorough
 def test_a_line_of_another_program(gpio_chip: GpioChip, tmp_path: Path) -> None:
     devices: dict[str, object] = {"bow": {**uart(tty(tmp_path)), "lines": {"alarm": {"line": "ALARM"}}}}
     with running("gpiomon", gpio_chip.path.name, str(gpio_chip.names.index("ALARM"))):
