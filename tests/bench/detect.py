@@ -1,4 +1,4 @@
-"""How long detection takes, in virtual time, at every baud rate and random phases.
+"""Duration of detection in virtual time, at every baud rate and at random phases.
 
 Neither driver nor rate is given: every search tries all families. The device sends at 100 Hz (at 9600 baud as often as
 the line carries); the line is modelled bit by bit, so that wrong rates deliver the garbage that they would. `quick`

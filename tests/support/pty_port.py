@@ -153,6 +153,20 @@ LINE_BAUD = 115200
 BEGIN_NS = 5 * NS_PER_S
 
 
+def wait_for_reply(
+    line: ModbusLine, finder: ReplyFinder, baud: int, now_ns: int, end_ns: int
+) -> tuple[bytes | None, int]:
+    """Play a line until a reply arrives, or until `end_ns`. Return the reply (None if it is missing) and the time."""
+    while (next_ns := line.next_ns()) is not None and next_ns <= end_ns:
+        now_ns = max(next_ns, now_ns)
+        for burst in line.advance(now_ns):
+            reply = finder.feed(burst.data if line.baud == baud else b"")
+            if reply is not None:
+                return reply, now_ns
+    line.advance(end_ns)
+    return None, end_ns
+
+
 class ModbusBench:
     """A line whose port has a rate of its own, and the address at which the script's device is."""
 
@@ -191,14 +205,9 @@ class ModbusBench:
         finder = ReplyFinder(frame, transfer.read_bytes, echoes=False)
         wire_ns = (len(frame) + transfer.read_bytes) * uart_byte_ns(self.baud) + 2 * frame_gap_ns(self.baud)
         end_ns = self.now_ns + wire_ns + max(REPLY_MS, transfer.reply_ms) * NS_PER_MS
-        while (next_ns := self.line.next_ns()) is not None and next_ns <= end_ns:
-            self.now_ns = max(next_ns, self.now_ns)
-            for burst in self.line.advance(self.now_ns):
-                reply = finder.feed(burst.data if self.line.baud == self.baud else b"")
-                if reply is not None:
-                    return reply
-        self.now_ns = end_ns
-        self.line.advance(end_ns)
+        reply, self.now_ns = wait_for_reply(self.line, finder, self.baud, self.now_ns, end_ns)
+        if reply is not None:
+            return reply
         if address == BROADCAST:
             return b""
         raise TransferError(Trouble.DISTURBED, f"no reply from address {address}")

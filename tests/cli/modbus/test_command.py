@@ -16,7 +16,7 @@ from imud.links.rs485.link import Rs485Settings
 from imud.sim.hipnuc.modbus import Slave
 from imud.units import NS_PER_MS, uart_byte_ns
 from tests.cli.conftest import Cli
-from tests.support.pty_port import LINE_BAUD, ModbusBench, modbus_slave, serial_of, slave, wired
+from tests.support.pty_port import LINE_BAUD, ModbusBench, modbus_slave, serial_of, slave, wait_for_reply, wired
 
 REPLY_MS = 30
 ON = ("--baud", LINE_BAUD, "--reply-ms", REPLY_MS)
@@ -55,14 +55,9 @@ class Bus(ModbusBench):
         finder = ReplyFinder(frame, transfer.read_bytes, echoes=False)
         wire_ns = (len(frame) + transfer.read_bytes) * uart_byte_ns(self.baud)
         end_ns = self.now_ns + wire_ns + max(self.reply_ms, transfer.reply_ms) * NS_PER_MS
-        while (next_ns := self.line.next_ns()) is not None and next_ns <= end_ns:
-            self.now_ns = max(next_ns, self.now_ns)
-            for burst in self.line.advance(self.now_ns):
-                reply = finder.feed(burst.data if self.line.baud == self.baud else b"")
-                if reply is not None:
-                    return reply
-        self.now_ns = end_ns
-        self.line.advance(end_ns)
+        reply, self.now_ns = wait_for_reply(self.line, finder, self.baud, self.now_ns, end_ns)
+        if reply is not None:
+            return reply
         if address == BROADCAST:
             return b""
         self.heard.strange += finder.strange + len(finder.rest())
