@@ -132,3 +132,24 @@ async def test_a_sender_whose_second_frame_is_refused_leaves_no_timer() -> None:
         LoopSender(write, errors.append, FRAMES)
     await asyncio.sleep(0.01)  # ten periods of the first frame
     assert (len(written), errors) == (1, [])
+
+
+class FakeSender:
+    def __init__(self, made: list["FakeSender"]) -> None:
+        self.closed = False
+        made.append(self)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_a_link_has_one_cyclic_sender_at_a_time(monkeypatch: pytest.MonkeyPatch, sys_with_can0: Path) -> None:
+    made: list[FakeSender] = []
+    monkeypatch.setattr("imud.links.can.link.KernelSender", lambda *_: FakeSender(made))
+    link = link_of(FakeSocket(), sys_with_can0)
+    link.open()
+    for expected in ([False], [True, False]):
+        link.send_cyclic(FRAMES)
+        assert [sender.closed for sender in made] == expected
+    link.close()
+    assert [sender.closed for sender in made] == [True, True]
