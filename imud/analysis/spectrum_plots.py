@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from imud.analysis.noise import AXES
 from imud.analysis.noise_plots import COLOURS
 from imud.analysis.peaks import Band, Peak
 from imud.analysis.quantities import SI, TITLES
@@ -15,13 +16,12 @@ from imud.analysis.series import Grid
 from imud.analysis.spectrum import Spectrogram, Spectrum
 from imud.contracts.sensors.data_sheet import SensorName
 
-AXES: Final = ("x", "y", "z")
 RANGE_DB: Final = 80.0
 """Of the colours, below the strongest."""
 LABELS_MOST: Final = 6
 SPAN_LEAST: Final = 100.0
 """Of a density, from the lowest to the highest that is shown."""
-PLOT_INCHES: Final = (9.0, 3.6)
+SPECTRUM_INCHES: Final = (9.0, 3.6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,9 @@ class SensorVibration:
 def spectrum_figure(sensors: Mapping[SensorName, SensorVibration], title: str, lines: Sequence[str]) -> Figure:
     """Density and spectrogram of each sensor, one below the other; what was measured stands below the title."""
     rows = 2 * len(sensors)
-    figure = Figure(figsize=(PLOT_INCHES[0], PLOT_INCHES[1] * rows * 0.8 + 0.2 * len(lines)), layout="constrained")
+    figure = Figure(
+        figsize=(SPECTRUM_INCHES[0], SPECTRUM_INCHES[1] * rows * 0.8 + 0.2 * len(lines)), layout="constrained"
+    )
     figure.suptitle("\n".join([title, *lines]), fontsize=9)
     places = figure.subplots(rows, 1, squeeze=False)[:, 0]
     for number, (name, sensor) in enumerate(sensors.items()):

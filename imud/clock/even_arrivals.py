@@ -27,7 +27,7 @@ UNDECIDED_MOST: Final = 32
 """After so many messages that come at pace and do not agree the rate is another."""
 EVEN_SHARE: Final = 0.25
 """Mean distance above the line, in periods, of arrivals that follow a pace; where it is more their times are better."""
-SMOOTHING: Final = 1 / 128
+MEAN_SMOOTHING: Final = 1 / 128
 LOST_MOST: Final = 3
 NEAR_SHARE: Final = 0.02
 """A message that is late by so few periods within this share of one is more likely another sample's, on a host where
@@ -97,7 +97,7 @@ class EvenArrivals:
         self._late_periods = self._agreeing = self._undecided = 0
         self._device_ns = device_ns
         if at_pace:
-            self._above_mean += (min(above_ns, period_ns) - self._above_mean) * SMOOTHING
+            self._above_mean += (min(above_ns, period_ns) - self._above_mean) * MEAN_SMOOTHING
         if fit.add_arrival(device_ns, arrival_ns, 0, above_ns):
             fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
         return self._use(delay, fit, device_ns, fit_ns, max(above_ns, 0.0) if triggered else 0.0)

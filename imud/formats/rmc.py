@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 from imud.formats.nmea0183 import checksum
 from imud.units import NS_PER_MS, NS_PER_S
 
-SENTENCE_BYTES_MAX: Final = 120
+RMC_BYTES_MAX: Final = 120
 """NMEA 0183 allows 82; receivers that give positions to the millimetre send up to some 100."""
 FIRST_YEAR: Final = 1980
 HUNDREDTH_NS: Final = 10 * NS_PER_MS
@@ -63,7 +63,7 @@ class Rmc(NamedTuple):
 
 def parse(sentence: bytes) -> Rmc | RmcFault:
     """Decode a sentence, with or without its line end. Returns the fault of any other bytes; never raises."""
-    if len(sentence) > SENTENCE_BYTES_MAX:
+    if len(sentence) > RMC_BYTES_MAX:
         return RmcFault.LENGTH
     match = _SENTENCE.fullmatch(sentence)
     if match is None:
@@ -97,7 +97,7 @@ def as_gprmc(sentence: bytes) -> bytes:
     """
     match = _SENTENCE.fullmatch(sentence)
     if match is None or isinstance(parse(sentence), RmcFault):
-        raise ValueError(f"expected an RMC sentence, got {sentence[:SENTENCE_BYTES_MAX]!r}")
+        raise ValueError(f"expected an RMC sentence, got {sentence[:RMC_BYTES_MAX]!r}")
     body = b"GPRMC," + match[2]
     return b"$%b*%02X\r\n" % (body, checksum(body))
 

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
 from typing import Final
 
-from imud.formats.rmc import SENTENCE_BYTES_MAX
+from imud.formats.rmc import RMC_BYTES_MAX
 from imud.utc.source import OnSentence
 
 LINE_BYTES_MAX: Final = 16384
@@ -111,7 +111,7 @@ def _rmc_in(line: bytes) -> bytes | None:
     """Return the RMC sentence at the end of a line: lost bytes may have joined it to an earlier one."""
     begin = line.rfind(b"$")
     sentence = line[begin:].rstrip(b"\r")
-    if begin < 0 or sentence[3:7] != b"RMC," or len(sentence) > SENTENCE_BYTES_MAX - 2:
+    if begin < 0 or sentence[3:7] != b"RMC," or len(sentence) > RMC_BYTES_MAX - 2:
         return None
     return sentence + b"\r\n"
 

@@ -4,7 +4,7 @@ A page acknowledges what it has drawn. At most WINDOW_MAX messages are on their 
 connection (a tunnel, a telephone) would have megabytes of old samples in the buffers of its kernels.
 """
 
-from asyncio import Event
+import asyncio
 from collections import deque
 from typing import Final
 
@@ -23,7 +23,7 @@ class Mailbox:
         self._newest: dict[str, str] = {}
         self._frames: deque[str] = deque()
         self._on_the_way = 0
-        self._changed = Event()
+        self._changed = asyncio.Event()
 
     def put(self, message: str) -> None:
         """Add a message behind those that wait; the oldest goes where there are too many."""

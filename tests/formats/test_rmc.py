@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.formats.nmea0183 import checksum
-from imud.formats.rmc import SENTENCE_BYTES_MAX, Rmc, RmcFault, as_gprmc, build, parse
+from imud.formats.rmc import RMC_BYTES_MAX, Rmc, RmcFault, as_gprmc, build, parse
 from imud.units import NS_PER_S
 
 
@@ -52,7 +52,7 @@ def test_examples(data: bytes, expected: Rmc) -> None:
         (b"\x00" + UBLOX, RmcFault.FORM),
         (UBLOX + b"\r\n", RmcFault.FORM),
         (UBLOX[:-2] + b"\n\r", RmcFault.FORM),
-        (b"$GPRMC," + b"," * SENTENCE_BYTES_MAX + b"*00", RmcFault.LENGTH),
+        (b"$GPRMC," + b"," * RMC_BYTES_MAX + b"*00", RmcFault.LENGTH),
         (sentence("GPRMC,120000,A,,,,,,010125"), RmcFault.FORM),
         (sentence("GPRMC,,V,,,,,,,,,,N"), RmcFault.CONTENT),
         (sentence("GPRMC,120000,V,,,,,,,,,,N"), RmcFault.CONTENT),

@@ -10,7 +10,7 @@ from typing import Final
 
 from imud.contracts.timing import UtcReference
 from imud.formats.nmea0183 import checksum
-from imud.formats.rmc import SENTENCE_BYTES_MAX, Rmc, RmcFault, as_gprmc, build, parse
+from imud.formats.rmc import RMC_BYTES_MAX, Rmc, RmcFault, as_gprmc, build, parse
 from imud.utc.rmc_feed import RmcFeed
 from imud.utc.sentence_stream import LINE_BYTES_MAX, SentenceSplitter
 from tests.fuzz.target import Target
@@ -29,7 +29,7 @@ def names() -> Sequence[str]:
 
 def make(name: str) -> Target:
     if name == "rmc":
-        return Target(run_rmc, rmc_seeds, mend, words=words, bytes_max=2 * SENTENCE_BYTES_MAX)
+        return Target(run_rmc, rmc_seeds, mend, words=words, bytes_max=2 * RMC_BYTES_MAX)
     return Target(run_sentences, stream_seeds, mend, words=words, bytes_max=STREAM_BYTES_MAX)
 
 
@@ -65,7 +65,7 @@ def run_sentences(data: bytes) -> None:
     long, end = data[:-FINE_BYTES], data[-FINE_BYTES:]  # single bytes of a long line would take its length squared
     parts = [*(long[at : at + 997] for at in range(0, len(long), 997)), *cut(end, random)]
     assert [sentence for part in parts for sentence in splitter.feed(part)] == whole
-    assert all(len(sentence) <= SENTENCE_BYTES_MAX and sentence[:-2] in data for sentence in whole)
+    assert all(len(sentence) <= RMC_BYTES_MAX and sentence[:-2] in data for sentence in whole)
 
 
 def mend(data: bytes, _random: Random) -> bytes:

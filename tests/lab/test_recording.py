@@ -19,7 +19,7 @@ from time import monotonic_ns, sleep
 import msgspec
 import pytest
 
-from imud.cli.recording.replay import play
+from imud.cli.recording.replay import play_to_end
 from imud.contracts.lines import DeviceLines, ReadySettings
 from imud.contracts.status import DeviceState
 from imud.event import Event, EventKind
@@ -143,7 +143,7 @@ def replayed(file: Path) -> dict[str, list[Sample]]:
 def ledgers(file: Path) -> Mapping[str, Mapping[str, int]]:
     player = Player(lambda _batch: None)
     with file.open("rb") as opened:
-        play(opened, file.name, player)
+        play_to_end(opened, file.name, player)
     return {device.described.name: device.ledger.snapshot() for device in player.devices.values()}
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from matplotlib import rc_context
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as MatplotlibFigure
 
 from imud.analysis.noise import AXES, SensorNoise
 from imud.analysis.noise_plots import DPI, density_figure, deviation_figure, page_figure
@@ -64,7 +64,7 @@ def noise_file(report: NoiseReport, kind: str) -> bytes:
     return picture(page_figure(report.sensors, text(report).splitlines()), kind)
 
 
-def picture(figure: Figure, kind: str) -> bytes:
+def picture(figure: MatplotlibFigure, kind: str) -> bytes:
     """A figure as the content of an SVG or PNG file."""
     buffer = io.BytesIO()
     with rc_context(REPEATABLE):
@@ -73,7 +73,7 @@ def picture(figure: Figure, kind: str) -> bytes:
     return buffer.getvalue()
 
 
-def inline_svg(figure: Figure) -> str:
+def inline_svg(figure: MatplotlibFigure) -> str:
     """A figure as an element of an HTML page, without the head of a file of its own."""
     content = picture(figure, ".svg").decode()
     return re.sub(r"^.*?(?=<svg)", "", content, count=1, flags=re.DOTALL)

@@ -4,11 +4,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
+from imud.analysis.noise import AXES
 from imud.analysis.peaks import Peak, bands_of, images_hz, peaks
 from imud.analysis.quantities import SI, TITLES, figure_text
 from imud.analysis.series import FloatArray, Readings, even_runs, grid_of, with_values
 from imud.analysis.spectrum import WINDOW_LEAST, power_spectrum, spectrogram, window_size
-from imud.analysis.spectrum_plots import AXES, SensorVibration, spectrum_figure
+from imud.analysis.spectrum_plots import SensorVibration, spectrum_figure
 from imud.cli.analysis.noise_page import picture
 from imud.cli.analysis.noise_report import circumstances, grid_object, measurement_object, readings_of
 from imud.cli.analysis.taking import Taken

@@ -18,7 +18,7 @@ import msgspec
 
 from imud.bridges.channel import LossCounts, StampedEvent
 from imud.cli.export.sinks import Sink
-from imud.cli.recording.replay import play
+from imud.cli.recording.replay import play_to_end
 from imud.contracts.publisher import Batch
 from imud.errors import ImudError
 from imud.event import Event, kind_of
@@ -78,7 +78,7 @@ def play_here(file: BinaryIO, name: str, sink: Sink, devices: Collection[str]) -
     """Play a recording in this process. Raises ImudError."""
     watch = LossWatch(sink, devices)
     player = Player(lambda batch: watch.batch(batch, player.devices[batch.device_id].ledger), on_event=watch.event)
-    report, status = play(file, name, player)
+    report, status = play_to_end(file, name, player)
     return report, status, sorted(device.described.name for device in player.devices.values())
 
 

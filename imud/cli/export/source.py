@@ -11,7 +11,7 @@ from imud.cli.export.playing import LossWatch, play_beside, play_here
 from imud.cli.export.progress import Progress
 from imud.cli.export.sinks import Sink
 from imud.cli.output import paragraph
-from imud.cli.recording.replay import block
+from imud.cli.recording.replay import device_block
 from imud.contracts.can import CanDriver
 from imud.contracts.driver import Driver
 from imud.contracts.publisher import Batch
@@ -147,4 +147,4 @@ def times_of(file: BinaryIO, driver: Driver) -> KnownTimes | None:
 def _block(device: PlayedDevice, times: KnownTimes) -> list[str]:
     """Lines about the device, without those that need times that were recorded, or a live run."""
     without = ("compared",) if times.has_host_times else ("compared", "clock")
-    return block(device, without)
+    return device_block(device, without)

@@ -12,7 +12,18 @@ from imud.formats.fleet.state import GatewayState, StreamAccount
 from imud.formats.fleet.topics import Stream
 from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
-HEAD: Final = ("GATEWAY", "STATE", "DEVICES", "SAMPLES/S", "LOST", "MISSING", "SPOOL", "AGE S", "ERROR µs", "UTC ms")
+TOP_HEAD: Final = (
+    "GATEWAY",
+    "STATE",
+    "DEVICES",
+    "SAMPLES/S",
+    "LOST",
+    "MISSING",
+    "SPOOL",
+    "AGE S",
+    "ERROR µs",
+    "UTC ms",
+)
 NOT_SET: Final = "not set"
 RATE_NS: Final = 5 * NS_PER_S
 """Rates are over so much time."""
@@ -62,7 +73,7 @@ class FleetOverview:
         line = f"{len(rows)} gateway{'s' * (len(rows) != 1)}, {away} away" + (
             f"; {fleet.problem}" * bool(fleet.problem)
         )
-        return f"{table(HEAD, rows)}\n\n{line}"
+        return f"{table(TOP_HEAD, rows)}\n\n{line}"
 
     def _row(self, key: tuple[str, str], found: list[StreamAccount]) -> tuple[str, ...]:
         state, name = self._fleet.states[key], key[1]

@@ -15,7 +15,8 @@ from contextlib import suppress
 from email.errors import MessageError
 from http.client import HTTPException, parse_headers
 from io import BytesIO
-from threading import Event, Thread
+from threading import Event as ThreadEvent
+from threading import Thread
 from typing import Final
 
 from imud.cli.foxglove.origins import ViewerOrigins
@@ -53,7 +54,7 @@ class ViewerGate:
         self.port: Final = int(self._socket.getsockname()[1])
         self._loop = asyncio.new_event_loop()
         self._stopped = asyncio.Event()
-        self._ready = Event()
+        self._ready = ThreadEvent()
         self._thread = Thread(target=self._run, name="foxglove-gate", daemon=True)
         self._thread.start()
         self._ready.wait()

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from threading import Event as Flag
+from threading import Event as ThreadEvent
 from time import monotonic, time_ns
 from typing import Any, Final, Protocol
 
@@ -87,7 +87,7 @@ class Relay:
         self._diagnostics = dialect.diagnostics()
         self._diagnosis = LiveDiagnosis()
         self._devices: dict[str, _ShownDevice] = {}
-        self._stop = Flag()
+        self._stop = ThreadEvent()
 
     def run(self) -> None:
         """Relay until `stop`."""

@@ -73,12 +73,12 @@ def state_of(interface: str) -> str:
 
 async def _report(link: CanLink, title: str, device: CanDevice, may_ask: bool) -> ProbeReport:
     driver, node = device
-    identity = await ask(device, link) if may_ask else Identity()
+    identity = await identity_of_node(device, link) if may_ask else Identity()
     words = identity_words(printable_identity(identity))
     return ProbeReport(link.title, title, driver.name, driver.node_title(node), link.bitrate, words)
 
 
-async def ask(device: CanDevice, link: CanLink) -> Identity:
+async def identity_of_node(device: CanDevice, link: CanLink) -> Identity:
     """Ask a device for its identity; empty when it does not answer."""
     driver, settings = device.driver, device.driver.node_settings(device.node)
     ledger = Ledger()

@@ -70,7 +70,7 @@ async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
     try:
         link.open()
         found = await find(config, link)
-        identity = await ask(found, link) if may_ask else Identity()
+        identity = await identity_of_device(found, link) if may_ask else Identity()
         words = identity_words(printable_identity(identity))
         return [ProbeReport(port, title, found.driver.name, baud=link.baud, identity=words)]
     except ImudError as error:
@@ -96,7 +96,7 @@ async def find(config: DeviceConfig, link: StreamLink) -> StreamFound:
     return findings[0]
 
 
-async def ask(found: StreamFound, link: StreamLink) -> Identity:
+async def identity_of_device(found: StreamFound, link: StreamLink) -> Identity:
     """Ask a device for its identity; empty when it does not answer."""
     ledger = Ledger()
     codec = found.driver.make_codec(ledger, found.driver.settings())

@@ -132,13 +132,13 @@ class Contents:
         return max(0, self.newest_ns - begun_ns) / NS_PER_S if begun_ns else 0.0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_info_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud info`."""
     parser.add_argument("file", type=Path, metavar="FILE", help="recording")
     parser.add_argument("--json", action="store_true", help="one JSON object")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_info(args: argparse.Namespace) -> int:
     """Print what is in the file; 1 where something of it is damaged, missing or was dropped."""
     contents = Contents()
     try:
@@ -215,4 +215,4 @@ def page(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-INFO = CliCommand(add_arguments, run)
+INFO = CliCommand(add_info_arguments, run_info)

@@ -46,7 +46,7 @@ def play_recording(args: argparse.Namespace) -> int:
 
 def _play(file: BinaryIO, args: argparse.Namespace) -> int:
     player = Player(print_samples if args.json else lambda _batch: None, fresh=args.fresh)
-    report, status = play(file, str(args.file), player)
+    report, status = play_to_end(file, str(args.file), player)
     sys.stdout.flush()
     print(report, file=sys.stderr)
     return status
@@ -57,7 +57,7 @@ def print_samples(batch: Batch) -> None:
     print("".join(msgspec.json.encode(sample).decode() + "\n" for sample in batch.samples), end="")
 
 
-def play(file: BinaryIO, name: str, player: Player) -> tuple[str, int]:
+def play_to_end(file: BinaryIO, name: str, player: Player) -> tuple[str, int]:
     """Play a recording to its end. Returns what came of it, for people, and the exit status of `imud replay`.
 
     Raises ImudError, and what the player's publisher raises as OSError.
@@ -65,12 +65,12 @@ def play(file: BinaryIO, name: str, player: Player) -> tuple[str, int]:
     reader = RecordingReader(file, name)
     player.play(reader)
     devices = list(player.devices.values())
-    report = "\n\n".join(["\n".join(block(device)) for device in devices] + remarks(reader, player))
+    report = "\n\n".join(["\n".join(device_block(device)) for device in devices] + remarks(reader, player))
     same = all(not device.differences for device in devices) and not player.lost and not reader.is_damaged
     return report, 0 if same and any(device.ledger.samples for device in devices) else 1
 
 
-def block(device: PlayedDevice, without: Collection[str] = ()) -> list[str]:
+def device_block(device: PlayedDevice, without: Collection[str] = ()) -> list[str]:
     """Format what came of a device, in 80 columns, without the rows of these names."""
     counts = device.ledger.snapshot()
     path = device.path

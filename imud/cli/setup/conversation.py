@@ -10,9 +10,9 @@ from imud.cli.setup.attached import Attached
 from imud.errors import BadArgument
 from imud.log import MESSAGE_CHARACTERS_MAX, printable
 
-HEAD: Final = ("PORT", "DRIVER", "RATE", "ADAPTER", "CONFIGURED")
+FOUND_HEAD: Final = ("PORT", "DRIVER", "RATE", "ADAPTER", "CONFIGURED")
 TITLE_WIDTH: Final = 16
-NAME_WIDTH: Final = 10
+CONFIGURED_WIDTH: Final = 10
 ANSWERS_MAX: Final = 10
 """Wrong answers to one question after which it is given up."""
 
@@ -69,11 +69,11 @@ def attached_table(found: Sequence[Attached]) -> list[str]:
             f"{one.driver} {one.device}".strip() or "-",
             one.baud or "-",
             shortened(one.title, TITLE_WIDTH) or "-",
-            shortened(one.configured, NAME_WIDTH) or "-",
+            shortened(one.configured, CONFIGURED_WIDTH) or "-",
         )
         for one in found
     ]
-    lines = table(HEAD, rows).splitlines()
+    lines = table(FOUND_HEAD, rows).splitlines()
     for one in found:
         if one.problem:
             lines += paragraph("  ", f"{one.node}: {one.problem}")

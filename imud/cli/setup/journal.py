@@ -29,7 +29,7 @@ from imud.files import read_regular, replace_file
 
 FOLDER: Final = "/var/lib/imud-setup"
 FILE: Final = f"{FOLDER}/journal.json"
-FOLDER_MODE: Final = 0o700
+JOURNAL_FOLDER_MODE: Final = 0o700
 JOURNAL_BYTES_MAX: Final = 16 << 20
 """Some hundred versions of a configuration."""
 
@@ -98,7 +98,7 @@ class Journal:
         """Have it on the medium; an empty one is removed. Raises OSError."""
         folder = self._file.parent
         if self.records:
-            folder.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
+            folder.mkdir(mode=JOURNAL_FOLDER_MODE, parents=True, exist_ok=True)
             replace_file(self._file, msgspec.json.encode(self.records), mode=0o600)
             sync_folder(folder)
         else:

@@ -10,7 +10,7 @@ from imud.contracts.status import DeviceState, DeviceStatus
 from imud.errors import ImudError
 from imud.units import NS_PER_MS
 
-HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "PRODUCT", "CLOCK ERROR")
+SAMPLES_HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "PRODUCT", "CLOCK ERROR")
 NAME_WIDTH: Final = 24
 PRODUCT_WIDTH: Final = 20
 LOOK_S: Final = 0.5
@@ -50,7 +50,7 @@ def wait_for_samples(
 
 def samples_table(found: Sequence[DeviceStatus]) -> str:
     """Format rate, product and error of each device."""
-    return table(HEAD, [_row(one) for one in found])
+    return table(SAMPLES_HEAD, [_row(one) for one in found])
 
 
 def reasons(found: Sequence[DeviceStatus], names: Sequence[str]) -> list[str]:

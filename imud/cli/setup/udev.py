@@ -13,7 +13,7 @@ from imud.cli.doctor.surroundings import Surroundings
 from imud.cli.setup.changes import FileChange, Words, content_of
 
 RULES: Final = "/etc/udev/rules.d/61-imud-setup.rules"
-HEAD: Final = "# Made by `imud setup` for the adapters of its devices; `imud setup --undo` removes it."
+RULES_HEAD: Final = "# Made by `imud setup` for the adapters of its devices; `imud setup --undo` removes it."
 FTDI: Final = "ftdi_sio"
 MODEM_MANAGER: Final = "ModemManager.service"
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_.:/ -]")
@@ -59,7 +59,7 @@ def rules(at: Surroundings, adapters: Sequence[UsbAdapter]) -> FileChange | None
     missing = [line for line in dict.fromkeys(wanted) if line not in present]
     if not missing:
         return None
-    lines = [*(present or [HEAD]), *missing]
+    lines = [*(present or [RULES_HEAD]), *missing]
     what = [
         words
         for word, words in (

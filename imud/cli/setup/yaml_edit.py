@@ -20,7 +20,7 @@ Blocks = Mapping[str, Mapping[str, Any]]
 INDENT: Final = 2
 EXAMPLE: Final = {"imu": {"uart": {"port": "/dev/ttyUSB0"}}}
 """The devices of etc/imud.yaml, which the package installs: nobody has written them."""
-HEAD: Final = """\
+FILE_HEAD: Final = """\
 # Made by `imud setup`, yours to change: docs/configuration.md has every key.
 # `imud check FILE` says whether it is good, `systemctl reload imud` makes the daemon read it again.
 """
@@ -44,7 +44,7 @@ def with_devices(content: bytes | None, blocks: Blocks, *, replace: str = "") ->
     Raises ImudError with the block to paste where the text cannot be changed safely.
     """
     if content is None:
-        return (HEAD + "devices:\n" + "\n".join(_block(blocks, INDENT)) + "\n").encode()
+        return (FILE_HEAD + "devices:\n" + "\n".join(_block(blocks, INDENT)) + "\n").encode()
     tree = read_yaml(content)
     text = content.decode("utf-8-sig")
     end = "\r\n" if "\r\n" in text else "\n"

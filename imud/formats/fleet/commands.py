@@ -64,7 +64,7 @@ class CommandAnswer(msgspec.Struct, frozen=True, omit_defaults=True, kw_only=Tru
     """Why it is not done, one sentence."""
 
 
-_DECODER: Final = msgspec.json.Decoder(CommandRequest)
+_REQUEST_DECODER: Final = msgspec.json.Decoder(CommandRequest)
 
 
 def decode_request(payload: bytes) -> CommandRequest:
@@ -72,7 +72,7 @@ def decode_request(payload: bytes) -> CommandRequest:
     if len(payload) > REQUEST_BYTES:
         raise ValueError(f"expected at most {REQUEST_BYTES} bytes, got {len(payload)}")
     try:
-        request = _DECODER.decode(payload)
+        request = _REQUEST_DECODER.decode(payload)
     except (msgspec.DecodeError, RecursionError) as error:
         raise ValueError(f"expected a request as JSON: {reason_of(error)}") from error
     if request.v != VERSION:

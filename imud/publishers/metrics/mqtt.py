@@ -16,27 +16,27 @@ def _dropped(snapshot: Snapshot) -> Lines:
     return [((cause,), count) for status in snapshot.mqtts for cause, count in status.dropped.items()]
 
 
-def _counter(name: str, words: str, read: Callable[[MqttStatus], float]) -> Family:
+def _counter_of(name: str, words: str, read: Callable[[MqttStatus], float]) -> Family:
     return Family(f"imud_mqtt_{name}_total", MetricType.COUNTER, NO_UNIT, words, _mqtt(read))
 
 
-def _gauge(name: str, unit: Unit, words: str, read: Callable[[MqttStatus], float]) -> Family:
+def _gauge_of(name: str, unit: Unit, words: str, read: Callable[[MqttStatus], float]) -> Family:
     return Family(f"imud_mqtt_{name}", MetricType.GAUGE, unit, words, _mqtt(read))
 
 
 MQTT_FAMILIES: Final = (
-    _gauge("connected", NO_UNIT, "1 while a broker is connected, else 0.", lambda status: bool(status.broker)),
-    _gauge(
+    _gauge_of("connected", NO_UNIT, "1 while a broker is connected, else 0.", lambda status: bool(status.broker)),
+    _gauge_of(
         "spooling", NO_UNIT, "1 while the spool can be written, 0 while the disk does not let it.",
         lambda status: not status.spool_problem,
     ),
-    _counter("queued", "Samples and events given to the output.", lambda status: status.queued),
-    _counter("spooled_messages", "Messages written to the spool.", lambda status: status.spooled),
-    _counter("sent_messages", "Messages sent, those sent again included.", lambda status: status.sent),
-    _counter("acknowledged_messages", "Messages that the broker has taken.", lambda status: status.acknowledged),
-    _gauge("waiting_messages", NO_UNIT, "Messages in the spool.", lambda status: status.waiting),
-    _gauge("spool_bytes", BYTES, "Room that the spool uses.", lambda status: status.spool_bytes),
-    _counter(
+    _counter_of("queued", "Samples and events given to the output.", lambda status: status.queued),
+    _counter_of("spooled_messages", "Messages written to the spool.", lambda status: status.spooled),
+    _counter_of("sent_messages", "Messages sent, those sent again included.", lambda status: status.sent),
+    _counter_of("acknowledged_messages", "Messages that the broker has taken.", lambda status: status.acknowledged),
+    _gauge_of("waiting_messages", NO_UNIT, "Messages in the spool.", lambda status: status.waiting),
+    _gauge_of("spool_bytes", BYTES, "Room that the spool uses.", lambda status: status.spool_bytes),
+    _counter_of(
         "thinned", "Samples of which only statistics are left, for want of room in the spool.",
         lambda status: status.thinned,
     ),
@@ -44,7 +44,7 @@ MQTT_FAMILIES: Final = (
         "imud_mqtt_dropped_total", MetricType.COUNTER, NO_UNIT, "Samples and events that were dropped, by cause.",
         Reader(("cause",), _dropped),
     ),
-    _counter("reconnects", "Connections to a broker after the first.", lambda status: status.reconnects),
-    _counter("commands", "Requests for actions that were carried out, or tried.", lambda status: status.commands),
-    _counter("commands_refused", "Requests for actions that were refused.", lambda status: status.commands_refused),
+    _counter_of("reconnects", "Connections to a broker after the first.", lambda status: status.reconnects),
+    _counter_of("commands", "Requests for actions that were carried out, or tried.", lambda status: status.commands),
+    _counter_of("commands_refused", "Requests for actions that were refused.", lambda status: status.commands_refused),
 )  # fmt: skip

@@ -6,10 +6,10 @@ the socket gets them at once. A snapshot is a recording like any other.
 """
 
 import logging
+import socket
 from collections.abc import Sequence
 from math import sqrt
 from pathlib import Path
-from socket import socket
 from typing import Final
 
 from imud.contracts.lines import Edge, WatchedInput
@@ -164,7 +164,7 @@ class FlightRecorder:
         while writer.saved:
             self._tell(writer.saved.popleft(), now_ns)
 
-    def snapshot(self, sock: socket) -> float:
+    def snapshot(self, sock: socket.socket) -> float:
         """Send what there is to a client's socket, which is closed then; return its length, s. Raises ServerError."""
         writer, oldest_ns = self._writer, self._ring.oldest_ns
         if writer is None or not oldest_ns:

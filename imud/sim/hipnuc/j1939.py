@@ -290,7 +290,7 @@ class HipnucJ1939Module:
             self._next_ms[pgn] = (int(device_ms) // value + 1) * value
         elif register == session.BITRATE and value < len(session.BITRATES):
             self.settings = replace(settings, bitrate_code=value)
-        elif register == session.ADDRESS and session.ADDRESS_MIN <= value <= session.ADDRESS_MAX:
+        elif register == session.ADDRESS and session.MODULE_ADDRESS_MIN <= value <= session.MODULE_ADDRESS_MAX:
             self.settings = replace(settings, address=value)
         elif register == session.X_SIGN and value in (0, 1):
             self.settings = replace(settings, x_reversed=value)
@@ -345,7 +345,7 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucJ1939Module:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … {1000 // session.INTERVAL_MIN_MS}")
     if options.message not in MESSAGES:
         raise ValueError(f"message {options.message!r}: expected {' or '.join(filter(None, MESSAGES))}, or none")
-    if options.node and not session.ADDRESS_MIN <= options.node <= session.ADDRESS_MAX:
+    if options.node and not session.MODULE_ADDRESS_MIN <= options.node <= session.MODULE_ADDRESS_MAX:
         raise ValueError(f"node {options.node}: expected an address 1 … 128, or 0 for {FACTORY_ADDRESS}")
     pgns = MESSAGES[options.message]
     settings = J1939Settings(

@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from imud.cli.recording.replay import play
+from imud.cli.recording.replay import play_to_end
 from imud.runtime.recording.player import Player
 from tests.cli.conftest import Cli
 from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
@@ -41,7 +41,7 @@ def test_records_that_were_dropped_are_an_answer_of_no(recorded: Recorded) -> No
         player = Player(lambda _batch: None)
         player.lost = lost
         with recorded[0].open("rb") as file:
-            report, got = play(file, "a", player)
+            report, got = play_to_end(file, "a", player)
         assert (got, "dropped when it was written: 3" in report) == (status, lost == 3)
 
 
@@ -62,7 +62,7 @@ def test_a_cut_file_is_replayed_as_far_as_it_goes(recorded: Recorded) -> None:
     file, lines, _ = recorded
     printed: list[str] = []
     player = Player(lambda batch: printed.extend(msgspec.json.encode(sample).decode() for sample in batch.samples))
-    report, status = play(BytesIO(file.read_bytes()[:-7]), "cut", player)
+    report, status = play_to_end(BytesIO(file.read_bytes()[:-7]), "cut", player)
     assert printed == lines[: len(printed)]
     assert status == (0 if printed else 1)
     assert "no regular end" in report

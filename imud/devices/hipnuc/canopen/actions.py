@@ -113,7 +113,7 @@ ACTIONS: Final[Actions] = {
     "factory_reset": Action(
         "factory settings, node 8 and 500 kbit/s included, in force after a restart; refused if another node of the "
         "bus has number 8",
-        lambda target: moves.factory_reset(target.settings),
+        lambda target: moves.factory_reset_and_find(target.settings),
         Risk.RESET,
     ),
     "interval": Action("how often a TPDO is sent by its timer; at once. Refused if the bus cannot carry it", _interval),

@@ -88,7 +88,7 @@ def reset(settings: HipnucCanopenSettings, bus_bit_s: int, command: NmtCommand) 
     return (yield from _reset(settings, bus_bit_s, session.nmt_request(settings.node, command)))
 
 
-def factory_reset(settings: HipnucCanopenSettings) -> RequestScript[str]:
+def factory_reset_and_find(settings: HipnucCanopenSettings) -> RequestScript[str]:
     """Restore the factory settings, in force after a restart: node 8 and 500 kbit/s.
 
     Raises BadArgument where another node has number 8, Aborted, NoReply.

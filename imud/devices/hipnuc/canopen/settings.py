@@ -104,7 +104,7 @@ def _read(target: Target) -> RequestScript[dict[str, Any]]:
     return values_of((yield from session.read_values(target.settings.node, SETTING_PLACES, silent_is_fine=True)))
 
 
-def _interval(tpdo: TpdoNumber) -> Setting:
+def _interval_setting(tpdo: TpdoNumber) -> Setting:
     return Setting(
         type=Annotated[
             int,
@@ -119,7 +119,7 @@ def _interval(tpdo: TpdoNumber) -> Setting:
     )
 
 
-def _transmission(tpdo: TpdoNumber) -> Setting:
+def _transmission_setting(tpdo: TpdoNumber) -> Setting:
     words = (
         f"when the message with the {CONTENT[tpdo]} is sent: at its interval, or when SYNC comes (`options.sync_hz`)"
     )
@@ -138,8 +138,8 @@ def _sign(axis: Literal["x", "y"]) -> Setting:
 
 SETTINGS: Final = DeviceSettings(
     table={
-        **{interval_name(tpdo): _interval(tpdo) for tpdo in TPDOS},
-        **{transmission_name(tpdo): _transmission(tpdo) for tpdo in TPDOS},
+        **{interval_name(tpdo): _interval_setting(tpdo) for tpdo in TPDOS},
+        **{transmission_name(tpdo): _transmission_setting(tpdo) for tpdo in TPDOS},
         "incli_x_reversed": _sign("x"),
         "incli_y_reversed": _sign("y"),
         "heartbeat_ms": Setting(

@@ -14,10 +14,10 @@ from imud.contracts.session import RequestScript
 from imud.devices.hipnuc.j1939 import moves, session
 from imud.devices.hipnuc.j1939.messages import PgnName
 from imud.devices.hipnuc.j1939.session import (
-    ADDRESS_MAX,
-    ADDRESS_MIN,
     INTERVAL_MAX_MS,
     INTERVAL_MIN_MS,
+    MODULE_ADDRESS_MAX,
+    MODULE_ADDRESS_MIN,
     BitRate,
     J1939Node,
     Zero,
@@ -59,8 +59,8 @@ def _address(
     address: Annotated[
         int,
         Meta(
-            ge=ADDRESS_MIN,
-            le=ADDRESS_MAX,
+            ge=MODULE_ADDRESS_MIN,
+            le=MODULE_ADDRESS_MAX,
             description="one that no other module of the bus has",
             extra={"section": "6.2.2"},
         ),
@@ -90,7 +90,7 @@ ACTIONS: Final[Actions] = {
     "factory_reset": Action(
         "factory settings, address 8 and its bit rate included, in force after a restart at the latest; refused if "
         "another node of the bus has address 8",
-        lambda target: moves.factory_reset(target.settings),
+        lambda target: moves.factory_reset_and_find(target.settings),
         Risk.RESET,
     ),
     "interval": Action("how often a message is sent; refused if the bus cannot carry it", _interval),

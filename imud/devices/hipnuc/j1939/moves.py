@@ -85,7 +85,7 @@ def restart(settings: HipnucJ1939Settings, bus_bit_s: int) -> RequestScript[str]
     return f"restarted, at address {found}"
 
 
-def factory_reset(settings: HipnucJ1939Settings) -> RequestScript[str]:
+def factory_reset_and_find(settings: HipnucJ1939Settings) -> RequestScript[str]:
     """Restore the factory settings, address 8 and its bit rate included; in force after a restart at the latest.
 
     Raises BadArgument where another module has address 8, Rejected.

@@ -68,7 +68,7 @@ SAVE, FACTORY, RESTART = 0x00, 0x01, 0xFF
 BitRate = Literal[1_000_000, 800_000, 500_000, 250_000, 125_000]
 BITRATES: Final[tuple[BitRate, ...]] = get_args(BitRate)
 """In bit/s, by their code in BITRATE."""
-ADDRESS_MIN, ADDRESS_MAX = 1, 128
+MODULE_ADDRESS_MIN, MODULE_ADDRESS_MAX = 1, 128
 INTERVAL_MIN_MS, INTERVAL_MAX_MS = 5, 1000
 
 REPLY_TIMEOUT_NS: Final = 500 * NS_PER_MS  # the manual gives none; J1939-21 gives a node 200 ms

@@ -15,12 +15,12 @@ from imud.contracts.session import RequestScript
 from imud.devices.hipnuc.common.bus_load import CyclicMessage, refuse_other_rate, refuse_overload
 from imud.devices.hipnuc.j1939 import messages, moves, session
 from imud.devices.hipnuc.j1939.session import (
-    ADDRESS_MAX,
-    ADDRESS_MIN,
     BITRATES,
     INTERVAL_MAX_MS,
     INTERVAL_MIN_MS,
     INTERVALS,
+    MODULE_ADDRESS_MAX,
+    MODULE_ADDRESS_MIN,
     BitRate,
 )
 
@@ -36,7 +36,7 @@ def interval_name(pgn: int) -> str:
     return f"{pgn:04x}_interval_ms"
 
 
-REGISTERS: Final = {
+SETTING_REGISTERS: Final = {
     **{interval_name(pgn): register for pgn, register in INTERVALS.items()},
     "x_reversed": session.X_SIGN,
     "y_reversed": session.Y_SIGN,
@@ -48,7 +48,7 @@ REGISTERS: Final = {
 
 def values_of(values: Mapping[int, int]) -> dict[str, Any]:
     """Settings by name from registers; what has none of the values of the table is left out."""
-    reported: dict[str, Any] = {name: values.get(register) for name, register in REGISTERS.items()}
+    reported: dict[str, Any] = {name: values.get(register) for name, register in SETTING_REGISTERS.items()}
     for pgn in INTERVALS:  # 0 or nothing: a message that this firmware does not send
         reported[interval_name(pgn)] = reported[interval_name(pgn)] or None
     for name in ("x_reversed", "y_reversed"):
@@ -82,10 +82,10 @@ def _check(target: Target, values: Mapping[str, Any]) -> None:
 
 
 def _read(target: Target) -> RequestScript[dict[str, Any]]:
-    return values_of((yield from session.read_values(target.settings.peer, tuple(REGISTERS.values()))))
+    return values_of((yield from session.read_values(target.settings.peer, tuple(SETTING_REGISTERS.values()))))
 
 
-def _interval(pgn: int) -> Setting:
+def _interval_setting(pgn: int) -> Setting:
     return Setting(
         type=Annotated[
             int,
@@ -110,7 +110,7 @@ def _sign(axis: Literal["X", "Y"]) -> Setting:
 
 SETTINGS: Final = DeviceSettings(
     table={
-        **{interval_name(pgn): _interval(pgn) for pgn in INTERVALS},
+        **{interval_name(pgn): _interval_setting(pgn) for pgn in INTERVALS},
         "x_reversed": _sign("X"),
         "y_reversed": _sign("Y"),
         "bit_rate": Setting(
@@ -129,8 +129,8 @@ SETTINGS: Final = DeviceSettings(
             type=Annotated[
                 int,
                 Meta(
-                    ge=ADDRESS_MIN,
-                    le=ADDRESS_MAX,
+                    ge=MODULE_ADDRESS_MIN,
+                    le=MODULE_ADDRESS_MAX,
                     description="one that nothing on the bus has",
                     extra={"section": "6.2.2"},
                 ),

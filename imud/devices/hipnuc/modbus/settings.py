@@ -25,7 +25,7 @@ MODES: Final[Mapping[Mode, AttitudeMode]] = {"6-axis": AttitudeMode.SIX_AXIS, "9
 _MODE_OF: Final = {mode.value: name for name, mode in MODES.items()}
 
 
-def _read(_target: Target) -> TransferScript[dict[str, object]]:
+def _read_settings(_target: Target) -> TransferScript[dict[str, object]]:
     baud, address, heading = yield from session.read_present()
     found: dict[str, object] = {}
     if heading in _MODE_OF:
@@ -88,7 +88,7 @@ SETTINGS: Final = DeviceSettings(
             connection=True,
         ),
     },
-    read=_read,
+    read=_read_settings,
     save=lambda _target: session.save(),
     restart=lambda target: session.restart(session.places_of(target), target.baud),
     check=_check,

@@ -51,7 +51,7 @@ def _differences(values: Mapping[str, Any], lines: DeviceLines) -> dict[str, str
         *_shared_pins(values.get("pins", {}), lines),
         *_divisor(values.get("sout_divisor"), lines),
         *_marks(values.get("output"), values.get("baud"), lines),
-        *_alarm(values.get("alarm"), lines),
+        *_alarm_differences(values.get("alarm"), lines),
     ):
         found.setdefault(key, []).append(words)
     return {key: "; ".join(words) for key, words in found.items()}
@@ -91,6 +91,6 @@ def _marks(output: Mapping[str, Any] | None, baud: int | None, lines: DeviceLine
         yield "pps", f"{' and '.join(marked)} on mark: each pulse per second makes a sample; output sets a rate"
 
 
-def _alarm(alarm: Mapping[str, Any] | None, lines: DeviceLines) -> Iterator[tuple[str, str]]:
+def _alarm_differences(alarm: Mapping[str, Any] | None, lines: DeviceLines) -> Iterator[tuple[str, str]]:
     if alarm is not None and lines.alarm is not None and not any(one.enabled for one in alarm.values()):
         yield "alarm", "the module watches no angle, so that the line stays low: alarm sets a range"

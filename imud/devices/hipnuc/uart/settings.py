@@ -185,7 +185,7 @@ def _sout_divisor(_target: Target, value: int) -> RequestScript[None]:
     return send(commands.sout_divider(value))
 
 
-def _alarm(_target: Target, value: dict[Axis, AngleAlarm]) -> RequestScript[None]:
+def _write_alarm(_target: Target, value: dict[Axis, AngleAlarm]) -> RequestScript[None]:
     for axis, one in value.items():
         yield from send(commands.alarm(AlarmAxis(axis.upper()), one.min_deg, one.max_deg, one.enabled))
 
@@ -275,7 +275,7 @@ SETTINGS: Final = DeviceSettings(
                 "2.2.4",
                 "°",
             ),
-            write=_alarm,
+            write=_write_alarm,
             agrees=_has_all,
         ),
         "output": Setting(
