@@ -75,7 +75,7 @@ test-thorough: lint
 	$(MAKE) lab-debian
 	$(MAKE) lab-arm64
 
-# 120 small changes to imud, and which of them the tests detect (ARGS="--seed 7 --only imud/runtime")
+# 120 small changes to imud, and which of them the tests detect (ARGS="--seed 7 --only imud/device")
 .PHONY: mutants
 mutants: $(VENV)/made
 	$(BIN)/python -m tests.mutants $(ARGS)
@@ -193,7 +193,7 @@ chaos: $(VENV)/made
 lab-debian: $(VENV)/made
 	tests/lab_debian/run $(RIG_OPTIONS) $(ARGS)
 
-# As root; ARGS="bookworm tests/clock": another release, some of the tests.
+# As root; ARGS="bookworm tests/sampling": another release, some of the tests.
 lab-debian-suite:
 	tests/lab_debian/suite $(ARGS)
 

@@ -7,37 +7,131 @@ tick, 10 Hz ──▶ devices, publishers         SIGHUP ──▶ reload       
 import asyncio
 import gc
 import logging
+import queue
 import secrets
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from time import thread_time_ns
-from typing import NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 from imud import __version__
 from imud import config as configuration
-from imud.config import Config, DeviceConfig
+from imud.config.model import Config, DeviceConfig
 from imud.contracts.lines import LineFactory
 from imud.contracts.publisher import Batch, DeviceControl, DeviceLedger, Publisher, PublisherContext
 from imud.contracts.status import DeviceState, DeviceStatus
-from imud.errors import CommandError, ConfigError, ServerError
-from imud.event import Event, EventKind
-from imud.host_clock import HostClock
-from imud.notify import ServiceManager
+from imud.device.device import Device
+from imud.device.factory import DeviceFactory
+from imud.device.latency import LatencyBudget
+from imud.host.clock import HostClock
+from imud.host.log import printable
+from imud.host.service_manager import ServiceManager, notify
+from imud.lines.gpio import GPIO_LINES
+from imud.lines.watched_line import watching
+from imud.model.errors import CommandError, ConfigError, ServerError
+from imud.model.event import Event, EventKind
+from imud.model.units import NS_PER_S
 from imud.publishers import PUBLISHERS
-from imud.reload import Reloader
-from imud.runtime.device import Device
-from imud.runtime.device_factory import DeviceFactory
-from imud.runtime.latency.budget import LatencyBudget
-from imud.runtime.recording.tap import DeviceTaps
-from imud.signals.gpio import GPIO_LINES
-from imud.signals.watched_line import watching
-from imud.units import NS_PER_S
+from imud.recording.observer import DeviceTaps
 from imud.utc.system_clock import kernel_clock, system_reference
 
 log = logging.getLogger(__name__)
+
+PAUSE_S: Final = 100e-6
+"""Long enough for the kernel to wake the loop's thread, which takes some ten microseconds."""
+
+
+class Reconfigurable(Protocol):
+    """What follows a configuration that was read again."""
+
+    async def change_to(self, new: Config) -> None:
+        """Apply `new`, and let the event loop run after every device."""
+        ...
+
+    def refuse(self, error: ConfigError) -> None:
+        """Note that the file cannot be used: everything stays as it is."""
+        ...
+
+
+class Reloader:
+    """Reads `file` on request and applies it to `target`. Synchronization: the event loop's thread only."""
+
+    def __init__(self, file: Path, target: Reconfigurable, now_ns: Callable[[], int]) -> None:
+        """`now_ns` reads CLOCK_MONOTONIC."""
+        self._file = file
+        self._target = target
+        self._now_ns = now_ns
+        self._jobs: queue.SimpleQueue[asyncio.Future[Config] | None] = queue.SimpleQueue()
+        self._again = False
+        self._task: asyncio.Task[None] | None = None
+        threading.Thread(target=self._serve, name="configuration", daemon=True).start()
+
+    def request(self, done: Callable[[asyncio.Task[None]], None]) -> None:
+        """Reload now, or once more after the reload that is under way. `done` is called with the task at its end."""
+        if self._task is not None and not self._task.done():
+            self._again = True
+            return
+        self._task = asyncio.create_task(self._reload(), name="reload")
+        self._task.add_done_callback(done)
+
+    async def close(self) -> None:
+        """End the thread and a reload that is under way; may be called twice."""
+        self._jobs.put(None)
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+
+    async def _reload(self) -> None:
+        again = True
+        while again:
+            self._again = False
+            notify(f"RELOADING=1\nMONOTONIC_USEC={self._now_ns() // 1000}")
+            try:
+                new = await self._read()
+            except ConfigError as error:
+                self._target.refuse(error)
+            else:
+                await self._target.change_to(new)
+            notify("READY=1")
+            again = self._again
+
+    async def _read(self) -> Config:
+        """Have the thread read the file. Raises ConfigError."""
+        answer: asyncio.Future[Config] = asyncio.get_running_loop().create_future()
+        self._jobs.put(answer)
+        return await answer
+
+    def _serve(self) -> None:
+        """Read the file for each future of the queue. Runs in the thread."""
+        while (answer := self._jobs.get()) is not None:
+            config, error = self._load()
+            with suppress(RuntimeError):  # the loop has ended meanwhile
+                answer.get_loop().call_soon_threadsafe(_give, answer, config, error)
+
+    def _load(self) -> tuple[Config | None, ConfigError | None]:
+        try:
+            return configuration.load(self._file, pause=lambda: time.sleep(PAUSE_S)), None
+        except ConfigError as error:
+            return None, error
+        except Exception as error:  # an internal error in reading a new configuration does not end what runs
+            log.exception("the configuration cannot be read because of an internal error")
+            return None, ConfigError(f"{self._file}: {type(error).__name__}: {printable(str(error))}")
+
+
+def _give(answer: "asyncio.Future[Config]", config: Config | None, error: ConfigError | None) -> None:
+    if answer.done():  # cancelled
+        return
+    if config is not None:
+        answer.set_result(config)
+    else:
+        answer.set_exception(error or ConfigError("not read"))
+
 
 TICK_S = 0.1
 RETRY_FIRST_NS = NS_PER_S

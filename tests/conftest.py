@@ -88,7 +88,7 @@ def open_descriptors() -> dict[int, str]:
 def _no_descriptor_left(request: pytest.FixtureRequest) -> Iterator[None]:
     """Fail if a test of an output or of the client leaves a descriptor open."""
     path = request.node.nodeid
-    if not path.startswith(("tests/publishers/", "tests/client/")) or path.startswith("tests/publishers/mqtt/"):
+    if not path.startswith(("tests/publishers/", "tests/client/")) or path.startswith("tests/fleet/"):
         yield
         return
     before = open_descriptors()

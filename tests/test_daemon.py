@@ -20,12 +20,12 @@ from typing import Any, cast
 import msgspec
 import pytest
 
-from imud.client import Ring
-from imud.config import Config
+from imud.client.ring import Ring
+from imud.config.model import Config
 from imud.contracts.publisher import Publisher
 from imud.daemon import Daemon
-from imud.errors import CommandError
-from imud.units import NS_PER_S
+from imud.model.errors import CommandError
+from imud.model.units import NS_PER_S
 from imud.utc.system_clock import KernelClock
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, running_daemon, wait_until, write_config
 from tests.support.event_loops import in_loop

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from imud.config import Config
-from imud.errors import ConfigError
-from imud.reload import Reloader
+from imud.config.model import Config
+from imud.daemon import Reloader
+from imud.model.errors import ConfigError
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, running_daemon, wait_until, write_config
 from tests.support.event_loops import in_loop
 from tests.support.surroundings import pipe
@@ -103,7 +103,7 @@ async def test_requests_during_a_reload_are_one_more_of_the_file_as_it_is_then(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[str] = []
-    monkeypatch.setattr("imud.reload.notify", told.append)
+    monkeypatch.setattr("imud.daemon.notify", told.append)
     file, target, done = tmp_path / "imud.yaml", SlowTarget(), asyncio.Event()
     reloader = Reloader(file, target, lambda: 5000)
 
@@ -123,7 +123,7 @@ async def test_requests_during_a_reload_are_one_more_of_the_file_as_it_is_then(
     await done.wait()
     assert target.applied[2].startswith(f"{file}:1:12: log_level: ")
     done.clear()
-    monkeypatch.setattr("imud.reload.configuration.load", lambda _file, pause: pause() or 1 // 0)
+    monkeypatch.setattr("imud.daemon.configuration.load", lambda _file, pause: pause() or 1 // 0)
     request("info")
     await done.wait()
     assert target.applied[3].startswith(f"{file}: ZeroDivisionError: ")

@@ -15,7 +15,7 @@ import pytest
 
 from imud import config
 from imud.cli import COMMANDS, build_parser
-from imud.devices import DRIVERS
+from imud.drivers import DRIVERS
 from tests.support import pictures, references
 from tests.support.daemon_process import LIMIT_S, sending_daemon
 from tests.support.files import ROOT, hi91

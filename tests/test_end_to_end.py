@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from imud.attitude import (
+from imud.attitude.rotation import (
     Matrix3,
     euler312_from_quat,
     matrix_from_quat,
@@ -23,12 +23,12 @@ from imud.attitude import (
     quat_from_matrix,
     transposed,
 )
-from imud.client import Ring
-from imud.devices.hipnuc.uart.codec import encode_hi91
-from imud.sample import Sample
-from imud.sim.hipnuc.uart.settings import HipnucHardware
-from imud.sim.hipnuc.uart.simulator import HipnucModule
-from imud.sim.physics.motion import FIELD_ENU_T, Still
+from imud.client.ring import Ring
+from imud.drivers.hipnuc.uart.codec import encode_hi91
+from imud.model.sample import Sample
+from imud.sim.hipnuc.uart import HipnucModule
+from imud.sim.hipnuc.uart_settings import HipnucHardware
+from imud.sim.physics import FIELD_ENU_T, Still
 from tests.support.daemon_process import LIMIT_S, running_daemon, wait_until
 from tests.support.files import SHARED
 

@@ -5,15 +5,275 @@ device's own low-pass filter takes the noise away. Below the τ that belongs to 
 filter, so the coefficients are fitted from there on.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from enum import IntEnum
+from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.optimize import nnls
+from scipy.stats import chi2
 
-from imud.analysis.allan import AllanCurve, allan_curve
-from imud.analysis.noise_terms import BIAS_FACTOR, NoiseTerms, noise_terms
-from imud.analysis.series import FloatArray, Grid, Readings, even_runs, grid_of, with_values
+from imud.analysis.series import FloatArray, Grid, IntArray, Readings, even_runs, grid_of, with_values
 from imud.analysis.spectrum import Spectrum, power_spectrum
+from imud.model.errors import BadArgument
+
+CONFIDENCE: Final = 0.683
+"""Share of intervals that hold the truth: one sigma."""
+PER_DECADE: Final = 12
+PARTS_LEAST: Final = 3
+"""The longest τ is this part of the longest run: beyond it there is hardly a degree of freedom."""
+CLUSTERS_LEAST: Final = 60
+"""Averages that the type of noise needs: with 30 (SP 1065, 5.5.6) its power is known to 0.4, often rounded wrong."""
+DIFFERENCES_MOST: Final = 2
+
+
+class NoiseType(IntEnum):
+    """Types of noise of a rate by the power α of its spectrum, S(f) ∝ f^α."""
+
+    RATE_RANDOM_WALK = -2
+    """Slope +1/2 of the deviation."""
+    FLICKER = -1
+    """Bias instability, slope 0."""
+    WHITE = 0
+    """Angle or velocity random walk, slope -1/2."""
+    FLICKER_PHASE = 1
+    QUANTISATION = 2
+    """Slope -1."""
+
+
+class AllanCurve(NamedTuple):
+    """The deviation of three axes over τ; k values of τ."""
+
+    tau_s: FloatArray
+    """(k,)"""
+    factors: IntArray
+    """(k,) samples per average."""
+    deviation: FloatArray
+    """(k, axes), unit of the rate."""
+    low: FloatArray
+    """(k, axes), lower end of the confidence interval."""
+    high: FloatArray
+    """(k, axes), upper end."""
+    freedom: FloatArray
+    """(k, axes), equivalent degrees of freedom."""
+    types: IntArray
+    """(k, axes), NoiseType."""
+
+
+def averaging_factors(longest: int) -> IntArray:
+    """Numbers of samples per average: PER_DECADE, evenly in the logarithm, up to a third of the longest run."""
+    most = longest // PARTS_LEAST
+    if most < 1:
+        raise BadArgument(f"expected a run of at least {PARTS_LEAST} samples, got {longest}")
+    wanted = np.logspace(0, np.log10(most), max(int(np.ceil(np.log10(most) * PER_DECADE)), 1) + 1)
+    return np.unique(np.clip(np.rint(wanted), 1, most).astype(np.int64))
+
+
+def allan_curve(runs: Sequence[FloatArray], rate_hz: float, factors: IntArray | None = None) -> AllanCurve:
+    """Deviation of even runs, each (m, axes) at `rate_hz`, over all of them: no average reaches across a gap.
+
+    Raises BadArgument where no run is long enough.
+    """
+    longest = max(runs, key=len)
+    factors = averaging_factors(len(longest)) if factors is None else factors
+    tau_s = factors / rate_hz
+    phases = [_phase(run, rate_hz) for run in runs]
+    lengths = [len(phase) for phase in phases]
+    deviation = np.array([_deviation(phases, int(m), m / rate_hz) for m in factors])
+    types = noise_types(longest, factors)
+    freedom = np.array(
+        [
+            [sum(degrees_of_freedom(NoiseType(int(t)), int(m), n) for n in lengths if n > 2 * m) for t in row]
+            for m, row in zip(factors, types, strict=True)
+        ]
+    )
+    low, high = interval(deviation, freedom)
+    return AllanCurve(tau_s, factors, deviation, low, high, freedom, types)
+
+
+def _phase(run: FloatArray, rate_hz: float) -> FloatArray:
+    """Integral of a run, (m + 1, axes); without its mean, of which sums of floats would suffer."""
+    total = np.cumsum(run - run.mean(axis=0), axis=0) / rate_hz
+    return np.concatenate((np.zeros((1, run.shape[1])), total))
+
+
+def _deviation(phases: Sequence[FloatArray], m: int, tau_s: float) -> FloatArray:
+    """(axes,) at one τ."""
+    squares, count = np.zeros(phases[0].shape[1]), 0
+    for phase in phases:
+        if len(phase) > 2 * m:
+            second = phase[2 * m :] - 2 * phase[m:-m] + phase[: -2 * m]
+            squares += np.einsum("ij,ij->j", second, second)
+            count += len(second)
+    if not count:
+        raise BadArgument(f"expected a run of at least {2 * m} samples for an average of {m}, got none")
+    return np.sqrt(squares / count / 2) / tau_s
+
+
+def interval(
+    deviation: FloatArray, freedom: FloatArray, confidence: float = CONFIDENCE
+) -> tuple[FloatArray, FloatArray]:
+    """Both ends of the interval in which the true deviation lies with this probability (SP 1065, 5.3)."""
+    tail = (1 - confidence) / 2
+    high: FloatArray = deviation * np.sqrt(freedom / chi2.ppf(tail, freedom))
+    low: FloatArray = deviation * np.sqrt(freedom / chi2.ppf(1 - tail, freedom))
+    return low, high
+
+
+def degrees_of_freedom(noise: NoiseType, m: int, n: int) -> float:
+    """Equivalent degrees of freedom of the overlapping estimate: `n` points of phase, `m` per average (table 5).
+
+    At least 1, where the formulas of some types fall below it.
+    """
+    if noise is NoiseType.QUANTISATION:
+        found = (n + 1) * (n - 2 * m) / (2 * (n - m))
+    elif noise is NoiseType.FLICKER_PHASE:
+        found = float(np.exp(np.sqrt(np.log((n - 1) / (2 * m)) * np.log((2 * m + 1) * (n - 1) / 4))))
+    elif noise is NoiseType.WHITE:
+        found = (3 * (n - 1) / (2 * m) - 2 * (n - 2) / n) * 4 * m**2 / (4 * m**2 + 5)
+    elif noise is NoiseType.FLICKER:
+        found = 2 * (n - 2) ** 2 / (2.3 * n - 4.9) if m == 1 else 5 * n**2 / (4 * m * (n + 3 * m))
+    else:
+        found = (n - 2) / m * ((n - 1) ** 2 - 3 * m * (n - 1) + 4 * m**2) / (n - 3) ** 2
+    return max(float(found), 1.0)
+
+
+def noise_types(run: FloatArray, factors: IntArray) -> IntArray:
+    """(k, axes) type of noise of a run (m, axes) at each average; where it is too short, as at the τ before.
+
+    Noise of the angle (flicker of it, quantisation) falls fastest with τ, so it is none once another type was there.
+    """
+    found = np.full((len(factors), run.shape[1]), int(NoiseType.WHITE), dtype=np.int64)
+    for row, m in enumerate(factors):
+        clusters = len(run) // int(m)
+        if clusters >= CLUSTERS_LEAST:
+            averages = run[: clusters * int(m)].reshape(clusters, int(m), -1).mean(axis=1)
+            found[row] = [int(_type_of(averages[:, axis])) for axis in range(run.shape[1])]
+            if row:
+                over = found[row - 1] <= int(NoiseType.WHITE)
+                found[row, over] = np.minimum(found[row, over], int(NoiseType.WHITE))
+        elif row:
+            found[row] = found[row - 1]
+    return found
+
+
+def _type_of(averages: FloatArray) -> NoiseType:
+    """Type of noise of averages (n,), by the autocorrelation at lag 1 (SP 1065, 5.5.6)."""
+    for differences in range(DIFFERENCES_MOST + 1):
+        centred = averages - averages.mean()
+        power = float(centred @ centred)
+        correlation = float(centred[1:] @ centred[:-1]) / power if power > 0 else 0.0
+        delta = correlation / (1 + correlation)
+        if delta < 0.25 or differences == DIFFERENCES_MOST:
+            break
+        averages = np.diff(averages)
+    alpha = round(-2 * delta - 2 * differences)
+    return NoiseType(min(max(alpha, -2), 2))
+
+
+BIAS_FACTOR: Final = float(np.sqrt(2 * np.log(2) / np.pi))
+"""0.664: the floor of the deviation of flicker noise, in B."""
+ROUNDS: Final = 12
+POINTS_LEAST: Final = 6
+RESOLVED_SIGMAS: Final = 2.0
+"""A square that is so many of its own standard deviations above zero is resolved."""
+POINTS_PER_OCTAVE: Final = PER_DECADE * float(np.log10(2))
+"""Points closer than an octave are made of nearly the same averages: so many count as one."""
+
+
+class Coefficient(NamedTuple):
+    """One coefficient of one axis, in the sensor's SI unit."""
+
+    value: float | None
+    """None where the series does not show it: other noise hides it, or it is too short."""
+    sigma: float
+    """Standard deviation of `value`, about; 0 where there is none."""
+    below: float
+    """It is below this, with two sigma."""
+
+
+class NoiseTerms(NamedTuple):
+    """All coefficients of one axis; units for a rate in rad/s."""
+
+    quantisation: Coefficient
+    """Q, rad."""
+    random_walk: Coefficient
+    """N, rad/s/√Hz = rad/√s; the line of slope -1/2 at τ = 1 s."""
+    bias_instability: Coefficient
+    """B, rad/s."""
+    rate_random_walk: Coefficient
+    """K, rad/s/√s."""
+    rate_ramp: Coefficient
+    """R, rad/s²."""
+
+    def deviation(self, tau_s: FloatArray) -> FloatArray:
+        """The curve that these coefficients make, (k,)."""
+        squares = np.array([(term.value or 0.0) ** 2 for term in self])
+        return np.asarray(np.sqrt(basis(tau_s) @ squares))
+
+
+def basis(tau_s: FloatArray) -> FloatArray:
+    """(k, 5) variance at each τ of coefficients of 1, in the order of NoiseTerms."""
+    ones = np.ones_like(tau_s)
+    return np.stack([3 / tau_s**2, 1 / tau_s, BIAS_FACTOR**2 * ones, tau_s / 3, tau_s**2 / 2], axis=1)
+
+
+def noise_terms(curve: AllanCurve, axis: int, tau_least_s: float = 0.0) -> NoiseTerms:
+    """Fit the coefficients of one axis, to the points from `tau_least_s` on. Raises BadArgument for too few points."""
+    used = curve.tau_s >= tau_least_s * (1 - 1e-9)
+    if used.sum() < POINTS_LEAST:
+        raise BadArgument(
+            f"expected at least {POINTS_LEAST} points of the Allan deviation from τ = {tau_least_s:.3g} s on, got "
+            f"{used.sum()}: a longer series is needed"
+        )
+    variance, freedom = curve.deviation[used, axis] ** 2, curve.freedom[used, axis]
+    if not variance.any():
+        return NoiseTerms(*(Coefficient(None, 0.0, 0.0) for _ in NoiseTerms._fields))
+    shapes = basis(curve.tau_s[used])
+    scale = (variance[:, None] / shapes).min(axis=0)  # of each term, the most that it can be: near one for all
+    scale = np.where(scale > 0, scale, variance.max())
+    chosen = list(range(shapes.shape[1]))
+    squares, spread = _fit(shapes * scale, variance, freedom, chosen)
+    bounds = squares + RESOLVED_SIGMAS * spread
+    while len(chosen) > 1:
+        weakest = min(chosen, key=lambda term: squares[term] / spread[term])
+        if squares[weakest] > RESOLVED_SIGMAS * spread[weakest]:
+            break
+        chosen.remove(weakest)
+        squares, spread = _fit(shapes * scale, variance, freedom, chosen)
+    return NoiseTerms(
+        *(
+            _coefficient(squares[term] * scale[term], spread[term] * scale[term], bounds[term] * scale[term])
+            for term in range(len(scale))
+        )
+    )
+
+
+def _fit(
+    shapes: FloatArray, variance: FloatArray, freedom: FloatArray, chosen: list[int]
+) -> tuple[FloatArray, FloatArray]:
+    """Squares (5,) of the chosen terms, zero for the others, and their standard deviations."""
+    fitted, squares, spread = variance, np.zeros(shapes.shape[1]), np.zeros(shapes.shape[1])
+    floor = variance[variance > 0].min() * 1e-6
+    weighted = shapes[:, chosen]
+    for _ in range(ROUNDS):
+        weight = np.sqrt(freedom / 2) / np.maximum(fitted, floor)
+        weighted = shapes[:, chosen] * weight[:, None]
+        squares[chosen], _ = nnls(weighted, variance * weight)
+        fitted = shapes @ squares
+    normal = np.linalg.pinv(weighted.T @ weighted)
+    spread[chosen] = np.sqrt(np.maximum(np.diag(normal), 0.0) * POINTS_PER_OCTAVE)
+    return squares, np.maximum(spread, 1e-300)
+
+
+def _coefficient(square: float, spread: float, bound: float) -> Coefficient:
+    below = float(np.sqrt(bound))
+    if square <= RESOLVED_SIGMAS * spread:
+        return Coefficient(None, 0.0, below)
+    value = float(np.sqrt(square))
+    return Coefficient(value, float(spread / (2 * value)), below)
+
 
 AXES: Final = ("x", "y", "z")
 CORNER_SHARE: Final = 0.5

@@ -8,8 +8,8 @@ import re
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
-from imud.contracts.sensors.data_sheet import SensorName
-from imud.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
+from imud.contracts.driver import SensorName
+from imud.model.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
 
 S_PER_H: Final = 3600.0
 ROOT_S_PER_ROOT_H: Final = 60.0

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from imud.errors import BadArgument
-from imud.units import NS_PER_S
+from imud.model.errors import BadArgument
+from imud.model.units import NS_PER_S
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -10,8 +10,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 from imud import __version__
-from imud.cli.streams import complain, discard_output, open_standard_streams
-from imud.errors import ConfigError, ImudError, reason_of
+from imud.cli.output import complain, discard_output, open_standard_streams
+from imud.model.errors import ConfigError, ImudError, reason_of
 
 if TYPE_CHECKING:
     from imud.cli.arguments import CliCommand
@@ -32,31 +32,31 @@ class Subcommand(NamedTuple):
 
 COMMANDS = {
     "run": Subcommand("imud.cli.run:RUN", "own the configured devices and serve their samples"),
-    "demo": Subcommand("imud.cli.demo.command:DEMO", "run the daemon on a simulated sensor and show what it does"),
+    "demo": Subcommand("imud.cli.demo:DEMO", "run the daemon on a simulated sensor and show what it does"),
     "check": Subcommand("imud.cli.run:CHECK", "check a configuration file without opening any port"),
-    "probe": Subcommand("imud.cli.probe.command:PROBE", "list what is attached"),
+    "probe": Subcommand("imud.cli.probe:PROBE", "list what is attached"),
     "setup": Subcommand(
         "imud.cli.setup.command:SETUP", "find what is attached, configure it, start the service; or take that back"
     ),
     "doctor": Subcommand("imud.cli.doctor.command:DOCTOR", "look for what is wrong, and say what to do next"),
-    "modbus": Subcommand("imud.cli.modbus.command:MODBUS", "find modules on an RS-485 line and give them addresses"),
+    "modbus": Subcommand("imud.cli.modbus:MODBUS", "find modules on an RS-485 line and give them addresses"),
     "decode": Subcommand("imud.cli.decode:DECODE", "raw capture in, one JSON object per message out"),
     "replay": Subcommand("imud.cli.replay:REPLAY", "run a recording or a capture through the daemon's whole path"),
-    "record": Subcommand("imud.cli.recording.record:RECORD", "record what devices deliver, or save the last minutes"),
-    "info": Subcommand("imud.cli.recording.info:INFO", "say what is in a recording, and whether it is whole"),
-    "noise": Subcommand("imud.cli.analysis.commands:NOISE", "judge the noise of a sensor that lies still"),
-    "spectrum": Subcommand("imud.cli.analysis.commands:SPECTRUM", "show vibration by frequency, live or of a file"),
-    "export": Subcommand("imud.cli.export.command:EXPORT", "write a recording or a capture as CSV or MCAP"),
+    "record": Subcommand("imud.cli.record:RECORD", "record what devices deliver, or save the last minutes"),
+    "info": Subcommand("imud.cli.record:INFO", "say what is in a recording, and whether it is whole"),
+    "noise": Subcommand("imud.cli.analysis:NOISE", "judge the noise of a sensor that lies still"),
+    "spectrum": Subcommand("imud.cli.analysis:SPECTRUM", "show vibration by frequency, live or of a file"),
+    "export": Subcommand("imud.cli.export:EXPORT", "write a recording or a capture as CSV or MCAP"),
     "devices": Subcommand("imud.cli.devices:DEVICES", "list the devices of the running daemon"),
     "status": Subcommand("imud.cli.status:STATUS", "show state, rate, clock and ledger of each device"),
-    "top": Subcommand("imud.cli.top.command:TOP", "watch all devices in the terminal, redrawn in place"),
+    "top": Subcommand("imud.cli.top:TOP", "watch all devices in the terminal, redrawn in place"),
     "foxglove": Subcommand(
-        "imud.cli.foxglove.command:FOXGLOVE", "serve samples, attitude, events and status to Foxglove and PlotJuggler"
+        "imud.cli.foxglove:FOXGLOVE", "serve samples, attitude, events and status to Foxglove and PlotJuggler"
     ),
     "web": Subcommand("imud.cli.web:WEB", "show all devices in a browser, live"),
-    "fleet": Subcommand("imud.cli.fleet.command:FLEET", "collect or show what gateways send to an MQTT broker"),
-    "watch": Subcommand("imud.cli.live.watch:WATCH", "print samples as they come"),
-    "events": Subcommand("imud.cli.live.events:EVENTS", "print events as they come"),
+    "fleet": Subcommand("imud.cli.fleet:FLEET", "collect or show what gateways send to an MQTT broker"),
+    "watch": Subcommand("imud.cli.watch:WATCH", "print samples as they come"),
+    "events": Subcommand("imud.cli.events:EVENTS", "print events as they come"),
     "clock": Subcommand(
         "imud.cli.clock:CLOCK", "show where time stamps come from, how good they are, and what limits them"
     ),

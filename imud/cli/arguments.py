@@ -4,22 +4,73 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from math import isfinite, nan
+from math import hypot, isfinite, nan, sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
-from imud.client import Client
-from imud.client.connection import default_path
-from imud.contracts.settings import Settings, unknown_name, value_problem, wrong_values
-from imud.contracts.status import DeviceStatus
-from imud.errors import BadArgument
-from imud.sample import SAMPLE_FIELDS
+from imud.client.connection import Client, default_path
+from imud.contracts.status import Deviations, DeviceStatus
+from imud.host.files import read_regular
+from imud.model.errors import BadArgument, ImudError, reason_of
+from imud.model.options import Settings, unknown_name, value_problem, wrong_values
+from imud.model.sample import SAMPLE_FIELDS
+
+FILE_BYTES_MAX: Final = 64 << 20
+"""A report has every point of its curves: some MB."""
+
+
+class _Spread(msgspec.Struct):
+    """Standard deviation of the samples of one axis, SI."""
+
+    value: float
+
+
+class _Axis(msgspec.Struct):
+    spread: _Spread
+
+
+class _Sensor(msgspec.Struct):
+    axes: dict[str, _Axis]
+
+
+class _Measurement(msgspec.Struct):
+    device: str
+
+
+class _Report(msgspec.Struct):
+    """The members of the report that are used."""
+
+    measurement: _Measurement
+    sensors: dict[str, _Sensor]
+
+
+def read_noise(path: Path) -> tuple[str, Deviations]:
+    """Return the device of a report, and the deviations of its sensors: the quadratic mean of the three axes'.
+
+    The standard deviation of samples at rest has in it what drifted during the measurement. Raises ImudError.
+    """
+    try:
+        report = msgspec.json.decode(read_regular(path, FILE_BYTES_MAX), type=_Report)
+    except (OSError, ValueError) as error:
+        raise ImudError(f"{path}: expected a report of `imud noise --json`: {reason_of(error)}") from error
+    return report.measurement.device, Deviations(
+        accel_m_s2=_sigma(report.sensors.get("accel")), gyro_rad_s=_sigma(report.sensors.get("gyro"))
+    )
+
+
+def _sigma(sensor: _Sensor | None) -> float | None:
+    """None for a sensor that was not measured, or whose values never changed."""
+    if sensor is None or not sensor.axes:
+        return None
+    spreads = [axis.spread.value for axis in sensor.axes.values()]
+    return hypot(*spreads) / sqrt(len(spreads)) or None
+
 
 if TYPE_CHECKING:  # what drivers promise takes as long to import as all that `imud status` needs
     from imud.contracts.driver import Driver
-    from imud.contracts.sensors.deviations import Deviations
+    from imud.contracts.status import Deviations
 
 SECONDS_OF: Final = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 DURATION: Final = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
@@ -167,7 +218,7 @@ def add_noise(parser: argparse.ArgumentParser) -> None:
 
 def noise_by_device(reports: Sequence[Path]) -> "dict[str, Deviations]":
     """Return what reports say, by the name of the device; of two of one device the later wins. Raises ImudError."""
-    from imud.bridges.noise_file import read_noise  # not part of every command's start
+    # not part of every command's start
 
     return dict(map(read_noise, reports))
 

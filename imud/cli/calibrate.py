@@ -10,11 +10,11 @@ import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket
 from imud.cli.output import table
-from imud.client import Client
-from imud.contracts.control.calibration import CalibrationInfo, CalibrationResult, Handling, Kept
-from imud.errors import BadArgument
-from imud.event import Event, EventKind
-from imud.units import RAD_PER_DEG
+from imud.client.connection import Client
+from imud.contracts.command import CalibrationInfo, CalibrationResult, Handling, Kept
+from imud.model.errors import BadArgument
+from imud.model.event import Event, EventKind
+from imud.model.units import RAD_PER_DEG
 
 HEAD: Final = ("CALIBRATION", "HANDLING", "RESULT LASTS", "EFFECT")
 LIMIT_S: Final = 600.0

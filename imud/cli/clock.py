@@ -12,11 +12,11 @@ import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, connect, finite, statuses
 from imud.cli.output import histogram
-from imud.client import Client
+from imud.client.connection import Client
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
-from imud.errors import ImudError
-from imud.sample import Sync
-from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
+from imud.model.errors import ImudError
+from imud.model.sample import Sync
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 KEPT: Final = 2000
 """Newest samples of a device that the histogram is made of."""

@@ -14,17 +14,17 @@ from typing import BinaryIO
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_option, driver_settings, given_options
-from imud.contracts.can import CanDriver
-from imud.contracts.codec import BadFrame, CodecEvent, ReplyFrame, TextLine
-from imud.contracts.driver import SAMPLE_COUNTER, Driver, StreamDriver
-from imud.contracts.settings import Settings
-from imud.devices import DRIVERS
-from imud.errors import ImudError
-from imud.files import NotRegularFile, open_stream
-from imud.formats.candump import CandumpReader
+from imud.contracts.codec import BadFrame, CodecEvent
+from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Driver, StreamDriver
+from imud.contracts.script import ReplyFrame, TextLine
+from imud.drivers import DRIVERS
+from imud.formats.can import CandumpReader
 from imud.formats.capture import CaptureReader
-from imud.ledger import Ledger
-from imud.sample import Measurement
+from imud.host.files import NotRegularFile, open_stream
+from imud.model.errors import ImudError
+from imud.model.ledger import Ledger
+from imud.model.options import Settings
+from imud.model.sample import Measurement
 
 FIFO_WAIT_MS = 5000
 """Time for the first bytes of a FIFO."""

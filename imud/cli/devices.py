@@ -7,8 +7,8 @@ import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, argument, confirmed, connect, statuses
 from imud.cli.output import table
-from imud.client import Client
-from imud.contracts.action import ActionInfo
+from imud.client.connection import Client
+from imud.contracts.command import ActionInfo
 
 HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "DRIVER", "PRODUCT", "SERIAL NUMBER", "LINK")
 LIMIT_S: Final = 180.0

@@ -10,18 +10,18 @@ from typing import Final
 
 from imud import config
 from imud.cli.arguments import CliCommand
-from imud.cli.streams import complain
-from imud.config import Config, DeviceConfig
-from imud.config.yaml_tree import FILE_BYTES_MAX
-from imud.contracts.device_settings import declared_values
+from imud.cli.output import complain
+from imud.config.model import Config, DeviceConfig
+from imud.config.yaml import FILE_BYTES_MAX
 from imud.contracts.lines import DeviceLines
-from imud.contracts.settings import unknown_name
+from imud.contracts.setting import declared_values
 from imud.daemon import Daemon
-from imud.devices import DRIVERS
-from imud.errors import ConfigError, ImudError, ServerError
-from imud.log import STDERR, is_journal, log_to
-from imud.publishers.mqtt.settings import EVERY
-from imud.runtime import event_loop
+from imud.drivers import DRIVERS
+from imud.fleet.settings import EVERY
+from imud.host import event_loop
+from imud.host.log import STDERR, is_journal, log_to
+from imud.model.errors import ConfigError, ImudError, ServerError
+from imud.model.options import unknown_name
 
 log = logging.getLogger(__name__)
 

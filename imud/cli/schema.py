@@ -7,8 +7,8 @@ import msgspec
 
 from imud.cli.arguments import CliCommand
 from imud.cli.output import table
-from imud.devices import DRIVERS
-from imud.sample import SAMPLE_SCHEMA
+from imud.drivers import DRIVERS
+from imud.model.sample import SAMPLE_SCHEMA
 
 FIELD_HEAD: Final = ("FIELD", "TYPE", "UNIT", "FRAME", "MEANING")
 DRIVER_HEAD: Final = ("DRIVER", "NAVIGATION FRAME", "EULER ANGLES")

@@ -11,15 +11,14 @@ import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, argument, confirmed
 from imud.cli.output import table, times
-from imud.client import Client
-from imud.config.yaml_tree import FILE_BYTES_MAX, no_pause, read_yaml
-from imud.contracts.device_settings import AppliedSettings, SettingInfo, SettingsPlan, SettingsReport, SettingsState
-from imud.contracts.settings import shown
-from imud.errors import BadArgument
-from imud.files import read_regular, replace_file
+from imud.client.connection import Client
+from imud.config.yaml import FILE_BYTES_MAX, no_pause, read_yaml, yaml_block, yaml_comment
+from imud.contracts.setting import AppliedSettings, SettingInfo, SettingsPlan, SettingsReport, SettingsState
+from imud.device.flash import backup_text
 from imud.formats.jsonrpc import Code, RpcError
-from imud.formats.yaml_text import yaml_block, yaml_comment
-from imud.runtime.settings.backup import backup_text
+from imud.host.files import read_regular, replace_file
+from imud.model.errors import BadArgument
+from imud.model.options import shown
 
 HEAD: Final = ("SETTING", "DECLARED", "ACTUAL", "")
 MORE: Final = ("UNIT", "MANUAL", "IN FORCE", "VALUES")

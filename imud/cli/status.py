@@ -8,8 +8,7 @@ import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, connect
 from imud.cli.output import paragraph, times
-from imud.contracts.device_settings import SettingsState, SettingsStatus
-from imud.contracts.settings import shown
+from imud.contracts.setting import SettingsState, SettingsStatus
 from imud.contracts.status import (
     DeviceState,
     DeviceStatus,
@@ -19,8 +18,9 @@ from imud.contracts.status import (
     SerialLineCounters,
     UtcStatus,
 )
-from imud.ledger import bytes_open, frames_open, lost
-from imud.units import NS_PER_MS, NS_PER_US
+from imud.model.ledger import bytes_open, frames_open, lost
+from imud.model.options import shown
+from imud.model.units import NS_PER_MS, NS_PER_US
 
 WELL: Final = (DeviceState.RUNNING, DeviceState.FINISHED)
 """States that need nobody's attention."""

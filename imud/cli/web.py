@@ -9,7 +9,7 @@ from time import time
 from typing import TYPE_CHECKING, Final
 
 from imud.cli.arguments import CliCommand, add_socket, check_port
-from imud.errors import BadArgument, LinkError, reason_of
+from imud.model.errors import BadArgument, LinkError, reason_of
 from imud.web.guard import WebGuard, is_loopback, read_token
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     check_port(args.port)
     guard = guard_of(args)
     try:
-        from imud.web.app import WebServer
+        from imud.web.server import WebServer
     except ModuleNotFoundError as error:
         raise BadArgument(f"it needs {error.name}: pip install 'imud[web]'") from None
     asyncio.run(_serve(WebServer(args.socket, guard).make_app(), args))

@@ -1,8 +1,7 @@
 """Readers for programs on the gateway: `Client` for the UNIX socket, `Ring` for shared memory."""
 
-from imud.client.connection import Client, Hello
+from imud.client.connection import Client, EventStream, Hello, Watch
 from imud.client.ring import Ring, RingRead
-from imud.client.watch import EventStream, Watch
 from imud.formats.jsonrpc import RpcError
 
 __all__ = ["Client", "EventStream", "Hello", "Ring", "RingRead", "RpcError", "Watch"]

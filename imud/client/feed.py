@@ -14,12 +14,11 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from imud.client.connection import Client, Hello
-from imud.client.watch import EventStream, Watch, event_of, params_of
+from imud.client.connection import Client, EventStream, Hello, Watch, event_of, params_of
 from imud.contracts.status import DeviceStatus
-from imud.errors import ImudError
-from imud.event import Event
-from imud.sample import Sample
+from imud.model.errors import ImudError
+from imud.model.event import Event
+from imud.model.sample import Sample
 
 STATUS_S: Final = 1.0
 """Time between two looks at the status, for few devices."""

@@ -24,7 +24,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
-from imud.errors import LinkMissing, ServerError
 from imud.formats.ring import (
     FILE_PREFIX,
     FIRST_WORD,
@@ -46,7 +45,8 @@ from imud.formats.ring import (
     ring_path,
 )
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, decode_slot
-from imud.sample import Sample
+from imud.model.errors import LinkMissing, ServerError
+from imud.model.sample import Sample
 
 ROOT_UID = 0
 _ATTEMPTS = 3

@@ -1,24 +1,369 @@
 """Reading of the devices: each has a driver, one link, and perhaps lines and a source of RMC sentences."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from re import compile as pattern
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from imud.config.claims import clashes
-from imud.config.declared import DeclaredReader
-from imud.config.frames import check_declination, read_frame
-from imud.config.keys import Keys
+import msgspec
+
+from imud.attitude.conventions import RFU_ENU, Heading
+from imud.attitude.published import FrameSettings, MountingAngles, MountingAxes, mounting_of
 from imud.config.model import DeviceConfig
-from imud.config.schema import DeviceGeneral, Tables
-from imud.config.signals import lines_once, read_lines, read_rmc
-from imud.config.yaml_tree import Path as KeyPath
-from imud.contracts.can import CanDriver
-from imud.contracts.polling import PolledDriver
-from imud.contracts.sensors.deviations import Deviations
-from imud.contracts.settings import Settings, got, unknown_name
-from imud.units import NS_PER_S, NS_PER_US
+from imud.config.schema import DeviceGeneral, DriverRow, Keys, LinkRow, Tables
+from imud.config.yaml import Path as KeyPath
+from imud.config.yaml import no_pause
+from imud.contracts.command import Target
+from imud.contracts.driver import CanDriver, PolledDriver
+from imud.contracts.lines import LINE_SCHEMAS, DeviceLines, LineSettings
+from imud.contracts.link import CanUse, Claim, conflict_of
+from imud.contracts.setting import DeviceSettings, declared_values
+from imud.contracts.status import Deviations
+from imud.model.errors import BadArgument
+from imud.model.options import Settings, got, shown, unknown_name
+from imud.model.units import NS_PER_S, NS_PER_US
+from imud.utc.receivers import RmcSettings
+
+
+class Clash(NamedTuple):
+    """A device that cannot have what another one has."""
+
+    path: KeyPath
+    """The key that has to change."""
+    message: str
+    """What was expected, what came, and who has it."""
+
+
+class _Owned(NamedTuple):
+    claim: Claim
+    owner: str
+
+
+def clashes(
+    devices: Sequence[DeviceConfig],
+    links: Mapping[str, LinkRow],
+    drivers: Mapping[str, DriverRow],
+    pause: Callable[[], None] = no_pause,
+) -> Iterator[Clash]:
+    """List what each device claims that one before it has. Symbolic links are followed; no port is opened."""
+    places: dict[str, list[_Owned]] = {}
+    buses: dict[str, list[tuple[CanUse, str]]] = {}
+    for device in devices:
+        owner = f"{device.name} (line {device.line})" if device.line else device.name
+        for part, claim in _claims(device, links):
+            held = places.setdefault(_place(claim), [])
+            for other in held:
+                if conflict := conflict_of(claim, other.claim, other.owner):
+                    yield Clash(("devices", device.name, part, conflict.key), conflict.message)
+                    break
+            held.append(_Owned(claim, owner))
+        use = _can_use(device, links, drivers)
+        if use is not None:
+            uses = buses.setdefault(use.bus, [])
+            yield from _can_clash(device.name, use, uses)
+            uses.append((use, owner))
+        pause()
+
+
+def owner_of(device: DeviceConfig, others: Sequence[DeviceConfig], links: Mapping[str, LinkRow]) -> str:
+    """Return the name of one of `others` that has the port of `device` for itself, or that cannot share it with it."""
+    mine = _claims(device, links)
+    for other in others:
+        for _, theirs in _claims(other, links) if other.name != device.name else ():
+            if any(_place(theirs) == _place(one) and conflict_of(one, theirs, "") for _, one in mine):
+                return other.name
+    return ""
+
+
+def _claims(device: DeviceConfig, links: Mapping[str, LinkRow]) -> list[tuple[str, Claim]]:
+    """List the claims of a device, each with the part of its configuration that it comes from."""
+    found = [(device.link, claim) for claim in links[device.link].claims(device.link_settings)]
+    if device.rmc is not None and device.rmc.port:
+        found.append(("rmc", Claim(place=device.rmc.port, key="port")))
+    return found
+
+
+def _place(claim: Claim) -> str:
+    return os.path.realpath(claim.place) if claim.place.startswith("/") else claim.place
+
+
+def _can_use(device: DeviceConfig, links: Mapping[str, LinkRow], drivers: Mapping[str, DriverRow]) -> CanUse | None:
+    """Return what a device needs of a bus that others can share; None where that is not known before it is found."""
+    claims = _claims(device, links)
+    if device.options is None or not claims:
+        return None
+    driver = drivers[device.driver]
+    if not isinstance(driver, CanDriver):
+        return None
+    return CanUse(_place(claims[0][1]), driver.filters(device.options), driver.cyclic(device.options))
+
+
+def _can_clash(name: str, use: CanUse, uses: Sequence[tuple[CanUse, str]]) -> Iterator[Clash]:
+    """List the frames that a device needs and another one has; the first owner is enough."""
+    path: KeyPath = ("devices", name, "options")
+    for other, owner in uses:
+        if both := use.both_receive(other):
+            yield Clash(path, f"expected a device of its own on {use.bus}, got one that sends {both}; {owner} has that")
+            return
+        if both := use.both_send(other):
+            message = f"expected one device on {use.bus} for which imud sends {both}, got it here and for {owner}"
+            yield Clash(path, f"{message}: leave it out here")
+            return
+
+
+class DeclaredReader:
+    """Reader of the declared settings of devices. `drivers` is the table of drivers."""
+
+    def __init__(self, keys: Keys, drivers: Mapping[str, DriverRow]) -> None:
+        self._keys = keys
+        self._drivers = drivers
+
+    def read(self, path: KeyPath, device: Mapping[str, Any]) -> Settings | None:
+        """Read `settings` among the keys of a device; None where there are none, or a problem is with them."""
+        key = (*path, "settings")
+        if device.get("settings") is None:
+            return None
+        driver = device.get("driver", "auto")
+        if driver == "auto":
+            message = f"expected settings only beside a named driver, got them with driver auto; {self._known()}"
+            self._keys.problem(key, message, at_key=True)
+            return None
+        if not isinstance(driver, str) or driver not in self._drivers:
+            return None  # reported with the driver
+        table = self._table(driver)
+        if table is None:
+            message = f"expected settings only of a driver that knows those of its device, got them with {driver}; "
+            self._keys.problem(key, message + self._known(), at_key=True)
+            return None
+        if device.get("identify") is False:
+            message = "expected identify: true, without which imud does not read settings, got false"
+            self._keys.problem(key, message, at_key=True)
+            return None
+        return self._keys.part(table.declarable, device["settings"], key)
+
+    def check(self, path: KeyPath, driver: str, declared: Settings, options: Settings | None, link: Settings) -> None:
+        """Refuse settings that do not go together, or with the place where the device is to be found."""
+        table = self._table(driver)
+        if table is None:
+            return
+        key, values = (*path, "settings"), declared_values(declared)
+        for name, value in values.items():
+            place = _fixed(name, options, link) if table.table[name].connection else None
+            if place not in (None, value):
+                message = f"expected {shown(place)}, where imud is configured to find the device, got {shown(value)}; "
+                hint = f"`imud command {path[-1]} {name} …` changes it, or let imud search for it where it can (auto)"
+                self._keys.problem((*key, name), message + hint)
+        baud = getattr(link, "baud", 0)
+        try:
+            table.check(Target(options, baud if isinstance(baud, int) else 0), values)
+        except BadArgument as error:
+            self._keys.problem(key, str(error))
+
+    def check_lines(self, path: KeyPath, driver: str, declared: Settings, lines: DeviceLines) -> None:
+        """Refuse lines that do nothing with the settings that are declared."""
+        if self._table(driver) is not None:
+            found = self._drivers[driver].declared_line_differences(declared_values(declared), lines)
+            for key, words in found.items():
+                self._keys.problem((*path, "lines", key), f"with the settings declared here {words}", at_key=True)
+
+    def _table(self, driver: str) -> DeviceSettings | None:
+        try:
+            return self._drivers[driver].device_settings
+        except ImportError:  # reported with the driver
+            return None
+
+    def _known(self) -> str:
+        names = [name for name in self._drivers if self._table(name) is not None]
+        return f"drivers with settings: {', '.join(names) or 'none'}"
+
+
+def _fixed(name: str, options: Settings | None, link: Settings) -> object:
+    """The value with which the configuration finds the device; None where it searches, or has no such key."""
+    for part in (link, options):
+        value = getattr(part, name, None)
+        if value is not None and value != "auto":
+            return value
+    return None
+
+
+KEY: Final = "frame"
+NESTED: Final[Mapping[str, type[Settings]]] = {"axes": MountingAxes, "euler": MountingAngles}
+"""Keys of `frame` with keys of their own."""
+WAYS: Final = ("axes", "euler", "quat_wxyz")
+"""The ways in which a rotation can be given."""
+
+
+def read_frame(keys: Keys, path: KeyPath, device: Mapping[str, Any]) -> FrameSettings | None:
+    """Read the key `frame` of a device; None where it has none or has problems."""
+    if KEY not in device:
+        return None
+    found = keys.mapping(path, device[KEY])
+    if found is None:
+        return None
+    given = [way for way in WAYS if found.get(way) is not None]
+    if len(given) > 1:
+        message = f"expected one way to give the rotation ({', '.join(WAYS)}), got {' and '.join(given)}"
+        keys.problem((*path, given[1]), message, at_key=True)
+    nested = _nested(keys, path, found)
+    if nested is None:
+        return None
+    settings = keys.part(FrameSettings, {name: value for name, value in found.items() if name not in NESTED}, path)
+    if settings is None:
+        return None
+    frame = msgspec.structs.replace(settings, **nested)
+    if len(given) == 1:
+        try:
+            mounting_of(frame, RFU_ENU)
+        except ValueError as error:
+            keys.problem((*path, given[0]), str(error))
+            return None
+    return frame
+
+
+def _nested(keys: Keys, path: KeyPath, found: Mapping[str, Any]) -> dict[str, Settings] | None:
+    """Read the keys that have keys of their own; None where one has a problem."""
+    made: dict[str, Settings] = {}
+    for name, schema in NESTED.items():
+        if found.get(name) is not None:
+            part = keys.part(schema, found[name], (*path, name))
+            if part is None:
+                return None
+            made[name] = part
+    return made
+
+
+def check_declination(
+    keys: Keys, path: KeyPath, general: DeviceGeneral, options: Settings | None, drivers: Mapping[str, DriverRow]
+) -> None:
+    """Refuse a declination where the heading is known not to be magnetic, or the driver is not named."""
+    if general.declination_deg is None:
+        return
+    place = (*path, "declination_deg")
+    if general.driver == "auto":
+        keys.problem(place, "expected declination_deg only beside a named driver, got it with driver auto", at_key=True)
+        return
+    heading = Heading.UNKNOWN
+    if general.driver in drivers:
+        with suppress(ImportError):  # reported elsewhere
+            heading = drivers[general.driver].heading(options, {})
+    if heading in (Heading.TRUE, Heading.RELATIVE):
+        why = "counts from power-on" if heading is Heading.RELATIVE else "is true already"
+        message = f"expected declination_deg only beside a magnetic heading, got it with {general.driver}"
+        keys.problem(place, f"{message}, whose heading {why}", at_key=True)
+
+
+LINK: Final = "uart"
+PULSE: Final = "pps"
+"""A device with this line synchronises to a pulse per second and RMC sentences."""
+TRIGGER: Final = "sin"
+"""Key of the line by which imud drives the input of the pulse."""
+
+
+def read_lines(
+    keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, DriverRow]
+) -> DeviceLines | None:
+    """Read the GPIO lines below the key `lines` of a device; None where it has none."""
+    if "lines" not in device:
+        return None
+    found = keys.mapping(path, device["lines"])
+    if found is None:
+        return None
+    _fit(keys, path, found, device.get("driver", "auto"), drivers)
+    made: dict[str, LineSettings] = {}
+    for name, schema in LINE_SCHEMAS.items():
+        if name in found:
+            inside = keys.mapping((*path, name), found[name])
+            settings = None if inside is None else keys.part(schema, inside, (*path, name))
+            if settings is not None:
+                made[name] = settings
+    return DeviceLines(**made) if made else None  # type: ignore[arg-type]  # each was made by the schema of its key
+
+
+def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
+    """Refuse a GPIO line that is used twice, by one device or by two."""
+    owners: list[tuple[LineSettings, str]] = []
+    for device in devices:
+        for name, settings in _lines_of_device(device):
+            path: KeyPath = ("devices", device.name, "lines", name)
+            first = next((place for other, place in owners if _same_line(other, settings)), None)
+            if first is not None:
+                wire = f"{settings.chip} line {settings.line}" if settings.chip else f"line {settings.line}"
+                keys.problem(path, f"expected a line of its own, got {wire}, which {first} has", at_key=True)
+            owners.append((settings, f"{device.name}.lines.{name} (line {keys.tree.key_mark(path).line})"))
+
+
+def read_rmc(
+    keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, DriverRow]
+) -> RmcSettings | None:
+    """Read the settings below the key `rmc` of a device; None where it has none."""
+    if "rmc" not in device:
+        return None
+    driver = device.get("driver", "auto")
+    if LINK not in device or (driver != "auto" and PULSE not in _lines_of_driver(drivers, driver)):
+        message = (
+            f"expected rmc only beside the link {LINK} of a device with SIN/PPS, got it with driver {shown(driver)}"
+        )
+        keys.problem(path, message, at_key=True)
+    if driver == "auto":
+        keys.problem(path, "expected rmc only beside a named driver, got it with driver auto", at_key=True)
+    lines = device.get("lines")
+    if isinstance(lines, dict) and TRIGGER in lines:
+        mark = keys.tree.key_mark((*path[:-1], "lines", TRIGGER))
+        message = (
+            "expected a receiver's pulse per second on SIN beside rmc, got imud as what drives it by lines.sin "
+            f"(line {mark.line}): leave one of them out"
+        )
+        keys.problem(path, message, at_key=True)
+    return keys.part(RmcSettings, device["rmc"], path)
+
+
+def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, drivers: Mapping[str, DriverRow]) -> None:
+    """Refuse lines that no device has, and lines that devices of this driver do not have."""
+    keys.unknown_keys(path, found, list(LINE_SCHEMAS))
+    if driver == "auto":
+        message = "expected lines only beside a named driver, got them with driver auto; drivers that have lines"
+        keys.problem(path, f"{message}: {', '.join(_with_lines(drivers))}", at_key=True)
+    if not isinstance(driver, str) or driver not in drivers:
+        return
+    try:
+        lines = drivers[driver].lines
+    except ImportError:
+        return  # reported elsewhere: the driver cannot be imported
+    for name in found:
+        if name in LINE_SCHEMAS and name not in lines:
+            known = ", ".join(key for key in LINE_SCHEMAS if key in lines) or "none"
+            message = f"expected a line that devices of {driver} have, got {shown(name)}; they have: {known}"
+            keys.problem((*path, name), message, at_key=True)
+
+
+def _with_lines(drivers: Mapping[str, DriverRow]) -> Iterator[str]:
+    for name in drivers:
+        with suppress(ImportError):
+            if drivers[name].lines:
+                yield name
+
+
+def _lines_of_device(device: DeviceConfig) -> Iterator[tuple[str, LineSettings]]:
+    for name in LINE_SCHEMAS if device.lines is not None else ():
+        settings = getattr(device.lines, name)
+        if settings is not None:
+            yield name, settings
+
+
+def _same_line(one: LineSettings, other: LineSettings) -> bool:
+    """Whether both are the same line, as far as names show: a line name without a chip is taken as on any chip."""
+    chips = {one.chip.removeprefix("/dev/"), other.chip.removeprefix("/dev/")}
+    return one.line == other.line and (len(chips) == 1 or "" in chips)
+
+
+def _lines_of_driver(drivers: Mapping[str, DriverRow], driver: object) -> frozenset[str]:
+    try:
+        return drivers[driver].lines if isinstance(driver, str) and driver in drivers else frozenset({PULSE})
+    except ImportError:
+        return frozenset({PULSE})  # reported elsewhere, as is an unknown driver
+
 
 DEVICES_MAX: Final = 256
 """Far more than one process serves at any useful rate; a file with more was generated by mistake."""

@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
-from imud.contracts.device_settings import OnDifference
+from imud.attitude.conventions import Convention
+from imud.attitude.published import FrameSettings
 from imud.contracts.lines import DeviceLines
-from imud.contracts.sensors.deviations import Deviations
-from imud.contracts.settings import Settings
-from imud.frames.conventions import Convention
-from imud.frames.settings import FrameSettings
-from imud.utc.source import RmcSettings
+from imud.contracts.setting import OnDifference
+from imud.contracts.status import Deviations
+from imud.model.options import Settings
+from imud.utc.receivers import RmcSettings
 
 
 @dataclass(frozen=True, slots=True)

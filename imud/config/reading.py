@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Final
 
 from imud.config.devices import DeviceReader
-from imud.config.keys import Keys
 from imud.config.model import Config
-from imud.config.schema import TABLES, General, Tables
-from imud.config.yaml_tree import FILE_BYTES_MAX, Problem, no_pause, path_text, read_yaml
-from imud.errors import ConfigError
-from imud.files import read_regular
+from imud.config.schema import TABLES, General, Keys, Tables
+from imud.config.yaml import FILE_BYTES_MAX, Problem, no_pause, path_text, read_yaml
+from imud.host.files import read_regular
+from imud.model.errors import ConfigError
 
 PROBLEMS_SHOWN: Final = 20
 

@@ -1,1 +1,1 @@
-"""Interfaces of codecs, links, drivers, sessions, actions and publishers."""
+"""Part of imud."""

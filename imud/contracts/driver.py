@@ -3,19 +3,74 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from random import Random
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
-from imud.contracts.action import Actions
-from imud.contracts.codec import StreamCodec
-from imud.contracts.control.calibration import Calibrations
-from imud.contracts.device_settings import DeviceSettings
-from imud.contracts.lines import AlarmRanges, DeviceLines
-from imud.contracts.sensors.data_sheet import DataSheet
-from imud.contracts.session import RequestScript
-from imud.contracts.settings import Settings
-from imud.contracts.timing import NO_TIME_BITS, TimeBits
-from imud.frames.conventions import RFU_ENU, DeviceAxes, Heading
-from imud.ledger import Ledger
+import msgspec
+from msgspec import Meta
+
+from imud.attitude.conventions import RFU_ENU, DeviceAxes, Heading
+from imud.contracts.codec import CanCodec, PolledCodec, StreamCodec
+from imud.contracts.command import Actions, Calibrations
+from imud.contracts.lines import NO_TIME_BITS, AlarmRanges, DeviceLines, TimeBits
+from imud.contracts.script import RequestScript, TransferScript
+from imud.contracts.setting import DeviceSettings
+from imud.formats.can import CanFilter, CanFrame, CyclicFrame
+from imud.model.ledger import Ledger
+from imud.model.options import Settings
+
+SensorName = Literal["gyro", "accel"]
+Figure = Annotated[float, Meta(gt=0)] | None
+"""A positive figure, None where none is stated."""
+
+
+class SensorFigures(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Figures of one sensor, SI; (rad/s) stands for the unit of the rate, m/s² for an accelerometer."""
+
+    random_walk: Figure = None
+    """Angle or velocity random walk N, (rad/s)/√Hz."""
+    noise_density: Figure = None
+    """Root of the one-sided spectral density, (rad/s)/√Hz: √2 N of white noise."""
+    bias_instability: Figure = None
+    """The least Allan deviation over 0.664, rad/s."""
+    rate_random_walk: Figure = None
+    """K, (rad/s)/√s."""
+    temperature_slope: Figure = None
+    """Change of the bias with temperature, either sign, (rad/s)/K."""
+
+
+class ModelFigures(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Figures of one model."""
+
+    gyro: SensorFigures = SensorFigures()
+    accel: SensorFigures = SensorFigures()
+    source: str = ""
+    """Document and section."""
+
+
+def _no_filter(_settings: Mapping[str, str], _sensor: SensorName) -> str:
+    return ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DataSheet:
+    """What is known of the sensors of a driver's devices from the vendor's documents."""
+
+    document: str = ""
+    """Title and version of the manual, and what it says of noise, in one sentence; empty for a driver without one."""
+    models: Mapping[str, ModelFigures] = field(default_factory=dict)
+    """Figures by the begin of the product's name; empty where the manual has none for any model."""
+    gyro_step_rad_s: float | None = None
+    """Value of one count of the angular rate on the wire; None for floats, or where the message decides."""
+    accel_step_m_s2: float | None = None
+    """The same of the acceleration."""
+    filter_words: Callable[[Mapping[str, str], SensorName], str] = _no_filter
+    """Describes the device's own low-pass filter of a sensor, from its settings as read back; empty: not known."""
+
+    def figures_of(self, product: str) -> ModelFigures | None:
+        """Return the figures of a model by its product name, the longest begin that fits; None for none."""
+        fitting = [begin for begin in self.models if product.startswith(begin)]
+        return self.models[max(fitting, key=len)] if fitting else None
+
 
 SAMPLE_COUNTER = 0
 """`tick_ns` of a device whose counter numbers its samples: a tick is one sample, its length is not known."""
@@ -166,3 +221,67 @@ D = TypeVar("D", bound=Driver)
 def of_kind(drivers: Iterable[Driver], kind: type[D]) -> list[D]:
     """Return the drivers of one kind, in their order."""
     return [driver for driver in drivers if isinstance(driver, kind)]
+
+
+def nothing_cyclic(_settings: Any) -> Sequence[CyclicFrame]:
+    """Return no cyclic frames: the version for devices that need none."""
+    return ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CanDriver(Driver):
+    """A device on a CAN bus, which it may share with others."""
+
+    make_codec: Callable[[Ledger, Any], CanCodec]
+    """Makes a codec that counts into the ledger, from an instance of `settings`."""
+    filters: Callable[[Any], Sequence[CanFilter]]
+    """The frames that a device with these settings sends, replies included."""
+    node_of: Callable[[int, bool, bytes], int | None]
+    """Which device of this protocol would send such a frame (identifier, 29 bits or not, data): its number, or None.
+
+    Only for frames that carry samples; the codec must confirm it."""
+    node_settings: Callable[[int], Any]
+    """Settings for the device of that number, the rest at its default."""
+    node_title: Callable[[int], str]
+    """The device of that number for people, for example `node 8`."""
+    identify: Callable[[Any], RequestScript[Identity]]
+    """Asks the device with these settings what it is, and leaves it as it was."""
+    read_settings: Callable[[Any], RequestScript[Mapping[str, str]]]
+    """Reads back the own settings of the device with these settings, by its own names, and leaves it as it was."""
+    apply_identity: Callable[[CanCodec, Identity], None] = lambda _codec, _identity: None
+    """Passes the identity to the codec, where the frames depend on it."""
+    sample_frames: int
+    """Frames that make one sample."""
+    example_frames: Callable[[Random], Sequence[CanFrame]]
+    """Valid frames that make one sample, in the order they are sent, with random values and the default settings."""
+    cyclic: Callable[[Any], Sequence[CyclicFrame]] = nothing_cyclic
+    """Frames that imud must send for a device with these settings, as long as the link is open; of a link that may not
+    send, none are."""
+
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PolledDriver(Driver):
+    """A device that sends only on request, without time or messages: its samples are dated by the host's deadlines."""
+
+    tick_ns: int = SAMPLE_COUNTER
+    tick_modulus: int = 2
+    link: str
+    """Name of the link it hangs on, a row of LINKS."""
+    targets: tuple[int, ...]
+    """Values to try when the link says `auto`, most likely first: I2C addresses, SPI modes."""
+    probe: Callable[[Any], TransferScript[Identity]]
+    """Reads the identity of a device with these settings. Raises DeviceRefused for another device. Changes nothing."""
+    set_up: Callable[[Any], TransferScript[Mapping[str, str]]]
+    """Writes the settings to the device, reads them back, returns them by the device's names. Raises DeviceRefused."""
+    make_codec: Callable[[Ledger, Any], PolledCodec]
+    """Makes a codec that counts into the ledger, from an instance of `settings`."""
+    update_ns: Callable[[Any], int]
+    """Longest time between two updates of the device's registers, from the settings; 0 for not known."""
+    example_reading: Callable[[Random], bytes]
+    """Bytes of the first poll with random values, for the shared property tests and for fault injection."""
+    read_ns: Callable[[Any, Any], int] = lambda _options, _link: 0
+    """Shortest time that one read of the samples takes on the bus, ns, from instances of `settings` and of the link's
+    settings; 0 for not known. The sum over the devices of a bus decides whether it carries their rates."""

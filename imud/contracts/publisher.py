@@ -3,29 +3,72 @@
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
+from socket import socket
 from typing import Any, Final, Protocol
 
-from imud.contracts.action import Actions
-from imud.contracts.control.calibration import CalibrationResult, Calibrations
-from imud.contracts.control.recording import NothingRecorded, RecordingSource, TakeSnapshot
-from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
-from imud.contracts.lines import WatchedInput, WatchLine
-from imud.contracts.settings import Settings
-from imud.contracts.status import (
-    ClientStatus,
-    DeviceStatus,
-    FlightStatus,
-    MqttStatus,
-    OutputStatus,
-    RecorderStatus,
-)
-from imud.contracts.timing import UtcReference
-from imud.errors import CommandError
-from imud.event import Event
+from imud.attitude.conventions import Convention
+from imud.attitude.published import PublishedFrame, as_sent
+from imud.contracts.command import Actions, CalibrationResult, Calibrations
+from imud.contracts.lines import UtcReference, WatchedInput, WatchLine
+from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
+from imud.contracts.status import ClientStatus, DeviceStatus, FlightStatus, MqttStatus, OutputStatus, RecorderStatus
 from imud.formats.slot import encode_slots
-from imud.frames.conventions import Convention
-from imud.frames.published import PublishedFrame, as_sent
-from imud.sample import Sample
+from imud.model.errors import CommandError
+from imud.model.event import Event
+from imud.model.options import Settings
+from imud.model.sample import Sample
+
+PutRecord = Callable[[bytes], None]
+"""Takes a whole record (`imud.formats.records`); returns at once. Called in the event loop's thread."""
+
+TakeSnapshot = Callable[[socket], float]
+"""Sends what a flight recorder has to a client's socket, a recording, and closes it; returns at once how many seconds
+that is. Raises ServerError. Called in the event loop's thread."""
+
+
+class RecordingSource(Protocol):
+    """The devices and the host's clocks of a daemon, as recorders see them. Synchronization: the loop's thread only."""
+
+    def names(self) -> Sequence[str]:
+        """Names of the devices there are."""
+        ...
+
+    def begin_host(self, put: PutRecord) -> None:
+        """Describe the host's clocks, and pass on their readings from now on; again for one that listens already."""
+        ...
+
+    def begin(self, device: str, put: PutRecord) -> None:
+        """Describe a device, and pass on all that it delivers; again for one that listens already. No-op if absent."""
+        ...
+
+    def check(self, device: str, put: PutRecord) -> None:
+        """Pass on the newest sample and the ledger of a device as a record. No-op if absent."""
+        ...
+
+    def end(self, put: PutRecord) -> None:
+        """Pass on nothing of any device any more, nor of the host."""
+        ...
+
+
+class NothingRecorded:
+    """Where nothing can be recorded."""
+
+    def names(self) -> Sequence[str]:
+        """None."""
+        return ()
+
+    def begin_host(self, put: PutRecord) -> None:
+        """Ignore it."""
+
+    def begin(self, device: str, put: PutRecord) -> None:
+        """Ignore it."""
+
+    def check(self, device: str, put: PutRecord) -> None:
+        """Ignore it."""
+
+    def end(self, put: PutRecord) -> None:
+        """Ignore it."""
+
 
 AS_SENT: Final = as_sent()
 """Axes and angles of HiPNUC modules: what a batch has of which nothing else is said."""

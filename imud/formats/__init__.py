@@ -1,1 +1,1 @@
-"""Formats of bytes and text that several parts share, without I/O."""
+"""Part of imud."""

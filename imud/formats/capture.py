@@ -1,8 +1,8 @@
-"""Capture files: bytes of a link. A raw capture is the bytes alone; a stamped one has the time of each read.
+r"""Capture files: bytes of a link. A raw capture is the bytes alone; a stamped one has the time of each read.
 
 A stamped capture begins with one line of ASCII, then come records to the end of the file, little-endian::
 
-    #imud-capture 1 driver=hipnuc-uart baud=115200 start_utc_ns=1763717507000000000\\n
+    #imud-capture 1 driver=hipnuc-uart baud=115200 start_utc_ns=1763717507000000000\n
     ┌───────────────┬─────────────┬───────────────┐
     │ t_ns i64      │ length u32  │ length bytes  │  t_ns is CLOCK_MONOTONIC right after the read
     └───────────────┴─────────────┴───────────────┘
@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping
 from typing import BinaryIO, Final, NamedTuple
 from urllib.parse import unquote
 
-from imud.errors import ImudError
+from imud.model.errors import ImudError
 
 MAGIC: Final = b"#imud-capture "
 VERSION: Final = "1"

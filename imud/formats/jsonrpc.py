@@ -1,6 +1,6 @@
-"""The UNIX socket's wire format, for the server and its clients: JSON-RPC 2.0, one object per line, and binary frames.
+r"""The UNIX socket's wire format, for the server and its clients: JSON-RPC 2.0, one object per line, and binary frames.
 
-    line     {"jsonrpc":"2.0",…}\\n
+    line     {"jsonrpc":"2.0",…}\n
     frame    +-----------------+------------------------------------------------------------+
              | length: u32, LE | length % 256 == 0: that many bytes of slots (slot.py)      |
              |                 | otherwise: one JSON object and its newline                 |
@@ -18,8 +18,8 @@ from typing import Any, Final
 
 import msgspec
 
-from imud.errors import ServerError
 from imud.formats.slot import SLOT_BYTES
+from imud.model.errors import ServerError
 
 PROTOCOL: Final = 1
 """Counts up when an old client could misread the server. New methods and members leave it as it is."""

@@ -9,7 +9,7 @@ frame has no sync word and no end mark: its meaning follows from the request, an
 
 from typing import Final
 
-from imud.units import NS_PER_US, uart_byte_ns
+from imud.model.units import NS_PER_US, uart_byte_ns
 
 READ_HOLDING: Final = 0x03
 WRITE_SINGLE: Final = 0x06

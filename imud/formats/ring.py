@@ -29,9 +29,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from imud.errors import ServerError
 from imud.formats.slot import SLOT_BYTES, SLOT_LAYOUT_VERSION, SlotField
-from imud.ledger import LEDGER_FIELDS
+from imud.model.errors import ServerError
+from imud.model.ledger import LEDGER_FIELDS
 
 DIRECTORY: Final = "/run/imud/shm"
 """Where only imud may make names: in /dev/shm any user may put a FIFO or a forged ring into its way."""

@@ -21,7 +21,7 @@ from zlib import crc32
 
 import msgspec
 
-from imud.sample import Pair, Quaternion, Sample, Sync, Vector3
+from imud.model.sample import Pair, Quaternion, Sample, Sync, Vector3
 
 SLOT_BYTES: Final = 256
 SLOT_LAYOUT_VERSION: Final = 1

@@ -3,17 +3,17 @@
 from typing import Any
 
 from imud.contracts.link import LinkType
-from imud.contracts.table import Table
+from imud.contracts.registry import Table
 
 LINKS: Table[LinkType[Any]] = Table(
     "link",
     {
-        "uart": "imud.links.uart.link:LINK",
-        "socketcan": "imud.links.can.link:LINK",
+        "uart": "imud.links.uart:LINK",
+        "socketcan": "imud.links.socketcan:LINK",
         "i2c": "imud.links.i2c:LINK",
         "spi": "imud.links.spi:LINK",
-        "rs485": "imud.links.rs485.link:LINK",
-        "replay": "imud.links.replay.link:LINK",
+        "rs485": "imud.links.rs485:LINK",
+        "replay": "imud.links.replay:LINK",
         "memory": "imud.links.memory:LINK",
     },
 )

@@ -11,13 +11,12 @@ from typing import Annotated, Final, Literal, Protocol
 from msgspec import Meta
 from smbus2 import I2cFunc, SMBus, i2c_msg
 
-from imud.contracts.claims import Claim
-from imud.contracts.link import LinkType
-from imud.contracts.polling import Transfer
-from imud.contracts.settings import Settings
+from imud.contracts.link import Claim, LinkType
+from imud.contracts.script import Transfer
 from imud.contracts.status import KernelCounters
-from imud.errors import LinkError
 from imud.links.device_node import DeviceNode, bus_open_problem, transfer_problem
+from imud.model.errors import LinkError
+from imud.model.options import Settings
 
 I2C_TIMEOUT: Final = 0x0702
 """ioctl: time-out of the adapter in units of 10 ms (<linux/i2c-dev.h>)."""

@@ -14,10 +14,10 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from imud.contracts.link import LinkType, OnBusNews, OnData, OnEnd, OnFrames
-from imud.contracts.settings import Settings
 from imud.contracts.status import KernelCounters
-from imud.errors import LinkBusy, LinkError, LinkMissing
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame
+from imud.model.errors import LinkBusy, LinkError, LinkMissing
+from imud.model.options import Settings
 
 
 class MemorySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):

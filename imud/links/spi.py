@@ -17,13 +17,12 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from imud.contracts.claims import Claim
-from imud.contracts.link import LinkType
-from imud.contracts.polling import Transfer
-from imud.contracts.settings import Settings
+from imud.contracts.link import Claim, LinkType
+from imud.contracts.script import Transfer
 from imud.contracts.status import KernelCounters
-from imud.errors import LinkError
 from imud.links.device_node import DeviceNode, bus_open_problem, transfer_problem
+from imud.model.errors import LinkError
+from imud.model.options import Settings
 
 WR_MODE: Final = 0x40016B01
 """_IOW('k', 1, __u8)"""

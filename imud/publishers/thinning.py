@@ -8,8 +8,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from imud.sample import Sample, Vector3
-from imud.units import NS_PER_S
+from imud.model.sample import Sample, Vector3
+from imud.model.units import NS_PER_S
 
 PAUSE_PERIODS: Final = 4
 """After so many periods without a sample how often samples come is learned anew; a lost one or two change nothing."""

@@ -1,13 +1,13 @@
 """Simulated devices with known truth, for `imud demo` and the tests."""
 
-from imud.contracts.table import Table
+from imud.contracts.registry import Table
 from imud.sim.can_module import CanSimulator
-from imud.sim.simulator import Simulator
+from imud.sim.sensor import Simulator
 
 SIMULATORS: Table[Simulator] = Table(
     "simulator",
     {
-        "hipnuc-uart": "imud.sim.hipnuc.uart.simulator:SIMULATOR",
+        "hipnuc-uart": "imud.sim.hipnuc.uart:SIMULATOR",
         "hipnuc-modbus": "imud.sim.hipnuc.modbus:SIMULATOR",
         "imu61x-uart": "imud.sim.imu61x.uart:SIMULATOR",
     },

@@ -19,17 +19,15 @@ import time
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
-from imud.errors import LinkError, reason_of
+from imud.model.errors import LinkError, reason_of
 from imud.sim import CAN_SIMULATORS, SIMULATORS
 from imud.sim.can_module import CanModules
-from imud.sim.command_line import ADAPTERS, DEVICE, make_parser, module_options
-from imud.sim.control import StandardInputControl
+from imud.sim.control import ADAPTERS, DEVICE, StandardInputControl, make_parser, module_options
 from imud.sim.ports.can_port import CanPort, default_interface
 from imud.sim.ports.faults import Faults, rates_from
-from imud.sim.ports.gpio_sim import SimulatedLines, pull_files
-from imud.sim.ports.pins import PinFaults, pin_rates
+from imud.sim.ports.pins import PinFaults, SimulatedLines, pin_rates, pull_files
 from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort, sharpen_timers
-from imud.sim.simulator import StreamModule
+from imud.sim.sensor import StreamModule
 
 
 def main(arguments: list[str] | None = None) -> int:

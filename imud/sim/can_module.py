@@ -13,10 +13,9 @@ from heapq import merge
 from typing import Final, NamedTuple, Protocol
 
 from imud.formats.can import DATA_BYTES_MAX, frame_bits
-from imud.sim.physics.motion import Truth
-from imud.sim.sensor import SensorHardware
-from imud.sim.simulator import SimulatorOptions
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sim.physics import Truth
+from imud.sim.sensor import SensorHardware, SimulatorOptions
 
 STUFF_BITS: Final = 9
 """Of a frame with average data. Frames with fewer than eight bytes take as long here as those with eight."""

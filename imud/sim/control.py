@@ -1,16 +1,22 @@
 """The main loop of a simulator's process, and the commands on its stdin (`imud.sim.__main__` lists them)."""
 
+import argparse
 import json
 import os
 import select
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sim import CAN_SIMULATORS, SIMULATORS
+from imud.sim.physics import GRAVITY_M_S2, MOTIONS
+from imud.sim.ports.arrival import BARE_UART, USB_1MS, USB_16MS
 from imud.sim.ports.can_port import CanPort
-from imud.sim.ports.gpio_sim import SimulatedLines
+from imud.sim.ports.pins import SIN_LOOK_NS, SimulatedLines
 from imud.sim.ports.pty import SimulatedPort
-from imud.units import NS_PER_S
+from imud.sim.sensor import SimulatorOptions
 
 COMMAND_BYTES_MAX: Final = 4096
 
@@ -89,3 +95,78 @@ def _duration_ns(text: str) -> int:
         return round(float(text) * NS_PER_S)
     except (ValueError, OverflowError):
         raise BadCommand(f"unplug {text!r}: expected seconds") from None
+
+
+ADAPTERS: Final = {profile.name: profile for profile in (BARE_UART, USB_1MS, USB_16MS)}
+DEVICE: Final = "hipnuc-uart"
+"""The device that is simulated where no other is named."""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of the command line."""
+    default = SimulatorOptions()
+    parser = argparse.ArgumentParser("python -m imud.sim", description="A simulated sensor behind a pseudo-terminal.")
+    add = parser.add_argument
+    add(
+        "--device",
+        action="append",
+        type=simulated,
+        metavar="NAME[:NODE]",
+        help=f"what to simulate ({DEVICE}), one of {', '.join(sorted([*SIMULATORS, *CAN_SIMULATORS]))}; "
+        "several times for several devices on one CAN interface",
+    )
+    add("--node", type=int, default=default.node, metavar="N", help="node, address or first identifier on a CAN bus")
+    add("--at-once", action="store_true", help="CAN frames of one instant leave together, not paced by the bit rate")
+    add("--rate", type=float, default=default.rate_hz, metavar="HZ", help="samples per second (%(default)s)")
+    add("--baud", type=int, default=0, help="rate of the port (the slowest common one that carries the samples)")
+    add("--message", default="", help="message to send (the factory's)")
+    add("--motion", choices=sorted(MOTIONS), default=default.motion, help="known motion (%(default)s)")
+    add("--gravity", type=float, default=GRAVITY_M_S2, metavar="M_S2", help="local gravity (%(default)s m/s²)")
+    add("--noise", action=argparse.BooleanOptionalAction, default=True, help="sensor noise and bias")
+    add("--skew-ppm", type=float, default=default.skew_ppm, metavar="PPM", help="crystal skew (%(default)s)")
+    add("--firmware", type=int, default=0, metavar="N", help="firmware version, for example 156 or 169")
+    add("--boot", type=float, default=default.boot_ms / 1000, metavar="S", help="silence after power-on (%(default)s)")
+    add("--processing-us", type=float, default=default.processing_ns / 1000, metavar="US",
+        help="time from sample to wire (%(default)s)")  # fmt: skip
+    add("--adapter", choices=list(ADAPTERS), default=BARE_UART.name, help="how bytes are handed over (%(default)s)")
+    add("--faults", default="", metavar="KIND=P,…", help="probability per burst: cut flip drop insert delay unplug …")
+    add("--pins", default="", metavar="NAME=PATH,…", help="pins by name (sout sout_div alarm), each on a `pull` file "
+        "of a gpio-sim line")  # fmt: skip
+    add("--pin-faults", default="", metavar="KIND=P,…", help="probability per pulse: lose_pulse lose_edge extra")
+    add("--pin-settle", type=float, default=0.0, metavar="MS", help="nothing else happens so long after a rising edge")
+    add("--pin-truth", type=Path, metavar="FILE", help="write edges, CSV: pin,level,due_ns,sample_ns,step_ns")
+    add("--sin", type=Path, metavar="PATH", help="SIN: the `value` file of a gpio-sim line, looked at every "
+        f"{SIN_LOOK_NS / NS_PER_MS:g} ms")  # fmt: skip
+    add("--seed", type=int, default=default.seed, help="seed of noise and faults (%(default)s)")
+    add("--interface", default="", metavar="NAME", help="CAN interface, for CAN devices (the first that is up)")
+    add("--path", type=Path, help="node to make (a temporary one)")
+    add("--truth", type=Path, metavar="FILE", help="write true sample times, CSV: sample_ns,device_ms,written_ns")
+    return parser
+
+
+def simulated(text: str) -> tuple[str, int]:
+    """Name and node of NAME or NAME:NODE, node 0 where none is given. Raises ArgumentTypeError."""
+    name, _, node = text.partition(":")
+    known = sorted([*SIMULATORS, *CAN_SIMULATORS])
+    if name not in known or (node and not node.isdecimal()):
+        raise argparse.ArgumentTypeError(f"expected one of {', '.join(known)}, with or without :NODE, got {text!r}")
+    return name, int(node or 0)
+
+
+def module_options(options: argparse.Namespace, node: int) -> SimulatorOptions:
+    """The options of one device from parsed arguments; `node` 0: of all devices."""
+    return SimulatorOptions(
+        rate_hz=options.rate,
+        baud=options.baud,
+        message=options.message,
+        motion=options.motion,
+        gravity_m_s2=options.gravity,
+        noise="real" if options.noise else "none",
+        skew_ppm=options.skew_ppm,
+        firmware=options.firmware,
+        boot_ms=round(options.boot * 1e3),
+        processing_ns=round(options.processing_us * 1e3),
+        seed=options.seed,
+        node=node or options.node,
+        at_once=options.at_once,
+    )

@@ -1,7 +1,7 @@
 """UTC: sources of RMC sentences, references from PPS pulses and the system clock, the feeds of device and chronyd."""
 
-from imud.contracts.table import Table
-from imud.utc.source import MakeSource
+from imud.contracts.registry import Table
+from imud.utc.receivers import MakeSource
 
 RMC_SOURCES: Table[MakeSource] = Table(
     "RMC source",

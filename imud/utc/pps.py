@@ -10,16 +10,19 @@ Doubtful pulses are rejected:
 - the second is known when two consecutive sentences give a pulse the same second, and is corrected the same way.
 """
 
+import socket
+import struct
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import combinations, pairwise
 from math import hypot
 from statistics import median, quantiles
 from typing import Final
 
-from imud.contracts.timing import UtcReference
-from imud.formats.rmc import Rmc, parse
-from imud.units import NS_PER_S, NS_PER_US
+from imud.contracts.lines import UtcReference
+from imud.formats.nmea0183 import Rmc, parse
+from imud.model.units import NS_PER_S, NS_PER_US
 
 STEP_TOLERANCE_NS: Final = 500 * NS_PER_US
 """Oscillators are within 100 ppm, interrupts late by some hundred µs at worst."""
@@ -140,3 +143,57 @@ class PpsReference:
         seconds = round((t_ns - before_ns) / NS_PER_S)
         off_ns = abs(t_ns - before_ns - seconds * NS_PER_S)
         return seconds if 1 <= seconds <= GAP_S_MAX and off_ns <= seconds * STEP_TOLERANCE_NS else 0
+
+
+MAGIC: Final = 0x534F434B
+SAMPLE: Final = struct.Struct("=qqdiiii")
+HALF_NS: Final = NS_PER_S // 2
+
+
+def encode(system_ns: int, offset_ns: int, *, pulse: bool, leap: int = 0) -> bytes:
+    """Encode a sample: at `system_ns` (CLOCK_REALTIME) true time was `offset_ns` more; `pulse`: modulo one second."""
+    seconds, rest_ns = divmod(system_ns, NS_PER_S)
+    return SAMPLE.pack(seconds, rest_ns // NS_PER_US, offset_ns / NS_PER_S, pulse, leap, 0, MAGIC)
+
+
+class ChronyFeed:
+    """Sender of samples to chronyd. Never blocks. Synchronization: one thread."""
+
+    def __init__(self, path: str, utc_offset_ns: Callable[[], int]) -> None:
+        """`path` is chronyd's socket, which may not exist yet; `utc_offset_ns` as `SourceContext.utc_offset_ns`."""
+        self.title = f"chronyd at {path}"
+        self.problem = ""
+        """Why the last sample was not accepted, one sentence; empty if it was."""
+        self.sent = 0
+        self.refused = 0
+        """Samples not accepted: chronyd does not run, or does not keep up."""
+        self._path = path
+        self._utc_offset_ns = utc_offset_ns
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+
+    def send_pulse(self, t_ns: int, unix_s: int | None = None) -> bool:
+        """Send a pulse at CLOCK_MONOTONIC `t_ns`, the begin of `unix_s` if known; return whether it was accepted.
+
+        Call it soon after the pulse. Without the second chronyd needs another source for it (`lock`).
+        """
+        system_ns = t_ns + self._utc_offset_ns()
+        second_s = (system_ns + HALF_NS) // NS_PER_S if unix_s is None else unix_s
+        offset_ns = second_s * NS_PER_S - system_ns
+        return self._send(encode(system_ns, offset_ns, pulse=unix_s is None))
+
+    def close(self) -> None:
+        """Close the socket; may be called twice."""
+        with suppress(OSError):
+            self._socket.close()
+
+    def _send(self, sample: bytes) -> bool:
+        try:
+            self._socket.sendto(sample, self._path)
+        except OSError as error:
+            self.refused += 1
+            self.problem = f"{self.title} refuses samples: {error.strerror or error}; is it running, with this socket?"
+            return False
+        self.sent += 1
+        self.problem = ""
+        return True

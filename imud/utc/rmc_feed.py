@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from imud.contracts.timing import UtcReference
-from imud.errors import LinkError
-from imud.formats.rmc import Rmc, RmcFault, as_gprmc, parse
-from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+from imud.contracts.lines import UtcReference
+from imud.formats.nmea0183 import Rmc, RmcFault, as_gprmc, parse
+from imud.model.errors import LinkError
+from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 GUARD_NS: Final = 20 * NS_PER_MS
 """A sentence is transmitted at least this long before the next second: the device has to process it as well."""

@@ -12,10 +12,10 @@ from collections.abc import Callable
 from math import sqrt
 from typing import Final, NamedTuple
 
-from imud.contracts.timing import UtcReference
-from imud.formats.rmc import build
-from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
-from imud.utc.source import OnSentence, RmcSettings, SourceContext
+from imud.contracts.lines import UtcReference
+from imud.formats.nmea0183 import build
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
+from imud.utc.receivers import OnSentence, RmcSettings, SourceContext
 
 STA_UNSYNC: Final = 0x40
 TIME_ERROR: Final = 5

@@ -15,7 +15,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from imud.errors import BadArgument, reason_of
+from imud.model.errors import BadArgument, reason_of
 
 TOKEN_CHARACTERS_MIN: Final = 20
 """Of letters and digits these are more than 100 bits: nobody guesses them, however fast they ask."""

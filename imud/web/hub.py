@@ -6,23 +6,157 @@ feed's thread; everything else in the event loop.
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from math import isfinite
 from threading import BoundedSemaphore
 from typing import Final, Protocol
 
 import msgspec
 
 from imud.client.feed import News, Wish
-from imud.contracts.device_settings import SettingsState
+from imud.contracts.setting import SettingsState
 from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
-from imud.event import Event, EventKind
-from imud.ledger import LEDGER_FIELDS, bytes_open, frames_open, lost
-from imud.sample import Sample
-from imud.units import NS_PER_S
+from imud.model.event import Event, EventKind
+from imud.model.ledger import LEDGER_FIELDS, bytes_open, frames_open, lost
+from imud.model.sample import Sample
+from imud.model.units import NS_PER_S
 from imud.web import messages
-from imud.web.buckets import Bucketing, raw_of
-from imud.web.mailbox import Mailbox
-from imud.web.messages import Look
+from imud.web.messages import VECTORS, Bucket, Look, Range, RawMessage
+
+LATE_PERIODS: Final = 2
+"""A bucket ends that long after its interval even where no later sample came."""
+
+
+class Bucketing:
+    """Buckets of one device at one rate. Their intervals begin at whole multiples of the period of CLOCK_MONOTONIC."""
+
+    def __init__(self, rate_hz: int) -> None:
+        self._period_ns = NS_PER_S // rate_hz
+        self._open: list[Sample] = []
+        self._number = -1
+        """Of the interval of the open bucket, since the clock's zero."""
+
+    def add(self, samples: Iterable[Sample], now_ns: int) -> list[Bucket]:
+        """Take samples in order, and return the buckets that are complete."""
+        done = []
+        for sample in samples:
+            number = sample.t_ns // self._period_ns
+            if number != self._number:
+                done += self._ended()
+                self._number = number
+            self._open.append(sample)
+        if now_ns >= (self._number + 1 + LATE_PERIODS) * self._period_ns:
+            done += self._ended()
+        return done
+
+    def _ended(self) -> list[Bucket]:
+        samples, self._open = self._open, []
+        return [bucket_of(samples)] if samples else []
+
+
+def bucket_of(samples: Sequence[Sample]) -> Bucket:
+    """Make the bucket of one sample or more of one device. Values that are not finite are left out."""
+    first, last = samples[0], samples[-1]
+    ranges = {name: _range([getattr(sample, name) for sample in samples]) for name in VECTORS}
+    return Bucket(
+        first_s=first.t_ns / NS_PER_S,
+        last_s=last.t_ns / NS_PER_S,
+        utc_s=last.utc_ns / NS_PER_S,
+        count=len(samples),
+        seq=last.seq,
+        sync=str(last.sync),
+        t_err_s=max(sample.t_err_ns for sample in samples) / NS_PER_S,
+        latency_s=max(sample.t_rx_ns - sample.t_ns for sample in samples) / NS_PER_S,
+        quat_wxyz=_last([sample.quat_wxyz for sample in samples]),
+        temperature_c=next((one.temperature_c for one in reversed(samples) if one.temperature_c is not None), None),
+        pressure_pa=next((one.pressure_pa for one in reversed(samples) if one.pressure_pa is not None), None),
+        **ranges,
+    )
+
+
+def raw_of(device: str, member: str, samples: Iterable[Sample]) -> RawMessage | None:
+    """Every value of a vector; None where no sample has it."""
+    found = [
+        (sample.seq, sample.t_ns / NS_PER_S, vector)
+        for sample in samples
+        if (vector := getattr(sample, member)) is not None and all(map(isfinite, vector))
+    ]
+    if not found:
+        return None
+    numbers, times, vectors = zip(*found, strict=True)
+    return RawMessage(device, member, numbers, times, tuple(zip(*vectors, strict=True)))
+
+
+def _range(vectors: Iterable[tuple[float, ...] | None]) -> Range | None:
+    kept = [vector for vector in vectors if vector is not None and all(map(isfinite, vector))]
+    if not kept:
+        return None
+    axes = list(zip(*kept, strict=True))
+    return tuple(map(min, axes)), tuple(map(max, axes))
+
+
+def _last(vectors: Sequence[tuple[float, ...] | None]) -> tuple[float, ...] | None:
+    for vector in reversed(vectors):
+        if vector is not None and all(map(isfinite, vector)):
+            return vector
+    return None
+
+
+FRAMES_MAX: Final = 100
+"""Messages of samples and events that wait: 2 s at 50 Hz. Of state and status only the newest waits, each once."""
+WINDOW_MAX: Final = 100
+"""Messages that were sent and are not acknowledged: 2 s at 50 Hz, while pages acknowledge four times a second."""
+
+
+class Mailbox:
+    """Messages for one browser. Synchronization: one event loop."""
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        """Messages left out."""
+        self._newest: dict[str, str] = {}
+        self._frames: deque[str] = deque()
+        self._on_the_way = 0
+        self._changed = asyncio.Event()
+
+    def put(self, message: str) -> None:
+        """Add a message behind those that wait; the oldest goes where there are too many."""
+        if len(self._frames) >= FRAMES_MAX:
+            self._frames.popleft()
+            self.dropped += 1
+        self._frames.append(message)
+        self._changed.set()
+
+    def put_newest(self, subject: str, message: str) -> None:
+        """Add a message of which only the newest on its subject is of use; one that waits is replaced."""
+        self._newest[subject] = message
+        self._changed.set()
+
+    def acknowledge(self, messages: int) -> None:
+        """Note that the page has dealt with so many; more than were sent is all of them."""
+        self._on_the_way = max(0, self._on_the_way - max(0, messages))
+        self._changed.set()
+
+    def forget(self) -> None:
+        """Throw away what waits: the page shows something else now."""
+        self._frames.clear()
+        self._newest.clear()
+
+    @property
+    def waiting(self) -> int:
+        """Messages that wait."""
+        return len(self._newest) + len(self._frames)
+
+    async def take(self) -> str:
+        """Wait for the next message to send, and for room on the way."""
+        while not self.waiting or self._on_the_way >= WINDOW_MAX:
+            self._changed.clear()
+            await self._changed.wait()
+        self._on_the_way += 1
+        if self._newest:
+            return self._newest.pop(next(iter(self._newest)))
+        return self._frames.popleft()
+
 
 EVENTS_KEPT: Final = 200
 NEWEST_S: Final = 0.5

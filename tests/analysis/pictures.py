@@ -17,15 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imud.analysis.noise import SensorNoise, sensor_noise
-from imud.analysis.noise_plots import deviation_figure
+from imud.analysis.plots import SensorVibration, deviation_figure, spectrum_figure
 from imud.analysis.quantities import DEG_PER_RAD, ROOT_S_PER_ROOT_H, S_PER_H
 from imud.analysis.series import Readings
-from imud.analysis.spectrum_plots import SensorVibration, spectrum_figure
-from imud.cli.analysis.noise_page import html, picture
-from imud.cli.analysis.noise_report import noise_report
-from imud.cli.analysis.sheet import figures_for
-from imud.cli.analysis.spectrum_report import SpectrumSettings, sensor_vibration
-from imud.cli.analysis.taking import Taken
+from imud.cli.noise import figures_for, html, noise_report, picture
+from imud.cli.sample_set import Taken
+from imud.cli.spectrum import SpectrumSettings, sensor_vibration
 from tests.analysis.synthetic import flicker, random_walk, stamps_ns, white
 from tests.support.files import ROOT
 

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from imud.analysis.allan import allan_curve
-from imud.analysis.noise_terms import BIAS_FACTOR, NoiseTerms, basis, noise_terms
+from imud.analysis.noise import BIAS_FACTOR, NoiseTerms, allan_curve, basis, noise_terms
 from imud.analysis.series import FloatArray
-from imud.errors import BadArgument
+from imud.model.errors import BadArgument
 from tests.analysis.synthetic import flicker, quantisation, ramp, random_walk, white
 
 RATE_HZ = 100.0

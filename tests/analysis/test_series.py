@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imud.analysis.series import FILL_MOST, Readings, even_runs, grid_of, with_values
-from imud.errors import BadArgument
+from imud.model.errors import BadArgument
 from tests.analysis.synthetic import stamps_ns
 
 

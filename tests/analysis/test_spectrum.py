@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import welch
 
 from imud.analysis.spectrum import noise_bandwidth, power_spectrum, spectrogram, window_size
-from imud.errors import BadArgument
+from imud.model.errors import BadArgument
 from tests.analysis.synthetic import white
 
 RATE_HZ = 500.0

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 from imud.formats.jsonrpc import encode_request, line_of
 from imud.formats.slot import SLOT_BYTES, decode_slot
-from imud.units import NS_PER_MS
+from imud.model.units import NS_PER_MS
 from tests.attack.hostile import become
 
 ASK_S = 0.01

@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from enum import Enum, auto
 
-from imud.sample import SAMPLE_FIELDS
+from imud.model.sample import SAMPLE_FIELDS
 
 RECONNECTS_PER_S = 200
 LOOPBACK = "127.0.0.1"

@@ -12,8 +12,8 @@ from threading import Event, Thread
 from time import monotonic_ns, sleep
 from typing import Final
 
-from imud.client import Ring
-from imud.errors import ServerError
+from imud.client.ring import Ring
+from imud.model.errors import ServerError
 from tests.attack.shared_memory import DEVICES
 from tests.attack.stage import SLOTS, AttackedDaemon
 

@@ -22,8 +22,8 @@ from typing import Any, Self
 import msgspec
 
 from imud.cli.arguments import statuses
-from imud.client import Client
-from imud.ledger import lost
+from imud.client.connection import Client
+from imud.model.ledger import lost
 from tests.bench.rig import CORES, REST_CORES, SERVER_CORE, Process, cpu_ns, rss_mb, wait_for
 from tests.support.surroundings import free_port
 

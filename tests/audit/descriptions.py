@@ -7,7 +7,7 @@ from typing import Any, Final
 import msgspec
 
 from imud.contracts.driver import Driver
-from imud.devices import DRIVERS
+from imud.drivers import DRIVERS
 
 MANUALS: Final = {"imu61x": "A", "hipnuc": "B"}
 """Letter of the manual by the first word of a driver's name."""

@@ -13,9 +13,9 @@ from math import ceil, pi, sin
 from random import Random
 from typing import Final, NamedTuple
 
-from imud.sample import Measurement
+from imud.model.sample import Measurement
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sim.ports.arrival import Arrival, ArrivalModel, ArrivalProfile
-from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 SECONDS: Final = 120
 WakeLaw = Callable[[Random, float], float]

@@ -15,7 +15,7 @@ import tty
 
 import msgspec
 
-from imud.devices.hipnuc.uart.codec import encode_hi91  # noqa: F401 - the same start-up cost on both sides
+from imud.drivers.hipnuc.uart.codec import encode_hi91  # noqa: F401 - the same start-up cost on both sides
 
 HEAD = struct.Struct("<2sHH")
 BODY = struct.Struct("<BHbfI16f")

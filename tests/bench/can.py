@@ -17,7 +17,7 @@ import can
 import msgspec
 
 from imud.formats.can import pack_frame
-from imud.links.can.frame_reader import BATCH_FRAMES, FrameReader
+from imud.links.socketcan import BATCH_FRAMES, FrameReader
 from tests.bench.rows import Row, at_least
 
 BUS = "vcanbench"

@@ -8,16 +8,16 @@ import socket
 from contextlib import ExitStack
 from time import monotonic_ns, process_time_ns
 
-from imud.clock import SampleClock
-from imud.contracts.can import CanDriver
+from imud.contracts.driver import CanDriver
 from imud.contracts.publisher import Batch
-from imud.devices import DRIVERS
+from imud.drivers import DRIVERS
 from imud.formats.can import RAW_FRAME, CanFilter
 from imud.formats.slot import encode_slot
-from imud.host_clock import HostClock
-from imud.ledger import Ledger
-from imud.links.can.frame_reader import FrameReader
-from imud.runtime.path import CanPath, PathContext
+from imud.host.clock import HostClock
+from imud.links.socketcan import FrameReader
+from imud.model.ledger import Ledger
+from imud.sampling.clock import SampleClock
+from imud.sampling.path import CanPath, PathContext
 from tests.bench.rows import Row, at_most
 from tests.lab.can_player import loop
 from tests.lab.can_traffic import Module, fleet

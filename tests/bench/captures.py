@@ -7,11 +7,11 @@ from typing import Any, Final, NamedTuple
 
 from imud import config
 from imud.daemon import Daemon
-from imud.runtime import event_loop
-from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
-from imud.sim.hipnuc.uart.simulator import HipnucModule
-from imud.sim.simulator import StreamModule
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.host import event_loop
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sim.hipnuc.uart import HipnucModule
+from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings, Output
+from imud.sim.sensor import StreamModule
 from tests.support.files import CaptureWriter
 
 BEGIN_NS: Final = 86_400 * NS_PER_S

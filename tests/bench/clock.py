@@ -12,10 +12,10 @@ from math import sqrt
 from time import perf_counter_ns
 from typing import NamedTuple
 
-from imud.clock import SampleClock
-from imud.sample import Measurement, Sync
+from imud.model.sample import Measurement, Sync
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sampling.clock import SampleClock
 from imud.sim.ports.arrival import BARE_UART, LOADED, PROFILES, USB_1MS, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
-from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.clock_figures import ARRIVAL_HEAD, ArrivalFigures, Spread, keep
 from tests.bench.rows import Row, at_least, at_most
 

@@ -5,18 +5,18 @@ Three ways to read 1,000 samples a second a latency apart, from the same simulat
 - at once: each message is read as it comes;
 - one in time: after a message that was read as it came, all that gathered is read a latency apart, which the clock is
   told; every 50 ms, or at once behind a latency timer, the next message is read as it comes
-  (`imud.runtime.latency.stream_hold`);
+  (`imud.device.stream_transport`);
 - by timer: all that gathered, a latency apart, and the clock takes that for an adapter's latency timer.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from imud.clock import SampleClock
-from imud.runtime.latency.stream_hold import WATCH_NS
-from imud.sample import Measurement, Sync
+from imud.device.stream_transport import WATCH_NS
+from imud.model.sample import Measurement, Sync
+from imud.model.units import NS_PER_MS
+from imud.sampling.clock import SampleClock
 from imud.sim.ports.arrival import BARE_UART, LOADED, USB_1MS, USB_16MS, Arrival, ArrivalModel, ArrivalProfile, Crystal
-from imud.units import NS_PER_MS
 from tests.bench.clock import BAUD_OF_RATE, CRYSTALS, TICK_MODULUS, TICK_NS, Accuracy, Point, accuracy
 from tests.bench.rows import Row, at_most
 

@@ -5,8 +5,9 @@ from collections.abc import Callable, Iterator, Sequence
 from math import sqrt
 from time import perf_counter_ns
 
-from imud.contracts.timing import SoutTiming
-from imud.sample import Measurement
+from imud.contracts.lines import SoutTiming
+from imud.model.sample import Measurement
+from imud.model.units import NS_PER_S
 from imud.sim.ports.arrival import (
     BARE_UART,
     LOADED,
@@ -17,7 +18,6 @@ from imud.sim.ports.arrival import (
     ArrivalProfile,
     Crystal,
 )
-from imud.units import NS_PER_S
 from tests.bench.clock import BAUD_OF_RATE, CRYSTALS, TICK_NS, clock_for
 from tests.bench.clock_figures import LINE_HEAD, LineFigures, keep
 from tests.bench.line_model import LineFaults, restarted, simulate_reads

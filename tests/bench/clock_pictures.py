@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from imud.cli.analysis.noise_page import picture
+from imud.cli.noise import picture
 from tests.bench.clock_figures import ArrivalFigures, LineFigures, kept
 from tests.support.files import ROOT
 

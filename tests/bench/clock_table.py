@@ -37,8 +37,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
-from imud.clock import SampleClock
-from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+from imud.sampling.clock import SampleClock
 from tests.bench.adversity import (
     CAN,
     FT232,
@@ -62,7 +62,7 @@ from tests.bench.compare import ROOT, checked_out
 from tests.bench.rows import Row, at_least
 
 if TYPE_CHECKING:  # a base may have none
-    from imud.host_clock import SteadyTime
+    from imud.host.clock import SteadyTime
 
 FILE: Final = Path(__file__).with_suffix(".json")
 SETTLING_NS: Final = 30 * NS_PER_S

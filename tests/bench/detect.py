@@ -11,14 +11,13 @@ from random import Random
 from statistics import quantiles
 
 from imud.contracts.driver import StreamDriver
-from imud.devices.hipnuc.uart.codec import encode_hi91
-from imud.devices.hipnuc.uart.driver import DRIVER as HIPNUC
-from imud.devices.imu61x.uart.codec import encode_status
-from imud.devices.imu61x.uart.commands import ask_status
-from imud.devices.imu61x.uart.driver import DRIVER as IMU61X
-from imud.devices.imu61x.uart.replies import Status
-from imud.runtime.detection import Search, StreamFound
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.device.stream_search import Search, StreamFound
+from imud.drivers.hipnuc.uart.codec import encode_hi91
+from imud.drivers.hipnuc.uart.driver import DRIVER as HIPNUC
+from imud.drivers.imu61x.uart.codec import Status, encode_status
+from imud.drivers.imu61x.uart.commands import ask_status
+from imud.drivers.imu61x.uart.driver import DRIVER as IMU61X
+from imud.model.units import NS_PER_MS, NS_PER_S
 from tests.bench.rows import Row, at_most
 from tests.support.uart_wire import FakeDevice, run_search
 

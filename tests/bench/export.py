@@ -18,8 +18,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Final
 
-from imud.sim.imu61x.settings import Imu61xSettings
-from imud.sim.imu61x.uart import Imu61xModule
+from imud.sim.imu61x.uart import Imu61xModule, Imu61xSettings
 from tests.bench.captures import BAUD, BEGIN_NS, Source, hi91_module, record
 from tests.bench.rows import Row, at_most
 

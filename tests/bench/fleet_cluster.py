@@ -24,8 +24,8 @@ from typing import Final
 
 from tests.bench.fleet_collector import CollectorProcess
 from tests.bench.fleet_load import GatewayFleet, acknowledged_by
+from tests.fleet.gateways import KilledGateway, in_spool
 from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
-from tests.publishers.mqtt.gateways import KilledGateway, in_spool
 from tests.support.surroundings import free_port
 
 PROGRAM: Final = shutil.which("nats-server") or shutil.which("nats-server", path="/usr/sbin:/sbin")

@@ -15,13 +15,12 @@ from collections.abc import Sequence
 from time import monotonic, time_ns
 from typing import Any, Final
 
-from imud.fleet import Fleet, FleetBatch
-from imud.fleet.collect import GC_ALLOCATIONS, FleetCollector, Offsets
+from imud.fleet.accounts import Accounts, FleetLedger
+from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, Offsets
 from imud.fleet.postgres import PostgresStore
-from imud.fleet.reader import VERSIONS
-from imud.formats.fleet.ledger import Accounts, FleetLedger
-from imud.units import NS_PER_MS
-from imud.worker import rare_garbage_collection
+from imud.fleet.reader import VERSIONS, Fleet, FleetBatch
+from imud.host.threads import rare_garbage_collection
+from imud.model.units import NS_PER_MS
 
 END_S: Final = 180.0
 LOOK_S: Final = 0.05

@@ -18,13 +18,13 @@ from time import monotonic, time_ns
 from typing import Final
 
 from imud.contracts.publisher import Batch
-from imud.publishers.mqtt.settings import DeviceSending
-from imud.publishers.mqtt.spool import Spool
-from imud.publishers.mqtt.streams import DeviceStreams, Gateway
-from imud.sample import Sample, Sync
-from imud.units import NS_PER_S
-from tests.publishers.mqtt.gateways import LiveGateway
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, running_broker
+from imud.fleet.settings import DeviceSending
+from imud.fleet.spool import Spool
+from imud.fleet.streams import DeviceStreams, Gateway
+from imud.model.sample import Sample, Sync
+from imud.model.units import NS_PER_S
+from tests.fleet.gateways import LiveGateway
+from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, running_broker
 
 RATE_HZ: Final = 4
 """Samples a second: a message of statistics has the same size for any rate."""

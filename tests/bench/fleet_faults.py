@@ -21,13 +21,13 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Final, NamedTuple
 
-from imud.formats.fleet.topics import Stream
+from imud.fleet.messages import Stream
 from tests.bench.fleet_rows import RowCollector
+from tests.fleet.authority import Authority
+from tests.fleet.gateways import KilledGateway, closes, in_spool
+from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, Mosquitto
 from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
-from tests.publishers.mqtt.authority import Authority
-from tests.publishers.mqtt.gateways import KilledGateway, closes, in_spool
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, Mosquitto
-from tests.publishers.mqtt.proxy import Proxy
+from tests.fleet.proxy import Proxy
 from tests.support.surroundings import free_port
 
 CAUGHT_UP: Final = 30

@@ -17,15 +17,14 @@ from pathlib import Path
 from time import monotonic, time_ns
 from typing import Final
 
-from imud.formats.fleet.messages import FleetMessage, Interval, Measures, MessageKind, encode_message
-from imud.formats.fleet.topics import Stream, topic_of
-from imud.sample import Sync
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.fleet.messages import FleetMessage, Interval, Measures, MessageKind, Stream, encode_message, topic_of
+from imud.model.sample import Sync
+from imud.model.units import NS_PER_MS, NS_PER_S
 from tests.bench.fleet_collector import END_S, CollectorProcess
 from tests.bench.mqtt_clients import Clients, MqttClient
 from tests.bench.rig import cpu_ns, rss_mb
+from tests.fleet.mosquitto import NO_MOSQUITTO, running_broker
 from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, running_broker
 
 DEVICES: Final = ("bow", "mast")
 SAMPLES: Final = 100

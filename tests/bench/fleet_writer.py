@@ -19,10 +19,10 @@ from collections.abc import Callable
 from random import Random
 from typing import Final
 
-from imud.devices.imu61x.uart.codec import encode_ahrs
-from imud.sample import Vector3
+from imud.drivers.imu61x.uart.codec import encode_ahrs
+from imud.model.sample import Vector3
+from imud.model.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
 from imud.sim.ports.pty import sharpen_timers
-from imud.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
 from tests.bench.writer import open_ptys, template
 
 BEGIN_NS: Final = 10_000_000

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from imud.clock import SampleClock
-from imud.host_clock import UNSTEERED, HostClock
-from imud.sample import Measurement, Sample
+from imud.host.clock import UNSTEERED, HostClock
+from imud.model.sample import Measurement, Sample
+from imud.model.units import NS_PER_S, NS_PER_US
+from imud.sampling.clock import SampleClock
 from imud.sim.ports.arrival import BARE_UART, LOADED, USB_16MS, Arrival, ArrivalModel, ArrivalProfile, Crystal
-from imud.units import NS_PER_S, NS_PER_US
 from tests.bench.clock import BAUD_OF_RATE, TICK_MODULUS, TICK_NS, Accuracy, Point, accuracy
 
 UTC_AHEAD_NS: Final = 1_795_000_000 * NS_PER_S

@@ -11,10 +11,9 @@ from itertools import groupby
 from random import Random
 from typing import NamedTuple
 
-from imud.contracts.lines import Edge
-from imud.contracts.timing import TriggerStamp
+from imud.contracts.lines import Edge, TriggerStamp
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sim.ports.arrival import Arrival, ArrivalModel
-from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 PULSE_NS = 80 * NS_PER_US
 SIN_NS = 125 * NS_PER_US

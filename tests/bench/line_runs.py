@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
-from imud.clock import SampleClock
-from imud.contracts.lines import Edge
-from imud.contracts.timing import SoutTiming, UtcReference
-from imud.sample import Measurement, Sample, Sync
+from imud.contracts.lines import Edge, SoutTiming, UtcReference
+from imud.model.sample import Measurement, Sample, Sync
+from imud.model.units import NS_PER_S
+from imud.sampling.clock import SampleClock
 from imud.sim.ports.arrival import Arrival, ArrivalModel
-from imud.units import NS_PER_S
 from tests.bench.clock import TICK_MODULUS, TICK_NS, clock_for
 from tests.bench.line_model import (
     LineFaults,

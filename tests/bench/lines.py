@@ -10,11 +10,10 @@ from statistics import mean
 
 from gpiod.edge_event import EdgeEvent
 
-from imud.contracts.timing import TriggerStamp
-from imud.signals.gpio.kernel_interface import EVENT, LineEventDecoder
-from imud.signals.gpio.line_request import READ_EVENTS
-from imud.signals.trigger import Trigger
-from imud.units import NS_PER_S, NS_PER_US
+from imud.contracts.lines import TriggerStamp
+from imud.lines.gpio import EVENT, READ_EVENTS, LineEventDecoder
+from imud.lines.trigger import Trigger
+from imud.model.units import NS_PER_S, NS_PER_US
 from tests.bench.rows import Row
 
 FIONREAD = 0x541B

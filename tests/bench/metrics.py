@@ -11,11 +11,11 @@ from functools import partial
 from threading import Event, Thread
 
 from imud.formats.slot import encode_slot
-from imud.publishers.metrics.family import Snapshot
+from imud.model.sample import Sample, Sync
+from imud.model.units import NS_PER_MS
+from imud.publishers.metrics.metric import Snapshot
 from imud.publishers.metrics.publisher import Renderer, pause
 from imud.publishers.metrics.rings import SAMPLES_MAX, motion_of
-from imud.sample import Sample, Sync
-from imud.units import NS_PER_MS
 from tests.bench.rows import Row, at_most
 from tests.support.metrics import client, equipped
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import msgspec
 
 from imud.formats.modbus import frame_gap_ns
-from imud.units import NS_PER_S, uart_byte_ns
+from imud.model.units import NS_PER_S, uart_byte_ns
 from tests.bench.rig import START_LIMIT_S, Process, ask, cpu_ns, wait_for
 from tests.bench.rows import Row, at_least, at_most
 

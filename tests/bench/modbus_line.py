@@ -12,7 +12,7 @@ from imud.sim.control import StandardInputControl
 from imud.sim.hipnuc.modbus import ModbusLine, slaves_at
 from imud.sim.ports.arrival import BARE_UART
 from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort, sharpen_timers
-from imud.sim.simulator import SimulatorOptions
+from imud.sim.sensor import SimulatorOptions
 
 
 def main() -> None:

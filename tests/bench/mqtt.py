@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 
 from tests.bench.rig import Load, Outcome, run
 from tests.bench.rows import Row, at_most
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, running_broker
+from tests.fleet.mosquitto import NO_MOSQUITTO, running_broker
 from tests.support.surroundings import free_port
 
 LOOP_RATIO_LIMIT: Final = 1.05

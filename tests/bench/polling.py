@@ -15,17 +15,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import imud.links.spi as spi_link
-from imud.config import DeviceConfig
+from imud.config.model import DeviceConfig
 from imud.contracts.lines import DeviceLines, LineFactory, ReadySettings
 from imud.contracts.link import LinkType
 from imud.contracts.publisher import Batch
-from imud.devices.imu61x.spi import bursts as spi
-from imud.devices.imu61x.spi.words import PIPELINE_BYTES
-from imud.host_clock import HostClock
+from imud.device.factory import DeviceFactory
+from imud.drivers.imu61x import spi
+from imud.drivers.imu61x.spi import PIPELINE_BYTES
+from imud.host.clock import HostClock
 from imud.links.spi import SpiLink, SpiSettings
-from imud.runtime.device_factory import DeviceFactory
 from imud.sim.imu61x.registers import Imu61xRegisters
-from imud.sim.ports.lines import MemoryOutput
+from imud.sim.ports.pins import MemoryOutput
 from tests.bench.ready_line import PipeInput
 from tests.bench.rows import Row, at_most
 

@@ -19,13 +19,13 @@ from itertools import count
 from pathlib import Path
 from random import Random
 
-from imud.errors import ImudError
-from imud.formats.recording import records
-from imud.formats.recording.file import RecordingReader
-from imud.formats.recording.records import Kind
+from imud.formats import records
+from imud.formats.recording import RecordingReader
+from imud.formats.records import Kind
+from imud.host.threads import BusThread
+from imud.model.errors import ImudError
 from imud.publishers.recorder.writer import RecordingWriter, RecordQueue
-from imud.runtime.recording.player import Player
-from imud.worker import BusThread
+from imud.recording.player import Player
 from tests.support.files import CaptureWriter, hi91
 
 RATE_HZ = 1000

@@ -20,11 +20,11 @@ from time import thread_time_ns
 import msgspec
 
 from imud.contracts.publisher import Batch
-from imud.event import Event
-from imud.formats.recording import records
-from imud.formats.recording.file import BlockGatherer, RecordingReader
-from imud.runtime.recording.player import Player
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.formats import records
+from imud.formats.recording import BlockGatherer, RecordingReader
+from imud.model.event import Event
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.recording.player import Player
 from tests.bench.captures import BEGIN_NS, Source, hi91_module, record
 from tests.bench.rig import Load, run
 from tests.bench.rows import Row, at_most

@@ -17,13 +17,12 @@ from pathlib import Path
 from threading import Event, Thread
 from time import sleep
 
-from imud.client import Client
-from imud.client.watch import Watch
+from imud.client.connection import Client, Watch
 from imud.contracts.publisher import Batch
-from imud.formats.recording.file import RecordingReader
+from imud.formats.recording import RecordingReader
 from imud.formats.slot import SLOT_BYTES, encode_slot
-from imud.ledger import lost
-from imud.runtime.recording.player import Player
+from imud.model.ledger import lost
+from imud.recording.player import Player
 from tests.bench.rows import Row, at_least, at_most
 from tests.support.daemon_process import running_daemon, wait_until
 

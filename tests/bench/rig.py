@@ -15,7 +15,7 @@ from typing import NamedTuple
 import msgspec
 
 from imud.cli.arguments import statuses
-from imud.client import Client
+from imud.client.connection import Client
 from imud.contracts.status import DeviceStatus
 
 CORES = sorted(os.sched_getaffinity(0))

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from imud.client.ring import Ring
 from imud.contracts.publisher import Batch, PublisherContext
-from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
-from imud.sample import Sample, Sync
+from imud.model.sample import Sample, Sync
+from imud.publishers.shm import ShmPublisher, ShmSettings
 from tests.bench.rows import Row
 
 INCLUDE = Path(__file__).parents[2] / "imud" / "include"

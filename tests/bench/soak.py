@@ -26,9 +26,9 @@ from urllib.request import urlopen
 
 import msgspec
 
-from imud.client import Client
+from imud.client.connection import Client
 from imud.contracts.status import DeviceStatus
-from imud.ledger import bytes_open, frames_open, lost
+from imud.model.ledger import bytes_open, frames_open, lost
 from tests.bench import soak_recordings
 from tests.bench.fleet_writer import hi91_frames
 from tests.bench.rig import REST_CORES, SERVER_CORE, START_LIMIT_S, Process, cpu_ns, wait_for

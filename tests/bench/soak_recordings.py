@@ -14,11 +14,11 @@ from typing import BinaryIO, Final
 from urllib.request import urlopen
 
 from imud.contracts.publisher import Batch
-from imud.errors import ImudError
-from imud.formats.recording import records
-from imud.formats.recording.file import RecordingReader
-from imud.formats.recording.records import Kind
-from imud.runtime.recording.player import Player
+from imud.formats import records
+from imud.formats.recording import RecordingReader
+from imud.formats.records import Kind
+from imud.model.errors import ImudError
+from imud.recording.player import Player
 
 FILE_MB: Final = 1.0
 KEEP_MB: Final = 3.0

@@ -17,8 +17,8 @@ from time import perf_counter_ns
 
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.formats.jsonrpc import encode_request, line_of
-from imud.publishers.socket.publisher import SocketServer, SocketSettings
-from imud.sample import Sample, Sync
+from imud.model.sample import Sample, Sync
+from imud.publishers.socket.server import SocketServer, SocketSettings
 from tests.bench.rows import Row, at_most
 
 CLIENTS = (1, 10, 100)

@@ -12,9 +12,9 @@ from typing import Any
 from imud import config
 from imud.contracts.lines import InputSettings, LineFactory
 from imud.daemon import Daemon
-from imud.log import STDERR, log_to
-from imud.runtime import event_loop
-from imud.signals.gpio import GpioInput, GpioOutput
+from imud.host import event_loop
+from imud.host.log import STDERR, log_to
+from imud.lines.gpio import GpioInput, GpioOutput
 
 
 class FifoInput(GpioInput):

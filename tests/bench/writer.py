@@ -21,9 +21,9 @@ from collections.abc import Callable
 from functools import reduce
 from operator import xor
 
-from imud.devices.hipnuc.uart.codec import encode_hi91
-from imud.signals.gpio.kernel_interface import EVENT, RISING
-from imud.units import uart_byte_ns
+from imud.drivers.hipnuc.uart.codec import encode_hi91
+from imud.lines.gpio import EVENT, RISING
+from imud.model.units import uart_byte_ns
 
 LATE_LIMIT_NS = 50_000_000
 """A writer this late has lost its deadlines: it counts them and starts anew."""

@@ -1,7 +1,7 @@
 """A sample with every value, another with next to none, and what they are in messages."""
 
-from imud.event import Event, EventKind
-from imud.sample import Sample, Sync
+from imud.model.event import Event, EventKind
+from imud.model.sample import Sample, Sync
 
 UTC_NS = 1_790_000_000_123_456_789
 FULL = Sample(

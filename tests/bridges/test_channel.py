@@ -1,8 +1,8 @@
 """Names of topics and frames, covariances by the rules of sensor_msgs/Imu, and the filter of steady values."""
 
+from imud.attitude.conventions import Convention
 from imud.bridges.channel import STEADY_NS, MessageFrames, StampedEvent, Steady, covariance, topic
-from imud.event import Event, EventKind
-from imud.frames.conventions import Convention
+from imud.model.event import Event, EventKind
 
 
 def test_topics_frames_covariances_and_steady_values() -> None:

@@ -4,6 +4,7 @@ import io
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO, Any, NamedTuple
@@ -11,7 +12,10 @@ from typing import IO, Any, NamedTuple
 import pytest
 
 from imud.cli import main
+from tests.fleet.conftest import broker
 from tests.support.daemon_process import LIMIT_S
+
+__all__ = ["broker"]
 
 
 class Terminal(io.StringIO):
@@ -75,3 +79,12 @@ def imud_process(*words: object, python: tuple[str, ...] = (), **options: Any) -
             yield ImudProcess(process)
         finally:
             process.kill()
+
+
+@pytest.fixture
+def in_kolkata(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("TZ", "IST-5:30")
+    time.tzset()
+    yield
+    monkeypatch.undo()
+    time.tzset()

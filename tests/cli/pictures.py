@@ -20,16 +20,15 @@ from secrets import token_hex
 
 import msgspec
 
-from imud.cli.top.app import TopApp
-from imud.cli.top.command import TopFeed
+from imud.cli.top import TopApp, TopFeed
 from imud.contracts.publisher import Batch
-from imud.devices.hipnuc.uart.codec import encode_hi91
-from imud.event import EventKind
-from imud.formats.recording.file import RecordingReader
-from imud.formats.recording.records import Kind
-from imud.runtime.recording.player import Player
-from imud.sample import Sample
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.drivers.hipnuc.uart.codec import encode_hi91
+from imud.formats.recording import RecordingReader
+from imud.formats.records import Kind
+from imud.model.event import EventKind
+from imud.model.sample import Sample
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.recording.player import Player
 from tests.support.daemon_process import RunningDaemon, running_daemon
 from tests.support.files import CaptureWriter
 from tests.support.pictures import FOLDER, svg, terminal, text

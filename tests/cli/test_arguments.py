@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from imud.cli.arguments import argument, check_port, chosen_fields, confirmed, duration_s
-from imud.errors import BadArgument
+from imud.model.errors import BadArgument
 from tests.cli.conftest import Cli
 from tests.cli.test_decode import MANUAL_FRAME
 from tests.support.files import imu61x_log

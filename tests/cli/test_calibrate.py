@@ -10,8 +10,8 @@ from threading import Event as ThreadingEvent
 import pytest
 
 from imud.cli.calibrate import _account, _show, progress_line
-from imud.contracts.control.calibration import CalibrationInfo, CalibrationResult, Check, Handling, Kept
-from imud.event import Event, EventKind
+from imud.contracts.command import CalibrationInfo, CalibrationResult, Check, Handling, Kept
+from imud.model.event import Event, EventKind
 from tests.cli.conftest import Cli, Terminal
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, daemon_with_module
 

@@ -9,8 +9,8 @@ import pytest
 
 from imud.cli.clock import EDGES_ENOUGH, ENOUGH, aids, block, verdict
 from imud.contracts.status import ClockStatus
-from imud.sample import Sync
-from imud.units import NS_PER_MS
+from imud.model.sample import Sync
+from imud.model.units import NS_PER_MS
 from tests.cli.conftest import Cli
 from tests.support.daemon_process import running_daemon, sending_daemon, wait_until, write_config
 from tests.support.files import hi91

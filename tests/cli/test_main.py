@@ -58,7 +58,7 @@ def test_a_daemon_that_hangs_is_named_and_an_interrupt_is_status_130(cli: Cli, m
 
 
 HEAVY = {"asyncio", "ssl", "http", "email", "multiprocessing", "concurrent", "sqlite3", "unittest", "xml"}
-LAYERS = {"imud.daemon", "imud.contracts.driver", "imud.contracts.session", "imud.devices", "imud.clock"}
+LAYERS = {"imud.daemon", "imud.contracts.driver", "imud.contracts.script", "imud.drivers", "imud.sampling"}
 CALLS: dict[str, tuple[list[str], set[str]]] = {
     "help": (["--help"], set()),
     "status": (["status", "--socket", "/nonexistent/socket"], {"msgspec", "typing_extensions"}),

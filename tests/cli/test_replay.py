@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from imud.formats.capture import RECORD
-from imud.units import NS_PER_MS
+from imud.model.units import NS_PER_MS
 from tests.cli.conftest import Cli
 from tests.support.files import hi91, imu61x_log
 

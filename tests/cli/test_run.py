@@ -9,8 +9,8 @@ import pytest
 
 from imud import config
 from imud.cli.run import state_dir
-from imud.config import Config
-from imud.errors import ImudError, ServerError
+from imud.config.model import Config
+from imud.model.errors import ImudError, ServerError
 from tests.cli.conftest import Cli
 from tests.support.files import ROOT
 from tests.support.surroundings import pipe

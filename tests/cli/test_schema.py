@@ -3,8 +3,8 @@
 import json
 
 from imud.cli.schema import driver_schemas
-from imud.devices import DRIVERS
-from imud.sample import SAMPLE_FIELDS
+from imud.drivers import DRIVERS
+from imud.model.sample import SAMPLE_FIELDS
 from tests.cli.conftest import Cli
 
 

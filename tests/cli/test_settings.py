@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from imud import config
-from imud.client import Client
-from imud.contracts.device_settings import declared_values
+from imud.client.connection import Client
+from imud.contracts.setting import declared_values
 from tests.cli.conftest import Cli, Terminal
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, daemon_with_module
 

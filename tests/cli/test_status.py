@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
+from imud.attitude.conventions import Heading
 from imud.cli.status import axes, block, driven, page, parts, utc, watched
-from imud.client import Client
+from imud.client.connection import Client
 from imud.contracts.status import DeviceState, FrameStatus, LinesStatus, UtcStatus
-from imud.frames.conventions import Heading
 from tests.cli.conftest import Cli
 from tests.support.metrics import LINES, POLLING, UTC, device, equipped
 from tests.support.socket_rig import daemon

@@ -10,7 +10,7 @@ import pytest
 
 from imud.cli import build_parser
 from imud.cli.web import _say, guard_of
-from imud.errors import BadArgument
+from imud.model.errors import BadArgument
 from tests.cli.conftest import Cli, imud_process
 from tests.support.daemon_process import LIMIT_S
 
@@ -54,7 +54,7 @@ def test_who_may_look(token: str) -> None:
 
 def test_without_the_library_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     monkeypatch.setitem(sys.modules, "aiohttp", None)
-    monkeypatch.delitem(sys.modules, "imud.web.app", raising=False)
+    monkeypatch.delitem(sys.modules, "imud.web.server", raising=False)
     cli.refuses("pip install 'imud[web]'", "web")
 
 

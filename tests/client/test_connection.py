@@ -12,13 +12,12 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from imud.client import Client, RpcError
-from imud.client.connection import default_path
-from imud.client.watch import event_of
+from imud.client.connection import Client, default_path, event_of
 from imud.contracts.publisher import Batch
-from imud.errors import LinkDenied, LinkMissing, ServerError
-from imud.event import Event, EventKind
-from imud.publishers.socket.publisher import SocketServer
+from imud.formats.jsonrpc import RpcError
+from imud.model.errors import LinkDenied, LinkMissing, ServerError
+from imud.model.event import Event, EventKind
+from imud.publishers.socket.server import SocketServer
 from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, Daemon, batch, daemon, sample
 
 HELLO = b'{"jsonrpc":"2.0","method":"hello","params":{"protocol":1,"version":"9","epoch":7,"rights":["read"],"x":1}}\n'

@@ -8,8 +8,8 @@ from time import monotonic_ns, time_ns
 import pytest
 
 from imud.client.feed import Feed, Wish, clock_ahead_ns, utc_offset_ns
-from imud.event import Event, EventKind
-from imud.units import NS_PER_S
+from imud.model.event import Event, EventKind
+from imud.model.units import NS_PER_S
 from tests.client.news import Listener
 from tests.support.socket_rig import NOW_NS, Daemon, batch, daemon
 

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from imud.client.ring import Ring, default_directory
-from imud.errors import LinkMissing, ServerError
 from imud.formats.ring import HEADER_BYTES, LEDGER_BLOCK_OFFSET, OFFSETS, encode_ledger_block
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES
-from imud.publishers.socket.waker import Waker
+from imud.model.errors import LinkMissing, ServerError
+from imud.publishers.socket.client import Waker
 from tests.support.rings import DEVICE, SLOTS, START_NS, TORN, WHOLE, Board, make_sample, slot_at
 from tests.support.surroundings import DAEMON_UID, HOSTILE_UID, needs_root
 

@@ -16,17 +16,20 @@ from hypothesis import strategies as st
 from msgspec import Meta
 
 from imud import config
-from imud.config import DEVICES_MAX, PROBLEMS_SHOWN, TABLES, Config, DeviceConfig, Tables
-from imud.config.yaml_tree import EVENTS_PER_TURN
-from imud.contracts.claims import Claim
-from imud.contracts.device_settings import DeviceSettings
+from imud.attitude.conventions import Heading
+from imud.config.devices import DEVICES_MAX
+from imud.config.model import Config, DeviceConfig
+from imud.config.reading import PROBLEMS_SHOWN
+from imud.config.schema import TABLES, Tables
+from imud.config.yaml import EVENTS_PER_TURN
 from imud.contracts.driver import KeyProblem
 from imud.contracts.lines import DeviceLines
-from imud.contracts.settings import NoSettings, Settings, expected, got
-from imud.devices import DRIVERS
-from imud.errors import ConfigError
-from imud.frames.conventions import Heading
+from imud.contracts.link import Claim
+from imud.contracts.setting import DeviceSettings
+from imud.drivers import DRIVERS
 from imud.links import LINKS
+from imud.model.errors import ConfigError
+from imud.model.options import NoSettings, Settings, expected, got
 from imud.publishers import PUBLISHERS
 from tests.support import references
 from tests.support.files import ROOT
@@ -391,7 +394,7 @@ def test_shipped_file_shows_the_defaults() -> None:
 
 
 def test_shipped_file_has_every_key() -> None:
-    from imud.config.yaml_tree import read_yaml
+    from imud.config.yaml import read_yaml
 
     tree = read_yaml(uncommented(SHIPPED.read_text()).encode())
     present = {

@@ -1,16 +1,16 @@
-"""Fixtures: a real broker, and a gateway that sends to it."""
+"""Fixtures: a certificate authority, a real broker, and a gateway that sends to the broker."""
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from imud.fleet.spool import Spool
+from tests.fleet.authority import Authority
 from tests.fleet.fleet_gateway import SendingGateway
-from tests.publishers.mqtt.conftest import authority
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
-from tests.publishers.mqtt.proxy import Proxy
-
-__all__ = ["authority", "broker", "gateway", "proxy"]
+from tests.fleet.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
+from tests.fleet.proxy import Proxy
 
 
 @pytest.fixture
@@ -33,3 +33,26 @@ def proxy(broker: Mosquitto) -> Iterator[Proxy]:
     one = Proxy(broker.port)
     yield one
     one.close()
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed")
+    return Authority(tmp_path_factory.mktemp("authority"))
+
+
+@pytest.fixture(autouse=True)
+def _closed_spools(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Close what a test leaves open: from Python 3.13 on there is a warning for each database that is not closed."""
+    opened: list[Spool] = []
+    opening = Spool.open
+
+    def noted(spool: Spool) -> None:
+        opened.append(spool)
+        opening(spool)
+
+    monkeypatch.setattr(Spool, "open", noted)
+    yield
+    for spool in opened:
+        spool.close()

@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, running_broker
+from tests.fleet.mosquitto import NO_MOSQUITTO, running_broker
 
 GATEWAYS: Final = ("crane-1", "crane-2", "boat-1")
 LIMIT_S: Final = 60.0

@@ -5,8 +5,9 @@ from typing import Any
 
 import msgspec
 
-from imud.event import Event, EventKind
-from imud.formats.fleet.messages import (
+from imud.fleet.accounts import GatewayState
+from imud.fleet.messages import (
+    STATE,
     VERSION,
     DropCause,
     FleetMessage,
@@ -14,12 +15,13 @@ from imud.formats.fleet.messages import (
     Interval,
     Measures,
     MessageKind,
+    Stream,
     encode_message,
+    topic_of,
 )
-from imud.formats.fleet.state import GatewayState
-from imud.formats.fleet.topics import STATE, Stream, topic_of
-from imud.sample import Sample, Sync
-from imud.units import NS_PER_MS
+from imud.model.event import Event, EventKind
+from imud.model.sample import Sample, Sync
+from imud.model.units import NS_PER_MS
 
 LIMIT_S = 60.0
 UTC_NS = 1_790_000_000_000_000_000

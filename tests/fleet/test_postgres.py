@@ -10,22 +10,21 @@ from typing import Any
 import msgspec
 import pytest
 
-from imud.errors import ServerError
-from imud.event import Event, EventKind
-from imud.fleet import FleetBatch
-from imud.fleet.collect import Offsets
-from imud.formats.fleet.boots import BootClocks, BootKey, BootOffset
-from imud.formats.fleet.ledger import FleetLedger, StoredAccount, key_of
-from imud.formats.fleet.messages import (
+from imud.fleet.accounts import BootClocks, BootKey, BootOffset, FleetLedger, StoredAccount, key_of
+from imud.fleet.collector import Offsets
+from imud.fleet.messages import (
     NUMBER_MOST,
     FleetMessage,
     GatewayClock,
     MessageKind,
+    Stream,
     decode_message,
     encode_message,
 )
-from imud.formats.fleet.topics import Stream
-from imud.sample import Sample, Sync
+from imud.fleet.reader import FleetBatch
+from imud.model.errors import ServerError
+from imud.model.event import Event, EventKind
+from imud.model.sample import Sample, Sync
 from tests.fleet.fleet_gateway import (
     UTC_NS,
     SendingGateway,
@@ -36,8 +35,8 @@ from tests.fleet.fleet_gateway import (
     samples_message,
     synchronised,
 )
+from tests.fleet.mosquitto import Mosquitto
 from tests.fleet.postgres_server import NO_POSTGRES, running_postgres, running_server
-from tests.publishers.mqtt.mosquitto import Mosquitto
 from tests.support.daemon_process import LIMIT_S, wait_until
 
 pytestmark = [pytest.mark.skipif(bool(NO_POSTGRES), reason=NO_POSTGRES), pytest.mark.live]

@@ -10,15 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from imud.errors import BadArgument
-from imud.fleet import Fleet, FleetBatch
-from imud.fleet.connection import RECEIVE_MAX
-from imud.fleet.reader import VERSIONS, FleetSession
-from imud.formats.fleet.ledger import StreamKey
-from imud.formats.fleet.state import GatewayState, StreamPosition
-from imud.formats.fleet.topics import topic_of
+from imud.fleet.accounts import GatewayState, StreamKey, StreamPosition
+from imud.fleet.messages import topic_of
+from imud.fleet.reader import RECEIVE_MAX, VERSIONS, Fleet, FleetBatch, FleetSession
+from imud.model.errors import BadArgument
 from tests.fleet.fleet_gateway import SendingGateway, dropped_message, samples_message
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
+from tests.fleet.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
 from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.event_loops import in_loop
 from tests.support.files import ROOT

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imud.errors import ImudError
 from imud.formats.capture import MAGIC, RAW_CHUNK_BYTES, RECORD_BYTES_MAX, CaptureReader
+from imud.model.errors import ImudError
 from tests.support.files import ROOT, CaptureWriter
 
 GOLDEN = (

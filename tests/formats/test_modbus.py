@@ -6,15 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imud.formats.modbus import (
-    ReplyFinder,
-    crc16_modbus,
-    exception_text,
-    frame_gap_ns,
-    framed,
-    is_exception,
-    is_whole,
-)
+from imud.formats.modbus import ReplyFinder, crc16_modbus, exception_text, frame_gap_ns, framed, is_exception, is_whole
 
 REQUEST = framed(5, bytes.fromhex("03 0034 0002"))
 REPLY = framed(5, bytes.fromhex("03 04 11 22 33 44"))

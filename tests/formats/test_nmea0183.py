@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from imud.formats import nmea0183
 from imud.formats.nmea0183 import SENTENCE_BYTES_MAX, Transducer
-from imud.units import NS_PER_S
+from imud.model.units import NS_PER_S
 
 ANGLES = st.floats(-4 * math.pi, 4 * math.pi)
 

@@ -3,7 +3,6 @@ import zlib
 
 import pytest
 
-from imud.errors import ServerError
 from imud.formats.ring import (
     HEADER_BYTES,
     HEADER_FIELDS,
@@ -18,7 +17,8 @@ from imud.formats.ring import (
     encode_ledger_block,
     ring_path,
 )
-from imud.ledger import LEDGER_FIELDS
+from imud.model.errors import ServerError
+from imud.model.ledger import LEDGER_FIELDS
 from tests.support.rings import check_layout
 
 HEADER = RingHeader(0x0102_0304_0506_0708, 4711, STATE_LIVE, "front-imu", 3, 4096, 10, 2, -5)

@@ -18,7 +18,7 @@ from imud.formats.slot import (
     encode_slots,
     slot_is_whole,
 )
-from imud.sample import Sample, Sync
+from imud.model.sample import Sample, Sync
 from tests.support.rings import check_layout
 
 FULL = Sample(

@@ -12,13 +12,13 @@ from pathlib import Path
 from threading import Thread
 from typing import Final
 
-from imud.client import Client
-from imud.errors import ImudError
-from imud.event import Event
+from imud.client.connection import Client
 from imud.formats.jsonrpc import PROTOCOL, encode_notification, encode_result, frame_of, line_of
 from imud.formats.slot import encode_slots
-from imud.sample import Sample, Sync
-from imud.web.calls import Calls
+from imud.model.errors import ImudError
+from imud.model.event import Event
+from imud.model.sample import Sample, Sync
+from imud.web.server import Calls
 from tests.fuzz.target import Target
 
 ITEMS: Final = 8

@@ -6,9 +6,8 @@ from contextlib import closing, suppress
 from threading import Thread
 from typing import Final
 
-from imud.publishers.mqtt.access import BrokerError
-from imud.publishers.mqtt.broker import PahoConnection, Will, check_extra
-from imud.publishers.mqtt.settings import MqttSettings, broker_of
+from imud.fleet.broker import BrokerError, PahoConnection, Will, check_extra
+from imud.fleet.settings import MqttSettings, broker_of
 from tests.fuzz.target import Target, check_printable
 
 WAITS: Final = 8

@@ -7,10 +7,10 @@ bits), the time since the frame before in steps of STEP_NS, the number of data b
 from collections.abc import Iterable, Sequence
 from random import Random
 
-from imud.contracts.can import CanDriver
+from imud.contracts.driver import CanDriver
 from imud.formats.can import EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame
-from imud.ledger import Ledger
-from imud.sample import Measurement
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
 from tests.fuzz.drivers import names_of, row, variants
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target
 from tests.support.codec_invariants import check_closed, feed_frames, finite

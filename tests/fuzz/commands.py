@@ -7,16 +7,14 @@ from typing import Any, Final
 
 import msgspec
 
-from imud.devices import DRIVERS
-from imud.errors import Rejected
-from imud.formats.fleet.commands import CommandAnswer, Outcome
-from imud.formats.fleet.messages import VERSION
-from imud.formats.fleet.topics import ANSWER, COMMAND, topic_of
-from imud.publishers.mqtt.broker import Received
-from imud.publishers.mqtt.commands import WAITING_MAX, CommandChannel, CommandReply
-from imud.publishers.mqtt.settings import CommandSettings
-from imud.publishers.mqtt.streams import Gateway
-from imud.units import NS_PER_S
+from imud.drivers import DRIVERS
+from imud.fleet.broker import Received
+from imud.fleet.commands import WAITING_MAX, CommandChannel, CommandReply
+from imud.fleet.messages import ANSWER, COMMAND, VERSION, CommandAnswer, Outcome, topic_of
+from imud.fleet.settings import CommandSettings
+from imud.fleet.streams import Gateway
+from imud.model.errors import Rejected
+from imud.model.units import NS_PER_S
 from tests.fuzz.target import Target
 from tests.support.socket_rig import FakeControl
 

@@ -7,8 +7,9 @@ from typing import Final
 
 import msgspec
 
-from imud.config import PROBLEMS_SHOWN, differences, parse
-from imud.errors import ConfigError
+from imud.config.model import differences
+from imud.config.reading import PROBLEMS_SHOWN, parse
+from imud.model.errors import ConfigError
 from tests.fuzz.target import Target, check_printable
 from tests.support.files import ROOT
 

@@ -6,9 +6,9 @@ from itertools import product
 from random import Random
 from typing import Any, Final, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from imud import devices
+from imud import drivers as devices
 from imud.contracts.driver import Driver, of_kind
-from imud.contracts.settings import Settings
+from imud.model.options import Settings
 from tests.fuzz.target import as_it_is
 
 D = TypeVar("D", bound=Driver)
@@ -51,7 +51,7 @@ def _mend_hipnuc_uart(data: bytes, _random: Random) -> bytes:
 
 
 def _mend_imu61x_uart(data: bytes, _random: Random) -> bytes:
-    from imud.devices.imu61x.common.family import crc32
+    from imud.drivers.imu61x.common import crc32
 
     return _mend_frames(data, b"\xaa\x55", 4, 10, None, 4, lambda frame: crc32(frame[:-4]))
 
@@ -76,7 +76,7 @@ def _mend_frames(
 
 def mend_reading(name: str, data: bytes) -> bytes:
     """The bytes of one transfer with a right check value."""
-    from imud.devices.imu61x.common.family import crc32
+    from imud.drivers.imu61x.common import crc32
     from imud.formats.modbus import crc16_modbus
 
     if name == "hipnuc-modbus" and len(data) > 2:

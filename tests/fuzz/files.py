@@ -8,18 +8,16 @@ from typing import Final
 
 import msgspec
 
-from imud.contracts.can import CanDriver
-from imud.contracts.driver import StreamDriver
-from imud.errors import ImudError
-from imud.formats.can import EXTENDED_ID_MAX, STANDARD_ID_MAX
-from imud.formats.candump import CandumpReader
+from imud.contracts.driver import CanDriver, StreamDriver
+from imud.formats import recording as blocks
+from imud.formats import records
+from imud.formats.can import EXTENDED_ID_MAX, STANDARD_ID_MAX, CandumpReader
 from imud.formats.capture import MAGIC, RECORD, RECORD_BYTES_MAX, CaptureReader, Chunk
-from imud.formats.recording import blocks, records
-from imud.formats.recording.blocks import BlockReader
-from imud.formats.recording.file import BlockGatherer, RecordingReader
-from imud.formats.recording.records import DeviceRecord, Kind, PathRecord, Record, SessionRecord, records_of
-from imud.ledger import Ledger
-from imud.runtime.recording.player import Player
+from imud.formats.recording import BlockGatherer, BlockReader, RecordingReader
+from imud.formats.records import DeviceRecord, Kind, PathRecord, Record, SessionRecord, records_of
+from imud.model.errors import ImudError
+from imud.model.ledger import Ledger
+from imud.recording.player import Player
 from tests.fuzz.drivers import row
 from tests.fuzz.target import Target, check_printable
 from tests.support.files import CaptureWriter, candump_line

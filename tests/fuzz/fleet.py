@@ -6,9 +6,8 @@ from typing import Final
 
 import zstandard
 
-from imud.event import Event, EventKind
-from imud.formats.fleet.ledger import FleetLedger
-from imud.formats.fleet.messages import (
+from imud.fleet.accounts import FleetLedger
+from imud.fleet.messages import (
     MAGIC,
     SLOTS_MAX,
     VERSION,
@@ -17,13 +16,16 @@ from imud.formats.fleet.messages import (
     Interval,
     Measures,
     MessageKind,
+    Stream,
     boot_text,
     decode_message,
     encode_message,
+    parse_topic,
+    topic_of,
 )
-from imud.formats.fleet.topics import Stream, parse_topic, topic_of
 from imud.formats.slot import SLOT_BYTES, encode_slots
-from imud.sample import Sample, Sync
+from imud.model.event import Event, EventKind
+from imud.model.sample import Sample, Sync
 from tests.fuzz.target import Target
 
 PLAIN: Final = b"\0"

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from random import Random
 
-from imud.contracts.polling import PolledDriver, Transfer, run_transfer_script
-from imud.errors import DeviceRefused, TransferError, Trouble
-from imud.ledger import Ledger
+from imud.contracts.driver import PolledDriver
+from imud.contracts.script import Transfer, run_transfer_script
+from imud.model.errors import DeviceRefused, TransferError, Trouble
+from imud.model.ledger import Ledger
 from tests.fuzz.drivers import EXAMPLES, mend_reading, names_of, row, variants
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target
 from tests.support.codec_invariants import check_closed, decode_polled

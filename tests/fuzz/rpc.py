@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from imud.contracts.publisher import PublisherContext
-from imud.devices import DRIVERS
-from imud.errors import Rejected
-from imud.event import Event, EventKind
+from imud.drivers import DRIVERS
 from imud.formats.jsonrpc import RpcError, encode_error, encode_result, parse_object, parse_request
-from imud.publishers.socket.publisher import SocketServer, SocketSettings
-from imud.sample import SAMPLE_FIELDS
+from imud.model.errors import Rejected
+from imud.model.event import Event, EventKind
+from imud.model.sample import SAMPLE_FIELDS
+from imud.publishers.socket.server import SocketServer, SocketSettings
 from tests.fuzz.target import Target
 from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, FakeControl, batch, device_status
 

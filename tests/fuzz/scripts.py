@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
-from imud.contracts.action import Target as ActionTarget
-from imud.contracts.can import CanDriver
-from imud.contracts.codec import CodecEvent, Message, message_of
-from imud.contracts.driver import Driver, StreamDriver
-from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
-from imud.errors import BadArgument, CommandError, DeviceRefused
-from imud.ledger import Ledger
+from imud.contracts.codec import CodecEvent, message_of
+from imud.contracts.command import Target as ActionTarget
+from imud.contracts.driver import CanDriver, Driver, StreamDriver
+from imud.contracts.script import Message, Outcome, Reply, Request, RequestScript
+from imud.device.scripts import Session
+from imud.model.errors import BadArgument, CommandError, DeviceRefused
+from imud.model.ledger import Ledger
 from tests.fuzz import can, streams
 from tests.fuzz.drivers import mender, names_of, row
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target

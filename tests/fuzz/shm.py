@@ -24,7 +24,6 @@ from random import Random
 from typing import Final
 
 from imud.client.ring import Ring
-from imud.errors import ServerError
 from imud.formats.ring import (
     HEADER_BYTES,
     LEDGER_BLOCK_BYTES,
@@ -36,8 +35,9 @@ from imud.formats.ring import (
     encode_ledger_block,
 )
 from imud.formats.slot import CRC_OFFSET, SLOT_BYTES, SYNC_CODES, decode_slot, encode_slot
-from imud.ledger import LEDGER_FIELDS
-from imud.sample import Sample
+from imud.model.errors import ServerError
+from imud.model.ledger import LEDGER_FIELDS
+from imud.model.sample import Sample
 from tests.fuzz.target import Target, check_printable
 from tests.support.rings import DEVICE, START_NS, make_sample
 

@@ -9,11 +9,11 @@ from typing import Final
 
 import msgspec
 
-from imud.runtime.detection import remembered
-from imud.runtime.detection.remembered import Remembered, RememberedDevice
-from imud.runtime.settings import flash
-from imud.runtime.settings.flash import LIMIT_ASKED, MODULES_MAX, FlashWrites
-from imud.units import NS_PER_S
+from imud.device import flash
+from imud.device import search as remembered
+from imud.device.flash import LIMIT_ASKED, MODULES_MAX, FlashWrites
+from imud.device.search import Remembered, RememberedDevice
+from imud.model.units import NS_PER_S
 from tests.fuzz.target import Target
 
 UTC_NS: Final = 1_800_000_000 * NS_PER_S

@@ -6,7 +6,7 @@ from random import Random
 
 from imud.contracts.codec import CodecEvent, StreamCodec
 from imud.contracts.driver import StreamDriver
-from imud.ledger import Ledger
+from imud.model.ledger import Ledger
 from tests.fuzz.drivers import EXAMPLES, mender, names_of, row, spliced, variants
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target
 from tests.support.codec_invariants import check_closed, check_counted, cut, feed_stream, untimed

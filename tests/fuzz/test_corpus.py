@@ -5,10 +5,8 @@ from random import Random
 
 import pytest
 
-from imud.contracts.can import CanDriver
-from imud.contracts.driver import StreamDriver
-from imud.contracts.polling import PolledDriver
-from imud.devices import DRIVERS
+from imud.contracts.driver import CanDriver, PolledDriver, StreamDriver
+from imud.drivers import DRIVERS
 from tests.fuzz import c_header, corpus
 from tests.fuzz.groups import all_names, load
 

@@ -6,12 +6,12 @@ from typing import Any
 import pytest
 
 from imud import config
-from imud.client.watch import EventStream, Watch
-from imud.errors import ConfigError, ServerError
+from imud.client.connection import EventStream, Watch
 from imud.formats.jsonrpc import encode_result, line_of
 from imud.formats.ring import OFFSETS
+from imud.model.errors import ConfigError, ServerError
 from imud.publishers.metrics.publisher import encoder_for
-from imud.utc.sentence_stream import LINE_BYTES_MAX, SentenceSplitter
+from imud.utc.receivers import LINE_BYTES_MAX, SentenceSplitter
 from imud.web.messages import CallRequest, LoginRequest, Look, decode_body
 from tests.fuzz import answers, c_header
 from tests.fuzz.shm import HEALTH, written

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from random import Random
 from typing import Final
 
-from imud.contracts.timing import UtcReference
-from imud.formats.nmea0183 import checksum
-from imud.formats.rmc import RMC_BYTES_MAX, Rmc, RmcFault, as_gprmc, build, parse
+from imud.contracts.lines import UtcReference
+from imud.formats.nmea0183 import RMC_BYTES_MAX, Rmc, RmcFault, as_gprmc, build, checksum, parse
+from imud.utc.receivers import LINE_BYTES_MAX, SentenceSplitter
 from imud.utc.rmc_feed import RmcFeed
-from imud.utc.sentence_stream import LINE_BYTES_MAX, SentenceSplitter
 from tests.fuzz.target import Target
 from tests.support.codec_invariants import cut
 

@@ -16,9 +16,9 @@ from imud.contracts.publisher import Batch
 from imud.formats import ring as shm_layout
 from imud.formats import slot
 from imud.formats.slot import PRESENT_BITS, SEQ_INVALID, SLOT_BYTES, SLOT_FIELDS, SYNC_CODES
-from imud.ledger import LEDGER_FIELDS
-from imud.publishers.socket.waker import Waker
-from imud.sample import Sample
+from imud.model.ledger import LEDGER_FIELDS
+from imud.model.sample import Sample
+from imud.publishers.socket.client import Waker
 from tests.support.rings import DEVICE, SLOTS, START_NS, TORN, WHOLE, Board, make_sample, slot_at
 from tests.support.surroundings import DAEMON_UID, HOSTILE_UID, needs_root
 

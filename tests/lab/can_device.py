@@ -6,15 +6,15 @@ from contextlib import closing, nullcontext
 from time import monotonic, monotonic_ns
 from typing import Any
 
-from imud.config import DeviceConfig
-from imud.contracts.settings import Settings
+from imud.config.model import DeviceConfig
 from imud.contracts.status import DeviceState
-from imud.event import Event
-from imud.host_clock import HostClock
-from imud.links.can.link import SocketCanSettings
-from imud.runtime.device import Device
-from imud.runtime.device_factory import DeviceFactory
-from imud.sample import Sample
+from imud.device.device import Device
+from imud.device.factory import DeviceFactory
+from imud.host.clock import HostClock
+from imud.links.socketcan import SocketCanSettings
+from imud.model.event import Event
+from imud.model.options import Settings
+from imud.model.sample import Sample
 from imud.sim.can_module import CanModule, CanModules
 from imud.sim.ports.can_port import CanPort
 

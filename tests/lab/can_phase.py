@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from imud.sim.physics.motion import GRAVITY_M_S2, MOTIONS, Truth
+from imud.sim.physics import GRAVITY_M_S2, MOTIONS, Truth
 
 LOOP_S: Final = 4.0
 """Played again and again; making it takes the guest longer than playing it."""

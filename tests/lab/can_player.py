@@ -17,14 +17,14 @@ import time
 from dataclasses import dataclass, field
 from functools import partial
 
-from imud.devices.imu61x.can.codec import INDEX_MODULUS, SET_FRAMES
+from imud.drivers.imu61x.can import INDEX_MODULUS, SET_FRAMES
 from imud.formats.can import RAW_FRAME, pack_frame
-from imud.links.can.frame_reader import MessageBuffers, Vector, libc
+from imud.links.socketcan import MessageBuffers, Vector, libc
 from imud.sim import CAN_SIMULATORS
 from imud.sim.can_module import CanModules
-from imud.sim.physics.motion import MOTIONS
+from imud.sim.physics import MOTIONS
 from imud.sim.ports.pty import sharpen_timers
-from imud.sim.simulator import SimulatorOptions
+from imud.sim.sensor import SimulatorOptions
 from tests.lab.can_phase import LOOP_S, Phased
 
 BURST_NS = 2_000_000

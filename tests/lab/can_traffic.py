@@ -10,11 +10,11 @@ from typing import Final
 
 import msgspec
 
-from imud.contracts.can import CanDriver
-from imud.devices import DRIVERS
-from imud.sample import Sample, Vector3
+from imud.contracts.driver import CanDriver
+from imud.drivers import DRIVERS
+from imud.model.sample import Sample, Vector3
 from imud.sim import CAN_SIMULATORS
-from imud.sim.physics.motion import Truth
+from imud.sim.physics import Truth
 from tests.lab.can_phase import LOOP_S, Phased
 
 GYRO_RAD_S: Final = 0.004

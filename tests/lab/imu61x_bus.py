@@ -4,7 +4,7 @@ from collections.abc import Callable
 from math import dist
 from time import monotonic_ns
 
-from imud.event import EventKind
+from imud.model.event import EventKind
 from imud.sim.imu61x.registers import Imu61xRegisters
 from tests.lab.wire import I2cTransfer, Refuse, SpiTransfer
 from tests.support.device_rig import DeviceRig

@@ -5,14 +5,14 @@ from time import monotonic_ns
 
 import pytest
 
-from imud.contracts.control.calibration import CalibrationResult
-from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
-from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
-from imud.errors import CommandError
-from imud.event import EventKind
+from imud.contracts.command import CalibrationResult
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.model.errors import CommandError
+from imud.model.event import EventKind
 from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
 from imud.sim.hipnuc.j1939 import HipnucJ1939Module, J1939Hardware, J1939Settings
-from imud.sim.physics.motion import Motion, Still, swing
+from imud.sim.physics import Motion, Still, swing
 from tests.lab.can_device import BusRig
 from tests.lab.can_interface import CanInterface
 

@@ -8,16 +8,15 @@ from time import monotonic, monotonic_ns
 
 import pytest
 
-from imud.config import DeviceConfig
+from imud.config.model import DeviceConfig
 from imud.contracts.status import DeviceState
-from imud.errors import LinkMissing
+from imud.device.can_search import EVERYTHING
+from imud.device.factory import DeviceFactory
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_frame
-from imud.host_clock import HostClock
-from imud.links.can.cyclic_sender import KernelSender, LoopSender
-from imud.links.can.frame_reader import FrameReader
-from imud.links.can.link import SocketCanLink, SocketCanSettings
-from imud.runtime.detection.rounds import EVERYTHING
-from imud.runtime.device_factory import DeviceFactory
+from imud.host.clock import HostClock
+from imud.links.cyclic_sender import KernelSender, LoopSender
+from imud.links.socketcan import FrameReader, SocketCanLink, SocketCanSettings
+from imud.model.errors import LinkMissing
 from imud.sim.can_module import CanModules
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
 from imud.sim.ports.can_port import CanPort
@@ -88,7 +87,7 @@ def test_a_kernel_without_the_manager_is_helped_by_the_loop(
     def without(interface: str, frames: object) -> KernelSender:
         raise OSError(93, "Protocol not supported")
 
-    monkeypatch.setattr("imud.links.can.link.KernelSender", without)
+    monkeypatch.setattr("imud.links.socketcan.KernelSender", without)
 
     async def story() -> None:
         link = SocketCanLink(SocketCanSettings(interface=vcan.name))

@@ -6,11 +6,10 @@ from time import monotonic, sleep
 
 import pytest
 
-from imud.client import Client
-from imud.client.watch import Watch
+from imud.client.connection import Client, Watch
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
-from imud.sample import Sample
+from imud.model.sample import Sample
 from tests.lab.can_interface import CanInterface
 from tests.lab.can_traffic import Against, Module, fleet, traffic
 from tests.support.daemon_process import RunningDaemon, running_daemon

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from imud.sample import Sample, Sync
+from imud.model.sample import Sample, Sync
 from tests.lab.chaos.account import KNOWN, Hole, Interval, account, find_holes, sequence_faults
 
 PERIOD_NS = 100_000_000

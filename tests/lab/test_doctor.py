@@ -42,7 +42,7 @@ pytestmark = pytest.mark.timeout(600)
 METRICS_PORT = 19322
 DEAF_RATE_HZ = 10
 ANSWERED_AFTER_S = 60
-"""Of imud.cli.doctor.traffic: a device that was silent on requests for so long does not hear them."""
+"""Of imud.cli.doctor.daemon: a device that was silent on requests for so long does not hear them."""
 DIALOUT = 20
 
 

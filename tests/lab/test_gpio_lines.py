@@ -11,14 +11,12 @@ from time import monotonic_ns
 
 import pytest
 
-from imud.contracts.lines import Edge, InputSettings, OutputSettings, ResetSettings
-from imud.contracts.timing import TriggerStamp
-from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
-from imud.signals.gpio import GpioInput, GpioOutput
-from imud.signals.gpio.line_request import KERNEL_EVENTS
-from imud.signals.reset import reset
-from imud.signals.trigger import Trigger
-from imud.units import NS_PER_S
+from imud.contracts.lines import Edge, InputSettings, OutputSettings, ResetSettings, TriggerStamp
+from imud.lines.gpio import KERNEL_EVENTS, GpioInput, GpioOutput
+from imud.lines.reset import reset
+from imud.lines.trigger import Trigger
+from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
+from imud.model.units import NS_PER_S
 from tests.lab.gpio_chip import GpioChip, simulated_chip
 from tests.lab.tool import running, tool
 from tests.lab.waiting import wait_until

@@ -9,15 +9,15 @@ from typing import Any
 
 import pytest
 
-from imud.config import DeviceConfig
+from imud.config.model import DeviceConfig
 from imud.contracts.status import DeviceState
-from imud.devices.imu61x.can.codec import Imu61xCanSettings, encode_set
-from imud.event import Event, EventKind
+from imud.device.factory import DeviceFactory
+from imud.drivers.imu61x.can import Imu61xCanSettings, encode_set
 from imud.formats.can import pack_frame
-from imud.host_clock import HostClock
-from imud.links.can.link import SocketCanSettings
-from imud.runtime.device_factory import DeviceFactory
-from imud.sample import Sample
+from imud.host.clock import HostClock
+from imud.links.socketcan import SocketCanSettings
+from imud.model.event import Event, EventKind
+from imud.model.sample import Sample
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
 from imud.sim.ports.can_port import CanPort
 from tests.lab.can_interface import CanInterface

@@ -5,10 +5,10 @@ import errno
 
 import pytest
 
-from imud.contracts.polling import Poll
+from imud.contracts.codec import Poll
 from imud.contracts.status import DeviceState
-from imud.devices.imu61x.i2c import codec as device_i2c
-from imud.devices.imu61x.i2c.session import READ_ID
+from imud.drivers.imu61x import i2c as device_i2c
+from imud.drivers.imu61x.i2c import READ_ID
 from tests.lab.bus import Bus
 from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_i2c, physics_holds, registers, vanishes

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from imud.config import DeviceConfig
+from imud.config.model import DeviceConfig
 from imud.contracts.lines import DeviceLines, LineFactory, OutputSettings, ReadySettings, ResetSettings
-from imud.event import EventKind
-from imud.sample import Sample, Sync
-from imud.signals.gpio import GpioInput, GpioOutput
+from imud.lines.gpio import GpioInput, GpioOutput
+from imud.model.event import EventKind
+from imud.model.sample import Sample, Sync
 from imud.sim.imu61x.registers import Imu61xRegisters
 from tests.lab.bus import Bus
 from tests.lab.gpio_chip import GpioChip

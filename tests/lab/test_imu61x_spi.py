@@ -5,11 +5,11 @@ import errno
 
 import pytest
 
-from imud.contracts.polling import Poll
+from imud.contracts.codec import Poll
 from imud.contracts.status import DeviceState
-from imud.devices.imu61x.spi import codec as spi
-from imud.devices.imu61x.spi.words import READ_STATE
-from imud.sim.imu61x.behaviour import REGISTER_VARIANTS
+from imud.drivers.imu61x import spi
+from imud.drivers.imu61x.spi import READ_STATE
+from imud.sim.imu61x.uart import REGISTER_VARIANTS
 from tests.lab.bus import Bus
 from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_spi, physics_holds, registers, vanishes

@@ -11,11 +11,11 @@ from time import monotonic, monotonic_ns
 import pytest
 
 from imud.contracts.status import DeviceState
-from imud.devices.hipnuc.j1939 import messages, session
-from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
-from imud.devices.hipnuc.nmea2000.codec import HipnucNmea2000Settings
-from imud.errors import NoReply
-from imud.sample import Sample
+from imud.drivers.hipnuc.j1939 import codec, commands
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.drivers.hipnuc.nmea2000 import HipnucNmea2000Settings
+from imud.model.errors import NoReply
+from imud.model.sample import Sample
 from imud.sim.hipnuc.j1939 import J1939_VARIANTS, HipnucJ1939Module, J1939Hardware, J1939Settings
 from imud.sim.hipnuc.nmea2000 import HipnucNmea2000Module, Nmea2000Hardware
 from imud.sim.ports.can_port import CanPort
@@ -44,10 +44,10 @@ def say(end: socket.socket, interface: str, pgn: int, data: bytes, address: int 
 
 
 def burst(end: socket.socket, interface: str, number: int) -> None:
-    say(end, interface, messages.ACCEL, messages.pack_accel((0.0, 0.0, 9.8)))
-    say(end, interface, messages.GYRO, messages.pack_gyro((0.1, 0.2, 0.3)))
-    say(end, interface, messages.ROLL_PITCH, messages.TWO_ANGLES.pack(number, 0))
-    say(end, interface, messages.HEADING, messages.pack_heading(1.0))
+    say(end, interface, codec.ACCEL, codec.pack_accel((0.0, 0.0, 9.8)))
+    say(end, interface, codec.GYRO, codec.pack_gyro((0.1, 0.2, 0.3)))
+    say(end, interface, codec.ROLL_PITCH, codec.TWO_ANGLES.pack(number, 0))
+    say(end, interface, codec.HEADING, codec.pack_heading(1.0))
 
 
 def rolls(samples: list[Sample]) -> list[int]:
@@ -58,18 +58,18 @@ def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
     """It sends samples and answers requests; another node's samples are on the bus, too."""
     rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Settings())
     requests: list[tuple[int, bytes]] = []
-    intervals = {0x0137: 100, session.ADDRESS: 8}
+    intervals = {0x0137: 100, commands.ADDRESS: 8}
 
     def answer(end: socket.socket) -> None:
         data, (_, _, pgn, source) = end.recvfrom(64)
-        if pgn != session.CONFIGURE:
+        if pgn != codec.CONFIGURE:
             return
         requests.append((source, data))
-        register, command, _, value = session.LAYOUT.unpack(data)
+        register, command, _, value = commands.LAYOUT.unpack(data)
         if register in intervals:  # it has no other
-            intervals[register] = value if command == session.WRITE else intervals[register]
-            reply = session.LAYOUT.pack(register, command, 0, intervals[register])
-            say(end, vcan.name, session.CONFIGURE, reply, 0x55)
+            intervals[register] = value if command == commands.WRITE else intervals[register]
+            reply = commands.LAYOUT.pack(register, command, 0, intervals[register])
+            say(end, vcan.name, codec.CONFIGURE, reply, 0x55)
 
     async def story() -> None:
         loop = asyncio.get_running_loop()
@@ -130,10 +130,10 @@ def test_our_simulator_heard_and_set_by_a_node_of_the_kernel(vcan: CanInterface)
         run_until(end, lambda: len(heard) >= 12)
         assert [pgn for pgn, _, _ in heard[:8]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41] * 2
         assert {source for _, source, _ in heard} == {8}
-        say(end, vcan.name, session.CONFIGURE, bytes.fromhex("3701060032000000"), 8)
-        run_until(end, lambda: heard[-1][0] == session.CONFIGURE)
-        assert heard[-1] == (session.CONFIGURE, 8, bytes.fromhex("3701060032000000"))
-        say(end, vcan.name, session.CONFIGURE, bytes.fromhex("3701030000000000"), 8)
+        say(end, vcan.name, codec.CONFIGURE, bytes.fromhex("3701060032000000"), 8)
+        run_until(end, lambda: heard[-1][0] == codec.CONFIGURE)
+        assert heard[-1] == (codec.CONFIGURE, 8, bytes.fromhex("3701060032000000"))
+        say(end, vcan.name, codec.CONFIGURE, bytes.fromhex("3701030000000000"), 8)
         run_until(end, lambda: heard[-1][2] == bytes.fromhex("3701030032000000"))
     accel = struct.unpack("<3hH", next(data for pgn, _, data in heard if pgn == 0xFF34))
     assert 1700 < sum(counts * counts for counts in accel[:3]) ** 0.5 < 2400  # 1 G and the swing
@@ -141,7 +141,7 @@ def test_our_simulator_heard_and_set_by_a_node_of_the_kernel(vcan: CanInterface)
 
 def test_driver_and_simulator_with_every_message_and_all_actions(vcan: CanInterface) -> None:
     """Two modules on the bus; one is set while both send, restarted, and sends as it was saved."""
-    fast = dict.fromkeys(messages.PGNS, 100)
+    fast = dict.fromkeys(codec.PGNS, 100)
     quiet = J1939Hardware(bitrate=0, boot_ms=0)
     module = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast), quiet)
     other = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast, address=9), quiet)

@@ -15,10 +15,10 @@ from urllib.request import urlopen
 import pytest
 
 from imud.contracts.status import DeviceStatus, LinesStatus
-from imud.event import EventKind
-from imud.sample import Sample, Sync
-from imud.signals.sync_signals import ALARM_STATUS
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.lines.sync import ALARM_STATUS
+from imud.model.event import EventKind
+from imud.model.sample import Sample, Sync
+from imud.model.units import NS_PER_MS, NS_PER_S
 from tests.lab.gpio_chip import GpioChip
 from tests.lab.imu_process import Pulse, running_imu, tell, tty
 from tests.lab.test_gpio_lines import INTERRUPTS, rising_edges

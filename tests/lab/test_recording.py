@@ -19,13 +19,13 @@ from time import monotonic_ns, sleep
 import msgspec
 import pytest
 
-from imud.cli.recording.replay import play_to_end
+from imud.cli.replay import play_to_end
 from imud.contracts.lines import DeviceLines, ReadySettings
 from imud.contracts.status import DeviceState
-from imud.event import Event, EventKind
-from imud.ledger import lost
-from imud.runtime.recording.player import Player
-from imud.sample import Sample, Sync
+from imud.model.event import Event, EventKind
+from imud.model.ledger import lost
+from imud.model.sample import Sample, Sync
+from imud.recording.player import Player
 from tests.lab.bus import Bus
 from tests.lab.chaos.daemon import Life, Snapshot
 from tests.lab.chaos.far_side import FarSide

@@ -9,8 +9,8 @@ from time import monotonic_ns
 
 import pytest
 
-from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
-from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
 from imud.sim.hipnuc.canopen import NODE_VARIANTS, HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
 from imud.sim.hipnuc.j1939 import J1939_VARIANTS, HipnucJ1939Module, J1939Hardware, J1939Settings
 from tests.lab.can_device import BusRig

@@ -13,13 +13,13 @@ from time import CLOCK_MONOTONIC_RAW, clock_gettime_ns, monotonic_ns
 
 import pytest
 
-from imud.config import DeviceConfig
-from imud.devices.hipnuc.uart.codec import HipnucSettings, encode_hi91
-from imud.host_clock import HostClock
-from imud.links.uart.link import UartSettings
-from imud.runtime.device_factory import DeviceFactory
-from imud.sample import Sample
-from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+from imud.config.model import DeviceConfig
+from imud.device.factory import DeviceFactory
+from imud.drivers.hipnuc.uart.codec import HipnucSettings, encode_hi91
+from imud.host.clock import HostClock
+from imud.links.uart import UartSettings
+from imud.model.sample import Sample
+from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 from imud.utc.system_clock import Timex
 from tests.lab.serial_port import PseudoTerminal
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from imud.errors import LinkBusy, LinkDenied, LinkMissing
+from imud.host.files import user_name
 from imud.links import LINKS
 from imud.links.device_node import SERIAL_GROUP, DeviceNode, holders_of, open_problem
-from imud.permissions import user_name
+from imud.model.errors import LinkBusy, LinkDenied, LinkMissing
 from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import in_loop
 from tests.support.surroundings import DAEMON_UID, needs_root

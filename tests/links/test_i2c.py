@@ -5,10 +5,10 @@ import errno
 import pytest
 from smbus2 import I2cFunc
 
-from imud.contracts.polling import Transfer
-from imud.errors import LinkDenied, LinkError, LinkMissing, TransferError, Trouble
+from imud.contracts.script import Transfer
 from imud.links import LINKS
 from imud.links.i2c import I2C_TIMEOUT, I2cLink, I2cSettings
+from imud.model.errors import LinkDenied, LinkError, LinkMissing, TransferError, Trouble
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.in_process_bus import InProcessI2c
 

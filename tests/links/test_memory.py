@@ -7,9 +7,9 @@ import pytest
 
 from imud.contracts.link import StreamLink
 from imud.contracts.status import KernelCounters
-from imud.errors import LinkBusy, LinkError, LinkMissing
 from imud.links import LINKS
 from imud.links.memory import MemoryLink, MemorySettings
+from imud.model.errors import LinkBusy, LinkError, LinkMissing
 from tests.support.event_loops import in_loop
 
 

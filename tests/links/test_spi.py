@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from imud.contracts.polling import Transfer
-from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble
+from imud.contracts.script import Transfer
 from imud.links import LINKS
 from imud.links.spi import WR_MAX_SPEED_HZ, SpiLink, SpiSettings
+from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble
 from imud.sim.ports.in_process_bus import InProcessSpi
 
 

@@ -25,20 +25,20 @@ from unittest import mock
 import msgspec
 
 from imud import config
-from imud.client import Client
-from imud.config import Config
+from imud.client.connection import Client
+from imud.config.model import Config
 from imud.contracts.status import DeviceStatus, KernelCounters
 from imud.daemon import Daemon
-from imud.devices.hipnuc.uart.codec import encode_hi91
-from imud.errors import LinkError
-from imud.log import LogWriter
+from imud.drivers.hipnuc.uart.codec import encode_hi91
+from imud.host import event_loop
+from imud.host.log import LogWriter
+from imud.model.errors import LinkError
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.publishers.recorder.writer import RecordQueue
-from imud.runtime import event_loop
-from imud.sim.hipnuc.uart.settings import ModuleSettings, Output
-from imud.sim.hipnuc.uart.simulator import HipnucModule
-from imud.sim.ports.lines import MemoryLines
-from imud.units import NS_PER_MS, NS_PER_S
-from tests.publishers.mqtt.mosquitto import running_broker
+from imud.sim.hipnuc.uart import HipnucModule
+from imud.sim.hipnuc.uart_settings import ModuleSettings, Output
+from imud.sim.ports.pins import MemoryLines
+from tests.fleet.mosquitto import running_broker
 from tests.support.daemon_process import wait_until, write_config
 from tests.support.pty_port import BAUD, plugged, slave, wired
 from tests.test_daemon import Cable

@@ -17,8 +17,8 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from imud.cli.demo.command import child, daemon
-from imud.client import Client
+from imud.cli.demo import child, daemon
+from imud.client.connection import Client
 from tests.monitoring.dashboard import dashboard, filled_in
 from tests.monitoring.prometheus import RealPrometheus, real_prometheus
 from tests.support.files import ROOT

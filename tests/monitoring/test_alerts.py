@@ -20,6 +20,7 @@ from typing import Final
 
 import pytest
 
+from tests.fleet.mosquitto import NO_MOSQUITTO
 from tests.monitoring.faults import WIRES, Wire, site
 from tests.monitoring.prometheus import (
     LIMIT_S,
@@ -32,7 +33,6 @@ from tests.monitoring.prometheus import (
     real_prometheus,
     shortened,
 )
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO
 from tests.support.daemon_process import wait_until, write_config
 from tests.support.surroundings import free_port
 

@@ -63,7 +63,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.mutants", description=(__doc__ or "").partition(":")[0])
     parser.add_argument("--count", type=int, default=120, help="number of mutants (120)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the choice (1)")
-    parser.add_argument("--only", default="imud", metavar="PATH", help="only modules below a path: imud/runtime")
+    parser.add_argument("--only", default="imud", metavar="PATH", help="only modules below a path: imud/device")
     parser.add_argument("--jobs", type=int, default=2, help="number of copies of the tree that run in parallel (2)")
     parser.add_argument("--show", action="store_true", help="print the mutants as diffs and do not run them")
     parser.add_argument("--mutant", type=int, metavar="K", help="run mutant K only and print the output of its tests")

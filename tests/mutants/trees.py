@@ -22,7 +22,7 @@ DOCUMENT_TESTS: Final = {"tests/test_docs.py", "tests/test_architecture.py"}
 LIMIT_S: Final = 900
 """Maximum time of one run of pytest."""
 NO_MIRROR: Final = {
-    "audit", "bench", "lab", "lab_host", "lab_debian", "fuzz", "attack", "support", "packaging", "monitoring",
+    "audit", "bench", "lab", "lab_debian", "fuzz", "attack", "support", "packaging", "monitoring",
 }  # fmt: skip
 
 
@@ -49,7 +49,8 @@ def stages(path: str) -> list[list[str]]:
     module = Path(path).with_suffix("")
     dotted = ".".join(module.parts)
     folders = [ROOT / "tests" / folder for folder in module.relative_to("imud").parents]
-    own = [test for test in tests_in(folders[0]) if test.endswith(f"/test_{module.name.strip('_')}.py")]
+    name = re.compile(rf".*/test_{module.name.strip('_')}(_\w+)?\.py")
+    own = [test for test in tests_in(folders[0]) if name.fullmatch(test)]
     first = own or ([f"tests/{tested_in()[dotted]}"] if dotted in tested_in() else [])
     below = sorted(folders[0].glob("*/**/")) if len(folders) > 1 else []
     found = [first, tests_in(folders[0]), [test for folder in below for test in tests_in(folder)]]

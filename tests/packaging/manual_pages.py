@@ -16,8 +16,8 @@ import msgspec
 
 from imud import __version__
 from imud.cli import COMMANDS, build_parser
-from imud.contracts.settings import expected
 from imud.formats.jsonrpc import DEFAULT_PATH
+from imud.model.options import expected
 from tests.support import references
 
 EXIT_STATUS: Final = (

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from imud.cli import COMMANDS, build_parser
-from imud.cli.doctor.report import STATUS
+from imud.cli.doctor.command import STATUS
 from tests.packaging.completions import every_parser
 from tests.packaging.manual_pages import escaped, help_of, marked, pages, sentence
 from tests.support import references

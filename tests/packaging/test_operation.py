@@ -13,15 +13,15 @@ from typing import Final
 
 import pytest
 
-from imud.cli.setup.journal import FOLDER as SETUP_FOLDER
-from imud.cli.setup.udev import RULES
+from imud.cli.setup.changes import FOLDER as SETUP_FOLDER
+from imud.cli.setup.plan import RULES
 from imud.config.schema import General
-from imud.publishers.mqtt.settings import MqttSettings
-from imud.publishers.mqtt.spool import FILE as SPOOL_FILE
-from imud.publishers.recorder.settings import RecorderSettings
-from imud.runtime.detection.remembered import FILE_NAME as FOUND
-from imud.runtime.settings.backup import FOLDER as BACKUPS
-from imud.runtime.settings.flash import FILE_NAME as FLASH
+from imud.device.flash import FILE_NAME as FLASH
+from imud.device.flash import FOLDER as BACKUPS
+from imud.device.search import FILE_NAME as FOUND
+from imud.fleet.settings import MqttSettings
+from imud.fleet.spool import FILE as SPOOL_FILE
+from imud.publishers.recorder.directory import RecorderSettings
 from tests.support.daemon_process import LIMIT_S
 from tests.support.files import ROOT
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from imud.cli import build_parser
-from imud.publishers.recorder.settings import FlightSettings
-from imud.publishers.shm.publisher import ShmSettings
+from imud.publishers.recorder.directory import FlightSettings
+from imud.publishers.shm import ShmSettings
 from imud.web.guard import is_loopback
 from tests.support.daemon_process import LIMIT_S
 from tests.support.files import ROOT

@@ -7,8 +7,8 @@ from math import ceil
 import msgspec
 import pytest
 
+from imud.model.sample import Sample, Sync
 from imud.publishers.thinning import MeanRate, Pace, RateThinner
-from imud.sample import Sample, Sync
 
 START_NS = 80_000_000_000_001
 

@@ -6,14 +6,14 @@ from typing import Any
 import pytest
 
 from imud.contracts.codec import CodecEvent
-from imud.devices.imu61x.can.driver import DRIVER
+from imud.drivers.imu61x.can import DRIVER
 from imud.formats.can import RAW_FRAME
-from imud.ledger import Ledger
-from imud.sample import Measurement
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
 from imud.sim import CAN_SIMULATORS
 from imud.sim.can_module import CanModules, FrameWire, SentFrame
 from imud.sim.ports.can_port import CanPort
-from imud.sim.simulator import SimulatorOptions
+from imud.sim.sensor import SimulatorOptions
 
 MS = 1_000_000
 PERIOD_NS = 10 * MS

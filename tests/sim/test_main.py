@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from imud.devices.hipnuc.uart.driver import DRIVER
-from imud.ledger import Ledger
-from imud.sample import Measurement
+from imud.drivers.hipnuc.uart.driver import DRIVER
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
 from imud.sim.__main__ import main
 from imud.sim.ports.pins import PinFaultRates, pin_rates
 from tests.support.daemon_process import LIMIT_S

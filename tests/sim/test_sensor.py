@@ -2,10 +2,8 @@
 
 import pytest
 
-from imud.sim.physics.motion import swing
-from imud.sim.physics.noise import Noise
-from imud.sim.sensor import SensorHardware, sensor_of
-from imud.sim.simulator import SimulatorOptions
+from imud.sim.physics import Noise, swing
+from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
 OPTIONS = SimulatorOptions(gravity_m_s2=9.7, noise="none", skew_ppm=-35.0, boot_ms=7, processing_ns=11)
 

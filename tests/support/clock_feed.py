@@ -3,9 +3,9 @@
 from collections.abc import Iterable
 from itertools import pairwise
 
-from imud.clock import SampleClock
-from imud.sample import Measurement, Sample
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.model.sample import Measurement, Sample
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sampling.clock import SampleClock
 
 Point = tuple[int | None, int]
 """(device ticks, ms of the host since the beginning)."""

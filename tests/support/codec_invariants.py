@@ -7,12 +7,11 @@ from typing import Final
 
 import msgspec
 
-from imud.contracts.can import CanCodec
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame, StreamCodec, TextLine
-from imud.contracts.polling import PolledCodec, PolledEvent
+from imud.contracts.codec import BadFrame, BadReason, CanCodec, CodecEvent, PolledCodec, PolledEvent, StreamCodec
+from imud.contracts.script import ReplyFrame, TextLine
 from imud.formats.can import CanFrame
-from imud.ledger import Ledger
-from imud.sample import Measurement
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
 
 PENDING_BYTES_MAX: Final = 2048
 """No protocol has frames above 1 KiB or lines above 256 characters."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from imud.client import Client
+from imud.client.connection import Client
 from imud.contracts.status import DeviceStatus
 from tests.support.pty_port import PtyPort
 

@@ -12,25 +12,25 @@ from typing import Any
 
 import msgspec
 
-from imud.config import DeviceConfig
+from imud.config.model import DeviceConfig
 from imud.contracts.lines import LineFactory
 from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceState
-from imud.devices import DRIVERS
-from imud.event import Event, EventKind
-from imud.formats.recording.records import Kind, PathRecord, decode_object, records_of
-from imud.host_clock import HostClock
-from imud.ledger import Ledger
+from imud.device.device import Device
+from imud.device.factory import DeviceFactory
+from imud.drivers import DRIVERS
+from imud.formats.records import Kind, PathRecord, decode_object, records_of
+from imud.host import event_loop
+from imud.host.clock import HostClock
+from imud.host.threads import BusThread, StartWatchingWorker
+from imud.lines.gpio import GPIO_LINES
 from imud.links import LINKS
 from imud.links.memory import MemoryCanLink, MemoryLink
-from imud.runtime import event_loop
-from imud.runtime.device import Device
-from imud.runtime.device_factory import DeviceFactory
-from imud.runtime.recording.player import PlayedDevice, Player
-from imud.runtime.recording.tap import HostTap
-from imud.sample import Sample
-from imud.signals.gpio import GPIO_LINES
-from imud.worker import BusThread, StartWatchingWorker
+from imud.model.event import Event, EventKind
+from imud.model.ledger import Ledger
+from imud.model.sample import Sample
+from imud.recording.observer import HostTap
+from imud.recording.player import PlayedDevice, Player
 from tests.support.event_loops import VirtualClock, run_virtually
 
 LIMIT_S = 60.0
@@ -125,7 +125,7 @@ class DeviceRigs:
     recording = bool(os.environ.get("IMUD_RECORD_RIGS"))
     """Whether devices are recorded from their begin to their end, and the replay is compared with what came out.
 
-    `IMUD_RECORD_RIGS=1 pytest tests/runtime tests/signals` does that in every test with rigs, but those of fake
+    `IMUD_RECORD_RIGS=1 pytest tests/device tests/lines` does that in every test with rigs, but those of fake
     drivers, which a replay cannot find."""
 
     def __init__(

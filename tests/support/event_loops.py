@@ -12,11 +12,11 @@ from collections.abc import Callable, Coroutine
 from functools import wraps
 from typing import Any, ParamSpec
 
-from imud.host_clock import HostClock
-from imud.runtime import event_loop
-from imud.runtime.polled.bus import PolledBuses
-from imud.units import NS_PER_S
-from imud.worker import Round
+from imud.device.polled_bus import PolledBuses
+from imud.host import event_loop
+from imud.host.clock import HostClock
+from imud.host.threads import Round
+from imud.model.units import NS_PER_S
 
 P = ParamSpec("P")
 

@@ -14,29 +14,28 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta
 
-from imud.contracts.action import Action, Risk, Target
-from imud.contracts.can import CanDriver
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent, StreamCodec, TextLine
-from imud.contracts.control.calibration import Calibration, Handling, Kept
-from imud.contracts.device_settings import DeviceSettings, Effect, Setting
-from imud.contracts.driver import SAMPLE_COUNTER, Identity, StreamDriver
-from imud.contracts.session import (
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, StreamCodec
+from imud.contracts.command import Action, Calibration, Handling, Kept, Risk, Target
+from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity, StreamDriver
+from imud.contracts.script import (
     Outcome,
     Rejection,
     Request,
     RequestScript,
     Silence,
+    TextLine,
     never,
     of_text,
     pause,
     says_nothing,
 )
-from imud.contracts.settings import NoSettings, Settings
-from imud.errors import BadArgument, NoReply, Rejected
+from imud.contracts.setting import DeviceSettings, Effect, Setting
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
-from imud.ledger import Ledger
 from imud.links.memory import MemoryLink, MemorySettings
-from imud.sample import Measurement
+from imud.model.errors import BadArgument, NoReply, Rejected
+from imud.model.ledger import Ledger
+from imud.model.options import NoSettings, Settings
+from imud.model.sample import Measurement
 
 SYNC: Final = b"\x5a\xa5"
 PAYLOAD_MAX: Final = 512

@@ -8,11 +8,11 @@ from urllib.parse import quote
 
 import pytest
 
-from imud.devices.hipnuc.uart.codec import encode_hi91
-from imud.devices.imu61x.can.codec import encode_set
+from imud.drivers.hipnuc.uart.codec import encode_hi91
+from imud.drivers.imu61x.can import encode_set
 from imud.formats.can import DATA_BYTES_MAX, EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame
 from imud.formats.capture import HEADER_BYTES_MAX, MAGIC, RECORD, RECORD_BYTES_MAX, VERSION
-from imud.units import NS_PER_S, NS_PER_US
+from imud.model.units import NS_PER_S, NS_PER_US
 
 ROOT: Final = Path(__file__).parents[2]
 SHARED: Final = Path(os.environ.get("IMUD_SHARED") or ROOT.parent / "shared")

@@ -6,6 +6,7 @@ import socket
 import msgspec
 from prometheus_client.parser import text_string_to_metric_families
 
+from imud.attitude.conventions import Heading
 from imud.contracts.status import (
     LATENCY_BOUNDS_NS,
     ClientStatus,
@@ -19,12 +20,11 @@ from imud.contracts.status import (
     SerialLineCounters,
     UtcStatus,
 )
-from imud.frames.conventions import Heading
-from imud.ledger import LEDGER_FIELDS
-from imud.publishers.metrics.family import Snapshot
+from imud.model.ledger import LEDGER_FIELDS
+from imud.model.sample import Sync
+from imud.publishers.metrics.metric import Snapshot
 from imud.publishers.metrics.publisher import Renderer
 from imud.publishers.metrics.rings import MotionValues, RingView
-from imud.sample import Sync
 
 
 def device(name: str, number: int = 0, **changes: object) -> DeviceStatus:

@@ -17,16 +17,16 @@ from typing import NamedTuple
 
 import msgspec
 
-from imud.attitude import IDENTITY, Matrix3, matrix_times, transposed
+from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, Convention, body_axes
+from imud.attitude.published import matrix_from_axes
+from imud.attitude.rotation import IDENTITY, Matrix3, matrix_times, transposed
 from imud.cli.arguments import statuses
-from imud.cli.demo.command import daemon, device, simulator
+from imud.cli.demo import daemon, device, simulator
 from imud.cli.status import page
-from imud.client import Client
-from imud.frames.conventions import FLU_LEVEL, RFU_ENU, Convention, body_axes
-from imud.frames.mounting import matrix_from_axes
-from imud.sample import Vector3
+from imud.client.connection import Client
+from imud.model.sample import Vector3
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.ports.arrival import USB_16MS, ArrivalModel, Crystal
-from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.clock import run
 from tests.support.files import ROOT
 

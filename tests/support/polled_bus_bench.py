@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 
-from imud.config import DeviceConfig
+from imud.config.model import DeviceConfig
 from imud.contracts.link import LinkType
-from imud.host_clock import HostClock
+from imud.host.clock import HostClock
 from imud.links.i2c import I2cLink, I2cSettings
 from imud.links.spi import SpiLink, SpiSettings
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.in_process_bus import InProcessI2c, InProcessSpi
-from imud.sim.ports.lines import MemoryLines
+from imud.sim.ports.pins import MemoryLines
 from tests.support.device_rig import DeviceRig, DeviceRigs, device_config, running
 from tests.support.event_loops import LoopWorker, VirtualClock, run_virtually
 

@@ -16,16 +16,16 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from imud.contracts.action import Target
-from imud.contracts.polling import Transfer, TransferScript
-from imud.devices.hipnuc.modbus.codec import HipnucModbusSettings
-from imud.errors import TransferError, Trouble
+from imud.contracts.command import Target
+from imud.contracts.script import Transfer, TransferScript
+from imud.drivers.hipnuc.modbus.codec import HipnucModbusSettings
 from imud.formats.modbus import BROADCAST, SLAVES, ReplyFinder, frame_gap_ns, framed
+from imud.model.errors import TransferError, Trouble
+from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveSettings, SlaveVariant
 from imud.sim.ports.arrival import BARE_UART
 from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort
-from imud.sim.simulator import StreamModule
-from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+from imud.sim.sensor import StreamModule
 
 T = TypeVar("T")
 

@@ -15,14 +15,15 @@ from typing import Final
 
 import msgspec
 
-from imud.config import TABLES, DeviceGeneral, General
-from imud.contracts.action import Action, Actions, parameters_of
-from imud.contracts.control.calibration import Handling
+from imud.attitude.published import FrameSettings, MountingAngles, MountingAxes
+from imud.config.schema import TABLES, DeviceGeneral, General
+from imud.contracts.command import Action, Actions, Handling, parameters_of
 from imud.contracts.driver import Driver
 from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
-from imud.contracts.sensors.deviations import Deviations
-from imud.contracts.settings import Settings, expected, shown
-from imud.devices import DRIVERS
+from imud.contracts.status import Deviations
+from imud.device.settings_plan import described_settings
+from imud.drivers import DRIVERS
+from imud.fleet.settings import DeviceSending
 from imud.formats.ring import (
     HEADER_BYTES,
     HEADER_FIELDS,
@@ -34,12 +35,10 @@ from imud.formats.ring import (
     STATE_LIVE,
 )
 from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES, SlotField
-from imud.frames.settings import FrameSettings, MountingAngles, MountingAxes
-from imud.ledger import LEDGER_FIELDS
-from imud.publishers.mqtt.settings import DeviceSending
-from imud.runtime.settings.difference import described_settings
-from imud.signals.line_actions import RESET, TRIGGER
-from imud.utc.source import RmcSettings
+from imud.lines.sync import RESET, TRIGGER
+from imud.model.ledger import LEDGER_FIELDS
+from imud.model.options import Settings, expected, shown
+from imud.utc.receivers import RmcSettings
 from tests.bench import clock_figures
 from tests.monitoring.alert_table import alert_table
 from tests.publishers.socket.schema import socket_schema

@@ -9,9 +9,9 @@ from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
 from imud.formats.ring import HEADER_BYTES, OFFSETS
 from imud.formats.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, SlotField, encode_slot
-from imud.ledger import Ledger
-from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
-from imud.sample import Sample, Sync
+from imud.model.ledger import Ledger
+from imud.model.sample import Sample, Sync
+from imud.publishers.shm import ShmPublisher, ShmSettings
 
 DEVICE = "imu0"
 SLOTS = 64

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Callable
 
-from imud.utc.source import OnSentence
+from imud.utc.receivers import OnSentence
 
 LIMIT_S = 60.0
 

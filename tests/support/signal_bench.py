@@ -10,10 +10,10 @@ from typing import Any
 
 import gpiod as real
 
-from imud.event import Event, EventKind
-from imud.signals.gpio.kernel_interface import EVENT
-from imud.sim.ports.lines import MemoryInput, MemoryLines, MemoryOutput
-from imud.worker import Round
+from imud.host.threads import Round
+from imud.lines.gpio import EVENT
+from imud.model.event import Event, EventKind
+from imud.sim.ports.pins import MemoryInput, MemoryLines, MemoryOutput
 from tests.support.event_loops import VirtualClock
 
 DEVICE = "bow"

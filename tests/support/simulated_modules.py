@@ -12,36 +12,33 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import pytest
 
-from imud.contracts.action import Target
-from imud.contracts.can import CanCodec, CanDriver
-from imud.contracts.codec import CodecEvent, ReplyFrame, StreamCodec, message_of
-from imud.contracts.device_settings import Written
-from imud.contracts.polling import Transfer
-from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
-from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
-from imud.devices.hipnuc.canopen.driver import DRIVER as CANOPEN_DRIVER
-from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
-from imud.devices.hipnuc.j1939.driver import DRIVER as J1939_DRIVER
-from imud.devices.hipnuc.uart.actions import ACTIONS
-from imud.devices.hipnuc.uart.codec import HipnucCodec, HipnucSettings
-from imud.devices.imu61x.uart.codec import Imu61xCodec
+from imud.contracts.codec import CanCodec, CodecEvent, StreamCodec, message_of
+from imud.contracts.command import Target
+from imud.contracts.driver import CanDriver
+from imud.contracts.script import Outcome, Reply, ReplyFrame, Request, RequestScript, Transfer
+from imud.contracts.setting import Written
+from imud.device.scripts import Session
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.drivers.hipnuc.canopen.driver import DRIVER as CANOPEN_DRIVER
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.drivers.hipnuc.j1939.driver import DRIVER as J1939_DRIVER
+from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucSettings
+from imud.drivers.hipnuc.uart.driver import ACTIONS
+from imud.drivers.imu61x.uart.codec import Imu61xCodec
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, CanFilter
-from imud.ledger import Ledger
-from imud.sample import Measurement
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+from imud.model.units import NS_PER_MS, NS_PER_US
 from imud.sim.can_module import CanModule, SentFrame
 from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings, NodeVariant
 from imud.sim.hipnuc.j1939 import HipnucJ1939Module, J1939Hardware, J1939Settings, J1939Variant
-from imud.sim.hipnuc.uart.behaviour import Behaviour
-from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
-from imud.sim.hipnuc.uart.simulator import HipnucModule
-from imud.sim.imu61x.behaviour import VARIANTS, Imu61xBehaviour
+from imud.sim.hipnuc.uart import HipnucModule
+from imud.sim.hipnuc.uart_settings import Behaviour, HipnucHardware, ModuleSettings, Output
 from imud.sim.imu61x.registers import Imu61xRegisters
-from imud.sim.imu61x.settings import Imu61xSettings
-from imud.sim.imu61x.uart import Imu61xHardware, Imu61xModule
-from imud.sim.physics.motion import Still
+from imud.sim.imu61x.uart import VARIANTS, Imu61xBehaviour, Imu61xHardware, Imu61xModule, Imu61xSettings
+from imud.sim.physics import Still
 from imud.sim.ports.uart_wire import heard
-from imud.sim.simulator import Burst
-from imud.units import NS_PER_MS, NS_PER_US
+from imud.sim.sensor import Burst
 
 T = TypeVar("T")
 

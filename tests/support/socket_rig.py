@@ -15,10 +15,28 @@ from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
 
-from imud.contracts.action import Action, Actions, Target
-from imud.contracts.control.calibration import Calibration, CalibrationResult, Calibrations, Check, Handling, Kept
-from imud.contracts.control.recording import NothingRecorded, RecordingSource
-from imud.contracts.device_settings import (
+from imud.attitude.conventions import Convention, Heading
+from imud.contracts.command import (
+    Action,
+    Actions,
+    Calibration,
+    CalibrationResult,
+    Calibrations,
+    Check,
+    Handling,
+    Kept,
+    Target,
+)
+from imud.contracts.publisher import (
+    AS_SENT,
+    Batch,
+    Latencies,
+    NoLatencies,
+    NothingRecorded,
+    PublisherContext,
+    RecordingSource,
+)
+from imud.contracts.setting import (
     AppliedSettings,
     AppliedStep,
     Effect,
@@ -32,15 +50,12 @@ from imud.contracts.device_settings import (
     SettingsStatus,
     StepOutcome,
 )
-from imud.contracts.publisher import AS_SENT, Batch, Latencies, NoLatencies, PublisherContext
-from imud.contracts.sensors.deviations import Deviations
-from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, FrameStatus, KernelCounters
-from imud.errors import Rejected
-from imud.frames.conventions import Convention, Heading
-from imud.publishers.socket.publisher import SocketServer, SocketSettings
-from imud.publishers.socket.rpc import METHODS
-from imud.runtime import event_loop
-from imud.sample import Sample, Sync
+from imud.contracts.status import ClockStatus, Deviations, DeviceState, DeviceStatus, FrameStatus, KernelCounters
+from imud.host import event_loop
+from imud.model.errors import Rejected
+from imud.model.sample import Sample, Sync
+from imud.publishers.socket.methods import METHODS
+from imud.publishers.socket.server import SocketServer, SocketSettings
 from tests.publishers.socket.schema import MessageChecker
 
 T = TypeVar("T")

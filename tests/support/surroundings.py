@@ -18,10 +18,9 @@ from typing import Final
 
 import pytest
 
-from imud.cli.doctor.finding import DoctorCheck, DoctorFinding
-from imud.cli.doctor.surroundings import CommandOutput, Surroundings
+from imud.cli.doctor.surroundings import CommandOutput, DoctorCheck, DoctorFinding, Surroundings
 from imud.contracts.status import DeviceStatus
-from imud.errors import LinkMissing
+from imud.model.errors import LinkMissing
 from imud.utc.system_clock import KernelClock
 from tests.support.files import ROOT
 

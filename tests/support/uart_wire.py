@@ -14,8 +14,9 @@ from random import Random
 from typing import Final
 
 from imud.contracts.driver import StreamDriver
-from imud.runtime.detection import GaveUp, Listen, Search, Step, StreamFound
-from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+from imud.device.search import GaveUp, Listen
+from imud.device.stream_search import Search, Step, StreamFound
+from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 SET_BAUD_NS: Final = 3 * NS_PER_MS
 """What setting a rate costs on a USB adapter; bytes that begin before are lost."""

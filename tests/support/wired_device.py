@@ -8,22 +8,21 @@ from typing import Any
 
 import pytest
 
-from imud.config import DeviceConfig
+from imud.config.model import DeviceConfig
 from imud.contracts.lines import DeviceLines, LineFactory, OutputSettings
-from imud.event import Event, EventKind
-from imud.formats.rmc import build
+from imud.device import utc as utc_keeper
+from imud.formats.nmea0183 import build
 from imud.links.memory import MemoryLink, MemorySettings
-from imud.runtime import utc_keeper
-from imud.sample import Sample
-from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings
-from imud.sim.hipnuc.uart.simulator import HipnucModule
+from imud.model.event import Event, EventKind
+from imud.model.sample import Sample
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sim.hipnuc.uart import HipnucModule
+from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings
 from imud.sim.imu61x.uart import Imu61xModule
 from imud.sim.ports.faults import Faults
-from imud.sim.ports.lines import MemoryInput, MemoryLines, MemoryOutput
-from imud.sim.ports.pins import OnEdge, Pin, PinFaults, Pins
+from imud.sim.ports.pins import MemoryInput, MemoryLines, MemoryOutput, OnEdge, Pin, PinFaults, Pins
 from imud.sim.ports.uart_wire import heard
-from imud.units import NS_PER_MS, NS_PER_S
-from imud.utc.source import RmcSettings
+from imud.utc.receivers import RmcSettings
 from imud.utc.system_clock import KernelClock
 from tests.support.device_rig import DeviceRigs
 from tests.support.event_loops import LoopWorker, VirtualClock, run_virtually

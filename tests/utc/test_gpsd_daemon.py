@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from imud.formats.nmea0183 import checksum
-from imud.formats.rmc import Rmc, build, parse
-from imud.units import NS_PER_S
+from imud.formats.nmea0183 import Rmc, build, checksum, parse
+from imud.model.units import NS_PER_S
 from tests.support.daemon_process import LIMIT_S, running_daemon
 from tests.support.pty_port import PtyPort
 from tests.support.surroundings import free_port

@@ -4,9 +4,9 @@ from random import Random
 
 import pytest
 
-from imud.contracts.timing import UtcReference
-from imud.formats.rmc import build
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.contracts.lines import UtcReference
+from imud.formats.nmea0183 import build
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.utc.pps import HOLD_NS, PULSES_NEEDED, PpsReference
 
 UTC_S = 1_795_000_000

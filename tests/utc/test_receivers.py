@@ -7,12 +7,10 @@ from collections.abc import Awaitable, Callable
 
 from imud.contracts.link import OnData, OnEnd
 from imud.contracts.status import KernelCounters
-from imud.errors import LinkError, LinkMissing
-from imud.formats.rmc import build
-from imud.units import NS_PER_S
-from imud.utc.receivers import GpsdSource, NmeaPortSource, make_nmea
-from imud.utc.sentence_stream import FIRST_PAUSE_S, Retry
-from imud.utc.source import RmcSettings, SourceContext
+from imud.formats.nmea0183 import build
+from imud.model.errors import LinkError, LinkMissing
+from imud.model.units import NS_PER_S
+from imud.utc.receivers import FIRST_PAUSE_S, GpsdSource, NmeaPortSource, Retry, RmcSettings, SourceContext, make_nmea
 from tests.support.event_loops import in_loop
 from tests.support.rmc_sources import LIMIT_S, Sentences, soon
 

@@ -4,16 +4,15 @@ from itertools import pairwise
 
 import pytest
 
-from imud.contracts.timing import UtcReference
-from imud.devices.hipnuc.uart.driver import DRIVER
-from imud.errors import LinkError
-from imud.formats.nmea0183 import checksum
-from imud.formats.rmc import build
-from imud.ledger import Ledger
-from imud.sample import Measurement
-from imud.sim.hipnuc.uart.settings import HipnucHardware
-from imud.sim.hipnuc.uart.simulator import HipnucModule
-from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+from imud.contracts.lines import UtcReference
+from imud.drivers.hipnuc.uart.driver import DRIVER
+from imud.formats.nmea0183 import build, checksum
+from imud.model.errors import LinkError
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+from imud.sim.hipnuc.uart import HipnucModule
+from imud.sim.hipnuc.uart_settings import HipnucHardware
 from imud.utc.rmc_feed import Refusal, RmcFeed
 
 UTC_S = 1_795_000_000

@@ -5,10 +5,10 @@ import time
 
 import pytest
 
-from imud.formats.rmc import Rmc, parse
-from imud.host_clock import HostClock
-from imud.units import NS_PER_MS, NS_PER_S
-from imud.utc.source import RmcSettings
+from imud.formats.nmea0183 import Rmc, parse
+from imud.host.clock import HostClock
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.utc.receivers import RmcSettings
 from imud.utc.system_clock import (
     AFTER_NS,
     LATEST_NS,

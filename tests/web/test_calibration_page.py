@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from imud.client import Client
+from imud.client.connection import Client
+from imud.device.calibration import COVERAGE_WANTED
 from imud.formats.jsonrpc import RpcError
-from imud.runtime.calibration.turning import COVERAGE_WANTED
 from tests.support.daemon_process import LIMIT_S, RunningDaemon
 from tests.web.browser import MISSING, Page, log_in, open_page, serving_web
 from tests.web.turned import BIAS, turned_module

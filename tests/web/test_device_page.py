@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from imud.cli.status import block
-from imud.contracts.device_settings import OnDifference, SettingDifference, SettingsState, SettingsStatus
+from imud.contracts.setting import OnDifference, SettingDifference, SettingsState, SettingsStatus
 from imud.contracts.status import ClockStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
-from imud.devices.hipnuc.uart.codec import encode_hi91
+from imud.drivers.hipnuc.uart.codec import encode_hi91
 from imud.web.hub import status_message
 from imud.web.messages import encode
 from tests.support.daemon_process import daemon_with_module

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from imud.errors import BadArgument
+from imud.model.errors import BadArgument
 from imud.web.guard import SESSION_S, WebGuard, WebRights, host_name, is_loopback, read_token, safety_headers
 
 TOKEN = "correct-horse-battery-staple"

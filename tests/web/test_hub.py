@@ -9,7 +9,7 @@ import msgspec
 from imud.client.connection import Hello
 from imud.client.feed import News, Wish
 from imud.contracts.status import DeviceState
-from imud.event import Event, EventKind
+from imud.model.event import Event, EventKind
 from imud.web.hub import DEVICES_MAX, EVENTS_KEPT, WAITING_MAX, Browser, BrowserHub, row_of, status_message
 from imud.web.messages import Look
 from tests.support.metrics import device

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from imud.runtime.calibration.turning import cell_of
+from imud.device.calibration import cell_of
 from tests.support.daemon_process import RunningDaemon, wait_until
 from tests.test_daemon import cable
 from tests.web.browser import MISSING, PHONE, Page, Sender, enter, sent_by, serving_web, upright

@@ -6,9 +6,9 @@ from pathlib import Path
 from time import monotonic_ns
 from typing import Final
 
-from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings
-from imud.sim.hipnuc.uart.simulator import HipnucModule
-from imud.sim.physics.motion import Sine, Swing
+from imud.sim.hipnuc.uart import HipnucModule
+from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings
+from imud.sim.physics import Sine, Swing
 from tests.support.daemon_process import RunningDaemon, running_daemon
 from tests.support.pty_port import plugged
 

@@ -8,7 +8,7 @@ from math import pi
 from typing import Final
 
 from imud.sim.__main__ import main
-from imud.sim.physics.motion import MOTIONS, Motion, Sine, Swing
+from imud.sim.physics import MOTIONS, Motion, Sine, Swing
 
 ENGINE_HZ: Final = 31.0
 UP_M_S2: Final = 0.6

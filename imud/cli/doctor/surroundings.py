@@ -8,7 +8,8 @@ import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from enum import StrEnum
 from functools import cached_property
 from http.client import HTTPConnection, HTTPException
 from pathlib import Path
@@ -18,11 +19,11 @@ import msgspec
 
 from imud import config
 from imud.cli.arguments import statuses
-from imud.client import Client
-from imud.config import Config, DeviceConfig
+from imud.client.connection import Client
+from imud.config.model import Config, DeviceConfig
 from imud.contracts.status import DeviceStatus
-from imud.errors import ConfigError, ImudError, LinkMissing
-from imud.units import NS_PER_S
+from imud.model.errors import ConfigError, ImudError, LinkMissing
+from imud.model.units import NS_PER_S
 from imud.utc.system_clock import KernelClock, kernel_clock
 
 COMMAND_S: Final = 5.0
@@ -237,3 +238,67 @@ def ask_daemon(socket: str) -> list[DeviceStatus]:
     """Ask the daemon for the status of every device. Raises ImudError, TimeoutError, msgspec.ValidationError."""
     with Client(socket) as client:
         return statuses(client)
+
+
+class Severity(StrEnum):
+    """What a finding means."""
+
+    OK = "ok"
+    """Looked at, and in order."""
+    NOTE = "note"
+    """Nothing wrong, but good to know."""
+    WARNING = "warning"
+    """imud works, but not as well as it could."""
+    ERROR = "error"
+    """A device or an output does not work."""
+    NOT_CHECKED = "not checked"
+    """It could not be looked at; `seen` says why."""
+
+
+class DoctorFinding(msgspec.Struct, frozen=True):
+    """One thing that a check found."""
+
+    severity: Severity
+    seen: str
+    """What was seen, for a person; with the device, port or interface that it is about."""
+    advice: str = ""
+    """What to do next; empty where there is nothing to do."""
+
+
+Findings = Iterator[DoctorFinding]
+
+
+class DoctorCheck(NamedTuple):
+    """One row of the list of checks."""
+
+    name: str
+    """Short, unique, for people and for programs that read `--json`."""
+    run: Callable[[Surroundings], Findings]
+    """Yields what it found; nothing where the configuration has nothing that it is about.
+
+    Raises OSError, ValueError and ImudError where it cannot look."""
+
+
+def ok(seen: str) -> DoctorFinding:
+    """Looked at, and in order."""
+    return DoctorFinding(Severity.OK, seen)
+
+
+def note(seen: str, advice: str = "") -> DoctorFinding:
+    """Good to know."""
+    return DoctorFinding(Severity.NOTE, seen, advice)
+
+
+def warning(seen: str, advice: str) -> DoctorFinding:
+    """Not as good as it could be."""
+    return DoctorFinding(Severity.WARNING, seen, advice)
+
+
+def error(seen: str, advice: str) -> DoctorFinding:
+    """Something does not work."""
+    return DoctorFinding(Severity.ERROR, seen, advice)
+
+
+def not_checked(why: str, advice: str = "") -> DoctorFinding:
+    """It could not be looked at, for this reason."""
+    return DoctorFinding(Severity.NOT_CHECKED, why, advice)

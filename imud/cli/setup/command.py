@@ -11,12 +11,9 @@ from typing import Final
 from imud.cli.arguments import CliCommand, add_socket, finite
 from imud.cli.doctor.surroundings import Surroundings, ask_daemon, run_command
 from imud.cli.run import DEFAULT_FILE
-from imud.cli.setup.attached import Wanted
-from imud.cli.setup.conversation import Conversation
-from imud.cli.setup.finders import FINDERS
-from imud.cli.setup.steps import SetupSteps
-from imud.cli.setup.ways import BITRATE_DEFAULT, BITRATE_MAX
-from imud.errors import BadArgument
+from imud.cli.setup.hardware import BITRATE_DEFAULT, BITRATE_MAX, FINDERS, Wanted
+from imud.cli.setup.steps import Conversation, SetupSteps
+from imud.model.errors import BadArgument
 
 COMMAND_LIMIT_S: Final = 330.0
 """Longer than the unit's own limit for a start, on a slow board."""

@@ -4,19 +4,221 @@ Devices are added, nothing is taken away: what a person wrote in the configurati
 devices of the example that the package installs, which nobody wrote. A machine that is as it should be has no changes.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final, NamedTuple
+
+import msgspec
 
 from imud import config
-from imud.cli.doctor.access import entries
+from imud.cli.doctor.ports import entries
 from imud.cli.doctor.surroundings import Surroundings
-from imud.cli.setup.attached import Attached
-from imud.cli.setup.changes import Change, CommandChange, FileChange, content_of
-from imud.cli.setup.udev import UsbAdapter, rules, usb_adapter
-from imud.cli.setup.ways import state
-from imud.cli.setup.yaml_edit import device_names, is_example, with_devices
-from imud.errors import ImudError
+from imud.cli.setup.changes import Change, CommandChange, FileChange, Words, content_of
+from imud.cli.setup.hardware import Attached, state
+from imud.config.yaml import YamlTree, plain, read_yaml
+from imud.model.errors import ImudError
+
+RULES: Final = "/etc/udev/rules.d/61-imud-setup.rules"
+RULES_HEAD: Final = "# Made by `imud setup` for the adapters of its devices; `imud setup --undo` removes it."
+FTDI: Final = "ftdi_sio"
+MODEM_MANAGER: Final = "ModemManager.service"
+_UNSAFE: Final = re.compile(r"[^A-Za-z0-9_.:/ -]")
+
+
+class UsbAdapter(NamedTuple):
+    """The USB device that a serial port is of."""
+
+    node: str
+    """Of the port, for example `ttyUSB0`."""
+    driver: str
+    """The kernel's driver of the port."""
+    vendor: str
+    """Number of the vendor, four hexadecimal digits."""
+    product: str
+    serial: str
+    """Serial number; empty where it has none."""
+
+
+def usb_adapter(at: Surroundings, node: str) -> UsbAdapter | None:
+    """Find the adapter of a port by its node; None for a port that is none of USB."""
+    name = node.rpartition("/")[2]
+    device = at.at(f"/sys/class/tty/{name}/device")
+    if not device.exists():
+        return None
+    driver = (device / "driver").resolve().name if (device / "driver").exists() else ""
+    real = device.resolve()
+    for parent in (real, *real.parents):
+        if vendor := at.text(at.outside(parent / "idVendor")):
+            product, serial = (at.text(at.outside(parent / key)) or "" for key in ("idProduct", "serial"))
+            return UsbAdapter(name, driver, vendor, product, serial)
+        if parent == at.root:
+            break
+    return None
+
+
+def rules(at: Surroundings, adapters: Sequence[UsbAdapter]) -> FileChange | None:
+    """Return what these adapters need in the file of rules; None where it has all. Raises ChangeRefused, OSError."""
+    before = (content_of(at, RULES) or b"").decode("utf-8", "replace")
+    present = before.splitlines()
+    ignore_modems = modem_manager_runs(at)
+    wanted = [line for adapter in adapters for line in _lines(adapter, ignore_modems=ignore_modems)]
+    missing = [line for line in dict.fromkeys(wanted) if line not in present]
+    if not missing:
+        return None
+    lines = [*(present or [RULES_HEAD]), *missing]
+    what = [
+        words
+        for word, words in (
+            ("latency_timer", "adapters send bytes after 1 ms"),
+            ("ID_MM_", "ModemManager leaves them alone"),
+        )
+        if any(word in line for line in missing)
+    ]
+    nodes = dict.fromkeys(f"--sysname-match={adapter.node}" for adapter in adapters)
+    then: tuple[Words, ...] = (("udevadm", "control", "--reload"),)
+    then += (
+        ("udevadm", "trigger", "--action=add", "--subsystem-match=tty", "--subsystem-match=usb-serial", *nodes),
+        ("udevadm", "settle", "--timeout=5"),
+    )
+    return FileChange(", ".join(what), RULES, ("\n".join(lines) + "\n").encode(), then)
+
+
+def modem_manager_runs(at: Surroundings) -> bool:
+    """Whether ModemManager runs, or will after the next start of the machine."""
+    words = ["systemctl", "show", MODEM_MANAGER, "--property=LoadState,ActiveState,UnitFileState"]
+    try:
+        states = at.run(words).text.split()
+    except OSError:
+        return False
+    return "LoadState=loaded" in states and ("ActiveState=active" in states or "UnitFileState=enabled" in states)
+
+
+def _lines(adapter: UsbAdapter, *, ignore_modems: bool) -> list[str]:
+    which = f'ATTRS{{idVendor}}=="{_pattern(adapter.vendor)}", ATTRS{{idProduct}}=="{_pattern(adapter.product)}"'
+    if adapter.serial:
+        which += f', ATTRS{{serial}}=="{_pattern(adapter.serial)}"'
+    lines = []
+    if adapter.driver == FTDI:
+        lines.append(f'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="{FTDI}", {which}, ATTR{{latency_timer}}="1"')
+    if ignore_modems:
+        properties = 'ENV{ID_MM_DEVICE_IGNORE}="1", ENV{ID_MM_PORT_IGNORE}="1"'
+        lines.append(f'ACTION!="remove", SUBSYSTEM=="tty", {which}, {properties}')
+    return lines
+
+
+def _pattern(text: str) -> str:
+    """A text as a pattern of udev: what means something there matches any character."""
+    return _UNSAFE.sub("?", text)
+
+
+Blocks = Mapping[str, Mapping[str, Any]]
+"""Keys of each device by its name."""
+
+INDENT: Final = 2
+EXAMPLE: Final = {"imu": {"uart": {"port": "/dev/ttyUSB0"}}}
+"""The devices of etc/imud.yaml, which the package installs: nobody has written them."""
+FILE_HEAD: Final = """\
+# Made by `imud setup`, yours to change: docs/configuration.md has every key.
+# `imud check FILE` says whether it is good, `systemctl reload imud` makes the daemon read it again.
+"""
+_SAFE: Final = re.compile(r"[A-Za-z0-9_/.][A-Za-z0-9_/.:@+-]*")
+
+
+def is_example(content: bytes) -> bool:
+    """Whether the configuration has the devices of the example, as the package installs it, and no others."""
+    data = read_yaml(content).data
+    return isinstance(data, dict) and data.get("devices") == EXAMPLE
+
+
+def device_names(content: bytes | None) -> list[str]:
+    """Names of all devices, disabled ones included."""
+    return list(_devices_of(read_yaml(content).data)) if content is not None else []
+
+
+def with_devices(content: bytes | None, blocks: Blocks, *, replace: str = "") -> bytes:
+    """Return the configuration with these devices, without the one named `replace`; None is no configuration yet.
+
+    Raises ImudError with the block to paste where the text cannot be changed safely.
+    """
+    if content is None:
+        return (FILE_HEAD + "devices:\n" + "\n".join(_block(blocks, INDENT)) + "\n").encode()
+    tree = read_yaml(content)
+    text = content.decode("utf-8-sig")
+    end = "\r\n" if "\r\n" in text else "\n"
+    lines = text.splitlines()
+    changed = end.join([*_inserted(lines, tree, blocks, replace), ""]).encode()
+    wanted = _devices_of(tree.data)
+    wanted.pop(replace, None)
+    if not _has(changed, tree.data, {**wanted, **blocks}):
+        paste = "\n".join(["devices:", *_block(blocks, INDENT)])
+        raise ImudError(
+            f"the configuration is written in a way that only you can add to; add below `devices`:\n{paste}"
+        )
+    return changed
+
+
+def _devices_of(data: object) -> dict[str, Any]:
+    devices = data.get("devices") if isinstance(data, dict) else None
+    return dict(devices) if isinstance(devices, dict) else {}
+
+
+def _has(content: bytes, before: object, devices: Mapping[str, object]) -> bool:
+    """Whether the text has these devices and everything else of `before`."""
+    tree = read_yaml(content)
+    others = {key: value for key, value in before.items() if key != "devices"} if isinstance(before, dict) else {}
+    return not tree.problems and tree.data == {**others, "devices": devices}
+
+
+def _inserted(lines: list[str], tree: YamlTree, blocks: Blocks, replace: str) -> list[str]:
+    key = tree.keys.get(("devices",))
+    if key is None:
+        return [*lines, *([""] if lines and lines[-1].strip() else []), "devices:", *_block(blocks, INDENT)]
+    at, column = key.line, INDENT
+    if names := list(_devices_of(tree.data)):
+        column = tree.keys["devices", names[0]].column - 1
+    head = re.sub(r"^(devices:)\s*(\{\s*\}|null|~)", r"\1", lines[at - 1])
+    rest = lines[at:]
+    if replace:
+        first = tree.keys["devices", replace].line - at - 1
+        last = first + 1
+        while last < len(rest) and rest[last].strip() and _indent(rest[last]) > column:
+            last += 1
+        return [*lines[: at - 1], head, *rest[:first], *_block(blocks, column), *rest[last:]]
+    return [*lines[: at - 1], head, *_block(blocks, column), *([""] if names else []), *rest]
+
+
+def _indent(line: str) -> int:
+    return len(line) - len(line.lstrip(" "))
+
+
+def _block(blocks: Blocks, column: int) -> list[str]:
+    lines: list[str] = []
+    for name, keys in blocks.items():
+        lines += [""] * bool(lines) + [f"{' ' * column}{name}:", *_keys(keys, column + INDENT)]
+    return lines
+
+
+def _keys(keys: Mapping[str, Any], column: int) -> list[str]:
+    lines: list[str] = []
+    for key, value in keys.items():
+        if isinstance(value, Mapping):
+            lines += [f"{' ' * column}{key}:", *_keys(value, column + INDENT)]
+        else:
+            lines.append(f"{' ' * column}{key}: {_scalar(value)}")
+    return lines
+
+
+def _scalar(value: object) -> str:
+    """A value as YAML; text in quotes unless every reader takes it for text without them."""
+    if isinstance(value, str) and _SAFE.fullmatch(value):
+        try:
+            if plain(value) == value:
+                return value
+        except ValueError:
+            pass
+    return msgspec.json.encode(value).decode()
+
 
 UNIT: Final = "imud.service"
 RELOAD: Final = ("systemctl", "try-reload-or-restart", UNIT)

@@ -7,16 +7,28 @@ adapters, group and service.
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+import textwrap
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, Final
 
 import msgspec
 
 from imud.cli.doctor.surroundings import Surroundings
-from imud.cli.setup.attached import Attached, Finders, PortNow, Wanted, look, ports_now
-from imud.cli.setup.changes import Change, describe, describe_undo
-from imud.cli.setup.conversation import ANSWERS_MAX, Conversation, attached_table
-from imud.cli.setup.journal import FILE, Journal, locked
+from imud.cli.output import COLUMNS, paragraph, shortened, table
+from imud.cli.setup.changes import FILE, Change, Journal, describe, describe_undo, locked
+from imud.cli.setup.hardware import (
+    BITRATE_DEFAULT,
+    BITRATE_MAX,
+    Attached,
+    Finders,
+    PortNow,
+    Wanted,
+    free_console,
+    look,
+    ports_now,
+    raise_can,
+    state,
+)
 from imud.cli.setup.plan import (
     CONTROLLERS,
     EXAMPLE_NODE,
@@ -31,12 +43,149 @@ from imud.cli.setup.plan import (
     real_path,
     service_reads,
 )
-from imud.cli.setup.samples import reasons, samples_table, wait_for_samples
-from imud.cli.setup.ways import BITRATE_DEFAULT, BITRATE_MAX, free_console, raise_can, state
-from imud.config import DEVICE_NAME
-from imud.contracts.status import DeviceStatus
-from imud.errors import ConfigError, ImudError
-from imud.links.can.netlink import absence, can_interfaces
+from imud.config.devices import DEVICE_NAME
+from imud.contracts.status import DeviceState, DeviceStatus
+from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
+from imud.links.netlink import absence, can_interfaces
+from imud.model.errors import BadArgument, ConfigError, ImudError
+from imud.model.units import NS_PER_MS
+
+FOUND_HEAD: Final = ("PORT", "DRIVER", "RATE", "ADAPTER", "CONFIGURED")
+TITLE_WIDTH: Final = 16
+CONFIGURED_WIDTH: Final = 10
+ANSWERS_MAX: Final = 10
+"""Wrong answers to one question after which it is given up."""
+
+
+class Conversation:
+    """Standard output and the terminal. Synchronization: one thread."""
+
+    def __init__(self, *, ask: bool, silent: bool = False) -> None:
+        """Without `ask` every question has its default answer."""
+        self.asks = ask
+        self._silent = silent
+
+    def say(self, text: str = "", indent: str = "") -> None:
+        """Print a paragraph."""
+        if not self._silent:
+            words = printable(text, MESSAGE_CHARACTERS_MAX)
+            print(
+                textwrap.fill(words, COLUMNS, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+            )
+
+    def show(self, lines: Sequence[str]) -> None:
+        """Print lines as they are: tables, lines of files."""
+        for line in lines if not self._silent else ():
+            print(printable(line, MESSAGE_CHARACTERS_MAX))
+
+    def agreed(self, question: str, *, default: bool) -> bool:
+        """Ask for yes or no. Raises BadArgument where there is no terminal to ask on."""
+        if not self.asks:
+            return default
+        word = self.answer(f"{question} [{'Y/n' if default else 'y/N'}]", "y" if default else "n")
+        return word.lower() in ("y", "yes")
+
+    def answer(self, question: str, default: str) -> str:
+        """Ask for a word; an empty answer is the default. Raises BadArgument where there is no terminal to ask on."""
+        if not self.asks:
+            return default
+        if not sys.stdin.isatty():
+            raise BadArgument("expected a terminal to ask on, or --yes")
+        try:
+            return input(f"{question} ").strip() or default
+        except KeyboardInterrupt:
+            self.show(["", "Nothing more was changed."])
+            raise
+        except EOFError:
+            self.show([""])
+            raise BadArgument("expected an answer, got the end of the input: nothing more was changed") from None
+
+
+def attached_table(found: Sequence[Attached]) -> list[str]:
+    """Format what is attached, and below it why nothing was found on a port."""
+    rows = [
+        (
+            one.node,
+            f"{one.driver} {one.device}".strip() or "-",
+            one.baud or "-",
+            shortened(one.title, TITLE_WIDTH) or "-",
+            shortened(one.configured, CONFIGURED_WIDTH) or "-",
+        )
+        for one in found
+    ]
+    lines = table(FOUND_HEAD, rows).splitlines()
+    for one in found:
+        if one.problem:
+            lines += paragraph("  ", f"{one.node}: {one.problem}")
+    return lines
+
+
+SAMPLES_HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "PRODUCT", "CLOCK ERROR")
+NAME_WIDTH: Final = 24
+PRODUCT_WIDTH: Final = 20
+LOOK_S: Final = 0.5
+"""Time between two looks."""
+SETTLE_S: Final = 4.0
+"""Time for the rate, a mean over seconds, and for the answer of the device to what it is."""
+
+
+def wait_for_samples(
+    ask: Callable[[], list[DeviceStatus]],
+    names: Collection[str],
+    limit_s: float,
+    now_s: Callable[[], float],
+    sleep: Callable[[float], None],
+) -> list[DeviceStatus]:
+    """Wait until all devices of these names run, and SETTLE_S more; return their status, at `limit_s` whatever it is.
+
+    Raises ImudError where the daemon does not answer until then.
+    """
+    end_s = now_s() + limit_s
+    settled_s = end_s
+    while True:
+        try:
+            found = [one for one in ask() if one.name in names]
+            problem: Exception | None = None
+        except (ImudError, TimeoutError, msgspec.ValidationError) as error:
+            found, problem = [], error
+        now = now_s()
+        runs = len(found) == len(names) and all(_runs(one) for one in found)
+        settled_s = min(settled_s, now + SETTLE_S) if runs else end_s
+        if now >= min(end_s, settled_s):
+            if problem is not None:
+                raise ImudError(f"the daemon does not answer: {problem}; `sudo imud doctor` says more")
+            return found
+        sleep(LOOK_S)
+
+
+def samples_table(found: Sequence[DeviceStatus]) -> str:
+    """Format rate, product and error of each device."""
+    return table(SAMPLES_HEAD, [_row(one) for one in found])
+
+
+def reasons(found: Sequence[DeviceStatus], names: Sequence[str]) -> list[str]:
+    """Say for each device of these names why it gives no samples; empty when all do."""
+    known = {one.name: one for one in found}
+    return [_reason(name, known.get(name)) for name in names if name not in known or not _runs(known[name])]
+
+
+def _reason(name: str, one: DeviceStatus | None) -> str:
+    return (
+        f"{name}: the daemon does not have it: `systemctl status imud`"
+        if one is None
+        else (f"{name}: {one.problem or one.state}")
+    )
+
+
+def _runs(one: DeviceStatus) -> bool:
+    return one.state is DeviceState.RUNNING
+
+
+def _row(one: DeviceStatus) -> tuple[object, ...]:
+    error = f"{one.clock.t_err_ns / NS_PER_MS:.3f} ms" if _runs(one) else "-"
+    product = shortened(one.identity.get("product", "-"), PRODUCT_WIDTH)
+    return shortened(one.name, NAME_WIDTH), one.state, one.rate_hz, product, error
+
 
 DONE, NOT_DONE = 0, 1
 CAN_UP_S: Final = 5.0

@@ -1,1 +1,1 @@
-"""Prometheus metrics over HTTP."""
+"""Part of imud."""

@@ -11,10 +11,22 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 import imud
-from imud.contracts.device_settings import SettingsState, SettingsStatus
-from imud.contracts.status import LATENCY_BOUNDS_NS, ClockStatus, DeviceState, DeviceStatus, LinesStatus, UtcStatus
-from imud.ledger import bytes_open, frames_open
-from imud.publishers.metrics.family import (
+from imud.contracts.setting import SettingsState, SettingsStatus
+from imud.contracts.status import (
+    LATENCY_BOUNDS_NS,
+    ClockStatus,
+    DeviceState,
+    DeviceStatus,
+    FlightStatus,
+    LinesStatus,
+    MqttStatus,
+    OutputStatus,
+    RecorderStatus,
+    UtcStatus,
+)
+from imud.model.ledger import bytes_open, frames_open
+from imud.model.sample import Sync, Vector3
+from imud.publishers.metrics.metric import (
     ACCELERATION,
     BYTES,
     CELSIUS,
@@ -32,10 +44,10 @@ from imud.publishers.metrics.family import (
     Snapshot,
     Unit,
     daemon,
+    each,
     status_part,
 )
 from imud.publishers.metrics.rings import MotionValues
-from imud.sample import Sync, Vector3
 
 DEVICE_INFO_LABELS: Final = ("device", "driver", "link", "product", "serial_number", "firmware")
 CLIENT_ENCODINGS: Final = ("json", "binary", "none")
@@ -498,3 +510,165 @@ FAMILIES: Final[tuple[Family | Histogram, ...]] = (
     *CLIENT_FAMILIES,
 )
 """Every metric, in the order they are shown."""
+
+
+def _mqtt(read: Callable[[MqttStatus], float]) -> Reader:
+    """A value of the output."""
+    return each(lambda snapshot: snapshot.mqtts, read)
+
+
+def _dropped(snapshot: Snapshot) -> Lines:
+    return [((cause,), count) for status in snapshot.mqtts for cause, count in status.dropped.items()]
+
+
+def _counter_of(name: str, words: str, read: Callable[[MqttStatus], float]) -> Family:
+    return Family(f"imud_mqtt_{name}_total", MetricType.COUNTER, NO_UNIT, words, _mqtt(read))
+
+
+def _gauge_of(name: str, unit: Unit, words: str, read: Callable[[MqttStatus], float]) -> Family:
+    return Family(f"imud_mqtt_{name}", MetricType.GAUGE, unit, words, _mqtt(read))
+
+
+MQTT_FAMILIES: Final = (
+    _gauge_of("connected", NO_UNIT, "1 while a broker is connected, else 0.", lambda status: bool(status.broker)),
+    _gauge_of(
+        "spooling", NO_UNIT, "1 while the spool can be written, 0 while the disk does not let it.",
+        lambda status: not status.spool_problem,
+    ),
+    _counter_of("queued", "Samples and events given to the output.", lambda status: status.queued),
+    _counter_of("spooled_messages", "Messages written to the spool.", lambda status: status.spooled),
+    _counter_of("sent_messages", "Messages sent, those sent again included.", lambda status: status.sent),
+    _counter_of("acknowledged_messages", "Messages that the broker has taken.", lambda status: status.acknowledged),
+    _gauge_of("waiting_messages", NO_UNIT, "Messages in the spool.", lambda status: status.waiting),
+    _gauge_of("spool_bytes", BYTES, "Room that the spool uses.", lambda status: status.spool_bytes),
+    _counter_of(
+        "thinned", "Samples of which only statistics are left, for want of room in the spool.",
+        lambda status: status.thinned,
+    ),
+    Family(
+        "imud_mqtt_dropped_total", MetricType.COUNTER, NO_UNIT, "Samples and events that were dropped, by cause.",
+        Reader(("cause",), _dropped),
+    ),
+    _counter_of("reconnects", "Connections to a broker after the first.", lambda status: status.reconnects),
+    _counter_of("commands", "Requests for actions that were carried out, or tried.", lambda status: status.commands),
+    _counter_of("commands_refused", "Requests for actions that were refused.", lambda status: status.commands_refused),
+)  # fmt: skip
+
+
+def _output(read: Callable[[OutputStatus], float]) -> Reader:
+    """A value of each way out."""
+
+    def lines(snapshot: Snapshot) -> Lines:
+        return [((status.name,), read(status)) for status in snapshot.outputs]
+
+    return Reader(("output",), lines)
+
+
+OUTPUT_FAMILIES: Final = (
+    Family(
+        "imud_nmea0183_sentences_total", MetricType.COUNTER, NO_UNIT, "Sentences sent.",
+        _output(lambda status: status.sent),
+    ),
+    Family(
+        "imud_nmea0183_sentences_dropped_total", MetricType.COUNTER, NO_UNIT,
+        "Sentences that were not sent because the way out had no room or was away.",
+        _output(lambda status: status.dropped),
+    ),
+    Family(
+        "imud_nmea0183_readers", MetricType.GAUGE, NO_UNIT,
+        "Clients of the TCP server; of a port or an address 1 while it takes what is sent, 0 while it does not.",
+        _output(lambda status: status.readers),
+    ),
+)  # fmt: skip
+
+
+def _recorder(read: Callable[[RecorderStatus], float]) -> Reader:
+    """A value of the recorder."""
+    return each(lambda snapshot: snapshot.recorders, read)
+
+
+def _flight(read: Callable[[FlightStatus], float]) -> Reader:
+    """A value of the flight recorder."""
+    return each(lambda snapshot: snapshot.flights, read)
+
+
+def _snapshots(snapshot: Snapshot) -> Lines:
+    """Snapshots by what became of them."""
+    return [
+        ((result,), getattr(status, result))
+        for status in snapshot.flights
+        for result in ("saved", "failed", "left_out")
+    ]
+
+
+def _disk(snapshot: Snapshot) -> Lines:
+    """Both recorders write to one directory; the one that always writes knows its present file, too."""
+    always = [status.disk_bytes for status in snapshot.recorders]
+    return [((), size) for size in always or [status.disk_bytes for status in snapshot.flights]]
+
+
+RECORDINGS_FAMILIES: Final = (
+    Family(
+        "imud_recordings_bytes", MetricType.GAUGE, BYTES,
+        "Size of all recordings in the directory of the recorder, snapshots included.", Reader((), _disk),
+    ),
+)  # fmt: skip
+
+RECORDER_FAMILIES: Final = (
+    Family(
+        "imud_recorder_active", MetricType.GAUGE, NO_UNIT, "1 while imud records, 0 while the disk does not let it.",
+        _recorder(lambda status: not status.problem),
+    ),
+    Family(
+        "imud_recorder_written_bytes_total", MetricType.COUNTER, BYTES, "Bytes written to recordings.",
+        _recorder(lambda status: status.written_bytes),
+    ),
+    Family(
+        "imud_recorder_records_total", MetricType.COUNTER, NO_UNIT, "Records written to recordings.",
+        _recorder(lambda status: status.records),
+    ),
+    Family(
+        "imud_recorder_records_dropped_total", MetricType.COUNTER, NO_UNIT,
+        "Records that are missing in recordings because the disk was too slow.",
+        _recorder(lambda status: status.records_dropped),
+    ),
+    Family(
+        "imud_recorder_waiting_bytes", MetricType.GAUGE, BYTES, "Records that wait to be written.",
+        _recorder(lambda status: status.waiting_bytes),
+    ),
+    Family(
+        "imud_recorder_files_removed_total", MetricType.COUNTER, NO_UNIT,
+        "Recordings that were removed to keep within the budget.",
+        _recorder(lambda status: status.files_removed),
+    ),
+)  # fmt: skip
+
+FLIGHT_FAMILIES: Final = (
+    Family(
+        "imud_flight_recorder_active", MetricType.GAUGE, NO_UNIT,
+        "1 while the flight recorder keeps what devices deliver, 0 while there is no room for it.",
+        _flight(lambda status: not status.problem),
+    ),
+    Family(
+        "imud_flight_recorder_kept_seconds", MetricType.GAUGE, SECONDS, "Length of what the flight recorder has.",
+        _flight(lambda status: status.kept_ns),
+    ),
+    Family(
+        "imud_flight_recorder_kept_bytes", MetricType.GAUGE, BYTES, "Size of what the flight recorder has.",
+        _flight(lambda status: status.kept_bytes),
+    ),
+    Family(
+        "imud_flight_recorder_records_dropped_total", MetricType.COUNTER, NO_UNIT,
+        "Records that the flight recorder does not have because this machine was too slow.",
+        _flight(lambda status: status.records_dropped),
+    ),
+    Family(
+        "imud_flight_recorder_snapshots_total", MetricType.COUNTER, NO_UNIT,
+        "Alerts whose snapshot was saved, could not be saved, or was one too many within an hour.",
+        Reader(("result",), _snapshots),
+    ),
+    Family(
+        "imud_flight_recorder_snapshots_sent_total", MetricType.COUNTER, NO_UNIT, "Snapshots that clients asked for.",
+        _flight(lambda status: status.sent),
+    ),
+)  # fmt: skip

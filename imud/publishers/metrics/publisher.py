@@ -27,18 +27,22 @@ from prometheus_client.registry import Collector
 from prometheus_client.samples import Sample as Line
 
 from imud.contracts.publisher import PublisherContext, PublisherType
-from imud.contracts.settings import Settings, is_ip_address, shown
 from imud.contracts.status import ClientStatus, DeviceStatus
-from imud.event import Event
-from imud.log import messages_dropped
-from imud.publishers.metrics.families import FAMILIES
-from imud.publishers.metrics.family import Snapshot
-from imud.publishers.metrics.mqtt import MQTT_FAMILIES
-from imud.publishers.metrics.outputs import OUTPUT_FAMILIES
-from imud.publishers.metrics.recorder import FLIGHT_FAMILIES, RECORDER_FAMILIES, RECORDINGS_FAMILIES
+from imud.host.log import messages_dropped
+from imud.model.event import Event
+from imud.model.options import Settings, is_ip_address, shown
+from imud.model.units import NS_PER_S
+from imud.publishers.metrics.families import (
+    FAMILIES,
+    FLIGHT_FAMILIES,
+    MQTT_FAMILIES,
+    OUTPUT_FAMILIES,
+    RECORDER_FAMILIES,
+    RECORDINGS_FAMILIES,
+)
+from imud.publishers.metrics.metric import Snapshot
 from imud.publishers.metrics.rings import RingReader
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
-from imud.units import NS_PER_S
 
 log = logging.getLogger(__name__)
 

@@ -23,11 +23,11 @@ from itertools import compress
 from operator import mul
 from typing import Final, NamedTuple
 
-from imud.errors import ServerError
 from imud.formats.ring import HEADER_BYTES, HEARTBEAT_LIMIT_NS, OPEN_FLAGS, STATE_LIVE, RingHeader, decode_header
 from imud.formats.slot import HAS_ACCEL, HAS_EULER, SLOT_BYTES, SLOT_FIELDS
-from imud.sample import Vector3
-from imud.units import NS_PER_S
+from imud.model.errors import ServerError
+from imud.model.sample import Vector3
+from imud.model.units import NS_PER_S
 
 LOOK_NS: Final = NS_PER_S
 """Rings are read at most once in this time; scrapes in between get the same values."""

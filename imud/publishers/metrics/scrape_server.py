@@ -17,8 +17,8 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Final
 
-from imud.errors import ServerError
-from imud.worker import share_interpreter
+from imud.host.threads import share_interpreter
+from imud.model.errors import ServerError
 
 CONNECTION_S: Final = 5.0
 """From connection to the end of the answer. Prometheus itself waits 10 s."""

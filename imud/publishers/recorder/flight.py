@@ -5,27 +5,473 @@ a bound, a device that is lost, or a GPIO line, has them saved to the directory 
 the socket gets them at once. A snapshot is a recording like any other.
 """
 
+import errno
 import logging
+import os
 import socket
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from imud.contracts.lines import Edge, WatchedInput
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import FlightStatus
-from imud.errors import ServerError, reason_of
-from imud.event import Event, EventKind
-from imud.publishers.recorder.alerts import Alert, AlertGate
-from imud.publishers.recorder.directory import RETRY_NS, SNAPSHOT, SUFFIX, RecordingDirectory
-from imud.publishers.recorder.feed import RecordFeed
-from imud.publishers.recorder.flight_writer import FlightWriter, Mark, Rescue, Save, Saved, Send
-from imud.publishers.recorder.segments import SEGMENTS_MAX, SegmentBegin, SegmentRing
-from imud.publishers.recorder.settings import MEGABYTE, RecorderSettings
-from imud.publishers.recorder.writer import RecordQueue
-from imud.units import NS_PER_S
-from imud.worker import BusThread, StartWorker
+from imud.formats.recording import HEAD, BlockEncoder, BlockGatherer, is_recording, renumbered
+from imud.host.threads import BusThread, StartWorker
+from imud.model.errors import ServerError, reason_of
+from imud.model.event import Event, EventKind
+from imud.model.units import NS_PER_S
+from imud.publishers.recorder.client_stream import FULL_NS, BlockSender
+from imud.publishers.recorder.directory import (
+    MEGABYTE,
+    RETRY_NS,
+    SNAPSHOT,
+    SUFFIX,
+    RecorderSettings,
+    RecordingDirectory,
+)
+from imud.publishers.recorder.writer import FLAGS, WRITE_NS, RecordFeed, RecordQueue
+
+HOUR_NS: Final = 3600 * NS_PER_S
+
+
+class Alert(NamedTuple):
+    """Something that is to be saved."""
+
+    t_ns: int
+    """CLOCK_MONOTONIC."""
+    device: str
+    """Empty for one of no device."""
+    reason: str
+    """What happened, one sentence."""
+
+
+class AlertGate:
+    """Decides on alerts: one at a time, for what follows it is in the same snapshot, and so many an hour.
+
+    Synchronization: one thread.
+    """
+
+    def __init__(self, after_ns: int, per_hour: int) -> None:
+        """`after_ns`: a snapshot is saved so long after its alert."""
+        self.pending: Alert | None = None
+        """The alert whose snapshot is to be saved."""
+        self.left_out = 0
+        """Alerts that were not saved since the last that was, because there were too many."""
+        self.left_out_total = 0
+        """The same since the start."""
+        self._after_ns = after_ns
+        self._per_hour = per_hour
+        self._accepted: deque[int] = deque()
+        """Times of those within an hour."""
+
+    def add(self, alert: Alert) -> bool:
+        """Take an alert; return False for the first one that is left out."""
+        if self.pending is not None:
+            return True
+        accepted = self._accepted
+        while accepted and alert.t_ns - accepted[0] >= HOUR_NS:
+            accepted.popleft()
+        if len(accepted) >= self._per_hour:
+            self.left_out += 1
+            self.left_out_total += 1
+            return self.left_out > 1
+        accepted.append(alert.t_ns)
+        self.pending = alert
+        self.left_out = 0
+        return True
+
+    def take_due(self, now_ns: int, *, at_once: bool = False) -> Alert | None:
+        """Return the alert whose snapshot is to be saved now, once; with `at_once` also one that is not due yet."""
+        alert = self.pending
+        if alert is None or (now_ns - alert.t_ns < self._after_ns and not at_once):
+            return None
+        self.pending = None
+        return alert
+
+
+SEGMENTS_MAX: Final = 64
+"""Each has a descriptor; the flight recorder makes half as many of the time that it keeps."""
+
+
+class SegmentBegin(NamedTuple):
+    """The mark at which a segment begins."""
+
+    t_ns: int
+    """CLOCK_MONOTONIC."""
+    session: bytes
+    """Record that a recording begins with."""
+    path: Path | None
+    """Its file; None for one in memory."""
+    drop_before_ns: int
+    """Segments that ended before this time are not kept any more, CLOCK_MONOTONIC."""
+
+
+@dataclass(slots=True)
+class Segment:
+    """A segment of the ring."""
+
+    t_ns: int
+    descriptor: int
+    path: Path | None
+    bytes: int = 0
+
+    def close(self) -> None:
+        """Give its room back; no-op if done."""
+        descriptor, self.descriptor = self.descriptor, -1
+        if descriptor >= 0:
+            os.close(descriptor)
+            if self.path is not None:
+                with suppress(OSError):
+                    self.path.unlink()
+
+
+class SegmentRing:
+    """The ring. Synchronization: the thread of the flight recorder; the counters are read by any."""
+
+    def __init__(self, bytes_max: int) -> None:
+        self.bytes = 0
+        """Size of all segments."""
+        self.oldest_ns = 0
+        """CLOCK_MONOTONIC at the begin of the oldest; 0 without any."""
+        self.newest_bytes = 0
+        """Size of the newest."""
+        self._bytes_max = bytes_max
+        self._segments: deque[Segment] = deque()
+
+    def begin(self, mark: SegmentBegin) -> None:
+        """Begin a segment, and drop those that are too old. Raises OSError."""
+        segments = self._segments
+        while len(segments) > 1 and segments[1].t_ns <= mark.drop_before_ns:
+            self._drop_oldest()
+        while len(segments) >= SEGMENTS_MAX:
+            self._drop_oldest()
+        if mark.path is None:
+            descriptor = os.memfd_create("imud flight recorder", os.MFD_CLOEXEC)
+        else:
+            descriptor = os.open(mark.path, FLAGS & ~os.O_WRONLY | os.O_RDWR, 0o640)
+        segments.append(Segment(mark.t_ns, descriptor, mark.path))
+        self.oldest_ns, self.newest_bytes = segments[0].t_ns, 0
+
+    def append(self, block: bytes) -> None:
+        """Append a block to the newest segment; the oldest go where there is no room. Raises OSError without any."""
+        segments = self._segments
+        while len(segments) > 1 and self.bytes + len(block) > self._bytes_max:
+            self._drop_oldest()
+        while not self._write(segments[-1], block):
+            if len(segments) == 1:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self._drop_oldest()
+
+    def _write(self, segment: Segment, block: bytes) -> bool:
+        """Append a whole block, or nothing; False where there is no room."""
+        try:
+            written = os.write(segment.descriptor, block)
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.ENOMEM, errno.EDQUOT):
+                raise
+            written = 0
+        if written < len(block):
+            os.ftruncate(segment.descriptor, segment.bytes)
+            os.lseek(segment.descriptor, segment.bytes, os.SEEK_SET)
+            return False
+        segment.bytes += written
+        self.bytes += written
+        self.newest_bytes = segment.bytes
+        return True
+
+    def _drop_oldest(self) -> None:
+        segment = self._segments.popleft()
+        self.bytes -= segment.bytes
+        segment.close()
+        self.oldest_ns = self._segments[0].t_ns if self._segments else 0
+
+    def clear(self) -> None:
+        """Drop all segments."""
+        while self._segments:
+            self._drop_oldest()
+        self.newest_bytes = 0
+
+    def reader(self, ending: bytes) -> "SegmentReader":
+        """Return a reader of what there is now, which goes on when segments are dropped. Raises OSError."""
+        opened: list[tuple[int, int]] = []
+        try:
+            for segment in self._segments:
+                opened.append((os.dup(segment.descriptor), segment.bytes))
+        except OSError:
+            for descriptor, _ in opened:
+                os.close(descriptor)
+            raise
+        return SegmentReader(opened, ending)
+
+
+class SegmentReader:
+    """Reader of the blocks of a snapshot. It closes its descriptors at the end. Synchronization: one thread."""
+
+    def __init__(self, opened: Sequence[tuple[int, int]], ending: bytes) -> None:
+        """`opened` are descriptors of segments with the bytes that are read of each; `ending` is the last record, or
+        nothing for a recording without its regular end."""
+        self.bytes = sum(size for _, size in opened)
+        """What a snapshot takes, about."""
+        self._opened = list(opened)
+        self._blocks = self._read(ending)
+
+    def next_block(self) -> bytes:
+        """Return the next block; nothing at the end. Raises OSError."""
+        return next(self._blocks, b"")
+
+    def close(self) -> None:
+        """Release the descriptors; may be called twice."""
+        while self._opened:
+            os.close(self._opened.pop()[0])
+
+    def _read(self, ending: bytes) -> Iterator[bytes]:
+        number = 0
+        while self._opened:
+            descriptor, size = self._opened[0]
+            is_first = number == 0
+            for index, block in enumerate(_blocks_of(descriptor, size)):
+                if index or is_first:  # the first block of a segment is its session
+                    yield renumbered(block, number)
+                    number += 1
+            os.close(self._opened.pop(0)[0])
+        if ending and number:
+            yield renumbered(BlockEncoder().encode(ending), number)
+
+
+def left_behind(files: Sequence[Path]) -> SegmentReader:
+    """Return a reader of the segments that a process left in files, in their order. Raises OSError."""
+    opened: list[tuple[int, int]] = []
+    try:
+        for path in files:
+            descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            opened.append((descriptor, os.fstat(descriptor).st_size))
+    except OSError:
+        for descriptor, _ in opened:
+            os.close(descriptor)
+        raise
+    return SegmentReader(opened, b"")
+
+
+def _blocks_of(descriptor: int, size: int) -> Iterator[bytes]:
+    """The whole blocks in so many bytes of a file; it may end in a part of one, if its writer was killed."""
+    at = 0
+    while at + HEAD.size <= size:
+        head = os.pread(descriptor, HEAD.size, at)
+        stored = HEAD.unpack(head)[4]
+        end = at + HEAD.size + stored
+        if not is_recording(head) or end > size:
+            return
+        yield head + os.pread(descriptor, stored, at + HEAD.size)
+        at = end
+
+
+class Save(NamedTuple):
+    """The mark at which a snapshot is to be saved."""
+
+    path: Path
+    ending: bytes
+    """Record that it ends with."""
+
+
+class Rescue(NamedTuple):
+    """The mark at which what another process left is to be saved, and then removed."""
+
+    path: Path
+    files: Sequence[Path]
+    """Its segments in their order."""
+
+
+class Send(NamedTuple):
+    """The mark at which a snapshot is to be sent to a client."""
+
+    sock: socket.socket
+    ending: bytes
+
+
+class Saved(NamedTuple):
+    """What became of a snapshot."""
+
+    path: Path
+    bytes: int
+    problem: str
+    """Why it was not saved, one sentence; empty if it was."""
+
+
+Mark = SegmentBegin | Save | Rescue | Send
+
+
+class FlightWriter:
+    """The thread. Synchronization: attributes are written by the thread and read by any."""
+
+    def __init__(
+        self,
+        queue: RecordQueue[Mark],
+        ring: SegmentRing,
+        directory: RecordingDirectory,
+        now_ns: Callable[[], int],
+        start_worker: StartWorker,
+    ) -> None:
+        self.problem = ""
+        """Why nothing is kept any more, until a new segment begins; empty while all is well."""
+        self.saved: deque[Saved] = deque()
+        """What became of snapshots; the loop takes it."""
+        self.failure: BaseException | None = None
+        """The exception that ended the thread, which is an internal error."""
+        self._queue = queue
+        self._ring = ring
+        self._directory = directory
+        self._now_ns = now_ns
+        self._gatherer = BlockGatherer()
+        self._is_open = False
+        self.sends_ended = 0
+        """Clients that have their snapshot, or have gone."""
+        self._sends: list[tuple[BlockSender, SegmentReader]] = []
+        self._worker = start_worker("flight", self._round, self._failed)
+        queue.ring = self._worker.ring
+
+    def close(self) -> None:
+        """Do what is asked for still, and end the thread; may be called twice."""
+        self._queue.ring = lambda: None
+        self._worker.end()
+        self._round()
+        for sender, reader in self._sends:
+            sender.close()
+            reader.close()
+        self._sends.clear()
+        self._ring.clear()
+
+    # --- the thread's side -------------------------------------------------------------------------------------------
+
+    def _round(self) -> int:
+        """Do all that waits; return the time until the next round, ns."""
+        while (item := self._queue.take()) is not None:
+            try:
+                if isinstance(item, bytes):
+                    self._append(self._gatherer.add(item) if self._is_open else b"")
+                else:
+                    self._mark(item)
+            except OSError as error:
+                self._fail(error)
+        try:
+            self._finish_block()
+        except OSError as error:
+            self._fail(error)
+        sending = [one for one in self._sends if not _is_sent(*one)]
+        self.sends_ended += len(self._sends) - len(sending)
+        self._sends = sending
+        return FULL_NS if self._sends else WRITE_NS
+
+    def _mark(self, mark: Mark) -> None:
+        if isinstance(mark, SegmentBegin):
+            self._finish_block()
+            self._gatherer = BlockGatherer()
+            self._ring.begin(mark)
+            self._is_open, self.problem = True, ""
+            self._gatherer.add(mark.session)
+            self._finish_block()
+            return
+        self._finish_block()
+        if isinstance(mark, Send):
+            self._send(mark)
+        elif isinstance(mark, Save):
+            self.saved.append(self._save(mark.path, lambda: self._ring.reader(mark.ending)))
+        else:
+            self._rescue(mark)
+
+    def _rescue(self, mark: Rescue) -> None:
+        """Save what was left, and remove it; where that is not possible, it is there at the next start."""
+        saved = self._save(mark.path, lambda: left_behind(mark.files))
+        self.saved.append(saved)
+        for file in mark.files if not saved.problem else ():
+            with suppress(OSError):
+                file.unlink()
+
+    def _send(self, mark: Send) -> None:
+        sender = BlockSender(mark.sock, self._now_ns)
+        try:
+            self._sends.append((sender, self._ring.reader(mark.ending)))
+        except OSError:  # no descriptors are left: the client sees an end without a recording
+            sender.close()
+            self.sends_ended += 1
+
+    def _finish_block(self) -> None:
+        if self._is_open:
+            self._append(self._gatherer.finish())
+
+    def _append(self, block: bytes) -> None:
+        if block:
+            self._ring.append(block)
+
+    def _save(self, path: Path, make_reader: Callable[[], SegmentReader]) -> Saved:
+        """Write the file, and leave nothing where that is not possible."""
+        self._directory.in_use.add(path.name)
+        try:
+            reader = make_reader()
+            try:
+                self._directory.make()
+                self._directory.make_room(reader.bytes)
+                size = _write(reader, path)
+                self._directory.add(size)
+                return Saved(path, size, "" if size else "nothing was kept")
+            finally:
+                reader.close()
+        except OSError as error:
+            return Saved(path, 0, reason_of(error))
+        finally:
+            self._directory.in_use.discard(path.name)
+
+    def _fail(self, error: OSError) -> None:
+        self._ring.clear()
+        self._gatherer = BlockGatherer()
+        self._is_open = False
+        self.problem = reason_of(error)
+
+    def _failed(self, error: BaseException) -> None:
+        self.failure = error
+
+
+def _write(reader: SegmentReader, path: Path) -> int:
+    """Write a snapshot; return its size. Leaves no file for an empty one, or where it raises OSError."""
+    size, descriptor = 0, os.open(path, FLAGS, 0o640)
+    try:
+        while block := reader.next_block():
+            rest = memoryview(block)
+            while rest:
+                rest = rest[os.write(descriptor, rest) :]
+            size += len(block)
+        if not size:
+            path.unlink()
+        os.fdatasync(descriptor)
+    except OSError:
+        with suppress(OSError):
+            path.unlink()
+        raise
+    finally:
+        os.close(descriptor)
+    return size
+
+
+def _is_sent(sender: BlockSender, reader: SegmentReader) -> bool:
+    """Send to a client as far as it takes something; return whether that is over, with everything closed then."""
+    block = b""
+    while not sender.ended and sender.send(block):
+        try:
+            block = reader.next_block()
+        except OSError:  # what was sent before is whole
+            block = b""
+        if not block:
+            sender.close()
+    if not sender.ended and sender.is_stuck:
+        sender.close()
+    if sender.ended:
+        reader.close()
+    return sender.ended
+
 
 log = logging.getLogger(__name__)
 

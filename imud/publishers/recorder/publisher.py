@@ -1,14 +1,187 @@
 """The output `recorder`: files that are always written, the flight recorder, or both, within one budget of the disk."""
 
+import logging
+import os
 from pathlib import Path
 
 from imud.contracts.publisher import Batch, Publisher, PublisherContext, PublisherType
-from imud.event import Event
-from imud.publishers.recorder.continuous import Recorder
-from imud.publishers.recorder.directory import RecordingDirectory
+from imud.contracts.status import RecorderStatus
+from imud.host.threads import BusThread, StartWorker
+from imud.model.errors import ServerError, reason_of
+from imud.model.event import Event, EventKind
+from imud.model.units import NS_PER_S
+from imud.publishers.recorder.directory import MEGABYTE, RETRY_NS, RecorderSettings, RecordingDirectory
 from imud.publishers.recorder.flight import FlightRecorder
-from imud.publishers.recorder.settings import RecorderSettings
-from imud.worker import BusThread, StartWorker
+from imud.publishers.recorder.writer import RecordFeed, RecordingWriter, RecordQueue
+
+log = logging.getLogger(__name__)
+
+
+class Recorder:
+    """The recorder. Synchronization: the event loop's thread only."""
+
+    def __init__(
+        self,
+        settings: RecorderSettings,
+        context: PublisherContext,
+        directory: RecordingDirectory,
+        start_worker: StartWorker = BusThread,
+    ) -> None:
+        self._settings = settings
+        self._context = context
+        self._start_worker = start_worker
+        self._directory = directory
+        self._file_bytes = round(settings.file_mb * MEGABYTE)
+        self._file_ns = round(settings.file_minutes * 60 * NS_PER_S)
+        self._queue = RecordQueue[Path]()
+        self._feed = RecordFeed(context, self._queue, settings.devices)
+        self._writer: RecordingWriter | None = None
+        self._number = 0
+        self._begun_ns = 0
+        self._path = Path()
+        self._problem = ""
+        self._due_ns = 0
+
+    # --- the publisher -----------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Make the directory and begin a file. Raises ServerError."""
+        try:
+            self._directory.make()
+            self._directory.make_room(self._file_bytes)
+        except OSError as error:
+            raise ServerError(f"recordings in {self._settings.directory}: {reason_of(error)}") from error
+        self._writer = RecordingWriter(self._queue, self._context.now_ns, self._start_worker)
+        self._begin_file()
+        self._context.recorder_sources.append(self.status)
+        log.info("recording to %s", self._settings.directory)
+
+    def add_device(self, name: str, device_id: int) -> None:
+        """Note the device: it is recorded from the next tick on, when it is there."""
+        self._feed.add_device(name, device_id)
+
+    def remove_device(self, name: str) -> None:
+        """Forget a device that left the configuration."""
+        self._feed.remove_device(name)
+
+    def publish(self, batch: Batch) -> None:
+        """No-op: what samples are made of is recorded."""
+
+    def event(self, event: Event) -> None:
+        """Record an event."""
+        if not self._problem and self._writer is not None:
+            self._feed.event(event)
+
+    def tick(self, now_ns: int) -> None:
+        """Record devices that are new, checks, losses; begin a file that is due; look after the disk."""
+        writer = self._writer
+        if writer is None:
+            return
+        if writer.failure is not None:
+            raise writer.failure
+        if self._problem:
+            if now_ns >= self._due_ns:
+                self._try_again(now_ns)
+            return
+        if writer.problem:
+            self._stop_recording(writer.problem, now_ns)
+            return
+        self._feed.follow()
+        if lost := self._feed.note_losses(now_ns):
+            self._raise(now_ns, f"the disk is too slow: {lost} records were not recorded")
+        is_full = writer.file_bytes >= self._file_bytes or now_ns - self._begun_ns >= self._file_ns
+        if self._feed.check_if_due(now_ns) and is_full:
+            self._next_file(now_ns)
+
+    def close(self) -> None:
+        """End the file regularly; may be called twice."""
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return
+        if self.status in self._context.recorder_sources:
+            self._context.recorder_sources.remove(self.status)
+        if not self._problem:
+            self._feed.check()
+            self._end_file("imud stopped")
+        self._feed.stop()
+        writer.close()
+        self._directory.in_use.discard(self._path.name)
+
+    def status(self) -> RecorderStatus:
+        """Return the state of the recorder."""
+        writer, queue = self._writer, self._queue
+        return RecorderStatus(
+            file=self._path.name if not self._problem else "",
+            problem=self._problem,
+            written_bytes=writer.written_bytes if writer is not None else 0,
+            records=writer.records if writer is not None else 0,
+            records_dropped=queue.dropped,
+            waiting_bytes=queue.waiting_bytes,
+            files_removed=self._directory.removed,
+            disk_bytes=self._directory.kept_bytes + (writer.file_bytes if writer is not None else 0),
+        )
+
+    # --- files -------------------------------------------------------------------------------------------------------
+
+    def _begin_file(self, end_of_last: str = "") -> None:
+        """Begin a file with what all records after it need; before it, end the last one, where a reason is given.
+
+        Each look at the clocks may record a reading of them: all come before the end of the last file.
+        """
+        context, now_ns = self._context, self._context.now_ns()
+        utc_ns = now_ns + context.utc_offset_ns()
+        self._directory.in_use.discard(self._path.name)
+        self._path = self._directory.new_file(utc_ns, context.epoch, self._number)
+        self._directory.in_use.add(self._path.name)
+        session = self._feed.session(self._number, now_ns)
+        if end_of_last:
+            self._end_file(end_of_last)
+        self._queue.mark(self._path)
+        self._feed.put(session)
+        self._number += 1
+        self._begun_ns = now_ns
+        self._feed.describe(at_once=True)
+
+    def _next_file(self, now_ns: int) -> None:
+        self._begin_file("a new file begins")
+        try:
+            removed = self._directory.make_room(self._file_bytes)
+        except OSError as error:
+            self._stop_recording(reason_of(error), now_ns)
+            return
+        if removed:
+            log.info("recordings removed to keep within %g GB: %s", self._settings.keep_gb, ", ".join(removed))
+
+    def _end_file(self, reason: str) -> None:
+        self._feed.put(self._feed.ending(reason))
+
+    # --- what goes wrong ---------------------------------------------------------------------------------------------
+
+    def _stop_recording(self, problem: str, now_ns: int) -> None:
+        self._feed.stop()
+        self._due_ns = now_ns + RETRY_NS
+        if problem != self._problem:
+            self._problem = problem
+            self._raise(now_ns, f"nothing is recorded: {self._settings.directory}: {problem}; samples go on")
+
+    def _try_again(self, now_ns: int) -> None:
+        problem = self._problem
+        self._due_ns = now_ns + RETRY_NS
+        try:
+            self._directory.make()
+            self._directory.make_room(self._file_bytes)
+            free = os.statvfs(self._directory.path)
+            if free.f_bavail * free.f_frsize < MEGABYTE:
+                return
+        except OSError:
+            return
+        self._problem = ""
+        self._begin_file()
+        self._raise(now_ns, f"recording again; it was not possible before: {problem}")
+
+    def _raise(self, now_ns: int, message: str) -> None:
+        log.warning("%s", message)
+        self._context.raise_event(Event(now_ns, "", EventKind.RECORDER, message))
 
 
 class RecorderOutput:

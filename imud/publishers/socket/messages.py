@@ -8,12 +8,12 @@ from typing import Annotated, Any, Final
 
 import msgspec
 
+from imud.attitude.conventions import Convention, Heading
+from imud.attitude.published import FrameWords
 from imud.contracts.status import DeviceState, DeviceStatus, SocketStatus
-from imud.event import Event
-from imud.frames.conventions import Convention, Heading
-from imud.frames.published import FrameWords
+from imud.model.event import Event
+from imud.model.sample import FieldInfo, Sample, Sync
 from imud.publishers.socket.subscription import Form
-from imud.sample import FieldInfo, Sample, Sync
 
 
 class BigNumbers(StrEnum):

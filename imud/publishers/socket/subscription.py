@@ -6,11 +6,10 @@ from enum import StrEnum
 from itertools import chain
 from typing import Final
 
+from imud.attitude.conventions import Convention
 from imud.contracts.publisher import Batch
-from imud.frames.conventions import Convention
-from imud.publishers.socket.encoding import BinaryEncoding, ConvertedEncoding, Encoding, JsonEncoding
-from imud.publishers.socket.outbox import Delivery, Outbox
-from imud.publishers.socket.serving import TokenBucket
+from imud.publishers.socket.outbox import BinaryEncoding, ConvertedEncoding, Delivery, Encoding, JsonEncoding, Outbox
+from imud.publishers.socket.scheduler import TokenBucket
 from imud.publishers.thinning import NOTHING, RateThinner
 
 PUBLISH_NS: Final = 1_000_000

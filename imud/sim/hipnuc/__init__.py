@@ -1,1 +1,1 @@
-"""Simulated HiPNUC modules, one module or folder per protocol, as in `imud.devices.hipnuc`."""
+"""Part of imud."""

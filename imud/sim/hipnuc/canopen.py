@@ -16,9 +16,9 @@ from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from typing import Final, Literal, NamedTuple
 
-from imud.attitude import euler312_from_quat
-from imud.devices.hipnuc.canopen import session as objects
-from imud.devices.hipnuc.canopen.cia301 import (
+from imud.attitude.rotation import euler312_from_quat
+from imud.drivers.hipnuc.canopen import commands as objects
+from imud.drivers.hipnuc.canopen.cia301 import (
     ABORT,
     HEARTBEAT,
     NMT,
@@ -37,8 +37,8 @@ from imud.devices.hipnuc.canopen.cia301 import (
     NmtState,
     abort_frame,
 )
-from imud.devices.hipnuc.canopen.codec import encode_tpdos
-from imud.devices.hipnuc.canopen.session import (
+from imud.drivers.hipnuc.canopen.codec import encode_tpdos
+from imud.drivers.hipnuc.canopen.commands import (
     BIT_RATES,
     IDENTITY_SUBS,
     TPDO_OBJECTS,
@@ -46,12 +46,11 @@ from imud.devices.hipnuc.canopen.session import (
     TPDO_TYPE,
     Transmission,
 )
-from imud.sample import Pair
+from imud.model.sample import Pair
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.can_module import BITRATE, CanSimulator, FrameWire, SentFrame
-from imud.sim.physics.motion import Truth
-from imud.sim.sensor import SensorHardware, sensor_of
-from imud.sim.simulator import SimulatorOptions
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.sim.physics import Truth
+from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
 NO_SUCH_OBJECT: Final = 0x0602_0000
 NO_SUCH_SUB_INDEX: Final = 0x0609_0011

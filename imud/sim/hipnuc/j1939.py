@@ -15,27 +15,26 @@ from dataclasses import dataclass, field, replace
 from math import atan2, cos, pi, sin
 from typing import Final, Literal
 
-from imud.devices.hipnuc.j1939 import messages, session
-from imud.devices.hipnuc.j1939.codec import FACTORY_ADDRESS, encode
-from imud.devices.hipnuc.j1939.session import LAYOUT, READ, WRITE
+from imud.drivers.hipnuc.j1939 import codec, commands
+from imud.drivers.hipnuc.j1939.codec import FACTORY_ADDRESS, encode
+from imud.drivers.hipnuc.j1939.commands import LAYOUT, READ, WRITE
 from imud.formats.j1939 import GLOBAL, J1939Id, join, split
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.can_module import BITRATE, CanSimulator, FrameWire, SentFrame
-from imud.sim.physics.motion import Truth
-from imud.sim.sensor import SensorHardware, sensor_of
-from imud.sim.simulator import SimulatorOptions
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.sim.physics import Truth
+from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
 INTERVAL_MS: Final = 100
 """Factory's interval of every message."""
 REPLY_NS: Final = 200_000
 """Time from a request to its reply (assumed)."""
 MESSAGES: Final = {
-    "": (messages.ACCEL, messages.GYRO, messages.ROLL_PITCH, messages.HEADING),
-    "all": messages.PGNS,
-    "inclinometer": (messages.INCLINOMETER,),
+    "": (codec.ACCEL, codec.GYRO, codec.ROLL_PITCH, codec.HEADING),
+    "all": codec.PGNS,
+    "inclinometer": (codec.INCLINOMETER,),
 }
 """PGNs that are on, by the name of a message; `` is what every module has."""
-SLOW: Final = (messages.TEMPERATURE, messages.UTC)
+SLOW: Final = (codec.TEMPERATURE, codec.UTC)
 SLOW_MS: Final = 1000
 """Interval of those in `all`."""
 YEAR: Final = 2025
@@ -89,7 +88,7 @@ class J1939Settings:
 
     intervals_ms: Mapping[int, int] = field(default_factory=lambda: dict.fromkeys(MESSAGES[""], INTERVAL_MS))
     """Of the messages that are on."""
-    bitrate_code: int = session.BITRATES.index(BITRATE)
+    bitrate_code: int = commands.BITRATES.index(BITRATE)
     address: int = FACTORY_ADDRESS
     x_reversed: int = 0
     y_reversed: int = 0
@@ -129,10 +128,10 @@ class HipnucJ1939Module:
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
         """Receive a frame of another node."""
         parts = split(can_id)
-        asks_claim = extended and parts.pgn == session.REQUEST and data[:3] == session.CLAIMED.to_bytes(3, "little")
+        asks_claim = extended and parts.pgn == commands.REQUEST and data[:3] == commands.CLAIMED.to_bytes(3, "little")
         if asks_claim and parts.destination in (self._address, GLOBAL) and now_ns >= self._begin_ns:
             self._claim(now_ns)
-        is_request = extended and parts.pgn == session.CONFIGURE and parts.destination == self._address
+        is_request = extended and parts.pgn == codec.CONFIGURE and parts.destination == self._address
         if is_request and len(data) == LAYOUT.size and now_ns >= self._begin_ns:
             self._sample(now_ns)
             register, command, _, value = LAYOUT.unpack(data)
@@ -170,7 +169,7 @@ class HipnucJ1939Module:
         hardware, settings = self.hardware, self.settings
         self._begin_ns = now_ns + hardware.boot_ms * NS_PER_MS
         self._address = settings.address
-        bitrate = session.BITRATES[settings.bitrate_code] if hardware.bitrate is None else hardware.bitrate
+        bitrate = commands.BITRATES[settings.bitrate_code] if hardware.bitrate is None else hardware.bitrate
         self._wire = FrameWire(bitrate, self._begin_ns)
         self._next_ms = dict.fromkeys(settings.intervals_ms, 0)
         self._leaving = []
@@ -178,7 +177,7 @@ class HipnucJ1939Module:
 
     def _claim(self, now_ns: int) -> None:
         if self.hardware.variant.claims_address:
-            can_id = join(J1939Id(session.REQUEST_PRIORITY, session.CLAIMED, self._address))
+            can_id = join(J1939Id(commands.REQUEST_PRIORITY, commands.CLAIMED, self._address))
             self._wire.send(now_ns + REPLY_NS, can_id, True, NAME)
             self.frames_sent += 1
 
@@ -211,15 +210,15 @@ class HipnucJ1939Module:
         """The data of a message."""
         roll, pitch, yaw = reading.euler_rad
         rows: dict[int, Callable[[], bytes]] = {
-            messages.ACCEL: lambda: messages.pack_accel(reading.accel_m_s2),
-            messages.GYRO: lambda: messages.pack_gyro(reading.gyro_rad_s),
-            messages.MAG: lambda: messages.pack_mag(reading.mag_t),
-            messages.ROLL_PITCH: lambda: messages.pack_roll_pitch(roll, pitch),
-            messages.HEADING: lambda: messages.pack_heading(yaw, twice=self.hardware.sends_heading_twice),
-            messages.TEMPERATURE: lambda: messages.pack_temperature(reading.temperature_c, reading.pressure_pa),
-            messages.QUATERNION: lambda: messages.pack_quaternion(reading.quat_wxyz),
-            messages.INCLINOMETER: lambda: messages.pack_inclinometer(*self._inclination(reading)),
-            messages.UTC: lambda: messages.pack_utc(YEAR, 1, 1, (sample_ns - self.epoch_ns) / NS_PER_S % 86_400),
+            codec.ACCEL: lambda: codec.pack_accel(reading.accel_m_s2),
+            codec.GYRO: lambda: codec.pack_gyro(reading.gyro_rad_s),
+            codec.MAG: lambda: codec.pack_mag(reading.mag_t),
+            codec.ROLL_PITCH: lambda: codec.pack_roll_pitch(roll, pitch),
+            codec.HEADING: lambda: codec.pack_heading(yaw, twice=self.hardware.sends_heading_twice),
+            codec.TEMPERATURE: lambda: codec.pack_temperature(reading.temperature_c, reading.pressure_pa),
+            codec.QUATERNION: lambda: codec.pack_quaternion(reading.quat_wxyz),
+            codec.INCLINOMETER: lambda: codec.pack_inclinometer(*self._inclination(reading)),
+            codec.UTC: lambda: codec.pack_utc(YEAR, 1, 1, (sample_ns - self.epoch_ns) / NS_PER_S % 86_400),
         }
         return rows[pgn]()
 
@@ -241,13 +240,13 @@ class HipnucJ1939Module:
             self._reply(register, command, present, now_ns)
         elif command == WRITE and register in variant.refuses:
             self._reply(register, command, value, now_ns, status=REFUSED)
-        elif command == WRITE and register == session.CONTROL:
+        elif command == WRITE and register == commands.CONTROL:
             self._control(value, now_ns)
-        elif command == WRITE and register == session.ONCE and value in session.INTERVALS:
+        elif command == WRITE and register == commands.ONCE and value in commands.INTERVALS:
             if variant.confirms_once:
                 self._reply(register, command, value, now_ns)
             self._send(value, self._reading(now_ns), now_ns)
-        elif command == WRITE and (register == session.ZERO or self._present(register) is not None):
+        elif command == WRITE and (register == commands.ZERO or self._present(register) is not None):
             self._write(register, value, now_ns)
 
     def _write(self, register: int, value: int, now_ns: int) -> None:
@@ -265,53 +264,53 @@ class HipnucJ1939Module:
     def _present(self, register: int) -> int | None:
         """The value of a register that can be read."""
         settings = self.settings
-        for pgn, interval_register in session.INTERVALS.items():
+        for pgn, interval_register in commands.INTERVALS.items():
             if register == interval_register:
                 return settings.intervals_ms.get(pgn, 0)
-        name = PRODUCT.encode().ljust(2 * len(session.PRODUCT_NAME), b"\0")
-        words = {register: 2 * place for place, register in enumerate(session.PRODUCT_NAME)}
+        name = PRODUCT.encode().ljust(2 * len(commands.PRODUCT_NAME), b"\0")
+        words = {register: 2 * place for place, register in enumerate(commands.PRODUCT_NAME)}
         if register in words:
             return int.from_bytes(name[words[register] :][:2], "big")
         return {
-            session.VERSION: FIRMWARE,
-            session.BITRATE: settings.bitrate_code,
-            session.ADDRESS: settings.address,
-            session.X_SIGN: settings.x_reversed,
-            session.Y_SIGN: settings.y_reversed,
+            commands.VERSION: FIRMWARE,
+            commands.BITRATE: settings.bitrate_code,
+            commands.ADDRESS: settings.address,
+            commands.X_SIGN: settings.x_reversed,
+            commands.Y_SIGN: settings.y_reversed,
         }.get(register)
 
     def _set(self, register: int, value: int, now_ns: int) -> None:
         """Set a register to a value that is in range."""
         settings = self.settings
-        pgn = next((pgn for pgn, address in session.INTERVALS.items() if address == register), None)
-        if pgn is not None and session.INTERVAL_MIN_MS <= value <= session.INTERVAL_MAX_MS:
+        pgn = next((pgn for pgn, address in commands.INTERVALS.items() if address == register), None)
+        if pgn is not None and commands.INTERVAL_MIN_MS <= value <= commands.INTERVAL_MAX_MS:
             self.settings = replace(settings, intervals_ms={**settings.intervals_ms, pgn: value})
             device_ms = (now_ns - self._begin_ns) / self._ns_per_ms
             self._next_ms[pgn] = (int(device_ms) // value + 1) * value
-        elif register == session.BITRATE and value < len(session.BITRATES):
+        elif register == commands.BITRATE and value < len(commands.BITRATES):
             self.settings = replace(settings, bitrate_code=value)
-        elif register == session.ADDRESS and session.MODULE_ADDRESS_MIN <= value <= session.MODULE_ADDRESS_MAX:
+        elif register == commands.ADDRESS and commands.MODULE_ADDRESS_MIN <= value <= commands.MODULE_ADDRESS_MAX:
             self.settings = replace(settings, address=value)
-        elif register == session.X_SIGN and value in (0, 1):
+        elif register == commands.X_SIGN and value in (0, 1):
             self.settings = replace(settings, x_reversed=value)
-        elif register == session.Y_SIGN and value in (0, 1):
+        elif register == commands.Y_SIGN and value in (0, 1):
             self.settings = replace(settings, y_reversed=value)
-        elif register == session.ZERO and value == session.Zero.HERE.value:
+        elif register == commands.ZERO and value == commands.Zero.HERE.value:
             self.settings = replace(settings, zero_rad=physical_inclination(self._reading(now_ns)))
-        elif register == session.ZERO and value == session.Zero.CANCEL.value:
+        elif register == commands.ZERO and value == commands.Zero.CANCEL.value:
             self.settings = replace(settings, zero_rad=(0.0, 0.0))
 
     def _control(self, value: int, now_ns: int) -> None:
         variant = self.hardware.variant
-        if value not in (session.SAVE, session.FACTORY, session.RESTART):
+        if value not in (commands.SAVE, commands.FACTORY, commands.RESTART):
             return
-        if value != session.RESTART or variant.confirms_restart:
-            wait_ns = variant.flash_ms * NS_PER_MS if value == session.SAVE else 0
-            self._reply(session.CONTROL, WRITE, value, now_ns + wait_ns)
-        if value == session.SAVE:
+        if value != commands.RESTART or variant.confirms_restart:
+            wait_ns = variant.flash_ms * NS_PER_MS if value == commands.SAVE else 0
+            self._reply(commands.CONTROL, WRITE, value, now_ns + wait_ns)
+        if value == commands.SAVE:
             self.flash = self.settings
             self.writes_to_flash += 1
-        elif value == session.FACTORY:
+        elif value == commands.FACTORY:
             self.flash = J1939Settings()
         else:
             leaving = self._wire.sent(now_ns + NS_PER_S)
@@ -322,7 +321,7 @@ class HipnucJ1939Module:
         self, register: int, command: int, value: int, now_ns: int, *, status: int = 0, source: int | None = None
     ) -> None:
         sender = self._address if source is None else source
-        can_id = join(J1939Id(messages.PRIORITY, session.CONFIGURE, sender, session.HOST_ADDRESS))
+        can_id = join(J1939Id(codec.PRIORITY, codec.CONFIGURE, sender, codec.HOST_ADDRESS))
         self._wire.send(now_ns + REPLY_NS, can_id, True, LAYOUT.pack(register, command, status, value))
         self.frames_sent += 1
 
@@ -341,11 +340,11 @@ def _within_pi(angle: float) -> float:
 def make(options: SimulatorOptions, now_ns: int) -> HipnucJ1939Module:
     """A module from the common options. Raises ValueError naming the option that it cannot have."""
     interval_ms = round(1000 / options.rate_hz) if options.rate_hz > 0 else 0
-    if not session.INTERVAL_MIN_MS <= interval_ms <= session.INTERVAL_MAX_MS:
-        raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … {1000 // session.INTERVAL_MIN_MS}")
+    if not commands.INTERVAL_MIN_MS <= interval_ms <= commands.INTERVAL_MAX_MS:
+        raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … {1000 // commands.INTERVAL_MIN_MS}")
     if options.message not in MESSAGES:
         raise ValueError(f"message {options.message!r}: expected {' or '.join(filter(None, MESSAGES))}, or none")
-    if options.node and not session.MODULE_ADDRESS_MIN <= options.node <= session.MODULE_ADDRESS_MAX:
+    if options.node and not commands.MODULE_ADDRESS_MIN <= options.node <= commands.MODULE_ADDRESS_MAX:
         raise ValueError(f"node {options.node}: expected an address 1 … 128, or 0 for {FACTORY_ADDRESS}")
     pgns = MESSAGES[options.message]
     settings = J1939Settings(

@@ -20,13 +20,20 @@ from math import atan2, cos, degrees, sin
 from random import Random
 from typing import Final, Literal
 
-from imud.devices.hipnuc.common.raw_units import QUAT_PER_LSB
-from imud.devices.hipnuc.modbus.codec import pack_block
-from imud.devices.hipnuc.modbus.frames import (
+from imud.drivers.hipnuc.common import QUAT_PER_LSB
+from imud.drivers.hipnuc.modbus.codec import pack_block
+from imud.drivers.hipnuc.modbus.commands import FACTORY_RESET, RESTART, SAVE
+from imud.drivers.hipnuc.modbus.registers import (
+    BAUD_RATES,
+    BLOCK_FIRST,
     BY_CHANCE,
+    BY_NAME,
     BY_SERIAL,
     CUSTOM,
+    FACTORY_BAUD,
     FACTORY_ID,
+    IDENTITY_FIRST,
+    QUAT_OLD_PER_LSB,
     RANDOMISE_IDS,
     READ,
     SET_ID_BY_SERIAL,
@@ -34,15 +41,6 @@ from imud.devices.hipnuc.modbus.frames import (
     pack_identity,
     registers_reply,
 )
-from imud.devices.hipnuc.modbus.registers import (
-    BAUD_RATES,
-    BLOCK_FIRST,
-    BY_NAME,
-    FACTORY_BAUD,
-    IDENTITY_FIRST,
-    QUAT_OLD_PER_LSB,
-)
-from imud.devices.hipnuc.modbus.session import FACTORY_RESET, RESTART, SAVE
 from imud.formats.modbus import (
     BROADCAST,
     CRC_BYTES,
@@ -56,14 +54,12 @@ from imud.formats.modbus import (
     framed,
     is_whole,
 )
-from imud.sample import Vector3
-from imud.sim.hipnuc.magnetometer import SelfCalibration
-from imud.sim.physics.motion import Motion, Truth, swing
-from imud.sim.physics.noise import Noise
+from imud.model.sample import Vector3
+from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+from imud.sim.hipnuc.uart_settings import SelfCalibration
+from imud.sim.physics import Motion, Noise, Truth, swing
 from imud.sim.ports.uart_wire import heard
-from imud.sim.sensor import motion_of, noise_of
-from imud.sim.simulator import Burst, Simulator, SimulatorOptions
-from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+from imud.sim.sensor import Burst, Simulator, SimulatorOptions, motion_of, noise_of
 
 NEW_FIRMWARE: Final = 169
 ILLEGAL_FUNCTION, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 3, 4

@@ -2,7 +2,7 @@
 
 Without I/O and without a clock of its own. It samples at whole periods of its own crystal, which runs `skew_ppm` fast,
 and sends the three messages of an instant, with the same SID, back to back `processing_ns` later. It ignores all other
-nodes and claims no address. Vessel and sensor frame: see `imud.devices.hipnuc.nmea2000.messages`. The rate of turn is
+nodes and claims no address. Vessel and sensor frame: see `imud.drivers.hipnuc.nmea2000`. The rate of turn is
 the sensor's rate about its own z.
 """
 
@@ -10,15 +10,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from imud.devices.hipnuc.nmea2000 import messages
-from imud.devices.hipnuc.nmea2000.codec import encode
-from imud.devices.hipnuc.nmea2000.driver import EXAMPLE_SOURCE
-from imud.devices.hipnuc.nmea2000.messages import Reference
+from imud.drivers.hipnuc import nmea2000 as messages
+from imud.drivers.hipnuc.nmea2000 import EXAMPLE_SOURCE, Reference, encode
 from imud.formats.j1939 import ADDRESS_MAX
 from imud.sim.can_module import CanSimulator, PeriodicCanModule
-from imud.sim.physics.motion import Truth
-from imud.sim.sensor import SensorHardware, sensor_of
-from imud.sim.simulator import SimulatorOptions
+from imud.sim.physics import Truth
+from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
 BITRATE: Final = 250_000
 """Of every NMEA 2000 bus."""

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from imud.attitude import euler_zyx_from_quat
-from imud.devices.imu61x.can.codec import BASE_ID, SET_FRAMES, encode_set
+from imud.attitude.rotation import euler_zyx_from_quat
+from imud.drivers.imu61x.can import BASE_ID, SET_FRAMES, encode_set
 from imud.formats.can import STANDARD_ID_MAX
 from imud.sim.can_module import BITRATE, CanSimulator, PeriodicCanModule
-from imud.sim.physics.motion import Truth
-from imud.sim.sensor import SensorHardware, sensor_of
-from imud.sim.simulator import SimulatorOptions
+from imud.sim.physics import Truth
+from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
 RATE_MAX_HZ: Final = 400.0
 

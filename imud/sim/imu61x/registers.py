@@ -16,15 +16,13 @@ from dataclasses import dataclass
 from random import Random
 from typing import Final
 
-from imud.attitude import euler_zyx_from_quat
-from imud.devices.imu61x.common import registers
-from imud.devices.imu61x.common.family import FILTER_DEFAULT, product_id_of
-from imud.devices.imu61x.i2c import codec as i2c
-from imud.devices.imu61x.spi import bursts as spi
-from imud.devices.imu61x.spi.words import PIPELINE_BYTES, PIPELINE_WORDS, write
-from imud.sim.imu61x.behaviour import RegisterBehaviour
-from imud.sim.physics.motion import Motion, Truth, swing
-from imud.units import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY_M_S2
+from imud.attitude.rotation import euler_zyx_from_quat
+from imud.drivers.imu61x import i2c, registers, spi
+from imud.drivers.imu61x.common import FILTER_DEFAULT, product_id_of
+from imud.drivers.imu61x.spi import PIPELINE_BYTES, PIPELINE_WORDS, write
+from imud.model.units import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY_M_S2
+from imud.sim.imu61x.uart import RegisterBehaviour
+from imud.sim.physics import Motion, Truth, swing
 
 UPDATE_NS: Final = NS_PER_MS
 """Time between two renewals of the registers (assumed)."""

@@ -16,24 +16,176 @@ device sent with `advance`. What it does, and what of it is assumed because the 
 - Heading starts as the truth has it and is not saved.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from math import degrees, pi, radians, remainder
 from typing import Final
 
-from imud.attitude import euler_zyx_from_quat
-from imud.devices.imu61x.uart.codec import encode_acknowledgement, encode_ahrs, encode_parameter, encode_status
-from imud.devices.imu61x.uart.commands import AHRS_FRAME_BYTES, BAUD_RATES, RATES_HZ, Command, OutputMode, max_rate_hz
-from imud.devices.imu61x.uart.framing import HOST_SYNC, Frame, FrameFinder
-from imud.devices.imu61x.uart.replies import PARAMETERS, Status
-from imud.ledger import Ledger
-from imud.sim.imu61x.behaviour import CALIBRATION_NS, Imu61xBehaviour
-from imud.sim.imu61x.settings import Imu61xSettings, ParameterRefused, changed
-from imud.sim.physics.motion import Truth
+from imud.attitude.rotation import euler_zyx_from_quat
+from imud.drivers.imu61x.common import FILTER_DEFAULT, I2C_ADDRESSES
+from imud.drivers.imu61x.registers import BURST_CTRL
+from imud.drivers.imu61x.uart.codec import (
+    AHRS_FRAME_BYTES,
+    HOST_SYNC,
+    PARAMETERS,
+    Frame,
+    FrameFinder,
+    Parameter,
+    Status,
+    encode_acknowledgement,
+    encode_ahrs,
+    encode_parameter,
+    encode_status,
+)
+from imud.drivers.imu61x.uart.commands import BAUD_RATES, RATES_HZ, BusMode, Command, OutputMode, max_rate_hz
+from imud.model.ledger import Ledger
+from imud.model.sample import Vector3
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, RAD_PER_DEG
+from imud.sim.physics import Truth
 from imud.sim.ports.uart_wire import Transmitter
-from imud.sim.sensor import SensorHardware, sensor_of
-from imud.sim.simulator import Burst, Simulator, SimulatorOptions
-from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US, RAD_PER_DEG
+from imud.sim.sensor import Burst, SensorHardware, Simulator, SimulatorOptions, sensor_of
+
+CALIBRATION_NS: Final = 3 * NS_PER_S
+"""Length of either calibration."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Imu61xBehaviour:
+    """One way to read the manual."""
+
+    answers_while_streaming: bool = True
+    """Whether it obeys more than CMD 3 in stream mode."""
+    baud_acts_at_start: bool = False
+    """Whether a new baud rate waits for the next start."""
+    reset_acts_at_start: bool = False
+    """Whether CMD 15 changes flash only, and acts at the next start."""
+    changes_mode: bool = True
+    """Whether it obeys the output mode it acknowledges."""
+    acknowledges: bool = True
+    """Whether it sends K1 at all."""
+    result_done: int = 0
+    """Result of K1 for what was carried out."""
+    result_refused: int = 2
+    """Result of K1 for what was not."""
+    refuses: frozenset[Command] = frozenset()
+    """Commands that are answered with `result_refused` and not carried out."""
+    ignores: frozenset[Command] = frozenset()
+    """Commands that are neither answered nor carried out."""
+    flash_ms: int = 0
+    """Time of CMD 5 and CMD 15 until their answer; nothing is sent and nothing heard meanwhile."""
+    quiet_ms: int = 0
+    """Time after K1 in which nothing is sent and nothing heard."""
+    acknowledges_at_end: bool = False
+    """Whether K1 of a calibration comes at its end."""
+    reports_calibration: bool = True
+    """Whether S1 is long enough to have a calibration status."""
+
+
+ORDERS: Final = frozenset(Command) - {Command.STATUS, Command.AHRS, Command.READ_PARAMETER}
+"""Commands without an answer of their own."""
+
+VARIANTS: Final[Mapping[str, Imu61xBehaviour]] = {
+    "obeys while it streams": Imu61xBehaviour(),
+    "answers in command mode only": Imu61xBehaviour(answers_while_streaming=False),
+    "K1 = 1 means done": Imu61xBehaviour(result_done=1, result_refused=0),
+    "no K1": Imu61xBehaviour(acknowledges=False),
+    "slow flash": Imu61xBehaviour(flash_ms=2000),
+    "quiet after an answer": Imu61xBehaviour(quiet_ms=700),
+    "baud rate at the next start": Imu61xBehaviour(baud_acts_at_start=True),
+    "factory reset at the next start": Imu61xBehaviour(reset_acts_at_start=True),
+    "K1 at the end of a calibration": Imu61xBehaviour(acknowledges_at_end=True),
+    "short status": Imu61xBehaviour(reports_calibration=False),
+    "all at once": Imu61xBehaviour(
+        answers_while_streaming=False, result_done=1, result_refused=0, flash_ms=2000, quiet_ms=700,
+        baud_acts_at_start=True, reset_acts_at_start=True,
+    ),
+}  # fmt: skip
+"""The simulated variants by name, each of which carries out its commands."""
+REFUSING: Final = Imu61xBehaviour(refuses=ORDERS)
+"""A device that answers questions and refuses every order."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegisterBehaviour:
+    """One way to read the manual's chapter 2."""
+
+    low_address: bool = True
+    """Whether BURST_CTRL reads back in the high byte of the word at 0x0C, as the manual's layout has it."""
+    high_address: bool = True
+    """Whether it reads back in the low byte of the word at 0x0D, as the vendor's program has it."""
+    window_bits: int = 0
+    """Bits of WIN_CTRL that are set next to its WINDOW_ID."""
+
+    def burst_ctrl(self, address: int, extended: int) -> int:
+        """The word that is read at 0x0C or 0x0D."""
+        if address == BURST_CTRL:
+            return extended << 8 if self.low_address else 0
+        return extended if self.high_address else 0
+
+
+REGISTER_VARIANTS: Final[Mapping[str, RegisterBehaviour]] = {
+    "BURST_CTRL at both addresses": RegisterBehaviour(),
+    "BURST_CTRL at 0x0C": RegisterBehaviour(high_address=False),
+    "BURST_CTRL at 0x0D": RegisterBehaviour(low_address=False),
+    "BURST_CTRL reads zero": RegisterBehaviour(low_address=False, high_address=False),
+    "other bits in WIN_CTRL": RegisterBehaviour(window_bits=0xA5FE),
+}
+"""The simulated variants by name."""
+
+GYRO_OFFSETS: Final = (Parameter.GYRO_X_OFF, Parameter.GYRO_Y_OFF, Parameter.GYRO_Z_OFF)
+INSTALLATION_ANGLES: Final = (Parameter.INSTALL_X_OFF, Parameter.INSTALL_Y_OFF, Parameter.INSTALL_Z_OFF)
+
+
+class ParameterRefused(ValueError):
+    """A parameter or value that the device does not have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Imu61xSettings:
+    """Settings that CMD 5 saves. The defaults are the factory's."""
+
+    mode: OutputMode = OutputMode.STREAM
+    baud: int = 115_200
+    rate_hz: int = 100
+    bus_mode: BusMode = BusMode.SPI
+    i2c_address: int = I2C_ADDRESSES[0]
+    filter_control: int = FILTER_DEFAULT
+    gyro_off_deg_s: Vector3 = (0.0, 0.0, 0.0)
+    """Taken off what the gyroscope measures."""
+    install_off_deg: Vector3 = (0.0, 0.0, 0.0)
+
+    def value(self, index: int) -> float:
+        """A parameter by its index. Raises ParameterRefused."""
+        values: dict[int, float] = {
+            Parameter.BAUD: self.baud,
+            Parameter.AHRS_RATE: self.rate_hz,
+            Parameter.BUS_MODE: self.bus_mode.value,
+            Parameter.I2C_ADDRESS: self.i2c_address,
+            Parameter.FILTER: self.filter_control,
+            **dict(zip(GYRO_OFFSETS, self.gyro_off_deg_s, strict=True)),
+            **dict(zip(INSTALLATION_ANGLES, self.install_off_deg, strict=True)),
+        }
+        if index not in values:
+            raise ParameterRefused(f"parameter {index}")
+        return values[index]
+
+
+def changed(settings: Imu61xSettings, index: int, value: float) -> Imu61xSettings:
+    """The settings after CMD 14. Raises ParameterRefused."""
+    factory = Imu61xSettings()
+    match index:
+        case Parameter.BAUD:
+            return replace(settings, baud=int(value) if value in BAUD_RATES else factory.baud)
+        case Parameter.AHRS_RATE:
+            return replace(settings, rate_hz=int(value) if value in RATES_HZ else factory.rate_hz)
+        case Parameter.BUS_MODE if value in [mode.value for mode in BusMode]:
+            return replace(settings, bus_mode=BusMode(int(value)))
+        case Parameter.I2C_ADDRESS if value in I2C_ADDRESSES:
+            return replace(settings, i2c_address=int(value))
+        case Parameter.FILTER if 0 <= value <= 0xFF and value == int(value):
+            return replace(settings, filter_control=int(value))
+    raise ParameterRefused(f"parameter {index} = {value}")
+
 
 TX_BUFFER_BYTES: Final = 512
 """A frame that would make more than this wait for the wire is not sent."""

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from random import Random
 
-from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US, uart_byte_ns
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, uart_byte_ns
 
 
 @dataclass(frozen=True, slots=True)

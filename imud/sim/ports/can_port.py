@@ -12,10 +12,10 @@ import socket
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from imud.errors import LinkError
 from imud.formats.can import ERROR_FLAG, EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, REMOTE_FLAG, pack_frame
-from imud.links.can.frame_reader import MessageBuffers, Vector, libc
-from imud.links.can.netlink import can_interfaces
+from imud.links.netlink import can_interfaces
+from imud.links.socketcan import MessageBuffers, Vector, libc
+from imud.model.errors import LinkError
 from imud.sim.can_module import CanModule
 
 READ_BYTES: Final = 4096

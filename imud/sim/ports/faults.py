@@ -12,9 +12,9 @@ from inspect import signature
 from random import Random
 from typing import Final, NamedTuple, TypeVar
 
+from imud.model.units import NS_PER_MS
 from imud.sim.ports.uart_wire import heard
-from imud.sim.simulator import Burst
-from imud.units import NS_PER_MS
+from imud.sim.sensor import Burst
 
 R = TypeVar("R")
 

@@ -6,16 +6,22 @@ The owner calls `step` right before it moves the bytes of the same device, so th
 the frame that follows it.
 """
 
+import asyncio
 from bisect import bisect_right, insort
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from enum import StrEnum
+from pathlib import Path
 from random import Random
+from time import sleep
 from typing import Final, NamedTuple, Protocol, TextIO, runtime_checkable
 
+from imud.contracts.lines import Edge, InputSettings, LineFactory, OnEdges, OnLineEnd, OutputSettings
+from imud.model.errors import LinkError
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.ports.faults import parse_rates
-from imud.units import NS_PER_MS
+from imud.sim.sensor import StreamModule
 
 OnEdge = Callable[[int, bool], None]
 """Called with the time at which an edge is due (CLOCK_MONOTONIC, ns) and whether it is a rising one."""
@@ -168,3 +174,267 @@ def pin_rates(text: str) -> PinFaultRates:
 
 def _due_ns(edge: PinEdge) -> int:
     return edge.due_ns
+
+
+class MemoryInput:
+    """An `InputLine` that the simulated device drives by `edge`. Synchronization: the loop's thread only."""
+
+    def __init__(self, title: str = "memory line", rising_only: bool = False) -> None:
+        self.title = title
+        self.open_error: LinkError | None = None
+        """Error that `open` raises."""
+        self.is_open = False
+        self._rising_only = rising_only
+        self._watch = True
+        self._level = False
+        self._lost = 0
+        self._number = 0
+        self._waiting: list[Edge] = []
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._on_edges: OnEdges | None = None
+        self._on_end: OnLineEnd | None = None
+
+    @property
+    def edges_lost(self) -> int:
+        """Number of edges that `lose` simulated."""
+        return self._lost
+
+    # --- the device's side -------------------------------------------------------------------------------------------
+
+    def edge(self, t_ns: int, rising: bool) -> None:
+        """Change the level at that time. Delivered by the loop in its next round, or by `drain`."""
+        self._level = rising
+        if self.is_open and (rising or not self._rising_only):
+            self._number += 1
+            self._waiting.append(Edge(t_ns, rising, self._number))
+            if self._loop is not None and self._watch and len(self._waiting) == 1:
+                self._loop.call_soon(self.drain)
+
+    def pulse(self, t_ns: int, width_ns: int) -> None:
+        """Pulse the line: up at that time, and down again."""
+        self.edge(t_ns, True)
+        self.edge(t_ns + width_ns, False)
+
+    def lose(self, count: int) -> None:
+        """Simulate edges that the kernel drops."""
+        self._number += count
+        self._lost += count
+
+    def vanish(self, error: LinkError) -> None:
+        """End the line with an error: the chip is removed."""
+        on_end = self._on_end
+        self.close()
+        if on_end is not None:
+            on_end(error)
+
+    # --- imud's side -------------------------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Open the line; edges count from now on. Raises `open_error`."""
+        if self.open_error is not None:
+            raise self.open_error
+        self.is_open = True
+
+    def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
+        """Deliver edges from now on, and those since `open`; without `watch` only when `drain` is called."""
+        self._on_edges, self._on_end = on_edges, on_end
+        self._loop = asyncio.get_running_loop()
+        self._watch = watch
+        if watch:
+            self._loop.call_soon(self.drain)
+
+    def fileno(self) -> int:
+        """Return -1: edges come without the kernel."""
+        return -1
+
+    def drain(self) -> None:
+        """Deliver the buffered edges."""
+        if self._on_edges is not None and self._waiting:
+            found, self._waiting = self._waiting, []
+            self._on_edges(found)
+
+    def level(self) -> bool:
+        """Return the level of the last edge. Raises LinkError."""
+        if not self.is_open:
+            raise LinkError(f"{self.title} is not open")
+        return self._level
+
+    def close(self) -> None:
+        """Stop the delivery of edges; may be called twice."""
+        self.is_open = False
+        self._waiting = []
+        self._loop = self._on_edges = self._on_end = None
+
+
+class MemoryOutput:
+    """An `OutputLine` that records its changes."""
+
+    def __init__(
+        self,
+        title: str = "memory line",
+        *,
+        now_ns: Callable[[], int] = lambda: 0,
+        on_change: Callable[[int, bool], None] | None = None,
+    ) -> None:
+        """`now_ns` dates changes; without it, all are at 0.
+
+        `on_change` is the device: called with the time and the new level, in the thread that drives the line.
+        """
+        self.title = title
+        self.open_error: LinkError | None = None
+        """Error that `open` raises."""
+        self.set_error: LinkError | None = None
+        """Error that `set` raises."""
+        self.is_open = False
+        self.active = False
+        self.history: list[tuple[int, bool]] = []
+        """Time (ns) and level of every change."""
+        self._now_ns = now_ns
+        self._on_change = on_change
+
+    def open(self) -> None:
+        """Open the line, inactive. Raises `open_error`."""
+        if self.open_error is not None:
+            raise self.open_error
+        self.is_open = True
+        self._become(False)
+
+    def set(self, active: bool) -> None:
+        """Set the level. Raises `set_error`, and LinkError where the line is not open."""
+        if self.set_error is not None or not self.is_open:
+            raise self.set_error or LinkError(f"{self.title} is not open")
+        self._become(active)
+
+    def close(self) -> None:
+        """Release the line, inactive; may be called twice."""
+        if self.is_open:
+            self._become(False)
+        self.is_open = False
+
+    def _become(self, active: bool) -> None:
+        if active != self.active:
+            self.active = active
+            now_ns = self._now_ns()
+            self.history.append((now_ns, active))
+            if self._on_change is not None:
+                self._on_change(now_ns, active)
+
+
+class MemoryLines:
+    """Factory of lines inside the process, which keeps them by their purpose, for example `bow sout`."""
+
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self.inputs: dict[str, MemoryInput] = {}
+        self.outputs: dict[str, MemoryOutput] = {}
+        self._now_ns = now_ns
+        self.maker = LineFactory(self.input, self.output)
+
+    def input(self, _settings: InputSettings, purpose: str, rising_only: bool = False) -> MemoryInput:
+        """Return the input of that purpose; the same one every time."""
+        return self.inputs.setdefault(purpose, MemoryInput(purpose, rising_only))
+
+    def output(self, _settings: OutputSettings, purpose: str) -> MemoryOutput:
+        """Return the output of that purpose; the same one every time."""
+        return self.outputs.setdefault(purpose, MemoryOutput(purpose, now_ns=self._now_ns))
+
+
+SIN_LOOK_NS: Final = 4 * NS_PER_MS
+"""Interval of reading SIN: a pulse has to be longer."""
+
+
+class MarkedModule(Protocol):
+    """A device with a sync input."""
+
+    def mark(self, now_ns: int) -> None:
+        """Pulse its sync input (a rising edge)."""
+        ...
+
+
+class PullFile:
+    """A line of a gpio-sim chip, driven through its `pull` file in sysfs; the kernel stamps the edge at the write."""
+
+    def __init__(self, path: Path, settle_s: float = 0.0) -> None:
+        """Wait `settle_s` after each rising edge: an edge that comes before the kernel has reported the last one is
+        not seen, and a frame must not come before its edge. Raises OSError."""
+        self._file = path.open("wb", buffering=0)
+        self._settle_s = settle_s
+
+    def __call__(self, _due_ns: int, rising: bool) -> None:
+        """Drive the line. Raises OSError."""
+        self._file.write(b"pull-up" if rising else b"pull-down")
+        if rising and self._settle_s:
+            sleep(self._settle_s)
+
+    def close(self) -> None:
+        """Close the file; the level stays. May be called twice."""
+        self._file.close()
+
+
+class SinFile:
+    """SIN of a device, read from the `value` file of a gpio-sim line that the program under test drives.
+
+    sysfs reports no change there, so the owner looks as often as it likes; the edge is as late as the look.
+    """
+
+    def __init__(self, path: Path, module: MarkedModule) -> None:
+        self._path, self._module = path, module
+        self._level = True  # a line that is high from the beginning has no edge
+
+    def look(self, now_ns: int) -> None:
+        """Pass a rising edge since the last call to the module. Raises OSError."""
+        level = self._path.read_bytes().strip() == b"1"
+        if level and not self._level:
+            self._module.mark(now_ns)
+        self._level = level
+
+
+class SimulatedLines:
+    """The lines next to a device's data: its pins on the way out, SIN on the way in. Synchronization: one thread."""
+
+    def __init__(
+        self, module: StreamModule, files: Mapping[Pin, PullFile], faults: PinFaults | None = None,
+        truth: TextIO | None = None, sin: Path | None = None,
+    ) -> None:  # fmt: skip
+        """`files` and `truth` are closed by `close`. Raises ValueError for pins that this device does not have."""
+        self._files, self._truth = files, truth
+        self._pins: Pins | None = None
+        if files:
+            if not isinstance(module, PinModule):
+                raise ValueError("pins: this device has none that are simulated")
+            self._pins = Pins(module, files, faults, truth)
+        self._sin = SinFile(sin, module) if sin else None
+
+    def step(self, now_ns: int) -> None:
+        """Do all that is due, right before the port does. Raises OSError."""
+        if self._sin is not None:
+            self._sin.look(now_ns)
+        if self._pins is not None:
+            self._pins.step(now_ns)
+
+    def next_ns(self, now_ns: int) -> int:
+        """Latest time of the next call of `step`."""
+        next_ns = self._pins.next_ns() if self._pins is not None else None
+        latest_ns = now_ns + (SIN_LOOK_NS if self._sin is not None else NS_PER_S)
+        return latest_ns if next_ns is None else min(next_ns, latest_ns)
+
+    def summary(self) -> dict[str, int]:
+        """Counters by name."""
+        return self._pins.summary() if self._pins is not None else {}
+
+    def close(self) -> None:
+        """Close the files; may be called twice."""
+        for file in self._files.values():
+            file.close()
+        if self._truth is not None:
+            self._truth.close()
+
+
+def pull_files(text: str, settle_s: float = 0.0) -> dict[Pin, PullFile]:
+    """Files by pin from `sout=PATH,alarm=PATH`. Raises ValueError, OSError."""
+    files: dict[Pin, PullFile] = {}
+    for part in filter(None, text.split(",")):
+        name, _, path = part.partition("=")
+        if name not in set(Pin) or not path:
+            raise ValueError(f"pin {part!r}: expected NAME=PATH with one of {', '.join(Pin)}")
+        files[Pin(name)] = PullFile(Path(path), settle_s)
+    return files

@@ -21,11 +21,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, TextIO
 
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.ports.arrival import ArrivalProfile
 from imud.sim.ports.faults import Faults
 from imud.sim.ports.uart_wire import heard
-from imud.sim.simulator import Burst, StreamModule
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.sim.sensor import Burst, StreamModule
 
 TCGETS2: Final = 0x802C542A
 TCSETS2: Final = 0x402C542B

@@ -3,8 +3,8 @@
 from collections import deque
 from typing import Final
 
-from imud.sim.simulator import Burst
-from imud.units import BITS_PER_UART_BYTE, NS_PER_S
+from imud.model.units import BITS_PER_UART_BYTE, NS_PER_S
+from imud.sim.sensor import Burst
 
 TOLERANCE: Final = 0.03
 """Rates closer than this read alike: at ±5 % the last of 10 bits is sampled half a bit off, and edges are not ideal."""

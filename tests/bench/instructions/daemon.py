@@ -17,8 +17,8 @@ import msgspec
 from imud import config
 from imud.daemon import Daemon
 from imud.formats.jsonrpc import encode_request, line_of
-from imud.runtime.event_loop import ReaderSelector, SampleLoop
-from imud.units import NS_PER_MS
+from imud.host.event_loop import ReaderSelector, SampleLoop
+from imud.model.units import NS_PER_MS
 from tests.bench.instructions import virtual_time
 from tests.bench.instructions.module import BAUD, SETTLE_READS, Module, Read
 

@@ -8,8 +8,8 @@ Frames, their times of arrival and the small delays in them are the same in ever
 import struct
 from typing import Final, NamedTuple
 
-from imud.devices.hipnuc.uart.codec import encode_frame, encode_hi91
-from imud.units import NS_PER_MS, uart_byte_ns
+from imud.drivers.hipnuc.uart.codec import encode_frame, encode_hi91
+from imud.model.units import NS_PER_MS, uart_byte_ns
 from tests.bench.instructions.virtual_time import BEGIN_NS
 
 BAUD: Final = 921600

@@ -13,25 +13,25 @@ from itertools import islice
 from random import Random
 from typing import Final
 
-from imud.clock import SampleClock
 from imud.contracts.codec import StreamCodec
 from imud.contracts.publisher import Batch, PublisherContext
-from imud.devices.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings, encode_tpdos
-from imud.devices.hipnuc.uart.codec import HipnucCodec, HipnucSettings
-from imud.devices.imu61x.can.codec import BASE_ID, Imu61xCanCodec, Imu61xCanSettings, encode_set
-from imud.devices.imu61x.uart.codec import Imu61xCodec, encode_ahrs
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings, encode_tpdos
+from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucSettings
+from imud.drivers.imu61x.can import BASE_ID, Imu61xCanCodec, Imu61xCanSettings, encode_set
+from imud.drivers.imu61x.uart.codec import Imu61xCodec, encode_ahrs
+from imud.fleet.writer import WriterQueue
 from imud.formats.can import pack_frame
 from imud.formats.jsonrpc import encode_request, line_of
 from imud.formats.slot import encode_slot, encode_slots
-from imud.host_clock import HostClock
-from imud.ledger import Ledger
-from imud.links.can.frame_reader import FrameReader
-from imud.publishers.mqtt.writer import WriterQueue
-from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
-from imud.publishers.socket.publisher import SocketServer, SocketSettings
-from imud.runtime.path import PathContext, StreamPath
-from imud.sample import Measurement, Sample
-from imud.units import NS_PER_MS, uart_byte_ns
+from imud.host.clock import HostClock
+from imud.links.socketcan import FrameReader
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement, Sample
+from imud.model.units import NS_PER_MS, uart_byte_ns
+from imud.publishers.shm import ShmPublisher, ShmSettings
+from imud.publishers.socket.server import SocketServer, SocketSettings
+from imud.sampling.clock import SampleClock
+from imud.sampling.path import PathContext, StreamPath
 from tests.bench.instructions import virtual_time
 from tests.bench.instructions.daemon import BUFFER, DRAIN_EVERY, VirtualDaemon, own_group
 from tests.bench.instructions.figures import INTERPRETER

@@ -8,7 +8,7 @@ import time
 from functools import partial
 from typing import Final
 
-from imud.units import NS_PER_S
+from imud.model.units import NS_PER_S
 
 BEGIN_NS: Final = 1000 * NS_PER_S
 UTC_AHEAD_NS: Final = 1_795_000_000 * NS_PER_S

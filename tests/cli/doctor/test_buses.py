@@ -6,11 +6,11 @@ import msgspec
 import pytest
 
 from imud.cli.doctor.buses import bus_nodes, i2c_transfers, spi_transfers
-from imud.cli.doctor.finding import DoctorCheck
+from imud.cli.doctor.surroundings import DoctorCheck
 from imud.contracts.status import DeviceState, DeviceStatus, PollingStatus
-from imud.devices.imu61x.common.register_driver import identity_of
-from imud.errors import DeviceRefused, LinkError
+from imud.drivers.imu61x.registers import identity_of
 from imud.links.spi import WR_BITS_PER_WORD, WR_MODE, SpiLink, SpiSettings
+from imud.model.errors import DeviceRefused, LinkError
 from tests.support.metrics import device
 from tests.support.surroundings import Machine
 

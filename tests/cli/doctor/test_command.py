@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from imud.cli.doctor.command import CHECKS
-from imud.cli.doctor.report import examine, exit_status, verdict
+from imud.cli.doctor.command import CHECKS, examine, exit_status, verdict
 from imud.contracts.status import KernelCounters
 from tests.cli.conftest import Cli
 from tests.support.files import ROOT

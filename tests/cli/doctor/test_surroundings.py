@@ -7,7 +7,7 @@ import pytest
 
 from imud.cli.doctor import surroundings
 from imud.cli.doctor.surroundings import ask_daemon, fetch_over_http, measure_sync_s, run_command
-from imud.errors import LinkMissing, ServerError
+from imud.model.errors import LinkMissing, ServerError
 from tests.support.metrics import device
 from tests.support.surroundings import Machine
 

@@ -7,12 +7,11 @@ from typing import Final
 import pytest
 
 from imud.cli.doctor.surroundings import CommandOutput
-from imud.cli.probe.report import ProbeReport
-from imud.cli.setup.attached import Attached, Finders
-from imud.cli.setup.conversation import Conversation
-from imud.cli.setup.steps import SetupSteps
+from imud.cli.probe import ProbeReport
+from imud.cli.setup.hardware import Attached, Finders
+from imud.cli.setup.steps import Conversation, SetupSteps
 from imud.contracts.status import DeviceStatus
-from imud.errors import LinkMissing
+from imud.model.errors import LinkMissing
 from tests.support.surroundings import Machine
 
 GROUPS: Final = "root:x:0:\nimud:x:990:\nimud-control:x:991:\n"

@@ -8,9 +8,9 @@ import pytest
 
 from imud.cli.doctor.surroundings import Surroundings
 from imud.cli.setup import command
-from imud.cli.setup.attached import Wanted
 from imud.cli.setup.command import numbered, sudo_user
-from imud.cli.setup.conversation import Conversation
+from imud.cli.setup.hardware import Wanted
+from imud.cli.setup.steps import Conversation
 from tests.cli.conftest import Cli
 
 

@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 
 from imud import config
-from imud.cli.setup import changes, journal
-from imud.cli.setup.attached import Wanted
+from imud.cli.setup import changes
+from imud.cli.setup import changes as journal
+from imud.cli.setup.hardware import Wanted
 from imud.contracts.status import DeviceState
-from imud.errors import BadArgument, ConfigError, ImudError
-from imud.files import replace_file
+from imud.host.files import replace_file
+from imud.model.errors import BadArgument, ConfigError, ImudError
 from tests.cli.setup.conftest import Attachments, LivingMachine, Setup
 from tests.support.files import ROOT
 from tests.support.metrics import device

@@ -20,8 +20,8 @@ from pathlib import Path
 from time import monotonic, monotonic_ns, sleep
 from typing import Final
 
-from imud.ledger import lost
-from imud.sample import Sample
+from imud.model.ledger import lost
+from imud.model.sample import Sample
 from tests.lab.chaos import account as accounts
 from tests.lab.chaos.account import Account, Hole, Interval
 from tests.lab.chaos.daemon import Life, Snapshot, memory_control

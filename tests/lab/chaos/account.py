@@ -23,15 +23,15 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 from imud.contracts.status import DeviceStatus
-from imud.ledger import bytes_open, frames_open
-from imud.sample import Sample
+from imud.model.ledger import bytes_open, frames_open
+from imud.model.sample import Sample
 
 LEARNED: Final = 4
-"""So many equal steps in a row are a rate (imud.clock.period_learner.CONSISTENT); before that no loss can be known."""
+"""So many equal steps in a row are a rate (imud.sampling.device_time.CONSISTENT); before that no loss can be known."""
 KNOWN: Final = 80
 """After so many samples since the device began, its counter is known over a link that was away. A fit needs 8
-(imud.clock.sampler.ENOUGH_POINTS), the pace of numbered samples four windows of 16 where one is disturbed
-(imud.clock.gaps.WINDOW_MESSAGES); one more window for SIGSTOP."""
+(imud.sampling.clock.ENOUGH_POINTS), the pace of numbered samples four windows of 16 where one is disturbed
+(imud.sampling.gaps.WINDOW_MESSAGES); one more window for SIGSTOP."""
 UNKNOWN_MOST: Final = 2
 """A hole before the rate is known is seen twice: as a step longer than the one before, and than the one after."""
 

@@ -13,12 +13,12 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from imud.client import Client, Ring
-from imud.client.watch import Watch
+from imud.client.connection import Client, Watch
+from imud.client.ring import Ring
 from imud.contracts.status import DeviceState, DeviceStatus
-from imud.errors import ImudError
 from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
-from imud.sample import Sample
+from imud.model.errors import ImudError
+from imud.model.sample import Sample
 from tests.lab.waiting import wait_until
 
 START_LIMIT_S: Final = 60.0

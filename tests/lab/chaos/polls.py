@@ -13,11 +13,11 @@ from itertools import pairwise
 from time import monotonic_ns
 from typing import Any, Final, NamedTuple
 
-from imud.devices.hipnuc.modbus.registers import BLOCK_REGISTERS
+from imud.drivers.hipnuc.modbus.registers import BLOCK_REGISTERS
 from imud.formats.modbus import READ_OVERHEAD_BYTES
-from imud.sample import Sample
+from imud.model.sample import Sample
 from imud.sim.imu61x.registers import Imu61xRegisters
-from imud.sim.simulator import Burst
+from imud.sim.sensor import Burst
 from tests.lab.chaos.account import Interval
 from tests.lab.wire import Refuse
 

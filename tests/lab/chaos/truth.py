@@ -9,13 +9,12 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
-from imud.devices.imu61x.can.codec import encode_set
-from imud.sample import Sample, Vector3
+from imud.drivers.imu61x.can import encode_set
+from imud.model.sample import Sample, Vector3
+from imud.model.units import NS_PER_MS
 from imud.sim.can_module import BITRATE, PeriodicCanModule
-from imud.sim.physics.motion import Truth
-from imud.sim.sensor import SensorHardware
-from imud.sim.simulator import Burst, StreamModule
-from imud.units import NS_PER_MS
+from imud.sim.physics import Truth
+from imud.sim.sensor import Burst, SensorHardware, StreamModule
 
 BASE: Final = 512
 """Of the number that an acceleration carries: x has the lower part, y the upper one."""

@@ -24,12 +24,12 @@ CLOCK = ("arrival_fit", "arrival_time", "device_utc", "edge_pairing", "even_arri
 """Tests of the clock but for those that play hours of arrivals: several minutes each where they are emulated."""
 PARTS = {
     "codecs": (
-        *("tests/formats", "tests/devices/hipnuc/common", "tests/devices/imu61x/common"),
-        *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("tests/devices/**/test_codec.py")),
-        *(f"tests/devices/test_every_{kind}_driver.py" for kind in ("stream", "can", "polled")),
+        *("tests/formats", "tests/drivers/hipnuc/common", "tests/drivers/imu61x/common"),
+        *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("tests/drivers/**/test_codec.py")),
+        *(f"tests/drivers/test_every_{kind}_driver.py" for kind in ("stream", "can", "polled")),
     ),
-    "clock": tuple(f"tests/clock/test_{name}.py" for name in CLOCK),
-    "ring": ("tests/publishers/shm/test_publisher.py", "tests/client/test_ring.py"),
+    "clock": tuple(f"tests/sampling/test_{name}.py" for name in CLOCK),
+    "ring": ("tests/publishers/test_shm.py", "tests/client/test_ring.py"),
     "C header": ("tests/include",),
 }
 """What is run: folders and files of tests by what they test. Not those of sessions, settings and simulators, which have

@@ -11,10 +11,21 @@ from prometheus_client.parser import text_string_to_metric_families as parse_tex
 
 import imud
 from imud.contracts import status as states
-from imud.event import EventKind
-from imud.ledger import LEDGER_FIELDS
-from imud.publishers.metrics.families import FAMILIES, LINE_FAMILIES, POLLING_FAMILIES, TIME_FAMILIES
-from imud.publishers.metrics.family import (
+from imud.model.event import EventKind
+from imud.model.ledger import LEDGER_FIELDS
+from imud.model.sample import Sync
+from imud.publishers.metrics.families import (
+    FAMILIES,
+    FLIGHT_FAMILIES,
+    LINE_FAMILIES,
+    MQTT_FAMILIES,
+    OUTPUT_FAMILIES,
+    POLLING_FAMILIES,
+    RECORDER_FAMILIES,
+    RECORDINGS_FAMILIES,
+    TIME_FAMILIES,
+)
+from imud.publishers.metrics.metric import (
     ACCELERATION,
     BYTES,
     CELSIUS,
@@ -26,12 +37,8 @@ from imud.publishers.metrics.family import (
     MetricType,
     Snapshot,
 )
-from imud.publishers.metrics.mqtt import MQTT_FAMILIES
-from imud.publishers.metrics.outputs import OUTPUT_FAMILIES
 from imud.publishers.metrics.publisher import ClientTotals, Renderer
-from imud.publishers.metrics.recorder import FLIGHT_FAMILIES, RECORDER_FAMILIES, RECORDINGS_FAMILIES
 from imud.publishers.metrics.rings import RingView
-from imud.sample import Sync
 from imud.utc.rmc_feed import Refusal
 from tests.support.files import ROOT
 from tests.support.metrics import FRAME, LINES, UTC, client, device, equipped, views

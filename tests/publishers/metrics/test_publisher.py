@@ -16,8 +16,8 @@ from prometheus_client.parser import text_string_to_metric_families as parse_tex
 
 from imud.contracts.publisher import PublisherContext
 from imud.contracts.status import DeviceStatus
-from imud.errors import ServerError
-from imud.event import Event, EventKind
+from imud.model.errors import ServerError
+from imud.model.event import Event, EventKind
 from imud.publishers import PUBLISHERS
 from imud.publishers.metrics.publisher import MetricsPublisher, MetricsSettings
 from tests.support.event_loops import in_loop

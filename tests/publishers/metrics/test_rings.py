@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from imud.formats.slot import SLOT_BYTES, encode_slot
+from imud.model.sample import Sample, Sync, Vector3
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.publishers.metrics.rings import MotionValues, RingReader, RingView, motion_of
-from imud.sample import Sample, Sync, Vector3
-from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board
 
 OVERTAKEN_SLOTS, SAMPLES_MAX = 8, 4096

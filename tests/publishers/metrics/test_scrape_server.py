@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from imud.errors import ServerError
+from imud.model.errors import ServerError
 from imud.publishers.metrics import scrape_server
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer, parse_request
 from tests.support.event_loops import in_loop

@@ -4,14 +4,13 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from imud.contracts.control.recording import PutRecord
-from imud.contracts.publisher import PublisherContext
-from imud.event import Event
-from imud.formats.recording import records
-from imud.formats.recording.file import RecordingReader
-from imud.formats.recording.records import Kind, Record
-from imud.units import NS_PER_S
-from imud.worker import Round
+from imud.contracts.publisher import PublisherContext, PutRecord
+from imud.formats import records
+from imud.formats.recording import RecordingReader
+from imud.formats.records import Kind, Record
+from imud.host.threads import Round
+from imud.model.event import Event
+from imud.model.units import NS_PER_S
 from tests.support.event_loops import VirtualClock
 from tests.support.signal_bench import HandWorker
 

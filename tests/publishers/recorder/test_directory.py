@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from imud.model.units import NS_PER_S
 from imud.publishers.recorder.directory import NAME, RecordingDirectory
-from imud.units import NS_PER_S
 
 
 def filled(folder: Path, keep_bytes: int, *sizes: int) -> RecordingDirectory:

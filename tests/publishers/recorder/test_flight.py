@@ -8,16 +8,15 @@ import pytest
 
 from imud.contracts.lines import Edge, InputSettings, OnEdges
 from imud.contracts.publisher import Batch, NoLine
-from imud.errors import ServerError
-from imud.event import Event, EventKind
-from imud.formats.recording import records
-from imud.formats.recording.file import RecordingReader
-from imud.formats.recording.records import EndRecord, Kind, SessionRecord, decode_object
-from imud.publishers.recorder.directory import RecordingDirectory
+from imud.formats import records
+from imud.formats.recording import RecordingReader
+from imud.formats.records import EndRecord, Kind, SessionRecord, decode_object
+from imud.model.errors import ServerError
+from imud.model.event import Event, EventKind
+from imud.model.units import NS_PER_S
+from imud.publishers.recorder.client_stream import stream_pair
+from imud.publishers.recorder.directory import FlightSettings, RecorderSettings, RecordingDirectory
 from imud.publishers.recorder.flight import FlightRecorder
-from imud.publishers.recorder.settings import FlightSettings, RecorderSettings
-from imud.publishers.recorder.stream import stream_pair
-from imud.units import NS_PER_S
 from tests.publishers.recorder.recording_bench import RecordingBench, records_in
 from tests.support.socket_rig import sample
 

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from imud.formats.recording import records
-from imud.formats.recording.records import NO_DEVICE, EndRecord, Kind, SessionRecord
+from imud.formats import records
+from imud.formats.records import NO_DEVICE, EndRecord, Kind, SessionRecord
+from imud.publishers.recorder.client_stream import stream_pair
 from imud.publishers.recorder.directory import RecordingDirectory
-from imud.publishers.recorder.flight_writer import FlightWriter, Mark, Rescue, Save, Send
-from imud.publishers.recorder.segments import SegmentBegin, SegmentRing
-from imud.publishers.recorder.stream import stream_pair
+from imud.publishers.recorder.flight import FlightWriter, Mark, Rescue, Save, SegmentBegin, SegmentRing, Send
 from imud.publishers.recorder.writer import RecordQueue
 from tests.publishers.recorder.recording_bench import RecordingBench, kinds_in, records_in
 

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from imud.errors import ServerError
-from imud.event import Event, EventKind
-from imud.formats.recording.records import Kind
+from imud.formats.records import Kind
+from imud.model.errors import ServerError
+from imud.model.event import Event, EventKind
+from imud.publishers.recorder.directory import FlightSettings, RecorderSettings
 from imud.publishers.recorder.publisher import PUBLISHER
-from imud.publishers.recorder.settings import FlightSettings, RecorderSettings
 from tests.publishers.recorder.recording_bench import RecordingBench, kinds_in
 from tests.support.socket_rig import batch
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from imud.formats.recording import records
-from imud.formats.recording.file import RecordingReader
+from imud.formats import records
+from imud.formats.recording import RecordingReader
 from imud.publishers.recorder.writer import RecordingWriter, RecordQueue
 from tests.support.event_loops import VirtualClock
 from tests.support.signal_bench import HandWorker

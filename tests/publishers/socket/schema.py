@@ -12,9 +12,9 @@ from typing import Any, Final
 import msgspec
 
 from imud.formats.jsonrpc import Code, is_big
-from imud.publishers.socket.encoding import ALWAYS_FIELDS
 from imud.publishers.socket.messages import NOTIFICATIONS
-from imud.publishers.socket.rpc import METHODS
+from imud.publishers.socket.methods import METHODS
+from imud.publishers.socket.outbox import ALWAYS_FIELDS
 
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 DIGITS: Final = "^-?[0-9]+$"

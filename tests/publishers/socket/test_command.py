@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from imud.publishers.socket.publisher import SocketServer
-from imud.publishers.socket.rights import Guard, Rights
+from imud.publishers.socket.admission import Guard, Rights
+from imud.publishers.socket.server import SocketServer
 from tests.support import socket_rig
 from tests.support.socket_rig import Peer, in_server, run, serving, until
 

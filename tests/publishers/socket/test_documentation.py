@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from imud.contracts import status as states
-from imud.contracts.device_settings import SettingsState, SettingsStatus, StepOutcome
-from imud.event import Event, EventKind
+from imud.contracts.setting import SettingsState, SettingsStatus, StepOutcome
 from imud.formats.jsonrpc import DEFAULT_PATH, LINE_MAX_BYTES, Code
+from imud.model.event import Event, EventKind
+from imud.publishers.socket.methods import METHODS, RATE_MAX_HZ, RATE_MIN_HZ
 from imud.publishers.socket.outbox import Limits
-from imud.publishers.socket.publisher import SocketServer, SocketSettings
-from imud.publishers.socket.rpc import METHODS, RATE_MAX_HZ, RATE_MIN_HZ
+from imud.publishers.socket.server import SocketServer, SocketSettings
 from tests.support.files import ROOT
 from tests.support.socket_rig import LIMIT_S, NOW_NS, Peer, batch, daemon, in_server, until
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from imud.publishers.socket.publisher import SocketServer
-from tests.publishers.socket.test_waker import notified
+from imud.publishers.socket.server import SocketServer
+from tests.publishers.socket.test_client_waker import notified
 from tests.support.socket_rig import Peer, batch, in_context, serving, until
 
 Asked = dict[str, tuple[float, tuple[str, ...] | None]]

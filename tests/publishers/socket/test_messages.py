@@ -10,11 +10,11 @@ from typing import Any, get_args
 import msgspec
 import pytest
 
-from imud.event import Event, EventKind
-from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
+from imud.model.event import Event, EventKind
+from imud.publishers.shm import ShmPublisher, ShmSettings
 from imud.publishers.socket.messages import NOTIFICATIONS
-from imud.publishers.socket.publisher import SocketServer
-from imud.publishers.socket.rpc import METHODS
+from imud.publishers.socket.methods import METHODS
+from imud.publishers.socket.server import SocketServer
 from tests.publishers.socket.schema import socket_document, socket_schema
 from tests.support.daemon_process import LIMIT_S, sending_daemon
 from tests.support.files import ROOT, hi91

@@ -14,11 +14,18 @@ import pytest
 
 from imud.formats.jsonrpc import encode_notification
 from imud.formats.slot import SLOT_BYTES, decode_slot
-from imud.publishers.socket.connection import Connection
-from imud.publishers.socket.encoding import BinaryEncoding, JsonEncoding
-from imud.publishers.socket.outbox import REPLY_BYTES, SAMPLE_BYTES, Delivery, Limits, Outbox, Pool
-from imud.publishers.socket.publisher import SocketServer
-from imud.publishers.socket.waker import BYTE
+from imud.publishers.socket.client import BYTE, Connection
+from imud.publishers.socket.outbox import (
+    REPLY_BYTES,
+    SAMPLE_BYTES,
+    BinaryEncoding,
+    Delivery,
+    JsonEncoding,
+    Limits,
+    Outbox,
+    Pool,
+)
+from imud.publishers.socket.server import SocketServer
 from tests.support.socket_rig import Peer, batch, in_server, run, until
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from imud.publishers.socket.publisher import SocketServer
+from imud.publishers.socket.server import SocketServer
 from imud.publishers.socket.subscription import Form, Subscription
 from tests.support.socket_rig import Peer, batch, in_server
 

@@ -5,10 +5,12 @@ import math
 
 import pytest
 
-from imud.attitude import euler312_from_quat
-from imud.devices.hipnuc.canopen import cia301, session
-from imud.devices.hipnuc.canopen.cia301 import NmtCommand
-from imud.devices.hipnuc.canopen.session import InclinometerZero, Transmission
+from imud.attitude.rotation import euler312_from_quat
+from imud.drivers.hipnuc.canopen import cia301
+from imud.drivers.hipnuc.canopen import commands as session
+from imud.drivers.hipnuc.canopen.cia301 import NmtCommand
+from imud.drivers.hipnuc.canopen.commands import InclinometerZero, Transmission
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.can_module import SentFrame
 from imud.sim.hipnuc.canopen import (
     SIMULATOR,
@@ -17,8 +19,7 @@ from imud.sim.hipnuc.canopen import (
     NodeSettings,
     ObjectDictionary,
 )
-from imud.sim.simulator import SimulatorOptions
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.sim.sensor import SimulatorOptions
 from tests.support.simulated_modules import BEGIN_NS, QUIET, CanopenBench
 
 MS = NS_PER_MS

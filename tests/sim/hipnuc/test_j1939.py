@@ -8,20 +8,18 @@ from functools import partial
 
 import pytest
 
-from imud.contracts.codec import ReplyFrame
-from imud.contracts.session import Outcome, Rejection, Reply, Request, RequestScript, Silence
-from imud.devices.hipnuc.j1939 import messages, session
-from imud.devices.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Settings
-from imud.devices.hipnuc.j1939.session import J1939Node
-from imud.errors import NoReply, Rejected
+from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
+from imud.drivers.hipnuc.j1939 import codec, commands
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Settings, J1939Node
 from imud.formats.can import EXTENDED_ID_MAX, RAW_FRAME
 from imud.formats.j1939 import split
-from imud.ledger import Ledger
-from imud.sample import Measurement
+from imud.model.errors import NoReply, Rejected
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
 from imud.sim.can_module import CanModules, SentFrame
 from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings, J1939Variant
-from imud.sim.physics.motion import Still
-from imud.sim.simulator import SimulatorOptions
+from imud.sim.physics import Still
+from imud.sim.sensor import SimulatorOptions
 from tests.support.simulated_modules import run_script
 
 BEGIN_NS = 5_000_000_000
@@ -87,7 +85,7 @@ class J1939Host:
 
 
 def restarted(peer: J1939Node) -> RequestScript[None]:
-    yield session.restart_request(peer)
+    yield commands.restart_request(peer)
 
 
 def test_values_are_the_truth_of_the_sample_instant() -> None:
@@ -117,7 +115,7 @@ def test_four_modules_crystal_wire_and_the_next_frame() -> None:
         assert len(found) >= 94
 
     module = made(baud=250_000, skew_ppm=1000.0)
-    frames = [f for f in module.advance(BEGIN_NS + SECOND_NS) if split(f.can_id).pgn != session.CLAIMED]
+    frames = [f for f in module.advance(BEGIN_NS + SECOND_NS) if split(f.can_id).pgn != commands.CLAIMED]
     assert [b.due_ns - a.due_ns for a, b in itertools.pairwise(frames[:4])] == [560_000] * 3  # 140 bits
     assert [split(frame.can_id).pgn for frame in frames[:4]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41]
     assert module.counters() == {"samples_sent": 101, "frames_sent": 405, "requests": 0}
@@ -136,13 +134,13 @@ def test_four_modules_crystal_wire_and_the_next_frame() -> None:
 @pytest.mark.manual("B 6.2.2 intervals", "B 6.2.2 bit rate", "B 6.2.2 address")
 def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
     bench = J1939Host(made())
-    bench.talk(lambda peer: session.set_interval(peer, 0xFF37, 20))
-    bench.talk(lambda peer: session.set_interval(peer, 0xFF4A, 500))  # switched on by it
+    bench.talk(lambda peer: commands.set_interval(peer, 0xFF37, 20))
+    bench.talk(lambda peer: commands.set_interval(peer, 0xFF4A, 500))  # switched on by it
     counts = pgns(bench.wait(SECOND_NS))
     assert counts[0xFF34] == pytest.approx(100, abs=1)
     assert counts[0xFF37] == pytest.approx(50, abs=1)
     assert counts[0xFF4A] == 2
-    settings = bench.talk(session.read_settings)
+    settings = bench.talk(commands.read_settings)
     assert isinstance(settings, dict)
     assert settings["interval_ms_FF37"] == "20"
     assert settings["address"] == "8"
@@ -150,38 +148,38 @@ def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
 
     bench = J1939Host(made(boot_ms=200))
     bench.wait(300 * MS)
-    bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 50))
+    bench.talk(lambda peer: commands.set_interval(peer, 0xFF34, 50))
     bench.talk(restarted)
     assert bench.module.settings.intervals_ms[0xFF34] == 10
     assert pgns(bench.wait(190 * MS)) == {}
     bench.wait(100 * MS)
-    bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 50))
-    bench.talk(session.save)
+    bench.talk(lambda peer: commands.set_interval(peer, 0xFF34, 50))
+    bench.talk(commands.save)
     bench.talk(restarted)
     assert bench.module.settings.intervals_ms[0xFF34] == 50
     bench.wait(300 * MS)
-    bench.talk(session.factory_reset)
+    bench.talk(commands.factory_reset)
     bench.talk(restarted)
     assert bench.module.settings == J1939Settings()
 
     bench = J1939Host(HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0)))
-    bench.talk(lambda peer: session.set_address(peer, 20))
-    bench.talk(lambda peer: session.set_bitrate(peer, 125_000))
+    bench.talk(lambda peer: commands.set_address(peer, 20))
+    bench.talk(lambda peer: commands.set_bitrate(peer, 125_000))
     assert {split(f.can_id).source for f in bench.wait(SECOND_NS)} == {8}
-    bench.talk(session.save)
+    bench.talk(commands.save)
     bench.talk(restarted)
     bench.wait(100 * MS)
     frames = bench.wait(SECOND_NS)
     assert {split(f.can_id).source for f in frames} == {20}
     assert frames[1].due_ns - frames[0].due_ns == 1_120_000
-    assert bench.talk(session.identify, address=20) is not None
+    assert bench.talk(commands.identify, address=20) is not None
 
 
 def written_and_read(peer: J1939Node, register: int, value: int) -> RequestScript[int]:
     """Write a register, which is acknowledged, and read it back."""
-    acknowledged = yield session.exchange(peer, register, session.WRITE, value, "write")
+    acknowledged = yield commands.exchange(peer, register, commands.WRITE, value, "write")
     assert isinstance(acknowledged, Reply)
-    return (yield from session.read(peer, register))
+    return (yield from commands.read(peer, register))
 
 
 def test_values_out_of_range_do_not_take() -> None:
@@ -189,14 +187,14 @@ def test_values_out_of_range_do_not_take() -> None:
     for register, value in ((0x0134, 4), (0x009A, 5), (0x009C, 129), (0x009E, 2)):
         assert bench.talk(partial(written_and_read, register=register, value=value)) != value
     with pytest.raises(Rejected):
-        bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 4))
+        bench.talk(lambda peer: commands.set_interval(peer, 0xFF34, 4))
     with pytest.raises(Rejected):
-        bench.talk(lambda peer: session.set_address(peer, 129))
+        bench.talk(lambda peer: commands.set_address(peer, 129))
     assert bench.module.settings == bench.module.flash
     with pytest.raises(NoReply):
-        bench.talk(lambda peer: session.read(peer, 0x0042))
+        bench.talk(lambda peer: commands.read(peer, 0x0042))
     with pytest.raises(NoReply):
-        bench.talk(lambda peer: session.read(peer, 0x009C), address=9)
+        bench.talk(lambda peer: commands.read(peer, 0x009C), address=9)
     before = bench.module.requests
     bench.module.receive(0x0CEF0955, True, bytes.fromhex("3401060064000000"), bench.now_ns)
     bench.module.receive(0x0CEF0855, True, bytes.fromhex("34010600640000"), bench.now_ns)
@@ -233,16 +231,16 @@ def test_an_address_is_claimed_after_power_on_and_when_asked() -> None:
 
 def test_registers_replies_and_a_single_message() -> None:
     bench = J1939Host(made())
-    assert bench.talk(lambda peer: session.read(peer, 0x78)) == 169
-    assert bench.talk(lambda peer: session.read(peer, 0x70)) == 0x4849  # "HI"
+    assert bench.talk(lambda peer: commands.read(peer, 0x78)) == 169
+    assert bench.talk(lambda peer: commands.read(peer, 0x70)) == 0x4849  # "HI"
 
     bench = J1939Host(made(), host=0x20)
-    assert bench.talk(lambda peer: session.read(peer, session.ADDRESS)) == 8
-    replies = [f for f in bench.heard if split(f.can_id).pgn == session.CONFIGURE]
+    assert bench.talk(lambda peer: commands.read(peer, commands.ADDRESS)) == 8
+    replies = [f for f in bench.heard if split(f.can_id).pgn == codec.CONFIGURE]
     assert {split(f.can_id).destination for f in replies} == {0x55}
 
     bench = J1939Host(made())
-    bench.talk(lambda peer: session.send_once(peer, 0xFF46))
+    bench.talk(lambda peer: commands.send_once(peer, 0xFF46))
     assert pgns(bench.heard)[0xFF46] == 1
     assert pgns(bench.wait(SECOND_NS))[0xFF46] == 0
 
@@ -250,29 +248,29 @@ def test_registers_replies_and_a_single_message() -> None:
 @pytest.mark.manual("B 6.2.2 zero", "B 6.2.2 directions")
 def test_zero_and_directions_of_the_inclinometer() -> None:
     still = Still(roll_rad=math.radians(10), pitch_rad=math.radians(20))
-    settings = J1939Settings(intervals_ms={messages.INCLINOMETER: 10})
+    settings = J1939Settings(intervals_ms={codec.INCLINOMETER: 10})
     bench = J1939Host(HipnucJ1939Module(BEGIN_NS, settings, J1939Hardware(boot_ms=0, motion=still)))
 
     def shown() -> tuple[float, float]:
-        last = messages.measurement_of([(0xFF4A, bench.wait(50 * MS)[-1].data)]).incli_rad
+        last = codec.measurement_of([(0xFF4A, bench.wait(50 * MS)[-1].data)]).incli_rad
         assert last is not None
         return round(math.degrees(last[0]), 2), round(math.degrees(last[1]), 2)
 
     # X is the roll; Y = atan2(sin 20°, cos 20° · cos 10°) = atan2(0.342020, 0.925417) = 20.28°
     assert shown() == (10.0, 20.28)
-    bench.talk(lambda peer: session.set_direction(peer, "Y", True))
+    bench.talk(lambda peer: commands.set_direction(peer, "Y", True))
     assert shown() == (10.0, -20.28)
-    bench.talk(lambda peer: session.set_direction(peer, "X", True))
+    bench.talk(lambda peer: commands.set_direction(peer, "X", True))
     assert shown() == (-10.0, -20.28)
-    bench.talk(lambda peer: session.zero(peer, session.Zero.HERE))
+    bench.talk(lambda peer: commands.zero(peer, commands.Zero.HERE))
     assert shown() == (0.0, 0.0)
-    bench.talk(lambda peer: session.zero(peer, session.Zero.CANCEL))
+    bench.talk(lambda peer: commands.zero(peer, commands.Zero.CANCEL))
     assert shown() == (-10.0, -20.28)
 
 
 def test_the_time_of_day_starts_again_after_a_day() -> None:
     """The module boots for a day and 5 s, and sends UTC each second of its own crystal."""
     hardware = J1939Hardware(boot_ms=86_405_000, skew_ppm=0)
-    module = HipnucJ1939Module(BEGIN_NS, J1939Settings(intervals_ms={messages.UTC: 1000}), hardware)
-    frames = [f for f in module.advance(BEGIN_NS + 86_407 * SECOND_NS) if split(f.can_id).pgn == messages.UTC]
+    module = HipnucJ1939Module(BEGIN_NS, J1939Settings(intervals_ms={codec.UTC: 1000}), hardware)
+    frames = [f for f in module.advance(BEGIN_NS + 86_407 * SECOND_NS) if split(f.can_id).pgn == codec.UTC]
     assert [tuple(frame.data[3:6]) for frame in frames][:1] == [(0, 0, 5)]  # hour, minute, second

@@ -5,14 +5,14 @@ from typing import Any
 
 import pytest
 
-from imud.devices.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusSettings
-from imud.devices.hipnuc.modbus.frames import randomise_ids, read_registers, set_id_by_serial, write_register
+from imud.drivers.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusSettings
+from imud.drivers.hipnuc.modbus.registers import randomise_ids, read_registers, set_id_by_serial, write_register
 from imud.formats.modbus import framed, is_exception, is_whole
-from imud.ledger import Ledger
-from imud.sample import Measurement
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+from imud.model.units import NS_PER_S
 from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveVariant, make
-from imud.sim.simulator import Burst, SimulatorOptions
-from imud.units import NS_PER_S
+from imud.sim.sensor import Burst, SimulatorOptions
 from tests.support.pty_port import serial_of, slave
 
 BEGIN_NS = 5 * NS_PER_S

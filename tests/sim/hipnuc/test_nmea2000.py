@@ -4,12 +4,12 @@ import itertools
 
 import pytest
 
-from imud.devices.hipnuc.nmea2000.codec import HipnucNmea2000Codec, HipnucNmea2000Settings
+from imud.drivers.hipnuc.nmea2000 import HipnucNmea2000Codec, HipnucNmea2000Settings
 from imud.formats.j1939 import split
-from imud.ledger import Ledger
-from imud.sample import Measurement
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
 from imud.sim.hipnuc.nmea2000 import SIMULATOR, HipnucNmea2000Module, Nmea2000Hardware
-from imud.sim.simulator import SimulatorOptions
+from imud.sim.sensor import SimulatorOptions
 
 BEGIN_NS = 5_000_000_000
 SECOND_NS = 1_000_000_000

@@ -4,10 +4,10 @@ import itertools
 
 import pytest
 
-from imud.attitude import euler_zyx_from_quat
-from imud.devices.imu61x.can.codec import Imu61xCanCodec, Imu61xCanSettings
-from imud.ledger import Ledger
-from imud.sample import Measurement
+from imud.attitude.rotation import euler_zyx_from_quat
+from imud.drivers.imu61x.can import Imu61xCanCodec, Imu61xCanSettings
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
 from imud.sim.can_module import SentFrame
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
 

@@ -4,11 +4,10 @@ import errno
 
 import pytest
 
-from imud.devices.imu61x.spi import bursts as spi
-from imud.devices.imu61x.spi.session import State
-from imud.devices.imu61x.spi.words import READ_STATE
-from imud.sim.imu61x.behaviour import RegisterBehaviour
+from imud.drivers.imu61x import spi
+from imud.drivers.imu61x.spi import READ_STATE, State
 from imud.sim.imu61x.registers import Imu61xRegisters
+from imud.sim.imu61x.uart import RegisterBehaviour
 
 MS = 1_000_000
 

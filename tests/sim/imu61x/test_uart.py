@@ -7,11 +7,10 @@ from math import pi
 
 import pytest
 
-from imud.attitude import matrix_from_quat
-from imud.contracts.codec import ReplyFrame
-from imud.contracts.session import Reply, Request
-from imud.devices.imu61x.uart import commands as c
-from imud.devices.imu61x.uart.replies import (
+from imud.attitude.rotation import matrix_from_quat
+from imud.contracts.script import Reply, ReplyFrame, Request
+from imud.drivers.imu61x.uart import commands as c
+from imud.drivers.imu61x.uart.codec import (
     Acknowledgement,
     Parameter,
     ParameterValue,
@@ -19,14 +18,12 @@ from imud.devices.imu61x.uart.replies import (
     parse_parameter,
     parse_status,
 )
-from imud.sample import Measurement
+from imud.model.sample import Measurement
+from imud.model.units import NS_PER_S
 from imud.sim import SIMULATORS
-from imud.sim.imu61x.settings import Imu61xSettings, ParameterRefused, changed
-from imud.sim.imu61x.uart import CALIBRATING, RESULT_BUSY, Imu61xModule, make
-from imud.sim.physics.motion import swing
-from imud.sim.physics.noise import Noise
-from imud.sim.simulator import SimulatorOptions
-from imud.units import NS_PER_S
+from imud.sim.imu61x.uart import CALIBRATING, RESULT_BUSY, Imu61xModule, Imu61xSettings, ParameterRefused, changed, make
+from imud.sim.physics import Noise, swing
+from imud.sim.sensor import SimulatorOptions
 from tests.support.simulated_modules import BEGIN_NS, IMU61X_STILL, Imu61xBench, imu61x_bench
 
 

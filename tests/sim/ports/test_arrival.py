@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import pytest
 
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.ports.arrival import (
     PERFECT,
     PROFILES,
@@ -15,7 +16,6 @@ from imud.sim.ports.arrival import (
     ArrivalProfile,
     Crystal,
 )
-from imud.units import NS_PER_MS, NS_PER_S
 
 
 def arrivals(profile: ArrivalProfile, rate_hz: float = 100, count: int = 2000, seed: int = 1) -> list[Arrival]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from imud.links.can.frame_reader import libc
+from imud.links.socketcan import libc
 from imud.sim.ports import can_port
 
 

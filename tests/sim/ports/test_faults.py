@@ -4,12 +4,12 @@ from random import Random
 
 import pytest
 
-from imud.devices.hipnuc.uart.driver import DRIVER
-from imud.ledger import Ledger
-from imud.sample import Measurement
+from imud.drivers.hipnuc.uart.driver import DRIVER
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+from imud.model.units import NS_PER_MS
 from imud.sim.ports.faults import Fault, FaultKind, FaultRates, Faults, rates_from
-from imud.sim.simulator import Burst
-from imud.units import NS_PER_MS
+from imud.sim.sensor import Burst
 
 STEP_NS = 10 * NS_PER_MS
 

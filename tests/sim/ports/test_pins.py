@@ -4,10 +4,9 @@ from itertools import pairwise
 
 import pytest
 
+from imud.model.units import NS_PER_MS
 from imud.sim.ports.faults import FaultKind, FaultRates, Faults
-from imud.sim.ports.lines import MemoryInput
-from imud.sim.ports.pins import Pin, PinFaultRates, PinFaults, Pins
-from imud.units import NS_PER_MS
+from imud.sim.ports.pins import MemoryInput, Pin, PinFaultRates, PinFaults, Pins
 from tests.support.simulated_modules import FAST, HipnucUartBench
 
 

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from imud.devices.hipnuc.uart.driver import DRIVER
-from imud.ledger import Ledger
-from imud.sample import Measurement
-from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
-from imud.sim.hipnuc.uart.simulator import HipnucModule
+from imud.drivers.hipnuc.uart.driver import DRIVER
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sim.hipnuc.uart import HipnucModule
+from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.ports.arrival import BARE_UART, USB_16MS, ArrivalProfile
 from imud.sim.ports.faults import FaultRates, Faults
 from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort, set_baud
-from imud.units import NS_PER_MS, NS_PER_S
 
 BEGIN_NS = 77 * NS_PER_S
 QUICK = HipnucHardware(skew_ppm=0, boot_ms=0)

@@ -4,9 +4,9 @@ from random import Random
 
 import pytest
 
-from imud.devices.hipnuc.uart.driver import DRIVER
-from imud.ledger import Ledger
-from imud.sample import Measurement
+from imud.drivers.hipnuc.uart.driver import DRIVER
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
 from imud.sim.ports.uart_wire import Transmitter, heard
 
 BYTE_NS = 10_000_000  # 1000 baud: 10 bits of 1 ms

@@ -1,0 +1,126 @@
+"""Table: conventions of axes and angles: what devices send, and what can be published.
+
+    name       body axes                     navigation frame         Euler angles
+    enu-flu    x forward, y left, z up       east, north, up          ZYX; yaw 0 east, counter-clockwise   (REP-103)
+    ned-frd    x forward, y right, z down    north, east, down        ZYX; yaw 0 north, clockwise          (aerospace)
+
+A device has axes and an order of angles of its own. Where its heading has no relation to north, its navigation frame is
+level and its x axis is where the heading is 0; then enu-flu keeps that x axis, and ned-frd turns the frame by 180°
+about it.
+"""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Final
+
+from imud.attitude.rotation import IDENTITY, Matrix3
+
+FLIP_X: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+"""Half a turn about x: FLU ↔ FRD."""
+FLIP_Y: Final[Matrix3] = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
+"""Half a turn about y."""
+ENU_TO_NED: Final[Matrix3] = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+RFU_TO_FLU: Final[Matrix3] = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+LFD_TO_FLU: Final[Matrix3] = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+"""x left, y forward, z down."""
+
+
+class Convention(StrEnum):
+    """Conventions in which samples can be published."""
+
+    ENU_FLU = "enu-flu"
+    """Body x forward, y left, z up; navigation frame east, north, up (REP-103)."""
+    NED_FRD = "ned-frd"
+    """Body x forward, y right, z down; navigation frame north, east, down."""
+
+
+class EulerOrder(StrEnum):
+    """Orders of Euler angles; yaw is always about Z and comes first."""
+
+    ZXY = "zxy"
+    """Then pitch about X, then roll about Y (312)."""
+    ZYX = "zyx"
+    """Then pitch about Y, then roll about X (321)."""
+
+
+class Heading(StrEnum):
+    """References of yaw."""
+
+    MAGNETIC = "magnetic"
+    TRUE = "true"
+    RELATIVE = "relative"
+    """Where the device pointed at power-on or at its last heading reset."""
+    UNKNOWN = "unknown"
+    """The device did not tell."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceAxes:
+    """Axes and angles of a device as it sends them."""
+
+    order: EulerOrder = EulerOrder.ZXY
+    """With ZXY its y axis is the one that yaw is counted to (forward), with ZYX its x axis."""
+    has_north: bool = True
+    """Whether its navigation frame is east, north, up in some reference of north; else level, z up."""
+    z_down: bool = False
+    """Whether its z axis and that of its navigation frame point down."""
+
+    def with_order(self, order: EulerOrder | None) -> "DeviceAxes":
+        """Return the same with another order of angles; None keeps it."""
+        return self if order is None else replace(self, order=order)
+
+    @property
+    def to_body(self) -> Matrix3:
+        """Rotation from the sensor's axes to the body's (FLU) when it lies as its manual draws it."""
+        if self.order is EulerOrder.ZXY:
+            return LFD_TO_FLU if self.z_down else RFU_TO_FLU
+        return FLIP_X if self.z_down else IDENTITY
+
+    @property
+    def to_z_up(self) -> Matrix3:
+        """Rotation from the device's navigation frame to the one with z up and the same horizontal reference."""
+        if not self.z_down:
+            return IDENTITY
+        return FLIP_Y if self.order is EulerOrder.ZXY else FLIP_X
+
+    @property
+    def words(self) -> str:
+        """The sensor's axes, for people."""
+        forward = "x right, y forward" if self.order is EulerOrder.ZXY else "x forward, y left"
+        return f"sensor: {forward}, z up, right-handed"
+
+
+RFU_ENU: Final = DeviceAxes()
+"""Of HiPNUC modules: x right, y forward, z up; navigation frame ENU; ZXY (manual V1.5.9, chapter 9)."""
+FLU_LEVEL: Final = DeviceAxes(order=EulerOrder.ZYX, has_north=False)
+"""Of the Forsense IMU61x, assumed: x forward, y left, z up; level navigation frame; ZYX. Its manual states none."""
+
+
+def body_axes(convention: Convention) -> Matrix3:
+    """Return the rotation from FLU to the body axes of a convention."""
+    return IDENTITY if convention is Convention.ENU_FLU else FLIP_X
+
+
+def navigation_axes(convention: Convention, has_north: bool) -> Matrix3:
+    """Return the rotation from a navigation frame with z up to that of a convention."""
+    if convention is Convention.ENU_FLU:
+        return IDENTITY
+    return ENU_TO_NED if has_north else FLIP_X
+
+
+BODY_WORDS: Final = {
+    Convention.ENU_FLU: "body: x forward, y left, z up (FLU)",
+    Convention.NED_FRD: "body: x forward, y right, z down (FRD)",
+}
+EULER_WORDS: Final = {
+    Convention.ENU_FLU: "ZYX: yaw about Z, then pitch about Y, then roll about X; yaw counter-clockwise from above",
+    Convention.NED_FRD: "ZYX: yaw about Z, then pitch about Y, then roll about X; yaw clockwise from above",
+}
+
+
+def navigation_words(convention: Convention, has_north: bool) -> str:
+    """Name the navigation frame of a convention, for people."""
+    down = convention is Convention.NED_FRD
+    if has_north:
+        return "NED" if down else "ENU"
+    return f"level, Z {'down' if down else 'up'}; X where the device's heading is 0"

@@ -1,0 +1,241 @@
+"""Comparison of gravity with the attitude at rest, which finds wrong conventions and wrong mountings.
+
+A device at rest measures nothing but gravity: its acceleration points up. Its attitude says where up is as well. Where
+the two directions are far apart for some seconds, the axes or the order of the angles are not what they are taken for.
+A rotation of all vectors and of the attitude together (the mounting) cannot be seen so; but a body that stands level
+has its z axis up, whatever the attitude says.
+
+Rest is an angular rate near zero and an acceleration near g, for WINDOW_NS without a break. What is moved slowly, or
+accelerated along a line for long, may count as at rest: the limits of the angles are wider than the error from that.
+All directions are in the sensor's own axes, as the device sends them.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from math import acos, asin, atan2, cos, degrees, hypot, inf, isfinite
+from typing import Final
+
+from imud.attitude.conventions import DeviceAxes, EulerOrder
+from imud.attitude.published import AXES, TO_QUAT
+from imud.attitude.rotation import Matrix3, matrix_from_quat, matrix_times
+from imud.model.sample import Quaternion, Sample, Vector3
+from imud.model.units import NS_PER_S, STANDARD_GRAVITY_M_S2
+
+WINDOW_NS: Final = 5 * NS_PER_S
+"""Rest of this length is judged."""
+BREAK_NS: Final = 2 * NS_PER_S
+"""Samples further apart do not belong to one window."""
+SAMPLES_MIN: Final = 5
+REST_RAD_S: Final = 0.05
+"""Angular rate at rest, at most: 2.9 °/s, above the bias of a gyroscope without calibration."""
+REST_M_S2: Final = 0.03 * STANDARD_GRAVITY_M_S2
+"""Distance of the acceleration from g at rest, at most: an accelerometer without calibration is off by 2 %. A sideways
+acceleration that stays within turns the direction by 14°."""
+CONTRADICTION_DEG: Final = 20.0
+LEVEL_DEG: Final = 45.0
+"""A body that stands level is tilted by less: a ship heels, a vehicle stands on a slope."""
+EXPLAINED_DEG: Final = 10.0
+"""A cause is named where it leaves less than this."""
+
+
+class Contradiction(StrEnum):
+    """What does not fit gravity."""
+
+    Z_AXIS = "z-axis"
+    """The z axis points the other way."""
+    ORDER = "euler-order"
+    """The angles turn about other axes."""
+    SIGN = "sign"
+    """An angle has the opposite sign."""
+    ATTITUDE = "attitude"
+    """The attitude, by no simple cause."""
+    MOUNTING = "mounting"
+    """The body does not stand level with the mounting that is given."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A contradiction with its explanation."""
+
+    kind: Contradiction
+    message: str
+    """What is seen, and what to change."""
+    angle_deg: float
+    """Between the two directions of up."""
+
+
+class GravityCheck:
+    """Compares samples at rest. `add` is cheap, and is meant for some samples a second. One thread."""
+
+    def __init__(self, device: DeviceAxes, mounting: Matrix3 | None = None) -> None:
+        """`mounting` is the rotation sensor → body (FLU) of a body that stands level at rest; None for no such."""
+        self.finding: Finding | None = None
+        """What the last window at rest has shown; None where all fits, or none was judged yet."""
+        self._device = device
+        self._mounting = mounting
+        self._seq = 0
+        self._begin_ns = self._last_ns = 0
+        self._count = 0
+        self._accel: Vector3 = (0.0, 0.0, 0.0)
+        self._up: dict[str, Vector3] = {}
+        """Sum of the directions of up, by the member of the sample that says so."""
+
+    def add(self, sample: Sample) -> bool:
+        """Add a sample; return whether a window was judged with it, so that `finding` is new."""
+        accel, gyro = sample.accel_m_s2, sample.gyro_rad_s
+        if sample.seq == self._seq or accel is None or gyro is None:
+            return False
+        self._seq = sample.seq
+        at_rest = hypot(*gyro) <= REST_RAD_S and abs(hypot(*accel) - STANDARD_GRAVITY_M_S2) <= REST_M_S2
+        if not at_rest or not self._count or sample.t_ns - self._last_ns > BREAK_NS:
+            self._begin(sample.t_ns)
+        self._last_ns = sample.t_ns
+        if not at_rest:
+            return False
+        self._count += 1
+        self._accel = _sum(self._accel, accel)
+        for name, up in _directions(self._device, sample):
+            self._up[name] = _sum(self._up.get(name, (0.0, 0.0, 0.0)), up)
+        if sample.t_ns - self._begin_ns < WINDOW_NS or self._count < SAMPLES_MIN:
+            return False
+        self.finding = self._judge()
+        self._begin(sample.t_ns)
+        return True
+
+    def _begin(self, t_ns: int) -> None:
+        self._begin_ns, self._count = t_ns, 0
+        self._accel, self._up = (0.0, 0.0, 0.0), {}
+
+    def _judge(self) -> Finding | None:
+        gravity = _unit(self._accel)
+        for name, total in self._up.items():
+            up = _unit(total)
+            if _angle_deg(gravity, up) > CONTRADICTION_DEG:
+                return _explained(self._device, name, gravity, up)
+        if self._mounting is not None and matrix_times(self._mounting, gravity)[2] < cos_deg(LEVEL_DEG):
+            return _not_level(self._mounting, gravity)
+        return None
+
+
+def cos_deg(angle_deg: float) -> float:
+    """Return the cosine of an angle in degrees."""
+    return cos(angle_deg / degrees(1.0))
+
+
+def _directions(device: DeviceAxes, sample: Sample) -> Iterator[tuple[str, Vector3]]:
+    """List where up is in the sensor's axes, by each member that says so."""
+    quat, euler = sample.quat_wxyz, sample.euler_rad
+    if quat is not None and 0.0 < hypot(*quat) < inf:
+        yield "quat_wxyz", _up_of(device, quat)
+    if euler is not None and isfinite(euler[0] + euler[1]):
+        yield "euler_rad", _up_of(device, TO_QUAT[device.order]((euler[0], euler[1], 0.0)))
+
+
+def _up_of(device: DeviceAxes, quat: Quaternion) -> Vector3:
+    """Return the third row of the matrix sensor → navigation frame: its z axis as the sensor sees it."""
+    x, y, z = matrix_from_quat(quat)[2]
+    return (-x, -y, -z) if device.z_down else (x, y, z)
+
+
+# --- causes -----------------------------------------------------------------------------------------------------------
+
+
+def _explained(device: DeviceAxes, member: str, gravity: Vector3, up: Vector3) -> Finding:
+    """Name the first cause that makes the two directions agree."""
+    angle = _angle_deg(gravity, up)
+    seen = (
+        f"at rest the acceleration says that up is {axis_words(gravity)} of the sensor, {member} says "
+        f"{axis_words(up)}, {angle:.0f}° away"
+    )
+    for kind, direction, advice in _causes(device, up):
+        if _angle_deg(gravity, direction) < min(EXPLAINED_DEG, angle / 2):
+            return Finding(kind, f"{seen}: {advice} (docs/frames.md)", angle)
+    advice = "no single axis or sign explains it; look at the device's own mounting and axis settings"
+    return Finding(Contradiction.ATTITUDE, f"{seen}: {advice} (docs/frames.md)", angle)
+
+
+def _causes(device: DeviceAxes, up: Vector3) -> Iterator[tuple[Contradiction, Vector3, str]]:
+    """List causes: what up would be, and what to do."""
+    x, y, z = up
+    zxy = device.order is EulerOrder.ZXY
+    change = "take z_down out of frame" if device.z_down else "set frame: {z_down: true}"
+    yield Contradiction.Z_AXIS, (-x, -y, -z), f"its z axis points the other way; {change}"
+    roll, pitch = _angles(device, up)
+    order = EulerOrder.ZYX if zxy else EulerOrder.ZXY
+    other = DeviceAxes(order=order, z_down=device.z_down)
+    yield (
+        Contradiction.ORDER,
+        _up_of(other, TO_QUAT[order]((roll, pitch, 0.0))),
+        f"roll and pitch turn about each other's axes; set frame: {{euler_order: {order}}}",
+    )
+    by_roll, by_pitch = ((-x, y, z), (x, -y, z)) if zxy else ((x, -y, z), (-x, y, z))
+    about = "no mounting makes this; look at the device's own axis settings"
+    yield Contradiction.SIGN, by_roll, f"roll has the opposite sign; {about}"
+    yield Contradiction.SIGN, by_pitch, f"pitch has the opposite sign; {about}"
+    yield Contradiction.SIGN, (-x, -y, z), f"roll and pitch have the opposite sign; {about}"
+    yield Contradiction.SIGN, (x, -y, -z), f"y and z of the acceleration have the opposite sign; {about}"
+    yield Contradiction.SIGN, (-x, y, -z), f"x and z of the acceleration have the opposite sign; {about}"
+    swapped = _up_of(device, TO_QUAT[device.order]((pitch, roll, 0.0)))
+    yield Contradiction.ORDER, swapped, f"roll and pitch are exchanged; {about}"
+
+
+def _angles(device: DeviceAxes, up: Vector3) -> tuple[float, float]:
+    """Return roll and pitch of a device that sees up there."""
+    sign = -1.0 if device.z_down else 1.0
+    x, y, z = (sign * value for value in up)
+    if device.order is EulerOrder.ZXY:
+        return atan2(-x, z), asin(max(-1.0, min(1.0, y)))
+    return atan2(y, z), asin(max(-1.0, min(1.0, -x)))
+
+
+def _not_level(mounting: Matrix3, gravity: Vector3) -> Finding:
+    body = matrix_times(mounting, gravity)
+    angle = _angle_deg(body, (0.0, 0.0, 1.0))
+    near = nearest_axis(gravity)
+    advice = "correct the mounting" if near is None else f"up is the sensor's {near} axis, so axes needs z: {near}"
+    return Finding(
+        Contradiction.MOUNTING,
+        f"at rest up is {axis_words(gravity)} of the sensor, which frame makes {_direction(body)} of the body: if the "
+        f"body stands level now, {advice}; if it need not be level, set frame: {{level_at_rest: false}} "
+        "(docs/frames.md)",
+        angle,
+    )
+
+
+def _direction(body: Vector3) -> str:
+    """Name the side of the body (FLU) that a direction is nearest to."""
+    names = {"x": "front", "-x": "back", "y": "left", "-y": "right", "z": "top", "-z": "bottom"}
+    return f"the {names[max(AXES, key=lambda name: _dot(AXES[name], body))]}"
+
+
+def nearest_axis(direction: Vector3) -> str | None:
+    """Return the name of the axis within LEVEL_DEG of a direction; None where two are as near."""
+    name = max(AXES, key=lambda one: _dot(AXES[one], direction))
+    return name if _dot(AXES[name], direction) > cos_deg(LEVEL_DEG) else None
+
+
+def axis_words(direction: Vector3) -> str:
+    """Describe a direction by the axis that it is near to, else by its three parts."""
+    name = nearest_axis(direction)
+    x, y, z = direction
+    if name is not None and _dot(AXES[name], direction) > cos_deg(EXPLAINED_DEG):
+        return name if name.startswith("-") else f"+{name}"
+    return f"({x:+.2f}, {y:+.2f}, {z:+.2f})"
+
+
+def _sum(a: Vector3, b: Vector3) -> Vector3:
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+def _unit(v: Vector3) -> Vector3:
+    norm = hypot(*v) or 1.0
+    return (v[0] / norm, v[1] / norm, v[2] / norm)
+
+
+def _dot(a: Vector3, b: Vector3) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _angle_deg(a: Vector3, b: Vector3) -> float:
+    return degrees(acos(max(-1.0, min(1.0, _dot(a, b)))))

@@ -1,0 +1,445 @@
+"""What is published of a device: its axes, angles and navigation frame, and the rotation of samples into them.
+
+With S the device's attitude (sensor → navigation frame, as a matrix), M the rotation sensor → published axes, and N
+that of the navigation frame (declination and convention), every sample is turned once:
+
+    vectors    v' = M · v               accel_m_s2, gyro_rad_s, mag_t
+    attitude   S' = N · S · Mᵀ          quat_wxyz; euler_rad is computed from it
+
+A sample with only Euler angles, or only a quaternion, has both afterwards. `incli_rad` and what has no direction stay
+as they are. A rotation by quarter turns only exchanges numbers and signs, so it loses no digit, and an element that is
+NaN stays one element.
+
+Where a device sends angles in part (NaN for the others), what does not depend on the missing ones is published: roll
+and pitch without a yaw; each angle if the sensor lies as its manual draws it; and a yaw alone if the sensor is only
+turned about the vertical, as if the body was level.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import hypot, isfinite, nan, radians
+from typing import Annotated, Final, Literal
+
+import msgspec
+from msgspec import Meta
+
+from imud.attitude.conventions import (
+    BODY_WORDS,
+    EULER_WORDS,
+    RFU_ENU,
+    Convention,
+    DeviceAxes,
+    EulerOrder,
+    Heading,
+    body_axes,
+    navigation_axes,
+    navigation_words,
+)
+from imud.attitude.rotation import (
+    IDENTITY,
+    Matrix3,
+    euler312_from_quat,
+    euler_zyx_from_quat,
+    is_rotation,
+    matrix_from_quat,
+    matrix_product,
+    quat_from_euler312,
+    quat_from_euler_zyx,
+    quat_from_matrix,
+    quat_product,
+    transposed,
+)
+from imud.model.options import Settings
+from imud.model.sample import Quaternion, Sample, Vector3
+
+TO_QUAT: Final = {EulerOrder.ZXY: quat_from_euler312, EulerOrder.ZYX: quat_from_euler_zyx}
+TO_EULER: Final = {EulerOrder.ZXY: euler312_from_quat, EulerOrder.ZYX: euler_zyx_from_quat}
+SAME: Final = 1e-9
+"""Rotations whose elements differ by less are the same."""
+
+
+class FrameWords(msgspec.Struct, frozen=True):
+    """Axes and angles of samples, for people."""
+
+    frame: str
+    """Axes of vectors."""
+    euler_convention: str
+    navigation_frame: str
+
+
+class Rotation:
+    """A rotation of samples. Immutable."""
+
+    def __init__(
+        self,
+        vectors: Matrix3,
+        navigation: Matrix3,
+        orders: tuple[EulerOrder, EulerOrder],
+        mounting: Matrix3 = IDENTITY,
+        *,
+        from_angles: bool = False,
+    ) -> None:
+        """`vectors` is M, `navigation` is N, `orders` are those of the angles before and after. `mounting` is the part
+        of M that turns the body, not only names its axes. `from_angles`: the device's quaternion is not used."""
+        self._turn = _vector_function(vectors)
+        self._attitude = _quat_function(navigation, vectors)
+        self._to_quat, self._to_euler = TO_QUAT[orders[0]], TO_EULER[orders[1]]
+        self._keeps_body = _same(mounting, IDENTITY)
+        self._keeps_level = abs(mounting[2][2] - 1.0) <= SAME
+        self._from_angles = from_angles
+
+    def sample(self, sample: Sample) -> Sample:
+        """Return the sample turned."""
+        turn = self._turn
+        accel, gyro, mag = sample.accel_m_s2, sample.gyro_rad_s, sample.mag_t
+        quat, euler = self._turned(sample.quat_wxyz, sample.euler_rad)
+        return Sample(
+            sample.device, sample.seq, sample.t_ns, sample.t_err_ns, sample.sync, sample.t_rx_ns, sample.utc_ns,
+            sample.t_dev_ns,
+            None if accel is None else turn(accel),
+            None if gyro is None else turn(gyro),
+            None if mag is None else turn(mag),
+            quat, euler, sample.temperature_c, sample.pressure_pa, sample.incli_rad, sample.status, sample.pps_age_ms,
+            sample.edge_seq,
+        )  # fmt: skip
+
+    def samples(self, samples: Sequence[Sample]) -> list[Sample]:
+        """Return the samples turned."""
+        return [self.sample(sample) for sample in samples]
+
+    def _turned(self, quat: Quaternion | None, euler: Vector3 | None) -> tuple[Quaternion | None, Vector3 | None]:
+        if quat is not None and not (self._from_angles and euler is not None):
+            try:
+                made = self._attitude(quat)
+                return made, self._to_euler(made)
+            except ValueError:  # without direction: zeros of a device that does not know it yet
+                pass
+        if euler is None:
+            return None, None
+        if isfinite(euler[0] + euler[1] + euler[2]):
+            made = self._attitude(self._to_quat(euler))
+            return made, self._to_euler(made)
+        return None, self._in_part(euler)
+
+    def _in_part(self, euler: Vector3) -> Vector3 | None:
+        """Turn angles of which some are not finite; None where nothing can be said without them."""
+        known = tuple(map(isfinite, euler))
+        filled = tuple(angle if is_known else 0.0 for angle, is_known in zip(euler, known, strict=True))
+        roll, pitch, yaw = self._to_euler(self._attitude(self._to_quat((filled[0], filled[1], filled[2]))))
+        if known == (True, True, False):
+            return roll, pitch, nan
+        if self._keeps_body:
+            return roll if known[0] else nan, pitch if known[1] else nan, yaw if known[2] else nan
+        if self._keeps_level and known == (False, False, True):
+            return nan, nan, yaw
+        return None
+
+
+@dataclass(frozen=True)
+class PublishedFrame:
+    """Axes, angles and navigation frame of what is published of one device. Made by `published_frame`."""
+
+    device: DeviceAxes
+    """What the device sends, as the configuration has it."""
+    mounting: Matrix3
+    """Rotation sensor → body (FLU)."""
+    convention: Convention | None
+    """None: the device's own axes and angles."""
+    declination_deg: float | None
+    """None: the heading is what the device sends."""
+    from_angles: bool = False
+    """Whether the device's Euler angles count, not its quaternion."""
+
+    @cached_property
+    def rotation(self) -> Rotation | None:
+        """Rotation of what the codec makes into what is published; None where that is the same."""
+        if self.convention is None and self.declination_deg is None:
+            return None
+        to_navigation = matrix_product(_about_up(-(self.declination_deg or 0.0)), self.device.to_z_up)
+        return Rotation(
+            matrix_product(self._body, self.mounting),
+            matrix_product(self._navigation, to_navigation),
+            (self.device.order, self._order),
+            matrix_product(self.mounting, transposed(self.device.to_body)),
+            from_angles=self.from_angles,
+        )
+
+    def rotation_to(self, convention: Convention) -> Rotation | None:
+        """Return the rotation of what is published into what a reader asks for; None where that is the same."""
+        return None if convention is self.convention else self._rotations[convention]
+
+    @cached_property
+    def _rotations(self) -> dict[Convention, Rotation]:
+        return {
+            convention: Rotation(
+                matrix_product(body_axes(convention), transposed(self._body)),
+                matrix_product(navigation_axes(convention, self.device.has_north), transposed(self._navigation)),
+                (self._order, EulerOrder.ZYX),
+            )
+            for convention in Convention
+        }
+
+    @property
+    def _body(self) -> Matrix3:
+        """Rotation from the body's axes (FLU) to those that are published."""
+        return transposed(self.device.to_body) if self.convention is None else body_axes(self.convention)
+
+    @property
+    def _navigation(self) -> Matrix3:
+        """Rotation from the navigation frame with z up to the one that is published."""
+        if self.convention is None:
+            return transposed(self.device.to_z_up)
+        return navigation_axes(self.convention, self.device.has_north)
+
+    @property
+    def _order(self) -> EulerOrder:
+        return self.device.order if self.convention is None else EulerOrder.ZYX
+
+    # --- for people ---------------------------------------------------------------------------------------------------
+
+    def heading(self, device: Heading) -> Heading:
+        """Return the reference of the published yaw, from that of the device."""
+        if self.declination_deg is None or device is Heading.RELATIVE:
+            return device
+        return Heading.TRUE
+
+    def words(self, euler_convention: str, navigation_frame: str) -> FrameWords:
+        """Describe what is published; the arguments are the driver's own words."""
+        if self.convention is None:
+            return FrameWords(self.device.words, euler_convention, navigation_frame)
+        return self.words_of(self.convention)
+
+    def words_of(self, convention: Convention) -> FrameWords:
+        """Describe what a reader gets who asks for a convention."""
+        navigation = navigation_words(convention, self.device.has_north)
+        return FrameWords(BODY_WORDS[convention], EULER_WORDS[convention], navigation)
+
+
+def as_sent(device: DeviceAxes = RFU_ENU) -> PublishedFrame:
+    """Return what is published of a device without `frame` and `convention`."""
+    return PublishedFrame(device, device.to_body, None, None)
+
+
+def _about_up(angle_deg: float) -> Matrix3:
+    return matrix_from_quat(quat_from_euler_zyx((0.0, 0.0, radians(angle_deg)))) if angle_deg else IDENTITY
+
+
+def _vector_function(matrix: Matrix3) -> Callable[[Vector3], Vector3]:
+    """Return matrix · v as a function; quarter turns pick elements, so that nothing is rounded and no NaN spreads."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix
+    picks = [[(column, value) for column, value in enumerate(row) if value] for row in matrix]
+    if all(len(pick) == 1 for pick in picks):
+        ((i0, s0),), ((i1, s1),), ((i2, s2),) = picks
+        return lambda v: (s0 * v[i0], s1 * v[i1], s2 * v[i2])
+
+    def turn(v: Vector3) -> Vector3:
+        x, y, z = v
+        return (a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z)
+
+    return turn
+
+
+def _quat_function(navigation: Matrix3, vectors: Matrix3) -> Callable[[Quaternion], Quaternion]:
+    """Return n ⊗ q ⊗ m* as a function: it is linear in q, so it is one matrix of 4 × 4."""
+    n = quat_from_matrix(navigation)
+    w, x, y, z = quat_from_matrix(vectors)
+    back = (w, -x, -y, -z)
+    units: tuple[Quaternion, ...] = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
+    columns = [quat_product(quat_product(n, unit), back) for unit in units]
+    (a0, b0, c0, d0), (a1, b1, c1, d1), (a2, b2, c2, d2), (a3, b3, c3, d3) = columns
+
+    def turn(q: Quaternion) -> Quaternion:
+        w, x, y, z = q
+        return (
+            a0 * w + a1 * x + a2 * y + a3 * z,
+            b0 * w + b1 * x + b2 * y + b3 * z,
+            c0 * w + c1 * x + c2 * y + c3 * z,
+            d0 * w + d1 * x + d2 * y + d3 * z,
+        )
+
+    return turn
+
+
+def _same(a: Matrix3, b: Matrix3) -> bool:
+    return all(abs(x - y) <= SAME for row, other in zip(a, b, strict=True) for x, y in zip(row, other, strict=True))
+
+
+AXES: Final[Mapping[str, Vector3]] = {
+    "x": (1.0, 0.0, 0.0),
+    "-x": (-1.0, 0.0, 0.0),
+    "y": (0.0, 1.0, 0.0),
+    "-y": (0.0, -1.0, 0.0),
+    "z": (0.0, 0.0, 1.0),
+    "-z": (0.0, 0.0, -1.0),
+}
+"""An axis of the sensor by its name, as a unit vector."""
+BODY: Final = ("forward", "left", "up")
+"""Meaning of the body's x, y, z."""
+LENGTH_TOLERANCE: Final = 1e-3
+"""Of a quaternion written with four digits."""
+SNAP: Final = 1e-12
+"""Elements this near to 0 and ±1 are meant to be these: the cosine of 90° is 6e-17."""
+
+
+def matrix_from_axes(x: str, y: str, z: str) -> Matrix3:
+    """Return the rotation sensor → body by which axis of the sensor points forward, left, up: names of AXES.
+
+    Raises ValueError where two are along one axis, and where they are left-handed (a mirror image).
+    """
+    names = (x, y, z)
+    for number, name in enumerate(names):
+        for before in range(number):
+            if name.strip("-") == names[before].strip("-"):
+                raise ValueError(
+                    f"expected three different axes of the sensor, got {names[before]} {BODY[before]} and {name} "
+                    f"{BODY[number]}"
+                )
+    matrix = (AXES[x], AXES[y], AXES[z])
+    if not is_rotation(matrix):
+        opposite = z.strip("-") if z.startswith("-") else f"-{z}"
+        raise ValueError(
+            f"expected right-handed axes, got a mirror image (x: {x}, y: {y}, z: {z}), which no mounting makes; look "
+            f"at the signs: with these x and y, z is {opposite}"
+        )
+    return matrix
+
+
+def matrix_from_angles(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Matrix3:
+    """Return the rotation sensor → body of a sensor that is turned so (ZYX, right-handed about the FLU axes)."""
+    quat = quat_from_euler_zyx((radians(roll_deg), radians(pitch_deg), radians(yaw_deg)))
+    return snapped(matrix_from_quat(quat))
+
+
+def matrix_from_mounting_quat(quat_wxyz: Quaternion) -> Matrix3:
+    """Return the rotation sensor → body of a quaternion. Raises ValueError where its length is not 1."""
+    length = hypot(*quat_wxyz)
+    if not abs(length - 1.0) <= LENGTH_TOLERANCE:
+        raise ValueError(f"expected a quaternion of length 1 (scalar first), got one of length {length:.6g}")
+    return snapped(matrix_from_quat(quat_wxyz))
+
+
+def levelling(convention: Convention, roll_deg: float, pitch_deg: float, heading_deg: float) -> Matrix3:
+    """Return the rotation of the body's axes (FLU) that takes away errors of the mounting.
+
+    `roll_deg` and `pitch_deg` are read while the body is level, in the convention that is published; `heading_deg` is
+    added to the heading (clockwise from above).
+    """
+    if not (roll_deg or pitch_deg or heading_deg):
+        return IDENTITY
+    up = pitch_deg if convention is Convention.ENU_FLU else -pitch_deg
+    return matrix_from_angles(roll_deg, up, heading_deg)
+
+
+def mounted(mounting: Matrix3, level: Matrix3) -> Matrix3:
+    """Return the whole rotation sensor → body."""
+    return snapped(matrix_product(level, mounting))
+
+
+def snapped(matrix: Matrix3) -> Matrix3:
+    """Replace elements that are 0 or ±1 but for rounding."""
+    first, second, third = (tuple(_snapped(value) for value in row) for row in matrix)
+    return (_vector(first), _vector(second), _vector(third))
+
+
+def _snapped(value: float) -> float:
+    near = float(round(value))
+    return near + 0.0 if abs(value - near) <= SNAP else value
+
+
+def _vector(row: tuple[float, ...]) -> Vector3:
+    x, y, z = row
+    return (x, y, z)
+
+
+AxisName = Literal["x", "-x", "y", "-y", "z", "-z"]
+Turn = Annotated[float, Meta(ge=-360, le=360)]
+
+
+class MountingAxes(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The axis of the sensor that each axis of the body is."""
+
+    x: AxisName
+    """The axis of the sensor that points forward in the body."""
+    y: AxisName
+    """The one that points to the left."""
+    z: AxisName
+    """The one that points up."""
+
+
+class MountingAngles(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the sensor is turned in the body, from its axes along the body's (x forward, y left, z up)."""
+
+    roll_deg: Turn = 0.0
+    """Last, about x (forward), right-handed: positive with the left side up."""
+    pitch_deg: Turn = 0.0
+    """Second, about y (left), right-handed: positive with the front down."""
+    yaw_deg: Turn = 0.0
+    """First, about z (up), right-handed: positive to the left."""
+
+
+class FrameSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a sensor lies in its body: one of `axes`, `euler`, `quat_wxyz`, or none: as its manual says."""
+
+    axes: MountingAxes | None = None
+    """Which axis of the sensor points forward (`x`), to the left (`y`) and up (`z`), for example x: y, y: -x, z: z."""
+    euler: MountingAngles | None = None
+    """How the sensor is turned in the body: `yaw_deg` about z, then `pitch_deg` about y, then `roll_deg` about x."""
+    quat_wxyz: Annotated[list[float], Meta(min_length=4, max_length=4)] | None = None
+    """Rotation from the sensor's axes to the body's, scalar first, of length 1."""
+    z_down: bool = False
+    """Whether the sensor's own z axis points down when it lies as its manual says, and its angles count so."""
+    euler_order: EulerOrder | None = None
+    """Order of the device's angles where it is not the driver's: zyx (x forward) or zxy (y forward)."""
+    level_roll_deg: Annotated[float, Meta(ge=-45, le=45)] = 0.0
+    """Roll as imud shows it, without this key, while the body is level; it is taken away."""
+    level_pitch_deg: Annotated[float, Meta(ge=-45, le=45)] = 0.0
+    """Pitch as imud shows it, without this key, while the body is level; it is taken away."""
+    heading_offset_deg: Turn = 0.0
+    """Added to the heading, clockwise from above: the sensor points so far to the left of the body's front."""
+    level_at_rest: bool = True
+    """Whether the body stands level within 45° when it is at rest: imud says when the mounting contradicts that."""
+
+    @property
+    def has_mounting(self) -> bool:
+        """Whether the file gives a rotation, other than that of the driver or of `z_down`."""
+        return self.axes is not None or self.euler is not None or self.quat_wxyz is not None
+
+
+NO_FRAME: Final = FrameSettings()
+
+
+def axes_of(frame: FrameSettings, device: DeviceAxes) -> DeviceAxes:
+    """Return the axes and angles of a device as the configuration has them, in place of those of its driver."""
+    order = device.order if frame.euler_order is None else frame.euler_order
+    return DeviceAxes(order=order, has_north=device.has_north, z_down=frame.z_down)
+
+
+def mounting_of(frame: FrameSettings, device: DeviceAxes) -> Matrix3:
+    """Return the rotation sensor → body (FLU) that the file gives, else that of `device`. Raises ValueError."""
+    if frame.axes is not None:
+        return matrix_from_axes(frame.axes.x, frame.axes.y, frame.axes.z)
+    if frame.euler is not None:
+        return matrix_from_angles(frame.euler.roll_deg, frame.euler.pitch_deg, frame.euler.yaw_deg)
+    if frame.quat_wxyz is not None:
+        w, x, y, z = frame.quat_wxyz
+        return matrix_from_mounting_quat((w, x, y, z))
+    return device.to_body
+
+
+def rotation_of(frame: FrameSettings, device: DeviceAxes, convention: Convention) -> Matrix3:
+    """Return the whole rotation sensor → body (FLU), errors of the mounting taken away. Raises ValueError."""
+    level = levelling(convention, frame.level_roll_deg, frame.level_pitch_deg, frame.heading_offset_deg)
+    return mounted(mounting_of(frame, device), level)
+
+
+def published_frame(
+    frame: FrameSettings | None, convention: Convention | None, declination_deg: float | None, device: DeviceAxes
+) -> PublishedFrame:
+    """Return what is published of a device whose driver gives its axes as `device`. Raises ValueError."""
+    if frame is None:
+        return PublishedFrame(device, device.to_body, convention, declination_deg)
+    wanted = convention or Convention.ENU_FLU
+    own = axes_of(frame, device)
+    from_angles = own.order is not device.order
+    return PublishedFrame(own, rotation_of(frame, own, wanted), wanted, declination_deg, from_angles)

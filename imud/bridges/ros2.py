@@ -1,0 +1,370 @@
+"""Samples as ROS 2 messages in CDR: sensor_msgs, tf2_msgs, diagnostic_msgs, and two types of imud's own (`ros2_types`).
+
+    /NAME/imu/data       sensor_msgs/Imu            with the attitude; /NAME/imu/data_raw of a device that sends none
+    /NAME/imu/mag        sensor_msgs/MagneticField
+    /NAME/temperature    sensor_msgs/Temperature    when it changes, and once a second
+    /NAME/pressure       sensor_msgs/FluidPressure  when it changes, and once a second
+    /tf                  tf2_msgs/TFMessage         attitude
+    /NAME/stamp          imud_msgs/SampleStamp      number, times and error of each sample, and what has no other place
+    /NAME/losses         imud_msgs/Losses           after each loss
+    /events              rcl_interfaces/Log
+    /diagnostics         diagnostic_msgs/DiagnosticArray   all devices
+
+Names of the topics of Imu and MagneticField are those of REP-145. The encoders are made for a device once: frames and
+covariances are constant, so that a message is one call of `struct`. Measured: 1 µs per message.
+"""
+
+import re
+import struct
+from collections.abc import Callable, Sequence
+from math import isfinite, nan
+from struct import Struct
+from typing import Any, Final
+
+from imud.bridges.channel import (
+    Diagnoses,
+    LossCounts,
+    MessageChannel,
+    MessageFrames,
+    MessageSchema,
+    StampedEvent,
+    Steady,
+    covariance,
+    diagnosis_name,
+    topic,
+)
+from imud.formats.slot import SYNC_CODES
+from imud.model.sample import Sample, Sync
+from imud.model.units import NS_PER_S
+
+ENCAPSULATION: Final = b"\x00\x01\x00\x00"
+"""CDR_LE, no options."""
+SIZES: Final = {"B": 1, "b": 1, "?": 1, "s": 1, "H": 2, "h": 2, "I": 4, "i": 4, "f": 4, "Q": 8, "q": 8, "d": 8}
+"""Size and alignment of numbers by their code of `struct`; `s` is bytes that are encoded already."""
+_NUMBERS: Final = re.compile(r"(\d*)([a-zA-Z?])")
+
+
+class Layout:
+    """A layout of messages of one size: numbers by their codes, and texts that are always the same. Immutable."""
+
+    def __init__(self, *parts: str) -> None:
+        """Each part is codes of numbers, as `iI` or `3d`, or a constant text after a `"`; in their order."""
+        self._format, self._at = f"<{len(ENCAPSULATION)}s", 0
+        texts: list[bytes] = []
+        for part in parts:
+            if part.startswith('"'):
+                texts.append(_text(part[1:]))
+                self._align(SIZES["I"])
+                self._add(len(texts[-1]), "s")
+            else:
+                for count, code in _NUMBERS.findall(part):
+                    self._align(SIZES[code])
+                    self._add(int(count or 1), code)
+        self.texts: Final = tuple(texts)
+        """The texts with their lengths, as `pack` takes them."""
+        self.pack: Final = struct.Struct(self._format).pack
+        """Packs a message from ENCAPSULATION, numbers, and each of `texts` where it stands among the parts."""
+
+    def _add(self, count: int, code: str) -> None:
+        self._format += f"{count}{code}"
+        self._at += count * SIZES[code]
+
+    def _align(self, size: int) -> None:
+        missing = -self._at % size
+        self._format += f"{missing}x" if missing else ""
+        self._at += missing
+
+
+class CdrWriter:
+    """Writer of one message. Synchronization: one thread."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray(ENCAPSULATION)
+
+    def number(self, code: str, value: Any) -> "CdrWriter":
+        """Append a number by its code of `struct`. Raises struct.error for one that does not fit."""
+        self._align(SIZES[code])
+        self._buffer += struct.pack("<" + code, value)
+        return self
+
+    def text(self, value: str) -> "CdrWriter":
+        """Append a string."""
+        self._align(4)
+        self._buffer += _text(value)
+        return self
+
+    def done(self) -> bytes:
+        """Return the message."""
+        return bytes(self._buffer)
+
+    def _align(self, size: int) -> None:
+        self._buffer += bytes(-(len(self._buffer) - len(ENCAPSULATION)) % size)
+
+
+def _text(value: str) -> bytes:
+    data = value.replace("\0", "").encode(errors="replace") + b"\0"
+    return len(data).to_bytes(4, "little") + data
+
+
+SEPARATOR: Final = "=" * 80
+
+FIELDS: Final = {
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
+    "geometry_msgs/TransformStamped": (
+        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform"
+    ),
+    "sensor_msgs/Imu": (
+        "std_msgs/Header header\n"
+        "geometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n"
+        "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n"
+        "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance"
+    ),
+    "sensor_msgs/MagneticField": (
+        "std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\nfloat64[9] magnetic_field_covariance"
+    ),
+    "sensor_msgs/Temperature": "std_msgs/Header header\nfloat64 temperature\nfloat64 variance",
+    "sensor_msgs/FluidPressure": "std_msgs/Header header\nfloat64 fluid_pressure\nfloat64 variance",
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+    "rcl_interfaces/Log": (
+        "byte DEBUG=10\nbyte INFO=20\nbyte WARN=30\nbyte ERROR=40\nbyte FATAL=50\n"
+        "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line"
+    ),
+    "diagnostic_msgs/KeyValue": "string key\nstring value",
+    "diagnostic_msgs/DiagnosticStatus": (
+        "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\n"
+        "byte level\nstring name\nstring message\nstring hardware_id\ndiagnostic_msgs/KeyValue[] values"
+    ),
+    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status",
+    "imud_msgs/SampleStamp": "\n".join(
+        [f"uint8 {sync.upper()}={code}" for code, sync in enumerate(Sync)]
+        + [
+            "std_msgs/Header header",
+            "uint64 seq",
+            "int64 t_ns",
+            "int64 t_rx_ns",
+            "int64 t_dev_ns",
+            "int64 edge_seq",
+            "int64 status",
+            "int64 pps_age_ms",
+            "float64[3] euler_rad",
+            "float64[2] incli_rad",
+            "uint32 t_err_ns",
+            "uint8 sync",
+        ]
+    ),
+    "imud_msgs/Losses": (
+        "std_msgs/Header header\nuint64 samples\nuint64 lost_gap_device\nuint64 lost_crc\nuint64 lost_overrun\n"
+        "uint64 lost_queue\nuint64 lost_unknown"
+    ),
+}
+"""Fields of each type, as in its file with the ending `.msg`."""
+NONE: Final = -1
+"""Stands in an integer of imud_msgs/SampleStamp for a value that the sample does not have; in numbers it is NaN."""
+
+
+def schema(name: str) -> MessageSchema:
+    """Return the definition of a type with those of all types that it is made of, each once."""
+    parts, done, waiting = [FIELDS[name]], {name}, _parts_of(name)
+    while waiting:
+        part = waiting.pop(0)
+        if part not in done:
+            done.add(part)
+            parts.append(f"{SEPARATOR}\nMSG: {part}\n{FIELDS[part]}")
+            waiting += _parts_of(part)
+    package, _, message = name.partition("/")
+    return MessageSchema(f"{package}/msg/{message}", "ros2msg", ("\n".join(parts) + "\n").encode())
+
+
+def _parts_of(name: str) -> list[str]:
+    words = [line.split()[0].removesuffix("[]") for line in FIELDS[name].splitlines()]
+    return [word for word in words if word in FIELDS]
+
+
+LEVEL_INFO: Final = 20
+LEVEL_WARN: Final = 30
+SEC_MAX: Final = 0x7FFF_FFFF
+"""`builtin_interfaces/Time` ends in 2038."""
+_MATRIX: Final = Struct("<9d")
+_NO_VECTOR: Final = (0.0, 0.0, 0.0)
+_NO_ROTATION: Final = (1.0, 0.0, 0.0, 0.0)
+_NO_ANGLES: Final = (nan, nan, nan)
+_NO_INCLINATION: Final = (nan, nan)
+
+Encoder = Callable[[Sample], bytes | None]
+
+
+class Ros2Dialect:
+    """Messages of ROS 2."""
+
+    profile = "ros2"
+
+    def samples(self, frames: MessageFrames) -> Sequence[MessageChannel[Sample]]:
+        """Channels of the samples of a device."""
+        name = frames.device
+        rows: tuple[tuple[str, str, Encoder, set[str]], ...] = (
+            (topic(name, "imu/data"), "sensor_msgs/Imu", _imu(frames, with_attitude=True), _IMU),
+            (topic(name, "imu/data_raw"), "sensor_msgs/Imu", _imu(frames, with_attitude=False), _IMU),
+            (topic(name, "imu/mag"), "sensor_msgs/MagneticField", _mag(frames), {"mag_t"}),
+            (
+                topic(name, "temperature"), "sensor_msgs/Temperature",
+                _scalar(frames, "temperature_c", frames.deviations.temperature_c), {"temperature_c"},
+            ),
+            (
+                topic(name, "pressure"), "sensor_msgs/FluidPressure",
+                _scalar(frames, "pressure_pa", frames.deviations.pressure_pa), {"pressure_pa"},
+            ),
+            ("/tf", "tf2_msgs/TFMessage", _transform(frames), {"quat_wxyz"}),
+            (topic(name, "stamp"), "imud_msgs/SampleStamp", _stamp(frames), _STAMP),
+        )  # fmt: skip
+        return [
+            MessageChannel(where, schema(type_), "cdr", encode, frozenset(fields))
+            for where, type_, encode, fields in rows
+        ]
+
+    def losses(self, device: str) -> MessageChannel[LossCounts]:
+        """Channel of the losses of a device."""
+        layout = Layout("iI", f'"{device}', "6Q")
+
+        def encode(losses: LossCounts) -> bytes:
+            sec, nanosec = time_of(losses.utc_ns)
+            return layout.pack(ENCAPSULATION, sec, nanosec, *layout.texts, losses.samples, *losses.counts)
+
+        return MessageChannel(topic(device, "losses"), schema("imud_msgs/Losses"), "cdr", encode)
+
+    def events(self) -> MessageChannel[StampedEvent]:
+        """Channel of the events of all devices."""
+        return MessageChannel("/events", schema("rcl_interfaces/Log"), "cdr", _log)
+
+    def diagnostics(self) -> MessageChannel[Diagnoses]:
+        """Channel of how all devices are."""
+        return MessageChannel("/diagnostics", schema("diagnostic_msgs/DiagnosticArray"), "cdr", _diagnostics)
+
+
+_IMU: Final = {"accel_m_s2", "gyro_rad_s", "quat_wxyz"}
+_STAMP: Final = {
+    "seq", "t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns", "t_dev_ns", "euler_rad", "incli_rad", "status",
+    "pps_age_ms", "edge_seq",
+}  # fmt: skip
+
+
+def time_of(utc_ns: int) -> tuple[int, int]:
+    """Return `sec` and `nanosec` of a stamp, clipped to what they hold."""
+    sec, nanosec = divmod(utc_ns, NS_PER_S)
+    return (sec, nanosec) if -SEC_MAX <= sec <= SEC_MAX else (SEC_MAX if sec > 0 else -SEC_MAX, nanosec)
+
+
+def _imu(frames: MessageFrames, *, with_attitude: bool) -> Encoder:
+    layout = Layout("iI", f'"{frames.body}', "4d", "72s", "3d", "72s", "3d", "72s")
+    pack, (body,) = layout.pack, layout.texts
+    noise = frames.deviations
+    attitude = _MATRIX.pack(*covariance(noise.attitude_rad, present=with_attitude))
+    rate = _MATRIX.pack(*covariance(noise.gyro_rad_s))
+    force = _MATRIX.pack(*covariance(noise.accel_m_s2))
+    missing = _MATRIX.pack(*covariance(None, present=False))
+
+    def encode(sample: Sample) -> bytes | None:
+        gyro, accel, quat = sample.gyro_rad_s, sample.accel_m_s2, sample.quat_wxyz
+        if (quat is not None) is not with_attitude or (gyro is None and accel is None):
+            return None
+        w, x, y, z = quat or _NO_ROTATION
+        gx, gy, gz = gyro or _NO_VECTOR
+        ax, ay, az = accel or _NO_VECTOR
+        sec, nanosec = time_of(sample.utc_ns)
+        return pack(
+            ENCAPSULATION, sec, nanosec, body, x, y, z, w, attitude,
+            gx, gy, gz, missing if gyro is None else rate, ax, ay, az, missing if accel is None else force,
+        )  # fmt: skip
+
+    return encode
+
+
+def _mag(frames: MessageFrames) -> Encoder:
+    layout = Layout("iI", f'"{frames.body}', "3d", "72s")
+    pack, (body,) = layout.pack, layout.texts
+    noise = _MATRIX.pack(*covariance(frames.deviations.mag_t))
+
+    def encode(sample: Sample) -> bytes | None:
+        mag = sample.mag_t
+        if mag is None:
+            return None
+        x, y, z = mag
+        sec, nanosec = time_of(sample.utc_ns)
+        return pack(ENCAPSULATION, sec, nanosec, body, x, y, z, noise)
+
+    return encode
+
+
+def _scalar(frames: MessageFrames, name: str, sigma: float | None) -> Encoder:
+    """A value without direction, with its variance; 0 where that is not known."""
+    layout = Layout("iI", f'"{frames.body}', "2d")
+    pack, (body,) = layout.pack, layout.texts
+    variance, steady = (sigma or 0.0) ** 2, Steady()
+
+    def encode(sample: Sample) -> bytes | None:
+        value: float | None = getattr(sample, name)
+        if value is None or not steady.passes(value, sample.utc_ns):
+            return None
+        sec, nanosec = time_of(sample.utc_ns)
+        return pack(ENCAPSULATION, sec, nanosec, body, value, variance)
+
+    return encode
+
+
+def _transform(frames: MessageFrames) -> Encoder:
+    layout = Layout("I", "iI", f'"{frames.navigation}', f'"{frames.body}', "3d", "4d")
+    pack, (navigation, body) = layout.pack, layout.texts
+
+    def encode(sample: Sample) -> bytes | None:
+        quat = sample.quat_wxyz
+        if quat is None or not isfinite(sum(quat)):  # tf refuses what is not finite, and warns of it each time
+            return None
+        w, x, y, z = quat
+        sec, nanosec = time_of(sample.utc_ns)
+        return pack(ENCAPSULATION, 1, sec, nanosec, navigation, body, 0.0, 0.0, 0.0, x, y, z, w)
+
+    return encode
+
+
+def _stamp(frames: MessageFrames) -> Encoder:
+    layout = Layout("iI", f'"{frames.body}', "Q6q", "3d", "2d", "I", "B")
+    pack, (body,) = layout.pack, layout.texts
+
+    def encode(sample: Sample) -> bytes | None:
+        roll, pitch, yaw = sample.euler_rad or _NO_ANGLES
+        incli_x, incli_y = sample.incli_rad or _NO_INCLINATION
+        sec, nanosec = time_of(sample.utc_ns)
+        return pack(
+            ENCAPSULATION, sec, nanosec, body, sample.seq, sample.t_ns, sample.t_rx_ns, _or_none(sample.t_dev_ns),
+            _or_none(sample.edge_seq), _or_none(sample.status), _or_none(sample.pps_age_ms), roll, pitch, yaw,
+            incli_x, incli_y, sample.t_err_ns, SYNC_CODES[sample.sync],
+        )  # fmt: skip
+
+    return encode
+
+
+def _or_none(value: int | None) -> int:
+    return NONE if value is None else value
+
+
+def _log(stamped: StampedEvent) -> bytes:
+    event, (sec, nanosec) = stamped.event, time_of(stamped.utc_ns)
+    writer = CdrWriter().number("i", sec).number("I", nanosec)
+    writer.number("B", LEVEL_WARN if stamped.is_warning else LEVEL_INFO)
+    writer.text(event.device or "imud").text(f"{event.kind}: {event.message}")
+    return writer.text("").text("").number("I", 0).done()
+
+
+def _diagnostics(diagnoses: Diagnoses) -> bytes:
+    sec, nanosec = time_of(diagnoses.utc_ns)
+    writer = CdrWriter().number("i", sec).number("I", nanosec).text("")
+    writer.number("I", len(diagnoses.devices))
+    for one in diagnoses.devices:
+        writer.number("B", one.level).text(diagnosis_name(one.device)).text(one.message).text(one.hardware)
+        writer.number("I", len(one.values))
+        for key, value in one.values.items():
+            writer.text(key).text(value)
+    return writer.done()

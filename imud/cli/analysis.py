@@ -1,0 +1,129 @@
+"""`imud noise`: noise of a sensor at rest, as data sheets have it; `imud spectrum`: its vibration, by frequency."""
+
+import argparse
+import re
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from imud.cli.arguments import CliCommand, add_option, add_socket, duration_s
+from imud.drivers import DRIVERS
+from imud.model.errors import BadArgument
+
+BAND: Final = re.compile(r"(\d+(?:\.\d*)?)-(\d+(?:\.\d*)?)")
+SENSORS: Final = ("accel", "gyro")
+
+
+def bands_hz(text: str) -> tuple[tuple[float, float], ...]:
+    """Read bands, for example `5-50,50-200`. Raises ArgumentTypeError."""
+    found = [BAND.fullmatch(one.strip()) for one in text.split(",")]
+    if not all(found):
+        raise argparse.ArgumentTypeError(f"expected bands in Hz as 5-50,50-200, got {text!r}")
+    return tuple((float(one[1]), float(one[2])) for one in found if one is not None)
+
+
+def common_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of both commands: where samples come from."""
+    add_socket(parser)
+    parser.add_argument("input", metavar="FILE|DEVICE", help="recording or capture, or a device of the running daemon")
+    parser.add_argument(
+        "--for", dest="duration", type=duration_s, metavar="DURATION",
+        help="so much: 90s, 10min, 2h (default: all of a file; of a device until Ctrl-C)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--skip", type=duration_s, metavar="DURATION", help="leave out so much at the begin, for example to warm up"
+    )
+    parser.add_argument("--device", metavar="NAME", help="of a recording of several devices, this one")
+    parser.add_argument("--driver", choices=sorted(DRIVERS), help="of a capture (default: hipnuc-uart)")
+    parser.add_argument("--baud", type=int, help="rate of a raw capture (default: 115200)")
+    add_option(parser)
+    parser.add_argument("--json", action="store_true", help="one JSON object, SI units")
+
+
+def noise_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud noise`."""
+    common_arguments(parser)
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="FILE", help="also write a report: .html (nothing else needed), .svg, .png"
+    )
+    parser.add_argument("--sheet", type=Path, metavar="FILE", help="compare with the figures of a data sheet, YAML")
+
+
+def spectrum_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud spectrum`."""
+    common_arguments(parser)
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="also write a picture: .svg, .png")
+    parser.add_argument("--sensor", choices=SENSORS, help="this one only (default: both; live the accelerometer)")
+    parser.add_argument("--resolution", type=float, metavar="HZ", help="distance of frequencies (default: by length)")
+    parser.add_argument("--bands", type=bands_hz, metavar="HZ-HZ,…", help="bands of the RMS (default: octaves)")
+
+
+def part(name: str) -> Any:
+    """Import a module of this package. Raises BadArgument where a library of the extra is missing."""
+    try:
+        return import_module(f"imud.cli.analysis.{name}")
+    except ModuleNotFoundError as error:
+        library = (error.name or "a library").partition(".")[0]
+        if library == "imud":
+            raise
+        raise BadArgument(f"it needs {library} of the extra analysis: pip install 'imud[analysis]'") from None
+
+
+def noise(args: argparse.Namespace) -> int:
+    """Print the noise of a device; with `-o` write the report."""
+    report_of, page, sheet = part("noise_report"), part("noise_page"), part("sheet")
+    kind = page.kind_of(args.output) if args.output is not None else ""
+    given = sheet.read_sheet(args.sheet) if args.sheet is not None else None
+    taken = take(args)
+    product = taken.identity.get("product", "")
+    report = report_of.noise_report(taken, sheet.figures_for(taken.sheet, product, given))
+    if args.output is not None:
+        page.write_file(args.output, page.noise_file(report, kind))
+    return show(args, report, report_of)
+
+
+def spectrum(args: argparse.Namespace) -> int:
+    """Print the vibration of a device, live until interrupted where no duration is given; with `-o` write a picture."""
+    report_of, page = part("spectrum_report"), part("noise_page")
+    kind = page.kind_of(args.output) if args.output is not None else ""
+    if kind == ".html":
+        raise BadArgument(f"{args.output}: expected a name that ends in .svg or .png")
+    sensors = SENSORS if args.sensor is None else (args.sensor,)
+    settings = report_of.SpectrumSettings(sensors, args.resolution, args.bands)
+    if is_live(args) and args.duration is None and not args.json and args.output is None and sys.stdout.isatty():
+        return int(part("spectrum_live").live(args, settings))
+    report = report_of.spectrum_report(take(args), settings)
+    if args.output is not None:
+        page.write_file(args.output, report_of.spectrum_file(report, kind))
+    return show(args, report, report_of)
+
+
+def is_live(args: argparse.Namespace) -> bool:
+    """Whether the input is a device: what exists as a file is a file."""
+    return not Path(args.input).exists()
+
+
+def take(args: argparse.Namespace) -> Any:
+    """Read the samples. Raises BadArgument for options that are for files only."""
+    taking = part("taking")
+    if not is_live(args):
+        return taking.take_file(args)
+    for option, default in (("device", None), ("driver", None), ("baud", None), ("option", [])):
+        if getattr(args, option) != default:
+            raise BadArgument(f"--{option}: expected none with a device of the daemon; {args.input} is no file")
+    return taking.take_live(args, taking.progress)
+
+
+def show(args: argparse.Namespace, report: Any, module: Any) -> int:
+    """Print a report."""
+    written: Callable[[Any], str] = module.text
+    print(msgspec.json.encode(module.as_object(report)).decode() if args.json else written(report))
+    return 0
+
+
+NOISE = CliCommand(noise_arguments, noise)
+SPECTRUM = CliCommand(spectrum_arguments, spectrum)

@@ -1,0 +1,318 @@
+"""`imud fleet`: collect what the gateways of a broker send, or show them all in the terminal."""
+
+import argparse
+import asyncio
+import signal
+import sys
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
+from time import monotonic_ns, time_ns
+from typing import Final, Protocol
+
+from imud.cli.arguments import CliCommand, duration_s
+from imud.cli.output import complain, table
+from imud.fleet.accounts import GatewayState, StreamAccount, StreamKey
+from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, FleetStore, JsonLines, Selection
+from imud.fleet.messages import GatewayClock, Stream
+from imud.fleet.postgres import PostgresStore
+from imud.fleet.reader import VERSIONS, Fleet, FleetBatch, ReaderAccess
+from imud.host.threads import rare_garbage_collection
+from imud.model.errors import BadArgument
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
+
+TOP_HEAD: Final = (
+    "GATEWAY",
+    "STATE",
+    "DEVICES",
+    "SAMPLES/S",
+    "LOST",
+    "MISSING",
+    "SPOOL",
+    "AGE S",
+    "ERROR µs",
+    "UTC ms",
+)
+NOT_SET: Final = "not set"
+RATE_NS: Final = 5 * NS_PER_S
+"""Rates are over so much time."""
+
+
+class FleetOverview:
+    """What is shown of the gateways of a fleet. Synchronization: one thread."""
+
+    def __init__(
+        self, fleet: Fleet, now_ns: Callable[[], int] = monotonic_ns, utc_ns: Callable[[], int] = time_ns
+    ) -> None:
+        """`now_ns`: CLOCK_MONOTONIC; `utc_ns`: CLOCK_REALTIME."""
+        self._fleet = fleet
+        self._now_ns, self._utc_ns = now_ns, utc_ns
+        self._counts: dict[tuple[str, Stream], deque[tuple[int, int]]] = {}
+        """Samples that came, by gateway and stream: when, and how many."""
+        self._newest_ns: dict[str, int] = {}
+        self._error_ns: dict[str, int] = {}
+        self._clocks: dict[str, GatewayClock] = {}
+        """What the last message of each gateway said of its wall clock."""
+
+    def add(self, batch: FleetBatch) -> None:
+        """Note what came."""
+        message = batch.message
+        name = message.gateway
+        if message.clock is not None:
+            self._clocks[name] = message.clock
+        self._newest_ns[name] = max(message.utc_ns, self._newest_ns.get(name, 0))
+        if batch.stream is not Stream.EVENTS:
+            counts = self._counts.setdefault((name, batch.stream), deque())
+            counts.append((self._now_ns(), message.last - message.first + 1))
+        errors = [sample.t_err_ns for sample in message.samples] or [one.t_err_ns for one in message.intervals]
+        if errors:
+            self._error_ns[name] = max(errors)
+
+    def text(self) -> str:
+        """The table, those that are away first, and below it how many there are and what is wrong with the broker."""
+        fleet = self._fleet
+        if not fleet.states:
+            return f"no gateway yet; {fleet.problem or 'connected'}"
+        found: dict[str, list[StreamAccount]] = {}
+        for key, account in fleet.accounts.items():
+            found.setdefault(key.gateway, []).append(account)
+        order = sorted(fleet.states, key=lambda key: (fleet.states[key].online, key))
+        rows = [self._row(key, found.get(key[1], [])) for key in order]
+        away = sum(not state.online for state in fleet.states.values())
+        line = f"{len(rows)} gateway{'s' * (len(rows) != 1)}, {away} away" + (
+            f"; {fleet.problem}" * bool(fleet.problem)
+        )
+        return f"{table(TOP_HEAD, rows)}\n\n{line}"
+
+    def _row(self, key: tuple[str, str], found: list[StreamAccount]) -> tuple[str, ...]:
+        state, name = self._fleet.states[key], key[1]
+        newest_ns, error_ns = self._newest_ns.get(name), self._error_ns.get(name)
+        return (
+            "/".join(key),
+            "online" if state.online else state.reason or "away",
+            str(len(state.devices)),
+            f"{self._rate_hz(name):.1f}",
+            str(sum(sum(one.counts.dropped.values()) for one in found)),
+            str(sum(one.counts.missing for one in found)),
+            str(sum(one.in_spool for one in found)),
+            "-" if newest_ns is None else f"{max(self._utc_ns() - newest_ns, 0) / NS_PER_S:.1f}",
+            "-" if error_ns is None else f"{error_ns / NS_PER_US:.0f}",
+            self._utc_text(name, state),
+        )
+
+    def _utc_text(self, name: str, state: GatewayState) -> str:
+        """The error of a gateway's wall clock, by what came last; nothing of one that does not speak of it."""
+        clock = self._clocks.get(name, state.clock)
+        if clock is None or (clock.synchronised and clock.error_ns is None):
+            return "-"
+        return f"{clock.error_ns / NS_PER_MS:.3g}" if clock.synchronised and clock.error_ns is not None else NOT_SET
+
+    def _rate_hz(self, name: str) -> float:
+        """Samples a second that came, or that statistics and status count: the same samples can be in both streams."""
+        begin_ns, most = self._now_ns() - RATE_NS, 0
+        for stream in (Stream.SAMPLES, Stream.STATISTICS):
+            counts = self._counts.get((name, stream), deque())
+            while counts and counts[0][0] < begin_ns:
+                counts.popleft()
+            most = max(most, sum(count for _, count in counts))
+        return most * NS_PER_S / RATE_NS
+
+
+INTERVAL_S: Final = 1.0
+INTERVAL_LEAST_S: Final = 0.1
+INTERVAL_MOST_S: Final = 3600.0
+
+
+class _Screen(Protocol):
+    def show(self, text: str) -> None: ...
+    def close(self) -> None: ...
+
+
+class _Lines:
+    """One text after another."""
+
+    def show(self, text: str) -> None:
+        print(text, flush=True)
+
+    def close(self) -> None:
+        """No-op."""
+
+
+class _Redrawn:
+    """Each text in the place of the one before, by rich. Raises BadArgument without the extra `top`."""
+
+    def __init__(self) -> None:
+        try:
+            from rich.live import Live
+            from rich.text import Text
+        except ModuleNotFoundError as error:
+            words = f"imud fleet top: it needs {error.name}: pip install 'imud[top]'; or use --plain"
+            raise BadArgument(words) from None
+        self._text: Callable[[str], Text] = Text
+        self._live = Live(screen=True, auto_refresh=False)
+        self._live.start()
+
+    def show(self, text: str) -> None:
+        self._live.update(self._text(text), refresh=True)
+
+    def close(self) -> None:
+        self._live.stop()
+
+
+def add_top(parser: argparse.ArgumentParser) -> None:
+    """Add the options that only this action has."""
+    parser.add_argument(
+        "--interval", type=float, default=INTERVAL_S, metavar="S", help="time between pictures (default: %(default)g)"
+    )
+    parser.add_argument("--plain", action="store_true", help="one table after another, as where it is no terminal")
+
+
+async def run_top(args: argparse.Namespace, fleet: Fleet) -> int:
+    """Show the gateways until SIGINT, SIGTERM, or --duration; 1 if there was none. Raises ImudError."""
+    if not INTERVAL_LEAST_S <= args.interval <= INTERVAL_MOST_S:
+        raise BadArgument(f"--interval: expected {INTERVAL_LEAST_S:g} to {INTERVAL_MOST_S:g}, got {args.interval:g}")
+    loop, overview = asyncio.get_running_loop(), FleetOverview(fleet)
+    with closing(_Redrawn() if sys.stdout.isatty() and not args.plain else _Lines()) as screen:
+        reading = asyncio.ensure_future(_read(args, fleet, overview))
+        drawing = asyncio.ensure_future(_draw(screen, overview, args.interval))
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, drawing.cancel)
+        await asyncio.wait((reading, drawing), timeout=args.duration, return_when=asyncio.FIRST_COMPLETED)
+        for task in (drawing, reading):
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
+    if fleet.problem:
+        complain(f"nothing comes at the end: {fleet.problem}")
+    return 0 if fleet.states else 1
+
+
+async def _read(args: argparse.Namespace, fleet: Fleet, overview: FleetOverview) -> None:
+    async for batch in fleet.watch(site=args.site, gateway=args.gateway, device=args.device):
+        overview.add(batch)
+
+
+async def _draw(screen: _Screen, overview: FleetOverview, interval_s: float) -> None:
+    while True:
+        await asyncio.sleep(interval_s)
+        screen.show(overview.text())
+
+
+NAME: Final = "collector"
+HEAD: Final = (
+    "GATEWAY",
+    "BOOT",
+    "DEVICE",
+    "STREAM",
+    "SENT",
+    "RECEIVED",
+    "DROPPED",
+    "MISSING",
+    "IN SPOOL",
+    "DUPLICATES",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud fleet`."""
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    collecting = actions.add_parser("collect", help="write what the gateways send into a store")
+    _broker(collecting)
+    collecting.add_argument(
+        "--to", required=True, metavar="STORE",
+        help="postgresql://USER@HOST/DATABASE writes rows, exactly once; - prints JSON lines",
+    )  # fmt: skip
+    collecting.add_argument(
+        "--name", default=NAME,
+        help="of the session that the broker keeps for this one collector while it is away (default: %(default)s)",
+    )  # fmt: skip
+    collecting.add_argument(
+        "--from-begin", action="store_true",
+        help="count as missing what a gateway had sent of its present boot before the collector first heard of it",
+    )  # fmt: skip
+    showing = actions.add_parser("top", help="show all gateways, redrawn in place")
+    _broker(showing)
+    add_top(showing)
+
+
+def _broker(parser: argparse.ArgumentParser) -> None:
+    """Arguments for the connection, and for what is read."""
+    parser.add_argument(
+        "urls", nargs="+", metavar="URL",
+        help="broker: mqtt, mqtts, ws or wss, for example mqtts://HOST:8883; several of one cluster are tried in turn",
+    )  # fmt: skip
+    parser.add_argument(
+        "--mqtt-version", choices=VERSIONS, default=VERSIONS[0], help="version of MQTT (default: %(default)s)"
+    )
+    parser.add_argument("--user", default="", help="name for the broker")
+    parser.add_argument("--password-file", metavar="FILE", help="file that has the password in its first line")
+    parser.add_argument(
+        "--ca-file",
+        metavar="FILE",
+        help="certificates (PEM) that the broker's is to be signed by (default: the system's)",
+    )
+    parser.add_argument("--cert-file", metavar="FILE", help="certificate (PEM) of this client")
+    parser.add_argument("--key-file", metavar="FILE", help="its key (PEM), where the certificate's file has none")
+    for name, words in (("site", "this site"), ("gateway", "this gateway"), ("device", "this device")):
+        parser.add_argument(f"--{name}", help=f"of {words} only")
+    parser.add_argument("--duration", type=duration_s, metavar="TIME", help="end after so long, as 90s, 10min or 2h")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out one of the actions. Raises ImudError."""
+    if args.action == "top":
+        return asyncio.run(run_top(args, fleet_of(args, "", from_begin=False)))
+    return asyncio.run(_collect(args))
+
+
+def fleet_of(args: argparse.Namespace, name: str, *, from_begin: bool) -> Fleet:
+    """The fleet that the arguments name. Raises BadArgument, ServerError."""
+    if args.password_file is not None and not args.user:
+        raise BadArgument("--password-file: expected --user as well")
+    if args.key_file is not None and args.cert_file is None:
+        raise BadArgument("--key-file: expected --cert-file as well")
+    access = ReaderAccess(args.user, args.password_file, args.ca_file, args.cert_file, args.key_file)
+    return Fleet(*args.urls, access=access, name=name, version=args.mqtt_version, from_begin=from_begin)
+
+
+async def _collect(args: argparse.Namespace) -> int:
+    fleet = fleet_of(args, args.name, from_begin=args.from_begin)
+    store = store_of(args.to)
+    collector = FleetCollector(fleet, store, Selection(args.site, args.gateway, args.device))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, collector.stop)
+    try:
+        with rare_garbage_collection(GC_ALLOCATIONS):
+            await collector.run(stop_after_s=args.duration)
+    finally:
+        store.close()
+    if ledger := account_table(fleet.accounts):
+        print(ledger, file=sys.stderr)
+    if fleet.problem:
+        print(f"nothing comes at the end: {fleet.problem}", file=sys.stderr)
+    return 1 if fleet.problem else 0
+
+
+def store_of(text: str) -> FleetStore:
+    """The store that `--to` names. Raises BadArgument, ServerError."""
+    if text == "-":
+        return JsonLines(sys.stdout)
+    if text.startswith(("postgresql://", "postgres://")):
+        return PostgresStore(text)
+    raise BadArgument("--to: expected - for standard output, or a URL as postgresql://USER@HOST/DATABASE")
+
+
+def account_table(accounts: Mapping[StreamKey, StreamAccount]) -> str:
+    """The ledger as a table; empty for none."""
+    rows = [
+        (
+            key.gateway, key.boot, key.device or "-", key.stream, str(one.sent), str(one.received),
+            ", ".join(f"{number} {cause}" for cause, number in sorted(one.counts.dropped.items())) or "0",
+            str(one.counts.missing), str(one.in_spool), str(one.counts.duplicates),
+        )
+        for key, one in sorted(accounts.items())
+    ]  # fmt: skip
+    return table(HEAD, rows) if rows else ""
+
+
+FLEET = CliCommand(add_arguments, run)

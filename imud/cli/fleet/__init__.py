@@ -1,1 +1,0 @@
-"""`imud fleet`: what gateways send over MQTT, collected or shown."""

@@ -1,1 +1,0 @@
-"""`imud modbus`."""

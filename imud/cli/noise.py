@@ -1,0 +1,598 @@
+"""Report of a noise analysis: the measurement, figures in units for people, comparison with a data sheet."""
+
+import io
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from html import escape
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure as MatplotlibFigure
+
+from imud import __version__
+from imud.analysis.noise import (
+    AXES,
+    KNOWN_PARTS,
+    AxisNoise,
+    Coefficient,
+    NoiseTerms,
+    NoiseType,
+    SensorNoise,
+    sensor_noise,
+)
+from imud.analysis.plots import DPI, density_figure, deviation_figure, page_figure
+from imud.analysis.quantities import (
+    DEG_PER_RAD,
+    MG_PER_M_S2,
+    QUANTITIES,
+    ROOT_S_PER_ROOT_H,
+    S_PER_H,
+    SI,
+    TITLES,
+    UG_PER_M_S2,
+    Quantity,
+    ShownUnit,
+    figure_text,
+    short_exponent,
+)
+from imud.analysis.series import Grid, Readings
+from imud.cli.output import COLUMNS, paragraph, shortened
+from imud.cli.sample_set import Taken
+from imud.contracts.driver import DataSheet, Figure, ModelFigures, SensorFigures, SensorName
+from imud.host.files import open_regular
+from imud.model.errors import BadArgument, ImudError, reason_of
+from imud.model.options import wrong_values
+from imud.model.units import NS_PER_S
+
+TITLE_WIDTH: Final = 23
+UNIT_WIDTH: Final = 10
+CELL_WIDTH: Final = 15
+DISTURBED_SHARE: Final = 0.01
+"""With more disturbed seconds than that the report says that it was no measurement at rest."""
+WITHIN: Final = 1.1
+"""A measured figure up to so much above that of the sheet is called within: coefficients are known to some per cent."""
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseReport:
+    """All that the outputs are made of."""
+
+    taken: Taken
+    sensors: dict[SensorName, SensorNoise]
+    sheet: ModelFigures | None
+    """What to compare with; None for nothing."""
+
+
+def noise_report(taken: Taken, sheet: ModelFigures | None) -> NoiseReport:
+    """Analyse both sensors. Raises ImudError where neither has values."""
+    readings = readings_of(taken)
+    sensors: dict[SensorName, SensorNoise] = {}
+    if readings.gyro_rad_s is not None:
+        sensors["gyro"] = sensor_noise(readings, readings.gyro_rad_s)
+    if readings.accel_m_s2 is not None:
+        sensors["accel"] = sensor_noise(readings, readings.accel_m_s2)
+    if not sensors:
+        raise ImudError(f"{taken.source}: {taken.device} sends neither angular rate nor acceleration")
+    return NoiseReport(taken, sensors, sheet)
+
+
+def readings_of(taken: Taken) -> Readings:
+    """Return the samples. Raises ImudError where there are none."""
+    if taken.readings is None or not len(taken.readings.t_ns):
+        raise ImudError(f"{taken.source}: expected samples, found none")
+    return taken.readings
+
+
+# --- the measurement --------------------------------------------------------------------------------------------------
+
+
+def circumstances(taken: Taken, *, full: bool = True) -> Iterator[tuple[str, str]]:
+    """Name and text of each thing to know about a measurement."""
+    readings = readings_of(taken)
+    begun = "not known"
+    if taken.begun_utc_ns is not None:
+        begun = f"{datetime.fromtimestamp(taken.begun_utc_ns // NS_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    yield "source", taken.source
+    yield "device", f"{taken.device}, driver {taken.driver}, {taken.link}" if taken.link else taken.driver
+    yield "identity", ", ".join(f"{key} {value}" for key, value in taken.identity.items()) or "not known"
+    if full:
+        yield "settings", ", ".join(f"{key} {value}" for key, value in taken.settings.items()) or "not read"
+    yield "begun", begun
+    yield "duration", f"{duration_words(readings.duration_s)}, {len(readings.t_ns)} samples"
+    yield "stamps", taken.stamps
+    lost = ", ".join(f"{cause.removeprefix('lost_')} {count}" for cause, count in taken.lost.items())
+    yield "lost", f"by the ledger: {lost}" if lost else "nothing, by the ledger"
+    yield "temperature", temperature_words(readings)
+    yield "software", f"imud {__version__}"
+    for note in taken.notes:
+        yield "note", note
+
+
+def duration_words(seconds: float) -> str:
+    """Format a duration."""
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
+
+
+def temperature_words(readings: Readings) -> str:
+    """Format the range of the temperature."""
+    if readings.temperature_c is None:
+        return "not sent by the device"
+    known = readings.temperature_c[np.isfinite(readings.temperature_c)]
+    return f"{known.min():.4g} to {known.max():.4g} °C, from {known[0]:.4g} at the begin to {known[-1]:.4g} at the end"
+
+
+def limits(report: NoiseReport, name: SensorName) -> Iterator[str]:
+    """Sentences about what limits the figures of a sensor."""
+    sensor = report.sensors[name]
+    yield sensor.grid.words()
+    if sensor.corner_hz is not None:
+        yield (
+            f"the noise has less than half its power above {sensor.corner_hz:.3g} Hz, as behind a low-pass filter: "
+            f"the coefficients are fitted from τ = {sensor.tau_least_s:.3g} s on"
+        )
+    words = report.taken.sheet.filter_words(report.taken.settings, name)
+    if words:
+        yield f"the device's own filter: {words}"
+    step = report.taken.sheet.gyro_step_rad_s if name == "gyro" else report.taken.sheet.accel_step_m_s2
+    if step is not None or sensor.step is not None:
+        size = step if step is not None else sensor.step
+        where = "by the manual" if step is not None else "as the values show"
+        yield f"values are whole counts of {size:.4g} {SI[name]} {where}"
+    if sensor.disturbed_s > DISTURBED_SHARE * sensor.still_s:
+        yield (
+            f"NOT AT REST: {sensor.disturbed_s} of {sensor.still_s} seconds scatter by far more than the others; the "
+            "device was moved or shaken, and the figures are those of that"
+        )
+    longest = sensor.curve.tau_s[-1]
+    yield f"σ(τ) up to {longest:.3g} s; known to about a quarter up to {sensor.grid.duration_s / KNOWN_PARTS:.3g} s"
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+
+
+def figure_of(axis: AxisNoise, quantity: Quantity) -> Coefficient | None:
+    """One figure of an axis, SI; None where it is not known."""
+    if quantity.key in NoiseTerms._fields:
+        found: Coefficient = getattr(axis.terms, quantity.key)
+        return found
+    if quantity.key == "temperature_slope":
+        return None if axis.drift is None else Coefficient(axis.drift.slope, axis.drift.sigma, 0.0)
+    if quantity.key == "least_deviation":
+        most = axis.bias_instability_most
+        return Coefficient(None, 0.0, most) if axis.least_at_end else Coefficient(most, 0.0, 0.0)
+    plain = {
+        "noise_density": axis.density, "mean": axis.mean, "spread": axis.spread
+    }  # fmt: skip
+    value = plain[quantity.key]
+    return Coefficient(value, 0.0, 0.0) if np.isfinite(value) else None
+
+
+def cell(figure: Coefficient | None, unit: ShownUnit) -> str:
+    """Format a figure: value and standard deviation, or what it is below."""
+    if figure is None:
+        return "-"
+    if figure.value is None:
+        return f"< {figure_text(figure.below * unit.factor)}"
+    words = figure_text(figure.value * unit.factor)
+    return f"{words} ±{short_exponent(f'{figure.sigma * unit.factor:.1g}')}" if figure.sigma else words
+
+
+def rows(name: SensorName, sensor: SensorNoise) -> Iterator[tuple[str, str, str, list[str]]]:
+    """Title, symbol, unit and a cell per axis of each figure."""
+    for quantity in QUANTITIES[name]:
+        figures = [figure_of(axis, quantity) for axis in sensor.axes]
+        if quantity.key == "temperature_slope" and not any(figures):
+            continue
+        for unit in quantity.units:
+            yield quantity.title, quantity.symbol, unit.name, [cell(figure, unit) for figure in figures]
+        if quantity.key == "temperature_slope":
+            shares = [f"{axis.drift.r2:.2f}" if axis.drift is not None else "-" for axis in sensor.axes]
+            yield "  of it explained", "R²", "", shares
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One figure of a sheet beside what was measured."""
+
+    quantity: Quantity
+    stated: float
+    """SI"""
+    measured: float | None
+    """Of the worst axis, SI, or its bound; None where the series leaves open whether it is within."""
+    ratio: float | None
+
+    @property
+    def verdict(self) -> str:
+        """One word."""
+        if self.ratio is None:
+            return "not resolved"
+        return "within" if self.ratio <= WITHIN else "ABOVE"
+
+
+def comparisons(report: NoiseReport, name: SensorName) -> list[Comparison]:
+    """Compare what the sheet states; a bias instability with the least deviation, which is what sheets mean."""
+    if report.sheet is None:
+        return []
+    stated = getattr(report.sheet, name)
+    found = []
+    for quantity in QUANTITIES[name]:
+        figure = getattr(stated, quantity.key, None)
+        if figure is None:
+            continue
+        key = "least_deviation" if quantity.key == "bias_instability" else quantity.key
+        source = next(one for one in QUANTITIES[name] if one.key == key)
+        measured = [one for axis in report.sensors[name].axes if (one := figure_of(axis, source)) is not None]
+        known = [abs(one.value) for one in measured if one.value is not None]
+        bounds = [one.below for one in measured if one.value is None]
+        worst = max([*known, *bounds]) if measured and all(one <= WITHIN * figure for one in bounds) else None
+        found.append(Comparison(quantity, figure, worst, None if worst is None else worst / figure))
+    return found
+
+
+# --- text -------------------------------------------------------------------------------------------------------------
+
+
+def text(report: NoiseReport) -> str:
+    """Format the report in 80 columns."""
+    lines = [f"{report.taken.device}: noise"]
+    for name, words in circumstances(report.taken):
+        lines += paragraph(f"  {name:<13}", words)
+    for sensor_name, sensor in report.sensors.items():
+        lines += ["", *table(sensor_name, sensor)]
+        for words in limits(report, sensor_name):
+            lines += paragraph("  ", words)
+        lines += compared(report, sensor_name)
+    if report.sheet is None:
+        lines += ["", *paragraph("", without_sheet(report))]
+    return "\n".join(lines)
+
+
+def without_sheet(report: NoiseReport) -> str:
+    """Say why nothing is compared."""
+    document = report.taken.sheet.document
+    return (
+        f"Not compared with a data sheet: {document or 'the driver has none'}. --sheet FILE compares with figures that "
+        "you have"
+    )
+
+
+def table(name: SensorName, sensor: SensorNoise) -> list[str]:
+    """The figures of a sensor."""
+    head = f"{TITLES[name]:<{TITLE_WIDTH + UNIT_WIDTH}}" + "".join(f"{axis:>{CELL_WIDTH}}" for axis in AXES)
+    lines = [head]
+    for title, symbol, unit, cells in rows(name, sensor):
+        label = f"{title} {symbol}".rstrip()
+        words = f"  {shortened(label, TITLE_WIDTH):<{TITLE_WIDTH}}{unit:<{UNIT_WIDTH}}"
+        lines.append((words + "".join(f"{one:>{CELL_WIDTH}}" for one in cells))[:COLUMNS])
+    return lines
+
+
+def compared(report: NoiseReport, name: SensorName) -> list[str]:
+    """The comparison with the sheet."""
+    found = comparisons(report, name)
+    if not found or report.sheet is None:
+        return []
+    lines = paragraph("  ", f"compared with {report.sheet.source}, the worst axis:")
+    for one in found:
+        unit = one.quantity.units[0]
+        measured = "-" if one.measured is None else figure_text(one.measured * unit.factor)
+        ratio = "" if one.ratio is None else f" = {one.ratio:.2f} times"
+        lines.append(
+            f"    {one.quantity.title:<{TITLE_WIDTH}}{measured:>9} of {figure_text(one.stated * unit.factor)} "
+            f"{unit.name}{ratio}: {one.verdict}"
+        )
+    return lines
+
+
+# --- JSON -------------------------------------------------------------------------------------------------------------
+
+
+def as_object(report: NoiseReport) -> dict[str, Any]:
+    """The report for programs; figures in SI, and beside them in the units of data sheets."""
+    return {
+        "measurement": measurement_object(report.taken),
+        "sensors": {name: _sensor_object(report, name, sensor) for name, sensor in report.sensors.items()},
+        "data_sheet": report.sheet.source if report.sheet is not None else None,
+        "manual": report.taken.sheet.document,
+    }
+
+
+def measurement_object(taken: Taken) -> dict[str, Any]:
+    """What is known of a measurement, for programs."""
+    readings = readings_of(taken)
+    warm = readings.temperature_c
+    return {
+        "imud": __version__, "source": taken.source, "device": taken.device, "driver": taken.driver,
+        "link": taken.link, "identity": dict(taken.identity), "settings": dict(taken.settings),
+        "begun_utc_ns": taken.begun_utc_ns, "duration_s": readings.duration_s, "samples": len(readings.t_ns),
+        "stamps": taken.stamps, "lost": taken.lost, "notes": taken.notes,
+        "temperature_c": None if warm is None else [float(np.nanmin(warm)), float(np.nanmax(warm))],
+    }  # fmt: skip
+
+
+def grid_object(name: SensorName, grid: Grid) -> dict[str, Any]:
+    """Unit of a sensor and the even grid of its samples, for programs."""
+    return {
+        "unit": SI[name],
+        "rate_hz": grid.rate_hz,
+        "missing": grid.missing,
+        "filled": grid.filled,
+        "runs": len(grid.runs),
+        "stamp_scatter_s": grid.scatter_s,
+    }
+
+
+def _sensor_object(report: NoiseReport, name: SensorName, sensor: SensorNoise) -> dict[str, Any]:
+    curve = sensor.curve
+    return {
+        **grid_object(name, sensor.grid),
+        "corner_hz": sensor.corner_hz,
+        "fitted_from_s": sensor.tau_least_s,
+        "disturbed_s": sensor.disturbed_s,
+        "step": sensor.step,
+        "axes": {label: _axis_object(name, axis) for label, axis in zip(AXES, sensor.axes, strict=True)},
+        "allan": {
+            "tau_s": curve.tau_s.tolist(),
+            "deviation": curve.deviation.T.tolist(),
+            "low": curve.low.T.tolist(),
+            "high": curve.high.T.tolist(),
+            "degrees_of_freedom": curve.freedom.T.tolist(),
+            "noise": [[NoiseType(int(one)).name.lower() for one in axis] for axis in curve.types.T],
+        },
+        "psd": {
+            "frequency_hz": sensor.spectrum.frequency_hz.tolist(),
+            "density": sensor.spectrum.density.T.tolist(),
+            "bandwidth_hz": sensor.spectrum.bandwidth_hz,
+            "averages": sensor.spectrum.averages,
+        },
+        "compared": [
+            {"figure": one.quantity.key, "stated": one.stated, "measured": one.measured, "ratio": one.ratio}
+            for one in comparisons(report, name)
+        ],
+    }
+
+
+def _axis_object(name: SensorName, axis: AxisNoise) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for quantity in QUANTITIES[name]:
+        figure = figure_of(axis, quantity)
+        if figure is None:
+            found[quantity.key] = None
+            continue
+        units: Mapping[str, float | None] = {
+            unit.name: None if figure.value is None else figure.value * unit.factor for unit in quantity.units
+        }
+        found[quantity.key] = {"value": figure.value, "sigma": figure.sigma or None, "si": quantity.si, **units}
+        if figure.value is None:
+            found[quantity.key]["below"] = figure.below
+    found["temperature_r2"] = axis.drift.r2 if axis.drift is not None else None
+    found["least_tau_s"] = axis.least_tau_s
+    return found
+
+
+KINDS: Final = (".html", ".svg", ".png")
+REPEATABLE: Final[Any] = {"svg.hashsalt": "imud", "svg.fonttype": "none", "font.family": "DejaVu Sans"}
+"""The same input makes the same file; text stays text."""
+STYLE: Final = """
+body { font: 15px/1.45 'DejaVu Sans', Verdana, sans-serif; color: #222; max-width: 60em; margin: 2em auto;
+       padding: 0 1em; }
+h1 { font-size: 1.5em; } h2 { font-size: 1.2em; margin-top: 2em; border-bottom: 1px solid #ccc; }
+table { border-collapse: collapse; margin: 1em 0; font-size: 0.9em; }
+td, th { padding: 0.25em 0.8em; border-bottom: 1px solid #ddd; text-align: left; vertical-align: top; }
+td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+svg { max-width: 100%; height: auto; } .above { color: #b00; font-weight: bold; }
+@media print { body { margin: 0; max-width: none; } figure { break-inside: avoid; } }
+"""
+
+
+def kind_of(path: Path) -> str:
+    """Return the kind of a file by its end. Raises BadArgument for others than KINDS."""
+    kind = path.suffix.lower()
+    if kind not in KINDS:
+        raise BadArgument(f"{path}: expected a name that ends in {', '.join(KINDS)}")
+    return kind
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write the file, over an older one. Raises BadArgument with the reason."""
+    try:
+        path.write_bytes(content)
+    except OSError as error:
+        raise BadArgument(f"{path}: {reason_of(error)}") from error
+
+
+def noise_file(report: NoiseReport, kind: str) -> bytes:
+    """The content of a report of one of KINDS."""
+    if kind == ".html":
+        return html(report).encode()
+    return picture(page_figure(report.sensors, text(report).splitlines()), kind)
+
+
+def picture(figure: MatplotlibFigure, kind: str) -> bytes:
+    """A figure as the content of an SVG or PNG file."""
+    buffer = io.BytesIO()
+    with rc_context(REPEATABLE):
+        metadata = {"Date": None, "Creator": "imud"} if kind == ".svg" else {"Software": "imud"}
+        figure.savefig(buffer, format=kind[1:], dpi=DPI, metadata=metadata)
+    return buffer.getvalue()
+
+
+def inline_svg(figure: MatplotlibFigure) -> str:
+    """A figure as an element of an HTML page, without the head of a file of its own."""
+    content = picture(figure, ".svg").decode()
+    return re.sub(r"^.*?(?=<svg)", "", content, count=1, flags=re.DOTALL)
+
+
+def html(report: NoiseReport) -> str:
+    """The whole page; it loads nothing."""
+    device = escape(report.taken.device)
+    parts = [
+        "<!DOCTYPE html>", "<html lang='en'><head><meta charset='utf-8'>", f"<title>{device}: noise</title>",
+        f"<style>{STYLE}</style></head><body>", f"<h1>Noise of {device}</h1>", *_facts(report),
+    ]  # fmt: skip
+    for name, sensor in report.sensors.items():
+        parts += _sensor(report, name, sensor)
+    if report.sheet is None:
+        parts.append(f"<p>{escape(without_sheet(report))}.</p>")
+    parts += [f"<h2>How it was made</h2>{METHOD}", "</body></html>", ""]
+    return "\n".join(parts)
+
+
+METHOD: Final = (
+    "<p>Overlapping Allan deviation with 68 % intervals by χ² and the equivalent degrees of freedom of the type of "
+    "noise at each τ (NIST SP 1065); coefficients by a weighted non-negative fit of "
+    "σ² = 3Q²/τ² + N²/τ + (2 ln 2/π)B² + K²τ/3 + R²τ²/2 (IEEE Std 952); ± is one standard deviation; a coefficient "
+    "that the series does not resolve has a bound of two. The noise density is one-sided, √2 N of white noise. Drift "
+    "with temperature by least squares over means. Axes as published by imud.</p>"
+)
+
+
+def _facts(report: NoiseReport) -> Iterator[str]:
+    yield "<table>"
+    for name, words in circumstances(report.taken):
+        yield f"<tr><th>{escape(name)}</th><td>{escape(words)}</td></tr>"
+    yield "</table>"
+
+
+def _sensor(report: NoiseReport, name: SensorName, sensor: SensorNoise) -> Iterator[str]:
+    yield f"<h2>{TITLES[name].capitalize()}</h2>"
+    yield f"<figure>{inline_svg(deviation_figure(name, sensor))}</figure>"
+    yield from _figures(name, sensor)
+    yield from _compared(report, name)
+    yield "<ul>"
+    yield from (f"<li>{escape(words)}</li>" for words in limits(report, name))
+    yield "</ul>"
+    yield f"<figure>{inline_svg(density_figure(name, sensor))}</figure>"
+    yield f"<p>{escape(sensor.spectrum.words())}.</p>"
+
+
+def _figures(name: SensorName, sensor: SensorNoise) -> Iterator[str]:
+    """Figures in the units of data sheets, then the same in SI."""
+    heads = "".join(f"<th class='number'>{axis}</th>" for axis in AXES)
+    yield f"<table><tr><th>figure</th><th></th><th>unit</th>{heads}</tr>"
+    for title, symbol, unit, cells in rows(name, sensor):
+        numbers = "".join(f"<td class='number'>{escape(one)}</td>" for one in cells)
+        yield f"<tr><td>{title}</td><td>{symbol}</td><td>{unit}</td>{numbers}</tr>"
+    yield f"</table><details><summary>in SI units</summary><table><tr><th>figure</th><th>unit</th>{heads}</tr>"
+    for quantity in QUANTITIES[name]:
+        figures = [figure_of(axis, quantity) for axis in sensor.axes]
+        words = ["-" if one is None or one.value is None else f"{one.value:.4g}" for one in figures]
+        numbers = "".join(f"<td class='number'>{one}</td>" for one in words)
+        yield f"<tr><td>{quantity.title}</td><td>{quantity.si}</td>{numbers}</tr>"
+    yield "</table></details>"
+
+
+def _compared(report: NoiseReport, name: SensorName) -> Iterator[str]:
+    found = comparisons(report, name)
+    if not found or report.sheet is None:
+        return
+    yield f"<h3>Compared with {escape(report.sheet.source)}</h3>"
+    yield "<table><tr><th>figure</th><th>unit</th><th class='number'>stated</th>"
+    yield "<th class='number'>measured, worst axis</th><th class='number'>ratio</th><th></th></tr>"
+    for one in found:
+        unit = one.quantity.units[0]
+        measured = "-" if one.measured is None else figure_text(one.measured * unit.factor)
+        ratio = "-" if one.ratio is None else f"{one.ratio:.2f}"
+        mark = " class='above'" if one.verdict == "ABOVE" else ""
+        yield (
+            f"<tr><td>{one.quantity.title}</td><td>{unit.name}</td>"
+            f"<td class='number'>{figure_text(one.stated * unit.factor)}</td><td class='number'>{measured}</td>"
+            f"<td class='number'>{ratio}</td><td{mark}>{one.verdict}</td></tr>"
+        )
+    yield "</table>"
+
+
+SHEET_BYTES_MOST: Final = 65_536
+"""A data sheet has some ten figures."""
+
+
+class GyroSheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Figures of a gyroscope."""
+
+    random_walk_deg_sqrt_h: Figure = None
+    """Angle random walk."""
+    noise_density_deg_s_sqrt_hz: Figure = None
+    bias_instability_deg_h: Figure = None
+    rate_random_walk_deg_h_sqrt_h: Figure = None
+    temperature_slope_deg_h_k: Figure = None
+
+    def figures(self) -> SensorFigures:
+        """Convert to SI."""
+        return SensorFigures(
+            random_walk=_si(self.random_walk_deg_sqrt_h, DEG_PER_RAD * ROOT_S_PER_ROOT_H),
+            noise_density=_si(self.noise_density_deg_s_sqrt_hz, DEG_PER_RAD),
+            bias_instability=_si(self.bias_instability_deg_h, DEG_PER_RAD * S_PER_H),
+            rate_random_walk=_si(self.rate_random_walk_deg_h_sqrt_h, DEG_PER_RAD * S_PER_H * ROOT_S_PER_ROOT_H),
+            temperature_slope=_si(self.temperature_slope_deg_h_k, DEG_PER_RAD * S_PER_H),
+        )
+
+
+class AccelSheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Figures of an accelerometer."""
+
+    random_walk_m_s_sqrt_h: Figure = None
+    """Velocity random walk."""
+    noise_density_ug_sqrt_hz: Figure = None
+    bias_instability_mg: Figure = None
+    rate_random_walk_mg_sqrt_h: Figure = None
+    temperature_slope_mg_k: Figure = None
+
+    def figures(self) -> SensorFigures:
+        """Convert to SI."""
+        return SensorFigures(
+            random_walk=_si(self.random_walk_m_s_sqrt_h, ROOT_S_PER_ROOT_H),
+            noise_density=_si(self.noise_density_ug_sqrt_hz, UG_PER_M_S2),
+            bias_instability=_si(self.bias_instability_mg, MG_PER_M_S2),
+            rate_random_walk=_si(self.rate_random_walk_mg_sqrt_h, MG_PER_M_S2 * ROOT_S_PER_ROOT_H),
+            temperature_slope=_si(self.temperature_slope_mg_k, MG_PER_M_S2),
+        )
+
+
+class SheetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The file."""
+
+    source: str = ""
+    """Document, revision and place, for the report."""
+    gyro: GyroSheet = GyroSheet()
+    accel: AccelSheet = AccelSheet()
+
+
+def _si(value: float | None, factor: float) -> float | None:
+    return None if value is None else value / factor
+
+
+def read_sheet(path: Path) -> ModelFigures:
+    """Read a file of figures. Raises BadArgument naming what is wrong in it."""
+    try:
+        with open_regular(path) as file:
+            text = file.read(SHEET_BYTES_MOST + 1)
+    except OSError as error:
+        raise BadArgument(f"--sheet {path}: {reason_of(error)}") from error
+    if len(text) > SHEET_BYTES_MOST:
+        raise BadArgument(f"--sheet {path}: expected at most {SHEET_BYTES_MOST} bytes; is it the data sheet itself?")
+    try:
+        tree: Any = msgspec.yaml.decode(text)
+    except msgspec.DecodeError as error:
+        raise BadArgument(f"--sheet {path}: expected YAML: {reason_of(error)}") from None
+    wrong = [str(one) for one in wrong_values(SheetFile, tree, "figure")] if isinstance(tree, dict) else ["no mapping"]
+    if wrong:
+        raise BadArgument(f"--sheet {path}: {'; '.join(wrong)}")
+    try:
+        sheet = msgspec.convert(tree, SheetFile)
+    except msgspec.ValidationError as error:
+        raise BadArgument(f"--sheet {path}: {reason_of(error)}") from None
+    return ModelFigures(gyro=sheet.gyro.figures(), accel=sheet.accel.figures(), source=sheet.source or str(path))
+
+
+def figures_for(sheet: DataSheet, product: str, given: ModelFigures | None) -> ModelFigures | None:
+    """Choose what to compare with: what the user gave, else what the driver's manual states of the model, else None."""
+    return given if given is not None else sheet.figures_of(product)

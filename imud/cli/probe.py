@@ -1,0 +1,222 @@
+"""`imud probe`: list what is attached to serial ports and CAN buses.
+
+Listens only; sends a query only to ports and buses named with `--active`.
+"""
+
+import argparse
+import asyncio
+import contextlib
+from collections.abc import Sequence
+from contextlib import suppress
+from time import monotonic_ns
+
+import msgspec
+
+from imud.cli.arguments import CliCommand
+from imud.cli.output import table
+from imud.config.model import DeviceConfig
+from imud.contracts.codec import message_of
+from imud.contracts.driver import CanDriver, Identity, of_kind
+from imud.contracts.link import CanLink, StreamLink
+from imud.device.can_search import EVERYTHING, CanDevice, CanRound, CanSearch
+from imud.device.scripts import Exchange
+from imud.device.settings import identity_words, printable_identity
+from imud.device.stream_search import StreamFound, StreamRound
+from imud.drivers import DRIVERS
+from imud.formats.can import CanFrame
+from imud.links import LINKS
+from imud.links.netlink import can_details, can_interfaces
+from imud.links.serial_port import list_ports
+from imud.links.socketcan import ControllerState
+from imud.model.errors import CommandError, ImudError, NothingHeard
+from imud.model.ledger import Ledger
+
+HEAD = ("PORT", "DRIVER", "RATE", "PRODUCT", "SERIAL NUMBER", "")
+
+
+class ProbeReport(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Result for one port, or for one device of a bus."""
+
+    port: str
+    title: str = ""
+    """Product name of the adapter; the state of a bus."""
+    driver: str = ""
+    device: str = ""
+    """Address on a bus, for example `node 8`."""
+    baud: int = 0
+    """Rate of port or bus, bit/s."""
+    identity: dict[str, str] = {}  # msgspec copies a mutable default
+    problem: str = ""
+
+
+def row(report: ProbeReport) -> tuple[object, ...]:
+    """Format a report as a row of the table."""
+    identity = report.identity
+    return (
+        report.port,
+        f"{report.driver} {report.device}".strip() or "-",
+        report.baud or "-",
+        identity.get("product", "-"),
+        identity.get("serial_number", "-"),
+        report.problem or report.title,
+    )
+
+
+async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
+    """List one report per device heard on an interface, or one that gives the reason for none."""
+    row = LINKS["socketcan"]
+    link = row.make_can(msgspec.convert({"interface": interface}, row.settings))
+    try:
+        if reason := link.absence():
+            return [ProbeReport(interface, problem=reason)]
+        link.filters = EVERYTHING
+        link.open()
+        devices, summary = await listen(link)
+        title = state_of(interface)
+        if not devices:
+            return [ProbeReport(interface, title, baud=link.bitrate, problem=summary)]
+        return [await _report(link, title, device, may_ask) for device in devices]
+    except ImudError as error:
+        return [ProbeReport(interface, problem=str(error))]
+    finally:
+        link.close()
+
+
+async def listen(link: CanLink) -> tuple[list[CanDevice], str]:
+    """Run one round of detection: the devices heard, and the reason for none. Raises LinkError."""
+    search = CanSearch(of_kind(DRIVERS.values(), CanDriver), link.title)
+    finder = CanRound(search, Ledger(), lambda found: None, monotonic_ns)
+    ended = asyncio.get_running_loop().create_future()
+    problems = [""]
+    link.start(finder.on_frames, lambda news, problem: problems.append(problem), ended.set_result)
+    finder.start()
+    searching = asyncio.ensure_future(finder.finished())
+    await asyncio.wait({searching, ended}, return_when=asyncio.FIRST_COMPLETED)
+    if ended.done():
+        searching.cancel()
+        raise ended.result() or ImudError(f"{link.title} ended")
+    with suppress(NothingHeard):
+        await searching
+    return search.survey.devices(), problems[-1] or search.summary()
+
+
+def state_of(interface: str) -> str:
+    """Describe the state of the controller. Raises LinkError."""
+    details = can_details(interface)
+    if details.bitrate is None or details.state is None or details.state >= len(ControllerState):
+        return "bus without a bit rate" if details.bitrate is None else ""
+    return f"error-{ControllerState(details.state).name.lower()}".replace("error-bus_off", "bus-off")
+
+
+async def _report(link: CanLink, title: str, device: CanDevice, may_ask: bool) -> ProbeReport:
+    driver, node = device
+    identity = await identity_of_node(device, link) if may_ask else Identity()
+    words = identity_words(printable_identity(identity))
+    return ProbeReport(link.title, title, driver.name, driver.node_title(node), link.bitrate, words)
+
+
+async def identity_of_node(device: CanDevice, link: CanLink) -> Identity:
+    """Ask a device for its identity; empty when it does not answer."""
+    driver, settings = device.driver, device.driver.node_settings(device.node)
+    ledger = Ledger()
+    codec = driver.make_codec(ledger, settings)
+    exchange = Exchange(ledger, link.write, monotonic_ns)
+
+    def on_frames(frames: Sequence[CanFrame]) -> None:
+        for frame in frames:
+            for event in codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns):
+                if (message := message_of(event)) is not None:
+                    exchange.on_message(message, frame.t_rx_ns)
+
+    link.filters = driver.filters(settings)
+    link.start(on_frames, lambda news, problem: None, lambda error: None)
+    with suppress(CommandError):
+        return await exchange.run(driver.identify(settings))
+    return Identity()
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud probe`."""
+    parser.add_argument("port", nargs="*", metavar="PORT", help="ports and CAN interfaces to listen on (default: all)")
+    parser.add_argument("--active", action="append", default=[], metavar="PORT", help="one that may be sent queries")
+    parser.add_argument("--json", action="store_true", help="one JSON object per port, or per device of a bus")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print one line per port, or per device of a bus; 1 when no device was found."""
+    titles = {port.path: port.title for port in list_ports()}
+    chosen = [*args.port, *args.active] or [*titles, *can_interfaces(down=True)]
+    reports = asyncio.run(examine_all(list(dict.fromkeys(chosen)), set(args.active), titles))
+    if args.json:
+        for report in reports:
+            print(msgspec.json.encode(report).decode())
+    elif reports:
+        print(table(HEAD, [row(report) for report in reports]))
+    else:
+        print("no serial port and no CAN interface here: is the adapter plugged in, is the UART switched on?")
+    return 0 if any(report.driver for report in reports) else 1
+
+
+async def examine_all(ports: list[str], active: set[str], titles: dict[str, str]) -> list[ProbeReport]:
+    """Probe all ports at the same time."""
+    found = await asyncio.gather(
+        *(
+            examine(port, port in active, titles.get(port, "")) if "/" in port else examine_bus(port, port in active)
+            for port in ports
+        )
+    )
+    return [report for reports in found for report in reports]
+
+
+async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
+    """Open a serial port, find what talks there, ask for its identity if that is permitted."""
+    settings = msgspec.convert({"port": port, "baud": "auto"}, LINKS["uart"].settings)
+    config = DeviceConfig("probe", "auto", None, may_ask, "uart", settings)
+    link = LINKS["uart"].make(settings)
+    try:
+        link.open()
+        found = await find(config, link)
+        identity = await identity_of_device(found, link) if may_ask else Identity()
+        words = identity_words(printable_identity(identity))
+        return [ProbeReport(port, title, found.driver.name, baud=link.baud, identity=words)]
+    except ImudError as error:
+        return [ProbeReport(port, title, problem=str(error))]
+    finally:
+        link.close()
+
+
+async def find(config: DeviceConfig, link: StreamLink) -> StreamFound:
+    """Run one round of detection. Raises NothingHeard and LinkError."""
+    findings: list[StreamFound] = []
+    finder = StreamRound(config, link, Ledger(), None, findings.append, monotonic_ns, may_ask=config.identify)
+    ended = asyncio.get_running_loop().create_future()
+    link.start(finder.on_data, ended.set_result)
+    finder.start()
+    searching = asyncio.ensure_future(finder.finished())
+    await asyncio.wait({searching, ended}, return_when=asyncio.FIRST_COMPLETED)
+    if not searching.done():
+        searching.cancel()
+        error = ended.result()
+        raise error if error is not None else ImudError(f"{link.title} ended")
+    await searching
+    return findings[0]
+
+
+async def identity_of_device(found: StreamFound, link: StreamLink) -> Identity:
+    """Ask a device for its identity; empty when it does not answer."""
+    ledger = Ledger()
+    codec = found.driver.make_codec(ledger, found.driver.settings())
+    exchange = Exchange(ledger, link.write, monotonic_ns, link.set_baud)
+
+    def on_data(data: bytes, t_rx_ns: int) -> None:
+        for event in codec.feed(data):
+            if (message := message_of(event)) is not None:
+                exchange.on_message(message, t_rx_ns)
+
+    link.start(on_data, lambda error: None)
+    with contextlib.suppress(CommandError):
+        return await exchange.run(found.driver.identify())
+    return Identity()
+
+
+PROBE = CliCommand(add_arguments, run)

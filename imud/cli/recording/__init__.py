@@ -1,1 +1,0 @@
-"""Commands on recordings: their replay, and what is in them."""

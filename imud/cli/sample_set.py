@@ -1,0 +1,400 @@
+"""Samples for an analysis, from a recording, a capture or a running daemon, with their origin and what is lost."""
+
+import argparse
+import sys
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from math import nan
+from time import monotonic
+from typing import Final
+
+import numpy as np
+
+from imud import config
+from imud.analysis.series import FloatArray, Readings
+from imud.cli.arguments import connect, statuses
+from imud.cli.replay import BAUD, DRIVER, check, configuration, has_times, looks_like_recording, problem_of, serve
+from imud.contracts.driver import DataSheet
+from imud.contracts.publisher import Batch
+from imud.contracts.status import DeviceStatus
+from imud.daemon import Daemon
+from imud.drivers import DRIVERS
+from imud.formats.recording import RecordingReader
+from imud.formats.records import Kind
+from imud.host import event_loop
+from imud.host.files import open_regular
+from imud.host.log import STDERR, log_to
+from imud.model.errors import BadArgument, ImudError
+from imud.model.event import Event
+from imud.model.ledger import LOST_FIELDS
+from imud.model.sample import Sample
+from imud.model.units import NS_PER_S
+from imud.recording.player import PlayedDevice, Player
+
+SAMPLES_MOST: Final = 20_000_000
+"""14 hours at 400 Hz; they take 1.3 GB, and the analysis as much again."""
+SILENCE_S: Final = 5.0
+"""A live device that sends nothing for so long is named."""
+LATENCY_MS: Final = 200.0
+"""Samples of a live device may come so late, several at once: an analysis costs the daemon little then."""
+NOTE_S: Final = 1.0
+"""Time between two notes of progress."""
+_NONE3: Final = (nan, nan, nan)
+
+
+@dataclass(slots=True)
+class Taken:
+    """Samples and their provenance."""
+
+    source: str
+    """The file, or the daemon's socket."""
+    device: str = ""
+    driver: str = ""
+    link: str = ""
+    identity: Mapping[str, str] = field(default_factory=dict)
+    settings: Mapping[str, str] = field(default_factory=dict)
+    begun_utc_ns: int | None = None
+    """UTC of the first sample; None where the capture has no time."""
+    readings: Readings | None = None
+    lost: dict[str, int] = field(default_factory=dict)
+    """Samples lost meanwhile, by the daemon's causes, those that are not zero."""
+    stamps: str = ""
+    """How the samples are dated, in words."""
+    notes: list[str] = field(default_factory=list)
+    """What else the reader of a report has to know."""
+
+    @property
+    def sheet(self) -> DataSheet:
+        """What the vendor's manual states."""
+        return DRIVERS[self.driver].data_sheet if self.driver in DRIVERS else DataSheet()
+
+
+class Collector:
+    """Collector of the samples of one device, in the order of arrival; also a publisher of a daemon that replays.
+
+    Before `skip_s` after the first sample nothing is kept, nor after `for_s` more.
+    """
+
+    def __init__(self, name: str = "", *, skip_s: float = 0.0, for_s: float | None = None) -> None:
+        self.name = name
+        """The device; empty for the only one."""
+        self.others: set[str] = set()
+        """Devices that were passed over although none was chosen."""
+        self.done = False
+        """Whether all that was asked for is there."""
+        self.first: Sample | None = None
+        self.newest: Sample | None = None
+        self.syncs: Counter[str] = Counter()
+        self.by_device_time = False
+        """Whether to date samples by the device's clock."""
+        self.look: Callable[[], None] = lambda: None
+        """Called after the first sample that is kept and the last that was asked for: losses are those between."""
+        self._chosen = bool(name)
+        self._skip_ns, self._for_ns = round(skip_s * NS_PER_S), None if for_s is None else round(for_s * NS_PER_S)
+        self._begin_ns: int | None = None
+        self._errors_ns = 0
+        self._times = array("q")
+        self._gyro, self._accel, self._temperature = array("d"), array("d"), array("d")
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def add(self, sample: Sample) -> None:
+        """Take one sample. Raises ImudError where there are more than fit."""
+        if self.done:
+            return
+        if not self.name:
+            self.name = sample.device
+        if sample.device != self.name:
+            if not self._chosen:
+                self.others.add(sample.device)
+            return
+        t_ns = sample.t_dev_ns if self.by_device_time else sample.t_ns
+        if t_ns is None:
+            raise BadArgument("the capture has no time of any read, and its messages no time of the device")
+        if self._begin_ns is None:
+            self._begin_ns = t_ns + self._skip_ns
+        if t_ns < self._begin_ns:
+            return
+        if self._for_ns is not None and t_ns - self._begin_ns > self._for_ns:
+            self.done = True
+            return
+        if len(self._times) >= SAMPLES_MOST:
+            raise BadArgument(f"expected at most {SAMPLES_MOST} samples: choose a part with --skip and --for")
+        self._keep(sample, t_ns)
+
+    def _keep(self, sample: Sample, t_ns: int) -> None:
+        self.first = self.first or sample
+        self.newest = sample
+        self.syncs[str(sample.sync)] += 1
+        self._errors_ns += sample.t_err_ns
+        self._times.append(t_ns)
+        self._gyro.extend(sample.gyro_rad_s or _NONE3)
+        self._accel.extend(sample.accel_m_s2 or _NONE3)
+        self._temperature.append(nan if sample.temperature_c is None else sample.temperature_c)
+
+    def drop_before(self, t_ns: int) -> None:
+        """Remove the samples before a time: a live view has no past."""
+        count = int(np.searchsorted(np.frombuffer(self._times, dtype=np.int64), t_ns)) if self._times else 0
+        del self._times[:count], self._temperature[:count], self._gyro[: 3 * count], self._accel[: 3 * count]
+
+    def readings(self) -> Readings:
+        """Copy what was collected into arrays."""
+        temperature = np.array(self._temperature)
+        return Readings(
+            np.array(self._times, dtype=np.int64), _sensor(self._gyro), _sensor(self._accel),
+            temperature if np.isfinite(temperature).any() else None,
+        )  # fmt: skip
+
+    def stamps(self) -> str:
+        """Describe how the samples are dated."""
+        if self.by_device_time:
+            return "the device's own clock; the capture has no time of any read, so the rate is as true as its crystal"
+        kinds = ", ".join(f"{100 * count / len(self):.3g} % {kind}" for kind, count in self.syncs.most_common())
+        return f"{kinds}; mean stated error {self._errors_ns / max(len(self), 1) / 1000:.3g} µs"
+
+    # --- as a publisher of a daemon -----------------------------------------------------------------------------------
+
+    def publish(self, batch: Batch) -> None:
+        """Take the samples."""
+        before = self.first, self.done
+        for sample in batch.samples:
+            self.add(sample)
+        if (self.first, self.done) != before:
+            self.look()
+
+    def start(self) -> None:
+        """No-op: there is nothing to open."""
+
+    def add_device(self, name: str, device_id: int) -> None:
+        """No-op: a device is known by its samples."""
+
+    def remove_device(self, name: str) -> None:
+        """No-op: its samples stay."""
+
+    def event(self, event: Event) -> None:
+        """No-op: events are in the log."""
+
+    def tick(self, now_ns: int) -> None:
+        """No-op: nothing depends on time."""
+
+    def close(self) -> None:
+        """No-op: nothing is open."""
+
+
+class LossTally:
+    """Tally of how many samples a device lost by each cause while its ledger was looked at."""
+
+    def __init__(self) -> None:
+        self.lost: Counter[str] = Counter()
+        """By the ledger's names."""
+        self._newest: Mapping[str, int] | None = None
+
+    @property
+    def begun(self) -> bool:
+        """Whether the ledger was looked at."""
+        return self._newest is not None
+
+    def look(self, ledger: Mapping[str, int]) -> None:
+        """Add what was lost since the look before. A ledger with fewer samples than then has begun anew."""
+        before = self._newest if self._newest is not None else ledger
+        if ledger.get("samples", 0) < before.get("samples", 0):
+            before = {}
+        self.lost.update({name: ledger.get(name, 0) - before.get(name, 0) for name in LOST_FIELDS})
+        self._newest = ledger
+
+    def found(self) -> dict[str, int]:
+        """Return the causes by which samples were lost."""
+        return {name: count for name, count in self.lost.items() if count}
+
+
+def _sensor(values: "array[float]") -> FloatArray | None:
+    found = np.array(values).reshape(-1, 3)
+    return found if np.isfinite(found).any() else None
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def take_file(args: argparse.Namespace) -> Taken:
+    """Read the samples of `args.input`, a recording or a capture. Raises ImudError, OSError."""
+    with log_to(STDERR, "error"):
+        taken = take_recording(args) if looks_like_recording(args.input) else take_capture(args)
+    if taken.readings is None or not len(taken.readings.t_ns):
+        after = f" of {args.device}" if args.device else ""
+        after += f" later than {args.skip:g} s after its first (--skip)" if args.skip else ""
+        raise ImudError(
+            f"{args.input}: expected samples{after}, found none; `imud info` says what is in a recording, "
+            "`imud decode` what is in a capture"
+        )
+    return taken
+
+
+def take_recording(args: argparse.Namespace) -> Taken:
+    """Play a recording; the stamps are those of the live run."""
+    for option, default in (("driver", None), ("option", []), ("baud", None)):
+        if getattr(args, option) != default:
+            raise BadArgument(f"--{option}: expected none with a recording, which has those of the live run")
+    collector = Collector(args.device or "", skip_s=args.skip or 0.0, for_s=args.duration)
+    taken, tally = Taken(args.input), LossTally()
+    with open_regular(args.input) as file:
+        player = Player(collector.publish)
+        reader = RecordingReader(file, args.input)
+
+        def look() -> None:
+            if (device := played(player, collector.name)) is not None and collector.first is not None:
+                tally.look(device.ledger.snapshot())
+
+        collector.look = look
+        for record in reader:
+            if record.kind == Kind.PATH:  # it may begin the ledger anew
+                look()
+            player.play((record,))
+            if record.kind in (Kind.PATH, Kind.CHECK):
+                look()
+            if collector.done or collector.others:
+                break
+        if not collector.done:
+            look()
+    names = [device.described.name for device in player.devices.values()]
+    if collector.others:
+        raise BadArgument(f"{args.input}: it has {', '.join(names)}: choose one with --device")
+    if args.device and args.device not in names:
+        there = ", ".join(names) or "none: the block that names them is damaged or missing"
+        raise BadArgument(f"--device {args.device}: expected one of the recording's, {there}")
+    _describe(taken, player, collector.name)
+    taken.notes += list(reader.problems)
+    if player.lost:
+        taken.notes.append(f"records that were dropped when the file was written: {player.lost}")
+    return _finished(taken, collector, tally.found())
+
+
+def played(player: Player, name: str) -> PlayedDevice | None:
+    """Return the device of this name; None where there is none yet."""
+    return next((device for device in player.devices.values() if device.described.name == name), None)
+
+
+def _describe(taken: Taken, player: Player, name: str) -> None:
+    """Note what the recording has of the device, and how it was replayed."""
+    if (device := played(player, name)) is None:
+        return
+    taken.driver = device.driver.name if device.driver is not None else device.described.driver
+    taken.link, taken.identity = device.described.where, device.described.identity
+    taken.settings = device.described.settings
+    taken.notes += [f"clock: {why}" for why in device.fresh_starts[:1]]
+    if device.differences:
+        taken.notes.append(f"replay: {len(device.differences)} of {device.checks} checks differ")
+
+
+def take_capture(args: argparse.Namespace) -> Taken:
+    """Run a capture through the daemon's whole path."""
+    replayed = argparse.Namespace(
+        file=args.input, driver=args.driver or DRIVER, speed="maximum", baud=args.baud or BAUD, socket=None,
+        option=args.option,
+    )  # fmt: skip
+    settings = config.parse(configuration(replayed), str(args.input))
+    check(settings.devices[0])
+    collector = Collector(skip_s=args.skip or 0.0, for_s=args.duration)
+    collector.by_device_time = not has_times(replayed)
+    daemon = Daemon(settings, extra={"collect": collector}, until_finished=True)
+    tally = LossTally()
+    collector.look = lambda: tally.look(daemon.status()[0].ledger)
+    event_loop.run(serve(daemon))
+    if not collector.done:
+        collector.look()
+    status = daemon.status()[0]
+    taken = Taken(args.input, driver=status.driver, link=status.link, identity=status.identity)
+    taken.settings = status.settings
+    if problem := problem_of(replayed)[0]:
+        taken.notes.append(problem)
+    finished = _finished(taken, collector, tally.found())
+    finished.device, finished.begun_utc_ns = args.device or "capture", None
+    return finished
+
+
+def _finished(taken: Taken, collector: Collector, lost: dict[str, int]) -> Taken:
+    taken.device, taken.lost = collector.name, lost
+    taken.readings, taken.stamps = collector.readings(), collector.stamps() if len(collector) else ""
+    taken.begun_utc_ns = collector.first.utc_ns if collector.first is not None else None
+    return taken
+
+
+# --- a running daemon -------------------------------------------------------------------------------------------------
+
+
+def take_live(args: argparse.Namespace, note: Callable[[float, int], None] = lambda _passed_s, _count: None) -> Taken:
+    """Collect the samples of the device `args.input` for `args.duration`, or until interrupted.
+
+    A device that falls silent is waited for until `args.duration` is over by the clock; what came is kept. `note` is
+    called about once a second with the time passed and the number of samples. Raises ImudError, BadArgument where
+    nothing comes from the begin.
+    """
+    with connect(args) as asking, connect(args) as listening:
+        before = status_of(statuses(asking), args.input)
+        collector = Collector(args.input, skip_s=args.skip or 0.0, for_s=args.duration)
+        samples = listening.watch([args.input], timeout_s=SILENCE_S, latency_ms=LATENCY_MS)
+        tally = LossTally()
+        if not args.skip:
+            tally.look(before.ledger)
+        begun = noted = monotonic()
+        with suppress(KeyboardInterrupt):
+            for sample in heard(samples, args.input):
+                if sample is None:
+                    if args.duration is not None and monotonic() - begun >= args.duration + (args.skip or 0.0):
+                        break
+                    continue
+                collector.add(sample)
+                if not tally.begun and collector.first is not None:
+                    tally.look(status_of(statuses(asking), args.input).ledger)
+                now = monotonic()
+                if now - noted >= NOTE_S:
+                    noted = now
+                    note(now - begun, len(collector))
+                if collector.done:
+                    break
+        after = status_of(statuses(asking), args.input)
+        taken = taken_of(after, args.socket)
+        dropped = samples.dropped.get(args.input, 0)
+    if tally.begun:
+        tally.look(after.ledger)
+    lost = tally.found()
+    return _finished(taken, collector, lost | ({"dropped": dropped} if dropped else {}))
+
+
+def heard(samples: Iterator[Sample], name: str) -> Iterator[Sample | None]:
+    """Yield the samples, and None after each SILENCE_S without one. Raises BadArgument where none comes at all."""
+    silent = True
+    while True:
+        try:
+            sample = next(samples)
+        except TimeoutError:
+            if silent:
+                raise BadArgument(f"{name}: it sends no samples; `imud status` says why") from None
+            yield None
+        except StopIteration:
+            return
+        else:
+            silent = False
+            yield sample
+
+
+def status_of(found: Iterable[DeviceStatus], name: str) -> DeviceStatus:
+    """Return the status of a device. Raises BadArgument with the names there are."""
+    known = {status.name: status for status in found}
+    if name not in known:
+        raise BadArgument(f"{name}: expected a file, or a device of the daemon ({', '.join(known) or 'it has none'})")
+    return known[name]
+
+
+def taken_of(status: DeviceStatus, socket: str) -> Taken:
+    """Begin the provenance of a live device."""
+    return Taken(f"live from {socket}", status.name, status.driver, status.link, status.identity, status.settings)
+
+
+def progress(passed_s: float, count: int) -> None:
+    """Say on a terminal how far it is, in a line that the next one replaces."""
+    if sys.stderr.isatty():
+        print(f"{passed_s:.0f} s, {count} samples", end="\r", file=sys.stderr, flush=True)

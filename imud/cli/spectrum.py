@@ -1,0 +1,306 @@
+"""Report of a vibration analysis: density, peaks and bands as text and JSON, and as a picture."""
+
+import argparse
+import sys
+from collections import deque
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from time import monotonic
+from typing import Any, Final
+
+import numpy as np
+
+from imud.analysis.noise import AXES
+from imud.analysis.plots import SensorVibration, spectrum_figure
+from imud.analysis.quantities import SI, TITLES, figure_text
+from imud.analysis.series import FloatArray, Readings, even_runs, grid_of, with_values
+from imud.analysis.spectrum import (
+    WINDOW_LEAST,
+    Peak,
+    Spectrum,
+    bands_of,
+    images_hz,
+    peaks,
+    power_spectrum,
+    spectrogram,
+    window_size,
+)
+from imud.cli.arguments import connect, statuses
+from imud.cli.noise import circumstances, grid_object, measurement_object, picture, readings_of
+from imud.cli.output import COLUMNS, paragraph, shortened
+from imud.cli.sample_set import LATENCY_MS, SILENCE_S, Collector, Taken, heard, status_of
+from imud.contracts.driver import SensorName
+from imud.model.errors import BadArgument, ImudError
+from imud.model.units import NS_PER_S
+
+NAME_WIDTH: Final = 6
+NUMBER_WIDTH: Final = 10
+GRAM_PART: Final = 4
+"""Windows of the spectrogram are so much shorter than those of the spectrum: when, rather than which frequency."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpectrumSettings:
+    """What the user chose."""
+
+    sensors: tuple[SensorName, ...] = ("accel", "gyro")
+    resolution_hz: float | None = None
+    """Distance of bins; None: by the length of the series."""
+    bands_hz: tuple[tuple[float, float], ...] | None = None
+    """None: octaves."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpectrumReport:
+    """All that the outputs are made of."""
+
+    taken: Taken
+    sensors: dict[SensorName, SensorVibration]
+
+
+def spectrum_report(taken: Taken, settings: SpectrumSettings) -> SpectrumReport:
+    """Analyse the chosen sensors. Raises ImudError where none of them has values."""
+    readings = readings_of(taken)
+    sensors: dict[SensorName, SensorVibration] = {}
+    for name in settings.sensors:
+        values = readings.accel_m_s2 if name == "accel" else readings.gyro_rad_s
+        if values is not None:
+            sensors[name] = sensor_vibration(readings, values, settings)
+    if not sensors:
+        raise ImudError(f"{taken.source}: {taken.device} sends no values of {' or '.join(settings.sensors)}")
+    return SpectrumReport(taken, sensors)
+
+
+def sensor_vibration(readings: Readings, values: FloatArray, settings: SpectrumSettings) -> SensorVibration:
+    """Analyse one sensor, values (n, 3). Raises BadArgument where the series is too short."""
+    t_ns, values = with_values(readings.t_ns, values)
+    grid = grid_of(t_ns)
+    runs = even_runs(grid, values, smooth=True)
+    size = window_size(runs, grid.rate_hz, settings.resolution_hz)
+    spectrum = power_spectrum(runs, grid.rate_hz, size)
+    starts = [float(t_ns[first] - readings.t_ns[0]) / NS_PER_S for first, _ in grid.runs]
+    gram = spectrogram(runs, starts, grid.rate_hz, max(size // GRAM_PART, min(size, WINDOW_LEAST)))
+    return SensorVibration(
+        grid, spectrum, gram, tuple(peaks(spectrum)), tuple(bands_of(spectrum, settings.bands_hz))
+    )  # fmt: skip
+
+
+# --- words ------------------------------------------------------------------------------------------------------------
+
+
+def limits(taken: Taken, name: SensorName, sensor: SensorVibration) -> Iterator[str]:
+    """Sentences about what limits the spectrum of a sensor."""
+    half = sensor.spectrum.rate_hz / 2
+    yield sensor.grid.words()
+    yield sensor.spectrum.words()
+    own = taken.sheet.filter_words(taken.settings, name)
+    yield (
+        f"aliasing: what vibrates above {half:.4g} Hz, half the rate, and passes the device's own filter "
+        f"({own or 'which no manual states'}) stands below it: a line at f may be one at "
+        f"{sensor.spectrum.rate_hz:.4g} Hz - f. Measured at another rate, such a line moves"
+    )
+
+
+def peak_words(number: int, peak: Peak) -> str:
+    """Name a peak: its number, and of which other it is a multiple."""
+    if peak.harmonic_of is None:
+        return f"P{number}"
+    return f"P{number} = {peak.multiple} × P{peak.harmonic_of + 1}"
+
+
+def peak_lines(sensor: SensorVibration) -> list[str]:
+    """A table of the peaks."""
+    if not sensor.peaks:
+        return ["  no line stands out of the noise"]
+    head = f"  {'peak':<13}{'Hz':>10}" + "".join(f"{axis:>{NUMBER_WIDTH}}" for axis in AXES)
+    lines = [f"{head}{'over noise':>13}"]
+    for number, peak in enumerate(sensor.peaks, start=1):
+        values = "".join(f"{figure_text(value):>{NUMBER_WIDTH}}" for value in peak.amplitude)
+        lines.append(f"  {peak_words(number, peak):<13}{peak.frequency_hz:>10.3f}{values}{peak.floor_ratio:>12.3g}x")
+    return lines
+
+
+def band_lines(sensor: SensorVibration) -> list[str]:
+    """A table of the bands."""
+    lines = [f"  {'band, Hz':<23}" + "".join(f"{axis:>{NUMBER_WIDTH}}" for axis in AXES)]
+    for band in sensor.bands:
+        words = f"{band.low_hz:.4g} to {band.high_hz:.4g}"
+        lines.append(f"  {words:<23}" + "".join(f"{figure_text(value):>{NUMBER_WIDTH}}" for value in band.rms))
+    return lines
+
+
+def text(report: SpectrumReport) -> str:
+    """Format the report in 80 columns."""
+    lines = [f"{report.taken.device}: vibration"]
+    for name, words in circumstances(report.taken, full=False):
+        lines += paragraph(f"  {name:<13}", words)
+    for sensor_name, sensor in report.sensors.items():
+        lines += ["", f"{TITLES[sensor_name]}: lines, peak amplitude in {SI[sensor_name]}", *peak_lines(sensor)]
+        lines += ["", f"{TITLES[sensor_name]}: RMS of bands in {SI[sensor_name]}", *band_lines(sensor)]
+        for words in limits(report.taken, sensor_name, sensor):
+            lines += paragraph("  ", words)
+    return "\n".join(lines)
+
+
+def spectrum_file(report: SpectrumReport, kind: str) -> bytes:
+    """The content of a picture, `.svg` or `.png`."""
+    facts = dict(circumstances(report.taken, full=False))
+    lines = [f"{facts['identity']}; {facts['begun']}; {facts['duration']}; {facts['software']}"]
+    for name, sensor in report.sensors.items():
+        grid, spectrum = sensor.grid, sensor.spectrum
+        lines.append(
+            f"{TITLES[name]}: {grid.rate_hz:.4f} Hz, {grid.missing} samples missing, {spectrum.averages} windows, "
+            f"{spectrum.window.capitalize()}, noise bandwidth {spectrum.bandwidth_hz:.3g} Hz"
+        )
+    return picture(spectrum_figure(report.sensors, f"Vibration of {report.taken.device}", lines), kind)
+
+
+# --- JSON -------------------------------------------------------------------------------------------------------------
+
+
+def as_object(report: SpectrumReport) -> dict[str, Any]:
+    """The report for programs, SI."""
+    return {
+        "measurement": measurement_object(report.taken),
+        "sensors": {
+            name: _sensor_object(report.taken, name, sensor) for name, sensor in report.sensors.items()
+        },
+    }  # fmt: skip
+
+
+def _sensor_object(taken: Taken, name: SensorName, sensor: SensorVibration) -> dict[str, Any]:
+    spectrum = sensor.spectrum
+    return {
+        **grid_object(name, sensor.grid),
+        "window": spectrum.window,
+        "window_samples": spectrum.size,
+        "bin_hz": spectrum.bin_hz,
+        "bandwidth_hz": spectrum.bandwidth_hz,
+        "averages": spectrum.averages,
+        "device_filter": taken.sheet.filter_words(taken.settings, name),
+        "peaks": [
+            {
+                "frequency_hz": peak.frequency_hz,
+                "amplitude": list(peak.amplitude),
+                "over_noise": peak.floor_ratio,
+                "harmonic_of": peak.harmonic_of,
+                "multiple": peak.multiple,
+                "images_hz": list(images_hz(peak.frequency_hz, spectrum.rate_hz)),
+            }
+            for peak in sensor.peaks
+        ],
+        "bands": [{"low_hz": band.low_hz, "high_hz": band.high_hz, "rms": list(band.rms)} for band in sensor.bands],
+        "frequency_hz": spectrum.frequency_hz.tolist(),
+        "density": spectrum.density.T.tolist(),
+    }
+
+
+REDRAW_S: Final = 1.0
+KEPT_S: Final = 10.0
+"""The spectrum is of so much: a longer past would hide what changes."""
+PAST_ROWS: Final = 8
+"""Rows of the spectrogram."""
+HEIGHT: Final = 8
+"""Rows of the curve."""
+PEAKS_SHOWN: Final = 5
+RANGE_DB: Final = 60.0
+SHADES: Final = " ░▒▓█"
+BARS: Final = " ▁▂▃▄▅▆▇█"
+CLEAR: Final = "\x1b[H\x1b[2J"
+
+
+def live(args: argparse.Namespace, settings: SpectrumSettings) -> int:
+    """Redraw until interrupted. Raises ImudError."""
+    name = settings.sensors[0]
+    with connect(args) as asking, connect(args) as listening:
+        status_of(statuses(asking), args.input)
+        collector = Collector(args.input)
+        view = LiveView(args.input, name)
+        drawn_s = monotonic()
+        with suppress(KeyboardInterrupt):
+            samples = listening.watch([args.input], timeout_s=SILENCE_S, latency_ms=LATENCY_MS)
+            for sample in heard(samples, args.input):
+                if sample is None:
+                    sys.stdout.write(f"{CLEAR}{args.input} sends no samples now; `imud status` says why\n")
+                    sys.stdout.flush()
+                    continue
+                collector.add(sample)
+                if monotonic() - drawn_s >= REDRAW_S:
+                    drawn_s = monotonic()
+                    collector.drop_before(sample.t_ns - round(KEPT_S * NS_PER_S))
+                    sys.stdout.write(CLEAR + view.page(collector, settings) + "\n")
+                    sys.stdout.flush()
+    return 0
+
+
+class LiveView:
+    """Text of the view, and the rows of its spectrogram."""
+
+    def __init__(self, device: str, name: SensorName) -> None:
+        self._device = device
+        self._name: SensorName = name
+        self._past: deque[str] = deque(maxlen=PAST_ROWS)
+
+    def page(self, collector: Collector, settings: SpectrumSettings) -> str:
+        """Format the view of what the collector has now, in 80 columns."""
+        readings = collector.readings()
+        values = readings.accel_m_s2 if self._name == "accel" else readings.gyro_rad_s
+        if values is None:
+            return f"{self._device} sends no values of the {TITLES[self._name]}"
+        try:
+            sensor = sensor_vibration(readings, values, settings)
+        except BadArgument as error:  # too few samples yet
+            return f"{self._device}: {error}"
+        return "\n".join(self._lines(sensor))
+
+    def _lines(self, sensor: SensorVibration) -> list[str]:
+        columns = in_columns(sensor.spectrum)
+        decibels = 10 * np.log10(np.maximum(columns, 1e-300))
+        top = 10 * int(np.ceil(decibels.max() / 10))
+        level = np.clip((decibels - top + RANGE_DB) / RANGE_DB, 0, 1)
+        self._past.appendleft("".join(SHADES[min(int(one * len(SHADES)), len(SHADES) - 1)] for one in level))
+        grid, spectrum = sensor.grid, sensor.spectrum
+        head = (
+            f"{shortened(self._device, 16)} {TITLES[self._name]}: {grid.rate_hz:.3f} Hz, {grid.missing} missing, "
+            f"bins of {spectrum.bin_hz:.3g} Hz"
+        )
+        unit = f"dB of ({SI[self._name]})²/Hz"
+        return [
+            head, f"{top} {unit}", *curve_rows(level), axis_line(spectrum.rate_hz / 2),
+            f"{top - RANGE_DB:.0f} {unit}; the last {len(self._past)} s, newest above:", *self._past,
+            f"lines, peak amplitude in {SI[self._name]}",
+            *peak_lines(sensor)[: PEAKS_SHOWN + 1],
+        ]  # fmt: skip
+
+
+def in_columns(spectrum: Spectrum) -> FloatArray:
+    """(COLUMNS,) the highest density of all axes together in each column: a line stays a line."""
+    power = spectrum.density[1:].sum(axis=1)
+    column = (np.arange(len(power)) * COLUMNS) // len(power)
+    found = np.full(COLUMNS, 0.0)
+    np.maximum.at(found, column, power)
+    if len(power) < COLUMNS:
+        found = power[np.arange(COLUMNS) * len(power) // COLUMNS]
+    return np.asarray(found, dtype=np.float64)
+
+
+def curve_rows(level: FloatArray) -> list[str]:
+    """The curve as HEIGHT rows of bars; level (COLUMNS,) 0 to 1."""
+    eighths = np.rint(level * HEIGHT * (len(BARS) - 1)).astype(int)
+    rows = []
+    for row in range(HEIGHT - 1, -1, -1):
+        inside = np.clip(eighths - row * (len(BARS) - 1), 0, len(BARS) - 1)
+        rows.append("".join(BARS[one] for one in inside).rstrip())
+    return rows
+
+
+def axis_line(half_hz: float) -> str:
+    """Frequencies below the columns: 0, a quarter, the middle, three quarters, the end."""
+    line = [" "] * COLUMNS
+    for quarter in range(5):
+        words = f"{half_hz * quarter / 4:.4g}" + (" Hz" if quarter == 4 else "")
+        place = round((COLUMNS - 1) * quarter / 4)
+        begin = min(max(place - len(words) // 2, 0), COLUMNS - len(words))
+        line[begin : begin + len(words)] = words
+    return "".join(line)

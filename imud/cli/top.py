@@ -1,0 +1,691 @@
+"""The screens and keys of `imud top`."""
+
+import argparse
+import math
+import sys
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from math import inf
+from typing import ClassVar, Final, NamedTuple, Protocol
+
+from textual.app import App, ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, VerticalScroll
+from textual.message import Message
+from textual.screen import Screen
+from textual.widgets import Footer, Input, Label, OptionList, RichLog, Sparkline, Static
+from textual.widgets.option_list import Option
+
+from imud.cli.arguments import CliCommand, add_socket
+from imud.cli.events import as_text, printed
+from imud.cli.output import fitted, shortened
+from imud.cli.status import WELL, block
+from imud.client.feed import Feed, News, Wish, utc_offset_ns
+from imud.contracts.status import DeviceState, DeviceStatus
+from imud.host.log import printable
+from imud.model.errors import BadArgument
+from imud.model.event import Event
+from imud.model.ledger import lost
+from imud.model.sample import Sample, Vector3
+from imud.model.units import NS_PER_S, NS_PER_US, RAD_PER_DEG, T_PER_UT
+
+POINTS_MAX: Final = 1200
+"""Samples kept of a device: a minute at 20 Hz."""
+SPAN_NS: Final = 60 * NS_PER_S
+"""Older samples are not shown."""
+
+
+class Curve(NamedTuple):
+    """One value over time that the page of a device shows."""
+
+    name: str
+    unit: str
+    value: Callable[[Sample], float | None]
+    """Its value in a sample in that unit; None where the sample has none."""
+
+
+def _part(member: str, index: int, unit: float) -> Callable[[Sample], float | None]:
+    def value(sample: Sample) -> float | None:
+        vector: Sequence[float] | None = getattr(sample, member)
+        return None if vector is None or not math.isfinite(vector[index]) else vector[index] / unit
+
+    return value
+
+
+CURVES: Final = (
+    *(Curve(name, "°", _part("euler_rad", index, RAD_PER_DEG)) for index, name in enumerate(("roll", "pitch", "yaw"))),
+    *(Curve(f"accel {axis}", "m/s²", _part("accel_m_s2", index, 1.0)) for index, axis in enumerate("xyz")),
+    *(Curve(f"gyro {axis}", "°/s", _part("gyro_rad_s", index, RAD_PER_DEG)) for index, axis in enumerate("xyz")),
+    *(Curve(f"mag {axis}", "µT", _part("mag_t", index, T_PER_UT)) for index, axis in enumerate("xyz")),
+)
+"""Rows of a device's page, in their order."""
+
+
+class Series(NamedTuple):
+    """A curve and what came of it."""
+
+    curve: Curve
+    values: list[float]
+    """Oldest first; empty where the device does not send it."""
+
+
+class DeviceHistory:
+    """One device."""
+
+    def __init__(self, status: DeviceStatus) -> None:
+        self.status = status
+        self._samples: deque[Sample] = deque(maxlen=POINTS_MAX)
+
+    @property
+    def newest(self) -> Sample | None:
+        """The newest sample; None before the first."""
+        return self._samples[-1] if self._samples else None
+
+    def add(self, sample: Sample) -> None:
+        """Keep a sample; one that is older than the newest begins the history anew: the daemon was restarted."""
+        samples = self._samples
+        if samples and sample.t_ns < samples[-1].t_ns:
+            samples.clear()
+        samples.append(sample)
+        while samples[0].t_ns < sample.t_ns - SPAN_NS:
+            samples.popleft()
+
+    def series(self) -> list[Series]:
+        """All curves, in the order of CURVES."""
+        found = []
+        for curve in CURVES:
+            values = (curve.value(sample) for sample in self._samples)
+            found.append(Series(curve, [value for value in values if value is not None]))
+        return found
+
+
+class DeviceHistories:
+    """All devices of a daemon, by name, in the order of its configuration."""
+
+    def __init__(self) -> None:
+        self.devices: dict[str, DeviceHistory] = {}
+        self.now_ns = 0
+        """CLOCK_MONOTONIC of the newest news."""
+        self.clients = 0
+        """Connected to the daemon, this one included."""
+
+    def update(self, statuses: Iterable[DeviceStatus], clients: int) -> None:
+        """Take a status of all devices; one that is not in it any more is forgotten."""
+        before, self.devices = self.devices, {}
+        for status in statuses:
+            device = before.get(status.name)
+            if device is None:
+                device = DeviceHistory(status)
+            device.status = status
+            self.devices[status.name] = device
+        self.clients = clients
+
+    def add(self, sample: Sample) -> None:
+        """Take a sample; one of a device that no status had yet is left out."""
+        device = self.devices.get(sample.device)
+        if device is not None:
+            device.add(sample)
+
+
+def norm(vector: Vector3 | None) -> float | None:
+    """Length of a vector; None for none, or where it is not finite."""
+    if vector is None:
+        return None
+    length = math.hypot(*vector)
+    return length if math.isfinite(length) else None
+
+
+WIDTH: Final = 78
+"""Of a row: a terminal of 80 columns less the scroll bar."""
+NONE: Final = "-"
+NAME_WIDTH: Final = 10
+TEXT_MAX: Final = 256
+AGE_OLD_S: Final = 999.9
+"""Beyond this an age is shown in minutes, hours or days."""
+
+Number = float | int | None
+
+
+class Column(NamedTuple):
+    """One column."""
+
+    title: str
+    width: int
+    text: Callable[[DeviceHistory, int], str]
+    """Of a device at a time (CLOCK_MONOTONIC, ns)."""
+    key: Callable[[DeviceHistory, int], float | str]
+    """What rows are sorted by."""
+    is_number: bool = True
+    """Numbers stand to the right, and the largest comes first."""
+
+
+def _number(
+    title: str, width: int, value: Callable[[DeviceHistory, int], Number], show: Callable[[float], str]
+) -> Column:
+    def text(device: DeviceHistory, now_ns: int) -> str:
+        found = value(device, now_ns)
+        return NONE if found is None else fitted(found, width, show)
+
+    def key(device: DeviceHistory, now_ns: int) -> float:
+        found = value(device, now_ns)
+        return -inf if found is None else found
+
+    return Column(title, width, text, key)
+
+
+def age_s(device: DeviceHistory, now_ns: int) -> float | None:
+    """Time since the newest sample was measured, s; None before the first."""
+    newest = device.newest
+    return None if newest is None else max(now_ns - newest.t_ns, 0) / NS_PER_S
+
+
+def duration(seconds: float) -> str:
+    """Format a time in at most five characters."""
+    if seconds < 10:
+        return f"{seconds:.2f}s"
+    if seconds <= AGE_OLD_S:
+        return f"{seconds:.0f}s"
+    if seconds < 100 * 3600:
+        return f"{seconds / 60:.0f}m" if seconds < 999 * 60 else f"{seconds / 3600:.0f}h"
+    return f"{seconds / 86400:.0f}d"
+
+
+def _angle(index: int) -> Callable[[DeviceHistory, int], Number]:
+    def value(device: DeviceHistory, now_ns: int) -> Number:
+        newest = device.newest
+        return None if newest is None or newest.euler_rad is None else newest.euler_rad[index] / RAD_PER_DEG
+
+    return value
+
+
+def _accel(device: DeviceHistory, now_ns: int) -> Number:
+    return None if device.newest is None else norm(device.newest.accel_m_s2)
+
+
+def _turn_rate(device: DeviceHistory, now_ns: int) -> Number:
+    found = None if device.newest is None else norm(device.newest.gyro_rad_s)
+    return None if found is None else found / RAD_PER_DEG
+
+
+def _error_us(device: DeviceHistory, now_ns: int) -> Number:
+    return None if device.newest is None else device.newest.t_err_ns / NS_PER_US
+
+
+def _counted(name: str) -> Callable[[DeviceHistory, int], Number]:
+    return lambda device, now_ns: device.status.ledger.get(name, 0)
+
+
+def _whole(value: float) -> str:
+    return f"{value:.0f}"
+
+
+def _tenths(value: float) -> str:
+    return f"{value:.1f}"
+
+
+def _hundredths(value: float) -> str:
+    return f"{value:.2f}"
+
+
+STATE_ORDER: Final = (
+    DeviceState.FAILED, DeviceState.MISSING, DeviceState.SILENT, DeviceState.SEARCHING, DeviceState.RUNNING,
+    DeviceState.FINISHED,
+)  # fmt: skip
+"""What needs attention comes first."""
+
+NAME: Final = Column(
+    "DEVICE",
+    NAME_WIDTH,
+    lambda device, now_ns: shortened(printable(device.status.name, TEXT_MAX), NAME_WIDTH),
+    lambda device, now_ns: device.status.name,
+    is_number=False,
+)
+STATE: Final = Column(
+    "STATE",
+    9,
+    lambda device, now_ns: str(device.status.state),
+    lambda device, now_ns: f"{STATE_ORDER.index(device.status.state)}",
+    is_number=False,
+)
+RATE: Final = _number("HZ", 6, lambda device, now_ns: device.status.rate_hz, _tenths)
+AGE: Final = Column(
+    "AGE",
+    5,
+    lambda device, now_ns: NONE if (age := age_s(device, now_ns)) is None else duration(age),
+    lambda device, now_ns: inf if (age := age_s(device, now_ns)) is None else age,
+)
+LOST: Final = _number("LOST", 5, lambda device, now_ns: lost(device.status.ledger), _whole)
+ERROR: Final = _number("±µs", 5, _error_us, _whole)
+SYNC: Final = Column(
+    "STAMP",
+    5,
+    lambda device, now_ns: NONE if device.newest is None else str(device.newest.sync)[:5],
+    lambda device, now_ns: "" if device.newest is None else str(device.newest.sync),
+    is_number=False,
+)
+
+VIEWS: Final[dict[str, tuple[Column, ...]]] = {
+    "motion": (
+        NAME, STATE, RATE, AGE, LOST, ERROR,
+        _number("ROLL°", 6, _angle(0), _tenths),
+        _number("PITCH°", 6, _angle(1), _tenths),
+        _number("YAW°", 6, _angle(2), _tenths),
+        _number("|a|", 5, _accel, _hundredths),
+        _number("|ω|°", 5, _turn_rate, _tenths),
+    ),
+    "losses": (
+        NAME, RATE,
+        _number("EXPECT", 6, lambda device, now_ns: device.status.expected_rate_hz or None, _tenths),
+        LOST,
+        _number("DEVICE", 6, _counted("lost_gap_device"), _whole),
+        _number("DAMAG", 5, _counted("lost_crc"), _whole),
+        _number("OVERR", 5, _counted("lost_overrun"), _whole),
+        _number("QUEUE", 5, _counted("lost_queue"), _whole),
+        _number("UNKN", 4, _counted("lost_unknown"), _whole),
+        _number("CRC", 5, _counted("frames_bad_crc"), _whole),
+        _number("OPENS", 5, lambda device, now_ns: device.status.connects, _whole),
+        _number("°C", 5, lambda device, now_ns: device.status.temperature_c, _tenths),
+    ),
+    "clock": (
+        NAME, SYNC, ERROR,
+        _number("SKEWppm", 8, lambda device, now_ns: device.status.clock.skew_ppm, _hundredths),
+        _number("RESIDµs", 7, lambda device, now_ns: device.status.clock.residual_ns / NS_PER_US, _tenths),
+        _number("HOLDms", 6, lambda device, now_ns: device.status.hold_ns / 1e6, _tenths),
+        _number("STEER", 6, lambda device, now_ns: device.status.clock.steering_ppm, _tenths),
+        _number("RESETS", 6, lambda device, now_ns: device.status.clock.resets, _whole),
+        _number("PULSES", 6, lambda device, now_ns: device.status.clock.edges, _whole),
+        _number("UNPAIR", 6, lambda device, now_ns: device.status.clock.edges_unpaired, _whole),
+    ),
+}  # fmt: skip
+"""Sets of columns, by name; each WIDTH wide at most, with a space between two columns."""
+
+SORTS: Final = (NAME, STATE, RATE, AGE, LOST, ERROR)
+"""What rows can be sorted by, in the order in which the key goes through them."""
+
+
+def head(columns: Iterable[Column]) -> str:
+    """Format the titles."""
+    return _line((column.title, column) for column in columns)
+
+
+def row(device: DeviceHistory, columns: Iterable[Column], now_ns: int) -> str:
+    """Format one device."""
+    return _line((column.text(device, now_ns), column) for column in columns)
+
+
+def _line(cells: Iterable[tuple[str, Column]]) -> str:
+    parts = [
+        text[: column.width].rjust(column.width) if column.is_number else text[: column.width].ljust(column.width)
+        for text, column in cells
+    ]
+    return " ".join(parts)
+
+
+def chosen(
+    devices: Iterable[DeviceHistory], sort: Column, now_ns: int, *, backwards: bool = False, words: str = ""
+) -> list[DeviceHistory]:
+    """Sort devices, the largest number first, and leave out those in which not all `words` occur.
+
+    Words are looked for in name, state, driver, link, problem and identity, whatever their case.
+    """
+    wanted = words.casefold().split()
+    found = [device for device in devices if all(word in _searched(device) for word in wanted)]
+    found.sort(key=lambda device: device.status.name)
+    found.sort(key=lambda device: sort.key(device, now_ns), reverse=sort.is_number != backwards)
+    return found
+
+
+def _searched(device: DeviceHistory) -> str:
+    status = device.status
+    parts = (status.name, status.state, status.driver, status.link, status.problem, *status.identity.values())
+    return " ".join(parts).casefold()
+
+
+EVENTS_KEPT: Final = 200
+
+
+def event_line(event: Event, utc_offset_ns: int) -> str:
+    """Format an event as `imud events` does, in one line; `utc_offset_ns` is CLOCK_REALTIME minus CLOCK_MONOTONIC."""
+    return as_text(printed(event, utc_offset_ns))[:TEXT_MAX]
+
+
+class NewsSource(Protocol):
+    """What reads the daemon."""
+
+    def start(self) -> None:
+        """Begin to read."""
+        ...
+
+    def look_at(self, device: str | None) -> None:
+        """Read samples of this device only, and more of them; None for all devices."""
+        ...
+
+    def close(self) -> None:
+        """End."""
+        ...
+
+
+class NewsCame(Message):
+    """News of the feed; a few a second."""
+
+    def __init__(self, news: News) -> None:
+        super().__init__()
+        self.news = news
+
+
+class TopApp(App[None]):
+    """The program. It takes `NewsCame`, from any thread."""
+
+    TITLE = "imud top"
+    CSS = """
+    #state, #head { height: 1; text-style: bold; }
+    #rows { height: 1fr; border: none; padding: 0; scrollbar-size-vertical: 1; }
+    #rows > .option-list--option { padding: 0; }
+    #filter { height: 1; border: none; padding: 0; display: none; }
+    .curve { height: 1; }
+    .curve Label { width: 44; }
+    .curve Sparkline { width: 1fr; }
+    #block { height: auto; margin: 1 0 0 0; }
+    #events { height: 6; border-top: solid $secondary; }
+    HelpPanel { split: bottom; width: 100%; max-width: 100%; height: 50%; }
+    HelpPanel { border-left: none; border-top: solid $secondary; }
+    """
+    ENABLE_COMMAND_PALETTE = False
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("q", "quit", "Quit"),
+        Binding("p,space", "pause", "Pause", key_display="p"),
+        Binding("question_mark", "toggle_help", "Help", key_display="?"),
+    ]
+
+    def __init__(self, make_feed: Callable[[Callable[[News], None]], NewsSource]) -> None:
+        """`make_feed` gets what takes news; from any thread."""
+        super().__init__()
+        self.fleet = DeviceHistories()
+        self.problem = "connecting"
+        self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
+        self.paused = False
+        self.ahead_ns = 0
+        """CLOCK_MONOTONIC of the daemon's machine minus that of this one."""
+        self._feed = make_feed(self._post)
+
+    def on_mount(self) -> None:
+        """Show the table, and start the feed."""
+        self.push_screen(Overview())
+        self._feed.start()
+
+    def on_unmount(self) -> None:
+        """End the feed."""
+        self._feed.close()
+
+    def look_at(self, device: str | None) -> None:
+        """Show more of this device, less of the others."""
+        self._feed.look_at(device)
+
+    def on_news_came(self, message: NewsCame) -> None:
+        """Take news and redraw; in a pause the picture stays, and what came meanwhile is in the next one."""
+        news = message.news
+        self.problem = news.problem
+        if news.statuses is not None:
+            self.fleet.update(news.statuses, news.clients)
+        self.fleet.now_ns, self.ahead_ns = news.now_ns, news.ahead_ns
+        for sample in news.samples:
+            self.fleet.add(sample)
+        self.events.extend(news.events)
+        if not self.paused:
+            self.redraw()
+
+    def redraw(self) -> None:
+        """Draw the screen that is shown."""
+        if isinstance(self.screen, TopScreen):
+            self.screen.redraw()
+
+    def action_pause(self) -> None:
+        """Stop drawing, or go on."""
+        self.paused = not self.paused
+        self.redraw()
+
+    def action_toggle_help(self) -> None:
+        """Show the keys, or hide them."""
+        if self.screen.query("HelpPanel"):
+            self.action_hide_help_panel()
+        else:
+            self.action_show_help_panel()
+
+    def state_line(self) -> str:
+        """Format how the daemon is."""
+        if self.problem:
+            return printable(self.problem, TEXT_MAX)
+        devices = self.fleet.devices.values()
+        well = sum(device.status.state in WELL for device in devices)
+        words = f"imud: {well} of {len(devices)} devices well, {self.fleet.clients} client"
+        words += "" if self.fleet.clients == 1 else "s"
+        return words + ("  PAUSED" if self.paused else "")
+
+    def _post(self, news: News) -> None:
+        self.post_message(NewsCame(news))
+
+
+class TopScreen(Screen[None]):
+    """A screen of the program, which is drawn once all its parts are there."""
+
+    is_ready = False
+
+    @property
+    def top(self) -> TopApp:
+        """The program."""
+        assert isinstance(self.app, TopApp)
+        return self.app
+
+    def redraw(self) -> None:
+        """Draw what the program knows now."""
+        if self.is_ready:
+            self.draw()
+
+    def begin(self) -> None:
+        """Draw for the first time."""
+        self.is_ready = True
+        self.draw()
+
+    def draw(self) -> None:
+        """Draw everything; all parts are there."""
+        raise NotImplementedError
+
+
+class Overview(TopScreen):
+    """The table of all devices."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("v", "view", "Columns"),
+        Binding("s", "sort", "Sort"),
+        Binding("r", "reverse", "Reverse"),
+        Binding("slash", "filter", "Filter", key_display="/"),
+        Binding("escape", "no_filter", "No filter", show=False),
+    ]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.view = next(iter(VIEWS))
+        self.sort = SORTS[0]
+        self.backwards = False
+        self.words = ""
+
+    def compose(self) -> ComposeResult:
+        """State, titles, rows, the words of the filter, keys."""
+        yield Static(id="state", markup=False)
+        yield Static(id="head", markup=False)
+        yield OptionList(id="rows", markup=False)
+        yield Input(placeholder="words of name, state, driver, link, problem", id="filter")
+        yield Footer()
+
+    def on_mount(self) -> None:
+        """Give the keys to the rows."""
+        self.query_one("#rows").focus()
+        self.begin()
+
+    def draw(self) -> None:
+        """Draw what changed; the row that was marked stays so."""
+        top, columns = self.top, VIEWS[self.view]
+        shown = chosen(
+            top.fleet.devices.values(), self.sort, top.fleet.now_ns, backwards=self.backwards, words=self.words
+        )
+        order = f"  by {self.sort.title}{' backwards' if self.backwards else ''}"
+        words = f"  filter: {self.words}" if self.words else ""
+        self.query_one("#state", Static).update(top.state_line() + ("" if top.problem else order + words))
+        self.query_one("#head", Static).update(head(columns))
+        rows = self.query_one("#rows", OptionList)
+        lines = {device.status.name: row(device, columns, top.fleet.now_ns) for device in shown}
+        names = [str(option.id) for option in rows.options]
+        if names == list(lines):
+            for name, line in lines.items():
+                rows.replace_option_prompt(name, line)
+            return
+        marked = rows.highlighted_option.id if rows.highlighted_option is not None else None
+        rows.set_options([Option(line, id=name) for name, line in lines.items()])
+        if lines:
+            rows.highlighted = list(lines).index(marked) if marked in lines else 0
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        """Open the page of a device."""
+        self.app.push_screen(DevicePage(str(event.option.id)))
+
+    def on_screen_resume(self) -> None:
+        """Draw again after a device's page."""
+        self.top.look_at(None)
+        self.redraw()
+
+    def on_input_changed(self, event: Input.Changed) -> None:
+        """Filter while the words are written."""
+        self.words = event.value
+        self.redraw()
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        """Keep the filter, and give the keys back to the rows."""
+        self.query_one("#rows").focus()
+        event.input.display = bool(self.words)
+
+    def action_view(self) -> None:
+        """Show the next set of columns."""
+        names = list(VIEWS)
+        self.view = names[(names.index(self.view) + 1) % len(names)]
+        self.redraw()
+
+    def action_sort(self) -> None:
+        """Sort by the next column."""
+        self.sort = SORTS[(SORTS.index(self.sort) + 1) % len(SORTS)]
+        self.redraw()
+
+    def action_reverse(self) -> None:
+        """Reverse the order."""
+        self.backwards = not self.backwards
+        self.redraw()
+
+    def action_filter(self) -> None:
+        """Ask for words."""
+        words = self.query_one("#filter", Input)
+        words.display = True
+        words.focus()
+
+    def action_no_filter(self) -> None:
+        """Show all devices again."""
+        words = self.query_one("#filter", Input)
+        words.value = ""
+        words.display = False
+        self.query_one("#rows").focus()
+
+
+class DevicePage(TopScreen):
+    """One device: its values over the last minute, its whole status, and events as they come."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,backspace", "app.pop_screen", "Back", key_display="esc")]
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        self._device = name
+        self._shown: Event | None = None
+        """The newest event in the list."""
+
+    def compose(self) -> ComposeResult:
+        """State, curves, status, events, keys."""
+        yield Static(id="state", markup=False)
+        with VerticalScroll():
+            for index, _ in enumerate(CURVES):
+                with Horizontal(classes="curve", id=f"curve{index}"):
+                    yield Label(markup=False)
+                    yield Sparkline()
+            yield Static(id="block", markup=False)
+        yield RichLog(id="events", max_lines=EVENTS_KEPT, wrap=True)
+        yield Footer()
+
+    def on_mount(self) -> None:
+        """Ask for more samples of the device."""
+        self.top.look_at(self._device)
+        self.call_after_refresh(self.begin)
+
+    def draw(self) -> None:
+        """Draw everything."""
+        self.query_one("#state", Static).update(self.top.state_line())
+        device = self.top.fleet.devices.get(self._device)
+        self.query_one("#block", Static).update(
+            block(device.status) if device else f"{self._device} is not in the configuration any more"
+        )
+        self._draw_curves(device)
+        self._list_events()
+
+    def _draw_curves(self, device: DeviceHistory | None) -> None:
+        series = device.series() if device else []
+        for index, _ in enumerate(CURVES):
+            line = self.query_one(f"#curve{index}")
+            values = series[index].values if series else []
+            line.display = bool(values)
+            if values:
+                curve = series[index].curve
+                spread = f"{min(values):.2f} to {max(values):.2f}"
+                line.query_one(Label).update(f"{curve.name:<8}{values[-1]:9.2f} {curve.unit:<5}{spread}")
+                line.query_one(Sparkline).data = values
+
+    def _list_events(self) -> None:
+        events = self.query_one("#events", RichLog)
+        fresh = []
+        for event in reversed(self.top.events):
+            if event is self._shown:
+                break
+            fresh.append(event)
+        for event in reversed(fresh):
+            if event.device == self._device:
+                events.write(event_line(event, utc_offset_ns(self.top.ahead_ns)))
+        self._shown = self.top.events[-1] if self.top.events else None
+
+
+OVERVIEW_HZ: Final = 4.0
+DEVICE_HZ: Final = 20.0
+
+
+class TopFeed(Feed):
+    """What the screens read: all devices slowly, or one of them faster."""
+
+    def __init__(self, path: str, on_news: Callable[[News], None]) -> None:
+        super().__init__(path, on_news, Wish(rate_hz=OVERVIEW_HZ))
+
+    def look_at(self, device: str | None) -> None:
+        """Read samples of this device only, and more of them; None for all devices."""
+        self.want(Wish(rate_hz=OVERVIEW_HZ) if device is None else Wish((device,), DEVICE_HZ))
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud top`."""
+    add_socket(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show the table until `q`. Raises BadArgument without a terminal, or without the library that draws."""
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise BadArgument("expected a terminal; `imud status` and `imud watch` write to anything")
+    try:
+        pass
+    except ModuleNotFoundError as error:
+        raise BadArgument(f"it needs {error.name}: pip install 'imud[top]'") from None
+    TopApp(lambda on_news: TopFeed(args.socket, on_news)).run()
+    return 0
+
+
+TOP = CliCommand(add_arguments, run)

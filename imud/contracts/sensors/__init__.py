@@ -1,1 +1,0 @@
-"""Contracts about the sensors themselves: what their documents state."""

@@ -1,0 +1,263 @@
+"""Detection of the devices on a CAN bus: listens and sends nothing, without I/O or clock of its own.
+
+Strategy. `node_of` of every driver returns the possible sender of a frame. Each such (driver, node) gets a trial codec
+with `node_settings(node)`, which is fed with all frames that pass its filters. A device is accepted after LOCK_SAMPLES
+measurements, more than it had damaged frames. A round lasts LISTEN_NS, so that all devices of the bus have been heard
+before one is chosen; while there are candidates in doubt it goes on, PATIENCE_NS at most: a device at 1 Hz whose sample
+is made of several frames needs some of its periods.
+
+One device is found when it is the only one that no other configured device of the bus has. A device that was found
+before is chosen as soon as it is accepted, whatever other devices send.
+
+A device that sends only when it is asked (CANopen TPDOs by SYNC, J1939 on request) is not heard; it must be named.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from imud.contracts.codec import CodecEvent
+from imud.contracts.driver import CanDriver
+from imud.device.search import GaveUp, Listen, SearchRound
+from imud.formats.can import CanFilter, CanFrame
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+from imud.model.units import NS_PER_MS, NS_PER_S
+
+LOCK_SAMPLES: Final = 2
+LISTEN_NS: Final = 1500 * NS_PER_MS
+"""1 Hz, the slowest rate that the manuals name for a single frame, is heard once."""
+PATIENCE_NS: Final = 6 * NS_PER_S
+DEVICES_MAX: Final = 128
+"""Candidates on trial; a bus that names more carries noise or another protocol."""
+IDENTIFIERS_MAX: Final = 4096
+"""Identifiers kept; more on one bus are a test."""
+SHOWN_MAX: Final = 8
+
+Identifier = tuple[int, bool]
+"""Of a frame, and whether it has 29 bits."""
+Claimed = Callable[[int, bool], bool]
+"""Whether a configured device has frames with this identifier (and 29 bits or not) already."""
+
+
+def none_claimed(_can_id: int, _extended: bool) -> bool:
+    """Return False: no other device is configured."""
+    return False
+
+
+class CanDevice(NamedTuple):
+    """A device of a bus, by the number that its driver uses."""
+
+    driver: CanDriver
+    node: int
+
+    @property
+    def title(self) -> str:
+        """Title for people, for example `imu61x-can base_id 101`."""
+        return f"{self.driver.name} {self.driver.node_title(self.node)}"
+
+
+@dataclass(frozen=True, slots=True)
+class CanFound:
+    """The only device found."""
+
+    device: CanDevice
+
+
+CanStep = Listen | CanFound | GaveUp
+
+
+class CanSurvey:
+    """The devices heard on a bus. Synchronization: one thread."""
+
+    def __init__(self, drivers: Sequence[CanDriver]) -> None:
+        self._drivers = tuple(drivers)
+        self._trials: dict[tuple[str, int], _Trial] = {}
+        self._listeners: dict[Identifier, tuple[_Trial, ...]] = {}
+        """Candidates whose filters pass a frame, by identifier; every received identifier is a key."""
+
+    def on_frames(self, frames: Sequence[CanFrame]) -> None:
+        """Process frames in the order they came."""
+        for frame in frames:
+            if frame.after_loss:
+                for trial in self._trials.values():
+                    trial.codec.reset()
+            self._look_for_devices(frame)
+            for trial in self._listening(frame):
+                trial.count(trial.codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns))
+
+    def flush(self) -> None:
+        """Process frames that wait: the bus is idle, or the round ends."""
+        for trial in self._trials.values():
+            trial.count(trial.codec.flush())
+
+    def devices(self, claimed: Claimed = none_claimed) -> list[CanDevice]:
+        """Return devices that yield measurements and are not claimed, in the order they were heard."""
+        return [trial.device for trial in self._trials.values() if trial.accepted and not trial.has_any(claimed)]
+
+    def doubtful(self, claimed: Claimed = none_claimed) -> list[CanDevice]:
+        """Return candidates without measurements (yet) whose frames are not those of a device that has some."""
+        known = {i for trial in self._trials.values() if trial.accepted for i in trial.identifiers}
+        return [
+            trial.device
+            for trial in self._trials.values()
+            if not trial.accepted and not trial.has_any(claimed) and not trial.identifiers <= known
+        ]
+
+    def others(self, claimed: Claimed = none_claimed) -> list[str]:
+        """Return identifiers, for people, that belong to no candidate and are not claimed: three or eight digits."""
+        free = (i for i, trials in self._listeners.items() if not trials and not claimed(*i))
+        return [f"0x{can_id:08X}" if extended else f"0x{can_id:03X}" for can_id, extended in sorted(free)]
+
+    def _look_for_devices(self, frame: CanFrame) -> None:
+        for driver in self._drivers:
+            node = driver.node_of(frame.can_id, frame.extended, frame.data)
+            if node is None:
+                continue
+            trial = self._trials.get((driver.name, node))
+            if trial is None:
+                if len(self._trials) >= DEVICES_MAX:
+                    continue
+                trial = self._begin(CanDevice(driver, node))
+            trial.identifiers.add((frame.can_id, frame.extended))
+
+    def _begin(self, device: CanDevice) -> "_Trial":
+        trial = self._trials[device.driver.name, device.node] = _Trial(device)
+        for identifier, trials in self._listeners.items():
+            if trial.hears(identifier):
+                self._listeners[identifier] = (*trials, trial)
+        return trial
+
+    def _listening(self, frame: CanFrame) -> "tuple[_Trial, ...]":
+        identifier = (frame.can_id, frame.extended)
+        trials = self._listeners.get(identifier)
+        if trials is None:
+            trials = tuple(trial for trial in self._trials.values() if trial.hears(identifier))
+            if len(self._listeners) < IDENTIFIERS_MAX:
+                self._listeners[identifier] = trials
+        return trials
+
+
+class CanSearch:
+    """A round of detection on one bus. Synchronization: one thread. All times are CLOCK_MONOTONIC in ns."""
+
+    def __init__(
+        self,
+        drivers: Sequence[CanDriver],
+        where: str,
+        *,
+        claimed: Claimed = none_claimed,
+        remembered: tuple[str, int] | None = None,
+    ) -> None:
+        """`where` is the bus for people; `remembered` is (driver name, node) of the last success.
+
+        `claimed` is asked when something is to be decided, so that it may change meanwhile.
+        """
+        self.survey = CanSurvey(drivers)
+        self._where = where
+        self._claimed = claimed
+        self._remembered = remembered
+        self._begun_ns = self._until_ns = 0
+
+    def start(self, now_ns: int) -> Listen:
+        """Return the first step."""
+        self._begun_ns = now_ns
+        return self._listen(now_ns)
+
+    def on_frames(self, frames: Sequence[CanFrame]) -> CanFound | None:
+        """Process frames as they come; return None to go on."""
+        self.survey.on_frames(frames)
+        if self._remembered is None:
+            return None
+        for device in self.survey.devices(self._claimed):
+            if (device.driver.name, device.node) == self._remembered:
+                return CanFound(device)
+        return None
+
+    def on_time(self, now_ns: int) -> CanStep | None:
+        """End the present step if `until_ns` of the last Listen has come; return None when it has not."""
+        if now_ns < self._until_ns:
+            return None
+        self.survey.flush()
+        devices = self.survey.devices(self._claimed)
+        if self.survey.doubtful(self._claimed) and now_ns - self._begun_ns < PATIENCE_NS:
+            return self._listen(now_ns)
+        return CanFound(devices[0]) if len(devices) == 1 else GaveUp(self.summary())
+
+    def summary(self) -> str:
+        """Explain why no device was chosen."""
+        survey, where = self.survey, self._where
+        if devices := survey.devices(self._claimed):
+            return f"{len(devices)} devices are heard on {where}, {_listed(devices)}: name driver and options"
+        if doubtful := survey.doubtful(self._claimed):
+            return f"frames as of {_listed(doubtful)} come on {where}, but no whole sample: name driver and options"
+        if others := survey.others(self._claimed):
+            more = f" and {len(others) - SHOWN_MAX} more" if len(others) > SHOWN_MAX else ""
+            names = ", ".join(others[:SHOWN_MAX])
+            return f"frames come on {where} that no driver knows ({names}{more}): name driver and options"
+        if survey.others() or survey.devices() or survey.doubtful():
+            return f"only frames of other configured devices come on {where}: is the device powered?"
+        return f"nothing is heard on {where}: is the bit rate right, is the bus terminated, is the device powered?"
+
+    def _listen(self, now_ns: int) -> Listen:
+        self._until_ns = now_ns + LISTEN_NS
+        return Listen(self._until_ns)
+
+
+class _Trial:
+    """A candidate and its codec."""
+
+    def __init__(self, device: CanDevice) -> None:
+        settings = device.driver.node_settings(device.node)
+        self.device = device
+        self.ledger = Ledger()
+        self.codec = device.driver.make_codec(self.ledger, settings)
+        self.identifiers: set[Identifier] = set()
+        """Of frames that named the device."""
+        self._filters = device.driver.filters(settings)
+        self._samples = 0
+
+    @property
+    def accepted(self) -> bool:
+        """Whether it is a device."""
+        return self._samples >= LOCK_SAMPLES and self._samples > self.ledger.frames_bad()
+
+    def count(self, events: Sequence[CodecEvent]) -> None:
+        """Events of its codec."""
+        for event in events:
+            self._samples += isinstance(event, Measurement)
+
+    def hears(self, identifier: Identifier) -> bool:
+        """Whether its codec needs such frames."""
+        return any(wanted.matches(*identifier) for wanted in self._filters)
+
+    def has_any(self, claimed: Claimed) -> bool:
+        """Whether another device is configured for frames of it."""
+        return any(claimed(*identifier) for identifier in self.identifiers)
+
+
+def _listed(devices: Sequence[CanDevice]) -> str:
+    return ", ".join(device.title for device in devices)
+
+
+EVERYTHING: Final = (CanFilter(0, 0, False), CanFilter(0, 0, True))
+"""Filters that pass every data frame."""
+
+
+class CanRound(SearchRound[CanFound]):
+    """A round on a CAN bus."""
+
+    def __init__(
+        self, search: CanSearch, ledger: Ledger, on_found: Callable[[CanFound], None], now_ns: Callable[[], int]
+    ) -> None:
+        super().__init__(search, ledger, on_found, now_ns)
+        self._search = search
+
+    def on_frames(self, frames: Sequence[CanFrame]) -> None:
+        """Pass on frames from the link, all of the bus; they count as skipped."""
+        self._count(sum(len(frame.data) for frame in frames))
+        if not self._done.done():
+            self._follow(self._search.on_frames(frames))
+
+    def _listen(self, step: Listen) -> None:
+        """Filters pass everything already."""

@@ -1,0 +1,406 @@
+"""Transport of a device on a CAN bus: its driver is configured, or found by listening; filters select its frames."""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from random import Random
+from typing import Any
+
+from imud.contracts.codec import CanCodec
+from imud.contracts.command import Target
+from imud.contracts.driver import CanDriver, Identity, of_kind
+from imud.contracts.link import CanLink, CanUse, OnEnd
+from imud.contracts.script import ReplyFrame
+from imud.contracts.status import DeviceState, DeviceStatus
+from imud.device.can_search import EVERYTHING, CanFound, CanRound, CanSearch
+from imud.device.scripts import Exchange
+from imud.device.search import Remembered, RememberedDevice
+from imud.device.settings import IDENTIFY_TRIES
+from imud.device.transport import SILENT_SEARCH_NS, UNHEARD_NS, DeviceContext, SearchLoop
+from imud.drivers import DRIVERS
+from imud.formats.can import CanFilter, CanFrame, CyclicFrame, frame_bits
+from imud.model.errors import LinkError
+from imud.model.event import EventKind
+from imud.model.options import Settings, shown
+from imud.model.units import NS_PER_S
+from imud.recording.observer import PathParts
+from imud.sampling.path import CanPath, SamplePath
+
+
+class CanBuses:
+    """Members of all buses by the name of the device. Synchronization: one thread."""
+
+    def __init__(self) -> None:
+        self._members: dict[str, CanUse] = {}
+        self._loads: dict[str, Callable[[], float]] = {}
+
+    def join(
+        self,
+        name: str,
+        bus: str,
+        filters: Sequence[CanFilter],
+        cyclic: Sequence[CyclicFrame],
+        bits_per_s: Callable[[], float] = lambda: 0.0,
+    ) -> None:
+        """Add a device to a bus: the frames it receives, those that it needs to be sent, and how much it sends now."""
+        self._members[name] = CanUse(bus, filters, cyclic)
+        self._loads[name] = bits_per_s
+
+    def leave(self, name: str) -> None:
+        """Remove the device; no-op if absent."""
+        self._members.pop(name, None)
+        self._loads.pop(name, None)
+
+    def bits_per_s(self, name: str, bus: str) -> float:
+        """Return what the other devices of a bus send, in bit/s without stuff bits."""
+        others = [other for other, member in self._members.items() if other != name and member.bus == bus]
+        return sum(self._loads[other]() for other in others)
+
+    def claimed(self, name: str, bus: str) -> Callable[[int, bool], bool]:
+        """Return a test of an identifier (and 29 bits or not): whether another device of the bus receives it."""
+
+        def is_claimed(can_id: int, extended: bool) -> bool:
+            return any(
+                other != name and member.bus == bus and member.receives(can_id, extended)
+                for other, member in self._members.items()
+            )
+
+        return is_claimed
+
+    def conflict(self, name: str) -> str:
+        """Return which other device takes the frames of this one, or has a frame sent that it needs, one sentence.
+
+        Empty if there is none. Of two, the one that joined first may go on: one that was found by listening is not
+        stopped by a device that a reload adds.
+        """
+        mine = self._members.get(name)
+        for other, member in self._members.items():
+            if other == name or mine is None:
+                break
+            if both := mine.both_send(member):
+                return f"{other} and {name} would both send {both} on {mine.bus}: let one of them do it"
+            if both := mine.both_receive(member):
+                return f"{other} and {name} would be the same device on {mine.bus}, the one that sends {both}"
+        return ""
+
+
+class CanTransport:
+    """Transport of the frames of one device on a CAN bus. Synchronization: the event loop's thread only."""
+
+    def __init__(self, context: DeviceContext, link: CanLink, buses: CanBuses, remembered: Remembered) -> None:
+        """`buses` is what the devices of a daemon share. Raises LinkError for a driver that is none for CAN."""
+        self.link = link
+        self.driver: CanDriver | None = None
+        self.path: CanPath | None = None
+        self._config = context.config
+        self._context = context
+        self._health = context.health
+        self._now_ns = context.host.now_ns
+        self._buses = buses
+        self._remembered = remembered
+        self._exchange = Exchange(
+            context.ledger, link.write, self._now_ns, follow=self._follow, listen=self._listen, on_busy=self._on_busy
+        )
+        self._latency_ns = 0
+        self._also: Sequence[CanFilter] = ()
+        """Frames that can answer the outstanding request although they are none of the device's replies."""
+        self._search = SearchLoop(
+            *(context.health, context.attachments, context.host),
+            begin=self._begin_search,
+            ask=self._ask,
+            ask_again=self._ask_once,
+            unanswered=lambda: self._may_ask and not context.identity.answered,
+        )
+        self._round: CanRound | None = None
+        """The search that frames go to; None while they go to the path."""
+        self._options: Settings | None = None
+        self._codec: CanCodec | None = None
+        self._node: int | None = None
+        """The device that was found, as its driver numbers them; None for a driver that is named."""
+        self._joined = False
+        if not self._searchable:
+            driver = DRIVERS[self._config.driver]
+            if not isinstance(driver, CanDriver):
+                raise LinkError(f"{self._config.name}: expected a driver for CAN, got {driver.name}")
+            self._set_up(driver, self._config.options or driver.settings())
+
+    # --- the bus's life ----------------------------------------------------------------------------------------------
+
+    async def wait_present(self) -> None:
+        """Return when the bus is up. Raises LinkError where another device sends the frames that this one needs."""
+        if not self._searchable and not self._joined:
+            self._join()
+        self._refuse_conflict()
+        if reason := self.link.absence():
+            self._health.down(self._now_ns(), DeviceState.MISSING, reason)
+        await self.link.wait_present()
+
+    def start(self, on_end: OnEnd) -> None:
+        """Deliver frames from now on, and begin the search."""
+        self._search.start()
+        self.link.start(self._on_frames, self._on_news, on_end)
+
+    async def work(self) -> None:
+        """Find the device and ask for its identity, as often as needed; ends only with the link."""
+        await self._search.run()
+
+    def stop(self) -> None:
+        """End the search and close the link; may be called twice."""
+        self._search.stop()
+        if self._searchable:
+            self._leave()
+        self.link.close()
+
+    def close(self) -> None:
+        """Stop, and leave the bus; may be called twice."""
+        self.stop()
+        self._leave()
+
+    # --- the search --------------------------------------------------------------------------------------------------
+
+    def _begin_search(self) -> CanRound | None:
+        """Listen to the whole bus, until a single device that no other configuration has is heard."""
+        if not self._searchable:
+            self._begin()
+            return None
+        name, link, last = self._config.name, self.link, self._remembered.get(self._config.name)
+        self._leave()
+        if self.path is not None:
+            self.path.reset()
+            self.path.begin(self._now_ns())
+        link.filters = EVERYTHING
+        link.gather_ns = 0
+        search = CanSearch(
+            of_kind(DRIVERS.values(), CanDriver),
+            self.where,
+            claimed=self._buses.claimed(name, link.bus),
+            remembered=(last.driver, last.node) if last and last.node is not None else None,
+        )
+        self._round = CanRound(search, self._context.ledger, self._on_found, self._now_ns)
+        self._round.start()
+        return self._round
+
+    def _on_found(self, found: CanFound) -> None:
+        """Go on with the device that was found."""
+        driver, node = found.device
+        if driver is not self.driver or node != self._node:
+            self._node = node
+            self._set_up(driver, driver.node_settings(node))
+        self._join()
+        self._remembered.put(self._config.name, RememberedDevice(driver.name, 0, node))
+        self._begin()
+
+    def _set_up(self, driver: CanDriver, options: Settings) -> None:
+        """Make codec, clock and path for a device."""
+        if self.path is not None:
+            self.path.reset()
+        context = self._context
+        clock = context.new_clock(driver, self.path)
+        self.driver = driver
+        self._options = options
+        self._codec = driver.make_codec(context.ledger, options)
+        self.path = CanPath(self._codec, clock, context.path_context(driver, self.link, self._exchange.on_message))
+        context.tap.path_made(PathParts(self.path, driver.name, options))
+
+    def _begin(self) -> None:
+        """Give frames that come from now on to the device's codec."""
+        link, path, driver = self.link, self.path, self.driver
+        assert driver is not None
+        assert path is not None
+        self._round = None
+        link.filters = driver.filters(self._options)
+        link.gather_ns = self._latency_ns
+        path.clock.restart()
+        first = driver.example_frames(Random(0))[0]
+        bits = frame_bits(first.extended, len(first.data))
+        path.set_frame_time(bits * NS_PER_S // link.bitrate if link.bitrate else 0)
+        path.loss.link_opened()
+        path.begin(self._now_ns())
+        self._context.attachments.start(path.clock)
+
+    # --- other devices of the bus ------------------------------------------------------------------------------------
+
+    def _join(self) -> None:
+        driver, options = self.driver, self._options
+        assert driver is not None
+        cyclic = driver.cyclic(options) if self.link.writable else ()
+        self._buses.join(self._config.name, self.link.bus, driver.filters(options), cyclic, self._bits_per_s)
+        self._joined = True
+
+    def _bits_per_s(self) -> float:
+        """What the device's samples take of the bus now, without stuff bits."""
+        if self.path is None or self.driver is None:
+            return 0.0
+        bits = sum(frame_bits(one.extended, len(one.data)) for one in self.driver.example_frames(Random(0)))
+        return bits * self.path.clock.expected_rate_hz
+
+    def _leave(self) -> None:
+        if self._joined:
+            self._joined = False
+            self._buses.leave(self._config.name)
+
+    def _refuse_conflict(self) -> None:
+        if conflict := self._buses.conflict(self._config.name):
+            raise LinkError(conflict)
+
+    # --- asking ------------------------------------------------------------------------------------------------------
+
+    async def _ask(self) -> None:
+        """Have the link send the cyclic frames, and ask for identity and settings where that is allowed.
+
+        Raises LinkError where another device sends it already.
+        """
+        self._refuse_conflict()
+        driver, options = self.driver, self._options
+        if driver is None or not self.link.writable:
+            return
+        if frames := driver.cyclic(options):
+            self.link.send_cyclic(frames)
+        await self._identify(IDENTIFY_TRIES)
+
+    async def _ask_once(self) -> None:
+        await self._identify(1)
+
+    async def read_back(self) -> None:
+        """Ask for identity and settings again."""
+        with suppress(LinkError):  # whoever waits for the link's end learns of it
+            await self._identify(1)
+
+    async def _identify(self, tries: int) -> None:
+        driver, options = self.driver, self._options
+        if driver is not None and self._may_ask:
+            await self._context.identity.ask(
+                self._exchange,
+                lambda: driver.identify(options),
+                lambda: driver.read_settings(options),
+                self._apply,
+                tries,
+            )
+
+    def _apply(self, identity: Identity) -> None:
+        if self.driver is not None and self._codec is not None:
+            self.driver.apply_identity(self._codec, identity)
+            self._context.tap.codec_changed()
+
+    def _follow(self, options: Settings) -> None:
+        """Follow a script that has given the device another number: filters, codec, and what other devices know."""
+        driver = self.driver
+        if driver is None or options == self._options:
+            return
+        self._leave()
+        self._set_up(driver, options)
+        self._join()
+        self._node = None  # the next search tells it
+        self._begin()
+        if not self._searchable and options != (self._config.options or driver.settings()):
+            message = f"the device is heard by other options now: change {_changed(self._config.options, options)}"
+            self._context.notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message)
+
+    def _listen(self, filters: Sequence[CanFilter]) -> None:
+        """Receive further frames, as long as a request can be answered by them."""
+        self._also = filters
+        if self.driver is not None and self._round is None:
+            self.link.filters = (*self.driver.filters(self._options), *filters)
+
+    async def run_script(self, make: Callable[[Target], Any]) -> Any:
+        """Run a request script on the device with its own node number; one that changes the number is followed."""
+        others = self._buses.bits_per_s(self._config.name, self.link.bus)
+        return await self._exchange.run(make(Target(self._options, self.bit_rate, other_bits_per_s=others)))
+
+    # --- the flow ----------------------------------------------------------------------------------------------------
+
+    def set_latency(self, latency_ns: int) -> None:
+        """Let frames gather for so long."""
+        self._latency_ns = latency_ns
+        self._on_busy(self._exchange.busy)
+
+    def _on_busy(self, busy: bool) -> None:
+        """Have frames gather, unless a request waits for a reply or the device is searched for."""
+        self.link.gather_ns = 0 if busy or self._round is not None else self._latency_ns
+
+    @property
+    def hold_ns(self) -> int:
+        """How long frames gather at present, ns."""
+        return self.link.gather_ns
+
+    def _on_frames(self, frames: Sequence[CanFrame]) -> None:
+        if self._round is not None:
+            self._round.on_frames(frames)
+        elif self.path is not None:
+            self.path.on_frames(frames)
+        if self._also:
+            self._answer(frames)
+
+    def _answer(self, frames: Sequence[CanFrame]) -> None:
+        for frame in frames:
+            if any(wanted.matches(frame.can_id, frame.extended) for wanted in self._also):
+                self._exchange.on_message(ReplyFrame(frame.can_id, frame.data), frame.t_rx_ns)
+
+    def _on_news(self, news: str, problem: str) -> None:
+        """Show trouble of the bus, or its end."""
+        self._health.on_link_news(self._now_ns(), news, problem)
+
+    def tick(self, now_ns: int) -> None:
+        """No-op: frames come by themselves."""
+
+    def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
+        """Report the received frames instead, and search anew after a long silence."""
+        health, driver = self._health, self.driver
+        since_ns = health.silent_since_ns if health.state is DeviceState.SILENT else path.begun_ns
+        if self._searchable and now_ns - since_ns > SILENT_SEARCH_NS:
+            self._search.search_again()
+        if health.state is not DeviceState.SEARCHING or driver is None or now_ns - path.begun_ns <= UNHEARD_NS:
+            return
+        if path.last_data_ns > path.begun_ns:
+            health.report(f"frames of {driver.name} come on {self.where}, but no whole sample")
+        else:
+            health.report(f"nothing of {driver.name} is heard on {self.where}: is its identifier right?")
+
+    def on_reset(self) -> None:
+        """No-op: the device sends again by itself."""
+
+    # --- state -------------------------------------------------------------------------------------------------------
+
+    @property
+    def where(self) -> str:
+        """The bus and its rate, for people."""
+        return f"{self.link.title} at {self.link.bitrate // 1000} kbit/s" if self.link.bitrate else self.link.title
+
+    @property
+    def bit_rate(self) -> int:
+        """Rate of the bus in bit/s; 0 where it is not known."""
+        return self.link.bitrate
+
+    @property
+    def receiving(self) -> bool:
+        """Whether frames go to the device's codec."""
+        return self._round is None
+
+    @property
+    def hears_replies(self) -> bool:
+        """Whether a codec hears replies: that of a named driver does, so that a device that sends nothing can be set
+        to send."""
+        return self.path is not None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a request script is running."""
+        return self._exchange.busy
+
+    def add_status(self, status: DeviceStatus) -> DeviceStatus:
+        """Return the status as it is."""
+        return status
+
+    @property
+    def _searchable(self) -> bool:
+        return self._config.driver == "auto"
+
+    @property
+    def _may_ask(self) -> bool:
+        return self._config.identify and self.link.writable
+
+
+def _changed(before: Settings | None, after: Settings) -> str:
+    """Options that differ, for people, for example `options.node to 9`."""
+    given = before if before is not None else type(after)()
+    names = [name for name in type(after).__struct_fields__ if getattr(given, name) != getattr(after, name)]
+    return ", ".join(f"options.{name} to {shown(getattr(after, name))}" for name in names) + " in the configuration"

@@ -1,0 +1,445 @@
+"""The life of one device, whatever its link: open, stream, detect silence and loss of the link, and recover.
+
+MISSING ──port appears──▶ SEARCHING ──samples──▶ RUNNING ──none for a while──▶ SILENT
+   ▲                        │    ▲                  │                            │
+   └──────── unplugged ─────┴────┼──────────────────┴────────────────────────────┤
+                                 └── bytes without frames, or long silence ──────┘
+
+A device is composed of a transport, which owns the link and the sample path, and of attachments next to the link.
+"""
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import msgspec
+
+from imud.config.model import DeviceConfig
+from imud.contracts.command import Action, Actions, CalibrationResult, Calibrations, Risk
+from imud.contracts.driver import status_words
+from imud.contracts.lines import LineFactory
+from imud.contracts.link import Link
+from imud.contracts.publisher import Batch, PutRecord
+from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
+from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, LinesStatus
+from imud.device.attachments import AttachmentHooks, Attachments
+from imud.device.calibration import Guide
+from imud.device.flash import SettingsFiles
+from imud.device.health import Health, Notices
+from imud.device.latency import Need
+from imud.device.settings import KnownIdentity, SettingsKeeper, identity_words
+from imud.device.transport import UNHEARD_NS, DeviceContext, Transport
+from imud.device.utc import DevicePort
+from imud.device.watches import FrameWatch, StatusWatch
+from imud.host.clock import HostClock
+from imud.host.log import printable, shown
+from imud.model.errors import BadArgument, CommandError, ImudError, LinkBusy, LinkError, LinkMissing
+from imud.model.event import Event, EventKind
+from imud.model.ledger import Ledger
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.recording.observer import DeviceTap
+from imud.sampling.path import LatencyMeter, RateMeter, SamplePath
+
+log = logging.getLogger(__name__)
+
+RETRY_S = 0.5
+"""Pause before a port that refused is opened again: short enough to be back within a second of its coming back."""
+GONE_S = 0.02
+"""The same after a port has gone; its coming back is waited for without polling, so this only keeps a node that is
+there and cannot be opened from being tried without end."""
+IDLE_FLUSH_NS = 50 * NS_PER_MS
+"""A line idle for longer than any adapter's latency timer (16 ms) sends no more of the frame that is pending."""
+SILENCE_NS = 1 * NS_PER_S
+"""Without samples for this long, and for five periods, a device counts as silent."""
+SILENCE_PERIODS = 5
+
+MakeTransport = Callable[[DeviceContext], Transport]
+
+
+class Device:
+    """A configured device. Synchronization: the event loop's thread only."""
+
+    def __init__(
+        self,
+        config: DeviceConfig,
+        device_id: int,
+        make_transport: MakeTransport,
+        publish: Callable[[Batch], None],
+        send_event: Callable[[Event], None],
+        host: HostClock,
+        lines: LineFactory,
+        files: SettingsFiles,
+        port_owner: Callable[[], str],
+    ) -> None:
+        """`port_owner` names the device of this configuration that has the port, empty for none."""
+        self._port_owner = port_owner
+        self.config = config
+        self.device_id = device_id
+        self.ledger = Ledger()
+        self._host = host
+        self._suspends = host.suspends
+        self._notices = Notices(config.name, self.ledger, send_event)
+        self._health = Health(self._notices)
+        port = DevicePort(self._write, lambda: self._transport.bit_rate, self._is_busy)
+        hooks = AttachmentHooks(port, self._on_reset)
+        self._attachments = Attachments(config, lines, hooks, self._notices, host)
+        self._identity = KnownIdentity(self._notices, host.now_ns, self._on_settings, self._described)
+        self._tap = DeviceTap(config, device_id, self.ledger, host)
+        self._transport = make_transport(
+            DeviceContext(
+                config, device_id, host, self.ledger, self._notices, self._health, self._identity, self._attachments,
+                publish, self._tap,
+            )
+        )  # fmt: skip
+        self._guide = Guide(self._transport.run_script, self._notices)
+        self._attachments.add(self._guide)
+        transport = self._transport
+        self._settings = SettingsKeeper(
+            config, transport.run_script, lambda: transport.driver, self._identity, self._notices, host, files,
+            self._can_be_asked, transport.read_back,
+        )  # fmt: skip
+        self._attachments.add(self._settings)
+        self._frame = FrameWatch(config, self._notices)
+        self._status = StatusWatch(self._notices)
+        self._line_differences: Mapping[str, str] = {}
+        self._rate = RateMeter()
+        self._connects = 0
+        self._need = Need(0, "")
+        self._ended: asyncio.Future[LinkError | None] | None = None
+
+    @property
+    def state(self) -> DeviceState:
+        """State now."""
+        return self._health.state
+
+    @property
+    def tap(self) -> DeviceTap:
+        """Where a recording hears the device; it begins by `record`."""
+        return self._tap
+
+    @property
+    def driver_name(self) -> str:
+        """Name of the driver in use; while none is known, what the configuration has."""
+        driver = self._transport.driver
+        return driver.name if driver else self.config.driver
+
+    @property
+    def link(self) -> Link:
+        """Link of the device."""
+        return self._transport.link
+
+    def set_need(self, need: Need) -> None:
+        """Let samples wait for as long as their consumers allow; with lines, on which edges, triggers or an alarm
+        belong to samples, they never do."""
+        self._need = need if self._attachments.drain_edges is None else Need(0, "its lines")
+        self._transport.set_latency(self._need.latency_ns)
+
+    async def run(self) -> None:
+        """Keep the device alive until cancelled, or until a replay ends."""
+        try:
+            self._attachments.tick(self._host.now_ns(), None)
+            await self._serve_until_finished()
+            self._health.finished()
+        finally:
+            self._attachments.close()
+            self._transport.close()
+
+    def tick(self, now_ns: int) -> None:
+        """Update states, detect an idle line, send gathered events; ten times a second."""
+        transport = self._transport
+        self._rate.mark(now_ns, self.ledger.samples)
+        path = transport.path
+        self._attachments.tick(now_ns, path.newest if path is not None else None)
+        transport.tick(now_ns)
+        if path is None:
+            return
+        if self._suspends != self._host.suspends:
+            self._suspends = self._host.suspends
+            if path.fresh:  # what it measured meanwhile is lost, and CLOCK_MONOTONIC does not show that time passed
+                self.ledger.add_unknown_gap()
+        if now_ns - path.last_data_ns > IDLE_FLUSH_NS + transport.hold_ns:
+            path.flush(now_ns)
+        if transport.receiving:
+            self._watch_flow(path, now_ns)
+        self._frame.tick(now_ns, path)
+        self._status.tick(now_ns, transport.driver, path)
+        self._notices.tick(now_ns, path.newest.sync if path.newest else None)
+
+    def close(self) -> None:
+        """Release the link; may be called twice."""
+        self._transport.close()
+
+    # --- the link's life ---------------------------------------------------------------------------------------------
+
+    async def _serve_until_finished(self) -> None:
+        """Serve the link whenever it is there; return at the regular end of a replay."""
+        while True:
+            try:
+                await self._transport.wait_present()
+                await self._serve()
+                return
+            except LinkMissing as error:
+                self._down(DeviceState.MISSING, error)
+                await asyncio.sleep(GONE_S)
+            except LinkError as error:
+                self._down(DeviceState.FAILED, self._with_owner(error))
+                await asyncio.sleep(RETRY_S)
+
+    async def _serve(self) -> None:
+        """Serve the link from open to its end; return at the regular end of a replay. Raises LinkError."""
+        transport = self._transport
+        transport.link.open()
+        self._connects += 1
+        self._health.link_opened()
+        ended = self._ended = asyncio.get_running_loop().create_future()
+        tasks: list[asyncio.Task[None]] = []
+        try:
+            transport.start(self._on_end)
+            tasks = [
+                asyncio.create_task(transport.work(), name=f"{self.config.name} work"),
+                asyncio.create_task(self._settings.run(), name=f"{self.config.name} settings"),
+            ]
+            await asyncio.wait({*tasks, ended}, return_when=asyncio.FIRST_COMPLETED)
+            if not ended.done():
+                for task in tasks:
+                    if task.done():
+                        await task  # it ends before its link only by an error
+            elif error := ended.result():
+                raise error
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            transport.stop()
+            self._attachments.stop()
+            if transport.path is not None:
+                transport.path.reset()
+
+    def _on_end(self, error: LinkError | None) -> None:
+        if self._ended is not None and not self._ended.done():
+            self._ended.set_result(error)
+
+    def _with_owner(self, error: LinkError) -> LinkError:
+        """Name the device that has the port, where it is one of this configuration."""
+        owner = self._port_owner() if isinstance(error, LinkBusy) else ""
+        if not owner:
+            return error
+        return LinkBusy(f"{self._transport.link.title} is in use by {owner}, another device of this configuration")
+
+    def _down(self, state: DeviceState, error: LinkError) -> None:
+        self._health.down(self._host.now_ns(), state, str(error))
+
+    # --- callbacks of its parts --------------------------------------------------------------------------------------
+
+    def _write(self, data: bytes) -> None:
+        self._transport.link.write(data)
+
+    def _is_busy(self) -> bool:
+        """Whether nothing may be sent in between: a script runs, or a search sets other rates."""
+        return self._transport.busy or not self._transport.receiving
+
+    def record(self, put: PutRecord) -> None:
+        """Describe the device as it is now, and pass on all that it delivers; `tap.end` ends it."""
+        self._tap.begin(
+            put, self._transport.where, identity_words(self._identity.identity), self._identity.shown_settings
+        )
+
+    def _on_reset(self) -> None:
+        self._transport.on_reset()
+
+    def _on_settings(self, settings: Mapping[str, str]) -> None:
+        """Compare lines with the settings that were read back."""
+        identity = identity_words(self._identity.identity)
+        self._tap.described(self._transport.where, identity, self._identity.shown_settings)
+        driver = self._transport.driver
+        read = driver.alarm_ranges if driver is not None else None
+        self._attachments.set_alarm_ranges(read(settings) if read is not None else None)
+        lines = self.config.lines
+        found = driver.line_differences(settings, lines) if driver is not None and lines is not None else {}
+        for key, words in found.items():
+            if self._line_differences.get(key) != words:
+                self._notices.raise_event(
+                    self._host.now_ns(), EventKind.CONFIGURATION, f"line {key}: {words}", line=key
+                )
+        self._line_differences = found
+
+    def _described(self, settings: Mapping[str, str]) -> Mapping[str, str]:
+        driver = self._transport.driver
+        return driver.shown_settings(settings) if driver is not None else settings
+
+    def _lines_status(self) -> LinesStatus | None:
+        """Status of the lines, with what the device's settings contradict."""
+        lines = self._attachments.lines_status()
+        if lines is None or not self._line_differences:
+            return lines
+        return msgspec.structs.replace(lines, problems={**self._line_differences, **lines.problems})
+
+    # --- actions -----------------------------------------------------------------------------------------------------
+
+    @property
+    def actions(self) -> Actions:
+        """Actions of the device by name; while its driver is not known, those of its lines only."""
+        driver = self._transport.driver
+        return {**(driver.actions if driver is not None else {}), **self._attachments.actions}
+
+    async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
+        """Run an action and return its answer. Raises CommandError, TransferError, DeviceRefused, LinkError."""
+        log.info("%s: run %s%s", self.config.name, printable(name), f" {shown(arguments)}" if arguments else "")
+        action = self.actions.get(name)
+        if action is None:
+            raise BadArgument(f"{self.config.name}: no action {name[:64]!r}; there are: {self._known_actions()}")
+        if name in self._attachments.actions:
+            return await self._attachments.run_action(name, arguments)
+        self._require_replies()
+        return await self._run_action(name, action, arguments)
+
+    @property
+    def calibrations(self) -> Calibrations:
+        """Calibrations of the device by kind; none while its driver is not known."""
+        driver = self._transport.driver
+        return driver.calibrations if driver is not None else {}
+
+    async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:
+        """Run a guided calibration. Raises CommandError, TransferError, DeviceRefused, LinkError."""
+        calibration = self.calibrations.get(kind)
+        if calibration is None:
+            known = ", ".join(self.calibrations) or "none"
+            raise BadArgument(f"{self.config.name}: no calibration {kind[:64]!r}; there are: {known}")
+        log.info("%s: calibrate %s%s", self.config.name, kind, ", save" if save else "")
+        self._require_replies()
+        async with self._settings.exclusive():
+            if save:
+                self._settings.spend_flash()
+            try:
+                return await self._guide.run(kind, calibration, save=save)
+            finally:
+                self._settings.commanded()
+
+    def stop_calibration(self) -> bool:
+        """End the calibration that runs; return whether there was one."""
+        return self._guide.cancel()
+
+    async def _run_action(self, name: str, action: Action, arguments: Mapping[str, Any]) -> object:
+        params = action.arguments(arguments)
+        async with self._settings.exclusive():
+            if action.saves:
+                self._settings.spend_flash()
+            if action.risk is Risk.RESET:
+                await self._settings.back_up(name)
+            self._attachments.set_alarm_ranges(None)  # what was read back need not hold any more
+            saved = False
+            try:
+                answer = await self._transport.run_script(lambda target: action.script(target, params))
+                saved = action.saves
+            except ImudError:
+                await self._transport.read_back()
+                raise
+            finally:
+                self._settings.commanded(saved=saved)
+            await self._transport.read_back()
+            return answer
+
+    # --- settings -----------------------------------------------------------------------------------------------------
+
+    async def settings_report(self, *, fresh: bool) -> SettingsReport:
+        """Return the device's settings: asked for now if `fresh`, otherwise as reported last.
+
+        Raises CommandError, TransferError, DeviceRefused, LinkError.
+        """
+        if fresh:
+            self._require_replies()
+        return await self._settings.report(fresh=fresh)
+
+    async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
+        """Plan to make the device as `given` (None: as declared). Raises what `settings_report` does."""
+        self._require_replies()
+        return await self._settings.plan(given, save=save)
+
+    async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
+        """Make the device as `given` (None: as declared). Raises what `settings_report` does, with nothing written."""
+        self._require_replies()
+        self._attachments.set_alarm_ranges(None)  # what was read back need not hold any more
+        return await self._settings.apply(given, save=save)
+
+    def _can_be_asked(self) -> bool:
+        """Whether a script can be run on the device now, and no other one is."""
+        transport = self._transport
+        searching = self._health.state is DeviceState.SEARCHING and transport.hears_replies
+        return transport.link.writable and (self._health.streaming or searching) and not transport.busy
+
+    def _require_replies(self) -> None:
+        health = self._health
+        searching = health.state is DeviceState.SEARCHING and self._transport.hears_replies
+        if not health.streaming and not searching:
+            problem = health.problem or "it accepts no commands now"
+            raise CommandError(f"{self.config.name} is {health.state}: {problem}")
+
+    def _known_actions(self) -> str:
+        return ", ".join(self.actions) or "none" + " while no device is found" * (self._transport.driver is None)
+
+    # --- the flow ----------------------------------------------------------------------------------------------------
+
+    def _watch_flow(self, path: SamplePath, now_ns: int) -> None:
+        state, quiet_ns = self._health.state, now_ns - max(path.last_sample_ns, path.begun_ns)
+        if (state is DeviceState.SEARCHING and path.fresh) or (
+            state is DeviceState.SILENT and now_ns - path.last_sample_ns < SILENCE_NS
+        ):
+            self._up(now_ns)
+        elif state is DeviceState.RUNNING and quiet_ns > max(SILENCE_NS, SILENCE_PERIODS * path.period_ns):
+            words = (
+                f"no sample for {quiet_ns / NS_PER_S:.1f} s, though the link is there: is it powered, was it stopped?"
+            )
+            self._health.down(now_ns, DeviceState.SILENT, words)
+        elif quiet_ns > UNHEARD_NS:
+            self._transport.on_no_samples(path, now_ns)
+
+    def _up(self, now_ns: int) -> None:
+        transport = self._transport
+        self._attachments.device_found()
+        driver = transport.driver.name if transport.driver is not None else ""
+        self._health.up(now_ns, driver, transport.where, transport.bit_rate)
+
+    # --- state -------------------------------------------------------------------------------------------------------
+
+    def status(self) -> DeviceStatus:
+        """Return the full status of the device."""
+        transport, health = self._transport, self._health
+        path, driver = transport.path, transport.driver
+        newest = path.newest if path is not None else None
+        latency = path.latency if path is not None else LatencyMeter()
+        frame = self._frame.status(driver, path, self._identity.settings)
+        status = DeviceStatus(
+            name=self.config.name,
+            device_id=self.device_id,
+            driver=self.driver_name,
+            euler_convention=frame.euler_convention if frame else "",
+            navigation_frame=frame.navigation_frame if frame else "",
+            frame=frame,
+            link=transport.where,
+            state=health.state,
+            problem=health.problem,
+            identity=identity_words(self._identity.identity),
+            settings=dict(self._identity.shown_settings),
+            rate_hz=self._rate.rate_hz(),
+            expected_rate_hz=path.clock.expected_rate_hz if path else 0.0,
+            newest_seq=newest.seq if newest else 0,
+            clock=path.clock.status() if path else ClockStatus(),
+            ledger=self.ledger.snapshot(),
+            kernel=transport.link.kernel_counters(),
+            latency_buckets=tuple(latency.buckets),
+            latency_sum_ns=latency.sum_ns,
+            hold_ns=transport.hold_ns,
+            hold_wanted_ns=self._need.latency_ns,
+            hold_by=self._need.who,
+            temperature_c=newest.temperature_c if newest else None,
+            status_bits=newest.status if newest else None,
+            status_words=status_words(driver.status_bits, newest.status) if driver and newest else (),
+            status_bit_names={str(number): bit.name for number, bit in driver.status_bits.items()} if driver else {},
+            connects=self._connects,
+            lines=self._lines_status(),
+            utc=self._attachments.utc_status(),
+            declared=self._settings.status(),
+            noise=self.config.noise,
+        )
+        return transport.add_status(status)

@@ -1,0 +1,166 @@
+"""State and present problem of a device: shown in its status, logged, raised as events UP and DOWN.
+
+Trouble of a link that goes on (a CAN bus that is error-passive) stays shown while samples flow, and explains why none
+come.
+"""
+
+import logging
+from collections.abc import Callable
+
+from imud.contracts.codec import BadFrame
+from imud.contracts.status import DeviceState
+from imud.host.log import MESSAGE_CHARACTERS_MAX, printable, same_as
+from imud.model.event import LEVELS, Event, EventKind
+from imud.model.ledger import Ledger
+from imud.model.sample import Sync
+from imud.model.units import NS_PER_S
+
+log = logging.getLogger(__name__)
+
+INTERVAL_NS = NS_PER_S
+"""At most one loss and one bad-frame event a second and device."""
+RAW_SHOWN_BYTES = 32
+
+
+class Notices:
+    """Events of one device: `raise_event` sends one at once, `tick` those of counters."""
+
+    def __init__(self, device: str, ledger: Ledger, send: Callable[[Event], None]) -> None:
+        self.device = device
+        """Name in the configuration."""
+        self._ledger = ledger
+        self._send = send
+        self._due_ns = 0
+        self._lost = 0
+        self._bad = 0
+        self._last_bad: BadFrame | None = None
+        self._sync: Sync | None = None
+
+    def raise_event(
+        self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
+    ) -> None:
+        """Send one event, and log it; texts that came from the device may hold anything, and are made printable."""
+        message = printable(message, MESSAGE_CHARACTERS_MAX)
+        detail = {name: printable(one) if isinstance(one, str) else one for name, one in detail.items()}
+        alike = same_as(kind if kind is EventKind.BAD_FRAME else message)  # the bytes of a damaged frame always differ
+        log.log(LEVELS.get(kind, logging.WARNING), "%s: %s", self.device, message, extra=alike)
+        self._send(Event(now_ns, self.device, kind, message, detail))
+
+    def bad_frame(self, frame: BadFrame) -> None:
+        """Note a damaged frame; the newest one is shown in the next event."""
+        self._last_bad = frame
+
+    def tick(self, now_ns: int, sync: Sync | None) -> None:
+        """Send the events gathered since the last interval."""
+        if sync is not None and sync is not self._sync:
+            self._report_sync(now_ns, sync)
+        if now_ns < self._due_ns:
+            return
+        ledger = self._ledger
+        troubled = ledger.frames_bad() + ledger.frames_not_finite
+        lost, bad = ledger.lost() - self._lost, troubled - self._bad
+        if lost:
+            self.raise_event(now_ns, EventKind.LOSS, _counted(lost, "sample") + " lost", **self._causes())
+        if bad and self._last_bad is not None:
+            frame = self._last_bad
+            shown = frame.raw[:RAW_SHOWN_BYTES].hex(" ")
+            self.raise_event(
+                now_ns,
+                EventKind.BAD_FRAME,
+                f"{_counted(bad, 'bad frame')}, the last by {frame.reason}: {shown}",
+                count=bad,
+            )
+        self._lost, self._bad = ledger.lost(), troubled
+        if lost or bad:
+            self._due_ns = now_ns + INTERVAL_NS
+
+    def _causes(self) -> dict[str, int]:
+        ledger = self._ledger
+        return {
+            "gap_device": ledger.lost_gap_device,
+            "crc": ledger.lost_crc,
+            "overrun": ledger.lost_overrun,
+            "queue": ledger.lost_queue,
+        }
+
+    def _report_sync(self, now_ns: int, sync: Sync) -> None:
+        before, self._sync = self._sync, sync
+        if before is not None:
+            self._send(Event(now_ns, self.device, EventKind.SYNC, f"time stamps by {sync}, were by {before}",
+                             {"sync": str(sync), "before": str(before)}))  # fmt: skip
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
+
+
+SEARCH_BEGUN = "no sample has come yet: wait until the search has listened for a while"
+"""The problem of a device whose link was opened just now."""
+STREAMING = (DeviceState.RUNNING, DeviceState.SILENT)
+
+
+class Health:
+    """State and problem of one device; all times are CLOCK_MONOTONIC in ns. Synchronization: the loop's thread only."""
+
+    def __init__(self, notices: Notices) -> None:
+        self.state = DeviceState.MISSING
+        self.problem = ""
+        """Present fault, one sentence; empty for none."""
+        self.silent_since_ns = 0
+        """CLOCK_MONOTONIC when the state became SILENT."""
+        self.link_problem = ""
+        """Present fault of a link that still works; empty for none."""
+        self._notices = notices
+
+    @property
+    def streaming(self) -> bool:
+        """Whether the device was found and its link is there."""
+        return self.state in STREAMING
+
+    def link_opened(self) -> None:
+        """Clear the problem: the link is open."""
+        self.problem = self.link_problem = ""
+
+    def searching(self) -> None:
+        """Enter SEARCHING; the problem stays shown until a device is found."""
+        self.state = DeviceState.SEARCHING
+        self.problem = self.problem or SEARCH_BEGUN
+
+    def finished(self) -> None:
+        """Enter FINISHED: a replay came to its end."""
+        self.state, self.problem = DeviceState.FINISHED, ""
+
+    def up(self, now_ns: int, driver: str, where: str, bit_rate: int) -> None:
+        """Enter RUNNING: samples of `driver` come on the link `where`."""
+        self.state, self.problem = DeviceState.RUNNING, self.link_problem
+        self._notices.raise_event(now_ns, EventKind.UP, f"{driver} on {where}", driver=driver, baud=bit_rate)
+
+    def down(self, now_ns: int, state: DeviceState, problem: str) -> None:
+        """Enter a state in which no samples come, for the reason `problem`."""
+        problem = printable(problem, MESSAGE_CHARACTERS_MAX)
+        if state is DeviceState.SILENT:
+            problem = self.link_problem or problem
+            self.silent_since_ns = now_ns
+        was_up, changed = self.streaming, state is not self.state or problem != self.problem
+        self.state, self.problem = state, problem
+        if was_up:
+            self._notices.raise_event(now_ns, EventKind.DOWN, problem, state=str(state))
+        elif changed:
+            log.warning("%s: %s", self._notices.device, problem, extra=same_as(problem))
+
+    def missing(self, now_ns: int, reason: str) -> None:
+        """Enter MISSING for `reason`, empty for a link that is there; how a link went stays shown until it is back."""
+        if reason and not (self.state is DeviceState.MISSING and self.problem):
+            self.down(now_ns, DeviceState.MISSING, reason)
+
+    def report(self, problem: str) -> None:
+        """Show what is wrong while the state stays; trouble of the link takes precedence."""
+        problem = self.link_problem or printable(problem, MESSAGE_CHARACTERS_MAX)
+        if problem != self.problem:
+            log.warning("%s: %s", self._notices.device, problem, extra=same_as(problem))
+        self.problem = problem
+
+    def on_link_news(self, now_ns: int, news: str, problem: str) -> None:
+        """Raise an event: the state of the link changed, and `problem` is what is wrong with it from now on."""
+        self.link_problem = self.problem = printable(problem, MESSAGE_CHARACTERS_MAX)
+        self._notices.raise_event(now_ns, EventKind.LINK, news, problem=problem)

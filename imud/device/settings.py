@@ -1,0 +1,633 @@
+"""The settings of one device: compared with what the configuration declares, and kept so where it says so.
+
+    link opened, identified again, clock of the device began anew, a command ─▶ read ─▶ compare ─▶ event, status
+                                                                                          │ on_difference
+                                                                                          └─▶ plan ─▶ apply ─▶ event
+
+A device that does not keep its settings gets them again after growing pauses (PAUSES_S), and its flash is written a
+limited number of times per day (`flash.py`).
+"""
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from contextlib import asynccontextmanager, suppress
+from itertools import chain, islice, repeat
+from typing import Any, Final
+
+import msgspec
+
+from imud.config.model import DeviceConfig
+from imud.contracts.command import Target
+from imud.contracts.driver import Driver, Identity, PolledDriver
+from imud.contracts.script import RequestScript
+from imud.contracts.setting import (
+    AppliedSettings,
+    DeviceSettings,
+    OnDifference,
+    SettingDifference,
+    SettingsPlan,
+    SettingsReport,
+    SettingsState,
+    SettingsStatus,
+    StepOutcome,
+    declared_values,
+)
+from imud.device.flash import ModuleFlash, SettingsFiles, backup_text
+from imud.device.health import Notices
+from imud.device.scripts import Exchange
+from imud.device.settings_plan import (
+    DEVICE_ERRORS,
+    Applying,
+    RunScript,
+    Values,
+    advice,
+    as_json,
+    described_settings,
+    differences,
+    make_plan,
+    unverified,
+    wanted_values,
+    words,
+)
+from imud.host.clock import HostClock
+from imud.host.log import printable
+from imud.model.errors import BadArgument, CommandError, reason_of
+from imud.model.event import EventKind
+from imud.model.options import shown
+from imud.model.sample import Sample
+from imud.model.units import NS_PER_S
+from imud.sampling.clock import SampleClock
+
+log = logging.getLogger(__name__)
+
+IDENTIFY_TRIES = 3
+IDENTIFY_AGAIN_S = (5, 30, 120, 300)
+"""Pauses before a device that has not answered is asked again, the last of them for ever: right after a plug requests
+and replies can be lost, and a line that is wired later, or a host that is busy for minutes, must not cost the identity
+until the next plug. One whose RX is not wired gets one request in five minutes for nothing."""
+WORDS_MAX = 200
+"""Settings or details of one device; the HI14 has the most, some 60."""
+
+
+def pauses_s() -> Iterator[int]:
+    """Return the pauses before the further requests to a device that has not answered, without an end."""
+    return chain(IDENTIFY_AGAIN_S, repeat(IDENTIFY_AGAIN_S[-1]))
+
+
+def ignore_settings(_settings: Mapping[str, str]) -> None:
+    """Ignore the settings: the version for devices on which nothing depends on them."""
+
+
+class KnownIdentity:
+    """Identity and settings of one device as read back last. Synchronization: the loop's thread only."""
+
+    def __init__(
+        self,
+        notices: Notices,
+        now_ns: Callable[[], int],
+        on_settings: Callable[[Mapping[str, str]], None] = ignore_settings,
+        describe: Callable[[Mapping[str, str]], Mapping[str, str]] = dict,
+    ) -> None:
+        """`on_settings` is called with settings as they are read back, `describe` makes them readable for people."""
+        self.identity = Identity()
+        self.settings: Mapping[str, str] = {}
+        """By the device's own names."""
+        self.shown_settings: Mapping[str, str] = {}
+        """The same for people."""
+        self.answered = False
+        """Whether the device answered every question about it when it was asked last."""
+        self._notices = notices
+        self._now_ns = now_ns
+        self._on_settings = on_settings
+        self._describe = describe
+
+    async def ask(
+        self,
+        exchange: Exchange,
+        identify: Callable[[], RequestScript[Identity]],
+        read_settings: Callable[[], RequestScript[Mapping[str, str]]],
+        apply: Callable[[Identity], None],
+        tries: int = IDENTIFY_TRIES,
+    ) -> bool:
+        """Ask for identity and settings; `apply` gets the identity. Return whether the device answered both.
+
+        What is known of a device that does not answer is left as it is; one that tells its identity only has that.
+        """
+        self.answered = False
+        for attempt in range(1, tries + 1):
+            try:
+                identity = await exchange.run(identify())
+                apply(identity)
+                self._keep_identity(identity)
+                self._keep_settings(await exchange.run(read_settings()))
+                self.answered = True
+                return True
+            except CommandError as error:
+                log.info("%s: %s (try %d of %d)", self._notices.device, error, attempt, tries)
+        return False
+
+    def update(self, identity: Identity, settings: Mapping[str, str]) -> None:
+        """Keep what the device said; raise an event for what differs from before."""
+        self._keep_identity(identity)
+        self._keep_settings(settings)
+
+    def _keep_identity(self, identity: Identity) -> None:
+        """Keep who the device says it is; raise an event when it is another one than before."""
+        before = self.identity
+        self.identity = identity = completed(printable_identity(identity), before)
+        if before.serial_number and identity.serial_number != before.serial_number:
+            message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
+            serial_number = identity.serial_number
+            self._notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message, serial_number=serial_number)
+
+    def _keep_settings(self, settings: Mapping[str, str]) -> None:
+        """Keep the settings that the device said; raise an event for those that differ from before."""
+        settings, known = printable_words(settings), self.shown_settings
+        shown = printable_words(self._describe(settings))
+        changed = {name: value for name, value in shown.items() if known.get(name, value) != value}
+        if changed:
+            words = ", ".join(f"{name} is {value}, was {known[name]}" for name, value in changed.items())
+            message = f"settings of the device changed: {words}"
+            self._notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message, **changed)
+        self.settings, self.shown_settings = settings, shown
+        self._on_settings(settings)
+
+
+def completed(identity: Identity, before: Identity) -> Identity:
+    """Return an identity with what its answer lost taken from the one before, if both can be of the same device.
+
+    An adapter that was just plugged in can lose bytes of the first answers.
+    """
+    pairs = ((identity.product, before.product), (identity.serial_number, before.serial_number))
+    if any(new and old and new != old for new, old in pairs):
+        return identity
+    return Identity(
+        identity.product or before.product,
+        identity.serial_number or before.serial_number,
+        identity.firmware or before.firmware,
+        before.details if identity.details is None else identity.details,
+    )
+
+
+def printable_identity(identity: Identity) -> Identity:
+    """Return an identity as every output can have it: each text bounded, in printable characters."""
+    product, serial, firmware = map(printable, (identity.product, identity.serial_number, identity.firmware))
+    return Identity(product, serial, firmware, None if identity.details is None else printable_words(identity.details))
+
+
+def printable_words(words: Mapping[str, str]) -> dict[str, str]:
+    """Return names and texts of a device, WORDS_MAX at most, each bounded, in printable characters."""
+    return {printable(name): printable(text) for name, text in islice(words.items(), WORDS_MAX)}
+
+
+def identity_words(identity: Identity) -> dict[str, str]:
+    """Return an identity as the flat mapping of `DeviceStatus`, empty members left out."""
+    words = {
+        "product": identity.product,
+        "serial_number": identity.serial_number,
+        "firmware": identity.firmware,
+        **(identity.details or {}),
+    }
+    return {name: value for name, value in words.items() if value}
+
+
+BEGIN_NS: Final = NS_PER_S
+"""From finding a device to the question: imud asks for its identity meanwhile, on which counting writes depends."""
+SETTLE_NS: Final = NS_PER_S // 2
+"""From the first sample after a restart to the question: a module that has just started need not answer at once."""
+AGAIN_NS: Final = 60 * NS_PER_S
+"""From one comparison to the next of a device that is polled: it has no clock by which its restart shows."""
+OWN_NS: Final = 2 * NS_PER_S
+"""After a script a device that paused its samples for it, or that it restarted, may begin its clock anew so late: what
+it has then is compared at the end of the script, and not once more, which would pause its samples again."""
+WAIT_S: Final = 10.0
+"""How long a command waits for another one."""
+BACKUP_LIMIT_S: Final = 5.0
+"""How long a command waits for a disk that does not answer."""
+READ_AGAIN_NS: Final = 5 * NS_PER_S
+READ_TRIES: Final = 3
+"""A device that does not tell its settings is asked so often; then at the next restart, replug or command."""
+PAUSES_S: Final = (0, 10, 60, 600, 3600)
+"""From one repair to the next within PAUSES_FORGOTTEN_S, by their number; the last for all further ones."""
+PAUSES_FORGOTTEN_S: Final = 2 * 3600
+
+
+class SettingsKeeper:
+    """Settings of one device. Synchronization: the event loop's thread only."""
+
+    def __init__(
+        self,
+        config: DeviceConfig,
+        run: RunScript,
+        driver: Callable[[], Driver | None],
+        identity: KnownIdentity,
+        notices: Notices,
+        host: HostClock,
+        files: SettingsFiles,
+        hears: Callable[[], bool],
+        read_back: Callable[[], Awaitable[None]],
+    ) -> None:
+        """`run` runs a script on the device; `driver` is the present one; `files` is shared by all devices; `hears`
+        says whether the device can be asked now; `read_back` asks for what the status shows of it."""
+        self._config = config
+        self._run = run
+        self._driver = driver
+        self._identity = identity
+        self._notices = notices
+        self._host = host
+        self._files = files
+        self._writes = files.flash
+        self._hears = hears
+        self._read_back = read_back
+        self._clock: SampleClock | None = None
+        self._own_until_ns = 0
+        """Until when a new beginning of the device's clock is counted as caused by imud's own scripts."""
+        self._resets = 0
+        self._lock = asyncio.Lock()
+        self._wanted = asyncio.Event()
+        self._due_ns: int | None = None
+        """When to compare; None for not before something happens."""
+        self._tries = 0
+        self._actual: Values | None = None
+        self._target: Target | None = None
+        self._written: dict[str, Any] = {}
+        """Values written since the device's last restart, of settings that it does not tell."""
+        self._unsaved = False
+        """Whether something was written since then that flash does not have, as far as imud knows."""
+        self._saved: Values | None = None
+        """While `_unsaved`: what the device had before, None where that is not known."""
+        self._reported: Mapping[str, SettingDifference] = {}
+        self._problem = ""
+        self._read_ns: int | None = None
+        self._repairs = 0
+        self._repaired_ns: list[int] = []
+        self._repaired_module = ""
+        """When imud set the device by itself, of the last PAUSES_FORGOTTEN_S."""
+
+    # --- when ---------------------------------------------------------------------------------------------------------
+
+    def start(self, clock: SampleClock) -> None:
+        """Note that a device was found: its link was opened, or it is back. It may be another one."""
+        self._clock, self._resets = clock, clock.status().resets
+        self._actual = None
+        self._begin_anew(BEGIN_NS)
+
+    def tick(self, now_ns: int, _newest: Sample | None) -> None:
+        """Wake `run` when it is time and the device can be asked; note a restart of the device by its clock."""
+        if not self._declared:
+            return
+        if self._clock is not None and (resets := self._clock.status().resets) != self._resets:
+            self._resets = resets
+            if not self.busy and now_ns >= self._own_until_ns:
+                self._begin_anew(SETTLE_NS)
+        if self._due_ns is not None and now_ns >= self._due_ns and not self.busy and self._hears():
+            self._wanted.set()
+
+    def commanded(self, *, saved: bool = False) -> None:
+        """Note that a command was carried out, which may have changed anything, or `saved` everything."""
+        if not self._unsaved:
+            self._saved = self._actual
+        self._unsaved, self._tries = not saved, 0
+        self._due_ns = self._host.now_ns()
+
+    def stop(self) -> None:
+        """Note that the link ended: nothing is known of the device; may be called twice."""
+        self._actual = self._due_ns = None
+        self._wanted.clear()
+
+    def close(self) -> None:
+        """End, without a restart; may be called twice."""
+        self.stop()
+
+    def _begin_anew(self, after_ns: int) -> None:
+        """Note that the device has what its flash has, and compare after a time."""
+        self._reported, self._written, self._unsaved, self._tries = {}, {}, False, 0
+        self._due_ns = self._host.now_ns() + after_ns
+
+    @property
+    def busy(self) -> bool:
+        """Whether settings are being read or written, or a command is carried out."""
+        return self._lock.locked()
+
+    @asynccontextmanager
+    async def exclusive(self) -> AsyncIterator[None]:
+        """Keep settings alone while a command is carried out, or they are read or written.
+
+        Raises CommandError where another one does not end in time, for example a calibration.
+        """
+        try:
+            async with asyncio.timeout(WAIT_S):
+                await self._lock.acquire()
+        except TimeoutError:
+            raise CommandError(f"{self._config.name}: another command or a calibration is still under way") from None
+        try:
+            yield
+        finally:
+            self._own_until_ns = self._host.now_ns() + OWN_NS
+            self._lock.release()
+
+    @property
+    def flash(self) -> ModuleFlash:
+        """The flash of the present module, as written for people and programs."""
+        return ModuleFlash(self._writes, self._module, asked=True)
+
+    def spend_flash(self) -> None:
+        """Count a write to flash that a command is about to make. Raises CommandError where it may not be made."""
+        if refusal := self.flash.refusal():
+            raise CommandError(f"{self._config.name}: {refusal}")
+        self.flash.count()
+
+    async def run(self) -> None:
+        """Compare whenever it is time. Ends only by an error of imud."""
+        while True:
+            await self._wanted.wait()
+            self._wanted.clear()
+            with suppress(CommandError):  # a command is under way, after which it is compared anyway
+                async with self.exclusive():
+                    self._due_ns = None
+                    await self._keep()
+
+    # --- questions ----------------------------------------------------------------------------------------------------
+
+    def status(self) -> SettingsStatus | None:
+        """Return the newest comparison; None for a driver that does not know its device's settings."""
+        table = self._known_table()
+        if table is None:
+            return None
+        found = self._differences(table)
+        state = SettingsState.DIFFER if found else SettingsState.AGREE
+        state = SettingsState.UNKNOWN if self._actual is None else state
+        return SettingsStatus(
+            state if self._declared else SettingsState.UNDECLARED,
+            self._config.on_difference,
+            self._problem,
+            found,
+            unverified(table, self._declared, self._actual or {}) if self._actual is not None else (),
+            self._read_ns,
+            self._repairs,
+            self._writes.writes(self._module),
+            self._writes.writes_day(self._module),
+        )
+
+    async def report(self, *, fresh: bool) -> SettingsReport:
+        """Return all settings: asked for now if `fresh`, otherwise as reported last.
+
+        Raises CommandError, TransferError, DeviceRefused, LinkError.
+        """
+        table = self._table()
+        if fresh:
+            async with self.exclusive():
+                await self._read(table)
+        status = self.status()
+        assert status is not None
+        return SettingsReport(
+            self._config.name,
+            self._driver_name,
+            identity_words(self._identity.identity),
+            status,
+            described_settings(table, self._declared, self._actual),
+        )
+
+    async def plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
+        """Plan to make the device as `given` (None: as declared), without changing it. Raises what `report` does."""
+        table = self._table()
+        wanted = self._wanted_values(table, given)
+        async with self.exclusive():
+            return self._make_plan(table, wanted, await self._read(table), save=save, unsaved=self._unsaved)
+
+    async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
+        """Make the device as `given` (None: as declared). Raises what `report` does, before anything is written."""
+        table = self._table()
+        wanted = self._wanted_values(table, given)
+        async with self.exclusive():
+            return await self._apply(table, wanted, await self._read(table), save=save, asked=True)
+
+    async def back_up(self, action: str) -> None:
+        """Write a backup before an action that loses all settings, and tell where it is; the caller has `exclusive`.
+
+        An action is not kept from a device that does not tell its settings: it may be what helps. An event says so.
+        """
+        table = self._known_table()
+        if table is None:
+            return
+        try:
+            actual = await self._read(table)
+            settable = [name for name, setting in table.table.items() if setting.write is not None and name in actual]
+            values = {name: as_json(actual[name]) for name in settable}
+            device, utc_ns = self._config.name, self._files.utc_ns()
+            words = identity_words(self._identity.identity)
+            text = backup_text(device, self._driver_name, words, values, utc_ns)
+            writing = asyncio.to_thread(self._files.backups.write, device, text, utc_ns)
+            file = await asyncio.wait_for(writing, BACKUP_LIMIT_S)
+        except TimeoutError:
+            self._raise(f"no backup of the settings before {action}: the disk does not answer")
+            return
+        except (*DEVICE_ERRORS, OSError) as error:
+            self._raise(f"no backup of the settings before {action}: {reason_of(error)}")
+            return
+        if file is not None:
+            self._raise(f"settings before {action} are in {file}", file=str(file))
+        else:
+            self._raise(f"no backup of the settings before {action}: there is no state directory")
+
+    # --- comparison ---------------------------------------------------------------------------------------------------
+
+    async def _keep(self) -> None:
+        """Read, compare, tell, and set what differs where the configuration says so."""
+        table = self._known_table()
+        if table is None:
+            return
+        try:
+            actual = await self._read(table)
+        except DEVICE_ERRORS as error:
+            self._not_read(error)
+            return
+        self._tries, self._problem = 0, ""
+        found = self._differences(table)
+        self._tell(found)
+        if isinstance(self._driver(), PolledDriver):
+            self._due_ns = self._host.now_ns() + AGAIN_NS
+        if self._config.on_difference is not OnDifference.REPORT:
+            await self._repair(table, actual)
+
+    async def _repair(self, table: DeviceSettings, actual: Values) -> None:
+        """Set what differs, or note when it may be set again."""
+        save = self._config.on_difference is OnDifference.APPLY_AND_SAVE
+        try:
+            unsaved = self._unsaved and not self._is_saved(actual)
+            plan = self._make_plan(table, self._declared, actual, save=save, unsaved=unsaved)
+        except BadArgument as error:
+            self._complain(f"settings cannot be set: {error}")
+            return
+        self._problem = "; ".join(f"{name} {why}" for name, why in plan.left_out.items())
+        if plan.empty:
+            return
+        now_ns = self._host.now_ns()
+        wait_ns = self._pause_ns(now_ns)
+        if wait_ns > 0:
+            self._due_ns = now_ns + wait_ns
+            self._problem = f"the device does not keep its settings; set again in {wait_ns / NS_PER_S:.0f} s"
+            return
+        self._repaired_ns.append(now_ns)
+        self._repairs += 1
+        applied = await self._apply(table, self._declared, actual, save=save, asked=False)
+        self._announce(applied)
+
+    def _is_saved(self, actual: Values) -> bool:
+        """Whether flash has what is declared, after commands that changed nothing."""
+        return actual == self._saved and all(name in actual for name in self._declared)
+
+    def _pause_ns(self, now_ns: int) -> int:
+        """Time to wait before the device may be set by imud itself again, by how often that was needed of late.
+
+        A module that takes the place of another one begins without pauses.
+        """
+        if self._module != self._repaired_module:
+            self._repaired_module = self._module
+            self._repaired_ns.clear()
+        forgotten_ns = now_ns - PAUSES_FORGOTTEN_S * NS_PER_S
+        self._repaired_ns = [time_ns for time_ns in self._repaired_ns if time_ns > forgotten_ns]
+        pause_s = PAUSES_S[min(len(self._repaired_ns), len(PAUSES_S) - 1)]
+        return self._repaired_ns[-1] + pause_s * NS_PER_S - now_ns if self._repaired_ns else 0
+
+    async def _read(self, table: DeviceSettings) -> Values:
+        def read(target: Target) -> Any:
+            self._target = target
+            return table.read(target)
+
+        actual: Values = await self._run(read)
+        self._actual, self._read_ns = actual, self._host.now_ns()
+        return actual
+
+    async def _apply(
+        self, table: DeviceSettings, wanted: Values, actual: Values, *, save: bool, asked: bool
+    ) -> AppliedSettings:
+        plan = self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved)
+        flash = ModuleFlash(self._writes, self._module, asked=asked)
+        applying = Applying(table, self._run, flash, wanted, actual)
+        try:
+            done = await applying.carry_out(plan)
+        finally:
+            self._written |= applying.written
+            self._unsaved |= applying.changed
+            self._actual = applying.actual if applying.heard else None
+            self._read_ns = self._host.now_ns()
+            if applying.saved:
+                self._unsaved = False
+                unreadable = {name: as_json(value) for name, value in self._all_written(table).items()}
+                self._writes.keep_unreadable(self._module, unreadable)
+        if asked:  # the rest is an event, which is in the log
+            log.info("%s: %s", self._config.name, _summary(done) or "settings are as wanted")
+        self._tell(self._differences(table), quiet=True)
+        if applying.changed:
+            await self._read_back()
+        return msgspec.structs.replace(done, advice=advice(self._config, done))
+
+    def _make_plan(
+        self, table: DeviceSettings, wanted: Values, actual: Values, *, save: bool, unsaved: bool
+    ) -> SettingsPlan:
+        assert self._target is not None
+        return make_plan(table, self._target, wanted, actual, self._all_written(table), save=save, unsaved=unsaved)
+
+    def _all_written(self, table: DeviceSettings) -> dict[str, Any]:
+        """Values of settings that the device does not report, as written to it since its restart or before a save."""
+        found: dict[str, Any] = {}
+        for name, value in self._writes.unreadable(self._module).items():
+            try:
+                found |= wanted_values(table, {name: value})
+            except BadArgument:
+                log.debug("%s: %s of an earlier version is not used", self._config.name, name)
+        return found | self._written
+
+    # --- what is reported ---------------------------------------------------------------------------------------------
+
+    def _tell(self, found: Mapping[str, SettingDifference], *, quiet: bool = False) -> None:
+        """Raise an event for differences that are news; `quiet` for those that an answer or another event tells."""
+        if found and found != self._reported and not quiet:
+            detail = {name: shown(one.actual) for name, one in found.items()}
+            self._raise(f"settings are not as declared: {words(found)}", **detail)
+        elif not found and self._reported:
+            self._raise("settings are as declared again")
+        self._reported = found
+
+    def _announce(self, applied: AppliedSettings) -> None:
+        """Raise an event for what imud did by itself."""
+        if applied.problem:
+            self._problem = applied.problem
+            now_ns = self._host.now_ns()
+            self._due_ns = now_ns + max(self._pause_ns(now_ns), NS_PER_S)
+        detail = {step.name: str(step.outcome) for step in applied.steps}
+        self._raise(_summary(applied), saved=applied.saved, **detail)
+
+    def _not_read(self, error: Exception) -> None:
+        """Ask again later, a limited number of times."""
+        self._tries += 1
+        self._actual = None
+        if self._tries < READ_TRIES:
+            self._problem = f"settings could not be read: {error}"
+            self._due_ns = self._host.now_ns() + READ_AGAIN_NS
+        else:
+            self._complain(f"settings could not be read, asked {self._tries} times: {error}")
+
+    def _complain(self, problem: str) -> None:
+        if problem != self._problem:
+            self._raise(problem)
+        self._problem = problem
+
+    def _raise(self, message: str, **detail: str | bool) -> None:
+        self._notices.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message, **detail)
+
+    # --- parts --------------------------------------------------------------------------------------------------------
+
+    @property
+    def _declared(self) -> Values:
+        return declared_values(self._config.declared)
+
+    @property
+    def _driver_name(self) -> str:
+        driver = self._driver()
+        return driver.name if driver is not None else self._config.driver
+
+    @property
+    def _module(self) -> str:
+        """The module whose flash is written: by its serial number, without one by the name of the device."""
+        serial_number = self._identity.identity.serial_number
+        return f"{self._driver_name} {serial_number}" if serial_number else f"device {self._config.name}"
+
+    def _differences(self, table: DeviceSettings) -> dict[str, SettingDifference]:
+        if self._actual is None:
+            return {}
+        return differences(table, self._declared, self._actual, self._all_written(table))
+
+    def _known_table(self) -> DeviceSettings | None:
+        driver = self._driver()
+        return driver.device_settings if driver is not None else None
+
+    def _table(self) -> DeviceSettings:
+        table = self._known_table()
+        if table is None:
+            name = self._driver_name
+            raise CommandError(f"{self._config.name}: driver {name} does not know the settings of its device")
+        return table
+
+    def _wanted_values(self, table: DeviceSettings, given: Mapping[str, Any] | None) -> Values:
+        if given is not None:
+            return wanted_values(table, given)
+        if not self._declared:
+            raise BadArgument(f"{self._config.name}: expected values, or `settings` in the configuration, got neither")
+        return self._declared
+
+
+def _summary(applied: AppliedSettings) -> str:
+    """Describe what was done, for example `settings: mode set to "6-axis" (was "9-axis"); saved to flash`."""
+    parts = []
+    for step in applied.steps:
+        if step.outcome is StepOutcome.NOT_DONE:
+            continue
+        before = f" (was {shown(step.before)})" if step.before is not None else ""
+        note = "" if step.outcome is StepOutcome.DONE else f": {step.outcome}"
+        parts.append(f"{step.name} set to {shown(step.value)}{before}{note}")
+    ends = ["saved to flash"] * applied.saved + ["restarted"] * applied.restarted
+    ends += [applied.problem] if applied.problem else []
+    return "settings: " + "; ".join([", ".join(parts), *ends] if parts else ends) if parts or ends else ""

@@ -1,0 +1,357 @@
+"""Plan of what is written to a device to make it as wanted, and in which order.
+
+Settings are written in the order of the driver's table, those that change how the device is reached last. What comes
+into force by a restart only is left out where nothing is to be saved: the restart would lose it.
+"""
+
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
+
+import msgspec
+
+from imud.config.model import DeviceConfig
+from imud.contracts.command import Risk, Target
+from imud.contracts.setting import (
+    AppliedSettings,
+    AppliedStep,
+    DeviceSettings,
+    Effect,
+    PlannedStep,
+    Setting,
+    SettingDifference,
+    SettingInfo,
+    SettingsPlan,
+    StepOutcome,
+    Written,
+)
+from imud.model.errors import BadArgument, CommandError, DeviceRefused, LinkError, TransferError
+from imud.model.options import expected, shown, unknown_name
+
+Values = Mapping[str, Any]
+"""Values of settings by name, in the types of the driver's table."""
+
+
+def has(table: DeviceSettings, name: str, wanted: Values, actual: Values, unreadable: Values) -> bool:
+    """Whether a device has a wanted value: as it reports, or as was written to it where it does not."""
+    setting = table.table[name]
+    known = actual if name in actual else unreadable
+    return name in known and setting.agrees(wanted[name], known[name])
+
+
+def differences(
+    table: DeviceSettings, wanted: Values, actual: Values, unreadable: Values
+) -> dict[str, SettingDifference]:
+    """List the settings that can be read and are not as wanted, in the order of the table.
+
+    `unreadable` are values as they were written, which count where the device does not say what it has.
+    """
+    return {
+        name: SettingDifference(as_json(wanted[name]), as_json(actual.get(name)))
+        for name, setting in table.table.items()
+        if name in wanted and setting.readable and not has(table, name, wanted, actual, unreadable)
+    }
+
+
+def unverified(table: DeviceSettings, wanted: Values, actual: Values) -> tuple[str, ...]:
+    """List the wanted settings that the device does not tell, in the order of the table."""
+    return tuple(name for name in table.table if name in wanted and name not in actual)
+
+
+def words(found: Mapping[str, SettingDifference]) -> str:
+    """Describe differences, for example `mode is "9-axis", declared "6-axis"`."""
+    return ", ".join(
+        f"{name} is {'not reported' if one.actual is None else shown(one.actual)}, declared {shown(one.declared)}"
+        for name, one in found.items()
+    )
+
+
+def as_json(value: Any) -> Any:
+    """Return a value of a setting as JSON has it."""
+    return msgspec.to_builtins(value)
+
+
+def wanted_values(table: DeviceSettings, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert values of JSON or YAML to the types of the table, in its order.
+
+    Raises BadArgument for a setting that is not known or cannot be set, and for a value that is not accepted.
+    """
+    settable = [name for name, setting in table.table.items() if setting.write is not None]
+    for name in given:
+        if name not in settable:
+            only_read = f"{name}: it can only be read" if name in table.table else ""
+            raise BadArgument(only_read or unknown_name("a setting", name, settable))
+    return {name: _converted(name, given[name], table.table[name].type) for name in settable if name in given}
+
+
+def described_settings(table: DeviceSettings, declared: Values, actual: Values | None) -> tuple[SettingInfo, ...]:
+    """Describe all settings of a table; `actual` is None where they were not read."""
+    found = differences(table, declared, actual, {}) if actual is not None else {}
+    return tuple(
+        SettingInfo(
+            name,
+            *description_of(setting.type),
+            setting.effect,
+            setting.connection,
+            setting.readable,
+            setting.write is not None,
+            as_json(declared.get(name)),
+            as_json((actual or {}).get(name)),
+            name in found,
+        )
+        for name, setting in table.table.items()
+    )
+
+
+def description_of(value_type: Any) -> tuple[str, str, str, str]:
+    """Return accepted values, description, unit and section of the manual, from the type of a setting."""
+    info = msgspec.inspect.type_info(value_type)
+    schema: Mapping[str, Any] = {}
+    extra: Mapping[str, Any] = {}
+    if isinstance(info, msgspec.inspect.Metadata):
+        schema, extra = info.extra_json_schema or {}, info.extra or {}
+    meaning, unit, section = schema.get("description", ""), extra.get("unit", ""), extra.get("section", "")
+    return expected(value_type), str(meaning), str(unit), str(section)
+
+
+def _converted(name: str, value: Any, value_type: Any) -> Any:
+    try:
+        return msgspec.convert(value, value_type)
+    except msgspec.ValidationError:
+        raise BadArgument(f"{name}: expected {expected(value_type)}, got {shown(value)[:60]}") from None
+
+
+NEEDS_SAVE: Final = "comes into force by save and restart only, and nothing is to be saved"
+SAVES_ITSELF: Final = "saves to flash and restarts the device, and nothing is to be saved"
+CANNOT_SAVE: Final = "comes into force by save and restart only, and this driver cannot save"
+
+
+def make_plan(
+    table: DeviceSettings,
+    target: Target,
+    wanted: Values,
+    actual: Values,
+    unreadable: Values,
+    *,
+    save: bool,
+    unsaved: bool,
+) -> SettingsPlan:
+    """Plan to make a device that has `actual` as `wanted`.
+
+    `unreadable` are values of settings that cannot be read back, as they were written to this device, `unsaved` whether
+    something was written that flash does not have. Raises BadArgument for values that do not go together.
+    """
+    differing = [name for name in table.table if name in wanted and not has(table, name, wanted, actual, unreadable)]
+    left_out = {name: why for name in differing if (why := _why_left_out(table, table.table[name], save))}
+    written = [name for name in differing if name not in left_out]
+    if written:
+        table.check(target, merged(actual, {name: wanted[name] for name in written}))
+    names = list(table.table)
+    written.sort(key=lambda name: (table.table[name].connection, table.table[name].saves, names.index(name)))
+    steps = tuple(_step(name, table.table[name], wanted, actual) for name in written)
+    by_itself = any(step.saves for step in steps)
+    return SettingsPlan(
+        steps,
+        save=save and table.save is not None and (bool(steps) or unsaved) and not by_itself,
+        restart=any(step.effect is Effect.AFTER_RESTART for step in steps) and not by_itself and bool(table.restart),
+        left_out=left_out,
+        risk=Risk.CONNECTION if any(step.connection for step in steps) else Risk.NONE,
+    )
+
+
+def merged(actual: Values, wanted: Values) -> dict[str, Any]:
+    """Return all values as they will be: of a setting with several keys those that are wanted on top of the others."""
+    values = dict(actual)
+    for name, value in wanted.items():
+        present = values.get(name)
+        both = isinstance(value, Mapping) and isinstance(present, Mapping)
+        values[name] = {**present, **value} if both else value  # type: ignore[dict-item]  # both are mappings
+    return values
+
+
+def _why_left_out(table: DeviceSettings, setting: Setting, save: bool) -> str:
+    if setting.saves:
+        return "" if save else SAVES_ITSELF
+    if setting.effect is Effect.AT_ONCE:
+        return ""
+    if not save:
+        return NEEDS_SAVE
+    return "" if table.save is not None else CANNOT_SAVE
+
+
+def _step(name: str, setting: Setting, wanted: Values, actual: Values) -> PlannedStep:
+    before = as_json(actual.get(name))
+    return PlannedStep(name, as_json(wanted[name]), before, setting.effect, setting.connection, setting.saves)
+
+
+DEVICE_ERRORS: Final = (CommandError, DeviceRefused, LinkError, TransferError)
+"""Raised where a device does not answer, does not take a value, or is gone."""
+
+PLACES: Final = ("baud", "address", "node")
+"""Settings by whose names link or options say where the device is found."""
+UNVERIFIED: Final = (Written.UNVERIFIED, Written.UNVERIFIED_PENDING)
+PENDING: Final = (Written.PENDING, Written.UNVERIFIED_PENDING)
+
+RunScript = Callable[[Callable[[Target], Any]], Awaitable[Any]]
+"""`run_script` of a transport."""
+
+
+class FlashBudget(Protocol):
+    """How often the flash of a device may be written."""
+
+    def refusal(self) -> str:
+        """Return why it may not be written now, one sentence; empty if it may."""
+        ...
+
+    def count(self) -> None:
+        """Count a write that is about to be made."""
+        ...
+
+
+@dataclass
+class Applying:
+    """One plan under way. `wanted` has the values in the types of the table, `actual` what was read last."""
+
+    table: DeviceSettings
+    run: RunScript
+    flash: FlashBudget
+    wanted: Values
+    actual: Values
+    written: dict[str, Any] = field(default_factory=dict)
+    """Values written of settings that cannot be read back."""
+    saved: bool = False
+    restarted: bool = False
+    changed: bool = False
+    """Whether anything was written."""
+    pending: bool = False
+    """Whether a script said that what it wrote comes into force by a restart, whatever the table says."""
+    heard: bool = True
+    """Whether the device answered to the newest question."""
+    problem: str = ""
+
+    async def carry_out(self, plan: SettingsPlan) -> AppliedSettings:
+        """Do everything, up to the first failure. Raises nothing that a device or its link can cause."""
+        done: list[AppliedStep] = []
+        for step in plan.steps:
+            done.append(await self._do(step) if not self.problem else _applied(step, StepOutcome.NOT_DONE))
+        if not self.problem and plan.save:
+            await self._save()
+        if not self.problem and (plan.restart or (self.pending and self.saved and self.table.restart is not None)):
+            done = await self._restart(done)
+        found = differences(self.table, self.wanted, self.actual, self.written)
+        return AppliedSettings(
+            tuple(done), self.saved, self.restarted, self.problem + self._present(), plan.left_out, found
+        )
+
+    async def _do(self, step: PlannedStep) -> AppliedStep:
+        setting, value = self.table.table[step.name], self.wanted[step.name]
+        assert setting.write is not None
+        write = setting.write
+        if step.saves and (refusal := self.flash.refusal()):
+            return self._failed(step, refusal)
+        try:
+            if step.saves:
+                self.flash.count()
+            result = await self.run(lambda target: write(target, value))
+        except DEVICE_ERRORS as error:
+            await self._read_again()
+            return self._failed(step, str(error))
+        self.changed = True
+        self.saved |= step.saves
+        if not await self._read_again():
+            return self._failed(step, "written, and the device does not tell its settings since")
+        if not setting.readable or (result in UNVERIFIED and step.name not in self.actual):
+            self.written[step.name] = value
+            return _applied(step, StepOutcome.NOT_VERIFIED)
+        if result in PENDING:
+            self.pending = True
+            return _applied(step, StepOutcome.WRITTEN)
+        return self._judged(step, setting)
+
+    def _judged(self, step: PlannedStep, setting: Setting) -> AppliedStep:
+        """Compare what was read back after a write."""
+        if step.effect is Effect.AFTER_RESTART and not step.saves:
+            return _applied(step, StepOutcome.WRITTEN)
+        if message := self._mismatch(step.name, setting):
+            return self._failed(step, message)
+        return _applied(step, StepOutcome.DONE)
+
+    def _mismatch(self, name: str, setting: Setting) -> str:
+        if name not in self.actual:
+            return "written, and the device does not tell it"
+        if setting.agrees(self.wanted[name], self.actual[name]):
+            return ""
+        return f"wrote {shown(as_json(self.wanted[name]))}, read back {shown(as_json(self.actual[name]))}"
+
+    def _failed(self, step: PlannedStep, message: str) -> AppliedStep:
+        self.problem = f"{step.name}: {message}"
+        return _applied(step, StepOutcome.FAILED, message)
+
+    async def _save(self) -> None:
+        save = self.table.save
+        assert save is not None
+        if refusal := self.flash.refusal():
+            self.problem = f"not saved: {refusal}"
+            return
+        self.flash.count()
+        try:
+            await self.run(save)
+            self.saved = True
+        except DEVICE_ERRORS as error:
+            self.problem = f"not saved: {error}"
+
+    async def _restart(self, done: list[AppliedStep]) -> list[AppliedStep]:
+        """Restart the device, and judge the settings that come into force by that."""
+        restart = self.table.restart
+        assert restart is not None
+        try:
+            await self.run(restart)
+            self.restarted = True
+        except DEVICE_ERRORS as error:
+            self.problem = f"restart: {error}"
+        if not await self._read_again():
+            self.problem = self.problem or "the device does not tell its settings after its restart"
+            return done
+        return [self._after_restart(one) for one in done]
+
+    def _after_restart(self, done: AppliedStep) -> AppliedStep:
+        if done.outcome is not StepOutcome.WRITTEN or self.problem:
+            return done
+        step = PlannedStep(done.name, done.value, done.before)
+        return self._judged(step, self.table.table[done.name])
+
+    async def _read_again(self) -> bool:
+        """Read all settings; return False where the device does not answer, and its values are not known then."""
+        try:
+            self.actual = await self.run(self.table.read)
+            self.heard = True
+        except DEVICE_ERRORS:
+            self.actual, self.heard = {}, False
+        return self.heard
+
+    def _present(self) -> str:
+        """How the device is after a failure, for the end of its message."""
+        if not self.problem:
+            return ""
+        if not self.heard:
+            return "; what it has now is not known"
+        if not self.changed:
+            return "; nothing else was written"
+        return "" if self.saved else "; what was written before holds until the device restarts"
+
+
+def advice(config: DeviceConfig, done: AppliedSettings) -> str:
+    """Say what to change in a configuration that looks for the device where it was; empty for nothing."""
+    found = []
+    for step in done.steps:
+        if step.outcome not in (StepOutcome.DONE, StepOutcome.WRITTEN):
+            continue
+        for key, part in ((config.link, config.link_settings), ("options", config.options)):
+            place = getattr(part, step.name, None)
+            if place not in (None, "auto", step.value) and type(place) is type(step.value) and step.name in PLACES:
+                found.append(f"change `{key}.{step.name}: {place}` in the configuration to {step.value}")
+    return "; ".join(found) + (": imud looks for the device there at its next start" if found else "")
+
+
+def _applied(step: PlannedStep, outcome: StepOutcome, message: str = "") -> AppliedStep:
+    return AppliedStep(step.name, step.value, step.before, outcome, message)

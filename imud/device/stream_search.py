@@ -1,0 +1,382 @@
+"""Detection of the device and the baud rate on a port: a search without I/O or clock of its own.
+
+Strategy. Listen at one rate after the other, decode with a fresh codec of every driver, and count frames whose check
+value holds. Passes get slower: QUICK finds a 100 Hz device, MIDDLE 5 Hz, SLOW 1 Hz; the slow ones run only when
+something is heard. One good frame prolongs the visit until a second can come, so a dwell needs to hold one frame only.
+The remembered rate comes first. Only after a whole pass and QUIET_NS without a single byte, and only if allowed, each
+driver's query is sent at each rate; from the first byte heard on, nothing is sent any more.
+
+False locks. LOCK_FRAMES = 2 good frames, more than there were bad ones. With a 16-bit check a wrong rate must pass it
+twice among the first three things that look like frames: 3 × 2⁻³² = 7 × 10⁻¹⁰ per visit, even if every frame of the
+device turns into a sync word with a plausible length. On random bytes a sync word and length of HiPNUC come at 2⁻²³
+per byte, so two good frames in a visit of 1,000 bytes have a chance of (1000 × 2⁻³⁹)² / 2 = 2 × 10⁻¹⁸. On a noisy line
+with more bad frames than good ones SURE_FRAMES = 4 are enough: C(60, 4) × 2⁻⁶⁴ = 3 × 10⁻¹⁴.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from imud.config.model import DeviceConfig
+from imud.contracts.codec import CodecEvent, StreamCodec, message_of
+from imud.contracts.driver import StreamDriver, of_kind
+from imud.contracts.link import StreamLink
+from imud.contracts.script import Request
+from imud.device.search import GaveUp, Listen, RememberedDevice, SearchRound
+from imud.drivers import DRIVERS
+from imud.model.errors import LinkError
+from imud.model.ledger import Ledger
+from imud.model.units import NS_PER_MS, uart_byte_ns
+
+LOCK_FRAMES: Final = 2
+SURE_FRAMES: Final = 4
+
+SETTLE_NS: Final = 10 * NS_PER_MS
+"""Setting a rate: up to some ms of control transfers on a USB adapter."""
+QUICK_NS: Final = 45 * NS_PER_MS
+"""A 100 Hz device: the rest of a frame, up to 10 ms, one whole frame of 8 ms at 115200; the same at 50 Hz."""
+MIDDLE_NS: Final = 250 * NS_PER_MS
+SLOW_NS: Final = 1150 * NS_PER_MS
+"""1 Hz, the slowest rate that the manuals name, and 15 % for a slow crystal and the frame itself."""
+WHOLE_FRAME_BYTES: Final = 300
+"""On a line that is full, one frame is whole within twice its length: two of 150 bytes (HI91 and HI92 in one frame are
+130). It decides at 9600 baud only."""
+QUIET_NS: Final = 1200 * NS_PER_MS
+"""Silence required before a query: a device at 1 Hz is received within it at any rate, if only as garbage."""
+ASK_NS: Final = 120 * NS_PER_MS
+QUERY_BYTES: Final = 32
+REPLY_GAP_NS: Final = 200 * NS_PER_MS
+"""Longest pause within a reply."""
+VISIT_BYTES_MAX: Final = 256 * 1024
+"""Bytes kept of one visit; a visit that receives more without a lock ends."""
+ASK_TRIES: Final = 2
+"""Bytes sent at wrong rates may stand in the device's line buffer and spoil the first query at the right one."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamFound:
+    """The device found, and the bytes to feed to its own codec so that every byte gets into its ledger."""
+
+    driver: StreamDriver
+    baud: int
+    chunks: tuple[tuple[bytes, int], ...] = ()
+    """Bytes of the last visit at that rate, with the time of each read."""
+    wasted_bytes: int = 0
+    """Bytes heard before, in visits that found nothing: the ledger's `bytes_skipped`."""
+
+
+Step = Listen | StreamFound | GaveUp
+
+
+class Search:
+    """A round of detection on one port. Synchronization: one thread. All times are CLOCK_MONOTONIC in ns."""
+
+    def __init__(
+        self,
+        drivers: Sequence[StreamDriver],
+        *,
+        bauds: Sequence[int] = (),
+        remembered: tuple[str, int] | None = None,
+        may_ask: bool = False,
+        hold_ns: int = 0,
+        options: Any = None,
+    ) -> None:
+        """`bauds` restricts the rates (a fixed one, say); empty means all that the drivers know, most likely first.
+
+        `remembered` is (driver name, rate) of the last success; `options` go to the codec in place of the driver's
+        default settings, which is for a single driver only. Raises ValueError without any driver or rate.
+        """
+        self._options = options
+        self._hold_ns = hold_ns
+        self._may_ask = may_ask
+        self._first = _usable(remembered, drivers, bauds)
+        self._drivers = sorted(
+            drivers, key=lambda d: self._first is None or remembered is None or d.name != remembered[0]
+        )
+        self._bauds = tuple(bauds) or _rates(drivers)
+        if not self._drivers or not self._bauds:
+            raise ValueError("a search needs at least one driver and one baud rate")
+        self._tallies = {baud: _Tally() for baud in self._bauds}
+        self._heard_bytes = 0
+        self._asked = False
+        self._started_ns = self._now_ns = 0
+        self._plan = self._visits()
+        self._visit = _Visit(self._bauds[0], 0)
+
+    def start(self, now_ns: int) -> Step:
+        """Return the first step."""
+        self._started_ns = now_ns
+        return self._next(now_ns)
+
+    def on_data(self, data: bytes, t_rx_ns: int) -> Step | None:
+        """Process bytes read at the present rate; return None to go on."""
+        visit = self._visit
+        self._heard_bytes += len(data)
+        before = visit.good_frames()
+        visit.on_data(data, t_rx_ns)
+        if found := self._found():
+            return found
+        if visit.size > VISIT_BYTES_MAX:
+            return self._next(t_rx_ns)
+        until_ns = visit.until_ns
+        if visit.good_frames() > before:
+            until_ns = t_rx_ns + self._dwell_ns(SLOW_NS)
+        elif visit.question is not None:
+            until_ns = max(until_ns, min(t_rx_ns + REPLY_GAP_NS + self._hold_ns, visit.started_ns + SLOW_NS))
+        elif visit.only_until_heard and len(visit.chunks) == 1:
+            until_ns = min(until_ns, t_rx_ns + self._dwell_ns(MIDDLE_NS))
+        return self._listen_until(until_ns)
+
+    def on_time(self, now_ns: int) -> Step | None:
+        """End the present step if `until_ns` of the last Listen has come; return None when it has not."""
+        visit = self._visit
+        if now_ns < visit.until_ns:
+            return None
+        before = visit.good_frames()
+        visit.flush()
+        if found := self._found():
+            return found
+        if visit.good_frames() > before:
+            return self._listen_until(now_ns + self._dwell_ns(SLOW_NS))
+        return self._next(now_ns)
+
+    def refused(self, why: str, now_ns: int) -> Step:
+        """Go on without the rate of the last Listen: the port does not support it."""
+        self._tallies[self._visit.baud].refusal = why
+        return self._next(now_ns)
+
+    # --- the order of visits -------------------------------------------------------------------------------------
+
+    def _visits(self) -> Iterator["_Visit"]:
+        if self._first is not None:
+            yield _Visit(self._first, SLOW_NS, only_until_heard=True)
+        others = [baud for baud in self._bauds if baud != self._first]
+        order = others + [baud for baud in self._bauds if baud == self._first]
+        alone = len(order) == 1
+        yield from self._pass(order, SLOW_NS if alone else QUICK_NS)
+        yield from self._rest_of_quiet(order)
+        if self._may_ask:
+            yield from self._questions(order)
+        if self._heard_bytes and not alone:
+            yield from self._pass(order, MIDDLE_NS)
+            yield from self._pass(order, SLOW_NS)
+
+    def _rest_of_quiet(self, bauds: Sequence[int]) -> Iterator["_Visit"]:
+        while usable := [baud for baud in bauds if not self._tallies[baud].refusal]:
+            for baud in usable:
+                if self._heard_bytes or self._now_ns - self._started_ns >= QUIET_NS:
+                    return
+                yield _Visit(baud, QUICK_NS)
+
+    def _pass(self, bauds: Sequence[int], dwell_ns: int) -> Iterator["_Visit"]:
+        for baud in bauds:
+            if not self._tallies[baud].refusal:
+                yield _Visit(baud, dwell_ns)
+
+    def _questions(self, bauds: Sequence[int]) -> Iterator["_Visit"]:
+        for baud in bauds:
+            for driver in self._drivers * ASK_TRIES:
+                if self._heard_bytes or self._tallies[baud].refusal:
+                    break
+                self._asked = True
+                question = next(driver.identify())
+                dwell_ns = ASK_NS + QUERY_BYTES * uart_byte_ns(baud)
+                yield _Visit(baud, dwell_ns, question=question, asked=driver)
+
+    def _next(self, now_ns: int) -> Step:
+        self._now_ns = now_ns
+        self._tallies[self._visit.baud].add(self._visit)
+        self._visit = _Visit(self._visit.baud, 0)
+        visit = next(self._plan, None)
+        if visit is None:
+            return GaveUp(self._summary(), self._heard_bytes)
+        self._visit = visit
+        visit.begin(self._trials(visit.baud), now_ns, now_ns + self._dwell_ns(visit.dwell_ns))
+        return Listen(visit.until_ns, visit.baud, visit.question.payload if visit.question else b"")
+
+    def _trials(self, baud: int) -> list["_Trial"]:
+        fitting = [driver for driver in self._drivers if baud in driver.baud_rates]
+        return [_Trial(driver, self._options) for driver in fitting or self._drivers]
+
+    def _dwell_ns(self, flow_ns: int) -> int:
+        """Duration of a visit that waits `flow_ns` for bytes to flow."""
+        return self._hold_ns + SETTLE_NS + max(flow_ns, WHOLE_FRAME_BYTES * uart_byte_ns(self._visit.baud))
+
+    def _listen_until(self, until_ns: int) -> Listen | None:
+        if until_ns == self._visit.until_ns:
+            return None
+        self._visit.until_ns = until_ns
+        return Listen(until_ns, self._visit.baud)
+
+    # --- results -------------------------------------------------------------------------------------------------
+
+    def _found(self) -> StreamFound | None:
+        visit = self._visit
+        for trial in visit.trials:
+            if trial.locked() or (trial.driver is visit.asked and visit.answered):
+                return StreamFound(trial.driver, visit.baud, tuple(visit.chunks), self._heard_bytes - visit.size)
+        return None
+
+    def _summary(self) -> str:
+        names = " or ".join(driver.name for driver in self._drivers)
+        rates = ", ".join(str(baud) for baud, tally in self._tallies.items() if not tally.refusal)
+        if rates and not self._heard_bytes:
+            asked = " and no answer to a query" if self._asked else ""
+            return (
+                f"expected {names}, heard nothing at {rates} baud{asked}: "
+                "is the device powered, and do its TX and ground reach this port's RX and ground?"
+            )
+        found = "; ".join(f"{baud}: {tally.text()}" for baud, tally in self._tallies.items())
+        return f"expected {names}, heard no two valid frames at any baud rate ({found}): is it another kind of device?"
+
+
+@dataclass(slots=True)
+class _Tally:
+    """Result of all visits at one rate."""
+
+    size: int = 0
+    good: int = 0
+    bad: int = 0
+    refusal: str = ""
+
+    def add(self, visit: "_Visit") -> None:
+        self.size += visit.size
+        self.good += visit.good_frames()
+        self.bad += max((trial.ledger.frames_bad() for trial in visit.trials), default=0)
+
+    def text(self) -> str:
+        if self.refusal:
+            return self.refusal
+        return f"{self.size} bytes, {self.good} valid frames, {self.bad} damaged" if self.size else "silence"
+
+
+class _Trial:
+    """A codec of one driver during one visit."""
+
+    def __init__(self, driver: StreamDriver, options: Any) -> None:
+        self.driver = driver
+        self.ledger = Ledger()
+        self.codec: StreamCodec = driver.make_codec(self.ledger, driver.settings() if options is None else options)
+
+    def good_frames(self) -> int:
+        """Binary frames whose check value holds; text lines have none and prove nothing."""
+        return self.ledger.frames_good - self.ledger.frames_in_replies
+
+    def locked(self) -> bool:
+        good = self.good_frames()
+        return good >= SURE_FRAMES or (good >= LOCK_FRAMES and good > self.ledger.frames_bad())
+
+
+@dataclass(slots=True)
+class _Visit:
+    """A period of listening at one rate."""
+
+    baud: int
+    dwell_ns: int
+    only_until_heard: bool = False
+    """A long wait for silence; the first byte shortens it."""
+    question: Request | None = None
+    asked: StreamDriver | None = None
+    answered: bool = False
+    started_ns: int = 0
+    until_ns: int = 0
+    size: int = 0
+    reply_parts: int = 0
+    trials: list[_Trial] = field(default_factory=list)
+    chunks: list[tuple[bytes, int]] = field(default_factory=list)
+
+    def begin(self, trials: list[_Trial], now_ns: int, until_ns: int) -> None:
+        self.trials, self.started_ns, self.until_ns = trials, now_ns, until_ns
+
+    def on_data(self, data: bytes, t_rx_ns: int) -> None:
+        self.chunks.append((data, t_rx_ns))
+        self.size += len(data)
+        for trial in self.trials:
+            self._look_for_reply(trial, trial.codec.feed(data))
+
+    def flush(self) -> None:
+        for trial in self.trials:
+            self._look_for_reply(trial, trial.codec.flush())
+
+    def good_frames(self) -> int:
+        return max((trial.good_frames() for trial in self.trials), default=0)
+
+    def _look_for_reply(self, trial: _Trial, events: Sequence[CodecEvent]) -> None:
+        """Look for a reply with as many messages as the query wants: the end alone (`OK`) is common to many devices."""
+        question = self.question
+        if question is None or trial.driver is not self.asked:
+            return
+        for event in events:
+            message = message_of(event)
+            if message is None:
+                continue
+            if question.is_end(message):
+                self.answered |= self.reply_parts + 1 >= question.messages_min
+            elif question.is_part(message):
+                self.reply_parts += 1
+
+
+def _usable(remembered: tuple[str, int] | None, drivers: Sequence[StreamDriver], bauds: Sequence[int]) -> int | None:
+    """The remembered rate, unless the configuration has changed since."""
+    if remembered is None:
+        return None
+    name, baud = remembered
+    known = any(driver.name == name and (baud in bauds if bauds else baud in driver.baud_rates) for driver in drivers)
+    return baud if known else None
+
+
+def _rates(drivers: Sequence[StreamDriver]) -> tuple[int, ...]:
+    """List all rates of all drivers once, the most likely ones of each first."""
+    ranked = [(rank, baud) for driver in drivers for rank, baud in enumerate(driver.baud_rates)]
+    return tuple(dict.fromkeys(baud for _, baud in sorted(ranked, key=lambda pair: pair[0])))
+
+
+class StreamRound(SearchRound[StreamFound]):
+    """A round on a link of bytes."""
+
+    def __init__(
+        self,
+        config: DeviceConfig,
+        link: StreamLink,
+        ledger: Ledger,
+        last: RememberedDevice | None,
+        on_found: Callable[[StreamFound], None],
+        now_ns: Callable[[], int],
+        *,
+        may_ask: bool,
+    ) -> None:
+        """The bytes of what was found are taken out of the ledger again, for the device's own codec to count."""
+        named = config.driver != "auto"
+        self._search = Search(
+            of_kind([DRIVERS[config.driver]] if named else DRIVERS.values(), StreamDriver),
+            bauds=() if link.auto_baud else (link.baud,),
+            remembered=(last.driver, last.baud) if last else None,
+            may_ask=may_ask,
+            hold_ns=link.hold_ns,
+            options=config.options if named else None,
+        )
+        super().__init__(self._search, ledger, on_found, now_ns)
+        self._link = link
+
+    def on_data(self, data: bytes, t_rx_ns: int) -> None:
+        """Pass on bytes from the link; they count as skipped until a device is found in them."""
+        self._count(len(data))
+        if not self._done.done():
+            self._follow(self._search.on_data(data, t_rx_ns))
+
+    def _found(self, found: StreamFound) -> None:
+        self._count(-sum(len(data) for data, _ in found.chunks))
+        super()._found(found)
+
+    def _listen(self, step: Listen) -> Listen | StreamFound | GaveUp | None:
+        if step.baud != self._link.baud:
+            try:
+                self._link.set_baud(step.baud)
+            except LinkError as error:
+                return self._search.refused(str(error), self._now_ns())
+        if step.send:
+            try:
+                self._link.write(step.send)
+            except LinkError as error:
+                self._done.set_exception(error)
+        return None

@@ -1,0 +1,140 @@
+"""Axes and angles of one device in its status, and the check of its attitude against gravity at rest.
+
+Ten times a second the newest sample is given to the check, not each one. A contradiction raises one event of its kind
+while the device stays the same; as long as the last rest has shown one, it is in the status.
+"""
+
+from collections.abc import Mapping
+from typing import Final
+
+from imud.attitude.conventions import Convention, Heading
+from imud.attitude.gravity import Contradiction, GravityCheck
+from imud.config.model import DeviceConfig
+from imud.contracts.driver import Driver, StatusBit
+from imud.contracts.status import FrameStatus
+from imud.device.health import Notices
+from imud.model.event import EventKind
+from imud.model.units import NS_PER_S
+from imud.sampling.path import SamplePath
+
+AS_DEVICE = "device"
+"""Name of the convention where the configuration has none."""
+
+
+class FrameWatch:
+    """Watches what is published of one device. Synchronization: the event loop's thread only."""
+
+    def __init__(self, config: DeviceConfig, notices: Notices) -> None:
+        self._config = config
+        self._notices = notices
+        self._path: SamplePath | None = None
+        self._check: GravityCheck | None = None
+        self._raised: set[Contradiction] = set()
+
+    def tick(self, now_ns: int, path: SamplePath) -> None:
+        """Give the newest sample to the check; raise an event when it contradicts for the first time."""
+        if path is not self._path:
+            self._path, self._check = path, self._new_check(path)
+            self._raised.clear()
+        check, sample = self._check, path.newest
+        if check is None or sample is None or not check.add(sample) or check.finding is None:
+            return
+        finding = check.finding
+        if finding.kind not in self._raised:
+            self._raised.add(finding.kind)
+            self._notices.raise_event(
+                now_ns,
+                EventKind.ATTITUDE,
+                finding.message,
+                contradiction=str(finding.kind),
+                angle_deg=round(finding.angle_deg, 1),
+            )
+
+    def status(
+        self, driver: Driver | None, path: SamplePath | None, read_back: Mapping[str, str]
+    ) -> FrameStatus | None:
+        """Describe what is published; None while the driver is not known."""
+        if driver is None or path is None:
+            return None
+        frame, config = path.frame, self._config
+        device_heading = driver.heading(config.options, read_back)
+        words = frame.words(driver.euler_convention, driver.navigation_frame)
+        return FrameStatus(
+            frame=words.frame,
+            convention=AS_DEVICE if frame.convention is None else str(frame.convention),
+            euler_convention=words.euler_convention,
+            navigation_frame=words.navigation_frame,
+            heading=frame.heading(device_heading),
+            declination_deg=frame.declination_deg,
+            conventions={str(one): frame.words_of(one) for one in Convention},
+            problem=self._problem(device_heading),
+        )
+
+    def _new_check(self, path: SamplePath) -> GravityCheck:
+        frame, given = path.frame, self._config.frame
+        stands_level = given is not None and given.level_at_rest
+        return GravityCheck(frame.device, frame.mounting if stands_level else None)
+
+    def _problem(self, heading: Heading) -> str:
+        finding = self._check.finding if self._check is not None else None
+        if finding is not None:
+            return finding.message
+        if self._config.declination_deg is not None and heading in (Heading.RELATIVE, Heading.TRUE):
+            why = "counts from power-on" if heading is Heading.RELATIVE else "is true already"
+            return f"declination_deg is given, but the device's heading {why}"
+        return ""
+
+
+CLEAR_NS: Final = NS_PER_S
+INTERVAL_NS: Final = NS_PER_S
+
+
+class StatusWatch:
+    """State of the notable status bits of one device. Synchronization: the loop's thread only."""
+
+    def __init__(self, notices: Notices) -> None:
+        self._notices = notices
+        self._path: SamplePath | None = None
+        self._bits: Mapping[int, StatusBit] = {}
+        self._set = 0
+        """Bits that are reported as set."""
+        self._seen_ns: dict[int, int] = {}
+        """CLOCK_MONOTONIC of the newest sample with a bit."""
+        self._due_ns = 0
+
+    def tick(self, now_ns: int, driver: Driver | None, path: SamplePath | None) -> None:
+        """Look at the samples since the last call, and raise an event for what changed. Call it at 10 Hz."""
+        if driver is None or path is None:
+            return
+        if path is not self._path:
+            self._begin(driver, path)
+        if not self._bits:
+            return
+        seen = path.take_status()
+        for number in self._bits:
+            if seen >> number & 1:
+                self._seen_ns[number] = now_ns
+        if now_ns >= self._due_ns:
+            self._report(now_ns, is_silent=now_ns - path.last_sample_ns > CLEAR_NS)
+
+    def _begin(self, driver: Driver, path: SamplePath) -> None:
+        """Watch another path: that of another driver."""
+        self._path = path
+        self._bits = {number: bit for number, bit in driver.status_bits.items() if bit.notable}
+        path.watch_status(sum(1 << number for number in self._bits))
+        self._set = 0
+        self._seen_ns.clear()
+
+    def _report(self, now_ns: int, *, is_silent: bool) -> None:
+        """Raise one event for all bits that changed; while no samples come, nothing changes."""
+        risen = [n for n in self._bits if not self._set >> n & 1 and n in self._seen_ns]
+        fallen = [n for n in self._bits if self._set >> n & 1 and now_ns - self._seen_ns[n] > CLEAR_NS]
+        if is_silent or not (risen or fallen):
+            return
+        for number in fallen:
+            del self._seen_ns[number]
+        self._set ^= sum(1 << number for number in (*risen, *fallen))
+        self._due_ns = now_ns + INTERVAL_NS
+        words = [self._bits[n].name for n in risen] + [f"cleared: {self._bits[n].name}" for n in fallen]
+        detail = {self._bits[n].name: n in risen for n in (*risen, *fallen)}
+        self._notices.raise_event(now_ns, EventKind.ALARM, f"status: {', '.join(words)}", **detail)

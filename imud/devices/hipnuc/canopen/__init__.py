@@ -1,1 +1,0 @@
-"""HiPNUC modules over CANopen."""

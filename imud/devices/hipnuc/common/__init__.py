@@ -1,1 +1,0 @@
-"""Parts that the HiPNUC protocols share: units of raw values, registers, assembly of samples from frames."""

@@ -1,1 +1,0 @@
-"""HiPNUC modules over Modbus RTU (manual B, chapter on Modbus)."""

@@ -1,1 +1,0 @@
-"""HiPNUC modules over a UART: HI91, HI92, ASCII commands."""

@@ -1,1 +1,0 @@
-"""IMU61x on I2C. To read in order: codec, session, settings, driver."""

@@ -1,0 +1,19 @@
+"""Wire protocols, a folder each: codec, session, actions, and `driver.py` with the row that names them. No I/O."""
+
+from imud.contracts.driver import Driver
+from imud.contracts.registry import Table
+
+DRIVERS: Table[Driver] = Table(
+    "driver",
+    {
+        "hipnuc-uart": "imud.drivers.hipnuc.uart.driver:DRIVER",
+        "hipnuc-modbus": "imud.drivers.hipnuc.modbus.driver:DRIVER",
+        "hipnuc-canopen": "imud.drivers.hipnuc.canopen.driver:DRIVER",
+        "hipnuc-j1939": "imud.drivers.hipnuc.j1939.driver:DRIVER",
+        "hipnuc-nmea2000": "imud.drivers.hipnuc.nmea2000:DRIVER",
+        "imu61x-uart": "imud.drivers.imu61x.uart.driver:DRIVER",
+        "imu61x-i2c": "imud.drivers.imu61x.i2c:DRIVER",
+        "imu61x-spi": "imud.drivers.imu61x.spi:DRIVER",
+        "imu61x-can": "imud.drivers.imu61x.can:DRIVER",
+    },
+)

@@ -1,0 +1,202 @@
+"""HiPNUC modules on CAN with CANopen. Manual "IMU配置手冊" V1.5.9, chapter 5; corrections ERRATA B5, B6, B17, B18.
+
+Standard frames, little-endian, one TPDO per quantity; identifier = function + node number (8 as delivered):
+
+    ┌───────┬───────┬───────────────────────────────────────┐
+    │ TPDO1 │ 0x180 │ accel x, y, z             i16 × 3     │  0.001 G, 1 G = 9.8 m/s²
+    │ TPDO2 │ 0x280 │ gyro x, y, z              i16 × 3     │  0.1 °/s
+    │ TPDO3 │ 0x380 │ roll, pitch, yaw          i16 × 3     │  0.01°
+    │ TPDO4 │ 0x480 │ quaternion w, x, y, z     i16 × 4     │  0.0001
+    │ TPDO6 │ 0x680 │ pressure                  i32         │  Pa
+    │ TPDO7 │ 0x780 │ inclinometer x, y         i32 × 2     │  0.01°
+    └───────┴───────┴───────────────────────────────────────┘
+
+1 G is what the firmware divides by, 9.8 m/s², not standard gravity. None of them has a counter or a time: how they
+become samples is the rule of `assembly`. Each TPDO is sent by its own timer, or when SYNC (0x080) comes.
+
+Other frames of a node: the heartbeat (0x700), whose first is the boot-up message, is a reply when the state changed, or
+is not operational; SDO replies (0x580) are replies; emergencies (0x080 + node) are ignored.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Final, Literal
+
+from msgspec import Meta
+
+from imud.attitude.rotation import quat_from_euler312
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.script import ReplyFrame
+from imud.drivers.hipnuc.assembly import Assembly
+from imud.drivers.hipnuc.canopen.cia301 import (
+    EMERGENCY,
+    HEARTBEAT,
+    NODE_DEFAULT,
+    NODE_MAX,
+    SDO_BYTES,
+    SDO_REPLY,
+    TPDO_FUNCTIONS,
+    NmtState,
+    TpdoNumber,
+)
+from imud.drivers.hipnuc.common import M_S2_PER_G, QUAT_PER_LSB, pressure_of
+from imud.model.ledger import Ledger
+from imud.model.options import Settings
+from imud.model.sample import Measurement, Pair, Quaternion, Vector3
+from imud.model.units import RAD_PER_DEG
+
+THREE: Final = struct.Struct("<3h")
+FOUR: Final = struct.Struct("<4h")
+ONE_LONG: Final = struct.Struct("<i")
+TWO_LONG: Final = struct.Struct("<2i")
+LAYOUTS: Final = {1: THREE, 2: THREE, 3: THREE, 4: FOUR, 6: ONE_LONG, 7: TWO_LONG}
+"""Data of the TPDOs by their number."""
+
+ACCEL_M_S2_PER_LSB: Final = 0.001 * M_S2_PER_G
+GYRO_RAD_S_PER_LSB: Final = 0.1 * RAD_PER_DEG
+EULER_RAD_PER_LSB: Final = 0.01 * RAD_PER_DEG
+INCLI_RAD_PER_LSB: Final = 0.01 * RAD_PER_DEG
+
+SYNC_HZ_MIN, SYNC_HZ_MAX = 0.01, 200.0
+
+
+class HipnucCanopenSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a node, and of SYNC."""
+
+    node: Annotated[int, Meta(ge=1, le=NODE_MAX)] = NODE_DEFAULT
+    """The node's number; 8 as delivered."""
+    tpdos: list[TpdoNumber] | Literal["auto"] = "auto"
+    """TPDOs to make samples of, for example [1, 2, 3]; auto = all that are heard."""
+    sync_hz: Annotated[float, Meta(ge=0, le=SYNC_HZ_MAX)] = 0.0
+    """SYNC frames per second, for TPDOs of type 1; one device sends for all of a bus. 0 = none, the timers count."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a rate that is no rate."""
+        if 0 < self.sync_hz < SYNC_HZ_MIN:
+            raise ValueError(f"sync_hz: expected 0, or {SYNC_HZ_MIN} to {SYNC_HZ_MAX:g}, got {self.sync_hz}")
+
+
+class HipnucCanopenCodec:
+    """Decoder of the TPDOs of one node. Synchronization: one thread."""
+
+    def __init__(self, ledger: Ledger, settings: HipnucCanopenSettings) -> None:
+        self.ledger = ledger
+        node, wanted = settings.node, settings.tpdos
+        self._tpdos = {function + node: (number, LAYOUTS[number].size) for number, function in TPDO_FUNCTIONS.items()}
+        self._sdo_id, self._heartbeat_id, self._emergency_id = SDO_REPLY + node, HEARTBEAT + node, EMERGENCY + node
+        self._assembly = Assembly(ledger, None if wanted == "auto" else frozenset(wanted))
+        self._state = NmtState.OPERATIONAL.value
+
+    def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
+        """Add one frame; return what it completed. Never raises for any frame."""
+        ledger, size = self.ledger, len(data)
+        ledger.bytes_in += size
+        tpdo = self._tpdos.get(can_id)
+        if tpdo is None or extended:
+            return self._other(can_id, extended, data)
+        number, expected = tpdo
+        if size != expected:
+            return self._bad_length(data)
+        ledger.bytes_in_good_frames += size
+        ledger.frames_good += 1
+        frames = self._assembly.add_frame(number, data, t_rx_ns)
+        return () if frames is None else (_measurement(dict(frames)),)
+
+    def flush(self) -> Sequence[CodecEvent]:
+        """No-op: the next frame shows what is lost."""
+        return ()
+
+    def reset(self) -> None:
+        """Drop the incomplete sample: frames are missing here."""
+        self._assembly.reset()
+
+    def _other(self, can_id: int, extended: bool, data: bytes) -> Sequence[CodecEvent]:
+        """Decode a frame that is no TPDO of this node."""
+        ledger, size = self.ledger, len(data)
+        if extended or can_id not in (self._sdo_id, self._heartbeat_id, self._emergency_id):
+            ledger.bytes_skipped += size
+            return ()
+        if size != (1 if can_id == self._heartbeat_id else SDO_BYTES):
+            return self._bad_length(data)
+        ledger.bytes_in_good_frames += size
+        ledger.frames_good += 1
+        if can_id == self._sdo_id or (can_id == self._heartbeat_id and self._is_news(data[0])):
+            ledger.frames_in_replies += 1
+            return (ReplyFrame(can_id, data),)
+        ledger.frames_ignored += 1
+        return ()
+
+    def _is_news(self, state: int) -> bool:
+        """Note a heartbeat; return whether the state changed, or is one in which the node sends no TPDOs."""
+        changed = state != self._state
+        self._state = state
+        if state == NmtState.BOOT_UP.value:
+            self._assembly.reset()
+        return changed or state != NmtState.OPERATIONAL.value
+
+    def _bad_length(self, data: bytes) -> Sequence[CodecEvent]:
+        self.ledger.bytes_in_bad_frames += len(data)
+        self.ledger.frames_bad_length += 1
+        return (BadFrame(BadReason.LENGTH, data),)
+
+
+def _measurement(frames: Mapping[int, bytes]) -> Measurement:
+    """Make a measurement of a set of TPDOs; without a quaternion its attitude comes from the angles."""
+    euler = _vector(frames.get(3), EULER_RAD_PER_LSB)
+    quat: Quaternion | None = None
+    if 4 in frames:
+        w, x, y, z = FOUR.unpack(frames[4])
+        quat = (w * QUAT_PER_LSB, x * QUAT_PER_LSB, y * QUAT_PER_LSB, z * QUAT_PER_LSB)
+    elif euler is not None:
+        quat = quat_from_euler312(euler)
+    incli: Pair | None = None
+    if 7 in frames:
+        x, y = TWO_LONG.unpack(frames[7])
+        incli = (x * INCLI_RAD_PER_LSB, y * INCLI_RAD_PER_LSB)
+    return Measurement(
+        sum(map(len, frames.values())), 0, None,
+        accel_m_s2=_vector(frames.get(1), ACCEL_M_S2_PER_LSB),
+        gyro_rad_s=_vector(frames.get(2), GYRO_RAD_S_PER_LSB),
+        quat_wxyz=quat,
+        euler_rad=euler,
+        pressure_pa=pressure_of(float(ONE_LONG.unpack(frames[6])[0])) if 6 in frames else None,
+        incli_rad=incli,
+    )  # fmt: skip
+
+
+def _vector(data: bytes | None, factor: float) -> Vector3 | None:
+    if data is None:
+        return None
+    x, y, z = THREE.unpack(data)
+    return (x * factor, y * factor, z * factor)
+
+
+# --- the device's side ------------------------------------------------------------------------------------------------
+
+
+def encode_tpdos(
+    *,
+    accel_m_s2: Vector3 | None = None,
+    gyro_rad_s: Vector3 | None = None,
+    euler_rad: Vector3 | None = None,
+    quat_wxyz: Quaternion | None = None,
+    pressure_pa: float | None = None,
+    incli_rad: Pair | None = None,
+) -> dict[int, bytes]:
+    """Data of the TPDOs by their number, in the order they are sent, from the SI values that are given.
+
+    Raises struct.error for a value beyond its range, for example 32.767 G.
+    """
+    values: dict[int, tuple[Sequence[float] | None, float]] = {
+        1: (accel_m_s2, ACCEL_M_S2_PER_LSB),
+        2: (gyro_rad_s, GYRO_RAD_S_PER_LSB),
+        3: (euler_rad, EULER_RAD_PER_LSB),
+        4: (quat_wxyz, QUAT_PER_LSB),
+        6: (None if pressure_pa is None else (pressure_pa,), 1.0),
+        7: (incli_rad, INCLI_RAD_PER_LSB),
+    }
+    return {
+        number: LAYOUTS[number].pack(*(round(value / factor) for value in vector))
+        for number, (vector, factor) in values.items()
+        if vector is not None
+    }

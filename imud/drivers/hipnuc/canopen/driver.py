@@ -1,0 +1,383 @@
+"""Table: the row `DRIVER` of HiPNUC modules on CANopen."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from random import Random
+from typing import Annotated, Any, Final, Literal, get_args
+
+from msgspec import Meta
+
+from imud.contracts.command import Action, Actions, Risk, Target
+from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, DataSheet
+from imud.contracts.script import RequestScript
+from imud.contracts.setting import DeviceSettings, Effect, Setting, Written
+from imud.drivers.hipnuc.bus_load import MS_PER_S, CyclicMessage, refuse_other_rate, refuse_overload
+from imud.drivers.hipnuc.canopen import commands as moves
+from imud.drivers.hipnuc.canopen import commands as session
+from imud.drivers.hipnuc.canopen.cia301 import (
+    EMERGENCY,
+    FUNCTION_MASK,
+    HEARTBEAT,
+    NODE_DEFAULT,
+    NODE_MASK,
+    NODE_MAX,
+    SDO_REPLY,
+    SYNC,
+    TPDO_FUNCTIONS,
+    NmtCommand,
+    TpdoNumber,
+)
+from imud.drivers.hipnuc.canopen.codec import (
+    ACCEL_M_S2_PER_LSB,
+    GYRO_RAD_S_PER_LSB,
+    LAYOUTS,
+    HipnucCanopenCodec,
+    HipnucCanopenSettings,
+    encode_tpdos,
+)
+from imud.drivers.hipnuc.canopen.commands import (
+    BIT_RATE_OF,
+    PERIOD_MAX_MS,
+    PERIOD_MIN_MS,
+    SETTING_PLACES,
+    TPDO_OBJECTS,
+    TPDO_TIMER,
+    TPDO_TYPE,
+    BitRate,
+    InclinometerZero,
+    Place,
+    Transmission,
+    identify,
+    read_settings,
+)
+from imud.drivers.hipnuc.common import DOCUMENT, inclinometer_zero
+from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
+from imud.model.errors import BadArgument
+from imud.model.units import NS_PER_S, NS_PER_US
+
+TPDOS: Final[tuple[TpdoNumber, ...]] = get_args(TpdoNumber)
+CONTENT: Final = {
+    1: "acceleration", 2: "angular rate", 3: "angles", 4: "quaternion", 6: "pressure", 7: "inclinometer",
+}  # fmt: skip
+By = Literal["timer", "sync"]
+TRANSMISSIONS: Final[Mapping[By, Transmission]] = {"timer": Transmission.TIMER, "sync": Transmission.SYNC}
+_BY_OF: Final[Mapping[int, By]] = {
+    Transmission.TIMER.value: "timer",
+    Transmission.TIMER_MANUFACTURER.value: "timer",
+    Transmission.SYNC.value: "sync",
+}
+
+
+def interval_name(tpdo: int) -> str:
+    """Name of the setting of a TPDO's interval."""
+    return f"tpdo{tpdo}_interval_ms"
+
+
+def transmission_name(tpdo: int) -> str:
+    """Name of the setting of a TPDO's transmission."""
+    return f"tpdo{tpdo}_by"
+
+
+def values_of(values: Mapping[Place, int]) -> dict[str, Any]:
+    """Settings by name from objects; what stands in none of the forms of the table is left out."""
+    reported: dict[str, Any] = {}
+    for tpdo, index in TPDO_OBJECTS.items():
+        reported[interval_name(tpdo)] = values.get((index, TPDO_TIMER))
+        reported[transmission_name(tpdo)] = _BY_OF.get(values.get((index, TPDO_TYPE), -1))
+    signs = {"incli_x_reversed": session.INCLI_SIGN_X, "incli_y_reversed": session.INCLI_SIGN_Y}
+    reported |= {name: {0: False, 1: True}.get(values.get((index, 0), -1)) for name, index in signs.items()}
+    reported["heartbeat_ms"] = values.get((session.HEARTBEAT_TIME, 0))
+    reported["bit_rate"] = BIT_RATE_OF.get(values.get((session.BIT_RATE, 0), -1))
+    reported["node"] = values.get((session.NODE_ID, 0))
+    return {name: value for name, value in reported.items() if value is not None}
+
+
+def set_interval(target: Target, tpdo: TpdoNumber, interval_ms: int) -> RequestScript[Written]:
+    """Set a TPDO's interval. Raises BadArgument where the TPDOs of the node are then more than the bus carries."""
+    session.check_period(interval_ms)
+    if interval_ms and target.baud:
+        places = [(index, sub) for index in TPDO_OBJECTS.values() for sub in (TPDO_TYPE, TPDO_TIMER)]
+        present = yield from session.read_values(target.settings.node, places, silent_is_fine=True)
+        _refuse_overload(target, values_of(present) | {interval_name(tpdo): interval_ms})
+    return (yield from session.set_tpdo_period(target.settings.node, tpdo, interval_ms))
+
+
+def _refuse_overload(target: Target, values: Mapping[str, Any]) -> None:
+    sync_ms = MS_PER_S / target.settings.sync_hz if target.settings.sync_hz else 0.0
+    messages = {
+        f"TPDO{tpdo}": CyclicMessage(
+            LAYOUTS[tpdo].size,
+            False,
+            sync_ms if values.get(transmission_name(tpdo)) == "sync" else values.get(interval_name(tpdo), 0),
+        )
+        for tpdo in TPDOS
+    }
+    refuse_overload(messages, target.other_bits_per_s, target.baud)
+
+
+def _check(target: Target, values: Mapping[str, Any]) -> None:
+    """Refuse another bit rate than that of the bus, and more than it carries. Raises BadArgument."""
+    refuse_other_rate(target, values)
+    for tpdo in TPDOS:
+        if 0 < values.get(interval_name(tpdo), 0) < PERIOD_MIN_MS:
+            got = values[interval_name(tpdo)]
+            raise BadArgument(f"{interval_name(tpdo)}: expected 0 or {PERIOD_MIN_MS} … {PERIOD_MAX_MS}, got {got}")
+    _refuse_overload(target, values)
+
+
+def _read(target: Target) -> RequestScript[dict[str, Any]]:
+    return values_of((yield from session.read_values(target.settings.node, SETTING_PLACES, silent_is_fine=True)))
+
+
+def _interval_setting(tpdo: TpdoNumber) -> Setting:
+    return Setting(
+        type=Annotated[
+            int,
+            Meta(
+                ge=0,
+                le=PERIOD_MAX_MS,
+                description=f"interval of the message with the {CONTENT[tpdo]}, {PERIOD_MIN_MS} or more; 0 for never",
+                extra={"unit": "ms", "section": "5.4.1"},
+            ),
+        ],
+        write=lambda target, interval_ms: session.set_tpdo_period(target.settings.node, tpdo, interval_ms),
+    )
+
+
+def _transmission_setting(tpdo: TpdoNumber) -> Setting:
+    words = (
+        f"when the message with the {CONTENT[tpdo]} is sent: at its interval, or when SYNC comes (`options.sync_hz`)"
+    )
+    return Setting(
+        type=Annotated[By, Meta(description=words, extra={"section": "5.4.2"})],
+        write=lambda target, by: session.set_tpdo_type(target.settings.node, tpdo, TRANSMISSIONS[by]),
+    )
+
+
+def _sign(axis: Literal["x", "y"]) -> Setting:
+    return Setting(
+        type=Annotated[bool, Meta(description="sign of the inclinometer turned around", extra={"section": "5.4.1"})],
+        write=lambda target, invert: session.set_inclinometer_sign(target.settings.node, axis, invert=invert),
+    )
+
+
+SETTINGS: Final = DeviceSettings(
+    table={
+        **{interval_name(tpdo): _interval_setting(tpdo) for tpdo in TPDOS},
+        **{transmission_name(tpdo): _transmission_setting(tpdo) for tpdo in TPDOS},
+        "incli_x_reversed": _sign("x"),
+        "incli_y_reversed": _sign("y"),
+        "heartbeat_ms": Setting(
+            type=Annotated[
+                int,
+                Meta(
+                    ge=0,
+                    le=65535,
+                    description="interval of the heartbeat, 0 for none; not every firmware has it",
+                    extra={"unit": "ms", "section": "CiA 301, 7.5.2.17"},
+                ),
+            ],
+            write=lambda target, period_ms: session.set_heartbeat(target.settings.node, period_ms),
+        ),
+        "bit_rate": Setting(
+            type=Annotated[
+                BitRate,
+                Meta(
+                    description="that of the bus: a module that would take another one at its restart is set back",
+                    extra={"unit": "bit/s", "section": "5.4.1"},
+                ),
+            ],
+            write=lambda target, rate: session.set_bit_rate(target.settings.node, rate),
+            effect=Effect.AFTER_RESTART,
+            connection=True,
+        ),
+        "node": Setting(
+            type=Annotated[
+                int,
+                Meta(ge=1, le=NODE_MAX, description="one that nothing on the bus has", extra={"section": "5.4.1"}),
+            ],
+            write=lambda target, node: moves.change_node(target.settings, node),
+            effect=Effect.AFTER_RESTART,
+            connection=True,
+        ),
+    },
+    read=_read,
+    save=lambda target: session.save(target.settings.node),
+    restart=lambda target: moves.restart(target.settings, target.baud),
+    check=_check,
+)
+
+Tpdo = Annotated[TpdoNumber, Meta(extra={"section": "5.2"})]
+Reversed = Annotated[bool, Meta(extra={"section": "5.4.1"})]
+
+_ZEROS: Final = {"here": InclinometerZero.SET, "cancel": InclinometerZero.CANCEL}
+
+
+def _simple(words: str, begin: Callable[[int], RequestScript[None]], risk: Risk = Risk.NONE) -> Action:
+    """An action without arguments."""
+    return Action(words, lambda target: begin(target.settings.node), risk)
+
+
+def _interval(
+    target: Target,
+    *,
+    tpdo: Tpdo,
+    interval_ms: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=PERIOD_MAX_MS,
+            description="time from one to the next, 5 or more; 0 for never",
+            extra={"unit": "ms", "section": "5.4.1"},
+        ),
+    ],
+) -> RequestScript[str]:
+    return set_interval(target, tpdo, interval_ms)
+
+
+def _transmission(
+    target: Target,
+    *,
+    tpdo: Tpdo,
+    by: Annotated[
+        Literal["timer", "sync"],
+        Meta(
+            description="SYNC must be sent by something on the bus: `options.sync_hz` makes imud do it",
+            extra={"section": "5.4.2"},
+        ),
+    ],
+) -> RequestScript[str]:
+    return session.set_tpdo_type(target.settings.node, tpdo, TRANSMISSIONS[by])
+
+
+def _bitrate(
+    target: Target,
+    *,
+    bitrate: Annotated[BitRate, Meta(description="rate of the bus", extra={"unit": "bit/s", "section": "5.4.1"})],
+) -> RequestScript[str]:
+    return session.set_bit_rate(target.settings.node, bitrate)
+
+
+def _node(
+    target: Target,
+    *,
+    node: Annotated[
+        int, Meta(ge=1, le=NODE_MAX, description="one that no other node of the bus has", extra={"section": "5.4.1"})
+    ],
+) -> RequestScript[str]:
+    return moves.change_node(target.settings, node)
+
+
+def _zero(
+    target: Target, *, zero: Annotated[Literal["here", "cancel"], Meta(extra={"section": "5.4.1"})]
+) -> RequestScript[None]:
+    return session.set_inclinometer_zero(target.settings.node, _ZEROS[zero])
+
+
+def _direction(target: Target, *, x_reversed: Reversed, y_reversed: Reversed) -> RequestScript[str]:
+    return session.set_inclinometer_signs(target.settings.node, invert_x=x_reversed, invert_y=y_reversed)
+
+
+def _nmt(
+    target: Target,
+    *,
+    command: Annotated[
+        Literal["start", "stop", "pre_operational", "reset_node", "reset_communication"],
+        Meta(
+            description="`stop` and `pre_operational` end the samples until `start`",
+            extra={"section": "CiA 301, 7.2.8.2"},
+        ),
+    ],
+) -> RequestScript[str | None]:
+    made = NmtCommand[command.upper()]
+    if made in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION):
+        return moves.reset(target.settings, target.baud, made)
+    return session.nmt(target.settings.node, made)
+
+
+ACTIONS: Final[Actions] = {
+    "save": replace(_simple("write all settings to flash", session.save), saves=True),
+    "restart": Action(
+        "restart it and wait until it is heard, also under another number; what was not saved is lost",
+        lambda target: moves.restart(target.settings, target.baud),
+    ),
+    "factory_reset": Action(
+        "factory settings, node 8 and 500 kbit/s included, in force after a restart; refused if another node of the "
+        "bus has number 8",
+        lambda target: moves.factory_reset_and_find(target.settings),
+        Risk.RESET,
+    ),
+    "interval": Action("how often a TPDO is sent by its timer; at once. Refused if the bus cannot carry it", _interval),
+    "transmission": Action("send a TPDO by its timer, or when SYNC comes; at once", _transmission),
+    "bitrate": Action(
+        "set the bit rate, in force after `save` and `restart`: the node is off the bus then, and disturbs it, until "
+        "interface and all other nodes have the same",
+        _bitrate,
+        Risk.CONNECTION,
+    ),
+    "node": Action(
+        "set its number, in force after `save` and `restart`, in some modules at once: imud follows. Refused if "
+        "something on the bus has it already",
+        _node,
+        Risk.CONNECTION,
+    ),
+    "zero": Action("make the present position the inclinometer's zero, or cancel that; at once", _zero),
+    "direction": Action("turn the signs of the inclinometer, or leave them as delivered; at once", _direction),
+    "nmt": Action("start or stop its TPDOs, or reset it, and follow it then", _nmt),
+}
+
+US_PER_S: Final = NS_PER_S // NS_PER_US
+
+
+def _example_frames(random: Random) -> list[CanFrame]:
+    """TPDO1 … TPDO4 with random values."""
+    frames = encode_tpdos(
+        accel_m_s2=(random.gauss(0, 5), random.gauss(0, 5), random.gauss(0, 5)),
+        gyro_rad_s=(random.gauss(0, 2), random.gauss(0, 2), random.gauss(0, 2)),
+        euler_rad=(random.uniform(-3, 3), random.uniform(-1.5, 1.5), random.uniform(-3, 3)),
+        quat_wxyz=(random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1)),
+    )
+    return [CanFrame(TPDO_FUNCTIONS[number] + NODE_DEFAULT, False, data, 0) for number, data in frames.items()]
+
+
+def _filters(settings: HipnucCanopenSettings) -> list[CanFilter]:
+    functions = (*TPDO_FUNCTIONS.values(), SDO_REPLY, HEARTBEAT, EMERGENCY)
+    return [CanFilter(function + settings.node, STANDARD_ID_MAX, False) for function in functions]
+
+
+_SIZES: Final = {function: LAYOUTS[number].size for number, function in TPDO_FUNCTIONS.items()}
+
+
+def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
+    """The sender of what has a TPDO's function and length."""
+    node = can_id & NODE_MASK
+    return node if node and not extended and _SIZES.get(can_id & FUNCTION_MASK) == len(data) else None
+
+
+def _cyclic(settings: HipnucCanopenSettings) -> list[CyclicFrame]:
+    return [CyclicFrame(SYNC, False, b"", round(US_PER_S / settings.sync_hz) * NS_PER_US)] if settings.sync_hz else []
+
+
+DRIVER: Final = CanDriver(
+    name="hipnuc-canopen",
+    title="HiPNUC CH0x0, CH10x, HI14 (CANopen)",
+    settings=HipnucCanopenSettings,
+    make_codec=HipnucCanopenCodec,
+    filters=_filters,
+    tick_ns=SAMPLE_COUNTER,
+    tick_modulus=2,
+    euler_convention="312 (Z-X-Y): pitch about X, roll about Y, yaw about Z counter-clockwise from above",
+    navigation_frame="ENU",
+    data_sheet=DataSheet(document=DOCUMENT, gyro_step_rad_s=GYRO_RAD_S_PER_LSB, accel_step_m_s2=ACCEL_M_S2_PER_LSB),
+    actions=ACTIONS,
+    calibrations=inclinometer_zero("5.4.1", ACTIONS),
+    device_settings=SETTINGS,
+    node_of=_node_of,
+    node_settings=lambda node: HipnucCanopenSettings(node=node),
+    node_title=lambda node: f"node {node}",
+    identify=lambda settings: identify(settings.node),
+    read_settings=lambda settings: read_settings(settings.node),
+    sample_frames=4,
+    example_frames=_example_frames,
+    cyclic=_cyclic,
+)

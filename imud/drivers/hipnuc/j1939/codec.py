@@ -1,0 +1,321 @@
+"""HiPNUC CH0x0/CH10x/HI14 on SAE J1939. Manual "IMU配置手冊" V1.5.9, chapter 6.
+
+    0CFF3408   priority 3 | PGN FF34 | source 08, the module's address     eight bytes, see `messages.py`
+    0CEF5508   a reply to imud, see `session.py`
+
+Several modules share a bus and have different addresses; priority means nothing on reception. A module sends each PGN
+that is switched on at its own interval, with neither counter nor time: `common/assembly.py` makes samples of them.
+
+FF2F (UTC) is accepted and ignored. It is a calendar time which jumps when the module's receiver finds out what
+time it is, it has an interval of its own, and no source says of which instant it is: no device time for a sample.
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import hypot, isfinite, nan
+from typing import Annotated, Final, Literal
+
+from msgspec import Meta
+
+from imud.attitude.rotation import quat_from_euler312
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.script import ReplyFrame
+from imud.drivers.hipnuc.assembly import Assembly
+from imud.drivers.hipnuc.common import (
+    ACCEL_M_S2_PER_LSB,
+    EULER_RAD_PER_LSB,
+    GYRO_RAD_S_PER_LSB,
+    MAG_T_PER_LSB,
+    PRESSURE_PA_PER_LSB,
+    QUAT_PER_LSB,
+    TEMPERATURE_C_PER_LSB,
+    counts_of,
+    pressure_of,
+)
+from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, join
+from imud.model.ledger import Ledger
+from imud.model.options import Settings
+from imud.model.sample import Measurement, Quaternion, Vector3
+
+MeasuredName = Literal["FF34", "FF37", "FF3A", "FF3D", "FF41", "FF43", "FF46", "FF4A"]
+"""A message that samples are made of, by the last four digits of its number."""
+PgnName = MeasuredName | Literal["FF2F"]
+"""Any message."""
+ACCEL, GYRO, ROLL_PITCH, HEADING, INCLINOMETER = 0xFF34, 0xFF37, 0xFF3D, 0xFF41, 0xFF4A
+MAG, TEMPERATURE, QUATERNION, UTC = 0xFF3A, 0xFF43, 0xFF46, 0xFF2F
+PGNS: Final = (UTC, ACCEL, GYRO, MAG, ROLL_PITCH, HEADING, TEMPERATURE, QUATERNION, INCLINOMETER)
+"""All PGNs, in rising order."""
+MEASURED: Final = PGNS[1:]
+"""Messages that become samples."""
+PRIORITY: Final = 3
+MESSAGE_BYTES: Final = 8
+
+VECTOR: Final = struct.Struct("<3hH")
+TWO_ANGLES: Final = struct.Struct("<2i")
+HEADING_LAYOUT: Final = struct.Struct("<Ii")
+QUATERNION_LAYOUT: Final = struct.Struct("<4h")
+TEMPERATURE_LAYOUT: Final = struct.Struct("<hHi")
+UTC_LAYOUT: Final = struct.Struct("<6BH")
+
+TURN: Final = 360_000
+"""Counts of a full turn."""
+HALF_TURN: Final = TURN // 2
+TEMPERATURE_MOST_C: Final = 150.0
+"""Highest valid temperature: no module works beyond."""
+UNIT_TOLERANCE: Final = 0.02
+YEAR_ZERO: Final = 2000
+"""Of the year in FF2F (assumed)."""
+
+_NOTHING: Final = bytes([0xFF]) * MESSAGE_BYTES
+_ZERO_VECTOR: Final = bytes(6)
+
+
+def measurement_of(messages: Sequence[tuple[int, bytes]]) -> Measurement:
+    """Make one sample of messages of eight bytes (PGN, data) of one instant, each PGN at most once."""
+    parts = _Parts()
+    for pgn, data in messages:
+        _DECODE[pgn](parts, data)
+    euler, quat = parts.euler, parts.quat
+    if quat is None and euler is not None and isfinite(sum(euler)):
+        quat = quat_from_euler312(euler)
+    return Measurement(
+        MESSAGE_BYTES * len(messages), 0, None,
+        parts.accel, parts.gyro, parts.mag, quat, euler, parts.temperature_c, parts.pressure_pa, parts.incli,
+    )  # fmt: skip
+
+
+class _Parts:
+    """Values of the messages of one sample."""
+
+    __slots__ = ("accel", "gyro", "incli", "mag", "pitch", "pressure_pa", "quat", "roll", "temperature_c", "yaw")
+
+    def __init__(self) -> None:
+        self.accel: Vector3 | None = None
+        self.gyro: Vector3 | None = None
+        self.mag: Vector3 | None = None
+        self.quat: Quaternion | None = None
+        self.roll = self.pitch = self.yaw = nan
+        self.incli: tuple[float, float] | None = None
+        self.temperature_c: float | None = None
+        self.pressure_pa: float | None = None
+
+    @property
+    def euler(self) -> Vector3 | None:
+        """The known ones of roll, pitch and yaw."""
+        roll, pitch, yaw = self.roll, self.pitch, self.yaw
+        return (roll, pitch, yaw) if roll == roll or pitch == pitch or yaw == yaw else None  # noqa: PLR0124 - no NaN
+
+    def decode_accel(self, data: bytes) -> None:
+        if data != _NOTHING:
+            self.accel = _vector(data, ACCEL_M_S2_PER_LSB)
+
+    def decode_gyro(self, data: bytes) -> None:
+        self.gyro = _vector(data, GYRO_RAD_S_PER_LSB)
+
+    def decode_mag(self, data: bytes) -> None:
+        if data != _NOTHING and data[:6] != _ZERO_VECTOR:
+            self.mag = _vector(data, MAG_T_PER_LSB)
+
+    def decode_roll_pitch(self, data: bytes) -> None:
+        roll, pitch = TWO_ANGLES.unpack(data)
+        self.roll, self.pitch = _angle(roll), _angle(pitch)
+
+    def decode_heading(self, data: bytes) -> None:
+        clockwise, _ = HEADING_LAYOUT.unpack(data)
+        if clockwise <= TURN:
+            self.yaw = (-clockwise if clockwise <= HALF_TURN else TURN - clockwise) * EULER_RAD_PER_LSB
+
+    def decode_inclinometer(self, data: bytes) -> None:
+        x, y = (_angle(counts) for counts in TWO_ANGLES.unpack(data))
+        if isfinite(x) or isfinite(y):
+            self.incli = x, y
+
+    def decode_temperature(self, data: bytes) -> None:
+        celsius, _, pressure = TEMPERATURE_LAYOUT.unpack(data)
+        celsius, pressure = celsius * TEMPERATURE_C_PER_LSB, pressure * PRESSURE_PA_PER_LSB
+        if abs(celsius) <= TEMPERATURE_MOST_C and (celsius or pressure) and data != _NOTHING:
+            self.temperature_c = celsius
+        self.pressure_pa = pressure_of(pressure)
+
+    def decode_quaternion(self, data: bytes) -> None:
+        w, x, y, z = QUATERNION_LAYOUT.unpack(data)
+        k = QUAT_PER_LSB
+        if abs(hypot(w, x, y, z) * k - 1) <= UNIT_TOLERANCE:
+            self.quat = w * k, x * k, y * k, z * k
+
+
+_DECODE: Final[dict[int, Callable[[_Parts, bytes], None]]] = {
+    ACCEL: _Parts.decode_accel,
+    GYRO: _Parts.decode_gyro,
+    MAG: _Parts.decode_mag,
+    ROLL_PITCH: _Parts.decode_roll_pitch,
+    HEADING: _Parts.decode_heading,
+    TEMPERATURE: _Parts.decode_temperature,
+    QUATERNION: _Parts.decode_quaternion,
+    INCLINOMETER: _Parts.decode_inclinometer,
+}
+
+
+def _vector(data: bytes, factor: float) -> Vector3:
+    x, y, z, _ = VECTOR.unpack(data)
+    return x * factor, y * factor, z * factor
+
+
+def _angle(counts: int) -> float:
+    """Decode an angle to rad; NaN beyond a full turn."""
+    return counts * EULER_RAD_PER_LSB if -TURN <= counts <= TURN else nan
+
+
+# --- the device's side ------------------------------------------------------------------------------------------------
+
+
+def pack_accel(accel_m_s2: Vector3) -> bytes:
+    """Pack FF34. Values beyond the range are clipped, here and in all of these."""
+    return _pack_vector(accel_m_s2, ACCEL_M_S2_PER_LSB)
+
+
+def pack_gyro(gyro_rad_s: Vector3) -> bytes:
+    """Pack FF37."""
+    return _pack_vector(gyro_rad_s, GYRO_RAD_S_PER_LSB)
+
+
+def pack_mag(mag_t: Vector3) -> bytes:
+    """Pack FF3A."""
+    return _pack_vector(mag_t, MAG_T_PER_LSB)
+
+
+def pack_roll_pitch(roll_rad: float, pitch_rad: float) -> bytes:
+    """Pack FF3D."""
+    return TWO_ANGLES.pack(counts_of(roll_rad / EULER_RAD_PER_LSB, 32), counts_of(pitch_rad / EULER_RAD_PER_LSB, 32))
+
+
+def pack_heading(yaw_rad: float, *, twice: bool = True) -> bytes:
+    """Pack FF41 of a counter-clockwise yaw; `twice` as newer firmware does, else with zeros in the reserved bytes."""
+    counter_clockwise = round(yaw_rad / EULER_RAD_PER_LSB)
+    signed = (counter_clockwise + HALF_TURN) % TURN - HALF_TURN
+    return HEADING_LAYOUT.pack(-counter_clockwise % TURN, signed if twice else 0)
+
+
+def pack_inclinometer(x_rad: float, y_rad: float) -> bytes:
+    """Pack FF4A."""
+    return pack_roll_pitch(x_rad, y_rad)
+
+
+def pack_temperature(temperature_c: float, pressure_pa: float) -> bytes:
+    """Pack FF43."""
+    celsius, pressure = temperature_c / TEMPERATURE_C_PER_LSB, pressure_pa / PRESSURE_PA_PER_LSB
+    return TEMPERATURE_LAYOUT.pack(counts_of(celsius, 16), 0, counts_of(pressure, 32))
+
+
+def pack_quaternion(quat_wxyz: Quaternion) -> bytes:
+    """Pack FF46."""
+    return QUATERNION_LAYOUT.pack(*(counts_of(q / QUAT_PER_LSB, 16) for q in quat_wxyz))
+
+
+def pack_utc(year: int, month: int, day: int, second_of_day: float) -> bytes:
+    """Pack FF2F."""
+    whole, millisecond = divmod(int(second_of_day * 1000), 1000)
+    minutes, second = divmod(whole, 60)
+    return UTC_LAYOUT.pack(year - YEAR_ZERO, month, day, *divmod(minutes, 60), second, millisecond)
+
+
+def _pack_vector(vector: Vector3, factor: float) -> bytes:
+    return VECTOR.pack(*(counts_of(value / factor, 16) for value in vector), 0)
+
+
+CONFIGURE: Final = 0xEF00
+"""PGN of requests and replies (proprietary A)."""
+HOST_ADDRESS: Final = 0x55
+"""Source address in the manual's example, and destination of all replies."""
+
+
+@dataclass(frozen=True, slots=True)
+class J1939Node:
+    """A module and the address under which imud talks to it."""
+
+    address: int
+    host: int = HOST_ADDRESS
+
+    def reply_ids(self) -> frozenset[int]:
+        """Identifiers of replies, without priority."""
+        return frozenset(
+            join(J1939Id(0, CONFIGURE, self.address, destination)) for destination in (self.host, HOST_ADDRESS)
+        )
+
+
+FACTORY_ADDRESS: Final = 8
+Address = Annotated[int, Meta(ge=0, le=ADDRESS_MAX)]
+
+
+class HipnucJ1939Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a module on J1939."""
+
+    address: Address = FACTORY_ADDRESS
+    """The module's address on the bus (J1939 source address); it can be set to 1 … 128."""
+    pgns: Literal["auto"] | Annotated[tuple[MeasuredName, ...], Meta(min_length=1)] = "auto"
+    """Messages that samples are made of; `auto` for all that come."""
+    host_address: Address = HOST_ADDRESS
+    """The address under which imud talks to the module; 0x55, which is 85, as in the manual."""
+
+    @property
+    def peer(self) -> J1939Node:
+        """Address of the module, and imud's own."""
+        return J1939Node(self.address, self.host_address)
+
+    def measured(self) -> tuple[int, ...]:
+        """PGNs that samples are made of."""
+        if self.pgns == "auto":
+            return MEASURED
+        return tuple(int(name, 16) for name in self.pgns)
+
+
+class HipnucJ1939Codec:
+    """Decoder of the frames of one module. Synchronization: one thread."""
+
+    def __init__(self, ledger: Ledger, settings: HipnucJ1939Settings) -> None:
+        self.ledger = ledger
+        taken = (UTC, *settings.measured())
+        self._pgns = {join(J1939Id(0, pgn, settings.address)): pgn for pgn in taken}
+        self._reply_ids = settings.peer.reply_ids()
+        self._assembly = Assembly(ledger)
+
+    def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
+        """Add one frame; return what it completed. Never raises for any frame."""
+        ledger, size = self.ledger, len(data)
+        ledger.bytes_in += size
+        key = can_id & WITHOUT_PRIORITY
+        pgn = self._pgns.get(key)
+        if not extended or (pgn is None and key not in self._reply_ids):
+            ledger.bytes_skipped += size
+            return ()
+        if size != MESSAGE_BYTES:
+            ledger.bytes_in_bad_frames += size
+            ledger.frames_bad_length += 1
+            return (BadFrame(BadReason.LENGTH, data),)
+        ledger.bytes_in_good_frames += size
+        ledger.frames_good += 1
+        if pgn is None:
+            ledger.frames_in_replies += 1
+            return (ReplyFrame(can_id, data),)
+        if pgn == UTC:
+            ledger.frames_ignored += 1
+            return ()
+        whole = self._assembly.add_frame(pgn, data, t_rx_ns)
+        return () if whole is None else (measurement_of(whole),)
+
+    def flush(self) -> Sequence[CodecEvent]:
+        """No-op: the next frame shows what is lost."""
+        return ()
+
+    def reset(self) -> None:
+        """Drop the incomplete sample: frames are missing here."""
+        self._assembly.reset()
+
+
+# --- the device's side ------------------------------------------------------------------------------------------------
+
+
+def encode(pgn: int, data: bytes, address: int = FACTORY_ADDRESS) -> tuple[int, bytes]:
+    """A message as (identifier, data)."""
+    return join(J1939Id(PRIORITY, pgn, address)), data

@@ -1,0 +1,285 @@
+"""HiPNUC CH0x0/CH10x/HI14 on RS-485: one block of registers per sample. Manual "IMU配置手冊" V1.5.9, chapter 4.
+
+    50 03 00 34 00 1A crc  →  50 03 34 | accel 3 | gyro 3 | mag 3 | roll pitch yaw i32 | °C | Pa i32 | quaternion 4 |
+                                         inclinometer 2 | uptime ms u32 | crc      i16 where not said, high byte first
+
+The manual's block ends at 0x4B; UPTIME is of newer firmware. A module that answers the longer block with an exception,
+or does not answer it, is asked for the manual's 24 registers. "Illegal data address" decides it until another module is
+there. Other exceptions, and silence, can have other causes: they count only before the longer block was ever answered,
+and it is tried again when the module is identified the next time.
+
+Two scales differ between modules and are decided by the values, then kept:
+- the quaternion: the one of the two that gives unit length;
+- the inclinometer: two axes (±180°, ±90°, 180/32768 degrees a count) or one (0 … 360°, 360/32768). Y is reserved in
+  products with one, so a Y that is not zero, or a negative X, means two; a Y of zero while the module is pitched means
+  one. That the reserved register reads as zero is a guess. Until it is decided, and where both read as zero (a product
+  without inclinometer), there is no value.
+Likewise a guess, after the manual's own example: a field of zero, and a temperature of zero together with a pressure of
+zero, are sensors that the product does not have. Which pressures are one: `common/air.py`.
+"""
+
+import struct
+from collections.abc import Sequence
+from math import atan2, cos, hypot, radians, sin
+from typing import Annotated, Final, Literal
+
+from msgspec import Meta
+
+from imud.contracts.codec import BadFrame, BadReason, Poll, PolledEvent, Vanished
+from imud.drivers.hipnuc.common import (
+    ACCEL_M_S2_PER_LSB,
+    EULER_RAD_PER_LSB,
+    GYRO_RAD_S_PER_LSB,
+    MAG_T_PER_LSB,
+    PRESSURE_PA_PER_LSB,
+    QUAT_PER_LSB,
+    TEMPERATURE_C_PER_LSB,
+    counts_of,
+    pressure_of,
+)
+from imud.drivers.hipnuc.modbus.registers import (
+    BLOCK_FIRST,
+    BLOCK_REGISTERS,
+    BY_NAME,
+    INCLI_DUAL_RAD_PER_LSB,
+    INCLI_SINGLE_RAD_PER_LSB,
+    QUAT_OLD_PER_LSB,
+    SHORT_BLOCK_REGISTERS,
+    read_registers,
+)
+from imud.drivers.polled_frames import Measured, PolledFrameDecoder, absence
+from imud.formats.modbus import (
+    CRC_BYTES,
+    ILLEGAL_ADDRESS,
+    READ_HOLDING,
+    READ_OVERHEAD_BYTES,
+    exception_text,
+    is_exception,
+    is_whole,
+)
+from imud.model.ledger import Ledger
+from imud.model.options import Settings
+from imud.model.sample import Measurement, Pair, Quaternion, Vector3
+from imud.model.units import NS_PER_S
+
+BLOCK: Final = struct.Struct(">3h3h3h3ihi4h2h")
+"""accel, gyro, mag, roll pitch yaw, temperature, pressure, quaternion wxyz, inclinometer: registers 0x34 … 0x4B."""
+UPTIME: Final = struct.Struct(">I")
+"""Registers 0x4C … 0x4D, ms."""
+DATA_AT: Final = 3
+CHECK_NS: Final = 10 * NS_PER_S
+"""Interval of reading the serial number again: another module can take a place on the line unnoticed."""
+SILENT_MAX: Final = 2
+"""Replies in a row that may be missing before the shorter block is tried; the device is given up after three."""
+UNIT_TOLERANCE: Final = 0.02
+"""Tolerance of a quaternion's length: the two scales are a factor of 3.3 apart, rounding costs 1e-4."""
+PITCHED_RAD: Final = radians(1.0)
+"""A dual-axis inclinometer shows 182 counts here."""
+
+READ_BLOCK: Final = read_registers(BLOCK_FIRST, BLOCK_REGISTERS)
+READ_SHORT_BLOCK: Final = read_registers(BLOCK_FIRST, SHORT_BLOCK_REGISTERS)
+READ_SERIAL: Final = read_registers(BY_NAME["SN"].address, BY_NAME["SN"].count)
+READ_STATUS: Final = read_registers(BY_NAME["MAIN_STATUS"].address, BY_NAME["MAIN_STATUS"].count)
+STATUS_NS: Final = NS_PER_S
+"""Interval of reading MAIN_STATUS, which the block does not have: `status` of a sample is at most so much older."""
+_SAMPLE, _SERIAL, _STATUS = 0, 1, 2
+
+
+class HipnucModbusSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a module on RS-485."""
+
+    inclinometer: Literal["auto", "single", "dual"] = "auto"
+    """Axes of an inclinometer product: `single` has X from 0 to 360°, `dual` X ±180° and Y ±90°; `auto` decides by the
+    values, which takes a tilt of more than 1°."""
+    update_hz: Annotated[float, Meta(ge=0, le=10000)] = 0.0
+    """Rate at which the device renews its registers, per second, for the error of time stamps; 0 if not known."""
+
+
+def update_ns(settings: HipnucModbusSettings) -> int:
+    """Longest time between two updates of the registers, 0 for not known."""
+    return int(NS_PER_S / settings.update_hz) if settings.update_hz else 0
+
+
+class HipnucModbusCodec:
+    """Decoder of blocks of registers. Synchronization: one thread.
+
+    What the module said of its registers stays, after `reset` too; scales and serial number are learned anew.
+    """
+
+    def __init__(self, ledger: Ledger, settings: HipnucModbusSettings) -> None:
+        self.ledger = ledger
+        self._fixed_incli = _INCLI[settings.inclinometer]
+        self._stale_before = 0
+        self._just_shortened = False
+        self._book = PolledFrameDecoder(ledger, READ_BLOCK.read_bytes)
+        self._read_block(short=False)
+        self.reset()
+
+    @property
+    def stale(self) -> int:
+        """Blocks that repeated the one before."""
+        return self._stale_before + self._book.stale
+
+    def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
+        """Decode one reply. Never raises."""
+        if poll == _SERIAL:
+            return self._decode_serial(data)
+        if poll == _STATUS:
+            return self._decode_status(data)
+        self._silent = 0
+        if is_exception(data):
+            return self._decode_exception(data)
+        return self._book.decode(data, self._bad, self._measure)
+
+    def on_silence(self, poll: int) -> Sequence[PolledEvent]:
+        """Try the shorter block after SILENT_MAX missing replies to a longer one that was never answered."""
+        if poll != _SAMPLE or self._short or self._answered:
+            return ()
+        self._silent += 1
+        if self._silent < SILENT_MAX:
+            return ()
+        return self._shorten(sure=False, why="it does not answer to the registers up to 0x4D")
+
+    def reset(self) -> None:
+        """Forget scales and serial number: another module may be there."""
+        if self._short and not self._sure and not self._just_shortened:
+            self._read_block(short=False)
+        self._just_shortened = False
+        self._silent = 0
+        self._book.reset()
+        self._quat_scale = 0.0
+        self._incli_scale = self._fixed_incli
+        self._serial = b""
+        self._status: int | None = None
+
+    def _decode_exception(self, data: bytes) -> Sequence[PolledEvent]:
+        missing = data[2] == ILLEGAL_ADDRESS
+        if not self._short and (missing or not self._answered):
+            self._book.add_reply(data, good=True)
+            return self._shorten(sure=missing, why=f"it answers {exception_text(data[2])} to the registers up to 0x4D")
+        self.ledger.bytes_in += len(data)
+        self.ledger.bytes_in_bad_frames += len(data)
+        self.ledger.frames_bad_content += 1
+        return (BadFrame(BadReason.CONTENT, data),)
+
+    def _shorten(self, *, sure: bool, why: str) -> Sequence[PolledEvent]:
+        self._read_block(short=True, sure=sure)
+        self._just_shortened = True
+        return (Vanished(f"{why}: reading up to 0x4B, without the device's time"),)
+
+    def _read_block(self, *, short: bool, sure: bool = False) -> None:
+        """Read this block from now on; `sure`: the module said that it has no other."""
+        self._short, self._sure = short, sure
+        self._just_shortened = self._answered = False
+        self._silent = 0
+        self.polls: Sequence[Poll] = _polls(short=short)
+        self._stale_before = self.stale
+        self._book = PolledFrameDecoder(self.ledger, (READ_SHORT_BLOCK if short else READ_BLOCK).read_bytes)
+
+    def _decode_serial(self, data: bytes) -> Sequence[PolledEvent]:
+        whole = len(data) == READ_SERIAL.read_bytes and is_whole(data) and not absence(data)
+        self._book.add_reply(data, good=whole or is_exception(data))
+        if not whole:  # damaged, or a firmware that does not like this read: nothing is known
+            return ()
+        serial, before = data[DATA_AT:-CRC_BYTES], self._serial
+        self._serial = serial
+        if not before or serial == before:
+            return ()
+        self._read_block(short=False)
+        return (Vanished(f"serial number {serial.hex().upper()}, was {before.hex().upper()}: another module"),)
+
+    def _decode_status(self, data: bytes) -> Sequence[PolledEvent]:
+        whole = len(data) == READ_STATUS.read_bytes and is_whole(data) and data[1] == READ_HOLDING
+        self._book.add_reply(data, good=whole or is_exception(data))
+        if whole:
+            self._status = int.from_bytes(data[DATA_AT:-CRC_BYTES], "big")
+        return ()
+
+    def _bad(self, data: bytes) -> BadReason | None:
+        if not is_whole(data):
+            return BadReason.CRC
+        good = data[1] == READ_HOLDING and data[2] == len(data) - READ_OVERHEAD_BYTES
+        return None if good else BadReason.CONTENT
+
+    def _measure(self, data: bytes) -> Measured:
+        (
+            ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, celsius, pressure, qw, qx, qy, qz, ix, iy,
+        ) = BLOCK.unpack_from(data, DATA_AT)  # fmt: skip
+        has_time = len(data) == READ_BLOCK.read_bytes
+        self._answered = True
+        a, w, b, angle = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, MAG_T_PER_LSB, EULER_RAD_PER_LSB
+        return Measurement(
+            len(data), 0, UPTIME.unpack_from(data, DATA_AT + BLOCK.size)[0] if has_time else None,
+            (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w), (mx * b, my * b, mz * b) if mx or my or mz else None,
+            self._quaternion(qw, qx, qy, qz), (roll * angle, pitch * angle, yaw * angle),
+            celsius * TEMPERATURE_C_PER_LSB if celsius or pressure else None,
+            pressure_of(pressure * PRESSURE_PA_PER_LSB),
+            self._inclination(ix, iy, roll * angle, pitch * angle), self._status,
+        ), True  # fmt: skip
+
+    def _quaternion(self, w: int, x: int, y: int, z: int) -> Quaternion | None:
+        if not self._quat_scale:
+            length = hypot(w, x, y, z)
+            fitting = [k for k in (QUAT_OLD_PER_LSB, QUAT_PER_LSB) if abs(length * k - 1) < UNIT_TOLERANCE]
+            if not fitting:
+                return None
+            self._quat_scale = fitting[0]
+        k = self._quat_scale
+        return (w * k, x * k, y * k, z * k) if w or x or y or z else None
+
+    def _inclination(self, x: int, y: int, roll_rad: float, pitch_rad: float) -> Pair | None:
+        if not self._incli_scale:
+            if not x and not y:
+                return None
+            if y or x < 0:
+                self._incli_scale = INCLI_DUAL_RAD_PER_LSB
+            elif abs(_dual_y_rad(roll_rad, pitch_rad)) > PITCHED_RAD:
+                self._incli_scale = INCLI_SINGLE_RAD_PER_LSB
+            else:
+                return None
+        k = self._incli_scale
+        return x * k, y * k
+
+
+_INCLI: Final = {"auto": 0.0, "single": INCLI_SINGLE_RAD_PER_LSB, "dual": INCLI_DUAL_RAD_PER_LSB}
+
+
+def _dual_y_rad(roll_rad: float, pitch_rad: float) -> float:
+    """Compute the Y axis of a dual-axis inclinometer in this attitude: atan2(gy, gz) of the vertical in the body."""
+    return atan2(sin(pitch_rad), cos(pitch_rad) * cos(roll_rad))
+
+
+def _polls(*, short: bool) -> Sequence[Poll]:
+    """Cyclic reads; firmware without UPTIME has no MAIN_STATUS either."""
+    serial = Poll(READ_SERIAL, CHECK_NS)
+    return (Poll(READ_SHORT_BLOCK), serial) if short else (Poll(READ_BLOCK), serial, Poll(READ_STATUS, STATUS_NS))
+
+
+# --- the device's side ------------------------------------------------------------------------------------------------
+
+
+def pack_block(
+    *,
+    accel_m_s2: Vector3,
+    gyro_rad_s: Vector3,
+    mag_t: Vector3,
+    euler_rad: Vector3,
+    quat_wxyz: Quaternion,
+    temperature_c: float,
+    pressure_pa: float,
+    uptime_ms: int | None,
+    incli_counts: tuple[int, int] = (0, 0),
+    quat_per_lsb: float = QUAT_PER_LSB,
+) -> bytes:
+    """Pack registers 0x34 … 0x4D from SI values, clipped to their range; up to 0x4B without `uptime_ms`."""
+    data = BLOCK.pack(
+        *(counts_of(a / ACCEL_M_S2_PER_LSB, 16) for a in accel_m_s2),
+        *(counts_of(w / GYRO_RAD_S_PER_LSB, 16) for w in gyro_rad_s),
+        *(counts_of(b / MAG_T_PER_LSB, 16) for b in mag_t),
+        *(counts_of(angle / EULER_RAD_PER_LSB, 32) for angle in euler_rad),
+        counts_of(temperature_c / TEMPERATURE_C_PER_LSB, 16),
+        counts_of(pressure_pa / PRESSURE_PA_PER_LSB, 32),
+        *(counts_of(q / quat_per_lsb, 16) for q in quat_wxyz),
+        *incli_counts,
+    )
+    return data if uptime_ms is None else data + UPTIME.pack(uptime_ms % 2**32)

@@ -1,0 +1,271 @@
+"""Table: the row `DRIVER` of HiPNUC modules on RS-485."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from random import Random
+from typing import Annotated, Any, Final, Literal
+
+from msgspec import Meta
+
+from imud.attitude.rotation import euler312_from_quat, quat_normalized
+from imud.contracts.command import Action, Actions, Calibrations, Risk, Target, Verdict
+from imud.contracts.driver import PolledDriver
+from imud.contracts.script import TransferScript
+from imud.contracts.setting import DeviceSettings, Effect, Setting
+from imud.drivers.hipnuc.common import (
+    MAIN_STATUS,
+    NINE_AXES_NEEDED,
+    REGISTERS,
+    AttitudeMode,
+    LevelReset,
+    heading_by_mode,
+    levels,
+    magnetometer,
+)
+from imud.drivers.hipnuc.modbus import commands as session
+from imud.drivers.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusSettings, pack_block, update_ns
+from imud.drivers.hipnuc.modbus.commands import LineMounting, probe, set_up
+from imud.drivers.hipnuc.modbus.registers import (
+    BAUD_RATES,
+    BY_NAME,
+    FACTORY_ID,
+    ID_MAX,
+    Access,
+    BaudRate,
+    registers_reply,
+)
+from imud.formats.modbus import SLAVES, framed
+from imud.model.errors import BadArgument
+from imud.model.sample import Vector3
+from imud.model.units import NS_PER_MS
+
+
+def _simple(words: str, begin: Callable[[], TransferScript[None]], risk: Risk = Risk.NONE) -> Action:
+    """An action without arguments."""
+    return Action(words, lambda _target: begin(), risk)
+
+
+def _address(
+    target: Target,
+    *,
+    address: Annotated[
+        int,
+        Meta(ge=1, le=ID_MAX, description="one that no other module of the line has", extra={"section": "4.3.3"}),
+    ],
+) -> TransferScript[str]:
+    return session.change_address(session.places_of(target)[0], address)
+
+
+def _restart(target: Target) -> TransferScript[str]:
+    return session.restart(session.places_of(target), target.baud)
+
+
+def _factory_reset(target: Target) -> TransferScript[str]:
+    return session.factory_reset(session.places_of(target), target.baud)
+
+
+def _baud(
+    _target: Target,
+    *,
+    baud: Annotated[BaudRate, Meta(description="rate of the line", extra={"unit": "bit/s", "section": "4.3.2"})],
+) -> TransferScript[str]:
+    return session.set_baud(baud)
+
+
+def _attitude_mode(
+    _target: Target, *, axes: Annotated[Literal[6, 9], Meta(extra={"section": "4.3.6"})]
+) -> TransferScript[str]:
+    return session.set_heading_mode(AttitudeMode.NINE_AXIS if axes == 9 else AttitudeMode.SIX_AXIS)
+
+
+def _level(
+    _target: Target, *, level: Annotated[Literal["relative", "automatic", "cancel"], Meta(extra={"section": "4.3.5"})]
+) -> TransferScript[None]:
+    return session.auto_level(LevelReset[level.upper()])
+
+
+def _mounting(
+    _target: Target,
+    *,
+    mounting: Annotated[Literal["level", "y_down", "y_up", "x_up", "x_down"], Meta(extra={"section": "4.3.4"})],
+) -> TransferScript[str]:
+    return session.set_mounting(LineMounting[mounting.upper()])
+
+
+def _read(
+    _target: Target, *, register: Annotated[str, Meta(description="its name in the manual", extra={"section": "4.2"})]
+) -> TransferScript[tuple[int, ...]]:
+    found = BY_NAME.get(register.upper())
+    if found is None or found.access is Access.WRITE:
+        known = ", ".join(one.name for one in BY_NAME.values() if one.access is not Access.WRITE)
+        raise BadArgument(f"register: expected one of {known}, got {register[:64]!r}")
+    return session.read(found)
+
+
+ACTIONS: Final[Actions] = {
+    "save": replace(_simple("write all settings to flash", session.save), saves=True),
+    "restart": Action("restart, as by power-on, and wait until it answers; what is not saved is lost", _restart),
+    "factory_reset": Action(
+        "factory settings, and restart: imud follows it to address 80 if no other module has that and the line has the "
+        "factory's 115200 baud",
+        _factory_reset,
+        Risk.RESET,
+    ),
+    "address": Action(
+        "set its address and follow it there; not saved. Refused if another module of the line answers there",
+        _address,
+        Risk.CONNECTION,
+    ),
+    "baud": Action(
+        "set the baud rate, in force after `save` and `restart`: imud then hears nothing of it until the line and all "
+        "other modules have the same",
+        _baud,
+        Risk.CONNECTION,
+    ),
+    "attitude_mode": Action("six axes, or nine with the magnetometer", _attitude_mode),
+    "level": Action("make the present attitude level, or cancel that; the module must be at rest", _level),
+    "mounting": Action("say how the module is mounted", _mounting),
+    "read": Action("read a register, as words of 16 bits", _read),
+}
+
+DONE_PERCENT: Final = 100
+
+
+def _nine_axes_needed(_target: Target) -> TransferScript[str]:
+    (mode,) = yield from session.read(BY_NAME["HEADING_MODE"])
+    if mode == AttitudeMode.SIX_AXIS.value:
+        return f"{NINE_AXES_NEEDED}: action attitude_mode, axes=9"
+    return ""
+
+
+def _nothing_to_start(_target: Target) -> TransferScript[None]:
+    """In 9-axis mode the module calibrates by itself."""
+    return
+    yield  # makes it a generator
+
+
+def _magnetometer_verdict(_target: Target) -> TransferScript[Verdict]:
+    (state,) = yield from session.read(BY_NAME["MAG_CALIBRATION"])
+    (percent,) = yield from session.read(BY_NAME["MAG_PROGRESS"])
+    return Verdict(percent >= DONE_PERCENT, f"state {state}, {percent} %", min(percent / DONE_PERCENT, 1.0))
+
+
+CALIBRATIONS: Final[Calibrations] = {
+    "magnetometer": magnetometer(_nothing_to_start, _magnetometer_verdict, _nine_axes_needed),
+    **levels("4.3.5", 15, lambda kind: lambda _target: session.auto_level(kind), lambda _target: session.save()),
+}
+
+Mode = Literal["6-axis", "9-axis"]
+Mounting = Literal["level", "x_up", "x_down", "y_up", "y_down"]
+
+MODES: Final[Mapping[Mode, AttitudeMode]] = {"6-axis": AttitudeMode.SIX_AXIS, "9-axis": AttitudeMode.NINE_AXIS}
+_MODE_OF: Final = {mode.value: name for name, mode in MODES.items()}
+
+
+def _read_settings(_target: Target) -> TransferScript[dict[str, object]]:
+    baud, address, heading = yield from session.read_present()
+    found: dict[str, object] = {}
+    if heading in _MODE_OF:
+        found["mode"] = _MODE_OF[heading]
+    if address is not None:
+        found["address"] = address
+    if baud is not None and baud < len(BAUD_RATES):
+        found["baud"] = BAUD_RATES[baud]
+    return found
+
+
+def _check(target: Target, values: Mapping[str, Any]) -> None:
+    """A module of another rate than its line is lost, and spoils the replies of the others."""
+    baud = values.get("baud")
+    if baud is not None and target.baud and baud != target.baud:
+        raise BadArgument(
+            f"baud: expected {target.baud}, the rate of the line, got {baud}; to change the rate of a line give all of "
+            "its modules the new one with the actions `baud`, `save` and `restart`, then set `rs485.baud`"
+        )
+
+
+SETTINGS: Final = DeviceSettings(
+    table={
+        "mode": Setting(
+            type=Annotated[
+                Mode,
+                Meta(description="without or with the magnetometer in the heading", extra={"section": "4.3.6"}),
+            ],
+            write=lambda _target, mode: session.set_heading_mode(MODES[mode]),
+        ),
+        "mounting": Setting(
+            type=Annotated[Mounting, Meta(description="the axis that points up or down", extra={"section": "4.3.4"})],
+            write=lambda _target, mounting: session.set_mounting(LineMounting[mounting.upper()]),
+            effect=Effect.AFTER_RESTART,
+            readable=False,
+        ),
+        "baud": Setting(
+            type=Annotated[
+                BaudRate,
+                Meta(
+                    description="that of the line: a module that would take another one at its restart is set back",
+                    extra={"unit": "bit/s", "section": "4.3.2"},
+                ),
+            ],
+            write=lambda _target, baud: session.set_baud(baud),
+            effect=Effect.AFTER_RESTART,
+            connection=True,
+        ),
+        "address": Setting(
+            type=Annotated[
+                int,
+                Meta(
+                    ge=1,
+                    le=ID_MAX,
+                    description="one that no other module of the line has",
+                    extra={"section": "4.3.3"},
+                ),
+            ],
+            write=lambda target, address: session.change_address(session.places_of(target)[0], address),
+            connection=True,
+        ),
+    },
+    read=_read_settings,
+    save=lambda _target: session.save(),
+    restart=lambda target: session.restart(session.places_of(target), target.baud),
+    check=_check,
+)
+
+
+def _example_reading(random: Random) -> bytes:
+    """A block with random values."""
+    quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
+
+    def three(spread: float) -> Vector3:
+        return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
+
+    data = pack_block(
+        accel_m_s2=three(9.8), gyro_rad_s=three(2), mag_t=three(5e-5), euler_rad=euler312_from_quat(quat),
+        quat_wxyz=quat, temperature_c=random.uniform(-40, 85), pressure_pa=random.uniform(80_000, 110_000),
+        uptime_ms=random.randrange(2**32),
+    )  # fmt: skip
+    return framed(FACTORY_ID, registers_reply(data))
+
+
+DRIVER: Final = PolledDriver(
+    name="hipnuc-modbus",
+    title="HiPNUC CH0x0, CH10x, HI14 (RS-485, Modbus RTU)",
+    settings=HipnucModbusSettings,
+    tick_ns=NS_PER_MS,
+    tick_modulus=2**32,
+    euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",
+    navigation_frame="ENU",
+    data_sheet=REGISTERS,
+    heading=heading_by_mode,
+    link="rs485",
+    targets=(FACTORY_ID, *(slave for slave in SLAVES if slave != FACTORY_ID)),
+    probe=probe,
+    set_up=set_up,
+    make_codec=HipnucModbusCodec,
+    update_ns=update_ns,
+    example_reading=_example_reading,
+    status_bits=MAIN_STATUS,
+    actions=ACTIONS,
+    device_settings=SETTINGS,
+    calibrations=CALIBRATIONS,
+)

@@ -1,0 +1,321 @@
+"""HiPNUC modules on NMEA 2000, and any other heading or attitude sensor there. Messages: `messages.py`.
+
+    09F112ss  127250 Vessel Heading     09F113ss  127251 Rate of Turn     0DF119ss  127257 Attitude
+
+ss is the sender's address, which NMEA 2000 gives out anew each time the bus is put together. `source: auto` selects
+the first sender of these messages and keeps it; after SILENT_NS without a message, the next sender. imud claims no
+address and sends no requests.
+
+Messages of one instant have the same SID. `common/assembly.py` makes samples by their order and time; frames held with
+another SID than the newest are dropped. A sender whose messages of one instant have SIDs of their own, against the
+standard, would never make a sample: after SID_DOUBTS such samples in a row SIDs are not looked at, until they agree in
+as many samples again.
+
+A sender may give its heading twice, from true and from magnetic north. `heading` selects the one to use; `auto` selects
+the reference that comes first and keeps it. The other heading is ignored. Deviation and variation are not applied.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from math import isfinite, nan, pi, tau
+from random import Random
+from typing import Annotated, Final, Literal, NamedTuple
+
+from msgspec import Meta
+
+from imud.attitude.conventions import Heading
+from imud.attitude.rotation import euler312_from_quat, quat_from_euler312, quat_normalized
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity
+from imud.contracts.script import says_nothing
+from imud.drivers.hipnuc.assembly import Assembly
+from imud.drivers.hipnuc.common import FLOATS
+from imud.formats.can import CanFilter, CanFrame
+from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, sender_of
+from imud.model.ledger import Ledger
+from imud.model.options import Settings
+from imud.model.sample import Measurement, Vector3
+from imud.model.units import NS_PER_S
+
+HEADING, RATE_OF_TURN, ATTITUDE = 127250, 127251, 127257
+PGNS: Final = (HEADING, RATE_OF_TURN, ATTITUDE)
+PRIORITIES: Final = {HEADING: 2, RATE_OF_TURN: 2, ATTITUDE: 3}
+"""Defaults of the standard."""
+MESSAGE_BYTES: Final = 8
+
+HEADING_LAYOUT: Final = struct.Struct("<BHhhB")
+RATE_LAYOUT: Final = struct.Struct("<Bi3x")
+ATTITUDE_LAYOUT: Final = struct.Struct("<BhhhB")
+RAD_PER_LSB: Final = 1e-4
+RATE_RAD_S_PER_LSB: Final = 1e-6 / 32
+
+I16_MOST, U16_MOST, I32_MOST, SID_MOST = 0x7FFC, 0xFFFC, 0x7FFF_FFFC, 252
+"""Highest counts that are values."""
+
+
+class Reference(IntEnum):
+    """North to which a heading refers."""
+
+    TRUE = 0
+    MAGNETIC = 1
+    ERROR = 2
+    UNKNOWN = 3
+
+
+class Head(NamedTuple):
+    """Header of a message: all that is known before its values."""
+
+    sid: int | None
+    """Number of the instant, the same in all messages of one; None where the sender has none."""
+    reference: Reference | None
+    """Of a heading."""
+
+
+def head_of(pgn: int, data: bytes) -> Head:
+    """Decode the header of a message of eight bytes."""
+    reference = Reference(data[7] & 3) if pgn == HEADING else None
+    return Head(data[0] if data[0] <= SID_MOST else None, reference)
+
+
+def measurement_of(messages: Sequence[tuple[int, bytes]], *, heading_elsewhere: bool = False) -> Measurement:
+    """Make one sample of messages (PGN, data) of one instant, each PGN at most once.
+
+    Yaw is that of the heading, else that of the attitude, but for a device that sends its heading in other samples.
+    """
+    roll = pitch = yaw = rate = nan
+    has_heading = heading_elsewhere
+    for pgn, data in messages:
+        if pgn == HEADING:
+            _, heading, _, _, reference = HEADING_LAYOUT.unpack(data)
+            has_heading = True
+            is_good = heading <= U16_MOST and reference & 3 != Reference.ERROR
+            yaw = _counter_clockwise(heading) if is_good else nan
+        elif pgn == RATE_OF_TURN:
+            _, counts = RATE_LAYOUT.unpack(data)
+            rate = -counts * RATE_RAD_S_PER_LSB if counts <= I32_MOST else nan
+        else:
+            _, clockwise, pitch_counts, roll_counts, _ = ATTITUDE_LAYOUT.unpack(data)
+            roll, pitch = _angle(roll_counts), _angle(pitch_counts)
+            if not has_heading and clockwise <= I16_MOST:
+                yaw = _counter_clockwise(clockwise)
+    euler = (roll, pitch, yaw)
+    is_whole = isfinite(roll + pitch + yaw)
+    return Measurement(
+        MESSAGE_BYTES * len(messages), 0, None,
+        gyro_rad_s=(nan, nan, rate) if isfinite(rate) else None,
+        quat_wxyz=quat_from_euler312(euler) if is_whole else None,
+        euler_rad=euler if is_whole or any(map(isfinite, euler)) else None,
+    )  # fmt: skip
+
+
+def _angle(counts: int) -> float:
+    return counts * RAD_PER_LSB if counts <= I16_MOST else nan
+
+
+def _counter_clockwise(clockwise: int) -> float:
+    """Yaw in ±π of a clockwise angle in counts."""
+    angle = -clockwise * RAD_PER_LSB
+    return angle if -pi <= angle <= pi else (angle + pi) % tau - pi
+
+
+# --- the device's side ------------------------------------------------------------------------------------------------
+
+
+def pack_heading(sid: int, yaw_rad: float | None, reference: Reference) -> bytes:
+    """Pack 127250 of a counter-clockwise yaw, without deviation and variation; None is "not available"."""
+    counts = 0xFFFF if yaw_rad is None else round(-yaw_rad % tau / RAD_PER_LSB)
+    return HEADING_LAYOUT.pack(sid, counts, 0x7FFF, 0x7FFF, 0xFC | reference)
+
+
+def pack_rate_of_turn(sid: int, gyro_z_rad_s: float | None) -> bytes:
+    """Pack 127251 of a counter-clockwise rate."""
+    counts = 0x7FFF_FFFF if gyro_z_rad_s is None else _clip(-gyro_z_rad_s / RATE_RAD_S_PER_LSB, I32_MOST)
+    return RATE_LAYOUT.pack(sid, counts)[:5] + b"\xff\xff\xff"
+
+
+def pack_attitude(sid: int, euler_rad: Vector3, *, has_yaw: bool = True) -> bytes:
+    """Pack 127257 of roll, pitch and a counter-clockwise yaw."""
+    roll, pitch, yaw = (_clip(angle / RAD_PER_LSB, I16_MOST) for angle in euler_rad)
+    return ATTITUDE_LAYOUT.pack(sid, -yaw if has_yaw else 0x7FFF, pitch, roll, 0xFF)
+
+
+def _clip(value: float, most: int) -> int:
+    return max(-most, min(most, round(value)))
+
+
+SILENT_NS: Final = 3 * NS_PER_S
+"""The slowest of the three messages comes once a second by the standard."""
+SID_DOUBTS: Final = 8
+
+_PGNS: Final = {join(J1939Id(0, pgn, 0)): pgn for pgn in PGNS}
+"""By identifier without priority and source."""
+_REFERENCES: Final = {"true": Reference.TRUE, "magnetic": Reference.MAGNETIC, "auto": None}
+
+
+class HipnucNmea2000Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a heading or attitude sensor."""
+
+    source: Literal["auto"] | Annotated[int, Meta(ge=0, le=ADDRESS_MAX)] = "auto"
+    """Address of the sender; `auto` for the first who is heard, and another one when that is silent."""
+    heading: Literal["auto", "true", "magnetic"] = "auto"
+    """Heading to use where the sender has two; `auto` for the first that is received."""
+
+
+class HipnucNmea2000Codec:
+    """Decoder of the frames of one sender. Synchronization: one thread."""
+
+    def __init__(self, ledger: Ledger, settings: HipnucNmea2000Settings) -> None:
+        self.ledger = ledger
+        self._fixed = None if settings.source == "auto" else settings.source
+        self._wanted_reference = _REFERENCES[settings.heading]
+        self._set_sender(self._fixed)
+        self._heard_ns = 0
+
+    def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
+        """Add one frame; return what it completed. Never raises for any frame."""
+        ledger, size = self.ledger, len(data)
+        ledger.bytes_in += size
+        pgn = _PGNS.get(can_id & WITHOUT_PRIORITY & ~0xFF) if extended else None
+        if pgn is None or not self._is_sender(can_id & 0xFF, t_rx_ns):
+            ledger.bytes_skipped += size
+            return ()
+        if size != MESSAGE_BYTES:
+            ledger.bytes_in_bad_frames += size
+            ledger.frames_bad_length += 1
+            return (BadFrame(BadReason.LENGTH, data),)
+        ledger.bytes_in_good_frames += size
+        ledger.frames_good += 1
+        sid, reference = head_of(pgn, data)
+        if reference is not None and not self._is_reference(reference):
+            ledger.frames_ignored += 1
+            return ()
+        self._match(sid)
+        whole = self._assembly.add_frame(pgn, data, t_rx_ns)
+        if whole is None:
+            return ()
+        self._count_sids(whole)
+        self._has_heading |= any(kind == HEADING for kind, _ in whole)
+        return (measurement_of(whole, heading_elsewhere=self._has_heading),)
+
+    def flush(self) -> Sequence[CodecEvent]:
+        """No-op: the next frame shows what is lost."""
+        return ()
+
+    def reset(self) -> None:
+        """Drop the incomplete sample: frames are missing here."""
+        self._assembly.reset()
+
+    # --- whose frames --------------------------------------------------------------------------------------------
+
+    def _is_sender(self, source: int, t_rx_ns: int) -> bool:
+        if source != self._source:
+            silent = t_rx_ns - self._heard_ns > SILENT_NS
+            if self._fixed is not None or source > ADDRESS_MAX or (self._source is not None and not silent):
+                return False
+            self._assembly.reset()
+            self._set_sender(source)
+        self._heard_ns = t_rx_ns
+        return True
+
+    def _set_sender(self, source: int | None) -> None:
+        """Begin anew with this sender."""
+        self._source = source
+        self._assembly = Assembly(self.ledger)
+        self._reference = self._wanted_reference
+        self._has_heading = False
+        self._held_sid: int | None = None
+        self._uses_sids = True
+        self._sid_doubts = 0
+
+    def _is_reference(self, reference: Reference) -> bool:
+        """Whether this is the heading to use; an error counts for both, with its value absent."""
+        if self._reference is None and reference is not Reference.ERROR:
+            self._reference = reference
+        return reference in (self._reference, Reference.ERROR)
+
+    # --- messages of one instant ---------------------------------------------------------------------------------
+
+    def _match(self, sid: int | None) -> None:
+        """Drop the frames of another instant."""
+        differs = sid is not None and self._held_sid is not None and sid != self._held_sid
+        self._held_sid = sid
+        if self._uses_sids and differs and self.ledger.frames_pending:
+            self._assembly.reset()
+            self._sid_doubts += 1
+            if self._sid_doubts >= SID_DOUBTS:
+                self._uses_sids, self._sid_doubts = False, 0
+
+    def _count_sids(self, whole: Sequence[tuple[int, bytes]]) -> None:
+        """Count the SIDs of a whole sample."""
+        if self._uses_sids:
+            self._sid_doubts = 0
+        elif len(whole) > 1:
+            agree = len({data[0] for _, data in whole}) == 1
+            self._sid_doubts = self._sid_doubts + 1 if agree else 0
+            if self._sid_doubts >= SID_DOUBTS:
+                self._uses_sids, self._sid_doubts = True, 0
+
+
+# --- the device's side ------------------------------------------------------------------------------------------------
+
+
+def encode(pgn: int, data: bytes, source: int) -> tuple[int, bytes]:
+    """A message as (identifier, data)."""
+    return join(J1939Id(PRIORITIES[pgn], pgn, source)), data
+
+
+EXAMPLE_SOURCE: Final = 35
+
+
+def _example_frames(random: Random) -> list[CanFrame]:
+    """A sample of all three, with random values."""
+    quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
+    euler = euler312_from_quat(quat)
+    sid = random.randrange(SID_MOST + 1)
+    made = (
+        encode(HEADING, pack_heading(sid, euler[2], Reference.MAGNETIC), EXAMPLE_SOURCE),
+        encode(RATE_OF_TURN, pack_rate_of_turn(sid, random.gauss(0, 0.5)), EXAMPLE_SOURCE),
+        encode(ATTITUDE, pack_attitude(sid, euler, has_yaw=False), EXAMPLE_SOURCE),
+    )
+    return [CanFrame(can_id, True, data, 0) for can_id, data in made]
+
+
+def _filters(settings: HipnucNmea2000Settings) -> list[CanFilter]:
+    """The three messages, of one sender or of any."""
+    source = None if settings.source == "auto" else settings.source
+    return [filter_of(pgn, source) for pgn in PGNS]
+
+
+def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
+    """The sender of one of the messages."""
+    return sender_of(can_id, extended, data, PGNS)
+
+
+def _heading(settings: object, _read_back: Mapping[str, str]) -> Heading:
+    """By the heading that is used; with `auto` the first that is received, which is not known beforehand."""
+    chosen = settings.heading if isinstance(settings, HipnucNmea2000Settings) else "auto"
+    return Heading.UNKNOWN if chosen == "auto" else Heading(chosen)
+
+
+DRIVER: Final = CanDriver(
+    name="hipnuc-nmea2000",
+    title="HiPNUC CH0x0, CH10x, HI14, other heading and attitude sensors (CAN, NMEA 2000)",
+    settings=HipnucNmea2000Settings,
+    make_codec=HipnucNmea2000Codec,
+    filters=_filters,
+    tick_ns=SAMPLE_COUNTER,
+    tick_modulus=2,
+    euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above, "
+    "0 with the bow to the north of the heading's reference; NaN for an angle that is not sent",
+    navigation_frame="ENU",
+    data_sheet=FLOATS,
+    heading=_heading,
+    node_of=_node_of,
+    node_settings=lambda source: HipnucNmea2000Settings(source=source),
+    node_title=lambda source: f"source {source}",
+    identify=lambda _settings: says_nothing(Identity()),
+    read_settings=lambda _settings: says_nothing({}),
+    sample_frames=len(PGNS),
+    example_frames=_example_frames,
+)

@@ -1,0 +1,488 @@
+"""HiPNUC CH0x0/CH10x/HI14 on a UART: binary frames. Manual "IMU配置手冊" V1.5.9, chapter 3.
+
+    0    1    2       4     6                 6 + length
+    +----+----+-------+-----+-----------------+
+    | 5A | A5 |length |crc  | payload         |    integers and floats little-endian
+    +----+----+-------+-----+-----------------+
+
+`crc` is CRC-16/XMODEM over bytes 0…3 and the payload. The payload is a row of sub-packets, each a tag byte and as many
+bytes as its tag says: 0x91 (HI91, floats, 76 bytes), 0x92 (HI92, integers, 48 bytes). Lines of text, the replies to
+commands (`commands.py`), stand between the frames and may be cut by them (`replies.py`).
+
+Strategy. A frame whose check fails spends only its sync word, because a real frame may begin inside the false one.
+What follows up to its claimed end counts as part of it unless it turns out to be good. While a claimed frame is
+incomplete everything waits, at most FRAME_BYTES_MAX; `flush` ends the wait when the line went idle.
+At 1 kHz the decoder is on the sample path, so HI91 frames back to back, which is what a stream consists of, are decoded
+by `_decode_run`: one match finds them, the CRC starts from that of the header, NaN is looked for in the high bytes of
+all floats of all frames at once, and one `iter_unpack` goes through all payloads. Everything else goes one by one.
+`make bench-instructions` measures it.
+"""
+
+import re
+import struct
+import sys
+from binascii import crc_hqx as crc16_xmodem
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any, Final, Literal, ParamSpec
+
+import msgspec
+
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.lines import TimeBits
+from imud.drivers.hipnuc.common import (
+    EULER_RAD_PER_LSB,
+    M_S2_PER_G,
+    MAG_T_PER_LSB,
+    PRESSURE_MAX_PA,
+    PRESSURE_MIN_PA,
+    QUAT_PER_LSB,
+    pressure_of,
+    temperature_beside,
+)
+from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, LineFinder
+from imud.model.ledger import Ledger
+from imud.model.options import Settings
+from imud.model.sample import Measurement, Quaternion, Vector3
+from imud.model.units import RAD_PER_DEG, T_PER_UT
+
+HI91: Final = struct.Struct("<BHbfI3f3f3f3f4f")
+"""tag, pps_sync_stamp or status, temperature °C, pressure Pa, system_time ms, accel G, gyro °/s, mag µT,
+roll pitch yaw °, quaternion wxyz (section 3.3.1)."""
+HI92: Final = struct.Struct("<BHbHh2x3h3h3h3i4h")
+"""tag, status, temperature °C, pps_sync_stamp ms, pressure - 100000 Pa, reserved, gyro, accel, mag, roll pitch yaw,
+quaternion wxyz (section 3.3.2). Gyro stands before accel here."""
+TAG_HI91: Final = 0x91
+TAG_HI92: Final = 0x92
+
+PPS_STAMP_MODULUS_MS: Final = 8192
+"""pps_sync_stamp counts 0 … 8191 ms and wraps when no edge comes (in a recording at 100 Hz, 8190 is followed by 8)."""
+
+ACCEL_M_S2_PER_LSB: Final = 0.0048828
+"""Of HI92, as printed; 160 / 32768 would be 2.6e-6 more."""
+GYRO_RAD_S_PER_LSB: Final = 0.001
+"""Of HI92."""
+PRESSURE_OFFSET_PA: Final = 100_000
+
+
+HI91_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") + "xBBbfI16f")
+"""HI91 behind its tag, the word in two bytes: in the machine's own layout `struct` reads a float in half the time."""
+HI91_HIGH_BYTES: Final = slice(7, None, 4)
+"""High bytes of all floats, and of system_time, in HI91 sub-packets back to back, because 76 is a multiple of 4. An
+exponent of all ones (NaN, infinity) needs 0x7F or 0xFF there; finite values above 1.7e38 and 9 of every 1193 hours of
+system time have them too."""
+
+
+def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing: int) -> Measurement:
+    """The measurement of HI91_VALUES, where NaN and infinity stay; `size` and `trailing` are those of the frame."""
+    low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz = values
+    # local names: a global costs twice as much, and there are thirty of them per frame
+    g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
+    if not PRESSURE_MIN_PA <= pressure <= PRESSURE_MAX_PA:  # `pressure_of`; a call each costs a tenth of a frame
+        temperature, pressure = temperature_beside(temperature, pressure), None
+    word = low + 256 * high
+    return Measurement(
+        size, trailing, ms,
+        (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), (mx * tesla, my * tesla, mz * tesla),
+        (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
+        word if word_is_status else None, None if word_is_status else word,
+    )  # fmt: skip
+
+
+def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int) -> list[Measurement]:
+    """`decode_hi91` of sub-packets back to back, one of each frame, written out: the call is a twentieth of the cost.
+
+    `trailing` bytes follow the first frame.
+    """
+    g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
+    low_pa, high_pa = PRESSURE_MIN_PA, PRESSURE_MAX_PA
+    made: list[Measurement] = []
+    make, keep = Measurement, made.append
+    for (
+        low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
+    ) in HI91_VALUES.iter_unpack(hi91s):  # fmt: skip
+        if not low_pa <= pressure <= high_pa:
+            temperature, pressure = temperature_beside(temperature, pressure), None  # noqa: PLW2901
+        word = low + 256 * high
+        keep(
+            make(
+                size, trailing, ms,
+                (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), (mx * tesla, my * tesla, mz * tesla),
+                (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
+                word if word_is_status else None, None if word_is_status else word,
+            )
+        )  # fmt: skip
+        trailing -= size
+    return made
+
+
+def _decode_hi91(data: bytes, at: int, word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
+    values = HI91_VALUES.unpack_from(data, at)
+    measurement = decode_hi91(values, word_is_status, size, trailing)
+    if all(map(isfinite, values)):
+        return measurement, True
+    return _finite_groups(measurement), False
+
+
+_GROUPS: Final = ("accel_m_s2", "gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad")
+
+
+def _finite_groups(m: Measurement) -> Measurement:
+    """Decode without the groups of values of which one is NaN or infinite."""
+    absent = [name for name in _GROUPS if not all(map(isfinite, getattr(m, name)))]
+    return msgspec.structs.replace(m, **dict.fromkeys(absent))
+
+
+def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
+    """Decode HI92, which has no device time: `dev_ticks` is None."""
+    (
+        _, status, temperature, pps_ms, pressure, gx, gy, gz, ax, ay, az, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
+    ) = HI92.unpack_from(data, at)  # fmt: skip
+    a, w, b, angle, q = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, MAG_T_PER_LSB, EULER_RAD_PER_LSB, QUAT_PER_LSB
+    return Measurement(
+        size, trailing, None,
+        (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w), (mx * b, my * b, mz * b),
+        (qw * q, qx * q, qy * q, qz * q), (roll * angle, pitch * angle, yaw * angle),
+        temperature, pressure_of(pressure + PRESSURE_OFFSET_PA), None, status, pps_ms,
+    ), True  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """A kind of sub-packet."""
+
+    size: int
+    """In bytes, tag included."""
+    decode: Callable[[bytes, int, bool, int, int], tuple[Measurement, bool]]
+    """`decode(data, at, word_is_status, size, trailing)` returns the measurement, and whether all is finite."""
+
+
+PACKETS: Final = {TAG_HI91: Packet(HI91.size, _decode_hi91), TAG_HI92: Packet(HI92.size, _decode_hi92)}
+
+
+def pack_hi91(
+    *,
+    system_time_ms: int,
+    accel_m_s2: Vector3,
+    gyro_rad_s: Vector3,
+    mag_t: Vector3,
+    euler_rad: Vector3,
+    quat_wxyz: Quaternion,
+    temperature_c: float,
+    pressure_pa: float,
+    word_1_2: int = 0,
+) -> bytes:
+    """An HI91 sub-packet. Values are clipped to the format's range, time wraps at 2³² ms; NaN is sent as it is."""
+    values = (
+        *(a / M_S2_PER_G for a in accel_m_s2),
+        *(w / RAD_PER_DEG for w in gyro_rad_s),
+        *(b / T_PER_UT for b in mag_t),
+        *(angle / RAD_PER_DEG for angle in euler_rad),
+        *quat_wxyz,
+    )
+    return HI91.pack(
+        TAG_HI91,
+        _clip(word_1_2, 0, 0xFFFF),
+        _clip(temperature_c, -128, 127),
+        _clip_float(pressure_pa),
+        system_time_ms % 2**32,
+        *map(_clip_float, values),
+    )
+
+
+def pack_hi92(
+    *,
+    pps_stamp_ms: int,
+    accel_m_s2: Vector3,
+    gyro_rad_s: Vector3,
+    mag_t: Vector3,
+    euler_rad: Vector3,
+    quat_wxyz: Quaternion,
+    temperature_c: float,
+    pressure_pa: float,
+    status: int = 0,
+) -> bytes:
+    """An HI92 sub-packet. Values are clipped to the format's range. Raises ValueError, OverflowError if not finite."""
+    return HI92.pack(
+        TAG_HI92,
+        _clip(status, 0, 0xFFFF),
+        _clip(temperature_c, -128, 127),
+        _clip(pps_stamp_ms, 0, 0xFFFF),
+        _clip16(pressure_pa - PRESSURE_OFFSET_PA),
+        *(_clip16(w / GYRO_RAD_S_PER_LSB) for w in gyro_rad_s),
+        *(_clip16(a / ACCEL_M_S2_PER_LSB) for a in accel_m_s2),
+        *(_clip16(b / MAG_T_PER_LSB) for b in mag_t),
+        *(_clip(angle / EULER_RAD_PER_LSB, -(2**31), 2**31 - 1) for angle in euler_rad),
+        *(_clip16(q / QUAT_PER_LSB) for q in quat_wxyz),
+    )
+
+
+_FLOAT32_MAX: Final = (2 - 2**-23) * 2.0**127
+
+
+def _clip(value: float, low: int, high: int) -> int:
+    return max(low, min(high, round(value)))
+
+
+def _clip16(value: float) -> int:
+    return _clip(value, -0x8000, 0x7FFF)
+
+
+def _clip_float(value: float) -> float:
+    return max(-_FLOAT32_MAX, min(_FLOAT32_MAX, value)) if isfinite(value) else value
+
+
+SYNC: Final = b"\x5a\xa5"
+HEADER: Final = struct.Struct("<2sHH")  # sync word, payload length, CRC
+PAYLOAD_BYTES_MAX: Final = 512  # section 3.1; devices build frames in a buffer of 512 bytes, header included
+FRAME_BYTES_MAX: Final = HEADER.size + PAYLOAD_BYTES_MAX
+
+STATUS_SINCE_APP_VER: Final = 169
+"""Firmware 1.6.9 and newer sends MAIN_STATUS in bytes 1-2 of HI91; before, pps_sync_stamp as in the manual."""
+TIME_BITS: Final = TimeBits(sync_out=1 << 12, not_utc=1 << 11)
+"""Status bits about time in MAIN_STATUS: pulse on SOUT with this frame; `system_time` not synchronised to UTC."""
+
+_HI91_FRAME_BYTES: Final = HEADER.size + HI91.size
+_HI91_HEAD: Final = SYNC + HI91.size.to_bytes(2, "little")
+_RUN_SEED: Final = crc16_xmodem(_HI91_HEAD, 0)
+_RUN_FRAMES_MAX: Final = 64  # a run is copied out of the buffer; this bounds what one damaged frame makes copy again
+_RUN: Final = re.compile(
+    rb"(?s:%b..%b.{%d}){1,%d}" % (re.escape(_HI91_HEAD), re.escape(bytes([TAG_HI91])), HI91.size - 1, _RUN_FRAMES_MAX)
+)
+"""HI91 frames back to back by header and tag."""
+_RUN_PARTS: Final = struct.Struct(f"<4xH{HI91.size}s")  # CRC and payload
+_IDLE_LINE: Final = re.compile(rb"[\t\x20-\x7e]{2,%d}\r\n\Z" % LINE_CHARACTERS_MAX)
+"""A line right before the port went idle: two characters at least and both characters of the line's end, which the
+device always sends. Less comes by chance inside half a frame, which would then be dropped."""
+
+
+class HipnucSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a module on a UART."""
+
+    hi91_word: Literal["auto", "pps", "status"] = "auto"
+    """Meaning of bytes 1-2 of HI91: time since the last PPS edge (firmware before 1.6.9) or status bits (since).
+    `auto` decides by the firmware version that the device reports, `pps` until that is known."""
+
+
+class HipnucCodec:
+    """Decoder of frames and lines of text from bytes in any split. Synchronization: one thread.
+
+    Every sub-packet that is known becomes one `Measurement`, with the size of the whole frame, so that all of a frame
+    come to the same time. A sub-packet cut off by the end of the payload makes the whole frame bad. A frame with NaN or
+    infinity is delivered without the values concerned, after a `BadFrame` (not-finite); its bytes and
+    itself count as good.
+    """
+
+    def __init__(self, ledger: Ledger, settings: HipnucSettings) -> None:
+        self.ledger = ledger
+        self.word_is_status = settings.hi91_word == "status"
+        """Whether bytes 1-2 of HI91 are status bits."""
+        self._word_is_fixed = settings.hi91_word != "auto"
+        self._lines = LineFinder(ledger)
+        self._tail = b""
+        """Incomplete rest of the bytes: begins with a sync word, or is the first half of one."""
+        self._bad_ahead = 0
+        """Claimed rest of a damaged frame, in bytes from the begin of the tail."""
+        self._barred_ahead = 0
+        """The same of one that came whole: no line is found in it."""
+
+    def learn_app_ver(self, app_ver: int) -> None:
+        """Set the firmware's version number, 169 for 1.6.9. A configured meaning of HI91 bytes 1-2 stays."""
+        if not self._word_is_fixed:
+            self.word_is_status = app_ver >= STATUS_SINCE_APP_VER
+
+    def feed(self, data: bytes) -> Sequence[CodecEvent]:
+        """Add bytes in the order they came; return what they completed. Never raises for any bytes."""
+        self.ledger.bytes_in += len(data)
+        if len(data) == _HI91_FRAME_BYTES and data.startswith(_HI91_HEAD) and not (self._tail or self._bad_ahead):
+            payload = data[HEADER.size :]  # a read that is one plain HI91 frame, as from a port at 1 kHz
+            high_bytes = payload[HI91_HIGH_BYTES]
+            if (
+                crc16_xmodem(payload, _RUN_SEED) == data[4] | data[5] << 8
+                and payload[0] == TAG_HI91
+                and 0x7F not in high_bytes
+                and 0xFF not in high_bytes
+            ):
+                ledger = self.ledger
+                ledger.bytes_in_good_frames += _HI91_FRAME_BYTES
+                ledger.frames_good += 1
+                ledger.frames_in_samples += 1
+                return (decode_hi91(HI91_VALUES.unpack(payload), self.word_is_status, _HI91_FRAME_BYTES, 0),)
+        return self._scan(self._tail + data if self._tail else data, 0)
+
+    def flush(self) -> Sequence[CodecEvent]:
+        """Drop an incomplete frame if a whole message waits inside it; no-op otherwise. The line is idle."""
+        events: list[CodecEvent] = []
+        while give_up := self._whole_inside():
+            events += self._scan(self._tail, give_up)
+        return events
+
+    def reset(self) -> None:
+        """Skip what is pending: the stream broke. The known firmware version stays."""
+        self._lines.clear()
+        self.ledger.bytes_skipped += len(self._tail)
+        self._tail = b""
+        self._bad_ahead = self._barred_ahead = 0
+        self.ledger.bytes_pending = 0
+
+    def _scan(self, data: bytes, give_up: int) -> list[CodecEvent]:
+        """Decode all that is complete in `data`, where incomplete frames that begin before `give_up` are bad."""
+        events: list[CodecEvent] = []
+        at, total = 0, len(data)
+        while at < total:
+            sync = data.find(SYNC, at)
+            if sync != at:
+                end = sync if sync >= 0 else total - data.endswith(SYNC[:1], at)
+                bad, barred = (max(min(ahead, end) - at, 0) for ahead in (self._bad_ahead, self._barred_ahead))
+                events += self._lines.add(data[at:end], bad, barred)
+                at = end
+                if sync < 0:
+                    break
+            after = self._decode_frame(data, at, give_up, events)
+            if after == at:
+                break
+            at = after
+        self._tail = data[at:]
+        self._bad_ahead, self._barred_ahead = max(self._bad_ahead - at, 0), max(self._barred_ahead - at, 0)
+        self.ledger.bytes_pending = total - at + self._lines.pending_bytes
+        return events
+
+    def _decode_frame(self, data: bytes, at: int, give_up: int, events: list[CodecEvent]) -> int:
+        """Decode the frame at `at`; return where it ends, or `at` if it is not complete yet."""
+        total = len(data)
+        if (run := _RUN.match(data, at)) and (after := self._decode_run(data, at, run.end(), events)) > at:
+            return after
+        if total - at < HEADER.size:
+            return self._spend_sync(data, at, total, BadReason.CRC, events) if at < give_up else at
+        length: int
+        _, length, crc = HEADER.unpack_from(data, at)
+        if not 1 <= length <= PAYLOAD_BYTES_MAX:
+            return self._spend_sync(data, at, at + 4, BadReason.LENGTH, events)
+        begin, end = at + HEADER.size, at + HEADER.size + length
+        if end > total and at >= give_up:
+            return at
+        if end > total or crc16_xmodem(data[begin:end], crc16_xmodem(data[at : at + 4], 0)) != crc:
+            return self._spend_sync(data, at, end, BadReason.CRC, events)
+        self._decode_payload(data, at, end, events)
+        return end
+
+    def _decode_run(self, data: bytes, at: int, end: int, events: list[CodecEvent]) -> int:
+        """Decode HI91 frames back to back up to the first whose CRC does not match; return where they end."""
+        size, crc_of, seed = _HI91_FRAME_BYTES, crc16_xmodem, _RUN_SEED
+        payloads: list[bytes] = []
+        keep = payloads.append
+        for crc, payload in _RUN_PARTS.iter_unpack(data[at:end]):
+            if crc_of(payload, seed) != crc:
+                break
+            keep(payload)
+        count = len(payloads)
+        end = at + count * size
+        hi91s = b"".join(payloads)
+        high_bytes = hi91s[HI91_HIGH_BYTES]
+        if 0x7F in high_bytes or 0xFF in high_bytes:  # `_decode_payload` finds out, at three times the cost
+            for begin in range(at, end, size):
+                self._decode_payload(data, begin, begin + size, events)
+            return end
+        events += decode_hi91_run(hi91s, self.word_is_status, size, len(data) - at - size)
+        ledger = self.ledger
+        ledger.bytes_in_good_frames += end - at
+        ledger.frames_good += count
+        ledger.frames_in_samples += count
+        return end
+
+    def _decode_payload(self, data: bytes, at: int, end: int, events: list[CodecEvent]) -> None:
+        """Decode the sub-packets of a frame whose CRC matches, from `at` to `end` with its header."""
+        ledger = self.ledger
+        found: list[Measurement] = []
+        finite = True
+        begin = at + HEADER.size
+        while begin < end:
+            packet = PACKETS.get(data[begin])
+            if packet is None:
+                ledger.unknown_tags += 1
+                break
+            if begin + packet.size > end:
+                ledger.frames_bad_content += 1
+                ledger.bytes_in_bad_frames += end - at
+                events.append(BadFrame(BadReason.CONTENT, data[at:end]))
+                return
+            measurement, is_finite = packet.decode(data, begin, self.word_is_status, end - at, len(data) - end)
+            finite = finite and is_finite
+            found.append(measurement)
+            begin += packet.size
+        ledger.bytes_in_good_frames += end - at
+        ledger.frames_good += 1
+        if found:
+            ledger.frames_in_samples += 1
+        else:
+            ledger.frames_ignored += 1
+        if not finite:
+            ledger.frames_not_finite += 1
+            events.append(BadFrame(BadReason.NOT_FINITE, data[at:end]))
+        events += found
+
+    def _spend_sync(self, data: bytes, at: int, end: int, reason: BadReason, events: list[CodecEvent]) -> int:
+        """Reject the frame from `at` to its claimed `end`: consume the sync word only."""
+        ledger = self.ledger
+        if reason is BadReason.CRC:
+            ledger.frames_bad_crc += 1
+        else:
+            ledger.frames_bad_length += 1
+        ledger.bytes_in_bad_frames += len(SYNC)
+        self._lines.break_off()
+        self._bad_ahead = max(self._bad_ahead, end)
+        if end <= len(data):
+            self._barred_ahead = max(self._barred_ahead, end)
+        events.append(BadFrame(reason, data[at:end]))
+        return at + len(SYNC)
+
+    def _whole_inside(self) -> int:
+        """Find the begin of the first whole frame in the tail, or the end of a line that the tail ends with; else 0."""
+        tail = self._tail
+        at = tail.find(SYNC, len(SYNC))
+        while at >= 0:
+            if _is_whole(tail, at):
+                return at
+            at = tail.find(SYNC, at + len(SYNC))
+        return len(tail) if _IDLE_LINE.search(tail) else 0
+
+
+def _is_whole(data: bytes, at: int) -> bool:
+    """Whether a frame with a matching CRC begins at `at`."""
+    if len(data) - at < HEADER.size:
+        return False
+    length: int
+    crc: int
+    _, length, crc = HEADER.unpack_from(data, at)
+    begin, end = at + HEADER.size, at + HEADER.size + length
+    if not 1 <= length <= PAYLOAD_BYTES_MAX or end > len(data):
+        return False
+    return crc16_xmodem(data[begin:end], crc16_xmodem(data[at : at + 4], 0)) == crc
+
+
+# --- the device's side ------------------------------------------------------------------------------------------------
+
+
+def encode_frame(payload: bytes) -> bytes:
+    """A frame around `payload`. Raises ValueError for a payload that is empty or above PAYLOAD_BYTES_MAX."""
+    if not 1 <= len(payload) <= PAYLOAD_BYTES_MAX:
+        raise ValueError(f"payload of {len(payload)} bytes: expected 1 … {PAYLOAD_BYTES_MAX}")
+    head = SYNC + len(payload).to_bytes(2, "little")
+    return head + crc16_xmodem(payload, crc16_xmodem(head, 0)).to_bytes(2, "little") + payload
+
+
+_Values = ParamSpec("_Values")
+
+
+def _framed(pack: Callable[_Values, bytes]) -> Callable[_Values, bytes]:
+    def encode(*args: _Values.args, **values: _Values.kwargs) -> bytes:
+        return encode_frame(pack(*args, **values))
+
+    return encode
+
+
+encode_hi91 = _framed(pack_hi91)
+"""A whole HI91 frame from SI values; see `pack_hi91`."""
+encode_hi92 = _framed(pack_hi92)
+"""A whole HI92 frame from SI values; see `pack_hi92`."""

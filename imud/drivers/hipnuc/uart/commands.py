@@ -1,0 +1,534 @@
+r"""ASCII commands of HiPNUC modules (replies: `replies.py`). Manual "IMU配置手冊" V1.5.9, chapter 2 and section 8.2.
+
+    LOG HI91 ONTIME 0.01\r\n   →   OK\r\n        done
+                               →   ERR…\r\n      refused
+                               →   (nothing)     not understood: unknown commands get no reply at all
+    LOG VERSION\r\n            →   PNAME=HI14R3\r\n … OK\r\n
+
+Each function returns a `Request`. Types say what an argument can be; ranges are those of the actions (`actions.py`),
+and what no range can express raises BadArgument here. Settings last until power is off unless `save_config` follows;
+`mounting` takes effect after `save_config` and `reboot`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from enum import Enum, StrEnum
+from typing import Final, Literal, get_args
+
+from imud.attitude.rotation import Matrix3, is_rotation
+from imud.contracts.driver import Identity
+from imud.contracts.script import Outcome, Rejection, Reply, Request, RequestScript, Silence, of_text, pause
+from imud.drivers.hipnuc.common import AttitudeMode, LevelReset
+from imud.drivers.hipnuc.uart.replies import (
+    ComConfig,
+    is_end,
+    is_rejection,
+    is_setting_line,
+    is_version_line,
+    lines_of,
+    parse_comconfig,
+    parse_report,
+    parse_version,
+)
+from imud.model.errors import BadArgument, NoReply, Rejected
+from imud.model.units import BITS_PER_UART_BYTE, NS_PER_S
+
+LINE_END: Final = "\r\n"
+BaudRate = Literal[115200, 921600, 460800, 256000, 230400, 9600]
+BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
+"""Rates of SERIALCONFIG (section 2.2.3) and 230400 of table 3.7; the factory default first."""
+REPLY_TIMEOUT_NS: Final = NS_PER_S // 2
+FLASH_TIMEOUT_NS: Final = 5 * NS_PER_S  # erasing flash can take 2 s and more; the manual gives no time
+
+OutputRate = Literal[0, 1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100, 125, 200, 250, 500, 1000]
+RATES_HZ: Final[tuple[OutputRate, ...]] = get_args(OutputRate)[1:]
+"""Output rates: section 2.2.5 lists some periods "and so on", which is read as every whole rate with a period of whole
+milliseconds, up to table 3.7."""
+LINE_SHARE_MAX: Final = 0.95
+"""Share of the line that frames may take: table 3.7 goes up to 94 % (HI92 with 200 Hz at 115200 baud)."""
+SOUT_DIVIDER_MAX: Final = 64
+PIN_MAX: Final = 9
+ROTATION_TOLERANCE: Final = 1e-3
+"""Tolerance of nine numbers typed with three decimals against a rotation matrix."""
+
+
+class OutputMessage(StrEnum):
+    """Output messages."""
+
+    HI91 = "HI91"
+    """Floats, with device time. `IMU91` is its other name."""
+    HI92 = "HI92"
+    """Integers, without device time."""
+
+
+MAX_RATE_HZ: Final = {
+    OutputMessage.HI91: {9600: 10, 115200: 100, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
+    OutputMessage.HI92: {9600: 10, 115200: 200, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
+}
+"""Highest output rate by baud rate (table 3.7)."""
+FRAME_BYTES: Final = {OutputMessage.HI91: 6 + 76, OutputMessage.HI92: 6 + 48}
+"""Size of a frame with its header (sections 3.1, 3.3)."""
+
+
+class YawMode(Enum):
+    """Meanings of the angle of `yaw`."""
+
+    RELATIVE = 0
+    """Added to the present yaw."""
+    ABSOLUTE = 1
+    """Replaces the present yaw."""
+
+
+class PinFunction(Enum):
+    """Functions of the multi-purpose pins (firmware 1.5.5 and newer), with the pin they have by default."""
+
+    SIN = 1
+    """Input of sync or PPS pulses; IO1."""
+    SOUT = 2
+    """High for 80 µs before each frame; IO2."""
+    LED = 3
+    """IO5."""
+    SOUT_DIV = 4
+    """Every n-th SOUT pulse, see `sout_divider`; IO6."""
+    ALARM = 5
+    """High while an angle is out of range, see `alarm`; IO9."""
+
+
+PinName = Literal["sin", "sout", "led", "sout_div", "alarm"]
+"""Names of `PinFunction`."""
+
+
+class AlarmAxis(StrEnum):
+    """The axis whose angle the alarm watches."""
+
+    X = "X"
+    Y = "Y"
+
+
+class Mounting(Enum):
+    """The nine mountings of section 2.2.4. The value is the URFR matrix, from new sensor axes to the old ones.
+
+    Each is named by the new axis that points up, or down, while the old Z axis does; that is what the third row of the
+    matrix says, and what the manual's words in brackets say. Its "turned by ±90° about Y" has the other sign.
+    """
+
+    LEVEL = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    """Z up, nothing turned: the default."""
+    Y_DOWN = ((1, 0, 0), (0, 0, 1), (0, -1, 0))
+    """Printed as turned by -90° about X: Y down."""
+    Y_UP = ((1, 0, 0), (0, 0, -1), (0, 1, 0))
+    """Printed as turned by 90° about X: Y up."""
+    Z_DOWN = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+    """Turned by 180° about X: Z down, X as before."""
+    X_UP = ((0, 0, -1), (0, 1, 0), (1, 0, 0))
+    """Printed as turned by 90° about Y: X up."""
+    X_DOWN = ((0, 0, 1), (0, 1, 0), (-1, 0, 0))
+    """Printed as turned by -90° about Y: X down."""
+    Z_DOWN_X_BACK = ((-1, 0, 0), (0, 1, 0), (0, 0, -1))
+    """Turned by 180° about Y: Z down, X where -X was."""
+    LEVEL_X_LEFT = ((0, -1, 0), (1, 0, 0), (0, 0, 1))
+    """Turned by 90° about Z: Z up, X where Y was."""
+    LEVEL_X_RIGHT = ((0, 1, 0), (-1, 0, 0), (0, 0, 1))
+    """Turned by -90° about Z: Z up, X where -Y was."""
+
+
+MountingName = Literal[
+    "level", "y_down", "y_up", "z_down", "x_up", "x_down", "z_down_x_back", "level_x_left", "level_x_right"
+]
+"""Names of `Mounting`."""
+
+
+class Query(StrEnum):
+    """Reports that LOG asks for; each reply is lines and then OK."""
+
+    VERSION = "VERSION"
+    USRCONFIG = "USRCONFIG"
+    COMCONFIG = "COMCONFIG"
+    MAGCONFIG = "MAGCONFIG"
+
+
+# --- commands ---------------------------------------------------------------------------------------------------------
+
+
+def reboot() -> Request:
+    """Restart, as by power-on. The module does not answer."""
+    return _command("REBOOT", silent=True)
+
+
+def save_config() -> Request:
+    """Write all settings to flash."""
+    return _command("SAVECONFIG", timeout_ns=FLASH_TIMEOUT_NS)
+
+
+def factory_reset() -> Request:
+    """Restore the factory settings, the baud rate included. When they come into force is not known: `session.py`."""
+    return _command("FRESET", timeout_ns=FLASH_TIMEOUT_NS)
+
+
+def unlog_all() -> Request:
+    """Set the rate of every timed message to 0."""
+    return _command("UNLOGALL")
+
+
+def serial_config(baud: BaudRate) -> Request:
+    """Set the baud rate: at once, even before the answer, or after `save_config` and `reboot` (`session.py`)."""
+    return _command(f"SERIALCONFIG {baud}")
+
+
+def attitude_mode(mode: AttitudeMode) -> Request:
+    """Choose 6-axis or 9-axis (AHRS) mode."""
+    return _command(f"CONFIG ATT MODE {mode.value}")
+
+
+def level_reset(kind: LevelReset) -> Request:
+    """Set or cancel the level."""
+    return _command(f"CONFIG ATT RST {kind.value}")
+
+
+def yaw(mode: YawMode, angle_deg: float) -> Request:
+    """Set yaw, -180° … 180°; lost at power-off."""
+    return _command(f"CONFIG YAW {mode.value} {_text(angle_deg)}")
+
+
+def mounting(matrix: Mounting | Matrix3) -> Request:
+    """Set the rotation from new sensor axes to the old ones (URFR). Raises BadArgument for what is no rotation."""
+    rows: Matrix3 = matrix.value if isinstance(matrix, Mounting) else matrix
+    if [len(row) for row in rows] != [3, 3, 3] or not is_rotation(rows, ROTATION_TOLERANCE):
+        raise BadArgument(
+            f"CONFIG IMU URFR: expected a rotation (three rows of three, orthonormal within {ROTATION_TOLERANCE:g}, "
+            f"determinant +1), got {rows}; a mirrored or scaled axis is not a mounting"
+        )
+    return _command("CONFIG IMU URFR " + ",".join(_text(value) for row in rows for value in row))
+
+
+def magnetic_calibration(enabled: bool) -> Request:
+    """Turn the calibration of the magnetometer in the background on (the default) or off (section 8.2)."""
+    return _command(f"CONFIG IMU EN_MCAL {int(enabled)}")
+
+
+def pin_function(function: PinFunction, pin: int) -> Request:
+    """Give `function` to pin IO1 … IO9. Not every product has every pin."""
+    return _command(f"CONFIG PMUX{function.value} IO{pin}")
+
+
+def alarm(axis: AlarmAxis, min_deg: float, max_deg: float, enabled: bool) -> Request:
+    """Watch the angle of an axis: the alarm pin is high outside `min_deg` … `max_deg`. Raises BadArgument."""
+    name, low, high = "CONFIG PMUX5", _text(min_deg), _text(max_deg)
+    if not min_deg < max_deg:
+        raise BadArgument(f"{name}: expected the minimum below the maximum, got {low}° and {high}°")
+    return _command(f"{name} {axis},{low},{high},0,{int(enabled)}")
+
+
+def sout_divider(divider: int) -> Request:
+    """Divide SOUT pulses by 1 … 64 for the SOUT_DIV pin."""
+    return _command(f"CONFIG PMUX4 DIV{divider}")
+
+
+def log_enable() -> Request:
+    """Send data frames (the default)."""
+    return _command("LOG ENABLE")
+
+
+def log_disable() -> Request:
+    """Send no data frames, whatever their rates."""
+    return _command("LOG DISABLE")
+
+
+def log_ontime(message: OutputMessage, rate_hz: OutputRate) -> Request:
+    """Send `message` at a rate, or not at all (0). Whether the line carries it is for `require_room`."""
+    return _command(f"LOG {message} ONTIME {_text(1 / rate_hz if rate_hz else 0)}")
+
+
+def log_onmark(message: OutputMessage) -> Request:
+    """Send `message` once for each pulse on SIN or `log_once`. Turn timed output off first (`unlog_all`)."""
+    return _command(f"LOG {message} ONMARK 1")
+
+
+def log_once(message: OutputMessage) -> Request:
+    """Send `message` once, as a pulse on SIN would. `log_onmark` comes first."""
+    return _command(f"LOG {message} ONMARK ONCE")
+
+
+def ask(query: Query) -> Request:
+    """Ask for one of the four reports."""
+    is_part = is_version_line if query is Query.VERSION else is_setting_line
+    return _command(f"LOG {query}", is_part=is_part, messages_min=2)
+
+
+def max_rate_hz(message: OutputMessage, baud: int) -> int:
+    """Highest output rate of `message` at `baud` (table 3.7). Raises BadArgument for a rate the table does not have."""
+    rates = MAX_RATE_HZ[message]
+    if baud not in rates:
+        known = ", ".join(map(str, sorted(rates)))
+        raise BadArgument(f"baud rate: expected one of {known}, got {baud!r}")
+    return rates[baud]
+
+
+def require_room(rates_hz: Mapping[OutputMessage, float], baud: int) -> None:
+    """Raise BadArgument where the line does not carry all messages together, or one of them is above table 3.7."""
+    for message, rate_hz in rates_hz.items():
+        if rate_hz > max_rate_hz(message, baud):
+            raise BadArgument(
+                f"{message}: expected at most {max_rate_hz(message, baud)} Hz at {baud} baud, got {rate_hz:g} Hz; "
+                f"set a lower rate or a higher baud rate first"
+            )
+    bits = sum(rate_hz * FRAME_BYTES[message] for message, rate_hz in rates_hz.items()) * BITS_PER_UART_BYTE
+    if bits > LINE_SHARE_MAX * baud:
+        all_rates = " and ".join(f"{message} at {rate_hz:g} Hz" for message, rate_hz in rates_hz.items() if rate_hz)
+        raise BadArgument(
+            f"expected at most {LINE_SHARE_MAX * baud:.0f} bit/s of frames at {baud} baud, got {bits:.0f} bit/s by "
+            f"{all_rates}; set lower rates or a higher baud rate first"
+        )
+
+
+def _never(_line: str) -> bool:
+    return False
+
+
+def _command(
+    text: str,
+    *,
+    timeout_ns: int = REPLY_TIMEOUT_NS,
+    silent: bool = False,
+    is_part: Callable[[str], bool] = _never,
+    messages_min: int = 1,
+) -> Request:
+    payload = (text + LINE_END).encode("ascii")
+    return Request(
+        payload, text, of_text(is_end), of_text(is_rejection), of_text(is_part), timeout_ns, silent, messages_min
+    )
+
+
+def _text(value: float) -> str:
+    """A number as the manual writes it: no exponent, no trailing zeros, no minus before zero."""
+    text = f"{value:.6f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
+
+
+BOOT_NS: Final = NS_PER_S
+"""From REBOOT until it answers; the manual gives no time."""
+BOOT_TRIES: Final = 5
+LOOK_TRIES: Final = 2
+"""Bytes sent at another rate may stand in the module's line buffer and spoil the first question."""
+FACTORY_BAUD: Final = BAUD_RATES[0]
+WAKE_HZ: Final = 100
+"""Output rate as delivered (section 3.2)."""
+
+
+def identify() -> RequestScript[Identity]:
+    """Ask for product, serial number and firmware (LOG VERSION).
+
+    `details` has every value by the device's own name; `firmware` is "1.5.6" for APP_VER=156. A reply without a product
+    has lost bytes, as the first one after a plug can. Raises NoReply, Rejected.
+    """
+    outcome = yield ask(Query.VERSION)
+    lines = _lines(outcome, Query.VERSION)
+    version = parse_version(lines)
+    if not version.product:
+        raise NoReply(f"LOG VERSION: expected PNAME=... and other lines, got {' / '.join(lines)}; bytes were lost")
+    firmware = "" if version.app_ver is None else ".".join(str(version.app_ver))
+    return Identity(version.product, version.uuid, firmware, version.report.values)
+
+
+def read_settings() -> RequestScript[Mapping[str, str]]:
+    """Ask for all settings (LOG USRCONFIG, COMCONFIG, MAGCONFIG) in one mapping, by the device's own names.
+
+    A line without a name is filed as "COMCONFIG 1", "COMCONFIG 2" and so on. A module without magnetometer may not know
+    MAGCONFIG: no answer to that one is no error (a guess, no such module was seen). Raises NoReply, Rejected.
+    """
+    settings: dict[str, str] = {}
+    for query in (Query.USRCONFIG, Query.COMCONFIG, Query.MAGCONFIG):
+        outcome = yield ask(query)
+        if query is Query.MAGCONFIG and isinstance(outcome, Silence | Rejection):
+            break
+        report = parse_report(_lines(outcome, query))
+        settings.update(report.values)
+        settings.update({f"{query} {number}": line for number, line in enumerate(report.other, 1)})
+    return settings
+
+
+def _lines(outcome: Outcome, query: Query) -> tuple[str, ...]:
+    """Lines of a good reply. Raises NoReply or Rejected for another outcome."""
+    if isinstance(outcome, Silence):
+        heard = f"got {len(outcome.lines)} lines and no end" if outcome.lines else "got nothing"
+        raise NoReply(
+            f"LOG {query}: expected lines up to OK, {heard}; "
+            "is the host's transmit line connected, and the baud rate right?"
+        )
+    if isinstance(outcome, Rejection):
+        raise Rejected(f"LOG {query}: the module refused: {' / '.join(outcome.lines)}")
+    return outcome.lines
+
+
+def send(request: Request) -> RequestScript[None]:
+    """Send one command. Raises NoReply (also for a command unknown to this firmware) and Rejected."""
+    outcome = yield request
+    if isinstance(outcome, Silence):
+        raise NoReply(f"{request.name}: expected OK, got nothing; is the host's transmit line connected?")
+    if isinstance(outcome, Rejection):
+        raise Rejected(f"{request.name}: the module refused: {' / '.join(outcome.lines)}")
+
+
+# --- output -----------------------------------------------------------------------------------------------------------
+
+
+def ask_outputs() -> RequestScript[ComConfig | None]:
+    """Ask which messages are sent and when (LOG COMCONFIG); None where the module does not tell that."""
+    outcome = yield ask(Query.COMCONFIG)
+    if not isinstance(outcome, Reply):
+        return None
+    config = parse_comconfig(outcome.lines)
+    return config if config.periods_s or config.on_mark else None
+
+
+def rates_hz(config: ComConfig | None) -> dict[OutputMessage, float]:
+    """Output rates of the messages that have one; messages on mark are sent when they are asked for."""
+    periods_s = config.periods_s if config is not None else {}
+    return {OutputMessage(name): 1 / period_s for name, period_s in periods_s.items() if period_s > 0}
+
+
+def set_output(message: OutputMessage, rate_hz: OutputRate, baud: int) -> RequestScript[None]:
+    """Send a message at a rate, or not at all (0). Raises BadArgument where the line does not carry all messages."""
+    if rate_hz and baud in BAUD_RATES:
+        require_room({message: rate_hz}, baud)
+        present = rates_hz((yield from ask_outputs()))
+        require_room({**present, message: rate_hz}, baud)
+    yield from send(log_ontime(message, rate_hz))
+
+
+def wake() -> RequestScript[bool | None]:
+    """Let frames out (LOG ENABLE) where a message has a rate by the module's own settings.
+
+    Returns whether it acknowledged; None where nothing was changed, because no message has a rate or one is on mark: a
+    module that is set so is meant to be silent. Raises NoReply, Rejected.
+    """
+    config = yield from ask_outputs()
+    if config is None or config.on_mark or not rates_hz(config):
+        return None
+    yield from send(log_enable())
+    return True
+
+
+def why_silent(settings: Mapping[str, str]) -> str:
+    """Say why it answers and sends no samples, from its settings (`read_settings`)."""
+    config = parse_comconfig(lines_of(settings))
+    if rates := rates_hz(config):
+        message, rate_hz = max(rates.items(), key=lambda item: item[1])
+        return f"its output is off (LOG DISABLE), though {message} has {rate_hz:g} Hz"
+    if config.on_mark:
+        return f"{' and '.join(sorted(config.on_mark))} on mark, one for each pulse on SIN"
+    return "no message has a rate" if config.periods_s else "its output is off, or on mark"
+
+
+def wake_by_force(baud: int) -> RequestScript[str]:
+    """Let frames out and, where no message has a rate, send HI91; return what was done. Not saved.
+
+    HI91 is sent with 100 Hz or what the line carries. Raises NoReply, Rejected.
+    """
+    yield from send(log_enable())
+    config = yield from ask_outputs()
+    if config is None:
+        return "LOG ENABLE; it does not tell the rates of its messages: where no sample comes, set one with output"
+    if rates_hz(config):
+        return "LOG ENABLE"
+    rate_hz: OutputRate = 10 if baud == min(BAUD_RATES) else WAKE_HZ
+    yield from send(log_ontime(OutputMessage.HI91, rate_hz))
+    return f"LOG ENABLE; HI91 at {rate_hz} Hz, which is not saved"
+
+
+# --- restart and baud rate --------------------------------------------------------------------------------------------
+
+
+def restart(present_baud: int = 0) -> RequestScript[Identity]:
+    """Restart and wait until it answers. What was not saved is lost, also a baud rate. Raises NoReply."""
+    yield reboot()
+    identity, _ = yield from _found_after_boot([present_baud])
+    return identity
+
+
+def change_baud(baud: BaudRate, present_baud: int) -> RequestScript[int]:
+    """Set the baud rate, save, restart, and follow; return the rate. Saves all other settings too.
+
+    The restart shows that the rate was saved, and puts in force what needs one.
+
+    Raises BadArgument where the line would not carry the present output, NoReply, and Rejected where the module answers
+    at the old rate only; the line is then left there.
+    """
+    require_room(rates_hz((yield from ask_outputs())), baud)
+    outcome = yield serial_config(baud)
+    answered = _is_answer(outcome, f"SERIALCONFIG {baud}")
+    heard = yield from _find((present_baud, baud) if answered else (baud, present_baud))
+    if heard == present_baud != baud and not answered:
+        raise NoReply(f"SERIALCONFIG {baud}: expected OK, got nothing; the module stays at {present_baud} baud")
+    yield from send(save_config())
+    yield reboot()
+    _, heard = yield from _found_after_boot((baud, present_baud))
+    if heard != baud:
+        raise Rejected(f"SERIALCONFIG {baud}: the module stays at {heard} baud")
+    return heard
+
+
+def reset_to_factory(present_baud: int) -> RequestScript[int]:
+    """Restore the factory settings, restart so that they are in force, and follow; return the baud rate.
+
+    Raises NoReply, Rejected.
+    """
+    outcome = yield factory_reset()
+    answered = _is_answer(outcome, "FRESET")
+    heard = yield from _find((present_baud, FACTORY_BAUD) if answered else (FACTORY_BAUD, present_baud))
+    if not answered and heard == present_baud:
+        raise NoReply("FRESET: expected OK, got nothing; read the settings to see whether it was carried out")
+    yield reboot()
+    _, heard = yield from _found_after_boot((FACTORY_BAUD, present_baud))
+    return heard
+
+
+def advice(baud: int, fixed_baud: int) -> str:
+    """Say what to change in a configuration that fixes another baud rate; empty where nothing is to be changed."""
+    if fixed_baud in (0, baud):
+        return ""
+    return f"change `baud: {fixed_baud}` in the configuration to {baud} or auto: imud uses it at its next start"
+
+
+def _is_answer(outcome: Outcome, name: str) -> bool:
+    """Whether the module answered well. Raises Rejected."""
+    if isinstance(outcome, Rejection):
+        raise Rejected(f"{name}: the module refused: {' / '.join(outcome.lines)}")
+    return isinstance(outcome, Reply)
+
+
+def _find(bauds: Sequence[int]) -> RequestScript[int]:
+    """Return the first of some rates at which it answers; the line stays there. Raises NoReply, at the first one."""
+    for baud in dict.fromkeys(bauds):
+        yield pause(0, baud=baud)
+        if (yield from _answers(LOOK_TRIES)) is not None:
+            return baud
+    yield pause(0, baud=bauds[0])
+    rates = " or ".join(str(baud) for baud in dict.fromkeys(bauds))
+    raise NoReply(f"LOG VERSION: expected an answer at {rates} baud, got nothing; `baud: auto` tries all rates")
+
+
+def _found_after_boot(bauds: Sequence[int]) -> RequestScript[tuple[Identity, int]]:
+    """Ask until it answers after a restart, at the likely rates first, then at all others. Raises NoReply.
+
+    A rate that was in force without being saved is lost by a restart, and which was saved is not known.
+    """
+    yield pause(BOOT_NS)  # at the present rate: REBOOT may still be on its way out of the port
+    likely = dict.fromkeys(bauds)
+    others = [baud for baud in BAUD_RATES if baud not in likely] if bauds[0] else []
+    for baud in (*likely, *others):
+        yield pause(0, baud=baud)
+        identity = yield from _answers(BOOT_TRIES if baud in likely else LOOK_TRIES)
+        if identity is not None:
+            return identity, baud
+    yield pause(0, baud=bauds[0])
+    raise NoReply("LOG VERSION: expected an answer after the restart, got nothing at any baud rate")
+
+
+def _answers(tries: int) -> RequestScript[Identity | None]:
+    """Ask for the identity some times; None for no answer."""
+    for _ in range(tries):
+        try:
+            return (yield from identify())
+        except (NoReply, Rejected):
+            continue
+    return None

@@ -1,0 +1,349 @@
+"""Table: the row `DRIVER` of HiPNUC modules on a UART."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from random import Random
+from typing import Annotated, Any, Final, Literal
+
+from msgspec import Meta
+
+from imud.attitude.rotation import euler312_from_quat, quat_normalized
+from imud.contracts.codec import StreamCodec
+from imud.contracts.command import (
+    YAW_ZERO,
+    Action,
+    Actions,
+    Calibration,
+    Calibrations,
+    Handling,
+    Kept,
+    Risk,
+    Target,
+    Verdict,
+)
+from imud.contracts.driver import Identity, StreamDriver
+from imud.contracts.script import Rejection, Request, RequestScript, Silence
+from imud.drivers.hipnuc.common import (
+    FLOATS,
+    MAIN_STATUS,
+    NINE_AXES_NEEDED,
+    AttitudeMode,
+    LevelReset,
+    heading_by_mode,
+    levels,
+    magnetometer,
+)
+from imud.drivers.hipnuc.uart import commands
+from imud.drivers.hipnuc.uart import commands as session
+from imud.drivers.hipnuc.uart.codec import (
+    HEADER,
+    PPS_STAMP_MODULUS_MS,
+    TIME_BITS,
+    HipnucCodec,
+    HipnucSettings,
+    encode_frame,
+    encode_hi91,
+    encode_hi92,
+)
+from imud.drivers.hipnuc.uart.commands import (
+    BAUD_RATES,
+    PIN_MAX,
+    SOUT_DIVIDER_MAX,
+    AlarmAxis,
+    BaudRate,
+    Mounting,
+    MountingName,
+    OutputMessage,
+    OutputRate,
+    PinFunction,
+    PinName,
+    Query,
+    YawMode,
+    ask,
+    identify,
+    read_settings,
+    send,
+    wake,
+    why_silent,
+)
+from imud.drivers.hipnuc.uart.replies import parse_magconfig
+from imud.drivers.hipnuc.uart.settings import (
+    SETTINGS,
+    alarm_ranges,
+    declared_line_differences,
+    line_differences,
+    message_limits,
+    shown,
+)
+from imud.model.errors import NoReply, Rejected
+from imud.model.units import NS_PER_MS
+
+Message = Annotated[OutputMessage, Meta(extra={"section": "2.2.5"})]
+Degrees = Annotated[float, Meta(ge=-180, le=180, extra={"unit": "°", "section": "2.2.4"})]
+Enabled = Annotated[bool, Meta(extra={"section": "2.2.4"})]
+
+_MOUNTINGS: Final = {mounting.name.lower(): mounting for mounting in Mounting}
+
+
+def _simple(words: str, make: Callable[[], Request], risk: Risk = Risk.NONE) -> Action:
+    """An action without arguments that is one command."""
+    return Action(words, lambda _target: send(make()), risk)
+
+
+def _restart(target: Target) -> RequestScript[Identity]:
+    return session.restart(target.baud)
+
+
+def _factory_reset(target: Target) -> RequestScript[dict[str, int | str]]:
+    return _followed(target, session.reset_to_factory(target.baud))
+
+
+def _followed(target: Target, script: RequestScript[int]) -> RequestScript[dict[str, int | str]]:
+    """Answer the baud rate at which the module is now, and what to change in the configuration."""
+    baud = yield from script
+    answer: dict[str, int | str] = {"baud": baud}
+    if advice := session.advice(baud, target.fixed_baud):
+        answer["configuration"] = advice
+    return answer
+
+
+def _wake(target: Target) -> RequestScript[str]:
+    return session.wake_by_force(target.baud)
+
+
+def _baud(
+    target: Target,
+    *,
+    baud: Annotated[BaudRate, Meta(description="rate of the line", extra={"unit": "bit/s", "section": "2.2.3"})],
+) -> RequestScript[dict[str, int | str]]:
+    return _followed(target, session.change_baud(baud, target.baud))
+
+
+def _output(
+    target: Target,
+    *,
+    message: Message,
+    rate_hz: Annotated[
+        OutputRate, Meta(description="output rate, 0 for off", extra={"unit": "Hz", "section": "2.2.5"})
+    ],
+) -> RequestScript[None]:
+    return session.set_output(message, rate_hz, target.baud)
+
+
+def _output_on_mark(_target: Target, *, message: Message) -> RequestScript[None]:
+    return send(commands.log_onmark(message))
+
+
+def _output_once(_target: Target, *, message: Message) -> RequestScript[None]:
+    return send(commands.log_once(message))
+
+
+def _output_enabled(_target: Target, *, enabled: Enabled) -> RequestScript[None]:
+    return send(commands.log_enable() if enabled else commands.log_disable())
+
+
+def _mode(_target: Target, *, axes: Annotated[Literal[6, 9], Meta(extra={"section": "2.2.4"})]) -> RequestScript[None]:
+    return send(commands.attitude_mode(AttitudeMode.NINE_AXIS if axes == 9 else AttitudeMode.SIX_AXIS))
+
+
+def _level(
+    _target: Target,
+    *,
+    level: Annotated[Literal["relative", "automatic", "cancel"], Meta(extra={"section": "2.2.4"})],
+) -> RequestScript[None]:
+    return send(commands.level_reset(LevelReset[level.upper()]))
+
+
+def _yaw(
+    _target: Target,
+    *,
+    angle_deg: Degrees,
+    relative: Annotated[bool, Meta(description="add it to the present one")] = False,
+) -> RequestScript[None]:
+    return send(commands.yaw(YawMode.RELATIVE if relative else YawMode.ABSOLUTE, angle_deg))
+
+
+def _mounting(
+    _target: Target,
+    *,
+    turned: Annotated[
+        MountingName | Annotated[list[float], Meta(min_length=9, max_length=9)],
+        Meta(
+            description="new axis that points up or down where Z pointed up, or the nine numbers C00 … C22 of URFR",
+            extra={"section": "2.2.4"},
+        ),
+    ],
+) -> RequestScript[None]:
+    if isinstance(turned, str):
+        return send(commands.mounting(_MOUNTINGS[turned]))
+    a, b, c, d, e, f, g, h, i = turned
+    return send(commands.mounting(((a, b, c), (d, e, f), (g, h, i))))
+
+
+def _magnetic_calibration(_target: Target, *, enabled: Enabled) -> RequestScript[None]:
+    return send(commands.magnetic_calibration(enabled))
+
+
+def _pin(
+    _target: Target,
+    *,
+    function: Annotated[PinName, Meta(extra={"section": "2.2.4"})],
+    pin: Annotated[int, Meta(ge=1, le=PIN_MAX, description="1 for IO1, and so on", extra={"section": "2.2.4"})],
+) -> RequestScript[None]:
+    return send(commands.pin_function(PinFunction[function.upper()], pin))
+
+
+def _alarm(
+    _target: Target, *, axis: AlarmAxis, min_deg: Degrees, max_deg: Degrees, enabled: Enabled = True
+) -> RequestScript[None]:
+    return send(commands.alarm(axis, min_deg, max_deg, enabled))
+
+
+def _sout_divider(
+    _target: Target, *, divisor: Annotated[int, Meta(ge=1, le=SOUT_DIVIDER_MAX, extra={"section": "2.2.4"})]
+) -> RequestScript[None]:
+    return send(commands.sout_divider(divisor))
+
+
+ACTIONS: Final[Actions] = {
+    "save": replace(_simple("write all settings to flash", commands.save_config), saves=True),
+    "restart": Action("restart it and wait until it answers; what was not saved is lost", _restart),
+    "factory_reset": Action(
+        "factory settings, the baud rate (115200) included: restart it, so that they are in force, and follow",
+        _factory_reset,
+        Risk.RESET,
+    ),
+    "wake": Action(
+        "let frames out, and send HI91 where no message has a rate, also in place of output on mark; not saved", _wake
+    ),
+    "baud": Action("set the baud rate, save, restart and follow", _baud, Risk.CONNECTION, saves=True),
+    "output": Action("send a message by itself at a rate, or not at all (0)", _output),
+    "output_on_mark": Action("send a message for each pulse on SIN", _output_on_mark),
+    "output_once": Action("send a message once, as a pulse on SIN would", _output_once),
+    "output_none": _simple("send nothing by itself", commands.unlog_all),
+    "output_enabled": Action("let frames out, or none whatever their rates", _output_enabled),
+    "mode": Action("6 axes, or 9 with the magnetometer", _mode),
+    "level": Action("make the present pitch and roll zero, level when nearly level, or cancel; at rest only", _level),
+    "yaw": Action("set the heading; lost at power-off", _yaw),
+    "mounting": Action("how the module is mounted; needs save and restart", _mounting),
+    "magnetic_calibration": Action("calibrate the magnetometer in the background", _magnetic_calibration),
+    "pin": Action("give a function to a pin", _pin),
+    "alarm": Action("watch an angle with the alarm pin", _alarm),
+    "sout_divider": Action("divide SOUT for SOUT_DIV", _sout_divider),
+}
+
+
+def _nine_axes_needed(_target: Target) -> RequestScript[str]:
+    settings = yield from read_settings()
+    if settings.get("ATT_MODE") == "0":
+        return f"{NINE_AXES_NEEDED}: action mode, axes=9"
+    return ""
+
+
+def _start_magnetometer(_target: Target) -> RequestScript[None]:
+    return send(commands.magnetic_calibration(enabled=True))
+
+
+def _magnetometer_verdict(_target: Target) -> RequestScript[Verdict]:
+    """Ask for the bias of the magnetometer. Raises NoReply, Rejected."""
+    outcome = yield ask(Query.MAGCONFIG)
+    if isinstance(outcome, Silence):
+        raise NoReply("LOG MAGCONFIG: expected lines up to OK, got nothing; has the module a magnetometer?")
+    if isinstance(outcome, Rejection):
+        raise Rejected(f"LOG MAGCONFIG: the module refused: {' / '.join(outcome.lines)}")
+    bias = parse_magconfig(outcome.lines).bias_ut
+    if bias is None:
+        return Verdict(done=False, words="it does not tell its bias")
+    words = "bias " + ", ".join(f"{value:g}" for value in bias) + " µT"
+    return Verdict(done=any(bias), words=words)
+
+
+def _keep_magnetometer(_target: Target) -> RequestScript[None]:
+    yield from send(commands.magnetic_calibration(enabled=False))
+    yield from send(commands.save_config())
+
+
+def _save(_target: Target) -> RequestScript[None]:
+    return send(commands.save_config())
+
+
+_MAGNETOMETER: Final = magnetometer(_start_magnetometer, _magnetometer_verdict, _nine_axes_needed)
+
+CALIBRATIONS: Final[Calibrations] = {
+    "magnetometer": _MAGNETOMETER,
+    "magnetometer_once": replace(
+        _MAGNETOMETER,
+        help="the same, and with `save` no further calibration in the background",
+        section="8.2",
+        kept=Kept.BY_SAVE,
+        save=_keep_magnetometer,
+    ),
+    **levels("2.2.4", 5, lambda kind: lambda _target: send(commands.level_reset(kind)), _save),
+    "heading": Calibration(
+        help="make the present heading zero",
+        section="2.2.4",
+        handling=Handling.REST,
+        instructions=("Point the module to where its heading is to be zero, and do not touch it.",),
+        begin=lambda _target: send(commands.yaw(YawMode.ABSOLUTE, 0.0)),
+        expected=(YAW_ZERO,),
+        kept=Kept.NEVER,
+    ),
+}
+
+
+def _example_frame(random: Random) -> bytes:
+    """HI91 or HI92 with random values; one in four carries both."""
+    quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
+    common: Mapping[str, Any] = {
+        "accel_m_s2": (random.gauss(0, 5), random.gauss(0, 5), random.gauss(9.8, 5)),
+        "gyro_rad_s": (random.gauss(0, 2), random.gauss(0, 2), random.gauss(0, 2)),
+        "mag_t": (random.gauss(0, 5e-5), random.gauss(0, 5e-5), random.gauss(0, 5e-5)),
+        "quat_wxyz": quat,
+        "euler_rad": euler312_from_quat(quat),
+        "temperature_c": random.uniform(-40, 85),
+        "pressure_pa": random.uniform(80_000, 110_000),
+    }
+    word = random.randrange(PPS_STAMP_MODULUS_MS)
+    floats = encode_hi91(system_time_ms=random.randrange(2**32), word_1_2=word, **common)
+    integers = encode_hi92(pps_stamp_ms=word, status=random.randrange(2**16), **common)
+    both = encode_frame(floats[HEADER.size :] + integers[HEADER.size :])
+    return random.choice((floats, floats, integers, both))
+
+
+def _apply_identity(codec: StreamCodec, identity: Identity) -> None:
+    version = (identity.details or {}).get("APP_VER", "")
+    if isinstance(codec, HipnucCodec) and version.isdecimal():
+        codec.learn_app_ver(int(version))
+
+
+DRIVER: Final = StreamDriver(
+    name="hipnuc-uart",
+    title="HiPNUC CH0x0, CH10x, HI14 (UART, RS-232, USB)",
+    baud_rates=BAUD_RATES,
+    settings=HipnucSettings,
+    make_codec=HipnucCodec,
+    tick_ns=NS_PER_MS,
+    tick_modulus=2**32,
+    stamp_modulus=PPS_STAMP_MODULUS_MS,
+    euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",
+    navigation_frame="ENU",
+    heading=heading_by_mode,
+    lines=frozenset({"sout", "sout_div", "sin", "alarm", "pps"}),
+    alarm_ranges=alarm_ranges,
+    time_bits=TIME_BITS,
+    status_bits=MAIN_STATUS,
+    data_sheet=FLOATS,
+    shown_settings=shown,
+    line_differences=line_differences,
+    declared_line_differences=declared_line_differences,
+    limits=message_limits,
+    actions=ACTIONS,
+    device_settings=SETTINGS,
+    calibrations=CALIBRATIONS,
+    identify=identify,
+    read_settings=read_settings,
+    apply_identity=_apply_identity,
+    wake=wake,
+    why_silent=why_silent,
+    example_frame=_example_frame,
+)

@@ -1,0 +1,294 @@
+"""Replies of HiPNUC modules to ASCII commands: kinds of lines, and the four reports of LOG as records.
+
+Manual "IMU配置手冊" V1.5.9 sections 2.2.5 and 8.1.1, which show one line of USRCONFIG and one of MAGCONFIG; LOG VERSION
+as modules with firmware 1.5.6 answer it:
+
+    PNAME=HI14R3 | BUILD=Oct 15 2024 | UUID=043995698D6E1708 | APP_VER=156 | BL_VER=109 | OK
+    ATT_MODE: 0  | …                                                                    | OK
+    …            | MB=14.14, -2.08, -8.75                                               | OK
+
+The rest is not documented, so every line is kept: NAME=VALUE and NAME: VALUE by name, others as they came.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import Final
+
+from imud.attitude.rotation import Matrix3
+from imud.contracts.script import TextLine
+from imud.model.ledger import Ledger
+from imud.model.sample import Vector3
+
+_VERSION_NAMES: Final = ("PNAME", "BUILD", "UUID", "APP_VER", "BL_VER")
+_VALUE_LINE: Final = re.compile(r"\s*([A-Za-z][A-Za-z0-9_.\-]*)\s*[=:]\s*(.*?)\s*")
+_COMMENT: Final = re.compile(r"\s*/\*.*?(\*/|$)")
+_OUTPUT: Final = re.compile(r"\b(?:IMU|HI)(91|92)\s+(?:COM\d+\s+)?ONTIME\s+(\d+(?:\.\d*)?|\.\d+)")
+_MARKED: Final = re.compile(r"\b(?:IMU|HI)(91|92)\s+(?:COM\d+\s+)?ONMARK\s+1\b")
+_PIN: Final = re.compile(r"IO([1-9])\b")
+_DIVISOR: Final = re.compile(r"(?:.*\bDIV)?\s*(\d{1,2})\b")
+
+
+def is_end(line: str) -> bool:
+    """Whether `line` ends a reply well."""
+    return line.strip() == "OK"
+
+
+def is_rejection(line: str) -> bool:
+    """Whether `line` is a refusal: ERR with any text, but not a setting whose name begins with it."""
+    return line.startswith("ERR") and "=" not in line
+
+
+def is_version_line(line: str) -> bool:
+    """Whether `line` can be part of the reply to LOG VERSION."""
+    match = _VALUE_LINE.fullmatch(line)
+    return match is not None and match[1] in _VERSION_NAMES
+
+
+def is_setting_line(line: str) -> bool:
+    """Whether `line` can be part of another report. Their form is not documented: anything but a version line."""
+    return not is_version_line(line)
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A reply split into lines by name, as far as its form is known."""
+
+    values: Mapping[str, str]
+    """Values by the device's own names."""
+    other: tuple[str, ...]
+    """Lines of another form, as they came."""
+
+
+@dataclass(frozen=True, slots=True)
+class Version:
+    """Reply to LOG VERSION. Fields are empty or None where the device sends none."""
+
+    product: str
+    build: str
+    uuid: str
+    app_ver: int | None
+    """156 for firmware 1.5.6."""
+    bl_ver: int | None
+    """Version of the boot loader."""
+    report: Report
+
+
+@dataclass(frozen=True, slots=True)
+class UserConfig:
+    """Reply to LOG USRCONFIG."""
+
+    att_mode: int | None
+    """0: 6-axis, 1: 9-axis."""
+    urfr: Matrix3 | None
+    """Rotation from new sensor axes to the old ones."""
+    magnetic_calibration: bool | None
+    """Whether calibration runs in the background (EN_MCAL)."""
+    pins: Mapping[int, int]
+    """Pin (1 for IO1) by the number of its function (1 for PMUX1)."""
+    sout_divisor: int | None
+    report: Report
+
+
+@dataclass(frozen=True, slots=True)
+class ComConfig:
+    """Reply to LOG COMCONFIG. Its form is in no source: output periods are looked for as the command writes them."""
+
+    periods_s: Mapping[str, float]
+    """Output periods by message (`HI91`, `HI92`); 0 is off."""
+    on_mark: frozenset[str]
+    """Messages that are sent for each pulse on SIN."""
+    baud: int | None
+    report: Report
+
+
+@dataclass(frozen=True, slots=True)
+class MagConfig:
+    """Reply to LOG MAGCONFIG."""
+
+    bias_ut: Vector3 | None
+    """Offset that calibration found (`MB`), in µT; all zero means not calibrated."""
+    report: Report
+
+
+def parse_report(lines: Sequence[str]) -> Report:
+    """Parse the lines of a reply by name; the end line and comments (`/* … */`) are left out."""
+    values: dict[str, str] = {}
+    other: list[str] = []
+    for line in lines:
+        match = _VALUE_LINE.fullmatch(_COMMENT.sub("", line))
+        if is_end(line):
+            continue
+        if match and match[1] not in values:
+            values[match[1]] = match[2]
+        else:
+            other.append(line)
+    return Report(values, tuple(other))
+
+
+def lines_of(values: Mapping[str, str]) -> list[str]:
+    """Return settings as one flat mapping (`session.read_settings`) in lines again, for the functions below."""
+    return [text if name.startswith("COMCONFIG ") else f"{name}: {text}" for name, text in values.items()]
+
+
+def parse_version(lines: Sequence[str]) -> Version:
+    """Parse the reply to LOG VERSION."""
+    report = parse_report(lines)
+    get = report.values.get
+    return Version(
+        get("PNAME", ""), get("BUILD", ""), get("UUID", ""), _whole(get("APP_VER")), _whole(get("BL_VER")), report
+    )
+
+
+def parse_usrconfig(lines: Sequence[str]) -> UserConfig:
+    """Parse the reply to LOG USRCONFIG."""
+    report = parse_report(lines)
+    get = report.values.get
+    pins = {number: _PIN.match(get(f"PMUX{number}", "")) for number in range(1, 6)}
+    divisor = _DIVISOR.match(get("SOUT_DIV", ""))
+    calibrates = _whole(get("EN_MCAL"))
+    return UserConfig(
+        _whole(get("ATT_MODE")),
+        _matrix(get("URFR", "")),
+        None if calibrates is None else calibrates != 0,
+        {number: int(pin[1]) for number, pin in pins.items() if pin},
+        int(divisor[1]) if divisor else None,
+        report,
+    )
+
+
+def parse_comconfig(lines: Sequence[str]) -> ComConfig:
+    """Parse the reply to LOG COMCONFIG."""
+    periods_s = {f"HI{message}": float(period) for line in lines for message, period in _OUTPUT.findall(line)}
+    on_mark = frozenset(f"HI{message}" for line in lines for message in _MARKED.findall(line))
+    report = parse_report(lines)
+    return ComConfig(periods_s, on_mark, _whole(report.values.get("BAUD")), report)
+
+
+def parse_magconfig(lines: Sequence[str]) -> MagConfig:
+    """Parse the reply to LOG MAGCONFIG."""
+    report = parse_report(lines)
+    return MagConfig(_vector(report.values.get("MB", "")), report)
+
+
+def _whole(text: str | None) -> int | None:
+    return int(text) if text is not None and text.isdecimal() else None
+
+
+def _numbers(text: str, count: int) -> tuple[float, ...] | None:
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        return None
+    return numbers if len(numbers) == count and all(map(isfinite, numbers)) else None
+
+
+def _vector(text: str) -> Vector3 | None:
+    numbers = _numbers(text, 3)
+    return None if numbers is None else (numbers[0], numbers[1], numbers[2])
+
+
+def _matrix(text: str) -> Matrix3 | None:
+    numbers = _numbers(text, 9)
+    if numbers is None:
+        return None
+    a, b, c, d, e, f, g, h, i = numbers
+    return ((a, b, c), (d, e, f), (g, h, i))
+
+
+LINE_CHARACTERS_MAX: Final = 255
+"""Longest line, without its end: replies of the manual are below 80. More means that the line end was lost."""
+
+_PRINTABLE: Final = bytes([0x09, *range(0x20, 0x7F)])
+
+
+class LineFinder:
+    """Finder of text lines across reads and frames; counts every byte in the ledger: good, bad, skipped, or pending.
+
+    What looks like a line inside a damaged frame is none: its first characters may be the frame's last bytes.
+    Synchronization: one thread. Holds at most LINE_CHARACTERS_MAX + 1 bytes.
+    """
+
+    def __init__(self, ledger: Ledger) -> None:
+        self._ledger = ledger
+        self._held = b""
+        """Printable characters without a line end yet, with the CR that may belong to it."""
+        self._held_bad = 0
+        """Number of the held bytes, from the first on, that lie inside a damaged frame's claimed length."""
+        self._held_barred = 0
+        """Number of these that lie inside a damaged frame that came whole."""
+        self._overlong = False
+        """The line is longer than allowed: it is dropped up to its end."""
+
+    @property
+    def pending_bytes(self) -> int:
+        """Bytes held for a line that has not ended."""
+        return len(self._held)
+
+    def add(self, data: bytes, bad: int, barred: int) -> list[TextLine]:
+        """Add bytes that belong to no frame; return whole lines.
+
+        The first `bad` of them are inside a damaged frame, the first `barred` inside one that came whole.
+        """
+        lines: list[TextLine] = []
+        start = 0
+        while (feed := data.find(b"\n", start)) >= 0:
+            self._extend(data[start:feed], max(bad - start, 0), max(barred - start, 0))
+            self._end(bad > feed, barred > feed, lines)
+            start = feed + 1
+        if start < len(data):
+            self._extend(data[start:], max(bad - start, 0), max(barred - start, 0))
+        return lines
+
+    def break_off(self) -> None:
+        """Drop the incomplete line: bytes other than text followed."""
+        self._drop(len(self._held))
+        self._overlong = False
+
+    def clear(self) -> None:
+        """Skip the held bytes: the stream broke."""
+        self._held_bad = self._held_barred = 0
+        self.break_off()
+
+    def _extend(self, part: bytes, bad: int, barred: int) -> None:
+        """Append `part`, which has no LF, and keep the printable characters after the last other byte."""
+        self._held_bad += min(bad, len(part))
+        self._held_barred += min(barred, len(part))
+        held = self._held = self._held + part
+        returned = held.endswith(b"\r")
+        body = held[:-1] if returned else held
+        characters = len(body) - len(body.rstrip(_PRINTABLE))
+        if characters < len(body):
+            self._overlong = False
+            self._drop(len(body) - characters)
+        if characters > LINE_CHARACTERS_MAX:
+            self._overlong = True
+        if self._overlong:
+            self._drop(characters)
+
+    def _end(self, bad: bool, barred: bool, lines: list[TextLine]) -> None:
+        """Finish a line at its LF; `bad`: that lies inside a damaged frame, `barred`: inside one that came whole."""
+        ledger = self._ledger
+        text = self._held.removesuffix(b"\r")
+        if text and not (self._overlong or barred or self._held_barred):
+            lines.append(TextLine(text.decode("ascii")))
+            ledger.bytes_in_good_frames += len(self._held) + 1
+            ledger.frames_good += 1
+            ledger.frames_in_replies += 1
+            self._held, self._held_bad = b"", 0
+            return
+        self.break_off()
+        if bad:
+            ledger.bytes_in_bad_frames += 1
+        else:
+            ledger.bytes_skipped += 1
+
+    def _drop(self, count: int) -> None:
+        """Drop the first `count` bytes held."""
+        bad = min(count, self._held_bad)
+        self._ledger.bytes_in_bad_frames += bad
+        self._ledger.bytes_skipped += count - bad
+        self._held_bad -= bad
+        self._held_barred -= min(count, self._held_barred)
+        self._held = self._held[count:]

@@ -1,0 +1,430 @@
+"""Settings that a HiPNUC module on a UART keeps itself: manual "IMU配置手冊" V1.5.9, chapter 2 and section 8.2.
+
+They are read from LOG USRCONFIG, COMCONFIG and MAGCONFIG (`replies.py`). The manual shows one line of each report, so
+a value in a form that is not known counts as not reported. `values_of` returns what is known by name, `shown` the same
+in words.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Final, Literal, get_args
+
+import msgspec
+from msgspec import Meta
+
+from imud.attitude.rotation import Matrix3
+from imud.contracts.command import Target
+from imud.contracts.lines import AlarmRange, AlarmRanges, DeviceLines
+from imud.contracts.script import RequestScript
+from imud.contracts.setting import DeviceSettings, Effect, Setting
+from imud.drivers.hipnuc.common import AttitudeMode
+from imud.drivers.hipnuc.uart import commands
+from imud.drivers.hipnuc.uart import commands as session
+from imud.drivers.hipnuc.uart.commands import (
+    BAUD_RATES,
+    MAX_RATE_HZ,
+    PIN_MAX,
+    ROTATION_TOLERANCE,
+    SOUT_DIVIDER_MAX,
+    AlarmAxis,
+    BaudRate,
+    Mounting,
+    MountingName,
+    OutputMessage,
+    OutputRate,
+    PinFunction,
+    PinName,
+    send,
+)
+from imud.drivers.hipnuc.uart.replies import lines_of, parse_comconfig, parse_magconfig, parse_usrconfig
+from imud.model.errors import BadArgument
+from imud.model.options import Settings
+
+PIN_SETTING: Final = "PMUX5"
+"""Selects what the pin does."""
+MOUNTING_SETTING: Final = "URFR"
+"""Rotates the sensor frame, and with it the axes X and Y."""
+EULER_INDEX: Final = {"X": 1, "Y": 0}
+
+_NUMBER = r"[-+]?[0-9]+(?:\.[0-9]*)?"
+_NAME: Final = re.compile(rf"(?:{PIN_SETTING}|.*ALARM)(?:[_ ]?([XY]))?", re.IGNORECASE)
+_VALUES: Final = re.compile(
+    rf"(?:([XY])\s*,\s*)?({_NUMBER})\s*,\s*({_NUMBER})\s*,\s*{_NUMBER}\s*,\s*([01])", re.IGNORECASE
+)
+
+
+def alarm_ranges(settings: Mapping[str, str]) -> AlarmRanges:
+    """Read the ranges from the device's settings; an axis that they do not give is missing."""
+    by_axis: dict[str, AlarmRange] = {}
+    for name, value in settings.items():
+        named, values = _NAME.fullmatch(name.strip()), _VALUES.fullmatch(value.strip())
+        if not named or not values:
+            continue
+        axis = (values[1] or named[1] or "").upper()
+        if axis:
+            by_axis[axis] = AlarmRange(EULER_INDEX[axis], float(values[2]), float(values[3]), values[4] == "1")
+    return AlarmRanges(by_axis, PIN_SETTING, MOUNTING_SETTING)
+
+
+ON_MARK: Final = "on_mark"
+MessageName = Literal["hi91", "hi92"]
+Output = dict[MessageName, OutputRate | Literal["on_mark"]]
+Modes = Literal["6-axis", "9-axis"]
+Axis = Literal["x", "y"]
+Pin = Annotated[int, Meta(ge=1, le=PIN_MAX)]
+Angle = Annotated[float, Meta(ge=-180, le=180, extra={"unit": "°"})]
+
+
+class AngleAlarm(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Range of one angle; the alarm pin is high outside of it."""
+
+    min_deg: Angle
+    max_deg: Angle
+    enabled: bool = True
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def values_of(raw: Mapping[str, str]) -> dict[str, Any]:
+    """Return the settings by name from the module's own words (`session.read_settings`); absent where not reported."""
+    lines = lines_of(raw)
+    user, com, mag = parse_usrconfig(lines), parse_comconfig(lines), parse_magconfig(lines)
+    rates = {name.lower(): _whole_rate(period_s) for name, period_s in com.periods_s.items()}
+    alarms = {
+        axis.lower(): AngleAlarm(min_deg=one.low_deg, max_deg=one.high_deg, enabled=one.enabled)
+        for axis, one in alarm_ranges(raw).by_axis.items()
+    }
+    reported: dict[str, Any] = {
+        "output": {**rates, **{name.lower(): ON_MARK for name in com.on_mark}} or None,
+        "mode": {0: "6-axis", 1: "9-axis"}.get(-1 if user.att_mode is None else user.att_mode),
+        "mounting": None if user.urfr is None else _mounting_name(user.urfr),
+        "magnetic_calibration": user.magnetic_calibration,
+        "pins": {PinFunction(number).name.lower(): pin for number, pin in user.pins.items()} or None,
+        "sout_divisor": user.sout_divisor,
+        "alarm": alarms or None,
+        "magnetometer_bias": None if mag.bias_ut is None else list(mag.bias_ut),
+        "baud": com.baud if com.baud in BAUD_RATES else None,
+    }
+    return {name: value for name, value in reported.items() if value is not None}
+
+
+def shown(raw: Mapping[str, str]) -> dict[str, str]:
+    """Return the settings by name, in words with units; what is not known keeps the module's own name and text."""
+    return {name: text for name, text in _words(raw) if text} | _unknown(raw)
+
+
+def _words(raw: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    for name, value in values_of(raw).items():
+        match name, value:
+            case "output", dict():
+                yield from ((f"output.{message}", _rate_words(rate)) for message, rate in sorted(value.items()))
+            case "pins", dict():
+                yield from ((f"pins.{function}", f"IO{pin}") for function, pin in value.items())
+            case "alarm", dict():
+                yield from ((f"alarm.{axis}", _alarm_words(alarm)) for axis, alarm in value.items())
+            case "magnetometer_bias", [x, y, z]:
+                yield name, f"{x:g}, {y:g}, {z:g} µT" if any(value) else "0, 0, 0 µT: not calibrated"
+            case "baud", int():
+                yield name, f"{value} bit/s"
+            case "mounting", list():
+                yield name, ", ".join(f"{number:g}" for number in value)
+            case _:
+                yield name, {True: "on", False: "off"}.get(value, str(value)) if isinstance(value, bool) else str(value)
+
+
+def _unknown(raw: Mapping[str, str]) -> dict[str, str]:
+    """Lines of the module that say nothing that is known."""
+    known = values_of(raw)
+    return {name: text for name, text in raw.items() if values_of({k: v for k, v in raw.items() if k != name}) == known}
+
+
+def _rate_words(rate: object) -> str:
+    return "on mark" if rate == ON_MARK else f"{rate:g} Hz" if rate else "off"
+
+
+def _alarm_words(alarm: AngleAlarm) -> str:
+    return f"{alarm.min_deg:g}° … {alarm.max_deg:g}°, {'on' if alarm.enabled else 'off'}"
+
+
+def _whole_rate(period_s: float) -> float:
+    """Return the rate of a period, as a whole number where it is one."""
+    rate_hz = round(1 / period_s, 3) if period_s else 0
+    return int(rate_hz) if rate_hz == int(rate_hz) else rate_hz
+
+
+def _mounting_name(urfr: Matrix3) -> str | list[float]:
+    """Return the name of a mounting, or its nine numbers where it has none."""
+    numbers = [value for row in urfr for value in row]
+    return next((one.name.lower() for one in Mounting if _near(_numbers(one), numbers)), numbers)
+
+
+def _numbers(mounting: Mounting) -> list[float]:
+    return [float(value) for row in mounting.value for value in row]
+
+
+def _near(one: list[float], other: list[float]) -> bool:
+    return len(one) == len(other) and all(abs(a - b) <= ROTATION_TOLERANCE for a, b in zip(one, other, strict=True))
+
+
+def _read(_target: Target) -> RequestScript[dict[str, Any]]:
+    return values_of((yield from session.read_settings()))
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def _output(_target: Target, value: Output) -> RequestScript[None]:
+    """Set each message that is named. Whether the line carries them is for `check`: the baud rate is set after them."""
+    for name, rate in value.items():
+        message = OutputMessage(name.upper())
+        yield from send(commands.log_ontime(message, 0 if rate == ON_MARK else rate))
+        if rate == ON_MARK:
+            yield from send(commands.log_onmark(message))
+
+
+def _output_enabled(_target: Target, value: bool) -> RequestScript[None]:
+    return send(commands.log_enable() if value else commands.log_disable())
+
+
+def _mode(_target: Target, value: Modes) -> RequestScript[None]:
+    return send(commands.attitude_mode(AttitudeMode.NINE_AXIS if value == "9-axis" else AttitudeMode.SIX_AXIS))
+
+
+def _mounting(_target: Target, value: MountingName | list[float]) -> RequestScript[None]:
+    return send(commands.mounting(matrix_of(value)))
+
+
+def matrix_of(value: MountingName | list[float]) -> Matrix3:
+    """Return the URFR matrix of a mounting by name or by its nine numbers, rows first."""
+    a, b, c, d, e, f, g, h, i = value if isinstance(value, list) else _numbers(Mounting[value.upper()])
+    return ((a, b, c), (d, e, f), (g, h, i))
+
+
+def _magnetic_calibration(_target: Target, value: bool) -> RequestScript[None]:
+    return send(commands.magnetic_calibration(value))
+
+
+def _pins(_target: Target, value: dict[PinName, int]) -> RequestScript[None]:
+    for function, pin in value.items():
+        yield from send(commands.pin_function(PinFunction[function.upper()], pin))
+
+
+def _sout_divisor(_target: Target, value: int) -> RequestScript[None]:
+    return send(commands.sout_divider(value))
+
+
+def _write_alarm(_target: Target, value: dict[Axis, AngleAlarm]) -> RequestScript[None]:
+    for axis, one in value.items():
+        yield from send(commands.alarm(AlarmAxis(axis.upper()), one.min_deg, one.max_deg, one.enabled))
+
+
+def _baud(target: Target, value: BaudRate) -> RequestScript[int]:
+    return session.change_baud(value, target.baud)
+
+
+def _save(_target: Target) -> RequestScript[None]:
+    return send(commands.save_config())
+
+
+def _restart(target: Target) -> RequestScript[Any]:
+    return session.restart(target.baud)
+
+
+# --- comparing and checking -------------------------------------------------------------------------------------------
+
+
+def _has_all(declared: Mapping[str, Any], actual: Mapping[str, Any]) -> bool:
+    """Whether the actual values have those that are declared; what is not declared may be anything."""
+    plain = msgspec.to_builtins(actual)
+    return all(plain.get(name) == value for name, value in msgspec.to_builtins(declared).items())
+
+
+def _same_mounting(declared: MountingName | list[float], actual: MountingName | list[float]) -> bool:
+    one, other = ([value for row in matrix_of(mounting) for value in row] for mounting in (declared, actual))
+    return _near(one, other)
+
+
+def _check(target: Target, values: Mapping[str, Any]) -> None:
+    """Refuse more output than the line carries, two functions on one pin, and an empty range of an alarm."""
+    baud = values.get("baud", target.baud)
+    output = values.get("output", {})
+    if baud in BAUD_RATES:
+        rates = {OutputMessage(name.upper()): float(rate) for name, rate in output.items() if rate != ON_MARK}
+        commands.require_room(rates, baud)
+    taken: dict[int, str] = {}
+    for function, pin in values.get("pins", {}).items():
+        if pin in taken:
+            raise BadArgument(f"pins: expected a pin of its own for {function}, got IO{pin}, which {taken[pin]} has")
+        taken[pin] = function
+    for axis, one in msgspec.to_builtins(values.get("alarm", {})).items():
+        if not one["min_deg"] < one["max_deg"]:
+            low, high = one["min_deg"], one["max_deg"]
+            raise BadArgument(f"alarm.{axis}: expected the minimum below the maximum, got {low:g}° and {high:g}°")
+
+
+def _described(value_type: Any, description: str, section: str, unit: str = "") -> Any:
+    return Annotated[value_type, Meta(description=description, extra={"section": section, "unit": unit})]
+
+
+SETTINGS: Final = DeviceSettings(
+    table={
+        "mode": Setting(
+            type=_described(Modes, "six axes, or nine with the magnetometer for the heading", "2.2.4"), write=_mode
+        ),
+        "mounting": Setting(
+            type=_described(
+                MountingName | Annotated[list[float], Meta(min_length=9, max_length=9)],
+                "new sensor axis that points up or down where Z pointed up, or the nine numbers C00 … C22 of URFR",
+                "2.2.4",
+            ),
+            write=_mounting,
+            effect=Effect.AFTER_RESTART,
+            agrees=_same_mounting,
+        ),
+        "magnetic_calibration": Setting(
+            type=_described(bool, "calibration of the magnetometer in the background", "8.2"),
+            write=_magnetic_calibration,
+        ),
+        "pins": Setting(
+            type=_described(dict[PinName, Pin], "pin of each function, 1 for IO1; others stay as they are", "2.2.4"),
+            write=_pins,
+            agrees=_has_all,
+        ),
+        "sout_divisor": Setting(
+            type=_described(
+                Annotated[int, Meta(ge=1, le=SOUT_DIVIDER_MAX)], "pulses on SOUT per pulse on SOUT_DIV", "2.2.4"
+            ),
+            write=_sout_divisor,
+        ),
+        "alarm": Setting(
+            type=_described(
+                dict[Axis, AngleAlarm],
+                "angle about each axis outside of which the alarm pin is high; others stay as they are",
+                "2.2.4",
+                "°",
+            ),
+            write=_write_alarm,
+            agrees=_has_all,
+        ),
+        "output": Setting(
+            type=_described(
+                Output,
+                "rate of each message, 0 for off, or on_mark for one at each pulse on SIN; others stay as they are",
+                "2.2.5",
+                "Hz",
+            ),
+            write=_output,
+            agrees=_has_all,
+        ),
+        "output_enabled": Setting(
+            type=_described(bool, "whether frames are sent at all, whatever their rates", "2.2.5"),
+            write=_output_enabled,
+            readable=False,
+        ),
+        "magnetometer_bias": Setting(
+            type=_described(
+                list[float],
+                "offset that the calibration of the magnetometer found; zero: not calibrated",
+                "8.1.1",
+                "µT",
+            )
+        ),
+        "baud": Setting(
+            type=_described(BaudRate, "rate of the line; saves all other settings too", "2.2.3", "bit/s"),
+            write=_baud,
+            connection=True,
+            saves=True,
+        ),
+    },
+    read=_read,
+    save=_save,
+    restart=_restart,
+    check=_check,
+)
+"""Settings of a module, in the order in which they are written. The level (CONFIG ATT RST) and the heading (CONFIG YAW)
+are taken from the attitude at that moment, so they are actions."""
+
+FUNCTIONS: Final = {"sin": "sin", "pps": "sin", "sout": "sout", "sout_div": "sout_div", "alarm": "alarm"}
+"""Function of the module's pin by the key of the line."""
+
+
+def line_differences(settings: Mapping[str, str], lines: DeviceLines) -> dict[str, str]:
+    """Return what the module's settings contradict, one sentence by the line's key, from `session.read_settings`."""
+    return _differences(values_of(settings), lines)
+
+
+def declared_line_differences(values: Mapping[str, Any], lines: DeviceLines) -> dict[str, str]:
+    """Return what declared settings contradict. What is declared in part is not compared: the module has the rest."""
+    known = dict(values)
+    if set(known.get("output") or ()) != set(get_args(MessageName)):
+        known.pop("output", None)
+    known.pop("alarm", None)
+    return _differences(known, lines)
+
+
+def message_limits(values: Mapping[str, Any], lines: DeviceLines, fed: bool) -> list[str]:
+    """Return what HI92 cannot do of all that the configuration has, if declared settings have the module send it.
+
+    `fed`: sentences with UTC are sent to the module.
+    """
+    output = values.get("output") or {}
+    if not output.get("hi92"):
+        return []
+    found = []
+    if fed or lines.pps is not None:
+        found.append("HI92 never shows UTC: its samples are dated by the host; those of HI91 can be on UTC")
+    if output.get("hi91"):
+        found.append("HI92 beside HI91 is dated by its arrival; alone it is dated by its stamp")
+    return found
+
+
+def _differences(values: Mapping[str, Any], lines: DeviceLines) -> dict[str, str]:
+    found: dict[str, list[str]] = {}
+    for key, words in (
+        *_shared_pins(values.get("pins", {}), lines),
+        *_divisor(values.get("sout_divisor"), lines),
+        *_marks(values.get("output"), values.get("baud"), lines),
+        *_alarm_differences(values.get("alarm"), lines),
+    ):
+        found.setdefault(key, []).append(words)
+    return {key: "; ".join(words) for key, words in found.items()}
+
+
+def _shared_pins(pins: Mapping[str, int], lines: DeviceLines) -> Iterator[tuple[str, str]]:
+    """Two functions on one pin: which of them the module serves is not known."""
+    for key, function in FUNCTIONS.items():
+        if getattr(lines, key) is None or function not in pins:
+            continue
+        others = [other for other, pin in pins.items() if pin == pins[function] and other != function]
+        if others:
+            yield key, f"the module has {function} and {' and '.join(others)} on IO{pins[function]}: set one with pin"
+
+
+def _divisor(divisor: int | None, lines: DeviceLines) -> Iterator[tuple[str, str]]:
+    configured = lines.sout_div.divisor if lines.sout_div is not None else divisor
+    if divisor is not None and configured != divisor:
+        yield "sout_div", f"divisor is {configured} in the configuration, and the module divides SOUT by {divisor}"
+
+
+def _marks(output: Mapping[str, Any] | None, baud: int | None, lines: DeviceLines) -> Iterator[tuple[str, str]]:
+    """Triggers need a message on mark that the line carries at their rate; a pulse per second needs none."""
+    if output is None:
+        return
+    marked = [OutputMessage(name.upper()) for name, rate in output.items() if rate == ON_MARK]
+    if lines.sin is not None:
+        if not marked:
+            yield "sin", "no message of the module is on mark, so that triggers make no samples: output_on_mark sets it"
+        for message in marked:
+            most_hz = MAX_RATE_HZ[message].get(baud or 0)
+            if baud in BAUD_RATES and most_hz is not None and lines.sin.rate_hz > most_hz:
+                yield "sin", f"{lines.sin.rate_hz:g} triggers a second, and {baud} baud carry {most_hz} Hz of {message}"
+        if marked == [OutputMessage.HI92]:
+            yield "sin", "HI92 on mark has no time of its own: samples are not paired with triggers, HI91 is"
+    if lines.pps is not None and marked:
+        yield "pps", f"{' and '.join(marked)} on mark: each pulse per second makes a sample; output sets a rate"
+
+
+def _alarm_differences(alarm: Mapping[str, Any] | None, lines: DeviceLines) -> Iterator[tuple[str, str]]:
+    if alarm is not None and lines.alarm is not None and not any(one.enabled for one in alarm.values()):
+        yield "alarm", "the module watches no angle, so that the line stays low: alarm sets a range"

@@ -1,0 +1,298 @@
+"""Forsense IMU61x on CAN. Manual "IMU61X Interface Protocol and Instructions", chapter 4 (tables 29 … 33).
+
+Five standard frames of eight data bytes make one sample; identifiers are decimal, all values little-endian:
+
+    ┌─────┬───────────────────┬───────────────────┐
+    │ 101 │ roll         f32  │ pitch        f32  │  °
+    │ 102 │ yaw          f32  │ gyro x       f32  │  °, °/s
+    │ 103 │ gyro y       f32  │ gyro z       f32  │  °/s
+    │ 104 │ accel x      f32  │ accel y      f32  │  g
+    │ 105 │ accel z      f32  │ temp i16 │ idx u16│  g, 0.01 °C (the manual's "100 °C" is a misprint), counter
+    └─────┴───────────────────┴───────────────────┘
+
+105 closes the sample: the 101 … 104 received since the 105 before belong to it. It alone carries INDEX, which counts
+samples and wraps at 65536. Two samples are never mixed where that can be known:
+
+- An identifier received again before a 105 means that a 105 was lost: the frames held are dropped (an exact copy right
+  after the frame itself is a repetition by the bus, and is ignored).
+- A set that came in another order than 101, 102, 103, 104, 105 counts only if INDEX follows that of the 105 before.
+- Where frames are known to be missing (`reset`), the frames held are dropped.
+- A set in order whose INDEX does not follow may still be 101 … 103 of one sample and 104, 105 of a later one, what came
+  between having been lost. The time decides: a set takes S from its first frame to its last, and such a mixture at
+  least one period P more. It counts only if it took no more than S + P/2. S and P are learned from sets whose INDEX
+  follows, which cannot be mixed; before SURE_SETS of them every set in order counts. Where a stalled host or adapter
+  has pressed the times of arrival together, nothing can be known this way.
+
+Frames of a set that stays incomplete are valid and come to nothing (`frames_ignored`); the jump of INDEX to the next
+whole set says how many samples were lost. The device takes no commands over CAN.
+"""
+
+import struct
+from collections.abc import Sequence
+from math import isfinite
+from random import Random
+from typing import Annotated, Final
+
+from msgspec import Meta
+
+from imud.attitude.conventions import FLU_LEVEL
+from imud.attitude.rotation import quat_from_euler_zyx
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity
+from imud.contracts.script import says_nothing
+from imud.drivers.imu61x.common import (
+    EULER_CONVENTION,
+    M_S2_PER_G,
+    NAVIGATION_FRAME,
+    RAD_S_PER_DEG_S,
+    SHEET,
+    random_vector,
+    relative_heading,
+    scaled,
+)
+from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame
+from imud.model.ledger import Ledger
+from imud.model.options import Settings
+from imud.model.sample import Measurement, Vector3
+from imud.model.units import RAD_PER_DEG
+
+BASE_ID: Final = 101
+"""Identifier of the first frame, as delivered (decimal)."""
+SET: Final = struct.Struct("<9fhH")
+"""The data of all five: roll, pitch, yaw; gyro x, y, z; accel x, y, z; temperature; INDEX."""
+SET_FRAMES: Final = 5
+FRAME_BYTES: Final = 8
+INDEX_MODULUS: Final = 1 << 16
+C_PER_COUNT: Final = 0.01
+
+DOWN: Final = 4
+UP: Final = 16
+"""Divisors: the part of a difference that the learned times follow at once."""
+SURE_SETS: Final = 8
+"""Number of sets needed to learn from: with fewer, one that came late has too much weight."""
+_NEVER_NS: Final = 1 << 63
+
+_CLOSING: Final = SET_FRAMES - 1
+_FLOATS: Final = tuple(struct.Struct(layout) for layout in ("<2f", "<2f", "<2f", "<2f", "<f4x"))
+_IN_ORDER: Final = (0, 1, 2, 3)
+
+
+class Imu61xCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of an IMU61x on CAN."""
+
+    base_id: Annotated[int, Meta(ge=0, le=STANDARD_ID_MAX - _CLOSING)] = BASE_ID
+    """Identifier of the first of the five frames, decimal; the others follow it."""
+
+
+class _Pace:
+    """Duration of a set on the bus, and of a sample, learned from sets that are certainly whole."""
+
+    __slots__ = ("_period_ns", "_sets", "_span_ns", "longest_ns")
+
+    def __init__(self) -> None:
+        self.longest_ns = _NEVER_NS
+        """Longest duration of a set of one sample, ns."""
+        self._span_ns = 0
+        self._period_ns = 0
+        self._sets = 0
+
+    def learn(self, span_ns: int, period_ns: int) -> None:
+        """Add a whole set: `span_ns` from its first frame to its last, ended `period_ns` after the one before.
+
+        Down quickly and up slowly, by no more than twice at once: too low costs a sample next to a lost one, too high
+        could mix two.
+        """
+        self._span_ns = _moved(self._span_ns, span_ns)
+        self._period_ns = _moved(self._period_ns, period_ns)
+        self._sets += 1
+        if self._period_ns and self._sets >= SURE_SETS:
+            self.longest_ns = self._span_ns + self._period_ns // 2
+
+
+def _moved(mean_ns: int, new_ns: int) -> int:
+    if not mean_ns:
+        return max(0, new_ns)
+    if new_ns < mean_ns:
+        return mean_ns - (mean_ns - max(0, new_ns)) // DOWN
+    return mean_ns + (min(new_ns, 2 * mean_ns) - mean_ns) // UP
+
+
+class Imu61xCanCodec:
+    """Decoder of the frames of one device. Synchronization: one thread."""
+
+    def __init__(self, ledger: Ledger, settings: Imu61xCanSettings) -> None:
+        self.ledger = ledger
+        self._slots = {settings.base_id + slot: slot for slot in range(SET_FRAMES)}
+        self._held: dict[int, bytes] = {}
+        """Data of 101 … 104 by their place, in the order they came."""
+        self._newest = -1
+        """Place of the newest frame held."""
+        self._first_ns = 0
+        """Arrival of the first frame of the set, ns."""
+        self._index: int | None = None
+        """INDEX of the newest 105."""
+        self._closed_ns = 0
+        """Arrival of the newest 105, ns."""
+        self._pace = _Pace()
+
+    def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
+        """Decode one frame; return what it completed. Never raises for any frame."""
+        ledger, size = self.ledger, len(data)
+        ledger.bytes_in += size
+        slot = self._slots.get(can_id)
+        if slot is None or extended:
+            ledger.bytes_skipped += size
+            return ()
+        if size != FRAME_BYTES:
+            ledger.bytes_in_bad_frames += size
+            ledger.frames_bad_length += 1
+            return (BadFrame(BadReason.LENGTH, data),)
+        ledger.bytes_in_good_frames += size
+        ledger.frames_good += 1
+        if slot == _CLOSING:
+            return self._close(data, t_rx_ns)
+        held = self._held
+        if slot in held:
+            if slot == self._newest and held[slot] == data:
+                ledger.frames_ignored += 1
+                return ()
+            self.reset()
+        if not held:
+            self._first_ns = t_rx_ns
+        held[slot] = data
+        self._newest = slot
+        ledger.frames_pending += 1
+        return ()
+
+    def flush(self) -> Sequence[CodecEvent]:
+        """Return nothing: a set is decided by its 105 only."""
+        return ()
+
+    def reset(self) -> None:
+        """Drop the frames held: others are missing after them."""
+        held, ledger = self._held, self.ledger
+        ledger.frames_ignored += len(held)
+        ledger.frames_pending -= len(held)
+        held.clear()
+        self._newest = -1
+
+    def _close(self, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
+        """Finish the set with its 105: it is whole, or lost."""
+        held, ledger, before, pace = self._held, self.ledger, self._index, self._pace
+        self._index = index = data[6] | data[7] << 8
+        before_ns, self._closed_ns = self._closed_ns, t_rx_ns
+        span_ns = t_rx_ns - self._first_ns
+        follows = before is not None and (index - before) % INDEX_MODULUS == 1
+        places = tuple(held)
+        in_time = places == _IN_ORDER and span_ns <= pace.longest_ns
+        is_whole = in_time or (follows and len(places) == _CLOSING)
+        if not is_whole:
+            self.reset()
+            ledger.frames_ignored += 1
+            return ()
+        if follows:
+            pace.learn(span_ns, t_rx_ns - before_ns)
+        raw = b"".join(held[slot] for slot in _IN_ORDER) + data
+        held.clear()
+        self._newest = -1
+        ledger.frames_pending -= _CLOSING
+        ledger.frames_in_samples += SET_FRAMES
+        *values, temperature, _ = SET.unpack(raw)
+        if isfinite(sum(values)):  # 32-bit floats cannot add up to a 64-bit infinity
+            return (_measurement(values, temperature, index),)
+        return (*self._not_finite(raw), _measurement(values, temperature, index))
+
+    def _not_finite(self, raw: bytes) -> list[CodecEvent]:
+        """A `BadFrame` for every frame with NaN or infinity in it."""
+        events: list[CodecEvent] = []
+        for slot, layout in enumerate(_FLOATS):
+            data = raw[slot * FRAME_BYTES : (slot + 1) * FRAME_BYTES]
+            if not isfinite(sum(layout.unpack(data))):
+                self.ledger.frames_not_finite += 1
+                events.append(BadFrame(BadReason.NOT_FINITE, data))
+        return events
+
+
+def _measurement(values: Sequence[float], temperature: int, index: int) -> Measurement:
+    """A whole set in SI units, without the groups of values of which one is not finite."""
+    euler = scaled(values[:3], RAD_PER_DEG)
+    return Measurement(
+        SET.size, 0, index,
+        accel_m_s2=scaled(values[6:9], M_S2_PER_G),
+        gyro_rad_s=scaled(values[3:6], RAD_S_PER_DEG_S),
+        quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
+        euler_rad=euler,
+        temperature_c=temperature * C_PER_COUNT,
+    )  # fmt: skip
+
+
+# --- the device's side ------------------------------------------------------------------------------------------------
+
+
+def encode_set(
+    *,
+    index: int,
+    accel_m_s2: Vector3,
+    gyro_rad_s: Vector3,
+    euler_rad: Vector3,
+    temperature_c: float,
+    base_id: int = BASE_ID,
+) -> list[tuple[int, bytes]]:
+    """The five frames (identifier, data) of a sample from SI values, `euler_rad` roll, pitch, yaw; INDEX wraps.
+
+    Raises OverflowError beyond f32 and struct.error for a temperature beyond ±327 °C.
+    """
+    raw = SET.pack(
+        *(angle / RAD_PER_DEG for angle in euler_rad),
+        *(w / RAD_S_PER_DEG_S for w in gyro_rad_s),
+        *(a / M_S2_PER_G for a in accel_m_s2),
+        round(temperature_c / C_PER_COUNT),
+        index % INDEX_MODULUS,
+    )
+    return [(base_id + slot, raw[slot * FRAME_BYTES : (slot + 1) * FRAME_BYTES]) for slot in range(SET_FRAMES)]
+
+
+def _example_frames(random: Random) -> list[CanFrame]:
+    """A set with random values."""
+    frames = encode_set(
+        index=random.randrange(INDEX_MODULUS),
+        accel_m_s2=random_vector(random, 9.8),
+        gyro_rad_s=random_vector(random, 2),
+        euler_rad=(random.uniform(-3, 3), random.uniform(-1.5, 1.5), random.uniform(-3, 3)),
+        temperature_c=random.uniform(-40, 85),
+    )
+    return [CanFrame(can_id, False, data, 0) for can_id, data in frames]
+
+
+def _filters(settings: Imu61xCanSettings) -> list[CanFilter]:
+    """The five identifiers, each by itself: other devices may have those next to them."""
+    return [CanFilter(settings.base_id + slot, STANDARD_ID_MAX, False) for slot in range(SET_FRAMES)]
+
+
+def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
+    """BASE_ID for a frame with one of the identifiers as delivered; a device with others cannot be recognized."""
+    slot = can_id - BASE_ID
+    return BASE_ID if 0 <= slot < SET_FRAMES and not extended and len(data) == FRAME_BYTES else None
+
+
+DRIVER: Final = CanDriver(
+    name="imu61x-can",
+    title="Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B (CAN)",
+    settings=Imu61xCanSettings,
+    make_codec=Imu61xCanCodec,
+    filters=_filters,
+    tick_ns=SAMPLE_COUNTER,
+    tick_modulus=INDEX_MODULUS,
+    euler_convention=EULER_CONVENTION,
+    navigation_frame=NAVIGATION_FRAME,
+    data_sheet=SHEET,
+    axes=FLU_LEVEL,
+    heading=relative_heading,
+    node_of=_node_of,
+    node_settings=lambda base_id: Imu61xCanSettings(base_id=base_id),
+    node_title=lambda base_id: f"base_id {base_id}",
+    identify=lambda _settings: says_nothing(Identity()),
+    read_settings=lambda _settings: says_nothing({}),
+    sample_frames=SET_FRAMES,
+    example_frames=_example_frames,
+)

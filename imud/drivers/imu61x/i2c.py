@@ -1,0 +1,201 @@
+"""Forsense IMU61x on I2C: a burst of 32 bytes with CRC. Manual "IMU61X Interface Protocol and Instructions", chapter 3.
+
+    S addr W 0x12 | Sr addr R  accel x y z g | gyro x y z °/s | temperature °C, all f32 | CRC-32 u32 | P
+
+Little-endian. The address is 0x18 as delivered, 0x18 to 0x1B by parameter 30 of the UART. There is no counter and no
+time in a burst: one that repeats the bytes of the one before counts as the same measurement. Identity and filters,
+which are also read at intervals, are in `session.py`.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from math import isfinite
+from random import Random
+from typing import Any, Final
+
+from imud.contracts.codec import BadReason, Poll, PolledEvent, Vanished
+from imud.contracts.command import Target
+from imud.contracts.driver import Identity
+from imud.contracts.script import Transfer, TransferScript
+from imud.contracts.setting import DeviceSettings
+from imud.drivers.imu61x.common import (
+    I2C_ADDRESSES,
+    M_S2_PER_G,
+    PRODUCT_ID_HEAD,
+    RAD_S_PER_DEG_S,
+    crc32,
+    product_of,
+    random_vector,
+)
+from imud.drivers.imu61x.registers import (
+    CHECK_NS,
+    FILTER_CTRL,
+    I2C_BURST,
+    PROD_ID,
+    FilterControl,
+    RegisterSettings,
+    check_filter,
+    check_settings,
+    filter_settings,
+    filter_words,
+    identity_of,
+    register_driver,
+    wanted_filter,
+)
+from imud.drivers.polled_frames import Measured, PolledFrameDecoder
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement, Vector3
+from imud.model.units import NS_PER_S
+
+READ_FILTER: Final = Transfer((bytes([FILTER_CTRL]),), 1)
+READ_ID: Final = Transfer((bytes([PROD_ID]),), len(PRODUCT_ID_HEAD) + 1)
+
+
+def write_filter(control: int) -> Transfer:
+    """Write FILTER_CTRL (figure 8)."""
+    return Transfer((bytes([FILTER_CTRL, control]),))
+
+
+def probe(_settings: RegisterSettings) -> TransferScript[Identity]:
+    """Read PROD_ID. Raises DeviceRefused for anything but an IMU61x."""
+    return identity_of((yield READ_ID))
+
+
+def set_up(settings: RegisterSettings) -> TransferScript[Mapping[str, str]]:
+    """Write FILTER_CTRL where it differs, read it back. Raises DeviceRefused if it is not the value written."""
+    present = yield from read_control()
+    wanted = wanted_filter(settings, present)
+    if present != wanted:
+        yield from write_control(wanted)
+    return filter_words(wanted)
+
+
+def read_control() -> TransferScript[int]:
+    """Read FILTER_CTRL."""
+    return _only((yield READ_FILTER))
+
+
+def write_control(control: int) -> TransferScript[None]:
+    """Write FILTER_CTRL and read it back. Raises DeviceRefused if it is not the value written."""
+    yield write_filter(control)
+    check_filter(control, (yield from read_control()))
+
+
+def id_problem(data: bytes) -> str:
+    """Compare a PROD_ID that was read later; an empty string if it is the same."""
+    return "" if product_of(data) is not None else f"wrong product id {data.hex(' ')}"
+
+
+def filter_problem(data: bytes, settings: RegisterSettings) -> str:
+    """Compare a FILTER_CTRL that was read later; an empty string if it is as set up."""
+    wanted = wanted_filter(settings, _only(data))
+    if data == bytes([wanted]):
+        return ""
+    return f"FILTER_CTRL is {data.hex()}, was set to {wanted:#04x}: the device restarted"
+
+
+def _only(data: bytes) -> int:
+    return data[0] if data else 0
+
+
+FRAME: Final = struct.Struct("<7fI")
+"""accel 3 g, gyro 3 °/s, temperature °C, CRC-32 of the 28 bytes before (table 27)."""
+CRC_OFFSET: Final = 28
+
+READ_BURST: Final = Transfer((bytes([I2C_BURST]),), FRAME.size)
+_BURST, _ID, _FILTER = range(3)
+
+
+class Imu61xI2cCodec:
+    """Decoder of bursts. Synchronization: one thread."""
+
+    polls: Sequence[Poll] = (Poll(READ_BURST), Poll(READ_ID, CHECK_NS), Poll(READ_FILTER, CHECK_NS))
+
+    def __init__(self, ledger: Ledger, settings: RegisterSettings) -> None:
+        self.ledger = ledger
+        self._settings = settings
+        self._frames = PolledFrameDecoder(ledger, FRAME.size)
+
+    @property
+    def stale(self) -> int:
+        """Bursts that repeated the one before."""
+        return self._frames.stale
+
+    def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
+        """Decode the bytes of one transfer. Never raises."""
+        if poll == _BURST:
+            return self._frames.decode(data, _check, _measure)
+        why = id_problem(data) if poll == _ID else filter_problem(data, self._settings)
+        self._frames.add_reply(data, good=not why)
+        return (Vanished(why),) if why else ()
+
+    def on_silence(self, poll: int) -> Sequence[PolledEvent]:
+        """No-op: nothing follows from one failed transfer."""
+        return ()
+
+    def reset(self) -> None:
+        """Forget the last burst: the next one is not compared with it."""
+        self._frames.reset()
+
+
+def _check(data: bytes) -> BadReason | None:
+    return None if crc32(data[:CRC_OFFSET]) == FRAME.unpack(data)[7] else BadReason.CRC
+
+
+def _measure(data: bytes) -> Measured:
+    ax, ay, az, gx, gy, gz, temperature, _ = FRAME.unpack(data)
+    g, rad = M_S2_PER_G, RAD_S_PER_DEG_S
+    accel, gyro = isfinite(ax + ay + az), isfinite(gx + gy + gz)  # sums of floats of 32 bits do not overflow in 64
+    measurement = Measurement(
+        FRAME.size, 0, None,
+        (ax * g, ay * g, az * g) if accel else None,
+        (gx * rad, gy * rad, gz * rad) if gyro else None,
+        temperature_c=temperature if isfinite(temperature) else None,
+    )  # fmt: skip
+    return measurement, accel and gyro and isfinite(temperature)
+
+
+# --- the device's side ------------------------------------------------------------------------------------------------
+
+
+def encode_burst(*, accel_m_s2: Vector3, gyro_rad_s: Vector3, temperature_c: float) -> bytes:
+    """The 32 bytes of a burst from SI values. Raises OverflowError beyond f32."""
+    g, rad = M_S2_PER_G, RAD_S_PER_DEG_S
+    values = struct.pack("<7f", *(a / g for a in accel_m_s2), *(w / rad for w in gyro_rad_s), temperature_c)
+    return values + struct.pack("<I", crc32(values))
+
+
+def _read(_target: Target) -> TransferScript[Mapping[str, Any]]:
+    return filter_words((yield from read_control()))
+
+
+SETTINGS: Final = DeviceSettings(
+    table=filter_settings(FilterControl(read_control, write_control)), read=_read, check=check_settings
+)
+"""Lost when the device restarts; what it starts with is parameter 31 of its UART."""
+
+
+def _example_reading(random: Random) -> bytes:
+    """A burst with random values."""
+    accel_m_s2, gyro_rad_s = random_vector(random, 9.8), random_vector(random, 2)
+    return encode_burst(accel_m_s2=accel_m_s2, gyro_rad_s=gyro_rad_s, temperature_c=random.uniform(-40, 85))
+
+
+BUS_HZ: Final = 400_000
+"""The fastest clock of table 25; the one that the bus has is set in the system."""
+BITS_PER_BYTE: Final = 9
+"""Eight and the acknowledgement."""
+OVERHEAD_BITS: Final = 2 * BITS_PER_BYTE + 3
+"""The address twice, start, repeated start and stop."""
+
+
+def _read_ns(_options: RegisterSettings, _link: Any) -> int:
+    """318 bits, 795 µs."""
+    (register,) = READ_BURST.sends
+    bits = OVERHEAD_BITS + (len(register) + READ_BURST.read_bytes) * BITS_PER_BYTE
+    return bits * NS_PER_S // BUS_HZ
+
+
+DRIVER: Final = register_driver(
+    "i2c", RegisterSettings, I2C_ADDRESSES, probe, set_up, Imu61xI2cCodec, _example_reading, _read_ns, SETTINGS
+)

@@ -1,0 +1,259 @@
+"""Settings, set-up, action and row of the Forsense IMU61x on SPI and I2C, where only the transfers differ.
+
+Of what can be changed over these buses only the low-pass filters concern the user; all else is set over the UART.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from random import Random
+from typing import Annotated, Any, Final, NamedTuple, TypeVar
+
+import msgspec
+from msgspec import Meta
+
+from imud.attitude.conventions import FLU_LEVEL
+from imud.contracts.codec import PolledCodec
+from imud.contracts.command import Action, Target
+from imud.contracts.driver import Identity, KeyProblem, PolledDriver
+from imud.contracts.script import TransferScript
+from imud.contracts.setting import DeviceSettings, Setting
+from imud.drivers.imu61x.common import (
+    ACCEL_FILTER,
+    EULER_CONVENTION,
+    FILTER_CODES,
+    FILTERS,
+    GYRO_FILTER,
+    M_S2_PER_G,
+    NAVIGATION_FRAME,
+    RAD_S_PER_DEG_S,
+    SHEET,
+    FilterChoice,
+    filter_code,
+    filter_codes,
+    filter_control,
+    product_of,
+    relative_heading,
+    same_filter,
+)
+from imud.drivers.polled_frames import absence
+from imud.model.errors import BadArgument, DeviceRefused
+from imud.model.ledger import Ledger
+from imud.model.options import Settings
+from imud.model.units import NS_PER_S
+
+CHECK_NS: Final = 10 * NS_PER_S
+"""Interval of reading identity and settings again: a device that restarted by itself has lost unsaved settings."""
+
+
+class RegisterSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of an IMU61x on a polled bus."""
+
+    accel_filter: FilterChoice | None = None
+    """Low-pass filter of the accelerometer, by name, or by its code in the order of these names (11: 47 Hz); null
+    leaves it as it is."""
+    gyro_filter: FilterChoice | None = None
+    """The same of the gyroscope."""
+    update_hz: Annotated[float, Meta(ge=0, le=10000)] = 0.0
+    """Rate at which the device renews its registers, per second, for the error of time stamps; 0 if not known."""
+
+
+S = TypeVar("S", bound=RegisterSettings)
+SetUp = Callable[[S], TransferScript[Mapping[str, str]]]
+
+
+# --- identity and filters --------------------------------------------------------------------------------------------
+
+
+def identity_of(product_id: bytes) -> Identity:
+    """The identity that PROD_ID states. Raises DeviceRefused for another device, with what to look at."""
+    product = product_of(product_id)
+    if product is None:
+        why = absence(product_id) or "another device, or the wrong SPI mode or speed?"
+        raise DeviceRefused(f"PROD_ID: expected 00 00 'IMU61' and a letter, got {product_id.hex(' ')}: {why}")
+    return Identity(product=product)
+
+
+def wanted_filter(settings: RegisterSettings, present: int) -> int:
+    """The value that FILTER_CTRL should have, from the value that it has."""
+    accel, gyro = filter_codes(present)
+    return filter_control(
+        accel if settings.accel_filter is None else filter_code(settings.accel_filter),
+        gyro if settings.gyro_filter is None else filter_code(settings.gyro_filter),
+    )
+
+
+def check_filter(wanted: int, got: int) -> None:
+    """Check what FILTER_CTRL reads back after a write. Raises DeviceRefused if it is not the value written."""
+    if got & 0xFF != wanted:
+        raise DeviceRefused(f"FILTER_CTRL: wrote {wanted:#04x}, read back {got & 0xFF:#04x}; is the bus too fast?")
+
+
+def filter_words(control: int) -> Mapping[str, str]:
+    """The filters by name, for people."""
+    accel, gyro = filter_codes(control)
+    return {"accel_filter": FILTERS[accel], "gyro_filter": FILTERS[gyro]}
+
+
+# --- settings and action ----------------------------------------------------------------------------------------------
+
+AccelFilter = Annotated[FilterChoice, ACCEL_FILTER]
+GyroFilter = Annotated[FilterChoice, GYRO_FILTER]
+_AccelFilterOrNone = Annotated[FilterChoice | None, ACCEL_FILTER]
+_GyroFilterOrNone = Annotated[FilterChoice | None, GYRO_FILTER]
+
+
+class FilterControl(NamedTuple):
+    """Scripts of a bus that read and write FILTER_CTRL."""
+
+    read: Callable[[], TransferScript[int]]
+    write: Callable[[int], TransferScript[None]]
+    """Reads back what it wrote. Raises DeviceRefused."""
+
+
+def filter_settings(control: FilterControl) -> Mapping[str, Setting]:
+    """The two filters as settings. The device loses them when it restarts: over the UART they are saved."""
+
+    def write(target: Target, accel: FilterChoice | None, gyro: FilterChoice | None) -> TransferScript[None]:
+        _require_as_configured(target.settings, accel_filter=accel, gyro_filter=gyro)
+        present_accel, present_gyro = filter_codes((yield from control.read()))
+        yield from control.write(
+            filter_control(
+                present_accel if accel is None else filter_code(accel),
+                present_gyro if gyro is None else filter_code(gyro),
+            )
+        )
+
+    return {
+        "accel_filter": Setting(
+            type=AccelFilter, write=lambda target, choice: write(target, choice, None), agrees=same_filter
+        ),
+        "gyro_filter": Setting(
+            type=GyroFilter, write=lambda target, choice: write(target, None, choice), agrees=same_filter
+        ),
+    }
+
+
+def check_settings(target: Target, values: Mapping[str, Any]) -> None:
+    """Raise BadArgument for a filter that `options` fix otherwise."""
+    if isinstance(target.settings, RegisterSettings):
+        filters = {name: values.get(name) for name in ("accel_filter", "gyro_filter")}
+        _require_as_configured(target.settings, **filters)
+
+
+def _require_as_configured(settings: RegisterSettings, **wanted: FilterChoice | None) -> None:
+    """Raise BadArgument for a filter that `options` fix otherwise: they would soon be written again."""
+    for name, choice in wanted.items():
+        configured: FilterChoice | None = getattr(settings, name)
+        if choice is not None and configured is not None and not same_filter(choice, configured):
+            raise BadArgument(
+                f"{name}: expected {_shown(configured)}, which `options.{name}` says, got {_shown(choice)}"
+            )
+
+
+def _shown(choice: FilterChoice) -> str:
+    return f"{FILTERS[filter_code(choice)]} (code {filter_code(choice)})"
+
+
+def _filter_action(set_up: SetUp[S]) -> Action:
+    """Set the filters by the driver's own `set_up`, which reads them back."""
+
+    def set_filter(
+        target: Target, *, accel_filter: _AccelFilterOrNone = None, gyro_filter: _GyroFilterOrNone = None
+    ) -> TransferScript[Mapping[str, str]]:
+        settings: S = target.settings
+        given = {"accel_filter": accel_filter, "gyro_filter": gyro_filter}
+        _require_as_configured(settings, **given)
+        wanted = {name: choice for name, choice in given.items() if choice is not None}
+        return set_up(msgspec.structs.replace(settings, **wanted))
+
+    return Action(
+        "set the low-pass filters until the device restarts, null leaves one as it is; answers what they are; "
+        f"`options` set them at every start; by name or code: {FILTER_CODES}",
+        set_filter,
+    )
+
+
+# --- row --------------------------------------------------------------------------------------------------------------
+
+
+def register_driver(
+    bus: str,
+    settings: type[S],
+    targets: tuple[int, ...],
+    probe: Callable[[S], TransferScript[Identity]],
+    set_up: SetUp[S],
+    make_codec: Callable[[Ledger, Any], PolledCodec],
+    example_reading: Callable[[Random], bytes],
+    read_ns: Callable[[Any, Any], int],
+    device_settings: DeviceSettings,
+) -> PolledDriver:
+    """The row of the driver on `bus` (`i2c` or `spi`)."""
+
+    def check(_options: S, link: Any) -> Sequence[KeyProblem]:
+        address = getattr(link, "address", "auto")
+        if address == "auto" or address in targets:
+            return ()
+        known = ", ".join(f"{target:#04x}" for target in targets)
+        return (
+            KeyProblem("link", "address", f"expected an address of an IMU61x ({known}) or auto, got {address:#04x}"),
+        )
+
+    return PolledDriver(
+        name=f"imu61x-{bus}",
+        title=f"Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B ({bus.upper()})",
+        settings=settings,
+        euler_convention=EULER_CONVENTION,
+        navigation_frame=NAVIGATION_FRAME,
+        data_sheet=SHEET,
+        axes=FLU_LEVEL,
+        heading=relative_heading,
+        lines=frozenset({"reset", "data_ready"}),
+        link=bus,
+        targets=targets,
+        probe=probe,
+        set_up=set_up,
+        make_codec=make_codec,
+        update_ns=_update_ns,
+        example_reading=example_reading,
+        read_ns=read_ns,
+        check=check,
+        device_settings=device_settings,
+        actions={"filter": _filter_action(set_up)},
+    )
+
+
+def _update_ns(settings: RegisterSettings) -> int:
+    """Time between two updates of the registers; 0 for not known."""
+    return int(NS_PER_S / settings.update_hz) if settings.update_hz else 0
+
+
+BURST: Final = 0x00
+FILTER_CTRL: Final = 0x06
+BURST_CTRL: Final = 0x0C
+"""The high byte, at 0x0D, selects the burst: 0 standard, 1 extended (the vendor's value, not the manual's)."""
+TEMP_HIGH: Final = 0x0E
+ZACCEL_LOW: Final = 0x28
+PROD_ID: Final = 0x6A
+"""The first of four words, 0x6A to 0x70; on I2C of eight bytes."""
+WIN_CTRL: Final = 0x7E
+I2C_BURST: Final = 0x12
+"""The text of 3.3.1; table 26 prints 0x00."""
+
+M_S2_PER_COUNT: Final = 0.2 / 65536 * M_S2_PER_G
+"""Burst: 327680 counts are 1 g."""
+M_S2_PER_COUNT_REGISTER: Final = 0.2 / 1000 / 65536 * M_S2_PER_G
+"""Single registers: 65536 counts, one step of the high word, are 0.0002 g."""
+RAD_S_PER_COUNT: Final = 0.016 / 65536 * RAD_S_PER_DEG_S
+"""Burst and single registers: 4096000 counts are 1 °/s."""
+TEMPERATURE_ZERO_COUNTS: Final = 172_621_824
+"""2634 · 65536: the count at 25 °C."""
+C_PER_COUNT: Final = -1 / 263.4 / 65536
+
+
+def temperature_c(counts: int) -> float:
+    """Temperature of TEMP, high and low word joined."""
+    return (counts - TEMPERATURE_ZERO_COUNTS) * C_PER_COUNT + 25.0
+
+
+def temperature_counts(celsius: float) -> int:
+    """The inverse, for the device's side."""
+    return round((celsius - 25.0) / C_PER_COUNT) + TEMPERATURE_ZERO_COUNTS

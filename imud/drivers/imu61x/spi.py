@@ -1,0 +1,448 @@
+"""Forsense IMU61x on SPI: decoding of bursts and single registers. Manual "IMU61X Interface Protocol and Instructions",
+chapter 2. Layouts and check values are in `bursts.py`, words in `words.py`, identity and settings in `session.py`.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from math import isfinite
+from random import Random
+from typing import Annotated, Any, Final, Literal
+
+from msgspec import Meta
+
+from imud.attitude.rotation import quat_from_euler_zyx
+from imud.contracts.codec import BadReason, Poll, PolledEvent, Vanished
+from imud.contracts.command import Target
+from imud.contracts.driver import Identity
+from imud.contracts.script import Transfer, TransferScript
+from imud.contracts.setting import DeviceSettings, Setting
+from imud.drivers.imu61x.common import M_S2_PER_G, RAD_S_PER_DEG_S, crc32, random_vector, scaled
+from imud.drivers.imu61x.registers import (
+    BURST,
+    BURST_CTRL,
+    CHECK_NS,
+    FILTER_CTRL,
+    M_S2_PER_COUNT,
+    M_S2_PER_COUNT_REGISTER,
+    PROD_ID,
+    RAD_S_PER_COUNT,
+    TEMP_HIGH,
+    WIN_CTRL,
+    ZACCEL_LOW,
+    FilterControl,
+    RegisterSettings,
+    check_filter,
+    check_settings,
+    filter_settings,
+    filter_words,
+    identity_of,
+    register_driver,
+    temperature_c,
+    wanted_filter,
+)
+from imud.drivers.polled_frames import Measured, PolledFrameDecoder, absence
+from imud.model.errors import DeviceRefused, TransferError
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement, Vector3
+from imud.model.units import NS_PER_S, NS_PER_US, RAD_PER_DEG
+
+PIPELINE_WORDS: Final = 2
+PIPELINE_BYTES: Final = 2 * PIPELINE_WORDS
+GAP_US: Final = 10
+
+
+def read(address: int) -> int:
+    """The word that reads a register."""
+    return address << 8
+
+
+def write(address: int, value: int) -> int:
+    """The word that writes one byte."""
+    return 0x8000 | address << 8 | value
+
+
+def message(*words: int) -> Transfer:
+    """Words with chip select released between them, and two more for the answers to the last ones."""
+    pipeline = (read(WIN_CTRL),) * PIPELINE_WORDS  # answers with the window, which must be 0 again by then
+    return Transfer(tuple(word.to_bytes(2, "big") for word in (*words, *pipeline)), gap_us=GAP_US)
+
+
+def answers(data: bytes) -> tuple[int, ...]:
+    """The answer to each word of a message, without the two of the pipeline itself."""
+    words = memoryview(data)[PIPELINE_BYTES:]
+    return struct.unpack(f">{len(words) // 2}H", words[: len(words) // 2 * 2])
+
+
+OPEN: Final = write(WIN_CTRL, 1)
+CLOSE: Final = write(WIN_CTRL, 0)
+CLOSE_ONLY: Final = message(CLOSE)
+READ_STATE: Final = message(
+    OPEN,
+    *(read(PROD_ID + 2 * n) for n in range(4)),
+    read(FILTER_CTRL),
+    read(BURST_CTRL),
+    read(BURST_CTRL + 1),
+    CLOSE,
+    read(WIN_CTRL),
+)
+"""Identity and settings in one message, both halves of BURST_CTRL, and the window after it was closed."""
+
+BurstKind = Literal["standard", "extended"]
+"""What the device sends for 0x8000."""
+STANDARD_WORDS: Final = 14
+EXTENDED_WORDS: Final = 24
+REGISTER_WORDS: Final = (ZACCEL_LOW - TEMP_HIGH) // 2 + 1
+STANDARD: Final = struct.Struct(">14H")
+EXTENDED: Final = struct.Struct("<10fII")
+"""gyro 3 °/s, accel 3 g, temperature °C, roll pitch yaw °, status, CRC-32 of the 44 bytes before."""
+CRC_OFFSET: Final = 44
+
+
+def _burst(words: int) -> Transfer:
+    """0x8000 and as many zeros as bring `words` words through the pipeline, in one selection."""
+    return Transfer((write(BURST, 0).to_bytes(2, "big") + bytes(2 * (PIPELINE_WORDS + words - 1)),))
+
+
+READ_STANDARD: Final = _burst(STANDARD_WORDS)
+READ_EXTENDED: Final = _burst(EXTENDED_WORDS)
+READ_REGISTERS: Final = message(*(read(address) for address in range(TEMP_HIGH, ZACCEL_LOW + 1, 2)))
+READ_TEMPERATURE: Final = message(read(TEMP_HIGH), read(TEMP_HIGH + 2))
+BURSTS: Final[dict[BurstKind, Transfer]] = {"standard": READ_STANDARD, "extended": READ_EXTENDED}
+"""The transfer that reads each kind of burst."""
+
+
+def sum_matches(frame: bytes, checksum_bits: int) -> bool:
+    """Whether the checksum of a standard burst is right."""
+    *words, low, high = STANDARD.unpack(frame)
+    total = sum(words)
+    return low == total & 0xFFFF and (checksum_bits == 16 or high == total >> 16)
+
+
+def little_endian(frame: bytes) -> bytes:
+    """The words of an extended burst as they lie in the memory of a little-endian host."""
+    return struct.pack("<24H", *struct.unpack(">24H", frame))
+
+
+def crc_matches(memory: bytes) -> bool:
+    """Whether the CRC of an extended burst, as `little_endian` returns it, is right."""
+    return bool(crc32(memory[:CRC_OFFSET]) == EXTENDED.unpack(memory)[11])
+
+
+def burst_problem(kind: BurstKind, data: bytes, checksum_bits: int) -> str:
+    """Return why bytes that were read are no burst of this kind, pipeline included; empty if they are one."""
+    frame = data[PIPELINE_BYTES:]
+    words = STANDARD_WORDS if kind == "standard" else EXTENDED_WORDS
+    if len(frame) != 2 * words:
+        return f"expected {2 * words} bytes, got {len(frame)}"
+    if why := absence(frame):
+        return why
+    good = sum_matches(frame, checksum_bits) if kind == "standard" else crc_matches(little_endian(frame))
+    return "" if good else f"its check value does not match: {frame[:8].hex(' ')} …"
+
+
+# --- the device's side ------------------------------------------------------------------------------------------------
+
+
+def encode_standard(*, accel_m_s2: Vector3, gyro_rad_s: Vector3) -> bytes:
+    """The 14 words of a standard burst from SI values; values beyond 32 bits are cut off."""
+    counts = [*(round(w / RAD_S_PER_COUNT) for w in gyro_rad_s), *(round(a / M_S2_PER_COUNT) for a in accel_m_s2)]
+    words = [word for count in counts for word in (count & 0xFFFF, count >> 16 & 0xFFFF)]
+    total = sum(words)
+    return STANDARD.pack(*words, total & 0xFFFF, total >> 16)
+
+
+def encode_extended(
+    *, accel_m_s2: Vector3, gyro_rad_s: Vector3, temperature_c: float, euler_rad: Vector3, status: int = 0
+) -> bytes:
+    """The 24 words of an extended burst from SI values. Raises OverflowError beyond f32."""
+    memory = struct.pack(
+        "<10fI",
+        *(w / RAD_S_PER_DEG_S for w in gyro_rad_s),
+        *(a / M_S2_PER_G for a in accel_m_s2),
+        temperature_c,
+        *(angle / RAD_PER_DEG for angle in euler_rad),
+        status,
+    )
+    memory += struct.pack("<I", crc32(memory))
+    return struct.pack(">24H", *struct.unpack("<24H", memory))
+
+
+MODES: Final = (0, 3)
+"""The manual's, and the one of the vendor's own program: both sample on the rising edge."""
+WINDOW_ID: Final = 0x01
+"""The bit of WIN_CTRL in which the two codes of table 24 differ; no other is defined."""
+BURST_TRIES: Final = 3
+"""One damaged burst, or one write that was lost, is no refusal."""
+
+
+class SpiDeviceSettings(RegisterSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of an IMU61x on SPI."""
+
+    burst: Literal["standard", "extended", "registers"] = "standard"
+    """Kind of read: the standard burst; the extended burst, which has temperature and angles; or single registers."""
+    checksum_bits: Literal[16, 32] = 32
+    """Checksum of the standard burst: all 32 bits, or only the 16 that the manual has."""
+
+
+# --- state -----------------------------------------------------------------------------------------------------------
+
+
+class State:
+    """State as READ_STATE reads it. Missing bytes count as zeros."""
+
+    def __init__(self, data: bytes) -> None:
+        _, *words, _, window = (*answers(data), *(0,) * 10)[:10]
+        self.product_id = b"".join(word.to_bytes(2, "big") for word in words[:4])
+        self.filter = words[4] & 0xFF
+        self.burst_ctrl = (words[5], words[6])
+        """The words at 0x0C and 0x0D."""
+        self.window = window & WINDOW_ID
+
+    def differences(self, settings: SpiDeviceSettings) -> str:
+        """Compare filter and window with the settings; an empty string if all agrees. Bursts show by themselves."""
+        wanted = wanted_filter(settings, self.filter)
+        if self.filter != wanted:
+            return f"FILTER_CTRL is {self.filter:#04x}, expected {wanted:#04x}"
+        return f"WIN_CTRL is {self.window}, expected 0" if self.window else ""
+
+    @property
+    def kind(self) -> BurstKind:
+        """The kind of burst by BURST_CTRL: extended if any of the places where it may be read says so."""
+        halves = {byte for word in self.burst_ctrl for byte in word.to_bytes(2, "big")}
+        return "extended" if 1 in halves else "standard"
+
+
+# --- scripts ---------------------------------------------------------------------------------------------------------
+
+
+def probe(_settings: SpiDeviceSettings) -> TransferScript[Identity]:
+    """Read PROD_ID1 … 4, and close the window in any case. Raises DeviceRefused for anything but an IMU61x."""
+    return identity_of((yield from read_state()).product_id)
+
+
+def set_up(settings: SpiDeviceSettings) -> TransferScript[Mapping[str, str]]:
+    """Write FILTER_CTRL and BURST_CTRL where they differ and read back. Raises DeviceRefused if they differ still.
+
+    Where BURST_CTRL reads back is not certain, so a burst itself decides which kind is selected.
+    """
+    state = yield from read_state()
+    wanted = wanted_filter(settings, state.filter)
+    if state.filter != wanted:
+        yield from write_control(wanted)
+    if state.window:
+        yield CLOSE_ONLY
+    if settings.burst != "registers":
+        yield from _select(settings.burst, state, settings.checksum_bits)
+    return {**filter_words(wanted), "burst": state.kind if settings.burst == "registers" else settings.burst}
+
+
+def read_state() -> TransferScript[State]:
+    """Read identity and settings."""
+    return State((yield from _in_window_1(READ_STATE)))
+
+
+def read_control() -> TransferScript[int]:
+    """Read FILTER_CTRL."""
+    return (yield from read_state()).filter
+
+
+def write_control(control: int) -> TransferScript[None]:
+    """Write FILTER_CTRL and read it back. Raises DeviceRefused if it is not the value written."""
+    yield from _in_window_1(message(OPEN, write(FILTER_CTRL, control), CLOSE))
+    check_filter(control, (yield from read_control()))
+
+
+def _select(kind: BurstKind, state: State, checksum_bits: int) -> TransferScript[None]:
+    """Select a kind of burst if it is not, until a burst is of that kind. Raises DeviceRefused."""
+    why = ""
+    for attempt in range(BURST_TRIES):
+        if attempt or state.kind != kind:
+            on = 1 if kind == "extended" else 0
+            yield from _in_window_1(message(OPEN, write(BURST_CTRL + 1, on), CLOSE))
+        why = burst_problem(kind, (yield BURSTS[kind]), checksum_bits)
+        if not why:
+            return
+    low, high = (yield from read_state()).burst_ctrl
+    raise DeviceRefused(
+        f"expected a burst of kind {kind}, which was selected: {why}; BURST_CTRL reads {low:#06x} at 0x0C and "
+        f"{high:#06x} at 0x0D; is the bus too fast?"
+    )
+
+
+def _in_window_1(transfer: Transfer) -> TransferScript[bytes]:
+    """A message that opens and closes window 1; one that failed on its way may have left it open."""
+    try:
+        return (yield transfer)
+    except TransferError:
+        yield CLOSE_ONLY
+        raise
+
+
+TEMPERATURE_NS: Final = NS_PER_S
+"""Interval of reading the temperature where the burst has none."""
+
+POLLS: Final = {
+    "standard": (Poll(READ_STANDARD), Poll(READ_STATE, CHECK_NS), Poll(READ_TEMPERATURE, TEMPERATURE_NS)),
+    "extended": (Poll(READ_EXTENDED), Poll(READ_STATE, CHECK_NS)),
+    "registers": (Poll(READ_REGISTERS), Poll(READ_STATE, CHECK_NS)),
+}
+"""Polls by the setting `burst`, in the order of the codec's polls."""
+_BURST, _STATE, _TEMPERATURE = range(3)
+DEVICE_STATUS: Final = 0x7FFF_FFFF
+"""The bits of the extended burst's status that are passed on: bit 31 of a sample's status is imud's own. The manual
+gives none of them a meaning."""
+
+
+class Imu61xSpiCodec:
+    """Decoder of bursts or registers. Synchronization: one thread.
+
+    Where a burst has no temperature, samples carry the last one read, at most two seconds old. Registers have no check
+    value: only what no device can send is refused there, and a value may be of two updates (by one step of its high
+    word at most).
+    """
+
+    def __init__(self, ledger: Ledger, settings: SpiDeviceSettings) -> None:
+        self.ledger = ledger
+        self.polls: Sequence[Poll] = POLLS[settings.burst]
+        self._settings = settings
+        self._bad, self._measure, words = {
+            "standard": (self._bad_sum, self._standard, STANDARD_WORDS),
+            "extended": (_bad_crc, _extended, EXTENDED_WORDS),
+            "registers": (_never_bad, _registers, REGISTER_WORDS),
+        }[settings.burst]
+        self._frames = PolledFrameDecoder(ledger, 2 * words)
+        self._temperature_c: float | None = None
+
+    @property
+    def stale(self) -> int:
+        """Frames that repeated the one before."""
+        return self._frames.stale
+
+    def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
+        """Decode the bytes of one transfer; those of the pipeline are no part of a frame. Never raises."""
+        if poll == _BURST:
+            return self._frames.decode(data[PIPELINE_BYTES:], self._bad, self._measure)
+        return self._on_state(data) if poll == _STATE else self._on_temperature(data)
+
+    def on_silence(self, poll: int) -> Sequence[PolledEvent]:
+        """No-op: nothing follows from one failed transfer."""
+        return ()
+
+    def reset(self) -> None:
+        """Forget the last frame: the next one is not compared with it."""
+        self._frames.reset()
+        self._temperature_c = None
+
+    def _on_state(self, data: bytes) -> Sequence[PolledEvent]:
+        state = State(data)
+        why = state.differences(self._settings)
+        try:
+            identity_of(state.product_id)
+        except DeviceRefused as error:
+            why = str(error)
+        self._frames.add_reply(data[PIPELINE_BYTES:], good=not why)
+        return (Vanished(why),) if why else ()
+
+    def _on_temperature(self, data: bytes) -> Sequence[PolledEvent]:
+        words = answers(data)
+        good = len(words) >= 2 and any(words[:2]) and words[:2] != (0xFFFF, 0xFFFF)
+        self._temperature_c = temperature_c(_signed(words[0] << 16 | words[1])) if good else None
+        self._frames.add_reply(data[PIPELINE_BYTES:], good=good)
+        return ()
+
+    def _bad_sum(self, frame: bytes) -> BadReason | None:
+        return None if sum_matches(frame, self._settings.checksum_bits) else BadReason.CRC
+
+    def _standard(self, frame: bytes) -> Measured:
+        gyro, accel = _in_si(_joined(frame, 0), RAD_S_PER_COUNT), _in_si(_joined(frame, 12), M_S2_PER_COUNT)
+        return Measurement(len(frame), 0, None, accel, gyro, temperature_c=self._temperature_c), True
+
+
+_SIX: Final = struct.Struct(">6H")
+_THREE: Final = struct.Struct(">3i")
+
+
+def _joined(frame: bytes, at: int) -> tuple[int, int, int]:
+    """Three i32 of low word, high word."""
+    words = _SIX.unpack_from(frame, at)
+    x, y, z = ((high << 16 | low) for low, high in zip(words[::2], words[1::2], strict=True))
+    return _signed(x), _signed(y), _signed(z)
+
+
+def _signed(value: int) -> int:
+    return value - 0x1_0000_0000 if value & 0x8000_0000 else value
+
+
+def _in_si(counts: Sequence[int], factor: float) -> Vector3:
+    x, y, z = counts
+    return (x * factor, y * factor, z * factor)
+
+
+def _registers(frame: bytes) -> Measured:
+    (temperature,) = struct.unpack_from(">i", frame)
+    gyro = _in_si(_THREE.unpack_from(frame, 4), RAD_S_PER_COUNT)
+    accel = _in_si(_THREE.unpack_from(frame, 16), M_S2_PER_COUNT_REGISTER)
+    return Measurement(len(frame), 0, None, accel, gyro, temperature_c=temperature_c(temperature)), True
+
+
+def _never_bad(_frame: bytes) -> BadReason | None:
+    return None
+
+
+def _bad_crc(frame: bytes) -> BadReason | None:
+    return None if crc_matches(little_endian(frame)) else BadReason.CRC
+
+
+def _extended(frame: bytes) -> Measured:
+    values = EXTENDED.unpack(little_endian(frame))
+    gyro, accel, euler = (
+        scaled(part, factor)
+        for part, factor in (
+            (values[0:3], RAD_S_PER_DEG_S), (values[3:6], M_S2_PER_G), (values[7:10], RAD_PER_DEG),
+        )
+    )  # fmt: skip
+    temperature = values[6] if isfinite(values[6]) else None
+    measurement = Measurement(
+        len(frame), 0, None, accel, gyro,
+        quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
+        euler_rad=euler, temperature_c=temperature, status=values[10] & DEVICE_STATUS,
+    )  # fmt: skip
+    return measurement, None not in (accel, gyro, euler, temperature)
+
+
+Burst = Annotated[
+    BurstKind,
+    Meta(description="kind of burst by BURST_CTRL; `options.burst` sets it", extra={"section": "2.4.1, table 16"}),
+]
+
+
+def _read(_target: Target) -> TransferScript[Mapping[str, Any]]:
+    state = yield from read_state()
+    return {**filter_words(state.filter), "burst": state.kind}
+
+
+SETTINGS: Final = DeviceSettings(
+    table={**filter_settings(FilterControl(read_control, write_control)), "burst": Setting(type=Burst)},
+    read=_read,
+    check=check_settings,
+)
+"""Lost when the device restarts; the filters that it starts with are parameter 31 of its UART."""
+
+
+def _example_reading(random: Random) -> bytes:
+    """A standard burst with random values, the words of the pipeline before it."""
+    pipeline = random.randbytes(PIPELINE_BYTES)
+    return pipeline + encode_standard(accel_m_s2=random_vector(random, 9.8), gyro_rad_s=random_vector(random, 2))
+
+
+def _read_ns(options: SpiDeviceSettings, link: Any) -> int:
+    """The bits at the bus's clock, and the pauses between words: 256 µs for a standard burst at 1 MHz."""
+    transfer = POLLS[options.burst][0].transfer
+    bits = 8 * sum(map(len, transfer.sends))
+    speed_hz: int = link.speed_hz
+    return bits * NS_PER_S // speed_hz + len(transfer.sends) * transfer.gap_us * NS_PER_US
+
+
+DRIVER: Final = register_driver(
+    "spi", SpiDeviceSettings, MODES, probe, set_up, Imu61xSpiCodec, _example_reading, _read_ns, SETTINGS
+)

@@ -1,0 +1,675 @@
+"""Settings that an IMU61x on a UART keeps: parameters of tables 9 and 12, and the output mode. Manual, 1.5 and 1.6.
+
+Values are numbers with the unit in the name of the setting, or names in place of the device's codes. Whether parameters
+27 and 30 come into force at once or at the next start is not documented.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import isfinite
+from typing import Annotated, Any, Final, Literal
+
+from msgspec import Meta
+
+from imud.contracts.command import Target
+from imud.contracts.driver import Identity
+from imud.contracts.script import Reply, Request, RequestScript, pause, with_undo
+from imud.contracts.setting import DeviceSettings, Setting
+from imud.drivers.imu61x.common import (
+    ACCEL_FILTER,
+    FILTER_DEFAULT,
+    FILTERS,
+    GYRO_FILTER,
+    I2C_ADDRESSES,
+    FilterChoice,
+    I2cAddressChoice,
+    filter_code,
+    filter_codes,
+    i2c_address,
+    same_address,
+    same_filter,
+)
+from imud.drivers.imu61x.uart import commands
+from imud.drivers.imu61x.uart.codec import RESULT_DONE, Parameter, Status
+from imud.drivers.imu61x.uart.commands import (
+    BAUD_RATES,
+    CONTACT_TRIES,
+    STREAM,
+    BaudRate,
+    BusMode,
+    Imu61xUartSettings,
+    OutputMode,
+    RateHz,
+    acknowledged,
+    answered,
+    in_contact,
+    ordered,
+    read,
+    result_of,
+    resume_streaming,
+    sample,
+    settled,
+)
+from imud.model.errors import BadArgument, NoReply, Rejected
+from imud.model.sample import Measurement
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
+
+SAMPLE_NS: Final = 3 * NS_PER_S
+"""Wait for the first sample after the order to stream: three times the longest period, 1 s."""
+QUIET_NS: Final = 1200 * NS_PER_MS
+"""Without a sample for longer than the longest period, the stream has stopped."""
+DRAIN_NS: Final = 200 * NS_PER_MS
+"""Time for samples that were on their way when the stream stopped: 512 bytes at 115200 baud, and an adapter."""
+
+GYRO_OFFSETS: Final = (Parameter.GYRO_X_OFF, Parameter.GYRO_Y_OFF, Parameter.GYRO_Z_OFF)
+INSTALLATION_ANGLES: Final = (Parameter.INSTALL_X_OFF, Parameter.INSTALL_Y_OFF, Parameter.INSTALL_Z_OFF)
+
+ParameterValues = Mapping[Parameter, float]
+"""Parameters as read; one that the device does not answer for is left out."""
+
+# --- identity and status ----------------------------------------------------------------------------------------------
+
+
+def identify() -> RequestScript[Identity]:
+    """Ask for versions, model and serial number (CMD 1). Raises NoReply.
+
+    A device that answers only in command mode misses the samples of the exchange, some 20 ms.
+    """
+
+    def ask() -> RequestScript[Identity]:
+        return identity_of((yield from settled(CONTACT_TRIES)))
+
+    return in_contact(ask)
+
+
+def identity_of(status: Status) -> Identity:
+    """Make the identity from S1. The numbers of the models are not documented."""
+    details = {"hardware_version": str(status.hardware_version), "model_number": str(status.model)}
+    return Identity("IMU61x", _serial_number(status), str(status.software_version), details)
+
+
+def _serial_number(status: Status) -> str:
+    return "".join(f"{word:08X}" for word in status.serial_number)
+
+
+def device_status() -> RequestScript[Mapping[str, Any]]:
+    """Ask for S1 (CMD 1); return its members by name, see `status_words`. Raises NoReply."""
+
+    def ask() -> RequestScript[Mapping[str, Any]]:
+        return status_words((yield from settled(CONTACT_TRIES)))
+
+    return in_contact(ask)
+
+
+def status_words(status: Status) -> Mapping[str, Any]:
+    """Name the members of S1 that were sent. Names that end in `_raw` have a number without a documented unit.
+
+    Bits are in hexadecimal: of the system's status, and of `imu_health`, 32 bytes.
+    """
+    words = {
+        "serial_number": _serial_number(status),
+        "software_version": status.software_version,
+        "hardware_version": status.hardware_version,
+        "model_number": status.model,
+        "system_status_bits": None if status.system_status is None else f"{status.system_status:#010x}",
+        "cpu_load_raw": status.cpu_load,
+        "drop_rate_raw": status.drop_rate,
+        "i2c_master_raw": status.i2c_master,
+        "voltage_raw": status.voltage,
+        "user_config_status_raw": status.user_config_status,
+        "calibration_status_raw": status.calibration_status,
+        "imu_health_bits": None if status.imu_health is None else status.imu_health.hex(),
+    }
+    return {name: value for name, value in words.items() if value is not None}
+
+
+def sample_once() -> RequestScript[Mapping[str, Any]]:
+    """Ask for one sample (CMD 2), or have the next one while it streams; return it in SI units. Raises NoReply."""
+
+    def ask() -> RequestScript[Mapping[str, Any]]:
+        return sample_words((yield from sample()))
+
+    return in_contact(ask)
+
+
+def sample_words(measurement: Measurement) -> Mapping[str, Any]:
+    """Name the values of an AHRS frame; those that were not finite are left out."""
+    words = {
+        "timer_us": measurement.dev_ticks,
+        "accel_m_s2": measurement.accel_m_s2,
+        "gyro_rad_s": measurement.gyro_rad_s,
+        "euler_rad": measurement.euler_rad,
+        "temperature_c": measurement.temperature_c,
+    }
+    return {name: value for name, value in words.items() if value is not None}
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+def read_settings() -> RequestScript[Mapping[str, str]]:
+    """Read all parameters of table 9 (CMD 6), by the names of imud's settings, for people. Raises NoReply.
+
+    A parameter that the device does not answer for is left out: not every model has every one (assumed).
+    """
+
+    def ask() -> RequestScript[Mapping[str, str]]:
+        return parameter_words((yield from read_parameters()))
+
+    return in_contact(ask)
+
+
+def read_parameters() -> RequestScript[ParameterValues]:
+    """Read all parameters of table 9, in contact. Raises NoReply where it does not even answer for the baud rate."""
+    values = {Parameter.BAUD: (yield from read(Parameter.BAUD))}
+    for parameter in Parameter:
+        if parameter is Parameter.BAUD:
+            continue
+        try:
+            values[parameter] = yield from read(parameter, 1)
+        except NoReply:
+            continue
+    return values
+
+
+def parameter_words(values: ParameterValues) -> Mapping[str, str]:
+    """Name parameters as imud's settings do, units in the names; a value that is none of the manual's as a number."""
+    words: dict[str, str] = {}
+    for name, parameter in (("baud", Parameter.BAUD), ("output_rate_hz", Parameter.AHRS_RATE)):
+        if parameter in values:
+            words[name] = _number(values[parameter])
+    control = values.get(Parameter.FILTER)
+    if control is not None and control in range(0x100):
+        accel, gyro = filter_codes(int(control))
+        words |= {"accel_filter": FILTERS[accel], "gyro_filter": FILTERS[gyro]}
+    elif control is not None:
+        words["filter"] = _number(control)
+    mode, address = values.get(Parameter.BUS_MODE), values.get(Parameter.I2C_ADDRESS)
+    if mode is not None:
+        words["second_bus"] = BUS_NAMES.get(mode, _number(mode))
+    if address is not None:
+        words["i2c_address"] = f"{int(address):#04x}" if address in range(0x80) else _number(address)
+    for name, three in (("gyro_offset_deg_s", GYRO_OFFSETS), ("installation_angles_deg", INSTALLATION_ANGLES)):
+        if all(parameter in values for parameter in three):
+            words[name] = ", ".join(_number(values[parameter]) for parameter in three)
+    return words
+
+
+BUS_NAMES: Final[Mapping[float, str]] = {mode.value: mode.name.lower() for mode in BusMode}
+"""Values of parameter 27 by number: `uart_only`, `spi`, `i2c`, `by_pin`."""
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if isfinite(value) and value == int(value) else f"{value:.7g}"
+
+
+# --- modes and saving -------------------------------------------------------------------------------------------------
+
+
+def start_streaming(*, done: int = RESULT_DONE) -> RequestScript[None]:
+    """Start streaming of AHRS frames (CMD 3, mode 1), and wait for one. Raises Rejected, and NoReply for no sample."""
+    for _ in range(CONTACT_TRIES):
+        if (yield from ordered(commands.output_mode(OutputMode.STREAM), done)):
+            break
+    if not isinstance((yield commands.await_sample(SAMPLE_NS)), Reply):
+        raise NoReply(
+            f"output mode STREAM: expected a sample within {SAMPLE_NS / NS_PER_S:.0f} s, got none; "
+            "is the host's transmit line connected?"
+        )
+
+
+def wake() -> RequestScript[bool]:
+    """Start streaming if the device answers; return whether it acknowledged, with any result. Raises NoReply.
+
+    Not saved. Whether it streams then, is seen by its samples.
+    """
+    yield from answered(commands.ask_status())
+    return (yield from resume_streaming())
+
+
+def stop_streaming(*, done: int = RESULT_DONE) -> RequestScript[None]:
+    """Enter command mode (CMD 3, mode 100), in which the device only replies, and see that samples end.
+
+    Raises NoReply for no answer, and Rejected where it refuses or streams on.
+    """
+    yield from ordered(commands.output_mode(OutputMode.COMMAND), done)
+    yield from settled()
+    yield pause(DRAIN_NS)
+    if isinstance((yield commands.await_sample(QUIET_NS)), Reply):
+        raise Rejected("output mode COMMAND: expected no more samples, got one")
+
+
+def save(*, done: int = RESULT_DONE) -> RequestScript[None]:
+    """Write all parameters to flash (CMD 5). Raises Rejected, and NoReply without an acknowledgement.
+
+    The output mode is one of them, so a device that obeys while it streams is not taken out of that: what is saved in
+    command mode starts silent. One that obeys in command mode only cannot keep that mode (assumed: it could never be
+    saved as streaming).
+    """
+
+    def ask() -> RequestScript[None]:
+        yield from acknowledged(commands.save(), done)
+        yield from settled()
+
+    return in_contact(ask, CONTACT_TRIES)
+
+
+# --- parameters and heading -------------------------------------------------------------------------------------------
+
+_SETTERS: Final[Mapping[Parameter, Callable[[int], Request]]] = {
+    Parameter.AHRS_RATE: commands.set_rate,
+    Parameter.I2C_ADDRESS: commands.set_i2c_address,
+    Parameter.FILTER: lambda value: commands.set_filter(*filter_codes(value)),
+}
+
+
+def write_parameter(parameter: Parameter, value: int | BusMode) -> RequestScript[None]:
+    """Set a parameter and read it back; not saved. Raises BadArgument, NoReply, and Rejected if it reads otherwise.
+
+    The baud rate is not set this way, see `following.change_baud`; offsets and angles come from calibrations.
+    """
+    if isinstance(value, BusMode) and parameter is Parameter.BUS_MODE:
+        request = commands.set_bus_mode(value)
+    elif parameter in _SETTERS and not isinstance(value, BusMode):
+        request = _SETTERS[parameter](value)
+    else:
+        settable = ", ".join(name.name for name in (*_SETTERS, Parameter.BUS_MODE))
+        raise BadArgument(f"parameter {parameter.name} = {value}: expected one of {settable}, with a value of its kind")
+    wanted = value.value if isinstance(value, BusMode) else value
+    return in_contact(lambda: _write(request, parameter, wanted))
+
+
+def _write(request: Request, parameter: Parameter, wanted: int) -> RequestScript[None]:
+    result = result_of((yield request))
+    found = yield from read(parameter)
+    if found != wanted:
+        word = "" if result is None else f", acknowledged with result {result}"
+        raise Rejected(f"{request.name}: reads back as {found:g}{word}")
+
+
+def write_filters(accel: int | None, gyro: int | None) -> RequestScript[None]:
+    """Set the codes of the low-pass filters, None to leave one as it is, and read back. Raises as `write_parameter`."""
+
+    def ask() -> RequestScript[None]:
+        present = yield from read(Parameter.FILTER)
+        if present not in range(0x100):
+            raise Rejected(f"parameter FILTER: expected 0 to 255, read {present:g}")
+        present_accel, present_gyro = filter_codes(int(present))
+        codes = (present_accel if accel is None else accel, present_gyro if gyro is None else gyro)
+        request = commands.set_filter(*codes)
+        yield from _write(request, Parameter.FILTER, codes[0] << 4 | codes[1])
+
+    return in_contact(ask)
+
+
+def reset_heading(heading_deg: float, *, done: int = RESULT_DONE) -> RequestScript[None]:
+    """Make the heading 0° … 360° (CMD 4). Raises NoReply, Rejected."""
+
+    def ask() -> RequestScript[None]:
+        yield from acknowledged(commands.reset_heading(heading_deg), done)
+        yield from settled()
+
+    return in_contact(ask)
+
+
+LOOK_TRIES: Final = 3
+"""A device in the middle of a false frame, made of bytes at another rate, or quiet after an answer, may miss two."""
+BOOT_NS: Final = NS_PER_S
+BOOT_TRIES: Final = 5
+"""Number of searches after a restart; with their time-outs longer than the 3 s that section 2.2 names."""
+US_PER_S: Final = NS_PER_S // NS_PER_US
+TIMER_US: Final = 2**32
+OLD_US: Final = 15 * US_PER_S
+"""Least age of the timer before a restart: more than the time in which the device is searched for afterwards, so that
+a timer that began again shows less."""
+
+FACTORY: Final[Mapping[Parameter, int]] = {
+    Parameter.BAUD: BAUD_RATES[0],
+    Parameter.AHRS_RATE: 100,
+    Parameter.BUS_MODE: BusMode.SPI.value,
+    Parameter.I2C_ADDRESS: I2C_ADDRESSES[0],
+    Parameter.FILTER: FILTER_DEFAULT,
+}
+"""The defaults that tables 1, 9 and 12 name."""
+FACTORY_BAUD: Final = FACTORY[Parameter.BAUD]
+
+
+@dataclass(frozen=True, slots=True)
+class BaudChange:
+    """Result of a successful change of the baud rate."""
+
+    baud: int
+    """The rate at which the device answered last; the line has it as well."""
+    saved: bool
+    """Whether the device acknowledged that it saved its parameters."""
+    configuration: str = ""
+    """What to change in the configuration; empty for nothing."""
+
+
+def with_advice(script: RequestScript[BaudChange], fixed_baud: int) -> RequestScript[BaudChange]:
+    """Make the same script; its answer says what to change where the configuration fixes the rate (0: it does not)."""
+    change = yield from script
+    if fixed_baud in (0, change.baud):
+        return change
+    words = f"change `uart.baud` from {fixed_baud} to {change.baud} or auto: imud uses it at its next start"
+    return replace(change, configuration=words)
+
+
+# --- restart ----------------------------------------------------------------------------------------------------------
+
+
+def restart(*, done: int = RESULT_DONE) -> RequestScript[Identity]:
+    """Restart (CMD 9) and wait until it answers again. Parameters that were not saved are lost.
+
+    Raises NoReply where it does not come back or sends no AHRS frame, and Rejected where its timer went on.
+    """
+    before_us = yield from _old_timer()
+    result = yield from in_contact(_restart)
+    yield pause(BOOT_NS)
+    identity, after_us = yield from _back()
+    if after_us >= before_us:
+        word = "no acknowledgement" if result is None else f"acknowledgement {result}"
+        raise Rejected(
+            f"restart: expected a timer that begins again, got {before_us / US_PER_S:.1f} s before and "
+            f"{after_us / US_PER_S:.1f} s after it, and {word} ({done} is done)"
+        )
+    return identity
+
+
+def _old_timer() -> RequestScript[int]:
+    """The timer, µs, once it can be distinguished from one that has just begun, and does not turn over soon."""
+    while True:
+        timer_us = (yield from in_contact(sample)).dev_ticks
+        assert timer_us is not None  # every AHRS frame has it
+        if timer_us < OLD_US:
+            yield pause((OLD_US - timer_us) * NS_PER_US)
+        elif timer_us > TIMER_US - 2 * OLD_US:
+            yield pause((TIMER_US - timer_us) * NS_PER_US)
+        else:
+            return timer_us
+
+
+def _restart() -> RequestScript[int | None]:
+    return result_of((yield commands.restart()))
+
+
+def _back() -> RequestScript[tuple[Identity, int]]:
+    """Wait for the device after a restart."""
+
+    def ask() -> RequestScript[tuple[Identity, int]]:
+        status = yield from settled(CONTACT_TRIES)
+        return identity_of(status), (yield from sample()).dev_ticks or 0
+
+    for _ in range(BOOT_TRIES - 1):
+        try:
+            return (yield from in_contact(ask))
+        except NoReply:
+            continue
+    return (yield from in_contact(ask))
+
+
+# --- baud rate --------------------------------------------------------------------------------------------------------
+
+
+def change_baud(
+    baud: int, present_baud: int, *, done: int = RESULT_DONE, save: bool = True
+) -> RequestScript[BaudChange]:
+    """Set the baud rate of device and line from `present_baud` to `baud`, and save it.
+
+    Whether the device changes at once or at its next start is not documented, so it is searched at both rates. The
+    rate is saved only after a reply at the new rate, or a report of it at the old one; without `save` in the second
+    case only, where it comes into force in no other way. Leaves it streaming.
+    Raises BadArgument for a rate that does not carry the output rate of the device, Rejected where it stays at the old
+    rate (the line too) or refuses to save, and NoReply where it is not heard; if nothing was saved, it has the old rate
+    again after power-on.
+    """
+    return with_undo(_change_baud(baud, present_baud, done, save), STREAM)
+
+
+def _change_baud(baud: int, present_baud: int, done: int, save: bool) -> RequestScript[BaudChange]:
+    request = commands.set_baud(baud)
+    if (yield from _look((present_baud,))) is None:
+        yield from resume_streaming()
+        raise NoReply(_unheard(f"{request.name}: nothing was changed", (present_baud,)))
+    rate_hz = yield from read(Parameter.AHRS_RATE)
+    try:
+        commands.require_fit(rate_hz, baud)
+    except BadArgument as error:
+        yield from resume_streaming()
+        raise BadArgument(f"baud: {error}; lower the output rate first") from None
+    yield request
+    saved = False
+    found = yield from _look((baud, present_baud))
+    if found == (present_baud, baud) != (baud, baud):  # set, but in force at the next start only
+        yield from resume_streaming()
+        saved = yield from _save(done)
+        yield from in_contact(_restart)
+        yield pause(BOOT_NS)
+        found = yield from _look((baud, present_baud), BOOT_TRIES)
+    if found is None:
+        yield from resume_streaming()  # at the present rate, where the search ended
+        kept = "it may have been saved" if saved else "switch its power off and on: nothing was saved"
+        raise NoReply(_unheard(f"{request.name}: {kept}", (baud, present_baud)))
+    yield from resume_streaming()
+    if found[0] != baud:
+        raise Rejected(f"{request.name}: the device stays at {present_baud} baud")
+    if save:
+        saved = (yield from _save(done)) or saved
+    return BaudChange(baud, saved)
+
+
+# --- factory reset ----------------------------------------------------------------------------------------------------
+
+
+def factory_reset(present_baud: int, *, done: int = RESULT_DONE) -> RequestScript[BaudChange]:
+    """Restore and save the factory settings (CMD 15), follow the device to its baud rate, and read its parameters back.
+
+    One that changes at its next start is restarted. Leaves it streaming, as delivered. Raises NoReply, and Rejected
+    where a parameter reads otherwise than `FACTORY`.
+    """
+    return with_undo(_factory_reset(present_baud, done), STREAM)
+
+
+def _factory_reset(present_baud: int, done: int) -> RequestScript[BaudChange]:
+    bauds = (FACTORY_BAUD, present_baud)
+    if (yield from _look((present_baud,))) is None:
+        yield from resume_streaming()
+        raise NoReply(_unheard("factory reset: nothing was changed", (present_baud,)))
+    result = result_of((yield commands.factory_reset()))
+    found = yield from _look(bauds)
+    others = {} if found is None else (yield from _not_factory())
+    refused = result is not None and result != done
+    pending = found is not None and found[0] != FACTORY_BAUD == found[1]
+    if found is not None and (pending or (others and not refused)):
+        yield from resume_streaming()
+        if pending:  # the parameters have the new values, which the restart must not lose
+            yield from _save(done)
+        yield from in_contact(_restart)
+        yield pause(BOOT_NS)
+        found = yield from _look(bauds, BOOT_TRIES)
+        others = {} if found is None else (yield from _not_factory())
+    yield from resume_streaming()
+    if found is None:
+        raise NoReply(_unheard("factory reset", bauds))
+    if others:
+        words = ", ".join(f"{parameter.name} {value:g}" for parameter, value in others.items())
+        expected = ", ".join(f"{parameter.name} {FACTORY[parameter]}" for parameter in others)
+        word = "none" if result is None else str(result)
+        raise Rejected(
+            f"factory reset: expected {expected}, read back {words}; acknowledgement {word} ({done} is done)"
+        )
+    return BaudChange(found[0], (yield from _save(done)))
+
+
+def _not_factory() -> RequestScript[Mapping[Parameter, float]]:
+    """The parameters that are not as delivered; one that the device does not have is left out."""
+    others = {}
+    for parameter, expected in FACTORY.items():
+        try:
+            value = yield from read(parameter)
+        except NoReply:
+            continue
+        if value != expected:
+            others[parameter] = value
+    return others
+
+
+# --- steps ------------------------------------------------------------------------------------------------------------
+
+
+def _save(done: int) -> RequestScript[bool]:
+    """Save; return whether the device acknowledged. Raises Rejected."""
+    return (yield from in_contact(lambda: ordered(commands.save(), done), CONTACT_TRIES))
+
+
+def _look(bauds: Sequence[int], tries: int = LOOK_TRIES) -> RequestScript[tuple[int, float] | None]:
+    """Find the device, and enter command mode; return the rate it answers at and the rate it reports.
+
+    The line is left at that rate, or at the last of `bauds` where it is not heard.
+    """
+    for baud in tuple(dict.fromkeys(bauds)) * tries:
+        heard = yield commands.output_mode(OutputMode.COMMAND, baud=baud)
+        try:
+            return baud, (yield from read(Parameter.BAUD, CONTACT_TRIES if isinstance(heard, Reply) else 1))
+        except NoReply:
+            continue
+    return None
+
+
+def _unheard(what: str, bauds: Sequence[int]) -> str:
+    rates = " and ".join(str(baud) for baud in dict.fromkeys(bauds))
+    return f"{what}; expected an answer at {rates} baud, got none: is the host's transmit line connected?"
+
+
+Baud = Annotated[
+    BaudRate, Meta(description="rate of the UART", extra={"unit": "bit/s", "section": "1.6, table 12, parameter 3"})
+]
+OutputRate = Annotated[
+    RateHz, Meta(description="AHRS frames per second", extra={"unit": "Hz", "section": "1.6, table 12, parameter 21"})
+]
+OutputModeName = Annotated[
+    Literal["stream", "command"],
+    Meta(
+        description="`stream`: sends AHRS frames; `command`: sends nothing but replies",
+        extra={"section": "1.6, table 12, CMD 3"},
+    ),
+]
+Address = Annotated[
+    I2cAddressChoice,
+    Meta(description="7-bit I2C address, 0x18 to 0x1b", extra={"section": "1.6, table 12, parameter 30"}),
+]
+SecondBus = Annotated[
+    Literal["uart_only", "spi", "i2c", "by_pin"],
+    Meta(
+        description="the bus next to the UART; `by_pin`: a pin that is open or low selects SPI, high selects I2C",
+        extra={"section": "1.6, table 12, parameter 27"},
+    ),
+]
+AccelFilter = Annotated[FilterChoice, ACCEL_FILTER]
+GyroFilter = Annotated[FilterChoice, GYRO_FILTER]
+_Three = Annotated[list[float], Meta(min_length=3, max_length=3)]
+GyroOffset = Annotated[
+    _Three,
+    Meta(
+        description="zero bias about X, Y, Z, as the static calibration found it",
+        extra={"unit": "°/s", "section": "1.5, table 9, parameters 8 to 10"},
+    ),
+]
+InstallationAngles = Annotated[
+    _Three,
+    Meta(
+        description="mounting error about X, Y, Z, as the installation calibration found it",
+        extra={"unit": "°", "section": "1.5, table 9, parameters 16 to 18"},
+    ),
+]
+
+
+def codes_of(target: Target) -> Imu61xUartSettings:
+    """The codes that the configuration gives, or the assumed ones."""
+    return target.settings if isinstance(target.settings, Imu61xUartSettings) else Imu61xUartSettings()
+
+
+# --- scripts ----------------------------------------------------------------------------------------------------------
+
+
+def _read(_target: Target) -> RequestScript[Mapping[str, Any]]:
+    streams = isinstance((yield commands.await_sample(QUIET_NS)), Reply)
+    values = yield from in_contact(read_parameters)
+    return {**settings_of(values), "output_mode": "stream" if streams else "command"}
+
+
+def settings_of(values: ParameterValues) -> Mapping[str, Any]:
+    """The settings in parameters as read; a value for which there are no words in the manual is left out."""
+    whole = {parameter: int(value) for parameter, value in values.items() if value in range(2_000_000)}
+    found: dict[str, Any] = {}
+    for name, parameter in (("baud", Parameter.BAUD), ("output_rate_hz", Parameter.AHRS_RATE)):
+        if parameter in whole:
+            found[name] = whole[parameter]
+    if (control := whole.get(Parameter.FILTER, -1)) in range(0x100):
+        accel, gyro = filter_codes(control)
+        found |= {"accel_filter": FILTERS[accel], "gyro_filter": FILTERS[gyro]}
+    if (mode := whole.get(Parameter.BUS_MODE, -1)) in BUS_NAMES:
+        found["second_bus"] = BUS_NAMES[mode]
+    if (address := whole.get(Parameter.I2C_ADDRESS, -1)) in range(0x80):
+        found["i2c_address"] = f"{address:#04x}"
+    for name, three in (("gyro_offset_deg_s", GYRO_OFFSETS), ("installation_angles_deg", INSTALLATION_ANGLES)):
+        if all(parameter in values for parameter in three):
+            found[name] = [values[parameter] for parameter in three]
+    return found
+
+
+def _write_baud(target: Target, baud: BaudRate) -> RequestScript[BaudChange]:
+    return change_baud(baud, target.baud, done=codes_of(target).result_done, save=False)
+
+
+def _write_mode(target: Target, mode: str) -> RequestScript[None]:
+    done = codes_of(target).result_done
+    return start_streaming(done=done) if mode == "stream" else stop_streaming(done=done)
+
+
+def _check(target: Target, values: Mapping[str, Any]) -> None:
+    rate_hz, baud = values.get("output_rate_hz"), values.get("baud") or target.baud
+    if rate_hz and baud:
+        try:
+            commands.require_fit(rate_hz, baud)
+        except BadArgument as error:
+            raise BadArgument(f"output_rate_hz and baud: {error}") from None
+
+
+SETTINGS: Final = DeviceSettings(
+    table={
+        "output_rate_hz": Setting(type=OutputRate, write=lambda _target, hz: write_parameter(Parameter.AHRS_RATE, hz)),
+        "accel_filter": Setting(
+            type=AccelFilter,
+            write=lambda _target, choice: write_filters(filter_code(choice), None),
+            agrees=same_filter,
+        ),
+        "gyro_filter": Setting(
+            type=GyroFilter,
+            write=lambda _target, choice: write_filters(None, filter_code(choice)),
+            agrees=same_filter,
+        ),
+        "second_bus": Setting(
+            type=SecondBus,
+            write=lambda _target, bus: write_parameter(Parameter.BUS_MODE, BusMode[bus.upper()]),
+        ),
+        "i2c_address": Setting(
+            type=Address,
+            write=lambda _target, address: write_parameter(Parameter.I2C_ADDRESS, i2c_address(address)),
+            agrees=same_address,
+        ),
+        "gyro_offset_deg_s": Setting(type=GyroOffset),
+        "installation_angles_deg": Setting(type=InstallationAngles),
+        "output_mode": Setting(type=OutputModeName, write=_write_mode),
+        "baud": Setting(type=Baud, write=_write_baud, connection=True),
+    },
+    read=_read,
+    save=lambda target: save(done=codes_of(target).result_done),
+    restart=lambda target: restart(done=codes_of(target).result_done),
+    check=_check,
+)
+"""What the device keeps; `output_rate_hz` and `baud` must go together.
+
+Filters are two halves of one parameter, each written by itself. A baud rate is saved by its own script only where the
+device changes at its next start.
+"""

@@ -1,0 +1,91 @@
+"""Decoding of frames read from a polled device: absent, damaged, stale (the same as before), or a new measurement."""
+
+from collections.abc import Callable, Sequence
+
+from imud.contracts.codec import BadFrame, BadReason, PolledEvent, Vanished
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+
+Measured = tuple[Measurement, bool]
+"""A measurement, and whether all of its values were finite."""
+
+
+class PolledFrameDecoder:
+    """Decoder of frames of fixed size with a check value, one per transfer. Synchronization: one thread.
+
+    In the ledger a stale frame is a good one that is ignored; one that shows an absent device is skipped bytes.
+    """
+
+    def __init__(self, ledger: Ledger, size_bytes: int) -> None:
+        self.stale = 0
+        """Good frames that had the same bytes as the one before."""
+        self._ledger = ledger
+        self._size_bytes = size_bytes
+        self._last = b""
+
+    def decode(
+        self,
+        data: bytes,
+        bad: Callable[[bytes], BadReason | None],
+        measure: Callable[[bytes], Measured],
+    ) -> Sequence[PolledEvent]:
+        """Decode one frame: `bad` returns why it is damaged, `measure` is called for new good ones. Never raises."""
+        ledger = self._ledger
+        ledger.bytes_in += len(data)
+        if len(data) != self._size_bytes or (why := absence(data)):
+            ledger.bytes_skipped += len(data)
+            short = f"expected {self._size_bytes} bytes, got {len(data)}"
+            return (Vanished(short if len(data) != self._size_bytes else why),)
+        reason = bad(data)
+        if reason is not None:
+            ledger.bytes_in_bad_frames += len(data)
+            if reason is BadReason.CRC:
+                ledger.frames_bad_crc += 1
+            else:
+                ledger.frames_bad_content += 1
+            return (BadFrame(reason, data),)
+        ledger.bytes_in_good_frames += len(data)
+        ledger.frames_good += 1
+        if data == self._last:
+            self.stale += 1
+            ledger.frames_ignored += 1
+            return ()
+        self._last = data
+        ledger.frames_in_samples += 1
+        measurement, finite = measure(data)
+        if finite:
+            return (measurement,)
+        ledger.frames_not_finite += 1
+        return (BadFrame(BadReason.NOT_FINITE, data), measurement)
+
+    def add_reply(self, data: bytes, *, good: bool) -> None:
+        """Count in the ledger what was read of other registers than those of the samples."""
+        ledger = self._ledger
+        ledger.bytes_in += len(data)
+        if good:
+            ledger.bytes_in_good_frames += len(data)
+            ledger.frames_good += 1
+            ledger.frames_in_replies += 1
+        else:
+            ledger.bytes_skipped += len(data)
+
+    def reset(self) -> None:
+        """Forget the last frame: the next one is new, even with the same bytes."""
+        self._last = b""
+
+
+_ONES = frozenset({0xFF})
+_ZEROS = frozenset({0x00})
+
+
+def absence(data: bytes) -> str:
+    """Return why these bytes come from a line that no device drives; empty if they may be of a device."""
+    first = data[:1]
+    if first not in (b"\xff", b"\x00", b""):
+        return ""
+    seen = frozenset(data)
+    if seen == _ONES:
+        return "only 0xFF is read: is it powered, is its data line wired?"
+    if seen == _ZEROS or not seen:
+        return "only 0x00 is read: is it powered, is its data line wired?"
+    return ""

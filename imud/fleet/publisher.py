@@ -1,0 +1,431 @@
+"""The output `mqtt`: what the event loop does of it, which is to put things into a queue.
+
+    loop: publish, event, tick ──▶ WriterQueue ──▶ writer (thread: messages, spool) ──▶ sender (thread: broker)
+
+On the broker: docs/fleet.md. The spool is of one daemon: a lock keeps a second one out.
+"""
+
+import fcntl
+import logging
+import os
+import socket
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+from zlib import crc32
+
+import msgspec
+
+from imud import __version__
+from imud.contracts.publisher import Batch, PublisherContext, PublisherType
+from imud.contracts.status import DeviceState, DeviceStatus, MqttStatus
+from imud.fleet.broker import BrokerTurn, Connect, PahoConnection, Will, check_extra
+from imud.fleet.commands import CommandChannel
+from imud.fleet.messages import (
+    SCHEMA,
+    SETTINGS,
+    STATE,
+    STATUS,
+    VERSION,
+    GatewayClock,
+    Stream,
+    boot_text,
+    is_name,
+    topic_of,
+)
+from imud.fleet.sender import MqttSender
+from imud.fleet.settings import DeviceSending, MqttSettings, broker_of
+from imud.fleet.spool import Spool
+from imud.fleet.streams import Gateway
+from imud.fleet.writer import SentState, SpoolWriter, WriterQueue
+from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES
+from imud.host.threads import BusThread, StartWorker
+from imud.model.errors import ServerError, reason_of
+from imud.model.event import Event, EventKind
+from imud.model.sample import SAMPLE_SCHEMA
+from imud.model.units import NS_PER_S
+
+PREFIX: Final = "homeassistant"
+"""The prefix of discovery that Home Assistant has unless it was changed there."""
+DEG_PER_RAD: Final = "57.29577951308232"
+"""180 / π, in templates."""
+ANGLES: Final = ("roll", "pitch", "yaw")
+"""Components of `euler_rad`."""
+
+
+def discovery_topic(gateway: Gateway, device: str) -> str:
+    """The topic of a device's configuration. The check sum keeps `a_b` of `c` apart from `a` of `b_c`."""
+    return f"{PREFIX}/device/{_unique_id(gateway, device)}/config"
+
+
+def discovery_of(gateway: Gateway, status: DeviceStatus, sending: DeviceSending) -> Mapping[str, object]:
+    """The configuration of a device with all its parts."""
+    unique_id = _unique_id(gateway, status.name)
+    parts = _status_parts(topic_of(gateway.site, gateway.gateway, status.name, STATUS))
+    if sending.rate_hz and "mean" in sending.values:
+        parts |= _attitude_parts(topic_of(gateway.site, gateway.gateway, status.name, Stream.STATISTICS))
+    identity = {
+        key: status.identity[name]
+        for key, name in (("model", "product"), ("serial_number", "serial_number"), ("sw_version", "firmware"))
+        if status.identity.get(name)
+    }
+    return {
+        "device": {"identifiers": [unique_id], "name": f"{gateway.gateway} {status.name}", **identity},
+        "origin": {"name": "imud", "sw_version": __version__},
+        "availability": [
+            {
+                "topic": topic_of(gateway.site, gateway.gateway, "", STATE),
+                "value_template": "{{ 'online' if value_json.online else 'offline' }}",
+            }
+        ],
+        "components": {name: {**part, "unique_id": f"{unique_id}_{name}"} for name, part in parts.items()},
+        "qos": 1,
+    }
+
+
+def _unique_id(gateway: Gateway, device: str) -> str:
+    whole = f"{gateway.site}/{gateway.gateway}/{device}"
+    return f"imud_{gateway.gateway}_{device}_{crc32(whole.encode()):08x}"
+
+
+def _status_parts(topic: str) -> dict[str, dict[str, object]]:
+    """What the retained state has."""
+    diagnostic = {"state_topic": topic, "entity_category": "diagnostic"}
+    return {
+        "running": {
+            "platform": "binary_sensor", "name": "Running", "device_class": "running", **diagnostic,
+            "value_template": f"{{{{ 'ON' if value_json.state == '{DeviceState.RUNNING.value}' else 'OFF' }}}}",
+        },
+        "rate": {
+            "platform": "sensor", "name": "Sample rate", "device_class": "frequency", "state_class": "measurement",
+            "unit_of_measurement": "Hz", **diagnostic, "value_template": "{{ value_json.rate_hz | round(1) }}",
+        },
+        "temperature": {
+            "platform": "sensor", "name": "Temperature", "device_class": "temperature", "state_class": "measurement",
+            "unit_of_measurement": "°C", "state_topic": topic,
+            "value_template": "{{ value_json.temperature_c | round(1) if value_json.temperature_c is number else '' }}",
+        },
+    }  # fmt: skip
+
+
+def _attitude_parts(topic: str) -> dict[str, dict[str, object]]:
+    """Means of the newest interval. A message without intervals, or a device without angles, gives an empty value,
+    which Home Assistant leaves out."""
+    found: dict[str, dict[str, object]] = {}
+    for at, name in enumerate(ANGLES):
+        newest = "value_json.intervals[-1]['values']"
+        value = f"({newest}.euler_rad.mean[{at}] * {DEG_PER_RAD}) | round(2)"
+        found[name] = {
+            "platform": "sensor", "name": name.capitalize(), "state_class": "measurement", "unit_of_measurement": "°",
+            "state_topic": topic, "suggested_display_precision": 1,
+            "value_template": (
+                f"{{{{ {value} if 'intervals' in value_json and 'euler_rad' in {newest} else '' }}}}"
+            ),
+        }  # fmt: skip
+    return found
+
+
+log = logging.getLogger(__name__)
+
+LOCK: Final = "lock"
+STATE_NS: Final = NS_PER_S
+"""After an event of STATE_KINDS the state of devices is looked at so soon: that of one takes the loop 0.6 ms."""
+STATE_KINDS: Final = frozenset(
+    (EventKind.UP, EventKind.DOWN, EventKind.SYNC, EventKind.CONFIGURATION, EventKind.ALARM, EventKind.ATTITUDE)
+)
+"""Events after which the state of a device is not what it was."""
+
+
+class MqttPublisher:
+    """The output. Synchronization: the event loop's thread only."""
+
+    def __init__(
+        self, settings: MqttSettings, context: PublisherContext, *, connect: Connect = PahoConnection,
+        start_worker: StartWorker = BusThread, host_name: Callable[[], str] = socket.gethostname,
+    ) -> None:  # fmt: skip
+        self._settings = settings
+        self._context = context
+        self._connect, self._start_worker, self._host_name = connect, start_worker, host_name
+        self._queue = WriterQueue()
+        self._gateway = Gateway("", "", "")
+        self._spool: Spool | None = None
+        self._sender: MqttSender | None = None
+        self._writer: SpoolWriter | None = None
+        self._commands: CommandChannel | None = None
+        self._names: set[str] = set()
+        self._sent: set[str] = set()
+        """Devices of which something is sent."""
+        self._known: dict[str, tuple[str, str, str]] = {}
+        """What was published of a device: its state, problem and frame."""
+        self._settings_known: dict[str, dict[str, object]] = {}
+        """The settings of devices as they were published."""
+        self._state_ns = self._all_ns = 0
+        self._is_changed = True
+        """Whether states are to be looked at before the next time."""
+        self._spool_problem = self._problem = ""
+        self._lock = -1
+
+    # --- the publisher -----------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Open the spool and start both threads. Raises ServerError."""
+        if self._connect is PahoConnection:
+            check_extra()
+        settings, context = self._settings, self._context
+        gateway = settings.gateway or self._host_name().partition(".")[0]
+        if not is_name(gateway):
+            raise ServerError(
+                f"mqtt.gateway: expected a name of 1 to 64 letters, digits, '_' or '-', and the host's name is "
+                f"{gateway!r}; set it"
+            )
+        self._gateway = Gateway(settings.site, gateway, boot_text(context.epoch))
+        directory = Path(settings.spool_directory)
+        self._lock_spool(directory)
+        will = Will(topic_of(settings.site, gateway, "", STATE), self._state(online=False, reason="connection lost"))
+        brokers = [found for url in settings.brokers if (found := broker_of(url)) is not None]
+        turn = BrokerTurn(brokers, settings.retry_max_s)
+        self._spool = Spool(
+            directory, settings.spool_bytes, settings.spool_age_ns, newest_first=settings.newest_first, gateway=gateway
+        )  # fmt: skip
+        if settings.commands.enabled:
+            self._commands = CommandChannel(
+                settings.commands, self._gateway, context.control, context.now_ns, context.utc_offset_ns
+            )
+        self._sender = MqttSender(
+            settings, f"imud-{settings.site}-{gateway}", will, turn, self._connect, context.now_ns, self._commands
+        )  # fmt: skip
+        if self._commands is not None:
+            self._commands.answer = self._sender.reply
+        self._writer = SpoolWriter(
+            settings, self._gateway, self._queue, self._spool, self._sender, context.now_ns, context.utc_offset_ns,
+            self._start_worker, self._clock,
+        )  # fmt: skip
+        lock, self._lock = self._lock, -1
+        self._writer.closed = lambda: os.close(lock)  # a thread that hangs in the disk keeps it
+        self._sender.retain({will.topic: self._state(online=True)})
+        self._sender.start()
+        context.mqtt_sources.append(self.status)
+        log.info("mqtt: %s as imud/%s/%s", ", ".join(broker.name for broker in brokers), settings.site, gateway)
+
+    def add_device(self, name: str, device_id: int) -> None:
+        """Note the device."""
+        self._names.add(name)
+        if is_name(name) and self._settings.sending(name) is not None:
+            self._sent.add(name)
+
+    def remove_device(self, name: str) -> None:
+        """Forget a device that left the configuration, and take its state off the broker."""
+        self._names.discard(name)
+        self._sent.discard(name)
+        topics = []
+        if self._known.pop(name, None) is not None:
+            topics += [self._topic(name, STATUS), self._topic(name, SCHEMA)]
+            if self._settings.home_assistant:
+                topics.append(discovery_topic(self._gateway, name))
+        if self._settings_known.pop(name, None) is not None:
+            topics.append(self._topic(name, SETTINGS))
+        if topics:
+            self._queue.put_state(SentState({}, dict.fromkeys(topics)))
+
+    def publish(self, batch: Batch) -> None:
+        """Put samples into the queue."""
+        if batch.device in self._sent:
+            self._queue.put_batch(batch)
+
+    def event(self, event: Event) -> None:
+        """Put an event into the queue."""
+        self._is_changed = self._is_changed or event.kind in STATE_KINDS
+        if not event.device or event.device in self._sent:
+            self._queue.put_event(event)
+
+    def tick(self, now_ns: int) -> None:
+        """Look after both threads, and publish states."""
+        writer, sender = self._writer, self._sender
+        if writer is None or sender is None:
+            return
+        failure = writer.failure or sender.failure
+        if failure is not None:
+            raise failure
+        self._look_at_problems(now_ns, writer, sender)
+        if self._commands is not None:
+            self._commands.run_next()
+        if now_ns - self._state_ns >= STATE_NS:
+            self._state_ns = now_ns
+            self._send_states(now_ns)
+
+    def close(self) -> None:
+        """End both threads; may be called twice."""
+        sender, self._sender = self._sender, None
+        writer, self._writer = self._writer, None
+        if self.status in self._context.mqtt_sources:
+            self._context.mqtt_sources.remove(self.status)
+        if self._commands is not None:
+            self._commands.close()
+        if sender is not None:
+            sender.close(self._state(online=False, reason="imud stopped"))
+        if writer is not None:
+            writer.close()
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+    def status(self) -> MqttStatus:
+        """Return the state of the output."""
+        writer, sender, spool = self._writer, self._sender, self._spool
+        if writer is None or sender is None or spool is None:
+            return MqttStatus("", "", "", self._queue.queued, 0, 0, 0, 0, 0, 0, {}, 0)
+        dropped = dict(spool.dropped)
+        commands = self._commands
+        for cause, count in (("queue", self._queue.dropped), ("disk", writer.lost_on_disk)):
+            dropped[cause] = dropped.get(cause, 0) + count
+        return MqttStatus(
+            sender.broker, sender.problem, writer.problem, self._queue.queued, spool.spooled, sender.sent,
+            sender.acknowledged, spool.messages, spool.used_bytes, spool.thinned, dropped, sender.reconnects,
+            commands.run if commands is not None else 0, commands.refused if commands is not None else 0,
+        )  # fmt: skip
+
+    # --- states ------------------------------------------------------------------------------------------------------
+
+    def _send_states(self, now_ns: int) -> None:
+        """Publish what changed of devices, and all of it now and then."""
+        is_due = now_ns - self._all_ns >= self._settings.status_s * NS_PER_S
+        if not is_due and not self._is_changed:
+            return
+        self._is_changed = False
+        statuses: dict[str, DeviceStatus] = {}
+        other: dict[str, object] = {}
+        for status in self._context.status():
+            sending = self._settings.sending(status.name)
+            if status.name not in self._sent or sending is None:
+                continue
+            if sending.settings:
+                other |= self._changed_settings(status)
+            if not sending.status:
+                continue
+            frame = status.frame
+            known = (status.state.value, status.problem, repr(frame))
+            if is_due or self._known.get(status.name) != known:
+                statuses[self._topic(status.name, STATUS)] = status
+                other[self._topic(status.name, SCHEMA)] = schema_of(status)
+                if self._settings.home_assistant:
+                    other[discovery_topic(self._gateway, status.name)] = discovery_of(self._gateway, status, sending)
+                self._known[status.name] = known
+        if is_due:
+            self._all_ns = now_ns
+            state = msgspec.json.decode(self._state(online=True))
+            other[self._topic("", STATE)] = state | {"mqtt": self.status(), "positions": self._positions()}
+        if statuses or other:
+            self._queue.put_state(SentState(statuses, other))
+
+    def _changed_settings(self, status: DeviceStatus) -> dict[str, object]:
+        """The message about the settings of a device, where they are not what was published."""
+        found = settings_of(status)
+        if found is None or self._settings_known.get(status.name) == found:
+            return {}
+        self._settings_known[status.name] = found
+        return {self._topic(status.name, SETTINGS): found}
+
+    def _positions(self) -> list[object]:
+        return list(self._writer.positions) if self._writer is not None else []
+
+    def _topic(self, device: str, leaf: str) -> str:
+        return topic_of(self._settings.site, self._gateway.gateway, device, leaf)
+
+    def _state(self, *, online: bool, reason: str = "") -> bytes:
+        """The state of the gateway: birth, death, or last will."""
+        found: dict[str, object] = {"v": VERSION, "online": online, "boot": boot_text(self._context.epoch)}
+        if online:
+            found |= {"imud": __version__, "devices": sorted(self._sent), "clock": self._clock()}
+        else:
+            found["reason"] = reason
+        return msgspec.json.encode(found)
+
+    def _clock(self) -> GatewayClock:
+        """The wall clock now. Called in the writer's thread as well."""
+        context = self._context
+        reference = context.utc_reference()
+        if reference is None:
+            return GatewayClock(context.now_ns(), context.utc_offset_ns(), synchronised=False)
+        return GatewayClock(context.now_ns(), reference.offset_ns, synchronised=True, error_ns=reference.error_ns)
+
+    # --- what goes wrong ---------------------------------------------------------------------------------------------
+
+    def _look_at_problems(self, now_ns: int, writer: SpoolWriter, sender: MqttSender) -> None:
+        """Tell of a spool that stopped or went on, and log what the broker says, each once."""
+        if writer.problem != self._spool_problem:
+            before, self._spool_problem = self._spool_problem, writer.problem
+            if not before:
+                self._raise(now_ns, f"nothing is spooled: {writer.problem}; samples go on")
+            elif not writer.problem:
+                self._raise(now_ns, f"spooling again; it was not possible before: {before}")
+        spool = self._spool
+        if spool is not None and spool.set_aside:
+            self._raise(now_ns, f"the spool was damaged and begins anew; the old one is {spool.set_aside}")
+            spool.set_aside = ""
+        if sender.problem != self._problem:
+            self._problem = sender.problem
+            if sender.problem:
+                log.warning("mqtt: nothing is sent: %s", sender.problem)
+            else:
+                log.info("mqtt: connected to %s", sender.broker)
+
+    def _raise(self, now_ns: int, message: str) -> None:
+        log.warning("mqtt: %s", message)
+        self._context.raise_event(Event(now_ns, "", EventKind.MQTT, message))
+
+    def _lock_spool(self, directory: Path) -> None:
+        """Keep another daemon from the same spool. Raises ServerError."""
+        try:
+            directory.mkdir(mode=0o750, parents=True, exist_ok=True)
+            self._lock = os.open(directory / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640)
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._lock)
+            self._lock = -1
+            raise ServerError(f"{directory}: another running imud has this spool; set mqtt.spool_directory") from None
+        except OSError as error:
+            raise ServerError(f"spool in {directory}: {reason_of(error)}") from error
+
+
+def schema_of(status: DeviceStatus) -> Mapping[str, object]:
+    """What a reader needs to understand samples and slots of a device."""
+    return {
+        "v": VERSION,
+        "device": status.name,
+        "driver": status.driver,
+        "identity": status.identity,
+        "euler_convention": status.euler_convention,
+        "navigation_frame": status.navigation_frame,
+        "frame": status.frame,
+        "fields": SAMPLE_SCHEMA,
+        "slot": {
+            "version": SLOT_LAYOUT_VERSION,
+            "bytes": SLOT_BYTES,
+            "byte_order": "little-endian",
+            "fields": [
+                {"name": one.name, "code": one.code, "count": one.count, "offset": one.offset} for one in SLOT_FIELDS
+            ],
+            "present_bits": PRESENT_BITS,
+            "sync_codes": {sync.value: code for sync, code in SYNC_CODES.items()},
+        },
+    }
+
+
+def settings_of(status: DeviceStatus) -> dict[str, object] | None:
+    """A device's own settings and how they differ from what is declared; None while nothing is known of them."""
+    declared = status.declared
+    if declared is None and not status.settings:
+        return None
+    found: dict[str, object] = {"v": VERSION, "device": status.name, "actual": dict(status.settings)}
+    if declared is not None:
+        found |= {
+            "state": declared.state,
+            "on_difference": declared.on_difference,
+            "differences": dict(declared.differences),
+            "unverified": list(declared.unverified),
+            "problem": declared.problem,
+        }
+    return found
+
+
+PUBLISHER = PublisherType("mqtt", MqttSettings, MqttPublisher, required=False)

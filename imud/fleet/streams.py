@@ -1,0 +1,274 @@
+"""What is sent of a device, from batches of samples and events to messages whose numbers have no gaps.
+
+    samples ─┬─▶ whole samples of `batch_s`           ─▶ stream `samples`
+             └─▶ intervals of `rate_hz`, `batch_s` of them ─▶ stream `statistics`
+    events  ───▶ each by itself                        ─▶ stream `events`
+
+Samples that had no room in the queue show as a gap of `seq`: a message says so in their place.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
+
+from imud.fleet.accounts import StreamPosition
+from imud.fleet.messages import (
+    SAMPLES_MAX,
+    SLOTS_MAX,
+    VERSION,
+    DropCause,
+    FleetMessage,
+    GatewayClock,
+    Interval,
+    MessageKind,
+    Stream,
+    decode_message,
+    encode_message,
+    encode_slots_message,
+    topic_of,
+)
+from imud.fleet.settings import DeviceSending, Whole
+from imud.fleet.spool import Spooled, row_of
+from imud.fleet.statistics import IntervalMaker, by_interval
+from imud.formats.slot import encode_slots
+from imud.model.event import Event
+from imud.model.sample import Sample
+from imud.model.units import NS_PER_S
+
+INTERVALS_MAX: Final = 100
+"""Intervals in one message: about 100 kB with all quantities and measures."""
+LATE_NS: Final = NS_PER_S
+"""An interval is over so long after its end, when no later sample has come: samples come up to 50 ms late."""
+
+
+ReadClock = Callable[[], GatewayClock | None]
+"""Reads the wall clock of this gateway with its state."""
+
+
+def no_clock() -> GatewayClock | None:
+    """Say nothing of the clock."""
+    return None
+
+
+class Gateway(NamedTuple):
+    """Names of this gateway, and of this start of its daemon."""
+
+    site: str
+    gateway: str
+    boot: str
+
+
+class _Numbered:
+    """One stream: makes messages and knows the next number."""
+
+    def __init__(self, gateway: Gateway, device: str, stream: Stream, clock: ReadClock) -> None:
+        self._gateway, self._device, self._stream, self._clock = gateway, device, stream, clock
+        self._topic = topic_of(gateway.site, gateway.gateway, device, stream)
+        self._begin = 0
+        self.next = 0
+        """The number that comes next; 0 while there was none."""
+
+    def message(
+        self, kind: MessageKind, first: int, last: int, count: int, utc_ns: int, *, cause: DropCause | None = None,
+        samples: list[Sample] | None = None, intervals: list[Interval] | None = None,
+        events: list[Event] | None = None,
+    ) -> FleetMessage:  # fmt: skip
+        """A message of the next numbers."""
+        self._begin = self._begin or first
+        self.next = last + 1
+        return FleetMessage(
+            v=VERSION, gateway=self._gateway.gateway, boot=self._gateway.boot, device=self._device, kind=kind,
+            begin=self._begin, first=first, last=last, count=count, utc_ns=utc_ns, clock=self._clock(), cause=cause,
+            samples=samples or [], intervals=intervals or [], events=events or [],
+        )  # fmt: skip
+
+    def row(self, message: FleetMessage, stored_utc_ns: int, payload: bytes | None = None) -> Spooled:
+        """The message as it is stored."""
+        return row_of(self._topic, self._stream, message, payload or encode_message(message), stored_utc_ns)
+
+    def resume(self, position: StreamPosition) -> None:
+        """Go on where the spool says that the stream came to."""
+        self._begin, self.next = position.begin, position.last + 1
+
+    def missing(self, first: int, utc_ns: int, cause: DropCause) -> list[Spooled]:
+        """The message about numbers that are missing before `first`, if there are any."""
+        if not self.next or first <= self.next:
+            return []
+        gap = self.message(MessageKind.DROPPED, self.next, first - 1, first - self.next, utc_ns, cause=cause)
+        return [self.row(gap, utc_ns)]
+
+
+class DeviceStreams:
+    """The streams of one device, or of the gateway itself (empty name). Synchronization: one thread."""
+
+    def __init__(
+        self, gateway: Gateway, device: str, device_id: int, sending: DeviceSending, clock: ReadClock = no_clock
+    ) -> None:
+        """`clock` is read for each message."""
+        self._device_id, self._sending = device_id, sending
+        self._whole = _Numbered(gateway, device, Stream.SAMPLES, clock) if device else None
+        self._statistics = _Numbered(gateway, device, Stream.STATISTICS, clock) if device else None
+        self._events = _Numbered(gateway, device, Stream.EVENTS, clock)
+        self._period_ns = round(NS_PER_S / sending.rate_hz) if sending.rate_hz else 0
+        self._maker = IntervalMaker(sending.values)
+        self._interval = 0
+        self._samples: list[Sample] = []
+        self._intervals: list[Interval] = []
+        self._samples_max = SLOTS_MAX if sending.whole is Whole.SLOTS else SAMPLES_MAX
+        self.gaps = 0
+        """Samples that did not come: they had no room in the queue."""
+        self.next_seq = 0
+        """The `seq` that comes next; 0 while there was none."""
+        self._gap_cause = DropCause.QUEUE
+
+    def resume(self, stream: str, position: StreamPosition) -> None:
+        """Go on where an earlier run of the output in the same boot ended."""
+        numbered = {Stream.SAMPLES: self._whole, Stream.STATISTICS: self._statistics, Stream.EVENTS: self._events}
+        found = numbered.get(Stream(stream))
+        if found is None:
+            return
+        found.resume(position)
+        if found is not self._events:
+            self.next_seq, self._gap_cause = max(self.next_seq, found.next), DropCause.OFF
+
+    def add(self, samples: Sequence[Sample]) -> list[Spooled]:
+        """Take samples in the order of their `seq`; return the messages that are whole."""
+        made: list[Spooled] = []
+        begin = 0
+        for at, sample in enumerate(samples):
+            if self.next_seq and sample.seq > self.next_seq:
+                made += self._add_run(samples[begin:at])
+                made += self.flush()
+                made += self._note_gap(sample)
+                begin = at
+            self.next_seq, self._gap_cause = sample.seq + 1, DropCause.QUEUE
+        return made + self._add_run(samples[begin:])
+
+    def event(self, event: Event, utc_ns: int) -> list[Spooled]:
+        """Take an event; return its message."""
+        if not self._sending.events:
+            return []
+        number = self._events.next or 1
+        message = self._events.message(MessageKind.EVENTS, number, number, 1, utc_ns, events=[event])
+        return [self._events.row(message, utc_ns)]
+
+    def missed_events(self, count: int, utc_ns: int) -> list[Spooled]:
+        """Take the count of events that had no room in the queue; return the message about them."""
+        if not self._sending.events:
+            return []
+        first = self._events.next or 1
+        message = self._events.message(
+            MessageKind.DROPPED, first, first + count - 1, count, utc_ns, cause=DropCause.QUEUE
+        )
+        return [self._events.row(message, utc_ns)]
+
+    def look(self, now_ns: int) -> list[Spooled]:
+        """Return messages that are due though no later sample has come."""
+        made: list[Spooled] = []
+        late_ns = now_ns - LATE_NS
+        if self._samples and self._is_over(self._samples[0].t_ns, late_ns):
+            made += self._send_samples()
+        if not self._maker.is_empty and late_ns >= (self._interval + 1) * self._period_ns:
+            self._end_interval()
+        if self._intervals and self._is_over(self._intervals[0].begin_t_ns, late_ns):
+            made += self._send_intervals()
+        return made
+
+    def flush(self) -> list[Spooled]:
+        """Return messages of all that there is, also of an interval that has not ended."""
+        self._end_interval()
+        return self._send_samples() + self._send_intervals()
+
+    # --- samples -----------------------------------------------------------------------------------------------------
+
+    def _add_run(self, samples: Sequence[Sample]) -> list[Spooled]:
+        """Take samples without a gap."""
+        made: list[Spooled] = []
+        if not samples:
+            return made
+        if self._sending.whole is not Whole.NONE:
+            for sample in samples:
+                held = self._samples
+                if held and (len(held) >= self._samples_max or self._is_over(held[0].t_ns, sample.t_ns)):
+                    made += self._send_samples()
+                self._samples.append(sample)
+        if self._period_ns:
+            for number, part in by_interval(samples, self._period_ns):
+                if number != self._interval:
+                    self._end_interval()
+                    self._interval = number
+                    made += self._send_intervals_if_due(part[0].t_ns)
+                self._maker.add(part)
+        return made
+
+    def _is_over(self, begin_ns: int, now_ns: int) -> bool:
+        """Whether the time of one message, on a grid of CLOCK_MONOTONIC, is over."""
+        batch_ns = self._sending.batch_ns
+        return begin_ns // batch_ns < now_ns // batch_ns
+
+    def _end_interval(self) -> None:
+        interval = self._maker.take()
+        if interval is not None:
+            self._intervals.append(interval)
+
+    def _send_intervals_if_due(self, t_ns: int) -> list[Spooled]:
+        held = self._intervals
+        if held and (len(held) >= INTERVALS_MAX or self._is_over(held[0].begin_t_ns, t_ns)):
+            return self._send_intervals()
+        return []
+
+    def _send_samples(self) -> list[Spooled]:
+        samples, self._samples = self._samples, []
+        stream = self._whole
+        if not samples or stream is None:
+            return []
+        first, last, utc_ns = samples[0].seq, samples[-1].seq, samples[-1].utc_ns
+        if self._sending.whole is Whole.JSON:
+            message = stream.message(MessageKind.SAMPLES, first, last, len(samples), utc_ns, samples=samples)
+            return [stream.row(message, utc_ns)]
+        message = stream.message(MessageKind.SLOTS, first, last, len(samples), utc_ns)
+        payload = encode_slots_message(message, encode_slots(samples, self._device_id))
+        return [stream.row(message, utc_ns, payload)]
+
+    def _send_intervals(self) -> list[Spooled]:
+        intervals, self._intervals = self._intervals, []
+        stream = self._statistics
+        if not intervals or stream is None:
+            return []
+        newest = intervals[-1]
+        count = sum([one.count for one in intervals])
+        message = stream.message(
+            MessageKind.INTERVALS, intervals[0].first, newest.last, count, newest.end_utc_ns, intervals=intervals
+        )
+        return [stream.row(message, newest.end_utc_ns)]
+
+    def _note_gap(self, sample: Sample) -> list[Spooled]:
+        """Messages about samples that are missing before this one."""
+        if self._gap_cause is DropCause.QUEUE:
+            self.gaps += sample.seq - self.next_seq
+        made = []
+        if self._whole is not None and self._sending.whole is not Whole.NONE:
+            made += self._whole.missing(sample.seq, sample.utc_ns, self._gap_cause)
+        if self._statistics is not None and self._period_ns:
+            made += self._statistics.missing(sample.seq, sample.utc_ns, self._gap_cause)
+        return made
+
+
+def notes_of(rows: Sequence[Spooled], cause: DropCause, gateway: str) -> list[Spooled]:
+    """Messages that say that others were dropped, one for each stream, in place of `rows`, whose numbers follow on."""
+    first: dict[tuple[str, str], Spooled] = {}
+    last: dict[tuple[str, str], Spooled] = {}
+    count: dict[tuple[str, str], int] = {}
+    for row in rows:
+        first.setdefault(row.key, row)
+        last[row.key] = row
+        count[row.key] = count.get(row.key, 0) + row.items
+    made = []
+    for key, begin in first.items():
+        end = last[key]
+        note = FleetMessage(
+            v=VERSION, gateway=gateway, boot=begin.boot, device=begin.device, kind=MessageKind.DROPPED,
+            begin=decode_message(begin.payload).begin,
+            first=begin.first, last=end.last, count=count[key], utc_ns=end.stored_utc_ns, cause=cause,
+        )  # fmt: skip
+        made.append(row_of(begin.topic, Stream(begin.stream), note, encode_message(note), end.stored_utc_ns))
+    return made

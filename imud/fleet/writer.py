@@ -1,0 +1,390 @@
+"""The thread of the spool: what the event loop put into a queue becomes messages on disk, and these go to the sender.
+
+    loop ──put──▶ queue ──▶ streams ──messages──▶ spool (a transaction a second) ──▶ sender
+                                                    ▲────────acknowledged──────────────┘
+
+The loop never waits: samples that have no room in the queue are counted, and show as a gap that a message explains. A
+disk that is full or fails ends the spooling; for a while messages wait in memory, then only their numbers do. What is
+newer than the last transaction, and samples whose `batch_s` is not over, are lost when the process is killed.
+"""
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Final, NamedTuple
+
+import msgspec
+
+from imud.contracts.publisher import Batch
+from imud.contracts.status import DeviceStatus
+from imud.fleet.accounts import StreamPosition
+from imud.fleet.messages import DropCause, Stream
+from imud.fleet.sender import MqttSender
+from imud.fleet.settings import DeviceSending, MqttSettings
+from imud.fleet.spool import Spool, Spooled, SpoolError
+from imud.fleet.streams import DeviceStreams, Gateway, ReadClock, no_clock, notes_of
+from imud.host.threads import END_LIMIT_S, StartWorker
+from imud.model.event import Event
+from imud.model.units import NS_PER_S
+
+log = logging.getLogger(__name__)
+
+QUEUE_SAMPLES: Final = 20_000
+"""Samples that wait for the writer: 20 s of a device at 1 kHz, about 20 MB. A flash card that erases stalls for a
+second, a checkpoint of the log for less."""
+QUEUE_EVENTS: Final = 2_000
+COMMIT_NS: Final = NS_PER_S
+"""Between two transactions: messages that are newer are lost when the process is killed."""
+DISK_RETRY_NS: Final = 10 * NS_PER_S
+"""A disk that was full or failed is tried again after so long."""
+PENDING_BYTES: Final = 8 << 20
+"""Messages that wait in memory while the disk fails; of those that are more only the numbers are kept."""
+
+
+class SentState(NamedTuple):
+    """State of devices that is to be published, retained, by topic."""
+
+    statuses: Mapping[str, DeviceStatus]
+    other: Mapping[str, object]
+    """Further messages by topic; None removes what is there."""
+
+
+class MissedEvents:
+    """Events of a device that had no room, in their place."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self.count = 0
+        self.t_ns = 0
+        """CLOCK_MONOTONIC of the newest."""
+
+
+Item = Batch | Event | MissedEvents | SentState
+
+
+class WriterQueue:
+    """Queue from the event loop to the writer. Synchronization: one thread puts, one takes."""
+
+    def __init__(self, samples_max: int = QUEUE_SAMPLES, events_max: int = QUEUE_EVENTS) -> None:
+        self.queued = 0
+        """Samples and events that were put since the start."""
+        self.dropped = 0
+        """Samples and events that had no room."""
+        self._samples_max, self._events_max = samples_max, events_max
+        self._items: deque[Batch | Event | MissedEvents] = deque()
+        self._lock = threading.Lock()
+        """Held where states and counts of missed events are changed, which never waits for a disk."""
+        self._missed: dict[str, MissedEvents] = {}
+        """Of devices whose newest event had no room: what the next one that has none is added to."""
+        self._statuses: dict[str, DeviceStatus] = {}
+        self._other: dict[str, object] = {}
+        self._put = self._taken = 0
+        self._events_put = self._events_taken = 0
+
+    @property
+    def waiting(self) -> int:
+        """Samples that wait."""
+        return self._put - self._taken
+
+    def put_batch(self, batch: Batch) -> None:
+        """Add samples, or drop and count them."""
+        count = len(batch.samples)
+        self.queued += count
+        if self._put - self._taken + count > self._samples_max:
+            self.dropped += count
+            return
+        self._items.append(batch)
+        self._put += count
+
+    def put_event(self, event: Event) -> None:
+        """Add an event; of one without room only that it was there, which is counted."""
+        self.queued += 1
+        if self._events_put - self._events_taken >= self._events_max:
+            self.dropped += 1
+            self._miss(event)
+            return
+        self._missed.pop(event.device, None)
+        self._items.append(event)
+        self._events_put += 1
+
+    def put_state(self, state: SentState) -> None:
+        """Add a state; of each topic the newest waits, so that there is always room."""
+        with self._lock:
+            for topic, status in state.statuses.items():
+                self._other.pop(topic, None)
+                self._statuses[topic] = status
+            for topic, other in state.other.items():
+                self._statuses.pop(topic, None)
+                self._other[topic] = other
+
+    def take(self) -> Item | None:
+        """Return the states that wait, or the oldest of all else; None for nothing."""
+        if self._statuses or self._other:
+            with self._lock:
+                state = SentState(self._statuses, self._other)
+                self._statuses, self._other = {}, {}
+            return state
+        try:
+            item = self._items.popleft()
+        except IndexError:
+            return None
+        if isinstance(item, Batch):
+            self._taken += len(item.samples)
+        elif isinstance(item, Event):
+            self._events_taken += 1
+        else:
+            with self._lock:  # what comes from now on is counted anew
+                if self._missed.get(item.device) is item:
+                    self._missed.pop(item.device, None)
+        return item
+
+    def _miss(self, event: Event) -> None:
+        """Count an event in the place that it would have had. There is one place between two events at most."""
+        with self._lock:
+            missed = self._missed.get(event.device)
+            if missed is None:
+                missed = self._missed[event.device] = MissedEvents(event.device)
+                self._items.append(missed)
+            missed.count += 1
+            missed.t_ns = event.t_ns
+
+
+class SpoolWriter:
+    """The thread and what it owns. Synchronization: counters are read by any thread, the rest is the thread's own."""
+
+    def __init__(
+        self, settings: MqttSettings, gateway: Gateway, queue: WriterQueue, spool: Spool, sender: MqttSender,
+        now_ns: Callable[[], int], utc_offset_ns: Callable[[], int], start_worker: StartWorker,
+        clock: ReadClock = no_clock,
+    ) -> None:  # fmt: skip
+        """`clock` reads the wall clock with its state; what is spooled before it was synchronised has no age."""
+        self.problem = ""
+        """Why nothing is spooled, one sentence; empty while it is."""
+        self.lost_on_disk = 0
+        """Samples and events of which only the numbers are left because the disk failed."""
+        self.failure: BaseException | None = None
+        """The exception that ended the thread, which is an internal error."""
+        self.positions: list[StreamPosition] = []
+        """How far the streams have come, as of the last transaction."""
+        self.closed: Callable[[], None] = lambda: None
+        """Called when the spool is closed, by the thread that closed it; set by who has its lock."""
+        self._is_closing = self._is_closed = False
+        self._settings, self._gateway = settings, gateway
+        self._queue, self._spool, self._sender = queue, spool, sender
+        self._now_ns, self._utc_offset_ns, self._clock = now_ns, utc_offset_ns, clock
+        self._is_set = False
+        """Whether the wall clock was synchronised at any time since the start: it goes on when the network is gone."""
+        self._streams: dict[str, DeviceStreams] = {}
+        self._resumable: dict[str, list[StreamPosition]] = {}
+        self._boots: dict[str, int] = {}
+        self._rows: list[Spooled] = []
+        self._acknowledged: set[int] = set()
+        self._session = 0
+        self._due_ns = 0
+        self._allowed, self._allowed_ns = 1.0, now_ns()
+        """Messages that may be given, as of a time, where `messages_per_s` bounds them."""
+        self._resume()
+        self._worker = start_worker("mqtt spool", self.work, self._failed)
+        sender.wanting = self._worker.ring
+
+    def close(self) -> None:
+        """Store all that waits and end the thread; may be called twice.
+
+        A thread that hangs in the disk is left with the spool: it does the same when the disk goes on.
+        """
+        self._sender.wanting = lambda: None
+        self._is_closing = True
+        if self._worker.end():
+            self._finish()
+        else:
+            log.error(
+                "mqtt: the spool's thread has not ended within %g s (a disk that hangs?): %d samples wait, and are "
+                "stored if the disk goes on before imud ends", END_LIMIT_S, self._queue.waiting,
+            )  # fmt: skip
+
+    def _finish(self) -> None:
+        """Store all that waits and close the spool, once. By the thread, or after its end."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        self._take_answers()
+        self._take_all()
+        for streams in self._streams.values():
+            self._rows += streams.flush()
+        self._due_ns = 0
+        self._store(self._now_ns())
+        if self._rows:
+            log.error(
+                "mqtt: %d messages are lost with the end, because nothing can be spooled: %s",
+                len(self._rows), self.problem,
+            )  # fmt: skip
+        self._spool.close()
+        self.closed()
+
+    # --- the thread's side -------------------------------------------------------------------------------------------
+
+    def work(self) -> int:
+        """Do what is due, the end included; return the time until the next round, ns."""
+        rest_ns = self._do_due()
+        if self._is_closing:
+            self._finish()
+        return rest_ns
+
+    def _do_due(self) -> int:
+        self._take_answers()
+        self._take_all()
+        now_ns = self._now_ns()
+        if now_ns >= self._due_ns:
+            for streams in self._streams.values():
+                self._rows += streams.look(now_ns)
+            self._store(now_ns)
+        pause_ns = self._give(now_ns)
+        return max(1, min(COMMIT_NS, self._due_ns - self._now_ns(), pause_ns))
+
+    def _take_answers(self) -> None:
+        """Note what was acknowledged, and begin anew with the oldest after a new connection."""
+        session = self._sender.session
+        for of_session, number in self._sender.take_acknowledged():
+            if of_session == self._session:
+                self._acknowledged.add(number)
+        if session != self._session:
+            self._session = session
+            self._spool.rewind()
+
+    def _take_all(self) -> None:
+        """Make messages of what waits in the queue."""
+        while (item := self._queue.take()) is not None:
+            if isinstance(item, Batch):
+                self._take_batch(item)
+            elif isinstance(item, Event):
+                streams = self._streams_of(item.device, 0)
+                if streams is not None:
+                    self._rows += streams.event(item, item.t_ns + self._utc_offset_ns())
+            elif isinstance(item, MissedEvents):
+                streams = self._streams_of(item.device, 0)
+                if streams is not None:
+                    self._rows += streams.missed_events(item.count, item.t_ns + self._utc_offset_ns())
+            else:
+                made = {topic: msgspec.json.encode(status) for topic, status in item.statuses.items()}
+                made |= {
+                    topic: b"" if value is None else msgspec.json.encode(value) for topic, value in item.other.items()
+                }
+                self._sender.retain(made)
+
+    def _take_batch(self, batch: Batch) -> None:
+        streams = self._streams_of(batch.device, batch.device_id)
+        if streams is None:
+            return
+        if batch.samples[0].seq < streams.next_seq:  # the device was made anew, and counts from 1 again
+            self._rows += streams.flush()
+            del self._streams[batch.device]
+            self._resumable.pop(batch.device, None)
+            self._boots[batch.device] = self._boots.get(batch.device, 1) + 1
+            streams = self._streams_of(batch.device, batch.device_id)
+            assert streams is not None
+        self._rows += streams.add(batch.samples)
+
+    def _streams_of(self, device: str, device_id: int) -> DeviceStreams | None:
+        found = self._streams.get(device)
+        if found is None:
+            sending = self._settings.sending(device) if device else DeviceSending(rate_hz=None)
+            if sending is None:
+                return None
+            number = self._boots.get(device, 1)
+            gateway = self._gateway if number == 1 else self._gateway._replace(boot=f"{self._gateway.boot}-{number}")
+            found = self._streams[device] = DeviceStreams(gateway, device, device_id, sending, self._clock)
+            for position in self._resumable.pop(device, []):
+                found.resume(position.stream, position)
+        return found
+
+    def _resume(self) -> None:
+        """Find out where an earlier run of the output in the same boot ended."""
+        try:
+            self._spool.open()
+            self.positions = self._spool.positions()
+        except SpoolError as error:
+            self.problem = str(error)
+            return
+        for position in self.positions:
+            boot, _, number = position.boot.partition("-")
+            if boot == self._gateway.boot and position.stream in Stream.__members__.values():
+                known = self._boots.get(position.device, 1)
+                if int(number or "1") > known:
+                    self._boots[position.device] = known = int(number)
+                    self._resumable.pop(position.device, None)
+                if int(number or "1") == known:
+                    self._resumable.setdefault(position.device, []).append(position)
+
+    # --- the spool ---------------------------------------------------------------------------------------------------
+
+    def _store(self, now_ns: int) -> None:
+        """Write one transaction of all that is new, if there is anything."""
+        self._due_ns = now_ns + COMMIT_NS
+        if not self._rows and not self._acknowledged and not self.problem:
+            return
+        if self.problem and sum([len(row.payload) for row in self._rows]) > PENDING_BYTES:
+            lost = sum([row.items for row in self._rows if row.kind != "dropped"])
+            self._rows = notes_of(self._rows, DropCause.DISK, self._gateway.gateway)
+            self.lost_on_disk += lost
+        acknowledged = frozenset(self._acknowledged)
+        try:
+            self._commit(acknowledged, now_ns)
+            self.positions = self._spool.positions()
+        except SpoolError as error:
+            self.problem = str(error)
+            self._due_ns = now_ns + DISK_RETRY_NS
+            self._make_room(acknowledged, now_ns)
+            return
+        self.problem = ""
+        self._acknowledged -= acknowledged
+
+    def _commit(self, acknowledged: frozenset[int], now_ns: int) -> None:
+        """Store what waits, one by one after a problem: a disk that was full may not have room for all of it at once.
+
+        Raises SpoolError.
+        """
+        utc_ns, most = self._stored_utc_ns(now_ns), 1 if self.problem else max(len(self._rows), 1)
+        self._spool.commit(self._rows[:most], acknowledged, now_ns, utc_ns)
+        del self._rows[:most]
+        while self._rows:
+            self._spool.commit(self._rows[:most], (), now_ns, utc_ns)
+            del self._rows[:most]
+
+    def _stored_utc_ns(self, now_ns: int) -> int:
+        """CLOCK_REALTIME, by which messages age; 0 before it was ever synchronised, when it says nothing of ages."""
+        clock = self._clock()
+        self._is_set = self._is_set or clock is None or clock.synchronised
+        return now_ns + self._utc_offset_ns() if self._is_set else 0
+
+    def _make_room(self, acknowledged: frozenset[int], now_ns: int) -> None:
+        """Remove what was acknowledged, for which a disk can have room that has none for more."""
+        if acknowledged:
+            with suppress(SpoolError):
+                self._spool.remove(acknowledged, now_ns, self._stored_utc_ns(now_ns))
+                self._acknowledged -= acknowledged
+                self._due_ns = now_ns + COMMIT_NS
+
+    def _give(self, now_ns: int) -> int:
+        """Give the sender what it has room for; return after what time more may be given, ns."""
+        room, rate_hz = self._sender.room(), self._settings.messages_per_s
+        if rate_hz is not None:
+            self._allowed += (now_ns - self._allowed_ns) * rate_hz / NS_PER_S
+            self._allowed, self._allowed_ns = min(self._allowed, max(rate_hz, 1.0)), now_ns
+            room = min(room, int(self._allowed))
+        try:
+            while room > 0:
+                rows = self._spool.after(room)
+                if not rows:
+                    return COMMIT_NS
+                fresh = [row for row in rows if row.id not in self._acknowledged]
+                self._sender.give(self._session, fresh)
+                room -= len(fresh)
+                self._allowed -= len(fresh) if rate_hz is not None else 0
+        except SpoolError as error:
+            self.problem = self.problem or str(error)
+        return COMMIT_NS if rate_hz is None else round(max(1.0 - self._allowed, 0.0) * NS_PER_S / rate_hz) or COMMIT_NS
+
+    def _failed(self, error: BaseException) -> None:
+        self.failure = error

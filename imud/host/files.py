@@ -1,0 +1,203 @@
+"""Reads and writes the regular files that imud uses: never waits for a FIFO or a device, never follows a surprise.
+
+Opening a FIFO waits for its other end, reading /dev/zero never ends, and opening a serial port moves its lines: the
+type is looked at before opening, and again afterwards, because the file may have been exchanged in between.
+"""
+
+import errno
+import grp
+import logging
+import os
+import pwd
+import queue
+import select
+import stat
+import threading
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO, Final, TypeVar
+
+import msgspec
+
+from imud.model.errors import reason_of
+
+KINDS: Final = (
+    (stat.S_ISFIFO, "a FIFO"),
+    (stat.S_ISCHR, "a character device"),
+    (stat.S_ISBLK, "a block device"),
+    (stat.S_ISSOCK, "a socket"),
+)
+"""What a path may be other than a regular file."""
+READ_FLAGS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+WRITE_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+class NotRegularFile(OSError):
+    """What stands at a path is no regular file. Example: a FIFO, /dev/zero, a directory."""
+
+
+def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
+    """Open a regular file for reading. Raises OSError, NotRegularFile for what is none."""
+    try:
+        _check_regular(os.stat(path), path)
+        descriptor = os.open(path, READ_FLAGS)
+    except ValueError as error:  # a path with a null character
+        raise OSError(errno.EINVAL, str(error), "…") from None
+    try:
+        _check_regular(os.fstat(descriptor), path)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return open(descriptor, "rb")
+
+
+def open_stream(path: str | os.PathLike[str], wait_ms: int) -> BinaryIO:
+    """Open a regular file, or a FIFO that a program writes to, which is waited for. Raises OSError, NotRegularFile.
+
+    A FIFO without data and without a writer for `wait_ms` is refused: opening it otherwise would wait without end.
+    """
+    if not stat.S_ISFIFO(os.stat(path).st_mode):
+        return open_regular(path)
+    descriptor = os.open(path, READ_FLAGS)
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    if not poll.poll(wait_ms):
+        os.close(descriptor)
+        raise NotRegularFile(errno.EAGAIN, "is a FIFO that no program writes to", os.fspath(path))
+    os.set_blocking(descriptor, True)
+    return open(descriptor, "rb")
+
+
+def read_regular(path: str | os.PathLike[str], bytes_max: int) -> bytes:
+    """Return the content of a regular file, `bytes_max` bytes at most. Raises OSError as `open_regular`."""
+    with open_regular(path) as file:
+        return file.read(bytes_max)
+
+
+def replace_file(path: Path, content: bytes, *, mode: int = 0o640, owner: tuple[int, int] | None = None) -> None:
+    """Write a file that is the old one or the new one, whole, whenever the process or the machine stops.
+
+    With `owner` (uid, gid) it is given to them, and has exactly `mode`; without, the umask takes its bits from `mode`.
+    Raises OSError; the old file is left then. What stands at the temporary name is removed, not followed.
+    """
+    temporary = path.with_name(path.name + ".new")
+    with suppress(FileNotFoundError):
+        temporary.unlink()
+    try:
+        with open(os.open(temporary, WRITE_FLAGS, mode), "wb") as file:
+            file.write(content)
+            if owner is not None:
+                _own(file.fileno(), mode, owner)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+def _own(descriptor: int, mode: int, owner: tuple[int, int]) -> None:
+    """Set owner and mode where they differ: a file system without them (vfat) refuses even to keep them."""
+    now = os.fstat(descriptor)
+    if (now.st_uid, now.st_gid) != owner:
+        os.fchown(descriptor, *owner)
+    if stat.S_IMODE(now.st_mode) != mode:
+        os.fchmod(descriptor, mode)
+
+
+def _check_regular(status: os.stat_result, path: str | os.PathLike[str]) -> None:
+    if stat.S_ISDIR(status.st_mode):
+        raise NotRegularFile(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
+    if not stat.S_ISREG(status.st_mode):
+        kind = next((name for is_kind, name in KINDS if is_kind(status.st_mode)), "something else")
+        raise NotRegularFile(errno.EINVAL, f"is {kind}, expected a regular file", os.fspath(path))
+
+
+GROUP_ACCESS: Final = stat.S_IRGRP | stat.S_IWGRP
+"""Bits of a mode with which members of the node's group may open it for reading and writing."""
+
+
+def group_of(path: str, otherwise: str) -> str:
+    """Return the name of the node's group; `otherwise` if that is root or not known."""
+    try:
+        gid = os.stat(path).st_gid
+        return grp.getgrgid(gid).gr_name if gid else otherwise
+    except (OSError, KeyError):
+        return otherwise
+
+
+def user_name() -> str:
+    """Return the name of the user that this process runs as, or its number."""
+    uid = os.geteuid()
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
+
+
+log = logging.getLogger(__name__)
+
+FILE_BYTES_MAX = 1 << 20
+"""256 devices take some 20 kB."""
+SAVE_LIMIT_S = 1.0
+"""How long the end of the daemon waits for a disk that does not answer."""
+
+T = TypeVar("T")
+
+
+class StateFile:
+    """A JSON file. Every error is reported, and costs the content only. Synchronization: the event loop's thread."""
+
+    def __init__(self, file: Path | None, thread: str, without: str) -> None:
+        """None as `file` reads and writes nothing; `without` says in messages what the next start does without it."""
+        self._file = file
+        self._without = without
+        self._contents: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        if file is not None:
+            self._thread = threading.Thread(target=self._save, args=(file,), name=thread, daemon=True)
+            self._thread.start()
+
+    def read(self, content_type: type[dict[str, T]]) -> dict[str, T]:
+        """Return the content; empty where there is none that can be used."""
+        if self._file is None:
+            return {}
+        try:
+            return msgspec.json.decode(read_regular(self._file, FILE_BYTES_MAX), type=content_type)
+        except FileNotFoundError:
+            return {}
+        except (OSError, msgspec.DecodeError, UnicodeError, RecursionError) as error:
+            reason = reason_of(error) if isinstance(error, OSError) else "it is not what imud wrote"
+            log.warning("%s cannot be used: %s; %s", self._file, reason, self._without)
+            return {}
+
+    def write(self, content: object) -> None:
+        """Have the content written soon; of several that wait only the newest is."""
+        if self._thread is not None:
+            self._contents.put(msgspec.json.encode(content))
+
+    def close(self) -> None:
+        """Wait until the file is written, for at most SAVE_LIMIT_S; may be called twice."""
+        if self._thread is not None:
+            self._contents.put(None)
+            self._thread.join(SAVE_LIMIT_S)
+            self._thread = None
+
+    def _save(self, file: Path) -> None:
+        """Write the newest content whenever there is one. Runs in the thread."""
+        while (content := self._contents.get()) is not None:
+            ended = False
+            while not ended and not self._contents.empty():
+                newer = self._contents.get()
+                ended, content = newer is None, newer or content
+            try:
+                file.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
+                replace_file(file, content)
+            except OSError as error:
+                log.warning(
+                    "%s cannot be written: %s; after the next start %s; may this user write to state_dir?",
+                    file, reason_of(error), self._without,
+                )  # fmt: skip
+            if ended:
+                return

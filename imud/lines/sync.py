@@ -1,0 +1,240 @@
+"""The synchronisation lines of one device: SOUT, SOUT_DIV, PPS and SIN for its clock, ALARM for its status.
+
+Edges have to reach the clock before the frame that follows them: `drain` is called before the data of a read is
+decoded. A line that fails affects only what it provides, and is opened again when that is possible.
+"""
+
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from typing import Any, Final
+
+from imud.contracts.command import Action
+from imud.contracts.lines import AlarmRanges, DeviceLines, Edge, LineFactory, Mark, OnEdges, TriggerStamp
+from imud.contracts.status import LinesStatus
+from imud.lines.alarm import AlarmMonitor
+from imud.lines.reset import ResetLine
+from imud.lines.trigger import SinTrigger, TriggerCounts
+from imud.lines.watched_line import WatchedLine
+from imud.model.errors import CommandError, LinkError
+from imud.model.event import EventKind, RaiseEvent
+from imud.model.sample import Sample
+from imud.sampling.clock import SampleClock
+
+ALARM_STATUS: Final = 1 << 31
+"""Bit of `Sample.status` that imud sets: the ALARM line was active. The devices' own bits are below 2¹⁶."""
+WITH_FRAMES: Final = ("sout", "sout_div")
+"""Lines whose edges are needed only together with frames: the loop is not woken for them, which costs as much as a
+frame."""
+
+
+class SyncSignals:
+    """Lines of one device, except reset and data ready. Synchronization: the loop's thread only."""
+
+    def __init__(
+        self,
+        device: str,
+        lines: DeviceLines,
+        factory: LineFactory,
+        raise_event: RaiseEvent,
+        now_ns: Callable[[], int],
+        *,
+        on_pulses: OnEdges | None = None,
+        follow: Callable[[], object] = int,
+    ) -> None:
+        """`now_ns` is CLOCK_MONOTONIC. `on_pulses` receives the edges of PPS after the clock.
+
+        `follow` is called before edges are delivered: it notes how CLOCK_MONOTONIC is steered, for their conversion.
+        """
+        self._raise_event, self._now_ns, self._follow = raise_event, now_ns, follow
+        self._on_pulses = on_pulses
+        self._clock: SampleClock | None = None
+        self._alarm = AlarmMonitor(raise_event)
+        self._closed = False
+        self._watched: dict[str, WatchedLine] = {}
+        handlers: dict[str, OnEdges] = {
+            "sout": self._on_sout, "sout_div": self._on_divided, "pps": self._on_pps, "alarm": self._on_alarm
+        }  # fmt: skip
+        for key, on_edges in handlers.items():
+            settings = getattr(lines, key)
+            if settings is not None:
+                line = factory.make_input(settings, f"{device} {key}", key != "alarm")
+                self._watched[key] = WatchedLine(
+                    line,
+                    on_edges,
+                    self._on_alarm_level if key == "alarm" else _ignore_level,
+                    self._reporter(key),
+                    now_ns,
+                    watch=key not in WITH_FRAMES,
+                )
+        self._drained = [watched for key, watched in self._watched.items() if key != "alarm"]
+        self._sin: SinTrigger | None = None
+        if lines.sin is not None:
+            output = factory.make_output(lines.sin, f"{device} sin")
+            self._sin = SinTrigger(
+                output, lines.sin, self._on_stamps, self._reporter("sin"), now_ns, factory.start_worker
+            )
+
+    def start(self, clock: SampleClock) -> None:
+        """Deliver edges to the clock of the device that was found, and drive SIN."""
+        self._clock = clock
+        self._show_alarm()
+        self.tick(self._now_ns(), None)
+
+    def tick(self, now_ns: int, newest: Sample | None) -> None:
+        """Open lines that are due, raise pending events, check ALARM against the newest sample. Call it at 10 Hz."""
+        if self._closed:
+            return
+        for watched in self._watched.values():
+            watched.tick(now_ns)
+        self._alarm.tick(now_ns, newest)
+        clock = self._clock
+        if clock is None:
+            return
+        if self._sin is not None:
+            self._sin.tick(now_ns)
+        for mark in clock.take_marks():
+            self._raise_mark(mark)
+
+    def stop(self) -> None:
+        """Stop at the end of the device's link: release SIN, drop further edges; may be called twice."""
+        self._clock = None
+        if self._sin is not None:
+            self._sin.stop()
+
+    def close(self) -> None:
+        """Release all lines; may be called twice. `tick` does not open them again."""
+        self._closed = True
+        self.stop()
+        for watched in self._watched.values():
+            watched.close()
+
+    def drain(self) -> None:
+        """Deliver all buffered edges and trigger stamps to the clock. Does not block; one system call per line."""
+        for watched in self._drained:
+            watched.drain()
+        if self._sin is not None:
+            self._sin.drain()
+
+    def set_alarm_ranges(self, ranges: AlarmRanges | None) -> None:
+        """Set what ALARM should indicate by the device's settings; None: not known, and not checked."""
+        self._alarm.set_ranges(ranges)
+
+    def trigger_once(self) -> None:
+        """Make one edge on SIN in addition to those of its rate. Raises CommandError."""
+        if self._sin is None:
+            raise CommandError("trigger: expected the key sin below lines of the device, got none")
+        try:
+            self._sin.once()
+        except LinkError as error:
+            raise CommandError(f"trigger: {error}") from error
+
+    @property
+    def can_trigger(self) -> bool:
+        """Whether SIN is configured."""
+        return self._sin is not None
+
+    def status(self, reset: ResetLine | None = None) -> LinesStatus:
+        """Return state and counters of the lines, with the problem of the reset line."""
+        watched, sin = self._watched, self._sin
+        problems = {key: line.problem for key, line in watched.items() if line.problem}
+        if sin is not None and sin.problem:
+            problems["sin"] = sin.problem
+        if reset is not None and reset.problem:
+            problems["reset"] = reset.problem
+        if self._alarm.problem:
+            problems.setdefault("alarm", self._alarm.problem)
+        counts = sin.counts if sin is not None else TriggerCounts()
+        return LinesStatus(
+            problems=problems,
+            edges={key: line.edges for key, line in watched.items()},
+            edges_lost={key: line.edges_lost for key, line in watched.items()},
+            alarm=self._alarm.line.active,
+            alarms=self._alarm.line.raised,
+            sin=sin is not None,
+            triggers=counts.edges,
+            triggers_missed=counts.missed,
+            trigger_late_mean_ns=round(counts.mean_late_ns),
+            trigger_late_worst_ns=counts.worst_late_ns,
+            trigger_late_sum_ns=counts.sum_late_ns,
+        )
+
+    # --- edges by line -----------------------------------------------------------------------------------------------
+
+    def _on_sout(self, edges: Sequence[Edge]) -> None:
+        if self._clock is not None:
+            self._follow()
+            self._clock.aiding.on_sout_edges(edges)
+
+    def _on_divided(self, edges: Sequence[Edge]) -> None:
+        if self._clock is not None:
+            self._clock.aiding.on_divided_edges(edges)
+
+    def _on_pps(self, edges: Sequence[Edge]) -> None:
+        self._follow()
+        if self._clock is not None:
+            self._clock.aiding.on_pps_edges(edges)
+        if self._on_pulses is not None:
+            self._on_pulses(edges)
+
+    def _on_stamps(self, stamps: Sequence[TriggerStamp]) -> None:
+        if self._clock is not None:
+            self._follow()
+            self._clock.aiding.on_trigger_stamps(stamps)
+
+    def _on_alarm(self, edges: Sequence[Edge]) -> None:
+        self._alarm.line.on_edges(edges)
+        self._show_alarm()
+
+    def _on_alarm_level(self, active: bool | None) -> None:
+        self._alarm.line.on_level(self._now_ns(), active)
+        self._show_alarm()
+
+    def _show_alarm(self) -> None:
+        """Set the alarm bit of the samples from now on."""
+        if self._clock is not None:
+            self._clock.set_own_status(ALARM_STATUS if self._alarm.line.active else None)
+
+    def _raise_mark(self, mark: Mark) -> None:
+        words = f"sample {mark.seq}" if mark.seq is not None else "a sample that was lost"
+        self._raise_event(
+            mark.t_ns, EventKind.MARK, f"pulse {mark.number} on SOUT_DIV belongs to {words}",
+            t_ns=mark.t_ns, edge_seq=mark.number, seq=mark.seq,
+        )  # fmt: skip
+
+    def _reporter(self, key: str) -> Callable[[str], None]:
+        """Return a function that raises an event about the line."""
+        return lambda message: self._raise_event(self._now_ns(), EventKind.LINK, f"line {key}: {message}", line=key)
+
+
+def _ignore_level(_active: bool | None) -> None:
+    """Ignore the level of a line whose edges carry the information."""
+
+
+def _no_script(_target: object) -> None:
+    raise AssertionError("a line is driven by `LineActions.run`")
+
+
+RESET: Final = Action("pulse the reset line, and wait until the device works again", _no_script)
+TRIGGER: Final = Action("make one edge on SIN, in addition to those of its rate", _no_script)
+
+
+class LineActions:
+    """Actions by the GPIO lines of one device. Synchronization: the loop's thread only."""
+
+    def __init__(self, reset: ResetLine | None, signals: SyncSignals | None) -> None:
+        self.rows: dict[str, Action] = {}
+        """Actions by name."""
+        self._coroutines: dict[str, Callable[[], Awaitable[None]]] = {}
+        if reset is not None:
+            self.rows["reset"], self._coroutines["reset"] = RESET, reset.pulse
+        if signals is not None and signals.can_trigger:
+
+            async def trigger() -> None:
+                signals.trigger_once()
+
+            self.rows["trigger"], self._coroutines["trigger"] = TRIGGER, trigger
+
+    async def run(self, name: str, arguments: Mapping[str, Any]) -> object:
+        """Run an action; none of them has a result. Raises BadArgument, CommandError."""
+        self.rows[name].arguments(arguments)
+        await self._coroutines[name]()
+        return None

@@ -1,1 +1,0 @@
-"""CAN buses: native SocketCAN, and any other interface of python-can."""

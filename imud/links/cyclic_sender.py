@@ -1,0 +1,117 @@
+"""Cyclic frames: sent by the kernel's broadcast manager, or by the event loop where there is none.
+
+The broadcast manager (CAN_BCM, linux/can/bcm.h) sends from a high-resolution timer of the kernel, independent of this
+process, and stops when its socket closes. It sets the timer anew each time, so that a period is longer by the
+latency of the interrupt: microseconds on a real machine (0.25 ms of 10 ms in the lab's emulated one). The event loop's
+timer has absolute deadlines, so that its error does not add up, but a busy process delays it;
+periods that it missed are left out.
+"""
+
+import asyncio
+import errno
+import socket
+import struct
+from collections.abc import Callable, Sequence
+from time import monotonic_ns
+from typing import Final, Protocol
+
+from imud.formats.can import EXTENDED_FLAG, CyclicFrame, pack_frame
+from imud.model.errors import LinkError
+from imud.model.units import NS_PER_S, NS_PER_US
+
+TX_SETUP: Final = 1
+"""Operation: send a frame cyclically."""
+SETTIMER: Final = 0x0001
+"""Flag: the intervals in this message hold."""
+STARTTIMER: Final = 0x0002
+"""Flag: start now, with a frame sent at once."""
+NO_MANAGER: Final = frozenset({errno.EPROTONOSUPPORT, errno.ESOCKTNOSUPPORT, errno.EAFNOSUPPORT})
+"""Errors of a kernel without CAN_BCM."""
+
+_HEAD: Final = struct.Struct("@3I4l2I")
+"""`struct bcm_msg_head`: operation, flags, count, s and us of the first and second interval, identifier, frames."""
+_PAD: Final = bytes(-_HEAD.size % 8)
+"""The frames behind it are aligned to eight bytes."""
+
+
+class Sender(Protocol):
+    """Sender of cyclic frames until it is closed."""
+
+    def close(self) -> None:
+        """Stop; may be called twice."""
+        ...
+
+
+def setup(frame: CyclicFrame) -> bytes:
+    """The TX_SETUP message for a frame, which is sent until the socket closes."""
+    seconds, rest_ns = divmod(frame.every_ns, NS_PER_S)
+    can_id = frame.can_id | EXTENDED_FLAG * frame.extended
+    head = _HEAD.pack(TX_SETUP, SETTIMER | STARTTIMER, 0, 0, 0, seconds, rest_ns // NS_PER_US, can_id, 1)
+    return head + _PAD + pack_frame(frame.can_id, frame.extended, frame.data)
+
+
+class KernelSender:
+    """Frames sent by the broadcast manager on one interface."""
+
+    def __init__(self, interface: str, frames: Sequence[CyclicFrame]) -> None:
+        """Start sending. Raises OSError, one of NO_MANAGER when the kernel has no broadcast manager."""
+        self._socket = socket.socket(socket.AF_CAN, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK, socket.CAN_BCM)
+        try:
+            self._socket.connect((interface,))
+            for frame in frames:
+                self._socket.send(setup(frame))
+        except OSError:
+            self._socket.close()
+            raise
+
+    def close(self) -> None:
+        """Stop; may be called twice."""
+        self._socket.close()
+
+
+class LoopSender:
+    """Frames sent by the event loop through a link's `write`. Synchronization: the loop's thread only."""
+
+    def __init__(
+        self,
+        write: Callable[[bytes], None],
+        on_error: Callable[[LinkError], None],
+        frames: Sequence[CyclicFrame],
+        now_ns: Callable[[], int] = monotonic_ns,
+    ) -> None:
+        """Start sending. An error of a later `write` stops it and goes to `on_error`. Raises LinkError."""
+        self._write = write
+        self._on_error = on_error
+        self._now_ns = now_ns
+        self._timers: dict[int, asyncio.TimerHandle] = {}
+        begin_ns = now_ns()
+        try:
+            for number, frame in enumerate(frames):
+                write(pack_frame(frame.can_id, frame.extended, frame.data))
+                self._wait(number, frame, begin_ns + frame.every_ns)
+        except LinkError:
+            self.close()  # the timers of the frames before
+            raise
+
+    def close(self) -> None:
+        """Stop; may be called twice."""
+        for timer in self._timers.values():
+            timer.cancel()
+        self._timers.clear()
+
+    def _wait(self, number: int, frame: CyclicFrame, due_ns: int) -> None:
+        delay_s = max(0, due_ns - self._now_ns()) / NS_PER_S
+        self._timers[number] = asyncio.get_running_loop().call_later(delay_s, self._send, number, frame, due_ns)
+
+    def _send(self, number: int, frame: CyclicFrame, due_ns: int) -> None:
+        now_ns = self._now_ns()
+        if now_ns < due_ns:  # the loop's timer may fire a little early against CLOCK_MONOTONIC
+            self._wait(number, frame, due_ns)
+            return
+        try:
+            self._write(pack_frame(frame.can_id, frame.extended, frame.data))
+        except LinkError as error:
+            self.close()
+            self._on_error(error)
+            return
+        self._wait(number, frame, due_ns + ((now_ns - due_ns) // frame.every_ns + 1) * frame.every_ns)

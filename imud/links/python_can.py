@@ -1,0 +1,166 @@
+"""A CAN bus through python-can, for adapters without a network interface: serial ones, vendors' drivers, `virtual`.
+
+A thread receives frames and hands them to the event loop in batches. A frame's time stamp is the moment python-can
+returns it: the stamps of adapters have no common time base.
+"""
+
+import asyncio
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any, Final
+
+import can
+from can.typechecking import CanFilters
+
+from imud.contracts.link import OnBusNews, OnEnd, OnFrames
+from imud.contracts.status import KernelCounters
+from imud.formats.can import EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, CanFilter, CanFrame, CyclicFrame
+from imud.links.cyclic_sender import LoopSender
+from imud.model.errors import LinkError, reason_of
+
+LOOK_S: Final = 0.05
+"""Time-out of a read, after which the thread checks whether to end, s."""
+BATCH_FRAMES: Final = 64
+
+
+class PythonCanLink:
+    """A bus of python-can as a `CanLink`. Synchronization: the loop's thread; the receiving thread is its own."""
+
+    def __init__(self, backend: str, channel: str, bitrate: int = 0) -> None:
+        self._backend = backend
+        self._channel = channel
+        self._bus: can.BusABC | None = None
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        self._filters: Sequence[CanFilter] = ()
+        self._sender: LoopSender | None = None
+        self._on_end: OnEnd | None = None
+        self.title = self.bus = f"{channel} ({backend})"
+        self.bitrate = bitrate
+        self.gather_ns = 0
+        """No-op: the receiving thread decides how many frames it hands over at once."""
+        self.writable = True
+
+    @property
+    def filters(self) -> Sequence[CanFilter]:
+        """Frames to deliver."""
+        return self._filters
+
+    @filters.setter
+    def filters(self, filters: Sequence[CanFilter]) -> None:
+        self._filters = filters
+        if self._bus is not None:
+            self._bus.set_filters(_as_python_can(filters))
+
+    def absence(self) -> str:
+        """Empty: unknown before the bus is opened."""
+        return ""
+
+    async def wait_present(self) -> None:
+        """Return at once."""
+
+    def open(self) -> None:
+        """Open the bus. Raises LinkError with the message of python-can."""
+        filters = _as_python_can(self._filters)
+        rate: dict[str, Any] = {"bitrate": self.bitrate} if self.bitrate else {}
+        try:
+            self._bus = can.Bus(self._channel, self._backend, can_filters=filters, ignore_config=True, **rate)
+        except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
+            raise LinkError(f"{self.title} cannot be opened: {reason_of(error)}") from error
+
+    def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
+        """Deliver frames from now on; python-can reports no changes of the bus state."""
+        assert self._bus is not None
+        self._on_end = on_end
+        self._stop = threading.Event()
+        arguments = (self._bus, self._stop, asyncio.get_running_loop(), on_frames, on_end)
+        self._thread = threading.Thread(target=self._receive, args=arguments, name=f"can {self._channel}")
+        self._thread.start()
+
+    def write(self, data: bytes) -> None:
+        """Send frames (`struct can_frame`). Raises LinkError."""
+        if self._bus is None:
+            raise LinkError(f"{self.title} is not open: nothing can be sent")
+        try:
+            for can_id, size, payload in RAW_FRAME.iter_unpack(data):
+                extended = can_id >= EXTENDED_FLAG
+                message = can.Message(
+                    arbitration_id=can_id & EXTENDED_ID_MAX, is_extended_id=extended, data=payload[:size]
+                )
+                self._bus.send(message, timeout=0)
+        except can.CanError as error:
+            raise LinkError(f"{self.title} does not send: {reason_of(error)}") from error
+
+    def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
+        """Send these from the event loop; the link ends when one cannot be sent. Raises LinkError.
+
+        python-can's own `send_periodic` needs a thread for each frame and does not report failures.
+        """
+        if self._sender is not None:
+            self._sender.close()
+        self._sender = LoopSender(self.write, self._failed, frames)
+
+    def kernel_counters(self) -> KernelCounters:
+        """Zeros: python-can counts no errors."""
+        return KernelCounters()
+
+    def close(self) -> None:
+        """Release the bus; may be called twice. Waits for the thread, LOOK_S at most."""
+        self._stop.set()
+        sender, self._sender = self._sender, None
+        if sender is not None:
+            sender.close()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.join()
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            bus.shutdown()
+
+    def _failed(self, error: LinkError) -> None:
+        if self._on_end is not None:
+            self._on_end(error)
+
+    def _receive(
+        self,
+        bus: can.BusABC,
+        stop: threading.Event,
+        loop: asyncio.AbstractEventLoop,
+        on_frames: OnFrames,
+        on_end: OnEnd,
+    ) -> None:
+        """Receive frames; the body of the thread."""
+
+        def deliver(frames: list[CanFrame]) -> None:
+            if not stop.is_set():
+                on_frames(frames)
+
+        def end(error: LinkError) -> None:
+            if not stop.is_set():
+                on_end(error)
+
+        try:
+            while not stop.is_set():
+                frames = _batch(bus)
+                if frames and not stop.is_set():
+                    loop.call_soon_threadsafe(deliver, frames)
+        except (can.CanError, OSError) as error:
+            if not stop.is_set():
+                loop.call_soon_threadsafe(end, LinkError(f"{self.title} ended: {reason_of(error)}"))
+
+
+def _as_python_can(filters: Sequence[CanFilter]) -> CanFilters:
+    return [{"can_id": f.can_id, "can_mask": f.mask, "extended": f.extended} for f in filters]
+
+
+def _batch(bus: can.BusABC) -> list[CanFrame]:
+    """Data frames that are there, waiting for the first."""
+    frames: list[CanFrame] = []
+    message = bus.recv(LOOK_S)
+    while message is not None:
+        if not (message.is_error_frame or message.is_remote_frame or message.is_fd):
+            now_ns = time.monotonic_ns()
+            frames.append(CanFrame(message.arbitration_id, message.is_extended_id, bytes(message.data), now_ns))
+        message = bus.recv(0) if len(frames) < BATCH_FRAMES else None
+    return frames

@@ -1,0 +1,371 @@
+"""A capture file as a source of bytes, through the same path as a port.
+
+Speeds, and what `t_rx_ns` is (it never decreases and never lies in the future):
+
+- `recorded`: each read of a stamped capture comes as long after the first as it did then; `t_rx_ns` is that due time,
+  so the recorded arrival jitter is what the clock sees, not the jitter of this process.
+- `real`: bytes come as fast as the wire at `baud` carries them, PIECE_NS at a time; `t_rx_ns` is the due time.
+- `maximum`: as fast as the receiver decodes. Time is virtual: recorded stamps, or wire time at `baud` (all the same
+  instant where neither is known), shifted so that the end of the capture is the moment of the start. It can be negative
+  where the capture is longer than the machine is up.
+"""
+
+import asyncio
+import logging
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from io import BytesIO
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, BinaryIO, Final, Literal
+
+from msgspec import Meta
+
+from imud.contracts.link import LinkType, OnBusNews, OnData, OnEnd, OnFrames
+from imud.contracts.status import KernelCounters
+from imud.formats.can import CandumpReader, CanFilter, CanFrame, CyclicFrame
+from imud.formats.capture import CaptureReader
+from imud.host.files import NotRegularFile
+from imud.host.files import open_regular as open_file
+from imud.links.device_node import wait_until
+from imud.model.errors import ImudError, LinkDenied, LinkError, LinkMissing
+from imud.model.options import Settings
+from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+
+
+class ReplaySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a replayed capture."""
+
+    path: Annotated[str, Meta(min_length=1)]
+    """Raw or stamped capture file."""
+    speed: Literal["recorded", "real", "maximum"] = "recorded"
+    """`recorded`: by the stamps in the file; `real`: by wire time at `baud`; `maximum`: as fast as possible."""
+    baud: Annotated[int, Meta(ge=0, le=4_000_000)] = 0
+    """Rate of the wire in bit/s; 0 for that of the capture. A raw capture at speed `real` needs it."""
+    repeat: bool = False
+    """Start again at the end of the file; not at speed `maximum`."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for keys that exclude each other."""
+        if self.repeat and self.speed == "maximum":
+            raise ValueError("repeat: expected false at speed maximum, whose time would run into the future, got true")
+
+
+class FileReplay:
+    """Common part of both kinds of replay. Synchronization: the loop's thread only.
+
+    `close` drops the timer and the file: a turn that finds another file in `_file` than at its begin has ended.
+    """
+
+    writable = False
+
+    def __init__(self, settings: ReplaySettings, now_ns: Callable[[], int]) -> None:
+        self.title = settings.path
+        self._settings = settings
+        self._now_ns = now_ns
+        self._file: BinaryIO | None = None
+        self._timer: asyncio.Handle | None = None
+
+    def absence(self) -> str:
+        """Return that the file is missing; empty when it is there."""
+        return "" if Path(self.title).exists() else f"{self.title} is not there: expected a capture file"
+
+    async def wait_present(self) -> None:
+        """Return when the file is there."""
+        path = Path(self.title)
+        await wait_until(path, path.exists)
+
+    def write(self, data: bytes) -> None:
+        """Raises LinkError: a file has no far end."""
+        raise LinkError(f"{self.title} is a replay: nothing can be sent to it")
+
+    def kernel_counters(self) -> KernelCounters:
+        """Zeros: the kernel counts no errors of a file."""
+        return KernelCounters()
+
+    def close(self) -> None:
+        """Release the file; may be called twice."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        file, self._file = self._file, None
+        if file is not None:
+            file.close()
+
+
+def open_regular(path: str) -> BinaryIO:
+    """Open a capture for reading. Raises LinkMissing, LinkDenied, LinkError."""
+    try:
+        return open_file(path)
+    except FileNotFoundError as error:
+        raise LinkMissing(f"{path} is not there: expected a capture file") from error
+    except PermissionError as error:
+        raise LinkDenied(f"{path} may not be read by this user") from error
+    except NotRegularFile as error:
+        raise LinkError(f"{path} is not a regular file: a replay reads a capture file") from error
+    except OSError as error:
+        raise unreadable(path, error) from error
+
+
+def unreadable(path: str, error: OSError) -> LinkError:
+    """Format the error for a file that cannot be read."""
+    return LinkError(f"{path} cannot be read: {error.strerror}")
+
+
+TURN_FRAMES: Final = 512
+"""Delivered in one turn of the event loop, 1 ms of decoding: others get their turn between."""
+
+log = logging.getLogger(__name__)
+
+
+def no_log(path: str) -> str:
+    """Format the error for a file without frames."""
+    return f"{path} is no CAN log: expected frames as `candump -L` writes them, found none"
+
+
+class CanReplayLink(FileReplay):
+    """A log as a `CanLink`. Synchronization: the loop's thread only."""
+
+    def __init__(self, settings: ReplaySettings, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        super().__init__(settings, now_ns)
+        self._span_ns = 0
+        self._frames: Iterator[CanFrame] = iter(())
+        self.filters: Sequence[CanFilter] = ()
+        self.bus = settings.path
+        self.bitrate = 0
+        self.gather_ns = 0
+        """No-op: the recording decides what is delivered together."""
+
+    def open(self) -> None:
+        """Open the log and check that it has frames. Raises LinkMissing, LinkDenied, LinkError."""
+        self._file = open_regular(self.title)
+        reader = CandumpReader(self._file)
+        first_ns = newest_ns = -1
+        try:
+            for frame in reader:
+                newest_ns = frame.t_rx_ns
+                first_ns = newest_ns if first_ns < 0 else first_ns
+                if self._settings.speed != "maximum":
+                    break
+        except OSError as error:
+            self.close()
+            raise unreadable(self.title, error) from error
+        if first_ns < 0:
+            self.close()
+            raise LinkError(no_log(self.title))
+        self._span_ns = newest_ns - first_ns
+
+    def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
+        """Play from the beginning."""
+        self._frames = self._play(self._now_ns() - self._span_ns)
+        self._timer = asyncio.get_running_loop().call_soon(self._turn, on_frames, on_end, None)
+
+    def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
+        """Raises LinkError: a file has no far end."""
+        raise LinkError(f"{self.title} is a replay: nothing can be sent to it")
+
+    def _turn(self, on_frames: OnFrames, on_end: OnEnd, waiting: CanFrame | None) -> None:
+        """Deliver what is due, at most TURN_FRAMES, then give way."""
+        file, frames, now_ns = self._file, list[CanFrame](), self._now_ns()
+        while (frame := waiting or next(self._frames, None)) is not None:
+            waiting = frame if frame.t_rx_ns > now_ns or len(frames) >= TURN_FRAMES else None
+            if waiting:
+                break
+            frames.append(frame)
+        if frames:
+            on_frames(frames)
+        if self._file is not file:  # closed by the receiver
+            return
+        if waiting is None:
+            self.close()
+            on_end(None)
+            return
+        delay_s = max(0, waiting.t_rx_ns - self._now_ns()) / NS_PER_S
+        self._timer = asyncio.get_running_loop().call_later(delay_s, self._turn, on_frames, on_end, waiting)
+
+    def _play(self, origin_ns: int) -> Iterator[CanFrame]:
+        """Frames that pass the filters, with the CLOCK_MONOTONIC at which each is due."""
+        while self._file is not None:
+            self._file.seek(0)
+            reader = CandumpReader(self._file)
+            first_ns, count, due_ns = None, 0, origin_ns
+            for frame in reader:
+                first_ns = frame.t_rx_ns if first_ns is None else first_ns
+                due_ns = origin_ns + frame.t_rx_ns - first_ns
+                count += 1
+                if any(wanted.matches(frame.can_id, frame.extended) for wanted in self.filters):
+                    yield frame._replace(t_rx_ns=due_ns)
+            if reader.problem:
+                log.warning("%s: %s", self.title, reader.problem)
+            if not self._settings.repeat:
+                return
+            origin_ns = due_ns + max((due_ns - origin_ns) // max(count, 1), NS_PER_MS)
+
+
+PIECE_NS: Final = 2 * NS_PER_MS
+"""Wire time of one piece at speed `real`; a native UART hands over about as much at a time."""
+PIECE_BYTES_MAX: Final = 65536
+"""Bytes per chunk of a capture without times: the size of a read from a port."""
+TURN_BYTES: Final = 16384
+"""Delivered in one turn of the event loop, 0.5 ms of decoding: others get their turn between."""
+
+LOOKED_AT_BYTES: Final = 65536
+"""Begin of a log in which the check of a configuration looks for a frame."""
+
+
+class ReplayLink(FileReplay):
+    """A capture as a `StreamLink`. Synchronization: the loop's thread only."""
+
+    def __init__(self, settings: ReplaySettings, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        super().__init__(settings, now_ns)
+        self._player: Iterator[tuple[bytes, int]] = iter(())
+        self._span_ns = 0
+        self.baud = settings.baud
+        self.auto_baud = False
+        self.hold_ns = 0
+        self.waiting_bytes = 0
+
+    def pause(self) -> None:
+        """No-op: a recording is not paused, for nothing wakes up for it but itself."""
+
+    def take(self) -> bytes:
+        """Nothing waits."""
+        return b""
+
+    def resume(self) -> None:
+        """No-op, as `pause`."""
+
+    def open(self) -> None:
+        """Open and check the capture. Raises LinkMissing, LinkDenied, LinkError."""
+        path, settings = self.title, self._settings
+        self._file = open_regular(path)
+        try:
+            reader = self._reader()
+            self.baud = settings.baud or reader.baud
+            self.hold_ns = PIECE_NS if settings.speed == "real" else reader.hold_ns
+            if unplayable := _unplayable(settings, reader):
+                raise LinkError(unplayable)
+            self._span_ns = self._measure(reader) if settings.speed == "maximum" else 0
+        except LinkError:
+            self.close()
+            raise
+        except OSError as error:
+            self.close()
+            raise unreadable(path, error) from error
+
+    def start(self, on_data: OnData, on_end: OnEnd) -> None:
+        """Play from the beginning."""
+        self._player = self._play(self._now_ns() - self._span_ns)
+        self._timer = asyncio.get_running_loop().call_soon(self._turn, on_data, on_end, None)
+
+    def set_baud(self, baud: int) -> None:
+        """Raises LinkError: a recording has the rate it has."""
+        raise LinkError(f"{self.title} is a replay: its rate cannot be changed")
+
+    def _turn(self, on_data: OnData, on_end: OnEnd, waiting: tuple[bytes, int] | None) -> None:
+        """Deliver what is due, at most TURN_BYTES, then give way."""
+        loop, file, room, now_ns = asyncio.get_running_loop(), self._file, TURN_BYTES, self._now_ns()
+        while self._file is file:  # until the receiver closes it
+            data, due_ns = item = waiting or next(self._player, (b"", 0))
+            waiting = None
+            if not data:
+                self.close()
+                on_end(None)
+                return
+            if due_ns > now_ns and due_ns > (now_ns := self._now_ns()):
+                delay_s = (due_ns - now_ns) / NS_PER_S
+                self._timer = loop.call_later(delay_s, self._turn, on_data, on_end, item)
+                return
+            if room <= 0:
+                self._timer = loop.call_soon(self._turn, on_data, on_end, item)
+                return
+            room -= len(data)
+            on_data(data, due_ns)
+
+    def _play(self, origin_ns: int) -> Iterator[tuple[bytes, int]]:
+        """Pieces with the CLOCK_MONOTONIC at which each is due."""
+        while True:
+            offset_ns = pieces = 0
+            reader = self._reader()
+            for data, offset_ns in self._pieces(reader):
+                yield data, origin_ns + offset_ns
+                pieces += 1
+            if reader.problem:
+                log.warning("%s: %s", self.title, reader.problem)
+            if not self._settings.repeat or not pieces:
+                return
+            origin_ns += offset_ns + max(offset_ns // pieces, NS_PER_MS)
+
+    def _pieces(self, reader: CaptureReader) -> Iterator[tuple[bytes, int]]:
+        """Pieces of bounded size with the time each was complete, from 0."""
+        if reader.stamped and self._settings.speed != "real":
+            return self._stamped_pieces(reader)
+        return self._wire_pieces(reader)
+
+    def _stamped_pieces(self, reader: CaptureReader) -> Iterator[tuple[bytes, int]]:
+        chunks = iter(reader)
+        first = next(chunks, None)
+        if first is None:
+            return
+        for t_ns, data in chain((first,), chunks):
+            offset_ns = (t_ns or 0) - (first.t_ns or 0)
+            for start in range(0, len(data), PIECE_BYTES_MAX):
+                yield data[start : start + PIECE_BYTES_MAX], offset_ns
+
+    def _wire_pieces(self, reader: CaptureReader) -> Iterator[tuple[bytes, int]]:
+        byte_ns = uart_byte_ns(self.baud)
+        real = self._settings.speed == "real"
+        size = min(max(PIECE_NS // byte_ns, 1), PIECE_BYTES_MAX) if real and byte_ns else PIECE_BYTES_MAX
+        sent = 0
+        for _, data in reader:
+            for start in range(0, len(data), size):
+                piece = data[start : start + size]
+                sent += len(piece)
+                yield piece, sent * byte_ns
+
+    def _measure(self, reader: CaptureReader) -> int:
+        """Duration of the capture in its own time, ns."""
+        if self._file is not None and not reader.stamped:
+            return os.fstat(self._file.fileno()).st_size * uart_byte_ns(self.baud)
+        return max((offset_ns for _, offset_ns in self._pieces(reader)), default=0)
+
+    def _reader(self) -> CaptureReader:
+        if self._file is None:
+            raise LinkError(f"{self.title} is not open")
+        self._file.seek(0)
+        try:
+            return CaptureReader(self._file)
+        except ImudError as error:
+            raise LinkError(f"{self.title}: {error}") from error
+
+
+def _unplayable(settings: ReplaySettings, reader: CaptureReader) -> str:
+    """Return why a capture cannot be played at the speed of the settings; empty if it can."""
+    if settings.speed == "recorded" and not reader.stamped:
+        return f"{settings.path} is a raw capture without times: use speed real with a baud, or maximum"
+    if settings.speed == "real" and not (settings.baud or reader.baud):
+        return f"{settings.path} does not say its baud rate: speed real needs the key baud"
+    return ""
+
+
+def _problem(settings: ReplaySettings, frames: bool) -> str:
+    """Return why the file cannot be played; empty if it can, or if it is not there now."""
+    try:
+        with open_regular(settings.path) as file:
+            if frames:
+                return _without_frames(settings.path, file.read(LOOKED_AT_BYTES))
+            return _unplayable(settings, CaptureReader(file))
+    except LinkMissing:
+        return ""
+    except ImudError as error:
+        return str(error)
+
+
+def _without_frames(path: str, begin: bytes) -> str:
+    """Return that a log has no frames, if its begin is all of it."""
+    found = len(begin) == LOOKED_AT_BYTES or next(iter(CandumpReader(BytesIO(begin))), None) is not None
+    return "" if found else no_log(path)
+
+
+LINK = LinkType("replay", ReplaySettings, ReplayLink, CanReplayLink, problem=_problem)

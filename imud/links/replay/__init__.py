@@ -1,1 +1,0 @@
-"""Replay of captures in place of a port."""

@@ -1,1 +1,0 @@
-"""Serial lines that several devices share, half-duplex."""

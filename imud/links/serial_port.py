@@ -1,0 +1,287 @@
+"""A serial port: exclusive raw access, the rate read back, the latency of its adapter lowered, errors counted.
+
+What pyserial leaves undone is done here: TIOCEXCL beside its flock (programs that do not lock are refused too), no
+BRKINT (with it, a break, which is what a wrong baud rate looks like, discards everything received), no HUPCL (DTR
+stays as it is between close and open, and a board that resets on DTR is left alone), and the rate is read back.
+
+FTDI-like USB adapters send a packet when 62 bytes are there or their latency timer (16 ms as delivered) runs out.
+ASYNC_LOW_LATENCY (linux/serial.h) or sysfs `latency_timer` sets it to 1 ms. Native UARTs and ptys hold nothing back;
+CDC ACM devices answer the host's polls of 1 ms (USB full-speed frame).
+"""
+
+import array
+import contextlib
+import errno
+import fcntl
+import os
+import termios
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import serial
+
+from imud.contracts.status import KernelCounters
+from imud.links.device_node import CABLE, PROC, errno_of, open_problem
+from imud.model.errors import LinkError, reason_of
+from imud.model.units import NS_PER_MS
+
+TCGETS2: Final = 0x802C542A
+"""ioctl: struct termios2, which has the rate as a number (asm-generic/termbits.h)."""
+TERMIOS2_INTS: Final = 11
+OSPEED_INDEX: Final = 10
+"""c_iflag c_oflag c_cflag c_lflag, c_line and c_cc[19] in five words, c_ispeed, c_ospeed."""
+BAUD_TOLERANCE: Final = 0.03
+"""8N1 is sampled 9.5 bits after its start edge: half a bit there is 5 %, of which the far end may use some."""
+UNKNOWN_USB_HOLD_NS: Final = 16 * NS_PER_MS
+"""Assumed hold time of USB adapters whose driver does not report one: the longest common one."""
+ACM_HOLD_NS: Final = 1 * NS_PER_MS
+TIOCGICOUNT: Final = 0x545D
+"""ioctl: errors that the kernel's serial driver counts (ioctl_tty(2))."""
+ICOUNTER_INTS: Final = 20
+"""struct serial_icounter_struct: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun reserved[9], all int."""
+FRAME, OVERRUN, PARITY, BREAK, BUFFER_OVERRUN = 6, 7, 8, 9, 10
+
+
+PIPE_ENDS: Final = ("pipe_abort_read_r", "pipe_abort_read_w", "pipe_abort_write_r", "pipe_abort_write_w")
+"""Of pyserial's two pipes, by which another thread can end a wait in its `read` and `write`."""
+
+
+class DescriptorPort(serial.Serial):
+    """A port that is read and written by its descriptor, not by pyserial: without its pipes, one descriptor instead of
+    five."""
+
+    def open(self) -> None:
+        """Open the port. Raises OSError, ValueError, termios.error."""
+        super().open()
+        for name in PIPE_ENDS:
+            descriptor = getattr(self, name, None)
+            if descriptor is not None:
+                os.close(descriptor)
+                setattr(self, name, None)
+
+    def close(self) -> None:
+        """Close the port; may be called twice."""
+        if self.is_open:
+            descriptor = self.fileno()
+            self.fd, self.is_open = None, False
+            os.close(descriptor)
+
+
+def open_port(path: str, baud: int, proc: Path) -> serial.Serial:
+    """Open `path` exclusively as raw 8N1 without flow control. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+    try:
+        # inter_byte_timeout=0 gives VMIN=1: then a read without data is EAGAIN, and 0 bytes always means hung up.
+        port = DescriptorPort(path, baud, exclusive=True, timeout=0, write_timeout=0, inter_byte_timeout=0)
+    except (OSError, ValueError, termios.error) as error:
+        raise port_problem(error, path, proc) from error
+    try:
+        fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
+        _finish_raw(port.fileno())
+        _check_rate(port, path, baud)
+    except (OSError, termios.error) as error:
+        port.close()
+        raise port_problem(error, path, proc) from error
+    except LinkError:
+        port.close()
+        raise
+    return port
+
+
+def change_baud(port: serial.Serial, path: str, baud: int, proc: Path) -> None:
+    """Set another rate and discard bytes received at the old one. Raises LinkError if the port cannot do it."""
+    try:
+        port.baudrate = baud
+        termios.tcflush(port.fileno(), termios.TCIFLUSH)
+        _check_rate(port, path, baud)
+    except (OSError, ValueError, termios.error) as error:
+        raise port_problem(error, path, proc) from error
+
+
+def baud_of(fd: int) -> int:
+    """The rate the driver really set, in bit/s (TCGETS2)."""
+    settings = array.array("I", [0] * (TERMIOS2_INTS + 5))
+    fcntl.ioctl(fd, TCGETS2, settings)
+    return settings[OSPEED_INDEX]
+
+
+def port_problem(error: Exception, path: str, proc: Path = PROC) -> LinkError:
+    """The LinkError for what the system reports of a serial port, with what to check."""
+    if known := open_problem(error, path, CABLE, proc):
+        return known
+    if errno_of(error) == errno.EIO:
+        return LinkError(f"{path} has a node but no hardware behind it: is this the right port, is it enabled?")
+    reason = reason_of(error)
+    if (os.path.exists(path) and not Path(path).is_char_device()) or reason == os.strerror(errno.ENOTTY):
+        return LinkError(f"{path} is not a serial port: expected one such as /dev/ttyUSB0")
+    return LinkError(f"{path} cannot be used as a serial port: {reason}")
+
+
+def _finish_raw(fd: int) -> None:
+    attributes = termios.tcgetattr(fd)
+    attributes[0] &= ~(termios.BRKINT | termios.IGNBRK | termios.IGNPAR)
+    attributes[2] &= ~termios.HUPCL
+    termios.tcsetattr(fd, termios.TCSANOW, attributes)
+
+
+def _check_rate(port: serial.Serial, path: str, baud: int) -> None:
+    real = baud_of(port.fileno())
+    if abs(real - baud) > baud * BAUD_TOLERANCE:
+        raise LinkError(f"{path} cannot do {baud} baud: asked for it, its driver set {real}")
+
+
+def request_low_latency(port: serial.Serial, path: str, sys: Path) -> None:
+    """Ask driver and adapter to hand over bytes at once. Absent support is normal (ptys, many drivers)."""
+    with contextlib.suppress(ValueError):  # pyserial's word for a driver without TIOCSSERIAL
+        port.set_low_latency_mode(True)
+    timer_ms = read_latency_timer_ms(path, sys)
+    if timer_ms is not None and timer_ms > 1:
+        with contextlib.suppress(OSError):  # writable for root only
+            _timer(path, sys).write_text("1")
+
+
+def hold_ns(path: str, sys: Path) -> int:
+    """Read the latency timer of the adapter behind `path`, ns; 0 without one."""
+    timer_ms = read_latency_timer_ms(path, sys)
+    if timer_ms is not None:
+        return timer_ms * NS_PER_MS
+    name = _node(path)
+    if name.startswith("ttyUSB"):
+        return UNKNOWN_USB_HOLD_NS
+    return ACM_HOLD_NS if name.startswith("ttyACM") else 0
+
+
+def read_latency_timer_ms(path: str, sys: Path) -> int | None:
+    """The adapter's latency timer in ms, or None where it has none."""
+    try:
+        return int(_timer(path, sys).read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def _timer(path: str, sys: Path) -> Path:
+    return sys / "class" / "tty" / _node(path) / "device" / "latency_timer"
+
+
+def _node(path: str) -> str:
+    return os.path.basename(os.path.realpath(path))
+
+
+def read_counters(fd: int) -> tuple[int, ...] | None:
+    """The driver's ICOUNTER_INTS counters since boot, or None where it has none."""
+    buffer = array.array("i", [0] * ICOUNTER_INTS)
+    try:
+        fcntl.ioctl(fd, TIOCGICOUNT, buffer)
+    except OSError:
+        return None
+    return tuple(buffer)
+
+
+def relative(start: tuple[int, ...] | None, now: tuple[int, ...] | None) -> KernelCounters:
+    """Subtract counters from `start` to `now`; modulo 2³², because the kernel's ints wrap."""
+    if start is None or now is None:
+        return KernelCounters()
+    counted = [(b - a) & 0xFFFF_FFFF for a, b in zip(start, now, strict=True)]
+    return KernelCounters(
+        overrun=counted[OVERRUN] + counted[BUFFER_OVERRUN],
+        framing=counted[FRAME],
+        parity=counted[PARITY],
+        break_=counted[BREAK],
+    )
+
+
+class TtyCounters:
+    """The counters of one open port relative to when this object was made; zeros where the driver has none (ptys)."""
+
+    def __init__(self, fd: int, read: Callable[[int], tuple[int, ...] | None] = read_counters) -> None:
+        """`read` gives the driver's counters of a descriptor, None where there are none."""
+        self._fd = fd
+        self._read_counters = read
+        self._start = read(fd)
+        self._newest = self._start
+
+    def read(self) -> KernelCounters:
+        """Counted since the start; the last known state once the port is gone."""
+        now = self._read_counters(self._fd)
+        if now is not None:
+            self._newest = now
+        return relative(self._start, self._newest)
+
+
+NODE_KINDS: Final = ("ttyUSB", "ttyACM", "ttyAMA", "ttyS", "ttySC", "ttyTHS", "ttymxc", "ttyO")
+"""USB adapters, USB virtual ports, PL011 (Raspberry Pi), 8250 and mini-UART, SC16IS7xx, Tegra, i.MX, OMAP."""
+UNKNOWN_TYPE: Final = "0"
+"""PORT_UNKNOWN of linux/serial_core.h: the driver made a node (ttyS4…) but found no UART."""
+ALIAS_DIRECTORIES: Final = ("by-id", "by-path")
+
+
+@dataclass(frozen=True, slots=True)
+class SerialPort:
+    """A serial port."""
+
+    path: str
+    """Device path for the configuration: the by-id name where there is one and it is this adapter's alone, else
+    by-path, else the node."""
+    node: str
+    """The device node, for example `/dev/ttyUSB0`."""
+    title: str
+    """Manufacturer, product and serial number of a USB adapter; else empty."""
+
+
+def list_ports(dev: Path = Path("/dev"), sys: Path = Path("/sys")) -> list[SerialPort]:
+    """List all ports that have hardware, by node name in natural order.
+
+    Of equal adapters without serial numbers, all have the same by-id name, and which of them it leads to changes with
+    the order in which they were plugged in: they are named by the socket that they are in.
+    """
+    ids, paths = (_aliases(dev / "serial" / directory) for directory in ALIAS_DIRECTORIES)
+    nodes = sorted(_nodes(dev, sys), key=lambda node: (node.name.rstrip("0123456789"), len(node.name), node.name))
+    titles = {node.name: _usb_title(sys, node.name) for node in nodes}
+    nameless = {title for name, title in titles.items() if title and name not in ids}
+    found = []
+    for node in nodes:
+        title = titles[node.name]
+        names = (paths, ids) if title in nameless else (ids, paths)
+        path = next((known[node.name] for known in names if node.name in known), str(node))
+        found.append(SerialPort(path, str(node), title))
+    return found
+
+
+def _nodes(dev: Path, sys: Path) -> Iterator[Path]:
+    for entry in (sys / "class" / "tty").glob("tty*"):
+        if entry.name.rstrip("0123456789") in NODE_KINDS and (dev / entry.name).exists() and _is_real(entry):
+            yield dev / entry.name
+
+
+def _is_real(entry: Path) -> bool:
+    """Whether hardware was found: USB ports exist only with it; the others have `type` in /sys."""
+    kind = _text(entry / "type")
+    return kind != UNKNOWN_TYPE if kind else (entry / "device").exists()
+
+
+def _aliases(directory: Path) -> dict[str, str]:
+    """Stable names by node name."""
+    found: dict[str, str] = {}
+    for link in sorted(directory.glob("*")):
+        found.setdefault(os.path.basename(os.path.realpath(link)), str(link))
+    return found
+
+
+def _usb_title(sys: Path, node: str) -> str:
+    """From the USB device that the port hangs on: the nearest parent in /sys with a product name."""
+    device = (sys / "class" / "tty" / node / "device").resolve()
+    for parent in (device, *device.parents):
+        if product := _text(parent / "product"):
+            words = (_text(parent / "manufacturer"), product, _text(parent / "serial"))
+            return " ".join(word for word in words if word)
+        if parent == sys:
+            break
+    return ""
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace").strip()
+    except OSError:
+        return ""

@@ -1,0 +1,610 @@
+"""A CAN bus: a raw SocketCAN socket, or any other interface of python-can.
+
+Every device opens its own socket with filters for its frames, so that several share a bus without seeing the
+frames of the others. Bit rate and state of the interface belong to the system (docs/can.md): imud reads them and
+changes nothing. It needs no privilege, only the receive buffer may be larger than net.core.rmem_max with CAP_NET_ADMIN.
+"""
+
+import asyncio
+import ctypes
+import errno
+import logging
+import os
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterable, Sequence
+from enum import IntEnum
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from msgspec import Meta
+
+from imud.contracts.link import CanLink, Claim, LinkType, OnBusNews, OnEnd, OnFrames
+from imud.contracts.status import KernelCounters
+from imud.formats.can import (
+    DATA_BYTES_MAX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    EXTENDED_ID_MAX,
+    RAW_FRAME,
+    REMOTE_FLAG,
+    CanFilter,
+    CanFrame,
+    CyclicFrame,
+)
+from imud.links import netlink
+from imud.links.cyclic_sender import NO_MANAGER, KernelSender, LoopSender, Sender
+from imud.model.errors import LinkDenied, LinkError, LinkMissing
+from imud.model.options import Settings
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
+
+CLASS_CONTROLLER: Final = 0x0004
+CLASS_BUS_OFF: Final = 0x0040
+CLASS_RESTARTED: Final = 0x0100
+WATCHED: Final = CLASS_CONTROLLER | CLASS_BUS_OFF | CLASS_RESTARTED
+"""Classes to subscribe to. Single errors of the bus are not among them: a bad cable makes thousands a second."""
+
+RECEIVE_OVERFLOW: Final = 0x01
+WARNING: Final = 0x04 | 0x08
+PASSIVE: Final = 0x10 | 0x20
+ACTIVE: Final = 0x40
+"""Bits of the second data byte, for receiver and transmitter."""
+
+
+class ControllerState(IntEnum):
+    """Error states of a CAN controller, numbered as `enum can_state` of linux/can/netlink.h."""
+
+    ACTIVE = 0
+    """Takes part in all traffic."""
+    WARNING = 1
+    """An error counter is above 96."""
+    PASSIVE = 2
+    """An error counter is above 127: it may not disturb others any more."""
+    BUS_OFF = 3
+    """The transmit error counter is above 255: it has left the bus."""
+
+
+_WORDS: Final = {
+    ControllerState.ACTIVE: "error-active again",
+    ControllerState.WARNING: "near its error limit (warning)",
+    ControllerState.PASSIVE: "error-passive",
+    ControllerState.BUS_OFF: "bus-off",
+}
+_HELP: Final = {
+    ControllerState.PASSIVE: "do all nodes have the same bit rate, is the bus terminated at both ends?",
+    ControllerState.BUS_OFF: (
+        "it left the bus; `ip link set {name} down`, then `ip link set {name} up type can restart-ms 100` let it "
+        "recover by itself"
+    ),
+}
+
+
+class BusState:
+    """The state of one interface's controller, with counts of its error-passive and bus-off states."""
+
+    def __init__(self, name: str, state: int | None = None) -> None:
+        """`state` as the kernel numbers it; None where it reports none (virtual interfaces)."""
+        self._name = name
+        known = state is not None and state in ControllerState.__members__.values()
+        self.state = ControllerState(state) if known else ControllerState.ACTIVE  # type: ignore[arg-type]  # not None
+        self.passive_count = 0
+        self.bus_off_count = 0
+        self.overflows = 0
+        """Times the controller's own receive buffer ran over."""
+
+    @property
+    def problem(self) -> str:
+        """Describe the fault in one sentence; empty in the states error-active and warning."""
+        advice = _HELP.get(self.state)
+        return f"{self._name} is {_WORDS[self.state]}: {advice.format(name=self._name)}" if advice else ""
+
+    def add_error_frame(self, classes: int, data: bytes) -> str:
+        """Record an error frame; return the change of state in it, one sentence, or an empty text."""
+        status = data[1] if classes & CLASS_CONTROLLER else 0
+        if status & RECEIVE_OVERFLOW:
+            self.overflows += 1
+        state = self._named(classes, status)
+        if state is None or state is self.state:
+            return ""
+        self.passive_count += state is ControllerState.PASSIVE
+        self.bus_off_count += state is ControllerState.BUS_OFF
+        self.state = state
+        return self.problem or f"{self._name} is {_WORDS[state]}"
+
+    def _named(self, classes: int, status: int) -> ControllerState | None:
+        """The state that an error frame names, or None."""
+        if classes & CLASS_BUS_OFF:
+            return ControllerState.BUS_OFF
+        if status & PASSIVE:
+            return ControllerState.PASSIVE
+        if status & WARNING:
+            return ControllerState.WARNING
+        if status & ACTIVE or classes & CLASS_RESTARTED:
+            return ControllerState.ACTIVE
+        return None
+
+
+BATCH_FRAMES: Final = 64
+"""Frames per read: 8 ms of a full bus at 1 Mbit/s. What is left is read at the next turn of the loop."""
+SO_TIMESTAMPNS_NEW: Final = 64
+"""Ask for arrival stamps, and the type they come under: two 64-bit integers, s and ns (Linux 5.1, asm-generic)."""
+SO_RXQ_OVFL: Final = 40
+"""Ask for the count of frames dropped because the receive buffer was full, and its type: u32."""
+STEADY_NS: Final = 20 * NS_PER_US
+"""Two clocks read further apart than this were interrupted: read again, and use the closest of STEADY_TRIES."""
+STEADY_TRIES: Final = 3
+_COUNT_MASK: Final = 0xFFFF_FFFF
+_NO_DATA_FLAGS: Final = ERROR_FLAG | REMOTE_FLAG
+
+_WORD_BYTES: Final = struct.calcsize("P")
+_CONTROL_BYTES: Final = 64
+_STAMP: Final = f"{_WORD_BYTES + 4}xiqq"  # length, level, type, s, ns
+_DROPS: Final = f"{_WORD_BYTES + 4}xiI"  # length, level, type, count
+_CONTROL: Final = struct.Struct(f"={_STAMP}{_DROPS}{_CONTROL_BYTES - struct.calcsize(f'={_STAMP}{_DROPS}')}x")
+"""Two control messages as the kernel writes them, without their lengths and levels."""
+
+_Rows = Iterable[tuple[tuple[Any, ...], tuple[Any, ...]]]
+"""Frames and their control messages, as unpacked."""
+OnErrorFrame = Callable[[int, bytes], bool]
+"""Called with class bits and data of an error frame; returns whether frames are missing since."""
+
+
+libc: Final = ctypes.CDLL(None, use_errno=True)
+_receive: Final = ctypes.PyDLL(None, use_errno=True).recvmmsg
+"""For calls that never block: other threads need not be let in meanwhile."""
+
+
+class MessageHeader(ctypes.Structure):
+    """`struct msghdr` (recvmsg(2))."""
+
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_bytes", ctypes.c_uint32),
+        ("vector", ctypes.c_void_p),
+        ("vector_count", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_bytes", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class MessageBuffers(ctypes.Structure):
+    """`struct mmsghdr` (recvmmsg(2), sendmmsg(2))."""
+
+    _fields_ = (("header", MessageHeader), ("received_bytes", ctypes.c_uint))
+
+
+class Vector(ctypes.Structure):
+    """`struct iovec`."""
+
+    _fields_ = (("base", ctypes.c_void_p), ("bytes", ctypes.c_size_t))
+
+
+_MESSAGE_BYTES: Final = ctypes.sizeof(MessageBuffers)
+_CONTROL_SIZE_WORD: Final = MessageHeader.control_bytes.offset // _WORD_BYTES
+"""Place of `control_bytes` in a header: of all that `recvmmsg` writes there, it reads this again."""
+_new_frame: Final[Callable[[tuple[int, bool, bytes, int, bool]], CanFrame]] = partial(tuple.__new__, CanFrame)
+"""`CanFrame` at a third of the cost of its own constructor."""
+
+
+STEP_NS: Final = 100 * NS_PER_US
+"""A smaller change of the offset may be the error of its two readings."""
+BACKLOG_NS: Final = 5 * NS_PER_MS
+"""A frame is stamped so long at most before it is in the queue of the socket: the kernel's own queue is before it."""
+
+
+class FrameReader:
+    """The receiving side of a socket whose messages are `struct can_frame`. The caller keeps and closes the socket."""
+
+    def __init__(
+        self,
+        receiver: socket.socket,
+        on_error: OnErrorFrame,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        wall_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        """Enable time stamps and the drop count on the socket."""
+        receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS_NEW, 1)
+        receiver.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        self.dropped = 0
+        """Frames that the kernel dropped because they were not read in time."""
+        self._on_error = on_error
+        self._now_ns = now_ns
+        self._wall_ns = wall_ns
+        self._frames = bytearray(RAW_FRAME.size * BATCH_FRAMES)
+        self._control = bytearray(_CONTROL_BYTES * BATCH_FRAMES)
+        self._vectors = (Vector * BATCH_FRAMES)()
+        self._headers = bytearray(_MESSAGE_BYTES * BATCH_FRAMES)
+        self._messages = (MessageBuffers * BATCH_FRAMES).from_buffer(self._headers)
+        self._assign_buffers()
+        self._fresh_headers = bytes(self._headers)
+        self._header_words = memoryview(self._headers).cast("L")  # as size_t on Linux
+        self._receive = partial(
+            _receive, receiver.fileno(), self._messages, BATCH_FRAMES, int(socket.MSG_DONTWAIT), None
+        )
+        self._empty_ns = now_ns()
+        self._newest_ns = self._empty_ns
+        self._empty_offset_ns = self._clocks()[0]
+        """CLOCK_REALTIME less CLOCK_MONOTONIC when frames were read and none was left."""
+        self._lost = False
+
+    def read(self) -> list[CanFrame]:
+        """Data frames that are there, at most BATCH_FRAMES, oldest first. Raises OSError as the kernel names it."""
+        begun_ns = self._now_ns()
+        count: int = self._receive()
+        if count < 0:
+            return self._failed(ctypes.get_errno(), begun_ns)
+        offset_ns, now_ns = self._clocks()
+        if count == 1:  # as on a quiet bus: not worth two iterators
+            only = RAW_FRAME.unpack_from(self._frames), _CONTROL.unpack_from(self._control)
+            frames = self._decoded((only,), offset_ns, now_ns)
+            self._header_words[_CONTROL_SIZE_WORD] = _CONTROL_BYTES
+        else:
+            frames = self._decoded(self._rows(count), offset_ns, now_ns)
+            header_bytes = count * _MESSAGE_BYTES
+            self._headers[:header_bytes] = self._fresh_headers[:header_bytes]
+        if count < BATCH_FRAMES:
+            self._empty_ns, self._empty_offset_ns = begun_ns, offset_ns
+        return frames
+
+    def _rows(self, count: int) -> _Rows:
+        raw = memoryview(self._frames)[: count * RAW_FRAME.size]
+        control = memoryview(self._control)[: count * _CONTROL_BYTES]
+        return zip(RAW_FRAME.iter_unpack(raw), _CONTROL.iter_unpack(control), strict=True)
+
+    def _decoded(self, rows: _Rows, offset_ns: int, now_ns: int) -> list[CanFrame]:
+        frames: list[CanFrame] = []
+        newest_ns, empty_ns, dropped, lost = self._newest_ns, self._empty_ns, self.dropped & _COUNT_MASK, self._lost
+        if newest_ns < empty_ns:  # noqa: PLR1730 - a call of max() costs 60 ns on the sample path
+            newest_ns = empty_ns
+        stepped_ns = offset_ns - self._empty_offset_ns
+        if -STEP_NS < stepped_ns < STEP_NS:
+            stepped_ns = 0
+        for (can_id, size, data), (kind, seconds, ns, drop_kind, drops) in rows:
+            if drop_kind == SO_RXQ_OVFL and drops != dropped:
+                self.dropped += (drops - dropped) & _COUNT_MASK
+                dropped, lost = drops, True
+            if can_id & _NO_DATA_FLAGS:
+                if can_id & ERROR_FLAG:
+                    lost |= self._on_error(can_id ^ ERROR_FLAG, data)
+                continue
+            t_ns = seconds * NS_PER_S + ns - offset_ns if kind == SO_TIMESTAMPNS_NEW else now_ns
+            if stepped_ns and not newest_ns < t_ns <= now_ns and newest_ns < t_ns + stepped_ns <= now_ns:
+                t_ns += stepped_ns
+            if t_ns > newest_ns:
+                newest_ns = t_ns
+            elif t_ns < newest_ns - BACKLOG_NS:
+                newest_ns = now_ns
+            if newest_ns > now_ns:  # noqa: PLR1730
+                newest_ns = now_ns
+            whole = data if size == DATA_BYTES_MAX else data[:size]
+            frames.append(_new_frame((can_id & EXTENDED_ID_MAX, can_id >= EXTENDED_FLAG, whole, newest_ns, lost)))
+            lost = False
+        self._newest_ns, self._lost = newest_ns, lost
+        return frames
+
+    def _clocks(self) -> tuple[int, int]:
+        """CLOCK_REALTIME less CLOCK_MONOTONIC, and CLOCK_MONOTONIC."""
+        before_ns, wall_ns, now_ns = self._now_ns(), self._wall_ns(), self._now_ns()
+        best_ns, offset_ns, tries = now_ns - before_ns, wall_ns - (before_ns + now_ns) // 2, 1
+        while best_ns > STEADY_NS and tries < STEADY_TRIES:
+            before_ns, wall_ns, now_ns = self._now_ns(), self._wall_ns(), self._now_ns()
+            tries += 1
+            if now_ns - before_ns < best_ns:
+                best_ns, offset_ns = now_ns - before_ns, wall_ns - (before_ns + now_ns) // 2
+        return offset_ns, now_ns
+
+    def _failed(self, number: int, begun_ns: int) -> list[CanFrame]:
+        if number in (errno.EAGAIN, errno.EINTR):
+            self._empty_ns = begun_ns
+            return []
+        raise OSError(number, os.strerror(number))
+
+    def _assign_buffers(self) -> None:
+        """Give each message one frame's bytes and its share of the control buffer."""
+        frames = ctypes.addressof(ctypes.c_char.from_buffer(self._frames))
+        control = ctypes.addressof(ctypes.c_char.from_buffer(self._control))
+        vector = ctypes.addressof(self._vectors)
+        for i, message in enumerate(self._messages):
+            self._vectors[i].base = frames + i * RAW_FRAME.size
+            self._vectors[i].bytes = RAW_FRAME.size
+            header = message.header
+            header.vector, header.vector_count = vector + i * ctypes.sizeof(Vector), 1
+            header.control, header.control_bytes = control + i * _CONTROL_BYTES, _CONTROL_BYTES
+
+
+NATIVE: Final = "socketcan"
+FRAME_BUFFER_BYTES: Final = 960
+"""Bytes that the kernel charges a socket for one queued frame, about (222 fit the usual 208 KiB)."""
+FRAME_BITS: Final = 95
+"""A data frame of six bytes, without stuff bits: a full bus of these fills half the buffer while frames gather."""
+HIGHEST_BITRATE: Final = 1_000_000
+TURN_FRAMES: Final = 1024
+"""Frames that are read in one turn of the event loop at most."""
+CAN_RAW_ERR_FILTER: Final = 2
+"""Option of SOL_CAN_RAW: classes of error frames to receive (linux/can/raw.h)."""
+SO_RCVBUFFORCE: Final = 33
+"""Receive buffer above net.core.rmem_max, with CAP_NET_ADMIN (asm-generic)."""
+
+log = logging.getLogger(__name__)
+
+
+class SocketCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a CAN bus."""
+
+    interface: Annotated[str, Meta(min_length=1, max_length=63)]
+    """Network interface, for example `can0` (`ip link` lists them); for another backend its channel."""
+    receive_buffer_bytes: Annotated[int, Meta(ge=4096, le=1 << 26)] = 1 << 20
+    """Kernel memory for frames that wait to be read, about 960 bytes each. The system may allow less."""
+    backend: Annotated[str, Meta(min_length=1)] = NATIVE
+    """`socketcan`, or the name of another interface of python-can, for example `virtual` or `slcan`."""
+    bitrate: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
+    """Bit rate that another backend is to set, bit/s; 0 leaves it alone. For a network interface the system sets it."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for keys that exclude each other."""
+        if self.bitrate and self.backend == NATIVE:
+            raise ValueError("bitrate: expected none with backend socketcan, the system sets it (docs/can.md)")
+
+
+OpenSocket = Callable[[SocketCanSettings, Sequence[CanFilter]], socket.socket]
+
+
+def open_raw(settings: SocketCanSettings, filters: Sequence[CanFilter]) -> socket.socket:
+    """A raw CAN socket bound to the interface, with filters and the error frames to watch. Raises OSError."""
+    opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
+    try:
+        opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(filters))
+        opened.setsockopt(socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, struct.pack("=I", WATCHED))
+        _enlarge(opened, settings)
+        opened.bind((settings.interface,))
+    except OSError:
+        opened.close()
+        raise
+    return opened
+
+
+def _enlarge(opened: socket.socket, settings: SocketCanSettings) -> None:
+    """Enlarge the receive buffer as far as permitted; the kernel doubles the value and reports the double."""
+    wanted = settings.receive_buffer_bytes
+    try:
+        opened.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, wanted // 2)
+    except PermissionError:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted // 2)
+    got = opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    if got < wanted:
+        log.info(
+            "%s: receive buffer of %d bytes, wanted %d (sysctl net.core.rmem_max): room for about %d frames",
+            settings.interface, got, wanted, got // FRAME_BUFFER_BYTES,
+        )  # fmt: skip
+
+
+def pack_filters(filters: Sequence[CanFilter]) -> bytes:
+    """Filters as `struct can_filter`: data frames only, and only of the named length of identifier."""
+    flags = EXTENDED_FLAG | REMOTE_FLAG
+    return b"".join(struct.pack("=II", f.can_id | EXTENDED_FLAG * f.extended, f.mask | flags) for f in filters)
+
+
+class SocketCanLink:
+    """A CAN network interface as a `CanLink`. Synchronization: the loop's thread only."""
+
+    def __init__(
+        self, settings: SocketCanSettings, *, sys: Path = netlink.SYS, open_socket: OpenSocket = open_raw
+    ) -> None:
+        """`open_socket` makes a bound, non-blocking socket whose messages are `struct can_frame`."""
+        self._settings = settings
+        self._open_socket = open_socket
+        self._gather_wanted_ns = self._gather_most_ns = self._gather_ns = 0
+        self._timer: asyncio.TimerHandle | None = None
+        self._sys = sys
+        self._socket: socket.socket | None = None
+        self._reader: FrameReader | None = None
+        self._state = BusState(settings.interface)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._on_frames: OnFrames = _ignore_frames
+        self._on_news: OnBusNews = _ignore_news
+        self._on_end: OnEnd = _ignore_end
+        self._filters: Sequence[CanFilter] = ()
+        self._sender: Sender | None = None
+        self.title = self.bus = settings.interface
+        self.bitrate = 0
+        self.writable = True
+
+    @property
+    def filters(self) -> Sequence[CanFilter]:
+        """Frames to deliver."""
+        return self._filters
+
+    @filters.setter
+    def filters(self, filters: Sequence[CanFilter]) -> None:
+        self._filters = filters
+        if self._socket is not None:
+            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(filters))
+
+    @property
+    def gather_ns(self) -> int:
+        """Time for which frames gather before they are read, ns; 0: they are read at once."""
+        return self._gather_ns
+
+    @gather_ns.setter
+    def gather_ns(self, gather_ns: int) -> None:
+        self._gather_wanted_ns = gather_ns
+        self._gather_ns = min(gather_ns, self._gather_most_ns)
+        if not self._gather_ns and self._timer is not None:
+            self._timer.cancel()
+            self._read_on_time()
+
+    def absence(self) -> str:
+        """Return why the interface cannot be used now; empty when it can. Raises LinkError if it is not of kind CAN."""
+        return netlink.absence(self._settings.interface, self._sys)
+
+    async def wait_present(self) -> None:
+        """Return when the interface is there and up."""
+        await netlink.wait_until(lambda: not self.absence())
+
+    def open(self) -> None:
+        """Open a socket on the interface. Raises LinkMissing, LinkDenied, LinkError."""
+        if reason := self.absence():
+            raise LinkMissing(reason)
+        details = netlink.can_details(self._settings.interface)
+        self.bitrate = details.bitrate or 0
+        self._state = BusState(self._settings.interface, details.state)
+        try:
+            self._socket = self._open_socket(self._settings, self._filters)
+            self._reader = FrameReader(self._socket, self._on_error_frame)
+            room_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        except OSError as error:
+            self.close()
+            raise self._explained(error) from error
+        frame_ns = FRAME_BITS * NS_PER_S // (self.bitrate or HIGHEST_BITRATE)
+        self._gather_most_ns = room_bytes // FRAME_BUFFER_BYTES // 2 * frame_ns
+        self._gather_ns = min(self._gather_wanted_ns, self._gather_most_ns)
+
+    def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
+        """Deliver frames from now on; a present problem of the bus is reported at once."""
+        assert self._socket is not None
+        self._on_frames, self._on_news, self._on_end = on_frames, on_news, on_end
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(self._socket.fileno(), self._read)
+        if problem := self._state.problem:
+            on_news(problem, problem)
+
+    def write(self, data: bytes) -> None:
+        """Send frames (`struct can_frame`), one system call each. Raises LinkError."""
+        if self._socket is None:
+            raise LinkError(f"{self.title} is not open: nothing can be sent")
+        try:
+            for at in range(0, len(data), RAW_FRAME.size):
+                self._socket.send(data[at : at + RAW_FRAME.size])
+        except OSError as error:
+            if error.errno in (errno.ENOBUFS, errno.EAGAIN):
+                raise LinkError(f"{self.title} does not send, its queue is full: is it alone on the bus?") from error
+            raise self._explained(error) from error
+
+    def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
+        """Have the kernel send these; by the event loop, less exactly, where it cannot. Raises LinkError."""
+        self._end_sender()
+        try:
+            self._sender = KernelSender(self._settings.interface, frames)
+        except OSError as error:
+            if error.errno not in NO_MANAGER:
+                raise self._explained(error) from error
+            log.info("%s: this kernel has no CAN_BCM (module can_bcm): cyclic frames are less exact", self.title)
+            self._sender = LoopSender(self.write, self._on_end, frames)
+
+    def kernel_counters(self) -> KernelCounters:
+        """Frames that the kernel or the controller dropped, and states of the controller, since `open`."""
+        dropped = self._reader.dropped if self._reader else 0
+        state = self._state
+        return KernelCounters(dropped + state.overflows, error_passive=state.passive_count, bus_off=state.bus_off_count)
+
+    def close(self) -> None:
+        """Release the socket; may be called twice."""
+        self._end_sender()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._loop is not None and self._socket is not None:
+            self._loop.remove_reader(self._socket.fileno())
+        self._loop = None
+        self._reader = None
+        opened, self._socket = self._socket, None
+        if opened is not None:
+            opened.close()
+
+    def _end_sender(self) -> None:
+        sender, self._sender = self._sender, None
+        if sender is not None:
+            sender.close()
+
+    def _read(self) -> None:
+        """Read one batch; the loop calls again for the rest. Where frames may gather, those that follow do."""
+        loop, opened = self._loop, self._socket
+        count = self._read_batch()
+        if self._gather_ns and count and loop is not None and opened is not None and opened is self._socket:
+            loop.remove_reader(opened.fileno())
+            self._timer = loop.call_later(self._gather_ns / NS_PER_S, self._read_on_time)
+
+    def _read_on_time(self) -> None:
+        """Read all that has gathered. A bus without frames is watched again."""
+        self._timer = None
+        loop, opened = self._loop, self._socket
+        count = total = self._read_batch()
+        while count >= BATCH_FRAMES // 2 and total < TURN_FRAMES:  # some of the batch may be no data frames
+            count = self._read_batch()
+            total += count
+        if loop is None or opened is None or opened is not self._socket or count < 0:  # ended, or was closed
+            return
+        if total and self._gather_ns:
+            self._timer = loop.call_later(self._gather_ns / NS_PER_S, self._read_on_time)
+        else:
+            loop.add_reader(opened.fileno(), self._read)
+
+    def _read_batch(self) -> int:
+        """Read and deliver one batch; returns its number of frames, -1 when the bus ended."""
+        if self._reader is None:
+            return -1
+        try:
+            frames = self._reader.read()
+        except OSError as error:
+            self._end(error)
+            return -1
+        if frames:
+            self._on_frames(frames)
+        return len(frames)
+
+    def _on_error_frame(self, classes: int, data: bytes) -> bool:
+        state = self._state
+        overflows = state.overflows
+        if news := state.add_error_frame(classes, data):
+            self._on_news(news, state.problem)
+        return state.overflows > overflows
+
+    def _end(self, error: OSError) -> None:
+        if self._loop is not None and self._socket is not None:
+            self._loop.remove_reader(self._socket.fileno())
+        self._on_end(self._explained(error))
+
+    def _explained(self, error: OSError) -> LinkError:
+        name = self.title
+        if error.errno in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
+            reason = "was taken down" if error.errno == errno.ENETDOWN else "is gone"
+            return LinkMissing(f"{name} {reason}: waiting for it to come up")
+        if error.errno == errno.EAFNOSUPPORT:
+            return LinkError(f"{name}: this kernel has no CAN (expected AF_CAN; is the module can_raw there?)")
+        if isinstance(error, PermissionError):
+            return LinkDenied(f"{name} may not be opened by this user")
+        return LinkError(f"{name}: {os.strerror(error.errno or 0)}")
+
+
+def _ignore_frames(_frames: object) -> None:
+    """The receiver before `start`."""
+
+
+def _ignore_news(_news: str, _problem: str) -> None:
+    """The receiver before `start`."""
+
+
+def _ignore_end(_error: LinkError | None) -> None:
+    """The receiver before `start`."""
+
+
+def make(settings: SocketCanSettings) -> CanLink:
+    """The link for the backend that the settings name."""
+    if settings.backend == NATIVE:
+        return SocketCanLink(settings)
+    from imud.links.python_can import PythonCanLink
+
+    return PythonCanLink(settings.backend, settings.interface, settings.bitrate)
+
+
+def _claims(settings: SocketCanSettings) -> list[Claim]:
+    """A bus, which devices share; the port of a serial adapter (`slcan` and others) is for one of them."""
+    name, port = settings.interface, settings.interface.startswith("/")
+    place = name if port or settings.backend == NATIVE else f"{name} ({settings.backend})"
+    return [Claim(place=place, key="interface", shared=not port, terms={"bitrate": settings.bitrate})]
+
+
+LINK = LinkType("socketcan", SocketCanSettings, make_can=make, claims=_claims)

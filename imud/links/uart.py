@@ -1,0 +1,213 @@
+"""A serial port: UART, RS-232, USB adapter or USB virtual port, read inside the event loop.
+
+At 1 kHz the cost is the number of wake-ups and system calls (measured), so a wake-up is one read of all that is
+there and one time stamp. A link that is paused does not watch its descriptor at all: bytes wait in the kernel until
+they are taken, or until the link is resumed.
+"""
+
+import asyncio
+import os
+import time
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import serial
+from msgspec import Meta
+
+from imud.contracts.link import Claim, LinkType, OnData, OnEnd
+from imud.contracts.status import KernelCounters
+from imud.links.device_node import CABLE, PROC, DeviceNode
+from imud.links.serial_port import TtyCounters, change_baud, hold_ns, open_port, port_problem, request_low_latency
+from imud.model.errors import LinkError, LinkMissing
+from imud.model.options import Settings
+
+READ_BYTES: Final = 65536
+FULL_READ_BYTES: Final = 2048
+"""A read of this size may leave more behind (n_tty hands over at most 4095): read again."""
+WAITING_BYTES: Final = 2048
+"""Half of what the kernel's line discipline keeps (n_tty: 4095): at three quarters it stops a USB adapter's driver from
+taking bytes, and what the adapter itself keeps can be 256."""
+WRITE_QUEUE_BYTES: Final = 4096
+"""Commands are some dozens of bytes; more waiting means that the port does not send."""
+DEFAULT_BAUD: Final = 115200
+"""Rate of a port that is opened for detection, until detection sets its own."""
+
+
+class UartSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a serial port."""
+
+    port: Annotated[str, Meta(min_length=1)]
+    """Path of the port. `/dev/serial/by-id/…` names the adapter and survives replugging; `/dev/ttyUSB0` does not."""
+    baud: Annotated[int, Meta(ge=50, le=4_000_000)] | Literal["auto"] = "auto"
+    """Rate in bit/s, or `auto`: search at every rate of the device."""
+    low_latency: bool = True
+    """Ask driver and USB adapter to hand bytes over at once."""
+
+
+class UartLink:
+    """A serial port as a `StreamLink`. Synchronization: the loop's thread only."""
+
+    def __init__(self, settings: UartSettings, *, sys: Path = Path("/sys"), proc: Path = PROC) -> None:
+        self._settings = settings
+        self._sys = sys
+        self._proc = proc
+        self._port: serial.Serial | None = None
+        self._fd = -1
+        self._counters: TtyCounters | None = None
+        self._node = DeviceNode(settings.port, CABLE)
+        self._on_data: OnData = _ignore_data
+        self._on_end: OnEnd = _ignore_end
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._unsent = bytearray()
+        self.waiting_bytes = WAITING_BYTES
+        self.title = settings.port
+        self.auto_baud = settings.baud == "auto"
+        self.writable = True
+        self.baud: int = DEFAULT_BAUD if settings.baud == "auto" else settings.baud
+        self.hold_ns = 0
+
+    def absence(self) -> str:
+        """Return why the port cannot be opened now; empty when it is there."""
+        return self._node.absence()
+
+    async def wait_present(self) -> None:
+        """Return when the port is there and may be opened, ACCESS_WAIT_S after it is there at the latest."""
+        await self._node.wait_present()
+
+    def open(self) -> None:
+        """Open the port exclusively, raw 8N1. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+        path = self._settings.port
+        self._port = open_port(path, self.baud, self._proc)
+        self._fd = self._port.fileno()
+        self._counters = TtyCounters(self._fd)
+        if self._settings.low_latency:
+            request_low_latency(self._port, path, self._sys)
+        self.hold_ns = hold_ns(path, self._sys)
+
+    def start(self, on_data: OnData, on_end: OnEnd) -> None:
+        """Deliver bytes from now on."""
+        self._on_data, self._on_end = on_data, on_end
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(self._fd, self._read)
+
+    def pause(self) -> None:
+        """Deliver nothing until `resume`: bytes wait in the kernel, and an end of the port is not seen."""
+        if self._loop is not None:
+            self._loop.remove_reader(self._fd)
+
+    def take(self) -> bytes:
+        """Return all bytes that wait. The end of the port is reported, with what came before it returned."""
+        data = b""
+        while self._loop is not None:
+            try:
+                piece = os.read(self._fd, READ_BYTES)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                self._end(error)
+                break
+            if not piece:
+                self._end(None)
+                break
+            data = data + piece if data else piece
+            if len(piece) < FULL_READ_BYTES:
+                break
+        return data
+
+    def resume(self) -> None:
+        """Deliver again as bytes come; no-op for a port that ended or is closed."""
+        if self._loop is not None:
+            self._loop.add_reader(self._fd, self._read)
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; what the port does not accept at once is queued, up to WRITE_QUEUE_BYTES. Raises LinkError."""
+        if self._fd < 0:
+            raise LinkError(f"{self.title} is not open: nothing can be sent")
+        if len(self._unsent) + len(data) > WRITE_QUEUE_BYTES:
+            raise LinkError(f"{self.title} does not send: {len(self._unsent)} bytes wait; is the port stuck?")
+        if self._unsent:
+            self._unsent += data
+            return
+        rest = data[self._send(data) :]
+        if rest:
+            self._unsent += rest
+            self._loop = self._loop or asyncio.get_running_loop()
+            self._loop.add_writer(self._fd, self._write_more)
+
+    def set_baud(self, baud: int) -> None:
+        """Change the rate; bytes received at the old one are discarded. Raises LinkError if the port cannot do it."""
+        if self._port is None:
+            raise LinkError(f"{self.title} is not open: its rate cannot be set")
+        change_baud(self._port, self._settings.port, baud, self._proc)
+        self.baud = baud
+
+    def kernel_counters(self) -> KernelCounters:
+        """Errors the kernel counted since `open`; zeros where the driver counts none."""
+        return self._counters.read() if self._counters else KernelCounters()
+
+    def close(self) -> None:
+        """Release the port; may be called twice."""
+        self._stop()
+        self._fd = -1
+        self._unsent.clear()
+        self._counters = None
+        port, self._port = self._port, None
+        if port is not None:
+            port.close()
+
+    def _read(self) -> None:
+        """Read once, and deliver what was read."""
+        try:
+            data = os.read(self._fd, READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._end(error)
+            return
+        if not data:
+            self._end(None)
+            return
+        self._on_data(data, time.monotonic_ns())
+
+    def _end(self, error: OSError | None) -> None:
+        self._stop()
+        reason = "hung up" if error is None else f"{os.strerror(error.errno or 0)}"
+        self._on_end(LinkMissing(f"{self.title} is gone ({reason}): was the cable or the adapter pulled out?"))
+
+    def _send(self, data: bytes | bytearray) -> int:
+        try:
+            return os.write(self._fd, data)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            raise port_problem(error, self.title, self._proc) from error
+
+    def _write_more(self) -> None:
+        try:
+            sent = self._send(self._unsent)
+        except LinkError:  # the reader sees the same end, and reports it
+            sent = len(self._unsent)
+        del self._unsent[:sent]
+        if not self._unsent and self._loop is not None:
+            self._loop.remove_writer(self._fd)
+
+    def _stop(self) -> None:
+        if self._loop is not None and self._fd >= 0:
+            self._loop.remove_reader(self._fd)
+            self._loop.remove_writer(self._fd)
+        self._loop = None
+
+
+def _ignore_data(data: bytes, t_rx_ns: int) -> None:
+    """The receiver before `start`."""
+
+
+def _ignore_end(error: LinkError | None) -> None:
+    """The receiver before `start`."""
+
+
+def _claims(settings: UartSettings) -> list[Claim]:
+    return [Claim(place=settings.port, key="port")]
+
+
+LINK = LinkType("uart", UartSettings, UartLink, claims=_claims)

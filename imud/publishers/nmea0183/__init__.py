@@ -1,1 +1,0 @@
-"""NMEA 0183: attitude and heading for plotters, autopilots, OpenCPN, Signal K and gpsd."""

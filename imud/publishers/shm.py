@@ -1,0 +1,619 @@
+"""Shared memory: one ring of slots per device, `/run/imud/shm/imud.<device>`, for readers that want no system call.
+
+Readers are `imud.client.ring` and `imud/include/imud.h`; the layout is `imud.formats.ring`. A reader may be as slow
+as it likes: the ring never waits for it. A ring that cannot be made, or that is removed or cut, is made anew as soon as
+that is possible; the daemon and its other outputs go on meanwhile.
+"""
+
+import fcntl
+import grp
+import logging
+import mmap
+import os
+import secrets
+import stat
+import struct
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Annotated, Final
+
+import msgspec
+
+from imud.contracts.publisher import Batch, PublisherContext, PublisherType
+from imud.formats.ring import (
+    DIRECTORY,
+    FIRST_WORD,
+    HEADER_BYTES,
+    HEARTBEAT_WORD,
+    LEDGER_BLOCK_BYTES,
+    LEDGER_BLOCK_OFFSET,
+    LEDGER_UPDATE_WORD,
+    NEWEST_WORD,
+    OFFSETS,
+    OPEN_FLAGS,
+    STATE_CLOSED,
+    STATE_HALF_WORD,
+    STATE_LIVE,
+    RingHeader,
+    decode_header,
+    default_directories,
+    encode_header,
+    encode_ledger_block,
+    ring_path,
+)
+from imud.formats.slot import SEQ_INVALID, SLOT_BYTES
+from imud.host.files import user_name
+from imud.model.errors import ServerError
+from imud.model.event import Event
+from imud.model.options import Settings
+from imud.model.sample import Sample
+from imud.model.units import NS_PER_MS
+
+log = logging.getLogger(__name__)
+
+LEFTOVERS_MAX: Final = 10_000
+"""Entries of the directory that are looked at for leftovers: in a shared directory others may make millions."""
+
+_DIRECTORY_MODE = 0o755
+_OPEN_DIRECTORY = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+_CREATE = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+_FLOCK = struct.Struct("hhqqi0q")  # struct flock of fcntl(2): type, whence, start, length (0: to the end), pid
+_TEMPORARY = ".new"
+
+
+class RingDirectory:
+    """An open directory of rings. Synchronization: one thread."""
+
+    def __init__(self, path: str) -> None:
+        """Open `path` and remove what a daemon left there that died while it made a ring.
+
+        Raises ServerError when it is missing, when others may replace files in it, or when this user may not make any.
+        """
+        self.path = path
+        self._fd = _open(path)
+        try:
+            self._identity = _identity(_checked(self._fd, path))
+        except BaseException:  # whatever ended it, the descriptor does not stay open
+            os.close(self._fd)
+            raise
+        self._remove_leftovers()
+
+    @property
+    def current(self) -> bool:
+        """Whether `path` still names this directory; False after it was removed, renamed or mounted over."""
+        try:
+            return _identity(os.stat(self.path, follow_symlinks=False)) == self._identity
+        except OSError:
+            return False
+
+    def names(self, name: str, file: os.stat_result) -> bool:
+        """Whether `name` here is `file`."""
+        try:
+            return _identity(os.stat(name, dir_fd=self._fd, follow_symlinks=False)) == _identity(file)
+        except OSError:
+            return False
+
+    def refuse_second_writer(self, name: str) -> None:
+        """Raise ServerError when another daemon of this user's or root's writes the ring `name`.
+
+        Whatever else has that name is left for `make` to replace.
+        """
+        try:
+            found = os.stat(name, dir_fd=self._fd, follow_symlinks=False)
+        except OSError:
+            return
+        if not _credible(found):
+            return
+        try:
+            descriptor = os.open(name, OPEN_FLAGS, dir_fd=self._fd)
+        except OSError:
+            return
+        try:
+            if _credible(os.fstat(descriptor)) and _is_locked(descriptor):
+                path = os.path.join(self.path, name)
+                raise ServerError(f"{path} is written by another imud, {_process(descriptor)}: stop that one first")
+        finally:
+            os.close(descriptor)
+
+    def make(self, name: str, size_bytes: int, head: bytes, mode: int, group_id: int | None) -> int:
+        """Make the file `name`, locked and whole before it appears, `head` and zeros in it; return its descriptor.
+
+        What has that name is replaced, if this user may. The group is given where this user may. Raises ServerError.
+        """
+        temporary = f".{name}.{secrets.token_hex(8)}{_TEMPORARY}"
+        path = os.path.join(self.path, name)
+        try:
+            descriptor = os.open(temporary, _CREATE, 0o600, dir_fd=self._fd)
+        except OSError as error:
+            raise ServerError(f"{path} cannot be made: {error.strerror}; may imud write to {self.path}?") from error
+        try:
+            _lock(descriptor)
+            os.posix_fallocate(descriptor, 0, size_bytes)  # a write into a page that does not fit would raise SIGBUS
+            os.pwrite(descriptor, head, 0)
+            if group_id is not None:
+                with suppress(PermissionError):  # not in the group: the caller sees it by the file's group
+                    os.fchown(descriptor, -1, group_id)
+            os.fchmod(descriptor, mode)
+            self._rename(temporary, name)
+        except OSError as error:
+            os.close(descriptor)
+            with suppress(OSError):
+                os.unlink(temporary, dir_fd=self._fd)
+            raise ServerError(
+                f"{path} cannot be made, {size_bytes} bytes: {error.strerror};"
+                f" look at what has its name (ls -ld {path}), at the free space (df {self.path}), or set fewer `slots`"
+            ) from error
+        return descriptor
+
+    def remove(self, name: str, file: os.stat_result) -> None:
+        """Remove `name` if it is `file`; without the right to do so it stays."""
+        if self.names(name, file):
+            with suppress(OSError):
+                os.unlink(name, dir_fd=self._fd)
+
+    def close(self) -> None:
+        """Release the descriptor; may be called twice."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def _rename(self, temporary: str, name: str) -> None:
+        try:
+            os.rename(temporary, name, src_dir_fd=self._fd, dst_dir_fd=self._fd)
+        except IsADirectoryError:
+            os.rmdir(name, dir_fd=self._fd)
+            os.rename(temporary, name, src_dir_fd=self._fd, dst_dir_fd=self._fd)
+
+    def _remove_leftovers(self) -> None:
+        with os.scandir(self._fd) as entries:
+            seen = [entry.name for entry in islice(entries, LEFTOVERS_MAX)]
+        for name in seen:
+            if name.startswith(".imud.") and name.endswith(_TEMPORARY):
+                with suppress(OSError):  # of another user: unlink is refused
+                    self._remove_leftover(name)
+
+    def _remove_leftover(self, name: str) -> None:
+        if not _credible(os.stat(name, dir_fd=self._fd, follow_symlinks=False)):
+            return
+        descriptor = os.open(name, OPEN_FLAGS, dir_fd=self._fd)
+        try:
+            if not _is_locked(descriptor):
+                os.unlink(name, dir_fd=self._fd)
+        finally:
+            os.close(descriptor)
+
+
+def open_directory(configured: str, environment: Mapping[str, str]) -> RingDirectory:
+    """Open the configured directory; instead of the default one, where it cannot be used, the user's own.
+
+    The default ones are made if they are missing. Raises ServerError.
+    """
+    if configured != DIRECTORY:
+        return RingDirectory(configured)
+    first, *others = default_directories(environment)
+    try:
+        return _made(first)
+    except ServerError as error:
+        for other in others:
+            directory = _made(other)
+            log.warning("shm: %s; rings are in %s", error, other)
+            return directory
+        raise
+
+
+def _made(path: str) -> RingDirectory:
+    for level in (Path(path).parent, Path(path)):
+        with suppress(OSError):  # it is there, or opening it says what is wrong
+            level.mkdir(_DIRECTORY_MODE)
+            level.chmod(_DIRECTORY_MODE)  # whatever the umask
+    return RingDirectory(path)
+
+
+def _open(path: str) -> int:
+    try:
+        return os.open(path, _OPEN_DIRECTORY)
+    except PermissionError:
+        raise ServerError(f"{path} may not be opened by user {user_name()}; `ls -ld {path}` shows who may") from None
+    except OSError as error:
+        reason = "a symbolic link" if os.path.islink(path) else error.strerror
+        hint = "make it, or set shm.directory"
+        raise ServerError(f"{path}: expected a directory for shared memory ({reason}); {hint}") from error
+
+
+def _checked(descriptor: int, path: str) -> os.stat_result:
+    """Status of the directory. Raises ServerError."""
+    status = os.fstat(descriptor)
+    if status.st_uid not in (0, os.geteuid()):
+        raise ServerError(
+            f"{path} belongs to user {status.st_uid}, who may replace the rings in it:"
+            f" expected root or {user_name()} as its owner; set shm.directory"
+        )
+    if status.st_mode & _OTHERS_WRITE and not status.st_mode & stat.S_ISVTX:
+        raise ServerError(
+            f"{path} has mode {stat.S_IMODE(status.st_mode):04o}: others may replace the rings in it; chmod go-w {path}"
+        )
+    if not os.access(".", os.W_OK | os.X_OK, dir_fd=descriptor):
+        raise ServerError(f"{path}: user {user_name()} may not make files there; `ls -ld {path}` shows who may")
+    return status
+
+
+def _credible(status: os.stat_result) -> bool:
+    """Whether a daemon of this user's, or root's, can have made the file."""
+    return stat.S_ISREG(status.st_mode) and status.st_uid in (0, os.geteuid())
+
+
+def _identity(status: os.stat_result) -> tuple[int, int]:
+    return status.st_dev, status.st_ino
+
+
+def _lock(descriptor: int) -> None:
+    fcntl.fcntl(descriptor, fcntl.F_OFD_SETLK, _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0))
+
+
+def _is_locked(descriptor: int) -> bool:
+    """Whether a process has a write lock on the file, for which it must have opened it for writing."""
+    asked = _FLOCK.pack(fcntl.F_RDLCK, os.SEEK_SET, 0, 0, 0)
+    answer = fcntl.fcntl(descriptor, fcntl.F_OFD_GETLK, asked)
+    assert isinstance(answer, bytes)
+    return bool(_FLOCK.unpack(answer)[0] == fcntl.F_WRLCK)
+
+
+def _process(descriptor: int) -> str:
+    try:
+        return f"process {decode_header(os.pread(descriptor, HEADER_BYTES, 0), '').pid}"
+    except ServerError:
+        return "of another version"
+
+
+_lseek, _END = os.lseek, os.SEEK_END  # looked up once: called for every batch
+_CLOSED = struct.pack("<I", STATE_CLOSED)
+_INVALID = struct.pack("<Q", SEQ_INVALID)
+_PAYLOAD = slice(8, SLOT_BYTES)
+_LEDGER_PAYLOAD = slice(LEDGER_BLOCK_OFFSET + 8, LEDGER_BLOCK_OFFSET + LEDGER_BLOCK_BYTES)
+
+
+class ShmRing:
+    """Owns the file of one device from creation to `close`. Synchronization: one thread."""
+
+    def __init__(self, directory: RingDirectory, header: RingHeader, mode: int, group_id: int | None) -> None:
+        """Make the file, whole before it appears in `directory`. Raises ServerError."""
+        self._directory = directory
+        self._name = ring_path(directory.path, header.device).name
+        self._size_bytes = HEADER_BYTES + header.slot_count * SLOT_BYTES
+        self._fd = directory.make(self._name, self._size_bytes, encode_header(header), mode, group_id)
+        self._status = os.fstat(self._fd)
+        self.group_given = self._status.st_gid == group_id
+        """Whether the file belongs to the group that was asked for."""
+        self._memory = self._mapped()
+        with memoryview(self._memory) as view:
+            self._words, self._halves = view.cast("Q"), view.cast("I")
+        self._mask = header.slot_count - 1
+        self._newest = header.newest_seq
+        self._update = 0
+        self._known: tuple[str, Mapping[str, int]] | None = None
+        self._least_bytes = self._size_bytes
+        """Size of the file from which on it may be written; none is enough any more once it was cut."""
+        self._closed = False
+
+    @property
+    def newest(self) -> int:
+        """Sequence number of the newest sample that was to be written, 0 before the first."""
+        return self._newest
+
+    def write(self, samples: Sequence[Sample], slots: Sequence[bytes]) -> None:
+        """Write `samples`, oldest first, which are encoded in `slots`; no-op if the file was cut."""
+        if _lseek(self._fd, 0, _END) < self._least_bytes:
+            self._restore_size()
+            self._newest = samples[-1].seq
+            return
+        if len(slots) == 1:
+            self._write_one(samples[0].seq, slots[0])
+        elif slots and not self._write_run(samples[0].seq, samples[-1].seq, slots):
+            for sample, slot in zip(samples, slots, strict=True):
+                self._write_one(sample.seq, slot)
+
+    def _write_one(self, seq: int, slot: bytes) -> None:
+        words, at = self._words, HEADER_BYTES + (seq & self._mask) * SLOT_BYTES
+        word = at >> 3
+        words[word] = SEQ_INVALID
+        self._memory[at + 8 : at + SLOT_BYTES] = slot[_PAYLOAD]
+        words[word] = words[NEWEST_WORD] = seq  # from left to right
+        if seq != self._newest + 1:  # samples in between were never here: readers must not wait for them
+            words[FIRST_WORD] = seq
+        self._newest = seq
+
+    def _write_run(self, first: int, last: int, slots: Sequence[bytes]) -> bool:
+        """Write slots back to back: all are invalid before the first payload is stored, and until the last one is.
+
+        Returns False, with nothing written, where a number is missing before or between them, or the ring ends there.
+        """
+        count, begin = len(slots), first & self._mask
+        if first != self._newest + 1 or last != self._newest + count or begin + count > self._mask + 1:
+            return False
+        at = HEADER_BYTES + begin * SLOT_BYTES
+        words, numbers = self._words, range(at >> 3, (at + count * SLOT_BYTES) >> 3, SLOT_BYTES >> 3)
+        for word in numbers:
+            words[word] = SEQ_INVALID
+        self._memory[at + 8 : at + count * SLOT_BYTES] = _INVALID.join([slot[_PAYLOAD] for slot in slots])
+        for seq, word in enumerate(numbers, first):
+            words[word] = seq
+        self._newest = words[NEWEST_WORD] = last
+        return True
+
+    def beat(self, now_ns: int) -> None:
+        """Show that the daemon lives."""
+        if self._is_whole():
+            self._words[HEARTBEAT_WORD] = now_ns
+
+    def set_ledger(self, driver: str, ledger: Mapping[str, int]) -> None:
+        """Show the ledger and the driver in use, if they are not what is shown already."""
+        if self._known == (driver, ledger) or not self._is_whole():
+            return
+        self._known = (driver, dict(ledger))
+        self._update += 1
+        block = encode_ledger_block(self._update, driver, ledger)
+        self._words[LEDGER_UPDATE_WORD] = SEQ_INVALID
+        self._memory[_LEDGER_PAYLOAD] = block[8:]
+        self._words[LEDGER_UPDATE_WORD] = self._update
+
+    def is_intact(self, directory: RingDirectory) -> bool:
+        """Whether the file has its size, and its name in `directory`."""
+        return self._is_whole() and self.is_named(directory)
+
+    def is_named(self, directory: RingDirectory) -> bool:
+        """Whether the file has its name in `directory`."""
+        return directory.names(self._name, self._status)
+
+    def close(self) -> None:
+        """Mark the ring closed for its readers, and remove the file if it is still this one; may be called twice."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._is_whole():
+            self._halves[STATE_HALF_WORD] = STATE_CLOSED
+        self._directory.remove(self._name, self._status)
+        for view in (self._words, self._halves):
+            view.release()
+        self._memory.close()
+        os.close(self._fd)
+
+    def _mapped(self) -> mmap.mmap:
+        try:
+            return mmap.mmap(self._fd, self._size_bytes)
+        except OSError as error:
+            self._directory.remove(self._name, self._status)
+            os.close(self._fd)
+            raise ServerError(f"{self._name}: {self._size_bytes} bytes cannot be mapped: {error.strerror}") from error
+
+    def _is_whole(self) -> bool:
+        whole = _lseek(self._fd, 0, _END) >= self._least_bytes
+        if not whole:
+            self._restore_size()
+        return whole
+
+    def _restore_size(self) -> None:
+        """Make the file as long as it was, for readers that have it mapped, and mark it closed, without the mapping.
+
+        Nothing is written to it any more.
+        """
+        self._least_bytes = sys.maxsize
+        with suppress(OSError):
+            os.ftruncate(self._fd, self._size_bytes)
+            os.pwrite(self._fd, _CLOSED, OFFSETS["state"])
+
+
+ASKER: Final = "shared memory"
+"""Who asks for the latency of its settings."""
+RETRY_NS: Final = 1_000_000_000
+"""A ring that cannot be made is tried again once a second: a full memory is not filled any faster."""
+OTHERS_WRITE: Final = 0o022
+SLOTS_MIN, SLOTS_MAX = 64, 1 << 20
+"""64 slots are one 16 kB ring; 2²⁰ are 256 MB, more than a gateway should give to one device."""
+
+
+class ShmSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Shared memory."""
+
+    enabled: bool = True
+    """Whether there are rings at all."""
+    directory: str = DIRECTORY
+    """Where the files are; $XDG_RUNTIME_DIR/imud/shm instead of the default for a daemon that may not use that. Readers
+    look into both; another directory is named by their environment variable IMUD_SHM."""
+    slots: Annotated[int, msgspec.Meta(ge=SLOTS_MIN, le=SLOTS_MAX)] = 4096
+    """Samples a ring holds, a power of two, 256 bytes each: 4096 are four seconds at 1 kHz and 1 MB per device."""
+    latency_ms: Annotated[float, msgspec.Meta(ge=0, le=50)] = 5.0
+    """Samples may be written so much later than they could be, several at once, which costs less CPU; 0: each at once.
+    Where a client of the socket asks for less, it is less for all."""
+    group: str = "imud"
+    """Group that may read, if it exists and imud may give files to it."""
+    mode: Annotated[int, msgspec.Meta(ge=0, le=0o777)] = 0o640
+    """File mode: what the owner, the group and all others may do; only the owner may write."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError, which the configuration reports with its line, for what no type can say."""
+        if self.slots & (self.slots - 1):
+            below = 1 << self.slots.bit_length() - 1
+            raise ValueError(f"slots: expected a power of two, found {self.slots}; near it are {below} and {2 * below}")
+        if not self.directory.startswith("/"):
+            raise ValueError(f"directory: expected an absolute path, found {self.directory!r}")
+        if self.mode & OTHERS_WRITE:
+            raise ValueError(f"mode: expected none that lets group or others write the rings, found {self.mode:#o}")
+
+
+@dataclass(slots=True)
+class _Place:
+    """A device of the configuration, and why it has no ring."""
+
+    device_id: int
+    newest: int = 0
+    """Sequence number of its newest sample while it had no ring."""
+    problem: str = ""
+    retry_ns: int = 0
+
+
+class ShmPublisher:
+    """Writes every device's samples into its ring. Synchronization: the event loop's thread only."""
+
+    def __init__(self, settings: ShmSettings, context: PublisherContext) -> None:
+        self._settings = settings
+        self._context = context
+        self._directory: RingDirectory | None = None
+        self._places: dict[str, _Place] = {}
+        self._rings: dict[str, ShmRing] = {}
+        self._group_id: int | None = None
+        self._started = False
+        self._directory_problem = ""
+
+    def start(self) -> None:
+        """Open the directory and find the group. Raises ServerError when files cannot be made in the directory."""
+        if sys.byteorder != "little":
+            raise ServerError("shared memory is little-endian and this machine is not: set `shm: {enabled: false}`")
+        self._opened_directory()
+        self._group_id = self._find_group()
+        self._started = True
+        self._context.latencies.ask(ASKER, round(self._settings.latency_ms * NS_PER_MS))
+
+    def add_device(self, name: str, device_id: int) -> None:
+        """Make the device's ring; where that fails, log why and go on trying.
+
+        Raises ServerError when another daemon writes it, or when the directory cannot be used.
+        """
+        self.remove_device(name)
+        try:
+            directory = self._opened_directory()
+            directory.refuse_second_writer(ring_path(directory.path, name).name)
+        except ServerError:
+            if not self._started:  # it will not be: leave nothing open
+                self.close()
+            raise
+        self._places[name] = _Place(device_id)
+        self._make(name, directory, self._context.now_ns())
+
+    def remove_device(self, name: str) -> None:
+        """Close the device's ring and remove its file; no-op if absent."""
+        self._places.pop(name, None)
+        ring = self._rings.pop(name, None)
+        self._context.rings.pop(name, None)
+        self._context.without_ring.discard(name)
+        if ring is not None:
+            ring.close()
+
+    def publish(self, batch: Batch) -> None:
+        """Write the samples; the oldest of the ring give way."""
+        ring = self._rings.get(batch.device)
+        if ring is not None:
+            ring.write(batch.samples, batch.slots())
+        elif batch.device in self._places:
+            self._places[batch.device].newest = batch.samples[-1].seq
+
+    def event(self, event: Event) -> None:
+        """Nothing: shared memory carries samples only."""
+
+    def tick(self, now_ns: int) -> None:
+        """Make rings anew that were removed or cut; refresh ledgers and heartbeats."""
+        directory = self._current_directory()
+        for name, place in self._places.items():
+            ring = self._rings.get(name)
+            if (ring is None or not ring.is_intact(directory)) and now_ns >= place.retry_ns:
+                self._make_anew(name, directory, now_ns)
+        self._show(now_ns)
+
+    def close(self) -> None:
+        """Show the final ledgers, then close every ring; may be called twice."""
+        self._context.latencies.release(ASKER)
+        if self._rings:
+            self._show(self._context.now_ns())
+        for name in list(self._places):
+            self.remove_device(name)
+        if self._directory is not None:
+            self._directory.close()
+            self._directory = None
+
+    def _show(self, now_ns: int) -> None:
+        for name, driver, ledger in self._context.ledgers():
+            ring = self._rings.get(name)
+            if ring is not None:
+                ring.set_ledger(driver, ledger)
+        for ring in self._rings.values():
+            ring.beat(now_ns)
+
+    def _opened_directory(self) -> RingDirectory:
+        if self._directory is None:
+            self._directory = open_directory(self._settings.directory, os.environ)
+        return self._directory
+
+    def _current_directory(self) -> RingDirectory:
+        """The directory that is at its path now; where none is there that can be used, the one that was."""
+        directory = self._opened_directory()
+        if directory.current:
+            return directory
+        try:
+            self._directory = open_directory(self._settings.directory, os.environ)
+        except ServerError as error:
+            if str(error) != self._directory_problem:
+                log.error("shm: %s; trying again", error)
+            self._directory_problem = str(error)
+            return directory
+        self._directory_problem = ""
+        directory.close()
+        return self._directory
+
+    def _make_anew(self, name: str, directory: RingDirectory, now_ns: int) -> None:
+        """Replace a ring that was removed or cut, or make the one that could not be made."""
+        old = self._rings.get(name)
+        if old is None or not old.is_named(directory):
+            try:
+                directory.refuse_second_writer(ring_path(directory.path, name).name)
+            except ServerError as error:
+                self._put_off(name, error, now_ns)
+                return
+        if self._make(name, directory, now_ns):
+            log.warning("shm: the ring of %s was missing or cut; it is made anew", name)
+            if old is not None:
+                old.close()
+
+    def _make(self, name: str, directory: RingDirectory, now_ns: int) -> bool:
+        """Make the device's ring, which goes on from the number where the one before ended."""
+        context, settings, place, old = self._context, self._settings, self._places[name], self._rings.get(name)
+        newest = place.newest if old is None else old.newest
+        header = RingHeader(
+            context.epoch, os.getpid(), STATE_LIVE, name, place.device_id, settings.slots, newest, newest + 1, now_ns
+        )  # fmt: skip
+        try:
+            ring = self._rings[name] = ShmRing(directory, header, settings.mode, self._group_id)
+        except ServerError as error:
+            self._put_off(name, error, now_ns)
+            return False
+        place.problem = ""
+        context.rings[name] = str(ring_path(directory.path, name))
+        context.without_ring.discard(name)
+        if self._group_id is not None and not ring.group_given:
+            self._warn_of_group(f"cannot be given files by user {os.geteuid()}, who is not in it")
+        return True
+
+    def _put_off(self, name: str, error: ServerError, now_ns: int) -> None:
+        place = self._places[name]
+        if str(error) != place.problem:
+            log.error("shm: no ring for %s: %s; trying again every second", name, error)
+        place.problem, place.retry_ns = str(error), now_ns + RETRY_NS
+        self._context.without_ring.add(name)
+
+    def _find_group(self) -> int | None:
+        try:
+            return grp.getgrnam(self._settings.group).gr_gid
+        except KeyError:
+            self._warn_of_group("does not exist")
+            return None
+
+    def _warn_of_group(self, why: str) -> None:
+        """Log once why the group cannot read; the daemon starts all the same."""
+        self._group_id = None
+        log.warning("shm: group %s %s; its members cannot read shared memory", self._settings.group, why)
+
+
+PUBLISHER = PublisherType("shm", ShmSettings, ShmPublisher)

@@ -1,1 +1,0 @@
-"""Samples in shared memory, one ring per device."""

@@ -1,0 +1,425 @@
+"""The UNIX socket publisher: JSON-RPC 2.0 for questions, samples as JSON lines or binary slots (docs/socket.md).
+
+    Listener ──accept──▶ Guard, Quota ──▶ Connection ◀──its turn── Scheduler;  line ──▶ rpc.handle_line ──▶ Hub
+    publish(batch) ──▶ Hub ──▶ DeliveryGroup per form ──the same bytes──▶ Outbox per client ──▶ send, or a bounded queue
+
+Samples go out while they are published; everything else that clients cause is done by the scheduler (serving.py), in
+pieces and in a limited time per turn of the event loop. No asyncio streams: measured elsewhere, they cost three times
+as much per sample.
+"""
+
+import asyncio
+import errno
+import logging
+import os
+import socket
+import stat
+import struct
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Final
+
+import msgspec
+
+from imud.contracts.publisher import PublisherContext, PublisherType
+from imud.formats.jsonrpc import DEFAULT_PATH, Code, RpcError, encode_error, line_of
+from imud.model.errors import ServerError, reason_of
+from imud.model.event import Event
+from imud.model.options import Settings, shown
+from imud.publishers.socket.admission import Guard, Peer, Quota, Rights, Seldom, Shares, gid_of, peer_of, raise_fd_limit
+from imud.publishers.socket.client import Connection, ServerSide
+from imud.publishers.socket.hub import Hub
+from imud.publishers.socket.methods import handle_line, hello
+from imud.publishers.socket.outbox import Limits, Pool
+from imud.publishers.socket.scheduler import SERVING_BURST_NS, SERVING_PER_S_NS, Scheduler, TokenBucket
+
+log = logging.getLogger(__name__)
+
+BACKLOG: Final = 128
+SOCKET_MODE: Final = 0o660
+DIRECTORY_MODE: Final = 0o755
+PID_DIGITS: Final = 7
+"""The kernel's largest limit of process numbers is 4,194,304 (proc(5), pid_max)."""
+PATH_MAX_BYTES: Final = 107 - len(".") - PID_DIGITS
+"""An address has room for 107 bytes and a zero (unix(7)); the name it is bound by is longer by the process number."""
+ACL_XATTR: Final = "system.posix_acl_access"
+_ACL_HEADER: Final = struct.Struct("<I")
+_ACL_ENTRY: Final = struct.Struct("<HHI")
+_ACL_VERSION: Final = 2
+_USER_OBJ, _GROUP_OBJ, _GROUP, _MASK, _OTHER = 0x01, 0x04, 0x08, 0x10, 0x20
+"""Tags of entries (linux/posix_acl.h), which stand in this order."""
+_RW: Final = 6
+_NO_ID: Final = 0xFFFF_FFFF
+PROBE_TIMEOUT_S: Final = 0.5
+"""A live daemon's kernel answers a connect at once; a full backlog waits, and is a sign of life."""
+
+
+class Listener:
+    """Owns the socket file at `path`, mode 0660, group `group` and an ACL entry for `control_group` where these exist.
+
+    The kernel refuses all others when they connect. A file open to every user, with the check left to `accept`, would
+    let them fill the backlog, which is one for all, and cost the daemon some 20 µs for each attempt.
+    Raises ServerError, and leaves nothing bound then.
+    """
+
+    def __init__(self, path: Path, group: str, control_group: str = "") -> None:
+        self.path = path
+        _check_length(path)
+        _make_directory(path.parent)
+        _check_free(path)
+        _remove_leftovers(path)
+        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._file = path.with_name(f"{path.name}.{os.getpid()}")
+        self._inode = (0, 0)
+        try:
+            self._listen(group, control_group)
+            self._take_place()
+        except OSError as error:
+            self.close()
+            raise ServerError(f"cannot serve at {path}: {_reason(error, self._file)}") from error
+        except ServerError:
+            self.close()
+            raise
+
+    def _listen(self, group: str, control_group: str) -> None:
+        self.sock.setblocking(False)
+        self.sock.bind(os.fspath(self._file))
+        self._inode = _inode_of(self._file)
+        _set_access(self._file, self.path, group)
+        _admit(self._file, self.path, gid_of(control_group))
+        self.sock.listen(BACKLOG)
+
+    def _take_place(self) -> None:
+        """Rename the file to its place. Raises ServerError when another daemon is there, before or right after."""
+        left_behind = _check_free(self.path)
+        self._file.rename(self.path)
+        self._file = self.path
+        if _inode_of(self.path) != self._inode:
+            raise ServerError(f"another daemon took {self.path} just now: give each a socket.path of its own")
+        if left_behind:
+            log.info("replaced the socket that a daemon left behind at %s", self.path)
+
+    def close(self) -> None:
+        """Stop listening and remove the file if it is still ours; may be called twice."""
+        if self.sock.fileno() < 0:
+            return
+        try:
+            if self._inode == _inode_of(self._file):
+                self._file.unlink()
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            log.warning("cannot remove %s: %s", self._file, error.strerror)
+        self.sock.close()
+
+
+def _inode_of(path: Path) -> tuple[int, int]:
+    found = path.lstat()
+    return found.st_dev, found.st_ino
+
+
+def _make_directory(directory: Path) -> None:
+    try:
+        directory.mkdir(DIRECTORY_MODE, parents=True, exist_ok=True)
+    except OSError as error:
+        raise ServerError(
+            f"cannot make the directory {directory} for the socket: {error.strerror}; run imud as a service, whose "
+            f"RuntimeDirectory= makes it, or give socket.path a place this user may write to"
+        ) from error
+
+
+def _check_length(path: Path) -> None:
+    size_bytes = len(os.fsencode(path))
+    if size_bytes > PATH_MAX_BYTES:
+        raise ServerError(f"a socket path has at most {PATH_MAX_BYTES} bytes, this one has {size_bytes}: {path}")
+
+
+def _check_free(path: Path) -> bool:
+    """Whether a dead daemon left a socket there. Raises ServerError for a live one's and for other files."""
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise ServerError(f"cannot look at {path}: {error.strerror}") from error
+    if not stat.S_ISSOCK(mode):
+        raise ServerError(f"{path} is in the way: expected a socket or nothing, found another kind of file")
+    if _is_alive(path):
+        raise ServerError(
+            f"another daemon serves {path}: stop it first (systemctl stop imud), or set another socket.path"
+        )
+    return True
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove what daemons that died while they started have left beside `path`."""
+    for file in path.parent.glob("*"):
+        stem, _, number = file.name.rpartition(".")
+        if stem == path.name and number.isdecimal() and _is_leftover(file, int(number)):
+            with suppress(OSError):  # harmless, unless it has our own number; then `bind` reports it
+                file.unlink()
+                log.info("removed %s, left behind by a daemon that died while it started", file)
+
+
+def _is_leftover(file: Path, pid: int) -> bool:
+    """Whether a socket's process is dead, or has died and passed its number on to us, as in a container's every start.
+
+    Another container's processes cannot be seen from here; if it is between its `bind` and `listen`, it has to start
+    again.
+    """
+    if pid != os.getpid() and Path(f"/proc/{pid}").exists():
+        return False
+    try:
+        return file.is_socket() and not _is_alive(file)
+    except ServerError:  # not accessible to us
+        return False
+
+
+def _is_alive(path: Path) -> bool:
+    """Whether a process listens. Raises ServerError where that cannot be determined."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(PROBE_TIMEOUT_S)
+        try:
+            probe.connect(os.fspath(path))
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except (TimeoutError, BlockingIOError):
+            return True
+        except OSError as error:
+            raise ServerError(f"cannot determine whether {path} is in use: {_reason(error, path)}") from error
+    return True
+
+
+def _set_access(file: Path, path: Path, group: str) -> None:
+    """Mode and group of `file`, which is to become `path`."""
+    file.chmod(SOCKET_MODE)
+    gid = gid_of(group)
+    if gid is None:
+        log.warning(
+            "no group %r (socket.group): only root and the daemon's own user can read from %s; "
+            "`sudo groupadd --system %s` makes it, then imud has to be restarted",
+            group, path, group,
+        )  # fmt: skip
+        return
+    try:
+        os.chown(file, -1, gid)
+    except PermissionError:
+        log.warning("cannot give %s to group %r: the daemon's user is not a member of it", path, group)
+
+
+def _admit(file: Path, path: Path, gid: int | None) -> None:
+    """Let members of a further group connect, by an ACL (acl(5)); no-op for None."""
+    if gid is None:
+        return
+    entries = ((_USER_OBJ, _RW, _NO_ID), (_GROUP_OBJ, _RW, _NO_ID), (_GROUP, _RW, gid), (_MASK, _RW, _NO_ID),
+               (_OTHER, 0, _NO_ID))  # fmt: skip
+    acl = _ACL_HEADER.pack(_ACL_VERSION) + b"".join(_ACL_ENTRY.pack(*entry) for entry in entries)
+    try:
+        os.setxattr(file, ACL_XATTR, acl)
+    except OSError as error:
+        log.warning(
+            "cannot give %s an ACL (%s): members of the control group must be members of the read group too",
+            path, error.strerror,
+        )  # fmt: skip
+
+
+def _reason(error: OSError, file: Path) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return f"{file} is in the way, remove it"
+    return error.strerror or str(error)
+
+
+ACCEPTS_PER_TURN: Final = 16
+ACCEPT_NS: Final = 300_000
+"""Accepting in one turn of the event loop, three clients with their greetings."""
+MIB: Final = 1 << 20
+
+
+class SocketSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the UNIX socket."""
+
+    enabled: bool = True
+    """Whether imud serves the socket."""
+    path: Annotated[str, msgspec.Meta(pattern="^/.*[^/]$", extra={"words": "an absolute path"})] = DEFAULT_PATH
+    """Where the socket is, an absolute path."""
+    group: str = "imud"
+    """Members of this group may read; the socket file belongs to it."""
+    control_group: str = "imud-control"
+    """Members of this group may also change things."""
+    clients_max: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256
+    """At most so many clients at a time; one more gets an error and is disconnected."""
+    clients_per_user: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 128
+    """At most so many of them belong to one user; not for root and the daemon's own user."""
+    memory_mb: Annotated[int, msgspec.Meta(ge=8, le=4096)] = 64
+    """At most so much memory for all that clients make imud hold: what waits for them, and what they have sent."""
+    queue_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 4096
+    """At most so many samples wait for a client that does not read; 4096 are 4 s at 1 kHz. The oldest are dropped."""
+    queue_bytes: Annotated[int, msgspec.Meta(ge=4096, le=1 << 30)] = 4 << 20
+    """At most so many bytes of samples wait for a client that does not read."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a path that no socket can have."""
+        if len(os.fsencode(self.path)) > PATH_MAX_BYTES:
+            size = len(os.fsencode(self.path))
+            raise ValueError(f"path: expected at most {PATH_MAX_BYTES} bytes, got {size}: {shown(self.path)}")
+
+
+class SocketServer:
+    """Serves clients on a UNIX socket. Synchronization: the event loop's thread."""
+
+    def __init__(self, settings: SocketSettings, context: PublisherContext) -> None:
+        self._settings = settings
+        self._context = context
+        shares = Shares(settings.clients_max, settings.clients_per_user)
+        self._quota = Quota(shares, os.geteuid(), raise_fd_limit(), context.now_ns)
+        self.pool = Pool(settings.memory_mb * MIB)
+        """What is held for clients."""
+        self._time = TokenBucket(SERVING_PER_S_NS, SERVING_BURST_NS, context.now_ns())
+        self.hub = Hub(settings.path, context, self._quota, self._time, self.pool)
+        self.publish: Final = self.hub.publish
+        self._side: ServerSide | None = None
+        self._listener: Listener | None = None
+        self._guard = Guard(os.geteuid(), None, None)
+        self._paused = False
+        self._pauses = Seldom(context.now_ns)
+
+    def start(self) -> None:
+        """Listen. Raises ServerError and leaves nothing behind when that is not possible."""
+        settings = self._settings
+        self._guard = Guard(os.geteuid(), gid_of(settings.group), gid_of(settings.control_group))
+        self._name_control_group(settings.control_group)
+        self._listener = Listener(Path(settings.path), settings.group, settings.control_group)
+        self._side = ServerSide(
+            self._on_line,
+            self.hub.remove,
+            self.hub.count_evicted,
+            self.hub.count_failed,
+            Limits(settings.queue_samples, settings.queue_bytes),
+            self.pool,
+            Scheduler(self._context.now_ns, self._context.cpu_ns, self._time),
+        )
+        asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)
+        self._context.client_sources.append(self.hub.clients)
+
+    def _name_control_group(self, group: str) -> None:
+        """Name the group in refusals, and say what to do where it does not exist."""
+        self.hub.control_group = f"group {group!r}"
+        if self._guard.control_gid is None:
+            hint = f"`sudo groupadd --system {group}` makes it, then imud has to be restarted"
+            self.hub.control_group += f", which does not exist on this machine: {hint}"
+            log.warning("no group %r (socket.control_group): only root can change things; %s", group, hint)
+
+    def add_device(self, name: str, device_id: int) -> None:
+        """A device appears."""
+        self.hub.add_device(name, device_id)
+
+    def remove_device(self, name: str) -> None:
+        """A device leaves."""
+        self.hub.remove_device(name)
+
+    def event(self, event: Event) -> None:
+        """Send the event to the clients that asked for it."""
+        self.hub.event(event)
+
+    def tick(self, now_ns: int) -> None:
+        """Close what lingered long enough, fill allowances; accept again after a pause."""
+        self.hub.tick()
+        if self._side is not None:
+            self._side.scheduler.tick()
+            self.pool.trim()
+        self._quota.tick()
+        self.hub.recordings.tick(now_ns)
+        if self._paused and self._listener is not None:
+            self._paused = False
+            asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)
+
+    def close(self) -> None:
+        """Stop listening, close every client, remove the socket file if it is ours; may be called twice."""
+        if self._listener is None or self._side is None:
+            return
+        asyncio.get_running_loop().remove_reader(self._listener.sock)
+        self._listener.close()
+        self._listener = None
+        self.hub.close()
+        self._side.scheduler.close()
+        self._context.client_sources.remove(self.hub.clients)
+
+    # --- clients ----------------------------------------------------------------------------------------------------
+
+    def _accept(self) -> None:
+        now_ns = self._context.now_ns
+        end_ns = now_ns() + ACCEPT_NS
+        for _ in range(ACCEPTS_PER_TURN):
+            if self._listener is None or now_ns() > end_ns:
+                return
+            try:
+                sock, _address = self._listener.sock.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:
+                self._pause(error)
+                return
+            sock.setblocking(False)
+            self._welcome(sock)
+
+    def _pause(self, error: OSError) -> None:
+        """Stop accepting until the next tick: out of descriptors or memory, an immediate retry would be a busy loop."""
+        assert self._listener is not None
+        count = self._pauses.count()
+        if count:
+            log.warning("cannot accept a client: %s (%d times since the last report)", error.strerror, count)
+        asyncio.get_running_loop().remove_reader(self._listener.sock)
+        self._paused = True
+
+    def _welcome(self, sock: socket.socket) -> None:
+        """Let a client in or refuse it. Whatever it meets ends that client, not the daemon."""
+        before = self.hub.accepted
+        try:
+            self._let_in(sock)
+        except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
+            made = self.hub.connections.get(before + 1)
+            if made is not None:
+                made.on_failure(error)
+            else:
+                self.hub.count_failed(error)
+                sock.close()
+
+    def _let_in(self, sock: socket.socket) -> None:
+        try:
+            peer = peer_of(sock)
+        except OSError:  # gone already
+            sock.close()
+            return
+        rights = self._guard.rights_of(peer)
+        try:
+            reserved = self._admit(peer, rights, sock.fileno())
+        except RpcError as refusal:
+            self.hub.count_refused()
+            _refuse(sock, refusal)
+            return
+        assert self._side is not None
+        connection = Connection(self.hub.next_number(), sock, peer, rights, self._side, reserved)
+        self.hub.add(connection)
+        connection.post(hello(self.hub, connection))
+
+    def _admit(self, peer: Peer, rights: Rights, fd: int) -> bool:
+        """Return whether the client's place is a reserved one. Raises RpcError when it is refused."""
+        if Rights.READ not in rights:
+            message = f"uid {peer.uid} may not read: expected root or a member of group {self._settings.group!r}"
+            raise RpcError(Code.DENIED, message)
+        return self._quota.admit(peer, rights, fd, self.hub.connections.values())
+
+    def _on_line(self, connection: Connection, line: bytes) -> None:
+        handle_line(self.hub, connection, line)
+
+
+def _refuse(sock: socket.socket, error: RpcError) -> None:
+    """Send the reason and close. The socket is new, so its buffer has room for the line."""
+    try:
+        sock.send(line_of(encode_error(error)))
+    except OSError as problem:
+        log.debug("a refused client left first: %s", reason_of(problem))
+    sock.close()
+
+
+PUBLISHER = PublisherType("socket", SocketSettings, SocketServer)

@@ -1,0 +1,369 @@
+"""Player of recordings: the records of a file go into the same codecs and clocks as in the daemon, in the same order.
+
+The samples, stamps, errors and ledgers that come out are those of the live run, which the recording proves: at each
+check record it says what they were there, and the player counts where they are not.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import msgspec
+
+from imud import __version__
+from imud.attitude.conventions import Convention
+from imud.attitude.published import FrameSettings, published_frame
+from imud.config.model import DeviceConfig
+from imud.contracts.codec import BadFrame, Reading
+from imud.contracts.driver import CanDriver, Driver, PolledDriver, StreamDriver
+from imud.contracts.lines import DeviceLines, Edge, TriggerStamp, UtcReference
+from imud.contracts.publisher import Batch
+from imud.contracts.script import Message
+from imud.drivers import DRIVERS
+from imud.formats import records
+from imud.formats.records import CallRecord, CheckRecord, DeviceRecord, Kind, PathRecord, Record, SessionRecord
+from imud.host.clock import HostClock
+from imud.host.log import printable
+from imud.model.errors import ImudError, TransferError, reason_of
+from imud.model.event import Event, kind_of
+from imud.model.ledger import LEDGER_FIELDS, Ledger
+from imud.model.options import NoSettings
+from imud.recording.observer import LINE_CALLS, TROUBLES
+from imud.recording.state import StateError, StateReader
+from imud.sampling.path import (
+    CanPath,
+    PathContext,
+    PolledPath,
+    PollTiming,
+    ReadyEdges,
+    SamplePath,
+    StreamPath,
+    make_clock,
+)
+
+FROM_OUTSIDE: Final = ("lost_queue", "replies_late", "replies_unsolicited")
+"""Counters that neither codec nor clock decides: a check sets them."""
+_DATA: Final = int(Kind.DATA)
+"""Of an enumeration each look at a member takes 0.1 µs on Python 3.11."""
+
+
+@dataclass(slots=True)
+class PlayedDevice:
+    """A device of a recording, and what came of it."""
+
+    device_id: int
+    described: DeviceRecord
+    ledger: Ledger = field(default_factory=Ledger)
+    path: SamplePath | None = None
+    driver: Driver | None = None
+    edges: ReadyEdges | None = None
+    overruns: int = 0
+    checks: int = 0
+    """Places where the recording says what the live run had."""
+    differences: list[str] = field(default_factory=list)
+    """Where the replay had something else, one sentence each."""
+    fresh_starts: list[str] = field(default_factory=list)
+    """Why the clock had to begin anew, which the live one did not."""
+
+
+class RecordedEvent(msgspec.Struct, frozen=True):
+    """An event as it was recorded, perhaps of a kind that this imud does not know."""
+
+    t_ns: int
+    device: str
+    kind: str
+    message: str
+    detail: dict[str, str | int | float | bool | None] = {}  # msgspec copies a mutable default
+
+
+class PlayedClock(HostClock):
+    """The host's clocks as they were recorded."""
+
+    __slots__ = ("offset_ns",)
+
+    def __init__(self) -> None:
+        super().__init__(int, int, int)
+        self.offset_ns = 0
+
+    def utc_offset_ns(self) -> int:
+        """Return CLOCK_REALTIME minus CLOCK_MONOTONIC as of the newest record."""
+        return self.offset_ns
+
+
+class Player:
+    """Player of the records of one recording, in their order. Synchronization: one thread."""
+
+    def __init__(
+        self,
+        publish: Callable[[Batch], None],
+        *,
+        fresh: bool = False,
+        on_event: Callable[[Event, int], None] = lambda _event, _utc_ns: None,
+    ) -> None:
+        """With `fresh` clocks and codecs begin anew with the file; they do so with one of another version of imud.
+
+        `on_event` gets events as they were noticed then, each with its CLOCK_REALTIME.
+        """
+        self.devices: dict[int, PlayedDevice] = {}
+        """By the daemon's number."""
+        self.lost = 0
+        """Records that the recorder dropped."""
+        self._publish = publish
+        self._on_event = on_event
+        self._host = PlayedClock()
+        self._no_state = "it was asked for a fresh clock" if fresh else ""
+        """Why states are not used."""
+
+    def play(self, found: Iterable[Record]) -> None:
+        """Process records. Raises ImudError for one that cannot be what a recorder wrote, and OSErrors of `publish`."""
+        for record in found:
+            try:
+                self._play(record)
+            except (ImudError, OSError):  # codecs and clocks do no I/O: the samples could not be written
+                raise
+            except Exception as error:  # a codec or clock whose recorded state was forged may raise anything
+                words = f"{type(error).__name__}: {printable(str(error))}"
+                raise ImudError(f"a record of kind {record.kind} cannot be replayed: {words}") from error
+
+    def _play(self, record: Record) -> None:
+        kind, device = record.kind, self.devices.get(record.device)
+        if kind == _DATA and device is not None:  # nearly all
+            self._play_device(device, record)
+        elif kind == Kind.CLOCKS:
+            self._read_clocks(records.decode_clocks(record.body))
+        elif kind == Kind.CALL:
+            self._call(device, records.decode_object(record, CallRecord))
+        elif kind == Kind.DEVICE:
+            self._describe(record.device, records.decode_object(record, DeviceRecord))
+        elif kind == Kind.SESSION:
+            self._begin(records.decode_object(record, SessionRecord))
+        elif kind == Kind.LOST:
+            self.lost += records.decode_lost(record.body).records
+        elif kind == Kind.EVENT:
+            self._event(records.decode_object(record, RecordedEvent))
+        elif device is not None:
+            self._play_device(device, record)
+
+    def _play_device(self, device: PlayedDevice, record: Record) -> None:
+        kind, path = record.kind, device.path
+        if kind == _DATA and isinstance(path, StreamPath):
+            t_rx_ns, waited_ns, data = records.decode_data(record.body)
+            if waited_ns < 0:
+                path.on_data(data, t_rx_ns)
+            else:
+                path.gather(data, t_rx_ns, waited_ns)
+        elif kind == Kind.FRAMES and isinstance(path, CanPath):
+            path.on_frames(records.decode_frames(record.body))
+        elif kind == Kind.READINGS and isinstance(path, PolledPath):
+            path.on_readings([_reading(one) for one in records.decode_readings(record.body)])
+        elif kind == Kind.EDGES:
+            _give_edges(device, *records.decode_edges(record.body))
+        elif kind == Kind.PATH:
+            self._make_path(device, records.decode_object(record, PathRecord))
+        elif kind == Kind.CHECK:
+            _check(device, records.decode_object(record, CheckRecord))
+
+    def _begin(self, session: SessionRecord) -> None:
+        if session.imud != __version__:
+            self._no_state = self._no_state or f"imud {session.imud} wrote the recording, this is {__version__}"
+
+    def _event(self, recorded: RecordedEvent) -> None:
+        event = Event(recorded.t_ns, recorded.device, kind_of(recorded.kind), recorded.message, recorded.detail)
+        self._on_event(event, event.t_ns + self._host.offset_ns)
+
+    # --- the host ----------------------------------------------------------------------------------------------------
+
+    def _read_clocks(self, clocks: records.ClocksRecord) -> None:
+        host = self._host
+        host.steady.add_pair(clocks.monotonic_ns, clocks.raw_ns, clocks.held_raw_ns, clocks.error_ns)
+        host.offset_ns = clocks.utc_offset_ns
+        if clocks.suspends > host.suspends:
+            host.suspends = clocks.suspends
+            for device in self.devices.values():
+                if device.path is not None and device.path.fresh:
+                    device.ledger.add_unknown_gap()
+
+    def _restore_host(self, steady: bytes, offset_ns: int, suspends: int) -> None:
+        StateReader(steady, {}).restore("steady", self._host.steady)
+        self._host.offset_ns, self._host.suspends = offset_ns, suspends
+
+    # --- devices -----------------------------------------------------------------------------------------------------
+
+    def _describe(self, device_id: int, described: DeviceRecord) -> None:
+        known = self.devices.get(device_id)
+        if known is None:
+            self.devices[device_id] = PlayedDevice(device_id, described)
+        else:
+            known.described = described
+
+    def _make_path(self, device: PlayedDevice, made: PathRecord) -> None:
+        try:
+            driver = DRIVERS[made.driver]
+        except KeyError as error:
+            raise ImudError(f"{device.described.name}: {error.args[0]}") from None
+        config = _config_of(device.described, driver, made)
+        before = device.path
+        device.path = self._path(device, driver, config, made, before=None)
+        for name in LEDGER_FIELDS:
+            setattr(device.ledger, name, made.ledger.get(name, 0))
+        try:
+            self._restore(device, made.state)
+        except StateError as error:
+            device.fresh_starts.append(str(error))
+            device.path = self._path(device, driver, config, made, before=before)
+            ledger = device.ledger
+            ledger.bytes_skipped, ledger.bytes_pending = ledger.bytes_skipped + ledger.bytes_pending, 0
+            ledger.frames_ignored, ledger.frames_pending = ledger.frames_ignored + ledger.frames_pending, 0
+
+    def _restore(self, device: PlayedDevice, state: bytes) -> None:
+        if self._no_state or not state:
+            raise StateError(self._no_state or "the recording does not have the state of its clock")
+        reader = StateReader(state, {"ledger": device.ledger, "steady": self._host.steady})
+        if device.edges is not None:
+            reader.restore("edges", device.edges)
+        assert device.path is not None
+        reader.restore("path", device.path)
+
+    def _path(
+        self, device: PlayedDevice, driver: Driver, config: DeviceConfig, made: PathRecord, before: SamplePath | None
+    ) -> SamplePath:
+        ledger, options = device.ledger, config.options
+        device.driver = driver
+        clock = make_clock(
+            config.name, config.lines, driver, before.clock if before is not None else None, host=self._host.steady,
+            on_unknown_gap=ledger.add_unknown_gap,
+        )  # fmt: skip
+        context = PathContext(
+            config.name, device.device_id, ledger, self._publish, _ignore_message, _ignore_frame,
+            lambda: device.overruns, self._host,
+            published_frame(config.frame, config.convention, config.declination_deg, driver.axes),
+        )  # fmt: skip
+        if isinstance(driver, StreamDriver):
+            return StreamPath(driver.make_codec(ledger, options), clock, context)
+        if isinstance(driver, CanDriver):
+            return CanPath(driver.make_codec(ledger, options), clock, context)
+        assert isinstance(driver, PolledDriver)
+        if config.lines is not None and config.lines.data_ready is not None:
+            device.edges = ReadyEdges(config.lines.data_ready, made.period_ns)
+        timing = PollTiming(made.period_ns, driver.update_ns(options), device.edges)
+        return PolledPath(driver.make_codec(ledger, options), timing, clock, context)
+
+    # --- calls -------------------------------------------------------------------------------------------------------
+
+    def _call(self, device: PlayedDevice | None, call: CallRecord) -> None:
+        if call.target == "host" and call.method == "restore":
+            self._restore_host(*call.arguments)
+            return
+        if device is None or device.path is None:
+            return
+        made = _CALLS.get((call.target, call.method))
+        if made is None:
+            raise ImudError(f"the recording has a call {call.target}.{call.method}, which this imud does not know")
+        made(device, *call.arguments, **call.keywords)
+
+
+def _config_of(described: DeviceRecord, driver: Driver, made: PathRecord) -> DeviceConfig:
+    """What is needed of the configuration. Raises ImudError where it cannot be one."""
+    tree = described.configuration
+    try:
+        return DeviceConfig(
+            described.name, made.driver, msgspec.convert(made.options, driver.settings), False, described.link,
+            NoSettings(), lines=msgspec.convert(tree.get("lines"), DeviceLines | None),
+            frame=msgspec.convert(tree.get("frame"), FrameSettings | None),
+            convention=msgspec.convert(tree.get("convention"), Convention | None),
+            declination_deg=msgspec.convert(tree.get("declination_deg"), float | None),
+        )  # fmt: skip
+    except msgspec.ValidationError as error:
+        raise ImudError(f"{described.name}: its configuration cannot be read: {reason_of(error)}") from None
+
+
+def _give_edges(device: PlayedDevice, line: str, found: list[records.EdgeRecord]) -> None:
+    edges = [Edge(*one) for one in found]
+    if line == "data_ready" and device.edges is not None:
+        device.edges.on_edges(edges)
+    elif line in LINE_CALLS and device.path is not None:
+        getattr(device.path.clock.aiding, LINE_CALLS[line])(edges)
+
+
+def _reading(one: records.ReadingRecord) -> Reading:
+    if not one.trouble:
+        return Reading(one.poll, one.data, None, one.start_ns, one.end_ns)
+    trouble = TROUBLES[min(one.trouble, len(TROUBLES)) - 1]
+    error = TransferError(trouble, one.data.decode(errors="replace"))
+    return Reading(one.poll, b"", error, one.start_ns, one.end_ns)
+
+
+def _check(device: PlayedDevice, live: CheckRecord) -> None:
+    """Compare with the live run; what neither codec nor clock decides is taken from it."""
+    ledger, newest = device.ledger, device.path.newest if device.path is not None else None
+    for name in FROM_OUTSIDE:
+        setattr(ledger, name, live.ledger[name])
+    searched = live.ledger["bytes_in"] - ledger.bytes_in
+    if searched and searched == live.ledger["bytes_skipped"] - ledger.bytes_skipped:
+        ledger.bytes_in += searched
+        ledger.bytes_skipped += searched
+    device.checks += 1
+    if not live.seq and newest is None:
+        found = {}
+    else:
+        own = (newest.seq, newest.t_ns, newest.t_err_ns) if newest is not None else (0, 0, 0)
+        names = ("seq", "t_ns", "t_err_ns")
+        theirs = (live.seq, live.sample_t_ns, live.sample_t_err_ns)
+        found = {name: (a, b) for name, a, b in zip(names, theirs, own, strict=True) if a != b}
+    found |= {
+        name: (live.ledger[name], here) for name, here in ledger.snapshot().items() if live.ledger.get(name) != here
+    }
+    if found:
+        words = ", ".join(f"{name} was {a}, is {b}" for name, (a, b) in found.items())
+        device.differences.append(f"at {live.t_ns} ns: {words}")
+
+
+def _set_ledger(device: PlayedDevice, values: dict[str, int]) -> None:
+    for name in LEDGER_FIELDS:
+        setattr(device.ledger, name, values[name])
+
+
+def _skip(device: PlayedDevice, size: int) -> None:
+    device.ledger.bytes_in += size
+    device.ledger.bytes_skipped += size
+
+
+def _set_overruns(device: PlayedDevice, overruns: int) -> None:
+    device.overruns = overruns
+
+
+def _of(part: str, method: str, convert: Callable[[Any], Any] = lambda one: one) -> Callable[..., None]:
+    """Return what calls a method of a part of a device's path."""
+
+    def call(device: PlayedDevice, *arguments: Any, **keywords: Any) -> None:
+        path: Any = device.path
+        targets = {"path": path, "edges": device.edges, "clock": path.clock, "loss": path.loss}
+        target = path.clock.aiding if part == "aiding" else targets[part]
+        getattr(target, method)(*map(convert, arguments), **keywords)
+
+    return call
+
+
+_CALLS: Final[dict[tuple[str, str], Callable[..., None]]] = {
+    **{("path", name): _of("path", name) for name in ("begin", "flush", "reset", "publish_gathered", "set_frame_time")},
+    ("path", "skip"): _skip,
+    ("path", "overruns"): _set_overruns,
+    ("ledger", "set"): _set_ledger,
+    ("loss", "link_opened"): _of("loss", "link_opened"),
+    **{("clock", name): _of("clock", name) for name in ("restart", "link_changed", "set_own_status")},
+    ("aiding", "on_trigger_stamps"): _of(
+        "aiding", "on_trigger_stamps", lambda stamps: [TriggerStamp(*one) for one in stamps]
+    ),
+    ("clock", "set_utc_reference"): _of(
+        "clock", "set_utc_reference", lambda one: None if one is None else UtcReference(*one)
+    ),
+    ("edges", "restart"): _of("edges", "restart"),
+}
+
+
+def _ignore_message(_message: Message, _t_rx_ns: int) -> None:
+    """Ignore what the device answered: nobody asked here."""
+
+
+def _ignore_frame(_frame: BadFrame) -> None:
+    """Ignore the frame: the ledger has it."""

@@ -1,1 +1,0 @@
-"""Devices on a CAN bus."""

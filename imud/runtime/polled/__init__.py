@@ -1,1 +1,0 @@
-"""Devices that send only on request: I2C, SPI, Modbus."""

@@ -1,0 +1,579 @@
+"""The clock of one device: the only maker of `Sample`. It dates each measurement in the host's time.
+
+Per message (`SampleClock.sample`, then `_by_device`):
+
+    ticks ─▶ device time (`device_time`) ─┐
+    arrival less wire time ───────────────┴▶ above or below the fit of arrivals (`arrival_fit`)?
+        ├─ the counter was corrected: device time is made even again
+        ├─ the clock jumped: a new fit begins, or time goes on by UTC (`Holdover`)
+        └─ the point is added to the fit
+    time of measurement = fit − half of the bias that the link can hide (`link_delay`) + what is still slewed (`Slew`)
+        └─ edges, a pulse per second and UTC improve on that (`steering`), where there are any
+
+Until the fit is known well enough, and for devices without time, a message is dated by its arrival. All this is done in
+steady time, which nothing steers (`imud.host.clock`); what comes and goes is in CLOCK_MONOTONIC.
+
+Three rules hold for any input: `t_ns` rises strictly, is never after arrival, and a device clock that jumps starts a
+new fit instead of carrying the stamps along.
+Synchronization: none; one thread.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from math import hypot
+from typing import Final, NamedTuple
+
+from imud.contracts.lines import NO_TIME_BITS, Mark, SoutTiming, TimeBits, TriggerTiming, UtcReference
+from imud.contracts.status import ClockStatus
+from imud.host.clock import UNSTEERED, SteadyTime
+from imud.model.sample import T_ERR_MOST, Measurement, Sample, Sync
+from imud.model.units import NS_PER_S
+from imud.sampling.arrival_fit import ENOUGH_SPAN_NS, SLOPE_HIGHEST, ArrivalFit
+from imud.sampling.arrival_time import FIRST_SPREAD_NS, ArrivalTime, LinkDelay
+from imud.sampling.device_time import FIRST_EARLY_NS, JUMP_EARLY_NS, JUMP_LATE_NS, DeviceTime, JumpDetector, StampTime
+from imud.sampling.gaps import GAP_PERIODS, CounterLine
+from imud.sampling.steering import SETTLED_AFTER_NS, AidingSources, Holdover, Slew
+
+_EARLY_NS: Final = -JUMP_EARLY_NS
+_T_ERR_MOST: Final = float(T_ERR_MOST)
+
+
+class RunStart(NamedTuple):
+    """What holds for all messages of a run; names are those of `SampleClock`."""
+
+    device: str
+    seq: int
+    """Of the newest sample."""
+    t_ns: int
+    """Of the newest sample."""
+    t_rx_ns: int
+    """When the messages were read."""
+    utc_offset_ns: int
+    byte_ns: int
+    waited_ns: int
+    bias_ns: float
+    error_ns: float
+    """Of the fit."""
+    sync: Sync
+    own_status: int | None
+
+
+def add_even_run(
+    samples: list[Sample],
+    events: Sequence[object],
+    at: int,
+    start: RunStart,
+    time: DeviceTime,
+    fit: ArrivalFit,
+    host: SteadyTime,
+) -> float:
+    """Append samples of the events from `at` on, while each is the usual case; return the error of the newest time.
+
+    `time` and `fit` are as after the newest of them.
+    """
+    device, seq, newest_ns, t_rx_ns, utc_offset_ns, byte_ns, waited_ns, bias_ns, fit_error_ns, sync, own = start
+    offset_ns, even_from_ns = host.offset_ns, host.even_from_ns
+    ref_arrival_ns, ref_device_ns, slope = fit.ref_arrival_ns, fit.ref_device_ns, fit.slope
+    slope_error, fitted_ns, until_ns = fit.slope_error, fit.fitted_ns, fit.until_ns
+    doubt_ns, ticks, device_ns, raw_ns = time.doubt_ns, time.ticks, time.even_ns, time.raw_ns
+    period_ticks, modulus, tick_ns = time.period.period_ticks, time.modulus, time.tick_ns
+    keep, add_arrival, before, newest_error_ns = samples.append, fit.add_arrival, len(samples), 0.0
+    for index in range(at, len(events)):
+        m = events[index]
+        if type(m) is not Measurement or m.dev_ticks is None:
+            break
+        step = (m.dev_ticks - ticks) % modulus
+        trailing_ns = m.trailing_bytes * byte_ns
+        arrival_ns = t_rx_ns - (m.size_bytes * byte_ns + trailing_ns + offset_ns)
+        if step != period_ticks or not step or arrival_ns < even_from_ns:
+            break
+        next_ns = device_ns + (step_ns := step * tick_ns)
+        fit_ns = ref_arrival_ns + slope * (next_ns - ref_device_ns)
+        above_ns = arrival_ns - fit_ns
+        is_new = not waited_ns or above_ns <= 0.0
+        if not is_new:
+            above_ns = max(above_ns - waited_ns, 0.0)
+        steady_ns = int(fit_ns - bias_ns)
+        t_ns = steady_ns + offset_ns
+        if (
+            not _EARLY_NS <= above_ns < JUMP_LATE_NS
+            or (is_new and next_ns >= until_ns)
+            or not even_from_ns <= steady_ns <= arrival_ns
+            or not newest_ns < t_ns <= t_rx_ns
+        ):
+            break
+        if is_new:
+            add_arrival(next_ns, arrival_ns, trailing_ns, above_ns)
+        ticks, device_ns, raw_ns, newest_ns = m.dev_ticks, next_ns, raw_ns + step_ns, t_ns
+        seq += 1
+        newest_error_ns = fit_error_ns + slope_error * (device_ns - fitted_ns) + doubt_ns
+        keep(
+            Sample(
+                device, seq, t_ns, int(newest_error_ns) + 1 if newest_error_ns < _T_ERR_MOST else T_ERR_MOST, sync,
+                t_rx_ns, t_ns + utc_offset_ns, raw_ns, m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad,
+                m.temperature_c, m.pressure_pa, m.incli_rad, m.status if own is None else own | (m.status or 0),
+                m.pps_age_ms, None,
+            )
+        )  # fmt: skip
+    if len(samples) > before:
+        time.advance_evenly(ticks, len(samples) - before)
+    return newest_error_ns
+
+
+YOUNG_NS: Final = 32 * NS_PER_S
+YOUNG_FACTOR: Final = 1.2
+"""A fit this short has not seen the timer's beat, and a stalled read in it weighs more."""
+_ARRIVAL: Final = Sync.ARRIVAL
+
+
+class SampleClock:
+    """Clock that makes samples of one device's measurements.
+
+    `tick_ns` and `tick_modulus` describe the device's counter, `byte_ns` is the time of a byte on the wire (0: none
+    known), `hold_ns` how long an adapter may hold bytes back (USB latency timer). A counter with `tick_ns` 0 numbers
+    the samples: it shows how many are missing, and the arrivals show when they were. Messages without that counter are
+    dated by `pps_age_ms`, in ms modulo `stamp_modulus` (0: by arrival). `bits` are the status bits of the device that
+    concern time, `sout` and `sin` where on their edges the measurement is. `host` is kept up to date by the caller.
+
+    `missed` counts within one sample; for a gap where that cannot be known `on_unknown_gap` is called.
+    Edges, triggers and UTC are given before the messages that follow them; without device time they are ignored.
+    """
+
+    __slots__ = (
+        "_aiding", "_arrivals", "_delay", "_device", "_error_ns", "_fit", "_fit_begin_ns", "_fit_bias_ns",
+        "_fit_error_ns", "_fit_sync", "_holdover", "_host", "_jump", "_known", "_line", "_make_aiding",
+        "_on_unknown_gap", "_own_status", "_resets", "_seq", "_slew", "_stamps", "_sync", "_t_err_ns", "_t_ns",
+        "_t_rx_ns", "_time", "missed", "waited_ns",
+    )  # fmt: skip
+
+    def __init__(
+        self, device: str, *, tick_ns: int, tick_modulus: int, byte_ns: int, hold_ns: int, stamp_modulus: int = 0,
+        bits: TimeBits = NO_TIME_BITS, sout: SoutTiming | None = None, sin: TriggerTiming | None = None,
+        host: SteadyTime = UNSTEERED, on_unknown_gap: Callable[[], None] = lambda: None,
+    ) -> None:  # fmt: skip
+        self._device, self._host, self._on_unknown_gap = device, host, on_unknown_gap
+        self._make_aiding = partial(
+            AidingSources, tick_ns, tick_modulus, bits, sout or SoutTiming(), sin or TriggerTiming(), host
+        )
+        self._aiding: AidingSources | None = None
+        self._time = DeviceTime(tick_ns, tick_modulus, on_unknown_gap)
+        self._stamps = StampTime(stamp_modulus) if stamp_modulus else None
+        self._delay = LinkDelay(byte_ns, hold_ns)
+        self._arrivals = ArrivalTime(self._delay, 0 if tick_ns else tick_modulus, on_unknown_gap)
+        self._line: CounterLine | None = None
+        """Where the device's counter is by the fit when it was lowest; None until a fit is used."""
+        self._jump, self._slew = JumpDetector(), Slew()
+        self._holdover: Holdover | None = None
+        self._fit: ArrivalFit | None = None
+        self._fit_begin_ns = 0  # device time
+        self._fit_bias_ns = self._fit_error_ns = 0.0  # distance from the fit down to the time of measurement; its error
+        self._fit_sync = Sync.ARRIVAL  # REGRESSION once the fit is used
+        self._sync = Sync.ARRIVAL  # origin of the newest time stamp, where there are aiding sources
+        self._known, self._resets = False, 0  # whether device time has begun
+        self._seq = self._t_ns = self._t_rx_ns = self._t_err_ns = 0
+        self._error_ns = 0.0  # one-sigma error of the newest time, before it is lifted or held back
+        self._own_status: int | None = None
+        self.missed = 0
+        """Samples missing right before the newest one; one of unknown size is no part of it."""
+        self.waited_ns = 0  # set by the owner: how long the messages given next may have waited unread
+
+    def sample(self, m: Measurement, t_rx_ns: int, utc_offset_ns: int, t_begin_ns: int | None = None) -> Sample:
+        """Return the measurement with its place in time, as the next sample of the device.
+
+        `t_rx_ns` is CLOCK_MONOTONIC right after the read that completed the message; it must not fall. Where it stands
+        still for more messages than there is room for before it, `t_rx_ns` of the sample is lifted by nanoseconds.
+        `utc_offset_ns` is CLOCK_REALTIME minus CLOCK_MONOTONIC at the same moment. `t_begin_ns` is CLOCK_MONOTONIC when
+        the message began on the wire, where that is known (its first frame came earlier); None: by its size.
+        """
+        if t_rx_ns < self._t_rx_ns:  # noqa: PLR1730 - a call of max() costs 60 ns on the sample path
+            t_rx_ns = self._t_rx_ns
+        size_bytes, ticks, byte_ns = m.size_bytes, m.dev_ticks, self._delay.byte_ns or 1
+        trailing_ns, host = m.trailing_bytes * byte_ns, self._host
+        offset_ns, even_from_ns = host.offset_ns, host.even_from_ns
+        on_wire_ns = size_bytes * byte_ns + trailing_ns
+        arrival_ns = t_rx_ns - (on_wire_ns + offset_ns) if t_begin_ns is None else host.steady_ns(t_begin_ns)
+        if t_begin_ns is None and arrival_ns < even_from_ns:
+            arrival_ns = host.steady_ns(t_rx_ns) - on_wire_ns
+        if ticks is None and self._stamps is not None and m.pps_age_ms is not None:
+            ticks = self._stamped(self._stamps, m.pps_age_ms, arrival_ns)
+        if ticks is None or not self._time.tick_ns:
+            wanted_ns, t_dev_ns, sync = self._by_arrival(m, ticks, arrival_ns), None, _ARRIVAL
+        else:
+            wanted_ns = self._by_device(ticks, arrival_ns, trailing_ns, t_rx_ns, size_bytes)
+            t_dev_ns, sync = self._time.raw_ns, self._fit_sync
+        edge_seq = None
+        aiding, slew, own = self._aiding, self._slew, self._own_status
+        if aiding is not None:
+            if t_dev_ns is not None and (sync is not _ARRIVAL or self._holdover is not None):
+                wanted_ns, slew = self._steered(aiding, m, wanted_ns, arrival_ns), aiding.slew
+                sync, edge_seq = aiding.sync, aiding.edge_seq
+            self._sync = sync
+        error_ns, steady_ns = self._error_ns, wanted_ns if wanted_ns <= arrival_ns else arrival_ns
+        t_ns = steady_ns + offset_ns
+        if steady_ns < even_from_ns:
+            t_ns, error_ns = min(host.monotonic_ns(steady_ns), t_rx_ns), error_ns + host.error_ns(steady_ns)
+        if t_ns <= self._t_ns:
+            steady_ns += self._t_ns + 1 - t_ns
+            t_ns = self._t_ns + 1
+        if steady_ns != wanted_ns:
+            slew.add(steady_ns - wanted_ns)
+            error_ns += abs(steady_ns - wanted_ns)
+        if t_ns > t_rx_ns:  # noqa: PLR1730 - as above
+            t_rx_ns = t_ns
+        self._t_ns, self._t_rx_ns = t_ns, t_rx_ns
+        self._seq = seq = self._seq + 1
+        self._t_err_ns = t_err_ns = int(error_ns) + 1 if error_ns < _T_ERR_MOST else T_ERR_MOST
+        if aiding is not None and aiding.marks is not None:
+            aiding.marks.add_sample(t_ns - aiding.sout_offset_ns, seq, self._period_ns())
+        return Sample(
+            self._device, seq, t_ns, t_err_ns, sync, t_rx_ns, t_ns + utc_offset_ns, t_dev_ns,
+            m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad, m.temperature_c, m.pressure_pa,
+            m.incli_rad, m.status if own is None else own | (m.status or 0), m.pps_age_ms, edge_seq,
+        )  # fmt: skip
+
+    def add_run(
+        self, samples: list[Sample], events: Sequence[object], at: int, t_rx_ns: int, utc_offset_ns: int
+    ) -> int:
+        """Append what `sample` makes of messages of one read from `at` on; return where one is not the usual case."""
+        time, fit, sync = self._time, self._fit, self._fit_sync
+        unusual = time.watched or time.rephased or self._jump.late_reads or self._slew.left_ns
+        if sync is _ARRIVAL or fit is None or unusual or self._aiding is not None:
+            return at
+        before = len(samples)
+        start = RunStart(
+            self._device, self._seq, self._t_ns, max(t_rx_ns, self._t_rx_ns), utc_offset_ns, self._delay.byte_ns or 1,
+            self.waited_ns, self._fit_bias_ns, self._fit_error_ns, sync, self._own_status,
+        )  # fmt: skip
+        error_ns = add_even_run(samples, events, at, start, time, fit, self._host)
+        if len(samples) > before:
+            newest = samples[-1]
+            self._seq, self._t_ns, self._t_rx_ns = newest.seq, newest.t_ns, newest.t_rx_ns
+            self._t_err_ns, self._error_ns, self.missed = newest.t_err_ns, error_ns, 0
+        return at + len(samples) - before
+
+    def sample_polled(
+        self, m: Measurement, t_ns: int, t_err_ns: int, t_rx_ns: int, utc_offset_ns: int, edge_seq: int | None = None
+    ) -> Sample:
+        """Return a measurement that the host polled, as the next sample of the device.
+
+        `t_ns` is CLOCK_MONOTONIC right before the poll, or by the data-ready edge of number `edge_seq`; `t_err_ns` is
+        its one-sigma error, `t_rx_ns` right after the answer. A `t_ns` that does not rise is lifted, and the error too.
+        """
+        self.missed, self._fit_sync = 0, _ARRIVAL if edge_seq is None else Sync.EDGE
+        self._arrivals.spread.add_arrival(t_ns)
+        t_err_ns = min(t_err_ns + max(0, self._t_ns + 1 - t_ns), T_ERR_MOST)
+        self._t_ns = t_ns = max(t_ns, self._t_ns + 1)
+        self._t_rx_ns = t_rx_ns = max(t_rx_ns, self._t_rx_ns, t_ns)
+        self._seq, self._t_err_ns = self._seq + 1, t_err_ns
+        return Sample(
+            self._device, self._seq, t_ns, t_err_ns, self._fit_sync, t_rx_ns, t_ns + utc_offset_ns, None,
+            m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad, m.temperature_c, m.pressure_pa,
+            m.incli_rad, m.status, m.pps_age_ms, edge_seq,
+        )  # fmt: skip
+
+    # --- aiding sources ------------------------------------------------------------------------------------------
+
+    @property
+    def aiding(self) -> AidingSources:
+        """Where edges and triggers are added, right before the messages that follow them; made on first use."""
+        if self._aiding is None:
+            self._aiding = self._make_aiding()
+        return self._aiding
+
+    def set_utc_reference(self, reference: UtcReference | None) -> None:
+        """Set the host's estimate of UTC, or None. A device on UTC is recognised by it."""
+        if reference is not None or self._aiding is not None:
+            self.aiding.set_utc_reference(reference)
+
+    @property
+    def utc_reference(self) -> UtcReference | None:
+        """The host's estimate of UTC; None while it has none."""
+        return self._aiding.utc_reference if self._aiding else None
+
+    def set_own_status(self, bits: int | None) -> None:
+        """Set the host's own bits, which `sample` adds to the status from now on; None for none."""
+        self._own_status = bits
+
+    def take_marks(self) -> list[Mark]:
+        """Return the pulses on SOUT_DIV whose samples are known by now, in order, each once."""
+        marks = self._aiding.marks if self._aiding is not None else None
+        return marks.take_marks() if marks is not None else []
+
+    # --- state ---------------------------------------------------------------------------------------------------
+
+    @property
+    def expected_rate_hz(self) -> float:
+        """Samples per second of the host by the device's own stamps; 0 while unknown."""
+        period_ns = self._period_ns()
+        if self._line is not None and self._fit is not None:
+            period_ns *= self._line.slope / self._fit.slope  # the fit's swings while messages wait
+        return NS_PER_S / period_ns if period_ns else 0.0
+
+    def status(self) -> ClockStatus:
+        """Return the state of the estimate at the newest sample."""
+        fit = self._fit if self._fit_sync is not Sync.ARRIVAL else None
+        status = ClockStatus(
+            sync=self._sync if self._aiding else self._fit_sync,
+            offset_ns=self._t_ns - self._time.raw_ns if self._known else 0,
+            skew_ppm=(1 / fit.slope - 1) * 1e6 if fit else 0.0,
+            steering_ppm=self._host.rate * 1e6,
+            residual_ns=int(fit.residual_ns if fit else self._arrivals.spread.sigma_ns),
+            t_err_ns=self._t_err_ns,
+            resets=self._resets + self._arrivals.resets,
+            hold_ns=self._delay.hold_ns,
+        )
+        return self._aiding.add_status(status) if self._aiding else status
+
+    def link_changed(self, *, byte_ns: int, hold_ns: int) -> None:
+        """Begin a new fit for another baud rate or port. `t_ns` goes on rising."""
+        self._delay = LinkDelay(byte_ns, hold_ns)
+        self._arrivals.change_link(self._delay)
+        self._drop_fit()
+
+    def restart(self) -> None:
+        """Begin anew after the device or the link was away: the next stamp is no reset. What is missing until then is
+        counted if the device's counter ran on; else the gap is one of unknown size."""
+        self._known = False
+        self._time.period.restart()
+        self._arrivals.restart()
+        if self._stamps is not None:
+            self._stamps.restart()
+        self.missed = 0
+        self._drop_fit()
+
+    def continue_from(self, other: "SampleClock") -> None:
+        """Go on where another clock of the same device ends: `seq` and `t_ns` keep rising."""
+        self._seq, self._t_ns, self._t_rx_ns = other._seq, other._t_ns, other._t_rx_ns
+        self.set_utc_reference(other.utc_reference)
+
+    # --- by arrival ----------------------------------------------------------------------------------------------
+
+    def _stamped(self, stamps: StampTime, stamp: int, arrival_ns: int) -> int | None:
+        """Return the ticks of a message that has a short stamp only; None where those do not date it."""
+        was_in_use = stamps.in_use
+        ticks = stamps.ticks(stamp, arrival_ns, self._time.ticks if self._known else None)
+        if was_in_use is not stamps.in_use:
+            self._known, self._line = stamps.in_use, None
+            self._drop_fit()
+            self._time.begin(stamps.before)
+        return ticks
+
+    def _by_arrival(self, m: Measurement, ticks: int | None, arrival_ns: int) -> int:
+        """Return the time of a message without device time, which may have a number; leave its error in `_error_ns`."""
+        arrivals = self._arrivals
+        t_ns = arrivals.date(
+            ticks, arrival_ns, m.size_bytes, alone=not self._known, triggered=m.pps_age_ms is not None,
+            is_first=not self._seq,
+        )  # fmt: skip
+        self.missed, self._error_ns = arrivals.missed, arrivals.error_ns
+        return t_ns
+
+    def _less_bias(self, arrival_ns: int, size_bytes: int) -> int:
+        """Return the time of a message before the fit is used; leave its error in `_error_ns`."""
+        t_ns, self._error_ns = self._delay.before(arrival_ns, size_bytes, self._period_ns(), float(FIRST_SPREAD_NS))
+        self._error_ns += self.waited_ns
+        return t_ns
+
+    # --- by device time ------------------------------------------------------------------------------------------
+
+    def _by_device(self, ticks: int, arrival_ns: int, trailing_ns: int, t_rx_ns: int, size_bytes: int) -> int:
+        """Return the time of a message with device time; leave its error in `_error_ns`."""
+        time, fit = self._time, self._fit
+        if fit is None:
+            self._begin(ticks, arrival_ns, t_rx_ns)
+            return self._less_bias(arrival_ns, size_bytes)
+        before_ns = time.even_ns
+        time.advance(ticks)
+        device_ns = time.even_ns
+        fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
+        above_ns = arrival_ns - fit_ns
+        if waited := self.waited_ns and above_ns > 0.0:  # it may have come when the fit says, or that much later
+            arrival_ns -= int(min(above_ns, self.waited_ns))
+            above_ns = max(above_ns - self.waited_ns, 0.0)
+        if time.rephased:
+            return self._begin_phase(fit, device_ns, arrival_ns, size_bytes)
+        if (
+            time.watched
+            and self._fit_sync is not _ARRIVAL
+            and (above_ns >= _EARLY_NS or not self._ran_on(device_ns, arrival_ns))
+            and time.absorb_correction(fit, before_ns, arrival_ns)
+        ):
+            device_ns = time.even_ns
+            fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
+            above_ns = arrival_ns - fit_ns
+        odd = above_ns < _EARLY_NS or above_ns > JUMP_LATE_NS or self._jump.late_reads
+        if odd and self._jump.is_jump(
+            fit, above_ns, device_ns - before_ns, None if self._fit_sync is _ARRIVAL else self._fit_error_ns, t_rx_ns,
+            self._t_rx_ns,
+        ):  # fmt: skip
+            return self._after_jump(above_ns, ticks, arrival_ns, size_bytes)
+        self.missed = time.missed
+        if not waited and fit.add_arrival(device_ns, arrival_ns, trailing_ns, above_ns):
+            if self._jump.stood_still(fit, self._fit_error_ns):
+                self._resets += 1  # messages stay late: the device's clock stood still for a while
+                self._start_fit(arrival_ns)
+            elif other := self._delay.corrected(fit, self._period_ns(), size_bytes):
+                self._delay = other
+                self._start_fit(arrival_ns)
+            else:
+                fit_ns = self._refit(fit, device_ns, device_ns - before_ns, fit_ns, size_bytes)
+        if self._fit_sync is _ARRIVAL:
+            if self._holdover is not None:
+                self._error_ns = self._holdover.error_ns(device_ns)
+                return self._holdover.at(device_ns)
+            return self._less_bias(arrival_ns, size_bytes)
+        slew = self._slew
+        error_ns = self._fit_error_ns + fit.slope_error * (device_ns - fit.fitted_ns) + time.doubt_ns
+        fit_ns -= self._fit_bias_ns
+        if slew.left_ns:
+            left_ns = slew.advance(device_ns - before_ns, device_ns - self._fit_begin_ns)
+            fit_ns, error_ns = fit_ns + left_ns, error_ns + abs(left_ns)
+        self._error_ns = error_ns if above_ns < JUMP_LATE_NS else error_ns + above_ns
+        return int(fit_ns)
+
+    def _begin(self, ticks: int, arrival_ns: int, t_rx_ns: int) -> None:
+        """Set the first stamp of a fit: of a new device, or of one whose clock runs on over a changed link."""
+        time, line = self._time, self._line
+        elapsed_ns = time.elapsed_ns(ticks)
+        if self._known and (
+            elapsed_ns <= SLOPE_HIGHEST * (t_rx_ns - self._t_rx_ns) + FIRST_EARLY_NS
+            or (line is not None and line.carries(time.even_ns + elapsed_ns, arrival_ns))
+        ):
+            time.advance(ticks)
+            self.missed = time.missed
+        else:
+            missed = time.missed_since(line, ticks, arrival_ns) if line is not None and not self._known else None
+            self._begin_counter(ticks, arrival_ns, missed)
+            self._resets += self._known
+            self._known = True
+        self._start_fit(arrival_ns)
+
+    def _begin_counter(self, ticks: int, arrival_ns: int, missed: int | None) -> None:
+        """Set the first stamp of a counter that began anew, or was not read for a while, `missed` where it is known."""
+        if missed is None and self._seq and not self._time.period.is_gap:
+            period_ns = self._period_ns()
+            if not period_ns or arrival_ns - self._host.steady_ns(self._t_ns) >= GAP_PERIODS * period_ns:
+                self._on_unknown_gap()
+        self.missed = missed or 0
+        self._line = None
+        self._time.begin(ticks)
+
+    def _after_jump(self, above_ns: float, ticks: int, arrival_ns: int, size_bytes: int) -> int:
+        """Return the time of the first message after a jump: by UTC if the counter jumped to it, else by arrival.
+
+        A counter that only looks as if it had jumped goes on: the fit rests on messages that waited, or they wait now.
+        """
+        aiding, time = self._aiding, self._time
+        ran_on = above_ns > 0.0 or self._ran_on(time.even_ns, arrival_ns)
+        if aiding is not None:
+            utc_ns = aiding.utc.above(ticks, arrival_ns, FIRST_SPREAD_NS + self._delay.hold_ns)
+            if utc_ns is not None:
+                utc_ns += arrival_ns + time.tick_ns // 2
+                return self._hold_over(aiding, ticks, arrival_ns, utc_ns, time.missed if ran_on else None)
+        if ran_on:
+            if above_ns > 0.0 and self._jump.is_late_since_gap(time.period.period_ticks * time.tick_ns):
+                self._on_unknown_gap()
+            self._resets += above_ns > 0.0
+            self.missed = time.missed
+        else:
+            self._resets += 1
+            self._begin_counter(ticks, arrival_ns, None)
+        self._start_fit(arrival_ns)
+        return self._less_bias(arrival_ns, size_bytes)
+
+    def _ran_on(self, device_ns: int, arrival_ns: int) -> bool:
+        """Whether a message below the fit is no earlier than the device's counter allows: the fit is late."""
+        return self._line is not None and self._line.carries(device_ns, arrival_ns)
+
+    def _hold_over(self, aiding: AidingSources, ticks: int, arrival_ns: int, utc_ns: int, missed: int | None) -> int:
+        """Return the time of a message whose counter jumped to `utc_ns`, or within UTC; holdover begins there."""
+        period_ns, tick_ns, error_ns = self._period_ns() or 1.0, self._time.tick_ns, float(self._t_err_ns)
+        newest_ns = self._host.steady_ns(self._t_ns)
+        steps = max(round((utc_ns - newest_ns) / period_ns), 1)
+        t_ns = newest_ns + int(steps * period_ns)
+        unknown = self._fit_sync is _ARRIVAL and self._holdover is None
+        if unknown or abs(t_ns - utc_ns) > tick_ns + 2 * error_ns:
+            t_ns, error_ns = max(utc_ns, newest_ns + 1), aiding.utc.tick_error_ns  # or the device samples anew
+        elif missed is None and error_ns + tick_ns < period_ns:
+            missed = steps - 1
+        self._begin_counter(ticks, arrival_ns, missed)
+        self._start_fit(arrival_ns)
+        aiding.utc.confirm()
+        self._holdover = holdover = Holdover(self._fit_begin_ns, t_ns, error_ns, tick_ns)
+        self._error_ns = holdover.error_ns(self._fit_begin_ns)
+        self._fit_begin_ns -= SETTLED_AFTER_NS  # time went on: corrections stay slow
+        return t_ns
+
+    def _begin_phase(self, fit: ArrivalFit, device_ns: int, arrival_ns: int, size_bytes: int) -> int:
+        """Return the time of a sample after the device's rate was changed: where in its tick it is now is not known.
+
+        The crystal is the same. Its rate is kept, and the former line until new arrivals show where the samples are.
+        """
+        self._time.rephased, self.missed = False, self._time.missed
+        holdover, slope, slope_error = self._holdover, fit.slope, fit.slope_error
+        if self._fit_sync is not _ARRIVAL:
+            t_ns = fit.ref_arrival_ns + slope * (device_ns - fit.ref_device_ns) - self._fit_bias_ns + self._slew.left_ns
+            error_ns = self._fit_error_ns + slope_error * (device_ns - fit.fitted_ns) + abs(self._slew.left_ns)
+            holdover = Holdover(device_ns, int(t_ns), error_ns, self._time.tick_ns, ENOUGH_SPAN_NS, slope, slope_error)
+        self._start_fit(arrival_ns, slope, slope_error)
+        self._holdover = holdover
+        self._error_ns = holdover.error_ns(device_ns) if holdover is not None else 0.0
+        return holdover.at(device_ns) if holdover is not None else self._less_bias(arrival_ns, size_bytes)
+
+    def _start_fit(self, arrival_ns: int, slope: float = 1.0, slope_error: float = SLOPE_HIGHEST - 1) -> None:
+        """Begin a new fit at the present device time."""
+        self._drop_fit()
+        self._fit_begin_ns = self._time.even_ns
+        self._fit = ArrivalFit(self._fit_begin_ns, arrival_ns, self._delay.hold_ns, slope, slope_error)
+
+    def _drop_fit(self) -> None:
+        self._fit = self._holdover = None
+        self._fit_sync = _ARRIVAL
+        self._jump.reset()
+        self._slew.set(0.0)
+        if self._aiding is not None:
+            self._aiding.restart()
+
+    def _refit(self, fit: ArrivalFit, device_ns: int, elapsed_ns: int, fit_ns_before: float, size_bytes: int) -> float:
+        """Use a fit that changed, without a step; return its value at `device_ns`."""
+        delay = self._delay
+        period_ns = self._period_ns()
+        fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
+        published_ns = fit_ns_before - self._fit_bias_ns + self._slew.left_ns
+        if period_ns:
+            fit.set_pause(delay.held_ns(period_ns, size_bytes), int(delay.hold_ns / period_ns) + 2)
+        self._fit_bias_ns = delay.floor_ns / 2 + fit.shift_ns
+        self._fit_error_ns = hypot(fit.error_ns, delay.bias_error_ns(fit.hidden_ns)) + self._time.error_ns
+        if delay.hold_ns and fit.span_ns < YOUNG_NS:
+            self._fit_error_ns *= YOUNG_FACTOR
+        if self._fit_sync is not _ARRIVAL:
+            self._slew.set(published_ns - (fit_ns - self._fit_bias_ns))
+        elif fit.is_known(self._holdover.least_ns if self._holdover else ENOUGH_SPAN_NS):
+            self._fit_sync = Sync.REGRESSION
+            newest_ns = self._host.steady_ns(self._t_ns)
+            held_ns = self._holdover.at(device_ns) if self._holdover else newest_ns + elapsed_ns * fit.slope
+            self._holdover = None
+            self._slew.set(held_ns - (fit_ns - self._fit_bias_ns))
+        if self._line is not None:
+            self._line.follow(fit, self._fit_error_ns)
+        elif self._fit_sync is not _ARRIVAL:
+            self._line = CounterLine(fit, self._fit_error_ns)
+        return fit_ns
+
+    def _steered(self, aiding: AidingSources, m: Measurement, fit_ns: int, arrival_ns: int) -> int:
+        """Return what aiding sources make of a time by the fit; leave its error in `_error_ns`."""
+        device_ns, fit = self._time.even_ns, self._holdover or self._fit
+        assert fit is not None
+        t_ns = aiding.steer(
+            m, device_ns, arrival_ns, fit_ns, self._error_ns, self._fit_sync, self._period_ns(), fit.slope,
+            fit.slope_error, device_ns - self._fit_begin_ns,
+        )  # fmt: skip
+        self._error_ns = aiding.error_ns
+        return t_ns
+
+    def _period_ns(self) -> float:
+        """Host time between samples; 0 while unknown."""
+        time, fit = self._time, self._fit
+        if not time.tick_ns:
+            return self._arrivals.spread.period_ns
+        return time.period.period_ticks * time.tick_ns * (fit.slope if fit else 1.0)

@@ -1,0 +1,631 @@
+"""The hot path of one device: bytes or frames → codec → clock → batch → publishers. Everything else happens around it.
+
+Per read: one `feed`, one clock call and one record per sample, one batch; counters are plain integers.
+Synchronization: the event loop's thread only.
+"""
+
+from abc import ABC, abstractmethod
+from bisect import bisect_left, bisect_right
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import hypot, sqrt
+from typing import Final, NamedTuple, Protocol
+
+from imud.attitude.published import PublishedFrame
+from imud.contracts.codec import BadFrame, BadReason, CanCodec, CodecEvent, PolledCodec, Reading, StreamCodec, Vanished
+from imud.contracts.driver import Driver
+from imud.contracts.lines import DeviceLines, Edge, ReadySettings
+from imud.contracts.publisher import AS_SENT, Batch
+from imud.contracts.script import Message, ReplyFrame, TextLine
+from imud.contracts.status import LATENCY_BOUNDS_NS
+from imud.formats.can import CanFrame
+from imud.host.clock import UNSTEERED, HostClock, SteadyTime
+from imud.model.errors import Trouble
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement, Sample
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
+from imud.sampling.clock import SampleClock
+from imud.sampling.steering import STAMP_FLOOR_NS, AidingSources
+
+RATE_WINDOW_NS = 2 * NS_PER_S
+"""The rate shown is that of the last two seconds: long enough for 1 Hz devices, short enough to see a stall."""
+
+
+class RateMeter:
+    """Samples per second over the last `RATE_WINDOW_NS`, from counts taken at every tick."""
+
+    def __init__(self) -> None:
+        self._marks: deque[tuple[int, int]] = deque()
+
+    def mark(self, now_ns: int, count: int) -> None:
+        """Note that `count` samples were made until `now_ns`."""
+        marks = self._marks
+        marks.append((now_ns, count))
+        while len(marks) > 2 and marks[1][0] <= now_ns - RATE_WINDOW_NS:
+            marks.popleft()
+
+    def rate_hz(self) -> float:
+        """Samples per second between the oldest and the newest mark; 0.0 before there are two."""
+        if len(self._marks) < 2:
+            return 0.0
+        (t0_ns, n0), (t1_ns, n1) = self._marks[0], self._marks[-1]
+        return (n1 - n0) * NS_PER_S / (t1_ns - t0_ns) if t1_ns > t0_ns else 0.0
+
+
+class LatencyMeter:
+    """Histogram of the time from a measurement to its publication."""
+
+    __slots__ = ("buckets", "sum_ns")
+
+    def __init__(self) -> None:
+        self.buckets = [0] * (len(LATENCY_BOUNDS_NS) + 1)
+        self.sum_ns = 0
+
+    def add(self, now_ns: int, samples: Sequence[Sample]) -> None:
+        """Count samples that are published at `now_ns`, oldest first."""
+        if len(samples) == 1:
+            latency_ns = now_ns - samples[0].t_ns
+            self.buckets[bisect_left(LATENCY_BOUNDS_NS, latency_ns)] += 1
+            self.sum_ns += latency_ns
+            return
+        latencies = [now_ns - sample.t_ns for sample in reversed(samples)]  # rising, as times of samples do
+        self.sum_ns += sum(latencies)
+        buckets, begin = self.buckets, 0
+        for bucket in range(bisect_left(LATENCY_BOUNDS_NS, latencies[0]), len(LATENCY_BOUNDS_NS)):
+            end = bisect_right(latencies, LATENCY_BOUNDS_NS[bucket], begin)
+            buckets[bucket] += end - begin
+            if end == len(latencies):
+                return
+            begin = end
+        buckets[-1] += len(latencies) - begin
+
+
+class LossMeter:
+    """Attribution of missing samples to causes: damaged frames, then kernel overruns, the rest to the device.
+
+    A device-time gap says how many samples are missing; damaged frames heard since the last sample explain as many of
+    them, then overruns the kernel counted explain the rest, and what is left the device itself did not send.
+    """
+
+    def __init__(self, ledger: Ledger) -> None:
+        self.bad_frames = 0
+        """Damaged frames heard since the last sample; the owner counts them and sets 0 after each sample."""
+        self._ledger = ledger
+        self._overruns_seen = 0
+
+    def missed(self, count: int, overruns: int) -> None:
+        """Attribute `count` missing samples; the kernel counted `overruns` since the link was opened."""
+        ledger = self._ledger
+        by_crc = min(count, self.bad_frames)
+        left = count - by_crc
+        by_overrun = left if overruns > self._overruns_seen else 0
+        ledger.lost_crc += by_crc
+        ledger.lost_overrun += by_overrun
+        ledger.lost_gap_device += left - by_overrun
+        self._overruns_seen = overruns
+
+    def link_opened(self) -> None:
+        """Note that the kernel's counters start anew."""
+        self._overruns_seen = 0
+
+
+@dataclass(frozen=True, slots=True)
+class PathContext:
+    """Parts that every sample path of one device needs in addition to its codec and clock."""
+
+    device: str
+    """Name in the configuration."""
+    device_id: int
+    ledger: Ledger
+    publish: Callable[[Batch], None]
+    on_message: Callable[[Message, int], None]
+    """Called with a text line or reply frame, and CLOCK_MONOTONIC of its arrival."""
+    on_bad_frame: Callable[[BadFrame], None]
+    overruns: Callable[[], int]
+    """Overruns that the kernel counted since the link was opened."""
+    host: HostClock
+    frame: PublishedFrame = AS_SENT
+    """Axes and angles of what is published."""
+
+
+class SamplePath(ABC):
+    """Path from the data of one device to published samples; subclasses receive the data."""
+
+    def __init__(self, clock: SampleClock, context: PathContext) -> None:
+        self.clock = clock
+        self.latency = LatencyMeter()
+        self.loss = LossMeter(context.ledger)
+        self.newest: Sample | None = None
+        """As the device sent it, in the sensor's own axes."""
+        self.frame = context.frame
+        self.begun_ns = 0
+        """CLOCK_MONOTONIC when the link was last given to this path."""
+        self.last_data_ns = 0
+        self.last_sample_ns = 0
+        self._begun_samples = context.ledger.samples
+        self._status_mask = self._status_seen = 0
+        self._device = context.device
+        self._device_id = context.device_id
+        self._ledger = context.ledger
+        self._rotation = context.frame.rotation
+        self._publish = context.publish
+        self._on_message = context.on_message
+        self._on_bad_frame = context.on_bad_frame
+        self._overruns = context.overruns
+        self._now_ns = context.host.now_ns
+        self._utc_offset_ns = context.host.utc_offset_ns
+
+    def watch_status(self, mask: int) -> None:
+        """Gather these bits of the status of all samples from now on."""
+        self._status_mask, self._status_seen = mask, 0
+
+    def take_status(self) -> int:
+        """Return the gathered bits that any sample had since the last call."""
+        seen, self._status_seen = self._status_seen, 0
+        return seen
+
+    @property
+    def fresh(self) -> bool:
+        """Whether a sample came since the link was last given to this path."""
+        return self._ledger.samples > self._begun_samples
+
+    @property
+    def period_ns(self) -> int:
+        """Expected time between two samples, ns; 0 while it is not known."""
+        expected_hz = self.clock.expected_rate_hz
+        return int(NS_PER_S / expected_hz) if expected_hz else 0
+
+    def begin(self, now_ns: int) -> None:
+        """Start on a link whose device is found."""
+        self.begun_ns = self.last_data_ns = now_ns
+        self._begun_samples = self._ledger.samples
+
+    @abstractmethod
+    def flush(self, now_ns: int) -> None:
+        """Process what waits for a rest that did not come: the link is idle."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Discard what is incomplete: the link ended."""
+
+    def publish_events(self, events: Sequence[CodecEvent], t_rx_ns: int) -> None:
+        """Publish the samples in what a codec made of something that came at `t_rx_ns`, as one batch."""
+        samples: list[Sample] = []
+        self._sort(events, t_rx_ns, self._utc_offset_ns(), samples)
+        if samples:
+            self._finish(samples, t_rx_ns)
+
+    def _sort(
+        self,
+        events: Sequence[CodecEvent],
+        t_rx_ns: int,
+        utc_offset_ns: int,
+        samples: list[Sample],
+        t_begin_ns: int | None = None,
+    ) -> None:
+        """Pass each event to where it belongs; append samples. `t_begin_ns` is that of `SampleClock.sample`."""
+        clock, loss = self.clock, self.loss
+        at, count = 0, len(events)
+        while at < count:
+            if t_begin_ns is None and count - at > 1:
+                after = clock.add_run(samples, events, at, t_rx_ns, utc_offset_ns)
+                if after > at:
+                    loss.bad_frames, at = 0, after
+                    continue
+            event = events[at]
+            at += 1
+            if type(event) is Measurement:
+                samples.append(clock.sample(event, t_rx_ns, utc_offset_ns, t_begin_ns))
+                if clock.missed:
+                    loss.missed(clock.missed, self._overruns())
+                loss.bad_frames = 0
+            elif type(event) is TextLine:
+                self._on_message(event.text, t_rx_ns)
+            elif type(event) is ReplyFrame:
+                self._on_message(event, t_rx_ns)
+            elif type(event) is BadFrame:
+                if event.reason is not BadReason.NOT_FINITE:  # that one comes with its sample
+                    loss.bad_frames += 1
+                self._on_bad_frame(event)
+
+    def _finish(self, samples: list[Sample], t_rx_ns: int) -> None:
+        self._ledger.samples += len(samples)
+        self.newest = samples[-1]
+        self.last_sample_ns = t_rx_ns
+        if self._rotation is not None:
+            samples = self._rotation.samples(samples)
+        self._publish(Batch(self._device, self._device_id, samples, self.frame))
+        if mask := self._status_mask:
+            for sample in samples:
+                if sample.status is not None:
+                    self._status_seen |= sample.status & mask
+        self.latency.add(self._now_ns(), samples)
+
+
+class SampleListener(Protocol):
+    """Listener to measurements as a codec makes them, before they are samples: a command waits for one."""
+
+    wants_samples: bool
+    """Whether it listens now."""
+
+    def on_sample(self, sample: Measurement) -> None:
+        """Process one measurement."""
+        ...
+
+
+class StreamPath(SamplePath):
+    """The path of a device that sends bytes."""
+
+    def __init__(
+        self,
+        codec: StreamCodec,
+        clock: SampleClock,
+        context: PathContext,
+        drain_edges: Callable[[], None] | None = None,
+        listener: SampleListener | None = None,
+    ) -> None:
+        """`drain_edges` gives the clock the edges of lines that precede the bytes; called before they are decoded."""
+        super().__init__(clock, context)
+        self.codec = codec
+        self._listener = listener
+        self._drain_edges = drain_edges
+        self.gathered: list[Sample] = []
+        """Samples that are not published yet, oldest first."""
+
+    def on_data(self, data: bytes, t_rx_ns: int) -> None:
+        """Process bytes as read, with CLOCK_MONOTONIC right after the read."""
+        self.last_data_ns = t_rx_ns
+        if self._drain_edges is not None:
+            self._drain_edges()
+        events = self.codec.feed(data)
+        if events:
+            self.publish_events(events, t_rx_ns)
+            if self._listener is not None and self._listener.wants_samples:
+                self._pass_on(events, self._listener)
+
+    def gather(self, data: bytes, t_rx_ns: int, waited_ns: int = 0) -> bool:
+        """Process bytes, and keep their samples for `publish_gathered`; returns whether there are any.
+
+        The bytes waited in the kernel for up to `waited_ns`; 0: they were read as they came.
+        """
+        self.last_data_ns = t_rx_ns
+        events = self.codec.feed(data)
+        if not events:
+            return False
+        before = len(self.gathered)
+        self.clock.waited_ns = waited_ns
+        self._sort(events, t_rx_ns, self._utc_offset_ns(), self.gathered)
+        self.clock.waited_ns = 0
+        return len(self.gathered) > before
+
+    def publish_gathered(self) -> None:
+        """Publish the samples that were kept, as one batch."""
+        samples, self.gathered = self.gathered, []
+        if samples:
+            self._finish(samples, samples[-1].t_rx_ns)
+
+    def _pass_on(self, events: Sequence[CodecEvent], listener: SampleListener) -> None:
+        for event in events:
+            if type(event) is Measurement:
+                listener.on_sample(event)
+
+    def flush(self, now_ns: int) -> None:
+        """Process whole frames that wait inside a longer one that never came."""
+        if self._ledger.bytes_pending:
+            events = self.codec.flush()
+            if events:
+                self.publish_events(events, now_ns)
+
+    def reset(self) -> None:
+        """Count bytes that wait for the rest of their frame as skipped."""
+        self.codec.reset()
+
+
+class CanPath(SamplePath):
+    """The path of a device on a CAN bus."""
+
+    def __init__(self, codec: CanCodec, clock: SampleClock, context: PathContext) -> None:
+        super().__init__(clock, context)
+        self.codec = codec
+        self._frame_ns = 0
+        self._first_ns = 0
+
+    def set_frame_time(self, frame_ns: int) -> None:
+        """Set the shortest time of a frame on the wire, ns; 0 where the bit rate is not known."""
+        self._frame_ns = frame_ns
+
+    def on_frames(self, frames: Sequence[CanFrame]) -> None:
+        """Process frames as read in one go, each with its own time of arrival.
+
+        What a device measured at one instant begins to arrive with the first frame that waits for others; frames of
+        other devices come between them.
+        """
+        feed, ledger, samples = self.codec.feed_frame, self._ledger, list[Sample]()
+        utc_offset_ns = self._utc_offset_ns()
+        t_rx_ns = self.last_data_ns
+        for can_id, extended, data, t_rx_ns, after_loss in frames:
+            if after_loss:
+                self.codec.reset()
+            pending = ledger.frames_pending
+            if not pending:
+                self._first_ns = t_rx_ns
+            events = feed(can_id, extended, data, t_rx_ns)
+            if events:
+                self._sort(events, t_rx_ns, utc_offset_ns, samples, self._first_ns - self._frame_ns)
+            if pending and ledger.frames_pending == 1:  # what waited is over, and this frame waits for others now
+                self._first_ns = t_rx_ns
+        self.last_data_ns = t_rx_ns
+        if samples:
+            self._finish(samples, t_rx_ns)
+
+    def flush(self, now_ns: int) -> None:
+        """Process what need not wait for frames that did not come."""
+        events = self.codec.flush()
+        if events:
+            self.publish_events(events, now_ns)
+
+    def reset(self) -> None:
+        """Drop frames that wait for the rest of their sample."""
+        self.codec.reset()
+
+
+class DeviceClock(SampleClock):
+    """A clock whose methods can be replaced on the object itself: a recording hears its calls (`recording.tap`)."""
+
+    heard_aiding: Callable[[AidingSources], AidingSources] | None = None
+    """Returns what stands for the aiding sources while a recording hears their calls; None while none does."""
+
+    @property
+    def aiding(self) -> AidingSources:
+        """Where edges and triggers are added."""
+        made = super().aiding
+        return made if self.heard_aiding is None else self.heard_aiding(made)
+
+
+def make_clock(
+    name: str,
+    lines: DeviceLines | None,
+    driver: Driver,
+    before: SampleClock | None,
+    *,
+    host: SteadyTime = UNSTEERED,
+    byte_ns: int = 0,
+    hold_ns: int = 0,
+    on_unknown_gap: Callable[[], None] = lambda: None,
+) -> SampleClock:
+    """Return the clock of the device `name` for samples of `driver`.
+
+    If `before` is a clock, the new clock continues its sequence numbers and time stamps.
+    """
+    clock = DeviceClock(
+        name,
+        tick_ns=driver.tick_ns,
+        tick_modulus=driver.tick_modulus,
+        byte_ns=byte_ns,
+        hold_ns=hold_ns,
+        stamp_modulus=driver.stamp_modulus,
+        bits=driver.time_bits,
+        sout=lines.sout.timing if lines is not None and lines.sout is not None else None,
+        sin=lines.sin.timing if lines is not None and lines.sin is not None else None,
+        host=host,
+        on_unknown_gap=on_unknown_gap,
+    )
+    if before is not None:
+        clock.continue_from(before)
+    return clock
+
+
+QUIET_NS: Final = 500 * NS_PER_MS
+"""Edges count as stopped after this time, which is shorter than what makes a device silent."""
+KEPT: Final = 1024
+"""Capacity of the buffer of edges without a read: that of the kernel's event buffer."""
+AGE_LIMIT: Final = 1.5
+"""A further read of an edge that begins later than this, in intervals, may belong to an unseen edge: the wire broke."""
+EITHER: Final = 1 / sqrt(2)
+"""Root mean square of an error that is 0 or its bound with equal probability."""
+
+
+class Stamp(NamedTuple):
+    """Instant of measurement of the values that were read."""
+
+    t_ns: int
+    """CLOCK_MONOTONIC; not after the begin of the read."""
+    err_ns: int
+    """One-sigma error of `t_ns`."""
+    number: int
+    """`Edge.number`."""
+
+
+class ReadyEdges:
+    """Edges of one data-ready line. Synchronization: the loop's thread only."""
+
+    def __init__(self, settings: ReadySettings, period_ns: int) -> None:
+        """`period_ns` is the expected interval of edges, used until two have come."""
+        self.missed = 0
+        """Edges without a read: the next edge came first, or the kernel dropped the edge."""
+        self.interval_ns = period_ns
+        """Interval of the two newest edges."""
+        self._offset_ns = round(settings.offset_us * NS_PER_US)
+        self._error_ns = settings.bias_us * NS_PER_US / sqrt(3) + STAMP_FLOOR_NS
+        self._edges: deque[Edge] = deque(maxlen=KEPT)
+        self._newest: Edge | None = None
+        self._read: int | None = None
+
+    def on_edges(self, edges: Sequence[Edge]) -> None:
+        """Add edges after which new values can be read, oldest first."""
+        for edge in edges:
+            before, self._newest = self._newest, edge
+            if before is not None:
+                self.interval_ns = max(1, (edge.t_ns - before.t_ns) // max(1, edge.number - before.number))
+            self._edges.append(edge)
+
+    def restart(self) -> None:
+        """Begin to read, possibly another device: earlier edges do not count as missed."""
+        self._read = None
+
+    def match(self, start_ns: int, end_ns: int) -> Stamp | None:
+        """Return the stamp of a read from `start_ns` to `end_ns`, failed or not; None without edge. In order only."""
+        edges = self._edges
+        while len(edges) > 1 and edges[1].t_ns <= start_ns:
+            edges.popleft()
+        if not edges or edges[0].t_ns > start_ns:
+            return None
+        t_ns, _, number = edges[0]
+        limit_ns = AGE_LIMIT * self.interval_ns
+        if self._read is not None and number != self._read:
+            self.missed += max(0, number - self._read - 1)
+            limit_ns = max(limit_ns, QUIET_NS)  # the first read of an edge: the host was late
+        self._read = number
+        if start_ns - t_ns > limit_ns:
+            return None
+        error_ns = self._error_ns
+        if len(edges) > 1 and edges[1].t_ns <= end_ns:  # new values during the read: either
+            newest_ns = max(edge.t_ns for edge in edges if edge.t_ns <= end_ns)
+            error_ns = hypot(error_ns, EITHER * (newest_ns - t_ns))
+        return Stamp(min(t_ns + self._offset_ns, start_ns), int(error_ns) + 1, number)
+
+
+FAULTS_MAX: Final = 3
+"""Number of damaged or failed reads in a row after which the device is identified again."""
+GAP_PERIODS: Final = 1.5
+"""With less time since the read before, none is missing."""
+SIGMA_OF_AGE: Final = 1 / sqrt(3)
+"""Root mean square of an age that is anything from 0 to its bound."""
+
+
+@dataclass(frozen=True, slots=True)
+class PollTiming:
+    """Timing of reads, as far as known."""
+
+    period_ns: int
+    """Time between two reads."""
+    update_ns: int
+    """Longest time between two updates of the device's registers; 0 where it is not known."""
+    edges: ReadyEdges | None
+    """Edges of the data-ready line; None without one."""
+
+
+class PolledPath(SamplePath):
+    """The path of a device that is polled."""
+
+    def __init__(self, codec: PolledCodec, timing: PollTiming, clock: SampleClock, context: PathContext) -> None:
+        super().__init__(clock, context)
+        self.codec = codec
+        self.failed = 0
+        """Transfers that failed."""
+        self._period_ns = timing.period_ns
+        self._update_ns = timing.update_ns
+        self._edges = timing.edges
+        self._before_ns = 0
+        self._faults = 0
+        self._read_ns = 0
+        """Begin of the newest read that gave a sample, a stale one or a lost one; 0 before the first."""
+        self._is_back = False
+        """Whether the device was identified and not read since."""
+        self._gap_unknown = context.ledger.samples > 0
+        """Whether the device was not read for a while since its newest sample."""
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two reads, ns."""
+        return self._period_ns
+
+    def begin(self, now_ns: int) -> None:
+        """Start: the device was identified and set up."""
+        super().begin(now_ns)
+        self.reset()
+        self._is_back = True
+
+    def flush(self, now_ns: int) -> None:
+        """No-op: what is read comes whole or not at all."""
+
+    def reset(self) -> None:
+        """Forget earlier data: the next frame is not compared with it."""
+        self.codec.reset()
+        self._before_ns = 0
+        self._faults = 0
+
+    def on_readings(self, readings: Sequence[Reading]) -> str:
+        """Process readings, oldest first; return why the device must be identified again, or an empty string."""
+        utc_offset_ns = self._utc_offset_ns()
+        samples: list[Sample] = []
+        gone = ""
+        edges = self._edges
+        for reading in readings:
+            if gone:
+                self.skip(reading)
+                continue
+            stamp = None
+            if reading.poll == 0:
+                stamp = edges.match(reading.start_ns, reading.end_ns) if edges is not None else None
+                self._measure_gap(reading.start_ns)
+            if reading.error is not None:
+                gone = self._failed(reading)
+            else:
+                gone = self._decode(reading, stamp, utc_offset_ns, samples)
+        if samples:
+            self._finish(samples, samples[-1].t_rx_ns)
+        return gone
+
+    def skip(self, reading: Reading) -> None:
+        """Count bytes of a device that is not identified as skipped."""
+        self._ledger.bytes_in += len(reading.data)
+        self._ledger.bytes_skipped += len(reading.data)
+
+    def _decode(self, reading: Reading, stamp: Stamp | None, utc_offset_ns: int, samples: list[Sample]) -> str:
+        gone, vanished = "", False
+        for event in self.codec.decode(reading.poll, reading.data):
+            if type(event) is Measurement:
+                self._faults = 0
+                if self._gap_unknown:
+                    self._gap_unknown = False
+                    self._ledger.add_unknown_gap()
+                t_ns, error_ns, edge_seq = stamp or (reading.start_ns, self._error_ns(reading), None)
+                sample = self.clock.sample_polled(event, t_ns, error_ns, reading.end_ns, utc_offset_ns, edge_seq)
+                samples.append(sample)
+            elif type(event) is Vanished:
+                gone, vanished = event.why, True
+            elif type(event) is BadFrame:
+                self._on_bad_frame(event)
+                if event.reason is not BadReason.NOT_FINITE:  # that one comes with its sample
+                    self._ledger.lost_crc += 1
+                    gone = gone or self._fault(f"{FAULTS_MAX} damaged frames in a row, the last by {event.reason}")
+        if reading.poll == 0:
+            self._before_ns = reading.start_ns
+            if not vanished:
+                self._read_ns = reading.start_ns
+        return gone
+
+    def _measure_gap(self, start_ns: int) -> None:
+        """Look at a read of a sample: where the device was looked for right before, it ends a gap of unknown size."""
+        if self._is_back:
+            self._is_back = False
+            if self._read_ns and start_ns - self._read_ns >= GAP_PERIODS * self._period_ns:
+                self._gap_unknown = True
+
+    def _failed(self, reading: Reading) -> str:
+        error = reading.error
+        assert error is not None
+        self.failed += 1
+        self._before_ns = 0
+        if reading.poll == 0:
+            self._ledger.lost_gap_device += 1
+            self._read_ns = reading.start_ns
+        for event in self.codec.on_silence(reading.poll):
+            if type(event) is Vanished:
+                return event.why
+        if error.trouble is Trouble.DISTURBED:
+            return self._fault(str(error))
+        return str(error)
+
+    def _fault(self, why: str) -> str:
+        self._faults += 1
+        return why if self._faults >= FAULTS_MAX else ""
+
+    def _error_ns(self, reading: Reading) -> int:
+        """One-sigma error of `start_ns` as the time of measurement."""
+        age_ns = reading.start_ns - self._before_ns if self._before_ns else self._period_ns
+        if self._update_ns and self._update_ns < age_ns:
+            age_ns = self._update_ns
+        return int(SIGMA_OF_AGE * (age_ns + reading.end_ns - reading.start_ns)) + 1

@@ -1,0 +1,512 @@
+"""A HiPNUC module (CH0x0, CH10x, HI14) at the far end of a UART: IMU configuration manual V1.5.9, chapters 1-3, 8.
+
+Without I/O and without a clock of its own: the owner passes what the host sent to `receive` and collects what the
+module sent with `advance`. What it does as a real one does:
+
+- It samples at whole milliseconds of its own crystal, which runs `skew_ppm` fast; `system_time` counts from power-on.
+- A frame leaves `processing_ns` after its sample, when the wire is free; text goes between whole frames. What does not
+  fit the transmit buffer is never sent: at 115200 baud and 1 kHz six frames of seven are missing.
+- Commands are lines of ASCII, obeyed at once; a known one is answered with `OK` or `ERR`, an unknown one not at all.
+  URFR acts after SAVECONFIG and REBOOT only. What is not saved is lost at a reboot. YAW is never saved. When
+  SERIALCONFIG and FRESET act, and other things that the manual leaves open, is in `behaviour.py`.
+- SOUT pulses before every frame, a rising edge on SIN sends messages set to ONMARK, the other pins and UTC are in
+  `pins.py` and `utc.py`; `pins` returns edges as `advance` returns bytes.
+- LOG DISABLE silences frames, not replies, and is forgotten at a reboot (assumed; the manual calls ENABLE the default).
+
+Attitude is the truth in both modes; heading does not start at zero in six-axis mode, as it would in a real module.
+"""
+
+from bisect import bisect_right, insort
+from collections.abc import Callable
+from dataclasses import replace
+from math import degrees, pi, radians
+from random import Random
+from typing import Final
+
+from imud.drivers.hipnuc.uart.codec import encode_hi91, encode_hi92
+from imud.drivers.hipnuc.uart.commands import BAUD_RATES, MAX_RATE_HZ, OutputMessage
+from imud.model.sample import Vector3
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, T_PER_UT
+from imud.sim.hipnuc.uart_settings import (
+    CommandRefused,
+    HipnucHardware,
+    ModuleSettings,
+    Output,
+    RateChange,
+    ResetEffect,
+    SelfCalibration,
+    UtcTime,
+    changed,
+    main_status,
+    number,
+    rows,
+)
+from imud.sim.physics import MountingRotation, Truth, frame_of, level_of
+from imud.sim.ports.pins import Pin, PinEdge
+from imud.sim.ports.uart_wire import Transmitter
+from imud.sim.sensor import Burst, Simulator, SimulatorOptions, sensor_of
+
+SOUT_HIGH_NS: Final = 80 * NS_PER_US
+ALARM_PERIOD_MS: Final = 10
+EDGES_MAX: Final = 8192
+"""Edges kept for an owner that does not ask for them, the newest."""
+
+
+class HipnucPins:
+    """Pending edges and present levels. Synchronization: one thread."""
+
+    def __init__(self) -> None:
+        self._waiting: list[PinEdge] = []
+        self._alarm = False
+        """Level of ALARM after all edges that wait."""
+        self._pulses = 0
+        """SOUT pulses since the last that SOUT_DIV repeated."""
+
+    def restart_divider(self) -> None:
+        """Restart the count of the divider: it was set anew."""
+        self._pulses = 0
+
+    def frame(self, start_ns: int, high_ns: int, divider: int, sample_ns: int) -> None:
+        """Schedule the pulse, `high_ns` long, before a frame that begins on the wire at `start_ns`."""
+        pins = [Pin.SOUT]
+        self._pulses += 1
+        if self._pulses >= divider:
+            self._pulses = 0
+            pins.append(Pin.SOUT_DIV)
+        for pin in pins:
+            self._add(PinEdge(start_ns - high_ns, pin, True, sample_ns))
+            self._add(PinEdge(start_ns, pin, False, sample_ns))
+
+    def alarm(self, at_ns: int, active: bool) -> None:
+        """Set the level of ALARM from now on."""
+        if active != self._alarm:
+            self._alarm = active
+            self._add(PinEdge(at_ns, Pin.ALARM, active))
+
+    def edges(self, now_ns: int) -> list[PinEdge]:
+        """Return and remove the edges that have happened by now."""
+        count = bisect_right(self._waiting, now_ns, key=_due_ns)
+        done, self._waiting = self._waiting[:count], self._waiting[count:]
+        return done
+
+    def next_ns(self) -> int | None:
+        """Time of the next edge that is known."""
+        return self._waiting[0].due_ns if self._waiting else None
+
+    def power_lost(self, now_ns: int) -> None:
+        """Cancel pending edges; pins that are high fall."""
+        count = bisect_right(self._waiting, now_ns, key=_due_ns)
+        dropped = self._waiting[count:]
+        del self._waiting[count:]
+        self._pulses = 0
+        first_dropped = {edge.pin: edge for edge in reversed(dropped)}
+        for pin in Pin:
+            dropped_edge = first_dropped.get(pin)
+            high = not dropped_edge.rising if dropped_edge else pin is Pin.ALARM and self._alarm
+            if high:
+                self._add(PinEdge(now_ns, pin, False))
+        self._alarm = False
+
+    def _add(self, edge: PinEdge) -> None:
+        if len(self._waiting) >= EDGES_MAX:
+            del self._waiting[: EDGES_MAX // 2]
+        insort(self._waiting, edge, key=_due_ns)
+
+
+def is_alarming(settings: ModuleSettings, euler_rad: Vector3) -> bool:
+    """Whether an angle is out of the range that PMUX5 has set for it."""
+    roll, pitch, _ = euler_rad
+    return any(
+        alarm.enabled and not alarm.low_deg <= degrees(angle_rad) <= alarm.high_deg
+        for alarm, angle_rad in ((settings.alarm_x, pitch), (settings.alarm_y, roll))
+    )
+
+
+def _due_ns(edge: PinEdge) -> int:
+    return edge.due_ns
+
+
+FACTORY_BAUD: Final = ModuleSettings().baud
+MAIN_STATUS_FIRMWARE: Final = 169
+"""From here on HI91 bytes 1-2 are MAIN_STATUS instead of the PPS stamp."""
+TX_BUFFER_BYTES: Final = 512
+"""A frame that would make more than this wait for the wire is not sent."""
+COMMAND_BYTES_MAX: Final = 128
+"""Assumed; the longest command of the manual, URFR, has 123 with nine decimals."""
+REPLY_NS: Final = 200_000
+"""Time from the end of a command to its reply (assumed)."""
+WRITES_FLASH: Final = ("SAVECONFIG", "FRESET")
+RATE_CHANGE_NS: Final = 5 * NS_PER_MS
+"""From an answer to the change of the rate, where that follows the answer (assumed)."""
+PPS_MODULUS_MS: Final = 8192
+"""The PPS stamp free-runs 0 … 8191 without edges (recorded so)."""
+NEAR_LEVEL_RAD: Final = radians(5)
+"""ATT RST 3 acts within this of level."""
+_PRINTABLE = range(0x20, 0x7F)
+_FRAME_BYTES: Final = {OutputMessage.HI91: 82, OutputMessage.HI92: 54}
+
+
+class HipnucModule:
+    """A simulated module, powered on from construction."""
+
+    def __init__(
+        self, now_ns: int, settings: ModuleSettings | None = None, hardware: HipnucHardware | None = None
+    ) -> None:
+        """`settings` are what its flash holds."""
+        self.hardware = hardware or HipnucHardware()
+        self.flash = self.settings = settings or ModuleSettings()
+        self.epoch_ns = now_ns
+        self.frames_sent = 0
+        self.frames_dropped = 0
+        """Frames that did not fit the wire."""
+        self._scale = NS_PER_S + round(self.hardware.skew_ppm * 1000)  # device ns per 1e9 ns of the host
+        self._before_reboot: list[Burst] = []
+        self._pins = HipnucPins()
+        self._random = Random(self.hardware.mark_seed)
+        self._line = bytearray()
+        self._magnetometer = SelfCalibration(self.hardware.hard_iron_t, self.hardware.mag_bias_t)
+        self._actions = self._make_actions()
+        self._power_on(now_ns, self.hardware.uptime_ms)
+
+    @property
+    def baud(self) -> int:
+        """Rate in bit/s in force."""
+        return self._wire.baud
+
+    def reboot(self, now_ns: int) -> None:
+        """Restart, by REBOOT or after a loss of power: unsaved settings are lost."""
+        self._sample(now_ns)
+        self._before_reboot += self._wire.stopped(now_ns)
+        self._pins.power_lost(now_ns)
+        self.settings = self.flash
+        self._power_on(now_ns, 0)
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        """Receive bytes that the host sent, already sampled at the module's rate."""
+        self._sample(now_ns)
+        if now_ns < self._ready_ns:  # still booting
+            return
+        for byte in data:
+            if byte == 0x0A:
+                line, self._line = self._line, bytearray()
+                if len(line) <= COMMAND_BYTES_MAX:
+                    self._obey(line.decode("ascii"), now_ns)
+                if now_ns < self._ready_ns:  # the command was REBOOT
+                    return
+            elif byte in _PRINTABLE:
+                if len(self._line) <= COMMAND_BYTES_MAX:
+                    self._line.append(byte)
+            elif byte != 0x0D:
+                self._line.clear()
+
+    def mark(self, now_ns: int) -> None:
+        """Pulse SIN/PPS (a rising edge): the PPS stamp starts anew, and messages set to ONMARK are sent."""
+        self._sample(now_ns)
+        if now_ns < self._ready_ns:  # still booting
+            return
+        self._pps_ns = self._device_ns(now_ns)
+        self._utc.pulse(self._pps_ns)
+        for message in self._outputs:
+            self._send_marked(message, now_ns)
+
+    def advance(self, now_ns: int) -> list[Burst]:
+        """Return what has left the wire since the last call, in order."""
+        self._sample(now_ns)
+        done, self._before_reboot = self._before_reboot, []
+        return done + self._wire.sent(now_ns)
+
+    def next_ns(self) -> int | None:
+        """Time of the next output of `advance`; None for none."""
+        if self._before_reboot:
+            return self._before_reboot[0].due_ns
+        if (due_ns := self._wire.next_ns()) is not None or not self._next_ms:
+            return due_ns
+        message, device_ms = min(self._next_ms.items(), key=lambda item: item[1])
+        ready_ns = self._instant_ns(device_ms) + self.hardware.processing_ns
+        return self._wire.due_ns(ready_ns, _FRAME_BYTES[message])
+
+    def pins(self, now_ns: int) -> list[PinEdge]:
+        """Return the edges on the output pins since the last call, in order."""
+        self._sample(now_ns)
+        return self._pins.edges(now_ns)
+
+    def next_pin_ns(self) -> int | None:
+        """Time of the next output of `pins`; None for none."""
+        times = [] if (next_ns := self._pins.next_ns()) is None else [next_ns]
+        if self._next_ms:
+            times.append(self._instant_ns(min(self._next_ms.values())))
+        if self._alarm_ms is not None:
+            times.append(self._instant_ns(self._alarm_ms))
+        return min(times, default=None)
+
+    def counters(self) -> dict[str, int]:
+        """Counters of frames by their fate."""
+        return {"frames_sent": self.frames_sent, "frames_dropped": self.frames_dropped}
+
+    def _power_on(self, now_ns: int, uptime_ms: int) -> None:
+        hardware, settings = self.hardware, self.settings
+        self._frame = frame_of(rows(settings.urfr))
+        self._yaw_rad = 0.0
+        self._on_ns, self._on_ms = now_ns, uptime_ms
+        self._ready_ns = now_ns + hardware.boot_ms * NS_PER_MS
+        self._wire = Transmitter(settings.baud, TX_BUFFER_BYTES, self._ready_ns)
+        self._rate_at_ns = self._quiet_until_ns = 0
+        self._pps_ns = 0
+        self._utc = UtcTime(hardware.utc_epoch)
+        self._enabled = True
+        self._line.clear()
+        self._settings_changed(self._ready_ns)
+
+    def _settings_changed(self, now_ns: int) -> None:
+        """Schedule the messages after `now_ns` and put the turns of the attitude in force."""
+        settings, device_ms = self.settings, self._device_ms(now_ns)
+        self._outputs = {OutputMessage.HI91: settings.hi91, OutputMessage.HI92: settings.hi92}
+        self._mounting = MountingRotation(self._frame, settings.level, settings.level_accel, self._yaw_rad)
+        watching = settings.alarm_x.enabled or settings.alarm_y.enabled
+        self._alarm_ms = (device_ms // ALARM_PERIOD_MS + 1) * ALARM_PERIOD_MS if watching else None
+        if not watching:
+            self._pins.alarm(now_ns, False)
+        self._next_ms: dict[OutputMessage, int] = {}
+        for message, output in self._outputs.items():
+            if output.period_ms and self._enabled:
+                self._next_ms[message] = (device_ms // output.period_ms + 1) * output.period_ms
+
+    def _device_ms(self, now_ns: int) -> int:
+        """Device time, not wrapped."""
+        return self._device_ns(now_ns) // NS_PER_MS
+
+    def _device_ns(self, now_ns: int) -> int:
+        return self._on_ms * NS_PER_MS + (now_ns - self._on_ns) * self._scale // NS_PER_S
+
+    def _instant_ns(self, device_ms: int) -> int:
+        """First host time at which the device's clock shows `device_ms`."""
+        return self._on_ns - (self._on_ms - device_ms) * NS_PER_MS * NS_PER_S // self._scale
+
+    def _sample(self, now_ns: int) -> None:
+        """Sample up to now and queue the frames; check the angles for ALARM as often as is due."""
+        if 0 < self._rate_at_ns <= now_ns:
+            self._change_rate(self._rate_at_ns)
+        self._watch_angles(now_ns)
+        while self._next_ms:
+            message, device_ms = min(self._next_ms.items(), key=lambda item: item[1])
+            sample_ns = self._instant_ns(device_ms)
+            if sample_ns > now_ns:
+                return
+            self._next_ms[message] = device_ms + self._outputs[message].period_ms
+            self._queue_frame(message, sample_ns, device_ms)
+
+    def _watch_angles(self, now_ns: int) -> None:
+        while self._alarm_ms is not None and (at_ns := self._instant_ns(self._alarm_ms)) <= now_ns:
+            self._alarm_ms += ALARM_PERIOD_MS
+            self._pins.alarm(at_ns, is_alarming(self.settings, self._truth(at_ns).euler_rad))
+
+    def _send_marked(self, message: OutputMessage, now_ns: int) -> None:
+        if self._enabled and self._outputs[message].on_mark and now_ns >= self._ready_ns:
+            spread_ns = self.hardware.mark_spread_ns
+            self._queue_frame(
+                message, now_ns, self._device_ms(now_ns), round(self._random.uniform(-spread_ns, spread_ns))
+            )
+
+    def _queue_frame(self, message: OutputMessage, sample_ns: int, device_ms: int, later_ns: int = 0) -> None:
+        """Queue a frame; `later_ns`: its delay in addition to the usual one."""
+        processing_ns = max(self.hardware.processing_ns + later_ns, 0)
+        ready_ns, size = sample_ns + processing_ns, _FRAME_BYTES[message]
+        if ready_ns < self._quiet_until_ns or not self._wire.fits(ready_ns, size):
+            self.frames_dropped += 1
+            return
+        self.frames_sent += 1
+        start_ns = self._wire.due_ns(ready_ns, size) - self._wire.wire_ns(size)
+        self._pins.frame(start_ns, min(SOUT_HIGH_NS, processing_ns), self.settings.sout_div, sample_ns)
+        self._wire.send(ready_ns, self._encode(message, sample_ns, device_ms), sample_ns, device_ms)
+
+    def _encode(self, message: OutputMessage, sample_ns: int, device_ms: int) -> bytes:
+        reading = self._reading(sample_ns)
+        accel, gyro, mag, euler, quat, temperature_c, pressure_pa = reading
+        device_ns = self._device_ns(sample_ns)
+        if self.settings.att_mode == 1 and self.settings.mag_calibration:
+            self._magnetometer.sample(device_ns, gyro)
+        mag = self._magnetometer.measured(mag)
+        pps_ms = (device_ns - self._pps_ns) // NS_PER_MS % PPS_MODULUS_MS
+        has_status = self.hardware.firmware >= MAIN_STATUS_FIRMWARE
+        status = 0
+        if has_status:
+            uptime_ms, utc = device_ms - self._on_ms, self._utc.synchronised(device_ns)
+            status = main_status(reading, uptime_ms, nine_axis=self.settings.att_mode == 1, utc=utc)
+        if message is OutputMessage.HI92:
+            return encode_hi92(
+                pps_stamp_ms=pps_ms, accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler, quat_wxyz=quat,
+                temperature_c=temperature_c, pressure_pa=pressure_pa, status=status,
+            )  # fmt: skip
+        return encode_hi91(
+            system_time_ms=self._utc.shown_ms(device_ns), accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler,
+            quat_wxyz=quat, temperature_c=temperature_c, pressure_pa=pressure_pa,
+            word_1_2=status if has_status else pps_ms,
+        )  # fmt: skip
+
+    def _reading(self, sample_ns: int) -> Truth:
+        """Return the measurement at an instant, noise and mounting included."""
+        truth = self._truth(sample_ns)
+        return self.hardware.noise.add(truth, self._t_s(sample_ns)) if self.hardware.noise else truth
+
+    def _truth(self, at_ns: int) -> Truth:
+        """Return the measurement of an ideal module that is mounted and levelled like this one."""
+        truth = self.hardware.motion.at(self._t_s(at_ns))
+        return self._mounting.turned(truth) if self._mounting.active else truth
+
+    def _t_s(self, at_ns: int) -> float:
+        return (at_ns - self.epoch_ns) / NS_PER_S
+
+    def _obey(self, line: str, now_ns: int) -> None:
+        if line.startswith("$"):
+            self._utc.sentence(line.encode("ascii"), self._device_ns(now_ns))
+            return
+        behaviour = self.hardware.behaviour
+        if line.startswith(behaviour.ignores):
+            return
+        try:
+            if line.startswith(behaviour.refuses):
+                raise CommandRefused(line)
+            settings = changed(self.settings, line, self.hardware.firmware)
+            if settings is not None:
+                reply: list[str] | None = []
+                self._change(settings, now_ns)
+            else:
+                reply = self._act(line, now_ns)
+        except CommandRefused:
+            self._say(["ERR"], now_ns)
+            return
+        if reply is not None:
+            self._say([*reply, "OK"], now_ns + behaviour.flash_ms * NS_PER_MS * (line in WRITES_FLASH))
+            if line.startswith("SERIALCONFIG") and behaviour.rate_change is RateChange.AFTER_ANSWER:
+                self._rate_at_ns = self._wire.due_ns(now_ns, 0) + RATE_CHANGE_NS
+
+    def _change(self, settings: ModuleSettings, now_ns: int) -> None:
+        """Put settings in force that a command has changed."""
+        before, self.settings = self.settings, settings
+        if settings.sout_div != before.sout_div:
+            self._pins.restart_divider()
+        if settings.baud != before.baud and self.hardware.behaviour.rate_change is RateChange.BEFORE_ANSWER:
+            self._change_rate(now_ns)
+        self._settings_changed(now_ns)
+
+    def _change_rate(self, now_ns: int) -> None:
+        """Put the baud rate in force; what waits for the wire is lost."""
+        self._rate_at_ns = 0
+        self._before_reboot += self._wire.stopped(now_ns)
+        self._wire = Transmitter(self.settings.baud, TX_BUFFER_BYTES, now_ns)
+
+    def _say(self, lines: list[str], now_ns: int) -> None:
+        data = "".join(f"{line}\r\n" for line in lines).encode("ascii")
+        self._wire.send(now_ns + REPLY_NS, data)
+        self._quiet_until_ns = now_ns + self.hardware.behaviour.quiet_ms * NS_PER_MS
+
+    def _make_actions(self) -> dict[str, Callable[[int], list[str] | None]]:
+        """Commands without a value that do more than change settings: reply lines before `OK`, None for no reply."""
+        hardware = self.hardware
+        version = [
+            f"PNAME={hardware.product}",
+            f"BUILD={hardware.build}",
+            f"UUID={hardware.uuid}",
+            f"APP_VER={hardware.firmware}",
+            f"BL_VER={hardware.bootloader}",
+        ]
+        return {
+            "REBOOT": self.reboot,
+            "SAVECONFIG": self._save,
+            "FRESET": self._factory_reset,
+            "LOG ENABLE": lambda now_ns: self._enable(True, now_ns),
+            "LOG DISABLE": lambda now_ns: self._enable(False, now_ns),
+            "LOG VERSION": lambda _: version,
+            "LOG USRCONFIG": lambda _: self.settings.user_lines(),
+            "LOG COMCONFIG": lambda _: self.settings.port_lines(),
+            "LOG MAGCONFIG": lambda _: [
+                "MB=" + ", ".join(f"{value / T_PER_UT:.2f}" for value in self._magnetometer.found_t)
+            ],
+        }
+
+    def _act(self, line: str, now_ns: int) -> list[str] | None:
+        action = self._actions.get(line)
+        if action is not None:
+            return action(now_ns)
+        match line.split(" "):
+            case ["CONFIG", "ATT", "RST", kind]:
+                return self._level(kind, now_ns)
+            case ["CONFIG", "YAW", mode, value]:
+                return self._set_yaw(mode, value, now_ns)
+            case ["LOG", "IMU91" | "HI91" | "HI92" as message, "ONMARK", "ONCE"]:
+                self._send_marked(OutputMessage.HI92 if message == OutputMessage.HI92 else OutputMessage.HI91, now_ns)
+                return []
+        return None
+
+    def _save(self, _now_ns: int) -> list[str]:
+        self.flash = self.settings
+        return []
+
+    def _factory_reset(self, now_ns: int) -> list[str]:
+        self.flash = ModuleSettings()
+        effect = self.hardware.behaviour.factory_reset
+        if effect is not ResetEffect.AFTER_RESTART:
+            self.settings = self.flash
+            if effect is ResetEffect.BEFORE_ANSWER:
+                self._change_rate(now_ns)
+            self._settings_changed(now_ns)
+        return []
+
+    def _enable(self, enabled: bool, now_ns: int) -> list[str]:
+        self._enabled = enabled
+        self._settings_changed(now_ns)
+        return []
+
+    def _attitude(self, now_ns: int) -> Truth:
+        """The attitude without levelling and without CONFIG YAW."""
+        return MountingRotation(self._frame).turned(self.hardware.motion.at(self._t_s(now_ns)))
+
+    def _level(self, kind: str, now_ns: int) -> list[str]:
+        """Carry out CONFIG ATT RST: 2 levels here, 3 only where nearly level (upside down allowed), 5 cancels."""
+        if kind not in ("2", "3", "5"):
+            raise CommandRefused(kind)
+        attitude = self._attitude(now_ns)
+        roll, pitch, _ = attitude.euler_rad
+        upside_down = kind == "3" and abs(roll) > pi / 2
+        if kind == "3" and max(abs(pitch), pi - abs(roll) if upside_down else abs(roll)) >= NEAR_LEVEL_RAD:
+            raise CommandRefused(kind)  # the manual says it does nothing; that it answers ERR is assumed
+        level = ModuleSettings().level if kind == "5" else level_of(attitude.quat_wxyz, upside_down)
+        self.settings = replace(self.settings, level=level, level_accel=kind == "3")
+        self._settings_changed(now_ns)
+        return []
+
+    def _set_yaw(self, mode: str, value: str, now_ns: int) -> list[str]:
+        """Carry out CONFIG YAW: 0 adds to the heading, 1 sets it."""
+        angle_rad = radians(number(value, -180.0, 180.0))
+        if mode not in ("0", "1"):
+            raise CommandRefused(mode)
+        if mode == "1":
+            angle_rad -= self._mounting.turned(self.hardware.motion.at(self._t_s(now_ns))).euler_rad[2]
+        self._yaw_rad += angle_rad
+        self._settings_changed(now_ns)
+        return []
+
+
+def make(options: SimulatorOptions, now_ns: int) -> HipnucModule:
+    """A module from the common options. Raises ValueError naming the option that it cannot have."""
+    period_ms = round(1000 / options.rate_hz) if options.rate_hz > 0 else 0
+    if not 1 <= period_ms <= 1000 or abs(period_ms * options.rate_hz - 1000) > 10:
+        raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … 1000 Hz, and 1000 divided by a whole number")
+    if options.message.upper() not in ("", *OutputMessage):
+        raise ValueError(f"message {options.message!r}: expected {' or '.join(OutputMessage)}")
+    message = OutputMessage(options.message.upper() or OutputMessage.HI91)
+    fitting = (b for b, most_hz in MAX_RATE_HZ[message].items() if b >= FACTORY_BAUD and most_hz >= options.rate_hz)
+    baud = options.baud or next(fitting)
+    if baud not in BAUD_RATES:
+        raise ValueError(f"baud {baud}: expected one of {', '.join(map(str, BAUD_RATES))}")
+    output, silent = Output(period_ms), Output()
+    hi91, hi92 = (output, silent) if message is OutputMessage.HI91 else (silent, output)
+    hardware = HipnucHardware(
+        firmware=options.firmware or HipnucHardware().firmware,
+        **sensor_of(options),
+        mark_seed=options.seed,
+    )
+    return HipnucModule(now_ns, ModuleSettings(baud=baud, hi91=hi91, hi92=hi92), hardware)
+
+
+SIMULATOR = Simulator("hipnuc-uart", "HiPNUC HI14R3 (CH0x0, CH10x, HI14) on a UART", make)

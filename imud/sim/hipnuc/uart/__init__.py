@@ -1,1 +1,0 @@
-"""A simulated HiPNUC module on a UART: HI91, HI92, ASCII commands, pins."""

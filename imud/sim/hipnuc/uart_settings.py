@@ -1,0 +1,421 @@
+"""Hardware of a simulated HiPNUC module, its settings in RAM and flash, the commands that change them, status bits.
+
+IMU configuration manual V1.5.9, chapters 2.2.3 to 2.2.6 and 8.2. The forms of the USRCONFIG and COMCONFIG replies
+beyond `ATT_MODE: 0` are assumed: the manual does not print them.
+"""
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
+from math import tau
+from typing import Final, Literal
+
+from imud.attitude.rotation import Matrix3, is_rotation
+from imud.drivers.hipnuc.uart.commands import BAUD_RATES
+from imud.formats.nmea0183 import Rmc, parse
+from imud.model.sample import Quaternion, Vector3
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sim.physics import Truth
+from imud.sim.sensor import SensorHardware
+
+
+class RateChange(Enum):
+    """Moments at which SERIALCONFIG changes the rate of the line."""
+
+    AFTER_RESTART = "after restart"
+    """After SAVECONFIG and REBOOT."""
+    BEFORE_ANSWER = "before answer"
+    """At once: the answer comes at the new rate."""
+    AFTER_ANSWER = "after answer"
+    """At once: the answer comes at the old rate."""
+
+
+class ResetEffect(Enum):
+    """Moments at which FRESET puts the factory settings in force."""
+
+    RATE_AFTER_RESTART = "rate after restart"
+    """All settings at once, but the baud rate after a restart."""
+    AFTER_RESTART = "after restart"
+    """Nothing changes until a restart."""
+    BEFORE_ANSWER = "before answer"
+    """Everything at once: the answer comes at the factory's rate."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Behaviour:
+    """One way to read the manual."""
+
+    rate_change: RateChange = RateChange.AFTER_RESTART
+    factory_reset: ResetEffect = ResetEffect.RATE_AFTER_RESTART
+    flash_ms: int = 0
+    """Time of SAVECONFIG and FRESET until their answer; no frame is sent meanwhile."""
+    quiet_ms: int = 0
+    """Time after an answer in which no frame is sent."""
+    refuses: tuple[str, ...] = ()
+    """Beginnings of commands that are answered with ERR."""
+    ignores: tuple[str, ...] = ()
+    """Beginnings of commands that are unknown: they get no answer."""
+
+
+AS_IN_MANUAL: Final = Behaviour()
+
+VARIANTS: Final[Mapping[str, Behaviour]] = {
+    "as in the manual": AS_IN_MANUAL,
+    "rate changes before the answer": Behaviour(rate_change=RateChange.BEFORE_ANSWER),
+    "rate changes after the answer": Behaviour(rate_change=RateChange.AFTER_ANSWER),
+    "factory reset after restart": Behaviour(factory_reset=ResetEffect.AFTER_RESTART),
+    "factory reset at once": Behaviour(factory_reset=ResetEffect.BEFORE_ANSWER),
+    "slow flash": Behaviour(flash_ms=2000),
+    "no magnetometer": Behaviour(ignores=("LOG MAGCONFIG",)),
+    "magnetometer refused": Behaviour(refuses=("LOG MAGCONFIG",)),
+    "quiet after an answer": Behaviour(quiet_ms=700),
+    "all at once": Behaviour(
+        rate_change=RateChange.BEFORE_ANSWER, factory_reset=ResetEffect.BEFORE_ANSWER, flash_ms=2000, quiet_ms=300
+    ),
+}
+"""The simulated variants by name."""
+
+Epoch = Literal["unix", "day"]
+MODULUS_MS: Final[dict[Epoch, int]] = {"unix": 2**32, "day": 86_400_000}
+MS_PER_S: Final = 1000
+STEP_TOLERANCE_NS: Final = 10 * NS_PER_MS
+INTERVALS_NEEDED: Final = 2
+SENTENCES_NEEDED: Final = 2
+REGAIN_NS: Final = 100 * NS_PER_MS
+"""Largest distance of a pulse from a full second at which it counts without a sentence."""
+LOST_NS: Final = 2 * NS_PER_S
+UPTIME_MODULUS_MS: Final = 2**32
+
+
+class UtcTime:
+    """Time in the module's frames. Arguments are ns of its own clock since power-on. Synchronization: one thread."""
+
+    def __init__(self, epoch: Epoch) -> None:
+        self._modulus_ms = MODULUS_MS[epoch]
+        self._anchor: tuple[int, int] | None = None
+        """The module's clock at a pulse, and the UTC second of that."""
+        self._pulse_ns: int | None = None
+        self._intervals = 0
+        """Intervals in step up to the last pulse."""
+        self._claim_s: int | None = None
+        """The second that sentences give the last pulse."""
+        self._agreed = 0
+
+    def pulse(self, device_ns: int) -> None:
+        """Note a rising edge on SIN/PPS."""
+        in_step = self._pulse_ns is not None and abs(device_ns - self._pulse_ns - NS_PER_S) <= STEP_TOLERANCE_NS
+        if in_step and self._claim_s is not None:
+            self._claim_s += 1
+        elif not in_step:
+            self._claim_s, self._agreed = None, 0
+        self._intervals = self._intervals + 1 if in_step else 0
+        self._pulse_ns = device_ns
+        if self._anchor is not None:
+            anchor_ns, second = self._anchor
+            seconds = round((device_ns - anchor_ns) / NS_PER_S)
+            if seconds and abs(device_ns - anchor_ns - seconds * NS_PER_S) <= REGAIN_NS:
+                self._anchor = device_ns, second + seconds
+
+    def sentence(self, line: bytes, device_ns: int) -> None:
+        """Process a line that begins with `$`; all but valid RMC sentences are ignored."""
+        rmc = parse(line)
+        if not isinstance(rmc, Rmc) or not rmc.valid or self._pulse_ns is None:
+            return
+        age_ns = device_ns - self._pulse_ns
+        if self._intervals < INTERVALS_NEEDED or not rmc.fraction_ns <= age_ns < NS_PER_S:
+            return
+        self._agreed = self._agreed + 1 if rmc.unix_s == self._claim_s else 1
+        self._claim_s = rmc.unix_s
+        if self._agreed >= SENTENCES_NEEDED:
+            self._anchor = self._pulse_ns, rmc.unix_s
+
+    def synchronised(self, device_ns: int) -> bool:
+        """Whether the time is UTC and pulses keep it so."""
+        return self._anchor is not None and device_ns - self._anchor[0] < LOST_NS
+
+    def shown_ms(self, device_ns: int) -> int:
+        """`system_time` of a frame sampled now."""
+        if self._anchor is None:
+            return device_ns // NS_PER_MS % UPTIME_MODULUS_MS
+        anchor_ns, second = self._anchor
+        return (second * MS_PER_S + (device_ns - anchor_ns) // NS_PER_MS) % self._modulus_ms
+
+
+PMUX_FIRMWARE: Final = 155
+"""PMUX commands need firmware 1.5.5 (chapter 2.2.4)."""
+URFR_TOLERANCE: Final = 1e-3
+"""Assumed: how far from a rotation a URFR matrix may be. Users type three or four digits."""
+
+
+class CommandRefused(ValueError):
+    """A known command with a value out of range; the module answers `ERR`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """An output message: sent every `period_ms` (0: never), or with each pulse on SIN."""
+
+    period_ms: int = 0
+    on_mark: bool = False
+
+    def __str__(self) -> str:
+        return "ONMARK 1" if self.on_mark else f"ONTIME {self.period_ms / 1000:g}"
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmSetting:
+    """Angle alarm of one axis (PMUX5), angles in degrees."""
+
+    low_deg: float = -5.0
+    high_deg: float = 5.0
+    enabled: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.low_deg:g},{self.high_deg:g},0,{self.enabled:d}"
+
+
+@dataclass(frozen=True, slots=True)
+class ModuleSettings:
+    """Settings that SAVECONFIG saves. The defaults are the factory's (chapter 3.2: HI91 at 100 Hz)."""
+
+    baud: int = 115_200
+    att_mode: int = 0
+    """0: six axes; 1: nine axes, heading from the magnetic field."""
+    urfr: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    """C in v_before = C · v_after, rows first (CONFIG IMU URFR)."""
+    level: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    """Turn of the attitude about the body that ATT RST found."""
+    level_accel: bool = False
+    """Whether the accelerometer is turned as well (ATT RST 3)."""
+    mag_calibration: bool = True
+    hi91: Output = Output(10)
+    hi92: Output = Output()
+    pins: tuple[int, ...] = (1, 2, 5, 6, 9)
+    """IO pin of PMUX1 … PMUX5."""
+    sout_div: int = 8
+    alarm_x: AlarmSetting = AlarmSetting()
+    alarm_y: AlarmSetting = AlarmSetting()
+
+    def user_lines(self) -> list[str]:
+        """Reply to LOG USRCONFIG."""
+        return [
+            f"ATT_MODE: {self.att_mode}",
+            "URFR: " + ",".join(f"{value:g}" for value in self.urfr),
+            f"EN_MCAL: {self.mag_calibration:d}",
+            *(f"PMUX{number}: IO{pin}" for number, pin in enumerate(self.pins, 1)),
+            f"SOUT_DIV: {self.sout_div}",
+            f"ALARM_X: {self.alarm_x}",
+            f"ALARM_Y: {self.alarm_y}",
+        ]
+
+    def port_lines(self) -> list[str]:
+        """Reply to LOG COMCONFIG."""
+        return [f"BAUD: {self.baud}", f"LOG HI91 {self.hi91}", f"LOG HI92 {self.hi92}"]
+
+
+def changed(settings: ModuleSettings, line: str, firmware: int) -> ModuleSettings | None:
+    """The settings after the command in `line`; None if it changes none. Raises CommandRefused."""
+    for pattern, change in _CHANGES:
+        if match := pattern.fullmatch(line):
+            if "PMUX" in line and firmware < PMUX_FIRMWARE:
+                return None
+            return change(settings, *match.groups())
+    return None
+
+
+def _whole(text: str, allowed: range | tuple[int, ...]) -> int:
+    if not re.fullmatch(r"[0-9]{1,9}", text) or int(text) not in allowed:
+        raise CommandRefused(text)
+    return int(text)
+
+
+def number(text: str, low: float, high: float) -> float:
+    """A finite number within bounds. Raises CommandRefused."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise CommandRefused(text) from None
+    if not low <= value <= high:  # NaN is refused too
+        raise CommandRefused(text)
+    return value
+
+
+def _baud(settings: ModuleSettings, text: str) -> ModuleSettings:
+    return replace(settings, baud=_whole(text, BAUD_RATES))
+
+
+def _att_mode(settings: ModuleSettings, text: str) -> ModuleSettings:
+    return replace(settings, att_mode=_whole(text, (0, 1)))
+
+
+def _urfr(settings: ModuleSettings, text: str) -> ModuleSettings:
+    values = tuple(number(part, -2.0, 2.0) for part in text.split(","))
+    if len(values) != 9 or not is_rotation(rows(values), URFR_TOLERANCE):
+        raise CommandRefused(text)
+    return replace(settings, urfr=values)
+
+
+def rows(urfr: tuple[float, ...]) -> Matrix3:
+    """The nine numbers of URFR as a matrix."""
+    c00, c01, c02, c10, c11, c12, c20, c21, c22 = urfr
+    return (c00, c01, c02), (c10, c11, c12), (c20, c21, c22)
+
+
+def _mag_calibration(settings: ModuleSettings, text: str) -> ModuleSettings:
+    return replace(settings, mag_calibration=bool(_whole(text, (0, 1))))
+
+
+def _pin(settings: ModuleSettings, function: str, pin: str) -> ModuleSettings:
+    pins = list(settings.pins)
+    pins[int(function) - 1] = _whole(pin, range(1, 10))
+    return replace(settings, pins=tuple(pins))
+
+
+def _sout_div(settings: ModuleSettings, text: str) -> ModuleSettings:
+    return replace(settings, sout_div=_whole(text, range(1, 65)))
+
+
+def _alarm(settings: ModuleSettings, axis: str, values: str) -> ModuleSettings:
+    low, high, reserved, enabled = values.split(",")
+    _whole(reserved, (0,))
+    alarm = AlarmSetting(number(low, -180, 180), number(high, -180, 180), bool(_whole(enabled, (0, 1))))
+    if alarm.low_deg > alarm.high_deg:
+        raise CommandRefused(values)
+    return replace(settings, alarm_x=alarm) if axis == "X" else replace(settings, alarm_y=alarm)
+
+
+def _on_time(settings: ModuleSettings, message: str, period: str) -> ModuleSettings:
+    period_s = number(period, 0.0, 1.0)
+    if 0 < period_s < 0.001:  # the fastest is 1 kHz (table 3.7)
+        raise CommandRefused(period)
+    return _with_output(settings, message, Output(round(period_s * 1000)))
+
+
+def _on_mark(settings: ModuleSettings, message: str, switch: str) -> ModuleSettings:
+    return _with_output(settings, message, Output(on_mark=bool(_whole(switch, (0, 1)))))
+
+
+def _with_output(settings: ModuleSettings, message: str, output: Output) -> ModuleSettings:
+    return replace(settings, hi92=output) if message == "HI92" else replace(settings, hi91=output)
+
+
+def _unlog_all(settings: ModuleSettings) -> ModuleSettings:
+    hi91, hi92 = (output if output.on_mark else Output() for output in (settings.hi91, settings.hi92))
+    return replace(settings, hi91=hi91, hi92=hi92)
+
+
+_CHANGES: Final[tuple[tuple[re.Pattern[str], Callable[..., ModuleSettings]], ...]] = (
+    (re.compile(r"SERIALCONFIG (\S+)"), _baud),
+    (re.compile(r"CONFIG ATT MODE (\S+)"), _att_mode),
+    (re.compile(r"CONFIG IMU URFR (\S+)"), _urfr),
+    (re.compile(r"CONFIG IMU EN_MCAL (\S+)"), _mag_calibration),
+    (re.compile(r"CONFIG PMUX([1-5]) IO(\S+)"), _pin),
+    (re.compile(r"CONFIG PMUX4 DIV(\S+)"), _sout_div),
+    (re.compile(r"CONFIG PMUX5 ([XY]),([^,]+,[^,]+,[^,]+,[^,]+)"), _alarm),
+    (re.compile(r"LOG (IMU91|HI91|HI92) ONTIME (\S+)"), _on_time),
+    (re.compile(r"LOG (IMU91|HI91|HI92) ONMARK (?!ONCE$)(\S+)"), _on_mark),
+    (re.compile(r"UNLOGALL"), _unlog_all),
+)
+"""Commands that change settings and nothing else."""
+
+
+MARK_SPREAD_NS: Final = 15_000
+"""Assumed: the manual (section 1.2.1) gives the mean only."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HipnucHardware(SensorHardware):
+    """Hardware of a module; settings are in `ModuleSettings`. `processing_ns` counts from an edge on SIN too."""
+
+    product: str = "HI14R3"
+    build: str = "Oct 15 2024"
+    uuid: str = "043995698D6E1708"
+    firmware: int = 156
+    bootloader: int = 109
+    mark_spread_ns: int = MARK_SPREAD_NS
+    """Largest deviation of the processing time after an edge on SIN."""
+    mark_seed: int = 1
+    utc_epoch: Epoch = "unix"
+    """Epoch of UTC in ms."""
+    uptime_ms: int = 0
+    """Device time at the first power-on, to begin near the end of a counter's range."""
+    mag_bias_t: Vector3 = (0.0, 0.0, 0.0)
+    """Result of its magnetic calibration before it was powered on; zero: never calibrated."""
+    hard_iron_t: Vector3 = (0.0, 0.0, 0.0)
+    """Field of what turns with it: the result of a calibration while it is powered on."""
+    behaviour: Behaviour = AS_IN_MANUAL
+    """What it does where the manual leaves it open."""
+
+
+STATIC_GYRO_RAD_S: Final = 0.02
+GYRO_SETTLED_MS: Final = 5000
+ATTITUDE_SETTLED_MS: Final = 1000
+"""Assumed times after power-on until bias and attitude count as converged."""
+
+GYRO_UNSETTLED, ATTITUDE_UNSETTLED = 1 << 3, 1 << 7
+STATIC, MAG_AIDING, NO_UTC, SYNC_OUT = 1 << 9, 1 << 10, 1 << 11, 1 << 12
+
+
+def main_status(reading: Truth, uptime_ms: int, *, nine_axis: bool, utc: bool) -> int:
+    """MAIN_STATUS (HI91 bytes 1-2 since firmware 1.6.9); a SOUT pulse goes before every frame."""
+    status = SYNC_OUT
+    if not utc:
+        status |= NO_UTC
+    if uptime_ms < GYRO_SETTLED_MS:
+        status |= GYRO_UNSETTLED
+    if uptime_ms < ATTITUDE_SETTLED_MS:
+        status |= ATTITUDE_UNSETTLED
+    if max(map(abs, reading.gyro_rad_s)) < STATIC_GYRO_RAD_S:
+        status |= STATIC
+    return status | MAG_AIDING if nine_axis else status
+
+
+NOT_CALIBRATED, CALIBRATED = 0, 1
+"""State as register 0x0A shows it; the true numbers are in no source."""
+TURN_RAD: Final = tau
+STEP_MAX_NS: Final = NS_PER_S
+"""A longer time between two samples adds no turn."""
+_NO_TURN: Final[Vector3] = (0.0, 0.0, 0.0)
+
+
+class SelfCalibration:
+    """Bias of one magnetometer, and what the module knows of it."""
+
+    def __init__(self, hard_iron_t: Vector3, found_t: Vector3) -> None:
+        """`hard_iron_t` is the field of what turns with the module; `found_t` is what it knows of that already."""
+        self._hard_iron_t = hard_iron_t
+        self.found_t = found_t
+        self.finished = any(found_t)
+        """Whether it was calibrated."""
+        self._turned: Vector3 = _NO_TURN
+        self._before_ns: int | None = None
+
+    @property
+    def state(self) -> int:
+        """NOT_CALIBRATED or CALIBRATED."""
+        return CALIBRATED if self.finished else NOT_CALIBRATED
+
+    @property
+    def progress(self) -> float:
+        """Share of the turning that it needs, 0 … 1; 1 once it was calibrated."""
+        return 1.0 if self.finished else min(self._turned) / TURN_RAD
+
+    def sample(self, device_ns: int, gyro_rad_s: Vector3) -> None:
+        """Take one sample in 9-axis mode while the calibration in the background is on.
+
+        `device_ns` is the time of the module's own clock.
+        """
+        before, self._before_ns = self._before_ns, device_ns
+        if before is None or not 0 < device_ns - before <= STEP_MAX_NS:
+            return
+        step_s = (device_ns - before) / NS_PER_S
+        x, y, z = (turned + abs(rate) * step_s for turned, rate in zip(self._turned, gyro_rad_s, strict=True))
+        self._turned = (x, y, z)
+        if min(self._turned) >= TURN_RAD:
+            self.finished, self.found_t, self._turned = True, self._hard_iron_t, _NO_TURN
+
+    def measured(self, field_t: Vector3) -> Vector3:
+        """The field as the module sends it: with what it does not know of its bias."""
+        (a, b, c), (d, e, f), (x, y, z) = self._hard_iron_t, self.found_t, field_t
+        return (x + a - d, y + b - e, z + c - f)

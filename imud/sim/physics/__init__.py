@@ -1,1 +1,0 @@
-"""Physics of a simulated sensor: motion, mounting, noise."""

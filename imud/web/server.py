@@ -1,0 +1,283 @@
+"""The HTTP server of `imud web` (aiohttp): the page, its WebSocket, logging in, questions and orders.
+
+GET  /                 the page; its files below /static/, the same for everybody
+GET  /api/session      what this browser may
+POST /api/login        {"token": …}: a cookie in exchange        POST /api/logout
+GET  /api/stream       WebSocket: `messages.Look` from the page, `messages.ToPage` to it
+POST /api/call         {"method": …, "params": {…}}: a method of docs/socket.md
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+from aiohttp import WSMsgType, web
+
+from imud import __version__
+from imud.client.connection import params_of, rpc_error
+from imud.client.feed import Feed
+from imud.formats.jsonrpc import PROTOCOL, RpcError, encode_request, line_of, parse_object
+from imud.model.errors import ImudError, LinkDenied, LinkMissing, ServerError, reason_of
+from imud.web import messages
+from imud.web.guard import COOKIE, SESSION_S, WebGuard, WebRights, safety_headers
+from imud.web.hub import Browser, BrowserHub, hub_of
+
+READING: Final = frozenset(("settings.get", "actions", "calibrations", "schema"))
+"""Methods that need the right to read."""
+CONTROLLING: Final = frozenset(("settings.plan", "settings.apply", "command", "calibrate", "stop_calibration"))
+"""Methods that need the right to control, here and at the daemon."""
+ANSWER_S: Final = 10.0
+LONG_ANSWER_S: Final = 660.0
+"""Longer than the daemon lets any calibration run."""
+LONG: Final = frozenset(("command", "calibrate", "settings.apply"))
+ANSWER_BYTES_MAX: Final = 1 << 22
+"""The answer of `schema` for 256 devices is a tenth of it."""
+AT_A_TIME_MAX: Final = 16
+"""Questions and orders on their way; each is a connection to the daemon."""
+
+
+class Busy(ServerError):
+    """Too many questions at a time."""
+
+
+class Calls:
+    """The way to the daemon at `path`. Synchronization: one event loop."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+        self._count = 0
+
+    async def call(self, method: str, params: Mapping[str, Any]) -> Any:
+        """Call a method of the daemon and return its result as JSON values.
+
+        Raises RpcError (what the daemon refused), LinkMissing, LinkDenied, ServerError, TimeoutError, and Busy.
+        """
+        if self._count >= AT_A_TIME_MAX:
+            raise Busy(f"{AT_A_TIME_MAX} requests are on their way, which is the most at a time; try again")
+        self._count += 1
+        try:
+            async with asyncio.timeout(LONG_ANSWER_S if method in LONG else ANSWER_S):
+                return await self._called(method, params)
+        except TimeoutError:
+            raise TimeoutError(f"{self._path}: the daemon did not answer {method}") from None
+        finally:
+            self._count -= 1
+
+    async def _called(self, method: str, params: Mapping[str, Any]) -> Any:
+        try:
+            reader, writer = await asyncio.open_unix_connection(self._path, limit=ANSWER_BYTES_MAX)
+        except PermissionError as error:
+            raise LinkDenied(f"no permission for {self._path}: is the user of imud web in group imud?") from error
+        except OSError as error:
+            raise LinkMissing(f"no daemon at {self._path}: {reason_of(error)}") from error
+        try:
+            hello = await self._message(reader)
+            if "error" in hello:
+                raise LinkDenied(f"the daemon refuses: {rpc_error(hello['error'])}")
+            if params_of(hello).get("protocol") != PROTOCOL:
+                raise ServerError(f"{self._path}: expected a daemon of protocol {PROTOCOL}")
+            writer.write(line_of(encode_request(method, params, 1)))
+            await writer.drain()
+            while (answer := await self._message(reader)).get("id", 0) not in (1, None):
+                pass
+        except OSError as error:
+            raise LinkMissing(f"{self._path}: the connection to the daemon is lost: {reason_of(error)}") from error
+        finally:
+            writer.close()
+        if "error" in answer:
+            raise rpc_error(answer["error"])
+        return answer.get("result")
+
+    async def _message(self, reader: asyncio.StreamReader) -> dict[str, Any]:
+        try:
+            line = await reader.readline()
+        except ValueError:
+            raise ServerError(f"{self._path}: a line of more than {ANSWER_BYTES_MAX} bytes") from None
+        if not line.endswith(b"\n"):
+            raise LinkMissing(f"{self._path}: the daemon closed the connection")
+        return parse_object(line)
+
+
+STATIC: Final = Path(__file__).parent / "static"
+BODY_BYTES_MAX: Final = 65536
+"""Of a POST: as much as a line of the daemon's socket."""
+LOOK_BYTES_MAX: Final = 4096
+"""Of a message of a page: a device's name is the longest part of it."""
+BROWSERS_MAX: Final = 64
+"""Pages at a time: memory, and the time to send to all of them."""
+HEARTBEAT_S: Final = 20.0
+"""A page that does not answer a ping within half of it is gone."""
+FAILURES_MAX: Final = 8
+FAILURE_S: Final = 2.0
+"""A wrong token is answered that late, and only so many at a time: four guesses a second."""
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class WebServer:
+    """The server for the daemon at `path`. `make_app` makes what aiohttp runs."""
+
+    def __init__(self, path: str, guard: WebGuard) -> None:
+        self._guard = guard
+        self._calls = Calls(path)
+        self._path = path
+        self._failures = 0
+        self.hub: BrowserHub | None = None
+        """While the app runs."""
+
+    def make_app(self) -> web.Application:
+        """Make the application with all routes."""
+        app = web.Application(middlewares=[self._guarded], client_max_size=BODY_BYTES_MAX)
+        app.router.add_get("/", self._page)
+        app.router.add_get("/api/session", self._session)
+        app.router.add_post("/api/login", self._login)
+        app.router.add_post("/api/logout", self._logout)
+        app.router.add_get("/api/stream", self._stream)
+        app.router.add_post("/api/call", self._call)
+        app.router.add_static("/static", STATIC)
+        app.on_response_prepare.append(_add_headers)
+        app.cleanup_ctx.append(self._reading)
+        return app
+
+    async def _reading(self, _app: web.Application) -> Any:
+        """Run the feed while the application runs."""
+        self.hub = hub = hub_of(asyncio.get_running_loop())
+        feed = Feed(self._path, hub.take, None)
+        hub.attach(feed)
+        feed.start()
+        yield
+        await asyncio.get_running_loop().run_in_executor(None, feed.close)
+
+    # --- who may ----------------------------------------------------------------------------------------------------
+
+    @web.middleware
+    async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Refuse what another site could have sent."""
+        headers = request.headers
+        if problem := self._guard.host_problem(headers.get("Host")):
+            return _refusal(421, problem)
+        rights = self._rights_of(request)
+        if request.method != "GET" or request.path == "/api/stream":
+            with_token = rights.control and not rights.by_cookie
+            if problem := self._guard.origin_problem(headers.get("Origin"), headers.get("Host"), with_token=with_token):
+                return _refusal(403, problem)
+        return await handler(request)
+
+    def _rights_of(self, request: web.Request) -> WebRights:
+        return self._guard.rights(request.headers.get("Authorization"), request.cookies.get(COOKIE))
+
+    async def _session(self, request: web.Request) -> web.StreamResponse:
+        rights = self._rights_of(request)
+        return _answer(
+            {"read": rights.read, "control": rights.control, "has_token": self._guard.has_token, "version": __version__}
+        )
+
+    async def _login(self, request: web.Request) -> web.StreamResponse:
+        try:
+            token = messages.decode_body(await request.read(), messages.LoginRequest).token
+        except ValueError:
+            return _refusal(400, 'expected a token, as {"token": "…"}')
+        if not self._guard.has_token:
+            return _refusal(403, "this server was started without a token: nothing can be controlled")
+        if not self._guard.is_token(token):
+            return await self._wrong_token()
+        response = _answer({"control": True})
+        response.set_cookie(COOKIE, self._guard.new_session(), max_age=SESSION_S, httponly=True, samesite="Strict")
+        return response
+
+    async def _wrong_token(self) -> web.Response:
+        if self._failures >= FAILURES_MAX:
+            return _refusal(429, "too many wrong tokens at a time; wait some seconds")
+        self._failures += 1
+        try:
+            await asyncio.sleep(FAILURE_S)
+        finally:
+            self._failures -= 1
+        return _refusal(401, "this is not the token")
+
+    async def _logout(self, _request: web.Request) -> web.StreamResponse:
+        response = _answer({"control": False})
+        response.del_cookie(COOKIE, httponly=True, samesite="Strict")
+        return response
+
+    # --- the page ---------------------------------------------------------------------------------------------------
+
+    async def _page(self, _request: web.Request) -> web.StreamResponse:
+        return web.FileResponse(STATIC / "index.html")
+
+    async def _stream(self, request: web.Request) -> web.StreamResponse:
+        assert self.hub is not None
+        if not self._rights_of(request).read:
+            return _refusal(401, "expected the token: log in first")
+        if len(self.hub.browsers) >= BROWSERS_MAX:
+            return _refusal(503, f"{BROWSERS_MAX} pages are open, which is the most")
+        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LOOK_BYTES_MAX, compress=False)
+        await socket.prepare(request)
+        browser = Browser()
+        self.hub.add(browser)
+        sending = asyncio.create_task(_send_all(browser, socket))
+        try:
+            async for message in socket:
+                if message.type is WSMsgType.TEXT:
+                    self._looked(browser, message.data)
+        finally:
+            self.hub.remove(browser)
+            sending.cancel()
+            with suppress(asyncio.CancelledError):
+                await sending
+        return socket
+
+    def _looked(self, browser: Browser, text: str) -> None:
+        assert self.hub is not None
+        try:
+            self.hub.look(browser, messages.decode_body(text, messages.Look))
+        except ValueError:
+            problem = messages.ProblemMessage("the page asked for something that imud web does not know: reload it")
+            browser.mailbox.put_newest("problem", messages.encode(problem).decode())
+
+    async def _call(self, request: web.Request) -> web.StreamResponse:
+        try:
+            asked = messages.decode_body(await request.read(), messages.CallRequest)
+        except ValueError:
+            return _refusal(400, 'expected a method and its parameters, as {"method": "status", "params": {}}')
+        rights = self._rights_of(request)
+        if asked.method not in READING | CONTROLLING:
+            return _refusal(404, f"no method {asked.method!r}; there are: {', '.join(sorted(READING | CONTROLLING))}")
+        is_control = asked.method in CONTROLLING or asked.params.get("fresh") not in (None, False)
+        if not (rights.control if is_control else rights.read):
+            return _refusal(401, "expected the token: log in first")
+        return await self._answered(asked)
+
+    async def _answered(self, asked: messages.CallRequest) -> web.Response:
+        try:
+            return _answer({"result": await self._calls.call(asked.method, asked.params)})
+        except RpcError as error:
+            return _answer({"error": str(error), "code": error.code})
+        except Busy as error:
+            return _refusal(503, str(error))
+        except (ImudError, TimeoutError) as error:
+            return _refusal(502, str(error))
+
+
+async def _send_all(browser: Browser, socket: web.WebSocketResponse) -> None:
+    """Send what comes for a page until its connection ends."""
+    with suppress(ConnectionError):
+        while True:
+            await socket.send_str(await browser.mailbox.take())
+
+
+async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:
+    response.headers.update(safety_headers())
+    response.headers.setdefault("Cache-Control", "no-cache")
+    response.headers["Server"] = "imud"
+
+
+def _answer(value: object) -> web.Response:
+    return web.Response(body=msgspec.json.encode(value), content_type="application/json")
+
+
+def _refusal(status: int, problem: str) -> web.Response:
+    return web.Response(status=status, body=msgspec.json.encode({"error": problem}), content_type="application/json")

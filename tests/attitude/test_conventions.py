@@ -1,0 +1,80 @@
+"""Axes of conventions and of devices against drawings: where front, left and up are."""
+
+import pytest
+
+from imud.attitude.conventions import (
+    ENU_TO_NED,
+    FLU_LEVEL,
+    RFU_ENU,
+    Convention,
+    DeviceAxes,
+    EulerOrder,
+    body_axes,
+    navigation_axes,
+    navigation_words,
+)
+from imud.attitude.rotation import is_rotation, matrix_times
+from imud.drivers import DRIVERS
+from imud.model.sample import Vector3
+
+FRONT_LEFT_UP: tuple[Vector3, Vector3, Vector3] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+
+
+def test_body_axes() -> None:
+    assert [matrix_times(body_axes(Convention.ENU_FLU), v) for v in FRONT_LEFT_UP] == list(FRONT_LEFT_UP)
+    assert matrix_times(body_axes(Convention.NED_FRD), (1, 2, 3)) == (1, -2, -3), "front, right, down"
+
+
+def test_navigation_axes() -> None:
+    east, north, up = 1.0, 2.0, 3.0
+    assert matrix_times(navigation_axes(Convention.ENU_FLU, True), (east, north, up)) == (east, north, up)
+    assert matrix_times(navigation_axes(Convention.NED_FRD, True), (east, north, up)) == (north, east, -up)
+    # without a north the x axis stays where it is
+    assert matrix_times(navigation_axes(Convention.ENU_FLU, False), (1, 2, 3)) == (1, 2, 3)
+    assert matrix_times(navigation_axes(Convention.NED_FRD, False), (1, 2, 3)) == (1, -2, -3)
+    assert is_rotation(ENU_TO_NED)
+
+
+@pytest.mark.parametrize(
+    ("axes", "front", "left", "up"),
+    [
+        (RFU_ENU, (0, 1, 0), (-1, 0, 0), (0, 0, 1)),  # x right, y forward, z up
+        (FLU_LEVEL, (1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        (DeviceAxes(order=EulerOrder.ZYX, z_down=True), (1, 0, 0), (0, -1, 0), (0, 0, -1)),  # front, right, down
+        (DeviceAxes(order=EulerOrder.ZXY, z_down=True), (0, 1, 0), (1, 0, 0), (0, 0, -1)),  # left, front, down
+    ],
+)
+def test_where_front_left_and_up_are_in_the_axes_of_a_device(
+    axes: DeviceAxes, front: Vector3, left: Vector3, up: Vector3
+) -> None:
+    assert [matrix_times(axes.to_body, v) for v in (front, left, up)] == list(FRONT_LEFT_UP)
+    assert is_rotation(axes.to_body)
+
+
+def test_a_frame_with_z_down_keeps_the_direction_that_yaw_is_counted_from() -> None:
+    """With ZYX the x axis of the sensor lies along x of the frame at yaw 0, with ZXY its y axis along y."""
+    assert matrix_times(DeviceAxes(order=EulerOrder.ZYX, z_down=True).to_z_up, (1, 2, 3)) == (1, -2, -3)
+    assert matrix_times(DeviceAxes(order=EulerOrder.ZXY, z_down=True).to_z_up, (1, 2, 3)) == (-1, 2, -3)
+    assert matrix_times(RFU_ENU.to_z_up, (1, 2, 3)) == (1, 2, 3)
+
+
+def test_another_order_is_another_device() -> None:
+    assert FLU_LEVEL.with_order(None) == FLU_LEVEL
+    assert FLU_LEVEL.with_order(EulerOrder.ZXY).to_body == RFU_ENU.to_body
+    assert not FLU_LEVEL.with_order(EulerOrder.ZXY).has_north
+
+
+def test_words() -> None:
+    assert RFU_ENU.words == "sensor: x right, y forward, z up, right-handed"
+    assert FLU_LEVEL.words == "sensor: x forward, y left, z up, right-handed"
+    assert [navigation_words(one, True) for one in Convention] == ["ENU", "NED"]
+    assert navigation_words(Convention.NED_FRD, False).startswith("level, Z down")
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_the_axes_of_a_driver_are_those_of_its_words(name: str) -> None:
+    driver = DRIVERS[name]
+    assert (driver.axes.order is EulerOrder.ZXY) == ("312" in driver.euler_convention)
+    assert (driver.axes.order is EulerOrder.ZYX) == ("ZYX" in driver.euler_convention)
+    assert driver.axes.has_north == (driver.navigation_frame == "ENU")
+    assert not driver.axes.z_down

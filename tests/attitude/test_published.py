@@ -1,0 +1,449 @@
+"""Samples in body axes and in both conventions, against values computed by hand, and what no rotation may change."""
+
+from math import cos, hypot, isnan, nan, pi, radians, sin, sqrt
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, Convention, DeviceAxes, EulerOrder, Heading
+from imud.attitude.published import (
+    FrameSettings,
+    MountingAngles,
+    MountingAxes,
+    PublishedFrame,
+    as_sent,
+    published_frame,
+)
+from imud.attitude.rotation import (
+    euler312_from_quat,
+    euler_zyx_from_quat,
+    matrix_from_quat,
+    matrix_product,
+    matrix_times,
+    quat_from_euler312,
+    quat_from_euler_zyx,
+    quat_from_matrix,
+    quat_normalized,
+    transposed,
+)
+from imud.model.sample import Quaternion, Sample, Sync, Vector3
+
+G = 9.8
+HALF = sqrt(0.5)
+ENU, NED = Convention.ENU_FLU, Convention.NED_FRD
+
+
+def sample(
+    accel: Vector3 | None = None,
+    euler_deg: Vector3 | None = None,
+    quat: Quaternion | None = None,
+    gyro: Vector3 | None = None,
+    mag: Vector3 | None = None,
+) -> Sample:
+    euler = None if euler_deg is None else (radians(euler_deg[0]), radians(euler_deg[1]), radians(euler_deg[2]))
+    times = (7, 100, 2, Sync.EDGE, 101, 102, 103)
+    return Sample("bow", *times, accel, gyro, mag, quat, euler, 20.5, 1e5, (0.1, 0.2), 5, 6, 8)
+
+
+def frame(
+    settings: FrameSettings | None = None,
+    convention: Convention | None = None,
+    declination_deg: float | None = None,
+    device: DeviceAxes = FLU_LEVEL,
+) -> PublishedFrame:
+    return published_frame(settings, convention, declination_deg, device)
+
+
+def turned(one: Sample, published: PublishedFrame) -> Sample:
+    assert published.rotation is not None
+    return published.rotation.sample(one)
+
+
+def degrees_of(euler: Vector3 | None) -> Vector3:
+    assert euler is not None
+    return (euler[0] * 180 / pi, euler[1] * 180 / pi, euler[2] * 180 / pi)
+
+
+def same_rotation(a: Quaternion | None, b: Quaternion) -> bool:
+    """Whether two quaternions are the same rotation: q and -q are."""
+    assert a is not None
+    return abs(abs(sum(x * y for x, y in zip(a, b, strict=True))) - 1.0) < 1e-12
+
+
+# --- nothing to do ----------------------------------------------------------------------------------------------------
+
+
+def test_without_frame_and_convention_nothing_is_turned() -> None:
+    assert frame(device=RFU_ENU).rotation is None
+    assert as_sent(FLU_LEVEL).rotation is None
+    assert frame(convention=NED).rotation_to(NED) is None
+
+
+def test_what_has_no_direction_stays() -> None:
+    after = turned(sample((1, 2, 3), (10, 20, 30)), frame(convention=NED))
+    before = sample()
+    for name in Sample.__struct_fields__:
+        if name not in ("accel_m_s2", "gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad"):
+            assert getattr(after, name) == getattr(before, name), name
+    assert (after.gyro_rad_s, after.mag_t) == (None, None), "what is absent stays absent"
+
+
+# --- conventions, from a HiPNUC module: x right, y forward, z up; ENU; pitch about x, roll about y --------------------
+
+LEVEL_NORTH = sample((0, 0, G), (0, 0, 0), (1, 0, 0, 0), gyro=(0.1, 0.2, 0.3), mag=(0, 30e-6, -20e-6))
+"""It turns to the front (x right, down at the front by 0.1 …), the field points north and down."""
+
+
+ENU_TURN, NED_TURN = (HALF, 0.0, 0.0, HALF), (1.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("convention", "accel", "gyro", "mag", "euler", "quat"),
+    [
+        # its y axis is the front, its x axis points right; the front is 90° counter-clockwise from east
+        (ENU, (0, 0, G), (0.2, -0.1, 0.3), (30e-6, 0, -20e-6), (0, 0, 90), ENU_TURN),
+        (NED, (0, 0, -G), (0.2, 0.1, -0.3), (30e-6, 0, 20e-6), (0, 0, 0), NED_TURN),
+    ],
+)
+def test_a_hipnuc_module_in_both_conventions(
+    convention: Convention, accel: Vector3, gyro: Vector3, mag: Vector3, euler: Vector3, quat: Quaternion
+) -> None:
+    made = turned(LEVEL_NORTH, frame(convention=convention, device=RFU_ENU))
+    assert (made.accel_m_s2, made.gyro_rad_s, made.mag_t) == (accel, gyro, mag)
+    assert degrees_of(made.euler_rad) == pytest.approx(euler, abs=1e-12)
+    assert same_rotation(made.quat_wxyz, quat)
+
+
+@pytest.mark.parametrize(("convention", "expected"), [(ENU, (10, -30, 0)), (NED, (10, 30, 90))])
+@pytest.mark.parametrize("members", ["euler", "quat", "both"])
+def test_bow_east_nose_up_right_side_down(convention: Convention, expected: Vector3, members: str) -> None:
+    """As a HiPNUC module says it: yaw -90° (east), pitch +30° (nose up), roll +10° (right side down)."""
+    euler = (radians(10), radians(30), radians(-90))
+    quat = quat_from_euler312(euler)
+    up = (-cos(radians(30)) * sin(radians(10)), sin(radians(30)), cos(radians(30)) * cos(radians(10)))
+    one = replace(
+        sample((up[0] * G, up[1] * G, up[2] * G)),
+        euler_rad=None if members == "quat" else euler,
+        quat_wxyz=None if members == "euler" else quat,
+    )
+    made = turned(one, frame(convention=convention, device=RFU_ENU))
+    assert degrees_of(made.euler_rad) == pytest.approx(expected, abs=1e-9)
+    assert made.quat_wxyz is not None
+    assert degrees_of(euler_zyx_from_quat(made.quat_wxyz)) == pytest.approx(expected, abs=1e-9)
+    back_side_up = -up[0] * G if convention is ENU else up[0] * G
+    assert made.accel_m_s2 == pytest.approx((up[1] * G, back_side_up, up[2] * G if convention is ENU else -up[2] * G))
+
+
+def test_an_imu61x_keeps_the_direction_of_its_power_on() -> None:
+    """It has no north: at its power-on yaw is 0 in both conventions; to the left is + in one, - in the other."""
+    one = sample((0, 0, G), (10, 20, 30))
+    assert degrees_of(turned(one, frame(convention=ENU)).euler_rad) == pytest.approx((10, 20, 30))
+    assert degrees_of(turned(one, frame(convention=NED)).euler_rad) == pytest.approx((10, -20, -30))
+
+
+# --- mountings, of a sensor whose own axes are FLU --------------------------------------------------------------------
+
+SIN30, COS30 = sin(radians(30)), cos(radians(30))
+TURNS = [
+    # name; the three ways; what the sensor says: accel, gyro, (roll, pitch, yaw); what the body does
+    (
+        "upside down", ("x", "-y", "-z"), (180, 0, 0), (0, 1, 0, 0),
+        # the body is level, its front at 20°, and it turns to the left
+        (0, 0, -G), (0, 0, -0.5), (180, 0, 20), (0, 0, G), (0, 0, 0.5), (0, 0, 20),
+    ),
+    (
+        "on its right side", ("x", "-z", "y"), (90, 0, 0), (HALF, HALF, 0, 0),
+        (0, G, 0), (0, 0.5, 0), (90, 0, 20), (0, 0, G), (0, 0, 0.5), (0, 0, 20),
+    ),
+    (
+        "turned 90° to the left", ("-y", "x", "z"), (0, 0, 90), (HALF, 0, 0, HALF),
+        # the body's nose is 30° up and turns to the left about the vertical of the body, its front at 20°
+        (0, -G * SIN30, G * COS30), (0, 0, 0.5), (-30, 0, 110), (G * SIN30, 0, G * COS30), (0, 0, 0.5), (0, -30, 20),
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("way", ["axes", "euler", "quat"])
+@pytest.mark.parametrize("members", ["euler", "quat", "both"])
+@pytest.mark.parametrize("case", TURNS, ids=[case[0] for case in TURNS])
+def test_a_mounting_is_taken_away(
+    case: tuple[str, tuple[str, str, str], Vector3, Quaternion, Vector3, Vector3, Vector3, Vector3, Vector3, Vector3],
+    way: str,
+    members: str,
+) -> None:
+    _, (x, y, z), (roll, pitch, yaw), quat, accel, gyro, said, body_accel, body_gyro, body_euler = case
+    given_as = {
+        "axes": FrameSettings(axes=MountingAxes(x=x, y=y, z=z)),  # type: ignore[arg-type]  # names of axes
+        "euler": FrameSettings(euler=MountingAngles(roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw)),
+        "quat": FrameSettings(quat_wxyz=list(quat)),
+    }[way]
+    one = sample(accel, said if members != "quat" else None, gyro=gyro, mag=gyro)
+    if members != "euler":
+        one = replace(one, quat_wxyz=quat_from_euler_zyx((radians(said[0]), radians(said[1]), radians(said[2]))))
+    made = turned(one, frame(given_as))
+    assert made.accel_m_s2 == pytest.approx(body_accel)
+    assert made.gyro_rad_s == pytest.approx(body_gyro)
+    assert made.mag_t == pytest.approx(body_gyro)
+    assert degrees_of(made.euler_rad) == pytest.approx(body_euler, abs=1e-9)
+    rolled, pitched, yawed = body_euler
+    wanted = quat_from_euler_zyx((radians(rolled), radians(pitched), radians(yawed)))
+    assert same_rotation(made.quat_wxyz, wanted)
+
+
+def test_a_module_in_any_mounting_shows_the_same_as_one_that_is_mounted_straight() -> None:
+    """A body with two modules of different axes and mountings: both show the attitude of the body."""
+    attitude = quat_from_euler_zyx((0.2, -0.4, 2.0))
+    matrix = matrix_from_quat(attitude)
+    up = matrix[2]
+    body_accel = (up[0] * G, up[1] * G, up[2] * G)
+    for given_frame in (FrameSettings(euler=MountingAngles(roll_deg=33, pitch_deg=-50, yaw_deg=170)), FrameSettings()):
+        for device in (RFU_ENU, FLU_LEVEL):
+            mounting = frame(given_frame, ENU, device=device).mounting
+            quat = quat_from_matrix(matrix_product(matrix, mounting))
+            one = replace(sample(matrix_times(transposed(mounting), body_accel)), quat_wxyz=quat)
+            made = turned(one, frame(given_frame, ENU, device=device))
+            assert made.accel_m_s2 == pytest.approx(body_accel)
+            assert same_rotation(made.quat_wxyz, attitude)
+
+
+# --- level, heading, declination --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("convention", [ENU, NED])
+def test_roll_and_pitch_that_were_read_level_are_taken_away(convention: Convention) -> None:
+    """What imud shows without the keys, written into them, becomes zero; the heading stays."""
+    one = sample((0, 0, G), (2, -3, 40))
+    shown = degrees_of(turned(one, frame(convention=convention)).euler_rad)
+    settings = FrameSettings(level_roll_deg=shown[0], level_pitch_deg=shown[1])
+    assert degrees_of(turned(one, frame(settings, convention)).euler_rad) == pytest.approx((0, 0, shown[2]), abs=1e-9)
+
+
+def test_a_heading_offset_is_added_clockwise() -> None:
+    one = sample((0, 0, G), (0, 0, -40), mag=(1.0, 0.0, 0.0))
+    settings = FrameSettings(heading_offset_deg=15)
+    assert degrees_of(turned(one, frame(settings, NED)).euler_rad)[2] == pytest.approx(40 + 15)
+    assert degrees_of(turned(one, frame(settings, ENU)).euler_rad)[2] == pytest.approx(-40 - 15)
+    # the sensor points 15° to the left of the front, so what it sees ahead is to the left of the front
+    mag = turned(one, frame(settings, ENU)).mag_t
+    assert mag == pytest.approx((cos(radians(15)), sin(radians(15)), 0.0))
+
+
+def test_a_declination_turns_the_heading_and_nothing_else() -> None:
+    """Magnetic heading 90° where magnetic north is 5° east of true north: true heading 95°."""
+    one = sample((1, 2, 3), (10, 20, -90), mag=(1, 2, 3))
+    ned = turned(one, frame(None, NED, 5.0, RFU_ENU))
+    assert degrees_of(ned.euler_rad) == pytest.approx((10, 20, 95))
+    own = turned(one, frame(None, None, 5.0, RFU_ENU))
+    assert degrees_of(own.euler_rad) == pytest.approx((10, 20, -95)), "in the device's own convention"
+    assert own.quat_wxyz is not None
+    assert degrees_of(euler312_from_quat(own.quat_wxyz)) == pytest.approx((10, 20, -95))
+    assert (own.accel_m_s2, own.mag_t) == ((1, 2, 3), (1, 2, 3))
+
+
+def test_what_the_heading_counts_from() -> None:
+    true = frame(None, None, 5.0, RFU_ENU)
+    assert true.heading(Heading.MAGNETIC) is Heading.TRUE
+    assert true.heading(Heading.UNKNOWN) is Heading.TRUE, "the configuration says that it is magnetic"
+    assert true.heading(Heading.RELATIVE) is Heading.RELATIVE
+    assert frame().heading(Heading.MAGNETIC) is Heading.MAGNETIC
+
+
+# --- what the device is -----------------------------------------------------------------------------------------------
+
+
+UPSIDE_DOWN = MountingAxes(x="y", y="x", z="-z")
+Z_DOWN = sample((0.5, 0.25, -G), (10, 20, 30), gyro=(1, 2, 3))
+"""Sample of a device with the axes front, right, down and with the angles of an aircraft."""
+
+
+@pytest.mark.parametrize(
+    ("one", "published", "accel", "gyro", "euler"),
+    [
+        # as the vendor's driver publishes them
+        (Z_DOWN, frame(FrameSettings(z_down=True)), (0.5, -0.25, G), (1, -2, -3), (10, -20, -30)),
+        (Z_DOWN, frame(FrameSettings(z_down=True), NED), (0.5, 0.25, -G), (1, 2, 3), (10, 20, 30)),
+        # turned 90° to the left in the body: its x axis points left, its y axis (right of that) to the front; the body
+        # is level, its front at 20° to the left. `axes` names axes of the device, z down
+        (
+            sample((0, 0, -G), (0, 0, -110), gyro=(1, 2, 3)), frame(FrameSettings(z_down=True, axes=UPSIDE_DOWN)),
+            (0, 0, G), (2, 1, -3), (0, 0, 20),
+        ),
+        # a HiPNUC module upside down: its y axis still points forward, its x axis to the left, its z axis down
+        (
+            sample((0, 0, -G), (180, 0, 0), gyro=(0.1, 0.2, 0.3)),
+            frame(FrameSettings(axes=UPSIDE_DOWN), NED, device=RFU_ENU), (0, 0, -G), (0.2, -0.1, 0.3), (0, 0, 0),
+        ),
+    ],
+)  # fmt: skip
+def test_a_device_whose_z_axis_points_down(
+    one: Sample, published: PublishedFrame, accel: Vector3, gyro: Vector3, euler: Vector3
+) -> None:
+    made = turned(one, published)
+    assert (made.accel_m_s2, made.gyro_rad_s) == (accel, gyro)
+    assert degrees_of(made.euler_rad) == pytest.approx(euler, abs=1e-9)
+
+
+def test_another_order_of_angles() -> None:
+    """The device says pitch 30° and means about its x axis, y forward: its quaternion is not used."""
+    one = replace(sample((0, G * SIN30, G * COS30), (0, 30, 0)), quat_wxyz=quat_from_euler_zyx((0, radians(30), 0)))
+    made = turned(one, frame(FrameSettings(euler_order=EulerOrder.ZXY)))
+    assert made.accel_m_s2 == pytest.approx((G * SIN30, 0, G * COS30)), "its y axis is the front, nose up"
+    assert degrees_of(made.euler_rad)[:2] == pytest.approx((0, -30), abs=1e-9)
+    assert matrix_from_quat(made.quat_wxyz or (0, 0, 0, 0))[2] == pytest.approx((SIN30, 0, COS30))
+
+
+# --- angles in part ---------------------------------------------------------------------------------------------------
+
+
+def known(euler: Vector3 | None) -> tuple[object, ...]:
+    """Angles in degrees, None for those that are NaN."""
+    return tuple(None if isnan(one) else pytest.approx(one, abs=1e-9) for one in degrees_of(euler))
+
+
+@pytest.mark.parametrize(
+    ("said", "settings", "expected"),
+    [
+        ((nan, nan, -90), None, (None, None, 90)),  # a compass: its heading
+        ((10, nan, nan), None, (10, None, None)),
+        ((10, 30, nan), None, (10, 30, None)),
+        ((10, 30, nan), FrameSettings(axes=MountingAxes(x="y", y="x", z="-z")), (-170, 30, None)),  # upside down
+        ((nan, nan, -90), FrameSettings(axes=MountingAxes(x="-x", y="-y", z="z")), (None, None, 0)),  # back to front
+        ((nan, nan, -90), FrameSettings(axes=MountingAxes(x="y", y="x", z="-z")), None),  # its tilt decides
+        ((10, nan, nan), FrameSettings(axes=MountingAxes(x="-x", y="-y", z="z")), None),
+    ],
+)  # fmt: skip
+def test_angles_in_part(said: Vector3, settings: FrameSettings | None, expected: tuple[float | None, ...]) -> None:
+    """From a module with x right, y forward; published in ned-frd."""
+    made = turned(sample(euler_deg=said), frame(settings, NED, device=RFU_ENU))
+    assert made.quat_wxyz is None
+    assert made.euler_rad is None if expected is None else known(made.euler_rad) == expected
+
+
+def test_a_quaternion_counts_more_than_the_angles_unless_it_has_no_direction() -> None:
+    made = turned(sample(euler_deg=(0, 0, 30), quat=(HALF, 0, 0, HALF)), frame(convention=ENU))
+    assert degrees_of(made.euler_rad) == pytest.approx((0, 0, 90))
+    made = turned(sample(euler_deg=(0, 0, 30), quat=(0, 0, 0, 0)), frame(convention=ENU))
+    assert degrees_of(made.euler_rad) == pytest.approx((0, 0, 30))
+    assert turned(sample(quat=(0, 0, 0, 0)), frame(convention=ENU)).quat_wxyz is None
+
+
+def test_an_element_that_is_nan_stays_one_element_in_quarter_turns() -> None:
+    made = turned(sample(gyro=(nan, 2, 3)), frame(FrameSettings(axes=MountingAxes(x="y", y="-x", z="z"))))
+    assert made.gyro_rad_s is not None
+    assert (made.gyro_rad_s[0], made.gyro_rad_s[2]) == (2, 3)
+    assert isnan(made.gyro_rad_s[1])
+
+
+# --- what no rotation may change --------------------------------------------------------------------------------------
+
+VECTORS = st.tuples(*[st.floats(-50, 50)] * 3)
+QUATS = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: hypot(*q) > 0.1).map(quat_normalized)
+MOUNTINGS = st.builds(
+    FrameSettings,
+    euler=st.builds(
+        MountingAngles, roll_deg=st.floats(-180, 180), pitch_deg=st.floats(-90, 90), yaw_deg=st.floats(-180, 180)
+    ),
+    z_down=st.booleans(),
+    level_roll_deg=st.floats(-45, 45),
+    level_pitch_deg=st.floats(-45, 45),
+    heading_offset_deg=st.floats(-180, 180),
+)
+DEVICES = st.sampled_from([RFU_ENU, FLU_LEVEL])
+FRAMES = st.builds(
+    published_frame, st.none() | MOUNTINGS, st.sampled_from([ENU, NED]), st.none() | st.floats(-30, 30), DEVICES
+)
+
+
+@given(FRAMES, VECTORS, VECTORS, VECTORS, QUATS)
+def test_lengths_and_the_direction_of_gravity_are_kept(
+    published: PublishedFrame, accel: Vector3, gyro: Vector3, mag: Vector3, quat: Quaternion
+) -> None:
+    """How far a vector is from the vertical, and two vectors from each other, is the same before and after."""
+    one = Sample("bow", 1, 1, 1, Sync.ARRIVAL, 1, 1, accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, quat_wxyz=quat)
+    made = turned(one, published)
+    assert made.quat_wxyz is not None
+    assert made.euler_rad is not None
+    vectors = [one for one in (made.accel_m_s2, made.gyro_rad_s, made.mag_t) if one is not None]
+    for before, after in zip((accel, gyro, mag), vectors, strict=True):
+        assert hypot(*after) == pytest.approx(hypot(*before), abs=1e-9)
+        up = matrix_times(matrix_from_quat(quat), before)[2] * (-1 if published.device.z_down else 1)
+        up_after = matrix_times(matrix_from_quat(made.quat_wxyz), after)[2] * (-1 if published.convention is NED else 1)
+        assert up_after == pytest.approx(up, abs=1e-9)
+    volume = _triple(accel, gyro, mag)
+    assert _triple(*vectors) == pytest.approx(volume, abs=1e-6), "no mirror image"
+    assert hypot(*made.quat_wxyz) == pytest.approx(1.0)
+    assert same_rotation(quat_from_euler_zyx(made.euler_rad), made.quat_wxyz)
+
+
+def _triple(a: Vector3, b: Vector3, c: Vector3) -> float:
+    return a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+
+
+@given(st.none() | MOUNTINGS, DEVICES, VECTORS, QUATS)
+def test_what_a_client_asks_for_is_what_the_device_would_be_configured_to(
+    settings: FrameSettings | None, device: DeviceAxes, accel: Vector3, quat: Quaternion
+) -> None:
+    """Configured as one convention and asked for as the other, and back again. Levelling is read in one convention."""
+    if settings is not None:
+        settings = replace(settings, level_pitch_deg=0.0)
+    one = Sample("bow", 1, 1, 1, Sync.ARRIVAL, 1, 1, accel_m_s2=accel, quat_wxyz=quat)
+    frames = {convention: frame(settings, convention, device=device) for convention in Convention}
+    direct = {convention: turned(one, published) for convention, published in frames.items()}
+    for asked, configured in ((ENU, NED), (NED, ENU)):
+        rotation = frames[configured].rotation_to(asked)
+        assert rotation is not None
+        made = rotation.sample(direct[configured])
+        assert made.accel_m_s2 == pytest.approx(direct[asked].accel_m_s2, abs=1e-9)
+        assert made.quat_wxyz
+        assert direct[asked].quat_wxyz
+        assert same_rotation(made.quat_wxyz, direct[asked].quat_wxyz or (0, 0, 0, 0))
+        back = frames[asked].rotation_to(configured)
+        assert back is not None
+        again = back.sample(made)
+        assert again.accel_m_s2 == pytest.approx(direct[configured].accel_m_s2, abs=1e-9)
+        assert same_rotation(again.quat_wxyz, direct[configured].quat_wxyz or (0, 0, 0, 0))
+
+
+@given(st.sampled_from([ENU, NED]), st.none() | st.floats(-30, 30), DEVICES, VECTORS, QUATS)
+def test_a_client_of_a_device_without_convention(
+    asked: Convention, declination_deg: float | None, device: DeviceAxes, accel: Vector3, quat: Quaternion
+) -> None:
+    one = Sample("bow", 1, 1, 1, Sync.ARRIVAL, 1, 1, accel_m_s2=accel, quat_wxyz=quat)
+    plain = frame(None, None, declination_deg, device)
+    published = one if plain.rotation is None else plain.rotation.sample(one)
+    rotation = plain.rotation_to(asked)
+    assert rotation is not None
+    made, wanted = rotation.sample(published), turned(one, frame(None, asked, declination_deg, device))
+    assert made.accel_m_s2 == pytest.approx(wanted.accel_m_s2, abs=1e-9)
+    assert same_rotation(made.quat_wxyz, wanted.quat_wxyz or (0, 0, 0, 0))
+
+
+ANY = st.floats(allow_nan=True, allow_infinity=True)
+ANY3 = st.none() | st.tuples(ANY, ANY, ANY)
+
+
+@given(FRAMES, ANY3, ANY3, st.none() | st.tuples(ANY, ANY, ANY, ANY))
+def test_no_value_of_a_device_raises(
+    published: PublishedFrame, vector: Vector3 | None, euler: Vector3 | None, quat: Quaternion | None
+) -> None:
+    one = Sample(
+        "bow", 1, 1, 1, Sync.ARRIVAL, 1, 1, accel_m_s2=vector, gyro_rad_s=vector, quat_wxyz=quat, euler_rad=euler
+    )
+    made = turned(one, published)
+    assert (made.accel_m_s2 is None) == (vector is None)
+    assert made.quat_wxyz is None or made.euler_rad is not None, "a quaternion never without its angles"
+
+
+# --- words ------------------------------------------------------------------------------------------------------------
+
+
+def test_words_of_what_is_published() -> None:
+    own = as_sent(RFU_ENU).words("312", "ENU")
+    assert (own.frame, own.euler_convention, own.navigation_frame) == (RFU_ENU.words, "312", "ENU")
+    down = frame(FrameSettings(), NED, device=RFU_ENU).words("312", "ENU")
+    assert "x forward, y right, z down" in down.frame
+    assert down.navigation_frame == "NED"
+    assert "clockwise" in down.euler_convention
+    assert frame(FrameSettings()).convention is ENU, "with frame, enu-flu unless the file says otherwise"

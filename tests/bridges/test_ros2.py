@@ -1,0 +1,141 @@
+"""ROS 2 messages, read by rosbags with its own definitions of the types: what a node of ROS 2 would see."""
+
+import math
+from typing import Any
+
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from imud.bridges.channel import (
+    Diagnoses,
+    Diagnosis,
+    DiagnosisLevel,
+    LossCounts,
+    MessageChannel,
+    MessageFrames,
+    StampedEvent,
+)
+from imud.bridges.ros2 import FIELDS, Ros2Dialect, schema, time_of
+from imud.contracts.status import Deviations
+from imud.model.sample import Sample
+from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
+
+DIALECT = Ros2Dialect()
+BOW = MessageFrames("bow")
+OWN = {"imud_msgs/SampleStamp", "imud_msgs/Losses"}
+ROS = get_typestore(Stores.ROS2_HUMBLE)
+"""Types as rosbags has them, and the two of imud by the definition that imud writes."""
+for own in OWN:
+    ROS.register(get_types_from_msg(FIELDS[own], own.replace("/", "/msg/")))
+
+
+def channels(frames: MessageFrames = BOW) -> dict[str, MessageChannel[Sample]]:
+    return {channel.topic: channel for channel in DIALECT.samples(frames)}
+
+
+def read(channel: MessageChannel[Any], item: object) -> Any:
+    data = channel.encode(item)
+    assert data is not None
+    return ROS.deserialize_cdr(data, channel.schema.name)
+
+
+def xyz(vector: Any) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z
+
+
+def test_quantities() -> None:
+    imu = read(channels()["/bow/imu/data"], FULL)
+    assert (imu.header.stamp.sec, imu.header.stamp.nanosec) == (1_790_000_000, 123_456_789)
+    assert imu.header.frame_id == "bow"
+    assert xyz(imu.angular_velocity) == FULL.gyro_rad_s
+    assert xyz(imu.linear_acceleration) == FULL.accel_m_s2
+    assert (imu.orientation.w, *xyz(imu.orientation)) == FULL.quat_wxyz
+    for matrix in (imu.orientation_covariance, imu.angular_velocity_covariance, imu.linear_acceleration_covariance):
+        assert list(matrix) == 9 * [0.0]
+    assert channels()["/bow/imu/data_raw"].encode(FULL) is None
+    assert channels()["/bow/imu/data"].encode(BARE) is None
+    imu = read(channels()["/bow/imu/data_raw"], BARE)
+    assert imu.orientation_covariance[0] == -1
+    assert imu.linear_acceleration_covariance[0] == -1
+    assert imu.angular_velocity_covariance[0] == 0
+    assert xyz(imu.angular_velocity)[0::2] == (0.0, 1.0)
+    assert math.isnan(imu.angular_velocity.y)
+    noise = Deviations(accel_m_s2=0.5, gyro_rad_s=0.25, mag_t=2.0, attitude_rad=0.125, temperature_c=3.0)
+    made = channels(MessageFrames("bow", deviations=noise))
+    imu = read(made["/bow/imu/data"], FULL)
+    assert list(imu.linear_acceleration_covariance) == [0.25, 0, 0, 0, 0.25, 0, 0, 0, 0.25]
+    assert imu.angular_velocity_covariance[4] == 0.0625
+    assert imu.orientation_covariance[8] == 0.015625
+    assert read(made["/bow/imu/mag"], FULL).magnetic_field_covariance[0] == 4.0
+    assert read(made["/bow/temperature"], FULL).variance == 9.0
+    made = channels()
+    assert xyz(read(made["/bow/imu/mag"], FULL).magnetic_field) == FULL.mag_t
+    assert read(made["/bow/temperature"], FULL).temperature == 31.5
+    assert read(made["/bow/pressure"], FULL).fluid_pressure == 101325.0
+    for name in ("imu/mag", "temperature", "pressure"):
+        assert made[f"/bow/{name}"].encode(BARE) is None
+
+
+def test_transform_stamp_and_alignment() -> None:
+    tf = channels(MessageFrames("bow"))["/tf"]
+    (transform,) = read(tf, FULL).transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("enu", "bow")
+    assert (transform.transform.rotation.w, *xyz(transform.transform.rotation)) == FULL.quat_wxyz
+    assert xyz(transform.transform.translation) == (0, 0, 0)
+    assert transform.header.stamp.nanosec == 123_456_789
+    assert tf.encode(BARE) is None
+    stamp = channels()["/bow/stamp"]
+    full, bare = read(stamp, FULL), read(stamp, BARE)
+    assert (full.seq, full.t_ns, full.t_rx_ns, full.t_dev_ns) == (7, FULL.t_ns, FULL.t_rx_ns, 5_000_000)
+    assert (full.t_err_ns, full.sync, full.EDGE) == (12_000, 2, 2)
+    assert (full.edge_seq, full.status, full.pps_age_ms) == (9, 3, 40)
+    assert tuple(full.euler_rad) == FULL.euler_rad
+    assert tuple(full.incli_rad) == FULL.incli_rad
+    assert (bare.t_dev_ns, bare.edge_seq, bare.status, bare.pps_age_ms) == (-1, -1, -1, -1)
+    assert bare.t_err_ns == 0xFFFF_FFFF
+    assert all(map(math.isnan, (*bare.euler_rad, *bare.incli_rad)))
+    for length in range(1, 9):
+        name = "abcdefgh"[:length]
+        for where, channel in channels(MessageFrames(name, has_north=False)).items():
+            data = channel.encode(FULL)
+            if data is not None:
+                message = ROS.deserialize_cdr(data, channel.schema.name)
+                header = message.transforms[0].header if where == "/tf" else message.header  # type: ignore[attr-defined]
+                assert header.frame_id == (f"{name}_level" if where == "/tf" else name)
+                again = ROS.serialize_cdr(message, channel.schema.name)
+                assert bytes(again) == data, where
+
+
+def test_losses_events_and_diagnoses() -> None:
+    losses = read(DIALECT.losses("bow"), LossCounts(1, UTC_NS, "bow", 100, 1, 2, 3, 4, 5))
+    assert (losses.samples, losses.lost_gap_device, losses.lost_crc) == (100, 1, 2)
+    assert (losses.lost_overrun, losses.lost_queue, losses.lost_unknown) == (3, 4, 5)
+    log = read(DIALECT.events(), StampedEvent(EVENT, UTC_NS))
+    assert (log.level, log.name, log.msg) == (30, "bow", 'loss: lost 3, "damaged"')
+    assert log.stamp.sec == 1_790_000_000
+    values = {"t_err_ns": "12000", "state": "running"}
+    bow = Diagnosis("bow", DiagnosisLevel.OK, "running", "17", values)
+    mast = Diagnosis("mast", DiagnosisLevel.STALE, "silent: nothing comes", "", {})
+    channel = DIALECT.diagnostics()
+    assert channel.topic == "/diagnostics"
+    array = read(channel, Diagnoses(UTC_NS, (bow, mast)))
+    assert (array.header.stamp.sec, array.header.stamp.nanosec) == (1_790_000_000, 123_456_789)
+    first, second = array.status
+    assert (first.level, first.name, first.message, first.hardware_id) == (first.OK, "imud: bow", "running", "17")
+    assert {one.key: one.value for one in first.values} == values
+    assert (second.level, second.name, second.values) == (second.STALE, "imud: mast", [])
+    assert bytes(ROS.serialize_cdr(array, channel.schema.name)) == channel.encode(Diagnoses(UTC_NS, (bow, mast)))
+
+
+def test_definitions_are_those_of_ros_2_and_times_are_clipped() -> None:
+    for name in FIELDS.keys() - OWN:
+        full = name.replace("/", "/msg/")
+        store = get_typestore(Stores.EMPTY)
+        store.register(get_types_from_msg(schema(name).data.decode(), full))
+        assert store.hash_rihs01(full) == ROS.hash_rihs01(full), name
+    text = schema("tf2_msgs/TFMessage").data.decode()
+    assert text.count("MSG: geometry_msgs/Quaternion") == 1
+    assert text.count("MSG: builtin_interfaces/Time") == 1
+    assert schema("tf2_msgs/TFMessage").name == "tf2_msgs/msg/TFMessage"
+    assert time_of(1_500_000_000) == (1, 500_000_000)
+    assert time_of(-1) == (-1, 999_999_999)
+    assert time_of(1 << 62) == (0x7FFF_FFFF, (1 << 62) % 1_000_000_000)

@@ -1,0 +1,67 @@
+"""Captures of a HiPNUC module with chosen values, a crystal that may be off, and samples that are missing."""
+
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+
+from imud.analysis.series import FloatArray
+from imud.drivers.hipnuc.uart.codec import encode_hi91
+from imud.model.units import NS_PER_S
+from tests.support.files import CaptureWriter
+
+BEGIN_NS = 1000 * NS_PER_S
+BAUD = 921_600
+
+
+def frame(system_time_ms: int, accel: FloatArray, gyro: FloatArray, temperature_c: float = 25.0) -> bytes:
+    return encode_hi91(
+        system_time_ms=system_time_ms,
+        accel_m_s2=(float(accel[0]), float(accel[1]), float(accel[2])),
+        gyro_rad_s=(float(gyro[0]), float(gyro[1]), float(gyro[2])),
+        mag_t=(0.0, 0.0, 0.0),
+        euler_rad=(0.0, 0.0, 0.0),
+        quat_wxyz=(1.0, 0.0, 0.0, 0.0),
+        temperature_c=round(temperature_c),
+        pressure_pa=1e5,
+    )
+
+
+def write_capture(
+    file: Path,
+    accel: FloatArray,
+    gyro: FloatArray,
+    *,
+    rate_hz: float,
+    fast: float = 0.0,
+    missing: Collection[int] = (),
+    temperature_c: FloatArray | None = None,
+) -> Path:
+    """Write samples (n, 3) of a module that is set to `rate_hz` and whose crystal is `fast` (0.02: 2 %).
+
+    Its messages have its own milliseconds; the host reads each right when it came.
+    """
+    gone = set(missing)
+    with file.open("wb") as out:
+        writer = CaptureWriter(out, driver="hipnuc-uart", baud=BAUD)
+        for number in range(len(accel)):
+            if number not in gone:
+                warm = 25.0 if temperature_c is None else float(temperature_c[number])
+                data = frame(int(1000 * number / rate_hz), accel[number], gyro[number], warm)
+                writer.write(data, BEGIN_NS + round(number * NS_PER_S / (rate_hz * (1 + fast))))
+    return file
+
+
+def shaken(count: int, rate_hz: float, frequency_hz: float, seed: int = 1) -> tuple[FloatArray, FloatArray]:
+    """Acceleration of 2 m/s² along z at a frequency over noise, and a gyroscope with noise alone."""
+    random = np.random.default_rng(seed)
+    accel = 0.05 * random.standard_normal((count, 3)) + np.array([0.0, 0.0, 9.8])
+    accel[:, 2] += 2.0 * np.sin(2 * np.pi * frequency_hz * np.arange(count) / rate_hz)
+    return accel, 1e-3 * random.standard_normal((count, 3))
+
+
+def resting(count: int, rate_hz: float, seed: int = 1) -> tuple[FloatArray, FloatArray]:
+    """White noise on both sensors: N = 5e-4 (m/s²)/√Hz and 1e-4 (rad/s)/√Hz."""
+    random = np.random.default_rng(seed)
+    accel = 5e-4 * np.sqrt(rate_hz) * random.standard_normal((count, 3)) + np.array([0.0, 0.0, 9.8])
+    return accel, 1e-4 * np.sqrt(rate_hz) * random.standard_normal((count, 3))

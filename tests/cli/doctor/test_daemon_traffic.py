@@ -1,0 +1,156 @@
+"""What the daemon's counters say of wires, rates, supplies and lines."""
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from imud.cli.doctor.daemon import half_duplex, heard, lines, restarts
+from imud.cli.doctor.surroundings import DoctorCheck
+from imud.contracts.status import (
+    ClockStatus,
+    DeviceState,
+    DeviceStatus,
+    KernelCounters,
+    LinesStatus,
+    SerialLineCounters,
+)
+from imud.model.sample import Sync
+from tests.support.metrics import POLLING, device
+from tests.support.surroundings import Machine
+
+HEARD, HALF, RESTARTS, LINES = (
+    DoctorCheck("h", heard),
+    DoctorCheck("d", half_duplex),
+    DoctorCheck("r", restarts),
+    DoctorCheck("l", lines),
+)
+UART = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}"
+WIRED = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}, lines: {sout: {line: GPIO17}}}"
+RS485 = "bow: {driver: hipnuc-modbus, rs485: {line: /dev/ttyUSB0, address: 80}}"
+
+GOOD: dict[str, Any] = {"frames_good": 5000, "samples": 5000}
+
+
+def counted(state: DeviceState = DeviceState.SEARCHING, **counts: int) -> DeviceStatus:
+    """A device with these counts, the others 0, and no errors of the kernel."""
+    made = device("bow", state=state, kernel=KernelCounters())
+    return msgspec.structs.replace(made, ledger=dict.fromkeys(made.ledger, 0) | counts)
+
+
+def test_without_the_daemon_a_port_or_samples(machine: Machine) -> None:
+    machine.configure(WIRED)
+    for check in (HEARD, RESTARTS, LINES):
+        assert [finding.severity for finding in machine.find(check)] == ["not checked"]
+    assert machine.find(HALF) == []  # no such line is configured
+    machine.configure(UART)
+    machine.status = [counted(DeviceState.MISSING)]
+    assert machine.find(HEARD) == []
+    machine.status = [counted()]
+    assert machine.find(RESTARTS) == []
+
+
+@pytest.mark.parametrize(
+    ("status", "severity", "words"),
+    [
+        (counted(), "error", "are TX and RX swapped"),
+        (counted(bytes_in=40), "error", "is it an echo of what imud sends"),
+        (counted(bytes_in=5000), "error", "wrong rate, driver or device"),
+        (
+            msgspec.structs.replace(counted(bytes_in=5000), kernel=KernelCounters(framing=9)),
+            "error",
+            "9 framing errors",
+        ),
+        (counted(bytes_in=5000, frames_good=7, frames_in_replies=7), "error", "but no sample in 7 frames"),
+        (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=3), "ok", "3 damaged"),
+        (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=6), "warning", "6 damaged frames"),
+        (msgspec.structs.replace(counted(**GOOD), kernel=KernelCounters(overrun=2)), "warning", "overrun"),
+    ],
+)
+def test_serial_data(machine: Machine, status: DeviceStatus, severity: str, words: str) -> None:
+    machine.configure(UART)
+    machine.status = [status]
+    machine.tells(HEARD, severity, words)
+
+
+def one_way(**changes: object) -> DeviceStatus:
+    """A device whose samples come at 100 Hz for 70 s, and that never answered."""
+    made = counted(DeviceState.RUNNING, frames_good=7000, samples=7000)
+    made = msgspec.structs.replace(made, identity={}, expected_rate_hz=100.0)
+    return msgspec.structs.replace(made, **changes)
+
+
+@pytest.mark.parametrize(
+    ("status", "severities"),
+    [
+        (one_way(), ["ok", "warning"]),
+        (one_way(identity={"product": "HI14"}), ["ok"]),
+        (one_way(ledger=one_way().ledger | {"frames_in_replies": 1}), ["ok"]),
+        (one_way(ledger=one_way().ledger | {"samples": 6000}), ["ok"]),
+        (one_way(state=DeviceState.SILENT), ["ok"]),
+        (one_way(expected_rate_hz=0.0, rate_hz=0.0), ["ok"]),
+    ],
+)
+def test_a_device_that_never_answers_does_not_hear_imud(
+    machine: Machine, status: DeviceStatus, severities: list[str]
+) -> None:
+    machine.configure(UART)
+    machine.status = [status]
+    told = machine.told(HEARD)
+    assert [severity for severity, _ in told] == severities
+    assert all("RX of the module is not wired" in text for severity, text in told if severity == "warning")
+    machine.configure(UART.replace("bow: {", "bow: {identify: false, "))
+    assert [finding.severity for finding in machine.find(HEARD)] == ["ok"]
+
+
+@pytest.mark.parametrize(
+    ("state", "line", "severity", "words"),
+    [
+        (DeviceState.RUNNING, SerialLineCounters(timeouts=10, echoes=1000), "ok", "echoes are expected"),
+        (DeviceState.RUNNING, SerialLineCounters(timeouts=11), "warning", "11 requests unanswered"),
+        (DeviceState.RUNNING, SerialLineCounters(strange_bytes=5), "warning", "5 strange bytes"),
+        (DeviceState.SEARCHING, SerialLineCounters(timeouts=9, echoes=9), "error", "only imud's own 9 echoes"),
+        (DeviceState.SEARCHING, SerialLineCounters(timeouts=9), "error", "nothing heard"),
+    ],
+)
+def test_rs485(machine: Machine, state: DeviceState, line: SerialLineCounters, severity: str, words: str) -> None:
+    machine.configure(RS485)
+    machine.status = [device("bow", state=state, serial_line=line, polling=POLLING)]  # 1000 reads
+    machine.tells(HALF, severity, words)
+
+
+@pytest.mark.parametrize(
+    ("resets", "samples", "severity"),
+    [
+        (0, 1000, "ok"),
+        (2, 1000, "note"),
+        (3, 360_000, "warning"),
+        (3, 2 * 360_000, "warning"),
+        (3, 4 * 360_000, "note"),
+    ],
+)
+def test_restarts_count_by_the_hour(machine: Machine, resets: int, samples: int, severity: str) -> None:
+    clock = ClockStatus(Sync.REGRESSION, resets=resets)
+    running = counted(DeviceState.RUNNING, samples=samples)
+    machine.status = [msgspec.structs.replace(running, clock=clock, expected_rate_hz=100.0)]  # 360,000 samples an hour
+    assert [finding.severity for finding in machine.find(RESTARTS)] == [severity]
+
+
+@pytest.mark.parametrize(
+    ("samples", "found", "severity", "words"),
+    [
+        (5000, LinesStatus({}, {"sout": 4999}, {"sout": 0}), "ok", "4999 edges"),
+        (5000, LinesStatus({}, {"sout": 4990}, {"sout": 9}), "warning", "9 of 4999 edges were lost"),
+        (5000, LinesStatus({}, {"sout": 0}, {}), "warning", "no edge in 5000 samples"),
+        (50, LinesStatus({}, {"sout": 0}, {}), "not checked", "too few samples"),
+        (5000, LinesStatus({}, {"alarm": 0}, {}), "note", "no edge so far"),
+        (900, LinesStatus({}, {"pps": 0}, {}), "not checked", "too few samples"),
+        (1100, LinesStatus({}, {"pps": 0}, {}), "warning", "has the receiver a fix"),
+        (5000, LinesStatus({"sout": "GPIO17 is in use"}, {"sout": 0}, {}), "error", "GPIO17 is in use"),
+    ],
+)
+def test_edges_of_lines(machine: Machine, samples: int, found: LinesStatus, severity: str, words: str) -> None:
+    machine.configure(WIRED)
+    running = counted(DeviceState.RUNNING, samples=samples)
+    machine.status = [msgspec.structs.replace(running, lines=found, expected_rate_hz=100.0)]
+    machine.tells(LINES, severity, words)

@@ -1,0 +1,228 @@
+"""`imud noise` and `imud spectrum` from the command line: captures, recordings, a running daemon."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imud.cli import main
+from imud.cli import sample_set as taking
+from imud.cli import spectrum as spectrum_live
+from imud.cli.analysis import bands_hz
+from imud.cli.output import COLUMNS
+from imud.model.units import NS_PER_MS
+from tests.cli.captures import frame, resting, shaken, write_capture
+from tests.cli.conftest import Cli
+from tests.cli.recorded_daemon import FRAMES, run_recorded
+from tests.support.daemon_process import LIMIT_S, running_daemon, sending_daemon
+from tests.support.files import CaptureWriter, hi91
+
+SET_HZ, TRUE_HZ, SHAKEN_HZ = 400.0, 408.0, 63.7
+SHEET = "source: a sheet\ngyro: {random_walk_deg_sqrt_h: 0.5}\naccel: {random_walk_m_s_sqrt_h: 0.001}\n"
+
+
+@pytest.fixture(scope="module")
+def shaken_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A module that is set to 400 Hz and whose crystal is 2 % fast, on a shaker; 1 % of its messages are missing."""
+    count = 16_000
+    missing = np.random.default_rng(1).choice(np.arange(2000, count), count // 100, replace=False).tolist()
+    accel, gyro = shaken(count, TRUE_HZ, SHAKEN_HZ)
+    file = tmp_path_factory.mktemp("shaken") / "shaken.capture"
+    return write_capture(file, accel, gyro, rate_hz=SET_HZ, fast=0.02, missing=missing)
+
+
+@pytest.fixture(scope="module")
+def resting_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A module at rest that becomes warmer."""
+    accel, gyro = resting(12_000, 100.0)
+    warm = np.linspace(25.0, 32.0, len(accel))
+    return write_capture(
+        tmp_path_factory.mktemp("resting") / "a.capture", accel, gyro, rate_hz=100.0, temperature_c=warm
+    )
+
+
+def test_a_line_is_found_at_the_true_rate(shaken_file: Path, cli: Cli) -> None:
+    accel = json.loads(cli("spectrum", "--json", "--skip", "5s", shaken_file).out)["sensors"]["accel"]
+    assert accel["rate_hz"] == pytest.approx(TRUE_HZ, rel=1e-5)
+    assert accel["missing"] == pytest.approx(160, abs=2)
+    peak = accel["peaks"][0]
+    assert peak["frequency_hz"] == pytest.approx(SHAKEN_HZ, abs=0.05 * accel["bin_hz"])
+    assert peak["amplitude"][2] == pytest.approx(2.0, rel=0.03)
+    assert peak["images_hz"] == pytest.approx([TRUE_HZ - SHAKEN_HZ, TRUE_HZ + SHAKEN_HZ], abs=0.1)
+
+
+def test_a_spectrum_in_words(shaken_file: Path, tmp_path: Path, cli: Cli) -> None:
+    picture = tmp_path / "vibration.png"
+    words = ["spectrum", "--sensor", "accel", "--bands", "5-60,60-70", "-o", str(picture), str(shaken_file)]
+    out = cli(*words, "--resolution", "0.5").out
+    assert max(map(len, out.splitlines())) <= COLUMNS
+    assert "P1" in out
+    assert "60 to 70" in out
+    assert "gyroscope" not in out
+    for word in ("aliasing", "no manual states", "noise bandwidth", "are\n  missing", "Hann"):
+        assert word in out, word
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_noise_of_a_capture(resting_file: Path, tmp_path: Path, cli: Cli) -> None:
+    sheet = tmp_path / "sheet.yaml"
+    sheet.write_text(SHEET)
+    told = json.loads(cli("noise", "--json", "--sheet", sheet, resting_file).out)
+    gyro, accel = told["sensors"]["gyro"], told["sensors"]["accel"]
+    assert gyro["axes"]["y"]["random_walk"]["value"] == pytest.approx(1e-4, rel=0.05)
+    assert gyro["axes"]["y"]["random_walk"]["deg/√h"] == pytest.approx(1e-4 * 3437.747, rel=0.05)
+    assert accel["axes"]["z"]["random_walk"]["µg/√Hz"] == pytest.approx(5e-4 / 9.80665e-6, rel=0.05)
+    assert told["measurement"]["temperature_c"] == [25.0, 32.0]
+    assert gyro["compared"][0]["ratio"] == pytest.approx(0.34377 / 0.5, rel=0.05)
+    assert accel["compared"][0]["ratio"] == pytest.approx(0.03 / 0.001, rel=0.05)
+    assert len(gyro["allan"]["tau_s"]) == len(gyro["allan"]["deviation"][0]) == len(gyro["allan"]["noise"][2])
+
+
+@pytest.mark.parametrize("end", [".html", ".svg", ".png"])
+def test_a_report_for_a_supplier(resting_file: Path, tmp_path: Path, cli: Cli, end: str) -> None:
+    sheet, file = tmp_path / "sheet.yaml", tmp_path / f"report{end}"
+    sheet.write_text(SHEET)
+    out = cli("noise", "--sheet", sheet, "--for", "60s", "-o", file, resting_file).out
+    assert max(map(len, out.splitlines())) <= COLUMNS
+    for words in ("angle random walk N", "µg/√Hz", "of 0.5 deg/√h = 0.6", "times: within", "times: ABOVE", "a sheet"):
+        assert words in out, words
+    content = file.read_bytes()
+    if end != ".png":
+        text = content.decode()
+        assert "angle random walk" in text
+        assert "Allan deviation" in text
+        assert "src=" not in text
+        assert "<script" not in text
+        assert "hipnuc-uart" in text
+
+
+def test_without_a_sheet_the_report_says_what_the_manual_has(resting_file: Path, cli: Cli) -> None:
+    assert "no figure of noise for any model" in " ".join(cli("noise", "--for", "20s", resting_file).out.split())
+
+
+# --- recordings -------------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_of_two_devices_and_a_part_of_it(tmp_path: Path, cli: Cli) -> None:
+    (file,) = run_recorded(tmp_path)[2]
+    cli.refuses("it has bow, mast: choose one with --device", "noise", file)
+    cli.refuses("--device stern: expected one of the recording's, bow, mast", "noise", "--device", "stern", file)
+    cli.refuses("--driver: expected none with a recording", "noise", "--driver", "hipnuc-uart", file)
+    words = ("noise", "--json", "--device", "bow", file)
+    measurement = json.loads(cli(*words).out)["measurement"]
+    assert measurement["samples"] == FRAMES
+    assert (measurement["device"], measurement["driver"]) == ("bow", "hipnuc-uart")
+    assert measurement["begun_utc_ns"] > 0
+    measurement = json.loads(cli(*words, "--for", "1s").out)["measurement"]
+    assert measurement["samples"] < FRAMES
+    assert measurement["notes"] == [], "nothing is said of the end of the recording"
+
+
+# --- captures ---------------------------------------------------------------------------------------------------------
+
+
+def gappy(file: Path) -> Path:
+    """A capture of 10 s at 100 Hz, of which the seventh second is missing."""
+    with file.open("wb") as out:
+        writer = CaptureWriter(out, driver="hipnuc-uart", baud=115200)
+        for number in [*range(600), *range(700, 1000)]:
+            writer.write(hi91(10 * number), (100 + number) * 10 * NS_PER_MS)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("part", "lost"), [([], 100), (["--for", "5s"], 0), (["--skip", "7.5s"], 0), (["--skip", "2s"], 100)]
+)
+def test_losses_are_those_of_the_part_that_was_taken(tmp_path: Path, cli: Cli, part: list[str], lost: int) -> None:
+    assert json.loads(cli("noise", "--json", *part, gappy(tmp_path / "c.capture")).out)["measurement"]["lost"] == (
+        {"lost_gap_device": lost} if lost else {}
+    )
+
+
+def test_a_damaged_capture_is_named_and_a_raw_one_dated_by_the_device(tmp_path: Path, cli: Cli) -> None:
+    file = gappy(tmp_path / "c.capture")
+    file.write_bytes(file.read_bytes() * 2)
+    assert "damaged at byte" in cli("spectrum", file).out
+    accel, gyro = resting(500, 100.0)
+    file = tmp_path / "raw"
+    file.write_bytes(b"".join(frame(10 * number, accel[number], gyro[number]) for number in range(500)))
+    out = " ".join(cli("spectrum", file).out.split())
+    assert "even grid of 100.0000 Hz" in out
+    assert "as true as its crystal" in out
+
+
+# --- what is wrong ----------------------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_done_is_said(resting_file: Path, cli: Cli) -> None:
+    for words, message in [
+        (["noise", "-o", "a.pdf"], "ends in .html, .svg, .png"),
+        (["spectrum", "-o", "a.html"], "ends in .svg or .png"),
+        (["spectrum", "--resolution", "0.0001"], "resolution 0.0001 Hz: expected from"),
+        (["spectrum", "--bands", "10-900"], "expected 0 to 50 Hz"),
+        (["noise", "--skip", "1h"], "expected samples later than 3600 s after its first (--skip), found none"),
+        (["noise", "--sheet", "/nowhere"], "--sheet /nowhere"),
+        (["noise", "-o", "/nowhere/a.svg"], "/nowhere/a.svg"),
+    ]:
+        cli.refuses(message, *words, str(resting_file))
+
+
+def test_what_is_neither_file_nor_device(tmp_path: Path, cli: Cli) -> None:
+    cli.refuses("no daemon at", "noise", "bow", "--socket", str(tmp_path / "none"))
+    cli.refuses(
+        "--baud: expected none with a device", "noise", "bow", "--baud", "9600", "--socket", str(tmp_path / "none")
+    )
+
+
+@pytest.mark.live
+def test_the_extra_is_named_if_it_is_missing_and_the_daemon_does_not_load_it(resting_file: Path) -> None:
+    program = (
+        "import sys, imud.daemon, imud.cli\nimud.cli.build_parser()\nprint({'numpy', 'scipy'} & set(sys.modules))\n"
+        f"sys.modules['scipy'] = None\nimud.cli.main(['noise', {str(resting_file)!r}])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT_S, check=True)
+    assert done.stdout == "set()\n"
+    assert "imud noise: it needs scipy of the extra analysis: pip install 'imud[analysis]'" in done.stderr
+
+
+def test_bands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert bands_hz("5-50, 50-200.5") == ((5.0, 50.0), (50.0, 200.5))
+    with pytest.raises(SystemExit):
+        main(["spectrum", "--bands", "5,6", "file"])
+    assert "expected bands in Hz" in capsys.readouterr().err
+
+
+# --- a running daemon -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.live
+def test_spectrum_and_noise_of_a_live_device(tmp_path: Path, cli: Cli) -> None:
+    accel, gyro = shaken(1000, 100.0, 12.0)
+    with sending_daemon(tmp_path, lambda n: frame(10 * n, accel[n % 1000], gyro[n % 1000])) as daemon:
+        live = ("--socket", daemon.socket, "bow")
+        measurement = json.loads(cli("spectrum", "--json", "--for", "1.5s", *live).out)["measurement"]
+        assert (measurement["device"], measurement["source"]) == ("bow", f"live from {daemon.socket}")
+        assert measurement["duration_s"] == pytest.approx(1.5, abs=0.1)
+        assert measurement["begun_utc_ns"] > 0
+        text = cli("noise", "--skip", "0.2s", "--for", "1.5s", *live).out
+        assert max(map(len, text.splitlines())) <= COLUMNS
+        for word in ("live from", "angle random walk N", "bow, driver hipnuc-uart"):
+            assert word in text, word
+        cli.refuses("stern: expected a file, or a device of the daemon (bow)", "noise", *live[:2], "stern")
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("on_a_terminal", [True, False])
+def test_a_device_that_sends_nothing_at_all_is_named(
+    tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch, on_a_terminal: bool
+) -> None:
+    monkeypatch.setattr(taking, "SILENCE_S", 0.2)
+    monkeypatch.setattr(spectrum_live, "SILENCE_S", 0.2)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: on_a_terminal)
+    device = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
+    with running_daemon(tmp_path, {"bow": device}) as daemon:
+        printed = cli("spectrum", "--socket", daemon.socket, "bow", status=2)
+    assert printed.err == "imud spectrum: bow: it sends no samples; `imud status` says why\n"

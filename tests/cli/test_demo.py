@@ -1,0 +1,132 @@
+"""`imud demo`: three real processes, the account at the end, and children that end too early."""
+
+import itertools
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.request import urlopen
+
+import pytest
+
+from imud.cli import demo as command
+from imud.cli import main
+from imud.client.connection import Client
+from imud.model.errors import ImudError, LinkMissing
+from tests.cli.conftest import Cli, ImudProcess, imud_process
+from tests.support.daemon_process import LIMIT_S, wait_until
+
+
+@contextmanager
+def demo(*words: str) -> Iterator[tuple[ImudProcess, Path]]:
+    with imud_process("demo", "--plain", *words, start_new_session=True) as process:
+        found = re.match(r"daemon at (\S+)/imud.sock", process.out.readline())
+        assert found is not None
+        try:
+            yield process, Path(found[1])
+        finally:
+            if process.process.poll() is None:
+                process.end(signal.SIGTERM)
+
+
+@pytest.mark.live
+@pytest.mark.parametrize(
+    ("device", "product"), [("hipnuc-uart", "HI14R3"), ("imu61x-uart", "IMU61x"), ("hipnuc-modbus", "HI14R2N")]
+)
+def test_samples_flow_and_the_ledger_closes(device: str, product: str) -> None:
+    with demo("--device", device, "--rate", "200") as (process, folder):
+        with Client(folder / "imud.sock") as client:
+
+            def watched_and_known() -> bool:
+                state = client.status()
+                watching = any(one["sent"] > 20 for one in state["socket"]["clients"])  # enough to show a rate
+                return watching and state["devices"][0]["identity"].get("product", "").startswith(product)
+
+            wait_until(watched_and_known, f"{product} is known and watched", 3 * LIMIT_S)
+        out = process.end(signal.SIGTERM).out
+    assert "the ledger closes to zero" in out
+    assert re.search(r"client +\d+ samples at \d+\.\d+ Hz, 0 missed", out)
+    assert product in out
+    assert not folder.exists()
+
+
+@pytest.mark.live
+def test_the_commands_it_prints_reach_it_from_another_directory() -> None:
+    with demo() as (process, _folder):
+        export, status, watch, clock, ring, scrape = (line.strip() for line in itertools.islice(process.out, 6))
+        assert clock.endswith("imud clock")
+        printed = pasted(export, f"{watch} --count 3", status, f"{clock} --duration 0.1", ring)
+        assert len(re.findall(r"^\d\d:\d\d:\d\d\.\d{3} ", printed, re.MULTILINE)) == 3
+        for words in ("demo: running", "verdict", "accel_m_s2="):
+            assert words in printed
+        with urlopen(scrape.removeprefix("curl ")) as answer:
+            assert b'imud_samples_total{device="demo"}' in answer.read()
+
+
+@pytest.mark.live
+def test_it_ends_after_its_duration(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--duration", "0.2", "--rate", "200", "--plain"]) == 0
+    out = capfd.readouterr().out
+    assert "the ledger closes to zero" in out
+    folder = re.search(r"daemon at (\S+)/imud.sock", out)
+    assert folder is not None
+    assert not Path(folder[1]).exists()
+
+
+def pasted(*lines: str) -> str:
+    script = "\n".join(["set -e", *lines])
+    return subprocess.run(
+        ["/bin/sh", "-c", script], cwd="/", env={}, capture_output=True, text=True, timeout=LIMIT_S, check=True
+    ).stdout
+
+
+@pytest.mark.live
+def test_children_that_end_too_early_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(command, "START_LIMIT_S", LIMIT_S)
+    simulator = command.simulator(tmp_path / "no" / "folder", [("hipnuc-uart", 0)], 100.0, "")
+    with pytest.raises(ImudError, match=r"^the simulator ended with status \d+ before it had a port$"), simulator:
+        pass
+    daemon = command.daemon(tmp_path, {"bow": {"driver": "none"}}, 0)
+    with pytest.raises(ImudError, match=r"^the daemon ended with status 78 at its start$"), daemon:
+        pass
+    monkeypatch.setattr(command, "START_LIMIT_S", 0.0)
+    daemon = command.daemon(tmp_path, {}, 0)
+    with pytest.raises(LinkMissing, match="the daemon opened no socket within 0 s"), daemon:
+        pass
+    monkeypatch.setattr(command, "STOP_LIMIT_S", 0.1)
+    deaf = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(99)"
+    with command.child([sys.executable, "-c", deaf], "the child", stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+    assert process.returncode == -signal.SIGKILL
+    assert capsys.readouterr().err.endswith("the child had to be killed\n")
+
+
+def test_devices_that_cannot_be_shown(cli: Cli) -> None:
+    for words, said in [
+        (["--device", "imu61x-i2c"], "imu61x-i2c is not simulated: say where a real one is, for example --bus 1"),
+        (
+            ["--device", "imu61x-spi", "--bus", "1"],
+            "imu61x-spi is not simulated: say where a real one is, for example --port /dev/spidev0.0",
+        ),
+        (["--device", "imu61x-i2c", "--device", "imu61x-uart"], "expected imu61x-i2c alone, got 2 devices"),
+        (
+            ["--device", "hipnuc-uart", "--device", "imu61x-can"],
+            "expected one device on a port, or one or more on a CAN bus",
+        ),
+        (
+            ["--device", "imu61x-can", "--device", "imu61x-can"],
+            "expected devices that differ, for example --device imu61x-can:101 --device imu61x-can:201",
+        ),
+    ]:
+        assert cli("demo", *words, status=2).err == f"imud demo: {said}\n"
+
+
+def test_a_can_device_needs_an_interface(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
+    monkeypatch.setattr("imud.sim.ports.can_port.can_interfaces", list)
+    cli.refuses("ip link add vcan0 type vcan", "demo", "--device", "imu61x-can", "--duration", "1")

@@ -1,0 +1,365 @@
+"""`imud export`: what comes out is what the daemon published, read back by csv, mcap and rosbags."""
+
+import csv
+import json
+import sys
+from collections.abc import Iterator
+from io import BytesIO, StringIO
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, Convention
+from imud.attitude.published import as_sent
+from imud.cli import export as command
+from imud.cli import main, replay
+from imud.cli.export_sources import recorded_noise
+from imud.contracts.publisher import Batch
+from imud.contracts.status import Deviations
+from imud.formats.recording import BlockGatherer, RecordingReader
+from imud.formats.records import Kind, encode, encode_object
+from imud.model.event import Event, EventKind
+from imud.model.sample import Sample
+from imud.model.units import NS_PER_MS, NS_PER_S
+from tests.cli.captures import resting, write_capture
+from tests.cli.conftest import Cli
+from tests.cli.recorded_daemon import FRAMES, run_recorded, stamped_capture
+from tests.support.files import hi91, imu61x_log
+
+EVENTS = (
+    Event(1000 * NS_PER_S, "bow", EventKind.UP, "is there", {"rate_hz": 100.0}),
+    Event(1001 * NS_PER_S, "mast", cast("EventKind", "new-kind"), "of a newer imud"),
+    Event(1002 * NS_PER_S, "", EventKind.RECORDER, "the disk is full"),
+)
+
+
+class Recorded(NamedTuple):
+    file: Path
+    samples: list[Sample]
+
+    def of(self, device: str) -> list[Sample]:
+        """Samples of a device in the axes of REP-103."""
+        mine = [sample for sample in self.samples if sample.device == device]
+        frame = as_sent(RFU_ENU if device == "bow" else FLU_LEVEL)
+        return list(Batch(device, 0, mine, frame).converted(Convention.ENU_FLU).samples)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    _, collector, (file,) = run_recorded(tmp_path_factory.mktemp("recorded"))
+    return Recorded(with_events(file), collector.samples)
+
+
+def with_events(file: Path) -> Path:
+    """Put an event of each device, and one of a newer imud, before the end of a recording."""
+    gatherer, data = BlockGatherer(), b""
+    with file.open("rb") as stream:
+        for record in RecordingReader(stream, file.name):
+            if record.kind == Kind.END:
+                for event in EVENTS:
+                    data += gatherer.add(encode_object(Kind.EVENT, 0, event))
+            data += gatherer.add(encode(Kind(record.kind), record.device, record.body))
+    file.write_bytes(data + gatherer.finish())
+    return file
+
+
+def rows(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(StringIO(text, newline="")))
+
+
+# --- CSV --------------------------------------------------------------------------------------------------------------
+
+
+def test_csv_has_every_sample_with_all_its_digits(recorded: Recorded, cli: Cli) -> None:
+    printed = cli("export", "--to", "csv", recorded.file)
+    found = rows(printed.out)
+    assert len(found) == len(recorded.samples) > FRAMES
+    for row, sample in zip(found, recorded.samples, strict=True):
+        assert (row["device"], int(row["seq"]), int(row["t_ns"])) == (sample.device, sample.seq, sample.t_ns)
+        assert (int(row["t_err_ns"]), row["sync"], int(row["utc_ns"])) == (sample.t_err_ns, sample.sync, sample.utc_ns)
+        assert sample.accel_m_s2 is not None
+        assert tuple(float(row[f"accel_{axis}_m_s2"]) for axis in "xyz") == sample.accel_m_s2
+    assert {row["mag_x_t"] for row in found if row["device"] == "mast"} == {""}
+    assert "the same as the live run" in printed.err
+    assert f"{len(found)} samples to standard output" in printed.err
+
+
+def test_csv_is_that_of_rfc_4180_and_has_chosen_fields(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
+    cli("export", "--to", "csv", "-o", tmp_path / "a.csv", recorded.file)
+    data = (tmp_path / "a.csv").read_bytes()
+    lines = data.split(b"\r\n")
+    assert lines[-1] == b""
+    assert b"\n" not in b"".join(lines)
+    assert len({line.count(b",") for line in lines[:-1]}) == 1
+    words = ["export", "--to", "csv", "--device", "mast", "--fields", "gyro_rad_s,t_ns", str(recorded.file)]
+    found = rows(cli(*words).out)
+    assert list(found[0]) == ["gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s", "t_ns"]
+    assert len(found) == sum(sample.device == "mast" for sample in recorded.samples)
+
+
+def test_events_and_losses_are_tables_of_their_own(recorded: Recorded, cli: Cli) -> None:
+    events = rows(cli("export", "--to", "csv", "--table", "events", recorded.file).out)
+    assert [(one["device"], one["kind"], one["t_ns"]) for one in events[-3:]] == [
+        (event.device, event.kind, str(event.t_ns)) for event in EVENTS
+    ]
+    newest = recorded.samples[-1]
+    for one in events[-3:]:
+        offset_ns = int(one["utc_ns"]) - int(one["t_ns"])
+        assert abs(offset_ns - (newest.utc_ns - newest.t_ns)) < NS_PER_MS
+    losses = rows(cli("export", "--to", "csv", "--table", "losses", recorded.file).out)
+    assert {(one["device"], one["lost_crc"]) for one in losses} == {("bow", "0"), ("mast", "0")}
+
+
+# --- MCAP -------------------------------------------------------------------------------------------------------------
+
+
+def messages(file: Path) -> Iterator[tuple[str, str, int, bytes]]:
+    with file.open("rb") as stream:
+        for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False):
+            assert schema is not None
+            yield channel.topic, schema.name, message.log_time, message.data
+
+
+def test_mcap_with_json(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
+    out = tmp_path / "a.mcap"
+    cli("export", "--to", "mcap", "-o", out, recorded.file)
+    found: dict[str, list[Any]] = {}
+    for topic, _, t_ns, data in messages(out):
+        found.setdefault(topic, []).append((t_ns, json.loads(data)))
+    assert set(found) == {
+        "/bow/imu/data", "/bow/imu/mag", "/bow/temperature", "/bow/pressure", "/bow/attitude", "/bow/stamp",
+        "/bow/losses", "/mast/imu/data", "/mast/temperature", "/mast/attitude", "/mast/stamp", "/mast/losses",
+        "/events", "/diagnostics",
+    }  # fmt: skip
+    for device in ("bow", "mast"):
+        samples = recorded.of(device)
+        for (t_ns, imu), (_, stamp), sample in zip(
+            found[f"/{device}/imu/data"], found[f"/{device}/stamp"], samples, strict=True
+        ):
+            assert t_ns == sample.utc_ns == imu["timestamp"]["sec"] * 10**9 + imu["timestamp"]["nsec"]
+            assert tuple(imu["linear_acceleration"].values()) == sample.accel_m_s2
+            assert tuple(imu["angular_velocity"].values()) == sample.gyro_rad_s
+            assert (stamp["seq"], stamp["t_err_ns"], stamp["sync"]) == (sample.seq, sample.t_err_ns, sample.sync)
+    frames = {one["child_frame_id"]: one["parent_frame_id"] for topic in ("bow", "mast")
+              for _, one in found[f"/{topic}/attitude"]}  # fmt: skip
+    assert frames == {"bow": "enu", "mast": "mast_level"}
+    assert [one["message"] for _, one in found["/events"]][-3:] == [
+        "up: is there", "new-kind: of a newer imud", "recorder: the disk is full"
+    ]  # fmt: skip
+
+
+def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
+    out = tmp_path / "a.mcap"
+    cli("export", "--to", "mcap", "--schema", "ros2", "-o", out, recorded.file)
+    found: dict[str, list[Any]] = {}
+    with AnyReader([out]) as reader:
+        types = {connection.topic: connection.msgtype for connection in reader.connections}
+        for connection, t_ns, data in reader.messages():
+            found.setdefault(connection.topic, []).append((t_ns, reader.deserialize(data, connection.msgtype)))
+    assert types["/bow/imu/data"] == "sensor_msgs/msg/Imu"
+    assert types["/bow/imu/mag"] == "sensor_msgs/msg/MagneticField"
+    assert types["/bow/pressure"] == "sensor_msgs/msg/FluidPressure"
+    assert types["/tf"] == "tf2_msgs/msg/TFMessage"
+    assert types["/events"] == "rcl_interfaces/msg/Log"
+    assert types["/diagnostics"] == "diagnostic_msgs/msg/DiagnosticArray"
+    for device in ("bow", "mast"):
+        for (t_ns, imu), (_, stamp), sample in zip(
+            found[f"/{device}/imu/data"], found[f"/{device}/stamp"], recorded.of(device), strict=True
+        ):
+            header, force, turn = imu.header, imu.linear_acceleration, imu.orientation
+            assert t_ns == sample.utc_ns == header.stamp.sec * 10**9 + header.stamp.nanosec
+            assert header.frame_id == device
+            assert (force.x, force.y, force.z) == sample.accel_m_s2
+            assert (turn.w, turn.x, turn.y, turn.z) == sample.quat_wxyz
+            assert (stamp.seq, stamp.t_ns, stamp.t_err_ns) == (sample.seq, sample.t_ns, sample.t_err_ns)
+    assert len(found["/tf"]) == len(recorded.samples)
+    assert found["/bow/losses"][0][1].lost_crc == 0
+
+
+def test_diagnostics_of_a_recording_have_its_losses_states_and_errors(
+    recorded: Recorded, tmp_path: Path, cli: Cli
+) -> None:
+    """Of a recording for the errors; of a capture in which 7 messages are missing for the losses."""
+    accel, gyro = resting(1500, 100.0)
+    gap = write_capture(tmp_path / "gap.capture", accel, gyro, rate_hz=100.0, missing=range(700, 707))
+    for file in (recorded.file, gap):
+        out = tmp_path / f"{file.name}.mcap"
+        cli("export", "--to", "mcap", "--schema", "ros2", "-o", out, file)
+        with AnyReader([out]) as reader:
+            found = [
+                (t_ns, reader.deserialize(data, connection.msgtype))
+                for connection, t_ns, data in reader.messages()
+                if connection.topic == "/diagnostics"
+            ]
+        if file == gap:
+            break
+        by_device = {one.name: one for _, array in found for one in array.status}  # type: ignore[attr-defined]
+        assert by_device.keys() == {"imud: bow", "imud: mast"}
+        newest = {one.key: one.value for one in by_device["imud: bow"].values}
+        sample = next(one for one in recorded.of("bow") if str(one.seq) == newest["samples"])
+        assert (newest["t_err_ns"], newest["sync"]) == (str(sample.t_err_ns), sample.sync)
+    arrays: list[Any] = [array for _, array in found]
+    statuses = [array.status[0] for array in arrays]
+    assert [one.level for one in statuses] == 7 * [statuses[0].OK] + 8 * [statuses[0].WARN]
+    lost = [{one.key: one.value for one in status.values}["lost_gap_device"] for status in statuses]
+    assert lost == 7 * ["0"] + 8 * ["7"]
+    stamps_ns = [array.header.stamp.sec * 10**9 + array.header.stamp.nanosec for array in arrays]
+    assert [t_ns for t_ns, _ in found] == [max(stamp_ns, 0) for stamp_ns in stamps_ns], "MCAP begins in 1970"
+
+
+def test_covariances_come_from_the_configuration_and_from_reports(tmp_path: Path, cli: Cli) -> None:
+    pytest.importorskip("scipy", reason="the analysis needs the extra imud[analysis]")
+    accel, gyro = resting(12_000, 100.0)
+    resting_file = write_capture(tmp_path / "rest.capture", accel, gyro, rate_hz=100.0)
+    _, _, (file,) = run_recorded(tmp_path, more="noise: {gyro_rad_s: 0.5, attitude_rad: 0.25}")
+    report = json.loads(cli("noise", "--json", resting_file).out)
+    report["measurement"]["device"] = "mast"
+    (tmp_path / "mast.json").write_text(json.dumps(report))
+    sigma = sum(axis["spread"]["value"] ** 2 for axis in report["sensors"]["gyro"]["axes"].values()) / 3
+    for words, variance in (([], 0.25), (["--noise", str(tmp_path / "mast.json")], sigma)):
+        out = tmp_path / "a.mcap"
+        cli("export", "--to", "mcap", "--schema", "ros2", "--force", *words, "-o", out, file)
+        with AnyReader([out]) as reader:
+            imu: dict[str, Any] = {
+                connection.topic: reader.deserialize(data, connection.msgtype)
+                for connection, _, data in reader.messages()
+                if connection.topic.endswith("/imu/data")
+            }
+        mast = imu["/mast/imu/data"]
+        assert list(mast.angular_velocity_covariance) == pytest.approx([variance, 0, 0, 0, variance, 0, 0, 0, variance])
+        assert mast.orientation_covariance[8] == 0.0625
+        assert not any(imu["/bow/imu/data"].angular_velocity_covariance)
+
+
+def test_the_noise_of_a_device_that_is_described_after_samples_of_another_one(tmp_path: Path) -> None:
+    """The daemon describes a device when it starts. Another device may send samples before that."""
+    _, _, (file,) = run_recorded(tmp_path, more="noise: {gyro_rad_s: 0.5}")
+    with file.open("rb") as stream:
+        records = list(RecordingReader(stream, file.name))
+    late = next(one for one in records if b"gyro_rad_s" in bytes(one.body) and one.kind == Kind.DEVICE)
+    gatherer, data = BlockGatherer(), b""
+    for record in [*(one for one in records if one is not late and one.device != late.device), late]:
+        data += gatherer.add(encode(Kind(record.kind), record.device, record.body))
+    assert recorded_noise(BytesIO(data + gatherer.finish()), "a") == {"mast": Deviations(gyro_rad_s=0.5)}
+
+
+def test_fields_choose_channels_and_ned_has_frames_of_its_own(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
+    out = tmp_path / "a.mcap"
+    words = ("export", "--to", "mcap", "--device", "bow", "--force", "-o", out, recorded.file)
+    cli(*words, "--fields", "mag_t,temperature_c")
+    topics = {topic for topic, *_ in messages(out)}
+    assert topics == {"/bow/imu/mag", "/bow/temperature", "/bow/losses", "/events", "/diagnostics"}
+    cli(*words, "--convention", "ned-frd")
+    found = [json.loads(data) for topic, _, _, data in messages(out) if topic in ("/bow/imu/data", "/bow/attitude")]
+    assert {one.get("frame_id", one.get("child_frame_id")) for one in found} == {"bow_frd"}
+    assert {one["linear_acceleration"]["z"] for one in found if "linear_acceleration" in one} == {-9.8}
+
+
+# --- captures ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_raw_capture_has_the_times_of_the_device_and_says_so(tmp_path: Path, cli: Cli) -> None:
+    (tmp_path / "c.raw").write_bytes(b"".join(hi91(10 * i) for i in range(300)))
+    printed = cli("export", "--to", "csv", tmp_path / "c.raw")
+    found = rows(printed.out)
+    assert len(found) == 300
+    for name in ("t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns"):
+        assert {row[name] for row in found} == {""}
+    assert [int(row["t_dev_ns"]) for row in found] == [10_000_000 * i for i in range(300)]
+    words = " ".join(printed.err.split())
+    assert "the capture has bytes and no time of any read" in words
+    assert "Hz" not in words
+    assert "live run" not in words
+    (tmp_path / "c.raw").write_bytes(b"".join(hi91(10 * i) for i in range(30)))
+    out = tmp_path / "c.mcap"
+    cli("export", "--to", "mcap", "-o", out, tmp_path / "c.raw")
+    stamps = [(t_ns, json.loads(data)) for topic, _, t_ns, data in messages(out) if topic == "/replay/stamp"]
+    assert [t_ns for t_ns, _ in stamps] == [10_000_000 * i for i in range(30)]
+    assert {one["t_err_ns"] for _, one in stamps} == {0xFFFF_FFFF}
+    with out.open("rb") as stream:
+        (metadata,) = [one.metadata for one in make_reader(stream).iter_metadata()]
+    assert "no time of any read" in metadata["times"]
+
+
+def test_a_stamped_capture_and_a_log_of_candump_have_their_own_times(tmp_path: Path, cli: Cli) -> None:
+    file = stamped_capture(tmp_path / "c.capture")
+    printed = cli("export", "--to", "csv", file)
+    found = rows(printed.out)
+    assert len(found) == FRAMES
+    assert abs(int(found[-1]["t_ns"]) - (1000 * 10**9 + 299 * 10**7)) < 10**7
+    assert int(found[0]["utc_ns"]) < 10**7
+    assert "does not say what time of day that was" in " ".join(printed.err.split())
+    (tmp_path / "can.log").write_text(imu61x_log(range(200)))
+    printed = cli("export", "--to", "csv", "--driver", "imu61x-can", tmp_path / "can.log")
+    found = rows(printed.out)
+    assert len(found) == 200
+    assert abs(int(found[100]["utc_ns"]) - (1_763_717_507 * 10**9 + 100 * 10**7)) < 10**6
+    assert "the log has the wall clock only" in " ".join(printed.err.split())
+
+
+# --- what goes wrong --------------------------------------------------------------------------------------------------
+
+
+def test_a_damaged_recording_is_exported_as_far_as_it_goes_and_is_an_answer_of_no(
+    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = recorded.file.read_bytes()
+    (tmp_path / "damaged").write_bytes(data[:-40] + bytes(20) + data)
+    out = tmp_path / "a.csv"
+    status = main(["export", "--to", "csv", "-o", str(out), str(tmp_path / "damaged")])
+    replayed = main(["replay", str(tmp_path / "damaged")])
+    assert status == replayed == 1
+    assert len(rows(out.read_text())) >= len(recorded.samples)
+    assert "damaged" in capsys.readouterr().err
+
+
+def test_files_that_are_no_recordings(tmp_path: Path, cli: Cli) -> None:
+    (tmp_path / "noise").write_bytes(b"\x00" * 500)
+    cli("export", "--to", "csv", tmp_path / "noise", status=1)
+    cli.refuses("expected a recording or a capture", "export", "--to", "csv", str(tmp_path / "none"))
+    (tmp_path / "c.raw").write_bytes(hi91(0))
+    cli.refuses(
+        "expected a driver of bytes or of CAN frames",
+        "export",
+        "--to",
+        "csv",
+        "--driver",
+        "hipnuc-modbus",
+        str(tmp_path / "c.raw"),
+    )
+
+
+def test_options_that_mean_nothing(recorded: Recorded, cli: Cli) -> None:
+    for words, expected in [
+        (["--to", "csv", "--schema", "ros2"], "--schema: expected with --to mcap only"),
+        (["--to", "csv", "--noise", "a.json"], "--noise: expected with --to mcap only"),
+        (["--to", "mcap", "--table", "events"], "--table: expected with --to csv only"),
+        (["--to", "csv", "--fields", "acel_m_s2"], "acel_m_s2"),
+        (["--to", "csv", "--table", "events", "--fields", "t_ns"], "--fields: expected with samples only"),
+        (["--to", "csv", "--driver", "hipnuc-uart"], "--driver: expected none with a recording"),
+        (["--to", "csv", "--device", "stern"], "expected a device of the recording, which has bow, mast"),
+    ]:
+        assert expected in " ".join(cli("export", *words, recorded.file, status=2).err.split())
+
+
+def test_without_the_library_it_says_how_to_get_it(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch, cli: Cli, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "mcap.records", None)
+    monkeypatch.delitem(sys.modules, "imud.bridges.mcap", raising=False)
+    cli.refuses("pip install 'imud[export]'", "export", "--to", "mcap", "-o", str(tmp_path / "a"), str(recorded.file))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_named_and_csv_needs_no_extra(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch, cli: Cli
+) -> None:
+    for to in ("csv", "mcap"):
+        cli.refuses("/dev/full: No space left on device", "export", "--to", to, "-o", "/dev/full", recorded.file)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "mcap"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    cli("export", "--to", "csv", recorded.file)
+    assert (command.DRIVER, command.BAUD) == (replay.DRIVER, replay.BAUD)

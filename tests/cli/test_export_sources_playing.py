@@ -1,0 +1,145 @@
+"""A recording that is played in a process of its own gives what it gives in this one."""
+
+import subprocess
+import sys
+from fcntl import F_GETPIPE_SZ, fcntl
+from io import BytesIO
+from pathlib import Path
+
+import pytest
+
+from imud.attitude.conventions import Convention
+from imud.bridges.channel import LossCounts, StampedEvent
+from imud.cli import export_sources as playing
+from imud.cli.export_sources import EVENT, HEAD, SAMPLES, PipeSink, play_beside, play_here
+from imud.contracts.publisher import Batch
+from imud.model.errors import ImudError
+from imud.model.sample import Sample
+from tests.cli.conftest import Cli
+from tests.cli.recorded_daemon import FRAMES, run_recorded
+from tests.support.socket_rig import batch
+
+
+class KeepingSink:
+    def __init__(self) -> None:
+        self.taken: list[Sample | LossCounts | StampedEvent] = []
+        self.largest = 0
+
+    def samples(self, batch: Batch) -> None:
+        self.taken += batch.converted(Convention.ENU_FLU).samples
+        self.largest = max(self.largest, len(batch.samples))
+
+    def losses(self, losses: LossCounts) -> None:
+        self.taken.append(losses)
+
+    def event(self, event: StampedEvent) -> None:
+        self.taken.append(event)
+
+    def finish(self) -> None: ...
+    def close(self) -> None: ...
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    _, _, (made,) = run_recorded(tmp_path_factory.mktemp("recorded"))
+    return made
+
+
+def test_both_ways_give_the_same_in_the_same_order(file: Path) -> None:
+    for devices in [[], ["bow"]]:
+        here, beside, positions = KeepingSink(), KeepingSink(), list[int]()
+        with file.open("rb") as stream:
+            first = play_here(stream, str(file), here, devices)
+        second = play_beside(file, beside, devices, positions.append)
+        assert second == first
+        assert first[2] == ["bow", "mast"]
+        assert beside.taken == here.taken
+        assert len(here.taken) > FRAMES
+        assert 1 < beside.largest < 2000
+        assert positions == sorted(positions)
+        assert 0 < positions[-1] <= file.stat().st_size
+
+
+def test_a_full_message_is_written_at_once() -> None:
+    pipe = BytesIO()
+    sink = PipeSink(pipe, lambda: 0)
+    sink.samples(batch(count=SAMPLES - 1))
+    head_only = pipe.tell()
+    sink.samples(batch(first=SAMPLES))
+    assert pipe.tell() > head_only
+    written = pipe.tell()
+    sink.finish()
+    assert pipe.tell() == written
+
+
+def test_the_pipe_is_as_large_as_the_kernel_allows(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: list[int] = []
+
+    def kept(pipe: int, command: int, size: int) -> None:
+        fcntl(pipe, command, size)
+        sizes.append(fcntl(pipe, F_GETPIPE_SZ))
+
+    monkeypatch.setattr(playing, "fcntl", kept)
+    play_beside(file, KeepingSink(), [], lambda _at: None)
+    assert sizes == [playing.PIPE_BYTES]
+
+    def refuse(*_arguments: int) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(playing, "fcntl", refuse)
+    sink = KeepingSink()
+    play_beside(file, sink, [], lambda _at: None)
+    assert len(sink.taken) > FRAMES
+
+
+def test_an_error_of_the_player_comes_out(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"\x89imudREC" + bytes(100))
+    with pytest.raises(ImudError, match="no whole block"):
+        play_beside(tmp_path / "a", KeepingSink(), [], lambda _at: None)
+
+
+WHOLE = HEAD.pack(EVENT, 4, 0)
+"""Head of a message with four bytes of data."""
+
+
+@pytest.mark.parametrize(
+    "sent", [b"", WHOLE[:-1], WHOLE, WHOLE + b"abc"], ids=["nothing", "in a head", "head", "in data"]
+)
+def test_a_player_that_ends_early_is_an_error(
+    sent: bytes, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "sent").write_bytes(sent)
+    player = tmp_path / "player"
+    player.write_text(f"#!/bin/sh\ncat {tmp_path}/sent\n")
+    player.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(player))
+    with pytest.raises(ImudError, match="ended before its end"):
+        play_beside(file, KeepingSink(), [], lambda _at: None)
+
+
+def test_an_error_of_the_sink_ends_the_player(file: Path) -> None:
+    class Full(KeepingSink):
+        def samples(self, batch: Batch) -> None:
+            raise ImudError("full")
+
+    with pytest.raises(ImudError, match="full"):
+        play_beside(file, Full(), [], lambda _at: None)
+
+
+def test_the_player_ends_quietly_when_nobody_reads(file: Path) -> None:
+    argv = [sys.executable, "-m", "imud.cli.export_sources", str(file)]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        process.stdout.close()
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
+
+
+def test_the_command_writes_the_same_file(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli
+) -> None:
+    cli("export", "--to", "csv", "-o", tmp_path / "here", file)
+    monkeypatch.setattr("imud.cli.export_sources.BESIDE_BYTES", 0)
+    cli("export", "--to", "csv", "-o", tmp_path / "beside", file)
+    assert (tmp_path / "here").read_bytes() == (tmp_path / "beside").read_bytes()
+    cli.refuses("which has bow, mast", "export", "--to", "csv", "--device", "stern", str(file))

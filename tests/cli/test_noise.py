@@ -1,0 +1,81 @@
+"""Cells and comparisons of a noise report; what a report says of a measurement that was none."""
+
+import numpy as np
+import pytest
+
+from imud.analysis.noise import Coefficient
+from imud.analysis.quantities import ShownUnit
+from imud.analysis.series import FloatArray, Readings
+from imud.cli.noise import cell, comparisons, duration_words, limits, noise_report, text
+from imud.cli.sample_set import Taken
+from imud.contracts.driver import ModelFigures, SensorFigures
+from imud.model.errors import ImudError
+from tests.analysis.synthetic import stamps_ns, white
+
+RATE_HZ = 100.0
+COUNT = 10_000
+MILLI = ShownUnit("m", 1000.0)
+
+
+def taken_of(values: FloatArray, driver: str = "hipnuc-canopen") -> Taken:
+    readings = Readings(stamps_ns(len(values), RATE_HZ), values, None, None)
+    return Taken("a file", "bow", driver, "can0", {"product": "HI14"}, readings=readings, stamps="edge")
+
+
+def noise_of_three(n: float = 1e-3) -> FloatArray:
+    random = np.random.default_rng(1)
+    return np.stack([white(random, COUNT, RATE_HZ, n) for _ in range(3)], axis=1)
+
+
+def test_cells_and_durations() -> None:
+    for figure, words in [
+        (None, "-"),
+        (Coefficient(0.00123456, 0.0, 0.0), "1.23"),
+        (Coefficient(0.00123456, 0.0000412, 0.0), "1.23 ±0.04"),
+        (Coefficient(None, 0.0, 0.005), "< 5"),
+        (Coefficient(3.26e3, 3e2, 0.0), "3.26e6 ±3e5"),
+    ]:
+        assert cell(figure, MILLI) == words
+    for seconds, words in [(12.34, "12.3 s"), (150.0, "2 min 30 s"), (7260.0, "2 h 1 min")]:
+        assert duration_words(seconds) == words
+
+
+def test_figures_hold_or_not_and_open_ones_have_no_verdict() -> None:
+    sheet = ModelFigures(gyro=SensorFigures(random_walk=1.2e-3, noise_density=1e-3), source="a sheet")
+    report = noise_report(taken_of(noise_of_three()), sheet)
+    walk, density = comparisons(report, "gyro")
+    assert (walk.quantity.key, walk.verdict) == ("random_walk", "within")
+    assert walk.ratio == pytest.approx(1 / 1.2, rel=0.05)
+    assert (density.quantity.key, density.verdict) == ("noise_density", "ABOVE")
+    assert density.ratio == pytest.approx(np.sqrt(2), rel=0.05)
+    report = noise_report(
+        taken_of(noise_of_three()),
+        ModelFigures(gyro=SensorFigures(bias_instability=1e-6, rate_random_walk=10.0), source="a sheet"),
+    )
+    bias, walk = comparisons(report, "gyro")
+    assert (bias.measured, bias.verdict) == (None, "not resolved")
+    assert walk.verdict == "within"
+
+
+def test_what_limits_the_figures() -> None:
+    values = np.round(noise_of_three() / 1.7453293e-3) * 1.7453293e-3
+    report = noise_report(taken_of(values), None)
+    words = " ".join(limits(report, "gyro"))
+    assert "whole counts of 0.001745 rad/s by the manual" in words
+    moved = noise_of_three()
+    moved[2000:4000] += np.sin(np.arange(2000) / 10)[:, None]
+    words = " ".join(limits(noise_report(taken_of(moved, "imu61x-can"), None), "gyro"))
+    assert "NOT AT REST: 20 of 100 seconds" in words
+    assert "the device's own filter: low-pass 47 Hz as delivered" in words
+
+
+def test_the_text_names_what_is_not_compared_and_a_device_without_sensors_is_refused() -> None:
+    words = text(noise_report(taken_of(noise_of_three()), None))
+    assert "bow: noise" in words
+    assert "product HI14" in words
+    assert "Not compared with a data sheet: HiPNUC" in words
+    empty = Readings(stamps_ns(COUNT, RATE_HZ), None, None, None)
+    with pytest.raises(ImudError, match="bow sends neither angular rate nor acceleration"):
+        noise_report(Taken("a file", "bow", readings=empty), None)
+    with pytest.raises(ImudError, match="expected samples, found none"):
+        noise_report(Taken("a file", "bow"), None)

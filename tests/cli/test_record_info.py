@@ -1,0 +1,79 @@
+"""`imud info`: begin, size, devices, rates, losses and integrity of a recording."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from imud.cli.record import Contents
+from imud.formats.records import CheckRecord, Kind, PathRecord, encode_object, records_of
+from imud.model.ledger import LEDGER_FIELDS
+from imud.model.units import NS_PER_S
+from tests.cli.conftest import Cli
+from tests.cli.recorded_daemon import run_recorded
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    _, _, (made,) = run_recorded(tmp_path_factory.mktemp("info"))
+    return made
+
+
+def test_whole_damaged_cut_and_foreign_files(file: Path, cli: Cli, tmp_path: Path) -> None:
+    page = cli("info", file).out
+    assert "integrity  whole" in page
+    assert "dropped    nothing" in page
+    assert "bow: " in page
+    assert "driver imu61x-can" in page
+    assert "bytes per sample" in page
+    assert all(len(line) <= 80 for line in page.splitlines())
+    told = json.loads(cli("info", "--json", file).out)
+    assert [device["name"] for device in told["devices"]] == ["bow", "mast"]
+    bow, mast = told["devices"]
+    assert (bow["samples"], bow["reads"], bow["lost"]) == (300, 300, 0)
+    assert bow["input_bytes"] == 300 * (82 + 17)
+    assert mast["samples"] > 190
+    assert told["stored_bytes"] == file.stat().st_size
+    assert told["problems"] == []
+    assert told["file_number"] == 0
+    data = bytearray(file.read_bytes())
+    (tmp_path / "cut").write_bytes(data[:-3])
+    assert "no regular end" in " ".join(cli("info", tmp_path / "cut").out.split())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "damaged").write_bytes(data + file.read_bytes())
+    assert "are damaged" in cli("info", tmp_path / "damaged", status=1).out
+    data = bytearray(file.read_bytes())
+    data[100] ^= 1
+    (tmp_path / "damaged").write_bytes(data)
+    page = " ".join(cli("info", tmp_path / "damaged", status=1).out.split())
+    assert "begun not known: the block that says it and names the devices is damaged or missing" in page
+    assert "duration not known" in page
+    assert "blocks that are missing by their numbers: 1" in page
+    (tmp_path / "a.csv").write_text("t_ns,accel\n" * 50)
+    cli.refuses("no recording of imud", "info", str(tmp_path / "a.csv"))
+    cli.refuses("No such file", "info", str(tmp_path / "none"))
+
+
+def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> None:
+    contents = Contents()
+
+    def add(kind: Kind, value: object) -> None:
+        contents.add(next(records_of(encode_object(kind, 0, value))))
+
+    def check(t_s: int, seq: int, lost: int) -> None:
+        ledger = dict.fromkeys(LEDGER_FIELDS, 0) | {"samples": seq, "lost_crc": lost}
+        add(Kind.CHECK, CheckRecord(t_s * NS_PER_S, seq, 0, 0, ledger))
+
+    check(10, 5000, 7)
+    check(12, 5200, 9)
+    add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 5250}, b""))  # the port was opened again
+    check(14, 5400, 9)
+    check(20, 50, 1)  # added again by a reload
+    check(21, 150, 4)
+    add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 0}, b""))  # and again, soon more than before
+    check(30, 200, 0)
+    check(32, 400, 5)
+    device = contents.devices[0]
+    assert device.samples == 400 + 100 + 200
+    assert device.lost == 2 + 3 + 5
+    assert device.rate_hz == pytest.approx(700 / (4 + 1 + 2))

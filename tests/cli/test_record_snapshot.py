@@ -1,0 +1,74 @@
+"""Snapshots of the flight recorder, from the middle of a run: they replay as the daemon ran."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from imud import config
+from imud.daemon import Daemon
+from imud.host import event_loop
+from imud.publishers.recorder import flight
+from tests.cli.conftest import Cli
+from tests.cli.recorded_daemon import FRAMES, Collector, stamped_capture
+from tests.support.daemon_process import running_daemon, wait_until
+from tests.support.files import imu61x_log
+
+
+def run_flying(folder: Path, settings: str) -> tuple[Collector, Sequence[Path]]:
+    """Run a daemon with a flight recorder to the end of its captures, 3 s; what it published, and the snapshots."""
+    stamped_capture(folder / "serial.capture")
+    (folder / "can.log").write_text(imu61x_log(range(FRAMES)))
+    text = f"""
+recorder: {{directory: {folder / "recordings"}, flight: {{enabled: true, {settings}}}}}
+socket: {{enabled: false}}
+shm: {{enabled: false}}
+metrics: {{enabled: false}}
+devices:
+  bow:
+    driver: hipnuc-uart
+    replay: {{path: {folder / "serial.capture"}, speed: recorded}}
+  mast:
+    driver: imu61x-can
+    replay: {{path: {folder / "can.log"}, speed: recorded}}
+"""
+    collector = Collector()
+    daemon = Daemon(config.parse(text, "imud.yaml"), extra={"test": collector}, until_finished=True)
+    event_loop.run(daemon.run())
+    return collector, sorted((folder / "recordings").iterdir())
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("place", ["memory", "directory"])
+def test_a_snapshot_whose_begin_is_gone_replays_as_the_daemon_ran(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli, place: str
+) -> None:
+    monkeypatch.setattr(flight, "SEGMENT_NS_MIN", 300_000_000)
+    monkeypatch.setattr(flight, "MEGABYTE", 28_000)  # of 39,000 that the run makes: the oldest segments go
+    directory = f"directory: {tmp_path / 'flight'}, " if place == "directory" else ""
+    collector, (file,) = run_flying(tmp_path, f"{directory}memory_mb: 1, minutes: 0.1, acceleration_m_s2: 5")
+    printed = cli("replay", "--json", file)
+    assert printed.err.count("the same as the live run") == 2
+    assert "0 of 0 checks" not in printed.err
+    for name in ("bow", "mast"):
+        live = [msgspec.json.encode(one).decode() for one in collector.samples if one.device == name]
+        again = [line for line in printed.out.splitlines() if f'"device":"{name}"' in line]
+        assert 20 < len(again) < len(live)
+        assert again == live[len(live) - len(again) :]
+    assert "integrity  whole" in cli("info", file).out
+
+
+@pytest.mark.live
+def test_a_client_saves_the_last_minutes(tmp_path: Path, cli: Cli) -> None:
+    capture = str(stamped_capture(tmp_path / "capture"))
+    played = {"driver": "hipnuc-uart", "replay": {"path": capture, "speed": "recorded", "repeat": True}}
+    recorder = {"directory": str(tmp_path / "recordings"), "flight": {"enabled": True}}
+    file = tmp_path / "snapshot.imudrec"
+    with running_daemon(tmp_path, {"bow": played}, recorder=recorder) as daemon:
+        wait_until(lambda: daemon.wait_for("bow", "running").newest_seq > 150, "150 samples")
+        assert "samples of 1 device" in cli("record", "--socket", daemon.socket, "--snapshot", file).err
+    printed = cli("replay", "--json", file)
+    assert len(printed.out.splitlines()) > 150
+    assert "the same as the live run" in printed.err
+    assert list((tmp_path / "recordings").iterdir()) == []

@@ -1,0 +1,110 @@
+"""The live spectrum: a page of at most 80 columns whose bars and shades are where the line is, drawn in a terminal."""
+
+import os
+import re
+import signal
+import subprocess
+import tty
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imud.analysis.spectrum import power_spectrum
+from imud.cli.output import COLUMNS
+from imud.cli.sample_set import Collector
+from imud.cli.spectrum import CLEAR, HEIGHT, SHADES, LiveView, SpectrumSettings, axis_line, curve_rows, in_columns
+from imud.model.sample import Sample, Sync
+from imud.model.units import NS_PER_S
+from tests.cli.captures import frame, shaken
+from tests.cli.conftest import imud_process
+from tests.support.daemon_process import sending_daemon
+
+RATE_HZ = 200.0
+COUNT = 2000
+PAGES = 4
+
+
+def collected(frequency_hz: float, count: int = COUNT) -> Collector:
+    collector = Collector("bow")
+    accel, _ = shaken(count, RATE_HZ, frequency_hz)
+    for number, (x, y, z) in enumerate(accel.tolist()):
+        t_ns = NS_PER_S + round(number * NS_PER_S / RATE_HZ)
+        collector.add(Sample("bow", number + 1, t_ns, 0, Sync.EDGE, t_ns, t_ns, accel_m_s2=(x, y, z)))
+    return collector
+
+
+def test_the_page() -> None:
+    view = LiveView("bow", "accel")
+    pages = [view.page(collected(hz), SpectrumSettings(("accel",))).splitlines() for hz in (25.0, 75.0)]
+    for page in pages:
+        assert max(map(len, page)) <= COLUMNS
+        assert page[0] == "bow accelerometer: 200.000 Hz, 0 missing, bins of 1.56 Hz"
+    first, second = pages
+    for page, hz in ((first, 25), (second, 75)):
+        top = next(row for row in page[2:] if row.strip())
+        assert len(top) - 1 == pytest.approx(COLUMNS * hz / 100, abs=2), "the highest bar"
+    past = second[2 + HEIGHT + 2 :][:2]
+    darkest = [max(range(len(row)), key=lambda at, row=row: SHADES.index(row[at])) for row in past]  # type: ignore[misc]
+    assert darkest == [pytest.approx(60, abs=2), pytest.approx(20, abs=2)], "newest above"
+    assert any(line.startswith("  P1") and " 75.0" in line for line in second)
+
+
+def test_too_few_samples_and_no_values_are_said() -> None:
+    view = LiveView("bow", "accel")
+    assert "at least 64 samples" in view.page(collected(25.0, 10), SpectrumSettings(("accel",)))
+    assert "sends no values of the gyroscope" in LiveView("bow", "gyro").page(
+        collected(25.0), SpectrumSettings(("gyro",))
+    )
+
+
+def test_columns_bars_and_axis() -> None:
+    accel, _ = shaken(20_000, RATE_HZ, 30.0)
+    spectrum = power_spectrum([accel], RATE_HZ, 2048)
+    columns = in_columns(spectrum)
+    assert len(columns) == COLUMNS
+    assert columns.max() == spectrum.density[1:].sum(axis=1).max()
+    few = in_columns(power_spectrum([accel], RATE_HZ, 64))
+    assert len(few) == COLUMNS
+    assert (few > 0).all()
+    rows = curve_rows(np.concatenate(([1.0, 0.5, 1 / (8 * HEIGHT)], np.zeros(COLUMNS - 3))))
+    assert len(rows) == HEIGHT
+    assert rows[0] == "█"
+    assert rows[HEIGHT // 2] == "██"
+    assert rows[-1] == "██▁"
+    line = axis_line(200.0)
+    assert len(line) == COLUMNS
+    assert line.startswith("0")
+    assert line.endswith("200 Hz")
+    assert line.split() == ["0", "50", "100", "150", "200", "Hz"]
+
+
+# --- in a terminal ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.live
+def test_it_is_redrawn_until_ctrl_c(tmp_path: Path) -> None:
+    accel, gyro = shaken(1000, 100.0, 12.0)
+    terminal, inside = os.openpty()
+    tty.setraw(inside)  # line ends stay as they are written
+    text = b""
+    with (
+        sending_daemon(tmp_path, lambda n: frame(10 * n, accel[n % 1000], gyro[n % 1000])) as daemon,
+        imud_process("spectrum", "--socket", daemon.socket, "bow", stdin=subprocess.DEVNULL, stdout=inside) as process,
+    ):
+        os.close(inside)
+        while text.count(b"newest above") < PAGES:  # the first pages have too few samples on a slow machine
+            text += os.read(terminal, 65536)
+        process.process.send_signal(signal.SIGINT)
+        with suppress(OSError):  # EIO: the process has closed the terminal; it waits for a reader before that
+            while True:
+                os.read(terminal, 65536)
+        assert process.end().err == ""
+    os.close(terminal)
+    pages = [page for page in text.decode(errors="replace").split(CLEAR)[:-1] if "newest above" in page]
+    assert pages
+    for page in pages:
+        assert max(map(len, page.splitlines())) <= COLUMNS
+        assert re.match(r"bow accelerometer: [0-9.]+ Hz, \d+ missing", page), page
+        assert re.search(r"the last \d+ s, newest above", page), page

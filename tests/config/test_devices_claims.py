@@ -1,0 +1,161 @@
+"""What the devices of one file cannot have together is refused with its place, by the real tables."""
+
+# ruff: noqa: E501 - a row of the table is a whole device and the whole message for it
+
+import re
+from pathlib import Path
+
+import pytest
+
+from imud import config
+from imud.config.devices import DEVICES_MAX, owner_of
+from imud.links import LINKS
+from imud.model.errors import ConfigError
+
+RAW = bytes(range(200))
+
+
+def problems(*devices: str) -> list[str]:
+    """The lines for a file with these devices, without its name and without columns; empty where it is good."""
+    text = "devices:\n" + "".join(f"  {name}: {keys}\n" for name, _, keys in (one.partition(" ") for one in devices))
+    try:
+        config.parse(text, "f")
+    except ConfigError as error:
+        return [re.sub(r"^f:(\d+):\d+:", r"\1:", line) for line in str(error).splitlines()]
+    return []
+
+
+MODBUS = "{{driver: hipnuc-modbus, rs485: {{line: {}, address: {}, baud: {}}}}}"
+CANOPEN = "{{driver: hipnuc-canopen, options: {{{}}}, socketcan: {{interface: {}}}}}"
+
+
+@pytest.mark.parametrize(
+    ("devices", "expected"),
+    [
+        (
+            ["a {uart: {port: /dev/x}}", "b {uart: {port: /dev/x}}"],
+            "3: devices.b.uart.port: expected a port of its own, got /dev/x, which a (line 2) has",
+        ),
+        (
+            ["a {uart: {port: /dev/x}}", "b " + MODBUS.format("/dev/x", 80, 9600)],
+            "3: devices.b.rs485.line: expected a line of its own, got /dev/x, which a (line 2) has",
+        ),
+        (
+            ["a " + MODBUS.format("/dev/x", 80, 9600), "b " + MODBUS.format("/dev/x", 80, 9600)],
+            "3: devices.b.rs485.address: expected an address of its own on /dev/x, got 80, which a (line 2) has",
+        ),
+        (
+            ["a " + MODBUS.format("/dev/x", 80, 9600), "b " + MODBUS.format("/dev/x", 81, 115200)],
+            "3: devices.b.rs485.baud: expected the same baud for all devices of /dev/x, got 115200; a (line 2) has 9600",
+        ),
+        (
+            ["a {driver: imu61x-i2c, i2c: {address: 0x18}}", "b {driver: imu61x-i2c, i2c: {address: 24}}"],
+            "3: devices.b.i2c.address: expected an address of its own on /dev/i2c-1, got 24, which a (line 2) has",
+        ),
+        (
+            ["a {spi: {port: /dev/spidev0.0}}", "b {spi: {port: /dev/../dev/spidev0.0}}"],
+            "3: devices.b.spi.port: expected a port of its own, got /dev/../dev/spidev0.0, which a (line 2) has",
+        ),
+        (
+            ["a " + CANOPEN.format("node: 8", "can0"), "b " + CANOPEN.format("", "can0")],
+            "3: devices.b.options: expected a device of its own on can0, got one that sends 0x188; a (line 2) has that",
+        ),
+        (
+            ["a " + CANOPEN.format("node: 8, sync_hz: 100", "can0"), "b " + CANOPEN.format("node: 9, sync_hz: 50", "can0")],
+            "3: devices.b.options: expected one device on can0 for which imud sends 0x080, got it here and for "
+            "a (line 2): leave it out here",
+        ),
+        (
+            ["a {driver: hipnuc-nmea2000, socketcan: {interface: can0}}",
+             "b {driver: hipnuc-nmea2000, options: {source: 35}, socketcan: {interface: can0}}"],
+            "3: devices.b.options: expected a device of its own on can0, got one that sends 0x01F11223; "
+            "a (line 2) has that",
+        ),
+        (
+            ["a {driver: imu61x-can, options: {base_id: 0x101}, socketcan: {interface: can0}}",
+             "b {driver: imu61x-can, options: {base_id: 0x105}, socketcan: {interface: can0}}"],
+            "3: devices.b.options: expected a device of its own on can0, got one that sends 0x105; a (line 2) has that",
+        ),
+        (
+            ["a {driver: imu61x-can, socketcan: {interface: c, backend: virtual}}",
+             "b {driver: hipnuc-canopen, socketcan: {interface: c, backend: virtual, bitrate: 500000}}"],
+            "3: devices.b.socketcan.bitrate: expected the same bitrate for all devices of c (virtual), got 500000; "
+            "a (line 2) has 0",
+        ),
+        (
+            ["a {driver: imu61x-can, socketcan: {interface: /dev/ttyACM0, backend: slcan}}", "b {uart: {port: /dev/ttyACM0}}"],
+            "3: devices.b.uart.port: expected a port of its own, got /dev/ttyACM0, which a (line 2) has",
+        ),
+        (
+            ["a {driver: hipnuc-uart, uart: {port: /dev/x}, rmc: {source: nmea, port: /dev/x}}"],
+            "2: devices.a.rmc.port: expected a port of its own, got /dev/x, which a (line 2) has",
+        ),
+    ],
+)  # fmt: skip
+def test_what_two_devices_cannot_have_together(devices: list[str], expected: str) -> None:
+    assert problems(*devices) == [expected]
+
+
+@pytest.mark.parametrize(
+    "devices",
+    [
+        ["a {uart: {port: /dev/x}}", "b {enabled: false, uart: {port: /dev/x}}"],
+        ["a " + MODBUS.format("/dev/x", 80, 9600), "b " + MODBUS.format("/dev/x", 81, 9600)],
+        ["a " + MODBUS.format("/dev/x", "auto", 9600), "b " + MODBUS.format("/dev/x", "auto", 9600)],
+        ["a " + CANOPEN.format("node: 8", "can0"), "b " + CANOPEN.format("node: 8", "can1")],
+        ["a " + CANOPEN.format("node: 8", "can0"), "b " + CANOPEN.format("node: 9", "can0")],
+        ["a " + CANOPEN.format("", "can0"), "b {driver: imu61x-can, socketcan: {interface: can0}}"],
+        [
+            "a {driver: hipnuc-j1939, socketcan: {interface: c}}",
+            "b {driver: hipnuc-nmea2000, socketcan: {interface: c}}",
+        ],
+        ["a {socketcan: {interface: can0}}", "b {socketcan: {interface: can0}}"],
+        ["a {spi: {port: /dev/spidev0.0}}", "b {spi: {port: /dev/spidev0.1, speed_hz: 200000}}"],
+        ["a {i2c: {bus: 1}}", "b {i2c: {bus: 1}}"],
+        ["a {memory: {}}", "b {memory: {}}"],
+    ],
+)
+def test_what_they_can_have_together(devices: list[str]) -> None:
+    assert problems(*devices) == []
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [
+        ("{replay: {path: PATH}}", "PATH is a raw capture without times: use speed real with a baud, or maximum"),
+        ("{replay: {path: PATH, speed: real}}", "PATH does not say its baud rate: speed real needs the key baud"),
+        ("{replay: {path: PATH, speed: real, baud: 9600}}", ""),
+        ("{replay: {path: PATH, speed: maximum}}", ""),
+        ("{replay: {path: PATH.none}}", ""),
+        ("{driver: imu61x-can, replay: {path: PATH}}", "PATH is no CAN log: expected frames"),
+        ("{driver: imu61x-can, replay: {path: PATH.log}}", ""),
+    ],
+)
+def test_a_capture_must_have_what_its_replay_needs(device: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "raw"
+    path.write_bytes(RAW)
+    (tmp_path / "raw.log").write_text("(1.000000) can0 101#0011223344556677\n")
+    found = problems("a " + device.replace("PATH", str(path)))
+    assert len(found) == bool(message)
+    assert not found or message.replace("PATH", str(path)) in found[0]
+
+
+def test_a_full_bus_and_a_full_line_are_compared() -> None:
+    nodes = [f"n{n} " + CANOPEN.format(f"node: {n}", "can0") for n in range(1, 128)]
+    slaves = [f"s{n} " + MODBUS.format("/dev/x", n, 9600) for n in range(1, 1 + DEVICES_MAX - len(nodes))]
+    assert problems(*nodes, *slaves) == []
+    assert len(problems(*nodes, *slaves[:-1], "last " + MODBUS.format("/dev/x", 1, 9600))) == 1
+
+
+def test_two_names_of_one_port_are_one_port(tmp_path: Path) -> None:
+    port, late = tmp_path / "port", tmp_path / "late"
+    late.touch()
+    first, second = config.parse(
+        f"devices:\n  a: {{uart: {{port: {port}}}}}\n  b: {{uart: {{port: {late}}}}}\n", "f"
+    ).devices
+    assert owner_of(second, [first, second], LINKS) == ""
+    late.unlink()
+    late.symlink_to("port")  # as udev makes it when the adapter is plugged in
+    assert owner_of(second, [first, second], LINKS) == "a"
+    (found,) = problems(f"a {{uart: {{port: {port}}}}}", f"b {{uart: {{port: {late}}}}}")
+    assert f"expected a port of its own, got {late}, which a (line 2) has" in found

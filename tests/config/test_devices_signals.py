@@ -1,0 +1,216 @@
+"""The wires of a device in the configuration: what is read, and every refusal with its place."""
+
+# ruff: noqa: E501 - a row of the table is a device and the whole message for it
+
+import pytest
+
+from imud import config
+from imud.config.model import DeviceConfig
+from imud.contracts.lines import (
+    LINE_SCHEMAS,
+    DeviceLines,
+    DividedSettings,
+    InputSettings,
+    PpsSettings,
+    ReadySettings,
+    ResetSettings,
+    SoutSettings,
+    TriggerSettings,
+)
+from imud.drivers import DRIVERS
+from imud.model.errors import ConfigError
+from imud.utc import RMC_SOURCES
+from imud.utc.receivers import RmcSettings
+
+
+def parse(*devices: str) -> tuple[DeviceConfig, ...]:
+    """Devices a, b, …, one a line."""
+    text = "".join(f"  {name}: {{{keys}}}\n" for name, keys in zip("abc", devices, strict=False))
+    return config.parse("devices:\n" + text, "f").devices
+
+
+def hipnuc(lines: str, port: str = "x") -> str:
+    return f"driver: hipnuc-uart, uart: {{port: {port}}}, lines: {{{lines}}}"
+
+
+def spi(lines: str) -> str:
+    return f"driver: imu61x-spi, spi: {{port: y}}, lines: {{{lines}}}"
+
+
+def errors(*devices: str) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        parse(*devices)
+    return [line.removeprefix("f:") for line in str(caught.value).splitlines()]
+
+
+def test_every_line() -> None:
+    bow, gimbal = parse(
+        hipnuc(
+            "sout: {line: 17, chip: gpiochip0, bias: pull-down}, sout_div: {line: D, divisor: 64}, "
+            "sin: {line: S, rate_hz: 0}, alarm: {line: A, active_low: true}, pps: {line: P, chrony: /run/chrony.imud.sock}"
+        ),
+        spi("reset: {line: R, hold_ms: 5, open_drain: true}, data_ready: {line: Y, edge: falling}"),
+    )
+    assert bow.lines == DeviceLines(
+        sout=SoutSettings(line=17, chip="gpiochip0", bias="pull-down"),
+        sout_div=DividedSettings(line="D", divisor=64),
+        sin=TriggerSettings(line="S", rate_hz=0.0),
+        alarm=InputSettings(line="A", active_low=True),
+        pps=PpsSettings(line="P", chrony="/run/chrony.imud.sock"),
+    )
+    assert gimbal.lines == DeviceLines(
+        reset=ResetSettings(line="R", hold_ms=5.0, open_drain=True), data_ready=ReadySettings(line="Y", edge="falling")
+    )
+
+
+def test_defaults() -> None:
+    reset = ResetSettings(line="R")
+    assert (reset.active_low, reset.hold_ms, reset.wait_s, reset.open_drain) == (True, 10.0, 3.0, False)
+    assert DividedSettings(line="D").divisor == 8
+    assert not TriggerSettings(line="S").active_low
+    for keys in ("driver: hipnuc-uart, uart: {port: x}", hipnuc("")):
+        assert parse(keys)[0].lines is None
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        (hipnuc("sut: {line: A}"), '2:53: devices.a.lines.sut: expected a key that imud knows, got "sut"; did you mean sout? known: alarm, data_ready, pps, reset, sin, sout, sout_div'),
+        (hipnuc("reset: {line: A}"), '2:53: devices.a.lines.reset: expected a line that devices of hipnuc-uart have, got "reset"; they have: sout, sout_div, sin, alarm, pps'),
+        (spi("sout: {line: A}"), '2:51: devices.a.lines.sout: expected a line that devices of imu61x-spi have, got "sout"; they have: reset, data_ready'),
+        ("driver: imu61x-uart, uart: {port: x}, lines: {data_ready: {line: A}}", "they have: reset"),
+        ("driver: imu61x-can, socketcan: {interface: c}, lines: {reset: {line: A}}", "they have: none"),
+        ("uart: {port: x}, lines: {sout: {line: A}}", "2:24: devices.a.lines: expected lines only beside a named driver, got them with driver auto; drivers that have lines: hipnuc-uart"),
+        ("driver: nobody, uart: {port: x}, lines: {sout: {line: A}}", 'expected a driver that imud knows, got "nobody"'),
+        (hipnuc("sout: {line: 17}"), "2:59: devices.a.lines.sout: expected the key chip beside the number of a line, got none"),
+        (hipnuc("sout: {chip: gpiochip0}"), "2:53: devices.a.lines.sout: expected the key line (a whole number from 0 to 1023, or text that is not empty), got none"),
+        (hipnuc("sout: {line: -1, chip: c}"), "expected a whole number from 0 to 1023, or text that is not empty, got -1"),
+        (hipnuc("sout: {line: A, rate_hz: 5}"), 'devices.a.lines.sout.rate_hz: expected a key that imud knows, got "rate_hz"; known: active_low, bias, bias_us, chip, line, offset_us, width_us'),
+        (hipnuc("sout: GPIO17"), '2:59: devices.a.lines.sout: expected keys and values, got "GPIO17"'),
+        (hipnuc("sout: "), "devices.a.lines.sout: expected keys and values, got nothing"),
+        (hipnuc("sout_div: {line: A, divisor: 65}"), "devices.a.lines.sout_div.divisor: expected a whole number from 1 to 64, got 65"),
+        (hipnuc("sout_div: {line: A, divisor: 0}"), "expected a whole number from 1 to 64, got 0"),
+        (hipnuc("sin: {line: A, rate_hz: 1001}"), "devices.a.lines.sin.rate_hz: expected a number from 0 to 1000, got 1001"),
+        (hipnuc("sin: {line: A, rate_hz: .nan}"), "expected a finite number, got .nan"),
+        (hipnuc("sin: {line: A, bias: pull-up}"), 'got "bias"; did you mean bias_us? known: active_low, bias_us, chip, line, offset_us, open_drain, pulse_ms, rate_hz'),
+        (hipnuc("alarm: {line: A, bias: up}"), 'expected one of "as-is", "disabled", "pull-down", "pull-up", got "up"'),
+        (spi("reset: {line: A, hold_ms: 0}"), "devices.a.lines.reset.hold_ms: expected a number from 0.01 to 10000, got 0"),
+        (spi("data_ready: {line: A, edge: both}"), 'expected one of "falling", "rising", got "both"'),
+        (hipnuc("")[:-2] + "5", "devices.a.lines: expected keys and values, got 5"),
+    ],
+)  # fmt: skip
+def test_refusals(keys: str, message: str) -> None:
+    (found,) = errors(keys)
+    assert message in found
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("line: 17, chip: gpiochip0", "line: 17, chip: gpiochip0"),
+        ("line: 17, chip: gpiochip0", "line: 17, chip: /dev/gpiochip0, active_low: true"),
+        ("line: A", "line: A"),
+        ("line: A, chip: gpiochip0", "line: A"),
+    ],
+)
+def test_one_wire_under_two_keys(one: str, other: str) -> None:
+    (found,) = errors(hipnuc(f"sout: {{{one}}}, pps: {{{other}}}"))
+    assert "devices.a.lines.pps: expected a line of its own, got " in found
+    assert found.endswith(", which a.lines.sout (line 2) has")
+    (found,) = errors(hipnuc(f"sout: {{{one}}}"), hipnuc(f"sout: {{{other}}}", "z"))
+    assert "3:53: devices.b.lines.sout: expected a line of its own" in found
+    assert found.endswith(", which a.lines.sout (line 2) has")
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("line: 17, chip: gpiochip0", "line: 17, chip: gpiochip1"),
+        ("line: 17, chip: gpiochip0", "line: 18, chip: gpiochip0"),
+        ("line: A, chip: gpiochip0", "line: A, chip: gpiochip1"),
+        ("line: A", "line: B"),
+    ],
+)
+def test_two_wires(one: str, other: str) -> None:
+    assert parse(hipnuc(f"sout: {{{one}}}, pps: {{{other}}}"))
+    assert parse(hipnuc(f"sout: {{{one}}}"), hipnuc(f"sout: {{{one}}}", "z") + ", enabled: false"), "has no wire"
+
+
+def test_a_changed_line_is_a_changed_device() -> None:
+    before, after = (
+        config.parse(f"devices:\n  a: {{{hipnuc(keys)}}}\n", "f") for keys in ("sout: {line: A}", "sout: {line: B}")
+    )
+    assert config.differences(before, after).devices_changed == ("a",)
+
+
+def test_drivers_have_lines_that_there_are() -> None:
+    for name, driver in DRIVERS.items():
+        assert driver.lines <= set(LINE_SCHEMAS), name
+    assert DRIVERS["hipnuc-uart"].lines == {"sout", "sout_div", "sin", "alarm", "pps"}
+    assert DRIVERS["imu61x-i2c"].lines == {"reset", "data_ready"}
+
+
+def test_the_shipped_examples_show_the_defaults() -> None:
+    from tests.config.test_reading import SHIPPED, uncommented
+
+    devices = config.parse(uncommented(SHIPPED.read_text()), "etc/imud.yaml").devices
+    lines = [device.lines for device in devices if device.lines]
+    shown = {name: made for one in lines for name in LINE_SCHEMAS if (made := getattr(one, name)) is not None}
+    assert set(shown) == set(LINE_SCHEMAS)
+    for name, made in shown.items():
+        assert made == LINE_SCHEMAS[name](line=made.line, chip=made.chip)
+
+
+# --- the source of RMC sentences --------------------------------------------------------------------------------------
+
+
+HIPNUC = "driver: hipnuc-uart, uart: {port: x}"
+
+
+@pytest.mark.parametrize(
+    ("keys", "rmc"),
+    [
+        (HIPNUC, None),
+        (HIPNUC + ", rmc: {source: gpsd}", RmcSettings(source="gpsd")),
+        (
+            HIPNUC + ", rmc: {source: system, rate_hz: 5, error_ms: 10}",
+            RmcSettings(source="system", rate_hz=5, error_ms=10.0),
+        ),
+        (
+            HIPNUC + ", rmc: {source: nmea, port: /dev/ttyUSB1, baud: 38400}",
+            RmcSettings(source="nmea", port="/dev/ttyUSB1", baud=38400),
+        ),
+        (hipnuc("pps: {line: GPIO17}") + ", rmc: {source: gpsd}", RmcSettings(source="gpsd")),
+    ],
+)
+def test_each_rmc_source(keys: str, rmc: RmcSettings | None) -> None:
+    assert parse(keys)[0].rmc == rmc
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        (HIPNUC + ", rmc: {}", "expected the key source"),
+        (HIPNUC + ", rmc: {source: ntp}", 'expected one of "gpsd", "nmea", "system"'),
+        (HIPNUC + ", rmc: {source: nmea}", "expected the key port beside source nmea"),
+        (HIPNUC + ", rmc: {source: gpsd, rate_hz: 11}", "rate_hz"),
+        (HIPNUC + ", rmc: {source: gpsd, rate_hz: 0}", "rate_hz"),
+        (HIPNUC + ", rmc: {source: gpsd, tcp_port: 0}", "tcp_port"),
+        (HIPNUC + ", rmc: {source: gpsd, error_ms: .nan}", "error_ms"),
+        (HIPNUC + ", rmc: {source: gpsd, speed: 1}", "speed"),
+        ("driver: imu61x-uart, uart: {port: x}, rmc: {source: gpsd}", "expected rmc only beside"),
+        ("driver: hipnuc-uart, replay: {path: x}, rmc: {source: gpsd}", "expected rmc only beside"),
+        ("uart: {port: x}, rmc: {source: gpsd}", "expected rmc only beside"),
+        # a device that imud triggers has no pulse per second
+        (hipnuc("sin: {line: GPIO17}") + ", rmc: {source: gpsd}", "by lines.sin (line 2): leave one of them out"),
+    ],
+)
+def test_what_is_wrong_with_an_rmc_source(keys: str, said: str) -> None:
+    (found,) = errors(keys)
+    assert found.startswith("2:")
+    assert said in found
+
+
+def test_every_source_has_its_row() -> None:
+    assert set(RMC_SOURCES) == set(RmcSettings.__annotations__["source"].__args__)
+    assert all(callable(RMC_SOURCES[name]) for name in RMC_SOURCES)

@@ -1,0 +1,67 @@
+"""Actions: arguments checked and described; and every driver's actions by their rows."""
+
+from typing import Annotated
+
+import msgspec
+import pytest
+from msgspec import Meta
+
+from imud.contracts.command import Action, Risk, Target, described, parameters_of
+from imud.drivers import DRIVERS
+from imud.model.errors import BadArgument
+
+SAVING = {("hipnuc-uart", "baud"), ("imu61x-uart", "baud"), ("imu61x-uart", "factory_reset")}
+RISKS = {
+    "factory_reset": Risk.RESET, "address": Risk.CONNECTION, "baud": Risk.CONNECTION, "bitrate": Risk.CONNECTION,
+    "node": Risk.CONNECTION,
+}  # fmt: skip
+"""Risk of the actions with these names, of every driver."""
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_every_action_is_described_and_says_what_it_saves_and_risks(driver: str) -> None:
+    for name, action in DRIVERS[driver].actions.items():
+        (info,) = described({name: action})
+        assert info.help, name
+        assert not info.help.endswith("."), name
+        assert name == name.lower()
+        assert all(parameter.values != "keys and values" for parameter in info.parameters), name
+        with pytest.raises(BadArgument):
+            action.arguments({"no_such_argument": 1})
+        assert action.saves == (name == "save" or (driver, name) in SAVING), name
+        assert info.risk is RISKS.get(name, info.risk), name
+        assert info.risk is not Risk.RESET or name == "factory_reset", name
+
+
+def _turn(target: Target, *, angle_deg: Annotated[float, Meta(ge=-180, le=180)], relative: bool = False) -> str:
+    return f"{target.baud} {angle_deg} {relative}"
+
+
+ACTION = Action("turn it", _turn)
+
+
+def test_arguments_are_converted_and_completed_by_defaults() -> None:
+    arguments = ACTION.arguments({"angle_deg": 5})
+    assert msgspec.structs.asdict(arguments) == {"angle_deg": 5.0, "relative": False}
+    assert ACTION.script(Target(None, 9600), arguments) == "9600 5.0 False"
+
+
+@pytest.mark.parametrize("given", [{}, {"angle_deg": "x"}, {"angle_deg": 1, "turns": 2}, {"angle_deg": 181}])
+def test_bad_arguments_name_the_good_ones(given: dict[str, object]) -> None:
+    good = r"angle_deg \(a number from -180 to 180\), relative \(true or false; default false\)"
+    with pytest.raises(BadArgument, match=good):
+        ACTION.arguments(given)
+    assert ", ".join(map(str, parameters_of(ACTION))) == good.replace("\\", "")
+
+
+def test_description_for_people() -> None:
+    (info,) = described({"yaw": ACTION})
+    assert msgspec.json.decode(msgspec.json.encode(info)) == {
+        "name": "yaw",
+        "help": "turn it",
+        "parameters": [
+            {"name": "angle_deg", "values": "a number from -180 to 180", "default": None, "required": True},
+            {"name": "relative", "values": "true or false", "default": "false", "required": False},
+        ],
+        "risk": "",
+    }

@@ -1,0 +1,35 @@
+"""Every row of every table leads to an object of that name; a wrong name is answered with the right ones."""
+
+from typing import Any
+
+import pytest
+
+from imud.contracts.driver import Driver
+from imud.contracts.link import LinkType
+from imud.contracts.publisher import PublisherType
+from imud.contracts.registry import Table
+from imud.drivers import DRIVERS
+from imud.links import LINKS
+from imud.publishers import PUBLISHERS
+
+TABLES: list[tuple[Table[Any], type]] = [(DRIVERS, Driver), (LINKS, LinkType), (PUBLISHERS, PublisherType)]
+
+
+@pytest.mark.parametrize(("table", "kind"), TABLES, ids=lambda value: getattr(value, "kind", ""))
+def test_rows_lead_to_objects_that_know_their_name(table: Table[Any], kind: type) -> None:
+    assert len(table) > 0
+    for name, row in table.items():
+        assert isinstance(row, kind)
+        assert row.name == name  # type: ignore[attr-defined]  # every kind of row has one
+
+
+def test_unknown_name_lists_the_known_ones() -> None:
+    with pytest.raises(KeyError, match=r"no driver named 'bno055'; there are: .*hipnuc-uart"):
+        DRIVERS["bno055"]
+
+
+def test_row_is_imported_on_first_use_only() -> None:
+    table: Table[object] = Table("thing", {"bad": "imud.no_such_module:X", "good": "imud.model.units:NS_PER_S"})
+    assert table["good"] == 1_000_000_000
+    with pytest.raises(ModuleNotFoundError):
+        table["bad"]

@@ -1,0 +1,262 @@
+"""Request and reply: replies, refusals, silence, late replies, and text that answers nothing."""
+
+from dataclasses import replace
+from inspect import GEN_CLOSED, getgeneratorstate
+
+import pytest
+
+from imud.contracts.script import (
+    Outcome,
+    Rejection,
+    Reply,
+    ReplyFrame,
+    Request,
+    RequestScript,
+    Silence,
+    never,
+    of_text,
+    pause,
+    with_undo,
+)
+from imud.device.scripts import LATE_WINDOW_NS, REPLY_MESSAGES_MAX, Session
+from imud.model.errors import CommandError
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+
+TIMEOUT_NS = 100
+
+
+def command(name: str, part: str = "", silent: bool = False) -> Request:
+    """A request whose reply is lines that begin with `part`, then OK; without `part`, OK alone."""
+    return Request(
+        payload=name.encode(),
+        name=name,
+        is_end=of_text(lambda line: line == "OK"),
+        is_rejection=of_text(lambda line: line == "ERR"),
+        is_part=of_text(lambda line: bool(part) and line.startswith(part)),
+        timeout_ns=TIMEOUT_NS,
+        silent=silent,
+        messages_min=2 if part else 1,
+    )
+
+
+@pytest.fixture
+def ledger() -> Ledger:
+    return Ledger()
+
+
+@pytest.fixture
+def session(ledger: Ledger) -> Session:
+    return Session(ledger)
+
+
+def strays(ledger: Ledger) -> tuple[int, int]:
+    return (ledger.replies_late, ledger.replies_unsolicited)
+
+
+def test_reply(session: Session, ledger: Ledger) -> None:
+    assert session.start(command("ask", "a"), 0) == b"ask"
+    assert session.busy
+    assert session.deadline_ns == TIMEOUT_NS
+    assert session.on_message("a=1", 5) is None
+    assert session.on_message("OK", 6) == Reply(("a=1", "OK"))
+    assert not session.busy
+    assert session.deadline_ns is None
+    assert session.on_time(1000) is None
+    assert strays(ledger) == (0, 0)
+
+
+def test_refusal_needs_no_lines(session: Session) -> None:
+    session.start(command("ask", "a"), 0)
+    assert session.on_message("ERR", 5) == Rejection(("ERR",))
+
+
+def test_silence_at_the_deadline_and_not_before(session: Session) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_message("a=1", 5)
+    assert session.on_time(TIMEOUT_NS - 1) is None
+    assert session.on_time(TIMEOUT_NS) == Silence(("a=1",))
+    assert session.on_time(TIMEOUT_NS) is None
+    assert not session.busy
+
+
+def test_one_request_at_a_time(session: Session) -> None:
+    session.start(command("first"), 0)
+    with pytest.raises(CommandError, match="second: still waiting for the reply to first"):
+        session.start(command("second"), 1)
+    assert session.on_message("OK", 2) == Reply(("OK",))
+
+
+def test_silent_request_is_done_at_once(session: Session) -> None:
+    assert session.start(command("reboot", silent=True), 0) == b"reboot"
+    assert not session.busy
+    assert session.deadline_ns is None
+
+
+def test_other_text_is_unsolicited_and_not_part_of_the_reply(session: Session, ledger: Ledger) -> None:
+    assert session.on_message("boot", 0) is None
+    session.start(command("ask", "a"), 0)
+    for line in ("noise", "a=1", "noise"):
+        assert session.on_message(line, 1) is None
+    assert session.on_message("OK", 2) == Reply(("a=1", "OK"))
+    assert strays(ledger) == (0, 3)
+
+
+Step = Request | str | ReplyFrame
+"""A request that is started, or a message that the device sends."""
+
+
+@pytest.mark.parametrize(
+    ("first", "wait_ns", "steps", "outcomes", "late_and_unsolicited"),
+    [
+        (["a"], 1, ["a=1", "OK", "OK"], [], (1, 1)),  # with nothing outstanding
+        ([], 1, ["ERR"], [], (1, 0)),  # a late refusal is late too
+        (["a"], LATE_WINDOW_NS + 1, ["OK"], [], (0, 1)),  # after the window nothing is late
+        # the reply to the next request is OK alone: the lines before an OK show its request
+        (["a"], 0, [command("set"), "a=1", "a=2", "OK", "OK"], [Reply(("OK",))], (1, 0)),
+        # the rest of a reply that timed out in the middle
+        (["a", "a=1"], 0, [command("set"), "OK", "ERR"], [Rejection(("ERR",))], (1, 0)),
+        # the OK of a command that timed out comes after the question
+        ([], 0, [command("ask", "a"), "OK", "a=1", "OK"], [Reply(("a=1", "OK"))], (1, 0)),
+        # lines that were late long ago do not cost a fresh reply
+        (["a", "a=1"], LATE_WINDOW_NS + 1, [command("set"), "OK"], [Reply(("OK",))], (0, 0)),
+        (["a"], 0, [command("ask", "a"), "a=1", "OK"], [Reply(("a=1", "OK"))], (0, 0)),  # the same question again
+    ],
+)
+def test_a_late_reply_does_not_answer_the_next_request(
+    session: Session, ledger: Ledger, first: list[str], wait_ns: int, steps: list[Step], outcomes: list[Outcome],
+    late_and_unsolicited: tuple[int, int],
+) -> None:  # fmt: skip
+    """`first`: the part of the first request, and the lines that come in time; it then times out."""
+    session.start(command("first", first[0] if first else ""), 0)
+    for line in first[1:]:
+        session.on_message(line, 5)
+    session.on_time(TIMEOUT_NS)
+    found, at_ns = [], TIMEOUT_NS + wait_ns
+    for step in steps:
+        if isinstance(step, Request):
+            session.start(step, at_ns)
+        elif (outcome := session.on_message(step, at_ns)) is not None:
+            found.append(outcome)
+    assert found == outcomes
+    assert strays(ledger) == late_and_unsolicited
+
+
+def test_cancel_forgets_the_request(session: Session, ledger: Ledger) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_message("a=1", 1)
+    session.cancel()
+    assert not session.busy
+    assert session.on_time(TIMEOUT_NS) is None
+    session.on_message("OK", 2)
+    assert strays(ledger) == (0, 1)
+    session.start(command("ask", "a"), 3)
+    session.on_message("a=2", 4)
+    assert session.on_message("OK", 4) == Reply(("a=2", "OK"))
+
+
+def test_endless_reply_is_bounded(session: Session) -> None:
+    session.start(command("ask", "a"), 0)
+    for number in range(REPLY_MESSAGES_MAX + 50):
+        session.on_message(f"a={number}", 1)
+    silence = session.on_time(TIMEOUT_NS)
+    assert silence is not None
+    assert len(silence.lines) == REPLY_MESSAGES_MAX
+
+
+def frame_command(frame_id: int) -> Request:
+    return Request(
+        payload=b"?",
+        name=f"frame {frame_id}",
+        is_end=lambda message: isinstance(message, ReplyFrame) and message.frame_id == frame_id,
+        is_rejection=never,
+        is_part=never,
+        timeout_ns=TIMEOUT_NS,
+    )
+
+
+def test_a_frame_answers_as_a_line_does(session: Session, ledger: Ledger) -> None:
+    session.start(frame_command(6), 0)
+    assert session.on_message("6", 1) is None
+    assert session.on_message(ReplyFrame(7, b""), 2) is None
+    reply = session.on_message(ReplyFrame(6, b"x"), 3)
+    assert reply == Reply((ReplyFrame(6, b"x"),))
+    assert reply.frames == (ReplyFrame(6, b"x"),)
+    assert reply.lines == ()
+    assert strays(ledger) == (0, 2)
+
+
+def test_a_late_frame_is_told_from_the_next_reply(session: Session, ledger: Ledger) -> None:
+    session.start(frame_command(6), 0)
+    session.on_time(TIMEOUT_NS)
+    session.start(frame_command(7), TIMEOUT_NS)
+    assert session.on_message(ReplyFrame(6, b""), TIMEOUT_NS + 1) is None
+    assert strays(ledger) == (1, 0)
+    assert session.on_message(ReplyFrame(7, b""), TIMEOUT_NS + 2) == Reply((ReplyFrame(7, b""),))
+
+
+def test_text_predicates_hold_for_no_frame() -> None:
+    assert of_text(lambda line: True)("x")
+    assert not of_text(lambda line: True)(ReplyFrame(1, b""))
+
+
+def test_a_pause_sends_nothing_and_late_replies_stay_late(session: Session, ledger: Ledger) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_time(TIMEOUT_NS)
+    assert session.start(pause(50), TIMEOUT_NS) == b""
+    assert session.on_message("a=1", TIMEOUT_NS + 10) is None
+    assert session.on_time(TIMEOUT_NS + 49) is None
+    assert session.on_time(TIMEOUT_NS + 50) == Silence(())
+    session.on_message("OK", TIMEOUT_NS + 60)
+    assert strays(ledger) == (1, 0)
+
+
+def test_a_script_with_undo_passes_requests_on_and_is_closed_with_it() -> None:
+    inner = asking()
+    outer = with_undo(inner, b"undo")
+    assert next(outer).undo == b"undo"
+    outer.close()
+    assert getgeneratorstate(inner) == GEN_CLOSED
+    outer = with_undo(asking(), b"undo")
+    next(outer)
+    with pytest.raises(StopIteration) as end:
+        outer.send(Reply(("OK",)))
+    assert end.value.value == Reply(("OK",))
+
+
+def asking() -> RequestScript[Outcome]:
+    return (yield command("ask"))
+
+
+# --- measurements -----------------------------------------------------------------------------------------------------
+
+
+def measured(tick: int) -> Measurement:
+    return Measurement(54, 0, tick)
+
+
+def waiting(ledger: Ledger, tick: int) -> Session:
+    """A session whose request waits for the measurement at `tick`."""
+    session = Session(ledger)
+    session.start(replace(command("once"), is_sample=lambda sample: sample.dev_ticks == tick), 0)
+    return session
+
+
+def test_a_measurement_ends_a_request_that_waits_for_it(ledger: Ledger) -> None:
+    session = waiting(ledger, 7)
+    assert session.wants_samples
+    assert session.on_sample(measured(6)) is None
+    assert session.on_sample(measured(7)) == Reply((), measured(7))
+    assert not session.wants_samples
+    assert session.on_sample(measured(7)) is None
+    assert ledger.replies_unsolicited == ledger.replies_late == 0
+
+
+def test_a_request_without_its_measurement_is_refused_or_silent_and_others_take_none(ledger: Ledger) -> None:
+    assert waiting(ledger, 7).on_message("ERR", 1) == Rejection(("ERR",))
+    assert waiting(ledger, 7).on_time(TIMEOUT_NS) == Silence(())
+    session = Session(ledger)
+    session.start(command("save"), 0)
+    assert not session.wants_samples
+    assert session.on_sample(measured(1)) is None
+    assert session.busy

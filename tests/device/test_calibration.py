@@ -1,0 +1,390 @@
+"""The guide with a device made of functions, and with a simulated module, in virtual time."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine
+from dataclasses import replace
+from math import radians
+from typing import Any
+
+import pytest
+
+from imud.contracts.command import GYRO_ZERO, Calibration, CalibrationResult, Handling, Kept, Target, Verdict
+from imud.contracts.lines import DeviceLines
+from imud.device.calibration import Guide
+from imud.device.health import Notices
+from imud.model.errors import BadArgument, CommandError, Rejected
+from imud.model.event import Event, EventKind
+from imud.model.ledger import Ledger
+from imud.model.sample import Sample, Sync, Vector3
+from imud.model.units import NS_PER_S
+from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings
+from imud.sim.physics import Motion, Still, Truth, tumble
+from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.stories import played
+from tests.support.wired_device import WiredDevice
+
+TICK_S = 0.1
+HARD_IRON_T: Vector3 = (14.14e-6, -2.08e-6, -8.75e-6)
+
+
+class GuideRig:
+    """A guide, the samples it sees, and what it runs on the device."""
+
+    def __init__(self) -> None:
+        self.clock = VirtualClock()
+        self.events: list[Event] = []
+        self.ran: list[str] = []
+        self.guide = Guide(self._run, Notices("bow", Ledger(), self.events.append))
+        self.motion: Callable[[float], Vector3] = lambda _t_s: (0.0, 0.0, 0.0)
+        """Angular rate by the time since the beginning."""
+        self.mag_t: Callable[[float], Vector3 | None] = lambda _t_s: None
+        self.silent = False
+        self._begin_ns = self.clock.now_ns()
+
+    async def _run(self, make: Callable[[Target], Any]) -> Any:
+        made = make(Target(None, 115200))
+        return await made if isinstance(made, Awaitable) else made
+
+    def does(self, name: str, answer: object = None, seconds: float = 0.0) -> Callable[[Target], Any]:
+        """A script that is noted, takes so long, and gives that answer."""
+
+        async def run() -> object:
+            self.ran.append(name)
+            await asyncio.sleep(seconds)
+            return answer
+
+        return lambda _target: run()
+
+    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        run_virtually(self.clock, self._play(story))
+
+    async def _play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        ticking = asyncio.create_task(self._tick())
+        try:
+            await story()
+        finally:
+            ticking.cancel()
+
+    async def _tick(self) -> None:
+        seq = 0
+        while True:
+            now_ns = self.clock.now_ns()
+            t_s = (now_ns - self._begin_ns) / NS_PER_S
+            seq += not self.silent
+            self.guide.tick(
+                now_ns,
+                Sample(
+                    "bow", seq, now_ns, 0, Sync.ARRIVAL, now_ns, now_ns, accel_m_s2=(0.0, 0.0, 9.81),
+                    gyro_rad_s=self.motion(t_s), mag_t=self.mag_t(t_s),
+                )
+                if seq
+                else None,
+            )  # fmt: skip
+            await asyncio.sleep(TICK_S)
+
+    def phases(self) -> list[object]:
+        assert all(event.kind is EventKind.CALIBRATION for event in self.events)
+        return [event.detail["phase"] for event in self.events]
+
+
+def gyro(rig: GuideRig, **changes: Any) -> Calibration:
+    made = Calibration(
+        help="measure the bias", section="1.6", handling=Handling.REST, instructions=(),
+        begin=rig.does("begin", (0.1, 0.2, 0.3), 3.0), expected=(GYRO_ZERO,), kept=Kept.BY_SAVE,
+        save=rig.does("save"),
+    )  # fmt: skip
+    return replace(made, **changes)
+
+
+def magnetometer(rig: GuideRig, verdicts: Callable[[], Verdict], **changes: Any) -> Calibration:
+    return gyro(
+        rig, handling=Handling.TURN, begin=rig.does("begin"), expected=(), kept=Kept.BY_DEVICE, save=None,
+        verdict=lambda _target: verdicts(), **changes,
+    )  # fmt: skip
+
+
+# --- at rest ----------------------------------------------------------------------------------------------------------
+
+
+@played(GuideRig)
+async def test_rest_calibrated_verified_and_saved(rig: GuideRig) -> None:
+    result = await rig.guide.run("gyro", gyro(rig), save=True)
+    (check,) = result.checks
+    assert check.name == "mean angular rate"
+    assert check.passed
+    assert result == CalibrationResult("gyro", True, "", "0.1, 0.2, 0.3", (check,), True, Kept.BY_SAVE)
+    assert rig.ran == ["begin", "save"]
+    assert rig.phases() == ["begin", "end"]
+    assert rig.events[-1].detail["saved"] is True
+
+
+@played(GuideRig)
+async def test_it_is_not_saved_unless_it_is_asked_for(rig: GuideRig) -> None:
+    result = await rig.guide.run("gyro", gyro(rig), save=False)
+    assert result.verified
+    assert not result.saved
+    assert rig.ran == ["begin"]
+
+
+@played(GuideRig)
+async def test_a_bias_that_stays_is_told_and_not_saved(rig: GuideRig) -> None:
+    rig.motion = lambda _t_s: (0.0, radians(0.3), 0.0)
+    result = await rig.guide.run("gyro", gyro(rig), save=True)
+    assert not result.verified
+    assert result.problem == "mean angular rate: expected at most 0.00175 rad/s, got 0.00524 rad/s"
+    assert not result.saved
+    assert rig.ran == ["begin"]
+
+
+@played(GuideRig)
+async def test_what_samples_do_not_tell_is_not_verified(rig: GuideRig) -> None:
+    expectation = replace(GYRO_ZERO, value=lambda _means: None)
+    result = await rig.guide.run("gyro", gyro(rig, expected=(expectation,)), save=False)
+    assert result.problem == "mean angular rate: the samples do not tell it"
+
+
+@played(GuideRig)
+async def test_motion_refuses_before_anything_is_sent(rig: GuideRig) -> None:
+    rig.motion = lambda _t_s: (0.0, 0.0, 0.5)
+    with pytest.raises(CommandError, match=r"expected the device at rest, got: it turns at 28\.6 °/s .* put it down"):
+        await rig.guide.run("gyro", gyro(rig), save=False)
+    assert rig.ran == []
+    assert rig.phases()[-2:] == ["rest", "end"]
+    assert rig.events[-1].message.startswith("calibration gyro: expected the device at rest, got: it turns at")
+    assert rig.events[-1].detail["verified"] is False
+
+
+@pytest.mark.parametrize("until_s", [19.7, 20.05])
+@played(GuideRig)
+async def test_motion_is_told_also_when_no_sample_came_since_it_was_seen(rig: GuideRig, until_s: float) -> None:
+    rig.motion = lambda _t_s: (0.0, 0.0, 0.5)
+    running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
+    await asyncio.sleep(until_s - 18)
+    rig.silent = True
+    with pytest.raises(CommandError, match="expected the device at rest"):
+        await running
+
+
+@pytest.mark.parametrize(
+    ("rate_rad_s", "words"), [(0.5, "it turns at 28.6 °/s"), (0.0, "only 11 samples came")], ids=["moved", "at rest"]
+)
+@played(GuideRig)
+async def test_too_few_samples_say_what_they_show(rig: GuideRig, rate_rad_s: float, words: str) -> None:
+    rig.motion, rig.silent = lambda _t_s: (0.0, 0.0, rate_rad_s), True
+    running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
+    await asyncio.sleep(19.05)
+    rig.silent = False
+    with pytest.raises(CommandError, match=f"expected the device at rest, got: {words}"):
+        await running
+
+
+@played(GuideRig)
+async def test_rest_is_waited_for(rig: GuideRig) -> None:
+    rig.motion = lambda t_s: (0.0, 0.0, 0.5 if t_s < 5 else 0.0)
+    assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified
+    assert rig.phases()[:2] == ["begin", "rest"]
+    assert rig.phases().count("rest") == 3  # once for each window of 2 s
+
+
+@played(GuideRig)
+async def test_motion_while_it_runs_spoils_it(rig: GuideRig) -> None:
+    rig.motion = lambda t_s: (0.0, 0.0, 0.5 if 4 < t_s < 4.5 else 0.0)
+    result = await rig.guide.run("gyro", gyro(rig), save=True)
+    assert result.problem.startswith("the device moved while it was calibrated: the angular rate changes by 2")
+    assert not result.saved
+    assert rig.ran == ["begin"]
+
+
+@played(GuideRig)
+async def test_no_samples(rig: GuideRig) -> None:
+    rig.silent = True
+    with pytest.raises(CommandError, match="gyro: expected samples of the device, got none for 20 s"):
+        await rig.guide.run("gyro", gyro(rig), save=False)
+    assert rig.clock.now_ns() >= 1020 * NS_PER_S
+
+
+@played(GuideRig)
+async def test_refusals(rig: GuideRig) -> None:
+    async def refuse() -> None:
+        raise Rejected("no")
+
+    with pytest.raises(CommandError, match="heading: expected no `save`, for its result lasts until power-off"):
+        await rig.guide.run("heading", gyro(rig, kept=Kept.NEVER), save=True)
+    with pytest.raises(CommandError, match="gyro: set the mode first"):
+        await rig.guide.run("gyro", gyro(rig, unready=rig.does("ready?", "set the mode first")), save=False)
+    with pytest.raises(Rejected):
+        await rig.guide.run("gyro", gyro(rig, begin=lambda _target: refuse()), save=False)
+    first = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
+    await asyncio.sleep(1)
+    with pytest.raises(CommandError, match="another calibration of this device is running"):
+        await rig.guide.run("gyro", gyro(rig), save=False)
+    assert (await first).verified
+
+
+@pytest.mark.parametrize("end", ["stop", "cancel", "close"])
+@played(GuideRig)
+async def test_it_can_be_ended(rig: GuideRig, end: str) -> None:
+    running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
+    await asyncio.sleep(1)
+    getattr(rig.guide, end)()
+    with pytest.raises(CommandError, match="link ended" if end == "stop" else "was cancelled"):
+        await running
+    assert rig.phases() == ["begin", "end"], "who looks on is told, too"
+    assert rig.events[-1].message == (
+        "calibration gyro: the device's link ended during the calibration"
+        if end == "stop"
+        else "calibration gyro: it was cancelled"
+    )
+    assert not rig.guide.cancel()
+    assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified  # and begun anew
+
+
+# --- turned -----------------------------------------------------------------------------------------------------------
+
+
+def turned_by_hand(rig: GuideRig, hard_iron_t: Vector3 = (0.0, 0.0, 0.0)) -> None:
+    a, b, c = hard_iron_t
+
+    def mag_t(t_s: float) -> Vector3:
+        x, y, z = tumble().at(t_s).mag_t
+        return (x + a, y + b, z + c)
+
+    rig.motion, rig.mag_t = lambda t_s: tumble().at(t_s).gyro_rad_s, mag_t
+
+
+def turned_where_it_is_disturbed(rig: GuideRig) -> None:
+    """A field that depends on the place: stronger where the module points to one side."""
+    turned_by_hand(rig)
+
+    def mag_t(t_s: float) -> Vector3:
+        x, y, z = tumble().at(t_s).mag_t
+        factor = 1.4 if tumble().at(t_s).euler_rad[2] > 0 else 0.8
+        return (x * factor, y * factor, z * factor)
+
+    rig.mag_t = mag_t
+
+
+@pytest.mark.manual("B 8.1.1 procedure")
+@played(GuideRig)
+async def test_turning_ends_when_the_device_says_so(rig: GuideRig) -> None:
+    turned_by_hand(rig, HARD_IRON_T)
+
+    def verdict() -> Verdict:
+        done = rig.clock.now_ns() > 1060 * NS_PER_S
+        return Verdict(done, "bias 14.1, -2.1, -8.8 µT" if done else "bias 0, 0, 0 µT")
+
+    result = await rig.guide.run("magnetometer", magnetometer(rig, verdict), save=False)
+    assert result.verified
+    assert result.saved
+    assert result.device == "bias 14.1, -2.1, -8.8 µT"
+    residual, field = result.checks
+    assert residual.value == pytest.approx(0.0, abs=1e-6)
+    assert field.value == pytest.approx(45.1e-6, rel=1e-3)
+    assert rig.clock.now_ns() > 1060 * NS_PER_S
+    turning = [event.detail for event in rig.events if event.detail["phase"] == "turn"]
+    assert len(turning) <= 2 * (rig.clock.now_ns() // NS_PER_S - 1000) + 2  # the first and the last one
+    progress = [float(detail["progress"] or 0) for detail in turning]
+    assert (progress[-1], max(progress)) == (1.0, 1.0)
+    assert progress[0] < 0.1
+    assert int(str(turning[-1]["cells"]), 16).bit_count() == round(48 * float(turning[-1]["coverage"] or 0))
+
+
+@played(GuideRig)
+async def test_a_device_that_was_calibrated_before_needs_the_turning_only(rig: GuideRig) -> None:
+    turned_by_hand(rig)
+    result = await rig.guide.run("magnetometer", magnetometer(rig, lambda: Verdict(True, "x")), save=False)
+    assert result.verified
+    assert 1010 * NS_PER_S < rig.clock.now_ns() < 1060 * NS_PER_S
+
+
+@pytest.mark.parametrize(
+    ("prepare", "words"),
+    [
+        (lambda _rig: None, "its samples have no magnetic field"),
+        (lambda rig: setattr(rig, "mag_t", lambda _t_s: (3e-5, 0.0, 0.0)), "turned into 2% of the directions"),
+        (lambda rig: setattr(rig, "mag_t", lambda t_s: tumble().at(t_s).mag_t), "turned by less than 360°"),
+        (turned_by_hand, "the field is good: repeat it more slowly"),
+        (turned_where_it_is_disturbed, "the field is disturbed: go outdoors"),
+    ],
+    ids=["no field", "at rest", "gyroscope at rest", "not accepted", "disturbed"],
+)
+@pytest.mark.manual("B 8.1.1 procedure", "B 8.1.2 disturbance")
+@played(GuideRig)
+async def test_advice(rig: GuideRig, prepare: Callable[[GuideRig], object], words: str) -> None:
+    prepare(rig)
+    asked: list[int] = []
+
+    def verdict() -> Verdict:
+        asked.append(rig.clock.now_ns())
+        return Verdict(rig.clock.now_ns() > 1290 * NS_PER_S, "bias 0, 0, 0 µT")  # done, with the result of before
+
+    result = await rig.guide.run("magnetometer", magnetometer(rig, verdict), save=False)
+    assert 98 <= len(asked) <= 101  # every 3 s
+    assert not result.verified
+    assert not result.saved
+    assert result.problem.startswith("the device did not end the calibration within 300 s; ")
+    assert words in result.problem
+
+
+# --- a simulated module -----------------------------------------------------------------------------------------------
+
+
+class ByHand:
+    def __init__(self, from_s: float) -> None:
+        self._from_s = from_s
+
+    def at(self, t_s: float) -> Truth:
+        return Still(0.05, -0.03, 0.4).at(t_s) if t_s < self._from_s else tumble().at(t_s)
+
+
+def module(motion: Motion, att_mode: int) -> WiredDevice:
+    hardware = HipnucHardware(motion=motion, hard_iron_t=HARD_IRON_T)
+    return WiredDevice(DeviceLines(), ModuleSettings(att_mode=att_mode), hardware)
+
+
+@pytest.mark.manual("B 1.1 9-axis mode")
+@played(lambda: module(ByHand(5.0), 1))
+async def test_magnetometer_of_a_module(it: WiredDevice) -> None:
+    await it.wait(2)
+    result = await it.device.calibrate("magnetometer", save=False)
+    assert result.verified, result.problem
+    assert result.device == "bias 14.14, -2.08, -8.75 µT"
+    assert any(event.kind is EventKind.CALIBRATION for event in it.events)
+
+
+@played(lambda: module(tumble(), 0))
+async def test_six_axes_have_no_use_for_the_magnetometer(it: WiredDevice) -> None:
+    await it.wait(2)
+    with pytest.raises(CommandError, match=r"magnetometer: expected 9-axis mode, .* action mode, axes=9"):
+        await it.device.calibrate("magnetometer", save=False)
+    with pytest.raises(BadArgument, match=r"no calibration 'gyro'; there are: magnetometer, .*, heading"):
+        await it.device.calibrate("gyro", save=False)
+
+
+@pytest.mark.manual("B 2.2.4 YAW range")
+@played(lambda: module(Still(0.05, -0.03, 0.4), 0))
+async def test_level_and_heading_of_a_module(it: WiredDevice) -> None:
+    await it.wait(2)
+    level = await it.device.calibrate("level", save=True)
+    assert level.verified, level.problem
+    assert level.saved
+    assert [check.name for check in level.checks] == ["roll", "pitch"]
+    heading = await it.device.calibrate("heading", save=False)
+    assert heading.verified, heading.problem
+    it.module.reboot(it.clock.now_ns())
+    await it.wait(5)
+    newest = it.samples[-1].euler_rad
+    assert newest is not None
+    assert abs(newest[0]) < 0.01  # the level was saved
+    assert abs(newest[2]) > 0.3  # the heading cannot be
+
+
+@pytest.mark.manual("B 2.2.4 rest")
+@played(lambda: module(tumble(), 0))
+async def test_a_module_that_moves_is_not_levelled(it: WiredDevice) -> None:
+    await it.wait(2)
+    before = it.module.settings.level
+    with pytest.raises(CommandError, match="expected the device at rest"):
+        await it.device.calibrate("level", save=True)
+    assert it.module.settings.level == before
+    assert not it.device.stop_calibration()

@@ -1,0 +1,273 @@
+"""The life of a device on a CAN bus inside the process: streams, loses frames by cause, bus down and up."""
+
+import asyncio
+from collections.abc import Callable, Coroutine, Sequence
+from itertools import count
+from random import Random
+from typing import Any
+
+import pytest
+
+from imud.config.model import DeviceConfig
+from imud.contracts.driver import CanDriver
+from imud.contracts.status import DeviceState, KernelCounters
+from imud.drivers import DRIVERS
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.drivers.imu61x.can import Imu61xCanSettings, encode_set
+from imud.formats.can import CanFrame
+from imud.host.clock import HostClock
+from imud.links.memory import MemorySettings
+from imud.model.event import EventKind
+from imud.model.options import Settings
+from imud.model.units import NS_PER_S
+from tests.support.device_rig import DeviceRig, DeviceRigs
+from tests.support.device_rig import play as play_rigs
+from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.stories import told
+
+MS = 1_000_000
+
+
+def configured(
+    driver: str = "imu61x-can", settings: Settings | None = None, *, base_id: int = 101, bitrate: int = 0
+) -> DeviceConfig:
+    link = MemorySettings(baud=bitrate, name="can0")
+    return DeviceConfig("mast", driver, settings or Imu61xCanSettings(base_id=base_id), True, "memory", link)
+
+
+class Frames:
+    """Samples of a module, whose frames are 1 ms apart."""
+
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self._clock, self._now_ns = now_ns, now_ns()
+
+    def of(self, index: int, *, base_id: int = 101, lost: Sequence[int] = ()) -> list[CanFrame]:
+        self._now_ns = max(self._now_ns, self._clock() - 10 * MS)
+        made = []
+        for place, (can_id, data) in enumerate(
+            encode_set(
+                index=index, accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), euler_rad=(0, 0, 0), temperature_c=20,
+                base_id=base_id,
+            )
+        ):  # fmt: skip
+            self._now_ns += MS
+            if place not in lost:
+                made.append(CanFrame(can_id, False, data, self._now_ns))
+        return made
+
+
+class CanDeviceBench:
+    def __init__(self, rig: DeviceRig) -> None:
+        self.rig = rig
+        self.link = rig.can_link
+        self.frames = Frames(rig.now_ns).of
+
+    def feed(self, *indices: int) -> None:
+        assert self.link.feed([frame for index in indices for frame in self.frames(index)])
+
+
+def play(story: Callable[[CanDeviceBench], Coroutine[Any, Any, None]], config: DeviceConfig | None = None) -> DeviceRig:
+    """Run the device while the story is told; at the end the ledger closes and the link is released."""
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host)
+    rig = rigs.add(config or configured())
+
+    async def told(_made: list[DeviceRig]) -> None:
+        await rig.turn(lambda: rig.can_link.listening)
+        await story(CanDeviceBench(rig))
+
+    play_rigs(rigs, told, clock)
+    assert rig.ledger.frames_pending == 0
+    return rig
+
+
+@told(play, configured(bitrate=500_000))
+async def test_samples_of_one_read_are_one_batch_with_their_own_times(bench: CanDeviceBench) -> None:
+    rig = bench.rig
+    bench.feed(1, 2, 3)
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert rig.batches == 1
+    assert [s.seq for s in rig.samples] == [1, 2, 3]
+    # measured before its first frame was complete (111 bits at 500 kbit/s), known when the fifth was
+    assert all(4 * MS + 222_000 <= s.t_rx_ns - s.t_ns < 4 * MS + 500_000 for s in rig.samples)
+    assert [b.t_rx_ns - a.t_rx_ns for a, b in zip(rig.samples, rig.samples[1:], strict=False)] == [5 * MS] * 2
+    assert rig.device.status().link == "can0 at 500 kbit/s"
+    assert rig.events[0].kind is EventKind.UP
+    assert rig.can_link.written == []
+
+
+def delay_ns(name: str, settings: Settings, bitrate: int) -> int:
+    """From the time of a sample to its arrival; four frames, 0.3 ms apart, every 10 ms."""
+    driver = DRIVERS[name]
+    assert isinstance(driver, CanDriver)
+    burst = driver.example_frames(Random(1))
+
+    async def story(bench: CanDeviceBench) -> None:
+        begin_ns = bench.rig.now_ns() - 300 * MS
+        for number in range(20):
+            t_ns = begin_ns + number * 10 * MS
+            assert bench.link.feed([f._replace(t_rx_ns=t_ns + place * 300_000) for place, f in enumerate(burst)])
+
+    rig = play(story, configured(name, settings, bitrate=bitrate))
+    assert len(rig.samples) > 10
+    return rig.samples[-1].t_rx_ns - rig.samples[-1].t_ns
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "bits"),
+    [("hipnuc-canopen", HipnucCanopenSettings(), 95), ("hipnuc-j1939", HipnucJ1939Settings(), 131)],
+)
+def test_the_length_of_the_first_frame_is_taken_off(name: str, settings: Settings, bits: int) -> None:
+    """TPDO1 has six bytes; a 29-bit identifier makes a frame 20 bits longer."""
+    taken_ns = delay_ns(name, settings, 500_000) - delay_ns(name, settings, 0)
+    assert taken_ns == pytest.approx(bits * 2000, abs=2000)
+
+
+@told(play, configured(base_id=300))
+async def test_only_own_identifiers_pass(bench: CanDeviceBench) -> None:
+    bench.link.feed(bench.frames(1) + bench.frames(1, base_id=300))
+    assert len(bench.rig.samples) == 1
+    assert bench.rig.ledger.bytes_in == 40
+
+
+@told(play)
+async def test_losses_by_cause(bench: CanDeviceBench) -> None:
+    bench.feed(1, 2)
+    bench.link.feed(bench.frames(3, lost=[2]))  # nobody says why
+    bench.feed(4)
+    bench.link.counters = KernelCounters(overrun=7)
+    after = bench.frames(6)
+    bench.link.feed([after[0]._replace(after_loss=True), *after[1:]])  # 5 is the kernel's
+    damaged = bench.frames(7)
+    bench.link.feed([*damaged[:4], damaged[4]._replace(data=b"\0" * 7)])
+    bench.feed(8)
+    bench.rig.tick()
+    ledger = bench.rig.ledger
+    assert (ledger.lost_gap_device, ledger.lost_overrun, ledger.lost_crc) == (1, 1, 1)
+    assert (ledger.frames_bad_length, ledger.frames_ignored) == (1, 4 + 4)
+    assert ledger.samples == 5
+    assert EventKind.LOSS in bench.rig.kinds
+
+
+@told(play)
+async def test_frames_from_before_a_loss_are_not_mixed_with_those_after(bench: CanDeviceBench) -> None:
+    first, second = bench.frames(1), bench.frames(2)
+    second[2] = second[2]._replace(after_loss=True)
+    bench.link.feed(first[:2] + second[2:])
+    assert bench.rig.samples == []
+
+
+def test_a_device_that_has_not_answered_is_asked_on() -> None:
+    """Nobody answers: after the first minutes one try in five, as on a serial line."""
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host)
+    rig = rigs.add(configured("hipnuc-canopen", HipnucCanopenSettings(node=8)))
+
+    async def story(_made: list[DeviceRig]) -> None:
+        await rig.until(lambda: rig.can_link.listening)
+        counts = []
+        for pass_s in (1.0, 180.0, 310.0, 310.0, 310.0):
+            end_ns = clock.now_ns() + int(pass_s * 1e9)
+            await rig.until(lambda end_ns=end_ns: clock.now_ns() > end_ns, limit_s=pass_s + 1, step_s=0.1)  # type: ignore[misc]
+            counts.append(len(rig.can_link.written))
+        assert counts == [3, 6, 7, 8, 9]  # a try is one request
+
+    play_rigs(rigs, story, clock)
+
+
+def test_what_a_device_measured_while_the_host_was_suspended_is_a_gap_of_unknown_size() -> None:
+    clock, asleep_ns, index = VirtualClock(), 0, count()
+    now_ns = clock.now_ns
+    host = HostClock(now_ns, clock.realtime_ns, now_ns, lambda: now_ns() + asleep_ns)
+    rigs = DeviceRigs(host)
+    rig = rigs.add(configured())
+
+    def send() -> None:
+        made = encode_set(
+            index=next(index), accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), euler_rad=(0, 0, 0), temperature_c=20,
+            base_id=101,
+        )  # fmt: skip
+        rig.can_link.feed([CanFrame(can_id, False, data, now_ns()) for can_id, data in made])
+
+    async def story(_made: list[DeviceRig]) -> None:
+        nonlocal asleep_ns
+        await rig.until(lambda: rig.can_link.listening)
+        await rig.until(lambda: len(rig.samples) > 200, step=send, step_s=0.01)
+        before = rig.ledger.lost_unknown
+        for suspends in (1, 2):
+            asleep_ns += 2 * NS_PER_S
+            samples = len(rig.samples)
+            await rig.until(lambda: len(rig.samples) > samples + 200, step=send, step_s=0.01)  # noqa: B023
+            assert (host.suspends, rig.ledger.lost_unknown) == (suspends, before + suspends)
+
+    play_rigs(rigs, story, clock)
+
+
+@pytest.mark.parametrize("end", ["run ends", "closed"])
+def test_a_device_that_ends_leaves_its_bus(end: str) -> None:
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host)
+    rig = rigs.add(configured())
+
+    async def story() -> None:
+        running = asyncio.create_task(rig.device.run())
+        await rig.turn(lambda: rig.can_link.listening)
+        claimed = rigs.factory._can_buses.claimed("other", "can0")
+        assert claimed(101, False)
+        if end == "closed":
+            rig.device.close()
+            assert not rig.can_link.is_open
+            assert not claimed(101, False)
+        running.cancel()
+        await asyncio.wait([running])
+        assert not claimed(101, False)
+
+    run_virtually(clock, story())
+
+
+@told(play)
+async def test_bus_down_and_up(bench: CanDeviceBench) -> None:
+    rig = bench.rig
+    bench.feed(1, 2)
+    bench.link.feed(bench.frames(3)[:3])
+    rig.tick()
+    bench.link.disappear()
+    await rig.turn(lambda: rig.state is DeviceState.MISSING)
+    await rig.turn(lambda: "is down" in rig.problem)
+    assert rig.ledger.frames_pending == 0
+    bench.link.appear()
+    await rig.turn(lambda: bench.link.listening)
+    bench.feed(10)
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+    assert rig.ledger.lost() == 0
+    assert rig.device.status().connects == 2
+
+
+@told(play)
+async def test_trouble_of_the_bus_is_shown_while_it_lasts(bench: CanDeviceBench) -> None:
+    rig = bench.rig
+    bench.link.news("can0 is error-passive: x", "can0 is error-passive: x")
+    bench.feed(1)
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert rig.problem == "can0 is error-passive: x"
+    bench.link.news("can0 is bus-off: y", "can0 is bus-off: y")
+    rig.tick(ahead_ns=3000 * MS)
+    assert rig.is_in(DeviceState.SILENT)
+    assert rig.problem == "can0 is bus-off: y"
+    bench.link.news("can0 is error-active again", "")
+    assert rig.problem == ""
+    assert [e.message for e in rig.events if e.kind is EventKind.LINK][-1] == "can0 is error-active again"
+
+
+@pytest.mark.parametrize(("lost", "words"), [([], "nothing of imu61x-can is heard"), ([4], "no whole sample")])
+@told(play)
+async def test_silence_says_what_is_heard(bench: CanDeviceBench, lost: list[int], words: str) -> None:
+    if lost:
+        bench.link.feed(bench.frames(1, lost=lost))
+    bench.rig.tick(ahead_ns=3000 * MS)
+    assert words in bench.rig.problem

@@ -1,0 +1,85 @@
+"""Writes to flash: counted over all runs, limited per day, whatever the wall clock does."""
+
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from imud.device.flash import FILE_NAME, FlashWrites, ModuleFlash
+from imud.model.units import NS_PER_S
+
+DAY_S = 86_400
+LIMIT_ASKED = 40
+LIMIT_ITSELF = 4
+MODULES_MAX = 1024
+
+BEGIN_S = 1_800_000_000
+
+
+class Days:
+    """A wall clock that is set."""
+
+    def __init__(self) -> None:
+        self.now_s = BEGIN_S
+
+    def utc_ns(self) -> int:
+        return self.now_s * NS_PER_S
+
+
+def test_imud_itself_is_stopped_before_people_are() -> None:
+    days = Days()
+    writes = FlashWrites(None, days.utc_ns)
+    itself, asked = ModuleFlash(writes, "A", asked=False), ModuleFlash(writes, "A", asked=True)
+    for number in range(LIMIT_ASKED):
+        assert bool(itself.refusal()) == (number >= LIMIT_ITSELF)
+        assert not asked.refusal()
+        asked.count()
+        days.now_s += 1
+    assert "written 40 times within 24 hours, and 40 are allowed" in asked.refusal()
+    assert "allowed by imud itself" in itself.refusal()
+    assert not ModuleFlash(writes, "B", asked=False).refusal()
+    days.now_s = BEGIN_S + DAY_S + LIMIT_ASKED - LIMIT_ITSELF - 1
+    assert itself.refusal()
+    days.now_s += 1
+    assert not itself.refusal()
+    assert writes.writes("A") == LIMIT_ASKED
+
+
+def test_counts_survive_a_restart_of_imud(tmp_path: Path) -> None:
+    days = Days()
+    with closing(FlashWrites(tmp_path, days.utc_ns)) as writes:
+        writes.count("A")
+        writes.count("A")
+        writes.keep_unreadable("A", {"secret": 5})
+    with closing(FlashWrites(tmp_path, days.utc_ns)) as writes:
+        assert (writes.writes("A"), writes.writes_day("A"), writes.unreadable("A")) == (2, 2, {"secret": 5})
+        assert (writes.writes("B"), writes.unreadable("B")) == (0, {})
+
+
+def test_a_wrong_clock_does_not_forbid_writes_and_the_modules_written_last_are_remembered() -> None:
+    days = Days()
+    days.now_s += 10 * 365 * DAY_S
+    writes = FlashWrites(None, days.utc_ns)
+    for _ in range(LIMIT_ITSELF):
+        writes.count("A")
+    days.now_s = BEGIN_S
+    assert writes.writes_day("A") == LIMIT_ITSELF
+    days.now_s += DAY_S
+    assert writes.writes_day("A") == 0
+    writes = FlashWrites(None, Days().utc_ns)
+    for number in range(MODULES_MAX):
+        writes.count(str(number))
+    writes.count("0")
+    writes.count("one more")
+    assert [writes.writes(name) for name in ("0", "1", "2", "one more")] == [2, 0, 1, 1]
+
+
+@pytest.mark.parametrize("content", [b"{", b'{"A": {"writes": "x"}}', b"[]"])
+def test_a_damaged_file_costs_the_count_only(tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / FILE_NAME).write_bytes(content)
+    with closing(FlashWrites(tmp_path, Days().utc_ns)) as writes:
+        assert writes.writes("A") == 0
+        writes.count("A")
+    assert "counted from the beginning" in caplog.text
+    with closing(FlashWrites(tmp_path, Days().utc_ns)) as writes:
+        assert writes.writes("A") == 1

@@ -1,0 +1,82 @@
+"""Events come at a bounded rate and say what is behind them."""
+
+import msgspec
+import pytest
+
+from imud.contracts.codec import BadFrame, BadReason
+from imud.device.health import Notices
+from imud.host.log import RepeatFilter
+from imud.model.event import Event, EventKind
+from imud.model.ledger import Ledger
+from imud.model.sample import Sync
+
+S = 1_000_000_000
+
+
+def make() -> tuple[Notices, Ledger, list[Event]]:
+    events: list[Event] = []
+    ledger = Ledger()
+    return Notices("bow", ledger, events.append), ledger, events
+
+
+def test_only_a_change_of_sync_is_told() -> None:
+    notices, _, events = make()
+    for t in range(5):
+        notices.tick(t * S, Sync.ARRIVAL)
+    assert events == []
+    notices, _, events = make()
+    notices.tick(0, Sync.ARRIVAL)
+    notices.tick(1, Sync.ARRIVAL)
+    notices.tick(2, Sync.REGRESSION)
+    assert [(e.kind, e.detail) for e in events] == [(EventKind.SYNC, {"sync": "regression", "before": "arrival"})]
+
+
+def test_losses_are_told_once_a_second_with_causes_and_bad_frames_with_the_last() -> None:
+    notices, ledger, events = make()
+    ledger.lost_crc = 2
+    notices.tick(10 * S, None)
+    ledger.lost_gap_device = 5
+    notices.tick(10 * S + S // 2, None)
+    assert [e.message for e in events] == ["2 samples lost"]
+    notices.tick(11 * S, None)
+    assert [e.message for e in events] == ["2 samples lost", "5 samples lost"]
+    assert events[1].kind is EventKind.LOSS
+    assert events[1].detail == {"gap_device": 5, "crc": 2, "overrun": 0, "queue": 0}
+    notices, ledger, events = make()
+    ledger.frames_bad_crc = 3
+    notices.bad_frame(BadFrame(BadReason.CRC, b"\x5a\xa5\x01"))
+    notices.tick(S, None)
+    assert events[0].kind is EventKind.BAD_FRAME
+    assert events[0].message == "3 bad frames, the last by crc: 5a a5 01"
+
+
+def test_texts_of_an_event_are_printable_and_bounded() -> None:
+    notices, _, events = make()
+    hostile = "a\n\x1b[31m\udc80" + "x" * 10_000
+    notices.raise_event(S, EventKind.LINK, hostile, message=hostile, kind=hostile, number=1)
+    assert events[0].message.isprintable()
+    assert len(events[0].message) <= 2000
+    assert events[0].message.startswith(r"a\n\x1b[31m\udc80")
+    assert isinstance(events[0].detail["kind"], str)
+    assert events[0].detail["kind"].isprintable()
+    assert events[0].detail["number"] == 1
+    msgspec.json.encode(events[0])
+
+
+def test_an_event_is_logged_at_once_after_another_kind_of_trouble(caplog: pytest.LogCaptureFixture) -> None:
+    notices, ledger, _ = make()
+    repeats = RepeatFilter()
+    for t, lost in enumerate((2, 3)):
+        ledger.lost_crc += lost
+        ledger.frames_bad_crc += 1
+        notices.bad_frame(BadFrame(BadReason.CRC, bytes((0x5A, 0xA5, t))))
+        notices.tick(t * S, None)
+    notices.raise_event(2 * S, EventKind.CONFIGURATION, "settings are not as declared")
+    for record in caplog.records:
+        record.created = 1000.0
+    told = [record.getMessage() for record in caplog.records if repeats.filter(record)]
+    assert told == [
+        "bow: 2 samples lost",
+        "bow: 1 bad frame, the last by crc: 5a a5 00",
+        "bow: settings are not as declared",
+    ]

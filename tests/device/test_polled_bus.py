@@ -1,0 +1,367 @@
+"""The thread of a bus: scripts get their turn, devices come and go, nothing is left behind."""
+
+import asyncio
+import os
+import threading
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from time import monotonic_ns
+from typing import Any
+
+import pytest
+
+from imud.contracts.codec import Poll, Reading
+from imud.contracts.script import Transfer, TransferScript
+from imud.contracts.status import KernelCounters
+from imud.device.polled_bus import BusMember, Deadlines, PolledBuses, ReadySchedule
+from imud.model.errors import DeviceRefused, LinkError, TransferError, Trouble
+from imud.model.units import NS_PER_S
+from tests.support.event_loops import VirtualClock, in_loop, run_virtually, virtual_buses
+from tests.support.stories import told
+
+ASK = Transfer((b"\x01",), 1)
+
+
+class Wire:
+    """A link whose answers are the number of the transfer."""
+
+    title, writable, bus, shared, rate_hz, bit_rate = "wire", True, "wire", True, 2000.0, 0
+
+    def __init__(self) -> None:
+        self.target: int | None = None
+        self.selected: int | None = None
+        self.targets: list[int | None] = []
+        """The selected target of each transfer."""
+        self.count = 0
+        self.fail: Exception | None = None
+        self.closed = 0
+        self.threads: set[str] = set()
+        self.takes_time: Callable[[], None] = lambda: None
+
+    def absence(self) -> str:
+        return ""
+
+    async def wait_present(self) -> None: ...
+    def open(self) -> None: ...
+    def write(self, data: bytes) -> None: ...
+
+    def select(self, target: int) -> None:
+        self.selected = target
+
+    def kernel_counters(self) -> KernelCounters:
+        return KernelCounters()
+
+    def serial_line(self) -> None: ...
+
+    def place(self, target: int) -> str:
+        return str(target)
+
+    def transfer(self, transfer: Transfer) -> bytes:
+        self.threads.add(threading.current_thread().name)
+        self.count += 1
+        self.targets.append(self.selected)
+        self.takes_time()
+        if self.fail is not None:
+            raise self.fail
+        return bytes([self.count % 256]) * transfer.read_bytes
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+class Sink:
+    def __init__(self) -> None:
+        self.readings: list[Reading] = []
+        self.problem: LinkError | None = None
+        self.calls = 0
+        self.enough = asyncio.Event()
+
+    def on_readings(self, readings: Sequence[Reading], problem: LinkError | None) -> None:
+        self.calls += 1
+        self.readings += readings
+        self.problem = problem or self.problem
+        if len(self.readings) > 20 or problem:
+            self.enough.set()
+
+
+def joined(buses: PolledBuses, wire: Wire, sink: Sink) -> BusMember:
+    return buses.get(wire.bus).join(wire, Deadlines(), sink.on_readings)
+
+
+def three() -> TransferScript[int]:
+    total = 0
+    for _ in range(3):
+        total += (yield ASK)[0]
+    return total
+
+
+def stubborn() -> TransferScript[str]:
+    try:
+        yield ASK
+    except TransferError as error:
+        return f"after {error.trouble}"
+    return "well"
+
+
+def refusing() -> TransferScript[None]:
+    yield ASK
+    raise DeviceRefused("no")
+
+
+def run(body: Callable[[PolledBuses], Coroutine[Any, Any, None]]) -> None:
+    clock = VirtualClock()
+
+    async def whole() -> None:
+        buses = virtual_buses(clock)
+        try:
+            await body(buses)
+        finally:
+            buses.end()
+            buses.end()
+
+    run_virtually(clock, whole())
+
+
+def moving() -> TransferScript[None]:
+    yield replace(ASK, at=7)
+    yield replace(ASK, then_at=9)
+    yield ASK
+    raise DeviceRefused("no")
+
+
+@told(run)
+async def test_a_script_takes_its_device_to_another_target_and_looks_at_others(buses: PolledBuses) -> None:
+    wire, ended_at = Wire(), list[int]()
+    member = joined(buses, wire, Sink())
+    with pytest.raises(DeviceRefused):
+        await member.run(moving(), 5, ended_at.append)
+    assert (wire.targets, wire.selected, ended_at) == ([7, 5, 9], 9, [9])
+    await member.run(three(), 5, ended_at.append)
+    assert ended_at == [9, 5]
+    wire.fail = TransferError(Trouble.ABSENT, "no")
+    with pytest.raises(TransferError):
+        await member.run(moving(), 5)
+    assert (wire.targets[-1], wire.selected) == (7, 5)  # what is read next goes to the device
+
+
+@told(run)
+async def test_scripts_return_raise_and_catch(buses: PolledBuses) -> None:
+    wire = Wire()
+    member = joined(buses, wire, Sink())
+    assert await member.run(three(), 1) == 1 + 2 + 3
+    with pytest.raises(DeviceRefused):
+        await member.run(refusing(), 1)
+    wire.fail = TransferError(Trouble.ABSENT, "no")
+    assert await member.run(stubborn(), 1) == "after absent"
+    with pytest.raises(TransferError):
+        await member.run(three(), 1)
+    wire.fail = LinkError("gone")
+    with pytest.raises(LinkError):
+        await member.run(stubborn(), 1)
+
+
+def test_readings_come_in_order_with_their_times() -> None:
+    """In virtual time: at 2 kHz, each 30 µs long, and every sixth time two of them."""
+    clock = VirtualClock()
+    buses = virtual_buses(clock)
+
+    async def body() -> None:
+        wire, sink = Wire(), Sink()
+        wire.takes_time = lambda: clock.advance(30_000)
+        member = joined(buses, wire, sink)
+        member.start((Poll(ASK), Poll(Transfer((b"\x02",), 2), 3_000_000)))
+        await sink.enough.wait()
+        buses.end()
+        readings = sink.readings
+        firsts = [reading.start_ns for reading in readings if reading.poll == 0]
+        steps = [after - before for before, after in pairwise(firsts)]
+        assert steps == pytest.approx([500_000] * len(steps), abs=2)
+        assert [r.poll for r in readings[:15]] == [0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0]
+        assert all(reading.end_ns - reading.start_ns == 30_000 for reading in readings)
+        assert all(before.end_ns <= after.start_ns for before, after in pairwise(readings))
+
+    run_virtually(clock, body())
+
+
+@pytest.mark.parametrize(("latency_ns", "together"), [(0, 1), (460_000, 1), (5_000_000, 11), (5_100_000, 11)])
+def test_readings_wait_and_their_polls_do_not(latency_ns: int, together: int) -> None:
+    """At 2 kHz in virtual time: the oldest reading is delivered before its latency would be over."""
+    clock = VirtualClock()
+    buses = virtual_buses(clock)
+    delivered: list[tuple[int, list[Reading]]] = []
+
+    async def body() -> None:
+        wire = Wire()
+        wire.takes_time = lambda: clock.advance(30_000)
+        bus = buses.get(wire.bus)
+        member = bus.join(wire, Deadlines(), lambda some, _problem: delivered.append((clock.now_ns(), list(some))))
+        member.set_latency(latency_ns)
+        member.start((Poll(ASK),))
+        await asyncio.sleep(0.1)
+        member.set_latency(0)
+        count = len(delivered)
+        await asyncio.sleep(0.002)
+        assert len(delivered) >= count + 4  # what waited, then each at once
+        buses.end()
+
+    run_virtually(clock, body())
+    assert {len(some) for at_ns, some in delivered[:-6]} == {together}
+    assert all(at_ns <= some[0].end_ns + latency_ns + 30_000 for at_ns, some in delivered)
+    starts = [reading.start_ns for _, some in delivered for reading in some]
+    assert [after - before for before, after in pairwise(starts)] == pytest.approx([500_000] * (len(starts) - 1), abs=2)
+
+
+@told(run)
+async def test_a_failed_reading_and_those_before_it_do_not_wait(buses: PolledBuses) -> None:
+    wire, delivered = Wire(), list[list[Reading]]()
+    member = buses.get(wire.bus).join(wire, Deadlines(), lambda some, _problem: delivered.append(list(some)))
+    member.set_latency(40_000_000)
+    member.start((Poll(ASK),))
+    await asyncio.sleep(0.0024)
+    assert delivered == []
+    wire.fail = TransferError(Trouble.ABSENT, "no")
+    await asyncio.sleep(0.0005)
+    (some,) = delivered
+    assert [reading.error is not None for reading in some] == [False] * 5 + [True]
+
+
+@told(run)
+async def test_script_has_its_turn_on_a_bus_that_is_never_idle(buses: PolledBuses) -> None:
+    wire, sink = Wire(), Sink()
+    wire.rate_hz = 1e6
+    member = joined(buses, wire, sink)
+    member.start((Poll(ASK),))
+    await sink.enough.wait()
+    assert await member.run(three(), 1) > 0
+
+
+@told(run)
+async def test_end_of_the_bus_is_told_once_and_reading_stops(buses: PolledBuses) -> None:
+    wire, sink = Wire(), Sink()
+    member = joined(buses, wire, sink)
+    wire.fail = LinkError("gone")
+    member.start((Poll(ASK),))
+    await sink.enough.wait()
+    wire.fail = None
+    count = wire.count
+    assert await member.run(three(), 1) == 3 * count + 6  # nothing else was transferred meanwhile
+    assert str(sink.problem) == "gone"
+    assert sink.calls == 1
+
+
+@told(run)
+async def test_device_that_left_hears_nothing_and_its_link_is_closed_by_the_thread(buses: PolledBuses) -> None:
+    wire, sink, other = Wire(), Sink(), Wire()
+    member, stays = joined(buses, wire, sink), joined(buses, other, Sink())
+    member.start((Poll(ASK),))
+    await sink.enough.wait()
+    member.leave()
+    member.leave()
+    calls = sink.calls
+    await stays.run(three(), 1)
+    assert sink.calls == calls
+    assert wire.closed == 1
+    assert other.closed == 0
+
+
+@told(run)
+async def test_a_script_that_is_given_up_ends_without_a_result(buses: PolledBuses) -> None:
+    failed, wire = list[object](), Wire()
+    asyncio.get_running_loop().set_exception_handler(lambda _loop, context: failed.append(context))
+    member = joined(buses, wire, Sink())
+    for script in (three(), refusing()):
+        running = asyncio.create_task(member.run(script, 1))
+        await asyncio.sleep(0)
+        running.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await running
+    assert await member.run(three(), 1) == 5 + 6 + 7  # after their transfers
+    assert failed == []
+
+
+@told(run)
+async def test_targets_are_taken_once(buses: PolledBuses) -> None:
+    a, b = joined(buses, Wire(), Sink()), joined(buses, Wire(), Sink())
+    assert a.claim(0x18)
+    assert a.claim(0x18)
+    assert not b.claim(0x18)
+    a.release()
+    assert b.claim(0x18)
+    b.leave()
+    assert a.claim(0x18)
+
+
+def holding(log: list[int], wire: Wire) -> TransferScript[None]:
+    yield replace(ASK, holds=True)
+    held_from = wire.count
+    yield replace(ASK, holds=True)
+    log.append(wire.count - held_from)
+    yield ASK
+
+
+@told(run)
+async def test_a_script_can_keep_its_device_from_being_read(buses: PolledBuses) -> None:
+    wire, log = Wire(), list[int]()
+    wire.rate_hz = 0.0  # a read is due at any time
+    member = joined(buses, wire, Sink())
+    member.start([Poll(ASK)])
+    while wire.count < 20:
+        await asyncio.sleep(0)
+    await member.run(holding(log, wire), 5)
+    assert log == [1]  # the script's own
+    read = wire.count
+    while wire.count < read + 20:
+        await asyncio.sleep(0)
+    member.leave()
+
+
+@pytest.mark.live
+@in_loop
+async def test_an_edge_is_read_while_the_loop_is_busy() -> None:
+    """The thread waits for the line: nothing is read from the descriptor here, and the loop does not run."""
+    edges, device = os.pipe2(os.O_NONBLOCK)
+    buses, wire, read = PolledBuses(monotonic_ns), Wire(), threading.Event()
+    wire.takes_time = read.set
+    member = joined(buses, wire, Sink())
+    schedule = ReadySchedule(1.0, monotonic_ns(), Deadlines())
+    assert not member.watch(-1, lambda: None)
+    assert member.watch(edges, lambda: schedule.noticed(monotonic_ns()))
+    try:
+        member.start((Poll(ASK),), schedule)
+        for number in range(1, 51):
+            assert read.wait(60)  # in the loop's thread
+            assert wire.count == number
+            read.clear()
+            os.write(device, b"x")
+        assert read.wait(60)
+        member.unwatch(edges)
+        member.unwatch(edges)
+        os.write(device, b"x")
+        await member.run(three(), 1)  # in the next turns of the thread, which would read for the edge first
+    finally:
+        buses.end()
+        os.close(edges)
+        os.close(device)
+    assert wire.count == 51 + 3
+    assert wire.threads == {"wire"}
+    assert [thread for thread in threading.enumerate() if thread.name == "wire"] == []
+
+
+@pytest.mark.live
+@in_loop
+async def test_a_watched_line_does_not_keep_others_from_their_deadlines() -> None:
+    edges, device = os.pipe2(os.O_NONBLOCK)
+    buses, wire, sink = PolledBuses(monotonic_ns), Wire(), Sink()
+    member = joined(buses, wire, sink)
+    assert member.watch(edges, lambda: None)
+    try:
+        member.start((Poll(ASK),))
+        await sink.enough.wait()
+    finally:
+        buses.end()
+        os.close(edges)
+        os.close(device)
+    starts = [reading.start_ns for reading in sink.readings]
+    assert min(b - a for a, b in pairwise(starts)) > 0
+    assert starts[-1] - starts[0] >= 0.9 * (len(starts) - 1) * NS_PER_S / wire.rate_hz - NS_PER_S / wire.rate_hz

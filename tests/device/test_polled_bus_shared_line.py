@@ -1,0 +1,301 @@
+"""Modules on an RS-485 line in the daemon's own path, in virtual time, and once from the port to samples."""
+
+from collections.abc import AsyncIterator, Coroutine, Sequence
+from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from math import dist
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imud.config.model import DeviceConfig
+from imud.contracts.command import Action, Target
+from imud.contracts.link import LinkType
+from imud.contracts.script import Transfer, TransferScript
+from imud.contracts.status import DeviceState, KernelCounters
+from imud.drivers.hipnuc.modbus import commands as session
+from imud.drivers.hipnuc.modbus import driver
+from imud.drivers.hipnuc.modbus.registers import BY_NAME
+from imud.links.rs485 import LineCounters, Rs485Link, Rs485Settings
+from imud.model.errors import BadArgument, TransferError
+from imud.model.event import EventKind
+from imud.model.units import NS_PER_MS
+from imud.sim.hipnuc.modbus import SLAVE_VARIANTS, Slave
+from tests.support.device_rig import DeviceRig, DeviceRigs, device_config, running
+from tests.support.event_loops import LoopWorker, VirtualClock, in_loop, run_virtually
+from tests.support.pty_port import BAUD, BEGIN_NS, LINE_BAUD, ModbusBench, modbus_slave, serial_of, slave, wired
+from tests.support.stories import in_bench
+
+
+class VirtualLine:
+    """An `Rs485Line` without a port: the transfers of its modules take virtual time."""
+
+    def __init__(self, clock: VirtualClock, *slaves: Slave) -> None:
+        self.bench = ModbusBench(*slaves)
+        self.counters = LineCounters()
+        self.users = 0
+        self._clock = clock
+
+    @property
+    def counted(self) -> "VirtualLine":
+        return self
+
+    def read(self) -> KernelCounters:
+        return KernelCounters()
+
+    def share(self, *_where: object) -> "VirtualLine":
+        self.users += 1
+        return self
+
+    def release(self, _line: object) -> None:
+        self.users -= 1
+
+    def transfer(self, target: int, request: bytes, reply_bytes: int, reply_ns: int) -> bytes:
+        bench, begin_ns = self.bench, self._clock.now_ns()
+        bench.now_ns = begin_ns
+        try:
+            return bench.transfer(Transfer((request,), reply_bytes, at=target, reply_ms=reply_ns // NS_PER_MS))
+        except TransferError as error:
+            self.counters.timeouts += 1
+            raise TransferError(error.trouble, f"no reply from address {target} on the line") from None
+        finally:
+            self._clock.advance(bench.now_ns - begin_ns)
+
+
+class LineBench:
+    """A line with modules, and devices of the daemon on it, in virtual time."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.clock = VirtualClock(BEGIN_NS)
+        self.path = folder / "line"
+        self.path.touch()
+        self._patch = monkeypatch
+
+    @asynccontextmanager
+    async def running(
+        self, *modules: Slave, at: Sequence[int | str] = (), **link: Any
+    ) -> AsyncIterator[list[DeviceRig]]:
+        """Run a device for each module, or for each of the addresses `at`."""
+        self.line = VirtualLine(self.clock, *modules)
+        ports: Any = self.line
+        row = LinkType("rs485", Rs485Settings, make_polled=lambda settings: Rs485Link(settings, ports=ports))
+        self._patch.setattr("imud.links.rs485.LINK", row)
+        configs = [on(self.path, address, **link) for address in at or [one.settings.slave for one in modules]]
+        async with running(*configs, rigs=DeviceRigs(self.clock.host, start_worker=LoopWorker)) as rigs:
+            yield rigs
+        assert self.line.users == 0
+
+    def run(self, body: Coroutine[Any, Any, None]) -> None:
+        run_virtually(self.clock, body)
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LineBench:
+    return LineBench(tmp_path, monkeypatch)
+
+
+def on(path: Path, address: int | str, **more: Any) -> DeviceConfig:
+    link = {"line": str(path), "baud": LINE_BAUD, "address": address, **more}
+    return device_config(f"imu{address}", "hipnuc-modbus", "rs485", link)
+
+
+def told(rig: DeviceRig) -> str:
+    return " ".join(event.message for event in rig.events)
+
+
+@in_bench
+async def test_several_modules_take_turns(bench: LineBench) -> None:
+    """Old and new firmware side by side; every one is the module it should be, and turns are fair."""
+    modules = [modbus_slave(1), modbus_slave(2, firmware=152), modbus_slave(3, inclinometer="dual")]
+    async with bench.running(*modules) as rigs:
+        for rig in rigs:
+            await rig.until_samples(30)
+        for rig, module in zip(rigs, modules, strict=True):
+            status = rig.device.status()
+            assert status.identity["serial_number"] == module.serial.hex().upper()
+            assert status.settings["id"] == str(module.settings.slave)
+            assert status.polling is not None
+            assert status.polling.missed == status.polling.late == 0
+            assert status.expected_rate_hz == 0
+        counts = [rig.device.status().polling.polls for rig in rigs]  # type: ignore[union-attr]  # seen above
+        await rigs[0].until_samples(30)
+        more = [rig.device.status().polling.polls - n for rig, n in zip(rigs, counts, strict=True)]  # type: ignore[union-attr]  # seen above
+        assert max(more) - min(more) <= 1
+        for rig, module in zip(rigs, modules, strict=True):
+            for sample in rig.samples[-10:]:
+                assert sample.accel_m_s2 is not None
+                instants = range(sample.t_ns - BEGIN_NS, sample.t_rx_ns - BEGIN_NS, 500_000)
+                truths = [module.motion.at(instant / 1e9).accel_m_s2 for instant in instants]
+                assert min(dist(sample.accel_m_s2, truth) for truth in truths) < 0.02
+        assert rigs[1].device.ledger.frames_in_replies >= 1  # the exception that told of old firmware
+        assert [rig.samples[-1].incli_rad is None for rig in rigs] == [True, True, False]
+        assert [rig.kinds.count(EventKind.UP) for rig in rigs] == [1, 1, 1]
+
+
+@in_bench
+async def test_a_dead_module_does_not_stall_the_others(bench: LineBench) -> None:
+    gone = modbus_slave(2)
+    async with bench.running(modbus_slave(1), gone, modbus_slave(3)) as rigs:
+        for rig in rigs:
+            await rig.until_samples(10)
+        gone.dead = True
+        await rigs[1].until(lambda: rigs[1].is_in(DeviceState.SEARCHING), "given up")
+        assert rigs[1].device.status().problem.startswith("no reply from address 2")
+        assert rigs[1].device.ledger.lost_gap_device == 3
+        line = rigs[0].device.status().serial_line  # of all its devices, also those that answer
+        assert line is not None
+        assert line.timeouts >= 3
+        await rigs[0].until_samples(30)
+        await rigs[2].until_samples(30)
+        assert rigs[1].is_in(DeviceState.SEARCHING)
+        gone.dead = False
+        await rigs[1].until_samples(10)
+        assert [rig.kinds.count(EventKind.DOWN) for rig in rigs] == [0, 1, 0]
+
+
+@in_bench
+async def test_noise_costs_one_sample_and_no_more(bench: LineBench) -> None:
+    module = modbus_slave(1)
+    async with bench.running(module) as (rig,):
+        await rig.until_samples(10)
+        module.bad_crc = 1
+        await rig.until(lambda: rig.device.ledger.lost_crc == 1, "damage counted")
+        for silences in (1, 2):
+            module.mute = 1
+            await rig.until(
+                partial(lambda count: rig.device.ledger.lost_gap_device == count, silences), "silence counted"
+            )
+            polling = rig.device.status().polling
+            assert polling is not None
+            assert polling.failed == silences
+        await rig.until_samples(10)
+        assert rig.kinds.count(EventKind.DOWN) == 0
+
+
+@in_bench
+async def test_module_is_told_something_while_it_is_read(bench: LineBench) -> None:
+    module, other = modbus_slave(1), modbus_slave(2)
+    async with bench.running(module, other) as rigs:
+        for rig in rigs:
+            await rig.until_samples(5)
+        assert rigs[0].device.status().status_words == ("time not UTC",)  # 0x0800 of the simulated module
+        await rigs[0].device.act("attitude_mode", {"axes": 9})
+        assert rigs[0].device.status().settings["heading_mode"] == "nine axes"  # read again by itself
+        assert await rigs[0].device.act("read", {"register": "HEADING_MODE"}) == (1,)
+        assert (module.settings.heading_mode, other.settings.heading_mode) == (1, 0)
+        await rigs[0].until_samples(5)
+        assert rigs[0].kinds.count(EventKind.DOWN) == 0
+
+
+@in_bench
+async def test_module_that_is_given_another_address_is_followed(
+    bench: LineBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def moving(_target: Target, *, address: int) -> TransferScript[None]:
+        with suppress(TransferError):
+            yield replace(next(session.set_id(address)), then_at=address)
+        yield next(session.read(BY_NAME["MD_ID"]))
+
+    monkeypatch.setattr(driver, "DRIVER", replace(driver.DRIVER, actions={"move": Action("move it", moving)}))
+    module, other = modbus_slave(1), modbus_slave(3)
+    async with bench.running(module, other) as rigs:
+        for rig in rigs:
+            await rig.until_samples(5)
+        await rigs[0].device.act("move", {"address": 2})
+        assert module.settings.slave == 2
+        assert rigs[0].device.status().link == f"{bench.path}, address 2"
+        await rigs[0].until_samples(5)
+        assert EventKind.DOWN not in rigs[0].kinds
+        module.dead = True  # and found again at the new address, although the configuration has the old one
+        await rigs[0].until(lambda: rigs[0].is_in(DeviceState.SEARCHING), "given up")
+        module.dead = False
+        await rigs[0].until_samples(5)
+        module.serial = serial_of(9)
+        other.dead = True
+        await rigs[0].device.act("move", {"address": 3})
+        assert "another device of this configuration has" in told(rigs[0])
+
+
+@in_bench
+async def test_module_exchanged_for_another_at_the_same_address(
+    bench: LineBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("imud.drivers.hipnuc.modbus.codec.CHECK_NS", 20 * NS_PER_MS)
+    module = modbus_slave(1)
+    async with bench.running(module) as (rig,):
+        await rig.until_samples(10)
+        await rig.until(lambda: rig.device.ledger.frames_in_replies > 1, "serial number read")
+        module.serial = serial_of(77)
+        await rig.until(lambda: EventKind.CONFIGURATION in rig.kinds, "told of another module")
+        await rig.until_samples(5)
+        assert rig.device.status().identity["serial_number"] == serial_of(77).hex().upper()
+
+
+@in_bench
+async def test_unknown_address_and_fixed_rate(bench: LineBench) -> None:
+    async with bench.running(modbus_slave(4), at=["auto"], rate_hz=20) as (rig,):
+        await rig.until_samples(5)
+        status = rig.device.status()
+        assert (status.link, status.expected_rate_hz) == (f"{bench.path}, address 4", 20)
+        steps = [after.t_ns - before.t_ns for before, after in pairwise(rig.samples)]
+        assert steps == pytest.approx([50 * NS_PER_MS] * len(steps), abs=NS_PER_MS)
+
+
+@pytest.mark.parametrize("variant", ["manual", "address after restart", "confirms from the new address"])
+@in_bench
+async def test_a_module_is_followed_to_another_address_and_back(bench: LineBench, variant: str) -> None:
+    module, other = modbus_slave(1, variant=SLAVE_VARIANTS[variant]), modbus_slave(2)
+    async with bench.running(module, other) as (rig, beside):
+        await rig.until_samples(5)
+        await beside.until_samples(5)
+        with pytest.raises(BadArgument, match="address 2 is taken"):
+            await rig.device.act("address", {"address": 2})
+        await rig.device.act("address", {"address": 9})
+        await rig.device.act("save", {})
+        await rig.device.act("restart", {})
+        await rig.until_samples(10)
+        assert rig.device.status().link == f"{bench.path}, address 9"
+        assert module.address == module.flash.slave == 9
+        assert "change address 1 in the configuration" in told(rig)
+        await rig.device.act("address", {"address": 1})
+        await rig.device.act("restart", {})  # not saved: it is at 9 again
+        await rig.until_samples(10)
+        assert rig.device.status().link == f"{bench.path}, address 9"
+        assert beside.kinds.count(EventKind.DOWN) == 0
+
+
+@pytest.mark.parametrize("variant", SLAVE_VARIANTS)
+@in_bench
+async def test_modules_of_every_kind_are_read_and_made_as_declared(bench: LineBench, variant: str) -> None:
+    module, other = modbus_slave(1, variant=SLAVE_VARIANTS[variant]), modbus_slave(2)
+    async with bench.running(module, other) as (rig, beside):
+        await rig.until_samples(10)
+        assert rig.kinds.count(EventKind.UP) == 1
+        assert rig.ledger.lost_gap_device == (2 if module.variant.long_block == "silent" else 0)
+        taken = await rig.device.settings_apply({"address": 2}, save=True)
+        assert "address 2 is taken" in taken.problem
+        applied = await rig.device.settings_apply({"mode": "9-axis", "mounting": "x_up", "address": 9}, save=True)
+        assert applied.problem == "", applied
+        assert {step.name: str(step.outcome) for step in applied.steps}["mounting"] == "written, not verified"
+        await rig.until_samples(5)
+        assert rig.device.status().link == f"{bench.path}, address 9"
+        assert (module.flash.heading_mode, module.flash.slave, module.address) == (1, 9, 9)
+        assert (module.writes_to_flash, other.writes_to_flash) == (1, 0)
+        assert beside.kinds.count(EventKind.DOWN) == 0
+
+
+@pytest.mark.live
+@in_loop
+async def test_on_a_real_port(tmp_path: Path) -> None:
+    modules = [slave(1), slave(2, firmware=152)]
+    with wired(tmp_path, *modules) as (path, _):
+        async with running(*(on(path, address, baud=BAUD, reply_ms=1000) for address in (1, 2))) as rigs:
+            for rig, module in zip(rigs, modules, strict=True):
+                await rig.until_samples(5)
+                assert rig.device.status().identity["serial_number"] == module.serial.hex().upper()
+            await rigs[0].device.act("attitude_mode", {"axes": 9})
+            assert [module.settings.heading_mode for module in modules] == [1, 0]
+            await rigs[0].until_samples(5)

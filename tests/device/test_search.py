@@ -1,0 +1,253 @@
+"""`driver: auto` on a CAN bus: found, several, exchanged, remembered; and frames that imud sends cyclically."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from contextlib import AsyncExitStack
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imud.config.model import DeviceConfig
+from imud.contracts.driver import Driver
+from imud.contracts.status import DeviceState
+from imud.device import can_search as detection
+from imud.device import can_transport
+from imud.device.search import Remembered, RememberedDevice
+from imud.drivers import DRIVERS
+from imud.formats.can import CyclicFrame
+from imud.links.memory import MemoryCanLink, MemorySettings
+from imud.model.options import Settings
+from imud.model.sample import Sample
+from imud.model.units import NS_PER_MS, NS_PER_S
+from tests.support.device_rig import DeviceRig, DeviceRigs
+from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.fake_drivers import BASE, SYNC_ID, FakeCanSettings, fake_can_driver, fake_can_frame
+from tests.support.stories import played
+
+SILENT_SEARCH_NS = 15 * 10**9
+
+
+@pytest.fixture(autouse=True)
+def fake_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fake driver beside the real ones, and rounds of no length."""
+    table: dict[str, Driver] = {**dict(DRIVERS), "fake-can": fake_can_driver()}
+    monkeypatch.setattr(can_transport, "DRIVERS", table)
+    monkeypatch.setattr(detection, "LISTEN_NS", 20 * NS_PER_MS)
+
+
+class Bus:
+    """Devices on the bus `can0`, in virtual time. They start when the test waits for the first time."""
+
+    def __init__(self, state_dir: Path | None = None) -> None:
+        self.clock = VirtualClock()
+        self.rigs = DeviceRigs(self.clock.host, state_dir=state_dir)
+        self._at_work = AsyncExitStack()
+        self._started = False
+
+    def add(
+        self, name: str = "mast", driver: str = "auto", options: Settings | None = None, *, writable: bool = True
+    ) -> "OnBus":
+        settings = MemorySettings(name="can0", writable=writable)
+        config = DeviceConfig(name, driver, options, True, "memory", settings)
+        return OnBus(self, self.rigs.add(config, MemoryCanLink(settings)))
+
+    async def start(self) -> None:
+        """Start the devices; may be called again."""
+        if not self._started:
+            self._started = True
+            await self._at_work.enter_async_context(self.rigs.at_work())
+            await asyncio.sleep(0)
+
+    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Run the story; at the end the ledgers of the devices balance and no link is open."""
+
+        async def whole() -> None:
+            async with self._at_work:
+                await story()
+            assert not any(rig.can_link.is_open for rig in self.rigs.rigs.values())
+
+        run_virtually(self.clock, whole())
+
+
+class OnBus:
+    def __init__(self, bus: Bus, rig: DeviceRig) -> None:
+        self._bus = bus
+        self.rig = rig
+        self.device = rig.device
+        self.link = rig.can_link
+
+    @property
+    def samples(self) -> list[Sample]:
+        return self.rig.samples
+
+    def hear(self, *nodes: int, number: int = 0) -> None:
+        self.link.feed([fake_can_frame(node, number, self.rig.now_ns()) for node in nodes])
+
+    async def until(self, condition: Callable[[], object], *nodes: int) -> None:
+        await self._bus.start()
+        numbers = count(len(self.samples) + 1)
+        await self.rig.until(condition, step=lambda: self.hear(*nodes, number=next(numbers) % 200), step_s=0.001)
+
+
+@played(Bus)
+async def test_the_only_device_is_found_nothing_was_sent_and_commands_go_to_it(bus: Bus) -> None:
+    bench = bus.add()
+    assert bench.device.actions == {}
+    await bench.until(lambda: bench.link.listening)
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 8)
+    status = bench.device.status()
+    assert (status.driver, status.state, status.problem) == ("fake-can", DeviceState.RUNNING, "")
+    assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 8]
+    assert bench.device.ledger.bytes_skipped > 0  # what was heard while searching
+    assert bench.link.written == []
+    assert await bench.device.act("node", {}) == 8
+
+
+@pytest.mark.parametrize("driver", ["auto", "fake-can"])
+@played(Bus)
+async def test_a_device_that_is_given_another_number_is_followed(bus: Bus, driver: str) -> None:
+    bench = bus.add(driver=driver, options=FakeCanSettings(node=8, sync_ms=10) if driver != "auto" else None)
+    other = bus.add("bow")
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 8)
+    path = bench.device._transport.path
+    await bench.device.act("renumber", {"node": 8})
+    assert bench.device._transport.path is path  # it has this number already
+    await bench.device.act("renumber", {"node": 9})
+    assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 9]
+    words = "change options.node to 9 in the configuration"
+    assert any(words in one.message for one in bench.rig.events) == (driver != "auto")
+    heard = len(bench.samples)
+    await bench.until(lambda: len(bench.samples) > heard, 9)
+    assert await bench.device.act("node", {}) == 9
+    await other.until(lambda: other.samples, 8)  # the former number is free
+    assert [wanted.can_id for wanted in other.link.filters] == [BASE + 8]
+    assert bench.device.state is DeviceState.RUNNING
+    assert [sample.seq for sample in bench.samples] == list(range(1, len(bench.samples) + 1))
+
+
+@played(Bus)
+async def test_commands_go_to_the_device_that_is_configured(bus: Bus) -> None:
+    bench = bus.add(driver="fake-can", options=FakeCanSettings(node=5))
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 5)
+    assert await bench.device.act("node", {}) == 5
+
+
+@played(Bus)
+async def test_several_are_named_and_the_search_goes_on(bus: Bus) -> None:
+    bench = bus.add()
+    await bench.until(lambda: "2 devices are heard" in bench.rig.problem, 8, 9)
+    assert "fake-can node 8, fake-can node 9: name driver and options" in bench.rig.problem
+    assert bench.device.state is DeviceState.SEARCHING
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 9)  # the other one was taken away
+
+
+@played(Bus)
+async def test_a_device_that_another_one_is_configured_for_is_left_alone(bus: Bus) -> None:
+    auto = bus.add()
+    bus.add("bow", "fake-can", FakeCanSettings(node=8))
+    await auto.until(lambda: auto.samples, 8, 9)
+    assert [wanted.can_id for wanted in auto.link.filters] == [BASE + 9]
+
+
+@played(Bus)
+async def test_two_that_search_do_not_both_take_the_same_device(bus: Bus) -> None:
+    first, second = bus.add("bow"), bus.add("mast")
+    await first.until(lambda: first.samples, 8)
+    await second.until(lambda: "only frames of other" in second.rig.problem, 8)
+    await second.until(lambda: second.samples, 8, 9)
+    assert [wanted.can_id for wanted in second.link.filters] == [BASE + 9]
+
+
+def test_what_was_found_is_remembered(tmp_path: Path) -> None:
+    for nodes in ((8,), (8, 9)):  # although two are heard the second time
+        bus = Bus(tmp_path)
+        bench = bus.add()
+
+        async def story(bench: OnBus = bench, nodes: tuple[int, ...] = nodes) -> None:
+            await bench.until(lambda: bench.samples, *nodes)
+            assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 8]
+
+        bus.play(story)
+        assert Remembered(tmp_path).get("mast") == RememberedDevice("fake-can", 0, 8)
+
+
+@played(Bus)
+async def test_after_long_silence_another_device_is_found(bus: Bus) -> None:
+    bench = bus.add()
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 8)
+    newest = bench.samples[-1].seq
+    now_ns = bench.rig.now_ns()
+    bench.device.tick(now_ns + 6 * NS_PER_S)
+    assert bench.device.state is DeviceState.SILENT
+    bench.device.tick(now_ns + 6 * NS_PER_S + SILENT_SEARCH_NS + NS_PER_S)
+    await bench.until(lambda: len(bench.link.filters) == 2)
+    bench.device.tick(bench.rig.now_ns())
+    assert bench.device.status().state is DeviceState.SEARCHING
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 9)
+    assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 9]
+    assert bench.samples[-1].seq > newest
+    assert [sample.seq for sample in bench.samples] == list(range(1, len(bench.samples) + 1))
+
+
+@played(Bus)
+async def test_the_bus_goes_down_while_searching_and_comes_back(bus: Bus) -> None:
+    bench = bus.add()
+    await bench.until(lambda: bench.link.listening)
+    bench.hear(8)
+    bench.link.disappear()
+    await bench.until(lambda: bench.device.state is DeviceState.MISSING)
+    bench.link.appear()
+    await bench.until(lambda: bench.samples, 8)
+    path = bench.device._transport.path
+    bench.link.disappear()
+    await bench.until(lambda: bench.rig.is_in(DeviceState.MISSING))
+    bench.link.appear()
+    await bench.until(lambda: bench.rig.is_in(DeviceState.RUNNING), 8)
+    assert bench.device._transport.path is path  # it is the same device
+
+
+@played(Bus)
+async def test_trouble_of_the_bus_explains_why_nothing_is_found(bus: Bus) -> None:
+    bench = bus.add()
+    await bench.until(lambda: "nothing is heard on can0" in bench.rig.problem)
+    bench.link.news("can0 is bus-off: x", "can0 is bus-off: x")
+    await bench.until(lambda: bench.rig.problem == "can0 is bus-off: x")
+
+
+# --- frames that are sent cyclically ----------------------------------------------------------------------------------
+
+
+def syncing(bus: Bus, name: str, node: int, *, writable: bool = True) -> OnBus:
+    return bus.add(name, "fake-can", FakeCanSettings(node=node, sync_ms=10), writable=writable)
+
+
+@played(Bus)
+async def test_cyclic_frames_are_sent_while_the_link_is_open(bus: Bus) -> None:
+    bench = syncing(bus, "mast", 8)
+    await bench.until(lambda: bench.link.cyclic)
+    assert list(bench.link.cyclic) == [CyclicFrame(SYNC_ID, False, b"", 10_000_000)]
+    bench.link.disappear()
+    await bench.until(lambda: bench.device.state is DeviceState.MISSING)
+    assert not bench.link.cyclic
+    bench.link.appear()
+    await bench.until(lambda: bench.link.cyclic)
+
+
+@played(Bus)
+async def test_a_link_that_may_not_send_sends_nothing(bus: Bus) -> None:
+    bench = syncing(bus, "mast", 8, writable=False)
+    await bench.until(lambda: bench.samples, 8)
+    assert not bench.link.cyclic
+
+
+@played(Bus)
+async def test_a_second_sender_of_the_same_frame_is_refused(bus: Bus) -> None:
+    first, second = syncing(bus, "bow", 8), syncing(bus, "mast", 9)
+    await first.until(lambda: first.link.cyclic)
+    await second.until(lambda: second.device.state is DeviceState.FAILED)
+    assert "bow and mast would both send 0x080 on can0" in second.rig.problem
+    assert not second.link.cyclic
+    assert second.device.status().connects == 0  # it is not even opened
+    assert first.rig.problem.startswith("no sample has come yet")

@@ -1,0 +1,652 @@
+"""The settings of a module behind a line, in virtual time: compared at start, replug and restart, applied and kept."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from imud.config.model import DeviceConfig
+from imud.contracts.setting import AppliedSettings, OnDifference, SettingsState, SettingsStatus, StepOutcome
+from imud.contracts.status import DeviceState
+from imud.device import stream_transport
+from imud.drivers import DRIVERS
+from imud.links.memory import MemorySettings
+from imud.model.errors import BadArgument, CommandError
+from imud.model.event import Event, EventKind
+from imud.model.units import NS_PER_S
+from tests.support.device_rig import DeviceRig, DeviceRigs
+from tests.support.device_rig import play as play_rigs
+from tests.support.event_loops import VirtualClock
+from tests.support.fake_drivers import FACTORY, FAKE_MODULE_DRIVER, FAKE_SETTINGS, FakeModule
+from tests.support.polled_bus_bench import PolledBusBench, on_i2c
+from tests.support.stories import played
+
+IDENTIFY_AGAIN_S = (5, 30, 120, 300)
+LIMIT_ASKED = 40
+LIMIT_ITSELF = 4
+
+STEP_S, LONG_STEP_S = 0.05, 0.5
+"""Time from one sample to the next, and while long times pass."""
+
+
+@pytest.fixture(autouse=True)
+def fake_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fake driver beside the real ones."""
+    monkeypatch.setattr(stream_transport, "DRIVERS", {**dict(DRIVERS), "fake-module": FAKE_MODULE_DRIVER})
+
+
+class AtOnce(ThreadPoolExecutor):
+    """What would be done by a thread is done at once: virtual time does not wait for threads."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        try:
+            done.set_result(fn(*args, **kwargs))
+        except OSError as error:
+            done.set_exception(error)
+        return done
+
+
+class ModuleBench:
+    """One module with what is declared for it, and all that is told of it."""
+
+    def __init__(
+        self,
+        on_difference: str = "report",
+        declared: dict[str, Any] | None = None,
+        state_dir: Path | None = None,
+        **module: Any,
+    ) -> None:
+        """`module` are attributes of the module from its start on."""
+        self.clock = VirtualClock()
+        self.module = FakeModule(self.clock.now_ns)
+        for name, value in module.items():
+            setattr(self.module, name, value)
+        self.rigs = DeviceRigs(self.clock.host, state_dir=state_dir)
+        config = DeviceConfig(
+            "bow", "fake-module", None, True, "memory", MemorySettings(name="/dev/fake", baud=115200),
+            declared=msgspec.convert(declared, FAKE_SETTINGS.declarable) if declared else None,
+            on_difference=OnDifference(on_difference),
+        )  # fmt: skip
+        self.rig = self.rigs.add(config, self.module)
+        self.device = self.rig.device
+
+    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        async def told(_made: list[DeviceRig]) -> None:
+            asyncio.get_running_loop().set_default_executor(AtOnce())
+            await self.rig.turn(lambda: self.module.listening)
+            await story()
+
+        play_rigs(self.rigs, told, self.clock)
+
+    async def until(self, holds: Callable[[], object], what: str = "the condition", limit_s: float = 30.0) -> None:
+        """Let time pass, with a sample in every step."""
+        step_s = STEP_S if limit_s < 100 else LONG_STEP_S
+        await self.rig.until(holds, what, limit_s, step=self.module.sample, step_s=step_s)
+
+    async def pass_s(self, duration_s: float) -> None:
+        end_ns = self.clock.now_ns() + int(duration_s * 1e9)
+        await self.until(lambda: self.clock.now_ns() >= end_ns, limit_s=duration_s + 10)
+
+    async def doing(self, work: Coroutine[Any, Any, Any]) -> Any:
+        """The result of something that takes its time, with samples all the while."""
+        task = asyncio.ensure_future(work)
+        await self.until(task.done)
+        return task.result()
+
+    @property
+    def status(self) -> SettingsStatus:
+        """How declared and actual settings compare."""
+        found = self.device.status().declared
+        assert found is not None
+        return found
+
+    def is_in(self, state: SettingsState) -> bool:
+        return self.status.state is state
+
+    @property
+    def told(self) -> list[Event]:
+        """Events about settings."""
+        return [e for e in self.rig.events if e.kind is EventKind.CONFIGURATION and "settings" in e.message]
+
+    @property
+    def messages(self) -> list[str]:
+        """What they say, without what the daemon has always said of changed settings."""
+        return [e.message for e in self.told if not e.message.startswith("settings of the device changed")]
+
+    def repaired(self, times: int) -> bool:
+        """Whether imud has set the settings so often."""
+        return self.status.repairs == times
+
+    def saved(self, times: int) -> bool:
+        return self.module.saves == times
+
+    def written(self) -> list[str]:
+        """Commands that set or save something."""
+        return [one for one in self.module.commands if one.startswith(("SET", "SAVE", "RESTART"))]
+
+
+# --- report -----------------------------------------------------------------------------------------------------------
+
+
+@played(ModuleBench)
+async def test_without_a_declaration_nothing_is_asked_and_nothing_told(bench: ModuleBench) -> None:
+    await bench.pass_s(5)
+    assert bench.is_in(SettingsState.UNDECLARED)
+    assert bench.module.commands == ["WHO", "GET"]  # identity, and settings as text
+    assert bench.messages == []
+
+
+@played(lambda: ModuleBench(declared={"mode": "6-axis", "output": {"a": 100}, "secret": 5}))
+async def test_what_agrees_is_said_to(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    assert bench.is_in(SettingsState.UNKNOWN)
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    assert bench.status.unverified == ("secret",)
+    assert (bench.messages, bench.written()) == ([], [])
+
+
+@played(lambda: ModuleBench(declared={"mode": "9-axis", "offset_deg": 1.5}))
+async def test_a_difference_is_told_once_and_nothing_is_written(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.is_in(SettingsState.DIFFER))
+    await bench.pass_s(100)
+    message = 'settings are not as declared: mode is "6-axis", declared "9-axis", offset_deg is 0.0, declared 1.5'
+    assert bench.messages == [message]
+    assert bench.told[0].detail == {"mode": '"6-axis"', "offset_deg": "0.0"}
+    assert bench.status.differences["mode"].declared == "9-axis"
+    assert bench.written() == []
+    asked = bench.module.commands.count("GET")
+    await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
+    await bench.until(lambda: bench.module.commands.count("GET") >= asked + 2)  # as text, and to compare
+    await bench.pass_s(2)
+    assert bench.messages == [message]  # it is as before
+
+
+@played(lambda: ModuleBench(declared={"mode": "6-axis"}))
+async def test_compared_again_after_a_replug_a_restart_and_a_command(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    await bench.pass_s(20)
+    bench.module.disappear()
+    await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
+    assert bench.is_in(SettingsState.UNKNOWN)
+    bench.module.set["mode"] = "9-axis"
+    bench.module.appear()
+    await bench.until(lambda: bench.is_in(SettingsState.DIFFER), "after a replug")
+    await bench.pass_s(20)
+    bench.module.restart()  # by itself: flash has what is declared
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE), "after a restart")
+    await bench.doing(bench.device.act("set_mode", {"mode": "9-axis"}))
+    await bench.until(lambda: bench.is_in(SettingsState.DIFFER), "after a command")
+    await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE), "after another one")
+    await bench.pass_s(2.2)  # a restart by imud's own script would have shown by now
+    asked = bench.module.commands.count("GET")
+    bench.module.restart()
+    await bench.until(lambda: bench.module.commands.count("GET") > asked, limit_s=3)
+    differ = 'settings are not as declared: mode is "9-axis", declared "6-axis"'
+    assert bench.messages == [differ, differ, "settings are as declared again"]
+
+
+@played(lambda: ModuleBench(declared={"mode": "6-axis"}, pauses_clock=True))
+async def test_a_device_whose_clock_begins_anew_by_the_question_is_asked_once(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    asked = bench.module.commands.count("GET")
+    await bench.pass_s(50)
+    assert bench.module.commands.count("GET") == asked
+    bench.module.set["mode"] = "9-axis"
+    bench.module.restart()  # and by itself it is noticed
+    await bench.until(lambda: bench.module.commands.count("GET") == asked + 1)
+
+
+@played(lambda: ModuleBench(declared={"mode": "6-axis"}, silent={"GET"}))
+async def test_a_device_that_does_not_tell_its_settings_is_asked_ever_more_seldom(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.messages)
+    assert bench.messages == ["settings could not be read, asked 3 times: GET: expected OK, got nothing"]
+    await bench.pass_s(sum(IDENTIFY_AGAIN_S) + 10)  # the identity is asked for with them, four times more
+    asked = bench.module.commands.count("GET")
+    await bench.pass_s(2 * IDENTIFY_AGAIN_S[-1])
+    assert asked + 1 <= bench.module.commands.count("GET") <= asked + 2
+    assert bench.is_in(SettingsState.UNKNOWN)
+    assert "could not be read" in bench.status.problem
+    bench.module.silent = set()
+    bench.module.restart()
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    assert bench.status.problem == ""
+
+
+# --- apply ------------------------------------------------------------------------------------------------------------
+
+
+@played(lambda: ModuleBench("apply", {"mode": "9-axis", "mounting": "x_up", "secret": 5}))
+async def test_apply_sets_what_is_in_force_at_once_and_leaves_flash_alone(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.status.repairs)
+    await bench.until(lambda: list(bench.status.differences) == ["mounting"])
+    await bench.pass_s(50)
+    assert bench.written() == ['SET mode="9-axis"', "SET secret=5"]
+    assert bench.module.flash == FACTORY
+    assert bench.status.flash_writes == 0
+    assert "mounting comes into force by save and restart only" in bench.status.problem
+    last = bench.told[-1]
+    assert last.message == ('settings: mode set to "9-axis" (was "6-axis"), secret set to 5: written, not verified')
+    assert last.detail == {"saved": False, "mode": "done", "secret": "written, not verified"}
+    bench.module.restart()
+    await bench.until(lambda: bench.module.set["mode"] == "9-axis", "set again after a restart")
+    await bench.until(lambda: bench.module.set["secret"] == 5)
+
+
+EVERYTHING = {"mode": "9-axis", "mounting": "x_up", "output": {"b": 50}, "secret": 5}
+
+
+@played(lambda: ModuleBench("apply_and_save", EVERYTHING))
+async def test_apply_and_save_does_everything_once(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.status.repairs)
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    assert bench.written() == [
+        'SET mode="9-axis"', 'SET output={"b":50}', 'SET mounting="x_up"', "SET secret=5", "SAVE", "RESTART",
+    ]  # fmt: skip
+    assert (bench.module.mounting, bench.module.flash["output"]) == ("x_up", {"a": 100, "b": 50})
+    await bench.pass_s(300)
+    assert bench.module.saves == bench.status.flash_writes == bench.status.repairs == 1
+    assert bench.told[-1].message.endswith("; saved to flash; restarted")
+    bench.module.restart()
+    await bench.pass_s(300)
+    assert bench.module.saves == 1
+
+
+@played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis"}))
+async def test_flash_is_not_written_after_commands_that_change_nothing_or_save_themselves(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.status.repairs == 1 and bench.is_in(SettingsState.AGREE))
+    await bench.doing(bench.device.act("save", {}))
+    await bench.pass_s(300)
+    assert bench.module.saves == 2
+    await bench.doing(bench.device.act("set_mode", {"mode": "9-axis"}))
+    await bench.pass_s(300)
+    assert bench.module.saves == 2
+    await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
+    await bench.until(lambda: bench.status.repairs == 2)
+    await bench.pass_s(300)
+    assert bench.module.saves == 3
+
+
+@played(lambda: ModuleBench("apply_and_save", {"output": {"b": 50}}))
+async def test_flash_is_not_written_again_after_a_change_that_a_command_has_saved(bench: ModuleBench) -> None:
+    async def change_and_save() -> None:
+        await asyncio.gather(bench.device.act("set_mode", {"mode": "9-axis"}), bench.device.act("save", {}))
+
+    await bench.until(lambda: bench.status.repairs == 1 and bench.is_in(SettingsState.AGREE))
+    await bench.pass_s(300)
+    await bench.doing(change_and_save())
+    await bench.pass_s(300)
+    assert (bench.module.flash["mode"], bench.module.saves) == ("9-axis", 2)
+
+
+def test_what_is_saved_and_not_told_is_not_written_again_in_the_next_run(tmp_path: Path) -> None:
+    modules = []
+    for _run in range(2):
+        bench = ModuleBench("apply_and_save", {"secret": 5}, tmp_path)
+
+        async def story(bench: ModuleBench = bench) -> None:
+            await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+            await bench.pass_s(30)
+            assert bench.status.flash_writes == 1
+
+        bench.play(story)
+        modules.append(bench.module)
+    assert [module.saves for module in modules] == [1, 0]
+
+
+@played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis"}))
+async def test_what_a_command_could_not_save_is_saved_later(bench: ModuleBench) -> None:
+    bench.module.silent = {"SAVE"}
+    await bench.until(lambda: "not saved" in bench.status.problem)
+    with pytest.raises(CommandError, match="SAVE: expected OK, got nothing"):
+        await bench.doing(bench.device.act("save", {}))
+    assert bench.module.flash == FACTORY
+    bench.module.silent = set()
+    await bench.until(lambda: bench.module.flash["mode"] == "9-axis", limit_s=90)
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    assert bench.status.problem == ""
+
+
+@played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis", "secret": 5}))
+async def test_another_module_is_brought_to_the_same_settings(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.module.saves == 1)
+    bench.module.disappear()
+    await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
+    bench.module.serial, bench.module.flash = "B2", dict(FACTORY)
+    bench.module.restart()
+    bench.module.appear()
+    await bench.until(lambda: bench.module.saves == 2)
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    assert (bench.module.flash["mode"], bench.module.flash["secret"]) == ("9-axis", 5)
+    assert bench.status.flash_writes == 1  # of this module
+
+
+@played(lambda: ModuleBench("apply", {"mode": "9-axis"}))
+async def test_each_module_that_takes_the_place_of_another_is_set_at_once(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.status.repairs == 1)
+    for number, serial in enumerate(("B2", "C3", "D4"), start=2):
+        bench.module.disappear()
+        await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
+        bench.module.serial, bench.module.flash = serial, dict(FACTORY)
+        bench.module.restart()
+        bench.module.appear()
+        await bench.until(partial(bench.repaired, number), limit_s=10)
+
+
+@played(lambda: ModuleBench("apply", {"mode": "9-axis"}, forgets={"mode"}))
+async def test_a_device_that_forgets_is_set_again_after_growing_pauses(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.status.repairs == 1)
+    assert bench.messages[-1].endswith(
+        'mode: wrote "9-axis", read back "6-axis"; what was written before holds until the device restarts'
+    )
+    times_s, reads, asked = [], [], bench.module.commands.count("GET")
+    for number in range(2, 5):
+        before_ns = bench.clock.now_ns()
+        await bench.until(partial(bench.repaired, number), limit_s=1000)
+        times_s.append((bench.clock.now_ns() - before_ns) / 1e9)
+        asked, before = bench.module.commands.count("GET"), asked
+        reads.append(asked - before)
+    assert [round(time_s, -1) for time_s in times_s] == [10, 60, 600]
+    assert reads == [3, 3, 3]  # before and after the write, and as text: the device is not read in the pause
+    bench.module.forgets = set()
+    await bench.pass_s(3)
+    bench.module.restart()
+    await bench.pass_s(20)
+    assert "does not keep its settings" in bench.status.problem
+    assert bench.is_in(SettingsState.DIFFER)
+    asked = bench.module.commands.count("GET")
+    await bench.pass_s(3500)
+    assert bench.module.commands.count("GET") == asked
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE), limit_s=200)
+
+
+@played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis"}))
+async def test_flash_is_written_a_few_times_a_day_by_itself_and_still_for_people(bench: ModuleBench) -> None:
+    for number in range(1, LIMIT_ITSELF + 1):
+        await bench.until(partial(bench.saved, number), limit_s=4000)
+        await bench.pass_s(3)
+        bench.module.flash = dict(FACTORY)
+        bench.module.restart()
+    await bench.until(lambda: "not saved" in bench.messages[-1], limit_s=4000)
+    assert "allowed by imud itself" in bench.status.problem
+    assert bench.module.saves == LIMIT_ITSELF
+    assert bench.module.set["mode"] == "9-axis"  # it is set all the same
+    applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
+    assert applied.saved
+    assert bench.status.flash_writes_day == LIMIT_ITSELF + 1
+
+
+# --- asked for --------------------------------------------------------------------------------------------------------
+
+
+@played(ModuleBench)
+async def test_plan_and_apply_of_given_values(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    plan = await bench.doing(bench.device.settings_plan({"mode": "9-axis", "baud": 921600}, save=True))
+    assert [step.name for step in plan.steps] == ["mode", "baud"]
+    assert bench.written() == []
+    applied = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+    assert [(one.name, one.before, one.outcome) for one in applied.steps] == [("mode", "6-axis", StepOutcome.DONE)]
+    assert (applied.problem, applied.saved, applied.differences) == ("", False, {})
+    saved = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+    assert (saved.steps, saved.saved) == ((), True)  # what was set before is saved
+    again = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+    assert (again.steps, again.saved, bench.module.saves) == ((), False, 1)
+
+
+@played(lambda: ModuleBench(declared={"mode": "9-axis"}))
+async def test_a_report_has_what_was_told_last_or_asks_now(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    known = await bench.device.settings_report(fresh=False)
+    assert {one.actual for one in known.settings} == {None}
+    fresh = await bench.doing(bench.device.settings_report(fresh=True))
+    assert (fresh.device, fresh.driver, fresh.identity["serial_number"]) == ("bow", "fake-module", "A1")
+    assert {one.name: one.actual for one in fresh.settings if one.readable} == {
+        name: value for name, value in FACTORY.items() if name != "secret"
+    }
+    assert [one.name for one in fresh.settings if one.differs] == ["mode"]
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        ({"mode": "x"}, BadArgument, 'mode: expected one of "6-axis", "9-axis", got "x"'),
+        (None, BadArgument, "expected values, or `settings` in the configuration, got neither"),
+        ({"output": {"a": 1000, "b": 1000}}, BadArgument, "at most 1152 Hz in all"),
+    ],
+)
+@played(ModuleBench)
+async def test_what_cannot_be_is_refused_before_anything_is_written(
+    bench: ModuleBench, given: Any, error: type[Exception], message: str
+) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    with pytest.raises(error, match=message):
+        await bench.doing(bench.device.settings_apply(given, save=True))
+    assert bench.written() == []
+
+
+@played(ModuleBench)
+async def test_a_device_that_is_not_there_is_not_asked(bench: ModuleBench) -> None:
+    bench.module.disappear()
+    await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
+    for work in (
+        bench.device.settings_report(fresh=True), bench.device.settings_plan({}, save=False),
+        bench.device.settings_apply({}, save=False),
+    ):  # fmt: skip
+        with pytest.raises(CommandError, match="bow is missing"):
+            await work
+
+
+# --- steps that fail --------------------------------------------------------------------------------------------------
+
+Outcomes = dict[str, StepOutcome]
+
+
+def applied_with(
+    given: dict[str, Any], prepare: Callable[[FakeModule], object], *, save: bool = True
+) -> tuple[ModuleBench, AppliedSettings]:
+    """Values applied to a module that `prepare` has changed."""
+    bench, answers = ModuleBench(), list[AppliedSettings]()
+
+    async def story() -> None:
+        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+        await bench.pass_s(1)
+        prepare(bench.module)
+        answers.append(await bench.doing(bench.device.settings_apply(given, save=save)))
+
+    bench.play(story)
+    return bench, answers[0]
+
+
+def outcomes(applied: AppliedSettings) -> Outcomes:
+    return {step.name: step.outcome for step in applied.steps}
+
+
+WANTED = {"mode": "9-axis", "output": {"a": 10}, "mounting": "x_up", "offset_deg": 1.5}
+
+
+def test_a_step_that_fails_ends_the_plan_and_nothing_is_saved() -> None:
+    bench, applied = applied_with(WANTED, lambda module: module.refuses.add("output"))
+    assert outcomes(applied) == {
+        "mode": StepOutcome.DONE, "output": StepOutcome.FAILED, "mounting": StepOutcome.NOT_DONE,
+        "offset_deg": StepOutcome.NOT_DONE,
+    }  # fmt: skip
+    assert applied.problem == (
+        'output: SET output={"a":10}: the module refused; what was written before holds until the device restarts'
+    )
+    assert not applied.saved
+    assert not applied.restarted
+    assert list(applied.differences) == ["output", "mounting", "offset_deg"]  # how it is now
+    assert bench.module.flash == FACTORY
+    assert bench.module.set == {**FACTORY, "mode": "9-axis"}
+    bench, applied = applied_with(WANTED, lambda module: module.refuses.add("mode"))
+    assert applied.problem == 'mode: SET mode="9-axis": the module refused; nothing else was written'
+    assert bench.module.set == FACTORY
+    _bench, applied = applied_with(WANTED, lambda module: module.forgets.add("offset_deg"))
+    assert outcomes(applied)["offset_deg"] is StepOutcome.FAILED
+    assert applied.steps[-1].message == "wrote 1.5, read back 0.0"
+    assert not applied.saved
+
+
+def test_a_device_that_falls_silent_in_the_middle() -> None:
+    class Dying(set[str]):
+        """Commands not answered: none until the second setting."""
+
+        def __contains__(self, command: object) -> bool:
+            return any(one.startswith("SET output") for one in bench_of[0].commands)
+
+    bench_of: list[FakeModule] = []
+
+    def prepare(module: FakeModule) -> None:
+        bench_of.append(module)
+        module.silent = Dying()
+
+    _bench, applied = applied_with(WANTED, prepare)
+    assert outcomes(applied)["output"] is StepOutcome.FAILED
+    assert applied.problem == 'output: SET output={"a":10}: expected OK, got nothing; what it has now is not known'
+
+
+def test_a_restart_or_a_save_that_fails_says_what_is_set() -> None:
+    _bench, applied = applied_with(
+        {"mounting": "x_up", "mode": "9-axis"}, lambda module: module.forgets.add("mounting")
+    )
+    assert outcomes(applied) == {"mode": StepOutcome.DONE, "mounting": StepOutcome.FAILED}
+    assert applied.problem == 'mounting: wrote "x_up", read back "level"'
+    assert (applied.saved, applied.restarted) == (True, True)
+    _bench, applied = applied_with({"mode": "9-axis"}, lambda module: module.silent.add("SAVE"))
+    assert outcomes(applied) == {"mode": StepOutcome.DONE}
+    assert applied.problem == (
+        "not saved: SAVE: expected OK, got nothing; what was written before holds until the device restarts"
+    )
+    bench, applied = applied_with({"baud": 921600, "mounting": "x_up", "mode": "9-axis"}, lambda _: None, save=False)
+    assert list(applied.left_out) == ["baud", "mounting"]
+    assert outcomes(applied) == {"mode": StepOutcome.DONE}
+    assert bench.module.flash == FACTORY
+
+
+def test_another_rate_is_followed_unless_the_device_is_not_heard_at_it() -> None:
+    bench, applied = applied_with({"baud": 921600, "mode": "9-axis"}, lambda _module: None)
+    assert outcomes(applied) == {"mode": StepOutcome.DONE, "baud": StepOutcome.DONE}
+    assert (bench.module.baud, bench.module.set["baud"], bench.module.saves) == (921600, 921600, 1)
+    assert (applied.problem, applied.saved) == ("", True)
+    assert applied.advice == (
+        "change `memory.baud: 115200` in the configuration to 921600: imud looks for the device there at its next start"
+    )
+    assert bench.status.flash_writes == 1
+    assert bench.rig.kinds.count(EventKind.UP) == 1
+    bench, applied = applied_with({"baud": 921600, "mode": "9-axis"}, lambda module: module.forgets.add("baud"))
+    assert outcomes(applied) == {"mode": StepOutcome.DONE, "baud": StepOutcome.FAILED}
+    assert "is not heard at 921600 baud; the line is at 115200 again" in applied.problem
+    assert bench.module.baud == 115200
+    assert list(applied.differences) == ["baud"]  # it was asked after it, and told
+    assert bench.status.flash_writes == 1  # the attempt counts
+
+
+@played(ModuleBench)
+async def test_commands_that_save_count_and_are_limited(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    await bench.pass_s(2)
+    assert (await bench.doing(bench.device.calibrate("zero", save=True))).saved
+    for _ in range(LIMIT_ASKED - 2):
+        await bench.doing(bench.device.act("save", {}))
+    applied = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+    assert (applied.saved, applied.problem) == (True, "")
+    assert bench.status.flash_writes_day == bench.module.saves == LIMIT_ASKED
+    sent = bench.module.commands.count("ZERO")
+    for saving in (bench.device.act("save", {}), bench.device.calibrate("zero", save=True)):
+        with pytest.raises(CommandError, match="bow: its flash was written 40 times within 24 hours"):
+            await bench.doing(saving)
+    applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
+    assert "not saved: its flash was written 40 times" in applied.problem
+    applied = await bench.doing(bench.device.settings_apply({"baud": 921600}, save=True))  # its step saves by itself
+    assert applied.problem.startswith("baud: its flash was written 40 times")
+    assert (bench.module.saves, bench.module.commands.count("ZERO"), bench.module.baud) == (LIMIT_ASKED, sent, 115200)
+    assert (await bench.doing(bench.device.calibrate("zero", save=False))).verified
+    assert bench.module.commands.count("ZERO") == sent + 1
+
+
+@played(ModuleBench)
+async def test_a_command_does_not_wait_for_another_one_for_ever(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    await bench.pass_s(2)
+    waiting = asyncio.ensure_future(bench.device.act("wait", {}))
+    await bench.pass_s(1)
+    with pytest.raises(CommandError, match="another command or a calibration is still under way"):
+        await bench.doing(bench.device.settings_report(fresh=True))
+    waiting.cancel()
+    await bench.pass_s(1)
+    await bench.doing(bench.device.settings_report(fresh=True))
+
+
+# --- a backup before all is lost --------------------------------------------------------------------------------------
+
+
+@played(lambda tmp_path: ModuleBench(state_dir=tmp_path))
+async def test_a_backup_is_made_before_a_factory_reset(bench: ModuleBench, tmp_path: Path) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    bench.module.set["mode"] = "9-axis"
+    await bench.doing(bench.device.act("factory_reset", {}))
+    (file,) = (tmp_path / "backups").iterdir()
+    assert file.name.startswith("bow.20261118T")  # UTC of `VirtualClock`
+    assert 'mode: "9-axis"' in file.read_text()
+    assert 'serial_number: "A1"' in file.read_text()
+    assert bench.told[-1].message == f"settings before factory_reset are in {file}"
+    assert bench.module.commands[-4:] == ["GET", "RESTART", "WHO", "GET"]  # then it is asked what it has now
+
+
+@pytest.mark.parametrize("silent", [True, False])
+@played(ModuleBench)
+async def test_a_reset_without_a_backup_says_so(bench: ModuleBench, silent: bool) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    await bench.pass_s(1)
+    bench.module.silent = {"GET"} if silent else set()
+    await bench.doing(bench.device.act("factory_reset", {}))
+    why = "GET: expected OK, got nothing" if silent else "there is no state directory"
+    assert bench.told[-1].message == f"no backup of the settings before factory_reset: {why}"
+    assert "RESTART" in bench.module.commands
+
+
+# --- on other links ---------------------------------------------------------------------------------------------------
+
+
+def declaring(config: DeviceConfig, on_difference: OnDifference, **declared: Any) -> DeviceConfig:
+    """The same device with settings that it should have."""
+    table = DRIVERS[config.driver].device_settings
+    assert table is not None
+    return replace(config, declared=msgspec.convert(declared, table.declarable), on_difference=on_difference)
+
+
+def test_a_device_that_is_polled_is_set_between_its_reads_and_again_after_a_restart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("imud.device.settings.AGAIN_NS", NS_PER_S)
+    bench = PolledBusBench(tmp_path, monkeypatch, VirtualClock())
+    device = bench.registers()
+    bench.i2c.devices[0x18] = device
+    config = declaring(on_i2c(), OnDifference.APPLY, accel_filter="10 Hz")
+
+    async def body() -> None:
+        async with bench.running(config) as (rig,):
+            await rig.until_samples(5)
+            await rig.until(lambda: compared(rig).state is SettingsState.AGREE, "set", 60)
+            assert rig.kinds.count(EventKind.UP) == 1
+            device.restart()
+            await rig.until(lambda: compared(rig).repairs == 2, "set again", 100)
+            await rig.until(lambda: compared(rig).state is SettingsState.AGREE, "as declared again")
+            assert rig.kinds.count(EventKind.DOWN) == 0
+            await rig.until_samples(5)
+
+    bench.run(body())
+
+
+def compared(rig: DeviceRig) -> SettingsStatus:
+    found = rig.device.status().declared
+    assert found is not None
+    return found

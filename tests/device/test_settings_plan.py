@@ -1,0 +1,79 @@
+"""What is written, in which order, and what is left out because nothing is to be saved."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from imud.contracts.command import Risk, Target
+from imud.contracts.setting import PlannedStep, SettingsPlan
+from imud.device.settings_plan import CANNOT_SAVE, NEEDS_SAVE, SAVES_ITSELF, make_plan, merged
+from imud.model.errors import BadArgument
+from tests.support.fake_drivers import FACTORY, FAKE_SETTINGS
+
+ACTUAL = {name: value for name, value in FACTORY.items() if name != "secret"}
+TARGET = Target(None, 115200)
+
+
+def planned(wanted: dict[str, Any], *, save: bool = True, unsaved: bool = False, **written: Any) -> SettingsPlan:
+    return make_plan(FAKE_SETTINGS, TARGET, wanted, ACTUAL, written, save=save, unsaved=unsaved)
+
+
+def names(plan: SettingsPlan) -> list[str]:
+    return [step.name for step in plan.steps]
+
+
+def test_only_what_differs_or_cannot_be_read_back_is_written_and_flash_only_then() -> None:
+    assert planned({"mode": "6-axis", "output": {"a": 100}}) == SettingsPlan()
+    assert planned({"mode": "6-axis"}).empty
+    plan = planned({"mode": "9-axis", "output": {"a": 100}})
+    assert plan == SettingsPlan((PlannedStep("mode", "9-axis", "6-axis"),), save=True)
+    assert not planned({"mode": "9-axis"}, save=False).save
+    assert planned({"mode": "6-axis"}, unsaved=True).save  # written before and not saved
+    assert not planned({"mode": "6-axis"}, save=False, unsaved=True).save
+    assert names(planned({"secret": 5})) == ["secret"]
+    assert names(planned({"secret": 5}, secret=5)) == []
+    assert names(planned({"secret": 5}, secret=4)) == ["secret"]
+
+
+def test_the_order_is_that_of_the_table_and_what_changes_the_connection_comes_last() -> None:
+    plan = planned({"baud": 921600, "offset_deg": 1.0, "mounting": "x_up", "mode": "9-axis"})
+    assert names(plan) == ["mode", "mounting", "offset_deg", "baud"]
+    assert plan.risk is Risk.CONNECTION
+    assert (plan.save, plan.restart) == (False, False)  # the step for the rate does both
+    assert planned({"mode": "9-axis"}).risk is Risk.NONE
+    baud = replace(FAKE_SETTINGS.table["baud"], saves=False)
+    table = replace(FAKE_SETTINGS, table={**FAKE_SETTINGS.table, "baud": baud})
+    assert next(iter(table.table)) == "baud"
+    plan = make_plan(table, TARGET, {"baud": 921600, "mode": "9-axis"}, ACTUAL, {}, save=True, unsaved=False)
+    assert (names(plan), plan.save) == (["mode", "baud"], True)
+
+
+def test_what_needs_a_restart_is_left_out_where_nothing_is_or_can_be_saved() -> None:
+    wanted = {"mounting": "x_up", "mode": "9-axis", "baud": 921600}
+    plan = planned(wanted, save=False)
+    assert names(plan) == ["mode"]
+    assert plan.left_out == {"baud": SAVES_ITSELF, "mounting": NEEDS_SAVE}
+    assert not plan.restart
+    saving = planned({"mounting": "x_up"})
+    assert (names(saving), saving.save, saving.restart) == (["mounting"], True, True)
+    table = replace(FAKE_SETTINGS, save=None)
+    plan = make_plan(table, TARGET, {"mounting": "x_up", "mode": "9-axis"}, ACTUAL, {}, save=True, unsaved=False)
+    assert (names(plan), plan.left_out, plan.save) == (["mode"], {"mounting": CANNOT_SAVE}, False)
+    table = replace(FAKE_SETTINGS, restart=None)
+    plan = make_plan(table, TARGET, {"mounting": "x_up"}, ACTUAL, {}, save=True, unsaved=False)
+    assert (names(plan), plan.save, plan.restart) == (["mounting"], True, False)
+
+
+def test_values_are_checked_together_with_the_present_ones() -> None:
+    assert names(planned({"output": {"b": 1000}})) == ["output"]  # with 100 Hz of `a` it is 1100 of 1152
+    with pytest.raises(BadArgument, match="at most 96 Hz in all at 9600 baud, got 100 Hz"):
+        planned({"baud": 9600})
+    planned({"baud": 9600, "output": {"a": 90}})
+    planned({"baud": 9600}, save=False)  # it is left out
+
+
+def test_values_of_several_keys_are_merged() -> None:
+    assert merged({"output": {"a": 1, "b": 2}, "mode": "6"}, {"output": {"b": 3}, "mode": "9"}) == {
+        "output": {"a": 1, "b": 3}, "mode": "9",
+    }  # fmt: skip

@@ -1,0 +1,121 @@
+"""What scripts say of how far a value is known, and the order of save and restart; failures are in test_keeper.py."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from imud.contracts.command import Target
+from imud.contracts.setting import AppliedSettings, DeviceSettings, Effect, Setting, StepOutcome, Written
+from imud.device.settings_plan import Applying, make_plan
+from imud.model.errors import LinkMissing, NoReply
+
+TARGET = Target(None, 0)
+
+
+class TableOfOne:
+    """A device with the setting `x`: its scripts are done as soon as they are made."""
+
+    def __init__(self, result: object, *, readable: bool = True, effect: Effect = Effect.AT_ONCE, **more: Any) -> None:
+        self.actual: dict[str, Any] = {"x": 1}
+        self.active: dict[str, Any] = {"x": 1} if readable else {}
+        self.done: list[str] = []
+        self.result = result
+        self.table = DeviceSettings(
+            table={"x": Setting(type=int, write=self._write, effect=effect, **more)},
+            read=self._read, save=lambda _target: self._do("save"), restart=lambda _target: self._restart(),
+        )  # fmt: skip
+
+    def _do(self, name: str) -> None:
+        self.done.append(name)
+
+    def _write(self, _target: Target, value: int) -> object:
+        self._do(f"x={value}")
+        self.actual = {"x": value}
+        if self.result is Written.VERIFIED or self.result is None:
+            self.active = dict(self.actual) if self.active else {}
+        if isinstance(self.result, Exception):
+            raise self.result
+        return self.result
+
+    def _read(self, _target: Target) -> dict[str, Any]:
+        self._do("read")
+        return dict(self.active)
+
+    def _restart(self) -> None:
+        self._do("restart")
+        self.active = dict(self.actual) if self.active else {}
+
+
+class Unlimited:
+    """Flash that may be written."""
+
+    def __init__(self) -> None:
+        self.counted = 0
+
+    def refusal(self) -> str:
+        return ""
+
+    def count(self) -> None:
+        self.counted += 1
+
+
+def applied(device: TableOfOne, *, save: bool = True, flash: Unlimited | None = None) -> AppliedSettings:
+    async def run(make: Callable[[Target], Any]) -> Any:
+        return make(TARGET)
+
+    plan = make_plan(device.table, TARGET, {"x": 2}, device.active, {}, save=save, unsaved=False)
+    applying = Applying(device.table, run, flash or Unlimited(), {"x": 2}, device.active)
+    return asyncio.run(applying.carry_out(plan))
+
+
+def test_values_are_written_read_back_saved_and_judged_after_a_restart() -> None:
+    device, flash = TableOfOne(None), Unlimited()
+    found = applied(device, flash=flash)
+    assert device.done == ["x=2", "read", "save"]
+    assert (found.steps[0].outcome, found.saved, found.restarted, found.differences) == (
+        StepOutcome.DONE,
+        True,
+        False,
+        {},
+    )
+    assert flash.counted == 1
+    device = TableOfOne(Written.PENDING, effect=Effect.AFTER_RESTART)
+    found = applied(device)
+    assert device.done == ["x=2", "read", "save", "restart", "read"]
+    assert (found.steps[0].outcome, found.restarted) == (StepOutcome.DONE, True)
+    device = TableOfOne(Written.PENDING)
+    found = applied(device)
+    assert device.done == ["x=2", "read", "save", "restart", "read"]
+    assert found.steps[0].outcome is StepOutcome.DONE
+    device = TableOfOne(Written.PENDING)
+    found = applied(device, save=False)
+    assert device.done == ["x=2", "read"]
+    assert found.steps[0].outcome is StepOutcome.WRITTEN
+    assert list(found.differences) == ["x"]
+
+
+@pytest.mark.parametrize("result", [Written.UNVERIFIED, Written.UNVERIFIED_PENDING])
+def test_a_device_that_ignores_reads_has_taken_the_value_and_one_that_tells_another_has_not(result: Written) -> None:
+    found = applied(TableOfOne(result, readable=False))
+    assert found.steps[0].outcome is StepOutcome.NOT_VERIFIED
+    assert (found.saved, found.problem, found.differences) == (True, "", {})
+    found = applied(TableOfOne(Written.UNVERIFIED))
+    assert found.steps[0].message == "wrote 2, read back 1"
+
+
+def test_a_setting_that_saves_itself_is_saved_once() -> None:
+    device, flash = TableOfOne(Written.VERIFIED, saves=True, connection=True), Unlimited()
+    found = applied(device, flash=flash)
+    assert device.done == ["x=2", "read"]
+    assert (found.saved, flash.counted) == (True, 1)
+
+
+@pytest.mark.parametrize("error", [NoReply("no answer"), LinkMissing("pulled out")])
+def test_errors_of_device_and_link_are_an_answer(error: Exception) -> None:
+    device = TableOfOne(error)
+    device.result = error
+    found = applied(device)
+    assert found.problem == f"x: {error}; nothing else was written"
+    assert device.done == ["x=2", "read"]

@@ -1,0 +1,71 @@
+"""What is declared against what a device has: the table decides what agrees, and every value is described."""
+
+from typing import Any
+
+import pytest
+
+from imud.contracts.setting import SettingDifference
+from imud.device.settings_plan import described_settings, differences, unverified, wanted_values, words
+from imud.model.errors import BadArgument
+from tests.support.fake_drivers import FACTORY, FAKE_SETTINGS
+
+ACTUAL = {name: value for name, value in FACTORY.items() if name != "secret"}
+
+
+def differing(
+    wanted: dict[str, Any], actual: dict[str, Any] = ACTUAL, unreadable: dict[str, Any] | None = None
+) -> list[str]:
+    return list(differences(FAKE_SETTINGS, wanted, actual, unreadable or {}))
+
+
+def test_the_table_says_what_agrees_and_what_cannot_be_read_differs_unless_it_was_written() -> None:
+    assert differing({"mode": "6-axis", "output": {"a": 100}, "offset_deg": 0.009}) == []
+    assert differing({"offset_deg": 0.02, "output": {"a": 100, "b": 1}, "mode": "9-axis"}) == [
+        "mode", "output", "offset_deg",
+    ]  # fmt: skip
+    found = differences(FAKE_SETTINGS, {"mode": "6-axis"}, {}, {})
+    assert found == {"mode": SettingDifference("6-axis", None)}
+    assert words(found) == 'mode is not reported, declared "6-axis"'
+    assert differing({"mode": "6-axis"}, {}, {"mode": "6-axis"}) == []
+    assert differing({"mode": "6-axis"}, {"mode": "9-axis"}, {"mode": "6-axis"}) == ["mode"]  # what it says counts
+    assert differing({"secret": 5}) == []
+    assert unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, ACTUAL) == ("secret",)
+    assert unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, {}) == ("mode", "secret")
+
+
+def test_words_name_both_values_and_given_values_get_the_types_of_the_table() -> None:
+    assert words({"mode": SettingDifference("6-axis", "9-axis"), "n": SettingDifference(1, 2)}) == (
+        'mode is "9-axis", declared "6-axis", n is 2, declared 1'
+    )
+    made = wanted_values(FAKE_SETTINGS, {"offset_deg": 5, "mode": "9-axis"})
+    assert list(made.items()) == [("mode", "9-axis"), ("offset_deg", 5.0)]
+    assert type(made["offset_deg"]) is float
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"mod": 1}, 'expected a setting that imud knows, got "mod"; did you mean mode?'),
+        ({"hours": 1}, "hours: it can only be read"),
+        ({"mode": 7}, 'mode: expected one of "6-axis", "9-axis", got 7'),
+        ({"offset_deg": 181}, "offset_deg: expected a number from -180 to 180, got 181"),
+        ({"secret": None}, "secret: expected a whole number from 0 to 9, got null"),
+    ],
+)
+def test_bad_values_are_named_with_what_is_expected(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadArgument) as caught:
+        wanted_values(FAKE_SETTINGS, given)
+    assert message in str(caught.value)
+
+
+def test_every_setting_is_described() -> None:
+    found = {one.name: one for one in described_settings(FAKE_SETTINGS, {"mode": "9-axis", "secret": 3}, ACTUAL)}
+    assert list(found) == list(FAKE_SETTINGS.table)
+    mode, secret, hours, offset = found["mode"], found["secret"], found["hours"], found["offset_deg"]
+    assert (mode.values, mode.declared, mode.actual, mode.differs) == (
+        'one of "6-axis", "9-axis"', "9-axis", "6-axis", True,
+    )  # fmt: skip
+    assert (secret.declared, secret.actual, secret.readable, secret.differs) == (3, None, False, False)
+    assert (hours.actual, hours.declarable) == (7, False)
+    assert (offset.unit, offset.section, offset.description) == ("°", "2.3", "added to the heading")
+    assert all(one.actual is None for one in described_settings(FAKE_SETTINGS, {}, None))

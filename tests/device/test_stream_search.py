@@ -1,0 +1,266 @@
+"""Detection in virtual time, against a model of the line that shows what a wrong rate makes of the bits."""
+
+from dataclasses import replace
+from random import Random
+
+import pytest
+
+from imud.contracts.codec import CodecEvent
+from imud.device.search import GaveUp, Listen
+from imud.device.stream_search import Search, Step, StreamFound
+from imud.model.ledger import Ledger
+from imud.model.units import NS_PER_MS, NS_PER_S
+from tests.support.fake_drivers import BAUD_RATES, FAKE_DRIVER, QUERY, REPLY, SYNC, fake_frame
+from tests.support.uart_wire import FakeDevice, received, run_search
+
+QUIET_NS = 1200 * 10**6
+
+
+def device(baud: int, rate_hz: float, phase_ns: int = 0, poll_ns: int = NS_PER_MS) -> FakeDevice:
+    return FakeDevice(FAKE_DRIVER, baud, rate_hz, phase_ns, poll_ns, REPLY, QUERY, random=Random(baud + phase_ns))
+
+
+def test_the_line_model_gives_the_bytes_at_the_right_rate_and_others_at_wrong_ones() -> None:
+    data = bytes(range(256))
+    assert bytes(value for _, value in received(data, 115200, 115200)) == data
+    # 0x00 at 9600 is one low of nine bits = 108 bits at 115200: one start edge only, sampled all low
+    assert [value for _, value in received(b"\x00", 9600, 115200)] == [0]
+    # 0x55 at half the rate: start low 2 bits, then pairs 11 00 11 00: sampled 0 11 00 11 0
+    assert received(b"\x55", 115200, 230400)[0][1] == 0b01100110
+
+
+def test_a_remembered_rate_that_is_wrong_costs_little_and_one_that_no_longer_exists_nothing() -> None:
+    search = Search([FAKE_DRIVER], remembered=("fake-uart", 9600))
+    found, took_ns, listens = run_search(search, device(921600, 100, 777), start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert found.baud == 921600
+    assert listens[0].baud == 9600
+    assert found.wasted_bytes > 0
+    assert took_ns < 0.8 * NS_PER_S  # garbage ends the long wait for silence
+    assert first_baud(Search([FAKE_DRIVER], remembered=("gone-uart", 9600))) == BAUD_RATES[0]
+    assert first_baud(Search([FAKE_DRIVER], remembered=("fake-uart", 57600))) == BAUD_RATES[0]
+    assert first_baud(Search([FAKE_DRIVER], bauds=(9600,), remembered=("fake-uart", 115200))) == 9600
+
+
+def test_an_adapter_that_holds_bytes_back_gets_as_much_more_time() -> None:
+    until_ns = []
+    for hold_ns in (0, 16 * NS_PER_MS):
+        step = Search([FAKE_DRIVER], hold_ns=hold_ns).start(0)
+        assert isinstance(step, Listen)
+        until_ns.append(step.until_ns)
+    assert until_ns[1] - until_ns[0] == 16 * NS_PER_MS
+
+
+def first_baud(search: Search) -> int:
+    step = search.start(0)
+    assert isinstance(step, Listen)
+    return step.baud
+
+
+@pytest.mark.parametrize(("baud", "rate_hz"), [(9600, 1.0), (115200, 1.0), (921600, 1.0), (230400, 5.0), (256000, 20)])
+def test_a_slow_device_is_found_in_a_later_pass(baud: int, rate_hz: float) -> None:
+    for phase_ns in range(0, NS_PER_S, NS_PER_S // 7):
+        far = device(baud, rate_hz, phase_ns)
+        found, took_ns, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far, start_ns=9 * NS_PER_S)
+        assert isinstance(found, StreamFound), found
+        assert found.baud == baud
+        assert took_ns < 15 * NS_PER_S
+        assert far.sent_to == []
+
+
+@pytest.mark.parametrize("baud", BAUD_RATES)
+def test_a_silent_device_is_asked_after_the_quiet_time_only(baud: int) -> None:
+    far = device(baud, 0)
+    found, took_ns, listens = run_search(Search([FAKE_DRIVER], may_ask=True), far, start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert found.baud == baud
+    first_question = next(index for index, listen in enumerate(listens) if listen.send)
+    assert listens[first_question - 1].until_ns - NS_PER_S >= QUIET_NS
+    assert took_ns < 4 * NS_PER_S
+    assert b"".join(data for data, _ in found.chunks) == REPLY
+
+
+def test_nothing_is_sent_without_leave_or_to_another_kind_of_device() -> None:
+    far = device(115200, 0)
+    result, _, listens = run_search(Search([FAKE_DRIVER]), far)
+    assert isinstance(result, GaveUp)
+    assert far.sent_to == []
+    assert {listen.baud for listen in listens} == set(BAUD_RATES)
+    assert "heard nothing at 115200" in result.summary
+    assert "query" not in result.summary
+    far = replace(device(115200, 10), noise=b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
+    result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far)
+    assert isinstance(result, GaveUp)
+    assert far.sent_to == []
+    assert "115200: " in result.summary
+    assert "0 valid frames" in result.summary
+    assert result.wasted_bytes > 0
+    far = replace(device(115200, 0), reply=b"OK\r\n")
+    result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far)
+    assert isinstance(result, GaveUp)
+
+
+def test_noise_stops_the_questions() -> None:
+    search = Search([FAKE_DRIVER], may_ask=True)
+    step: Step | None = search.start(0)
+    now_ns = 0
+    while isinstance(step, Listen) and not step.send:
+        now_ns = step.until_ns
+        step = search.on_time(now_ns)
+    assert isinstance(step, Listen)
+    assert step.send == QUERY
+    sent = 0
+    step = search.on_data(b"\xff", now_ns + 1) or step
+    while isinstance(step, Listen):
+        now_ns = step.until_ns
+        step = search.on_time(now_ns)
+        sent += isinstance(step, Listen) and bool(step.send)
+    assert isinstance(step, GaveUp)
+    assert sent == 0
+
+
+def test_two_valid_frames_are_a_lock_if_few_are_damaged() -> None:
+    search = Search([FAKE_DRIVER], bauds=(115200,))
+    search.start(0)
+    step = search.on_data(fake_frame(b"x" * 76), 1)
+    assert isinstance(step, Listen)  # a longer stay
+    assert step.until_ns > NS_PER_S
+    assert isinstance(search.on_data(fake_frame(b"y" * 76), 2), StreamFound)
+    bad = fake_frame(b"x" * 76)[:-1] + b"y"
+    good = fake_frame(b"z" * 76)
+    search = Search([FAKE_DRIVER], bauds=(115200,))
+    search.start(0)
+    for place, frame in enumerate([bad, bad, bad, bad, bad, good, good, good]):
+        assert not isinstance(search.on_data(frame, place), StreamFound)
+    assert isinstance(search.on_data(good, 9), StreamFound)
+
+
+def test_a_noisy_line_still_locks_also_on_frames_inside_a_false_long_one() -> None:
+    far = replace(device(460800, 100, 4_000_000), damage=0.4)
+    found, took_ns, _ = run_search(Search([FAKE_DRIVER]), far, start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert took_ns < 2 * NS_PER_S
+    search = Search([FAKE_DRIVER], bauds=(115200,))
+    step = search.start(0)
+    assert isinstance(step, Listen)
+    lie = b"\x5a\xa5\x00\x02\x00\x00"  # claims 512 bytes
+    assert search.on_data(lie + fake_frame(b"a" * 76) + fake_frame(b"b" * 76), 1) is None
+    assert isinstance(search.on_time(step.until_ns), StreamFound)
+
+
+def test_every_byte_is_in_the_chunks_or_wasted() -> None:
+    far = device(9600, 100, 5_000_000)
+    search = Search([FAKE_DRIVER])
+    heard = 0
+    take = search.on_data
+
+    def counting(data: bytes, t_rx_ns: int) -> object:
+        nonlocal heard
+        heard += len(data)
+        return take(data, t_rx_ns)
+
+    search.on_data = counting  # type: ignore[method-assign, assignment]  # a spy
+    found, _, _ = run_search(search, far, start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert found.wasted_bytes > 0
+    assert sum(len(data) for data, _ in found.chunks) + found.wasted_bytes == heard
+
+
+def test_a_rate_that_the_port_cannot_do_is_left_out_and_named() -> None:
+    search = Search([FAKE_DRIVER], bauds=(921600, 9600))
+    step: Step | None = search.start(0)
+    now_ns = 0
+    seen: list[int] = []
+    while isinstance(step, Listen):
+        seen.append(step.baud)
+        now_ns = step.until_ns
+        if step.baud == 921600:
+            step = search.refused("the port cannot do it", now_ns)
+        else:
+            search.on_data(b"\x01", now_ns - 1)
+            step = search.on_time(now_ns)
+    assert isinstance(step, GaveUp)
+    assert seen.count(921600) == 1
+    assert "921600: the port cannot do it" in step.summary
+    search = Search([FAKE_DRIVER], may_ask=True)
+    step = search.start(0)
+    for number in range(len(BAUD_RATES)):
+        assert isinstance(step, Listen)
+        step = search.refused("not to be had", number)
+    assert isinstance(step, GaveUp)
+    assert "9600: not to be had" in step.summary
+
+
+def test_a_visit_ends_at_its_time_or_by_a_flood() -> None:
+    search = Search([FAKE_DRIVER])
+    step = search.start(0)
+    assert isinstance(step, Listen)
+    assert search.on_time(step.until_ns - 1) is None
+    search = Search([FAKE_DRIVER])
+    step = search.start(0)
+    assert isinstance(step, Listen)
+    change = None
+    for number in range(100):
+        change = search.on_data(bytes(4096), number)
+        if change is not None:
+            break
+    assert isinstance(change, Listen)
+    assert change.baud != step.baud
+
+
+def test_the_driver_is_told_apart_by_its_frames() -> None:
+    other = replace(FAKE_DRIVER, name="other-uart", make_codec=lambda ledger, options: DeafCodec(ledger))
+    for drivers in ([other, FAKE_DRIVER], [FAKE_DRIVER, other]):
+        found, _, _ = run_search(Search(drivers), device(115200, 100), start_ns=NS_PER_S)
+        assert isinstance(found, StreamFound)
+        assert found.driver is FAKE_DRIVER
+
+
+class DeafCodec:
+    def __init__(self, ledger: Ledger) -> None:
+        self.ledger = ledger
+
+    def feed(self, data: bytes) -> list[CodecEvent]:
+        return []
+
+    def flush(self) -> list[CodecEvent]:
+        return []
+
+    def reset(self) -> None:
+        """Has nothing to forget."""
+
+
+def test_cut_frames_and_random_bytes_are_no_device() -> None:
+    random = Random(7)
+    for noise in (fake_frame(b"x" * 76)[:60], fake_frame(b"x" * 76)[:60] + SYNC, random.randbytes(82), SYNC * 40):
+        far = replace(device(115200, 100, 3_000_000), noise=noise)
+        result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far, start_ns=NS_PER_S)
+        assert isinstance(result, GaveUp)
+        assert far.sent_to == []
+
+
+def test_a_search_needs_drivers() -> None:
+    with pytest.raises(ValueError, match="at least one driver"):
+        Search([])
+
+
+def test_a_reply_behind_other_frames_and_frames_of_several_visits_count() -> None:
+    search = Search([FAKE_DRIVER], bauds=(115200,), may_ask=True)
+    step: Step | None = search.start(0)
+    while isinstance(step, Listen) and not step.send:
+        step = search.on_time(step.until_ns)
+    assert isinstance(step, Listen)
+    found = search.on_data(fake_frame(b"x" * 76) + REPLY, step.until_ns - 1)  # one frame does not suffice
+    assert isinstance(found, StreamFound)
+    deaf = replace(FAKE_DRIVER, name="other-uart", make_codec=lambda ledger, options: DeafCodec(ledger))
+    search = Search([deaf, FAKE_DRIVER], bauds=(115200, 9600))
+    step, visits = search.start(0), 0
+    while isinstance(step, Listen):
+        if step.baud == 9600:
+            visits += 1
+            frame = fake_frame(b"x" * 76)
+            step = search.on_data(frame + frame[:-1] + b"y", step.until_ns - 1) or step
+        step = search.on_time(step.until_ns) if isinstance(step, Listen) else step
+    assert isinstance(step, GaveUp)
+    assert visits > 1
+    assert f"9600: {visits * 164} bytes, {visits} valid frames, {visits} damaged" in step.summary

@@ -1,0 +1,531 @@
+"""The life of a device on a link inside the process: found, asked, lost, back, silent, never crashing."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from time import monotonic_ns
+from typing import Any
+
+import msgspec
+import pytest
+
+from imud.config.model import DeviceConfig
+from imud.contracts.command import Action
+from imud.contracts.link import OnData, OnEnd
+from imud.contracts.script import Request, RequestScript, never
+from imud.contracts.status import DeviceState, KernelCounters
+from imud.device.search import RememberedDevice
+from imud.drivers.hipnuc.uart import driver
+from imud.links import LINKS
+from imud.links.memory import MemoryLink, MemorySettings
+from imud.model.errors import LinkBusy, LinkError, Rejected
+from imud.model.event import EventKind
+from tests.support.device_rig import LIMIT_S, DeviceRig, DeviceRigs
+from tests.support.device_rig import play as play_rigs
+from tests.support.event_loops import VirtualClock, in_loop
+from tests.support.files import hi91
+from tests.support.stories import played, told
+
+MS = 1_000_000
+VERSION = b"PNAME=HI14R3\r\nBUILD=Oct 15 2024\r\nUUID=%s\r\nAPP_VER=156\r\nBL_VER=109\r\nOK\r\n"
+
+
+Story = Callable[[DeviceRig], Coroutine[Any, Any, None]]
+
+
+def configured(*, identify: bool = False, baud: Any = 115200, driver: str = "hipnuc-uart", **link: Any) -> DeviceConfig:
+    return DeviceConfig("bow", driver, None, identify, "memory", MemorySettings(baud=baud, **link))
+
+
+def feed(rig: DeviceRig, data: bytes) -> None:
+    assert rig.link.feed(data, rig.now_ns())
+
+
+def play(story: Story, config: DeviceConfig | None = None, link: MemoryLink | None = None) -> None:
+    """Run the device while the story is told; at the end the ledger closes and the link is released."""
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host)
+    rigs.add(config or configured(), link)
+
+    async def told(made: list[DeviceRig]) -> None:
+        await made[0].turn(lambda: made[0].state is not DeviceState.MISSING)
+        await story(made[0])
+
+    play_rigs(rigs, told, clock)
+
+
+@told(play)
+async def test_samples_flow_and_the_device_is_up(rig: DeviceRig) -> None:
+    assert rig.is_in(DeviceState.SEARCHING)
+    for i in range(5):
+        feed(rig, hi91(1000 + 10 * i))
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert [s.seq for s in rig.samples] == [1, 2, 3, 4, 5]
+    assert [s.t_dev_ns for s in rig.samples] == [(1000 + 10 * i) * MS for i in range(5)]
+    assert rig.kinds == [EventKind.UP]
+    status = rig.device.status()
+    assert (status.newest_seq, status.driver, status.connects) == (5, "hipnuc-uart", 1)
+    assert sum(status.latency_buckets) == 5
+    assert status.temperature_c == 20.0
+
+
+@told(play)
+async def test_unplugged_and_back_the_count_goes_on_and_time_rises(rig: DeviceRig) -> None:
+    for i in range(5):
+        feed(rig, hi91(5000 + 10 * i))
+    feed(rig, hi91(5050)[:40])  # the cable goes in the middle of a frame
+    rig.tick()
+    rig.link.disappear()
+    await rig.turn(lambda: rig.state is DeviceState.MISSING)
+    assert rig.ledger.bytes_pending == 0
+    assert rig.ledger.bytes_skipped == 40
+    assert "gone" in rig.problem
+    rig.link.appear()
+    await rig.turn(lambda: rig.state is not DeviceState.MISSING)
+    for i in range(3):
+        feed(rig, hi91(10 * i))  # the device was without power: its clock starts again
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert [s.seq for s in rig.samples] == list(range(1, 9))
+    times = [s.t_ns for s in rig.samples]
+    assert times == sorted(set(times))
+    assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+    assert rig.device.status().connects == 2
+    assert rig.ledger.lost() == 0
+
+
+def test_identity_is_asked_and_a_changed_setting_is_told_after_a_replug() -> None:
+    async def answer(rig: DeviceRig, mode: bytes, uuid: bytes = b"043995698D6E1708") -> None:
+        done = 0
+        while done < 4:
+            await rig.turn(partial(lambda seen: len(rig.link.written) > seen, done))
+            request = rig.link.written[done]
+            done += 1
+            if b"VERSION" in request:
+                feed(rig, VERSION % uuid)
+            elif b"USRCONFIG" in request:
+                feed(rig, b"ATT_MODE: " + mode + b"\r\nOK\r\n")
+            elif b"MAGCONFIG" in request:
+                feed(rig, b"MB=14.14, -2.08, -8.75\r\nOK\r\n")
+            else:
+                feed(rig, b"COM1=115200\r\nOK\r\n")
+        rig.link.written.clear()
+
+    async def story(rig: DeviceRig) -> None:
+        await answer(rig, b"0")
+        await rig.turn(lambda: rig.device.status().settings)
+        assert rig.device.status().identity["product"] == "HI14R3"
+        assert rig.device.status().identity["serial_number"] == "043995698D6E1708"
+        rig.link.disappear()
+        await rig.turn(lambda: rig.state is DeviceState.MISSING)
+        rig.link.appear()
+        await answer(rig, b"1", b"0000000000000001")
+        await rig.turn(lambda: EventKind.CONFIGURATION in rig.kinds)
+        await rig.turn(lambda: len(rig.events) >= 2)
+        messages = [event.message for event in rig.events]
+        assert any("another device: serial number 0000000000000001" in message for message in messages)
+        assert any("mode is 9-axis, was 6-axis" in message for message in messages)
+
+    play(story, configured(identify=True))
+
+
+@told(play)
+async def test_device_that_falls_silent_is_told_once_and_comes_up_again(rig: DeviceRig) -> None:
+    for i in range(3):
+        feed(rig, hi91(10 * i))
+    rig.tick()
+    rig.tick(ahead_ns=1500 * MS)
+    rig.tick(ahead_ns=1600 * MS)
+    assert rig.is_in(DeviceState.SILENT)
+    assert rig.kinds == [EventKind.UP, EventKind.DOWN]
+    feed(rig, hi91(1_500))
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+
+
+def test_port_that_is_busy_is_tried_again_and_says_why() -> None:
+    class Busy(MemoryLink):
+        def open(self) -> None:
+            if len(self.bauds) < 3:
+                self.bauds.append(0)
+                raise LinkBusy("memory is in use by minicom (pid 4711)")
+            super().open()
+
+    async def story(rig: DeviceRig) -> None:
+        await rig.turn(lambda: rig.state is DeviceState.FAILED)
+        assert rig.problem == "memory is in use by minicom (pid 4711)"
+        await rig.turn(lambda: rig.link.listening)
+        feed(rig, hi91(10))
+        rig.tick()
+        assert rig.is_in(DeviceState.RUNNING)
+
+    play(story, link=Busy(MemorySettings(baud=115200)))
+
+
+@in_loop
+async def test_end_of_a_replay_finishes_the_runner() -> None:
+    rig = DeviceRigs().add(configured(writable=False))
+    task = asyncio.create_task(rig.device.run())
+    await rig.turn(lambda: rig.link.listening)
+    feed(rig, hi91(10))
+    rig.link.end(None)
+    await asyncio.wait_for(task, LIMIT_S)
+    assert rig.is_in(DeviceState.FINISHED)
+    assert len(rig.samples) == 1
+
+
+@told(play)
+async def test_missing_samples_are_put_to_their_cause(rig: DeviceRig) -> None:
+    for i in range(20):
+        feed(rig, hi91(10 * i))
+    damaged = bytearray(hi91(200))
+    damaged[50] ^= 1
+    feed(rig, bytes(damaged))
+    feed(rig, hi91(210))
+    assert rig.ledger.lost_crc == 1
+    rig.link.counters = KernelCounters(overrun=1)
+    feed(rig, hi91(240))  # 220 and 230 are missing
+    assert rig.ledger.lost_overrun == 2
+    feed(rig, hi91(260))
+    assert rig.ledger.lost_gap_device == 1
+    rig.tick()
+    assert EventKind.LOSS in rig.kinds
+    assert EventKind.BAD_FRAME in rig.kinds
+
+
+@told(play)
+async def test_frame_held_by_a_lying_length_is_delivered_when_the_line_is_idle(rig: DeviceRig) -> None:
+    feed(rig, b"\x5a\xa5\xff\x01" + hi91(10))
+    rig.tick(ahead_ns=50 * MS)
+    assert rig.samples == []  # the rest of the long frame may still come
+    rig.tick(ahead_ns=51 * MS)
+    assert len(rig.samples) == 1
+
+
+@told(play, configured(baud="auto", driver="auto"))
+async def test_detection_locks_counts_every_byte_and_is_remembered(rig: DeviceRig) -> None:
+    noise = bytes(range(200, 250))
+    feed(rig, noise)
+    first = rig.link.baud
+    await rig.turn(lambda: rig.link.bauds and rig.link.baud != first)
+    right = rig.link.baud
+    stream = hi91(10) + hi91(20) + hi91(30)
+    feed(rig, stream[:100])
+    feed(rig, stream[100:])
+    await rig.turn(lambda: rig.ledger.frames_good)
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    assert len(rig.samples) == 3
+    assert rig.ledger.bytes_in == len(noise) + len(stream)
+    assert rig.ledger.bytes_skipped == len(noise)
+    rig.link.disappear()
+    await rig.turn(lambda: rig.state is DeviceState.MISSING)
+    rig.link.appear()
+    await rig.turn(lambda: rig.state is not DeviceState.MISSING)
+    feed(rig, hi91(1000) + hi91(1010))
+    await rig.turn(lambda: len(rig.samples) == 5)
+    assert rig.link.baud == right
+
+
+@told(play)
+async def test_a_device_without_samples_is_given_time_and_then_says_what_to_look_at(rig: DeviceRig) -> None:
+    rig.tick()
+    assert rig.problem == "no sample has come yet: wait until the search has listened for a while"
+    rig.tick(ahead_ns=3000 * MS)
+    assert rig.problem.startswith("nothing is heard on memory at 115200 baud")
+    rig.tick()
+    feed(rig, hi91(10))
+    rig.tick()
+    assert rig.problem == ""
+
+
+class DeafModule:
+    """A module that streams, and answers from a request for its version on; in virtual time."""
+
+    def __init__(self, deaf_to: int, deaf_to_settings: int = 0) -> None:
+        self.clock = VirtualClock()
+        self.rigs = DeviceRigs(self.clock.host)
+        self.rig = self.rigs.add(configured(identify=True))
+        self.asked_ns: list[int] = []
+        """When it was asked for its version."""
+        self.paused = False
+        """It sends nothing, and hears."""
+        self._deaf_to, self._deaf_to_settings = deaf_to, deaf_to_settings
+        self._ms = self._seen = 0
+
+    def step(self) -> None:
+        """A frame every 0.25 s, and the replies."""
+        self._ms += 250
+        if not self.paused:
+            assert self.rig.link.feed(hi91(self._ms), self.clock.now_ns())
+        for request in self.rig.link.written[self._seen :]:
+            self._seen += 1
+            if b"VERSION" in request:
+                self.asked_ns.append(self.clock.now_ns())
+            if len(self.asked_ns) > self._deaf_to + self._deaf_to_settings * (b"VERSION" not in request):
+                reply = VERSION % b"043995698D6E1708" if b"VERSION" in request else b"COM1=115200\r\nOK\r\n"
+                assert self.rig.link.feed(reply, self.clock.now_ns())
+
+    async def pass_s(self, duration_s: float) -> None:
+        end_ns = self.clock.now_ns() + int(duration_s * 1e9)
+        await self.rig.until(lambda: self.clock.now_ns() > end_ns, limit_s=duration_s + 1, step=self.step, step_s=0.25)
+
+    @property
+    def product(self) -> str | None:
+        return self.rig.device.status().identity.get("product")
+
+    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Run the device while the story is told."""
+
+        async def told(_made: list[DeviceRig]) -> None:
+            await self.rig.until(lambda: self.rig.link.listening)
+            await story()
+
+        play_rigs(self.rigs, told, self.clock)
+
+
+@pytest.mark.parametrize("deaf_to", [3, 5, 9])
+@played(DeafModule)
+async def test_a_device_that_streams_and_did_not_answer_is_asked_until_it_does(
+    module: DeafModule, deaf_to: int
+) -> None:
+    """Three tries, then one after 5, 30 and 120 s, then every five minutes."""
+    await module.rig.until(lambda: module.product, limit_s=2000, step=module.step, step_s=0.25)
+    await module.pass_s(310)
+    assert len(module.asked_ns) == deaf_to + 1
+    assert module.product == "HI14R3"
+
+
+@played(lambda: DeafModule(1_000_000))
+async def test_a_device_that_never_answers_gets_a_request_in_five_minutes(module: DeafModule) -> None:
+    await module.pass_s(1500)
+    pauses_s = [(after - before) / 1e9 for before, after in pairwise(module.asked_ns)]
+    for pause_s, wanted_s in zip(pauses_s[2:5], (5, 30, 120), strict=True):
+        assert wanted_s <= pause_s < wanted_s + 3  # a request waits for its reply before the pause
+    assert len(pauses_s[5:]) == 4
+    assert all(300 <= pause_s < 303 for pause_s in pauses_s[5:])
+    assert module.product is None
+    assert module.rig.is_in(DeviceState.RUNNING)  # it streams all the same
+    assert len(module.rig.samples) > 5000
+
+
+@played(lambda: DeafModule(5))
+async def test_a_device_that_is_silent_for_a_moment_before_it_has_answered_is_asked_on(module: DeafModule) -> None:
+    """The request at its silence is lost, too, and its samples come back meanwhile: no search, and no last request."""
+    await module.pass_s(12)
+    assert len(module.asked_ns) == 4  # the next pause is of 30 s
+    module.paused = True
+    await module.rig.until(lambda: len(module.asked_ns) == 5, step=module.step, step_s=0.25)
+    assert module.rig.is_in(DeviceState.SILENT)
+    module.paused = False
+    module.step()  # within the time of that request
+    await module.pass_s(2)
+    assert module.rig.is_in(DeviceState.RUNNING)
+    assert module.product is None
+    await module.pass_s(200)
+    assert module.product == "HI14R3"
+
+
+@played(lambda: DeafModule(0, deaf_to_settings=4))
+async def test_a_device_whose_settings_are_lost_has_told_its_product_already(module: DeafModule) -> None:
+    await module.pass_s(4)
+    assert module.product == "HI14R3"
+    assert not module.rig.device.status().settings
+    await module.pass_s(60)
+    assert module.rig.device.status().settings
+
+
+def test_a_device_that_refuses_to_stream_is_told_again_and_of_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    module, told = DeafModule(0), list[int]()
+    module.paused = True
+
+    def wake() -> RequestScript[bool]:
+        told.append(module.clock.now_ns())
+        yield Request(b"wake", "wake", never, never, never, silent=True)
+        if len(told) < 3:
+            raise Rejected("not now")
+        return True
+
+    monkeypatch.setattr(driver, "DRIVER", replace(driver.DRIVER, wake=wake))
+
+    async def story() -> None:
+        await module.pass_s(20)
+        assert len(told) >= 5
+        assert min(after - before for before, after in pairwise(told)) >= 2e9
+        assert sum("commanded to stream" in event.message for event in module.rig.events) == 1
+
+    module.play(story)
+
+
+def test_a_link_that_cannot_start_is_closed_before_it_is_opened_again() -> None:
+    class Failing(MemoryLink):
+        starts = 0
+
+        def open(self) -> None:
+            assert not self.is_open
+            super().open()
+
+        def start(self, on_data: OnData, on_end: OnEnd) -> None:
+            self.starts += 1
+            if self.starts < 3:
+                raise LinkError("it does not start")
+            super().start(on_data, on_end)
+
+    async def story(rig: DeviceRig) -> None:
+        await rig.turn(lambda: rig.link.listening)
+        feed(rig, hi91(10))
+        rig.tick()
+        assert rig.is_in(DeviceState.RUNNING)
+        assert rig.device.status().connects == 3
+
+    play(story, link=Failing(MemorySettings(baud=115200)))
+
+
+def test_bytes_that_come_before_the_search_begins_are_counted() -> None:
+    class Early(MemoryLink):
+        def start(self, on_data: OnData, on_end: OnEnd) -> None:
+            super().start(on_data, on_end)
+            for size in (3, 5):
+                self.feed(bytes(size), monotonic_ns())
+
+    async def story(rig: DeviceRig) -> None:
+        feed(rig, hi91(10))
+        assert (rig.ledger.bytes_in, rig.ledger.bytes_skipped, len(rig.samples)) == (8 + 82, 8, 1)
+
+    play(story, link=Early(MemorySettings(baud=115200)))
+
+
+@pytest.mark.parametrize("baud", [115200, "auto"])
+def test_the_time_unplugged_is_no_silence(baud: Any) -> None:
+    """A device that was away for 6 s and needs another 3 s to start again is up once, and was never silent."""
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host)
+    rig = rigs.add(configured(baud=baud))
+    ms = 0
+
+    def send() -> None:
+        nonlocal ms
+        ms += 10
+        assert rig.link.feed(hi91(ms), clock.now_ns())
+
+    async def until_after(duration_ms: int, step: Callable[[], object] = lambda: None, step_s: float = 0.1) -> None:
+        end_ns = clock.now_ns() + duration_ms * MS
+        await rig.until(lambda: clock.now_ns() > end_ns, step=step, step_s=step_s)
+
+    async def story(_made: list[DeviceRig]) -> None:
+        await rig.until(lambda: rig.link.listening)
+        for _ in range(2):
+            await rig.until(lambda: rig.state is DeviceState.RUNNING, step=send, step_s=0.01)
+            await until_after(300, send, 0.01)
+            rig.link.disappear()
+            await until_after(6000)
+            assert "gone" in rig.problem
+            rig.link.appear()
+            await until_after(3000)
+        kinds = [kind for kind in rig.kinds if kind in (EventKind.UP, EventKind.DOWN)]
+        assert kinds == [EventKind.UP, EventKind.DOWN] * 2
+        assert not [event for event in rig.events if "no sample for" in event.message]
+
+    play_rigs(rigs, story, clock)
+
+
+def test_a_port_that_is_not_there_says_so_and_what_to_look_at(caplog: pytest.LogCaptureFixture) -> None:
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host)
+    rig = rigs.add(configured())
+    rig.link.disappear()
+
+    async def story(_made: list[DeviceRig]) -> None:
+        await rig.turn(lambda: rig.problem)
+        assert (rig.state, rig.problem) == (DeviceState.MISSING, "memory is not there: the test pulled it out")
+        assert rig.kinds == []
+        rig.link.appear()
+        await rig.turn(lambda: rig.link.listening)
+        assert not rig.is_in(DeviceState.MISSING)
+
+    play_rigs(rigs, story, clock)
+    assert caplog.text.count("is not there") == 1
+
+
+def test_a_port_that_another_device_of_the_configuration_has_names_it() -> None:
+    class Busy(MemoryLink):
+        def open(self) -> None:
+            raise LinkBusy("memory is in use by this imud (pid 4711): stop that first")
+
+    first = DeviceConfig(
+        "mast", "auto", None, True, "uart", msgspec.convert({"port": "/dev/x"}, LINKS["uart"].settings)
+    )
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host, configured=[first, replace(first, name="bow")])
+    rig = rigs.add(replace(first, name="bow"), Busy(MemorySettings(baud=115200)))
+
+    async def story(_made: list[DeviceRig]) -> None:
+        await rig.turn(lambda: rig.state is DeviceState.FAILED)
+        assert rig.problem == "memory is in use by mast, another device of this configuration"
+
+    play_rigs(rigs, story, clock)
+
+
+@told(play)
+async def test_bytes_without_frames_say_so(rig: DeviceRig) -> None:
+    later_ns = rig.now_ns() + 2500 * MS
+    rig.link.feed(b"\x00" * 100, later_ns)
+    rig.device.tick(later_ns + 100 * MS)
+    assert rig.problem.startswith("bytes come on memory at 115200 baud, but no valid frame")
+
+
+@told(play)
+async def test_error_of_the_link_is_a_failed_device_and_tried_again(rig: DeviceRig) -> None:
+    rig.link.end(LinkError("input/output error: the adapter stopped answering"))
+    await rig.turn(lambda: rig.device.status().connects == 2)
+    feed(rig, hi91(10))
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+
+
+def test_an_action_that_changes_the_rate_takes_port_and_memory_along(monkeypatch: pytest.MonkeyPatch) -> None:
+    def at_921600(_target: object) -> RequestScript[None]:
+        yield Request(b"?", "?", never, never, never, silent=True, baud=921600)
+
+    monkeypatch.setattr(driver, "DRIVER", replace(driver.DRIVER, actions={"rate": Action("set it", at_921600)}))
+
+    async def story(rigs: DeviceRigs, rig: DeviceRig) -> None:
+        for ms in range(0, 400, 10):
+            feed(rig, hi91(ms))
+        rig.tick()
+        await rig.device.act("rate", {})
+        assert rig.link.baud == 921600
+        assert rig.link.written[-1] == b"?"
+        assert rigs.factory.remembered.get("bow") == RememberedDevice("hipnuc-uart", 921600)
+        feed(rig, hi91(400))
+        assert len(rig.samples) == 41
+
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host)
+    rigs.add(configured(baud="auto"))
+
+    async def told(made: list[DeviceRig]) -> None:
+        await made[0].turn(lambda: made[0].link.listening)
+        await story(rigs, made[0])
+
+    play_rigs(rigs, told, clock)
+
+
+@told(play, configured(baud="auto"))
+async def test_a_device_that_is_back_counts_as_found_by_its_new_samples_only(rig: DeviceRig) -> None:
+    """While a line is searched, samples of before do not make it run."""
+    for ms in range(0, 400, 10):
+        feed(rig, hi91(ms))
+    rig.tick()
+    assert rig.is_in(DeviceState.RUNNING)
+    rig.link.disappear()
+    await rig.turn(lambda: rig.state is DeviceState.MISSING)
+    rig.link.appear()
+    await rig.turn(lambda: rig.state is DeviceState.SEARCHING)
+    rig.tick()
+    assert rig.is_in(DeviceState.SEARCHING)
+    assert rig.kinds == [EventKind.UP, EventKind.DOWN]

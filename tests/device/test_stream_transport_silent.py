@@ -1,0 +1,285 @@
+"""A simulated HiPNUC module on a line in virtual time: silent and told things, changed, read back, never lost."""
+
+import asyncio
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from imud.contracts.lines import DeviceLines, DividedSettings
+from imud.contracts.setting import StepOutcome
+from imud.contracts.status import DeviceState
+from imud.device.stream_transport import StreamTransport
+from imud.drivers.hipnuc.uart.settings import SETTINGS
+from imud.model.errors import CommandError
+from imud.model.event import EventKind
+from imud.sim.hipnuc.uart import HipnucModule
+from imud.sim.hipnuc.uart_settings import VARIANTS, Behaviour, ModuleSettings, Output
+from tests.support.device_rig import device_config, running
+from tests.support.pty_port import plugged
+from tests.support.simulated_modules import hardware_of
+from tests.support.stories import played
+from tests.support.wired_device import LinkedDevice
+
+NO_RATE = ModuleSettings(hi91=Output())
+ON_MARK = ModuleSettings(hi91=Output(on_mark=True))
+LINKS: list[dict[str, Any]] = [{}, {"baud": "auto"}, {"baud": "auto", "driver": "auto"}]
+OUTPUT_OFF = msgspec.convert({"output_enabled": False}, SETTINGS.declarable)
+UP_AND_DOWN = (EventKind.UP, EventKind.DOWN)
+
+every_link = pytest.mark.parametrize("link", LINKS, ids=str)
+
+
+def turns(device: LinkedDevice) -> list[EventKind]:
+    """The events up and down so far."""
+    return [event.kind for event in device.events if event.kind in UP_AND_DOWN]
+
+
+@pytest.mark.parametrize(
+    ("settings", "why", "link"),
+    [
+        (NO_RATE, "no message has a rate", LINKS[0]),
+        (ON_MARK, "HI91 on mark, one for each pulse on SIN", LINKS[1]),
+        (NO_RATE, "no message has a rate", LINKS[2]),
+    ],
+)
+@pytest.mark.manual("B 2.2.5 LOG DISABLE")
+@played(lambda settings, link: LinkedDevice(settings, **link))
+async def test_a_module_that_is_silent_by_its_settings_is_known_and_left_so(
+    device: LinkedDevice, settings: ModuleSettings, why: str, link: dict[str, Any]
+) -> None:
+    await device.wait(35)
+    assert device.rig.is_in(DeviceState.SILENT)
+    assert device.problem == (
+        f"it answers (HI14R3, firmware 1.5.6) and sends no samples: {why}; the action wake makes it send"
+    )
+    assert device.device.status().identity["serial_number"] == "043995698D6E1708"
+    assert device.module.settings == settings
+    assert turns(device) == []
+    await device.act("mode", axes=9)
+    assert device.module.settings.att_mode == 1
+    assert device.device.status().settings["mode"] == "9-axis"
+    await device.act("wake")
+    await device.until(lambda: len(device.samples) > 20)
+    assert device.rig.is_in(DeviceState.RUNNING)
+    assert device.problem == ""
+    assert turns(device) == [EventKind.UP]
+
+
+@played(lambda: LinkedDevice(NO_RATE))
+async def test_commands_are_accepted_as_soon_as_it_has_answered(device: LinkedDevice) -> None:
+    await device.until(lambda: device.device.actions, limit_s=0.1)
+    with pytest.raises(CommandError, match="bow is searching"):
+        await device.device.act("wake", {})
+    await device.until(lambda: device.device.status().settings, limit_s=1.9)
+    assert device.rig.is_in(DeviceState.SEARCHING)
+    await device.act("output", message="HI91", rate_hz=50)
+    await device.until(lambda: device.samples)
+
+
+@every_link
+@played(lambda link: LinkedDevice(hardware=hardware_of(Behaviour(), boot_ms=0), **link))
+async def test_output_that_is_only_switched_off_is_switched_on(device: LinkedDevice, link: dict[str, Any]) -> None:
+    device.module.receive(b"LOG DISABLE\r\n", device.clock.now_ns())
+    await device.until(lambda: len(device.samples) > 20)
+    assert "it answered and sent no samples: commanded to stream, which is not saved" in device.messages
+    assert device.module.settings == device.module.flash == ModuleSettings()
+    assert turns(device) == [EventKind.UP]
+
+
+@every_link
+@played(lambda link: LinkedDevice(**link))
+async def test_a_module_that_was_silenced_stays_so_and_is_asked_at_its_own_rate(
+    device: LinkedDevice, link: dict[str, Any]
+) -> None:
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    await device.act("output_none")
+    count, sent = len(device.samples), len(device.link.sent_at)
+    await device.wait(50)
+    assert len(device.samples) <= count + 2
+    assert device.rig.is_in(DeviceState.SILENT)
+    assert "no message has a rate" in device.problem
+    assert turns(device) == [EventKind.UP, EventKind.DOWN]
+    asked = device.link.sent_at[sent:]
+    assert {baud for baud, _ in asked} == {115200}
+    assert 2 <= sum(data.startswith(b"LOG VERSION") for _, data in asked) <= 4  # once in 15 s
+    await device.act("output", message="HI91", rate_hz=100)
+    await device.until(lambda: len(device.samples) > count + 20)
+    assert turns(device) == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+
+
+@played(lambda: LinkedDevice(baud="auto"))
+async def test_while_a_lost_module_is_searched_for_no_command_goes_out(device: LinkedDevice) -> None:
+    """It is switched off: the search asks at all rates, and nothing else does."""
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    device.module.receive(b"UNLOGALL\r\n", device.clock.now_ns())
+    await device.wait(0.1)
+    device.link.module_is_on = False
+    await device.until(lambda: device.rig.is_in(DeviceState.SEARCHING), limit_s=60)
+    bauds, refused = set(), 0
+    for _ in range(200):
+        bauds.add(device.link.baud)
+        try:
+            await device.device.act("output", {"message": "HI91", "rate_hz": 50})
+        except CommandError:
+            refused += 1
+        await device.wait(0.05)
+    assert refused == 200
+    assert len(bauds) > 4
+    assert {data for _, data in device.link.sent_at if data.startswith(b"LOG HI91")} == set()
+    assert turns(device) == [EventKind.UP, EventKind.DOWN]
+
+
+@played(lambda: LinkedDevice(baud="auto", identify=False))
+async def test_a_script_under_way_ends_when_a_search_begins_under_it(
+    device: LinkedDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even if the search did not wait for it, it would send nothing at the rates of the search."""
+    monkeypatch.setattr(StreamTransport, "busy", property(lambda _transport: False))
+    await device.until(lambda: len(device.samples) > 20)
+    device.link.module_is_on = False
+    acting = [asyncio.ensure_future(device.device.act("restart", {})) for _ in range(3)]
+    await device.until(lambda: all(one.done() for one in acting), limit_s=90)
+    assert all(isinstance(one.exception(), CommandError) for one in acting)
+    assert any("is searched for at all baud rates now" in str(one.exception()) for one in acting)
+    reboots = [baud for baud, data in device.link.sent_at if data.startswith(b"REBOOT")]
+    assert set(reboots) == {115200}
+
+
+@pytest.mark.parametrize(
+    ("variant", "link"),
+    [*((variant, {}) for variant in VARIANTS), *(("as in the manual", link) for link in LINKS[1:])],
+    ids=str,
+)
+@pytest.mark.manual("B 2.2.3 a wrong rate")
+@played(lambda variant, link: LinkedDevice(hardware=hardware_of(VARIANTS[variant]), **link))
+async def test_every_variant_is_followed_to_another_rate_and_back(
+    device: LinkedDevice, variant: str, link: dict[str, Any]
+) -> None:
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    answer = await device.act("baud", baud=921600)
+    assert isinstance(answer, dict)
+    assert answer["baud"] == device.link.baud == device.module.baud == device.module.flash.baud == 921600
+    assert ("configuration" in answer) is (not link)
+    count = len(device.samples)
+    await device.until(lambda: len(device.samples) > count + 20)
+    assert device.device.status().settings["baud"] == "921600 bit/s"
+    answer = await device.act("factory_reset")
+    assert answer == {"baud": 115200}
+    count = len(device.samples)
+    await device.until(lambda: len(device.samples) > count + 20)
+    assert device.device.status().settings["baud"] == "115200 bit/s"
+    assert device.module.settings == ModuleSettings()
+    assert device.device.ledger.frames_bad() < 10
+
+
+@played(LinkedDevice)
+async def test_settings_are_read_again_after_each_action(device: LinkedDevice) -> None:
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    await device.act("pin", function="led", pin=7)
+    await device.act("mounting", turned="y_up")
+    await device.act("output", message="HI91", rate_hz=25)
+    settings = device.device.status().settings
+    assert (settings["pins.led"], settings["mounting"]) == ("IO7", "y_up")
+    assert settings["output.hi91"] == "25 Hz"
+    assert "settings of the device changed: pins.led is IO7, was IO5" in device.messages
+
+
+@played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(refuses=("CONFIG ATT RST",)))))
+async def test_after_an_action_that_fails_the_settings_are_what_the_module_has(device: LinkedDevice) -> None:
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    device.module.receive(b"CONFIG ATT MODE 1\r\n", device.clock.now_ns())  # by somebody else
+    await device.wait(0.1)
+    with pytest.raises(CommandError, match="the module refused"):
+        await device.act("level", level="automatic")
+    assert device.device.status().settings["mode"] == "9-axis"
+
+
+@played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(), firmware=169)))
+async def test_status_bits_and_settings_are_shown_by_name(device: LinkedDevice) -> None:
+    """Firmware 1.6.9 and newer sends MAIN_STATUS; the simulated module converges within 5 s."""
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    status = device.device.status()
+    assert status.status_words == (
+        "gyroscope bias not converged", "attitude not converged", "at rest", "time not UTC", "frame with SOUT pulse"
+    )  # fmt: skip
+    assert status.status_bit_names["4"] == "magnetic disturbance"
+    assert status.settings["output.hi91"] == "100 Hz"
+    assert status.settings["magnetometer_bias"] == "0, 0, 0 µT: not calibrated"
+    await device.wait(10)
+    assert device.device.status().status_words == ("at rest", "time not UTC", "frame with SOUT pulse")
+    alarms = [event.message for event in device.events if event.kind is EventKind.ALARM]
+    assert alarms[0] == "status: gyroscope bias not converged, attitude not converged"
+    assert alarms[-1] == "status: cleared: gyroscope bias not converged"
+
+
+@played(lambda: LinkedDevice(lines=DeviceLines(sout_div=DividedSettings(line="A", divisor=4))))
+async def test_lines_that_the_module_contradicts_are_events_and_shown(device: LinkedDevice) -> None:
+    words = "divisor is 4 in the configuration, and the module divides SOUT by 8"
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    assert device.messages.count(f"line sout_div: {words}") == 1
+    await device.act("mode", axes=9)
+    assert device.messages.count(f"line sout_div: {words}") == 1
+    await device.act("sout_divider", divisor=4)
+    await device.act("sout_divider", divisor=8)
+    assert device.messages.count(f"line sout_div: {words}") == 2
+
+
+@played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(), boot_ms=0), declared=OUTPUT_OFF))
+async def test_output_that_is_declared_to_be_off_is_not_switched_on(device: LinkedDevice) -> None:
+    device.module.receive(b"LOG DISABLE\r\n", device.clock.now_ns())
+    await device.wait(20)
+    assert device.samples == []
+    assert "its output is off (LOG DISABLE), though HI91 has 100 Hz" in device.problem
+
+
+@pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARIANTS)
+@played(lambda behaviour: LinkedDevice(hardware=hardware_of(behaviour), baud="auto"))
+async def test_declared_settings_reach_every_variant(device: LinkedDevice, behaviour: Behaviour) -> None:
+    """More output than the old rate carries, with the rate that carries it."""
+    wanted = {"mode": "9-axis", "mounting": "y_up", "sout_divisor": 3, "output": {"hi91": 500}, "baud": 921600}
+    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+    applying = asyncio.ensure_future(device.device.settings_apply(wanted, save=True))
+    await device.until(applying.done, "the end of the plan", 90)
+    applied = applying.result()
+    assert applied.problem == ""
+    outcomes = {step.name: step.outcome for step in applied.steps}
+    assert outcomes.pop("mounting") in (StepOutcome.DONE, StepOutcome.WRITTEN)  # in force by the restart for baud
+    assert set(outcomes.values()) == {StepOutcome.DONE}
+    assert applied.steps[-1].name == "baud"
+    flash = ModuleSettings(
+        baud=921600, att_mode=1, urfr=(1, 0, 0, 0, 0, -1, 0, 1, 0), sout_div=3, hi91=Output(2)
+    )  # fmt: skip
+    assert device.module.flash == device.module.settings == flash
+    assert device.link.baud == device.module.baud == 921600
+    count = len(device.samples)
+    await device.until(lambda: len(device.samples) > count + 100)
+
+
+@pytest.mark.live
+def test_on_a_real_port(tmp_path: Path) -> None:
+    """The line's rate follows the terminal's: what is sent at another one is garbage at the far end."""
+    hardware = hardware_of(Behaviour(), boot_ms=200)
+    module = HipnucModule(time.monotonic_ns(), NO_RATE, hardware)
+
+    async def story(path: Path) -> None:
+        config = device_config("bow", "hipnuc-uart", "uart", {"port": str(path), "baud": 115200})
+        async with running(config) as (rig,):
+            await rig.until(lambda: rig.is_in(DeviceState.SILENT), "silence")
+            assert "no message has a rate" in rig.problem
+            await rig.device.act("wake", {})
+            await rig.until_samples(20)
+            answer = await rig.device.act("baud", {"baud": 460800})
+            assert isinstance(answer, dict)
+            assert (answer["baud"], module.baud, module.flash.baud) == (460800, 460800, 460800)
+            await rig.until_samples(20)
+            assert await rig.device.act("factory_reset", {}) == {"baud": 115200}
+            assert (module.baud, module.settings) == (115200, ModuleSettings())
+            await rig.until_samples(20)
+            assert rig.device.status().settings["baud"] == "115200 bit/s"
+            assert rig.device.ledger.closes()
+
+    with plugged(tmp_path / "port", module) as path:
+        asyncio.run(story(path))

@@ -1,0 +1,233 @@
+"""UTC of one device: sentences to its port, a reference for its clock, pulses to chronyd."""
+
+from typing import cast
+
+import pytest
+
+from imud.config.model import DeviceConfig
+from imud.contracts.lines import DeviceLines, Edge, PpsSettings, UtcReference
+from imud.device import utc as utc_keeper
+from imud.device.utc import DevicePort, UtcKeeper, make_keeper
+from imud.formats.nmea0183 import build
+from imud.host.clock import HostClock
+from imud.links.memory import MemorySettings
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sampling.clock import SampleClock
+from imud.utc.pps import ChronyFeed
+from imud.utc.receivers import RmcSettings
+from imud.utc.system_clock import KernelClock
+from tests.support.rmc_sources import FakeSource
+
+UTC_S = 1_795_000_000
+BEGIN_NS = 1000 * NS_PER_S
+OFFSET_NS = UTC_S * NS_PER_S - BEGIN_NS
+
+
+class FakeChrony:
+    problem = ""
+    refused = 0
+
+    def __init__(self) -> None:
+        self.pulses: list[tuple[int, int]] = []
+        self.closed = False
+
+    @property
+    def sent(self) -> int:
+        return len(self.pulses)
+
+    def send_pulse(self, t_ns: int, unix_s: int) -> None:
+        self.pulses.append((t_ns, unix_s))
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class KeeperBench:
+    def __init__(self, *, source: bool = True, system: UtcReference | None = None) -> None:
+        self.written: list[bytes] = []
+        self.busy = False
+        self.system = system
+        self.source, self.chrony = FakeSource(), FakeChrony()
+        port = DevicePort(self.written.append, lambda: 115_200, lambda: self.busy)
+        self.keeper = UtcKeeper(
+            self.source if source else None,
+            port if source else None,
+            lambda: self.system,
+            lambda: self.now_ns,
+            chrony=cast(ChronyFeed, self.chrony),
+        )
+        self.now_ns = BEGIN_NS - NS_PER_S
+        self.clock = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
+        self.keeper.tick(self.now_ns, None)
+        self.keeper.start(self.clock)
+
+    def second(self, number: int, *, pulse: bool = True, sentence: bool = True) -> None:
+        t_ns = BEGIN_NS + number * NS_PER_S
+        if pulse:
+            self.keeper.on_pulses([Edge(t_ns, True, 2 * number), Edge(t_ns + NS_PER_MS, False, 2 * number + 1)])
+        self.now_ns = t_ns + NS_PER_S // 5
+        if sentence:
+            self.source.give(build((UTC_S + number) * NS_PER_S), self.now_ns)
+        self.keeper.tick(self.now_ns, None)
+
+
+@pytest.fixture
+def bench() -> KeeperBench:
+    return KeeperBench()
+
+
+def test_sentences_go_to_the_device_and_make_pulses_utc(bench: KeeperBench) -> None:
+    for number in range(6):
+        bench.second(number)
+    assert len(bench.written) == 6
+    assert bench.written[3] == build((UTC_S + 3) * NS_PER_S)
+    reference = bench.clock.utc_reference
+    assert reference is not None
+    assert reference.offset_ns == pytest.approx(OFFSET_NS, abs=1000)
+    assert reference.error_ns < 100_000
+    assert bench.chrony.pulses[-1] == (BEGIN_NS + 5 * NS_PER_S, UTC_S + 5)
+    status = bench.keeper.status()
+    assert (status.source, status.sent, status.refused, status.pulses) == ("test", 6, {}, 6)
+    assert status.chrony_sent == len(bench.chrony.pulses) > 1
+
+
+def test_a_sentence_for_a_busy_or_wrong_second_is_refused_and_counted(bench: KeeperBench) -> None:
+    for number in range(4):
+        bench.second(number)
+    bench.busy = True
+    bench.second(4)
+    bench.busy = False
+    bench.second(5, sentence=False)
+    bench.source.give(build((UTC_S + 7) * NS_PER_S), bench.now_ns)
+    assert bench.keeper.status().refused == {"busy": 1, "ahead": 1}
+    assert len(bench.written) == 4
+
+
+def test_the_better_of_two_references_counts(bench: KeeperBench) -> None:
+    good, bad = UtcReference(OFFSET_NS + 77, 10), UtcReference(OFFSET_NS + 55, 10**9)
+    bench.system = bad
+    bench.second(0)
+    assert bench.clock.utc_reference == bad
+    for number in range(1, 6):
+        bench.second(number)
+    by_pulses = bench.clock.utc_reference
+    assert by_pulses is not None
+    assert by_pulses.error_ns < 10**6
+    bench.system = good
+    bench.second(6)
+    assert bench.clock.utc_reference == good
+    bench.system = None
+    bench.second(7)
+    by_pulses = bench.clock.utc_reference
+    assert by_pulses is not None
+    assert by_pulses.offset_ns != good.offset_ns
+
+
+def test_a_clock_has_the_reference_of_each_second_from_its_start_to_the_end_of_the_link() -> None:
+    bench = KeeperBench(source=False, system=UtcReference(5, 5))
+    bench.keeper.tick(BEGIN_NS, None)
+    assert bench.clock.utc_reference == UtcReference(5, 5)
+    bench.system = None
+    bench.keeper.tick(BEGIN_NS + NS_PER_S - 1, None)
+    assert bench.clock.utc_reference == UtcReference(5, 5)
+    bench.keeper.tick(BEGIN_NS + NS_PER_S, None)
+    assert bench.clock.utc_reference is None
+    bench = KeeperBench(source=False, system=UtcReference(5, 5))
+    bench.keeper.tick(BEGIN_NS, None)
+    other = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
+    bench.keeper.start(other)
+    assert other.utc_reference == UtcReference(5, 5)
+    bench.keeper.stop()
+    bench.keeper.stop()
+    bench.system = UtcReference(6, 6)
+    bench.keeper.tick(BEGIN_NS + NS_PER_S, None)
+    assert other.utc_reference == UtcReference(5, 5)
+    bench.keeper.start(other)
+    assert other.utc_reference == UtcReference(6, 6)
+
+
+def test_close_releases_source_and_socket_and_nothing_starts_again_or_at_all() -> None:
+    bench = KeeperBench()
+    bench.keeper.close()
+    bench.keeper.close()
+    assert bench.source.closed
+    assert bench.chrony.closed
+    bench.source.started = 0
+    bench.keeper.tick(BEGIN_NS, None)
+    assert bench.source.started == 0
+    UtcKeeper(None, None, lambda: None, lambda: 0).close()
+    source = FakeSource()
+    keeper = UtcKeeper(source, None, lambda: None, lambda: 0)
+    keeper.close()
+    keeper.tick(BEGIN_NS, None)
+    assert source.started == 0
+
+
+def test_problems_show_and_a_sentence_that_is_too_late_for_its_pulse_is_refused(bench: KeeperBench) -> None:
+    assert bench.keeper.status().problem == ""
+    bench.chrony.problem = "no chronyd"
+    assert bench.keeper.status().problem == "no chronyd"
+    bench.source.problem = "no gpsd"
+    assert bench.keeper.status().problem == "no gpsd"
+    bench.second(0, sentence=False)
+    bench.now_ns = BEGIN_NS + NS_PER_S - 25 * NS_PER_MS  # 6 ms on the wire, and 20 ms before the next second at least
+    bench.source.give(build(UTC_S * NS_PER_S), bench.now_ns)
+    assert bench.keeper.status().refused == {"stale": 1}
+
+
+def test_the_system_clock_counts_only_while_something_keeps_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
+    port = DevicePort(lambda _data: None, lambda: 9600, lambda: False)
+    offset_ns, now_ns = [OFFSET_NS], lambda: BEGIN_NS
+    host = HostClock(now_ns, lambda: BEGIN_NS + offset_ns[0], now_ns)
+    keeper = make_keeper(configured(None, PpsSettings(line="A")), port, host)
+    assert keeper is not None
+    keeper.start(clock)
+    monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 100, 100))
+    keeper.tick(BEGIN_NS, None)
+    assert clock.utc_reference is None
+    monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(True, 100, 0))
+    offset_ns[0] += 37 * NS_PER_S
+    keeper.tick(BEGIN_NS + NS_PER_S, None)
+    assert clock.utc_reference == UtcReference(OFFSET_NS + 37 * NS_PER_S, 100_000)
+    keeper.close()
+
+
+def configured(rmc: RmcSettings | None, pps: PpsSettings | None) -> DeviceConfig:
+    return DeviceConfig(
+        "bow", "hipnuc-uart", None, False, "memory", MemorySettings(), lines=DeviceLines(pps=pps), rmc=rmc
+    )
+
+
+@pytest.mark.parametrize("rmc", [None, RmcSettings(source="gpsd", rate_hz=5)])
+@pytest.mark.parametrize("pps", [None, PpsSettings(line="A"), PpsSettings(line="A", chrony="/nowhere/imud.sock")])
+def test_a_device_gets_what_it_is_configured_for(
+    monkeypatch: pytest.MonkeyPatch, rmc: RmcSettings | None, pps: PpsSettings | None
+) -> None:
+    now_ns, written, source = [BEGIN_NS], list[bytes](), FakeSource()
+
+    def make() -> UtcKeeper | None:
+        port = DevicePort(written.append, lambda: 9600, lambda: False)
+        host = HostClock(lambda: now_ns[0], lambda: now_ns[0] + OFFSET_NS, lambda: now_ns[0])
+        return make_keeper(configured(rmc, pps), port, host)
+
+    real = make()
+    assert (real is None) == (rmc is None and pps is None)
+    if real is None:
+        return
+    assert real.status().source.startswith("gpsd" if rmc else "")
+    assert bool(real.status().source) == (rmc is not None)
+    real.close()
+    monkeypatch.setattr(utc_keeper, "RMC_SOURCES", {"gpsd": lambda _settings, _context: source})
+    keeper = make()
+    assert keeper is not None
+    keeper.tick(BEGIN_NS, None)
+    assert source.started == (rmc is not None)
+    for second in range(1, 7):
+        keeper.on_pulses([Edge(BEGIN_NS + second * NS_PER_S, True, second)])
+        now_ns[0] = BEGIN_NS + second * NS_PER_S + NS_PER_S // 5
+        source.give(build((UTC_S + second) * NS_PER_S), now_ns[0])
+    assert len(written) == (6 if rmc is not None else 0)
+    to_chrony = pps is not None and pps.chrony and rmc is not None  # the second of a pulse must be known
+    assert bool(keeper.status().chrony_refused) == bool(to_chrony)
+    keeper.close()

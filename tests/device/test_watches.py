@@ -1,0 +1,298 @@
+"""Simulated modules of known attitude in a body: what is published of them, and when an event says that it is wrong."""
+
+import asyncio
+from math import degrees, radians
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, Convention, EulerOrder, Heading
+from imud.attitude.published import FrameSettings, MountingAngles, MountingAxes, mounting_of, published_frame
+from imud.attitude.rotation import (
+    euler312_from_quat,
+    matrix_from_quat,
+    matrix_product,
+    quat_from_euler_zyx,
+    quat_from_matrix,
+    quat_product,
+)
+from imud.config.model import DeviceConfig
+from imud.contracts.publisher import Batch
+from imud.contracts.status import FrameStatus
+from imud.device.health import Notices
+from imud.device.watches import FrameWatch
+from imud.drivers import DRIVERS
+from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucSettings, encode_hi91
+from imud.links.memory import MemorySettings
+from imud.model.event import Event, EventKind
+from imud.model.ledger import Ledger
+from imud.model.sample import Sample, Sync, Vector3
+from imud.sampling.path import PathContext, StreamPath, make_clock
+from imud.sim.hipnuc.uart import HipnucModule
+from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings
+from imud.sim.imu61x.uart import Imu61xHardware, Imu61xModule
+from imud.sim.physics import Motion, Sine, Still, Swing, Truth
+from imud.sim.sensor import StreamModule
+from tests.support.device_rig import DeviceRig, DeviceRigs, play
+from tests.support.event_loops import VirtualClock
+
+BODY_DEG = (5.0, -10.0, 30.0)
+"""Roll, pitch, yaw of the body in enu-flu: left side up by 5°, nose up by 10°, its front 30° to the left of east."""
+STEP_S = 0.01
+
+
+def in_body(frame: FrameSettings, euler_deg: Vector3 = BODY_DEG, device: Any = RFU_ENU) -> Still:
+    """The sensor at rest in a body of this attitude, as it is mounted; `Still` takes its angles in the order 312."""
+    roll, pitch, yaw = euler_deg
+    body = matrix_from_quat(quat_from_euler_zyx((radians(roll), radians(pitch), radians(yaw))))
+    sensor = quat_from_matrix(matrix_product(body, mounting_of(frame, device)))
+    return Still(*euler312_from_quat(sensor))
+
+
+class ZDown:
+    """The same motion of a sensor whose own axes are x forward, y right, z down, in a level frame with z down."""
+
+    def __init__(self, motion: Motion) -> None:
+        self._motion = motion
+
+    def at(self, t_s: float) -> Truth:
+        truth = self._motion.at(t_s)
+        x, y, z = truth.accel_m_s2
+        p, q, r = truth.gyro_rad_s
+        flip = (0.0, 1.0, 0.0, 0.0)
+        quat = quat_product(quat_product(flip, truth.quat_wxyz), flip)
+        return truth._replace(accel_m_s2=(x, -y, -z), gyro_rad_s=(p, -q, -r), quat_wxyz=quat)
+
+
+class Played:
+    def __init__(self, rig: DeviceRig) -> None:
+        self.samples = rig.samples
+        self.events: list[Event] = [one for one in rig.events if one.kind is EventKind.ATTITUDE]
+        status = rig.device.status().frame
+        assert status is not None
+        self.status: FrameStatus = status
+        self.newest = rig.samples[-1]
+
+    @property
+    def euler_deg(self) -> Vector3:
+        assert self.newest.euler_rad is not None
+        roll, pitch, yaw = map(degrees, self.newest.euler_rad)
+        return (roll, pitch, yaw)
+
+
+def played(driver: str, motion: Motion, seconds: float = 12.0, identify: bool = False, **keys: Any) -> Played:
+    """Run the module of a driver on a link in memory in virtual time, with these keys of the configuration."""
+    clock = VirtualClock()
+    module: StreamModule
+    if driver == "hipnuc-uart":
+        module = HipnucModule(clock.now_ns(), ModuleSettings(att_mode=1), HipnucHardware(motion=motion, skew_ppm=0))
+    else:
+        module = Imu61xModule(clock.now_ns(), hardware=Imu61xHardware(motion=motion, skew_ppm=0))
+    rigs = DeviceRigs(clock.host)
+    rigs.add(DeviceConfig("bow", driver, None, identify, "memory", MemorySettings(baud=115_200), **keys))
+    results: list[Played] = []
+
+    async def story(made: list[DeviceRig]) -> None:
+        (rig,) = made
+        heard = 0
+        for number in range(int(seconds / STEP_S)):
+            await asyncio.sleep(STEP_S)
+            now_ns = clock.now_ns()
+            for data in rig.link.written[heard:]:
+                module.receive(data, now_ns)
+            heard = len(rig.link.written)
+            for burst in module.advance(now_ns):
+                rig.link.feed(burst.data, now_ns)
+            if number % 10 == 0:
+                rig.tick()
+        results.append(Played(rig))
+
+    play(rigs, story, clock)
+    return results[0]
+
+
+def axes(x: str, y: str, z: str) -> FrameSettings:
+    return FrameSettings(axes=MountingAxes(x=x, y=y, z=z))  # type: ignore[arg-type]  # names of axes
+
+
+MOUNTINGS = {
+    "as the manual draws it": FrameSettings(),
+    "on its side": axes("y", "z", "x"),
+    "upside down": axes("y", "x", "-z"),
+    "turned 90° in yaw": axes("x", "y", "z"),  # of a module with x right, y forward
+    "by angles": FrameSettings(euler=MountingAngles(roll_deg=90, pitch_deg=20, yaw_deg=-70)),
+    "by a quaternion": FrameSettings(quat_wxyz=[0.5, -0.5, 0.5, -0.5]),
+}
+
+
+@pytest.mark.parametrize("name", MOUNTINGS)
+def test_a_module_in_any_mounting_shows_the_attitude_of_the_body(name: str) -> None:
+    frame = MOUNTINGS[name]
+    straight = played("hipnuc-uart", in_body(FrameSettings()), 2.0, frame=FrameSettings())
+    made = played("hipnuc-uart", in_body(frame), frame=frame)
+    assert made.euler_deg == pytest.approx(BODY_DEG, abs=1e-3)
+    assert made.newest.accel_m_s2 == pytest.approx(straight.newest.accel_m_s2, abs=1e-4)
+    assert made.newest.mag_t == pytest.approx(straight.newest.mag_t, abs=1e-10)
+    assert made.newest.gyro_rad_s == pytest.approx((0, 0, 0), abs=1e-6)
+    up = matrix_from_quat(made.newest.quat_wxyz or (0, 0, 0, 0))[2]
+    assert made.newest.accel_m_s2 == pytest.approx([9.8 * one for one in up], abs=1e-3)
+    assert made.events == []
+    assert made.status.problem == ""
+
+
+def test_the_same_body_in_ned_frd_and_without_the_keys() -> None:
+    frame = MOUNTINGS["on its side"]
+    made = played("hipnuc-uart", in_body(frame), 2.0, frame=frame, convention=Convention.NED_FRD)
+    assert made.euler_deg == pytest.approx((5.0, 10.0, 60.0), abs=1e-3), "nose up, and 60° clockwise from north"
+    assert (made.status.convention, made.status.navigation_frame) == ("ned-frd", "NED")
+    assert "z down" in made.status.frame
+    # Bit for bit: the published samples are those that the path without any rotation makes
+    motion = in_body(FrameSettings())
+    made = played("hipnuc-uart", motion, 2.0)
+    truth = motion.at(0.0)
+    assert made.newest.quat_wxyz == pytest.approx(truth.quat_wxyz, abs=1e-6)
+    assert made.newest.euler_rad == pytest.approx(truth.euler_rad, abs=1e-6)
+    assert made.newest.accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=1e-5)
+    assert made.status.convention == "device"
+    assert made.status.frame == RFU_ENU.words
+    assert made.status.euler_convention == DRIVERS["hipnuc-uart"].euler_convention
+    assert set(made.status.conventions) == {"enu-flu", "ned-frd"}
+
+
+def test_a_declination_and_what_the_heading_counts_from() -> None:
+    """The mode is read back from the module: nine axes, so its heading is magnetic."""
+    motion = in_body(FrameSettings())
+    plain = played("hipnuc-uart", motion, 2.0, identify=True)
+    assert plain.status.heading is Heading.MAGNETIC
+    true = played("hipnuc-uart", motion, 2.0, identify=True, declination_deg=7.0)
+    assert true.status.heading is Heading.TRUE
+    assert true.status.declination_deg == 7.0
+    assert true.euler_deg[2] == pytest.approx(plain.euler_deg[2] - 7.0, abs=1e-4), "yaw is counter-clockwise"
+    assert true.euler_deg[:2] == pytest.approx(plain.euler_deg[:2], abs=1e-4)
+    relative = played("imu61x-uart", motion, 2.0, declination_deg=7.0)
+    assert relative.status.heading is Heading.RELATIVE
+    assert relative.status.problem == "declination_deg is given, but the device's heading counts from power-on"
+
+
+# --- the event --------------------------------------------------------------------------------------------------------
+
+
+def test_z_down_is_found_and_cured_either_way() -> None:
+    """The axes of an IMU61x are not settled: with z down the event says what to set, and setting it is right."""
+    motion = ZDown(in_body(FrameSettings(), device=FLU_LEVEL))
+    wrong = played("imu61x-uart", motion, 20.0)
+    (event,) = wrong.events
+    assert event.detail["contradiction"] == "z-axis"
+    assert event.detail["angle_deg"] == pytest.approx(180, abs=0.5)
+    assert "set frame: {z_down: true}" in event.message
+    assert wrong.status.problem == event.message, "as long as it is so"
+    right = played("imu61x-uart", motion, 20.0, frame=FrameSettings(z_down=True))
+    assert (right.events, right.status.problem) == ([], "")
+    assert right.euler_deg == pytest.approx(BODY_DEG, abs=1e-3)
+    made = played("imu61x-uart", in_body(FrameSettings(), device=FLU_LEVEL), frame=FrameSettings(z_down=True))
+    (event,) = made.events
+    assert "take z_down out of frame" in event.message
+
+
+def test_a_wrong_order_of_angles_is_found() -> None:
+    motion = in_body(FrameSettings(), (20.0, -15.0, 30.0), FLU_LEVEL)
+    assert played("imu61x-uart", motion).events == []
+    made = played("imu61x-uart", motion, frame=FrameSettings(euler_order=EulerOrder.ZXY))
+    (event,) = made.events
+    assert event.detail["contradiction"] == "euler-order"
+    assert "{euler_order: zyx}" in event.message
+
+
+@pytest.mark.parametrize(
+    ("is_so", "said"),
+    [
+        ("upside down", FrameSettings()),
+        ("as the manual draws it", axes("y", "x", "-z")),
+        ("on its side", axes("y", "-x", "z")),
+        ("on its side", axes("y", "-z", "-x")),
+        ("by angles", FrameSettings(level_roll_deg=1.0)),
+        ("as the manual draws it", FrameSettings(euler=MountingAngles(roll_deg=90))),
+        ("as the manual draws it", FrameSettings(quat_wxyz=[0.5, -0.5, 0.5, -0.5])),
+    ],
+)
+def test_a_wrong_mounting_is_found(is_so: str, said: FrameSettings) -> None:
+    motion = in_body(MOUNTINGS[is_so])
+    made = played("hipnuc-uart", motion, frame=said)
+    (event,) = made.events
+    assert event.detail["contradiction"] == "mounting"
+    assert made.status.problem == event.message
+    arm = played("hipnuc-uart", motion, frame=replace(said, level_at_rest=False))
+    assert arm.events == [], "a body that need not stand level"
+
+
+def test_another_device_is_checked_anew() -> None:
+    """The driver of a device that replaces another one makes another path: its contradictions are events again."""
+    events: list[Event] = []
+    config = DeviceConfig("bow", "auto", None, False, "memory", MemorySettings(), frame=FrameSettings())
+    watch = FrameWatch(config, Notices("bow", Ledger(), events.append))
+    sensor = in_body(MOUNTINGS["upside down"]).at(0.0)
+    paths: list[Any] = [
+        SimpleNamespace(frame=published_frame(FrameSettings(), None, None, RFU_ENU), newest=None) for _ in range(2)
+    ]
+
+    def rest(path: Any) -> None:
+        for number in range(200):
+            path.newest = Sample(
+                "bow", number, number * 10**8, 0, Sync.ARRIVAL, 0, 0, accel_m_s2=sensor.accel_m_s2,
+                gyro_rad_s=sensor.gyro_rad_s, quat_wxyz=sensor.quat_wxyz, euler_rad=sensor.euler_rad,
+            )  # fmt: skip
+            watch.tick(number * 10**8, path)
+
+    driver = DRIVERS["hipnuc-uart"]
+    for number, path in enumerate(paths, 1):
+        path.newest = None
+        watch.tick(0, path)
+        status = watch.status(driver, path, {})
+        assert status is not None
+        assert status.problem == "", "nothing is known of this device yet"
+        rest(path)
+        assert len(events) == number
+        rest(path)
+        assert len(events) == number
+
+
+def test_in_motion_nothing_is_said() -> None:
+    """A module that is mounted wrongly and swings without a rest."""
+    swing = Swing(roll=(Sine(0.3, 0.5), Sine(3.1, 0.0, 1.57)), pitch=(Sine(0.3, 0.4),), yaw=(Sine(0.5, 0.3),))
+    made = played("hipnuc-uart", swing, 20.0, frame=FrameSettings())
+    assert made.events == []
+
+
+def test_every_sample_is_turned_once_and_the_newest_of_the_path_not_at_all() -> None:
+    """That one stays in the sensor's axes: the ALARM line is compared with it."""
+    frame = published_frame(MOUNTINGS["upside down"], None, None, RFU_ENU)
+    clock, ledger, batches = VirtualClock(), Ledger(), list[Batch]()
+    context = PathContext(
+        "bow",
+        0,
+        ledger,
+        batches.append,
+        lambda _message, _t_ns: None,
+        lambda _frame: None,
+        lambda: 0,
+        clock.host,
+        frame,
+    )
+    driver = DRIVERS["hipnuc-uart"]
+    path = StreamPath(HipnucCodec(ledger, HipnucSettings()), make_clock("bow", None, driver, None), context)
+    data = encode_hi91(
+        system_time_ms=1, word_1_2=0, accel_m_s2=(1, 2, 3), gyro_rad_s=(0.25, 0.5, 0.75), mag_t=(1e-5, 2e-5, 3e-5),
+        euler_rad=(0.0, 0.0, 0.0), quat_wxyz=(1, 0, 0, 0), temperature_c=20.0, pressure_pa=1e5,
+    )  # fmt: skip
+    path.on_data(data * 3, clock.now_ns())
+    (batch,) = batches
+    assert len(batch.samples) == 3
+    for sample in batch.samples:
+        assert sample.gyro_rad_s == pytest.approx((0.5, 0.25, -0.75), rel=1e-6)
+    assert path.newest is not None
+    assert path.newest.gyro_rad_s == pytest.approx((0.25, 0.5, 0.75), rel=1e-6)
+    assert frame.rotation is not None
+    assert frame.rotation.sample(path.newest) == batch.samples[-1]
+    assert batch.frame is frame

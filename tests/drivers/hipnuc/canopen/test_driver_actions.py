@@ -1,0 +1,130 @@
+"""Named actions of a CANopen module: what goes to the bus, and what the simulated module does."""
+
+from typing import Any
+
+import pytest
+
+from imud.contracts.command import Target
+from imud.contracts.script import RequestScript
+from imud.contracts.setting import Written
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.drivers.hipnuc.canopen.driver import DRIVER
+from imud.model.errors import BadArgument
+from imud.sim.hipnuc.canopen import NodeSettings
+from tests.support.simulated_modules import QUIET, CanopenBench
+
+
+def begun(name: str, at: int = 8, /, **given: object) -> RequestScript[Any]:
+    """The conversation of an action with the node that the settings name."""
+    action = DRIVER.actions[name]
+    conversation: RequestScript[Any] = action.script(
+        Target(HipnucCanopenSettings(node=at), 500_000), action.arguments(given)
+    )
+    return conversation
+
+
+ROWS: list[tuple[str, dict[str, object], str]] = [
+    ("save", {}, "23 00 20 00 00 00 00 00"),
+    ("restart", {}, "23 00 20 00 FF 00 00 00"),
+    ("factory_reset", {}, "23 00 20 00 01 00 00 00"),
+    ("node", {"node": 9}, "23 A0 20 00 09 00 00 00"),
+    ("bitrate", {"bitrate": 1_000_000}, "23 9A 20 00 00 00 00 00"),
+    ("bitrate", {"bitrate": 500_000}, "23 9A 20 00 02 00 00 00"),
+    ("bitrate", {"bitrate": 250_000}, "23 9A 20 00 03 00 00 00"),
+    ("bitrate", {"bitrate": 125_000}, "23 9A 20 00 04 00 00 00"),
+    ("interval", {"tpdo": 1, "interval_ms": 5}, "2B 00 18 05 05 00 00 00"),
+    ("interval", {"tpdo": 6, "interval_ms": 0}, "2B 04 18 05 00 00 00 00"),
+    ("interval", {"tpdo": 7, "interval_ms": 1000}, "2B 05 18 05 E8 03 00 00"),
+    ("transmission", {"tpdo": 1, "by": "sync"}, "2F 00 18 02 01 00 00 00"),
+    ("transmission", {"tpdo": 4, "by": "timer"}, "2F 03 18 02 FF 00 00 00"),
+    ("direction", {"x_reversed": True, "y_reversed": False}, "23 9E 20 00 01 00 00 00"),
+    ("direction", {"x_reversed": False, "y_reversed": False}, "23 9E 20 00 00 00 00 00"),
+    ("transmission", {"tpdo": 1, "by": "timer"}, "2F 00 18 02 FF 00 00 00"),
+    ("zero", {"zero": "here"}, "23 A5 20 00 02 00 00 00"),
+    ("zero", {"zero": "cancel"}, "23 A5 20 00 05 00 00 00"),
+]
+
+
+@pytest.mark.parametrize(("name", "given", "data"), ROWS)
+@pytest.mark.parametrize("node", [8, 127])
+@pytest.mark.manual(
+    "B 5.4.1 node number",
+    "B 5.4.1 save",
+    "B 5.4.1 restart",
+    "B 5.4.1 factory settings",
+    "B 5.4.1 bit rate",
+    "B 5.4.1 zero of the inclinometer",
+    "B 5.4.2 transmission type",
+)
+def test_commands_of_the_manual_go_to_the_node_of_the_settings(
+    name: str, given: dict[str, object], data: str, node: int
+) -> None:
+    bench = CanopenBench(NodeSettings(node=node))
+    bench.run_script(begun(name, node, **given))
+    writes = [frame for frame in bench.sent if frame[1][0] != 0x40]
+    assert writes[0] == (0x600 + node, bytes.fromhex(data))
+
+
+@pytest.mark.parametrize(
+    ("command", "code"),
+    [("start", 1), ("stop", 2), ("pre_operational", 0x80), ("reset_node", 0x81), ("reset_communication", 0x82)],
+)
+def test_network_management(command: str, code: int) -> None:
+    bench = CanopenBench(NodeSettings(node=5))
+    bench.run_script(begun("nmt", 5, command=command))
+    assert (0, bytes([code, 5])) in bench.sent
+    assert {name for name, _, _ in ROWS} | {"nmt"} == set(DRIVER.actions)
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("node", {"node": 128}),
+        ("node", {"node": True}),
+        ("bitrate", {"bitrate": 800_000}),
+        ("interval", {"tpdo": 5, "interval_ms": 10}),
+        ("interval", {"tpdo": 1, "interval_ms": 4}),
+        ("interval", {"tpdo": 1, "interval_ms": 1001}),
+        ("transmission", {"tpdo": 1, "by": "remote"}),
+        ("direction", {"x_reversed": 1, "y_reversed": False}),
+        ("zero", {"zero": 2}),
+        ("nmt", {"command": "sleep"}),
+    ],
+)
+def test_arguments_that_cannot_be_send_nothing(name: str, given: dict[str, object]) -> None:
+    with pytest.raises(BadArgument, match=r"(?i)expected|invalid enum value"):
+        next(begun(name, **given))
+
+
+@pytest.mark.manual("B 5.4.1 node number")
+def test_the_module_obeys() -> None:
+    bench = CanopenBench(NodeSettings(periods_ms=QUIET.periods_ms))
+    bench.run_script(begun("direction", x_reversed=False, y_reversed=True))
+    bench.run_script(begun("interval", tpdo=2, interval_ms=20))
+    bench.run(100_000_000)
+    assert 0x288 in {can_id for can_id, _ in bench.heard}
+    assert bench.module.objects.settings.invert_y
+    assert not bench.module.objects.settings.invert_x
+    assert bench.run_script(begun("nmt", command="reset_node")) == "restarted, as node 8"
+    assert not bench.module.objects.settings.invert_y  # nothing was saved
+    bench = CanopenBench()
+    bench.run_script(begun("node", node=9))
+    assert bench.module.node == 8
+    bench.run_script(begun("save"))
+    assert bench.run_script(begun("restart")) == "restarted, as node 9"
+    assert bench.module.node == bench.settings.node == 9
+
+
+def test_an_interval_that_the_bus_cannot_carry_says_what_it_costs() -> None:
+    bench = CanopenBench(NodeSettings(node=8))
+
+    def interval(bit_rate: int, others_bit_s: float) -> object:
+        action = DRIVER.actions["interval"]
+        target = bench.target(bit_rate, others_bit_s)
+        return bench.run_script(action.script(target, action.arguments({"tpdo": 1, "interval_ms": 5})))
+
+    # 95 bits · 200 + (95 + 95 + 111 + 111) · 100 + 79 · 20 = 61,780 bit/s: 49.4 % of 125 kbit/s, of which TPDO1 15.2 %
+    assert interval(125_000, 63_000.0) is Written.VERIFIED
+    with pytest.raises(BadArgument, match=r"got 101 % of that: TPDO1 every 5 ms 15.2 %, .*; other devices 51.2 %"):
+        interval(125_000, 64_000.0)
+    assert interval(0, 1e9) is Written.VERIFIED  # a virtual bus has no rate

@@ -1,0 +1,320 @@
+"""J1939 messages of the manual with SI values computed by hand, and the codec that makes samples of them."""
+
+import math
+from random import Random
+
+import msgspec
+import pytest
+
+from imud.attitude.rotation import quat_normalized
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.script import ReplyFrame
+from imud.drivers.hipnuc.j1939 import codec as messages
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Settings, encode
+from imud.drivers.hipnuc.j1939.driver import DRIVER
+from imud.formats.j1939 import J1939Id, join
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+from tests.support.files import shared
+
+MS = 1_000_000
+NONE = bytes([0xFF]) * 8
+
+
+def measured(pgn: int, data: str) -> Measurement:
+    return messages.measurement_of([(pgn, bytes.fromhex(data))])
+
+
+def make(**options: object) -> HipnucJ1939Codec:
+    return HipnucJ1939Codec(Ledger(), msgspec.convert(options, HipnucJ1939Settings))
+
+
+def feed(codec: HipnucJ1939Codec, frames: list[tuple[int, bytes]], t_ns: int) -> list[CodecEvent]:
+    events: list[CodecEvent] = []
+    for place, (can_id, data) in enumerate(frames):
+        events += codec.feed_frame(can_id, True, data, t_ns + place * 300_000)
+        assert codec.ledger.closes()
+    return events
+
+
+def burst(value: int, address: int = 8, *more: tuple[int, bytes]) -> list[tuple[int, bytes]]:
+    """The four messages of every module; `value` counts in roll, so that samples are known apart."""
+    rows = (
+        (messages.ACCEL, bytes.fromhex("000000000008") + bytes(2)),
+        (messages.GYRO, bytes(8)),
+        (messages.ROLL_PITCH, value.to_bytes(4, "little") + bytes(4)),
+        (messages.HEADING, bytes(8)),
+    )
+    return [encode(pgn, data, address) for pgn, data in (*rows, *more)]
+
+
+def counts(events: list[CodecEvent]) -> list[int]:
+    """`value` of each sample."""
+    rolls = [event.euler_rad[0] for event in events if isinstance(event, Measurement) and event.euler_rad]
+    return [round(math.degrees(roll) * 1000) for roll in rolls]
+
+
+def learned(**options: object) -> HipnucJ1939Codec:
+    """A codec that has heard enough; the next burst begins at 100 ms."""
+    codec = make(**options)
+    for n in range(10):
+        feed(codec, burst(n), n * 10 * MS)
+    return codec
+
+
+@pytest.mark.manual("B 6.1.1 FF34", "B 6.1.2 FF37", "B 6.1.3 FF3D", "B 6.1.5 FF4A")
+def test_messages_in_si_units() -> None:
+    # 2048 · 0.00048828 = 0.99999744 G · 9.8; -2048; 1 count = 0.0047851 m/s²
+    accel = measured(0xFF34, "0008 00f8 0100 ffff").accel_m_s2
+    assert accel == pytest.approx((9.799974912, -9.799974912, 0.004785144), abs=1e-12)
+    # 1000 · 0.061035 = 61.035 °/s = 1.06526171… rad/s; -16384 → -999.99744 °/s
+    gyro = measured(0xFF37, "e803 00c0 ffff 0000").gyro_rad_s
+    assert gyro == pytest.approx((1.0652617, -17.4532478, -0.00106526171), abs=1e-7)
+    # 8.701° and -33.058°
+    assert measured(0xFF4A, "fd210000de7effff").incli_rad == pytest.approx((0.15186110, -0.57697094), abs=1e-8)
+    assert measured(0xFF4A, "407e0500ffffff7f").incli_rad == pytest.approx((6.2831853, math.nan), nan_ok=True)
+    assert measured(0xFF4A, "ffffff7fffffff7f").incli_rad is None
+    # 1000 · 0.030517 µT
+    assert measured(0xFF3A, "e80318fc01000000").mag_t == pytest.approx((3.0517e-5, -3.0517e-5, 3.0517e-8), abs=1e-15)
+    air = measured(0xFF43, "c409000052c59a00")  # 2500, 10143058
+    assert (air.temperature_c, air.pressure_pa) == pytest.approx((25.0, 101430.58))
+    assert measured(0xFF43, "18fc000052c59a00").temperature_c == pytest.approx(-10.0)
+
+
+@pytest.mark.manual("B 6.1.3 FF3D")
+def test_attitude() -> None:
+    # roll 10.5°, pitch -20.25°; heading 90° clockwise is yaw -90°
+    both = [(0xFF3D, bytes.fromhex("04290000e6b0ffff")), (0xFF41, bytes.fromhex("905f010000000000"))]
+    found = messages.measurement_of(both)
+    assert found.euler_rad == pytest.approx((0.1832595715, -0.3534291735, -1.5707963268), abs=1e-9)
+    # by hand: z ⊗ x = (0.696095, -0.124306, 0.124306, -0.696095), and that ⊗ (0.995805, 0, 0.091502, 0)
+    assert found.quat_wxyz == pytest.approx((0.681801, -0.060091, 0.187479, -0.704549), abs=2e-6)
+    assert (found.size_bytes, found.dev_ticks) == (16, None)
+    sent = measured(0xFF46, "881300008813f01b")  # 0.5, 0, 0.5, 0.7152: length 1.0055
+    assert sent.quat_wxyz == pytest.approx((0.5, 0.0, 0.5, 0.7152))
+    assert sent.euler_rad is None
+    # the quaternion of the module goes before the computed one
+    three = [(0xFF3D, bytes(8)), (0xFF41, bytes(8)), (0xFF46, bytes.fromhex("0000102700000000"))]
+    assert messages.measurement_of(three).quat_wxyz == pytest.approx((0, 1, 0, 0))
+    assert messages.measurement_of(three[:2]).quat_wxyz == (1, 0, 0, 0)
+    assert messages.measurement_of(three[:1]).quat_wxyz is None  # no heading, no attitude
+
+
+@pytest.mark.parametrize(
+    ("clockwise", "yaw_deg"),
+    [(0, 0.0), (1, -0.001), (90_000, -90.0), (180_000, -180.0), (180_001, 179.999), (270_000, 90.0), (359_999, 0.001),
+     (360_000, 0.0)],
+)  # fmt: skip
+@pytest.mark.manual("B 6.1.4 FF41")
+def test_heading_is_clockwise_and_yaw_is_not(clockwise: int, yaw_deg: float) -> None:
+    for second in (0, -1, 12345):  # what the other bytes say does not count
+        data = clockwise.to_bytes(4, "little") + second.to_bytes(4, "little", signed=True)
+        found = messages.measurement_of([(0xFF41, data)]).euler_rad
+        assert found is not None
+        assert found[2] == pytest.approx(math.radians(yaw_deg), abs=1e-12)
+        assert math.isnan(found[0])
+        assert math.isnan(found[1])
+
+
+def test_packing_gives_the_golden_messages_and_clips_them() -> None:
+    for yaw_deg in (-179.5, -90, -0.001, 0, 45.25, 179.999):
+        data = messages.pack_heading(math.radians(yaw_deg))
+        assert int.from_bytes(data[:4], "little") == round(-yaw_deg * 1000) % 360_000
+        assert int.from_bytes(data[4:], "little", signed=True) == round(yaw_deg * 1000)
+        assert messages.pack_heading(math.radians(yaw_deg), twice=False) == data[:4] + bytes(4)
+    assert messages.pack_accel((9.8, -9.8, 0.0048)) == bytes.fromhex("000800f801000000")
+    assert messages.pack_gyro((math.radians(61.035), -1e9, 1e9)).hex() == "e8030080ff7f0000"
+    assert messages.pack_roll_pitch(math.radians(10.5), math.radians(-20.25)).hex() == "04290000e6b0ffff"
+    assert messages.pack_temperature(25.0, 101430.58).hex() == "c409000052c59a00"
+    assert messages.pack_utc(2025, 3, 14, 15 * 3600 + 9 * 60 + 26.535).hex() == "19030e0f091a1702"
+
+
+@pytest.mark.parametrize(
+    ("pgn", "data", "field"),
+    [
+        (0xFF34, NONE, "accel_m_s2"),
+        (0xFF3A, NONE, "mag_t"),
+        (0xFF3A, bytes(8), "mag_t"),
+        (0xFF3D, bytes.fromhex("ffffff7fffffff7f"), "euler_rad"),
+        (0xFF3D, bytes.fromhex("0000008000000080"), "euler_rad"),
+        (0xFF41, NONE, "euler_rad"),
+        (0xFF41, bytes.fromhex("000000fe00000000"), "euler_rad"),
+        (0xFF41, bytes.fromhex("417e050000000000"), "euler_rad"),  # 360.001°
+        (0xFF43, NONE, "temperature_c"),
+        (0xFF43, NONE, "pressure_pa"),
+        (0xFF43, bytes(8), "temperature_c"),
+        (0xFF43, bytes(8), "pressure_pa"),
+        (0xFF43, bytes.fromhex("ff7f000000000000"), "temperature_c"),
+        (0xFF46, NONE, "quat_wxyz"),
+        (0xFF46, bytes(8), "quat_wxyz"),
+    ],
+)
+def test_absent_is_not_zero(pgn: int, data: bytes, field: str) -> None:
+    assert getattr(messages.measurement_of([(pgn, data)]), field) is None
+
+
+def test_one_negative_count_is_a_value() -> None:
+    assert measured(0xFF37, "ffffffffffffffff").gyro_rad_s == pytest.approx((-0.00106526,) * 3, abs=1e-8)
+    assert measured(0xFF34, "ffffffffffff0000").accel_m_s2 == pytest.approx((-0.00478514,) * 3, abs=1e-8)
+    assert measured(0xFF3D, "ffffffff00000000").euler_rad == pytest.approx((-1.74532925e-5, 0, math.nan), nan_ok=True)
+    assert measured(0xFF43, "0000000052c59a00").temperature_c == 0.0  # with a pressure it is 0 °C
+    placeholder = measured(0xFF43, "9a090000e7030000")  # 24.58 °C, 999: a module without a barometer
+    assert placeholder.temperature_c == pytest.approx(24.58)
+    assert placeholder.pressure_pa is None
+    assert measured(0xFF43, "9a090000a0860100").pressure_pa == pytest.approx(1000)  # 100000 counts of 0.01 Pa
+    assert measured(0xFF43, "9a090000011bb700").pressure_pa is None  # 12000001 counts
+
+
+SIGNALS = {
+    "Acc": ("accel_m_s2", 9.8), "Gyr": ("gyro_rad_s", math.pi / 180), "Mag": ("mag_t", 1e-6),
+}  # fmt: skip
+
+
+def test_the_vendors_signal_definitions_agree() -> None:
+    cantools = pytest.importorskip("cantools")
+    database = cantools.database.load_file(shared("hipnuc-j1939.dbc"))
+    random = Random(6)
+    compared = 0
+    for pgn in messages.MEASURED:
+        definition = database.get_message_by_frame_id(encode(pgn, b"")[0])
+        for _ in range(50):
+            data = some_payload(pgn, random)
+            theirs = definition.decode(data)
+            ours = messages.measurement_of([(pgn, data)])
+            compared += compare(ours, theirs)
+    assert compared == 50 * (3 + 3 + 3 + 2 + 1 + 2 + 4 + 2)
+    theirs = database.decode_message(encode(messages.UTC, b"")[0], messages.pack_utc(2025, 3, 14, 54566.535))
+    expected = {"Year": 25, "Month": 3, "Day": 14, "Hour": 15, "Minute": 9, "Second": 26, "Millisecond": 535}
+    assert theirs == {f"UTC_{name}": value for name, value in expected.items()}
+
+
+def some_payload(pgn: int, random: Random) -> bytes:
+    """Random counts, within the range where they are values."""
+    if pgn in (messages.ROLL_PITCH, messages.INCLINOMETER):
+        return messages.TWO_ANGLES.pack(random.randint(-360_000, 360_000), random.randint(-360_000, 360_000))
+    if pgn == messages.HEADING:
+        return random.randint(0, 360_000).to_bytes(4, "little") + random.randbytes(4)
+    if pgn == messages.TEMPERATURE:
+        return messages.TEMPERATURE_LAYOUT.pack(random.randint(-9000, 9000), 7, random.randint(10**5, 12 * 10**6))
+    if pgn == messages.QUATERNION:
+        w, x, y, z = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), 0.1))
+        return messages.pack_quaternion((w, x, y, z))
+    return random.randbytes(8)
+
+
+def compare(ours: Measurement, theirs: dict[str, float]) -> int:
+    """Assert that all signals are equal; return how many there were."""
+    values: dict[str, float] = {}
+    for prefix, (field, factor) in SIGNALS.items():
+        if (vector := getattr(ours, field)) is not None:
+            values |= {f"{prefix}_{axis}": value / factor for axis, value in zip("XYZ", vector, strict=True)}
+    if ours.euler_rad is not None:
+        roll, pitch, yaw = map(math.degrees, ours.euler_rad)
+        values |= {"Roll": roll, "Pitch": pitch} if math.isfinite(roll) else {"Yaw_360": -yaw % 360}
+    if ours.incli_rad is not None:
+        values |= {"Incli_X": math.degrees(ours.incli_rad[0]), "Incli_Y": math.degrees(ours.incli_rad[1])}
+    if ours.quat_wxyz is not None:
+        values |= {f"Quat_{axis}": value for axis, value in zip("WXYZ", ours.quat_wxyz, strict=True)}
+    if ours.temperature_c is not None and ours.pressure_pa is not None:
+        values |= {"Temperature": ours.temperature_c, "Pressure": ours.pressure_pa}
+    for name, value in values.items():
+        there = theirs[name] % 360 if name == "Yaw_360" else theirs[name]
+        assert value == pytest.approx(there, rel=1e-9, abs=1e-9), name
+    return len(values)
+
+
+@pytest.mark.manual("B 6 identifiers")
+def test_a_burst_makes_a_sample_whatever_its_priority() -> None:
+    codec = learned()
+    (sample,) = feed(codec, burst(1234), 100 * MS)
+    assert isinstance(sample, Measurement)
+    assert sample.accel_m_s2 == pytest.approx((0, 0, 9.799974912))
+    assert sample.gyro_rad_s == (0, 0, 0)
+    assert counts([sample]) == [1234]
+    assert sample.size_bytes == 32
+    codec = learned()
+    frames = [(can_id & 0x03FFFFFF | priority << 26, data) for priority, (can_id, data) in enumerate(burst(77), 4)]
+    assert counts(feed(codec, frames, 100 * MS)) == [77]
+    pgns = (0xFF34, 0xFF37, 0xFF3D, 0xFF41, 0xFF4A)
+    assert [encode(pgn, b"")[0] for pgn in pgns] == [0x0CFF3408, 0x0CFF3708, 0x0CFF3D08, 0x0CFF4108, 0x0CFF4A08]
+    codec = learned()
+    utc = encode(messages.UTC, messages.pack_utc(2025, 1, 1, 0))
+    before = codec.ledger.frames_ignored
+    assert counts(feed(codec, [utc, *burst(5)], 100 * MS)) == [5]
+    assert codec.ledger.frames_ignored == before + 1
+
+
+def test_samples_of_several_modules_slow_messages_and_loss() -> None:
+    codecs = {address: make(address=address) for address in (8, 9, 128, 1)}
+    found: dict[int, list[int]] = {address: [] for address in codecs}
+    for n in range(20):
+        mixed = zip(*(burst(1000 * address + n, address) for address in codecs), strict=True)
+        frames = [frame for group in mixed for frame in group]
+        for address, codec in codecs.items():
+            found[address] += counts(feed(codec, frames, n * 20 * MS))
+            assert codec.ledger.bytes_skipped == (n + 1) * 3 * 32
+    for address, values in found.items():
+        assert values == [1000 * address + n for n in range(20 - len(values), 20)]
+        assert len(values) >= 15
+
+    codec = make()
+    slow = messages.TEMPERATURE, messages.pack_temperature(21.5, 100_000)
+    events: list[CodecEvent] = []
+    for n in range(100):
+        events += feed(codec, burst(n, 8, *([slow] if n % 10 == 0 else [])), n * 10 * MS)
+    warm = [n for event, n in zip(events, counts(events), strict=True) if isinstance(event, Measurement)
+            and event.temperature_c is not None]  # fmt: skip
+    assert warm
+    assert all(n % 10 == 0 for n in warm)
+    assert warm[-1] == 90
+    assert codec.ledger.lost() == 0
+
+    for missing in range(4):
+        codec = learned()
+        frames = burst(50)
+        del frames[missing]
+        assert counts(feed(codec, frames, 100 * MS)) == []
+        assert counts(feed(codec, burst(51), 110 * MS)) == [51]
+
+
+def test_which_frames_count() -> None:
+    codec = make()
+    assert codec.feed_frame(0x0CFF3408, True, b"\1\2\3", 0) == (BadFrame(BadReason.LENGTH, b"\1\2\3"),)
+    skipped = [(0x0CFF3508, True), (0x0CFF3409, True), (0x0CEF0855, True), (0x0DFF3408, True), (0x0CFF3408, False)]
+    for can_id, extended in skipped:
+        assert not codec.feed_frame(can_id, extended, bytes(8), 0)
+    assert codec.ledger.bytes_skipped == 8 * len(skipped)
+    assert codec.ledger.frames_bad_length == 1
+    assert codec.ledger.closes()
+    reply = bytes.fromhex("3701060064000000")
+    for options, destinations in (({}, [0x55]), ({"host_address": 0x20}, [0x55, 0x20])):
+        codec = make(**options)
+        for destination in destinations:
+            can_id = join(J1939Id(6, 0xEF00, 8, destination))
+            assert codec.feed_frame(can_id, True, reply, 0) == (ReplyFrame(can_id, reply),)
+        assert codec.ledger.frames_in_replies == len(destinations)
+        assert not codec.feed_frame(join(J1939Id(6, 0xEF00, 8, 0x21)), True, reply, 0)
+
+    codec = learned(pgns=["FF34", "FF3D"])
+    (sample,) = feed(codec, burst(5), 100 * MS)
+    assert isinstance(sample, Measurement)
+    assert sample.gyro_rad_s is None
+    assert sample.size_bytes == 16
+    assert [f.can_id >> 8 for f in DRIVER.filters(HipnucJ1939Settings(pgns=("FF34", "FF3D")))] == [
+        0xFF2F, 0xFF34, 0xFF3D, 0xEF55,
+    ]  # fmt: skip
+
+    assert DRIVER.node_of(0x18FF3D05, True, bytes(8)) == 5
+    for can_id, extended, size in [
+        (0x0CFF3405, False, 8), (0x0CFF3405, True, 6), (0x0CFF2F05, True, 8), (0x0CEF5505, True, 8),
+        (0x0CFF34FE, True, 8),
+    ]:  # fmt: skip
+        assert DRIVER.node_of(can_id, extended, bytes(size)) is None
+    assert DRIVER.node_settings(5) == HipnucJ1939Settings(address=5)
+    assert DRIVER.node_title(5) == "address 5"
+
+
+@pytest.mark.parametrize("options", [{"address": 254}, {"pgns": []}, {"pgns": ["FF2F"]}, {"pgns": "all"}, {"node": 8}])
+def test_options_that_mean_nothing(options: dict[str, object]) -> None:
+    with pytest.raises(msgspec.ValidationError):
+        make(**options)

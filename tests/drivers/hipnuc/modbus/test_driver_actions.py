@@ -1,0 +1,73 @@
+"""Named actions of a module on RS-485, on the simulated one."""
+
+import pytest
+
+from imud.contracts.command import Target, parameters_of
+from imud.drivers.hipnuc.modbus.codec import HipnucModbusSettings
+from imud.drivers.hipnuc.modbus.driver import DRIVER
+from imud.model.errors import BadArgument
+from tests.support.pty_port import ModbusBench
+from tests.support.pty_port import modbus_slave as module
+
+
+def act(bench: ModbusBench, name: str, **given: object) -> object:
+    action = DRIVER.actions[name]
+    result: object = bench.run(action.script(bench.target, action.arguments(given)))
+    return result
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "sent"),
+    [
+        ("save", {}, "0600000000"),
+        ("factory_reset", {}, "0600000001"),
+        ("restart", {}, "06000000ff"),
+        ("address", {"address": 128}, "0600050080"),
+        ("baud", {"baud": 4800}, "0600040000"),
+        ("baud", {"baud": 256000}, "0600040009"),
+        ("attitude_mode", {"axes": 9}, "0600060001"),
+        ("attitude_mode", {"axes": 6}, "0600060000"),
+        ("level", {"level": "relative"}, "0600a50002"),
+        ("level", {"level": "cancel"}, "0600a50005"),
+        ("mounting", {"mounting": "level"}, "0600a60000"),
+        ("mounting", {"mounting": "y_down"}, "0600a60001"),
+        ("mounting", {"mounting": "x_up"}, "0600a60003"),
+    ],
+)
+@pytest.mark.manual("B 4.3.1 save", "B 4.3.4 mounting", "B 4.3.5 level", "B 4.3.6 axes")
+def test_what_is_sent(name: str, given: dict[str, object], sent: str) -> None:
+    bench = ModbusBench()
+    act(bench, name, **given)
+    assert next(request.hex() for _, request in bench.sent if request[0] == 6) == sent
+
+
+def test_actions_without_an_address_and_reading_by_name() -> None:
+    action = DRIVER.actions["address"]
+    with pytest.raises(BadArgument, match="expected the address of the module"):
+        action.script(Target(HipnucModbusSettings(), 0), action.arguments({"address": 9}))
+    bench = ModbusBench(module(7))
+    assert act(bench, "read", register="MD_ID") == (7,)
+    assert act(bench, "read", register="sn") == (0xA000, 0, 0, 7)
+    for name in ("CTRL", "nothing"):
+        with pytest.raises(BadArgument, match="HEADING_MODE"):
+            act(bench, "read", register=name)
+    assert all(action.help for action in DRIVER.actions.values())
+    assert [str(one) for one in parameters_of(DRIVER.actions["attitude_mode"])] != []
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "names"),
+    [
+        ("address", {"address": 129}, "from 1 to 128"),
+        ("address", {}, "from 1 to 128"),
+        ("baud", {"baud": 12345}, "4800, 9600"),
+        ("mounting", {"mounting": 1}, "level"),
+        ("attitude_mode", {"axes": 1}, "6, 9"),
+        ("level", {"level": 3}, "automatic"),
+    ],
+)
+def test_what_a_module_cannot_take_is_not_sent(name: str, given: dict[str, object], names: str) -> None:
+    bench = ModbusBench()
+    with pytest.raises(BadArgument, match=names):
+        act(bench, name, **given)
+    assert bench.sent == []

@@ -1,0 +1,37 @@
+"""What yaw counts from, by the settings that a module reported."""
+
+import pytest
+
+from imud.attitude.conventions import Heading
+from imud.drivers import DRIVERS
+from imud.drivers.hipnuc.common import heading_by_mode
+from imud.drivers.hipnuc.nmea2000 import HipnucNmea2000Settings
+
+
+@pytest.mark.parametrize(
+    ("read_back", "heading"),
+    [
+        ({"ATT_MODE": "0"}, Heading.RELATIVE),
+        ({"ATT_MODE": " 1"}, Heading.MAGNETIC),
+        ({"heading_mode": "six axes"}, Heading.RELATIVE),
+        ({"heading_mode": "nine axes"}, Heading.MAGNETIC),
+        ({"heading_mode": "code 7"}, Heading.UNKNOWN),
+        ({"mode": "9-axis"}, Heading.MAGNETIC),
+        ({}, Heading.UNKNOWN),
+    ],
+)
+def test_by_mode(read_back: dict[str, str], heading: Heading) -> None:
+    assert heading_by_mode(None, read_back) is heading
+
+
+def test_drivers_that_read_it_back_and_that_know_it_beforehand() -> None:
+    for name in ("hipnuc-uart", "hipnuc-modbus"):
+        assert DRIVERS[name].heading(None, {"ATT_MODE": "1"}) is Heading.MAGNETIC
+    for name in ("imu61x-uart", "imu61x-can", "imu61x-i2c", "imu61x-spi"):
+        assert DRIVERS[name].heading(None, {}) is Heading.RELATIVE
+    nmea = DRIVERS["hipnuc-nmea2000"].heading
+    assert nmea(HipnucNmea2000Settings(heading="true"), {}) is Heading.TRUE
+    assert nmea(HipnucNmea2000Settings(heading="magnetic"), {}) is Heading.MAGNETIC
+    assert nmea(HipnucNmea2000Settings(), {}) is Heading.UNKNOWN
+    assert nmea(None, {}) is Heading.UNKNOWN
+    assert DRIVERS["hipnuc-canopen"].heading(None, {}) is Heading.UNKNOWN

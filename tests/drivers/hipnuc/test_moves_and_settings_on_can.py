@@ -1,0 +1,330 @@
+"""HiPNUC modules on CAN: settings are written, saved and read back, and a module is followed to another number.
+
+Most tests run on CANopen and on J1939, over everything that no manual settles.
+"""
+
+from collections.abc import Callable, Mapping
+from itertools import product
+from typing import Any, NamedTuple
+
+import msgspec
+import pytest
+
+from imud.contracts.command import Target
+from imud.contracts.script import Outcome, Reply, Request, RequestScript, Silence
+from imud.contracts.setting import DeviceSettings, Effect, Written
+from imud.drivers.hipnuc.canopen import commands as canopen
+from imud.drivers.hipnuc.canopen.cia301 import Aborted
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.drivers.hipnuc.canopen.driver import SETTINGS as CANOPEN_SETTINGS
+from imud.drivers.hipnuc.j1939 import commands as j1939
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.drivers.hipnuc.j1939.driver import SETTINGS as J1939_SETTINGS
+from imud.formats.can import EXTENDED_ID_MAX, RAW_FRAME
+from imud.model.errors import BadArgument, DeviceRefused, NoReply, Rejected
+from imud.sim.hipnuc.canopen import NODE_VARIANTS, NodeSettings, NodeVariant
+from imud.sim.hipnuc.j1939 import J1939_VARIANTS, J1939Settings, J1939Variant
+from tests.support.simulated_modules import CanBench, CanopenBench, J1939Bench, run_script
+
+BOOTED_NS = 500_000_000
+TPDOS = (1, 2, 3, 4, 6, 7)
+PGNS = ("ff2f", "ff34", "ff37", "ff3a", "ff3d", "ff41", "ff43", "ff46", "ff4a")
+
+
+class Protocol(NamedTuple):
+    """A protocol on CAN by the names and values that differ."""
+
+    noun: str
+    """Setting and action of the number of a module."""
+    restarted: str
+    """Answer of a restart, without the number."""
+    make: Callable[..., CanopenBench | J1939Bench]
+    """Makes a bench of a module with a number."""
+    variants: Mapping[str, Any]
+    variant: Callable[..., Any]
+    register: int
+    """Place of the number in the module."""
+    values: Mapping[str, tuple[object, ...]]
+    """Values of every setting, in the order of the table."""
+    of_each_form: tuple[str, ...]
+    """Settings that every kind of module must take; the other settings have the same forms."""
+    delivered: Mapping[str, object]
+    wrong: Mapping[str, object]
+    settings: DeviceSettings
+    options: Callable[[int], Any]
+    session: Any
+    place: Any
+    number_of: Callable[[Any], int]
+    go_back: tuple[int, str]
+    """Identifier and data of the frame that commands a lost module to go back from 9 to 8."""
+    is_write: Callable[[bytes], bool]
+
+
+CANOPEN = Protocol(
+    noun="node",
+    restarted="restarted, as node",
+    make=lambda number=8, **more: CanopenBench(NodeSettings(node=number), **more),
+    variants=NODE_VARIANTS,
+    variant=NodeVariant,
+    register=0x20A0,
+    values={
+        **{f"tpdo{tpdo}_interval_ms": (5, 1000, 0) for tpdo in TPDOS},
+        **{f"tpdo{tpdo}_by": ("sync", "timer") for tpdo in TPDOS},
+        **dict.fromkeys(("incli_x_reversed", "incli_y_reversed"), (True, False)),
+        "heartbeat_ms": (500, 0),
+        "bit_rate": (500_000,),
+        "node": (127, 1),
+    },
+    of_each_form=("tpdo1_interval_ms", "tpdo1_by", "bit_rate", "node"),
+    delivered={
+        **{f"tpdo{tpdo}_interval_ms": 50 if tpdo == 6 else 10 for tpdo in TPDOS},
+        **{f"tpdo{tpdo}_by": "timer" for tpdo in TPDOS},
+        "incli_x_reversed": False,
+        "incli_y_reversed": False,
+        "heartbeat_ms": 0,
+        "bit_rate": 500_000,
+        "node": 8,
+    },
+    wrong={"tpdo1_interval_ms": 1001, "tpdo1_by": "remote", "bit_rate": 800_000, "node": 128, "incli_x_reversed": 1},
+    settings=CANOPEN_SETTINGS,
+    options=lambda number: HipnucCanopenSettings(node=number),
+    session=canopen,
+    place=(canopen.NODE_ID, 0),
+    number_of=lambda module: module.node,
+    go_back=(0x609, "23 A0 20 00 08 00 00 00"),
+    is_write=lambda data: data[0] != 0x40,
+)
+J1939 = Protocol(
+    noun="address",
+    restarted="restarted, at address",
+    make=lambda number=8, **more: J1939Bench(J1939Settings(address=number), **more),
+    variants=J1939_VARIANTS,
+    variant=J1939Variant,
+    register=j1939.ADDRESS,
+    values={
+        **{f"{pgn}_interval_ms": (5, 1000) for pgn in PGNS},
+        **dict.fromkeys(("x_reversed", "y_reversed"), (True, False)),
+        "bit_rate": (500_000,),
+        "address": (128, 1),
+    },
+    of_each_form=("ff34_interval_ms", "x_reversed", "bit_rate", "address"),
+    delivered={
+        **{f"{pgn}_interval_ms": 100 for pgn in ("ff34", "ff37", "ff3d", "ff41")},  # the other ones are not on
+        "x_reversed": False,
+        "y_reversed": False,
+        "bit_rate": 500_000,
+        "address": 8,
+    },
+    wrong={"ff34_interval_ms": 0, "ff41_interval_ms": 1001, "bit_rate": 100_000, "address": 129},
+    settings=J1939_SETTINGS,
+    options=lambda number: HipnucJ1939Settings(address=number),
+    session=j1939,
+    place=j1939.ADDRESS,
+    number_of=lambda module: module.settings.address,
+    go_back=(0x0CEF0955, "9C 00 06 00 08 00 00 00"),
+    is_write=lambda data: data[2] == 6,
+)
+both = pytest.mark.parametrize("protocol", [CANOPEN, J1939], ids=["CANopen", "J1939"])
+EVERY = [(protocol, name) for protocol in (CANOPEN, J1939) for name in protocol.variants]
+
+
+@pytest.fixture(params=EVERY, ids=[name for _, name in EVERY])
+def kind(request: pytest.FixtureRequest) -> tuple[Protocol, Any]:
+    """A protocol, and a bench with a module of each kind and another module with the number 12."""
+    protocol, name = request.param
+    bench = protocol.make(boot_ms=300, variant=protocol.variants[name], others=(12,))
+    bench.run(BOOTED_NS)
+    return protocol, bench
+
+
+def move(protocol: Protocol, bench: CanBench, number: int) -> object:
+    return bench.act(protocol.noun, **{protocol.noun: number})
+
+
+def numbers(protocol: Protocol, bench: Any) -> tuple[int, int]:
+    return getattr(bench.settings, protocol.noun), protocol.number_of(bench.module)
+
+
+def is_told(variant: Any) -> bool:
+    return variant.reads not in ("ignored", "aborted")
+
+
+def is_at_once(variant: Any) -> bool:
+    return bool(getattr(variant, "number_at_once", False) or getattr(variant, "address_at_once", False))
+
+
+def test_a_module_is_followed_to_another_number(kind: tuple[Protocol, Any]) -> None:
+    protocol, bench = kind
+    variant = bench.module.hardware.variant
+    written = move(protocol, bench, 9)
+    if is_at_once(variant):
+        assert written is (Written.VERIFIED if is_told(variant) else Written.UNVERIFIED)
+        assert numbers(protocol, bench) == (9, 9)
+    else:
+        assert written is (Written.PENDING if is_told(variant) else Written.UNVERIFIED_PENDING)
+        assert getattr(bench.settings, protocol.noun) == 8
+        assert bench.act("restart") == f"{protocol.restarted} 8"  # the number is not saved
+        assert numbers(protocol, bench) == (8, 8)
+        move(protocol, bench, 9)
+    bench.act("save")
+    assert bench.act("restart") == f"{protocol.restarted} 9"
+    assert numbers(protocol, bench) == (9, 9)
+    before = len(bench.measured)
+    bench.run(2_000_000_000)
+    assert len(bench.measured) > before + 5
+
+
+def test_a_number_that_is_in_force_before_it_is_saved_is_left_at_a_restart(kind: tuple[Protocol, Any]) -> None:
+    protocol, bench = kind
+    if is_at_once(bench.module.hardware.variant):
+        move(protocol, bench, 9)
+        assert bench.act("restart") == f"{protocol.restarted} 8"
+        assert numbers(protocol, bench) == (8, 8)
+
+
+def test_a_number_that_is_heard_on_the_bus_is_refused_and_nothing_is_written(kind: tuple[Protocol, Any]) -> None:
+    protocol, bench = kind
+    with pytest.raises(BadArgument, match=rf"{protocol.noun} 12 is taken: (frame 0x|PGN F).* (on the bus|from it)"):
+        move(protocol, bench, 12)
+    assert not any(protocol.is_write(data) for _, data in bench.sent)
+    move(protocol, bench, 8)  # its own number is written all the same
+    assert numbers(protocol, bench) == (8, 8)
+
+
+@both
+def test_refused_and_ignored_numbers_are_told(protocol: Protocol) -> None:
+    register = frozenset({protocol.register})
+    with pytest.raises((Aborted, Rejected), match=r"invalid value|status 1"):
+        move(protocol, protocol.make(variant=protocol.variant(refuses=register)), 9)
+    with pytest.raises((DeviceRefused, Rejected), match=r"reads back 8|the module has 8"):
+        move(protocol, protocol.make(variant=protocol.variant(ignores=register)), 9)
+
+
+@both
+def test_a_module_that_is_heard_nowhere_is_told_to_go_back(protocol: Protocol) -> None:
+    sent: list[bytes] = []
+
+    def silent(request: Request) -> Outcome:
+        sent.append(request.payload)
+        return Reply(()) if request.silent else Silence(())
+
+    action = protocol.make().driver.actions[protocol.noun]
+    script = action.script(Target(protocol.options(8), 500_000), action.arguments({protocol.noun: 9}))
+    with pytest.raises(NoReply, match=r"answers neither (as node 9 nor as node 8|at address 9 nor at 8)"):
+        run_script(script, silent)
+    can_id, _, data = RAW_FRAME.unpack(sent[-1])
+    assert (can_id & EXTENDED_ID_MAX, data) == (protocol.go_back[0], bytes.fromhex(protocol.go_back[1]))
+
+
+@both
+def test_a_restart_that_loses_the_module_is_told(protocol: Protocol) -> None:
+    bench = protocol.make(boot_ms=300)
+    bench.run(BOOTED_NS)
+    bench.act("bitrate", bitrate=250_000)
+    bench.module.hardware = type(bench.module.hardware)(boot_ms=60_000)  # the host does not understand its frames then
+    assert bench.act("restart") == "restarted; it has 250000 bit/s now, which this bus has not"
+    bench = protocol.make(boot_ms=60_000)
+    bench.now_ns += 70_000_000_000
+    with pytest.raises(NoReply, match=f"nothing is heard of {protocol.noun} 8 after the restart"):
+        bench.act("restart")
+
+
+@both
+def test_factory_settings_are_in_force_after_a_restart(protocol: Protocol) -> None:
+    bench = protocol.make(9)
+    done = str(bench.act("factory_reset"))
+    assert f"{protocol.noun} 8" in done
+    assert "after the next restart" in done
+    bench = protocol.make(9, others=(8,))
+    bench.run(100_000_000)
+    with pytest.raises(BadArgument, match=f"{protocol.noun} 8 is taken"):
+        bench.act("factory_reset")
+    assert not any(protocol.is_write(data) for _, data in bench.sent)
+
+
+@pytest.mark.parametrize("told", [254, 0xF006_0102])
+@both
+def test_a_number_that_is_none_is_not_looked_for(
+    protocol: Protocol, told: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Found by fuzzing: such a number made an identifier that no frame can have, a ValueError."""
+
+    def read_values(*_arguments: object, **_more: object) -> RequestScript[dict[object, int]]:
+        return {protocol.place: told}
+        yield  # makes it a generator
+
+    monkeypatch.setattr(protocol.session, "read_values", read_values)
+    action = protocol.make().driver.actions["restart"]
+    script = action.script(Target(protocol.options(8), 500_000), action.arguments({}))
+    with pytest.raises(NoReply, match=f"nothing is heard of {protocol.noun} 8 after the restart"):
+        run_script(script, lambda _request: Silence(()))
+
+
+@both
+def test_the_table_has_order_effects_and_types(protocol: Protocol) -> None:
+    table = protocol.settings.table
+    assert protocol.make().driver.device_settings is protocol.settings
+    assert list(protocol.values) == list(table)
+    pending = {name for name, one in table.items() if one.effect is Effect.AFTER_RESTART}
+    moving = {name for name, one in table.items() if one.connection}
+    assert pending == moving == {"bit_rate", protocol.noun}
+    for name, values in protocol.values.items():
+        for value in values:
+            assert msgspec.convert(value, table[name].type) == value
+    for name, value in protocol.wrong.items():
+        with pytest.raises(msgspec.ValidationError):
+            msgspec.convert(value, table[name].type)
+
+
+def test_present_values_are_read_and_nothing_is_written(kind: tuple[Protocol, Any]) -> None:
+    protocol, bench = kind
+    assert bench.present() == (protocol.delivered if is_told(bench.module.hardware.variant) else {})
+    assert not any(protocol.is_write(data) for _, data in bench.sent)
+
+
+@both
+def test_a_setting_written_saved_and_restarted_is_what_is_read(protocol: Protocol) -> None:
+    """Each kind of module takes one setting of each form; the real one takes all."""
+    for variant, (name, values) in product(protocol.variants.values(), protocol.values.items()):
+        if name in protocol.of_each_form or variant == protocol.variant():
+            bench = protocol.make(boot_ms=100, variant=variant)
+            bench.run(200_000_000)
+            for value in values:
+                written = bench.set_for_good(name, value)
+                assert (written in (Written.VERIFIED, Written.PENDING)) == is_told(variant)
+                if is_told(variant):
+                    assert protocol.settings.table[name].agrees(value, bench.present()[name])
+
+
+def test_canopen_values_that_do_not_go_together_are_refused() -> None:
+    target = CanopenBench().target(125_000, 30_000.0)
+    CANOPEN_SETTINGS.check(target, {**CANOPEN.delivered, "bit_rate": 125_000})
+    with pytest.raises(BadArgument, match="expected 125000, the rate of the bus, got 500000"):
+        CANOPEN_SETTINGS.check(target, {"bit_rate": 500_000})
+    with pytest.raises(BadArgument, match=r"tpdo1_interval_ms: expected 0 or 5 … 1000, got 4"):
+        CANOPEN_SETTINGS.check(target, {"tpdo1_interval_ms": 4})
+    fast = {f"tpdo{tpdo}_interval_ms": 5 for tpdo in TPDOS}  # 586 bits · 200 = 117,200 bit/s
+    with pytest.raises(BadArgument, match=r"got 118 % of that: .*TPDO4 every 5 ms 17.8 %.*; other devices 24 %"):
+        CANOPEN_SETTINGS.check(target, fast)
+    # sent when SYNC comes, which does not
+    CANOPEN_SETTINGS.check(target, fast | {f"tpdo{tpdo}_by": "sync" for tpdo in TPDOS})
+
+
+def test_j1939_values_that_do_not_go_together_are_refused() -> None:
+    bench = J1939Bench()
+    with pytest.raises(BadArgument, match="expected 125000, the rate of the bus, got 500000"):
+        J1939_SETTINGS.check(bench.target(125_000), {"bit_rate": 500_000})
+    fast = {f"{pgn}_interval_ms": 5 for pgn in ("ff34", "ff37", "ff3d", "ff41")}  # 131 bits · 200 · 4 = 104,800 bit/s
+    J1939_SETTINGS.check(bench.target(125_000), fast)
+    with pytest.raises(BadArgument, match=r"got 105 % of that: FF34 every 5 ms 21 %, .*"):
+        J1939_SETTINGS.check(bench.target(125_000), fast | {"ff43_interval_ms": 5})
+    action = bench.driver.actions["interval"]
+
+    def interval(others_bit_s: float) -> object:
+        arguments = action.arguments({"pgn": "FF34", "interval_ms": 5})
+        return bench.run_script(action.script(bench.target(125_000, others_bit_s), arguments))
+
+    # 131 · (200 + 3 · 10) = 30,130 bit/s
+    assert interval(94_000) is Written.VERIFIED
+    with pytest.raises(BadArgument, match="FF34 every 5 ms 21 %"):
+        interval(95_000)

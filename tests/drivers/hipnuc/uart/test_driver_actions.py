@@ -1,0 +1,136 @@
+"""What a HiPNUC module can be told by name: what goes over the wire, and what the simulated module does."""
+
+import math
+from typing import Any
+
+import pytest
+
+from imud.contracts.command import Target
+from imud.contracts.script import Outcome, Rejection, Reply, Request, Silence
+from imud.drivers.hipnuc.uart.driver import ACTIONS
+from imud.model.errors import BadArgument, NoReply, Rejected
+from tests.support.simulated_modules import run_script
+
+OK = Reply(("OK",))
+VERSION = Reply(("PNAME=HI14R3", "OK"))
+
+
+def sent(name: str, answers: list[Outcome] | None = None, **arguments: Any) -> tuple[list[Request], object]:
+    """The requests of an action, answered in turn, and its value."""
+    action = ACTIONS[name]
+    left = list(answers or [OK])
+    requests: list[Request] = []
+
+    def answer(request: Request) -> Outcome:
+        requests.append(request)
+        return left.pop(0)
+
+    value = run_script(action.script(Target(None, 115200), action.arguments(arguments)), answer)
+    assert not left
+    return requests, value
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "command"),
+    [
+        ("save", {}, "SAVECONFIG"),
+        ("output_none", {}, "UNLOGALL"),
+        ("output", {"message": "HI92", "rate_hz": 0}, "LOG HI92 ONTIME 0"),
+        ("output_on_mark", {"message": "HI91"}, "LOG HI91 ONMARK 1"),
+        ("output_once", {"message": "HI91"}, "LOG HI91 ONMARK ONCE"),
+        ("output_enabled", {"enabled": False}, "LOG DISABLE"),
+        ("output_enabled", {"enabled": True}, "LOG ENABLE"),
+        ("mode", {"axes": 9}, "CONFIG ATT MODE 1"),
+        ("mode", {"axes": 6}, "CONFIG ATT MODE 0"),
+        ("level", {"level": "automatic"}, "CONFIG ATT RST 3"),
+        ("yaw", {"angle_deg": 16}, "CONFIG YAW 1 16"),
+        ("yaw", {"angle_deg": 1.5, "relative": True}, "CONFIG YAW 0 1.5"),
+        ("mounting", {"turned": "y_down"}, "CONFIG IMU URFR 1,0,0,0,0,1,0,-1,0"),
+        ("mounting", {"turned": "x_up"}, "CONFIG IMU URFR 0,0,-1,0,1,0,1,0,0"),
+        ("mounting", {"turned": [0, -1, 0, 1, 0, 0, 0, 0, 1]}, "CONFIG IMU URFR 0,-1,0,1,0,0,0,0,1"),
+        ("magnetic_calibration", {"enabled": True}, "CONFIG IMU EN_MCAL 1"),
+        ("pin", {"function": "sout_div", "pin": 9}, "CONFIG PMUX4 IO9"),
+        ("alarm", {"axis": "Y", "min_deg": -5, "max_deg": 5}, "CONFIG PMUX5 Y,-5,5,0,1"),
+        ("sout_divider", {"divisor": 4}, "CONFIG PMUX4 DIV4"),
+    ],
+)
+@pytest.mark.manual(
+    "B 2.2.4 ATT MODE 0",
+    "B 2.2.4 ATT MODE 1",
+    "B 2.2.4 YAW 1",
+    "B 2.2.4 YAW 0",
+    "B 2.2.4 PMUX",
+    "B 2.2.4 alarm range",
+    "B 2.2.5 LOG ENABLE",
+    "B 2.2.5 LOG DISABLE",
+    "B 2.2.5 output off",
+    "B 2.2.5 ONMARK 1",
+    "B 2.2.5 ONMARK ONCE",
+    "B 2.2.6 UNLOGALL",
+    "B 8.2 EN_MCAL",
+)
+def test_one_command(name: str, arguments: dict[str, Any], command: str) -> None:
+    (request,), value = sent(name, **arguments)
+    assert request.payload == f"{command}\r\n".encode()
+    assert value is None
+
+
+def test_the_actions_that_write_to_flash_say_so() -> None:
+    assert [name for name, action in ACTIONS.items() if action.saves] == ["save", "baud"]
+
+
+RATES = r"rate_hz \(one of 0, 1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100, 125, 200, 250, 500, 1000\)"
+HALF_TURN = "a number from -180 to 180"
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("output", {"message": "HI91", "rate_hz": 500}, "expected at most 100 Hz"),  # more than 115200 baud carry
+        ("output", {"message": "HI91", "rate_hz": 300}, RATES),
+        ("output", {"message": "HI93", "rate_hz": 1}, 'one of "HI91", "HI92"'),
+        ("output_on_mark", {"message": None}, 'one of "HI91", "HI92"'),
+        ("output_once", {"message": None}, 'one of "HI91", "HI92"'),
+        ("mode", {"axes": 7}, "one of 6, 9"),
+        ("level", {"level": None}, '"automatic", "cancel", "relative"'),
+        ("mounting", {"turned": [1.0] * 8}, "or a list of 9, each of it a number"),
+        ("mounting", {"turned": [2, 0, 0, 0, 1, 0, 0, 0, 1]}, "expected a rotation"),
+        ("magnetic_calibration", {"enabled": None}, "true or false"),
+        ("yaw", {"angle_deg": 180.1}, HALF_TURN),
+        ("yaw", {"angle_deg": math.nan}, HALF_TURN),
+        ("yaw", {"angle_deg": True}, HALF_TURN),
+        ("yaw", {"angle_deg": 5, "relative": None}, "true or false"),
+        ("pin", {"function": "sin", "pin": 10}, "a whole number from 1 to 9"),
+        ("pin", {"function": "sin", "pin": 0}, "a whole number from 1 to 9"),
+        ("pin", {"function": None, "pin": 1}, '"sin", "sout"'),
+        ("alarm", {"axis": "X", "min_deg": 5, "max_deg": -5}, "expected the minimum below the maximum"),
+        ("alarm", {"axis": None, "min_deg": -5, "max_deg": 5}, 'one of "X", "Y"'),
+        ("sout_divider", {"divisor": 0}, "from 1 to 64"),
+        ("sout_divider", {"divisor": 65}, "from 1 to 64"),
+        ("baud", {"baud": 1200}, "one of 9600, 115200, 230400, 256000, 460800, 921600"),
+    ],
+)
+@pytest.mark.manual("B 2.2.4 YAW range", "B 2.2.4 divider")
+def test_bad_arguments_send_nothing(name: str, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadArgument, match=message):
+        sent(name, [], **arguments)
+
+
+@pytest.mark.manual("B 2.2.1 REBOOT")
+def test_refusal_silence_output_and_restart() -> None:
+    with pytest.raises(Rejected, match="ERR 3"):
+        sent("save", [Rejection(("ERR 3",))])
+    with pytest.raises(NoReply, match="SAVECONFIG: expected OK, got nothing"):
+        sent("save", [Silence(())])
+    left: list[Outcome] = [OK, OK, *([Silence(())] * 7)]
+    with pytest.raises(NoReply, match="expected an answer at 115200 or 921600 baud"):
+        sent("baud", left, baud=921600)
+
+    requests, _ = sent("output", [Reply(("LOG HI92 ONTIME 0.1", "OK")), OK], message="HI91", rate_hz=100)
+    assert [request.name for request in requests] == ["LOG COMCONFIG", "LOG HI91 ONTIME 0.01"]
+    requests, _ = sent("output", [Silence(()), OK], message="HI91", rate_hz=50)
+    assert requests[-1].name == "LOG HI91 ONTIME 0.02"
+
+    requests, value = sent("restart", [Reply(()), Silence(()), Silence(()), Silence(()), VERSION])
+    assert requests[0].silent
+    assert getattr(value, "product", "") == "HI14R3"

@@ -1,0 +1,103 @@
+"""Lines of the configuration against the module's settings, as the simulated module reports them."""
+
+import pytest
+
+from imud import config
+from imud.config.schema import TABLES
+from imud.contracts.lines import DeviceLines, DividedSettings, InputSettings, PpsSettings, SoutSettings, TriggerSettings
+from imud.drivers.hipnuc.uart.commands import read_settings
+from imud.drivers.hipnuc.uart.settings import declared_line_differences, line_differences, message_limits
+from imud.model.errors import ConfigError
+from imud.sim.hipnuc.uart_settings import AlarmSetting, ModuleSettings, Output
+from tests.support.simulated_modules import HipnucLine
+
+SOUT = DeviceLines(sout=SoutSettings(line="A"))
+DIVIDED = DeviceLines(sout_div=DividedSettings(line="B", divisor=4))
+SIN = DeviceLines(sin=TriggerSettings(line="C", rate_hz=200))
+PPS = DeviceLines(pps=PpsSettings(line="D"))
+ALARM = DeviceLines(alarm=InputSettings(line="E"))
+MARKED = Output(on_mark=True)
+
+
+@pytest.mark.parametrize(
+    ("lines", "settings", "found"),
+    [
+        (SOUT, ModuleSettings(), {}),
+        (SOUT, ModuleSettings(pins=(1, 2, 2, 6, 9)), {"sout": "the module has sout and led on IO2: set one with pin"}),
+        (DIVIDED, ModuleSettings(sout_div=4), {}),
+        (
+            DIVIDED,
+            ModuleSettings(),
+            {"sout_div": "divisor is 4 in the configuration, and the module divides SOUT by 8"},
+        ),
+        (SIN, ModuleSettings(baud=921600, hi91=MARKED), {}),
+        (SIN, ModuleSettings(), {"sin": "no message of the module is on mark"}),
+        (SIN, ModuleSettings(hi91=MARKED), {"sin": "200 triggers a second, and 115200 baud carry 100 Hz of HI91"}),
+        (SIN, ModuleSettings(hi91=Output(), hi92=MARKED), {"sin": "HI92 on mark has no time of its own"}),
+        (PPS, ModuleSettings(), {}),
+        (PPS, ModuleSettings(hi91=MARKED), {"pps": "HI91 on mark: each pulse per second makes a sample"}),
+        (ALARM, ModuleSettings(alarm_y=AlarmSetting(-5, 5, True)), {}),
+        (ALARM, ModuleSettings(), {"alarm": "the module watches no angle"}),
+    ],
+)
+def test_what_the_module_contradicts_is_found(
+    lines: DeviceLines, settings: ModuleSettings, found: dict[str, str]
+) -> None:
+    differences = line_differences(HipnucLine(settings).run(read_settings()), lines)
+    assert differences.keys() == found.keys()
+    for key, words in found.items():
+        assert words in differences[key]
+
+
+@pytest.mark.parametrize("lines", [SOUT, DIVIDED, SIN, PPS, ALARM])
+def test_what_the_module_does_not_tell_is_not_compared(lines: DeviceLines) -> None:
+    assert line_differences({"ATT_MODE": "0"}, lines) == {}
+
+
+@pytest.mark.parametrize(
+    ("lines", "declared", "found"),
+    [
+        (SIN, {"output": {"hi91": 0, "hi92": "on_mark"}}, {"sin": "HI92 on mark has no time of its own"}),
+        (SIN, {"output": {"hi91": 100, "hi92": 0}}, {"sin": "no message of the module is on mark"}),
+        (SIN, {"output": {"hi91": "on_mark", "hi92": 0}}, {}),
+        (SIN, {"output": {"hi92": "on_mark"}}, {}),  # the module may have HI91 on mark
+        (DIVIDED, {"sout_divisor": 8}, {"sout_div": "divisor is 4 in the configuration"}),
+        (SOUT, {"pins": {"sout": 2, "led": 2}}, {"sout": "sout and led on IO2"}),
+        (ALARM, {"alarm": {"x": {"min_deg": -5, "max_deg": 5, "enabled": False}}}, {}),  # Y may be watched
+    ],
+)
+def test_what_declared_settings_contradict_is_found(
+    lines: DeviceLines, declared: dict[str, object], found: dict[str, str]
+) -> None:
+    differences = declared_line_differences(declared, lines)
+    assert differences.keys() == found.keys()
+    for key, words in found.items():
+        assert words in differences[key]
+
+
+def test_check_refuses_a_line_that_declared_settings_contradict() -> None:
+    text = (
+        "devices:\n  bow:\n    driver: hipnuc-uart\n    uart: {port: /dev/ttyUSB0, baud: 921600}\n"
+        "    lines: {sin: {line: GPIO1, rate_hz: 10}}\n    settings: {output: {hi91: 0, hi92: on_mark}}\n"
+    )
+    with pytest.raises(ConfigError, match=r"f:5:\d+: devices\.bow\.lines\.sin: .*HI92 on mark has no time of its own"):
+        config.parse(text, "f", TABLES)
+
+
+@pytest.mark.parametrize(
+    ("declared", "lines", "fed", "found"),
+    [
+        ({}, DeviceLines(), True, []),
+        ({"output": {"hi91": 100, "hi92": 0}}, DeviceLines(), True, []),
+        ({"output": {"hi92": 100}}, DeviceLines(), False, []),
+        ({"output": {"hi92": 100}}, DeviceLines(), True, ["HI92 never shows UTC"]),
+        ({"output": {"hi92": 100}}, DeviceLines(pps=PpsSettings(line="GPIO1")), False, ["HI92 never shows UTC"]),
+        ({"output": {"hi91": 50, "hi92": 50}}, DeviceLines(), False, ["HI92 beside HI91 is dated by its arrival"]),
+    ],
+)
+def test_what_hi92_cannot_do_is_said(
+    declared: dict[str, object], lines: DeviceLines, fed: bool, found: list[str]
+) -> None:
+    limits = message_limits(declared, lines, fed)
+    assert len(limits) == len(found)
+    assert all(limit.startswith(words) for limit, words in zip(limits, found, strict=True))

@@ -1,0 +1,215 @@
+"""Frames of the IMU61x on CAN, made and computed by hand, and the rules by which five of them become a sample."""
+
+import math
+import struct
+
+import msgspec
+import pytest
+
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.drivers.imu61x.can import DRIVER, Imu61xCanCodec, Imu61xCanSettings, encode_set
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+
+F1_5, F_M2, F_90, F_10, F_M20, F_0_5, F_1, F_0_25, F_M1 = (
+    bytes.fromhex(text)
+    for text in (
+        "0000c03f", "000000c0", "0000b442", "00002041", "0000a0c1", "0000003f", "0000803f", "0000803e", "000080bf",
+    )
+)  # fmt: skip
+GOLDEN = [
+    (101, F1_5 + F_M2),  # roll 1.5°, pitch -2°
+    (102, F_90 + F_10),  # yaw 90°, gyro x 10 °/s
+    (103, F_M20 + F_0_5),  # gyro y -20 °/s, z 0.5 °/s
+    (104, F_1 + F_0_25),  # accel x 1 g, y 0.25 g
+    (105, F_M1 + bytes.fromhex("c409ffff")),  # accel z -1 g, 0x09C4 = 2500 = 25 °C, INDEX 65535
+]
+
+
+def make(base_id: int = 101) -> Imu61xCanCodec:
+    return Imu61xCanCodec(Ledger(), Imu61xCanSettings(base_id=base_id))
+
+
+def feed(codec: Imu61xCanCodec, frames: list[tuple[int, bytes]]) -> list[CodecEvent]:
+    events = [event for can_id, data in frames for event in codec.feed_frame(can_id, False, data, 0)]
+    assert codec.ledger.closes()
+    return events
+
+
+def sample(index: int, value: float = 1.0) -> list[tuple[int, bytes]]:
+    return encode_set(
+        index=index,
+        accel_m_s2=(value,) * 3,
+        gyro_rad_s=(value,) * 3,
+        euler_rad=(0.1, 0.1, value / 10),
+        temperature_c=25,
+    )
+
+
+def indices(events: list[CodecEvent]) -> list[int | None]:
+    return [event.dev_ticks for event in events if isinstance(event, Measurement)]
+
+
+@pytest.mark.manual(
+    "A 4.2 frame 101", "A 4.2 frame 102", "A 4.2 frame 103", "A 4.2 frame 104", "A 4.2 frame 105", "A 4.1 frames"
+)
+def test_golden_set_in_si_units_and_back() -> None:
+    (measured,) = feed(make(), GOLDEN)
+    assert isinstance(measured, Measurement)
+    assert measured.euler_rad == pytest.approx((0.0261799388, -0.0349065850, 1.5707963268), abs=1e-9)
+    assert measured.gyro_rad_s == pytest.approx((0.1745329252, -0.3490658504, 0.0087266463), abs=1e-9)
+    assert measured.accel_m_s2 == pytest.approx((9.80665, 2.4516625, -9.80665), abs=1e-12)
+    assert measured.temperature_c == pytest.approx(25.0)
+    assert measured.dev_ticks == 65535
+    assert measured.size_bytes == 40
+    # half angles 0.75°, -1°, 45°: w = 0.70710678 (0.99984770 · 0.99991433 - 0.01745241 · 0.01308960) and so on
+    assert measured.quat_wxyz == pytest.approx((0.7067770, 0.0215940, -0.0030853, 0.7071000), abs=1e-7)
+    made = encode_set(
+        index=65535,
+        accel_m_s2=(9.80665, 2.4516625, -9.80665),
+        gyro_rad_s=(math.radians(10), math.radians(-20), math.radians(0.5)),
+        euler_rad=(math.radians(1.5), math.radians(-2), math.radians(90)),
+        temperature_c=25.0,
+    )
+    assert made == GOLDEN
+    codec = make()
+    for can_id, data in GOLDEN:
+        assert not codec.feed_frame(can_id, True, data, 0)
+    assert codec.ledger.bytes_skipped == 40
+    codec = make()
+    found = [indices(feed(codec, sample(index))) for index in (65534, 65535, 65536, 65537)]
+    assert found == [[65534], [65535], [0], [1]]
+
+    moved = [(can_id - 101 + 600, data) for can_id, data in GOLDEN]
+    assert indices(feed(make(600), moved)) == [65535]
+    assert feed(make(600), GOLDEN) == []
+    wanted = DRIVER.filters(Imu61xCanSettings(base_id=600))
+    assert [f.can_id for f in wanted] == [600, 601, 602, 603, 604]
+    assert not any(f.matches(605, False) or f.matches(600, True) for f in wanted)
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert({"base_id": 2044}, Imu61xCanSettings)
+
+
+@pytest.mark.manual("A 4.2 temperature")
+def test_temperature_is_in_hundredths() -> None:
+    for raw, expected in (("0000", 0.0), ("9cff", -1.0), ("ff7f", 327.67), ("0080", -327.68)):
+        (measured,) = feed(make(), [*GOLDEN[:4], (105, F_M1 + bytes.fromhex(raw) + b"\0\0")])
+        assert isinstance(measured, Measurement)
+        assert measured.temperature_c == pytest.approx(expected)
+
+
+def test_incomplete_mixed_and_disordered_sets() -> None:
+    for missing in range(5):
+        codec = make()
+        frames = sample(7)
+        del frames[missing]
+        assert indices(feed(codec, frames + sample(8, 2.0))) == [8]
+        assert codec.ledger.frames_ignored == 4
+        assert codec.ledger.frames_in_samples == 5
+
+    codec = make()
+    first, second = sample(1, 1.0), sample(2, 2.0)
+    events = feed(codec, first[:4] + second[1:])  # the first one's 105 and the second one's 101 are lost
+    assert events == []
+    late = sample(9, 3.0)
+    events = feed(codec, second[2:4] + late[:2] + late[4:])  # joined inside a set, then 105, 103 and 104 lost
+    assert events == []
+
+    codec = make()
+    mixed = [sample(4)[n] for n in (2, 0, 3, 1, 4)]
+    assert indices(feed(codec, mixed)) == []  # nothing is known before
+    mixed = [sample(5)[n] for n in (2, 0, 3, 1, 4)]
+    assert indices(feed(codec, mixed)) == [5]
+    mixed = [sample(7)[n] for n in (2, 0, 3, 1, 4)]
+    assert indices(feed(codec, mixed)) == []
+    assert codec.ledger.frames_ignored == 10
+
+
+PERIOD_NS = 10_000_000
+FRAME_NS = 250_000
+
+
+def timed(
+    codec: Imu61xCanCodec, index: int, places: str = "12345", *, late_ns: int = 0, period_ns: int = PERIOD_NS
+) -> list[int | None]:
+    """Feed some of the frames of a sample, sent one after the other, at the time that its INDEX says."""
+    events: list[CodecEvent] = []
+    for place, (can_id, data) in enumerate(sample(index, float(index % 100))):
+        if str(place + 1) in places:
+            t_ns = index * period_ns + place * FRAME_NS + late_ns
+            events += codec.feed_frame(can_id, False, data, t_ns)
+    assert codec.ledger.closes()
+    return indices(events)
+
+
+def learned(period_ns: int = PERIOD_NS) -> Imu61xCanCodec:
+    """A codec that has seen samples up to INDEX 9, as few as it needs."""
+    codec = make()
+    assert [timed(codec, index, period_ns=period_ns) for index in range(1, 10)] == [[index] for index in range(1, 10)]
+    return codec
+
+
+@pytest.mark.parametrize("cut", range(1, 5))
+def test_frames_of_two_samples_in_order_are_told_by_time(cut: int) -> None:
+    """1 … `cut` of one sample and the rest of another, what was between them lost: in order, and yet no sample."""
+    codec = learned()
+    first, rest = "12345"[:cut], "12345"[cut:]
+    assert timed(codec, 10, first) + timed(codec, 11, rest) == []
+    assert codec.ledger.frames_ignored == 5
+    assert timed(codec, 12) == [12]
+    assert timed(codec, 60, first) + timed(codec, 77, rest) == []
+    assert timed(codec, 78) == [78]
+
+
+def test_time_tells_whole_sets_from_mixed_ones() -> None:
+    """At 100 Hz, on a bus that is nearly full, before a period is known, and after a pause or at another rate."""
+    codec = learned()
+    assert [timed(codec, index) for index in (17, 18, 400, 401)] == [[17], [18], [400], [401]]
+    # the last frame 4.9 ms late: 5.9 ms are less than 1 ms + half of 10 ms
+    assert timed(codec, 410, "1234") + timed(codec, 410, "5", late_ns=4_900_000) == [410]
+    assert timed(codec, 420, "1234") + timed(codec, 420, "5", late_ns=5_100_000) == []
+
+    period_ns = 1_250_000
+    codec = learned(period_ns)
+    assert timed(codec, 15, period_ns=period_ns) == [15]
+    assert timed(codec, 16, "123", period_ns=period_ns) + timed(codec, 17, "45", period_ns=period_ns) == []
+    assert timed(codec, 19, period_ns=period_ns) == [19]
+
+    codec = make()
+    assert timed(codec, 1, "123") + timed(codec, 2, "45") == [2]
+    assert [timed(codec, index) for index in range(3, 10)] == [[index] for index in range(3, 10)]
+    assert timed(codec, 10, "123") + timed(codec, 12, "45") == [12]  # seven sets were seen whose INDEX follows
+    timed(codec, 13)
+    assert timed(codec, 14, "123") + timed(codec, 15, "45") == []
+
+    codec = make()
+    for index in range(1, 20):
+        timed(codec, index)
+    assert timed(codec, 20, late_ns=10**9) == [20]  # a second late, and the next come on time again
+    assert timed(codec, 121, "123") + timed(codec, 122, "45") == []
+    codec.reset()
+    begin, fast_ns = 1000, 2_500_000
+    for index in range(begin, begin + 8):
+        assert timed(codec, index, period_ns=fast_ns) == [index]
+    later = begin + 20
+    assert timed(codec, later, "12", period_ns=fast_ns) + timed(codec, later + 1, "345", period_ns=fast_ns) == []
+
+
+def test_wrong_length_is_a_bad_frame() -> None:
+    codec = make()
+    events = feed(codec, [*sample(1)[:2], (103, b"\1\2\3")])
+    assert events == [BadFrame(BadReason.LENGTH, b"\1\2\3")]
+    assert (codec.ledger.frames_bad_length, codec.ledger.bytes_in_bad_frames) == (1, 3)
+
+    frames = sample(1)
+    frames[1] = (102, struct.pack("<2f", math.nan, 1.0))
+    frames[4] = (105, struct.pack("<fhH", math.inf, 2500, 1))
+    codec = make()
+    events = feed(codec, frames)
+    assert [e.raw for e in events if isinstance(e, BadFrame)] == [frames[1][1], frames[4][1]]
+    measured = events[-1]
+    assert isinstance(measured, Measurement)
+    assert (measured.euler_rad, measured.quat_wxyz, measured.accel_m_s2) == (None, None, None)
+    assert measured.gyro_rad_s is not None
+    assert codec.ledger.frames_not_finite == 2
+    assert codec.ledger.frames_in_samples == 5

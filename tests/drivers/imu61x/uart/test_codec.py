@@ -1,0 +1,318 @@
+"""Golden frames with SI values by hand, false lengths, content that cannot be, and how every byte is booked."""
+
+import struct
+from math import inf, nan, pi, sqrt
+from random import Random
+
+import msgspec
+import pytest
+
+from imud.attitude.rotation import matrix_from_quat, quat_from_euler_zyx
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.script import ReplyFrame
+from imud.drivers.imu61x.common import crc32
+from imud.drivers.imu61x.uart.codec import (
+    AHRS_FRAME,
+    DEVICE_SYNC,
+    FRAME_BYTES_MAX,
+    PAYLOAD_BYTES_MAX,
+    Imu61xCodec,
+    Status,
+    encode_acknowledgement,
+    encode_ahrs,
+    encode_frame,
+    encode_parameter,
+    encode_status,
+)
+from imud.drivers.imu61x.uart.driver import DRIVER
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+
+AHRS_HEX = (
+    "AA55 0200 2C00"
+    "78563412"  # timer 0x12345678 µs
+    "0000F041 000034C2 0000B442"  # pitch 30°, roll -45°, yaw 90°
+    "0000803F 000000BF 00000040"  # accel 1, -0.5, 2 g
+    "00003443 0000B4C2 0000803F"  # gyro 180, -90, 1 °/s
+    "00001242"  # 36.5 °C
+)
+
+
+def with_crc(text: str) -> bytes:
+    body = bytes.fromhex(text)
+    return body + crc32(body).to_bytes(4, "little")
+
+
+GOLDEN = with_crc(AHRS_HEX)
+
+
+def codec() -> Imu61xCodec:
+    return Imu61xCodec(Ledger())
+
+
+def only(events: object) -> Measurement:
+    assert isinstance(events, list | tuple)
+    (event,) = events
+    assert isinstance(event, Measurement)
+    return event
+
+
+@pytest.mark.manual(
+    "A 1.2 headers",
+    "A 1.3 frame",
+    "A 1.3 pitch",
+    "A 1.3 roll",
+    "A 1.3 yaw",
+    "A 1.3 acceleration",
+    "A 1.3 angular rate",
+    "A 1.3 temperature",
+    "A 1.3 timer",
+)
+def test_golden_ahrs_frame() -> None:
+    """Where the axes of the body point at roll -45°, pitch 30°, yaw 90°, by hand: Rz(90°) Ry(30°) Rx(-45°)."""
+    measurement = only(codec().feed(GOLDEN))
+    assert measurement.size_bytes == len(GOLDEN) == 54
+    assert measurement.trailing_bytes == 0
+    assert measurement.dev_ticks == 0x12345678
+    assert measurement.accel_m_s2 == pytest.approx((9.80665, -4.903325, 19.6133), abs=1e-12)
+    assert measurement.gyro_rad_s == pytest.approx((pi, -pi / 2, 0.017453292519943295), abs=1e-15)
+    assert measurement.euler_rad == pytest.approx((-pi / 4, pi / 6, pi / 2), abs=1e-15)  # roll, pitch, yaw
+    assert measurement.temperature_c == 36.5
+    absent = (measurement.mag_t, measurement.pressure_pa, measurement.status, measurement.pps_age_ms)
+    assert absent == (None, None, None, None)
+    assert (DRIVER.tick_ns, DRIVER.tick_modulus) == (1000, 2**32)
+    assert "assumed" in DRIVER.euler_convention
+    assert (
+        encode_ahrs(
+            timer_us=0x12345678 + 2**32,
+            accel_m_s2=(9.80665, -4.903325, 19.6133),
+            gyro_rad_s=(pi, -pi / 2, pi / 180),
+            euler_rad=(-pi / 4, pi / 6, pi / 2),
+            temperature_c=36.5,
+        )
+        == GOLDEN
+    )
+    quat = measurement.quat_wxyz
+    assert quat is not None
+    x, y, z = zip(*matrix_from_quat(quat), strict=True)
+    root = sqrt(0.5)
+    assert x == pytest.approx((0, sqrt(0.75), -0.5), abs=1e-12)  # yaw 90° turns forward to y, pitch 30° nose below
+    assert z == pytest.approx((-root, root * 0.5, root * sqrt(0.75)), abs=1e-12)
+    assert y == pytest.approx((-root, -root * 0.5, -root * sqrt(0.75)), abs=1e-12)
+    assert sum(q * q for q in quat) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("before", [b"", b"?"])
+def test_a_run_and_the_general_way_give_the_same_as_a_frame_in_a_read(before: bytes) -> None:
+    """A run is at the begin of a read; behind another byte each frame goes the general way."""
+    slow = codec()
+    first, second = slow.feed(before + GOLDEN + GOLDEN)
+    fast = only(codec().feed(GOLDEN))
+    assert second == fast
+    assert isinstance(first, Measurement)
+    assert first.trailing_bytes == 54
+    ledger = slow.ledger
+    assert (ledger.frames_good, ledger.frames_in_samples, ledger.bytes_in_good_frames) == (2, 2, 108)
+    assert ledger.closes()
+
+
+def test_a_run_ends_before_a_frame_that_is_damaged_or_not_finite() -> None:
+    damaged = bytearray(GOLDEN)
+    damaged[20] ^= 1
+    hot = with_crc(AHRS_HEX.replace("00001242", "0000C07F"))  # NaN °C
+    for bad in (bytes(damaged), hot):
+        stream = GOLDEN * 3 + bad + GOLDEN * 2
+        run, one_by_one = codec(), codec()
+        events = list(run.feed(stream))
+        apart = [event for part in (GOLDEN, GOLDEN, GOLDEN, bad, GOLDEN, GOLDEN) for event in one_by_one.feed(part)]
+        trailing = [event.trailing_bytes for event in events if isinstance(event, Measurement)]
+        assert trailing == [left for left in range(270, -1, -54) if bad is hot or left != 108]
+        for event, same in zip(events, apart, strict=True):
+            if isinstance(event, Measurement):
+                assert isinstance(same, Measurement)
+                assert event.dev_ticks == same.dev_ticks
+                assert event.accel_m_s2 == same.accel_m_s2
+            else:
+                assert event == same
+        assert run.ledger.snapshot() == one_by_one.ledger.snapshot()
+        assert run.ledger.closes()
+
+    split = codec()
+    events = [*split.feed(GOLDEN[:20]), *split.feed(GOLDEN[20:] + GOLDEN + GOLDEN[:9]), *split.feed(GOLDEN[9:])]
+    assert [event.trailing_bytes for event in events if isinstance(event, Measurement)] == [63, 9, 0]
+    assert len(events) == 3
+    assert split.ledger.closes()
+
+
+def test_values_near_infinity_and_quaternions_to_the_last_bit() -> None:
+    """High bytes 0x7F and 0xFF, in which NaN and infinity are looked for: of the timer, and of finite 2e38."""
+    late = [with_crc(AHRS_HEX.replace("78563412", f"785634{high}")) for high in ("7F", "FF")]
+    large = with_crc(AHRS_HEX.replace("00001242", struct.pack("<f", -2e38).hex()))
+    for frame in (*late, large):
+        run, alone = codec(), codec()
+        events = run.feed(GOLDEN + frame + GOLDEN)
+        found = [event for event in events if isinstance(event, Measurement)]
+        assert [event.trailing_bytes for event in found] == [108, 54, 0]
+        assert msgspec.structs.replace(found[1], trailing_bytes=0) == only(alone.feed(frame))
+        assert run.ledger.frames_not_finite == alone.ledger.frames_not_finite == 0
+        assert run.ledger.closes()
+
+    random = Random(5)
+    frames = [
+        encode_ahrs(
+            timer_us=number, accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), temperature_c=20,
+            euler_rad=(random.uniform(-pi, pi), random.uniform(-pi / 2, pi / 2), random.uniform(-pi, pi)),
+        )
+        for number in range(100)
+    ]  # fmt: skip
+    for event in (*codec().feed(b"".join(frames)), *map(only, map(codec().feed, frames))):
+        assert isinstance(event, Measurement)
+        assert event.euler_rad is not None
+        assert event.quat_wxyz == quat_from_euler_zyx(event.euler_rad)
+
+    broken = encode_frame(DEVICE_SYNC, AHRS_FRAME, GOLDEN[6:46] + struct.pack("<f", nan))
+    _, measurement = codec().feed(broken)
+    whole = only(codec().feed(GOLDEN))
+    assert isinstance(measurement, Measurement)
+    assert measurement.temperature_c is None
+    for name in ("dev_ticks", "size_bytes", "accel_m_s2", "gyro_rad_s", "euler_rad"):
+        assert getattr(measurement, name) == getattr(whole, name)
+    assert measurement.quat_wxyz == pytest.approx(whole.quat_wxyz, abs=1e-15)
+
+
+@pytest.mark.parametrize("value", [nan, inf, -inf])
+@pytest.mark.parametrize(
+    ("place", "missing"),
+    [
+        (0, {"euler_rad", "quat_wxyz"}),
+        (2, {"euler_rad", "quat_wxyz"}),
+        (3, {"accel_m_s2"}),
+        (8, {"gyro_rad_s"}),
+        (9, {"temperature_c"}),
+    ],
+)
+def test_what_is_not_finite_is_left_out_and_told(place: int, missing: set[str], value: float) -> None:
+    values = [1.0] * 10
+    values[place] = value
+    frame = encode_frame(DEVICE_SYNC, AHRS_FRAME, struct.pack("<I10f", 5, *values))
+    tested = codec()
+    bad, measurement = tested.feed(frame)
+    assert bad == BadFrame(BadReason.NOT_FINITE, frame)
+    assert isinstance(measurement, Measurement)
+    there = {"accel_m_s2", "gyro_rad_s", "euler_rad", "quat_wxyz", "temperature_c"}
+    assert {name for name in there if getattr(measurement, name) is None} == missing
+    ledger = tested.ledger
+    assert (ledger.frames_not_finite, ledger.frames_good, ledger.frames_bad()) == (1, 1, 0)
+    assert ledger.closes()
+
+
+@pytest.mark.manual("A 1.2 ID and length", "A 1.2 headers")
+def test_frames_of_other_kinds_and_lengths() -> None:
+    tested = codec()
+    status = encode_status(Status(1, 2, 3, (4, 5, 6)))
+    stream = GOLDEN + status + encode_parameter(21, 100.0) + encode_acknowledgement(14, 0, frame_id=0x4242)
+    kinds = [type(event) for event in tested.feed(stream)]
+    assert kinds == [Measurement, ReplyFrame, ReplyFrame, ReplyFrame]
+    assert (tested.ledger.frames_in_samples, tested.ledger.frames_in_replies) == (1, 3)
+    assert tested.ledger.bytes_in_good_frames == len(stream)
+
+    for frame_id in (2, 6, 14, 0xFF, 0xFFFF):
+        (event,) = codec().feed(encode_acknowledgement(3, 0, frame_id=frame_id))
+        assert event == ReplyFrame(frame_id, b"\x03\x00\x00\x00")
+
+    tested = codec()
+    assert tested.feed(encode_frame(DEVICE_SYNC, 0x0123, bytes(30))) == []
+    assert (tested.ledger.frames_ignored, tested.ledger.frames_good) == (1, 1)
+    assert tested.ledger.bytes_in_good_frames == 40
+    assert tested.ledger.closes()
+
+    longer = encode_frame(DEVICE_SYNC, AHRS_FRAME, GOLDEN[6:-4] + bytes(8))
+    measurement = only(codec().feed(longer))
+    assert measurement.temperature_c == 36.5
+    assert measurement.size_bytes == 62
+
+    tested = codec()
+    command = bytes.fromhex("55AA 0300 1800 0000803F") + bytes(20) + bytes.fromhex("52D88EE8")
+    assert tested.feed(command) == []
+    assert tested.ledger.bytes_skipped == len(command)
+
+    for size in (0, PAYLOAD_BYTES_MAX + 1):
+        with pytest.raises(ValueError, match="payload"):
+            encode_frame(DEVICE_SYNC, 1, bytes(size))
+
+
+@pytest.mark.parametrize("length", [0, PAYLOAD_BYTES_MAX + 1, 0xFFFF])
+@pytest.mark.manual("A 1.2 ID and length")
+def test_a_length_beyond_the_maximum_is_refused_at_once(length: int) -> None:
+    lie = b"\xaa\x55\x02\x00" + length.to_bytes(2, "little")
+    tested = codec()
+    bad, measurement = tested.feed(lie + GOLDEN)
+    assert bad == BadFrame(BadReason.LENGTH, lie)
+    assert isinstance(measurement, Measurement)
+    assert (tested.ledger.frames_bad_length, tested.ledger.bytes_in_bad_frames) == (1, len(lie))
+    assert tested.ledger.closes()
+
+
+def test_frames_inside_damaged_ones_and_false_lengths() -> None:
+    damaged = GOLDEN[:20] + GOLDEN
+    tested = codec()
+    bad, measurement = tested.feed(damaged)
+    assert isinstance(bad, BadFrame)
+    assert bad.reason is BadReason.CRC
+    assert isinstance(measurement, Measurement)
+    ledger = tested.ledger
+    assert (ledger.bytes_in_bad_frames, ledger.bytes_in_good_frames, ledger.bytes_skipped) == (20, 54, 0)
+
+    lie = b"\xaa\x55\x02\x00" + PAYLOAD_BYTES_MAX.to_bytes(2, "little")
+    tested = codec()
+    assert [*tested.feed(lie + GOLDEN[:30]), *tested.flush(), *tested.feed(GOLDEN[30:])] == []
+    bad, measurement = tested.flush()
+    assert bad == BadFrame(BadReason.CRC, lie + GOLDEN)
+    assert isinstance(measurement, Measurement)
+    assert tested.flush() == []
+    ledger = tested.ledger
+    assert (ledger.bytes_in_bad_frames, ledger.bytes_in_good_frames, ledger.bytes_pending) == (6, 54, 0)
+    assert ledger.closes()
+
+    lie = b"\xaa\x55\x02\x00" + PAYLOAD_BYTES_MAX.to_bytes(2, "little")
+    tested = codec()
+    events: list[CodecEvent] = [*tested.feed(lie)]
+    while not events:
+        assert tested.ledger.bytes_pending < FRAME_BYTES_MAX
+        events += tested.feed(GOLDEN)
+    sent = (tested.ledger.bytes_in - len(lie)) // len(GOLDEN)
+    assert sent == 5
+    assert sum(isinstance(event, Measurement) for event in events) == sent
+    assert tested.ledger.closes()
+
+
+@pytest.mark.parametrize("end", [b"\xaa", b"\xaa\x55", b"\xaa\x55\x02\x00\x00"])
+def test_bytes_where_a_damaged_frame_claimed_to_be_are_its_in_any_split(end: bytes) -> None:
+    """A damaged frame ends with what may begin another: given up later, it was part of the damaged one all the same."""
+    damaged = GOLDEN[: -len(end)] + end
+    stream = damaged + bytes([0xFF] * 40)
+    whole, split = codec(), codec()
+    whole.feed(stream)
+    for place in range(len(stream)):
+        split.feed(stream[place : place + 1])
+    assert whole.ledger.snapshot() == split.ledger.snapshot()
+    header_bytes = 6 if len(end) > 1 else len(end)  # a whole sync word claims a header
+    assert whole.ledger.bytes_in_bad_frames == len(damaged) - len(end) + header_bytes
+    assert whole.ledger.closes()
+
+
+@pytest.mark.manual("A 1.2 CRC")
+def test_short_frames_are_bad_and_every_single_bit_matters() -> None:
+    for frame_id, size in ((2, 43), (0xFF, 21), (6, 23), (2, 5)):
+        frame, tested = encode_frame(DEVICE_SYNC, frame_id, bytes(size)), codec()
+        assert tested.feed(frame) == [BadFrame(BadReason.CONTENT, frame)]
+        assert (tested.ledger.frames_bad_content, tested.ledger.bytes_in_bad_frames) == (1, len(frame))
+        assert tested.ledger.closes()
+    for place in range(len(GOLDEN)):
+        for bit in (0, 3, 7):
+            flipped = bytearray(GOLDEN)
+            flipped[place] ^= 1 << bit
+            tested = codec()
+            events = [*tested.feed(bytes(flipped)), *tested.feed(bytes(FRAME_BYTES_MAX))]
+            assert not any(isinstance(event, Measurement) for event in events), (place, bit)
+            assert tested.ledger.closes()

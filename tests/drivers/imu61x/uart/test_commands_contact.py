@@ -1,0 +1,63 @@
+"""Steps of scripts: contact in either mode, results by one option, what is sent when a device stays quiet."""
+
+import pytest
+
+from imud.contracts.script import Reply, RequestScript, Silence
+from imud.drivers.imu61x.uart import commands
+from imud.drivers.imu61x.uart import commands as contact
+from imud.drivers.imu61x.uart.codec import Parameter
+from imud.drivers.imu61x.uart.commands import Imu61xUartSettings, OutputMode
+from imud.model.errors import NoReply, Rejected
+from imud.sim.imu61x.uart import Imu61xSettings
+from tests.support.simulated_modules import every_variant, imu61x_bench, variant_bench
+
+
+def _baud() -> RequestScript[float]:
+    return contact.read(Parameter.BAUD)
+
+
+@every_variant
+def test_contact_leaves_the_mode_as_it_was(variant: str) -> None:
+    for mode in OutputMode:
+        far = variant_bench(variant, Imu61xSettings(mode=mode))
+        assert far.run(contact.in_contact(_baud)) == 115200
+        far.samples(800)
+        assert bool(far.samples(1000)) is (mode is OutputMode.STREAM)
+
+
+def test_every_request_in_command_mode_can_be_undone() -> None:
+    """A script that is cancelled anywhere after CMD 3 leaves the bytes that make the device stream."""
+    far = imu61x_bench(answers_while_streaming=False)
+    script = contact.in_contact(_baud)
+    request = next(script)
+    undone = []
+    with pytest.raises(StopIteration):  # noqa: PT012  # driven by hand
+        while True:
+            undone.append((request.name, request.undo == contact.STREAM))
+            request = script.send(far.ask(request))
+    assert undone[0] == ("status", False)
+    assert [undo for name, undo in undone[1:] if name != "output mode STREAM"] == [True] * 3
+
+
+def test_result_is_judged_by_the_option() -> None:
+    far = imu61x_bench(Imu61xSettings(mode=OutputMode.COMMAND), result_done=1)
+    assert far.run(contact.ordered(commands.reset_heading(0), 1)) is True
+    with pytest.raises(Rejected, match="heading reset: expected result 0"):
+        far.run(contact.ordered(commands.reset_heading(0), 0))
+    far = imu61x_bench(Imu61xSettings(mode=OutputMode.COMMAND), acknowledges=False)
+    assert far.run(contact.ordered(commands.reset_heading(0), 0)) is False
+    assert Imu61xUartSettings() == Imu61xUartSettings(result_done=0, calibration_done=0)
+    assert contact.result_of(Silence(())) is None
+    assert contact.result_of(Reply(("text",))) is None
+
+
+def test_a_device_that_never_answers_again_is_no_reply() -> None:
+    script = contact.settled()
+    request = next(script)
+    asked = 1
+    with pytest.raises(NoReply, match="status: expected a reply, got nothing"):  # noqa: PT012  # driven by hand
+        while True:
+            request = script.send(Silence(()))
+            asked += 1
+    assert asked == contact.SETTLE_TRIES
+    assert request.name == "status"

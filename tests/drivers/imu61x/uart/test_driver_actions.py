@@ -1,0 +1,181 @@
+"""Actions of an IMU61x on a UART, against the simulated device."""
+
+from math import nan
+from typing import Any
+
+import pytest
+
+from imud.contracts.command import Target
+from imud.drivers.imu61x.uart.commands import Imu61xUartSettings
+from imud.drivers.imu61x.uart.driver import ACTIONS
+from imud.drivers.imu61x.uart.settings import BaudChange
+from imud.model.errors import BadArgument, CommandError
+from imud.sim.imu61x.uart import REFUSING, VARIANTS, Imu61xSettings
+from tests.support.simulated_modules import Imu61xBench, done, imu61x_bench, variant_bench
+
+
+def act(far: Imu61xBench, name: str, options: Imu61xUartSettings | None = None, **arguments: Any) -> Any:
+    action = ACTIONS[name]
+    return far.run(action.script(Target(options, far.baud), action.arguments(arguments)))
+
+
+ARGUMENTS: dict[str, dict[str, Any]] = {
+    "rate": {"rate_hz": 50},
+    "filter": {"accel_filter": "5 Hz", "gyro_filter": 13},
+    "i2c_address": {"address": "0x1A"},
+    "bus": {"bus": "i2c"},
+    "heading": {"heading_deg": 90},
+    "baud": {"baud": 230400},
+}
+CODED = [name for name, one in VARIANTS.items() if one.result_done]
+"""Variants whose result for done is not 0."""
+WITHOUT_K1 = ("save", "heading", "calibrate_gyro", "calibrate_installation", "installation_status")
+"""What only an acknowledgement can tell of; where CMD 8 has no other answer, it is one of them."""
+
+
+@pytest.mark.parametrize("variant", ["obeys while it streams", "no K1", *CODED])
+@pytest.mark.parametrize("name", ACTIONS)
+def test_every_action(variant: str, name: str) -> None:
+    """The scripts of the actions are tested in every variant; here an action must reach them with its arguments."""
+    far = variant_bench(variant, uptime_us=20_000_000)
+    options = Imu61xUartSettings(result_done=done(variant))
+    if variant == "no K1" and name in WITHOUT_K1 and name != "installation_status":
+        with pytest.raises(CommandError, match="whether it is done is not known"):
+            act(far, name, options, **ARGUMENTS.get(name, {}))
+    else:
+        act(far, name, options, **ARGUMENTS.get(name, {}))
+    far.samples(1000)
+    assert bool(far.samples(100)) is (name != "stop_streaming")
+    assert far.baud == far.module.baud
+
+
+ORDERS = (
+    "stop_streaming", "save", "restart", "baud", "rate", "filter", "i2c_address", "bus", "heading", "calibrate_gyro",
+    "calibrate_installation", "factory_reset",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ORDERS)
+def test_every_order_to_a_device_that_refuses_is_an_error(name: str) -> None:
+    """It keeps what it had, and streams on."""
+    settings = Imu61xSettings(rate_hz=200)
+    far = imu61x_bench(settings, behaviour=REFUSING, uptime_us=20_000_000)
+    with pytest.raises(CommandError):
+        act(far, name, **ARGUMENTS.get(name, {}))
+    assert far.module.settings == far.module.flash == settings
+    assert far.baud == 115200
+    assert len(far.samples(100)) >= 15
+
+
+@pytest.mark.manual("A 1.6 CMD 3 stream", "A 1.6 CMD 3 command", "A 1.6 CMD 14, 3")
+def test_answers_of_actions() -> None:
+    far = imu61x_bench()
+    answer = act(far, "stop_streaming")
+    assert answer["output_mode"] == "command"
+    assert "start_streaming" in answer["configuration"]
+    assert not far.samples(50)
+    act(far, "start_streaming")
+    assert far.samples(50)
+
+    far = imu61x_bench()
+    assert act(far, "baud", baud=460800) == BaudChange(460800, saved=True)
+    assert far.baud == far.module.baud == 460800
+
+    far = imu61x_bench()
+    assert act(far, "status")["model_number"] == 614
+    assert act(far, "settings")["output_rate_hz"] == "100"
+    assert set(act(far, "sample_once")) > {"accel_m_s2", "gyro_rad_s"}
+
+    far = imu61x_bench()
+    for name in ("calibrate_gyro", "calibrate_installation"):
+        assert len(act(far, name)) == 3
+
+    far = imu61x_bench(result_done=4)
+    act(far, "save", Imu61xUartSettings(result_done=4))
+    with pytest.raises(CommandError, match=r"options\.result_done"):
+        act(far, "save")
+
+    far = imu61x_bench(uptime_us=20_000_000)
+    act(far, "baud", baud=921600)
+    assert getattr(act(far, "restart"), "product", "") == "IMU61x"
+    act(far, "factory_reset")
+    assert far.baud == far.module.baud == 115200
+
+
+@pytest.mark.manual("A 1.6 CMD 14, 21", "A 1.6 CMD 14, 27", "A 1.6 CMD 14, 30", "A 1.6 CMD 14, 31")
+def test_parameters_are_set_and_stay() -> None:
+    far = imu61x_bench()
+    act(far, "rate", rate_hz=200)
+    assert act(far, "filter", accel_filter=3, gyro_filter="15 Hz") == {"accel_filter": "5 Hz", "gyro_filter": "15 Hz"}
+    address, bus = act(far, "i2c_address", address=0x19), act(far, "bus", bus="i2c")
+    assert address["i2c_address"] == "0x19"
+    assert "`i2c.address` must be the new one" in address["configuration"]
+    assert "a host on the bus that was selected before loses the device" in bus["configuration"]
+    act(far, "save")
+    far.restart()
+    settings = far.module.settings
+    assert (settings.rate_hz, settings.filter_control, settings.i2c_address) == (200, 0x35, 0x19)
+
+
+def test_a_rate_that_the_line_does_not_carry_is_refused_before_anything_is_sent() -> None:
+    far = imu61x_bench()
+    words = "rate_hz: expected at most 200 Hz at 115200 baud, got 400 Hz, .* 400 Hz need 230400 baud; set that first"
+    with pytest.raises(BadArgument, match=words):
+        act(far, "rate", rate_hz=400)
+    assert far.asked == []
+    act(far, "baud", baud=230400)
+    act(far, "rate", rate_hz=400)
+    assert len(far.samples(100)) >= 39
+    with pytest.raises(BadArgument, match="lower the output rate first"):
+        act(far, "baud", baud=115200)
+    assert len(far.samples(100)) >= 35
+    assert "10 = 40 Hz, 11 = 47 Hz, 12 = average 4" in ACTIONS["filter"].help
+    for name, words in (
+        ("stop_streaming", "cuts off"),
+        ("baud", "`uart.baud`"),
+        ("factory_reset", "`uart.baud`"),
+        ("i2c_address", "`i2c.address`"),
+        ("bus", "loses the device"),
+    ):
+        assert words in ACTIONS[name].help
+
+
+@pytest.mark.parametrize("name", ["baud", "factory_reset"])
+def test_a_fixed_rate_in_the_configuration_is_to_be_changed(name: str) -> None:
+    far = imu61x_bench(Imu61xSettings(baud=921600))
+    action = ACTIONS[name]
+    arguments = action.arguments({"baud": 115200} if name == "baud" else {})
+    answer = far.run(action.script(Target(None, 921600, fixed_baud=921600), arguments))
+    assert answer.configuration == "change `uart.baud` from 921600 to 115200 or auto: imud uses it at its next start"
+    back = ACTIONS["baud"]
+    assert far.run(back.script(Target(None, 115200, 921600), back.arguments({"baud": 921600}))).configuration == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "named"),
+    [
+        ("baud", {"baud": 9600}, "one of 115200, 230400, 460800, 921600, 1500000"),
+        ("baud", {"baud": True}, "baud"),
+        ("rate", {"rate_hz": 0}, "one of 1, 10, 50, 100, 200, 400"),
+        ("rate", {"rate_hz": 100.5}, "rate_hz"),
+        ("bus", {"bus": 1}, '"spi"'),
+        ("i2c_address", {"address": 0x1C}, "address"),
+        ("i2c_address", {"address": "0x1c"}, "address"),
+        ("i2c_address", {"address": "18"}, "address"),
+        ("filter", {"accel_filter": 16, "gyro_filter": 0}, "accel_filter"),
+        ("filter", {"accel_filter": "9 Hz", "gyro_filter": 0}, '"0.2 Hz", "1 Hz", "2 Hz", "5 Hz", "10 Hz", "15 Hz"'),
+        ("filter", {"accel_filter": -1, "gyro_filter": 0}, "accel_filter"),
+        ("filter", {"accel_filter": 0, "gyro_filter": True}, "gyro_filter"),
+        ("heading", {"heading_deg": -0.1}, "from 0 to 360"),
+        ("heading", {"heading_deg": 360.1}, "from 0 to 360"),
+        ("heading", {"heading_deg": nan}, "from 0 to 360"),
+        ("heading", {"heading_deg": True}, "from 0 to 360"),
+        ("heading", {"heading_deg": "90"}, "from 0 to 360"),
+    ],
+)
+@pytest.mark.manual("A 1.6 other values")
+def test_what_the_device_would_not_take_is_refused(name: str, arguments: dict[str, Any], named: str) -> None:
+    far = imu61x_bench()
+    with pytest.raises(BadArgument, match=named):
+        act(far, name, **arguments)
+    assert not far.asked

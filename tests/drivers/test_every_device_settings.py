@@ -1,0 +1,191 @@
+"""The settings of every driver by its table alone: described, declarable, written as declared and read as accepted.
+
+Simulated modules behind a pseudo-terminal are set to an example of each setting by the running daemon, and say so.
+"""
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from subprocess import PIPE, Popen
+from typing import Any
+
+import msgspec
+import pytest
+from msgspec import inspect
+
+from imud import config
+from imud.client.connection import Client
+from imud.config.yaml import yaml_block
+from imud.contracts.command import Target
+from imud.contracts.setting import DeviceSettings, Effect, SettingInfo, declared_values
+from imud.device.settings_plan import described_settings, differences, make_plan, wanted_values
+from imud.drivers import DRIVERS
+from imud.formats.jsonrpc import RpcError
+from imud.links import LINKS
+from imud.model.errors import BadArgument, ConfigError
+from imud.sim import SIMULATORS
+from tests.support.daemon_process import running_daemon, wait_until
+
+TABLES = {name: driver.device_settings for name, driver in DRIVERS.items() if driver.device_settings is not None}
+EVERY = [(name, setting) for name, table in TABLES.items() for setting in table.table]
+every_table = pytest.mark.parametrize("name", TABLES)
+every_setting = pytest.mark.parametrize(("driver", "name"), EVERY)
+PLACES = ("baud", "address", "node", "bit_rate", "i2c_address")
+"""Settings that would take a module away from its test."""
+
+
+def table_of(driver: str) -> DeviceSettings:
+    found = DRIVERS[driver].device_settings
+    assert found is not None
+    return found
+
+
+def info_of(driver: str, name: str) -> SettingInfo:
+    return next(one for one in described_settings(table_of(driver), {}, None) if one.name == name)
+
+
+def example(info: inspect.Type, last: bool = False) -> Any:
+    """A value of a type; the other one with `last`, where there is more than one."""
+    value: Any = None
+    match info:
+        case inspect.Metadata(type=inner):
+            value = example(inner, last)
+        case inspect.UnionType(types=types):
+            value = example(types[0], last)
+        case inspect.LiteralType(values=values):
+            value = sorted(values, key=str)[-1 if last else 0]
+        case inspect.BoolType():
+            value = last
+        case inspect.IntType() | inspect.FloatType():
+            low, high = (bound if bound is not None else default for bound, default in ((info.ge, 1), (info.le, 2)))
+            value = high if last else low
+        case inspect.ListType(item_type=item, min_length=shortest):
+            value = [example(item, last)] * (shortest or 1)
+        case inspect.DictType(key_type=key, value_type=item):
+            value = {example(key): example(item, last)}
+        case inspect.StructType(fields=fields):
+            value = {one.encode_name: example(one.type, number % 2 == 1) for number, one in enumerate(fields)}
+    assert value is not None, f"no example of {info}"
+    return value
+
+
+def examples(driver: str, name: str) -> list[Any]:
+    """Two JSON values of a setting, the same one twice where it has only one."""
+    info = inspect.type_info(table_of(driver).table[name].type)
+    return [example(info), example(info, last=True)]
+
+
+@every_table
+def test_tables_can_do_what_their_settings_need(name: str) -> None:
+    """With nothing told by the device all that can be read differs, and nothing else."""
+    table = table_of(name)
+    assert table.table
+    settings = table.table.values()
+    if any(setting.effect is Effect.AFTER_RESTART and not setting.saves for setting in settings):
+        assert table.save is not None
+        assert table.restart is not None
+    assert all(setting.readable or setting.write is not None for setting in settings)
+    fields = set(table.declarable.__struct_fields__)
+    assert fields == {one for one, setting in table.table.items() if setting.write is not None}
+    order = [setting.connection for setting in settings]
+    assert order == sorted(order), "settings that change the connection stand last"
+
+    table = table_of(name)
+    settable = [one for one, setting in table.table.items() if setting.write is not None]
+    declared = msgspec.convert({one: examples(name, one)[1] for one in settable}, table.declarable)
+    values = declared_values(declared)
+    assert list(values) == settable
+    assert set(differences(table, values, {}, {})) == {one for one in settable if table.table[one].readable}
+
+
+@every_setting
+def test_every_setting_describes_itself_and_can_be_declared(driver: str, name: str) -> None:
+    one = info_of(driver, name)
+    assert name == name.lower()
+    assert name.isidentifier()
+    assert one.description
+    assert not one.description.endswith(".")
+    assert one.section
+    assert "keys and values" not in one.values
+    if name.endswith(("_ms", "_hz", "_deg", "_deg_s")):
+        assert one.unit, "a setting with a unit in its name says it"
+    table = table_of(driver)
+    setting = table.table[name]
+    for value in examples(driver, name):
+        typed = msgspec.convert(value, setting.type)
+        assert msgspec.to_builtins(typed) == msgspec.to_builtins(
+            msgspec.convert(msgspec.to_builtins(typed), setting.type)
+        )
+        assert setting.agrees(typed, typed)
+        if setting.write is None:
+            with pytest.raises(BadArgument, match="only be read"):
+                wanted_values(table, {name: value})
+            continue
+        wanted = wanted_values(table, {name: value})
+        link = next(link for link in LINKS if LINKS[link].fits(DRIVERS[driver]) and link not in ("memory", "replay"))
+        text = yaml_block({"driver": driver, "settings": {name: value}})
+        assert errors_but_of_the_link(text, link) == []
+        assert differences(table, wanted, wanted, {}) == {}
+        target = Target(DRIVERS[driver].settings(), 0)
+        plan = make_plan(table, target, wanted, {}, {}, save=True, unsaved=False)
+        if plan.left_out:  # an own setting of a bus on which nothing can be saved
+            assert table.save is None
+        else:
+            assert [step.name for step in plan.steps] == [name]
+
+
+def errors_but_of_the_link(device: str, link: str) -> list[str]:
+    """What is wrong with the device's settings in a configuration whose link has no keys."""
+    body = "".join(f"    {line}\n" for line in device.splitlines())
+    try:
+        config.parse(f"devices:\n  bow:\n{body}    {link}: {{}}\n", "f")
+    except ConfigError as error:
+        return [line for line in str(error).splitlines() if ".settings" in line and "where imud is told" not in line]
+    return []
+
+
+LINK_OF = {"hipnuc-uart": "uart", "hipnuc-modbus": "rs485", "imu61x-uart": "uart"}
+
+
+def simulated_device(driver: str, port: Path) -> dict[str, Any]:
+    link = {"uart": {"port": str(port), "baud": 115200}, "rs485": {"line": str(port), "reply_ms": 200}}
+    return {"driver": driver, LINK_OF[driver]: link[LINK_OF[driver]]}
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("name", [name for name in SIMULATORS if name in TABLES])
+def test_a_simulated_module_takes_every_setting_and_tells_it(name: str, tmp_path: Path) -> None:
+    """One after the other, to the one value and to the other; what cannot go together is refused in words."""
+    table = table_of(name)
+    settable = [one for one, setting in table.table.items() if setting.write is not None and one not in PLACES]
+    with ExitStack() as stack:
+        argv = [sys.executable, "-m", "imud.sim", "--device", name, "--path", str(tmp_path / "port")]
+        simulator = stack.enter_context(Popen(argv, stdin=PIPE, stdout=PIPE, text=True))
+        stack.callback(simulator.communicate)
+        stack.callback(simulator.terminate)
+        assert simulator.stdout is not None
+        assert simulator.stdout.readline()
+        devices = {"bow": simulated_device(name, tmp_path / "port")}
+        daemon = stack.enter_context(running_daemon(tmp_path, devices))
+        daemon.wait_for("bow", "running")
+        with daemon.client() as client:
+            client.timeout_s = 60
+            told = {one["name"] for one in client.call("settings.get", device="bow", fresh=True)["settings"]
+                    if one["actual"] is not None}  # fmt: skip
+            assert {one for one in table.table if table.table[one].readable} <= told
+            for one in settable:
+                taken = [value for value in examples(name, one) if takes(client, one, value)]
+                assert taken, f"none of {examples(name, one)} for {one}"
+                wait_until(lambda: daemon.statuses()["bow"].state in ("running", "silent"), "it is there")
+
+
+def takes(client: Client, name: str, value: Any) -> bool:
+    """Whether the module takes a value, which it has then; else it does not go together with what it has."""
+    try:
+        done = client.call("settings.apply", device="bow", settings={name: value}, save=True)
+    except RpcError as error:
+        assert "expected" in str(error)  # noqa: PT017 - with what it does not go together, which no match can know
+        return False
+    assert (done["problem"], done["differences"]) == ("", {}), (name, value, done)
+    assert {step["outcome"] for step in done["steps"]} <= {"done", "written, not verified"}
+    return True

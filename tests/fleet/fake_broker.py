@@ -1,0 +1,100 @@
+"""A broker in memory for the sender: takes what is sent when the test says so, and fails when it says so."""
+
+import threading
+from collections.abc import Callable
+
+from imud.fleet.broker import BrokerError, Received, Will
+from imud.fleet.settings import Broker, MqttSettings
+from tests.support.daemon_process import LIMIT_S
+
+
+class FakeConnection:
+    """A connection to it."""
+
+    def __init__(self, broker: "FakeBroker") -> None:
+        self.acknowledged: list[int] = []
+        self.in_flight_max = broker.window
+        self.received: list[Received] = []
+        self.subscribed: list[str] = []
+        self.correlations: list[bytes | None] = []
+        self.sent: list[tuple[str, bytes, bool]] = []
+        self.types: list[str] = []
+        self.closed = False
+        self.rings = 0
+        self._bell = threading.Event()
+        self._broker = broker
+        self._answered = 0
+
+    def subscribe(self, topic: str) -> None:
+        self.subscribed.append(topic)
+
+    def publish(
+        self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
+    ) -> int:
+        self.correlations.append(correlation)
+        self.sent.append((topic, payload, retain))
+        self.types.append(content_type)
+        with self._broker.changed:
+            self._broker.changed.notify_all()
+        return len(self.sent)
+
+    def wait(self, seconds: float) -> None:
+        """Acknowledge what is not held back; fail if the broker is to."""
+        if self._broker.problem:
+            raise BrokerError(self._broker.problem)
+        while self._answered < len(self.sent) and self._broker.answers > 0:
+            self._broker.answers -= 1
+            self._answered += 1
+            self.acknowledged.append(self._answered)
+        if self._broker.blocks and not self.acknowledged:
+            self._bell.wait(seconds)
+            self._bell.clear()
+
+    def ring(self) -> None:
+        self.rings += 1
+        self._bell.set()
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class FakeBroker:
+    """The broker. `connect` is a `Connect`; with `blocks` waits are waits, for a sender that runs."""
+
+    def __init__(self, *, blocks: bool = False) -> None:
+        self.blocks = blocks
+        self.changed = threading.Condition()
+        self.connections: list[FakeConnection] = []
+        self.asked: list[str] = []
+        self.problem = ""
+        """Why every connection fails now; empty for none."""
+        self.answers = 1_000_000
+        """Acknowledgements that are still given."""
+        self.window = 4
+        self.will: Will | None = None
+        self.connecting, self.accepts = threading.Event(), threading.Event()
+        self.accepts.set()
+        self.was_wanted = True
+        """What the sender said when the newest connection was accepted."""
+
+    def connect(
+        self, broker: Broker, _settings: MqttSettings, _client_id: str, will: Will, is_wanted: Callable[[], bool]
+    ) -> FakeConnection:
+        """Accept, or not; with `accepts` unset once it is set, whether the connection is still wanted or not."""
+        self.asked.append(broker.host)
+        self.will = will
+        self.connecting.set()
+        assert self.accepts.wait(LIMIT_S)
+        self.was_wanted = is_wanted()
+        if self.problem:
+            raise BrokerError(self.problem)
+        self.connections.append(FakeConnection(self))
+        return self.connections[-1]
+
+    def wait_for(self, topic: str, holds: Callable[[bytes], bool] = lambda payload: True) -> None:
+        """Wait until a message of the topic was sent whose payload fits."""
+        with self.changed:
+            assert self.changed.wait_for(
+                lambda: any(sent[0] == topic and holds(sent[1]) for one in self.connections
+                            for sent in one.sent), LIMIT_S
+            )  # fmt: skip

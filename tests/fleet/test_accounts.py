@@ -1,0 +1,74 @@
+"""The ledger of a reader: closes after every message, whatever comes in which order how often."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imud.fleet.accounts import FleetLedger, StreamCounts
+from imud.fleet.messages import VERSION, DropCause, FleetMessage, Interval, MessageKind, Stream
+from imud.model.sample import Sample, Sync
+
+
+def message(first: int, last: int, kind: MessageKind = MessageKind.SAMPLES, *, boot: str = "1") -> FleetMessage:
+    samples = [Sample("bow", seq, seq, 0, Sync.ARRIVAL, seq, seq) for seq in range(first, last + 1)]
+    return FleetMessage(
+        v=VERSION, gateway="gw", boot=boot, device="bow", kind=kind, begin=1, first=first, last=last,
+        count=last - first + 1, utc_ns=0, cause=DropCause.SPACE if kind is MessageKind.DROPPED else None,
+        samples=samples if kind is MessageKind.SAMPLES else [],
+        intervals=[Interval(first, last, 1, 0, 0, 0, 0, 0, Sync.ARRIVAL, {})] if kind is MessageKind.INTERVALS else [],
+    )  # fmt: skip
+
+
+def counts_of(*messages: FleetMessage, stream: Stream = Stream.SAMPLES, from_begin: bool = True) -> StreamCounts:
+    ledger = FleetLedger(from_begin=from_begin)
+    for one in messages:
+        ledger.take(one, stream)
+    (counts,) = ledger.counts.values()
+    assert counts.balance == 0
+    return counts
+
+
+def test_each_number_counts_once_and_is_not_given_twice() -> None:
+    dropped, intervals = MessageKind.DROPPED, MessageKind.INTERVALS
+    counts = counts_of(message(1, 10), message(11, 20, intervals), message(21, 25, dropped), message(28, 30))
+    assert counts == StreamCounts(1, 30, whole=13, thinned=10, dropped={"space": 5}, missing=2)
+    assert counts_of(message(1, 4, intervals), stream=Stream.STATISTICS) == StreamCounts(1, 4, whole=4)
+    counts = counts_of(message(1, 10), message(5, 20, dropped))
+    assert counts == StreamCounts(1, 20, whole=10, dropped={"space": 10}, duplicates=6)
+    counts = counts_of(message(1, 2), message(9, 10), message(4, 6))
+    assert counts == StreamCounts(1, 10, whole=7, missing=3), "missing samples can arrive later"
+    assert counts_of(message(7, 8), from_begin=False) == StreamCounts(7, 8, whole=2)
+    assert counts_of(message(7, 8)) == StreamCounts(1, 8, whole=2, missing=6)
+    ledger = FleetLedger()
+    assert ledger.take(message(1, 10), Stream.SAMPLES) is not None
+    assert ledger.take(message(1, 10), Stream.SAMPLES) is None
+    partly = ledger.take(message(8, 12), Stream.SAMPLES)
+    assert partly is not None
+    assert [one.seq for one in partly.samples] == [11, 12]
+    (counts,) = ledger.counts.values()
+    assert counts == StreamCounts(1, 12, whole=12, duplicates=13)
+    ledger.take(message(1, 3, boot="2"), Stream.SAMPLES)
+    assert [one.whole for one in ledger.counts.values()] == [12, 3]
+
+
+RANGES = st.tuples(st.integers(1, 40), st.integers(0, 12)).map(lambda pair: (pair[0], pair[0] + pair[1]))
+
+
+@given(
+    st.lists(
+        st.tuples(RANGES, st.sampled_from([MessageKind.SAMPLES, MessageKind.DROPPED, MessageKind.INTERVALS])),
+        min_size=1,
+    )
+)
+def test_it_closes_whatever_comes(taken: list[tuple[tuple[int, int], MessageKind]]) -> None:
+    ledger = FleetLedger(from_begin=True)
+    seen: set[int] = set()
+    for (first, last), kind in taken:
+        fresh = ledger.take(message(first, last, kind), Stream.SAMPLES)
+        new = set(range(first, last + 1)) - seen
+        assert (fresh is None) == (not new)
+        if fresh is not None and kind is MessageKind.SAMPLES:
+            assert {one.seq for one in fresh.samples} == new
+        seen |= new
+        (counts,) = ledger.counts.values()
+        assert counts.balance == 0
+        assert counts.missing == max(seen) - len(seen)

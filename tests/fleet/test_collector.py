@@ -1,0 +1,212 @@
+"""The collector with a real broker: what the store has is acknowledged, and its ledger goes on."""
+
+import asyncio
+import gc
+import threading
+from collections.abc import Sequence
+
+import msgspec
+import pytest
+
+from imud.fleet.accounts import (
+    Accounts,
+    BootKey,
+    BootOffset,
+    FleetLedger,
+    GatewayState,
+    StoredAccount,
+    StreamKey,
+    StreamPosition,
+)
+from imud.fleet.collector import BATCHES_MAX, GC_ALLOCATIONS, TURN_BYTES, FleetCollector, Offsets
+from imud.fleet.messages import GatewayClock, decode_message, encode_message
+from imud.fleet.reader import RECEIVE_MAX, Fleet, FleetBatch
+from imud.host.threads import rare_garbage_collection
+from imud.model.errors import ServerError
+from imud.model.event import Event, EventKind
+from tests.fleet.fleet_gateway import UTC_NS, SendingGateway, intervals_message, samples_message, synchronised
+from tests.fleet.mosquitto import Mosquitto
+from tests.fleet.proxy import Proxy
+from tests.support.daemon_process import LIMIT_S
+
+pytestmark = pytest.mark.live
+
+
+class MemoryStore:
+    """A store that keeps what it is given, and fails when it is told to."""
+
+    def __init__(self) -> None:
+        self.rows: list[int] = []
+        self.accounts: dict[StreamKey, StoredAccount] = {}
+        self.offsets: dict[BootKey, BootOffset] = {}
+        self.fails = False
+        self.collector: FleetCollector | None = None
+        self.most = 1 << 30
+
+    def restore(self, ledger: FleetLedger) -> None:
+        for key, account in self.accounts.items():
+            ledger.restore(key, account)
+
+    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
+        if self.fails:
+            raise ServerError("the store is full")
+        self.rows += [sample.seq for batch in batches for sample in batch.message.samples]
+        self.accounts |= accounts
+        self.offsets |= offsets
+        if len(self.rows) >= self.most and self.collector is not None:
+            self.collector.stop()
+
+    def close(self) -> None:
+        pass
+
+
+def collect(broker: Mosquitto | Proxy, store: MemoryStore, most: int) -> Fleet:
+    """Run the collector until the store has so many rows."""
+    fleet = Fleet(f"mqtt://127.0.0.1:{broker.port}", name="archive", retry_max_s=1.0)
+    store.most = most
+    store.collector = FleetCollector(fleet, store)
+
+    async def run() -> None:
+        assert store.collector is not None
+        async with asyncio.timeout(LIMIT_S):
+            await store.collector.run()
+
+    asyncio.run(run())
+    return fleet
+
+
+def begin_session(broker: Mosquitto) -> None:
+    fleet = Fleet(f"mqtt://127.0.0.1:{broker.port}", name="archive", retry_max_s=1.0)
+
+    async def run() -> None:
+        running = asyncio.ensure_future(FleetCollector(fleet, MemoryStore()).run())
+        async with asyncio.timeout(LIMIT_S):
+            while not any("Sending SUBACK to imud-reader-archive" in line for line in broker.log):
+                await asyncio.sleep(0.005)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    asyncio.run(run())
+    assert not fleet.problem
+
+
+def test_what_a_store_refused_comes_again_to_the_next_collector(broker: Mosquitto, gateway: SendingGateway) -> None:
+    begin_session(broker)
+    gateway.send(samples_message(1, 5), samples_message(6, 9))
+    store = MemoryStore()
+    store.fails = True
+    with pytest.raises(ServerError, match="the store is full"):
+        collect(broker, store, 9)
+    store.fails = False
+    collect(broker, store, 9)
+    assert store.rows == list(range(1, 10))
+    # a restarted collector knows what it had
+    gateway.send(samples_message(1, 5), samples_message(10, 12))
+    fleet = collect(broker, store, 12)
+    assert store.rows == list(range(1, 13))
+    (account,) = fleet.accounts.values()
+    assert (account.received, account.counts.duplicates, account.balance) == (12, 5, 0)
+    assert store.accounts == {StreamKey("gw", "1", "bow", "samples"): StoredAccount(account.counts, [])}
+
+
+class ResettingStore(MemoryStore):
+    """A store whose collector loses its connection while it writes, so that acknowledgements meet the reset."""
+
+    def __init__(self, proxy: Proxy, resets: int) -> None:
+        super().__init__()
+        self.proxy, self.resets = proxy, resets
+
+    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
+        super().write(batches, accounts, offsets)
+        if self.resets:
+            self.resets -= 1
+            self.proxy.reset()
+
+
+def test_a_reset_while_a_transaction_is_acknowledged_costs_a_connection_and_nothing_else(
+    broker: Mosquitto, gateway: SendingGateway, proxy: Proxy
+) -> None:
+    begin_session(broker)
+    number = BATCHES_MAX + 100
+    gateway.send(*(samples_message(n, n) for n in range(1, number + 1)))
+    store = ResettingStore(proxy, 3)
+    fleet = collect(proxy, store, number)
+    assert store.rows == list(range(1, number + 1))
+    (account,) = fleet.accounts.values()
+    assert (account.received, account.balance) == (number, 0)
+    assert fleet.connections >= 2
+    assert account.counts.duplicates > 0
+
+
+class SlowStore(MemoryStore):
+    """A store whose first transaction lasts until the test allows it to end."""
+
+    def __init__(self, *, is_slow: bool) -> None:
+        super().__init__()
+        self.goes_on = threading.Event()
+        self.sizes: list[int] = []
+        if not is_slow:
+            self.goes_on.set()
+
+    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
+        self.sizes.append(len(batches))
+        assert self.goes_on.wait(LIMIT_S)
+        super().write(batches, accounts, offsets)
+
+
+def test_a_slow_store_is_given_more_at_once_and_its_ledger_closes(broker: Mosquitto, gateway: SendingGateway) -> None:
+    begin_session(broker)
+    number = RECEIVE_MAX + BATCHES_MAX
+    store = SlowStore(is_slow=True)
+
+    def send() -> None:
+        gateway.send(samples_message(1, 1))
+        while not store.sizes:  # the first message is alone in its transaction
+            store.goes_on.wait(0.005)
+        gateway.send(*(samples_message(n, n) for n in range(2, number + 1)))
+        store.goes_on.set()
+
+    sending = threading.Thread(target=send)
+    sending.start()
+    gateway.send_state(
+        GatewayState(v=1, online=True, boot="1", positions=[StreamPosition("1", "bow", "samples", 1, number)])
+    )
+    fleet = collect(broker, store, number)
+    sending.join()
+    assert store.rows == list(range(1, number + 1))
+    assert max(store.sizes) == BATCHES_MAX, "the messages of the meantime fill a transaction"
+    (account,) = fleet.accounts.values()
+    assert (account.sent, account.received, account.in_spool, account.balance) == (number, number, 0, 0)
+    assert (account.counts.missing, account.counts.duplicates) == (0, 0)
+
+
+def test_what_waits_in_memory_is_bounded_in_bytes(broker: Mosquitto, gateway: SendingGateway) -> None:
+    begin_session(broker)
+    text = [Event(0, "bow", EventKind.UP, "1" * 100_000)]
+    large = [msgspec.structs.replace(samples_message(n, n), events=text) for n in range(1, 151)]
+    gateway.send(*large)
+    store = SlowStore(is_slow=False)
+    collect(broker, store, 150)
+    assert store.rows == list(range(1, 151))
+    assert max(store.sizes) <= TURN_BYTES // 100_000 + 1
+
+
+def test_a_state_that_knows_the_clock_gives_the_store_its_offset(broker: Mosquitto, gateway: SendingGateway) -> None:
+    clock = GatewayClock(9, UTC_NS, synchronised=True, error_ns=700)
+    gateway.send_state(GatewayState(v=1, online=True, boot="1", clock=clock))
+    store = MemoryStore()
+    collect(broker, store, 0)
+    assert store.offsets == {BootKey("gw", "1"): BootOffset(9, UTC_NS, 700)}
+
+
+def test_what_a_collector_holds_is_nothing_to_the_search_for_cycles() -> None:
+    """A collector holds hundreds of thousands of these objects, which a search would go through."""
+    message = decode_message(encode_message(synchronised(intervals_message(1, 5))))
+    (interval,) = message.intervals
+    for one in (message, message.clock, interval, interval.values["accel_m_s2"]):
+        assert not gc.is_tracked(one)
+    before = gc.get_threshold()
+    with rare_garbage_collection(GC_ALLOCATIONS):
+        assert gc.get_threshold()[0] == GC_ALLOCATIONS > before[0]
+    assert gc.get_threshold() == before
+    assert not gc.get_freeze_count()

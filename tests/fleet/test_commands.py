@@ -1,0 +1,444 @@
+"""The command channel: what is refused and why, that a request is carried out once, and a real broker with rights."""
+
+import asyncio
+import re
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from imud.contracts.publisher import PublisherContext
+from imud.fleet.broker import Received
+from imud.fleet.commands import ANSWERS_KEPT, WAITING_MAX, CommandChannel, CommandReply
+from imud.fleet.messages import REQUEST_BYTES, CommandAnswer, Outcome, answer_topic
+from imud.fleet.publisher import MqttPublisher
+from imud.fleet.settings import CommandSettings, MqttSettings
+from imud.fleet.streams import Gateway
+from imud.host.clock import HostClock
+from imud.host.log import RepeatFilter
+from imud.model.errors import BadArgument, CommandError
+from imud.model.options import wrong_values
+from imud.model.units import NS_PER_S
+from tests.fleet.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
+from tests.support.daemon_process import LIMIT_S
+from tests.support.event_loops import VirtualClock, in_loop
+
+UTC_NS = 1_800_000_000 * NS_PER_S
+DOCS = Path(__file__).parents[3] / "docs" / "fleet.md"
+
+
+class FakeDevice:
+    def __init__(self) -> None:
+        self.done: list[tuple[str, Mapping[str, Any]]] = []
+        self.go_on: asyncio.Event | None = None
+
+    async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
+        if name == "turn" and "angle" not in arguments:
+            raise BadArgument("angle: expected a number, got nothing")
+        if name == "break":
+            raise ZeroDivisionError
+        self.done.append((name, arguments))
+        if self.go_on is not None:
+            await self.go_on.wait()
+        return {"serial": 7}
+
+
+class ChannelBench:
+    def __init__(self, **settings: object) -> None:
+        self.clock = VirtualClock()
+        self.clock.advance(5 * NS_PER_S)
+        self.device = FakeDevice()
+        self.offset_ns = UTC_NS
+        self.replies: list[CommandReply] = []
+        made = msgspec.convert({"enabled": True, "actions": ["identity", "bow/turn"], **settings}, CommandSettings)
+        gateway = Gateway("mill", "gw", "b")
+        self.channel = CommandChannel(made, gateway, self._control, self.clock.now_ns, lambda: self.offset_ns)
+        self.channel.answer = self.replies.append
+        self.clock.advance(NS_PER_S)
+
+    def _control(self, name: str) -> Any:
+        if name != "bow":
+            raise CommandError(f"{name}: no such device")
+        return self.device
+
+    def ask(
+        self, number: int = 1, action: str = "identity", *, age_s: float = 0.5, device: str = "bow",
+        response_topic: str = "", retain: bool = False, **arguments: object,
+    ) -> Outcome | None:  # fmt: skip
+        """Have a request taken; return the answer to it, if there is one at once."""
+        issued = self.clock.now_ns() + self.offset_ns - round(age_s * NS_PER_S)
+        request = {"v": 1, "id": f"r{number}", "action": action, "arguments": arguments, "issued_utc_ns": issued}
+        self.take(msgspec.json.encode(request), device=device, response_topic=response_topic, retain=retain)
+        return self.answers()[-1].outcome if self.replies else None
+
+    def take(
+        self, payload: bytes, *, device: str = "bow", response_topic: str = "", retain: bool = False
+    ) -> None:  # fmt: skip
+        self.channel.take(Received(f"imud/mill/gw/{device}/command", payload, retain, response_topic, b"c"))
+
+    def answers(self) -> list[CommandAnswer]:
+        return [msgspec.json.decode(reply.payload, type=CommandAnswer) for reply in self.replies]
+
+    def run(self, rounds: int = 3) -> None:
+
+        async def loop() -> None:
+            for _ in range(rounds):
+                self.channel.run_next()
+                for _ in range(5):
+                    await asyncio.sleep(0)
+
+        asyncio.run(loop())
+
+
+def test_a_request_is_carried_out_and_answered_with_its_correlation() -> None:
+    bench = ChannelBench()
+    assert bench.ask(1, "turn", angle=3, response_topic="imud/mill/gw/bow/answer/me") is None
+    assert bench.device.done == [], "nothing happens in the sender's thread"
+    bench.run()
+    assert bench.device.done == [("turn", {"angle": 3})]
+    (reply,) = bench.replies
+    assert (reply.topic, reply.correlation) == ("imud/mill/gw/bow/answer/me", b"c")
+    (answer,) = bench.answers()
+    assert (answer.id, answer.outcome, answer.result) == ("r1", Outcome.DONE, {"serial": 7})
+    assert (bench.channel.run, bench.channel.refused) == (1, 0)
+    bench.ask(2)
+    bench.run()
+    assert bench.replies[1].topic == "imud/mill/gw/bow/answer", "without a response topic, of the device"
+
+
+def test_what_is_not_in_the_list_is_denied() -> None:
+    bench = ChannelBench()
+    assert bench.ask(1, "factory_reset") is Outcome.DENIED
+    assert bench.ask(2, "turn", device="mast", angle=3) is Outcome.DENIED
+    bench.ask(3, "bow/turn")
+    assert ChannelBench(actions=[]).ask() is Outcome.DENIED
+    bench.run()
+    assert (bench.device.done, bench.channel.refused, len(bench.replies)) == ([], 3, 2)
+    (wrong,) = wrong_values(CommandSettings, {"actions": ["a b"]})
+    assert "expected names of actions, or DEVICE/ACTION" in str(wrong)
+    assert wrong_values(CommandSettings, {"actions": ["a", "bow/a"]}) == []
+
+
+@pytest.mark.parametrize(
+    ("age_s", "taken"), [(29.9, False), (30.1, False), (-29.9, True), (-30.1, False), (0.9, True), (1.1, False)]
+)
+def test_a_request_has_an_age(age_s: float, taken: bool) -> None:
+    bench = ChannelBench()  # the output started 1 s ago, which an older request was not meant for
+    assert (bench.ask(age_s=age_s) is None) is taken
+    bench = ChannelBench()
+    bench.clock.advance(100 * NS_PER_S)
+    assert (bench.ask(age_s=age_s) is None) is (abs(age_s) < 30)
+
+
+def test_a_request_that_becomes_old_while_it_waits_is_not_carried_out() -> None:
+    bench = ChannelBench()
+    bench.ask(1)
+    bench.clock.advance(31 * NS_PER_S)
+    bench.run()
+    assert [one.outcome for one in bench.answers()] == [Outcome.STALE]
+    assert bench.device.done == []
+    bench.offset_ns = 0
+    assert bench.ask(2) is Outcome.STALE, "without a clock nothing is carried out"
+
+
+def test_a_request_is_carried_out_once_for_as_long_as_its_age_would_allow() -> None:
+    bench = ChannelBench(per_minute=600)
+    bench.ask(1, age_s=-29.0)
+    bench.run()
+    issued_ahead_ns = bench.clock.now_ns() + bench.offset_ns + 29 * NS_PER_S
+    for _ in range(59):
+        bench.clock.advance(NS_PER_S)
+        age_s = (bench.clock.now_ns() + bench.offset_ns - issued_ahead_ns) / NS_PER_S
+        assert bench.ask(1, "turn", age_s=age_s, angle=3) in (Outcome.DUPLICATE, Outcome.STALE)
+        bench.ask(1, age_s=age_s)
+    bench.run()
+    assert len(bench.device.done) == 1
+
+
+def test_a_request_that_comes_again_has_the_answer_that_it_had() -> None:
+    bench = ChannelBench()
+    bench.ask(1, "turn", angle=3)
+    assert bench.ask(1, "turn", angle=3) is Outcome.DUPLICATE, "it waits, and will have its answer"
+    bench.run()
+    bench.replies.clear()
+    bench.ask(1, "turn", angle=3, response_topic="imud/mill/gw/bow/answer/other")
+    (reply,) = bench.replies
+    assert (reply.topic, reply.correlation) == ("imud/mill/gw/bow/answer/other", b"c")
+    assert (bench.answers()[0].outcome, bench.answers()[0].result) == (Outcome.DONE, {"serial": 7})
+    bench.ask(1, "turn", angle=4)
+    assert bench.answers()[-1].outcome is Outcome.DUPLICATE, "another request with the id of this one"
+    bench.run()
+    assert bench.device.done == [("turn", {"angle": 3})]
+    assert (bench.channel.run, bench.channel.refused) == (1, 2)
+    for _ in range(2):  # a request that failed has its failure again
+        bench.replies.clear()
+        bench.ask(2, "turn")
+        bench.run()
+        assert [(one.outcome, one.error.split(":")[0]) for one in bench.answers()] == [(Outcome.FAILED, "angle")]
+
+
+def test_as_many_answers_are_kept_as_are_allowed() -> None:
+    bench = ChannelBench(per_minute=600)
+    for number in range(ANSWERS_KEPT + 1):
+        bench.ask(number)
+        bench.run()
+    assert bench.ask(0) is Outcome.DUPLICATE
+    assert bench.ask(1) is Outcome.DONE
+    assert len(bench.device.done) == ANSWERS_KEPT + 1
+
+
+def test_more_than_the_rate_or_the_queue_has_room_for_is_busy() -> None:
+    bench = ChannelBench(per_minute=5)
+    assert [bench.ask(number) for number in range(5)] == [None] * 5
+    assert bench.ask(5) is Outcome.BUSY
+    bench.run(rounds=10)
+    bench.clock.advance(60 * NS_PER_S)
+    bench.replies.clear()
+    assert bench.ask(6) is None
+    bench = ChannelBench(per_minute=600)
+    assert [bench.ask(number) for number in range(WAITING_MAX)] == [None] * WAITING_MAX
+    assert bench.ask(99) is Outcome.BUSY
+    bench.run(rounds=WAITING_MAX + 1)
+    assert len(bench.device.done) == WAITING_MAX
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"", b"{}", b"[]", b"\xff", b'{"v": 1}', b"[" * 3000, b" " * (REQUEST_BYTES + 1),
+        b'{"v": 2, "id": "a", "action": "identity", "issued_utc_ns": 1}',
+        b'{"v": 1, "id": "a/b", "action": "identity", "issued_utc_ns": 1}',
+        b'{"v": 1, "id": "a", "action": "identity", "issued_utc_ns": 1, "more": 1}',
+        b'{"v": 1, "id": "a", "action": "", "issued_utc_ns": 1}',
+    ],
+)  # fmt: skip
+def test_what_is_no_request_is_counted_and_not_answered(payload: bytes) -> None:
+    bench = ChannelBench()
+    bench.take(payload)
+    assert (bench.channel.refused, bench.replies) == (1, [])
+
+
+def test_kept_requests_and_answers_elsewhere_are_ignored() -> None:
+    bench = ChannelBench()
+    bench.ask(1, retain=True)
+    for topic in ("imud/mill/gw/bow/samples", "imud/mill/gw/state", "imud/mill/gw/mast/answer", "a/b",
+                  "imud/mill/gw/bow/answer/a/b", "imud/mill/gw/bow/answer/#", "imud/mill/gw/bow/answer/"):  # fmt: skip
+        bench.ask(2, response_topic=topic)
+        assert answer_topic("mill", "gw", "bow", topic) is None
+    bench.run()
+    assert (bench.channel.refused, bench.replies, bench.device.done) == (8, [], [])
+
+
+def test_errors_are_answers_and_a_defect_is_one_too() -> None:
+    bench = ChannelBench(actions=["identity", "turn", "break"])
+    bench.ask(1, "turn")
+    bench.ask(2, "identity", device="mast")
+    bench.ask(3, "break")
+    bench.run(rounds=5)
+    assert [(one.outcome, one.error) for one in bench.answers()] == [
+        (Outcome.FAILED, "angle: expected a number, got nothing"),
+        (Outcome.FAILED, "mast: no such device"),
+        (Outcome.FAILED, "an internal error; the log of imud has a traceback"),
+    ]
+
+
+@pytest.fixture
+def log_of_daemon(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
+    """Messages without the repeated ones that the daemon's log leaves out; the handler is that of all tests."""
+    repeats = RepeatFilter()
+    caplog.handler.addFilter(repeats)
+    yield caplog
+    caplog.handler.removeFilter(repeats)
+
+
+def test_every_request_is_in_the_log(log_of_daemon: pytest.LogCaptureFixture) -> None:
+    bench = ChannelBench(actions=["identity", "turn"])
+    for number in range(4):
+        bench.ask(number)
+        bench.ask(100 + number, "turn")
+        bench.ask(200 + number, "factory_reset")
+        bench.run(rounds=2)
+    asked = {f"request r{number}" for number in (*range(4), *range(100, 104), *range(200, 204))}
+    assert asked <= set(re.findall(r"request r\d+", log_of_daemon.text))
+
+
+@in_loop
+async def test_one_runs_at_a_time_and_the_end_ends_it() -> None:
+    bench = ChannelBench()
+    bench.device.go_on = asyncio.Event()
+    bench.ask(1)
+    bench.ask(2)
+    for _ in range(5):
+        bench.channel.run_next()
+        await asyncio.sleep(0)
+    assert len(bench.device.done) == 1
+    bench.channel.close()
+    bench.channel.close()
+    for _ in range(5):
+        await asyncio.sleep(0)
+    bench.channel.run_next()
+    await asyncio.sleep(0)
+    assert (len(bench.device.done), bench.replies) == (1, [])
+
+
+# --- with a broker that has the rights of docs/fleet.md ---------------------------------------------------------------
+
+USERS = ("gw-17", "gw-18", "collector", "operator")
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Mosquitto]:
+    if NO_MOSQUITTO:
+        pytest.skip(NO_MOSQUITTO)
+    found = re.search(r"```acl\n(.*?)```", DOCS.read_text(), re.DOTALL)
+    assert found is not None
+    rights, passwords = tmp_path / "rights", tmp_path / "passwords"
+    rights.write_text(found.group(1))
+    passwords.write_text("".join(f"{user}:secret\n" for user in USERS))
+    program = shutil.which("mosquitto_passwd")
+    if program is None:
+        pytest.skip("mosquitto_passwd is not installed (make mqtt-deps)")
+    subprocess.run([program, "-U", passwords], check=True, capture_output=True)  # hashes them
+    lines = ("allow_anonymous false", f"password_file {passwords}", f"acl_file {rights}")
+    with running_broker(tmp_path / "broker", *lines) as made:
+        yield made
+
+
+class Operator:
+    def __init__(self, port: int, user: str, *, v5: bool = True) -> None:
+        from paho.mqtt.client import Client, MQTTv5, MQTTv311
+        from paho.mqtt.enums import CallbackAPIVersion
+
+        self.got: list[Any] = []
+        self.changed = threading.Condition()
+        self.v5 = v5
+        self._ready = threading.Event()
+        self.client = Client(CallbackAPIVersion.VERSION2, "", protocol=MQTTv5 if v5 else MQTTv311)
+        self.client.username_pw_set(user, "secret")
+        self.client.on_connect = lambda client, *_: client.subscribe("imud/#", qos=1)
+        self.client.on_subscribe = lambda *_: self._ready.set()
+        self.client.on_message = self._on_message
+        self.client.connect("127.0.0.1", port)
+        self.client.loop_start()
+        assert self._ready.wait(LIMIT_S)
+
+    def _on_message(self, _client: object, _data: object, message: Any) -> None:
+        with self.changed:
+            self.got.append(message)
+            self.changed.notify_all()
+
+    def ask(self, device: str, number: str, action: str, response_topic: str = "", qos: int = 1) -> None:
+        from paho.mqtt.packettypes import PacketTypes
+        from paho.mqtt.properties import Properties
+
+        properties = None
+        if self.v5:
+            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]  # the library has no types
+            properties.CorrelationData = number.encode()
+            properties.MessageExpiryInterval = 30
+            if response_topic:
+                properties.ResponseTopic = response_topic
+        issued_ns = HostClock().now_ns() + HostClock().utc_offset_ns()
+        request = {"v": 1, "id": number, "action": action, "issued_utc_ns": issued_ns}
+        topic = f"imud/mill/gw-17/{device}/command"
+        self.client.publish(topic, msgspec.json.encode(request), qos, properties=properties)
+
+    def answer(self, number: str) -> tuple[Any, CommandAnswer]:
+
+        def found() -> list[tuple[Any, CommandAnswer]]:
+            answers = [
+                (one, msgspec.json.decode(one.payload, type=CommandAnswer))
+                for one in self.got
+                if "/answer" in one.topic
+            ]
+            return [one for one in answers if one[1].id == number]
+
+        with self.changed:
+            assert self.changed.wait_for(lambda: bool(found()), LIMIT_S), [one.topic for one in self.got]
+            return found()[0]
+
+    def close(self) -> None:
+        self.client.disconnect()
+        self.client.loop_stop()
+
+
+class Loop:
+    def __init__(self, folder: Path, port: int, device: FakeDevice, version: str) -> None:
+        host = HostClock()
+        password = folder / "password"
+        password.write_text("secret\n")
+        settings = msgspec.convert(
+            {
+                "brokers": [f"mqtt://127.0.0.1:{port}"], "site": "mill", "gateway": "gw-17", "version": version,
+                "user": "gw-17", "password_file": str(password), "spool_directory": str(folder / "spool"),
+                "commands": {"enabled": True, "actions": ["identity"]},
+            },
+            MqttSettings,
+        )  # fmt: skip
+        context = PublisherContext(
+            list, 7, host.now_ns, utc_offset_ns=host.utc_offset_ns, control=lambda _name: device  # type: ignore[arg-type,return-value]  # what the channel uses of it
+        )  # fmt: skip
+        self.output = MqttPublisher(settings, context)
+        self._ended = threading.Event()
+        self.up = threading.Event()
+        self._host = host
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._main()))
+        self._thread.start()
+        assert self.up.wait(LIMIT_S)
+
+    async def _main(self) -> None:
+        self.output.start()
+        while not self._ended.is_set():
+            self.output.tick(self._host.now_ns())
+            if self.output.status().broker:
+                self.up.set()
+            await asyncio.sleep(0.02)
+        self.output.close()
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join(LIMIT_S)
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+def test_a_broker_with_rights_lets_the_operator_ask_and_nobody_else(
+    tmp_path: Path, broker: Mosquitto, version: str
+) -> None:
+    device = FakeDevice()
+    loop = Loop(tmp_path, broker.port, device, version)
+    operator, collector = Operator(broker.port, "operator", v5=version == "5"), Operator(broker.port, "collector")
+    others = [Operator(broker.port, user) for user in ("collector", "gw-18")]
+    try:
+        for other in others:  # the broker takes it and passes it on to nobody
+            other.ask("bow", f"of-{other is others[0]}", "identity", qos=0)  # mosquitto 2.0.11 may hang up
+        operator.ask("bow", "first", "identity", "imud/mill/gw-17/bow/answer/desk")
+        message, answer = operator.answer("first")
+        assert (answer.outcome, answer.result) == (Outcome.DONE, {"serial": 7})
+        if version == "5":
+            assert message.topic == "imud/mill/gw-17/bow/answer/desk"
+            assert message.properties.CorrelationData == b"first"
+        else:
+            assert message.topic == "imud/mill/gw-17/bow/answer"
+        operator.ask("bow", "second", "restart")
+        assert operator.answer("second")[1].outcome is Outcome.DENIED
+        operator.ask("bow", "first", "identity")
+        operator.ask("bow", "third", "identity")
+        operator.answer("third")
+        assert len(device.done) == 2, "the operator's two, none twice, and none of the others"
+        assert not any("/answer" in one.topic for one in others[1].got), "gateways do not read each other"
+        collector.answer("third")  # who collects reads everything
+        assert sum("Denied PUBLISH" in line for line in broker.log) == 2
+        status = loop.output.status()
+        assert (status.commands, status.commands_refused) == (2, 1)
+        again = [one for one in operator.got if b'"first"' in one.payload and "/answer" in one.topic]
+        assert len(again) == 2, "what came again has its answer again"
+    finally:
+        loop.close()
+        for one in (operator, collector, *others):
+            one.close()

@@ -1,0 +1,164 @@
+"""Payloads: JSON and slots come back as they went, and nothing else does."""
+
+import copy
+import functools
+import json
+import math
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+import msgspec
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imud.fleet.messages import (
+    MAGIC,
+    NUMBER_MOST,
+    SLOTS_MAX,
+    VERSION,
+    FleetMessage,
+    GatewayClock,
+    Interval,
+    MessageKind,
+    boot_text,
+    decode_message,
+    encode_message,
+    encode_slots_message,
+    finite,
+)
+from imud.formats.slot import encode_slots
+from imud.model.event import Event, EventKind
+from imud.model.sample import Sample, Sync
+
+
+def made(seq: int) -> Sample:
+    return Sample(
+        "bow", seq, 1000 * seq, 5, Sync.EDGE, 1000 * seq + 9, 77_000 + seq, accel_m_s2=(0.1, -0.2, 9.8), status=3
+    )
+
+
+def message(kind: MessageKind, first: int = 5, last: int = 7, **more: object) -> FleetMessage:
+    return FleetMessage(
+        v=VERSION, gateway="gw", boot=boot_text(255), device="bow", kind=kind, begin=1, first=first, last=last,
+        count=last - first + 1, utc_ns=9, **more,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def test_the_header_is_what_the_document_says() -> None:
+    payload = encode_message(message(MessageKind.EVENTS, 1, 1, events=[Event(3, "bow", EventKind.UP, "up")]))
+    assert json.loads(payload) == {
+        "v": 1, "gateway": "gw", "boot": "00000000000000ff", "device": "bow", "kind": "events", "begin": 1,
+        "first": 1, "last": 1, "count": 1, "utc_ns": 9,
+        "events": [{"t_ns": 3, "device": "bow", "kind": "up", "message": "up"}],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("as_slots", [False, True])
+def test_samples_come_back_as_they_went(as_slots: bool) -> None:
+    samples = [made(seq) for seq in (5, 6, 7)]
+    if as_slots:
+        payload = encode_slots_message(message(MessageKind.SLOTS), encode_slots(samples, 0))
+        size = struct.unpack_from("<4sBBH", payload)[3]
+        assert zstandard.ZstdDecompressor().decompress(payload[8 + size :]) == b"".join(encode_slots(samples, 0))
+        assert json.loads(payload[8 : 8 + size])["last"] == 7
+    else:
+        payload = encode_message(message(MessageKind.SAMPLES, samples=samples))
+    assert decode_message(payload).samples == samples
+
+
+def test_values_that_json_does_not_have_are_left_out() -> None:
+    bad = msgspec.structs.replace(made(5), gyro_rad_s=(0.0, math.nan, 0.0), temperature_c=math.inf)
+    payload = encode_message(message(MessageKind.SAMPLES, samples=[bad]))
+    assert b"null" not in payload
+    assert decode_message(payload).samples == [made(5)]
+    assert finite(made(5)) == made(5)
+
+
+def bomb() -> bytes:
+    head = msgspec.json.encode(message(MessageKind.SLOTS))
+    return struct.pack("<4sBBH", MAGIC, 1, 0, len(head)) + head + zstandard.compress(bytes(256 * (SLOTS_MAX + 1)))
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"", b"{}", b"IMUB", b"null", bomb(), b'{"deep":' + b"[" * 100_000,
+        encode_message(message(MessageKind.SAMPLES)).replace(b'"v":1', b'"v":2'),
+        encode_message(message(MessageKind.SAMPLES, 8, 7)),
+        encode_message(message(MessageKind.SAMPLES)).replace(b'"begin":1', b'"begin":0'),
+        encode_slots_message(message(MessageKind.SLOTS), [bytes(256)]),
+        encode_slots_message(message(MessageKind.SLOTS), [bytes(100)]),
+    ],
+)  # fmt: skip
+def test_anything_else_is_an_error_with_a_reason(payload: bytes) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        decode_message(payload)
+    for boot in ("", "a b", "x" * 65, "1\n"):
+        with pytest.raises(ValueError, match="expected the number of a start"):
+            decode_message(encode_message(msgspec.structs.replace(message(MessageKind.SAMPLES), boot=boot)))
+
+
+def fields(kind: MessageKind, **more: Any) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(encode_message(message(kind, **more)))
+    return found
+
+
+INTERVAL = Interval(5, 7, 3, 1, 2, 3, 4, 5, Sync.EDGE, {}, 6)
+CLOCK = GatewayClock(1, 2, synchronised=True, error_ns=3)
+FULL = (
+    fields(MessageKind.SAMPLES, samples=[msgspec.structs.replace(made(5), t_dev_ns=1, pps_age_ms=2, edge_seq=3)]),
+    fields(MessageKind.INTERVALS, intervals=[INTERVAL]),
+    fields(MessageKind.EVENTS, events=[Event(3, "bow", EventKind.UP, "up")], clock=CLOCK),
+)
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    members = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for name, one in members:
+        yield from places(one, (*path, name))
+    if type(value) is int and path != ("v",):
+        yield path
+
+
+def put(value: Any, path: tuple[Any, ...], number: int) -> bytes:
+    copied = copy.deepcopy(value)
+    *above, name = path
+    functools.reduce(lambda inner, step: inner[step], above, copied)[name] = number
+    return msgspec.json.encode(copied) if abs(number) < 1 << 63 else json.dumps(copied).encode()
+
+
+@pytest.mark.parametrize("whole", FULL, ids=lambda whole: str(whole["kind"]))
+def test_numbers_that_no_database_has_are_refused_wherever_they_are(whole: dict[str, Any]) -> None:
+    for path in places(whole):
+        for number in (NUMBER_MOST, -NUMBER_MOST, 1 << 63, 10**30):
+            with pytest.raises(ValueError, match="expected"):
+                decode_message(put(whole, path, number))
+        if path[-1] not in ("begin", "first"):
+            assert decode_message(put(whole, path, NUMBER_MOST - 1))
+    slots = encode_slots([msgspec.structs.replace(made(5), t_ns=NUMBER_MOST, t_rx_ns=NUMBER_MOST)], 0)
+    with pytest.raises(ValueError, match=r"below 2\*\*62, got one of 63 bits"):
+        decode_message(encode_slots_message(message(MessageKind.SLOTS), slots))
+
+
+def test_events_have_text_without_nul_and_a_number_each() -> None:
+    for text in ("\0", "a\0", "\\\\\0"):
+        with pytest.raises(ValueError, match="without NUL"):
+            decode_message(encode_message(message(MessageKind.EVENTS, events=[Event(3, "bow", EventKind.UP, text)])))
+    for text in ("\\u0000", "\\\\u0000", "u0000", "\\\1"):
+        event = Event(3, "bow", EventKind.UP, text)
+        assert decode_message(encode_message(message(MessageKind.EVENTS, events=[event]))).events == [event]
+    events = [Event(3, "bow", EventKind.UP, "up")] * 4
+    with pytest.raises(ValueError, match="expected an event per number, got 4 events for 3 numbers"):
+        decode_message(encode_message(message(MessageKind.EVENTS, events=events)))
+
+
+@given(st.binary(max_size=200), st.integers(0, 400))
+def test_damaged_bytes_raise_nothing_else(noise: bytes, at: int) -> None:
+    payload = encode_slots_message(message(MessageKind.SLOTS), encode_slots([made(5)], 0))
+    for one in (noise, MAGIC + noise, payload[:at] + noise + payload[at + len(noise) :]):
+        with suppress(ValueError):
+            decode_message(one)

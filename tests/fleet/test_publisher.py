@@ -1,0 +1,339 @@
+"""The output as a whole with a broker in memory: births and states, what is put into the queue, what goes wrong."""
+
+import importlib
+import json
+import struct
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zstandard
+
+from imud.contracts.lines import UtcReference
+from imud.contracts.publisher import Batch, PublisherContext
+from imud.contracts.setting import OnDifference, SettingDifference, SettingsState, SettingsStatus
+from imud.contracts.status import DeviceState, DeviceStatus
+from imud.fleet.broker import EXTRA_MISSING
+from imud.fleet.publisher import MqttPublisher
+from imud.fleet.settings import Broker, MqttSettings, broker_of
+from imud.model.errors import ServerError
+from imud.model.event import Event, EventKind
+from imud.model.options import wrong_values
+from imud.model.sample import Sample, Sync
+from imud.model.units import NS_PER_MS, NS_PER_S
+from tests.fleet.fake_broker import FakeBroker
+from tests.support.event_loops import VirtualClock
+from tests.support.signal_bench import HandWorker
+from tests.support.socket_rig import device_status, sample
+
+pytestmark = pytest.mark.live
+
+
+class PublisherBench:
+    """The output with the threads' work done by hand, but for the sender's, which runs."""
+
+    def __init__(self, path: Path, **settings: object) -> None:
+        self.clock, self.broker = VirtualClock(), FakeBroker(blocks=True)
+        self.events: list[Event] = []
+        self.statuses: list[DeviceStatus] = [device_status("imu0", 0)]
+        self.asked = 0
+        self.workers: list[HandWorker] = []
+        self.reference: UtcReference | None = None
+        self.context = PublisherContext(
+            self._status, 77, self.clock.now_ns, raise_event=self.events.append, utc_offset_ns=lambda: 99,
+            utc_reference=lambda: self.reference,
+        )  # fmt: skip
+        made = msgspec.convert({"spool_directory": str(path), "gateway": "gw", **settings}, MqttSettings)
+        self.output = MqttPublisher(
+            made, self.context, connect=self.broker.connect, start_worker=self._start, host_name=lambda: "host.example"
+        )
+
+    def _status(self) -> list[DeviceStatus]:
+        self.asked += 1
+        return self.statuses
+
+    def _start(self, *args: object) -> HandWorker:
+        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # as StartWorker
+        return self.workers[-1]
+
+    def tick(self, seconds: float = 1.0) -> None:
+        self.clock.advance(round(seconds * NS_PER_S))
+        self.output.tick(self.clock.now_ns())
+        self.workers[0].work()
+
+    def start(self, device_id: int = 0, device: str = "imu0") -> None:
+        self.output.add_device(device, device_id)
+        self.output.start()
+
+    def close(self) -> list[tuple[str, bytes, bool]]:
+        """Close it; return all that was sent."""
+        self.output.close()
+        self.output.close()
+        return [one for connection in self.broker.connections for one in connection.sent]
+
+
+def test_birth_states_and_farewell(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path)
+    bench.start()
+    bench.tick()
+    bench.broker.wait_for("imud/default/gw/imu0/schema")
+    sent = bench.close()
+    topics = {topic: json.loads(payload) for topic, payload, retain in sent if retain}
+    assert {"imud/default/gw/state", "imud/default/gw/imu0/status", "imud/default/gw/imu0/schema"} == set(topics)
+    assert json.loads(sent[0][1])["online"] is True
+    assert json.loads(sent[0][1])["boot"] == "000000000000004d"
+    assert topics["imud/default/gw/state"] == {
+        "v": 1, "online": False, "boot": "000000000000004d", "reason": "imud stopped",
+    }  # fmt: skip
+    assert topics["imud/default/gw/imu0/schema"]["slot"]["bytes"] == 256
+    assert topics["imud/default/gw/imu0/status"]["state"] == "running"
+    assert bench.broker.will is not None
+    assert json.loads(bench.broker.will.payload)["reason"] == "connection lost"
+
+
+def test_states_are_looked_at_after_events_and_now_and_then(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path, status_s=60)
+    bench.start()
+    bench.tick()
+    assert bench.asked == 1
+    for _ in range(50):
+        bench.tick()
+        bench.output.event(Event(0, "imu0", EventKind.MARK, "pulse"))
+    assert bench.asked == 1
+    bench.output.event(Event(0, "imu0", EventKind.DOWN, "gone"))
+    bench.statuses = [msgspec.structs.replace(bench.statuses[0], state=DeviceState.MISSING)]
+    bench.tick()
+    bench.broker.wait_for("imud/default/gw/imu0/status", lambda payload: b'"missing"' in payload)
+    assert bench.asked == 2
+    for _ in range(30):
+        bench.tick()
+    assert bench.asked == 3
+    assert bench.events == []
+    bench.close()
+
+
+def test_a_device_that_is_removed_leaves_no_state(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path)
+    bench.start()
+    bench.tick()
+    bench.output.remove_device("imu0")
+    bench.statuses = []
+    bench.tick()
+    bench.tick(100)
+    sent = [topic for topic, payload, _ in bench.close() if not payload]
+    assert set(sent) <= {"imud/default/gw/imu0/status", "imud/default/gw/imu0/schema"}
+    assert bench.output.status().broker == ""
+
+
+def test_settings_that_are_not_as_declared_are_published_when_they_change(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path)
+    topic = "imud/default/gw/imu0/settings"
+
+    def declare(state: SettingsState, read_ns: int, **differences: SettingDifference) -> None:
+        declared = SettingsStatus(state, OnDifference.REPORT, differences=differences, read_ns=read_ns)
+        bench.statuses = [
+            msgspec.structs.replace(device_status("imu0", 0), settings={"rate_hz": "50"}, declared=declared)
+        ]
+        bench.output.event(Event(0, "imu0", EventKind.CONFIGURATION, "x"))
+        bench.tick()
+
+    bench.start()
+    declare(SettingsState.AGREE, 1)
+    bench.broker.wait_for(topic)
+    declare(SettingsState.AGREE, 2)  # read again, and nothing is different
+    declare(SettingsState.DIFFER, 3, rate_hz=SettingDifference(100, 50))
+    bench.broker.wait_for(topic, lambda payload: b'"differ"' in payload)
+    sent = [json.loads(payload) for one, payload, retain in bench.close() if one == topic and retain]
+    assert [one["state"] for one in sent] == ["agree", "differ"]
+    assert sent[1]["differences"] == {"rate_hz": {"declared": 100, "actual": 50}}
+    assert sent[1]["actual"] == {"rate_hz": "50"}
+
+
+def test_only_declared_devices_are_queued(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path, devices={"imu0": {}})
+    for name in ("imu0", "imu1"):
+        bench.output.add_device(name, 0)
+    bench.output.start()
+    for name in ("imu0", "imu1"):
+        bench.output.publish(Batch(name, 0, [sample(name, 1), sample(name, 2)]))
+        bench.output.event(Event(0, name, EventKind.LOSS, "x"))
+    assert bench.output.status().queued == 3
+    bench.output.event(Event(0, "", EventKind.CONFIGURATION, "x"))
+    assert bench.output.status().queued == 4
+    assert bench.context.mqtt_sources == [bench.output.status]
+    bench.close()
+    assert bench.context.mqtt_sources == []
+
+
+def test_a_spool_that_fails_is_an_event_and_no_end(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path / "spool")
+    bench.start()
+    database = tmp_path / "spool" / "spool.db"
+    bench.output.publish(Batch("imu0", 0, [sample("imu0", 1)]))
+    bench.tick()
+    for path in tmp_path.glob("spool/spool.db*"):
+        path.write_bytes(b"\xff" * 10_000)
+    for _ in range(20):
+        bench.output.event(Event(0, "imu0", EventKind.LOSS, "x"))
+        bench.tick(20)
+    messages = [event.message for event in bench.events]
+    assert any("nothing is spooled" in one for one in messages), messages
+    assert any("spooling again" in one for one in messages), messages
+    assert sum("the spool was damaged" in one for one in messages) == 1, messages
+    assert all(event.kind is EventKind.MQTT and not event.device for event in bench.events)
+    assert database.exists()
+    bench.close()
+
+
+def test_a_thread_that_ends_by_a_defect_ends_the_daemon(tmp_path: Path) -> None:
+    first, second = PublisherBench(tmp_path), PublisherBench(tmp_path)
+    first.output.start()
+    with pytest.raises(ServerError, match="another running imud"):
+        second.output.start()  # two outputs do not share a spool
+    first.workers[0].failed(ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        first.output.tick(0)
+    first.close()
+    second.output.start()
+    second.close()
+
+
+def test_the_name_of_the_host_is_the_gateway(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path, gateway="")
+    bench.output.start()
+    bench.close()
+    assert bench.broker.will is not None
+    assert bench.broker.will.topic == "imud/default/host/state"
+    odd = MqttPublisher(
+        MqttSettings(spool_directory=str(tmp_path)), bench.context, connect=bench.broker.connect,
+        host_name=lambda: "Gerät",
+    )  # fmt: skip
+    with pytest.raises(ServerError, match=r"mqtt.gateway: expected a name .* 'Gerät'"):
+        odd.start()
+
+
+def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr(importlib, "import_module", refuse)
+    output = MqttPublisher(MqttSettings(spool_directory=str(tmp_path)), PublisherBench(tmp_path).context)
+    with pytest.raises(ServerError) as found:
+        output.start()
+    assert str(found.value) == EXTRA_MISSING == "the output mqtt needs the extra mqtt: pip install 'imud[mqtt]'"
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"brokers": []}, "brokers: expected a list of 1 to 16"),
+        ({"brokers": ["http://a"]}, "expected a URL such as mqtts://"),
+        ({"brokers": ["mqtt://user:secret@a"]}, "no user"),
+        ({"brokers": ["mqtt://a:99999"]}, "expected a URL"),
+        ({"brokers": ["mqtt://a/path"]}, "expected a URL"),
+        ({"site": "a/b"}, "site: expected letters, digits"),
+        ({"key_file": "/k"}, "key_file: expected cert_file as well"),
+        ({"password_file": "/p"}, "password_file: expected user as well"),
+        ({"devices": {"a b": {}}}, "devices: expected names of devices"),
+        (
+            {"devices": {"*": {"rate_hz": 0.001}}},
+            'devices: expected a number from 0.01 to 100, or null, got 0.001, at "*.rate_hz"',
+        ),
+        ({"devices": {"*": {"whole": "xml"}}}, 'expected one of "none", "json", "slots", got "xml", at "*.whole"'),
+        ({"devices": {"*": {"wole": "json"}}}, "wole"),
+        ({"version": "3.1"}, "version: expected"),
+    ],
+)
+def test_bad_settings_are_named(given: Mapping[str, Any], words: str) -> None:
+    (wrong,) = wrong_values(MqttSettings, given)
+    assert words in str(wrong)
+
+
+@pytest.mark.parametrize(
+    ("url", "broker"),
+    [
+        ("mqtt://a", Broker("a", 1883, False, False, "/mqtt")),
+        ("mqtts://a.example", Broker("a.example", 8883, True, False, "/mqtt")),
+        ("ws://10.0.0.1:8080/x", Broker("10.0.0.1", 8080, False, True, "/x")),
+        ("wss://[::1]", Broker("::1", 443, True, True, "/mqtt")),
+    ],
+)
+def test_names_of_brokers_and_devices(url: str, broker: Broker) -> None:
+    assert broker_of(url) == broker
+    assert broker_of(broker.name) == broker
+    settings = msgspec.convert({"devices": {"bow": {"rate_hz": 5}, "*": {"rate_hz": 2}}}, MqttSettings)
+    assert [getattr(settings.sending(name), "rate_hz", None) for name in ("bow", "mast")] == [5, 2]
+    alone = msgspec.convert({"devices": {"bow": {}}}, MqttSettings)
+    assert alone.sending("mast") is None
+
+
+def test_birth_and_messages_say_whether_the_wall_clock_is_set(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path)
+    bench.start()
+    bench.reference = UtcReference(100, 40)
+    bench.tick(1000)  # more than status_s
+    bench.output.event(Event(1, "imu0", EventKind.UP, "it is up"))
+    bench.tick()
+    bench.broker.wait_for("imud/default/gw/imu0/events")
+    sent = [(topic, json.loads(payload)) for topic, payload, _ in bench.close()]
+    first, *others = [found["clock"] for topic, found in sent if topic.endswith("/state") and found["online"]]
+    assert (first["synchronised"], first["utc_offset_ns"], first["error_ns"]) == (False, 99, None)
+    others += [found["clock"] for topic, found in sent if topic.endswith("/events")]
+    assert len(others) >= 2
+    for one in others:
+        assert (one["synchronised"], one["utc_offset_ns"], one["error_ns"]) == (True, 100, 40)
+        assert one["t_ns"] > first["t_ns"]
+
+
+# --- a reader that has only what is published -------------------------------------------------------------------------
+
+
+def fields_by_schema(slot: bytes, layout: Mapping[str, Any]) -> dict[str, Any]:
+    order = {"little-endian": "<", "big-endian": ">"}[layout["byte_order"]]
+    found: dict[str, Any] = {}
+    for field in layout["fields"]:
+        values = struct.unpack_from(f"{order}{field['count']}{field['code']}", slot, field["offset"])
+        found[field["name"]] = values if field["count"] > 1 else values[0]
+    for name, bit in layout["present_bits"].items():
+        if not found["present"] & bit:
+            found.pop(name, None)
+    found["sync"] = {code: name for name, code in layout["sync_codes"].items()}[found["sync"]]
+    return found
+
+
+def test_slots_are_read_by_the_schema_that_is_published_beside_them(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path, devices={"*": {"whole": "slots", "rate_hz": None}})
+    bench.start(3)
+    sent = [
+        Sample(
+            "imu0", seq, seq * NS_PER_MS, 7, Sync.EDGE, seq * NS_PER_MS + 5, 1_800_000_000 * NS_PER_S + seq,
+            accel_m_s2=(seq / 3, -0.1, 9.8), temperature_c=20.5,
+        )
+        for seq in (1, 2, 3)
+    ]  # fmt: skip
+    bench.output.publish(Batch("imu0", 3, sent))
+    for _ in range(3):
+        bench.tick()
+    bench.broker.wait_for("imud/default/gw/imu0/samples")
+    topics = {topic: payload for topic, payload, _ in bench.close()}
+    layout = json.loads(topics["imud/default/gw/imu0/schema"])["slot"]
+    payload = topics["imud/default/gw/imu0/samples"]
+    begin = 8 + int.from_bytes(payload[6:8], "little")  # "IMUB", version, 0, bytes of the header (docs/fleet.md)
+    slots = zstandard.ZstdDecompressor().decompress(payload[begin:])
+    size = layout["bytes"]
+    assert len(slots) == 3 * size
+    for at, one in enumerate(sent):
+        found = fields_by_schema(slots[at * size : (at + 1) * size], layout)
+        assert {name: found[name] for name in ("seq", "t_ns", "t_rx_ns", "utc_ns", "device_id", "sync")} == {
+            "seq": one.seq, "t_ns": one.t_ns, "t_rx_ns": one.t_rx_ns, "utc_ns": one.utc_ns, "device_id": 3,
+            "sync": "edge",
+        }  # fmt: skip
+        assert (found["accel_m_s2"], found["temperature_c"]) == (one.accel_m_s2, 20.5)
+        assert not {"gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad", "pressure_pa", "t_dev_ns"} & set(found)
+        assert found["crc32"] == zlib.crc32(slots[at * size : (at + 1) * size - 4])

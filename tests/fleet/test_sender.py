@@ -1,0 +1,175 @@
+"""The sender: a window of messages, retained ones first, everything again after a loss, in order."""
+
+import threading
+
+import pytest
+
+from imud.fleet.broker import BrokerTurn, Will
+from imud.fleet.commands import CommandReply
+from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
+from imud.fleet.sender import OUTBOX_MAX, REPLIES_MAX, MqttSender
+from imud.fleet.settings import Broker, MqttSettings
+from imud.fleet.spool import Spooled
+from tests.fleet.fake_broker import FakeBroker
+from tests.support.daemon_process import LIMIT_S
+from tests.support.event_loops import VirtualClock
+
+
+def row(number: int, payload: bytes = b"{}") -> Spooled:
+    return Spooled(number, "1", "bow", "samples", "samples", "topic", number, number, 1, 0, payload)
+
+
+class SenderBench:
+    def __init__(self, *hosts: str) -> None:
+        self.broker, self.clock = FakeBroker(), VirtualClock()
+        turn = BrokerTurn([Broker(host, 1, False, False, "") for host in hosts or ("a",)], 60.0, lambda: 0.5)
+        will = Will("state", b"gone")
+        self.sender = MqttSender(MqttSettings(), "me", will, turn, self.broker.connect, self.clock.now_ns)
+        self.wanted = 0
+        self.sender.wanting = self._want
+
+    def _want(self) -> None:
+        self.wanted += 1
+
+    def sent(self) -> list[bytes]:
+        return [payload for _, payload, _ in self.broker.connections[-1].sent]
+
+
+def test_messages_go_in_their_order_within_the_window() -> None:
+    bench = SenderBench()
+    bench.broker.answers = 0
+    assert bench.sender.room() == 0
+    assert bench.sender.work() == 0
+    assert bench.sender.room() == OUTBOX_MAX
+    bench.sender.give(bench.sender.session, [row(n, b"%d" % n) for n in range(1, 7)])
+    bench.sender.work()
+    assert bench.sent() == [b"1", b"2", b"3", b"4"]
+    assert bench.sender.room() == OUTBOX_MAX - 6
+    bench.broker.answers = 2
+    bench.sender.work()
+    bench.sender.work()
+    assert bench.sent() == [b"1", b"2", b"3", b"4", b"5", b"6"]
+    assert bench.sender.take_acknowledged() == [(1, 1), (1, 2)]
+    assert bench.sender.take_acknowledged() == []
+    assert bench.broker.connections[0].rings == 1
+    bench.sender.retain({})
+    assert bench.broker.connections[0].rings == 2, "each change wakes the connection"
+    assert (bench.sender.sent, bench.sender.acknowledged) == (6, 2)
+    assert bench.broker.connections[0].types == [JSON_TYPE] * 6
+    bench.sender.give(bench.sender.session, [row(7, MAGIC + b"x")])
+    bench.broker.answers = 6
+    bench.sender.work()
+    bench.sender.work()
+    assert bench.broker.connections[0].types[6:] == [SLOTS_TYPE]
+
+
+def test_after_a_loss_nothing_is_held_and_the_session_is_another() -> None:
+    bench = SenderBench("a", "b")
+    bench.broker.answers = 1
+    bench.sender.work()
+    bench.sender.give(1, [row(1), row(2)])
+    bench.sender.work()
+    bench.broker.problem = "the cable was pulled"
+    assert bench.sender.work() == 2.0
+    assert bench.broker.connections[0].closed
+    assert (bench.sender.connected, bench.sender.problem, bench.sender.session) == (False, "the cable was pulled", 2)
+    assert bench.sender.take_acknowledged() == [(1, 1)]
+    bench.sender.give(1, [row(3)])
+    assert bench.sender.work() > 0
+    bench.broker.problem = ""
+    bench.sender.work()
+    bench.sender.work()
+    assert bench.sent() == []
+    assert (bench.sender.problem, bench.sender.reconnects) == ("", 1)
+    assert bench.broker.asked == ["a", "a", "b"]
+
+
+def test_retained_messages_go_first_and_again_at_each_connection() -> None:
+    bench = SenderBench()
+    bench.sender.retain({"state": b"born", "status": b"1"})
+    bench.sender.work()
+    bench.sender.give(1, [row(1, b"data")])
+    bench.sender.work()
+    assert bench.broker.connections[0].sent == [
+        ("state", b"born", True),
+        ("status", b"1", True),
+        ("topic", b"data", False),
+    ]
+    bench.sender.retain({"status": b"1"})
+    bench.sender.work()
+    assert len(bench.sent()) == 3, "what is the same is not sent again"
+    bench.sender.retain({"status": b""})
+    bench.sender.work()
+    assert bench.sent()[3:] == [b""]
+    bench.broker.problem = "gone"
+    bench.sender.work()
+    bench.broker.problem = ""
+    bench.sender.work()
+    bench.sender.work()
+    assert bench.sent() == [b"born"], "what was removed is not sent again"
+
+
+@pytest.mark.live
+def test_it_ends_with_a_farewell() -> None:
+    bench = SenderBench()
+    connected = threading.Event()
+    bench.sender.wanting = connected.set
+    bench.sender.start()
+    assert connected.wait(LIMIT_S)
+    bench.sender.close(b"bye")
+    bench.sender.close(b"bye")
+    assert bench.broker.connections[-1].sent[-1] == ("state", b"bye", True)
+    assert bench.broker.connections[-1].closed
+    assert bench.sender.failure is None
+
+
+@pytest.mark.live
+def test_what_is_still_connecting_at_the_end_says_nothing() -> None:
+    """The next output has the same name, and may be connected already."""
+    bench = SenderBench()
+    bench.broker.accepts.clear()
+    bench.sender.retain({"state": b"born"})
+    bench.sender.start()
+    assert bench.broker.connecting.wait(LIMIT_S)
+    bench.sender.close(b"bye")
+    bench.broker.accepts.set()
+    bench.sender.join(LIMIT_S)
+    (connection,) = bench.broker.connections
+    assert not bench.broker.was_wanted
+    assert (connection.sent, connection.closed, bench.sender.connected) == ([], True, False)
+    assert bench.broker.asked == ["a"], "it does not try again"
+
+
+def test_an_answer_that_is_lost_with_its_connection_goes_again() -> None:
+    bench = SenderBench()
+    bench.broker.answers = 1
+    bench.sender.work()
+    for number in range(3):
+        bench.sender.reply(CommandReply("answer", b"%d" % number, b"c"))
+    bench.sender.work()
+    assert bench.sent() == [b"0", b"1", b"2"]
+    bench.broker.problem = "the cable was pulled"
+    bench.sender.work()
+    bench.sender.reply(CommandReply("answer", b"3", None))
+    bench.broker.problem, bench.broker.answers = "", 100
+    bench.sender.work()
+    bench.sender.work()
+    assert bench.sent() == [b"1", b"2", b"3"]
+    assert bench.broker.connections[-1].correlations == [b"c", b"c", None]
+
+
+def test_answers_that_wait_are_bounded_and_the_oldest_go() -> None:
+    bench = SenderBench()
+    bench.broker.window, bench.broker.answers = 1000, 0
+    bench.sender.work()
+    for number in range(10):
+        bench.sender.reply(CommandReply("answer", b"%d" % number, None))
+    bench.sender.work()
+    bench.broker.problem = "the cable was pulled"
+    for number in range(10, REPLIES_MAX + 5):
+        bench.sender.reply(CommandReply("answer", b"%d" % number, None))
+    bench.sender.work()
+    bench.broker.problem = ""
+    bench.sender.work()
+    bench.sender.work()
+    assert bench.sent() == [b"%d" % number for number in range(5, REPLIES_MAX + 5)]

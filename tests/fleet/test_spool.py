@@ -1,0 +1,447 @@
+"""The spool: order, room, age, a full disk, a damaged file; every number is covered by exactly one message, always."""
+
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from imud.fleet.accounts import FleetLedger, StreamCounts, StreamPosition
+from imud.fleet.messages import (
+    VERSION,
+    FleetMessage,
+    MessageKind,
+    Stream,
+    decode_message,
+    encode_message,
+    encode_slots_message,
+    topic_of,
+)
+from imud.fleet.spool import CLOCK_SET_NS, FILE, RESERVE_FILE, STEP, Spool, Spooled, SpoolError, row_of
+from imud.formats.slot import encode_slots
+from imud.model.sample import Sample, Sync
+from imud.model.units import NS_PER_S
+
+HOUR_NS = 3600 * NS_PER_S
+UTC_NS = CLOCK_SET_NS + 10_000 * HOUR_NS
+
+
+def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = True) -> Spooled:
+    stream = Stream.SAMPLES if whole else Stream.EVENTS
+    last = first + count - 1
+    samples = [
+        Sample(device, seq, seq, 0, Sync.EDGE, seq, seq, accel_m_s2=(seq * 0.37, seq / 7, 9.8))
+        for seq in range(first, last + 1)
+    ]
+    message = FleetMessage(
+        v=VERSION, gateway="gw", boot="1", device=device, begin=1,
+        kind=MessageKind.SLOTS if whole else MessageKind.EVENTS, first=first, last=last, count=count, utc_ns=last,
+    )  # fmt: skip
+    payload = encode_slots_message(message, encode_slots(samples, 0)) if whole else encode_message(message)
+    return row_of(topic_of("site", "gw", device, stream), stream, message, payload, 0)
+
+
+class SpoolBench:
+    def __init__(
+        self, path: Path, kilobytes: int = 100_000, hours: float = 100.0, *, newest_first: bool = False
+    ) -> None:
+        self.spool = Spool(path, kilobytes * 1000, round(hours * HOUR_NS), newest_first=newest_first)
+        self.spool.open()
+        self.now_ns = 0
+
+    def commit(self, *rows: Spooled, done: tuple[int, ...] = (), utc_ns: int = UTC_NS) -> None:
+        self.now_ns += NS_PER_S
+        self.spool.commit(rows, done, self.now_ns, utc_ns)
+
+    def all(self) -> list[Spooled]:
+        self.spool.rewind()
+        found = self.spool.after(1_000_000)
+        self.spool.rewind()
+        return found
+
+    def counts(self) -> StreamCounts:
+        """What a reader would get, of the stream `samples`."""
+        ledger = FleetLedger(from_begin=True)
+        for row in self.all():
+            ledger.take(decode_message(row.payload), Stream(row.stream))
+        (found,) = [one for key, one in ledger.counts.items() if key.stream == "samples"]
+        assert found.balance == 0
+        return found
+
+
+def test_messages_come_in_their_order_until_they_are_acknowledged(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    bench.commit(batch(1), batch(101), batch(201))
+    first = bench.spool.after(2)
+    assert [row.first for row in first] == [1, 101]
+    assert [row.first for row in bench.spool.after(5)] == [201]
+    assert bench.spool.after(5) == []
+    bench.commit(done=(first[0].id,))
+    assert [row.first for row in bench.all()] == [101, 201]
+    assert bench.spool.messages == 2
+
+
+@pytest.mark.live
+def test_what_was_committed_is_there_after_the_end_without_a_farewell(tmp_path: Path) -> None:
+    code = (
+        "import os, sys; from pathlib import Path; from tests.fleet.test_spool import SpoolBench, batch\n"
+        "bench = SpoolBench(Path(sys.argv[1]))\n"
+        "for n in range(5): bench.commit(batch(100 * n + 1))\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, tmp_path], check=False)
+    assert ended.returncode == -9
+    bench = SpoolBench(tmp_path)
+    assert bench.counts() == StreamCounts(1, 500, whole=500)
+    assert bench.spool.positions()[0].last == 500
+    bench.commit(batch(501))
+    assert [row.id for row in bench.all()] == [1, 2, 3, 4, 5, 6]
+
+
+def test_the_oldest_samples_become_statistics_before_anything_is_dropped(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, kilobytes=300)
+    for number in range(150):
+        bench.commit(batch(100 * number + 1))
+        assert bench.spool.used_bytes <= 300_000
+    counts = bench.counts()
+    assert counts.dropped == {}
+    assert counts.thinned >= 3_000
+    assert counts.whole >= 1000
+    assert counts.whole + counts.thinned == 15_000
+    assert bench.spool.thinned == counts.thinned
+    kinds = [row.kind for row in bench.all()]
+    assert kinds == sorted(kinds), "intervals are the oldest, slots the newest"
+
+
+def test_when_nothing_can_be_thinned_the_oldest_are_dropped_and_it_is_said(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, kilobytes=100)
+    for number in range(200):
+        bench.commit(batch(100 * number + 1), batch(number + 1, 1, whole=False))
+        assert bench.spool.used_bytes <= 100_000
+    counts = bench.counts()
+    assert counts.missing == 0
+    assert counts.newest == 20_000
+    assert counts.dropped["space"] > 5_000
+    rows = bench.all()
+    events = sum(row.items for row in rows if row.stream == "events" and row.kind == "dropped")
+    assert bench.spool.dropped["space"] == counts.dropped["space"] + events
+    assert sum(row.kind == "dropped" for row in rows) == 2, "neighbours share one note for each stream"
+
+
+def test_what_is_new_goes_before_what_waited_where_asked(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, newest_first=True)
+    bench.commit(batch(1), batch(101), batch(201), batch(301))
+    bench.spool.rewind()
+    assert [row.first for row in bench.spool.after(1)] == [1]
+    bench.commit(batch(401), batch(501))
+    assert [row.first for row in bench.spool.after(3)] == [401, 501, 101]
+    bench.commit(batch(601))
+    assert [row.first for row in bench.spool.after(9)] == [601, 201, 301]
+    assert bench.spool.after(9) == []
+    bench.commit(batch(701), batch(801))
+    assert [row.first for row in bench.spool.after(1)] == [701]
+    assert [row.first for row in bench.spool.after(9)] == [801]
+    bench.spool.rewind()
+    assert [row.first for row in bench.spool.after(9)] == list(range(1, 900, 100))
+
+
+@pytest.mark.parametrize("newest_first", [False, True])
+def test_messages_that_the_sender_has_are_not_changed(tmp_path: Path, newest_first: bool) -> None:
+    bench = SpoolBench(tmp_path, kilobytes=150, newest_first=newest_first)
+    bench.commit(batch(1), batch(101))
+    bench.spool.rewind()
+    bench.commit(batch(201), batch(301))
+    given = bench.spool.after(2)
+    assert [row.first for row in given] == ([201, 301] if newest_first else [1, 101])
+    for number in range(4, 200):
+        bench.commit(batch(100 * number + 1))
+    assert bench.spool.thinned > 0
+    assert bench.spool.dropped["space"] > 0
+    kept = {row.id: row for row in bench.all()}
+    assert [kept[row.id] for row in given] == given
+    assert bench.counts().missing == 0
+
+
+@pytest.mark.parametrize("newest_first", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_everything_is_given_once_and_never_changed_afterwards(tmp_path: Path, seed: int, newest_first: bool) -> None:
+    random = Random(seed)
+    bench = SpoolBench(tmp_path, kilobytes=random.choice([120, 250, 100_000]), newest_first=newest_first)
+    ledger, first, given = FleetLedger(from_begin=True), 1, dict[int, Spooled]()
+    for _ in range(150):
+        match random.randrange(8):
+            case 0:
+                bench.spool.rewind()
+                given.clear()
+            case 1 | 2 if given:
+                done = tuple(random.sample(sorted(given), random.randint(1, len(given))))
+                for number in done:
+                    ledger.take(decode_message(given.pop(number).payload), Stream.SAMPLES)
+                bench.commit(done=done)
+            case 3 | 4:
+                for row in bench.spool.after(random.randint(1, 6)):
+                    assert row.id not in given
+                    given[row.id] = row
+            case _:
+                bench.commit(*(batch(first + 100 * number) for number in range(2)))
+                first += 200
+    kept = {row.id: row for row in bench.all()}
+    assert {number: row.payload for number, row in kept.items() if number in given} == {
+        number: row.payload for number, row in given.items()
+    }
+    for row in kept.values():
+        ledger.take(decode_message(row.payload), Stream.SAMPLES)
+    (counts,) = ledger.counts.values()
+    assert (counts.newest, counts.missing, counts.balance) == (first - 1, 0, 0)
+
+
+def test_ages_count_only_while_the_clock_is_set(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, hours=1)
+    bench.commit(batch(1), batch(101))
+    bench.commit(batch(201), utc_ns=UTC_NS + HOUR_NS // 2)
+    bench.commit(utc_ns=UTC_NS + HOUR_NS + 1)
+    assert bench.counts() == StreamCounts(1, 300, whole=100, dropped={"age": 200})
+    assert bench.spool.dropped == {"age": 200}
+    bench = SpoolBench(tmp_path / "other", hours=1)
+    bench.commit(batch(1), utc_ns=5 * NS_PER_S)
+    bench.commit(batch(101), utc_ns=UTC_NS)
+    bench.commit(utc_ns=UTC_NS + 1)
+    assert bench.counts() == StreamCounts(1, 200, whole=200)
+
+
+def test_a_note_that_was_delivered_is_not_widened(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, hours=1)
+    bench.commit(batch(1))
+    bench.commit(batch(101), utc_ns=UTC_NS + HOUR_NS)
+    bench.commit(utc_ns=UTC_NS + HOUR_NS + 1)
+    (note,) = bench.spool.after(1)
+    assert note.kind == "dropped"
+    bench.commit(utc_ns=UTC_NS + 2 * HOUR_NS + 2)
+    bench.commit(done=(note.id,), utc_ns=UTC_NS + 2 * HOUR_NS + 2)
+    (left,) = bench.all()
+    assert (left.first, left.last, left.kind) == (101, 200, "dropped")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 512 kB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=512k", "x", disk], check=False).returncode:
+        pytest.skip("no tmpfs can be mounted here")
+    try:
+        yield disk
+    finally:
+        subprocess.run(["umount", "-l", disk], check=True)
+
+
+def test_a_full_disk_leaves_the_spool_as_it_was_until_messages_are_acknowledged(small_disk: Path) -> None:
+    bench = SpoolBench(small_disk)
+    number = 0
+    with pytest.raises(SpoolError, match="full"):  # noqa: PT012
+        while True:
+            bench.commit(batch(100 * number + 1))
+            number += 1
+    assert (bench.spool.messages, bench.spool.thinned) == (number, 0)
+    assert number > 5
+    assert bench.counts() == StreamCounts(1, 100 * number, whole=100 * number)
+    bench.spool.close()
+    bench = SpoolBench(small_disk)
+    assert bench.counts() == StreamCounts(1, 100 * number, whole=100 * number)
+    given = bench.spool.after(1000)
+    assert len(given) == number
+    bench.spool.remove([row.id for row in given], bench.now_ns, UTC_NS)
+    assert bench.spool.messages == 0
+    for _ in range(300):  # from here on the file does not grow, and what waits becomes thinner
+        bench.commit(batch(100 * number + 1))
+        number += 1
+    assert bench.spool.thinned > 0
+
+
+def test_the_reserve_is_taken_again_when_the_disk_has_room(small_disk: Path) -> None:
+    reserve, other = small_disk / RESERVE_FILE, small_disk / "other"
+    bench = SpoolBench(small_disk)
+    assert reserve.stat().st_size > 100_000
+    bench.commit(batch(1))
+    with suppress(OSError), other.open("wb", buffering=0) as file:
+        while True:
+            file.write(bytes(1024))
+    (row,) = bench.spool.after(1)
+    bench.spool.remove([row.id], bench.now_ns, UTC_NS)
+    assert not reserve.exists()
+    for number in range(1, 20):
+        bench.commit(batch(100 * number + 1))
+    assert not reserve.exists()
+    other.unlink()
+    for number in range(20, 26):
+        bench.commit(batch(100 * number + 1))
+    assert reserve.stat().st_size > 100_000
+
+
+def test_a_damaged_file_is_set_aside(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_bytes(b"This is no database at all, and it is long enough to be seen as none." * 100)
+    bench = SpoolBench(tmp_path)
+    assert bench.spool.set_aside == str(tmp_path / "spool.db.damaged")
+    bench.commit(batch(1))
+    assert bench.counts() == StreamCounts(1, 100, whole=100)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SpoolError, match="file"):
+        Spool(tmp_path / "file" / "spool", 1_000_000, HOUR_NS).open()
+
+
+def test_a_file_that_is_damaged_later_is_set_aside_at_the_next_attempt(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    for number in range(STEP):
+        bench.commit(batch(100 * number + 1))
+    bench.spool.close()
+    path = tmp_path / FILE
+    content = bytearray(path.read_bytes())
+    content[1024:] = b"\xa5" * (len(content) - 1024)
+    path.write_bytes(content)
+    bench = SpoolBench(tmp_path)
+    for _ in range(2):
+        try:
+            bench.commit(batch(1))
+        except SpoolError:
+            continue
+    assert bench.spool.set_aside
+    assert bench.counts().whole == 100
+
+
+def test_a_payload_that_cannot_be_read_is_dropped_as_damaged(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, kilobytes=60)
+    bench.commit(batch(1)._replace(payload=b"IMUB" + bytes(30_000)))
+    for number in range(1, 20):
+        bench.commit(batch(100 * number + 1))
+    assert bench.spool.dropped["damaged"] == 100
+    assert bench.counts().dropped["damaged"] == 100
+
+
+DAMAGE = {
+    "a topic that is no text": "topic = CAST(x'696d75642f73ff' AS TEXT)",
+    "a topic with a wildcard": "topic = 'imud/site/#/bow/samples'",
+    "a payload that is a number": "payload = 17",
+    "a payload with other bytes": "payload = x'00ff'",
+    "JSON that ends early": 'payload = CAST(\'{"boot":"1"\' AS BLOB)',
+    "slots that cannot be decompressed": "payload = CAST(substr(payload, 1, length(payload) - 9) AS BLOB)",
+    "a boot that is no text": "boot = CAST(x'ff' AS TEXT)",
+    "a device that is not that of the topic": "device = 'stern'",
+    "a kind that there is not": "kind = 'other'",
+    "numbers that are not those of the payload": "first = 150",
+    "a number that is a text": "last = 'many'",
+    "a time that is a text": "stored_utc_ns = 'never'",
+}
+"""What a disk can make of a row, as SQL; SQLite gives all of it back without an error."""
+
+
+def damage(folder: Path, change: str, where: str = "id = 2", table: str = "message") -> None:
+    """Change rows behind the back of the spool; without more words the second message."""
+    base = sqlite3.connect(folder / FILE, isolation_level=None)
+    base.execute(f"UPDATE {table} SET {change} WHERE {where}")
+    base.close()
+
+
+@pytest.mark.parametrize("change", DAMAGE.values(), ids=DAMAGE)
+@pytest.mark.parametrize("kilobytes", [100_000, 20], ids=["read", "thinned"])
+def test_a_damaged_row_costs_only_itself(tmp_path: Path, change: str, kilobytes: int) -> None:
+    bench = SpoolBench(tmp_path)
+    bench.commit(*(batch(100 * number + 1) for number in range(10)))
+    bench.spool.close()
+    damage(tmp_path, change)
+    again = SpoolBench(tmp_path, kilobytes=kilobytes)
+    again.commit(batch(1001))
+    assert [one.last for one in again.spool.positions()] == [1100]
+    counts = again.counts()
+    assert (counts.newest, counts.whole + counts.thinned + counts.dropped.get("space", 0)) == (1100, 1000)
+    assert counts.dropped.get("damaged", 0) + counts.missing == 100
+    assert set(again.spool.dropped) <= {"damaged", "space"}
+    assert again.spool.dropped["damaged"]
+
+
+def test_a_damaged_row_that_says_its_numbers_is_a_note(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    bench.commit(*(batch(100 * number + 1) for number in range(3)))
+    damage(tmp_path, "payload = 17")
+    counts = bench.counts()
+    assert (counts.whole, counts.dropped, counts.missing) == (200, {"damaged": 100}, 0)
+    assert bench.counts() == counts, "the note is stored, and counts once"
+    assert bench.spool.dropped == {"damaged": 100}
+    assert bench.spool.messages == 3
+
+
+def test_messages_behind_damaged_ones_that_are_gone_are_given(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    bench.commit(*(batch(100 * number + 1) for number in range(4)))
+    damage(tmp_path, "topic = ''", "id <= 2")
+    assert [row.first for row in bench.spool.after(2)] == [201, 301]
+    assert bench.spool.messages == 2
+
+
+def test_a_damaged_position_is_left_out(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    bench.commit(batch(1), batch(1, device="stern"))
+    damage(tmp_path, "stored_utc_ns = 'never', boot = CAST(x'ff' AS TEXT)", "device = 'stern'", "progress")
+    bench.commit(batch(101))
+    assert [(one.device, one.last) for one in bench.spool.positions()] == [("bow", 200)]
+
+
+def test_a_file_whose_numbers_are_at_their_end_is_set_aside(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    bench.commit(batch(1))
+    bench.spool.close()
+    damage(tmp_path, "id = 9223372036854775807", "id = 1")
+    again = SpoolBench(tmp_path)
+    again.commit(batch(101))
+    assert again.spool.set_aside
+    assert [row.first for row in again.all()] == [101]
+
+
+def test_positions_are_those_of_one_name_of_the_gateway(tmp_path: Path) -> None:
+    old = Spool(tmp_path, 1 << 30, HOUR_NS, gateway="gw")
+    old.open()
+    old.commit([batch(1)], (), 1, UTC_NS)
+    old.close()
+    new = Spool(tmp_path, 1 << 30, HOUR_NS, gateway="other")
+    new.open()
+    assert new.positions() == []
+    row = batch(101)
+    new.commit([row._replace(topic=row.topic.replace("gw", "other"))], (), 1, UTC_NS)
+    assert [(one.begin, one.last) for one in new.positions()] == [(101, 200)]
+    new.close()
+
+
+def test_what_was_dropped_of_two_names_is_in_two_notes(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, hours=1)
+    first, second = batch(1), batch(101)
+    bench.commit(first, second._replace(topic=second.topic.replace("gw", "other")))
+    bench.commit(utc_ns=UTC_NS + 2 * HOUR_NS)
+    assert [(row.gateway, row.first, row.last, row.kind) for row in bench.spool.after(9)] == [
+        ("gw", 1, 100, "dropped"),
+        ("other", 101, 200, "dropped"),
+    ]
+
+
+def test_positions_of_an_earlier_version_are_taken_over(tmp_path: Path) -> None:
+    base = sqlite3.connect(tmp_path / FILE, isolation_level=None)
+    base.execute("CREATE TABLE position (boot, device, stream, begin, last, stored_utc_ns)")
+    base.execute("INSERT INTO position VALUES ('1', 'bow', 'samples', 3, 17, 1)")
+    base.close()
+    for _ in range(2):
+        spool = Spool(tmp_path, 1 << 30, HOUR_NS, gateway="gw")
+        spool.open()
+        assert spool.positions() == [StreamPosition("1", "bow", "samples", 3, 17)]
+        spool.close()
+
+
+def test_the_streams_of_as_many_devices_as_there_may_be_keep_their_begin(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    for first in (1, 2):
+        for whole in (True, False):
+            bench.commit(*(batch(first, 1, f"device-{number}", whole=whole) for number in range(256)))
+    positions = bench.spool.positions()
+    assert len(positions) == 512
+    assert {(one.begin, one.last) for one in positions} == {(1, 2)}

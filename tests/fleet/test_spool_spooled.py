@@ -1,0 +1,61 @@
+"""Rows of the spool: what is sound, what is mended, what is left of the rest; all of SQLite's types are looked at."""
+
+import msgspec
+import pytest
+
+from imud.fleet.messages import DropCause, MessageKind, Stream, decode_message
+from imud.fleet.spool import Spooled, is_position, mended_row, row_of, sound_row
+from tests.fleet.test_spool import batch
+
+FOREIGN = (None, 1.5, "text", b"\xff", -1, 1 << 63)
+"""What SQLite can give back in any column."""
+
+
+def test_a_row_is_what_it_was() -> None:
+    assert sound_row(tuple(batch(1))) == batch(1)
+    assert sound_row(tuple(batch(7, 1, whole=False))) == batch(7, 1, whole=False)
+
+
+@pytest.mark.parametrize("column", Spooled._fields[1:])
+def test_a_column_of_another_kind_is_found_or_is_as_good(column: str) -> None:
+    """The time may be any number; `items` is of no message that is sent."""
+    for value in FOREIGN:
+        row = sound_row(tuple(value if name == column else one for name, one in batch(1)._asdict().items()))
+        assert row is None or column in ("stored_utc_ns", "items"), value
+
+
+@pytest.mark.parametrize("column", ["kind", "payload"])
+def test_a_row_that_says_its_numbers_becomes_a_note(column: str) -> None:
+    row = mended_row([17 if name == column else one for name, one in batch(101)._asdict().items()])
+    assert row is not None
+    note = decode_message(row.payload)
+    assert (note.kind, note.cause, note.first, note.last, note.count) == (
+        MessageKind.DROPPED, DropCause.DAMAGED, 101, 200, 100,
+    )  # fmt: skip
+    assert (note.gateway, note.boot, note.device) == ("gw", "1", "bow")
+    assert sound_row(tuple(row)) == row
+
+
+@pytest.mark.parametrize("change", [{"last": 900}, {"items": 3}, {"topic": "imud/x"}, {"boot": ""}, {"first": 0}])
+def test_a_row_whose_numbers_do_not_agree_does_not(change: dict[str, object]) -> None:
+    """A note of numbers that it never had would take other messages for duplicates."""
+    assert mended_row([change.get(name, one) for name, one in batch(101)._asdict().items()]) is None
+
+
+def test_numbers_of_the_payload_count() -> None:
+    message = decode_message(batch(1).payload)
+    for name, value in (("first", 2), ("last", 99), ("boot", "2"), ("device", "stern"), ("gateway", "other")):
+        other = msgspec.structs.replace(message, kind=MessageKind.EVENTS, samples=[], **{name: value})
+        row = row_of(batch(1).topic, Stream.SAMPLES, message, msgspec.json.encode(other), 0)
+        assert sound_row(tuple(row)) is None, name
+
+
+def test_positions() -> None:
+    assert is_position(("1", "bow", "samples", 1, 9))
+    assert is_position(("1", "", "events", 9, 9))
+    for values in (
+        ("1", "bow", "samples", 0, 9), ("1", "bow", "samples", 9, 1), ("1", "bow", "other", 1, 9),
+        ("\ufffd", "bow", "samples", 1, 9), ("1", "bow", "samples", 1, "9"), ("1", None, "samples", 1, 9),
+        ("1", "bow", "samples", 1, 1 << 62),
+    ):  # fmt: skip
+        assert not is_position(values), values

@@ -1,0 +1,139 @@
+"""Blocks of recordings: golden bytes, every cut, every damaged byte, foreign bytes between them."""
+
+import io
+import struct
+import zlib
+from random import Random
+
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imud.formats.recording import (
+    HEAD,
+    MAGIC,
+    PLAIN_MAX,
+    BlockEncoder,
+    BlockReader,
+    check_begin,
+    is_recording,
+    renumbered,
+)
+from imud.model.errors import ImudError
+
+GOLDEN_HEAD = b"\x89imudREC" + b"\0" + b"\0\0\0" + b"\0\0\0\0" + b"\3\0\0\0" + b"\3\0\0\0"
+GOLDEN = GOLDEN_HEAD + zlib.crc32(GOLDEN_HEAD + b"abc").to_bytes(4, "little") + b"abc"
+"""A stored block, written by hand from the description."""
+
+
+def blocks_of(data: bytes) -> tuple[list[bytes], BlockReader]:
+    reader = BlockReader(io.BytesIO(data))
+    return [block.content for block in reader], reader
+
+
+def some_blocks(count: int, seed: int = 1) -> list[tuple[bytes, bytes]]:
+    random, encoder = Random(seed), BlockEncoder()
+    contents = [random.randbytes(random.randrange(1, 40)) * random.randrange(1, 30) for _ in range(count)]
+    return [(content, encoder.encode(content)) for content in contents]
+
+
+def test_the_golden_block_is_read_and_written_and_one_that_compresses_is_a_zstandard_frame() -> None:
+    assert BlockEncoder().encode(b"abc") == GOLDEN
+    found, reader = blocks_of(GOLDEN)
+    assert found == [b"abc"]
+    assert (reader.bytes_bad, reader.bytes_cut, reader.blocks_missing) == (0, 0, 0)
+    assert is_recording(GOLDEN)
+    with pytest.raises(ImudError, match=r"a\.csv is no recording of imud: expected"):
+        check_begin(b"t_ns,accel", "a.csv")
+    block = BlockEncoder().encode(b"abcd" * 1000)
+    assert block[8] == 1
+    assert zstandard.ZstdDecompressor().decompress(block[HEAD.size :]) == b"abcd" * 1000
+    assert blocks_of(block)[0] == [b"abcd" * 1000]
+
+
+def test_after_a_cut_at_any_byte_all_whole_blocks_are_read() -> None:
+    made = some_blocks(6)
+    data = b"".join(block for _, block in made)
+    for end in range(len(data) + 1):
+        whole, at = [], 0
+        for content, block in made:
+            at += len(block)
+            if at <= end:
+                whole.append(content)
+        found, reader = blocks_of(data[:end])
+        assert found == whole
+        assert reader.bytes_bad == 0
+        assert sum(len(block) for content, block in made[: len(whole)]) + reader.bytes_cut == end
+
+
+def test_a_damaged_byte_costs_its_own_block_only() -> None:
+    made = some_blocks(4)
+    data = b"".join(block for _, block in made)
+    for place in range(len(data)):
+        damaged = data[:place] + bytes([data[place] ^ 0x40]) + data[place + 1 :]
+        begins = [sum(len(block) for _, block in made[:i]) for i in range(len(made))]
+        hit = max(i for i, begin in enumerate(begins) if begin <= place)
+        found, reader = blocks_of(damaged)
+        assert found == [content for i, (content, _) in enumerate(made) if i != hit]
+        assert reader.bytes_bad + reader.bytes_cut == len(made[hit][1])
+        assert reader.blocks_missing == (hit != len(made) - 1)
+
+
+@given(st.lists(st.binary(max_size=60), max_size=6), st.integers(0, 1000))
+def test_foreign_bytes_between_blocks_are_passed_over(foreign: list[bytes], seed: int) -> None:
+    made = some_blocks(len(foreign), seed)
+    data = b"".join(junk.replace(MAGIC, b"") + block for junk, (_, block) in zip(foreign, made, strict=True))
+    assert blocks_of(data)[0] == [content for content, _ in made]
+
+
+@given(st.binary(max_size=400))
+def test_no_bytes_raise(data: bytes) -> None:
+    found, reader = blocks_of(MAGIC + data)
+    assert not found
+    assert reader.bytes_bad + reader.bytes_cut == len(data) + len(MAGIC)
+
+
+def valid_crc(stored: bytes, plain: int, method: int = 1) -> bytes:
+    """Return a block with these contents and the CRC of them."""
+    head = HEAD.pack(MAGIC, method, 0, plain, len(stored), 0)[:-4]
+    return head + struct.pack("<I", zlib.crc32(stored, zlib.crc32(head))) + stored
+
+
+FRAME = zstandard.compress(b"abcd" * 1000)
+DAMAGED = {
+    "no Zstandard frame": valid_crc(b"x" * 40, 4000),
+    "a frame that is cut": valid_crc(FRAME[:-3], 4000),
+    "a frame with damaged data": valid_crc(FRAME[:-4] + b"\xff\xff\xff\xff", 4000),
+    "a frame with a byte too much": valid_crc(FRAME, 3999),
+    "a frame with a byte too few": valid_crc(FRAME, 4001),
+    "a frame without its size": valid_crc(zstandard.ZstdCompressor(write_content_size=False).compress(b"a" * 99), 99),
+    "a frame of 64 MB": valid_crc(zstandard.compress(bytes(64 << 20)), 1 << 16),
+    "a content that is too large": valid_crc(zstandard.compress(bytes(PLAIN_MAX + 1)), PLAIN_MAX + 1),
+    "a frame as large as its content": valid_crc(FRAME, len(FRAME)),
+    "another method": valid_crc(b"abc", 3, method=2),
+    "stored bytes of another size": valid_crc(b"abc", 4, method=0),
+}
+"""Blocks whose CRC is valid, as another program or a defect writes them."""
+
+
+@pytest.mark.parametrize("block", DAMAGED.values(), ids=DAMAGED)
+def test_a_block_with_a_valid_crc_and_damaged_content_costs_only_itself(block: bytes) -> None:
+    found, reader = blocks_of(GOLDEN + block + GOLDEN)
+    assert (found, reader.bytes_bad, reader.first_bad) == ([b"abc"] * 2, len(block), len(GOLDEN))
+    found, reader = blocks_of(block)
+    assert (found, reader.bytes_bad + reader.bytes_cut) == ([], len(block))
+
+
+def test_the_largest_content_is_read_and_a_larger_one_refused() -> None:
+    assert blocks_of(BlockEncoder().encode(bytes(PLAIN_MAX)))[0] == [bytes(PLAIN_MAX)]
+    with pytest.raises(ValueError, match="at most"):
+        BlockEncoder().encode(b"\0" * (PLAIN_MAX + 1))
+
+
+def test_a_block_with_another_number_is_whole() -> None:
+    encoder = BlockEncoder()
+    blocks = [encoder.encode(content) for content in (b"a", b"b" * 1000)]
+    found = list(BlockReader(io.BytesIO(renumbered(blocks[1], 0) + renumbered(blocks[0], 1))))
+    assert [(block.number, block.content) for block in found] == [(0, b"b" * 1000), (1, b"a")]
+    assert renumbered(blocks[1], 1) == blocks[1]

@@ -1,0 +1,86 @@
+"""Records of recordings: each kind back as it was written, layouts by hand, and errors for what is none."""
+
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imud.formats import records
+from imud.formats.can import CanFrame
+from imud.formats.records import CallRecord, ClocksRecord, EdgeRecord, Kind, LostRecord, ReadingRecord, Record
+from imud.model.errors import ImudError
+
+DECODERS: dict[Kind, Callable[[bytes], Any]] = {
+    Kind.DATA: records.decode_data,
+    Kind.FRAMES: records.decode_frames,
+    Kind.READINGS: records.decode_readings,
+    Kind.EDGES: records.decode_edges,
+    Kind.CLOCKS: records.decode_clocks,
+    Kind.LOST: records.decode_lost,
+}
+
+
+def only(data: bytes) -> Record:
+    (record,) = records.records_of(data)
+    return record
+
+
+def test_a_data_record_by_hand_and_objects_that_come_back() -> None:
+    data = records.encode_data(3, b"\x5a\xa5", 258, -1)
+    assert data == b"\x05\x03\x00\x13\x00\x00\x00" + struct.pack("<qq", 258, -1) + b"\0\x5a\xa5"
+    record = only(data)
+    assert (record.kind, record.device) == (Kind.DATA, 3)
+    assert records.decode_data(record.body) == (258, -1, b"\x5a\xa5")
+    call = CallRecord("clock", "link_changed", [], {"byte_ns": 86_806, "hold_ns": 0})
+    record = only(records.encode_object(Kind.CALL, 1, call))
+    assert records.decode_object(record, CallRecord) == call
+    with pytest.raises(ImudError, match="kind 9 cannot be read"):
+        records.decode_object(record._replace(body=b"\xc1"), CallRecord)
+
+
+FRAMES = [
+    CanFrame(0x188, False, b"\1\2\3", 10), CanFrame(0x0CFF3408, True, b"", 11, True),
+    CanFrame(0x7FF, False, bytes(64), 12),
+]  # fmt: skip
+READINGS = [ReadingRecord(0, 5, 9, 0, b"\1" * 300), ReadingRecord(1, 10, 12, 2, "bus é".encode())]
+CLOCKS, LOST = ClocksRecord(1, -2, 3, 4, 5, 6), LostRecord(1, 2, -3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "data", "value"),
+    [
+        (Kind.FRAMES, records.encode_frames(0, FRAMES), FRAMES),
+        (Kind.READINGS, records.encode_readings(7, READINGS), READINGS),
+        (Kind.CLOCKS, records.encode_clocks(CLOCKS), CLOCKS),
+        (Kind.LOST, records.encode_lost(LOST), LOST),
+    ],
+)
+def test_records_come_back(kind: Kind, data: bytes, value: object) -> None:
+    assert only(data).kind == kind
+    assert DECODERS[kind](only(data).body) == value
+
+
+@pytest.mark.parametrize("line", records.LINES)
+def test_edges_come_back(line: str) -> None:
+    edges = [EdgeRecord(-5, True, 1), EdgeRecord(1 << 60, False, 1 << 40)]
+    assert records.decode_edges(only(records.encode_edges(0, line, edges)).body) == (line, edges)
+
+
+def test_records_follow_one_another_and_a_cut_one_is_an_error() -> None:
+    data = records.encode_data(0, b"a", 1, -1) + records.encode(Kind.EVENT, 2, msgspec.msgpack.encode({}))
+    assert [record.kind for record in records.records_of(data)] == [Kind.DATA, Kind.EVENT]
+    for end in range(1, len(data)):
+        if end != len(records.encode_data(0, b"a", 1, -1)):
+            with pytest.raises(ImudError):
+                list(records.records_of(data[:end]))
+
+
+@given(st.sampled_from(sorted(DECODERS)), st.binary(max_size=80))
+def test_no_body_raises_anything_but_an_imud_error(kind: Kind, body: bytes) -> None:
+    with suppress(ImudError):
+        DECODERS[kind](body)

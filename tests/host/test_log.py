@@ -1,0 +1,322 @@
+"""A message is one line whatever it is made of, and no reader of the log makes the one who logs wait."""
+
+import logging
+import os
+import re
+import select
+import sys
+import threading
+import warnings
+from pathlib import Path
+
+import pytest
+
+from imud.host.log import (
+    KNOWN_MOST,
+    MESSAGE_CHARACTERS_MAX,
+    TRACEBACK_LINES_MAX,
+    VALUE_CHARACTERS_MAX,
+    LineFormatter,
+    LogWriter,
+    RepeatFilter,
+    is_journal,
+    log_to,
+    messages_dropped,
+    printable,
+    same_as,
+    shown,
+)
+from tests.support.daemon_process import wait_until
+from tests.support.surroundings import pipe, read_until
+
+log = logging.getLogger("imud.test")
+WRITE_S = 60.0
+
+
+@pytest.fixture(autouse=True)
+def _time_to_write(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the end wait longer for the last messages: a loaded host writes slowly."""
+    monkeypatch.setattr("imud.host.log.FLUSH_S", WRITE_S)
+
+
+FORGED = "bow\n2026-11-22 05:00:00,000 WARNING root logged in"
+HOSTILE = (
+    FORGED, "\x1b[2J\x1b]0;title\x07", "a\rb", "\x00", "\x85next", "\u2028line", "\u202eevil", "\udc80\ud800",
+    "\x9b31m", "x" * 10_000, "\n" * 10_000,
+)  # fmt: skip
+
+
+def nested(levels: int) -> object:
+    """What 974 brackets of a request become."""
+    value: object = {}
+    for number in range(levels):
+        value = [value] if number % 2 else {"a": value}
+    return value
+
+
+def formatted(message: str, *values: object, **more: object) -> str:
+    """The line of one message."""
+    record = logging.LogRecord("imud", logging.WARNING, __file__, 1, message, values, None)
+    record.__dict__.update(more)
+    return LineFormatter(journal=True).format(record)
+
+
+# --- the journal, and repeated trouble --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("level", "priority"),
+    [(logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.DEBUG, 7), (1, 7)],
+)
+def test_lines_for_the_journal_begin_with_their_priority(level: int, priority: int) -> None:
+    record = logging.LogRecord("imud", level, __file__, 1, "bow is %s", ("up",), None)
+    assert LineFormatter(journal=True).format(record) == f"<{priority}>bow is up"
+    elsewhere = rf"\d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d,\d{{3}} {logging.getLevelName(level)} bow is up"
+    assert re.fullmatch(elsewhere, LineFormatter(journal=False).format(record))
+
+
+def passed(repeats: RepeatFilter, t_s: float, message: str, *values: object, level: int = logging.WARNING) -> str:
+    """The line that passes the filter at a time; empty for none."""
+    record = logging.LogRecord("imud", level, __file__, 1, message, values, None)
+    record.created = t_s
+    return LineFormatter(journal=True).format(record) if repeats.filter(record) else ""
+
+
+def test_repeated_trouble_is_told_less_and_less_often() -> None:
+    repeats = RepeatFilter()
+    told = {t: line for t in range(200) if (line := passed(repeats, 1000 + t, "%s: %d lost", "bow", t))}
+    assert list(told) == [0, 1, 3, 7, 15, 31, 63, 123, 183]
+    assert told[1] == "<4>bow: 1 lost"
+    assert told[7] == "<4>bow: 7 lost, 3 more like it in 4 s"
+    assert told[183] == "<4>bow: 183 lost, 59 more like it in 60 s"
+    assert passed(repeats, 1300, "%s: %d lost", "bow", 1) == "<4>bow: 1 lost"  # after a minute of quiet it is new
+
+
+def test_other_trouble_is_told_at_once() -> None:
+    repeats = RepeatFilter()
+    assert passed(repeats, 0, "%s: %d lost", "bow", 1)
+    assert not passed(repeats, 0, "%s: %d lost", "bow", 2)
+    assert passed(repeats, 0, "%s: %d lost", "stern", 2)
+    assert passed(repeats, 0, "%s: gone", "bow")
+    assert passed(repeats, 0, "%s: %d lost", "bow", 3, level=logging.ERROR)
+    for _ in range(10):
+        assert passed(repeats, 0, "%s: up", "bow", level=logging.INFO)
+    assert passed(repeats, -100, "%s: %d lost", "bow", 1)  # the clock was set back
+    assert passed(repeats, 0, "nothing %s", 5)
+
+
+def test_texts_that_are_values_are_told_apart_and_numbers_in_them_are_not() -> None:
+    repeats, told = RepeatFilter(), []
+    for text in ("3 samples lost", "5 samples lost", "the adapter is gone"):
+        values = {"msg": "%s: %s", "args": ("bow", text), "levelno": logging.WARNING, "created": 0.0}
+        told.append(repeats.filter(logging.makeLogRecord(values | same_as(text))))
+    assert told == [True, False, True]
+
+
+def test_what_is_remembered_is_bounded() -> None:
+    repeats = RepeatFilter()
+    for number in range(KNOWN_MOST + 1):
+        assert passed(repeats, 0, f"message {number}")
+    assert passed(repeats, 0, "message 0")  # forgotten
+    assert not passed(repeats, 0, f"message {KNOWN_MOST}")
+
+
+# --- texts and values -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_printable_is_one_bounded_line_for_every_encoding(text: str) -> None:
+    line = printable(text)
+    assert line.isprintable()
+    assert len(line) <= VALUE_CHARACTERS_MAX
+    line.encode("utf-8")
+
+
+def test_printable_says_what_it_hides() -> None:
+    assert printable("Überseeschiff 3 °C") == "Überseeschiff 3 °C"
+    assert printable("a\nb\x1b\udc80\u202e") == r"a\nb\x1b\udc80\u202e"
+    assert printable("x" * 300, 10) == "x" * 9 + "…"
+    assert printable("\n" * 6, 10) == r"\n\n\n\n\n"[:9] + "…"
+
+
+class Unshowable:
+    def __repr__(self) -> str:
+        raise ValueError("no")
+
+
+@pytest.mark.parametrize(
+    "value",
+    [nested(974), nested(100_000), {f"k{n}": "\n" for n in range(10_000)}, b"\n\xff" * 10_000, 10**5000, Unshowable(),
+     [Unshowable()], *HOSTILE],
+    ids=lambda value: type(value).__name__,
+)  # fmt: skip
+def test_shown_is_one_bounded_line_of_any_value(value: object) -> None:
+    line = shown(value)
+    assert line.isprintable()
+    assert len(line) <= VALUE_CHARACTERS_MAX
+
+
+def test_shown_is_a_literal_where_it_fits_and_has_the_outer_levels_of_a_deep_value() -> None:
+    assert shown({"rate_hz": 100, "name": "a'b"}) == """{'name': "a'b", 'rate_hz': 100}"""
+    assert shown(b"\x01") == r"b'\x01'"
+    assert shown(nested(100_001)) == "{'a': [{'a': [{...}]}]}"
+
+
+# --- messages ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_a_message_is_one_line_and_each_line_of_a_traceback_is_escaped(text: str) -> None:
+    for line in (formatted("%s: gone", text), formatted(text)):
+        assert line.isprintable()
+        assert line.startswith("<4>")
+        assert len(line) <= MESSAGE_CHARACTERS_MAX + len("<4>")
+    try:
+        raise ValueError(text)
+    except ValueError:
+        lines = formatted("it failed", exc_info=sys.exc_info()).split("\n")
+    assert all(line.isprintable() and len(line) <= MESSAGE_CHARACTERS_MAX + len("<4>    ") for line in lines)
+    assert all(line.startswith("<4>    ") for line in lines[1:]), "no line of a traceback looks like a message"
+
+
+@pytest.mark.parametrize(
+    ("message", "values"), [("%d of %s", ("x", "y")), ("%s", (nested(100_000),)), ("%s", (Unshowable(),)), ("%s", ())]
+)
+def test_a_message_that_cannot_be_made_is_still_one(message: str, values: tuple[object, ...]) -> None:
+    line = formatted(message, *values)
+    assert line.isprintable()
+    assert line.startswith("<4>")
+
+
+def test_a_long_traceback_is_cut_and_its_end_is_kept() -> None:
+    try:
+        raise ValueError("\n".join(f"line {number}" for number in range(10_000)))
+    except ValueError:
+        lines = formatted("it failed", exc_info=sys.exc_info()).split("\n")
+    assert lines[0] == "<4>it failed"
+    assert len(lines) == TRACEBACK_LINES_MAX + 1
+    assert lines[-1] == "<4>    line 9999"
+
+
+# --- the writer -------------------------------------------------------------------------------------------------------
+
+
+def test_messages_arrive_in_order_and_whole_at_the_end() -> None:
+    with pipe() as (reader, descriptor):
+        with log_to(descriptor, "info"):
+            for number in range(100):
+                log.info("message %d", number)
+            log.debug("not this one")
+        os.close(descriptor)
+        lines = os.read(reader, 1 << 16).decode().splitlines()
+    assert [line.partition("INFO ")[2] for line in lines] == [f"message {number}" for number in range(100)]
+
+
+@pytest.mark.live
+def test_a_log_that_nobody_reads_stops_nothing_and_says_what_is_missing() -> None:
+    with pipe(full=True) as (reader, descriptor), log_to(descriptor, "info") as writer:
+        for number in range(5000):
+            log.info("message %d", number)
+        dropped = writer.dropped
+        assert 3900 < dropped <= 4000  # all but what the queue holds, and what the thread has in its hand
+        assert messages_dropped() == dropped
+        text = read_until(reader, b"messages dropped").decode()
+        lines = text.splitlines()
+        assert f"WARNING {dropped} messages dropped: the log was not read in time" in lines
+        assert sum("INFO message " in line for line in lines) == 5000 - dropped
+        log.warning("it flows")
+        assert "dropped" not in read_until(reader, b"it flows\n").decode()
+
+
+def no_thread_is_left() -> None:
+    wait_until(lambda: all(thread.name != "log" for thread in threading.enumerate()), "the thread has ended")
+
+
+@pytest.mark.live
+def test_the_end_does_not_wait_for_a_reader_that_reads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[float | None] = []
+    monkeypatch.setattr(threading.Thread, "join", lambda _thread, wait_s=None: waits.append(wait_s))
+    with pipe(full=True) as (reader, descriptor):
+        with log_to(descriptor, "info"):
+            log.warning("lost")
+        writer = LogWriter(descriptor)
+        writer.close()
+        writer.close()
+        assert waits == [WRITE_S] * 2, "the second time it returns at once"
+        no_thread_is_left()
+        # a pipe with room for a page says that it can be written; a longer write would wait in it
+        assert len(os.read(reader, select.PIPE_BUF)) == select.PIPE_BUF
+        with log_to(descriptor, "info"):
+            try:
+                raise ValueError("\n".join("x" * 200 for _ in range(50)))
+            except ValueError:
+                log.exception("long")
+        no_thread_is_left()
+
+
+def test_a_message_that_cannot_be_formatted_is_counted_and_nothing_else(capfd: pytest.CaptureFixture[str]) -> None:
+    class Broken(logging.Formatter):
+        def format(self, record: logging.LogRecord) -> str:
+            raise ValueError(record.msg)
+
+    with pipe() as (_, descriptor), log_to(descriptor, "info") as writer:
+        writer.setFormatter(Broken())
+        log.warning("one")
+        assert writer.dropped == 1
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("journal", [False, True])
+def test_the_journal_adds_the_time_itself(journal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("JOURNAL_STREAM", raising=False)
+    with pipe() as (reader, descriptor):
+        assert not is_journal(descriptor)
+        status = os.fstat(descriptor)
+        monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino + (not journal)}")  # else redirected
+        with log_to(descriptor, "info"):
+            log.info("begun")
+        line = os.read(reader, 1 << 16).decode()
+    assert line == "<6>begun\n" if journal else line.endswith(" INFO begun\n")
+    assert not is_journal(-1)
+
+
+@pytest.mark.parametrize("kind", ["no reader", "full disk", "closed"])
+def test_messages_that_cannot_be_written_are_counted(kind: str) -> None:
+    reader, descriptor = os.pipe()
+    os.close(reader)
+    if kind == "full disk":
+        os.dup2(os.open("/dev/full", os.O_WRONLY), descriptor)
+    elif kind == "closed":
+        os.close(descriptor)
+    with log_to(descriptor, "info") as writer:
+        log.warning("one")
+        log.warning("two")
+        wait_until(lambda: writer.dropped == 2, "both are counted")
+    if kind != "closed":
+        os.close(descriptor)
+
+
+class Unclosable:
+    def __del__(self) -> None:
+        raise KeyError("not closed")
+
+
+def test_a_file_is_written_and_what_python_reports_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hooks = print, repr
+    monkeypatch.setattr(sys, "unraisablehook", hooks[0])
+    monkeypatch.setattr(threading, "excepthook", hooks[1])
+    with (tmp_path / "log").open("wb") as file, log_to(file.fileno(), "info"):
+        thread = threading.Thread(target=lambda: {}["missing"], name="worker")  # type: ignore[index]
+        thread.start()
+        thread.join()
+        Unclosable()
+        with warnings.catch_warnings():
+            warnings.simplefilter("default")
+            warnings.warn("out of date", DeprecationWarning, stacklevel=1)
+    assert (sys.unraisablehook, threading.excepthook) == hooks
+    text = (tmp_path / "log").read_text()
+    assert "ERROR thread worker ended by an exception" in text
+    assert "KeyError: 'missing'" in text
+    assert "ERROR exception ignored in <function Unclosable.__del__" in text
+    assert "KeyError: 'not closed'" in text
+    assert "DeprecationWarning: out of date" in text

@@ -1,0 +1,89 @@
+"""Datagrams to a service manager, against a real socket."""
+
+import os
+import socket
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from imud.host.service_manager import STATUS_NS, ServiceManager, notify, status_line, watchdog_interval_s
+
+NO_PROCESS = str(1 << 30)
+"""Above the largest number of a process (proc(5), pid_max)."""
+
+
+@pytest.mark.parametrize("is_abstract", [False, True])
+def test_state_arrives(is_abstract: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = f"imud-test-{os.getpid()}" if is_abstract else str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind("\0" * is_abstract + name)
+        manager.settimeout(60)
+        monkeypatch.setenv("NOTIFY_SOCKET", "@" * is_abstract + name)
+        notify("READY=1")
+        assert manager.recv(100) == b"READY=1"
+
+
+def test_no_manager_no_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    notify("READY=1")
+    assert caplog.text == ""
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "gone"))
+    notify("READY=1")
+    assert "cannot notify the service manager of READY=1" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("usec", "pid", "expected"),
+    [("10000000", "", 5.0), ("", "", None), ("0", "", None), ("x", "", None), ("10000000", NO_PROCESS, None)],
+)
+def test_watchdog_interval(usec: str, pid: str, expected: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WATCHDOG_USEC", usec)
+    monkeypatch.delenv("WATCHDOG_PID", raising=False)
+    if pid:
+        monkeypatch.setenv("WATCHDOG_PID", pid)
+    assert watchdog_interval_s() == expected
+
+
+@pytest.mark.parametrize(
+    ("states", "line"),
+    [
+        ({}, "No devices are configured."),
+        ({"bow": "running"}, "1 of 1 device running."),
+        ({"bow": "missing"}, "0 of 1 device running; not: bow (missing)."),
+        ({"a": "running", "b": "silent", "c": "finished"}, "2 of 3 devices running; not: b (silent)."),
+        (
+            {f"d{n}": "missing" for n in range(8)},
+            "0 of 8 devices running; not: "
+            "d0 (missing), d1 (missing), d2 (missing), d3 (missing), d4 (missing) and 3 more.",
+        ),
+    ],
+)
+def test_status_line(states: dict[str, str], line: str) -> None:
+    assert status_line(states) == line
+
+
+def test_status_is_sent_when_it_changes_and_the_watchdog_is_fed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(str(tmp_path / "notify"))
+        receiver.settimeout(60)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", "4000000")
+        monkeypatch.delenv("WATCHDOG_PID", raising=False)
+        manager = ServiceManager()
+        manager.ready()
+        for tenth in range(31):
+            states = {"bow": "running" if tenth > 12 else "searching"}
+            manager.tick(tenth * STATUS_NS // 10, partial(dict, states))
+        manager.stopping()
+        sent = [receiver.recv(100).decode() for _ in range(6)]
+    assert sent == [
+        "READY=1",
+        "WATCHDOG=1",
+        "STATUS=0 of 1 device running; not: bow (searching).",
+        "WATCHDOG=1",
+        "STATUS=1 of 1 device running.",
+        "STOPPING=1",
+    ]

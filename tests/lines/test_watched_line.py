@@ -1,0 +1,158 @@
+"""A line that is kept open: opened when due, failures reported once, its level read when it may have changed."""
+
+import asyncio
+
+from imud.contracts.lines import Edge, InputSettings, OnEdges, OnLineEnd
+from imud.lines.watched_line import WatchedLine, watching
+from imud.model.errors import LinkBusy, LinkError, LinkMissing
+from imud.sim.ports.pins import MemoryInput, MemoryLines
+from tests.support.event_loops import VirtualClock, in_loop
+
+RETRY_NS = 5 * 10**9
+
+BUSY = LinkBusy("gpiochip0 line 3 is in use by gpiomon: stop that")
+
+
+class Watched:
+    def __init__(self, line: MemoryInput | None = None, *, watch: bool = True) -> None:
+        self.clock = VirtualClock()
+        self.line = line or MemoryInput()
+        self.edges: list[Edge] = []
+        self.levels: list[bool | None] = []
+        self.reports: list[str] = []
+        self.watched = WatchedLine(
+            self.line, self.edges.extend, self.levels.append, self.reports.append, self.clock.now_ns,
+            watch=watch,
+        )  # fmt: skip
+
+
+@in_loop
+async def test_it_is_opened_at_once_and_its_level_read_again_after_lost_edges() -> None:
+    it = Watched()
+    it.watched.drain()  # before it is open there is nothing
+    it.watched.tick(0)
+    assert it.line.is_open
+    assert it.levels == [False]
+    it.line.edge(10, True)
+    it.watched.drain()
+    it.line.edge(20, False)
+    await asyncio.sleep(0)
+    assert it.edges == [Edge(10, True, 1), Edge(20, False, 2)]
+    assert (it.watched.edges, it.reports, it.watched.problem) == (2, [], "")
+    it.watched.tick(1)
+    assert it.levels == [False]  # edges say the rest
+    it = Watched()
+    it.watched.tick(0)
+    it.line.edge(5, True)
+    it.line.lose(3)
+    it.watched.tick(1)
+    it.watched.tick(2)
+    assert it.levels == [False, True]
+
+
+@in_loop
+async def test_a_line_that_cannot_be_had_is_reported_once_and_tried_again() -> None:
+    it = Watched()
+    it.line.open_error = BUSY
+    it.watched.tick(0)
+    it.watched.tick(RETRY_NS - 1)
+    assert it.reports == [str(BUSY)]
+    it.watched.tick(RETRY_NS)
+    assert it.reports == [str(BUSY)]
+    it.line.open_error = LinkMissing("gpiochip0 is not there")
+    it.watched.tick(2 * RETRY_NS)
+    assert it.reports[1:] == ["gpiochip0 is not there"]
+    assert it.watched.problem == "gpiochip0 is not there"
+    it.line.open_error = None
+    it.watched.tick(3 * RETRY_NS - 1)
+    assert not it.line.is_open
+    it.watched.tick(3 * RETRY_NS)
+    assert it.line.is_open
+    assert it.watched.problem == ""
+    assert it.reports[2:] == ["watched again"]
+    assert it.levels == [False]
+
+
+@in_loop
+async def test_a_line_that_goes_has_no_level_and_comes_back() -> None:
+    it = Watched()
+    it.watched.tick(it.clock.now_ns())
+    it.line.edge(5, True)
+    it.line.vanish(LinkMissing("it was pulled out"))
+    assert it.levels == [False, None]
+    assert it.reports == ["it was pulled out"]
+    it.watched.tick(it.clock.now_ns() + RETRY_NS - 1)
+    assert not it.line.is_open
+    it.watched.tick(it.clock.now_ns() + RETRY_NS)
+    assert it.levels == [False, None, True]
+    it.line.edge(30, False)
+    it.watched.drain()
+    assert it.edges == [Edge(30, False, 2)]  # numbers go on; the one that was not delivered shows
+
+
+@in_loop
+async def test_edges_of_a_line_that_is_not_watched_are_delivered_by_the_tick() -> None:
+    it = Watched(watch=False)
+    it.watched.tick(0)
+    it.line.edge(10, True)
+    await asyncio.sleep(0)
+    assert it.edges == []
+    it.watched.tick(1)
+    assert it.edges == [Edge(10, True, 1)]
+
+
+class Unstartable(MemoryInput):
+    """A line that opens and cannot start."""
+
+    def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
+        raise LinkError("it does not start")
+
+
+@in_loop
+async def test_a_line_that_cannot_start_is_closed_and_tried_again() -> None:
+    it = Watched(Unstartable())
+    for now_ns in (0, RETRY_NS):
+        it.watched.tick(now_ns)
+        assert not it.line.is_open
+    assert (it.reports, it.levels) == (["it does not start"], [])
+
+
+class Blind(MemoryInput):
+    def level(self) -> bool:
+        raise LinkError("no level")
+
+
+@in_loop
+async def test_a_level_that_cannot_be_read_ends_it_and_closing_is_no_failure() -> None:
+    it = Watched(Blind())
+    it.watched.tick(it.clock.now_ns())
+    assert not it.line.is_open
+    assert it.watched.problem == "no level"
+    assert it.levels == [None]
+    it = Watched()
+    it.watched.tick(0)
+    it.watched.close()
+    it.watched.close()
+    assert not it.line.is_open
+    assert it.reports == []
+    it.watched.tick(1)
+    assert it.line.is_open
+
+
+@in_loop
+async def test_a_line_of_no_device_is_kept_open_by_its_settings() -> None:
+    clock, edges, reports = VirtualClock(), list[Edge](), list[str]()
+    memory = MemoryLines(clock.now_ns)
+    watch = watching(memory.maker, clock.now_ns)
+    watched = watch(InputSettings(line="GPIO5"), "flight recorder", edges.extend, reports.append)
+    line = memory.inputs["flight recorder"]
+    line.open_error = BUSY
+    watched.tick(0)
+    assert reports == [str(BUSY)]
+    line.open_error = None
+    watched.tick(RETRY_NS)
+    line.pulse(10, 5)
+    await asyncio.sleep(0)
+    assert edges == [Edge(10, True, 1)]  # only rising ones are asked for
+    watched.close()
+    assert not line.is_open

@@ -1,0 +1,155 @@
+"""Sockets and timers that a failed step must not leave behind: every step after `socket()` fails once."""
+
+import asyncio
+import errno
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from imud.formats.can import CyclicFrame, pack_frame
+from imud.links import netlink
+from imud.links.cyclic_sender import KernelSender, LoopSender
+from imud.links.socketcan import SO_RCVBUFFORCE, SocketCanLink, SocketCanSettings, open_raw
+from imud.model.errors import LinkDenied, LinkError, LinkMissing
+from tests.support.event_loops import in_loop
+
+FRAMES = [CyclicFrame(number, False, b"", 1_000_000) for number in (1, 2)]
+BUFFER_BYTES = 1 << 20
+
+
+class FakeSocket:
+    """A socket whose call number `fails_at` fails."""
+
+    def __init__(self, fails_at: int = 0, error: int = errno.ENODEV) -> None:
+        self._fails_at, self._error = fails_at, error
+        self.calls: list[tuple[object, ...]] = []
+        self.closed = False
+
+    def _call(self, *arguments: object) -> int:
+        self.calls.append(arguments)
+        if len(self.calls) == self._fails_at:
+            raise OSError(self._error, os.strerror(self._error))
+        return BUFFER_BYTES
+
+    setsockopt = getsockopt = bind = connect = send = _call
+
+    def fileno(self) -> int:
+        return 3
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.mark.parametrize("fails_at", range(1, 6))
+def test_a_raw_socket_is_closed_when_a_step_fails(monkeypatch: pytest.MonkeyPatch, fails_at: int) -> None:
+    made = FakeSocket(fails_at)
+    monkeypatch.setattr(socket, "socket", lambda *_: made)
+    with pytest.raises(OSError, match="No such device"):
+        open_raw(SocketCanSettings(interface="can0"), [])
+    assert made.closed
+    assert len(made.calls) == fails_at
+
+
+def test_a_raw_socket_has_the_permitted_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without CAP_NET_ADMIN the third call fails: the usual option then sets the buffer."""
+    made = FakeSocket(3, errno.EPERM)
+    monkeypatch.setattr(socket, "socket", lambda *_: made)
+    assert open_raw(SocketCanSettings(interface="can0"), []) is made  # type: ignore[comparison-overlap]  # the fake
+    assert made.calls[2] == (socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES // 2), "the kernel doubles the value"
+    assert made.calls[3] == (socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES // 2)
+    assert (made.calls[-1], made.closed) == ((("can0",),), False)
+
+
+@pytest.fixture
+def sys_with_can0(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "class/net/can0"
+    folder.mkdir(parents=True)
+    (folder / "type").write_text(f"{netlink.ARPHRD_CAN}\n")
+    (folder / "flags").write_text(f"{netlink.IFF_UP:#x}\n")
+    monkeypatch.setattr(netlink, "can_details", lambda name: netlink.CanDetails(None, None))
+    return tmp_path
+
+
+def link_of(made: FakeSocket, sys: Path) -> SocketCanLink:
+    """Return a link whose socket is `made`."""
+    settings = SocketCanSettings(interface="can0")
+    return SocketCanLink(settings, sys=sys, open_socket=lambda *_: made)  # type: ignore[arg-type]  # the fake
+
+
+@pytest.mark.parametrize(
+    ("fails_at", "error", "kind"),
+    [(1, errno.ENODEV, LinkMissing), (2, errno.EPERM, LinkDenied), (3, errno.EAFNOSUPPORT, LinkError)],
+)
+def test_a_link_that_cannot_be_set_up_is_closed(
+    sys_with_can0: Path, fails_at: int, error: int, kind: type[LinkError]
+) -> None:
+    made = FakeSocket(fails_at, error)
+    link = link_of(made, sys_with_can0)
+    with pytest.raises(LinkError) as caught:
+        link.open()
+    assert type(caught.value) is kind
+    assert made.closed
+    with pytest.raises(LinkError, match="not open"):
+        link.write(b"")
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [(errno.ENOBUFS, "queue is full"), (errno.EAGAIN, "queue is full"), (errno.ENETDOWN, "taken down")],
+)
+def test_a_refused_frame_is_explained(sys_with_can0: Path, error: int, words: str) -> None:
+    made = FakeSocket(4, error)  # after two options and the size of the buffer
+    link = link_of(made, sys_with_can0)
+    link.open()
+    with pytest.raises(LinkError, match=words):
+        link.write(pack_frame(1, False, b""))
+
+
+@pytest.mark.parametrize("fails_at", range(1, 4))
+def test_a_socket_of_the_broadcast_manager_is_closed_when_a_step_fails(
+    monkeypatch: pytest.MonkeyPatch, fails_at: int
+) -> None:
+    made = FakeSocket(fails_at)
+    monkeypatch.setattr(socket, "socket", lambda *_: made)
+    with pytest.raises(OSError, match="No such device"):
+        KernelSender("can0", FRAMES)
+    assert made.closed
+
+
+@in_loop
+async def test_a_sender_whose_second_frame_is_refused_leaves_no_timer() -> None:
+    written: list[bytes] = []
+    errors: list[LinkError] = []
+
+    def write(data: bytes) -> None:
+        if len(written) == 1:
+            raise LinkError("full")
+        written.append(data)
+
+    with pytest.raises(LinkError, match="full"):
+        LoopSender(write, errors.append, FRAMES)
+    await asyncio.sleep(0.01)  # ten periods of the first frame
+    assert (len(written), errors) == (1, [])
+
+
+class FakeSender:
+    def __init__(self, made: list["FakeSender"]) -> None:
+        self.closed = False
+        made.append(self)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_a_link_has_one_cyclic_sender_at_a_time(monkeypatch: pytest.MonkeyPatch, sys_with_can0: Path) -> None:
+    made: list[FakeSender] = []
+    monkeypatch.setattr("imud.links.socketcan.KernelSender", lambda *_: FakeSender(made))
+    link = link_of(FakeSocket(), sys_with_can0)
+    link.open()
+    for expected in ([False], [True, False]):
+        link.send_cyclic(FRAMES)
+        assert [sender.closed for sender in made] == expected
+    link.close()
+    assert [sender.closed for sender in made] == [True, True]

@@ -1,0 +1,54 @@
+"""Network interfaces: presence from a tree of files, details from answers made by hand, waiting on news."""
+
+import asyncio
+import struct
+from pathlib import Path
+
+import pytest
+
+from imud.links.netlink import CanDetails, absence, can_details, can_interfaces, parse_details, wait_until
+from imud.model.errors import LinkError
+
+
+def interface(sys: Path, name: str, kind: int, flags: int) -> None:
+    folder = sys / "class/net" / name
+    folder.mkdir(parents=True)
+    (folder / "type").write_text(f"{kind}\n")
+    (folder / "flags").write_text(f"{flags:#x}\n")
+
+
+def test_absence_says_what_to_do(tmp_path: Path) -> None:
+    interface(tmp_path, "can0", 280, 0x40081)
+    interface(tmp_path, "can1", 280, 0x40080)
+    interface(tmp_path, "eth0", 1, 0x1003)
+    assert absence("can0", tmp_path) == ""
+    assert "can1 is down" in absence("can1", tmp_path)
+    assert "can9 is not there" in absence("can9", tmp_path)
+    with pytest.raises(LinkError, match="eth0 is no CAN interface"):
+        absence("eth0", tmp_path)
+    assert can_interfaces(tmp_path) == ["can0"]
+    assert can_interfaces(tmp_path / "none") == []
+
+
+def attribute(kind: int, data: bytes) -> bytes:
+    return struct.pack("=HH", 4 + len(data), kind) + data + bytes(-len(data) % 4)
+
+
+def answer(info: bytes) -> bytes:
+    body = bytes(16) + attribute(3, b"can0\0") + (attribute(18, info) if info else b"")
+    return struct.pack("=IHHII", 16 + len(body), 16, 0, 1, 0) + body
+
+
+def test_details_of_an_interface() -> None:
+    timing = struct.pack("=8I", 250_000, 875, 0, 0, 0, 0, 0, 0)
+    data = attribute(1, timing) + attribute(4, struct.pack("=I", 3))
+    info = attribute(1, b"can\0") + attribute(2, data)
+    assert parse_details(answer(info)) == CanDetails(250_000, 3)
+    assert parse_details(answer(attribute(1, b"vcan\0"))) == CanDetails(None, None)
+    assert parse_details(answer(b"")) == CanDetails(None, None)
+    assert parse_details(struct.pack("=IHHIIi", 20, 2, 0, 1, 0, -19)) == CanDetails(None, None)
+    assert parse_details(answer(attribute(2, b"\1\0\1\0"))[:-1]) == CanDetails(None, None)
+    assert can_details("lo") == CanDetails(None, None)
+    with pytest.raises(LinkError, match="nosuch0"):
+        can_details("nosuch0")
+    asyncio.run(wait_until(lambda: True))

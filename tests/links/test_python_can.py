@@ -1,0 +1,137 @@
+"""Buses of python-can, on its virtual one."""
+
+import asyncio
+import threading
+from collections.abc import Sequence
+
+import can
+import msgspec
+import pytest
+
+from imud.contracts.link import CanLink
+from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_frame
+from imud.links import LINKS
+from imud.links.python_can import PythonCanLink
+from imud.links.socketcan import LINK, SocketCanSettings, pack_filters
+from imud.model.errors import LinkError
+from tests.support.daemon_process import LIMIT_S, wait_until
+from tests.support.event_loops import in_loop
+
+
+def make(channel: str, **keys: object) -> CanLink:
+    row = LINKS["socketcan"]
+    return row.make_can(msgspec.convert({"interface": channel, "backend": "virtual", **keys}, row.settings))
+
+
+@in_loop
+async def test_frames_pass_the_filters_and_come_in_the_loops_thread() -> None:
+    link = make("pass")
+    link.filters = [CanFilter(0x65, 0x7FF, False)]
+    await link.wait_present()
+    link.open()
+    got: list[CanFrame] = []
+    threads: set[threading.Thread] = set()
+    done = asyncio.Event()
+
+    def on_frames(frames: Sequence[CanFrame]) -> None:
+        threads.add(threading.current_thread())
+        got.extend(frames)
+        if len(got) == 2:
+            done.set()
+
+    link.start(on_frames, lambda news, problem: None, lambda error: None)
+    with can.Bus("pass", "virtual") as far:
+        for can_id, extended in ((0x65, False), (0x66, False), (0x65, True), (0x65, False)):
+            far.send(can.Message(arbitration_id=can_id, is_extended_id=extended, data=b"\1\2"))
+        await asyncio.wait_for(done.wait(), LIMIT_S)
+    assert threads == {threading.current_thread()}
+    link.close()
+    link.close()
+    frames = got
+    assert [frame[:3] for frame in frames] == [(0x65, False, b"\1\2")] * 2
+    assert 0 < frames[0].t_rx_ns <= frames[1].t_rx_ns
+    assert "can pass" not in [thread.name for thread in threading.enumerate()]
+
+
+def test_commands_go_out() -> None:
+    link = make("out")
+    link.open()
+    with can.Bus("out", "virtual") as far:
+        link.write(pack_frame(0x123, False, b"\7") + pack_frame(0x1234, True, b""))
+        sent = [far.recv(LIMIT_S) for _ in range(2)]
+    link.close()
+    assert [(m.arbitration_id, m.is_extended_id, bytes(m.data)) for m in sent if m] == [
+        (0x123, False, b"\7"),
+        (0x1234, True, b""),
+    ]
+    with pytest.raises(LinkError, match="not open"):
+        link.write(b"")
+
+
+def test_settings_of_other_backends_and_filters() -> None:
+    with pytest.raises(msgspec.ValidationError, match="the system sets it"):
+        msgspec.convert({"interface": "can0", "bitrate": 500000}, SocketCanSettings)
+    assert make("rate", bitrate=250000).bitrate == 250000
+    assert LINK.make_can(SocketCanSettings(interface="can0")).title == "can0"
+    with pytest.raises(LinkError, match="cannot be opened"):
+        PythonCanLink("nosuch", "x").open()
+    packed = pack_filters([CanFilter(0x65, 0x7FF, False), CanFilter(0x18FEE900, 0x03FFFF00, True)])
+    assert packed.hex() == "65000000ff0700c0" + "00e9fe9800ffffc3"
+
+
+class FakeBus:
+    """A bus of python-can that gives these messages, and notes its end."""
+
+    def __init__(self, *messages: can.Message) -> None:
+        self.messages = list(messages)
+        self.sent: list[can.Message] = []
+        self.is_shut_down = False
+
+    def recv(self, _timeout: float) -> can.Message | None:
+        return self.messages.pop(0) if self.messages else None
+
+    def send(self, message: can.Message, timeout: float) -> None:
+        assert timeout == 0
+        self.sent.append(message)
+
+    def shutdown(self) -> None:
+        self.is_shut_down = True
+
+
+@in_loop
+async def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds: list[dict[str, bool]] = [{}, {"is_error_frame": True}, {"is_remote_frame": True}, {"is_fd": True}, {}]
+    bus = FakeBus(*(can.Message(arbitration_id=n, is_extended_id=False, **kind) for n, kind in enumerate(kinds)))
+    monkeypatch.setattr(can, "Bus", lambda *_, **__: bus)
+    got: list[int] = []
+    link = make("fake")
+    link.open()
+    first = asyncio.Event()
+
+    def on_frames(frames: Sequence[CanFrame]) -> None:
+        got.extend(frame.can_id for frame in frames)
+        first.set()
+
+    link.start(on_frames, lambda news, problem: None, lambda error: None)
+    await asyncio.wait_for(first.wait(), LIMIT_S)
+    bus.messages += [can.Message(arbitration_id=9, is_extended_id=False)]
+    wait_until(lambda: not bus.messages, "the thread has read the frame")
+    link.close()
+    await asyncio.sleep(0.01)  # the loop would deliver the frame now
+    assert got == [0, 4]
+    assert bus.is_shut_down
+
+
+@in_loop
+async def test_cyclic_frames_are_replaced_and_end_with_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = FakeBus()
+    monkeypatch.setattr(can, "Bus", lambda *_, **__: bus)
+    link = make("fake")
+    link.open()
+    link.send_cyclic([CyclicFrame(1, False, b"", 10**12)])
+    link.send_cyclic([CyclicFrame(2, False, b"", 10**12)])
+    running = [timer for timer in asyncio.get_running_loop()._scheduled if not timer.cancelled()]  # type: ignore[attr-defined]
+    assert len(running) == 1
+    link.close()
+    assert all(timer.cancelled() for timer in asyncio.get_running_loop()._scheduled)  # type: ignore[attr-defined]
+    assert [message.arbitration_id for message in bus.sent] == [1, 2]

@@ -1,0 +1,240 @@
+"""Captures played through the link."""
+
+import asyncio
+import errno
+import os
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from imud.contracts.link import StreamLink
+from imud.links import LINKS
+from imud.links.replay import PIECE_BYTES_MAX, PIECE_NS, CanReplayLink, ReplayLink, ReplaySettings
+from imud.model.errors import LinkDenied, LinkError, LinkMissing
+from imud.model.units import NS_PER_MS, uart_byte_ns
+from tests.support.event_loops import VirtualClock, in_loop, run_virtually
+from tests.support.files import CaptureWriter
+
+READS = [(b"a" * 82, 1_000_000_000), (b"b" * 41, 1_004_000_000), (b"c", 1_004_000_000), (b"d" * 82, 1_030_000_000)]
+
+
+@pytest.fixture
+def stamped(tmp_path: Path) -> Path:
+    path = tmp_path / "stamped"
+    with path.open("wb") as file:
+        writer = CaptureWriter(file, driver="hipnuc-uart", baud=115200, details={"hold_ns": 16_000_000})
+        for data, t_ns in READS:
+            writer.write(data, t_ns)
+    return path
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    path = tmp_path / "raw"
+    path.write_bytes(bytes(range(256)) * 2)
+    return path
+
+
+class Played:
+    """A link that plays a capture in virtual time; what came, and when."""
+
+    def __init__(self, path: Path, **settings: Any) -> None:
+        self.clock = VirtualClock()
+        self.link = ReplayLink(ReplaySettings(path=str(path), **settings), self.clock.now_ns)
+        self.chunks: list[tuple[bytes, int]] = []
+        self.delivered_ns: list[int] = []
+        self.started_ns = 0
+        self.ends: list[LinkError | None] = []
+
+    @property
+    def data(self) -> bytes:
+        return b"".join(data for data, _ in self.chunks)
+
+    @property
+    def offsets_ns(self) -> list[int]:
+        return [t_rx_ns - self.chunks[0][1] for _, t_rx_ns in self.chunks]
+
+    def play(self, pieces_max: int) -> None:
+        """Play to the end, or until so many pieces came."""
+        run_virtually(self.clock, self._play(pieces_max))
+
+    async def _play(self, pieces_max: int) -> None:
+        done, link = asyncio.Event(), self.link
+
+        def on_data(data: bytes, t_rx_ns: int) -> None:
+            self.chunks.append((data, t_rx_ns))
+            self.delivered_ns.append(self.clock.now_ns())
+            if len(self.chunks) >= pieces_max:
+                link.close()
+                done.set()
+
+        def on_end(error: LinkError | None) -> None:
+            self.ends.append(error)
+            done.set()
+
+        await link.wait_present()
+        link.open()
+        self.started_ns = self.clock.now_ns()
+        link.start(on_data, on_end)
+        await done.wait()
+        link.close()
+
+
+def play(path: Path, *, pieces_max: int = 1 << 30, **settings: Any) -> Played:
+    played = Played(path, **settings)
+    played.play(pieces_max)
+    return played
+
+
+def check_times(played: Played) -> None:
+    """True of every speed: never in the future, never back."""
+    times = [t_rx_ns for _, t_rx_ns in played.chunks]
+    assert times == sorted(times)
+    assert all(t_rx_ns <= now_ns for t_rx_ns, now_ns in zip(times, played.delivered_ns, strict=True))
+
+
+def test_recorded_speed_keeps_the_recorded_jitter(stamped: Path) -> None:
+    played = play(stamped)
+    assert [data for data, _ in played.chunks] == [data for data, _ in READS]
+    assert played.offsets_ns == [t_ns - READS[0][1] for _, t_ns in READS]
+    assert played.delivered_ns[-1] - played.delivered_ns[0] == pytest.approx(30 * NS_PER_MS, abs=100)
+    assert played.ends == [None]
+    assert (played.link.baud, played.link.hold_ns, played.link.writable) == (115200, 16_000_000, False)
+    check_times(played)
+
+
+def test_real_speed_is_the_wire_s(raw: Path, stamped: Path) -> None:
+    played = play(raw, speed="real", baud=115200)
+    assert played.data == raw.read_bytes()
+    byte_ns = uart_byte_ns(115200)
+    assert max(len(data) for data, _ in played.chunks) == PIECE_NS // byte_ns
+    whole_ns = played.chunks[-1][1] - played.chunks[0][1] + len(played.chunks[0][0]) * byte_ns
+    assert whole_ns == len(played.data) * byte_ns
+    assert played.delivered_ns[-1] - played.started_ns == pytest.approx(whole_ns, abs=100)
+    assert played.link.hold_ns == PIECE_NS
+    check_times(played)
+    played = play(stamped, speed="real")
+    assert played.data == b"".join(data for data, _ in READS)
+    assert len(played.chunks) > len(READS)
+
+
+def test_maximum_speed_is_virtual_time(tmp_path: Path, stamped: Path) -> None:
+    path = tmp_path / "long"
+    path.write_bytes(bytes(3 * PIECE_BYTES_MAX + 5))
+    played = play(path, speed="maximum", baud=921600)
+    assert len(played.data) == 3 * PIECE_BYTES_MAX + 5
+    byte_ns = uart_byte_ns(921600)
+    sizes = [len(data) for data, _ in played.chunks]
+    assert [b - a for a, b in pairwise(played.offsets_ns)] == [size * byte_ns for size in sizes[1:]]
+    check_times(played)
+    assert set(play(path, speed="maximum").offsets_ns) == {0}
+    played = play(stamped, speed="maximum")
+    assert played.offsets_ns == [t_ns - READS[0][1] for _, t_ns in READS]
+    assert {*played.delivered_ns} == {played.started_ns} == {played.chunks[-1][1]}  # nothing was waited for
+    check_times(played)
+
+
+@in_loop
+async def test_others_get_their_turn_at_maximum_speed(tmp_path: Path) -> None:
+    path = tmp_path / "long"
+    path.write_bytes(bytes(1 << 20))
+    link = ReplayLink(ReplaySettings(path=str(path), speed="maximum"))
+    order: list[str] = []
+    done = asyncio.Event()
+    link.open()
+    link.start(lambda data, t_rx_ns: order.append("data"), lambda error: done.set())
+    while not done.is_set():
+        order.append("other")
+        await asyncio.sleep(0)
+    assert order.count("other") > order.count("data") / 16
+    assert order.count("data") == (1 << 20) // 4096
+
+
+def test_a_capture_can_be_repeated_and_played_again(stamped: Path) -> None:
+    played = play(stamped, repeat=True, pieces_max=2 * len(READS))
+    assert played.data == 2 * b"".join(data for data, _ in READS)
+    assert played.offsets_ns[len(READS)] > played.offsets_ns[len(READS) - 1]
+    assert played.ends == []
+    check_times(played)
+    played = play(stamped, speed="maximum")
+    first = played.data
+    played.play(1 << 30)
+    assert played.data == 2 * first
+
+
+def test_a_capture_without_an_end_plays_its_whole_records(
+    stamped: Path, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    stamped.write_bytes(stamped.read_bytes()[:-1])
+    played = play(stamped, speed="maximum")
+    assert played.data == b"".join(data for data, _ in READS[:-1])
+    assert played.ends == [None]
+    assert "cut short" in caplog.text
+    path = tmp_path / "empty"
+    with path.open("wb") as file:
+        CaptureWriter(file, driver="x")
+    assert play(path, repeat=True).ends == [None]
+
+
+def test_captures_that_cannot_be_played(raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(LinkError, match="raw capture without times"):
+        ReplayLink(ReplaySettings(path=str(raw))).open()
+    with pytest.raises(LinkError, match="needs the key baud"):
+        ReplayLink(ReplaySettings(path=str(raw), speed="real")).open()
+    raw.write_bytes(b"#imud-capture 9\n")
+    with pytest.raises(LinkError, match="version '9'"):
+        ReplayLink(ReplaySettings(path=str(raw))).open()
+    with pytest.raises(LinkMissing, match="expected a capture file"):
+        ReplayLink(ReplaySettings(path=str(tmp_path / "none"))).open()
+    with pytest.raises(LinkError, match="not a regular file"):
+        ReplayLink(ReplaySettings(path=str(tmp_path))).open()
+
+    def refuse(path: str) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr("imud.host.files.os.stat", refuse)
+    with pytest.raises(LinkDenied):
+        ReplayLink(ReplaySettings(path=str(tmp_path))).open()
+
+
+class BrokenFile(BytesIO):
+    def read(self, size: int | None = -1) -> bytes:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    readline = read
+
+
+@pytest.mark.parametrize(("kind", "module"), [(ReplayLink, "link"), (CanReplayLink, "can")])
+def test_a_file_whose_read_fails_is_closed(
+    monkeypatch: pytest.MonkeyPatch, kind: type[ReplayLink | CanReplayLink], module: str
+) -> None:
+    file = BrokenFile()
+    monkeypatch.setattr(f"imud.links.replay.{module}.open_regular", lambda _path: file)
+    with pytest.raises(LinkError, match="a cannot be read: Input/output error"):
+        kind(ReplaySettings(path="a")).open()
+    assert file.closed
+
+
+def test_a_capture_that_is_refused_is_closed(raw: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = raw.open("rb")
+    monkeypatch.setattr("imud.links.replay.open_regular", lambda _path: file)
+    with pytest.raises(LinkError, match="raw capture without times"):
+        ReplayLink(ReplaySettings(path=str(raw))).open()
+    assert file.closed
+
+
+def test_a_replay_has_settings_and_refuses_commands(stamped: Path) -> None:
+    row = LINKS["replay"]
+    link: StreamLink = row.make(msgspec.convert({"path": "a", "speed": "maximum"}, row.settings))
+    assert (link.title, link.auto_baud) == ("a", False)
+    with pytest.raises(msgspec.ValidationError, match="repeat: expected false at speed maximum"):
+        msgspec.convert({"path": "a", "speed": "maximum", "repeat": True}, row.settings)
+    link = ReplayLink(ReplaySettings(path=str(stamped)))
+    with pytest.raises(LinkError, match="nothing can be sent"):
+        link.write(b"x")
+    with pytest.raises(LinkError, match="cannot be changed"):
+        link.set_baud(9600)

@@ -1,0 +1,372 @@
+"""An RS-485 line on a real pty: one port for all, echoes, silence, late and foreign replies, and a cable pulled."""
+
+import asyncio
+import errno
+import fcntl
+import os
+import select
+import struct
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from imud.contracts.script import Transfer
+from imud.contracts.status import KernelCounters, SerialLineCounters
+from imud.drivers.hipnuc.modbus.registers import read_registers, set_id_by_serial, write_register
+from imud.formats.modbus import framed, is_exception, is_whole
+from imud.links.rs485 import (
+    ENABLED,
+    RTS_ON_SEND,
+    TIOCGRS485,
+    TIOCSRS485,
+    Direction,
+    Rs485Line,
+    Rs485Link,
+    Rs485Settings,
+    SharedPorts,
+)
+from imud.links.serial_port import TtyCounters, open_port
+from imud.model.errors import LinkBusy, LinkError, LinkMissing, TransferError, Trouble
+from tests.support.daemon_process import LIMIT_S, wait_until
+from tests.support.pty_port import BAUD, PtyPort, serial_of, slave, waiting_bytes, wired
+
+SETTINGS = read_registers(4, 3)
+SERIAL = read_registers(0x7F, 4)
+PROC = Path("/proc")
+TRIES = 2000
+
+pytestmark = pytest.mark.live
+
+
+@contextmanager
+def opened(path: Path | str, ports: SharedPorts | None = None, address: int = 1, **more: Any) -> Iterator[Rs485Link]:
+    settings = {"line": str(path), "baud": BAUD, "reply_ms": 1000, **more}
+    link = Rs485Link(msgspec.convert(settings, Rs485Settings), ports=ports or SharedPorts())
+    link.open()
+    link.select(address)
+    try:
+        yield link
+    finally:
+        link.close()
+        link.close()
+
+
+def sure(link: Rs485Link, transfer: Transfer) -> bytes:
+    for _ in range(TRIES):
+        try:
+            return link.transfer(transfer)
+        except TransferError:
+            pass
+    raise AssertionError(f"no reply in {TRIES} tries")
+
+
+def time_out(link: Rs485Link, transfer: Transfer) -> None:
+    """Ask until a reply is later than its time-out: this thread itself may be late."""
+    for _ in range(TRIES):
+        try:
+            link.transfer(transfer)
+        except TransferError:
+            return
+    raise AssertionError(f"no time-out in {TRIES} tries")
+
+
+@pytest.fixture
+def pty() -> Iterator[PtyPort]:
+    port = PtyPort()
+    yield port
+    port.unplug()
+
+
+@pytest.mark.parametrize("chunk_bytes", [0, 1])
+def test_modules_of_a_line_share_its_port(tmp_path: Path, chunk_bytes: int) -> None:
+    ports = SharedPorts()
+    with (
+        wired(tmp_path, slave(1), slave(2), chunk_bytes=chunk_bytes) as (path, _),
+        opened(path, ports, 1) as one,
+        opened(path, ports, 2) as two,
+    ):
+        assert one.bus == two.bus == str(path)
+        assert one.transfer(SERIAL)[3:11] == serial_of(1)
+        assert two.transfer(SERIAL)[3:11] == serial_of(2)
+        assert one.transfer(write_register(6, 1))[1] == 6
+        assert one.heard.echoed == 0, "an echo that does not arrive is not awaited"
+        one.close()
+        assert two.transfer(SERIAL)[3:11] == serial_of(2)
+        with pytest.raises(LinkError, match="not open"):
+            one.transfer(SERIAL)
+        with pytest.raises(LinkBusy):
+            open_port(str(path), BAUD, PROC)
+        with pytest.raises(LinkError, match="the same baud for all its devices, got 921600 and 9600"), ExitStack() as s:
+            s.enter_context(opened(path, ports, 3, baud=9600))
+        two.close()
+        open_port(str(path), BAUD, PROC).close()
+
+
+@pytest.mark.parametrize("setting", ["auto", True])
+@pytest.mark.parametrize("chunk_bytes", [0, 3])
+def test_adapter_that_echoes(tmp_path: Path, setting: str | bool, chunk_bytes: int) -> None:
+    write = write_register(6, 1)
+    with wired(tmp_path, slave(1), slave(2), echo=True, chunk_bytes=chunk_bytes) as (path, line):
+        with opened(path, echo=setting) as link:
+            assert link.transfer(write) == framed(1, write.sends[0])
+            assert line.slaves[0].settings.heading_mode == 1
+            assert link.transfer(SERIAL)[3:11] == serial_of(1)
+            assert link.heard.strange == link.heard.late == 0
+            assert link.serial_line().echoes == link.heard.echoed >= 2
+        line.slaves[0].dead = True
+        with opened(path, echo=setting, reply_ms=30) as link:
+            link.select(2)
+            assert sure(link, SERIAL)
+            link.select(1)
+            with pytest.raises(TransferError):
+                link.transfer(write)  # what comes back is the echo and nothing else
+
+
+def test_noise_before_the_first_echo_does_not_hide_that_there_are_echoes(pty: PtyPort) -> None:
+    request, reply = framed(1, SERIAL.sends[0]), framed(1, b"\x03\x08" + serial_of(1))
+
+    def answer() -> None:
+        for noise in (b"\0", b""):
+            select.select([pty.master], [], [], LIMIT_S)
+            assert pty.received() == request
+            pty.send(noise + request + reply)
+
+    far = threading.Thread(target=answer)
+    far.start()
+    try:
+        with opened(pty.path, reply_ms=1000) as link:
+            assert link.transfer(SERIAL) == reply
+            assert (link.heard.strange, link.heard.echoed) == (1 + len(request), 0)
+            assert link.transfer(SERIAL) == reply
+            assert (link.heard.strange, link.heard.echoed) == (1 + len(request), 1)
+    finally:
+        far.join(LIMIT_S)
+
+
+@pytest.mark.parametrize("more", [{"echo": True}, {"direction": "none"}])
+def test_devices_of_a_line_agree_on_it(pty: PtyPort, more: dict[str, object]) -> None:
+    ports = SharedPorts()
+    with opened(pty.path, ports):
+        with (
+            pytest.raises(LinkError, match=r"expected the same (direction|echo) for all its devices"),
+            opened(pty.path, ports, 2, **more),
+        ):
+            pass
+        with opened(pty.path, ports, 2):
+            pass
+
+
+def test_a_reply_can_be_an_exception_or_damaged(tmp_path: Path) -> None:
+    with wired(tmp_path, slave(1, bad_crc=1)) as (path, _), opened(path) as link:
+        damaged = link.transfer(SERIAL)
+        assert len(damaged) == SERIAL.read_bytes
+        assert not is_whole(damaged)
+        assert is_whole(link.transfer(SERIAL))
+        assert is_exception(link.transfer(read_registers(0x33, 4)))
+        assert link.heard.timeouts == 0
+
+
+def test_silent_module_costs_its_time_out_and_comes_back(tmp_path: Path) -> None:
+    with wired(tmp_path, slave(1), slave(2, dead=True)) as (path, line), opened(path, reply_ms=5) as link:
+        link.select(2)
+        with pytest.raises(TransferError, match="no reply from address 2") as silent:
+            link.transfer(SERIAL)
+        assert silent.value.trouble is Trouble.DISTURBED
+        link.select(1)
+        assert sure(link, SERIAL)[3:11] == serial_of(1)
+        line.slaves[1].dead = False
+        link.select(2)
+        assert sure(link, SERIAL)[3:11] == serial_of(2)
+        assert link.heard.timeouts >= 1
+
+
+def test_late_reply_is_never_taken_for_the_next(tmp_path: Path) -> None:
+    """The reply that says 0 comes 100 ms after its time-out, when the same has been asked again and is 1."""
+    late = slave(1, processing_ns=100_000_000)
+    with wired(tmp_path, late, slave(2)) as (path, line), opened(path, reply_ms=1) as link:
+        time_out(link, SETTINGS)
+        wait_until(lambda: line.requests, "the request is received")
+        late.processing_ns, late.settings = 0, replace(late.settings, heading_mode=1)
+        assert sure(link, SETTINGS)[3:9] == bytes.fromhex("0008 0001 0001")
+        assert link.heard.strange + link.heard.late >= SETTINGS.read_bytes
+
+
+def test_after_a_time_out_one_register_is_read_first_and_then_no_more(pty: PtyPort) -> None:
+    """The reply to that request differs in length from the reply that the module owes: two registers for one."""
+    one, value = read_registers(4, 1).sends[0], bytes.fromhex("03 02 0008")
+    long, serial = SERIAL.sends[0], b"\x03\x08" + serial_of(1)
+    script = [
+        (long, b""), (bytes.fromhex("03 007f 0001"), bytes.fromhex("03 02 a000")), (long, serial), (long, serial),
+        (one, b""), (bytes.fromhex("03 0004 0002"), bytes.fromhex("03 04 0008 0001")), (one, value), (one, value),
+    ]  # fmt: skip
+    heard = []
+
+    def answer() -> None:
+        for _, reply in script:
+            select.select([pty.master], [], [], LIMIT_S)
+            heard.append(pty.received())
+            if reply:
+                pty.send(framed(1, reply))
+
+    far = threading.Thread(target=answer)
+    far.start()
+    try:
+        with opened(pty.path, reply_ms=500, echo=False) as link:
+            for transfer, reply in ((SERIAL, serial), (read_registers(4, 1), value)):
+                with pytest.raises(TransferError):
+                    link.transfer(transfer)
+                for _ in range(2):
+                    assert link.transfer(transfer) == framed(1, reply)
+    finally:
+        far.join(LIMIT_S)
+    assert heard == [framed(1, request) for request, _ in script]
+
+
+def test_unrequested_bytes_are_discarded_and_counted(pty: PtyPort) -> None:
+    with opened(pty.path, reply_ms=1) as link:
+        pty.send(framed(1, b"\x03\x08" + bytes(8)))
+        wait_until(lambda: waiting_bytes(pty.slave) == 13, "the pty handed the bytes over")
+        with pytest.raises(TransferError):
+            link.transfer(SERIAL)
+        assert link.serial_line() == SerialLineCounters(timeouts=1, late_bytes=13)
+        select.select([pty.master], [], [], LIMIT_S)
+        assert pty.received() == framed(1, SERIAL.sends[0])
+
+
+def test_two_modules_of_one_address_are_detected(tmp_path: Path) -> None:
+    twins = slave(1, serial=0x0F), slave(1, serial=0xF0)
+    with wired(tmp_path, *twins) as (path, _), opened(path) as link:
+        assert not is_whole(link.transfer(SERIAL))
+
+
+def test_garbage_instead_of_a_reply_is_reported(pty: PtyPort) -> None:
+    def babble() -> None:
+        select.select([pty.master], [], [], LIMIT_S)
+        pty.send(b"\x81\x00\xfe" * 7)
+
+    speaker = threading.Thread(target=babble)
+    speaker.start()
+    try:
+        with opened(pty.path, reply_ms=1000) as link:
+            with pytest.raises(TransferError, match=r"other bytes: 81 00 fe .* is the baud rate right"):
+                link.transfer(SERIAL)
+            assert link.serial_line() == SerialLineCounters(timeouts=1, strange_bytes=21)
+    finally:
+        speaker.join(LIMIT_S)
+
+
+def test_request_to_all_expects_no_reply(tmp_path: Path) -> None:
+    with wired(tmp_path, slave(1), slave(2), echo=True) as (path, line), opened(path) as link:
+        link.select(0)
+        assert link.transfer(set_id_by_serial(serial_of(2).hex(), 33)) == b""
+        wait_until(lambda: line.slaves[1].settings.slave == 33, "the module has its address")
+        link.select(33)
+        assert link.transfer(SERIAL)[3:11] == serial_of(2)
+
+
+def test_cable_pulled_and_back(pty: PtyPort) -> None:
+    ports = SharedPorts()
+    link_a = Rs485Link(Rs485Settings(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
+    link_b = Rs485Link(Rs485Settings(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
+    link_a.open()
+    link_b.open()
+    pty.unplug()
+    for link in (link_a, link_b):
+        link.select(1)
+        with pytest.raises(LinkMissing):
+            link.transfer(SERIAL)
+    link_a.close()
+    with pytest.raises(LinkError):  # the node is gone: a new port is opened, not the old one shared
+        link_a.open()
+    link_b.close()
+
+
+def test_missing_port_and_what_a_link_cannot_do(tmp_path: Path) -> None:
+    link = Rs485Link(Rs485Settings(line=str(tmp_path / "none")))
+    with pytest.raises(LinkMissing):
+        link.open()
+    with pytest.raises(LinkError):
+        link.write(b"x")
+    with pytest.raises(LinkError):
+        link.transfer(SERIAL)
+    assert link.kernel_counters().overrun == 0
+    assert link.place(80) == "address 80"
+    assert link.target is None
+    (tmp_path / "none").touch()
+    asyncio.run(asyncio.wait_for(link.wait_present(), LIMIT_S))
+
+
+def test_the_line_gets_the_longer_time_for_a_reply_and_has_the_counters_of_the_kernel(
+    pty: PtyPort, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[int] = []
+    monkeypatch.setattr(Rs485Line, "transfer", lambda *args: waits.append(args[-1]) or b"")  # type: ignore[func-returns-value]
+    monkeypatch.setattr(TtyCounters, "read", lambda _counters: KernelCounters(overrun=3))
+    with opened(pty.path, reply_ms=30) as link:
+        for reply_ms in (29, 31):
+            link.transfer(replace(SERIAL, reply_ms=reply_ms))
+        assert waits == [30_000_000, 31_000_000]
+        assert link.kernel_counters() == KernelCounters(overrun=3)
+
+
+class Driver:
+    """A serial driver's ioctls for RS-485."""
+
+    def __init__(self, flags: int, error: int = 0) -> None:
+        self.flags, self.error = flags, error
+        self.set: list[int] = []
+
+    def ioctl(self, _fd: int, request: int, data: bytes) -> bytes:
+        if self.error:
+            raise OSError(self.error, os.strerror(self.error))
+        if request == TIOCSRS485:
+            self.flags = struct.unpack("8I", data)[0]
+            self.set.append(self.flags)
+        else:
+            assert request == TIOCGRS485
+        return struct.pack("8I", self.flags, *[0] * 7)
+
+
+def test_direction_by_the_kernel(monkeypatch: pytest.MonkeyPatch, pty: PtyPort) -> None:
+    driver, real, requests = Driver(0), fcntl.ioctl, (TIOCGRS485, TIOCSRS485)
+    monkeypatch.setattr(fcntl, "ioctl", driver.ioctl)
+    direction = Direction(3, "x", required=True)
+    assert direction.by_kernel
+    direction.restore()
+    direction.restore()
+    assert driver.set == [ENABLED | RTS_ON_SEND, 0]
+    monkeypatch.setattr(fcntl, "ioctl", lambda *a: driver.ioctl(*a) if a[1] in requests else real(*a))
+    with opened(pty.path):
+        assert driver.set[2:] == [ENABLED | RTS_ON_SEND]
+    assert driver.set[3:] == [0], "the link leaves the port as it was"
+    driver = Driver(ENABLED)
+    monkeypatch.setattr(fcntl, "ioctl", driver.ioctl)
+    direction = Direction(3, "x", required=False)
+    direction.restore()
+    assert direction.by_kernel
+    assert driver.set == []
+
+
+def test_direction_that_the_kernel_cannot_switch(monkeypatch: pytest.MonkeyPatch, pty: PtyPort) -> None:
+    for number in (errno.ENOTTY, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):
+        monkeypatch.setattr(fcntl, "ioctl", Driver(0, number).ioctl)
+        assert not Direction(3, "x", required=False).by_kernel
+        with pytest.raises(LinkError, match="direction: none"):
+            Direction(3, "x", required=True)
+    monkeypatch.setattr(fcntl, "ioctl", Driver(0, errno.EIO).ioctl)
+    with pytest.raises(LinkError):
+        Direction(3, "x", required=False)
+    monkeypatch.undo()
+    before, ports = len(os.listdir("/proc/self/fd")), SharedPorts()
+    link = Rs485Link(Rs485Settings(line=pty.path, baud=BAUD, direction="kernel"), ports=ports)
+    with pytest.raises(LinkError, match="direction: none") as caught:
+        link.open()
+    assert len(os.listdir("/proc/self/fd")) == before, f"{caught} keeps the port object: only close() releases it"
+    with opened(pty.path, ports, direction="none"):
+        pass

@@ -1,0 +1,36 @@
+"""The ledger's two sums."""
+
+from imud.model.ledger import LEDGER_FIELDS, Ledger
+
+
+def test_new_ledger_is_zero_and_closes_and_a_snapshot_is_a_copy() -> None:
+    ledger = Ledger()
+    assert ledger.closes()
+    assert set(ledger.values()) == {0}
+    before = ledger.snapshot()
+    assert tuple(before) == LEDGER_FIELDS
+    ledger.samples += 1
+    assert (before["samples"], ledger.snapshot()["samples"]) == (0, 1)
+
+
+def test_every_byte_and_every_good_frame_must_be_somewhere() -> None:
+    ledger = Ledger()
+    ledger.bytes_in = 100
+    assert ledger.bytes_open() == 100
+    assert not ledger.closes()
+    ledger.bytes_in_good_frames, ledger.bytes_in_bad_frames, ledger.bytes_skipped, ledger.bytes_pending = 70, 10, 15, 5
+    assert ledger.closes()
+    ledger.frames_good = 10
+    assert ledger.frames_open() == 10
+    assert not ledger.closes()
+    ledger.frames_in_samples, ledger.frames_in_replies, ledger.frames_ignored, ledger.frames_pending = 4, 3, 2, 1
+    assert ledger.closes()
+
+
+def test_sums_by_reason_and_cause() -> None:
+    ledger = Ledger()
+    ledger.frames_bad_crc, ledger.frames_bad_length, ledger.frames_bad_content = 1, 2, 4
+    assert ledger.frames_bad() == 7
+    ledger.lost_gap_device, ledger.lost_crc, ledger.lost_overrun, ledger.lost_queue = 1, 2, 4, 8
+    ledger.add_unknown_gap()
+    assert (ledger.lost(), ledger.lost_unknown) == (15, 1), "gaps of unknown size are not among them"

@@ -1,0 +1,19 @@
+"""Metrics of outputs that send sentences: each value of each way out, and none without one."""
+
+from imud.contracts.status import OutputStatus
+from imud.publishers.metrics.metric import Snapshot
+from tests.support.metrics import shown
+
+
+def test_each_value_is_that_of_the_way_out() -> None:
+    tcp, serial = "tcp 127.0.0.1:10110", "serial /dev/ttyUSB0"
+    outputs = (OutputStatus(tcp, 1, 2, 3, ""), OutputStatus(serial, 4, 5, 0, "No such file or directory"))
+    assert shown("imud_nmea0183_", Snapshot(outputs=outputs)) == {
+        f"sentences_total {tcp}": 1,
+        f"sentences_dropped_total {tcp}": 2,
+        f"readers {tcp}": 3,
+        f"sentences_total {serial}": 4,
+        f"sentences_dropped_total {serial}": 5,
+        f"readers {serial}": 0,
+    }
+    assert shown("imud_nmea0183_", Snapshot()) == {}

@@ -1,0 +1,237 @@
+"""Who gets in: no user locks out another, root and the control group always get in, devices keep their descriptors."""
+
+import resource
+from dataclasses import dataclass, field
+
+import pytest
+
+from imud.formats.jsonrpc import Code, RpcError
+from imud.publishers.socket import admission as quota
+from imud.publishers.socket.admission import Peer, Quota, Rights, Seldom, Shares, raise_fd_limit
+from imud.publishers.socket.scheduler import TokenBucket
+
+READ, ALL = Rights.READ, Rights.READ | Rights.CONTROL
+OWN_UID = 500
+MS = 1_000_000
+
+
+@dataclass
+class Client:
+    peer: Peer
+    wakers: list[str] = field(default_factory=list)
+    reserved: bool = False
+
+
+class House:
+    def __init__(self, clients: int = 64, per_user: int = 20, fd_limit: int = 1024) -> None:
+        self.now_ns = 0
+        self.quota = Quota(Shares(clients, per_user), OWN_UID, fd_limit, lambda: self.now_ns)
+        self.clients: list[Client] = []
+
+    def connect(self, uid: int, rights: Rights = READ, fd: int = 50) -> str:
+        peer = Peer(1, uid, frozenset())
+        try:
+            reserved = self.quota.admit(peer, rights, fd, self.clients)
+        except RpcError as refusal:
+            return str(refusal) if refusal.code == Code.TOO_MANY_CLIENTS else pytest.fail(str(refusal))
+        self.clients.append(Client(peer, reserved=reserved))
+        return ""
+
+    def fill(self, uids: tuple[int, ...], rights: Rights = READ) -> int:
+        """Let clients of these users in, in turns, until none of them gets in; how many did."""
+        before = len(self.clients)
+        while [uid for uid in uids if not self.connect(uid, rights)]:
+            pass
+        return len(self.clients) - before
+
+    def leave(self, uid: int, count: int) -> None:
+        for client in [client for client in self.clients if client.peer.uid == uid][:count]:
+            self.clients.remove(client)
+
+
+def test_one_user_gets_its_share_and_others_get_in() -> None:
+    house = House()
+    refusals = [house.connect(1000) for _ in range(25)]
+    assert refusals[:20] == [""] * 20
+    assert all("socket.clients_per_user" in words for words in refusals[20:])
+    assert house.connect(1001) == ""
+
+
+def test_many_users_leave_places_for_root_and_control() -> None:
+    house = House()
+    outcomes = [house.connect(1000 + number) for number in range(70)]
+    assert outcomes.count("") == 48  # 64 less the 16 reserved
+    assert all("reserved" in words for words in outcomes[48:])
+    assert house.connect(0, ALL) == ""
+    assert house.connect(OWN_UID) == ""
+    assert [house.connect(2000, ALL) for _ in range(14)].count("") == 3
+    assert [house.connect(2001, ALL) for _ in range(14)].count("") == 3
+
+
+def test_root_and_another_member_get_in_beside_two_readers_and_a_member_that_take_all() -> None:
+    """With the defaults: 128 and 112 clients of two readers and 16 of one member of the control group are 256."""
+    house = House(clients=256, per_user=128)
+    assert house.fill((1000, 1001)) == 240
+    assert house.fill((2000,), ALL) == 3
+    assert "uid 2000 has 3 of the reserved places" in house.connect(2000, ALL)
+    assert house.connect(2001, ALL) == ""
+    assert [house.connect(0, ALL) for _ in range(4)] == [""] * 4
+
+
+def test_root_has_places_that_nobody_else_can_take_not_even_the_daemon_s_own_user() -> None:
+    house = House(clients=256, per_user=128)
+    house.fill(tuple(range(1000, 1010)))
+    house.fill((OWN_UID, *range(2000, 2010)), ALL)
+    assert len(house.clients) == 252
+    assert "for root" in house.connect(2011, ALL)
+    assert [house.connect(0, ALL) for _ in range(5)].count("") == 4
+    assert len(house.clients) == 256  # the total is kept
+    assert "socket.clients_max" in house.connect(0, ALL)
+    house = House(clients=256, per_user=128)
+    assert house.fill((OWN_UID,)) == 243
+    assert house.connect(2000, ALL) == ""
+    assert house.connect(0, ALL) == ""
+
+
+def test_places_that_come_free_do_not_give_a_member_more_of_the_reserved_ones() -> None:
+    house = House(clients=256, per_user=128)
+    house.fill((1000, 1001))
+    house.fill((2000,), ALL)
+    for _ in range(10):  # takes what readers leave, who come back for more
+        house.leave(1000, 30)
+        house.fill((2000,), ALL)
+        house.fill((1000, 1001))
+        assert house.connect(2001, ALL) == ""
+        house.leave(2001, 1)
+        house.leave(2000, 20)
+        house.fill((1000, 1001))
+        house.fill((2000,), ALL)
+        assert house.connect(2001, ALL) == ""
+        house.leave(2001, 1)
+        assert house.connect(0, ALL) == ""
+        house.leave(0, 1)
+
+
+def test_members_and_root_with_many_clients_have_their_own_places_too() -> None:
+    house = House(clients=256, per_user=128)
+    assert [house.connect(2000, ALL) for _ in range(20)] == [""] * 20
+    house.fill((1000, 1001))
+    assert house.connect(2000, ALL) == ""
+    house = House(clients=256, per_user=128)
+    assert [house.connect(0, ALL) for _ in range(4)] == [""] * 4
+    assert house.fill((1000, 1001)) == 240
+    house = House(clients=256, per_user=128)
+    assert [house.connect(0, ALL) for _ in range(20)] == [""] * 20
+    assert house.fill((1000, 1001)) == 224  # the others of root have open places
+    assert [house.connect(uid, ALL) for uid in (2000, 2001, 2002, 2003)] == [""] * 4
+
+
+def test_a_small_house_has_few_reserved_places_or_none() -> None:
+    house = House(clients=3)
+    assert [house.connect(1000) for _ in range(4)].count("") == 3
+    house = House(clients=4)
+    assert [house.connect(1000) for _ in range(4)].count("") == 3
+    assert house.connect(0, ALL) == ""
+    house = House(clients=8)
+    assert [house.connect(1000) for _ in range(8)].count("") == 6
+    assert [house.connect(2000, ALL), house.connect(0, ALL)] == ["", ""]
+
+
+def test_connecting_again_and_again_is_limited_by_user() -> None:
+    house = House()
+    outcomes = []
+    for seconds, count in ((0, 256), (1, 64), (3, 192), (60, 256)):
+        house.now_ns += seconds * 1000 * MS
+        for _ in range(count + 2):
+            outcomes.append(house.connect(1000))
+            house.clients.clear()
+        assert outcomes.count("") == count
+        assert "uid 1000 connects more than 64 times a second" in outcomes[-1]
+        outcomes.clear()
+    assert house.connect(1001) == ""
+    house.quota.tick()  # 1000 is still in debt, and is not forgotten
+    assert house.connect(1000) != ""
+    for _ in range(1000):
+        assert house.connect(0) == ""
+        house.clients.clear()
+
+
+def test_a_user_that_has_not_connected_lately_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[TokenBucket] = []
+
+    def make(*args: int) -> TokenBucket:
+        made.append(TokenBucket(*args))
+        return made[-1]
+
+    monkeypatch.setattr(quota, "TokenBucket", make)
+    house = House()
+    for milliseconds, buckets in ((0, 1), (15, 1), (17, 2)):  # a token takes 15.6 ms
+        house.now_ns += milliseconds * MS
+        house.quota.tick()
+        house.connect(1000)
+        assert len(made) == buckets
+
+
+def test_high_descriptors_are_kept_for_devices() -> None:
+    house = House(fd_limit=1024)
+    assert house.connect(1000, fd=767) == ""
+    assert "descriptor" in house.connect(1000, fd=768)
+    assert "descriptor" in house.connect(OWN_UID, fd=784)
+    assert [house.connect(uid, ALL, fd=783) for uid in (0, 2000)] == ["", ""]  # one for each reserved place
+    assert "descriptor" in house.connect(0, ALL, fd=784)
+    house.quota.check_fds((5, 767))
+    with pytest.raises(RpcError, match="no descriptor to spare"):
+        house.quota.check_fds((5, 768))
+
+
+def test_wakers_of_all_clients_of_a_user_count() -> None:
+    house = House(per_user=2)
+    house.connect(1000)
+    house.connect(1000)
+    for client in house.clients:
+        client.wakers = ["imu0", "imu1", "imu2", "imu3"]
+    with pytest.raises(RpcError, match="uid 1000 has 8 descriptors already"):
+        house.quota.check_waker(house.clients[0].peer, house.clients)
+    house.clients[0].wakers.pop()
+    house.quota.check_waker(house.clients[0].peer, house.clients)
+    for uid in (0, OWN_UID, 1001):
+        house.quota.check_waker(Peer(1, uid, frozenset()), house.clients)
+
+
+def test_selections_of_fields_are_limited() -> None:
+    house = House()
+    for form in range(1, 17):
+        house.quota.exchange_form(1000, None, form)
+    house.quota.exchange_form(1000, None, 3)
+    for _ in range(2):  # a refusal counts nothing
+        with pytest.raises(RpcError, match="16 selections"):
+            house.quota.exchange_form(1000, None, 99)
+    with pytest.raises(RpcError, match="16 selections"):
+        house.quota.exchange_form(1000, 3, 99)  # another client has that form, too
+    house.quota.exchange_form(1001, None, 99)
+    house.quota.exchange_form(1000, 4, 99)  # its own form goes
+    house.quota.exchange_form(1000, 99, None)
+    house.quota.exchange_form(1000, None, 100)
+    with pytest.raises(RpcError, match="16 selections"):
+        house.quota.exchange_form(1000, None, 101)
+
+
+def test_a_frequent_message_is_logged_once_a_minute_with_its_count() -> None:
+    now_ns = 0
+    seldom = Seldom(lambda: now_ns)
+    assert [seldom.count() for _ in range(5)] == [1, 0, 0, 0, 0]
+    now_ns = 60_000 * MS - 1
+    assert seldom.count() == 0
+    now_ns += 1
+    assert [seldom.count() for _ in range(2)] == [6, 0]
+
+
+def test_the_limit_of_descriptors_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = [(1024, 524_288)]
+    monkeypatch.setattr(resource, "getrlimit", lambda _which: limits[-1])
+    monkeypatch.setattr(resource, "setrlimit", lambda _which, pair: limits.append(pair))
+    assert raise_fd_limit() == 16_384
+    assert limits[-1] == (16_384, 524_288)
+    assert raise_fd_limit() == 16_384
+    limits[:] = [(1024, 4096)]
+    assert raise_fd_limit() == 4096

@@ -1,0 +1,183 @@
+"""Descriptors that wake clients: for what, until when, and that no client makes the daemon wait with them."""
+
+import asyncio
+import os
+import select
+import socket
+from pathlib import Path
+
+import pytest
+
+from imud.formats.jsonrpc import encode_notification
+from imud.publishers.socket.client import BYTE
+from imud.publishers.socket.server import SocketServer
+from tests.support.socket_rig import NOW_NS, Peer, batch, in_server, run, serving, until
+
+
+async def notified(peer: Peer, device: str = "imu0") -> int:
+    await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"notify","params":{"device":"%s"}}\n' % device.encode())
+    await until(lambda: bool(select.select([peer.sock], [], [], 0)[0]))
+    data, fds, _flags, _address = socket.recv_fds(peer.sock, 4096, 4)
+    assert data == b'{"jsonrpc":"2.0","id":1,"result":{"device":"%s","latency_ms":0.0}}\n' % device.encode()
+    (fd,) = fds
+    return fd
+
+
+async def wakened() -> None:
+    """Return behind the wake-ups of what is published already."""
+    done = asyncio.Event()
+    asyncio.get_running_loop().call_soon(done.set)
+    await done.wait()
+
+
+def read_all(fd: int) -> bytes | None:
+    try:
+        return os.read(fd, 4096)
+    except BlockingIOError:
+        return None
+
+
+@in_server()
+async def test_notify_wakes_for_batches_of_one_device(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    fd = await notified(peer)
+    (connection,) = server.hub.connections.values()
+    assert connection.wakers.client_ends == 0  # the daemon keeps no copy
+    server.publish(batch("imu1"))
+    await wakened()
+    assert read_all(fd) is None
+    for first in (1, 3):
+        server.publish(batch("imu0", first, 2))
+        assert read_all(fd) is None  # not yet: shared memory may have its turn after this
+        await wakened()
+        assert read_all(fd) == BYTE
+    other = await notified(peer, "imu1")
+    server.publish(batch("imu1", 2))
+    await wakened()
+    assert (read_all(fd), read_all(other)) == (None, BYTE)
+    peer.close()
+    await until(lambda: not server.hub.connections)
+    assert (read_all(fd), read_all(other)) == (b"", b"")
+    os.close(fd)
+    os.close(other)
+
+
+@in_server()
+async def test_notify_again_ends_the_old_descriptor(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    before = len(os.listdir("/proc/self/fd"))
+    fds = [await notified(peer) for _ in range(5)]
+    assert len(os.listdir("/proc/self/fd")) == before + 5 + 1  # ours, and one of the daemon's
+    server.publish(batch())
+    await wakened()
+    assert [read_all(fd) for fd in fds] == [b"", b"", b"", b"", BYTE]
+    for fd in fds:
+        os.close(fd)
+
+
+def test_many_clients_are_woken_in_several_turns(tmp_path: Path) -> None:
+    """A turn takes 0.3 ms. imud looks at the clock after 16 clients."""
+    now_ns, step_ns = NOW_NS, 0
+
+    def clock() -> int:
+        nonlocal now_ns
+        now_ns += step_ns
+        return now_ns
+
+    async def body() -> None:
+        nonlocal step_ns
+        async with serving(tmp_path, clock) as server:
+            fds = [await notified(await Peer.greeted(server)) for _ in range(40)]
+            step_ns = 200_000
+            server.publish(batch("imu0"))
+            woken = []
+            for _ in range(2):
+                await asyncio.sleep(0)
+                woken.append(sum(read_all(fd) == BYTE for fd in fds))
+            assert woken == [32, 8]
+            for fd in fds:
+                os.close(fd)
+
+    run(body)
+
+
+@pytest.mark.timeout(60)  # a daemon that waits never returns
+@in_server()
+async def test_no_client_makes_the_daemon_wait(server: SocketServer) -> None:
+    """One clears O_NONBLOCK of its descriptor and never reads; the others are woken on and on."""
+    hostile, other = await Peer.greeted(server), await Peer.greeted(server)
+    held, fd = await notified(hostile), await notified(other)
+    os.set_blocking(held, True)
+    with pytest.raises(BrokenPipeError), socket.socket(fileno=os.dup(held)) as sock:
+        sock.send(b"this is never read")
+    for seq in range(1, 101):
+        server.publish(batch("imu0", seq))
+        await wakened()
+        assert read_all(fd) == BYTE
+    assert 1 <= len(os.read(held, 4096)) <= 64  # was full; "64 bytes at once are plenty"
+    server.publish(batch("imu0", 301))
+    await wakened()
+    assert read_all(held) == BYTE
+    for end in (held, fd):
+        os.close(end)
+    for peer in (hostile, other):
+        assert len(await peer.result("devices")) == 2
+
+
+@in_server()
+async def test_a_client_that_closes_its_descriptor_is_not_woken_any_more(server: SocketServer) -> None:
+    closing, other = await Peer.greeted(server), await Peer.greeted(server)
+    os.close(await notified(closing))
+    fd = await notified(other)
+    first, second = server.hub.connections.values()
+    for seq in (1, 2):
+        server.publish(batch("imu0", seq))
+        await wakened()
+        assert read_all(fd) == BYTE
+        assert not first.wakers
+    os.close(fd)
+    server.publish(batch("imu0", 3))
+    await wakened()
+    assert not second.wakers
+    server.publish(batch("imu0", 4))
+    assert not server.hub.wakes("imu0")  # no client is left to wake
+    for peer in (closing, other):
+        assert len(await peer.result("devices")) == 2
+
+
+@in_server()
+async def test_unread_replies_do_not_gather_descriptors(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    (connection,) = server.hub.connections.values()
+    connection.post(encode_notification("big", "x" * 500_000))  # the socket is full
+    before = len(os.listdir("/proc/self/fd"))
+    requests = [(number, "imu0" if number < 5 else "imu1") for number in range(6)]
+    for number, device in requests:
+        line = b'{"jsonrpc":"2.0","id":%d,"method":"notify","params":{"device":"%s"}}\n'
+        await peer.send(line % (number, device.encode()))
+    await until(lambda: len(connection.wakers) == 2)
+    assert len(os.listdir("/proc/self/fd")) == before + 4  # both ends of two
+    replies = (await peer.messages(7))[1:]
+    assert ["error" in reply for reply in replies] == [False, True, True, True, True, False]
+    assert "ask again" in replies[1]["error"]["message"]
+    assert replies[1]["error"]["code"] == -32004
+    assert len(os.listdir("/proc/self/fd")) == before + 2
+    os.close(await notified(peer))
+
+
+@in_server()
+async def test_no_descriptor_to_be_had(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_arguments: object) -> None:
+        raise OSError(24, "Too many open files")
+
+    peer = await Peer.greeted(server)
+    fd = await notified(peer)
+    with monkeypatch.context() as patch:
+        patch.setattr(socket, "socketpair", refuse)
+        code, message = await peer.error("notify", device="imu0")
+    assert code == -32004
+    assert "Too many open files" in message
+    server.publish(batch())
+    await wakened()
+    assert read_all(fd) == BYTE  # the old one is still there
+    os.close(fd)

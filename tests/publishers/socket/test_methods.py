@@ -1,0 +1,246 @@
+"""Whatever a client sends, it gets an error by the book, and server and other clients live on."""
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from imud.contracts.publisher import Batch
+from imud.formats.jsonrpc import LINE_MAX_BYTES
+from imud.publishers.socket.admission import Rights
+from imud.publishers.socket.methods import METHODS
+from imud.publishers.socket.scheduler import BYTES_BURST
+from imud.publishers.socket.server import SocketServer
+from tests.support.socket_rig import Peer, batch, in_server, run, serving
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "request_id", "words"),
+    [
+        (b"{", -32700, None, "not JSON"),
+        (b"\xff\xfe", -32700, None, "not JSON"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"x\xff"}', -32700, None, "not JSON"),
+        (b"[" * 60_000, -32700, None, "nested too deeply"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":NaN}}', -32700, None, "not JSON"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":1e999}}', -32700, None, "not JSON"),
+        (
+            b'{"jsonrpc":"2.0","id":1,"method":"x","params":' + b'{"a":' * 974 + b"1" + b"}" * 975,
+            -32700,
+            None,
+            "nested",
+        ),
+        (b"[" + b"1," * 3000 + b"1]", -32700, None, "too long a list: expected at most 2048"),
+        (b"7", -32600, None, "got a number"),
+        (b'[{"jsonrpc":"2.0","id":1,"method":"devices"}]', -32600, None, "one JSON object per line, got an array"),
+        (b"{}", -32600, None, '"2.0"'),
+        (b'{"jsonrpc":2.0,"id":1,"method":"devices"}', -32600, 1, '"2.0"'),
+        (b'{"jsonrpc":"2.0","id":"a"}', -32600, "a", "method: expected a string, got null"),
+        (b'{"jsonrpc":"2.0","id":1.5,"method":[]}', -32600, 1.5, "method: expected a string, got an array"),
+        (b'{"jsonrpc":"2.0","id":true,"method":"devices"}', -32600, None, "id: expected"),
+        (b'{"jsonrpc":"2.0","id":{},"method":"devices"}', -32600, None, "id: expected"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"devices","params":"x"}', -32600, 1, "params: expected an object"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"devices","params":[1]}', -32602, 1, "by name only"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"config.get"}', -32601, 1, "there are: devices, status"),
+        (b'{"jsonrpc":"2.0","id":null,"method":"x"}', -32601, None, "no method 'x'"),
+    ],
+)
+@in_server()
+async def test_bad_lines(server: SocketServer, line: bytes, code: int, request_id: object, words: str) -> None:
+    peer = await Peer.greeted(server)
+    await peer.send(line + b"\n")
+    reply = await peer.message()
+    assert (reply["jsonrpc"], reply["id"], reply["error"]["code"]) == ("2.0", request_id, code)
+    assert words in reply["error"]["message"]
+    assert len(await peer.result("devices")) == 2
+
+
+@pytest.mark.parametrize(
+    ("method", "params", "words"),
+    [
+        ("watch", {"rate_hz": -1}, "0.001 … 1000000, got -1"),
+        ("watch", {"rate_hz": 0.00099}, "expected 0 (every sample) or 0.001"),
+        ("watch", {"rate_hz": 1_000_001}, "expected 0 (every sample) or 0.001"),
+        ("watch", {"rate_hz": True}, "rate_hz: expected a number, or null, got true"),
+        ("watch", {"rate_hz": "fast"}, 'got "fast"'),
+        ("watch", {"devices": ["imu7"]}, "no device named 'imu7'; there are: imu0, imu1"),
+        ("watch", {"devices": []}, "empty list"),
+        ("watch", {"devices": "imu0"}, 'expected a list, each of it text, or null, got "imu0"'),
+        ("watch", {"devices": [1]}, "got a list with 1 at [0]"),
+        ("watch", {"fields": ["accel"]}, "no field named 'accel'; there are: device, seq, t_ns"),
+        ("watch", {"encoding": "xml"}, "xml"),
+        ("poll", {"devices": ["imu7"]}, "there are: imu0, imu1"),
+        ("events", {"enable": "yes"}, 'enable: expected true or false, or null, got "yes"'),
+        ("notify", {}, "notify: expected the parameter device (text), got none"),
+        ("notify", {"device": "imu7"}, "there are: imu0, imu1"),
+    ],
+)
+@in_server()
+async def test_bad_parameters(server: SocketServer, method: str, params: dict[str, Any], words: str) -> None:
+    peer = await Peer.greeted(server)
+    code, message = await peer.error(method, **params)
+    assert code == -32602
+    assert words in message
+    (connection,) = server.hub.connections.values()
+    assert connection.number not in watching(server)
+    assert not connection.wakers
+
+
+def watching(server: SocketServer) -> set[int]:
+    return {client.number for client in server.hub.clients() if client.encoding}
+
+
+@in_server()
+async def test_the_limits_themselves_are_allowed_and_unknown_members_ignored(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    for rate_hz in (0.001, 1_000_000):
+        assert (await peer.result("watch", rate_hz=rate_hz))["rate_hz"] == rate_hz
+    line = b'{"later":1,"jsonrpc":"2.0","id":1,"method":"watch","params":{"later":[],"rate_hz":null}}\r\n'
+    await peer.send(line)
+    assert (await peer.message())["result"]["rate_hz"] == 0
+
+
+def test_rights_and_effects_of_the_methods() -> None:
+    changing = {"command", "calibrate", "settings.plan", "settings.apply", "stop_calibration"}
+    recording = {"record.start", "record.stop", "record.snapshot"}
+    assert {name for name, method in METHODS.items() if method.right is not Rights.READ} == changing | recording
+    assert {name for name, method in METHODS.items() if method.acts} == {
+        "options", "watch", "unwatch", "events", "command", "calibrate", "settings.apply", "stop_calibration",
+        "record.stop",
+    }  # fmt: skip
+
+
+@in_server()
+async def test_notifications_act_and_are_not_answered(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    await peer.send(b'{"jsonrpc":"2.0","method":"status"}\n')
+    await peer.send(b'{"jsonrpc":"2.0","method":"nonsense"}\n')
+    await peer.send(b'{"jsonrpc":"2.0","method":"notify","params":{"device":"imu0"}}\n')
+    await peer.send(b'{"jsonrpc":"2.0","method":"watch","params":{"devices":["imu1"]}}\n')
+    await peer.send(b'{"jsonrpc":"2.0","id":9,"method":"devices"}\n')
+    assert (await peer.message())["id"] == 9
+    (connection,) = server.hub.connections.values()
+    assert connection.number in watching(server)
+    assert not connection.wakers
+
+
+@in_server()
+async def test_half_lines_several_requests_and_blank_lines(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    lines = b"".join(b'{"jsonrpc":"2.0","id":%d,"method":"poll"}\n\r\n\n' % number for number in range(25))
+    await peer.send(lines)  # more than one turn's worth
+    assert [reply["id"] for reply in await peer.messages(25)] == list(range(25))
+    line = b'{"jsonrpc":"2.0","id":"cut","method":"poll"}\n'
+    for cut in range(1, len(line), 7):
+        await peer.send(line[:cut])
+        await asyncio.sleep(0)
+        await peer.send(line[cut:])
+        assert (await peer.message())["id"] == "cut"
+
+
+@in_server()
+async def test_a_client_that_leaves_in_the_middle_of_a_line(server: SocketServer) -> None:
+    peer, other = await Peer.greeted(server), await Peer.greeted(server)
+    await peer.send(b'{"jsonrpc":"2.0","id":1,"meth')
+    peer.close()
+    while len(server.hub.connections) > 1:
+        await asyncio.sleep(0)
+    assert len(await other.result("devices")) == 2
+
+
+@pytest.mark.parametrize("newline", [b"", b"\n"])
+@in_server()
+async def test_a_line_over_the_limit_ends_the_connection(server: SocketServer, newline: bytes) -> None:
+    peer, other = await Peer.greeted(server), await Peer.greeted(server)
+    start = b'{"jsonrpc":"2.0","id":1,"method":"poll","x":"'
+    longest = start + b"x" * (LINE_MAX_BYTES - len(start) - 2) + b'"}'
+    await peer.send(longest + b"\n")
+    assert (await peer.message())["id"] == 1
+    await peer.send(b"x" * (LINE_MAX_BYTES + 1) + newline)
+    assert (await peer.message())["error"]["code"] == -32003
+    assert await peer.ended()
+    assert server.hub.status().evicted == 1
+    assert len(await other.result("devices")) == 2
+
+
+@in_server()
+async def test_one_client_s_flood_of_requests_leaves_turns_to_others(server: SocketServer) -> None:
+    flood, other = await Peer.greeted(server), await Peer.greeted(server)
+    await flood.send(b'{"jsonrpc":"2.0","id":1,"method":"poll"}\n' * 1000)
+    await other.result("poll")
+    while b"\n" not in flood.buffer:
+        flood.buffer += await asyncio.get_running_loop().sock_recv(flood.sock, 1 << 20)
+    assert flood.buffer.count(b"\n") < 200  # of 1000, when the other was answered
+
+
+@in_server()
+async def test_a_name_that_would_forge_a_line_of_the_log_is_refused(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    for name, expected in (("x\nERROR forged", -32602), ("x" * 65, -32602), ("x" * 64, -32005)):
+        code, _ = await peer.error("command", device="imu0", name=name)
+        assert code == expected
+        assert (await peer.error("calibrate", device="imu0", kind=name))[0] == expected
+
+
+def test_a_mistake_in_an_action_ends_that_client_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            other = await Peer.greeted(server)
+            for _ in range(3):
+                peer = await Peer.greeted(server)
+                params = b'{"device":"imu0","name":"break"}'
+                await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"command","params":' + params + b"}\n")
+                assert (await peer.message())["error"]["code"] == -32603
+                assert await peer.ended()
+                peer.close()
+            assert server.hub.status().failed == 3
+            assert len(await other.result("devices")) == 2
+            other.close()
+
+    run(body)
+    assert caplog.text.count("an internal error while a client was served") == 1
+
+
+@in_server()
+async def test_a_mistake_in_answering_ends_that_client_only(
+    server: SocketServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise RecursionError("deep")
+
+    peer, other = await Peer.greeted(server), await Peer.greeted(server)
+    with monkeypatch.context() as patch:
+        patch.setattr("imud.publishers.socket.methods.encode_result", fail)
+        await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"devices"}\n')
+        assert (await peer.message())["error"]["code"] == -32603
+        assert await peer.ended()
+    assert server.hub.status().failed == 1
+    assert len(await other.result("devices")) == 2
+
+
+@in_server()
+async def test_empty_lines_use_up_the_allowance_of_their_client(server: SocketServer) -> None:
+    """30 clients with 7 MB of them each kept the daemon busy for minutes."""
+    peer, other = await Peer.greeted(server), await Peer.greeted(server)
+    peer.sock.setblocking(False)
+    written, full = 0, 0
+    while full < 200:  # nothing is read any more
+        try:
+            written += peer.sock.send(b"\n" * 65_536)
+            full = 0
+        except BlockingIOError:
+            full += 1
+        await asyncio.sleep(0)
+    assert written < 2 * BYTES_BURST
+    assert len(await other.result("devices")) == 2
+
+
+@in_server()
+async def test_nan_and_infinity_are_null(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    await peer.result("watch")
+    nan = batch()
+    values = (float("nan"), float("inf"), -float("inf"))
+    server.publish(Batch("imu0", 0, [replace(nan.samples[0], gyro_rad_s=values)]))
+    assert (await peer.message())["params"]["gyro_rad_s"] == [None, None, None]

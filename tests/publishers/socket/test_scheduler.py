@@ -1,0 +1,304 @@
+"""The scheduler: turns are limited, the least user is next, abuse is parked and evicted, errors are contained."""
+
+import asyncio
+import select
+import socket
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from imud.publishers.socket import scheduler as serving
+from imud.publishers.socket.scheduler import Place, Scheduler, TokenBucket
+from tests.support.socket_rig import in_context, until
+
+MS = 1_000_000
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.ns = 80_000 * MS
+
+    def __call__(self) -> int:
+        return self.ns
+
+
+class Worker:
+    """A client with `pieces` pieces of work of `cost_ns` each."""
+
+    def __init__(self, name: str, rig: "SchedulerBench", pieces: int, cost_ns: int) -> None:
+        self.name, self.rig = name, rig
+        self.pieces, self.cost_ns = pieces, cost_ns
+        self.error: Exception | None = None
+        self.failures: list[Exception] = []
+        self.overloads = 0
+
+    def on_ready(self, events: int) -> None:
+        assert events & select.EPOLLIN
+
+    def serve(self) -> bool:
+        self.rig.clock.ns += self.cost_ns
+        self.rig.log.append(self.name)
+        self.rig.on_piece()
+        self.pieces -= 1
+        if self.error is not None:
+            raise self.error
+        return self.pieces > 0
+
+    def wanted_events(self) -> int:
+        return 0
+
+    def on_failure(self, error: Exception) -> None:
+        self.failures.append(error)
+        self.error = None
+
+    def on_overload(self) -> None:
+        self.overloads += 1
+
+
+class SchedulerBench:
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.log: list[str] = []
+        self.on_piece: Callable[[], object] = lambda: None
+        """Called after each piece."""
+        time = TokenBucket(1_000_000_000, 1_000 * MS, self.clock())
+        self.scheduler = Scheduler(self.clock, self.clock, time)
+        self.socks: list[socket.socket] = []
+
+    def add(self, name: str, uid: int, pieces: int, cost_ns: int) -> tuple[Worker, Place]:
+        ours, theirs = socket.socketpair()
+        self.socks += [ours, theirs]
+        worker = Worker(name, self, pieces, cost_ns)
+        place = self.scheduler.add(worker, ours.fileno(), len(self.socks), uid)
+        return worker, place
+
+
+@asynccontextmanager
+async def scheduling(_folder: Path) -> AsyncIterator[SchedulerBench]:
+    rig = SchedulerBench()
+    try:
+        yield rig
+    finally:
+        rig.scheduler.close()
+        for sock in rig.socks:
+            sock.close()
+
+
+@in_context("rig", scheduling)
+async def test_a_turn_is_limited_and_other_callbacks_run_in_between(rig: SchedulerBench) -> None:
+    rig.add("busy", 1, 100, MS // 4)[1].line_up()
+    for _ in range(20):
+        asyncio.get_running_loop().call_soon(rig.log.append, "sample")
+        await asyncio.sleep(0)
+    served = "".join("b" if word == "busy" else "." for word in rig.log)
+    assert "b" * 5 not in served  # 4 pieces of 0.25 ms make a turn
+    assert served.count("b") > 40
+
+
+@in_context("rig", scheduling)
+async def test_the_client_that_used_least_is_next_within_its_user_and_among_users(rig: SchedulerBench) -> None:
+    for number in range(8):
+        rig.add(f"many{number}", 1, 50, MS // 4)[1].line_up()
+    rig.add("one", 2, 50, MS // 4)[1].line_up()
+    await until(lambda: len(rig.log) >= 60)
+    assert 26 <= rig.log[:60].count("one") <= 34  # half of the time for each user
+    counts = [rig.log[:60].count(f"many{number}") for number in range(8)]
+    assert max(counts) - min(counts) <= 1
+
+
+@in_context("rig", scheduling)
+async def test_a_newcomer_goes_before_those_that_use_much(rig: SchedulerBench) -> None:
+    for number in range(20):
+        rig.add(f"many{number}", 1, 1000, MS // 2)[1].line_up()
+    await until(lambda: len(rig.log) > 100)
+    before = len(rig.log)
+    rig.add("good", 1, 1, MS // 10)[1].line_up()
+    await until(lambda: "good" in rig.log)
+    assert rig.log.index("good") - before <= 20  # one round of the others at most
+
+
+@in_context("rig", scheduling)
+async def test_who_asks_too_much_is_parked_put_in_line_by_ticks_and_evicted(rig: SchedulerBench) -> None:
+    worker, place = rig.add("busy", 1, 1_000_000, 5 * MS)
+    place.line_up()
+    for _ in range(200):
+        await asyncio.sleep(0)
+    used = len(rig.log)
+    assert used * 5 * MS <= serving.CPU_NEW_NS + serving.CPU_PER_S_NS  # then nothing for it any more
+    rig.clock.ns += 500 * MS
+    rig.scheduler.tick()
+    await until(lambda: len(rig.log) > used)
+    ticks = 0
+    while not worker.overloads:
+        for _ in range(100):
+            await asyncio.sleep(0)
+        rig.clock.ns += 20 * MS
+        rig.scheduler.tick()
+        ticks += 1
+    assert 100 <= ticks <= 102  # 10 s
+
+
+@in_context("rig", scheduling)
+async def test_a_client_has_an_allowance_of_cpu_time_and_of_bytes(rig: SchedulerBench) -> None:
+    place = rig.add("talker", 1, 5, 0)[1]
+    now_ns = rig.clock()
+    place.fill(now_ns + 499 * MS)
+    assert not place.is_light
+    place.fill(now_ns + 500 * MS)  # 100 ms that a new client has, and 100 ms a second
+    assert place.is_light
+    place.count_bytes(1 << 20)
+    assert (place.is_over, place.is_light) == (False, True)
+    place.count_bytes(262_144)
+    assert (place.is_over, place.is_light) == (True, False)
+    place.fill(now_ns + 1499 * MS)
+    assert place.is_over
+    place.fill(now_ns + 1501 * MS)
+    assert not place.is_over
+    place.charge(200 * MS)  # all that can gather
+    assert not place.is_over
+    place.charge(1)
+    assert place.is_over
+    place.charge(1000 * MS)  # the debt is at most what can gather
+    place.fill(now_ns + 3500 * MS)
+    assert place.is_over
+    place.fill(now_ns + 3502 * MS)
+    assert not place.is_over
+
+
+@in_context("rig", scheduling)
+async def test_a_turn_has_a_limited_number_of_pieces(rig: SchedulerBench) -> None:
+    rig.add("free", 1, 1000, 0)[1].line_up()
+    await asyncio.sleep(0)
+    assert len(rig.log) == 64
+
+
+@in_context("rig", scheduling)
+async def test_sockets_are_looked_at_again_within_a_turn(rig: SchedulerBench) -> None:
+    """After 0.2 ms, so that a client that asks little is next."""
+    busy, place = rig.add("busy", 1, 100, MS // 10)
+    rig.add("asking", 2, 1, 0)
+    place.line_up()
+    rig.on_piece = lambda: rig.socks[3].send(b"x") if rig.log == ["busy"] else None
+    await asyncio.sleep(0)
+    assert rig.log[:4] == ["busy", "busy", "asking", "busy"]
+    assert len(rig.log) == 11  # 10 pieces make a turn of 1 ms
+    assert busy.pieces == 90
+
+
+@pytest.mark.parametrize("uid", [1, 2])
+@in_context("rig", scheduling)
+async def test_a_client_that_waited_long_is_ahead_for_a_millisecond(rig: SchedulerBench, uid: int) -> None:
+    rig.add("busy", 1, 1000, MS // 4)[1].line_up()
+    idle = rig.add("idle", uid, 1000, MS // 4)[1]
+    await until(lambda: len(rig.log) >= 100)
+    count = len(rig.log)
+    idle.line_up()
+    await until(lambda: len(rig.log) >= count + 12)
+    later = rig.log[count:]
+    assert later.index("busy") in (4, 5)
+    assert 2 <= later[4:12].count("busy") <= 6
+
+
+@in_context("rig", scheduling)
+async def test_when_the_time_for_serving_is_used_up_only_light_clients_are_served(rig: SchedulerBench) -> None:
+    for number in range(4):
+        rig.add(f"heavy{number}", 1, 10_000, MS // 2)[1].line_up()
+    good, place = rig.add("good", 1, 1, MS // 10)
+    place.fill(rig.clock() + 1000 * MS)  # it has been there, silent, for a second
+    await until(lambda: len(rig.log) >= 8)
+    rig.scheduler.serving_time.use(2_000 * MS)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    before = len(rig.log)
+    place.line_up()
+    await until(lambda: "good" in rig.log[before:])
+    assert len(rig.log) - before <= 3  # at most the turn that everybody has in 10 ms
+    assert not good.pieces
+
+
+@in_context("rig", scheduling)
+async def test_without_time_for_serving_all_clients_are_served_every_10_ms(rig: SchedulerBench) -> None:
+    rig.add("heavy", 1, 10_000, MS // 2)[1].line_up()
+    await until(lambda: bool(rig.log))
+    rig.scheduler.serving_time.use(2_000 * MS)
+    for _ in range(2):
+        rig.clock.ns += 10 * MS
+        count = len(rig.log)
+        await until(lambda count=count: len(rig.log) > count)  # type: ignore[misc]
+        count = len(rig.log)
+        rig.clock.ns += 8 * MS  # the turn itself took 1 ms
+        await asyncio.sleep(0.01)  # several pauses of 2 ms
+        assert len(rig.log) == count
+
+
+@in_context("rig", scheduling)
+async def test_an_error_ends_that_client_and_no_other(rig: SchedulerBench, caplog: pytest.LogCaptureFixture) -> None:
+    bad, place = rig.add("bad", 1, 2, 1000)
+    bad.error = RecursionError("deep")
+    other, other_place = rig.add("other", 1, 3, 1000)
+    place.line_up()
+    other_place.line_up()
+    await until(lambda: not other.pieces and not bad.pieces)
+    assert [str(error) for error in bad.failures] == ["deep"]
+    assert not other.failures
+
+
+@pytest.mark.parametrize("where", ["on_overload", "on_ready", "wanted_events"])
+@in_context("rig", scheduling)
+async def test_an_error_outside_of_a_piece_ends_that_client_too(
+    rig: SchedulerBench, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """None of them may reach the loop, whose handler ends the daemon; `run` fails then."""
+    bad, place = rig.add("bad", 1, 10_000 if where == "on_overload" else 1, 5 * MS)
+
+    def broken(*_: object) -> int:
+        raise ZeroDivisionError(where)
+
+    monkeypatch.setattr(bad, where, broken)
+    if where == "on_ready":
+        rig.socks[1].send(b"x")
+    else:
+        place.line_up()
+    for _ in range(serving.OVER_TICKS_MAX + 10):
+        for _ in range(30):
+            await asyncio.sleep(0)
+        rig.clock.ns += 2 * MS
+        rig.scheduler.tick()
+        if bad.failures:
+            break
+    assert str(bad.failures[0]) == where
+    other, other_place = rig.add("other", 1, 1, 1000)
+    other_place.line_up()
+    await until(lambda: not other.pieces)
+
+
+@in_context("rig", scheduling)
+async def test_a_client_that_cannot_even_be_ended_is_served_no_more(
+    rig: SchedulerBench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    bad, place = rig.add("bad", 1, 1000, 1000)
+    bad.error = RecursionError("deep")
+
+    def broken(_error: Exception) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(bad, "on_failure", broken)
+    other, other_place = rig.add("other", 1, 3, 1000)
+    place.line_up()
+    other_place.line_up()
+    await until(lambda: not other.pieces)
+    assert rig.log.count("bad") == 1
+    assert "served no more" in caplog.text
+
+
+@in_context("rig", scheduling)
+async def test_a_client_that_left_is_not_served(rig: SchedulerBench) -> None:
+    _, place = rig.add("gone", 1, 5, 1000)
+    _, other = rig.add("other", 1, 1, 1000)
+    place.line_up()
+    place.leave()
+    place.leave()
+    other.line_up()
+    await until(lambda: rig.log == ["other"])

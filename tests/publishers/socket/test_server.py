@@ -1,0 +1,424 @@
+"""The socket server end to end: greeting, questions, samples in both encodings, events, limits."""
+
+import asyncio
+import itertools
+import os
+import random
+import socket
+import struct
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from imud import __version__
+from imud.formats.slot import SLOT_BYTES, decode_slot
+from imud.model.event import Event, EventKind
+from imud.model.sample import SAMPLE_FIELDS
+from imud.publishers import PUBLISHERS
+from imud.publishers.socket.server import PUBLISHER, SocketServer, SocketSettings
+from tests.support.socket_rig import (
+    DEVICES,
+    EPOCH,
+    NOW_NS,
+    Peer,
+    batch,
+    done_late,
+    in_server,
+    run,
+    sample,
+    serving,
+    until,
+)
+
+FORMS_PER_USER = 16
+
+
+def test_row_is_the_table_s() -> None:
+    assert PUBLISHERS["socket"] is PUBLISHER
+    assert PUBLISHER.name == "socket"
+    assert PUBLISHER.settings() == SocketSettings()
+
+
+@in_server()
+async def test_hello_names_protocol_daemon_epoch_and_rights(server: SocketServer) -> None:
+    rights = ["read", "control"] if os.getuid() == 0 else ["read"]
+    params = {"protocol": 1, "version": __version__, "epoch": EPOCH, "rights": rights}
+    peer = await Peer.connect(server)
+    assert await peer.message() == {"jsonrpc": "2.0", "method": "hello", "params": params}
+
+
+@in_server()
+async def test_devices_status_and_schema(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    devices = await peer.result("devices")
+    assert [(d["name"], d["device_id"], d["state"], d["sync"]) for d in devices] == [
+        ("imu0", 0, "running", "regression"),
+        ("imu1", 1, "running", "regression"),
+    ]
+    status = await peer.result("status")
+    assert status["now_ns"] == NOW_NS
+    assert status["devices"][1]["ledger"] == {"bytes_in": 82}
+    (client,) = status["socket"]["clients"]
+    assert (client["pid"], client["uid"], client["sent"]) == (os.getpid(), os.getuid(), 0)
+    schema = await peer.result("schema")
+    assert tuple(field["name"] for field in schema["fields"]) == SAMPLE_FIELDS
+    assert schema["devices"]["imu0"]["navigation_frame"] == "ENU"
+    assert schema["slot"]["bytes"] == SLOT_BYTES
+
+
+@in_server()
+async def test_json_samples_have_the_names_of_the_design_and_only_the_selected_members(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    assert await peer.result("watch") == {"encoding": "json", "devices": DEVICES, "rate_hz": 0.0, "latency_ms": 0.0}
+    server.publish(batch("imu0", 7, 2))
+    server.publish(batch("imu1", 1))
+    first, second, other = await peer.messages(3)
+    assert first["method"] == "sample"
+    assert first["params"] == {
+        "device": "imu0",
+        "seq": 7,
+        "t_ns": 80_000_007_000_000,
+        "t_err_ns": 12_000,
+        "sync": "regression",
+        "t_rx_ns": 80_000_007_200_000,
+        "utc_ns": 1_790_000_000_007_000_000,
+        "t_dev_ns": 7_000_000,
+        "accel_m_s2": [0.125, -0.5, 9.75],
+        "gyro_rad_s": [0.25, 0.5, -0.75],
+        "temperature_c": 31.5,
+    }
+    assert (second["params"]["seq"], other["params"]["device"]) == (8, "imu1")
+    reply = await peer.result("watch", devices=["imu1"], fields=["gyro_rad_s", "mag_t"])
+    assert reply["devices"] == {"imu1": 1}
+    server.publish(batch("imu0"))
+    server.publish(batch("imu1"))
+    params = (await peer.message())["params"]
+    assert params == {"device": "imu1", "seq": 1, "t_ns": 80_000_001_000_000, "gyro_rad_s": [0.25, 0.5, -0.75]}
+
+
+@pytest.mark.parametrize("seq", [1, 0x7B])  # 0x7B is `{`: a slot that begins like JSON
+@in_server()
+async def test_binary_frames_hold_one_slot_each(server: SocketServer, seq: int) -> None:
+    peer = await Peer.greeted(server)
+    assert (await peer.result("watch", encoding="binary"))["devices"] == DEVICES
+    peer.framed = True
+    server.publish(batch("imu1", seq, 2))
+    for number in (seq, seq + 1):
+        slot = await peer.body()
+        assert len(slot) == SLOT_BYTES
+        assert decode_slot(slot, "imu1") == sample("imu1", number)
+
+
+@in_server()
+async def test_after_a_binary_watch_everything_is_framed_for_good(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    await peer.result("watch", encoding="binary")
+    peer.framed = True
+    assert len(await peer.result("devices")) == 2
+    await peer.result("watch", encoding="json", fields=["sync"])
+    server.publish(batch())
+    assert (await peer.message())["params"]["sync"] == "regression"
+    assert (await peer.error("nonsense"))[0] == -32601
+    lines, frames = await Peer.greeted(server), await Peer.greeted(server)
+    await frames.result("watch", encoding="binary")
+    frames.framed = True
+    for peer in (frames, lines):
+        await peer.result("watch")
+    server.publish(batch("imu0", 1, 2))
+    for seq in (1, 2):
+        assert (await lines.message())["params"]["seq"] == seq
+        assert (await frames.message())["params"]["seq"] == seq
+
+
+def test_framed_json_is_never_as_long_as_slots() -> None:
+    from imud.formats.jsonrpc import frame_of
+
+    for size in range(2, 1100):
+        frame = frame_of(b"{" + b" " * (size - 2) + b"}")
+        (length,) = struct.unpack_from("<I", frame)
+        assert length == len(frame) - 4
+        assert length % SLOT_BYTES
+
+
+@in_server()
+async def test_a_watch_replaces_the_one_before_and_unwatch_ends_it(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    await peer.result("watch", devices=["imu0"])
+    await peer.result("watch", devices=["imu1"])
+    server.publish(batch("imu0"))
+    server.publish(batch("imu1"))
+    assert (await peer.message())["params"]["device"] == "imu1"
+    await peer.result("unwatch")
+    server.publish(batch("imu1", 2))
+    await peer.send(b'{"jsonrpc":"2.0","id":"last","method":"poll"}\n')
+    assert (await peer.message())["id"] == "last"
+
+
+@in_server()
+async def test_a_device_that_appears_later_matches_a_watch_of_all(server: SocketServer) -> None:
+    all_of_them, one = await Peer.greeted(server), await Peer.greeted(server)
+    await all_of_them.result("watch")
+    await one.result("watch", devices=["imu0"])
+    server.add_device("imu9", 9)
+    server.publish(batch("imu9"))
+    server.publish(batch("imu0"))
+    told, first = await all_of_them.messages(2)
+    assert (told["method"], told["params"]) == ("device", {"device": "imu9", "device_id": 9})
+    assert first["params"]["device"] == "imu9"
+    assert (await one.message())["params"]["device"] == "imu0"
+
+
+@in_server()
+async def test_poll_gives_the_newest_of_each_device(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    assert await peer.result("poll") == {"now_ns": NOW_NS, "samples": []}
+    server.publish(batch("imu0", 1, 3))
+    server.publish(batch("imu1", 5))
+    assert [s["seq"] for s in (await peer.result("poll"))["samples"]] == [3, 5]
+    chosen = await peer.result("poll", devices=["imu1"], fields=["t_ns", "sync"])
+    assert chosen["samples"] == [{"device": "imu1", "seq": 5, "t_ns": 80_000_005_000_000, "sync": "regression"}]
+    server.remove_device("imu0")
+    server.add_device("imu0", 0)  # nothing of its former life is left
+    assert [s["seq"] for s in (await peer.result("poll"))["samples"]] == [5]
+
+
+@in_server()
+async def test_events_go_to_those_who_want_them(server: SocketServer) -> None:
+    everything, one, none = [await Peer.greeted(server) for _ in range(3)]
+    await everything.result("events")
+    await one.result("events", devices=["imu1"])
+    await none.result("devices")
+    for name in ("imu0", "imu1", ""):
+        server.event(Event(5, name, EventKind.DOWN, "gone", {"errno": 5}))
+    seen = [(await everything.message())["params"] for _ in range(3)]
+    assert [event["device"] for event in seen] == ["imu0", "imu1", ""]
+    assert seen[0] == {"t_ns": 5, "device": "imu0", "kind": "down", "message": "gone", "detail": {"errno": 5}}
+    assert [(await one.message())["params"]["device"] for _ in range(2)] == ["imu1", ""]
+    await everything.result("events", enable=False)
+    server.event(Event(6, "imu0", EventKind.UP, "back"))
+    assert len(await everything.result("devices")) == 2
+    assert len(await none.result("devices")) == 2
+
+
+@in_server()
+async def test_one_set_of_fields_has_one_form_in_any_order(server: SocketServer) -> None:
+    fields = ["sync", "mag_t", "gyro_rad_s", "t_err_ns", "accel_m_s2"]
+    peers = []
+    for number in range(2 * FORMS_PER_USER):  # 16 different forms are what a user may have
+        peers.append(await Peer.greeted(server))
+        random.Random(number).shuffle(fields)
+        await peers[-1].result("watch", fields=fields)
+    server.publish(batch())
+    assert len({await peer.body() for peer in peers}) == 1
+
+
+@in_server()
+async def test_a_user_s_clients_watch_a_limited_number_of_selections(server: SocketServer) -> None:
+    peers = [await Peer.greeted(server) for _ in range(FORMS_PER_USER + 1)]
+    names = ["sync", "gyro_rad_s", "accel_m_s2", "t_err_ns", "utc_ns", "mag_t", "t_rx_ns"]
+    choices = list(itertools.combinations(names, 2))
+    for peer, fields in zip(peers[:-1], choices[:FORMS_PER_USER], strict=True):
+        await peer.result("watch", fields=fields)
+    assert (await peers[-1].error("watch", fields=choices[FORMS_PER_USER]))[0] == -32004
+    await peers[0].result("watch", fields=choices[FORMS_PER_USER])  # in place of its own
+    await peers[-1].result("watch", fields=choices[1])  # one that there is
+
+
+def test_to_many_clients_samples_go_in_several_turns_and_none_is_lost(tmp_path: Path) -> None:
+    now_ns, step_ns = NOW_NS, 0
+
+    def clock() -> int:
+        nonlocal now_ns
+        now_ns += step_ns
+        return now_ns
+
+    async def body() -> None:
+        nonlocal step_ns
+        async with serving(tmp_path, clock) as server:
+            peers = [await Peer.greeted(server) for _ in range(100)]
+            for number, peer in enumerate(peers):
+                await peer.result("watch", **({"rate_hz": 1000.0} if number % 3 else {}))
+            step_ns = 400_000  # sending takes its time
+            for seq in range(1, 6):
+                server.publish(batch("imu0", seq))
+                waiting = sum(client.queue_samples > 0 for client in server.hub.clients())
+            step_ns = 0
+            assert waiting == 34  # publishing takes 1 ms, with a look at the clock after 32 clients
+            for peer in peers:
+                assert [message["params"]["seq"] for message in await peer.messages(5)] == list(range(1, 6))
+            assert all(client.dropped == 0 for client in server.hub.clients())
+
+    run(body)
+
+
+@pytest.mark.parametrize("selection", ["one", "many"])
+@in_server(memory_mb=8)
+async def test_what_waits_for_all_clients_together_is_bounded(server: SocketServer, selection: str) -> None:
+    fields = ["sync", "gyro_rad_s", "accel_m_s2", "t_err_ns", "utc_ns", "t_dev_ns", "t_rx_ns", "temperature_c"]
+    peers = [await Peer.greeted(server) for _ in range(20)]
+    for number, peer in enumerate(peers):
+        chosen = {"fields": fields[: 1 + number % 8]} if selection == "many" else {}
+        await peer.result("watch", **chosen)
+    for seq in range(1, 1801):
+        server.publish(batch("imu0", seq))
+    server.tick(0)
+    clients = server.hub.clients()
+    assert sum(client.dropped for client in clients)
+    assert 1 << 20 < sum(client.queue_bytes for client in clients) < 4 << 20
+
+
+@in_server(clients_max=2)
+async def test_one_client_too_many_gets_an_error(server: SocketServer) -> None:
+    _first, second, third = await Peer.greeted(server), await Peer.greeted(server), await Peer.connect(server)
+    assert (await third.message())["error"]["code"] == -32002
+    assert await third.ended()
+    assert server.hub.status().refused == 1
+    second.close()
+    await until(lambda: len(server.hub.connections) == 1)
+    await Peer.greeted(server)
+
+
+@in_server()
+async def test_clients_are_seen_through_the_context(server: SocketServer) -> None:
+    known = server.hub.context
+    assert known.clients() == []
+    peer = await Peer.greeted(server)
+    await peer.result("watch", encoding="binary")
+    server.publish(batch("imu0", 1, 3))
+    (client,) = known.clients()
+    assert (client.encoding, client.sent, client.dropped, client.queue_samples) == ("binary", 3, 0, 0)
+    server.close()
+    assert known.clients() == []
+    assert known.client_sources == []
+
+
+@in_server()
+async def test_out_of_descriptors_pauses_accepting_until_the_next_tick_and_is_logged_once(
+    server: SocketServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    calls = 0
+
+    def refuse(_sock: socket.socket) -> None:
+        nonlocal calls
+        calls += 1
+        raise OSError(24, "Too many open files")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(socket.socket, "accept", refuse)
+        peer = await Peer.connect(server)
+        for count in range(1, 11):
+            await until(lambda count=count: calls >= count)  # type: ignore[misc]
+            for _ in range(10):
+                await asyncio.sleep(0)
+            assert calls == count  # no busy loop
+            if count < 10:
+                server.tick(0)
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert not server.hub.connections  # not before the tick
+    server.tick(0)
+    assert (await peer.message())["method"] == "hello"
+    assert caplog.text.count("cannot accept a client: Too many open files") == 1
+
+
+@pytest.mark.parametrize(("step_ns", "accepted"), [(0, [16, 32, 40]), (100_000, [2, 4, 6])])
+def test_accepting_takes_a_limited_part_of_a_turn(tmp_path: Path, step_ns: int, accepted: list[int]) -> None:
+    """At most 16 clients, and 0.3 ms."""
+    now_ns, step = NOW_NS, 0
+
+    def clock() -> int:
+        nonlocal now_ns
+        now_ns += step
+        return now_ns
+
+    async def body() -> None:
+        nonlocal step
+        async with serving(tmp_path, clock) as server:
+            for _ in range(40):
+                await Peer.connect(server)
+            found = []
+            step = step_ns
+            for _ in range(3):
+                await asyncio.sleep(0)
+                found.append(server.hub.accepted)
+            assert found == accepted
+
+    run(body)
+
+
+@in_server()
+async def test_a_client_that_is_gone_when_it_is_accepted_leaves_nothing(
+    server: SocketServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(_sock: socket.socket) -> None:
+        raise OSError(107, "Transport endpoint is not connected")
+
+    monkeypatch.setattr("imud.publishers.socket.server.peer_of", gone)
+    peer = await Peer.connect(server)
+    assert await peer.ended()
+    status = server.hub.status()
+    assert (status.accepted, status.refused, status.failed) == (0, 0, 0)
+
+
+def broken(*_args: object, **_names: object) -> bytes:
+    raise ZeroDivisionError("a mistake")
+
+
+@pytest.mark.parametrize(
+    "place", ["Quota.admit", "Connection.__init__", "hello", "peer_of"], ids=lambda place: place.split(".")[0]
+)
+@in_server()
+async def test_an_error_while_a_client_is_welcomed_ends_that_client_only(
+    server: SocketServer, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    good = await Peer.greeted(server)
+    with monkeypatch.context() as patch:
+        patch.setattr(f"imud.publishers.socket.server.{place}", broken)
+        bad = await Peer.connect(server)
+        if place == "hello":
+            assert (await bad.message())["error"]["code"] == -32603
+        assert await bad.ended()
+    assert server.hub.status().failed == 1
+    assert len(server.hub.connections) == 1
+    other = await Peer.greeted(server)
+    for peer in (good, other):
+        assert len(await peer.result("devices")) == 2
+
+
+@pytest.mark.parametrize("what", ["wake", "tick", "event", "reply"])
+@in_server()
+async def test_an_error_in_one_client_s_part_ends_that_client_only(
+    server: SocketServer, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    done_late.clear()
+    bad, good = await Peer.greeted(server), await Peer.greeted(server)
+    connection, _ = server.hub.connections.values()
+    for peer in (bad, good):
+        await peer.result("events")
+    os.close(await descriptor(bad))
+    if what == "wake":
+        monkeypatch.setattr(connection.wakers, "wake", broken)
+        server.publish(batch())
+    elif what == "tick":
+        monkeypatch.setattr(connection, "tick", broken)
+        server.tick(0)
+    else:
+        monkeypatch.setattr(connection, "post", broken)
+        if what == "event":
+            server.event(Event(5, "", EventKind.UP, "back"))
+        else:
+            done_late.set()
+            await bad.send(b'{"jsonrpc":"2.0","id":9,"method":"command","params":{"device":"imu0","name":"wait"}}\n')
+    await until(lambda: connection.closed)
+    assert server.hub.status().failed == 1
+    assert len(await good.result("devices")) == 2
+
+
+async def descriptor(peer: Peer) -> int:
+    await peer.send(b'{"jsonrpc":"2.0","id":7,"method":"notify","params":{"device":"imu0"}}\n')
+    while True:
+        await asyncio.sleep(0)
+        with suppress(BlockingIOError):
+            _data, fds, _flags, _address = socket.recv_fds(peer.sock, 4096, 4)
+            return fds[0]

@@ -1,0 +1,327 @@
+"""The output as a whole: which device, when, by which axes; and a real gpsd that reads it."""
+
+import asyncio
+import json
+import shutil
+import socket
+import subprocess
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from math import radians
+from typing import Any
+
+import msgspec
+import pynmea2
+import pytest
+from pynmea2.types.proprietary.ash import ASHRATT
+
+from imud.attitude.conventions import Convention, Heading
+from imud.attitude.published import PublishedFrame, published_frame
+from imud.contracts.publisher import AS_SENT, Batch, PublisherContext
+from imud.contracts.status import FrameStatus
+from imud.model.options import wrong_values
+from imud.model.sample import Sample, Sync, Vector3
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.publishers.nmea0183 import (
+    USUAL_BYTES,
+    WHO,
+    Formatter,
+    HeadingReference,
+    Nmea0183,
+    Nmea0183Settings,
+    address_of,
+    make,
+)
+from tests.support.event_loops import VirtualClock, in_loop
+from tests.support.socket_rig import device_status, in_context
+from tests.support.surroundings import free_port
+
+REFERENCE_NS = NS_PER_S
+
+LIMIT_S = 60.0
+NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (make bench-deps)"
+GPSD_VERSION = "" if NO_GPSD else subprocess.check_output(["gpsd", "-V"], text=True).split()[1]
+LEFT_45: Vector3 = (radians(10), radians(5), radians(-45))
+"""As a HiPNUC module sends it: right side down by 10°, bow up by 5°, heading 45°."""
+
+
+class Asked:
+    def __init__(self) -> None:
+        self.of: dict[str, tuple[int, tuple[str, ...]]] = {}
+
+    def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
+        self.of[who] = (latency_ns, tuple(devices or ()))
+
+    def release(self, who: str) -> None:
+        self.of.pop(who, None)
+
+
+class OutputBench:
+    def __init__(
+        self, *, heading: Heading = Heading.TRUE, declination_deg: float | None = 3.0, **settings: object
+    ) -> None:
+        self.clock, self.asked = VirtualClock(), Asked()
+        frame = FrameStatus("", "device", "", "", heading, declination_deg, {})
+        statuses = [
+            msgspec.structs.replace(device_status(name, n), frame=frame) for n, name in enumerate(("bow", "mast"))
+        ]
+        self.context = PublisherContext(lambda: statuses, 1, self.clock.now_ns, latencies=self.asked)
+        made = msgspec.convert({"tcp_port": 0, **settings}, Nmea0183Settings)
+        self.output = Nmea0183(made, self.context)
+        self.output.start()
+        self.output.add_device("bow", 0)
+        self.seq = 0
+        self.tick()
+
+    def tick(self) -> None:
+        self.clock.advance(REFERENCE_NS)
+        self.output.tick(self.clock.now_ns())
+
+    @property
+    def port(self) -> int:
+        return int(self.output.status()[0].name.rpartition(":")[2])
+
+    def publish(
+        self, count: int = 1, device: str = "bow", euler: Vector3 | None = LEFT_45, frame: PublishedFrame = AS_SENT,
+        gyro_z: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Samples at 1 kHz."""
+        samples = []
+        for _ in range(count):
+            self.seq += 1
+            t_ns = self.seq * NS_PER_MS
+            samples.append(
+                Sample(
+                    device, self.seq, t_ns, 0, Sync.ARRIVAL, t_ns, NS_PER_S + t_ns, euler_rad=euler,
+                    gyro_rad_s=(0.0, 0.0, gyro_z),
+                )
+            )  # fmt: skip
+        self.output.publish(Batch(device, 0, samples, frame))
+
+    async def connect(self) -> None:
+        self.reader = socket.create_connection(("127.0.0.1", self.port), timeout=LIMIT_S)
+        async with asyncio.timeout(LIMIT_S):
+            while not self.output.status()[0].readers:
+                await asyncio.sleep(0)
+
+    def received(self) -> list[str]:
+        """Sentences that the client has got, without checksums, which are checked."""
+        sentences = self.reader.recv(65536).decode().splitlines()
+        for one in sentences:
+            pynmea2.parse(one, check=True)
+        return [one.partition("*")[0].removeprefix("$") for one in sentences]
+
+
+@asynccontextmanager
+async def sending(**settings: Any) -> AsyncIterator[OutputBench]:
+    bench = OutputBench(**settings)
+    await bench.connect()
+    yield bench
+    bench.reader.close()
+    bench.output.close()
+
+
+def in_output(**settings: Any) -> Callable[[Callable[..., Awaitable[None]]], Callable[..., None]]:
+    """Run a test in a loop of its own. Its argument `bench` is an output with these settings and one client."""
+    return in_context("bench", lambda _folder: sending(**settings))
+
+
+@in_output(sentences={"HDT": 10.0, "ROT": 4.0})
+async def test_each_sentence_has_its_own_rate(bench: OutputBench) -> None:
+    for _ in range(100):
+        bench.publish(10)
+    got = bench.received()
+    assert got.count("HCHDT,45.0,T") == 10
+    assert got.count("TIROT,0.0,A") == 4
+    assert len(got) == 14
+
+
+@in_loop
+async def test_each_udp_address_gets_the_sentences() -> None:
+    with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as two:
+        for receiver in (one, two):
+            receiver.bind(("127.0.0.1", 0))
+            receiver.settimeout(LIMIT_S)
+        ports = [receiver.getsockname()[1] for receiver in (one, two)]
+        bench = OutputBench(sentences={"HDT": 1.0}, udp=[f"127.0.0.1:{port}" for port in ports])
+        bench.publish()
+        assert [receiver.recv(100)[:14] for receiver in (one, two)] == [b"$HCHDT,45.0,T*"] * 2
+        bench.output.close()
+
+
+@pytest.mark.parametrize("convention", [None, *Convention])
+@in_output(sentences={"PASHR": 1.0, "HDG": 1.0, "XDR": 1.0, "ROT": 1.0})
+async def test_values_are_those_of_ships_whatever_the_axes_are(
+    bench: OutputBench, convention: Convention | None
+) -> None:
+    frame = published_frame(None, convention, None, AS_SENT.device)
+    euler, gyro_z = LEFT_45, radians(-2.0)
+    if frame.rotation is not None:
+        as_sent = Sample("bow", 1, 0, 0, Sync.ARRIVAL, 0, 0, euler_rad=euler, gyro_rad_s=(0.0, 0.0, gyro_z))
+        turned = frame.rotation.sample(as_sent)
+        assert turned.euler_rad is not None
+        assert turned.gyro_rad_s is not None
+        euler, gyro_z = turned.euler_rad, turned.gyro_rad_s[2]
+    bench.publish(euler=euler, frame=frame, gyro_z=gyro_z)
+    got = bench.received()
+    assert got[:2] == ["PASHR,000001.001,45.00,T,+10.00,+5.00,,,,,0,0", "HCHDG,42.0,,,3.0,E"]
+    rate_deg_min = float(got[3].split(",")[1])
+    assert 115 < rate_deg_min < 122  # 2° a second to starboard about the body's z axis
+
+
+@in_output(sentences={"PASHR": 1.0})
+async def test_pynmea2_reads_the_attitude_of_pashr(bench: OutputBench) -> None:
+    bench.publish()
+    bench.publish(1000, euler=(radians(-20.5), radians(-7.25), radians(100.0)))
+    first, second = (pynmea2.parse(line, check=True) for line in bench.reader.recv(65536).decode().splitlines())
+    for found, heading, roll, pitch in ((first, 45.0, 10.0, 5.0), (second, 260.0, -20.5, -7.25)):
+        assert isinstance(found, ASHRATT)
+        assert (found.true_heading, found.is_true_heading) == (heading, "T")
+        assert (found.roll, found.pitch) == (roll, pitch)
+
+
+@in_output(sentences={"ROT": 10.0})
+async def test_the_rate_of_turn_is_the_mean_since_the_last(bench: OutputBench) -> None:
+    bench.publish(1, euler=(0.0, 0.0, 0.0))
+    for number in range(100):  # vibration of 500 Hz about a turn of 1° a second to starboard
+        bench.publish(1, euler=(0.0, 0.0, 0.0), gyro_z=radians(-1.0 + (20.0 if number % 2 else -20.0)))
+    assert bench.received() == ["TIROT,0.0,A", "TIROT,60.0,A"]
+
+
+@in_output(heading=Heading.RELATIVE, declination_deg=None, sentences={"HDT": 100.0})
+async def test_the_reference_is_looked_up_again(bench: OutputBench) -> None:
+    bench.publish()
+    statuses = bench.context.status()
+    known = FrameStatus("", "device", "", "", Heading.TRUE, None, {})
+    statuses[0] = msgspec.structs.replace(statuses[0], frame=known)  # type: ignore[index]  # it is a list
+    bench.publish(20)
+    bench.tick()
+    bench.publish(20)
+    assert bench.received() == ["HCHDT,45.0,T"]
+
+
+@in_loop
+async def test_the_only_device_is_sent_and_of_several_the_named_one(caplog: pytest.LogCaptureFixture) -> None:
+    bench = OutputBench(sentences={"HDT": 100.0})
+    assert bench.asked.of == {WHO: (10 * NS_PER_MS, ("bow",))}
+    bench.output.add_device("mast", 1)
+    assert bench.asked.of == {}
+    assert "nmea0183.device: expected the name of one device (bow, mast), got none" in caplog.text
+    bench.output.remove_device("bow")
+    assert bench.asked.of == {WHO: (10 * NS_PER_MS, ("mast",))}
+    bench.output.close()
+    assert bench.asked.of == {}
+    assert bench.context.output_sources == []
+
+    named = OutputBench(device="mast", sentences={"HDT": 100.0})
+    assert named.asked.of == {}
+    named.output.add_device("mast", 1)
+    named.tick()
+    await named.connect()
+    named.publish()
+    named.publish(device="mast")
+    assert named.received() == ["HCHDT,45.0,T"]
+    named.reader.close()
+    named.output.close()
+
+
+# --- settings -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"udp": ["plotter:10110"]}, "expected IP address and port such as"),
+        ({"udp": ["192.168.1.255"]}, "expected IP address and port such as"),
+        ({"udp": ["192.168.1.255:0"]}, "expected IP address and port such as"),
+        ({"udp": ["fe80::1:10110"]}, "expected IP address and port such as"),
+        ({"tcp_address": "boat"}, "expected an IP address"),
+        ({"sentences": {}}, "expected one at least"),
+        ({"sentences": {"GGA": 1}}, "keys HDG, HDM, HDT, PASHR, ROT, XDR"),
+        ({"sentences": {"HDT": 0}}, "a number from 0.01 to 100"),
+        ({"talker": "ii"}, "two capital letters"),
+        ({"serial_port": "/dev/ttyS0", "serial_baud": 4800}, "480 bytes a second, got 844"),
+    ],
+)
+def test_settings_that_are_refused(given: dict[str, object], words: str) -> None:
+    assert words in "; ".join(map(str, wrong_values(Nmea0183Settings, given)))
+
+
+def test_addresses() -> None:
+    assert address_of("192.168.1.255:10110") == ("192.168.1.255", 10110)
+    assert address_of("[fe80::1]:2000") == ("fe80::1", 2000)
+
+
+@pytest.mark.parametrize("kind", Formatter)
+def test_the_usual_size_of_a_sentence_is_no_less_than_a_full_one(kind: Formatter) -> None:
+    full = Sample(
+        "bow", 1, 0, 0, Sync.ARRIVAL, 0, NS_PER_S, euler_rad=(radians(-80), radians(-80), radians(211.5)),
+        gyro_rad_s=(0.0, 0.0, radians(-0.3)), temperature_c=23.4, pressure_pa=101_325.0,
+    )  # fmt: skip
+    made = make(kind, full, HeadingReference(Heading.TRUE, 12.6))
+    assert made is not None
+    assert len(made) <= USUAL_BYTES[kind]
+
+
+# --- a reader that no one here wrote --------------------------------------------------------------------------------
+
+
+@contextmanager
+def gpsd(port: int, source: str) -> Iterator[None]:
+    process = subprocess.Popen(["gpsd", "-N", "-n", "-b", "-S", str(port), source], stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(timeout=LIMIT_S)
+
+
+async def reports(port: int, bench: OutputBench, enough: int) -> tuple[list[dict[str, object]], set[str]]:
+    """Attitude reports of gpsd while samples come, and which sentences its parser took, checksum included."""
+    async with asyncio.timeout(LIMIT_S):
+        while True:
+            try:
+                reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                break
+            except ConnectionRefusedError:
+                await asyncio.sleep(0.05)
+        writer.write(b'?WATCH={"enable":true,"json":true,"raw":1};\n')
+        found: list[dict[str, object]] = []
+        taken: set[str] = set()
+        line = asyncio.ensure_future(reader.readline())
+        while len(found) < enough:
+            bench.publish(100, gyro_z=radians(-2.0))
+            done, _ = await asyncio.wait([line], timeout=0.05)
+            if done:
+                text = line.result().decode()
+                if text.startswith("$"):
+                    taken.add(text.partition(",")[0])
+                elif (report := json.loads(text))["class"] == "ATT":
+                    found.append(report)
+                line = asyncio.ensure_future(reader.readline())
+        line.cancel()
+        writer.close()
+        await writer.wait_closed()
+    return found, taken
+
+
+@pytest.mark.live
+@pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)
+@in_loop
+async def test_gpsd_takes_all_sentences_and_reports_what_it_knows_of_them() -> None:
+    """Bow to starboard at 2° a second, right side down by 10°, bow up by 5°.
+
+    gpsd 3.22 reports the heading alone; of one that knows more, signs and units are checked.
+    """
+    bench = OutputBench(sentences={"HDT": 10.0, "HDG": 10.0, "ROT": 10.0, "XDR": 2.0, "PASHR": 10.0})
+    port = free_port()
+    with gpsd(port, f"tcp://127.0.0.1:{bench.port}"):
+        found, taken = await reports(port, bench, 8)
+    bench.output.close()
+    assert taken == {"$HCHDT", "$HCHDG", "$TIROT", "$YXXDR", "$PASHR"}
+    for report in found:
+        assert report["heading"] == 45.0
+        assert (report.get("roll", 10.0), report.get("pitch", 5.0)) == (10.0, 5.0)
+        assert report.get("rot", 118.6) == pytest.approx(118.6, abs=0.1)
+    if GPSD_VERSION == "3.22":
+        assert {name for report in found for name in report} == {"class", "device", "heading"}

@@ -1,0 +1,444 @@
+"""What other users may put into a directory of rings, or do to it: nothing stops or misleads the daemon."""
+
+import errno
+import logging
+import os
+import resource
+import signal
+import stat
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from time import monotonic_ns
+from typing import Final
+
+import pytest
+
+from imud.client.ring import Ring
+from imud.formats.ring import HEADER_BYTES, STATE_CLOSED, STATE_LIVE, RingHeader, decode_header, encode_header
+from imud.formats.slot import SLOT_BYTES
+from imud.model.errors import ServerError
+from imud.publishers import shm as directory
+from imud.publishers.shm import RingDirectory, open_directory
+from tests.support.daemon_process import running_daemon, wait_until, write_config
+from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
+from tests.support.surroundings import DAEMON_UID, HOSTILE_UID, needs_root, python_as
+
+RING_BYTES: Final = HEADER_BYTES + SLOTS * SLOT_BYTES
+FORGED: Final = encode_header(
+    RingHeader(5, 1, STATE_LIVE, DEVICE, 0, SLOTS, newest_seq=1 << 60, first_seq=1 << 59, heartbeat_ns=1 << 62)
+)  # fmt: skip
+
+
+@pytest.fixture(name="shared")
+def _shared() -> Iterator[Path]:
+    """A directory as /dev/shm is: every user may make names, only owners may remove them."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-test-") as name:
+        os.chmod(name, 0o1777)
+        yield Path(name)
+
+
+def make_full_directory(path: Path) -> None:
+    path.mkdir()
+    (path / "file").touch()
+
+
+def make_huge_file(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 1 << 40)
+
+
+HOSTILE: Final[dict[str, Callable[[Path], object]]] = {
+    "FIFO": os.mkfifo,
+    "symbolic link to a file": lambda path: path.symlink_to("/etc/passwd"),
+    "symbolic link to nothing": lambda path: path.symlink_to("/nowhere/at/all"),
+    "directory": lambda path: path.mkdir(),
+    "directory with content": make_full_directory,
+    "device node": lambda path: os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(5, 0)),  # /dev/tty
+    "forged ring": lambda path: path.write_bytes(FORGED + bytes(SLOTS * SLOT_BYTES)),
+    "forged header": lambda path: path.write_bytes(FORGED),
+    "empty file": lambda path: path.touch(),
+    "huge file": make_huge_file,
+}
+
+
+def plant(path: Path, kind: str) -> None:
+    HOSTILE[kind](path)
+    os.chown(path, HOSTILE_UID, HOSTILE_UID, follow_symlinks=False)
+
+
+@needs_root
+@pytest.mark.parametrize("kind", [kind for kind in HOSTILE if kind != "directory with content"])
+def test_what_has_the_name_gives_way(shared: Path, kind: str) -> None:
+    """For root, who may replace other users' files."""
+    plant(shared / f"imud.{DEVICE}", kind)
+    board = Board(shared)
+    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
+        board.publish([1])
+        assert ring.read() == ([make_sample(1)], 0)
+    board.publisher.close()
+    assert not list(shared.iterdir())
+
+
+@needs_root
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_names_of_unfinished_rings(shared: Path, kind: str) -> None:
+    """Those of a daemon that died while it made them are removed, other users' neither opened nor in the way."""
+    plant(shared / f".imud.{DEVICE}.new", kind)
+    (shared / ".imud.mine.new").touch()
+    board = Board(shared)
+    assert sorted(file.name for file in shared.iterdir()) == [f".imud.{DEVICE}.new", f"imud.{DEVICE}"]
+    board.publisher.close()
+
+
+DAEMON: Final = """
+import sys
+from pathlib import Path
+from tests.support.rings import DEVICE, Board
+board = Board(Path(sys.argv[1]))
+board.publisher.add_device("other", 4)
+for line in sys.stdin:
+    command, number = line.split()
+    if command == "publish":
+        board.publish([int(number)])
+    board.tick(int(number) if command == "tick" else 100_000_000)
+    print("done", flush=True)
+board.publisher.close()
+"""
+
+
+def ask(process: subprocess.Popen[str], command: str) -> None:
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.write(command + "\n")
+    process.stdin.flush()
+    assert process.stdout.readline() == "done\n", process.stderr and process.stderr.read()
+
+
+@needs_root
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_what_cannot_be_replaced_costs_one_ring_only(shared: Path, kind: str) -> None:
+    """For a user who may not: the ring comes as soon as the name is free."""
+    path = shared / f"imud.{DEVICE}"
+    plant(path, kind)
+    with python_as(DAEMON_UID, DAEMON, str(shared)) as daemon:
+        ask(daemon, "publish 7")
+        assert path.lstat().st_uid == HOSTILE_UID
+        assert (shared / "imud.other").stat().st_uid == DAEMON_UID
+        path.rename(shared.parent / f"{shared.name}-away")
+        ask(daemon, "tick 1000000000")
+        ask(daemon, "publish 8")
+        header = decode_header(path.read_bytes()[:HEADER_BYTES], "ring")
+        assert (header.newest_seq, header.first_seq, path.stat().st_uid) == (8, 8, DAEMON_UID)
+        _, errors = daemon.communicate()
+    away = shared.parent / f"{shared.name}-away"
+    subprocess.run(["rm", "-rf", away], check=True)
+    assert daemon.returncode == 0, errors
+    assert errors.count("no ring for imu0") == 1
+    assert not list(shared.iterdir())
+
+
+@needs_root
+@pytest.mark.live
+@pytest.mark.parametrize("kind", ["FIFO", "directory with content"])
+def test_daemon_starts_reloads_and_stops(tmp_path: Path, shared: Path, kind: str) -> None:
+    """The process: at its start, at reload, and at SIGTERM, which `running_daemon` waits for."""
+    nothing = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
+    another = {**nothing, "uart": {"port": str(tmp_path / "nothing"), "baud": 115200}}
+    for name in ("bow", "stern"):
+        plant(shared / f"imud.{name}", kind)
+    with running_daemon(tmp_path, {"bow": nothing}, shm={"directory": str(shared)}) as daemon:
+        daemon.wait_for("bow", "missing")
+        write_config(tmp_path, {"bow": nothing, "stern": another}, shm={"directory": str(shared)})
+        daemon.signal(signal.SIGHUP)
+        wait_until(lambda: "stern" in daemon.statuses(), "the second device")
+        daemon.wait_for("stern", "missing")
+
+
+# ---- the directory -------------------------------------------------------------------------------------------------
+
+
+@needs_root
+@pytest.mark.parametrize(
+    ("uid", "mode", "message"),
+    [
+        (HOSTILE_UID, 0o755, f"belongs to user {HOSTILE_UID}, who may replace the rings"),
+        (HOSTILE_UID, 0o1777, f"belongs to user {HOSTILE_UID}, who may replace the rings"),
+        (0, 0o777, "has mode 0777: others may replace the rings in it; chmod go-w"),
+        (0, 0o775, "has mode 0775: others may replace"),
+    ],
+)
+def test_directory_that_others_rule(shared: Path, uid: int, mode: int, message: str) -> None:
+    shared.chmod(mode)
+    os.chown(shared, uid, uid)
+    with pytest.raises(ServerError, match=message):
+        RingDirectory(str(shared))
+
+
+@pytest.mark.parametrize(
+    ("make", "why"),
+    [
+        (lambda path: path.symlink_to("real"), "a symbolic link"), (os.mkfifo, "Not a directory"),
+    ],
+)  # fmt: skip
+def test_what_is_no_directory(tmp_path: Path, make: Callable[[Path], object], why: str) -> None:
+    (tmp_path / "real").mkdir()
+    make(tmp_path / "shm")
+    with pytest.raises(ServerError, match=rf"expected a directory for shared memory \({why}\)"):
+        RingDirectory(str(tmp_path / "shm"))
+
+
+def test_directory_of_the_user_where_the_system_has_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    system, own = tmp_path / "none" / "imud" / "shm", tmp_path / "run"
+    own.mkdir()
+    monkeypatch.setattr(directory, "DIRECTORY", str(system))
+    monkeypatch.setattr("imud.formats.ring.DIRECTORY", str(system))
+    umask = os.umask(0o077)
+    try:
+        found = open_directory(str(system), {"XDG_RUNTIME_DIR": str(own)})
+    finally:
+        os.umask(umask)
+    assert found.path == str(own / "imud" / "shm")
+    assert stat.S_IMODE(Path(found.path).stat().st_mode) == 0o755
+    assert caplog.messages == [
+        f"shm: {system}: expected a directory for shared memory (No such file or directory); "
+        f"make it, or set shm.directory; rings are in {found.path}"
+    ]
+    found.close()
+    with pytest.raises(ServerError, match="expected a directory"):
+        open_directory(str(system), {})
+    system.parent.parent.mkdir()
+    found = open_directory(str(system), {"XDG_RUNTIME_DIR": str(own)})
+    assert found.path == str(system)
+    found.close()
+
+
+def test_reader_looks_where_the_daemon_may_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = tmp_path / "imud" / "shm"
+    own.mkdir(parents=True)
+    (tmp_path / "system").mkdir()
+    monkeypatch.setattr("imud.formats.ring.DIRECTORY", str(tmp_path / "system"))
+    monkeypatch.delenv("IMUD_SHM", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with pytest.raises(ServerError, match=f"{tmp_path}/system/imud.imu0: no such ring"):
+        Ring(DEVICE)
+    boards = []
+    for folder in (own, tmp_path / "system"):  # the system's comes first where there are both
+        boards.append(Board(folder))
+        with Ring(DEVICE) as ring:
+            assert ring.path.parent == folder
+    for board in boards:
+        board.publisher.close()
+
+
+# ---- what happens to a ring while it is in use --------------------------------------------------------------------
+
+
+def test_removed_ring_is_made_anew(board: Board, caplog: pytest.LogCaptureFixture) -> None:
+    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
+        board.publish([1, 2])
+        board.path.unlink()
+        board.publish([3])
+        assert ring.read() == ([make_sample(seq) for seq in (1, 2, 3)], 0)  # still mapped by both
+        board.publish([4])
+        board.tick()
+        board.publish([5, 6])
+        assert ring.read() == ([make_sample(4)], 0)  # the old one to its end
+        assert ring.read() == ([make_sample(5), make_sample(6)], 0)
+        assert (ring.epoch, ring.missed) == (77, 0)
+    assert f"the ring of {DEVICE} was missing or cut; it is made anew" in caplog.text
+    assert board.word("first_seq") == 5
+
+
+def test_slow_reader_of_a_removed_ring(board: Board) -> None:
+    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
+        board.publish([1, 2])
+        board.path.unlink()
+        board.tick()
+        board.publish(range(3, 3 + 2 * SLOTS))
+        assert ring.read() == ([make_sample(1), make_sample(2)], 0)
+        samples, missed = ring.read()
+        assert [sample.seq for sample in samples] == list(range(3 + SLOTS, 3 + 2 * SLOTS))
+        assert missed == SLOTS
+
+
+@pytest.mark.parametrize("size_bytes", [0, 1, HEADER_BYTES, HEADER_BYTES + SLOT_BYTES])
+@pytest.mark.parametrize("first", ["publish", "tick", "read", "close"])
+def test_cut_ring_is_made_anew(tmp_path: Path, size_bytes: int, first: str) -> None:
+    board = Board(tmp_path)
+    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
+        board.publish([1, 2])
+        assert ring.latest() == make_sample(2)
+        os.truncate(board.path, size_bytes)
+        if first == "close":
+            board.publisher.close()
+            assert ring.read() == ([], 0)
+            return
+        if first == "read":
+            assert (ring.read(), ring.latest(), ring.ledger(), ring.newest_seq) == (([], 0), None, None, 0)
+            assert not ring.alive(board.now_ns)
+        if first == "publish":
+            board.publish([3])
+        board.tick()
+        board.publish([4])
+        assert ring.read() == ([make_sample(4)], 3)
+        assert ring.alive(board.now_ns)
+    assert board.path.stat().st_size == RING_BYTES
+    board.publisher.close()
+
+
+def test_new_ring_before_its_first_sample(board: Board) -> None:
+    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
+        board.publish([1, 2])
+        os.truncate(board.path, 0)
+        board.tick()
+        assert ring.read() == ([], 2)
+        board.publish([3])
+        assert ring.read() == ([make_sample(3)], 0)
+
+
+def test_ring_cut_by_a_byte(board: Board) -> None:
+    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
+        board.publish([1, 2])
+        os.truncate(board.path, RING_BYTES - 1)
+        board.publish([3])
+        board.tick()
+        board.publish([4])
+        assert ring.read() == ([make_sample(1), make_sample(2)], 0)
+        assert ring.read() == ([make_sample(4)], 1)
+
+
+def test_reader_of_a_cut_ring_has_its_pages_back(board: Board) -> None:
+    """Those of a reader that looks at nothing: the file is as long again, closed, and not used any more."""
+    board.publish([1])
+    with board.path.open("rb") as file:
+        os.truncate(board.path, 0)
+        board.publish([2])
+        raw = file.read()
+    assert (len(raw), raw[44], any(raw[HEADER_BYTES:])) == (RING_BYTES, STATE_CLOSED, False)
+
+
+def test_ring_replaced_by_another_file(board: Board) -> None:
+    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
+        other = board.path.with_name("other")
+        other.write_bytes(FORGED + bytes(SLOTS * SLOT_BYTES))
+        other.rename(board.path)
+        board.publish([1])
+        assert ring.read() == ([make_sample(1)], 0)
+        board.tick()
+        board.publish([2])
+        assert ring.read() == ([make_sample(2)], 0)
+
+
+def test_directory_removed_and_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = tmp_path / "shm"
+    folder.mkdir()
+    board = Board(folder)
+    caplog.clear()
+    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
+        board.path.unlink()
+        folder.rmdir()
+        for seq in range(1, 16):
+            board.publish([seq])
+            board.tick()
+        assert ring.read() == ([make_sample(seq) for seq in range(1, 16)], 0)
+        assert len([record for record in caplog.records if record.levelno == logging.ERROR]) == 2  # each once
+        folder.mkdir()
+        board.tick(1_000_000_000)
+        board.publish([16])
+        assert ring.read() == ([make_sample(16)], 0)
+    board.publisher.close()
+    assert not list(folder.iterdir())
+
+
+def test_descriptors_are_given_back(tmp_path: Path) -> None:  # checked by a fixture of tests/conftest.py
+    board = Board(tmp_path)
+    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
+        for _ in range(20):
+            os.truncate(board.path, 5)
+            board.tick(1_000_000_000)
+            board.path.unlink()
+            board.tick(1_000_000_000)
+            ring.read()
+    board.publisher.close()
+
+
+def test_no_descriptor_left(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    board = Board(tmp_path)
+    board.path.unlink()
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
+        board.tick()
+        board.publish([1])
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert os.strerror(errno.EMFILE) in caplog.text
+    board.tick(1_000_000_000)
+    assert board.path.exists()
+    board.publisher.close()
+
+
+@needs_root
+def test_full_tmpfs(tmp_path: Path) -> None:
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k,mode=1777", "x", tmp_path], check=False).returncode:
+        pytest.skip("no tmpfs can be mounted here")
+    try:
+        (tmp_path / "filler").write_bytes(bytes(250_000))
+        board = Board(tmp_path)
+        board.publish([1])
+        board.tick()
+        assert not board.path.exists()
+        (tmp_path / "filler").unlink()
+        board.tick(1_000_000_000)
+        left = os.statvfs(tmp_path).f_bfree * 4096
+        (tmp_path / "filler").write_bytes(bytes(left))
+        assert os.statvfs(tmp_path).f_bfree == 0
+        board.publish(range(2, 2 + 2 * SLOTS))
+        os.truncate(board.path, 0)
+        board.publish([200])
+        board.tick()
+        assert board.path.stat().st_size == RING_BYTES
+        board.publisher.close()
+    finally:
+        subprocess.run(["umount", "-l", tmp_path], check=True)
+
+
+def test_reader_does_not_wait_for_a_fifo(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "imud.x")
+    (tmp_path / "imud.y").symlink_to("imud.x")
+    with pytest.raises(ServerError, match=r"expected a regular file \(-\), found another kind \(p\)"):
+        Ring(tmp_path / "imud.x")
+    with pytest.raises(ServerError, match="cannot be read"):
+        Ring(tmp_path / "imud.y")
+
+
+def test_reader_of_a_heartbeat_from_the_future(tmp_path: Path) -> None:
+    (tmp_path / "imud.x").write_bytes(FORGED + bytes(SLOTS * SLOT_BYTES))
+    with Ring(tmp_path / "imud.x") as ring:
+        assert not ring.alive(monotonic_ns())
+        assert not ring.alive(START_NS)
+        assert ring.latest() is None
+        assert ring.read() == ([], 0)
+
+
+def test_names_of_rings_in_a_message(tmp_path: Path) -> None:
+    for name in ("bow", "\x1b[31m", "a\nb", "c" * 100, *(f"n{i}" for i in range(100))):
+        (tmp_path / f"imud.{name}").touch()
+    with pytest.raises(ServerError) as caught:
+        Ring("none", directory=str(tmp_path))
+    message = str(caught.value)
+    assert message.isprintable()
+    assert "bow, n0, n1, n10," in message
+    assert len(message) < 500
+
+
+def test_leftovers_are_not_looked_for_without_end(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(directory, "LEFTOVERS_MAX", 3)
+    for number in range(10):
+        (shared / f".imud.{number}.new").touch()
+    RingDirectory(str(shared)).close()
+    assert len(list(shared.iterdir())) == 7

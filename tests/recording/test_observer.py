@@ -1,0 +1,128 @@
+"""Taps: nothing is different on path and clock while nobody listens, and everything is heard while somebody does."""
+
+from types import SimpleNamespace
+from typing import cast
+
+from imud.config.model import DeviceConfig
+from imud.contracts.lines import Edge
+from imud.drivers.hipnuc.uart.driver import DRIVER
+from imud.formats.records import CheckRecord, Kind, decode_object, records_of
+from imud.model.ledger import Ledger
+from imud.model.options import NoSettings
+from imud.recording.observer import DeviceTap, DeviceTaps, HostTap, PathParts, RecordedDevice
+from imud.sampling.path import PathContext, StreamPath, make_clock
+from tests.support.event_loops import VirtualClock
+from tests.support.files import hi91
+
+
+class TappedPath:
+    def __init__(self) -> None:
+        self.clock = VirtualClock()
+        self.host = self.clock.host
+        self.ledger = Ledger()
+        config = DeviceConfig("bow", "hipnuc-uart", None, False, "uart", NoSettings())
+        context = PathContext(
+            "bow", 3, self.ledger, lambda _batch: None, lambda _message, _t: None, lambda _frame: None, lambda: 0,
+            self.host,
+        )  # fmt: skip
+        options, gap = DRIVER.settings(), self.ledger.add_unknown_gap
+        self.path = StreamPath(
+            DRIVER.make_codec(self.ledger, options),
+            make_clock(config.name, config.lines, DRIVER, None, host=self.host.steady, on_unknown_gap=gap),
+            context,
+        )
+        self.tap = DeviceTap(config, 3, self.ledger, self.host)
+        self.tap.path_made(PathParts(self.path, DRIVER.name, options))
+        self.heard: list[bytes] = []
+
+    def begin(self) -> None:
+        self.tap.begin(self.heard.append, "/dev/ttyUSB0", {}, {})
+
+    def kinds(self) -> list[int]:
+        return [record.kind for one in self.heard for record in records_of(one)]
+
+    def replaced(self) -> set[str]:
+        """Names of methods that are replaced on the objects themselves."""
+        path = self.path
+        return {
+            name for one in (path, path.clock, path.loss) for name in vars(one) if callable(getattr(type(one), name, 0))
+        }
+
+
+def test_all_is_heard_in_its_order_while_somebody_listens() -> None:
+    one = TappedPath()
+    assert one.replaced() == set()
+    one.begin()
+    assert {"on_data", "gather", "restart", "link_changed", "missed"} <= one.replaced()
+    one.tap.end(one.heard.append)
+    assert one.replaced() == set()
+    one.path.on_data(hi91(0), 1)
+    assert one.kinds() == [Kind.DEVICE, Kind.PATH]
+    one = TappedPath()
+    one.begin()
+    one.path.clock.link_changed(byte_ns=86_806, hold_ns=0)
+    one.path.on_data(hi91(0), 5)
+    one.path.flush(6)
+    assert one.kinds() == [Kind.DEVICE, Kind.PATH, Kind.CALL, Kind.DATA, Kind.CALL]
+
+
+def test_two_recorders_hear_the_same_and_another_path_is_described() -> None:
+    one, other = TappedPath(), list[bytes]()
+    one.begin()
+    one.tap.begin(other.append, "", {}, {})
+    one.path.on_data(hi91(0), 5)
+    one.tap.end(one.heard.append)
+    one.path.on_data(hi91(10), 6)
+    assert one.heard[-1] == other[-2]
+    assert len(other) == 4
+    one = TappedPath()
+    one.begin()
+    before = one.path
+    two = TappedPath()
+    one.tap.path_made(PathParts(two.path, DRIVER.name, None))
+    before.on_data(hi91(0), 5)
+    assert one.kinds() == [Kind.DEVICE, Kind.PATH, Kind.PATH]
+    two.path.on_data(hi91(0), 6)
+    assert one.kinds()[-1] == Kind.DATA
+    for path in (two.path, TappedPath().path):  # the clock of the present path gets the edges, and the recording too
+        one.tap.path_made(PathParts(path, DRIVER.name, None))
+        path.clock.aiding.on_sout_edges([Edge(7, True, 1)])
+        assert (path.clock.status().edges, one.kinds()[-1]) == (1, Kind.EDGES)
+
+
+def test_readings_of_the_clocks_are_heard() -> None:
+    clock = VirtualClock()
+    host, heard = clock.host, list[bytes]()
+    tap = HostTap(host)
+    tap.begin(heard.append)
+    assert [record.kind for one in heard for record in records_of(one)] == [Kind.CALL]
+    clock.advance(2_000_000_000)
+    host.utc_offset_ns()
+    assert [record.kind for record in records_of(heard[-1])] == [Kind.CLOCKS]
+    tap.end(heard.append)
+    clock.advance(2_000_000_000)
+    host.utc_offset_ns()
+    assert len(heard) == 2
+
+
+def test_the_taps_of_the_devices_pass_on_what_there_is() -> None:
+    one, put = TappedPath(), list[bytes]()
+    taps = DeviceTaps({"bow": cast("RecordedDevice", SimpleNamespace(tap=one.tap))}, one.host)
+    assert taps.names() == ["bow"]
+    for name in ("stern", "bow"):
+        taps.check(name, put.append)
+    assert [record.kind for data in put for record in records_of(data)] == [Kind.CHECK]
+
+
+def test_a_check_has_the_newest_sample_if_there_is_one() -> None:
+    one, put = TappedPath(), list[bytes]()
+    one.tap.check(put.append)
+    one.path.on_data(hi91(0), 5)
+    one.tap.check(put.append)
+    newest = one.path.newest
+    assert newest is not None
+    found = [decode_object(record, CheckRecord) for data in put for record in records_of(data)]
+    assert [(check.seq, check.sample_t_ns, check.sample_t_err_ns) for check in found] == [
+        (0, 0, 0), (newest.seq, newest.t_ns, newest.t_err_ns)
+    ]  # fmt: skip
+    assert found[1].ledger == one.ledger.snapshot()

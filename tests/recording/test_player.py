@@ -1,0 +1,223 @@
+"""Recording and replay: stories of devices again, recorded, and their replay field by field the same (`check_replay`).
+
+`IMUD_RECORD_RIGS=1 pytest tests/device tests/lines` does it with all of them.
+"""
+
+import asyncio
+import errno
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import msgspec
+import pytest
+
+from imud.drivers import DRIVERS
+from imud.formats import records
+from imud.formats.records import CheckRecord, Kind, PathRecord, Record, records_of
+from imud.host.clock import HostClock
+from imud.links.memory import MemoryLink
+from imud.model.errors import ImudError
+from imud.model.sample import Sample
+from imud.model.units import NS_PER_S
+from imud.recording.player import Player, _reading
+from tests.device import test_can_transport as can
+from tests.device import test_polled_transport as polled
+from tests.device import test_polled_transport_data_ready as data_ready
+from tests.device import test_stream_transport_stream_hold as waiting
+from tests.lines import test_end_to_end as signals
+from tests.support.device_rig import DeviceRig, DeviceRigs, device_config, play
+from tests.support.event_loops import LoopWorker, VirtualClock
+from tests.support.polled_bus_bench import PolledBusBench
+
+SAMPLES = 60
+
+
+@pytest.fixture
+def recorded(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    monkeypatch.setattr(DeviceRigs, "recording", True)
+    return monkeypatch
+
+
+@pytest.fixture
+def bench(tmp_path: Path, recorded: pytest.MonkeyPatch) -> PolledBusBench:
+    return PolledBusBench(tmp_path, recorded, VirtualClock())
+
+
+@pytest.mark.usefixtures("recorded")
+@pytest.mark.parametrize(
+    "run",
+    [
+        lambda: signals.test_every_sample_has_its_edge(settings=None),
+        signals.test_frames_answer_the_triggers_on_sin,
+        signals.test_an_alarm_is_an_event_and_shown_in_the_samples,
+        waiting.test_a_link_that_cannot_be_paused_is_not,
+        can.test_losses_by_cause,
+        can.test_frames_from_before_a_loss_are_not_mixed_with_those_after,
+        can.test_bus_down_and_up,
+        can.test_what_a_device_measured_while_the_host_was_suspended_is_a_gap_of_unknown_size,
+    ],
+    ids=[
+        "edges",
+        "triggers",
+        "alarm",
+        "held samples",
+        "losses on CAN",
+        "loss within a sample",
+        "bus down",
+        "suspended",
+    ],
+)
+def test_a_run_on_a_line_or_can_bus_is_replayed(run: Callable[[], None]) -> None:
+    """`check_replay` compares the samples and the ledger at the end of each run."""
+    run()
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        data_ready.test_every_edge_is_a_sample_of_its_own_instant,
+        polled.test_single_damage_costs_its_sample_and_nothing_else,
+        lambda bench: polled.test_vanished_device_is_not_believed_before_it_is_identified(
+            bench=bench, fault={"error": errno.EIO}, why="transfer failed"
+        ),
+    ],
+    ids=["edges", "damage", "failed transfers"],
+)
+def test_a_run_of_a_polled_device_is_replayed(bench: PolledBusBench, run: Callable[..., None]) -> None:
+    run(bench=bench)
+
+
+# --- from the middle of a run -----------------------------------------------------------------------------------------
+
+
+def run_of(driver: str, middle: int) -> DeviceRig:
+    """A stream of frames with jitter; what was recorded up to `middle` of them is forgotten, and begins anew there.
+
+    The host's time is slewed by 100 ppm. The host is suspended before the first frame and shortly before the last.
+    """
+    row, clock, asleep_ns = DRIVERS[driver], VirtualClock(), 0
+    now_ns = clock.now_ns
+    host = HostClock(now_ns, clock.realtime_ns, lambda: now_ns() + now_ns() // 10_000, lambda: now_ns() + asleep_ns)
+    rigs = DeviceRigs(host, start_worker=LoopWorker)
+    random = Random(driver)
+    config = device_config("imu", driver, "memory", {"baud": 115200})
+    link = MemoryLink(config.link_settings)  # type: ignore[arg-type]  # those of its row
+    rig = rigs.add(config, link)
+
+    async def story(_rigs: list[DeviceRig]) -> None:
+        nonlocal asleep_ns
+        for number in range(SAMPLES):
+            asleep_ns += 2 * NS_PER_S * (number in (0, SAMPLES - 20))
+            host.utc_offset_ns()
+            rig.tick()
+            if number == middle:
+                rig.recorded.clear()
+                rig.samples.clear()
+                rigs.record(rig)
+            frame = row.example_frame(random)  # type: ignore[attr-defined]  # a driver of streams
+            cut = random.randrange(len(frame))
+            link.feed(frame[:cut], clock.now_ns())
+            await asyncio.sleep(0.001 * random.random())
+            link.feed(frame[cut:], clock.now_ns())
+            await asyncio.sleep(0.010 * random.random())
+        rig.tick()
+
+    play(rigs, story, clock)
+    return rig
+
+
+@pytest.mark.parametrize("driver", ["hipnuc-uart", "imu61x-uart"])
+@pytest.mark.parametrize("middle", [1, 7, 30])
+def test_a_recording_that_begins_in_the_middle_has_the_stamps_and_numbers_of_the_run(
+    recorded: pytest.MonkeyPatch, driver: str, middle: int
+) -> None:
+    rig = run_of(driver, middle)
+    assert rig.samples
+    assert rig.samples[0].seq > 1 or middle == 1
+
+
+def test_without_the_state_the_clock_begins_anew_and_says_so(recorded: pytest.MonkeyPatch) -> None:
+    rig = run_of("hipnuc-uart", 30)
+    samples: list[Sample] = []
+    player = Player(lambda batch: samples.extend(batch.samples))
+    player.play(without_state(record) for one in rig.recorded for record in records_of(one))
+    (played,) = player.devices.values()
+    assert played.fresh_starts == ["the recording does not have the state of its clock"]
+    assert len(samples) == len(rig.samples)
+    assert played.ledger.closes()
+    assert played.differences
+
+
+def without_state(record: Record) -> Record:
+    if record.kind != Kind.PATH:
+        return record
+    made = msgspec.structs.replace(records.decode_object(record, PathRecord), state=b"")
+    return record._replace(body=msgspec.msgpack.encode(made))
+
+
+# --- a replay that differs, and what is no recording ------------------------------------------------------------------
+
+
+def recorded_run() -> list[Record]:
+    rig = run_of("hipnuc-uart", SAMPLES + 1)
+    return [record for one in rig.recorded for record in records_of(one)]
+
+
+def test_a_check_finds_a_stamp_a_number_and_a_count_that_differ(recorded: pytest.MonkeyPatch) -> None:
+    found = recorded_run()
+    for name in ("seq", "sample_t_ns", "sample_t_err_ns", "ledger"):
+        player = Player(lambda _batch: None)
+        player.play(_changed(record, name) for record in found)
+        (played,) = player.devices.values()
+        assert len(played.differences) == played.checks > 0
+
+
+def _changed(record: Record, name: str) -> Record:
+    if record.kind != Kind.CHECK:
+        return record
+    check = records.decode_object(record, CheckRecord)
+    value = {**check.ledger, "frames_good": 1} if name == "ledger" else getattr(check, name) + 1
+    return record._replace(body=msgspec.msgpack.encode(msgspec.structs.replace(check, **{name: value})))
+
+
+def test_a_read_that_is_missing_is_found_by_the_checks(recorded: pytest.MonkeyPatch) -> None:
+    found = recorded_run()
+    reads = [number for number, record in enumerate(found) if record.kind == Kind.DATA]
+    del found[reads[len(reads) // 2]]
+    player = Player(lambda _batch: None)
+    player.play(found)
+    (played,) = player.devices.values()
+    assert played.differences
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_records_that_make_no_sense_are_an_error_and_no_crash(recorded: pytest.MonkeyPatch, seed: int) -> None:
+    random, found = Random(seed), recorded_run()
+    for _ in range(20):
+        at = random.randrange(len(found))
+        kind, device, body = found[at]
+        place = random.randrange(len(body)) if body else 0
+        damaged = body[:place] + random.randbytes(1) + body[place + 1 :]
+        try:
+            Player(lambda _batch: None).play([*found[:at], Record(kind, device, damaged), *found[at + 1 :]])
+        except ImudError:
+            continue
+
+
+def test_lost_records_and_events_are_passed_on_and_an_unknown_trouble_is_the_last_known() -> None:
+    told: list[tuple[str, int]] = []
+    player = Player(lambda _batch: None, on_event=lambda event, utc_ns: told.append((event.message, utc_ns)))
+    recorded_event = {"t_ns": 7, "device": "bow", "kind": "up", "message": "hello"}
+    player.play(
+        record
+        for data in (
+            records.encode_clocks(records.ClocksRecord(5, 5, 5, 1, 1000, 0)),
+            records.encode_lost(records.LostRecord(2, 99, 5)),
+            records.encode_lost(records.LostRecord(3, 99, 6)),
+            records.encode_object(Kind.EVENT, records.NO_DEVICE, recorded_event),
+        )
+        for record in records_of(data)
+    )
+    assert (player.lost, told) == (5, [("hello", 1007)])
+    assert _reading(records.ReadingRecord(0, 1, 2, 99, b"new kind")).error is not None

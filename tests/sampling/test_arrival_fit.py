@@ -1,0 +1,153 @@
+"""The fit under the arrivals, and the lines that a latency timer leaves open, against a brute-force search."""
+
+from collections.abc import Iterable
+from itertools import pairwise
+from random import Random
+
+import pytest
+
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sampling.arrival_fit import BINS, ArrivalFit, extend_lower_hull, feasible_lines, lower_hull
+
+
+def at(fit: ArrivalFit, device_ns: int) -> float:
+    return fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
+
+
+def add(fit: ArrivalFit, device_ns: int, arrival_ns: int) -> bool:
+    """Add an arrival without bytes behind it; whether the fit changed."""
+    return fit.add_arrival(device_ns, arrival_ns, 0, arrival_ns - at(fit, device_ns))
+
+
+def fitted(slope: float, delay_mean_ns: float, seconds: int, seed: int = 1) -> tuple[ArrivalFit, int]:
+    """A fit under 100 points a second of a line through the origin, and its error at the newest point."""
+    random = Random(seed)
+    fit, device_ns = ArrivalFit(0, 0), 0
+    for i in range(1, 100 * seconds):
+        device_ns = i * 10 * NS_PER_MS
+        add(fit, device_ns, int(slope * device_ns + random.expovariate(1 / delay_mean_ns)))
+    return fit, int(at(fit, device_ns) - slope * device_ns)
+
+
+@pytest.mark.parametrize("slope", [1.0, 1 / 0.95, 1 / 1.05, 1.00005])
+def test_it_lies_where_nothing_was_delayed(slope: float) -> None:
+    fit, off_ns = fitted(slope, 1_000_000, 100)
+    assert abs(off_ns) < 20_000  # the mean delay is 1 ms
+    assert fit.slope == pytest.approx(slope, abs=1e-6)
+    assert fit.error_ns < 20_000
+
+
+def test_it_is_young_but_not_wild() -> None:
+    fit, off_ns = fitted(1.0, 1_000_000, 1)
+    assert abs(off_ns) < 1_000_000
+    assert fit.slope_error > 1e-5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_point_is_under_the_hull_however_it_was_made(seed: int) -> None:
+    """Corners are points, the slopes between them rise, and a hull that was extended is that of all points at once."""
+    random = Random(seed)
+    points = [(float(x), random.gauss(0, 100)) for x in sorted(random.sample(range(10_000), 80))]
+    hull = lower_hull(points)
+    slopes = [(yb - ya) / (xb - xa) for (xa, ya), (xb, yb) in pairwise(hull)]
+    assert slopes == sorted(slopes)
+    assert {hull[0], hull[-1]} == {points[0], points[-1]}
+    assert set(hull) <= set(points)
+    for (xa, ya), (xb, yb) in pairwise(hull):
+        assert all(y >= ya + (yb - ya) / (xb - xa) * (x - xa) - 1e-9 for x, y in points if xa <= x <= xb)
+    at_once: list[tuple[float, float]] = []
+    for begin in range(0, 80, 7):
+        extend_lower_hull(at_once, points[begin : begin + 7])
+    assert at_once == hull
+
+
+def test_the_fit_is_over_the_bins_that_are_left() -> None:
+    """What went with the oldest bins, or was merged away, has no corner in the hull any more."""
+    random = Random(3)
+    fit, points = ArrivalFit(0, 0), [(0, 0)]
+    for i in range(1, 4000):
+        device_ns = i * 50 * NS_PER_MS
+        arrival_ns = int(1.00002 * device_ns + 1e-16 * -(device_ns**2) + random.expovariate(1e-5))
+        points.append((device_ns, arrival_ns))
+        if add(fit, device_ns, arrival_ns):
+            kept = [(x, y) for x, y in points if x >= device_ns - fit.span_ns]
+            assert min(y - at(fit, x) for x, y in kept) > -10_000  # a bin keeps what was lowest above an earlier fit
+
+
+def test_the_window_is_bounded() -> None:
+    """A bin opens with each change: no more in a window's time than the window may have."""
+    fit, _ = fitted(1.0, 1_000_000, 200)
+    assert 30 * NS_PER_S < fit.span_ns < (BINS + 2) * NS_PER_S
+    later = range(200 * NS_PER_S, 200 * NS_PER_S + fit.span_ns, 10 * NS_PER_MS)
+    assert sum(add(fit, device_ns, device_ns + 1_000_000) for device_ns in later) <= BINS
+
+
+def test_an_old_minimum_goes() -> None:
+    """One impossible early arrival bends the line for no more than a window."""
+    fit, device_ns = ArrivalFit(0, -5_000_000), 0
+    for i in range(1, 100 * 100):
+        device_ns = i * 10 * NS_PER_MS
+        add(fit, device_ns, device_ns)
+    assert abs(at(fit, device_ns) - device_ns) < 10
+
+
+# --- latency timers -------------------------------------------------------------------------------------------------
+
+
+def behind_timer(seconds: int, stalls_ns: Iterable[tuple[int, int]], hold_ns: int, pause_ns: int) -> ArrivalFit:
+    """A fit of messages every 10 ms that a timer of `hold_ns` hands over; none are in a stall from ns to ns."""
+    random, fit, stalls = Random(3), ArrivalFit(0, 0, hold_ns), tuple(stalls_ns)
+    fit.set_pause(pause_ns, hold_ns // (10 * NS_PER_MS) + 2)
+    for i in range(1, 100 * seconds):
+        sent_ns = i * 10 * NS_PER_MS
+        handed_ns = sent_ns + hold_ns - (sent_ns + 7_000_000 + i * 40) % hold_ns
+        handed_ns = next((until for since, until in stalls if since <= handed_ns < until), handed_ns)
+        device_ns, arrival_ns = sent_ns, handed_ns + int(random.expovariate(1 / 30_000))
+        trailing_ns = max(arrival_ns - sent_ns - pause_ns, 0)  # the wire is busy, but for the pause
+        fit.add_arrival(device_ns, arrival_ns - trailing_ns, trailing_ns, arrival_ns - trailing_ns - at(fit, device_ns))
+    return fit
+
+
+def test_messages_between_stalls_bound_what_a_timer_hides() -> None:
+    """A third of all messages is handed over late; the others show what they show on a quiet host."""
+    hold_ns, pause_ns = 16 * NS_PER_MS, 3 * NS_PER_MS
+    stalls = [(at_ms * NS_PER_MS, (at_ms + 120) * NS_PER_MS) for at_ms in range(0, 70_000, 350)]
+    fit = behind_timer(70, stalls, hold_ns, pause_ns)
+    assert fit.hidden_ns < 2 * pause_ns
+    device_ns = 70 * NS_PER_S
+    assert abs(at(fit, device_ns) - fit.shift_ns - device_ns) < 2 * pause_ns
+
+
+# --- feasible lines ---------------------------------------------------------------------------------------------------
+
+
+def test_level_bounds() -> None:
+    found = feasible_lines([(0.0, 10.0), (10.0, 10.0)], [(0.0, 0.0), (10.0, 0.0)], 10.0)
+    assert found is not None
+    assert (found.lowest_ns, found.highest_ns) == (0.0, 10.0)
+    assert (found.slope_lowest, found.slope_highest) == (-1.0, 1.0)
+
+
+def test_no_line_fits() -> None:
+    assert feasible_lines([(0.0, 0.0), (10.0, 0.0)], [(5.0, 1.0)], 10.0) is None
+    assert feasible_lines([(5.0, 0.0)], [(5.0, 1.0)], 10.0) is None
+
+
+def test_bounds_hold_for_every_line_that_fits() -> None:
+    random = Random(5)
+    ceiling = [(float(x), random.uniform(5, 15)) for x in range(0, 100, 9)]
+    floor = [(float(x), random.uniform(-15, -5)) for x in range(3, 100, 9)]
+    found = feasible_lines(ceiling, floor, 100.0)
+    assert found is not None
+    seen = []
+    for _ in range(5000):
+        slope, at_end = random.uniform(-0.4, 0.4), random.uniform(-40, 40)
+        if all(at_end + slope * (x - 100) <= y for x, y in ceiling) and all(
+            at_end + slope * (x - 100) >= y for x, y in floor
+        ):
+            seen.append(at_end)
+            assert found.slope_lowest <= slope <= found.slope_highest
+            assert found.lowest_ns <= at_end <= found.highest_ns
+    assert len(seen) > 25
+    assert max(seen) > found.highest_ns - 2
+    assert min(seen) < found.lowest_ns + 2

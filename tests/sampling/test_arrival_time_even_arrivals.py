@@ -1,0 +1,93 @@
+"""Messages without device time by their even pace: delayed ones, missing ones, another rate, triggers."""
+
+from random import Random
+
+import pytest
+
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
+from imud.sampling.arrival_time import EvenArrivals, LinkDelay
+
+PERIOD_NS = 10 * NS_PER_MS
+BEGIN_NS = 1000 * NS_PER_S
+DELAY = LinkDelay(0, 0)
+
+
+def settled(even: EvenArrivals, count: int = 300) -> int:
+    """Arrivals at an even pace, each up to 100 µs late; return when the next one is due."""
+    random = Random(1)
+    for i in range(count):
+        even.add_arrival(DELAY, BEGIN_NS + i * PERIOD_NS + int(random.random() * 100 * NS_PER_US), 0, triggered=False)
+    return BEGIN_NS + count * PERIOD_NS
+
+
+def test_it_is_not_used_before_its_pace_is_known() -> None:
+    even = EvenArrivals()
+    used = [even.add_arrival(DELAY, BEGIN_NS + i * PERIOD_NS, 0, triggered=False) for i in range(60)]
+    assert not any(used[:40])
+    assert used[-1]
+
+
+def test_messages_that_waited_are_dated_as_if_they_had_not() -> None:
+    """Two seconds of them arrive together."""
+    even = EvenArrivals()
+    due_ns = settled(even)
+    read_ns = due_ns + 200 * PERIOD_NS
+    for i in range(200):
+        assert even.add_arrival(DELAY, read_ns, 0, triggered=False)
+        off_ns = even.t_ns - (due_ns + i * PERIOD_NS)
+        assert abs(off_ns) < 200 * NS_PER_US
+        assert 2 * even.error_ns >= abs(off_ns)
+
+
+@pytest.mark.parametrize("missing", [1, 2, 40])
+def test_messages_that_are_missing_are_counted_after_four(missing: int) -> None:
+    even = EvenArrivals()
+    due_ns = settled(even) + missing * PERIOD_NS
+    for i in range(8):
+        assert even.add_arrival(DELAY, due_ns + i * PERIOD_NS, 0, triggered=False)
+        off_ns = even.t_ns - (due_ns + i * PERIOD_NS)
+        assert 2 * even.error_ns >= abs(off_ns)
+        if i >= 3:
+            assert abs(off_ns) < 200 * NS_PER_US
+            assert even.error_ns < 200 * NS_PER_US
+
+
+def test_a_number_leaves_no_doubt() -> None:
+    even = EvenArrivals()
+    for i in range(300):
+        even.add_arrival(DELAY, BEGIN_NS + i * PERIOD_NS, 1, triggered=False)
+    late_ns = BEGIN_NS + 305 * PERIOD_NS
+    assert even.add_arrival(DELAY, late_ns + 3 * PERIOD_NS, 6, triggered=False)
+    assert abs(even.t_ns - late_ns) < 200 * NS_PER_US
+    assert even.error_ns < 200 * NS_PER_US
+
+
+def test_a_triggered_sample_may_be_as_late_as_it_arrives() -> None:
+    even = EvenArrivals()
+    due_ns = settled(even)
+    assert even.add_arrival(DELAY, due_ns + 4 * NS_PER_MS, 0, triggered=True)
+    assert 2 * even.error_ns >= 4 * NS_PER_MS
+
+
+@pytest.mark.parametrize("period_ns", [5 * NS_PER_MS, 20 * NS_PER_MS])
+def test_another_rate_begins_anew(period_ns: int) -> None:
+    even = EvenArrivals()
+    due_ns = settled(even)
+    used = [even.add_arrival(DELAY, due_ns + i * period_ns, 0, triggered=False) for i in range(400)]
+    assert not all(used)
+    assert used[-1]
+    assert abs(even.t_ns - (due_ns + 399 * period_ns)) < 200 * NS_PER_US
+
+
+def test_arrivals_without_a_pace_are_not_dated_by_one() -> None:
+    random, even, t_ns, used = Random(2), EvenArrivals(), BEGIN_NS, 0
+    for _ in range(3000):
+        t_ns += int(random.expovariate(1 / PERIOD_NS))
+        used += even.add_arrival(DELAY, t_ns, 0, triggered=False)
+    assert used < 300
+
+
+def test_an_adapter_that_holds_messages_hides_what_is_missing() -> None:
+    even = EvenArrivals()
+    delay = LinkDelay(0, 16 * NS_PER_MS)
+    assert not any(even.add_arrival(delay, BEGIN_NS + i * PERIOD_NS, 0, triggered=False) for i in range(200))

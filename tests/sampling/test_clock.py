@@ -1,0 +1,291 @@
+"""The clock as a whole: three rules for any input, what devices and hosts do to it, polled samples."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imud.model.sample import Measurement, Sample, Sync
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sampling.clock import SampleClock
+from tests.support.clock_feed import BEGIN_NS, Point, feed, make_clock, message, rises, steady
+
+# --- samples that arrive ----------------------------------------------------------------------------------------------
+
+
+FRAME = Measurement(28, 0, None, (0.0, 0.0, 9.8))
+NEAR_NS = 2 * NS_PER_MS
+"""Messages are read 1 ms after they were measured and take 0.9 ms on the wire."""
+
+
+def far(samples: Sequence[Sample], points: Sequence[Point]) -> int:
+    """Largest distance of a stamp from the truth, ns."""
+    return max(abs(s.t_ns - BEGIN_NS - ms * NS_PER_MS) for s, (_, ms) in zip(samples, points, strict=True))
+
+
+@given(st.lists(st.sampled_from([1, 2, 3, 10, 11, 500, 990, 999]), min_size=20, max_size=150), st.integers(0, 999))
+def test_a_believable_device_never_resets(steps: list[int], first: int) -> None:
+    clock = make_clock(tick_modulus=1000)
+    points: list[Point] = []
+    ms = 0
+    for step in steps:
+        points.append(((first + ms) % 1000, ms))
+        ms += step
+    samples = feed(clock, points)
+    assert clock.status().resets == 0
+    assert far(samples, points) < NEAR_NS
+    assert samples[-1].t_dev_ns == (first + points[-1][1]) * NS_PER_MS
+
+
+def test_it_comes_from_arrival_to_regression() -> None:
+    clock = make_clock()
+    samples = feed(clock, steady(5000, 0, 200))
+    assert samples[0].sync is Sync.ARRIVAL
+    assert samples[-1].sync is Sync.REGRESSION
+    assert samples[-1].t_err_ns < samples[0].t_err_ns
+    status = clock.status()
+    assert status.sync is Sync.REGRESSION
+    assert abs(status.skew_ppm) < 1
+    assert status.t_err_ns == samples[-1].t_err_ns
+    assert abs(status.offset_ns - (BEGIN_NS - 5000 * NS_PER_MS)) < NEAR_NS
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "resets"),
+    [
+        (steady(100_000, 0, 300), steady(7, 3500, 300), 1),  # the counter restarted
+        (steady(0, 0, 500), steady(3_605_000, 5000, 500), 1),  # the host was suspended for an hour
+        # 40 ms in the future is impossible; the clock accepts neither a new minimum nor a restart
+        (steady(0, 0, 1000), steady(10_040, 10_000, 500), 0),
+        (steady(0, 0, 500), steady(305_000, 305_000, 100), 0),  # silent for five minutes
+    ],
+    ids=["restarted", "suspended", "set forward", "silent"],
+)
+def test_what_a_jump_of_the_counter_means(before: list[Point], after: list[Point], resets: int) -> None:
+    clock = make_clock()
+    samples = feed(clock, [*before, after[0]])
+    assert clock.missed == (30_000 if after[0][1] == 305_000 else 0)
+    samples += feed(clock, after[1:])
+    assert clock.missed == 0
+    assert clock.status().resets == resets
+    assert rises(samples)
+    assert far(samples, [*before, *after]) < NEAR_NS
+    assert samples[len(before)].sync is (Sync.ARRIVAL if resets else Sync.REGRESSION)
+    assert samples[-1].sync is Sync.REGRESSION
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "settled"),
+    [
+        # reboot at 3 s, silent for a minute, counter at 5 s: forward, believable alone, and 58 s late
+        (steady(0, 0, 300), steady(5000, 63_000, 500), 150),
+        (steady(0, 0, 2000), steady(20_000, 20_040, 3000), 2500),  # the clock of the device stopped for 20 s
+    ],
+)
+def test_a_counter_that_is_late_for_good_began_anew(before: list[Point], after: list[Point], settled: int) -> None:
+    clock = make_clock()
+    feed(clock, before)
+    samples = feed(clock, after)
+    assert clock.status().resets == 1
+    assert rises(samples)
+    assert far(samples[settled:], after[settled:]) < NEAR_NS
+    # the error of 58 s is above the maximum of 32 bits
+    assert (max(sample.t_err_ns for sample in samples) == 0xFFFF_FFFF) == (settled == 150)
+
+
+@pytest.mark.parametrize("reads", [((200, 22_001),), ((150, 22_001), (150, 23_500))])
+def test_a_busy_host_is_no_reset(reads: tuple[tuple[int, int], ...]) -> None:
+    """The messages that its reader finds later are old; many messages of one read are one witness."""
+    clock = make_clock()
+    feed(clock, steady(0, 0, 2000))
+    samples: list[Sample] = []
+    for count, read_ms in reads:
+        for i in range(count):
+            late = message(20_000 + 10 * len(samples), 82 * (count - 1 - i))
+            samples.append(clock.sample(late, BEGIN_NS + read_ms * NS_PER_MS, 0))
+    assert clock.status().resets == 0
+    assert len(reads) > 1 or far(samples, steady(20_000, 20_000, 200)) < NEAR_NS
+
+
+def test_a_repeated_stamp_still_rises() -> None:
+    clock = make_clock()
+    points = [(10 * (i // 2), 10 * (i // 2) + i % 2) for i in range(400)]
+    samples = feed(clock, points)
+    assert rises(samples)
+    assert clock.missed == 0
+    assert clock.status().resets == 0
+
+
+def test_an_arrival_without_room_for_more_samples_is_lifted() -> None:
+    clock = make_clock()
+    clock.sample_polled(FRAME, BEGIN_NS, 1, BEGIN_NS, 0)
+    samples = [clock.sample(message(None), BEGIN_NS, 0) for _ in range(2)]
+    assert [(s.t_ns, s.t_rx_ns) for s in samples] == [(BEGIN_NS + 1,) * 2, (BEGIN_NS + 2,) * 2]
+
+
+def test_a_stuck_counter_falls_back_to_arrival() -> None:
+    clock = make_clock()
+    feed(clock, steady(0, 0, 300))
+    points: list[Point] = [(2990, 3000 + 10 * i) for i in range(600)]
+    samples = feed(clock, points)
+    assert rises(samples)
+    assert samples[-1].sync is Sync.ARRIVAL
+    assert samples[-1].t_rx_ns - samples[-1].t_ns < NS_PER_S
+
+
+def test_five_percent_fast_is_learned() -> None:
+    clock = make_clock()
+    points: list[Point] = [(int(10.5 * i), 10 * i) for i in range(6000)]
+    samples = feed(clock, points)
+    assert abs(clock.status().skew_ppm - 50_000) < 20
+    assert abs(clock.expected_rate_hz - 100) < 0.01
+    assert far(samples[1000:], points[1000:]) < NEAR_NS
+
+
+def test_without_device_time() -> None:
+    clock = make_clock()
+    points: list[Point] = [(None, 10 * i) for i in range(100)]
+    samples = feed(clock, points)
+    assert {(s.sync, s.t_dev_ns) for s in samples} == {(Sync.ARRIVAL, None)}
+    assert far(samples, points) < NEAR_NS
+    assert clock.missed == 0
+    assert clock.expected_rate_hz == 0.0
+    clock = make_clock(byte_ns=1000)  # messages of one burst keep their distance
+    samples = [clock.sample(message(None, 82 * (3 - i)), BEGIN_NS, 0) for i in range(4)]
+    assert [b.t_ns - a.t_ns for a, b in pairwise(samples)] == [82_000] * 3
+    assert samples[0].t_ns <= BEGIN_NS - 4 * 82_000
+
+
+def test_corrections_are_slewed() -> None:
+    """Arrivals suddenly 3 ms earlier: the step between samples stays within 0.05 %."""
+    clock = make_clock(hold_ns=0)
+    late = [clock.sample(message(10 * i), BEGIN_NS + (10 * i + 4) * NS_PER_MS, 0) for i in range(3000)]
+    steps = [b.t_ns - a.t_ns for a, b in pairwise(late[2000:])]
+    assert max(abs(step - 10 * NS_PER_MS) for step in steps) <= 5_001
+
+
+def test_wall_clock_steps_move_only_utc() -> None:
+    clock, same = make_clock(), make_clock()
+    for i in range(300):
+        at = BEGIN_NS + 10 * i * NS_PER_MS
+        a = clock.sample(message(10 * i), at, 1_700_000_000 * NS_PER_S if i < 150 else 5)
+        b = same.sample(message(10 * i), at, 0)
+        assert a.t_ns == b.t_ns
+        assert a.utc_ns - a.t_ns == (1_700_000_000 * NS_PER_S if i < 150 else 5)
+
+
+def test_a_changed_link_starts_arrival_anew_but_not_time() -> None:
+    clock = make_clock()
+    samples = feed(clock, steady(0, 0, 300))
+    clock.link_changed(byte_ns=1_085, hold_ns=NS_PER_MS)
+    samples += feed(clock, steady(3000, 3000, 300))
+    assert samples[300].sync is Sync.ARRIVAL
+    assert samples[-1].sync is Sync.REGRESSION
+    assert clock.status().resets == 0
+    clock.restart()  # counts neither a reset nor a gap
+    samples += feed(clock, [(7, 9000)])
+    assert clock.missed == 0
+    assert clock.status().resets == 0
+    clock.link_changed(byte_ns=10_850, hold_ns=0)  # behind it the device restarts: a reset
+    samples += feed(clock, steady(27, 9020, 300)) + feed(clock, steady(7, 15_000, 300))
+    assert clock.status().resets == 1
+    assert clock.missed == 0
+    assert rises(samples)
+    assert samples[-300].t_dev_ns == 7 * NS_PER_MS
+
+
+def test_one_clock_follows_another() -> None:
+    first, second = make_clock(), make_clock()
+    samples = feed(first, steady(0, 0, 100))
+    second.continue_from(first)
+    samples += feed(second, steady(5, 990, 100))
+    assert rises(samples)
+    assert [s.seq for s in samples] == list(range(1, 201))
+
+
+def test_a_wire_too_slow_for_the_rate_is_not_believed() -> None:
+    """A pty says 9600 baud and delivers 1 kHz: counting 85 ms of wire back would be nonsense."""
+    clock = make_clock(byte_ns=1_041_666)
+    points = steady(0, 0, 5000, step_ms=1)
+    samples = feed(clock, points)
+    assert far(samples[-500:], points[-500:]) < NEAR_NS
+    assert clock.status().resets == 0
+
+
+def test_every_value_of_the_measurement_is_in_the_sample() -> None:
+    values = {
+        "accel_m_s2": (1.0, 2.0, 3.0), "gyro_rad_s": (4.0, 5.0, 6.0), "mag_t": (7.0, 8.0, 9.0),
+        "quat_wxyz": (1.0, 0.0, 0.0, 0.0), "euler_rad": (0.1, 0.2, 0.3), "temperature_c": 20.5,
+        "pressure_pa": 101325.0, "incli_rad": (0.01, 0.02), "status": 3, "pps_age_ms": 17,
+    }  # fmt: skip
+    m = Measurement(82, 0, 5, **values)  # type: ignore[arg-type] # a dict of all fields has one value type
+    s = make_clock().sample(m, BEGIN_NS, 0)
+    assert {name: getattr(s, name) for name in values} == values
+    assert s.device == "imu"
+
+
+def test_messages_with_and_without_device_time_mix() -> None:
+    clock = make_clock()
+    points: list[Point] = [(10 * (i // 2) if i % 2 else None, 10 * (i // 2) + 3 * (i % 2)) for i in range(600)]
+    samples = feed(clock, points)
+    assert rises(samples)
+    assert [s.sync for s in samples[-4:]] == [Sync.ARRIVAL, Sync.REGRESSION] * 2
+
+
+# --- polled samples ---------------------------------------------------------------------------------------------------
+
+
+def polled_clock() -> SampleClock:
+    return SampleClock("imu", tick_ns=0, tick_modulus=2, byte_ns=0, hold_ns=0)
+
+
+def test_time_is_that_of_the_poll() -> None:
+    one = polled_clock()
+    sample = one.sample_polled(FRAME, 1_000_000, 300, 1_200_000, 5_000_000_000)
+    assert (sample.t_ns, sample.t_err_ns, sample.t_rx_ns, sample.utc_ns) == (1_000_000, 300, 1_200_000, 5_001_000_000)
+    assert (sample.seq, sample.sync, sample.t_dev_ns) == (1, Sync.ARRIVAL, None)
+    assert polled_clock().sample_polled(FRAME, 1, 2**40, 2, 0).t_err_ns == 2**32 - 1, "the largest that fits"
+    other = polled_clock()  # another clock of the device continues from this clock
+    other.continue_from(one)
+    sample = other.sample_polled(FRAME, 500, 1, 1_000_001, 0)
+    assert (sample.seq, sample.t_ns) == (2, 1_000_001)
+
+
+def test_time_rises_strictly_is_never_after_the_answer_and_the_lift_is_in_the_error() -> None:
+    one = polled_clock()
+    samples = [one.sample_polled(FRAME, t_ns, 1, t_ns + 5, 0) for t_ns in (100, 100, 50, 103, 200)]
+    assert [sample.t_ns for sample in samples] == [100, 101, 102, 103, 200]
+    assert [sample.t_err_ns for sample in samples] == [1, 2, 53, 1, 1]
+    assert all(sample.t_ns <= sample.t_rx_ns for sample in samples)
+    assert [sample.seq for sample in samples] == [1, 2, 3, 4, 5]
+
+
+def test_by_an_edge() -> None:
+    one = polled_clock()
+    samples = [
+        one.sample_polled(FRAME, t_ns, 5, t_ns + 50, 0, edge) for t_ns, edge in ((100, 7), (200, None), (300, 8))
+    ]
+    assert [(sample.sync, sample.edge_seq, sample.t_ns) for sample in samples] == [
+        (Sync.EDGE, 7, 100), (Sync.ARRIVAL, None, 200), (Sync.EDGE, 8, 300),
+    ]  # fmt: skip
+    assert one.status().sync is Sync.EDGE
+
+
+@pytest.mark.parametrize(("hold_ns", "slower"), [(0, 0.0), (NS_PER_MS, 0.0), (0, 50e-6)])
+def test_messages_that_waited_are_dated_by_the_fit_and_do_not_hold_it_back(hold_ns: int, slower: float) -> None:
+    """Nine of ten are read up to 9 ms late. If the crystal slows by 50 ppm, one of ten shows it."""
+    clock = make_clock(hold_ns=hold_ns)
+    feed(clock, steady(0, 0, 20_000, 1))
+    before, offs = clock.status(), []
+    for number in range(20_000, 45_000 if slower else 30_000):
+        true_ns = BEGIN_NS + number * NS_PER_MS + int((number - 20_000) * slower * NS_PER_MS)
+        late_ms = (10 - number % 10) if number % 10 else 0
+        clock.waited_ns = 10 * NS_PER_MS if late_ms else 0
+        offs.append(abs(clock.sample(message(number), true_ns + (late_ms + 1) * NS_PER_MS, 0).t_ns - true_ns))
+    assert max(offs) < 1.2 * NS_PER_MS
+    if slower:
+        assert offs[-1] < 100_000
+    else:
+        assert abs(clock.status().t_err_ns - before.t_err_ns) < 20_000

@@ -1,0 +1,116 @@
+"""The stated error in short cells of `tests.bench.clock_table`, and defects that its cells showed."""
+
+from dataclasses import replace
+
+import pytest
+
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, uart_byte_ns
+from tests.bench.adversity import (
+    CAN,
+    FRAMES,
+    LOADED,
+    UART,
+    USB_1,
+    USB_16,
+    Cell,
+    Device,
+    HostClocks,
+    Link,
+    Stalls,
+    machine_of,
+    messages,
+)
+from tests.bench.clock_table import HOST_CLOCKS, RATIO_LEAST, RATIO_MOST, SLOW_RATE, clock_of, dated, figures_of
+
+FAST = replace(UART, baud=921_600)
+CHANGED = Device(rates_hz=((0.0, 100.0), (32.0, 400.0), (37.0, 50.0)))
+TIMELESS = Device(says="nothing")
+STALLS = Stalls(20 * NS_PER_S, 2 * NS_PER_S, 12 * NS_PER_S)
+UNTOLD = Link("usb, told 1 ms", timer_ns=16 * NS_PER_MS, told_hold_ns=NS_PER_MS)
+
+CELLS = [
+    (Cell("100 Hz to 400 to 50", FAST, CHANGED), 700.0),
+    (Cell("loaded host", USB_1, wake=LOADED), 600.0),
+    (Cell("loaded host", USB_16, wake=LOADED), 1200.0),
+    (Cell("wrong timer", UNTOLD), 2500.0),
+    (Cell("TPDO, loaded host", CAN, TIMELESS, LOADED), 1500.0),
+    (Cell("numbered, loaded host", CAN, Device(says="number"), LOADED), 800.0),
+    (Cell("TPDO, stalls of 2 s", CAN, TIMELESS, stalls=STALLS), 300.0),
+    (Cell("stalls of 2 s", UART, stalls=STALLS), 150.0),
+]
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(("cell", "most_us"), CELLS, ids=lambda v: getattr(v, "name", ""))
+def test_the_stated_error_is_honest(cell: Cell, most_us: float, seed: int) -> None:
+    got = figures_of(cell, [seed], 45)
+    assert got.settling >= 0.95
+    assert got.settled >= 0.97
+    assert got.sigma_us <= most_us
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    "cell", [c for c, _ in CELLS if c.adversity in {"loaded host", "stalls of 2 s", "numbered, loaded host"}],
+    ids=lambda c: c.name,
+)  # fmt: skip
+def test_the_stated_error_is_neither_too_small_nor_too_large(cell: Cell) -> None:
+    """Over six machines: what no arrival shows is another delay on each."""
+    assert RATIO_LEAST <= figures_of(cell, range(6), 45).ratio <= RATIO_MOST
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("host", HOST_CLOCKS, ids=lambda host: host.name)
+def test_the_stated_error_is_honest_whatever_happens_to_the_clocks_of_the_host(host: HostClocks) -> None:
+    got = figures_of(Cell(host.name, UART, host=host), (1, 4))
+    assert got.settling >= 0.95
+    assert got.settled >= 0.97
+    assert got.sigma_us < 200
+
+
+@pytest.mark.parametrize("seed", [1, 13, 21])
+def test_the_first_step_of_another_rate_is_no_correction_of_the_counter(seed: int) -> None:
+    """Taken for one, it stayed in all stamps after: 7.9 ms off with 0.5 ms stated."""
+    cell = Cell("100 Hz to 400", FAST, Device(rates_hz=((0.0, 100.0), (12.0, 400.0))))
+    later = list(dated(cell, seed, 20))[600:]
+    far = [one for one in later if abs(one.off_ns) > NS_PER_MS]
+    assert len(far) <= 12, "those in which the change is found out"
+    assert all(abs(one.off_ns) <= 2 * one.t_err_ns for one in far)
+
+
+def test_a_timer_longer_than_the_driver_says_is_measured() -> None:
+    clock = clock_of(Cell("wrong timer", UNTOLD))
+    for message in messages(Cell("wrong timer", UNTOLD), 1, 5):
+        clock.sample(message.measurement, message.t_rx_ns, 0)
+    assert 12 * NS_PER_MS < clock.status().hold_ns <= 16 * NS_PER_MS
+
+
+def test_a_timer_that_is_as_the_driver_says_is_left_alone_on_a_busy_host() -> None:
+    for stalls in (None, Stalls(5 * NS_PER_S, 200 * NS_PER_MS)):
+        cell = Cell("loaded host", USB_1, wake=LOADED, stalls=stalls)
+        clock = clock_of(cell)
+        for message in messages(cell, 2, 20):
+            clock.sample(message.measurement, message.t_rx_ns, 0)
+        assert clock.status().hold_ns == NS_PER_MS
+
+
+def test_a_first_read_that_waited_bounds_nothing() -> None:
+    """What was sent in the first 200 ms arrives at once: no message in it shows how long the timer holds others."""
+    cell = Cell("hub stalls 200 ms every 5 s", FRAMES, stalls=Stalls(5 * NS_PER_S, 200 * NS_PER_MS))
+    later = list(dated(cell, 3, 9))[200:]
+    assert max(abs(d.off_ns) for d in later) < NS_PER_MS
+
+
+def test_messages_that_a_young_fit_took_for_late_are_so_no_longer_when_it_has_moved() -> None:
+    """Else two such messages at 10 Hz widen what the timer leaves open for a minute."""
+    assert figures_of(Cell("10 Hz", USB_16, SLOW_RATE), (0, 4), 60).sigma_us < 1300
+
+
+@pytest.mark.parametrize("seed", [2, 61010, 61016])
+def test_messages_come_by_the_machine_of_their_seed(seed: int) -> None:
+    """Seeds that are alike modulo six are different machines: the shortest way from sample to read is their own."""
+    cell = Cell("plain", UART)
+    profile = machine_of(seed).profile(UART, "")
+    least_ns = min(m.t_rx_ns - m.truth_ns for m in messages(cell, seed, 30))
+    wire_ns = (cell.device.size_bytes + profile.fifo_bytes) * uart_byte_ns(UART.baud)
+    assert abs(least_ns - wire_ns - profile.floor_ns) < NS_PER_US

@@ -1,0 +1,448 @@
+"""Device time: unwrapped, finer than its tick, even over corrections of the counter; missing samples; numbers."""
+
+from collections.abc import Callable
+from itertools import pairwise, product
+from random import Random
+
+import pytest
+
+from imud.contracts.lines import UtcReference
+from imud.model.sample import Measurement, Sample, Sync
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sampling.arrival_fit import ArrivalFit
+from imud.sampling.clock import SampleClock
+from imud.sampling.device_time import UNJUDGED_MOST, DeviceTime, PeriodLearner
+from imud.sim.ports.arrival import BARE_UART, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
+from tests.bench.clock import BAUD_OF_RATE
+from tests.bench.line_model import LineFaults, measured_ns, simulate_reads
+from tests.bench.line_runs import (
+    REFERENCE,
+    UTC_OFFSET_NS,
+    DatedSample,
+    after,
+    begun_ns,
+    measurement,
+    share_honest,
+    sout_clock,
+    steepest,
+)  # fmt: skip
+from tests.support.clock_feed import BEGIN_NS, feed, make_clock, rises, steady
+
+# --- unwrapping -------------------------------------------------------------------------------------------------------
+
+
+def test_it_wraps_any_number_of_times() -> None:
+    time = DeviceTime(NS_PER_MS, 1000)
+    time.begin(990)
+    for i in range(1, 1001):
+        time.advance((990 + 10 * i) % 1000)
+    assert time.raw_ns == (990 + 10_000) * NS_PER_MS
+    assert time.even_ns == time.raw_ns
+    assert time.error_ns == 0
+
+
+def test_a_backward_step_is_a_long_way_forward() -> None:
+    """The caller compares it with the host's time; nothing here is signed."""
+    time = DeviceTime(NS_PER_MS, 1 << 32)
+    time.begin(5000)
+    assert time.elapsed_ns(4990) == ((1 << 32) - 10) * NS_PER_MS
+
+
+def test_an_uneven_rate_becomes_even() -> None:
+    """400 Hz in milliseconds: the stamps step 2, 3, 2, 3; the samples 2.5."""
+    time = DeviceTime(NS_PER_MS, 1 << 32)
+    time.begin(0)
+    even = []
+    for i in range(1, 2000):
+        time.advance(i * 5 // 2)
+        even.append(time.even_ns)
+        assert 0 <= time.even_ns - time.raw_ns <= NS_PER_MS
+    steps = [b - a for a, b in pairwise(even[1000:])]
+    assert max(abs(step - 2_500_000) for step in steps) < 2_000
+    assert 0 < time.error_ns < 50_000
+
+
+def test_two_samples_in_one_tick_are_distinguished() -> None:
+    """1 kHz in milliseconds, 100 ppm fast: after 5 s a stamp comes twice."""
+    time = DeviceTime(NS_PER_MS, 1 << 32)
+    time.begin(0)
+    even = []
+    for i in range(1, 14_000):
+        time.advance(int(i * 0.9999 + 0.5))
+        even.append(time.even_ns)
+    assert all(abs(b - a - NS_PER_MS) < 1000 for a, b in pairwise(even[100:]))
+
+
+def test_a_loss_is_counted_with_the_step() -> None:
+    time = DeviceTime(NS_PER_MS, 1 << 32)
+    time.begin(0)
+    for i in range(1, 11):
+        time.advance(10 * i)
+    time.advance(130)
+    assert time.missed == 2
+    time.begin(0)
+    assert time.missed == 0
+
+
+# --- the period and missing samples -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("steps", "missed", "period"),
+    [
+        ([10, 30, 10, 50, 10], [0] * 5, 0),  # nothing is missing before a period is known
+        ([10] * 10 + [20, 10, 10], [1, 0, 0], 10),
+        ([10] * 10 + [30, 10, 10], [2, 0, 0], 10),
+        ([1] * 10 + [2, 1, 1], [1, 0, 0], 1),
+        ([1] * 10 + [5, 1, 1], [4, 0, 0], 1),
+        ([1000] * 10 + [3000, 1000], [2, 0], 1000),
+        ([1] * 10 + [2, 1, 3, 1] * 500, [1, 0, 2, 0] * 500, 1),  # losses among good steps do not change the period
+        ([10, 0] * 50, [0] * 100, 10),  # repeats are ignored
+        ([10] * 20 + [1] * 20 + [10], [0] * 20 + [9], 1),  # a faster rate costs nothing
+        ([10] * 20 + [20] * 12 + [40], [0, 1], 20),  # a slower one is adopted after twelve
+        ([1, 2, 1, 1] + [1] * 100, [0] * 100, 1),  # losses in the beginning leave no fraction
+    ],
+)
+def test_missing_samples_of_steps(steps: list[int], missed: list[int], period: int) -> None:
+    """`missed` is of the last steps."""
+    learner = PeriodLearner()
+    assert [learner.add_step(step) for step in steps][-len(missed) :] == missed
+    assert learner.period_ticks == period
+    assert learner.changes == 0
+
+
+@pytest.mark.parametrize(
+    ("steps", "gaps"),
+    [
+        ([400, 300, 100, 100, 100, 100], 2),  # of a like length: neither stands out beside the other
+        ([300, 300, 100, 100, 100, 100], 2),
+        ([400, 100, 300, 100, 100, 100, 100], 3),  # 300 stands out beside the period before and the one after
+        ([100, 101, 99, 100], 0),
+        ([2, 3, 2, 3, 2, 3], 0),
+        ([1, 1, 2, 1], 0),  # 750 Hz in milliseconds, or a loss: within one
+    ],
+)
+def test_gaps_from_before_a_period_is_known_are_noted_when_it_is(steps: list[int], gaps: int) -> None:
+    noted: list[int] = []
+    learner = PeriodLearner(lambda: noted.append(1))
+    for step in steps:
+        assert learner.add_step(step) == 0
+    assert learner.period_ticks
+    assert len(noted) == gaps
+    learner.add_even_steps(1000)
+    assert len(noted) == gaps
+
+
+def test_a_step_to_another_counter_is_noted_by_whoever_restarts() -> None:
+    noted: list[int] = []
+    learner = PeriodLearner(lambda: noted.append(1))
+    learner.add_step(1 << 31)
+    learner.restart(was_added=True)
+    for _ in range(10):
+        learner.add_step(100)
+    assert learner.period_ticks == 100
+    assert not noted
+
+
+def test_steps_that_never_agree_are_kept_in_bounds() -> None:
+    learner = PeriodLearner()
+    random = Random(7)
+    for _ in range(1000):
+        learner.add_step(random.randrange(1, 1 << 30))
+    assert not learner.period_ticks
+    assert len(learner._unjudged) <= UNJUDGED_MOST
+
+
+def test_uneven_ticks_are_no_loss() -> None:
+    """400 Hz in milliseconds."""
+    learner = PeriodLearner()
+    assert [learner.add_step(2 + i % 2) for i in range(1000)] == [0] * 1000
+    assert learner.period_ticks == pytest.approx(2.5, abs=0.01)
+    assert learner.add_step(8) == 2
+
+
+def test_losses_do_not_blur_an_uneven_rate() -> None:
+    """A mean of only what is left is off by a thousandth, and that drags device time through its tick."""
+    random = Random(3)
+    learner = PeriodLearner()
+    ticks, i, found = 0, 0, []
+    for _ in range(20_000):
+        i += 1
+        while random.random() < 0.1:
+            i += 1
+        ticks, before = i * 5 // 2, ticks
+        learner.add_step(ticks - before)
+        found.append(learner.period_ticks)
+    assert all(abs(period - 2.5) < 5e-4 for period in found[5000:])
+
+
+def test_at_a_tick_per_sample_two_may_share_one() -> None:
+    """1 kHz in milliseconds, 100 ppm fast: a stamp comes twice after 10 s."""
+    learner = PeriodLearner()
+    for i in range(10_100):
+        learner.add_step(int(i * 0.9999) - int((i - 1) * 0.9999))
+    assert learner.period_ticks == pytest.approx(0.9999, abs=3e-5)
+
+
+def test_one_of_ten_lost_at_random_is_no_slower_rate() -> None:
+    random = Random(1)
+    learner = PeriodLearner()
+    for _ in range(20_000):
+        step = 1
+        while random.random() < 0.1:
+            step += 1
+        learner.add_step(step)
+        assert learner.period_ticks < 2
+    assert learner.period_ticks == 1
+
+
+def test_a_rate_hardly_off_whole_ticks_is_learned_from_its_first_odd_step() -> None:
+    learner = PeriodLearner()
+    for i in range(4001):
+        learner.add_step(11 if i % 2000 == 1999 else 10)
+    assert learner.period_ticks == pytest.approx(10.0005, abs=1e-5)
+    assert 0 < learner.changes < 5
+
+
+# --- corrections ------------------------------------------------------------------------------------------------------
+
+
+UNIX = 1 << 32
+SECONDS = 14
+SEED = 1
+SET_AT_S = 12
+SETTLED_S = 10.5
+SLEW = 550e-6
+JITTER_STEP_NS = 60_000
+"""Stamps of edges are late by an exponential law of 4 µs."""
+
+
+def run(
+    profile: ArrivalProfile,
+    rate_hz: int,
+    set_ms: float,
+    *,
+    edges: bool,
+    reference: UtcReference | None = None,
+    faults: LineFaults | None = None,
+) -> tuple[list[DatedSample], Callable[[], int]]:
+    """A device on UTC whose counter is set by so much; also how often that was taken for a restart."""
+    model = ArrivalModel(profile, rate_hz, SEED, Crystal(0.0), BAUD_OF_RATE[rate_hz])
+    clock, dated = sout_clock(model), []
+    clock.set_utc_reference(reference)
+    first_ns = 0
+    for read in simulate_reads(model.run(rate_hz * SECONDS), SEED, faults or LineFaults()):
+        if edges:
+            clock.aiding.on_sout_edges(read.edges)
+        for a, number in zip(read.arrivals, read.numbers, strict=True):
+            truth_ns = measured_ns(a)
+            first_ns = first_ns or truth_ns
+            age_ns = truth_ns - first_ns
+            moved_ns = set_ms * NS_PER_MS * (age_ns >= SET_AT_S * NS_PER_S)
+            ticks = (truth_ns + UTC_OFFSET_NS + NS_PER_MS // 3 + int(moved_ns)) // NS_PER_MS % UNIX
+            dated.append(
+                DatedSample(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), truth_ns, number, begun_ns(model, a))
+            )
+    return dated, lambda: clock.status().resets
+
+
+CORRECTIONS_MS = (-0.9, 0.9, -30.0, 30.0)
+USUAL = {
+    (-0.9, 100, False, None), (0.9, 100, False, REFERENCE), (-30.0, 100, False, REFERENCE), (30.0, 100, False, None),
+    (-0.9, 100, True, REFERENCE), (0.9, 100, True, None), (-30.0, 100, True, None), (30.0, 100, True, REFERENCE),
+    (-0.9, 1000, True, REFERENCE),
+}  # fmt: skip
+"""Combinations of correction, rate, edges and reference that `make test` runs."""
+CORRECTIONS = [
+    pytest.param(*case, marks=() if case in USUAL else pytest.mark.thorough)
+    for case in product(CORRECTIONS_MS, (100, 1000), (False, True), (None, REFERENCE))
+]
+
+
+@pytest.mark.parametrize(("set_ms", "rate_hz", "edges", "reference"), CORRECTIONS)
+def test_a_correction_is_no_step(set_ms: float, rate_hz: int, edges: bool, reference: UtcReference | None) -> None:
+    dated, resets = run(BARE_UART, rate_hz, set_ms, edges=edges, reference=reference)
+    settled = after(dated, SETTLED_S)
+    assert resets() == 0
+    assert all(abs(t.off_ns) <= 2 * t.sample.t_err_ns for t in settled)
+    assert rises(t.sample for t in dated)
+    if edges:
+        assert max(abs(b.off_ns - a.off_ns) for a, b in pairwise(settled)) < JITTER_STEP_NS
+        assert all(t.sample.edge_seq == t.number for t in settled)
+        assert max(t.sample.t_err_ns for t in settled) < JITTER_STEP_NS
+    else:
+        assert steepest(settled) < 2 * SLEW
+
+
+@pytest.mark.parametrize("edges", [False, True], ids=["bare", "edges"])
+@pytest.mark.parametrize("rate_hz", [100, pytest.param(1000, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("set_ms", CORRECTIONS_MS)
+def test_a_correction_behind_a_slow_adapter_with_losses_is_covered(set_ms: float, rate_hz: int, edges: bool) -> None:
+    faults = LineFaults(pulse_loss=0.02, frame_loss=0.02)
+    dated, resets = run(USB_16MS, rate_hz, set_ms, edges=edges, reference=REFERENCE, faults=faults)
+    settled = after(dated, SETTLED_S)
+    assert resets() == 0
+    assert share_honest(settled) > 0.99
+    assert all(abs(t.off_ns) <= 3 * t.sample.t_err_ns for t in settled)
+    assert rises(t.sample for t in dated)
+    wrong = sum(t.sample.edge_seq not in (None, t.number) for t in settled)
+    assert wrong <= 16 * rate_hz // 1000  # no more than the adapter holds in one read, until the next shows it
+
+
+def stamps(*steps: int) -> tuple[DeviceTime, list[int]]:
+    """Device time over steps in ms after 100 of 10 ms, relative to the last of those."""
+    time = DeviceTime(NS_PER_MS, UNIX)
+    time.begin(0)
+    ticks, found = 0, []
+    for i, step in enumerate([10] * 100 + list(steps)):
+        ticks += step
+        time.advance(ticks)
+        if i >= 99:
+            found.append(time.even_ns)
+    return time, [x - found[0] for x in found[1:]]
+
+
+def test_two_ticks_less_within_a_minute_are_no_step() -> None:
+    """The correction takes what room the tick leaves, and the next natural one finds none."""
+    time, found = stamps(9, *[10] * 70, 9, 10)
+    assert max(abs(b - a - 10 * NS_PER_MS) for a, b in pairwise([0, *found])) < 0.05 * NS_PER_MS
+    assert time.doubt_ns > NS_PER_MS // 3
+
+
+def test_samples_that_are_uneven_are_followed() -> None:
+    """Stamps that change all the time are the device's: its samples are where they say, within a tick."""
+    time, found = stamps(*[11, 11, 11, 9, 9, 9] * 10)
+    assert abs(found[-1] - 600 * NS_PER_MS) <= 2 * NS_PER_MS
+    assert not time.uneven
+
+
+def test_messages_that_pause_are_no_correction() -> None:
+    """The device rested for 13 ms once, and its message came when it should."""
+    clock = make_clock()
+    points = steady(0, 0, 1000) + steady(9_993 + 10, 10_003, 500)
+    samples = feed(clock, points)
+    assert (
+        max(
+            abs(s.t_ns - BEGIN_NS - int(ms * NS_PER_MS) - NS_PER_MS)
+            for s, (_, ms) in zip(samples[500:], points[500:], strict=True)
+        )
+        < NS_PER_MS
+    )
+
+
+@pytest.mark.parametrize("set_ms", [-2_000, 2_000])
+def test_a_counter_that_moves_far_began_anew(set_ms: int) -> None:
+    clock = make_clock()
+    feed(clock, steady(100_000, 0, 1000))
+    feed(clock, [(110_030, 10_000)])
+    assert clock.missed == 0, "samples that were never missing are not counted missing"
+    feed(clock, steady(110_010 + set_ms, 10_010, 500))
+    assert clock.status().resets == 1
+
+
+def test_until_an_arrival_confirms_it_the_correction_is_doubted() -> None:
+    """A period more may have passed; device time as stamped goes back with the counter."""
+    clock = make_clock()
+    (last,) = feed(clock, steady(100_000, 0, 1000))[-1:]
+    first, second = feed(clock, [(109_970, 10_000), (109_980, 10_010)])
+    assert last.t_dev_ns is not None
+    assert first.t_dev_ns == last.t_dev_ns - 20 * NS_PER_MS
+    assert first.t_err_ns > 10 * NS_PER_MS
+    assert second.t_err_ns < NS_PER_MS
+    assert abs(first.t_ns - last.t_ns - 10 * NS_PER_MS) < NS_PER_MS // 100
+
+
+@pytest.mark.parametrize(("seconds", "seen"), [(4, False), (6, True)])
+def test_a_young_line_takes_nothing_for_a_correction(seconds: int, seen: bool) -> None:
+    time, _ = stamps(7)
+    before_ns = time.even_ns - 7 * NS_PER_MS
+    begin = before_ns - seconds * NS_PER_S
+    fit = ArrivalFit(begin, begin)
+    for at_ns in range(begin, before_ns + 1, 10 * NS_PER_MS):
+        fit.add_arrival(at_ns, at_ns, 0, 0.0)
+    assert time.absorb_correction(fit, before_ns, before_ns + 10 * NS_PER_MS) is seen
+
+
+# --- counters of samples ----------------------------------------------------------------------------------------------
+
+
+PERIOD_NS = 10 * NS_PER_MS
+
+
+def numbering_clock() -> SampleClock:
+    return SampleClock("imu", tick_ns=0, tick_modulus=65536, byte_ns=0, hold_ns=0)
+
+
+def numbered(clock: SampleClock, index: int, t_ns: int, wait_ns: int = 2 * NS_PER_MS) -> Sample:
+    """Sample `index`, begun on the wire at `t_ns`, complete `wait_ns` later."""
+    return clock.sample(Measurement(40, 0, index % 65536), t_ns + wait_ns, 0, t_ns)
+
+
+@pytest.mark.parametrize(
+    ("indices", "missed"),
+    [
+        ((65530, 65531, 65532, 65535, 65536, 65540, 65541), [0, 0, 0, 2, 0, 3, 0]),  # through the wrap
+        ((1, 2, 3, 4, 1004), [0, 0, 0, 0, 999]),  # a long gap is believed when time agrees
+    ],
+)
+def test_missing_samples_are_counted(indices: tuple[int, ...], missed: list[int]) -> None:
+    made, found = numbering_clock(), []
+    for index in indices:
+        numbered(made, index, index * PERIOD_NS)
+        found.append(made.missed)
+    assert found == missed
+    assert made.status().resets == 0
+
+
+@pytest.mark.parametrize(("later", "resets"), [(0, 1), (500, 0)], ids=["began anew", "link restarted"])
+def test_a_counter_that_jumps_is_no_loss(later: int, resets: int) -> None:
+    """400 ms after sample 40019 it starts again from 0, or it runs on while the link is away."""
+    made = numbering_clock()
+    for index in range(40000, 40020):
+        numbered(made, index, index * PERIOD_NS)
+    if not resets:
+        made.restart()
+    for index in range(3):
+        numbered(made, later + index, (40060 + index) * PERIOD_NS)
+        assert made.missed == 0
+    assert made.status().resets == resets
+
+
+def test_time_is_that_of_the_first_frame_and_says_its_error() -> None:
+    """The error shown covers what arrivals are off, and gaps do not spoil the rate."""
+    made, random, offs = numbering_clock(), Random(1), []
+    for index in range(2000):
+        if index % 50 in (7, 8):
+            continue
+        delay_ns = int((0.05 + random.expovariate(20)) * NS_PER_MS)  # the least in the middle of what links allow for
+        made_of = numbered(made, index, index * PERIOD_NS + delay_ns, random.randrange(1 * NS_PER_MS, 6 * NS_PER_MS))
+        assert made_of.sync is Sync.ARRIVAL
+        assert made_of.t_dev_ns is None
+        if index > 100:
+            offs.append(abs(made_of.t_ns - index * PERIOD_NS) / made_of.t_err_ns)
+    assert sum(off < 1 for off in offs) / len(offs) > 0.68
+    assert sum(off < 3 for off in offs) / len(offs) > 0.98
+    assert made.status().t_err_ns < 0.5 * NS_PER_MS
+    assert abs(made.expected_rate_hz - 100) < 1
+
+
+# --- another rate -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("steps", "is_new"),
+    [
+        ([10] * 100 + [35] + [2, 3] * 6, True), ([2, 3] * 100 + [20] * 12, True), ([2] * 100 + [1] * 12, True),
+        ([5] * 100 + [4] * 12, True), ([10] * 100 + [35] + [2, 3] * 5, False), ([2, 3] * 300, False),
+        ([1] * 999 + [2] + [1] * 40, False),
+        # of a stream that loses every second message, twelve in a row may look like half the rate
+        ([1, 2, 1, 1, 2] * 20 + [2] * 12 + [1] * 12, False),
+    ],
+)  # fmt: skip
+def test_a_change_of_rate_is_noticed_within_twelve_samples(steps: list[int], is_new: bool) -> None:
+    learner = PeriodLearner()
+    for step in steps:
+        learner.add_step(step)
+    assert learner.is_new is is_new
+    if is_new or steps[-1] == 1:
+        assert learner.period_ticks == pytest.approx(sum(steps[-12:]) / 12, abs=0.1)

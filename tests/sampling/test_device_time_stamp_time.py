@@ -1,0 +1,129 @@
+"""Time from stamps of 13 bits: they turn, pulses set them to zero, messages wait, and other messages carry time."""
+
+from itertools import pairwise
+
+import pytest
+
+from imud.model.sample import Measurement, Sync
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sampling.clock import SampleClock
+from imud.sampling.device_time import FOREIGN_NS, STUCK_MESSAGES, StampTime
+
+MODULUS = 8192
+BEGIN_NS = 1_000 * NS_PER_S
+
+
+def ticks_of(stamps: list[int], step_ms: int = 10) -> list[int | None]:
+    """Ticks of stamps that come every `step_ms`."""
+    time, known = StampTime(MODULUS), None
+    found = []
+    for i, stamp in enumerate(stamps):
+        ticks = time.ticks(stamp, BEGIN_NS + i * step_ms * NS_PER_MS, known)
+        known = ticks if ticks is not None else known
+        found.append(ticks)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("stamps", "ticks"),
+    [
+        ([8170, 8180, 8190, 8, 18], [8180, 8190, 8200, 8210]),  # the turn of a real module at 100 Hz, as recorded
+        # a pulse per second does not look like seven lost seconds
+        ([950, 960, 970, 980, 990, 2, 12, 22, 32], [960, 970, 980, 990, 1002, 1012, 1022, 1032]),
+        ([0] * 50, [None] * 49),  # messages that follow a trigger each have no time
+        ([4711] * 50, [None] * 49),
+    ],
+)
+def test_ticks_of_stamps(stamps: list[int], ticks: list[int | None]) -> None:
+    assert ticks_of(stamps) == [None, *ticks]
+
+
+def test_pulses_that_stay_away_and_come_again() -> None:
+    """After pulses the stamp runs on to its turn, and a pulse sets it to zero again."""
+    truth = list(range(500, 30_000, 10))
+    stamps = [t % 1000 if t < 3000 or t >= 20_000 else (t - 2000) % MODULUS for t in truth]
+    assert ticks_of(stamps)[1:] == truth[1:]
+
+
+def test_a_loss_within_a_turn_is_what_the_stamp_says() -> None:
+    """4 s of messages are missing, those around it arrive together: only the stamp shows it."""
+    time = StampTime(MODULUS)
+    known = None
+    for i in range(100):
+        known = time.ticks(10 * i, BEGIN_NS + 10 * i * NS_PER_MS, known)
+    late_ns = BEGIN_NS + 5_000 * NS_PER_MS
+    assert time.ticks(1000, late_ns, known) == 1000
+    assert time.ticks(5000, late_ns, 1000) == 5000
+
+
+def test_turns_that_were_missed_are_added_when_messages_come_on_time() -> None:
+    """20 s are missing, the stamp shows 20000 - 2 · 8192 = 3616 ms of them."""
+    time = StampTime(MODULUS)
+    known: int | None = None
+    truth = [*range(0, 3000, 10), *range(23_000, 25_000, 10)]
+    found = []
+    for ms in truth:
+        ticks = time.ticks(ms % MODULUS, BEGIN_NS + ms * NS_PER_MS, known)
+        known = ticks if ticks is not None else known
+        found.append(ticks)
+    assert found[1:300] == truth[1:300]
+    assert found[300] == 23_000 - 2 * MODULUS
+    assert found[-100:] == truth[-100:]
+    assert sum(b - a > 10 for a, b in pairwise(found[1:]) if a is not None and b is not None) == 2
+
+
+def test_triggers_after_timed_output_end_the_time() -> None:
+    found = ticks_of([*range(0, 500, 10), *[0] * 20])
+    assert found[49] == 490
+    assert found[-(20 - STUCK_MESSAGES) :] == [None] * (20 - STUCK_MESSAGES)
+
+
+def test_messages_that_carry_time_are_preferred() -> None:
+    time = StampTime(MODULUS)
+    for i in range(200):
+        ms = 10 * i
+        assert time.ticks(ms % MODULUS, BEGIN_NS + ms * NS_PER_MS, 77_000 + ms) is None
+    later_ns = BEGIN_NS + 1990 * NS_PER_MS + FOREIGN_NS
+    assert time.ticks(4000, later_ns, 78_990) is None
+    assert time.ticks(4010, later_ns + 10 * NS_PER_MS, 78_990) == 78_990 + 1010
+
+
+def hi92(stamp: int) -> Measurement:
+    """An HI92 frame with nothing in it but its stamp."""
+    return Measurement(54, 0, None, pps_age_ms=stamp)
+
+
+def make_clock(unknown: list[int]) -> SampleClock:
+    """A clock of a module that sends HI91 or HI92 at 115200 baud."""
+    return SampleClock(
+        "bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=86_806, hold_ns=0, stamp_modulus=MODULUS,
+        on_unknown_gap=lambda: unknown.append(1),
+    )  # fmt: skip
+
+
+def test_samples_are_dated_by_the_fit_of_their_stamps() -> None:
+    """Every third arrival is 4 ms late, which the fit does not follow."""
+    unknown: list[int] = []
+    clock, truth_ns, errors = make_clock(unknown), BEGIN_NS, []
+    for i in range(3000):
+        truth_ns += 10 * NS_PER_MS
+        late_ns = 54 * 86_806 + (4 * NS_PER_MS if i % 3 == 2 else 0)
+        sample = clock.sample(hi92(10 * i % MODULUS), truth_ns + late_ns, 0)
+        errors.append(abs(sample.t_ns - truth_ns))
+        assert clock.missed == 0
+    assert sample.sync is Sync.REGRESSION
+    assert max(errors[500:]) < NS_PER_MS
+    assert not unknown
+    assert clock.status().resets == 0
+
+
+def test_a_module_changed_from_hi91_to_hi92_and_back_goes_on() -> None:
+    unknown: list[int] = []
+    clock, samples = make_clock(unknown), []
+    for i in range(3000):
+        m = hi92(10 * i % MODULUS) if 1000 <= i < 2000 else Measurement(82, 0, 500_000 + 10 * i)
+        samples.append(clock.sample(m, BEGIN_NS + 10 * i * NS_PER_MS + 8_000_000, 0))
+        assert clock.missed == 0
+    assert all(a.t_ns < b.t_ns for a, b in pairwise(samples))
+    assert [samples[i].sync for i in (900, 1900, 2900)] == [Sync.REGRESSION] * 3
+    assert not unknown

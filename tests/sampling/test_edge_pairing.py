@@ -1,0 +1,112 @@
+"""Edges paired with samples by device time, whichever side loses; pulses decoded from edges."""
+
+import pytest
+
+from imud.contracts.lines import Edge
+from imud.model.units import NS_PER_MS
+from imud.sampling.edge_pairing import MISSES_MOST, QUEUE_MOST, WRONG_MOST, EdgePairing, PulseDecoder, rising_edges
+
+# --- pulses -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("reads", "pulses"),
+    [
+        ([[Edge(1000, True, 1), Edge(81_000, False, 2)]], [(1000, 1)]),  # a pulse is its rising edge
+        # the halves of a pulse may come apart
+        ([[Edge(1000, True, 1)], [Edge(81_000, False, 2), Edge(500_000, True, 3)]], [(1000, 1), (500_000, 3)]),
+        # a falling edge alone is counted back
+        ([[Edge(1000, True, 1), Edge(581_000, False, 4)]], [(1000, 1), (501_000, 3)]),
+    ],
+)
+def test_pulses(reads: list[list[Edge]], pulses: list[tuple[int, int]]) -> None:
+    decoder = PulseDecoder(80_000)
+    assert [pulse for edges in reads for pulse in decoder.decode(edges)] == pulses
+
+
+def test_only_rising_edges() -> None:
+    assert rising_edges([Edge(1, True, 1), Edge(2, False, 2), Edge(3, True, 3)]) == [(1, 1), (3, 3)]
+
+
+# --- pairing ----------------------------------------------------------------------------------------------------------
+
+
+PERIOD_NS = 10 * NS_PER_MS
+LEAD_NS = 80_000
+ERROR_NS = 100_000.0
+
+
+def pair(pairing: EdgePairing, i: int, fit_off_ns: int = LEAD_NS) -> bool:
+    """Sample `i`, whose event was at i periods; the fit is where its message began."""
+    at = i * PERIOD_NS
+    return pairing.pair(at, at + NS_PER_MS, at + fit_off_ns, ERROR_NS, float(PERIOD_NS), 1.0)
+
+
+def running(count: int = 100) -> EdgePairing:
+    pairing = EdgePairing(LEAD_NS)
+    for i in range(count):
+        pairing.add_events([(i * PERIOD_NS, i)])
+        pair(pairing, i)
+    assert pairing.running
+    return pairing
+
+
+def test_events_that_come_together_are_distinguished() -> None:
+    pairing = running()
+    pairing.add_events([(i * PERIOD_NS, i) for i in range(100, 116)])
+    assert [(pair(pairing, i), pairing.number) for i in range(100, 116)] == [(True, i) for i in range(100, 116)]
+
+
+def test_either_side_may_lose() -> None:
+    pairing = running()
+    pairing.add_events([(i * PERIOD_NS, i) for i in (100, 102, 103)])
+    assert [(pair(pairing, i), pairing.number) for i in (100, 101, 103)] == [(True, 100), (False, 100), (True, 103)]
+    assert (pairing.events_unpaired, pairing.samples_unpaired) == (1, 1)
+
+
+def test_the_nearest_is_taken_and_a_distant_one_is_not() -> None:
+    pairing = running()
+    at = 100 * PERIOD_NS
+    pairing.add_events([(at - 3 * NS_PER_MS, 1), (at - 20_000, 2), (at + 5_000, 3), (at + 3 * NS_PER_MS, 4)])
+    assert pair(pairing, 100)
+    assert (pairing.stamp_ns, pairing.number) == (at + 5_000, 3)
+    assert not pair(pairing, 101)
+
+
+def test_what_is_near_but_not_near_enough_is_counted_on_both_sides() -> None:
+    pairing = running()
+    pairing.add_events([(100 * PERIOD_NS + NS_PER_MS, 100)])
+    assert not pair(pairing, 100)
+    assert (pairing.events_unpaired, pairing.samples_unpaired) == (1, 1)
+
+
+@pytest.mark.parametrize(("apart_ns", "error_ns"), [(NS_PER_MS, ERROR_NS), (0, 0.5 * PERIOD_NS)])
+def test_it_begins_only_when_most_agree_and_the_fit_is_sure(apart_ns: int, error_ns: float) -> None:
+    pairing = EdgePairing(LEAD_NS)
+    for i in range(30):
+        at = i * PERIOD_NS
+        pairing.add_events([(at + (i % 4) * apart_ns, i)])
+        assert not pairing.pair(at, at + NS_PER_MS, at + LEAD_NS, error_ns, float(PERIOD_NS), 1.0)
+    assert not pairing.running
+
+
+def test_a_line_without_events_is_dropped() -> None:
+    pairing = running()
+    assert not any(pair(pairing, 100 + i) for i in range(MISSES_MOST))
+    assert not pairing.running
+    assert pairing.learned
+
+
+def test_a_line_off_by_a_period_is_found_by_the_fit() -> None:
+    pairing = running()
+    for i in range(100, 100 + WRONG_MOST + 200):
+        pairing.add_events([(i * PERIOD_NS, i)])
+        pair(pairing, i, PERIOD_NS + LEAD_NS)
+    assert pairing.number < 300 + WRONG_MOST
+    assert not pairing.learned or abs(pairing.delay_ns) < PERIOD_NS / 2
+
+
+def test_events_without_samples_are_bounded() -> None:
+    pairing = EdgePairing(LEAD_NS)
+    pairing.add_events([(i, i) for i in range(QUEUE_MOST + 10)])
+    assert pairing.events_unpaired == 10

@@ -1,0 +1,283 @@
+"""Edges through the whole clock: every pair right, no step when edges come and go, errors honest; slewing."""
+
+from itertools import pairwise
+from math import sqrt
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imud.contracts.lines import Edge, SoutTiming, TimeBits, TriggerStamp, UtcReference
+from imud.model.sample import Measurement, Sync
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sampling.clock import SampleClock
+from imud.sampling.steering import SETTLED_AFTER_NS, SLEW, SLEW_SETTLING, Slew
+from imud.sim.ports.arrival import (
+    BARE_UART,
+    LOADED,
+    USB_1MS,
+    USB_16MS,
+    USB_16MS_PACKET,
+    ArrivalModel,
+    ArrivalProfile,
+    Crystal,
+)
+from tests.bench.clock import BAUD_OF_RATE
+from tests.bench.line_model import LineFaults, measured_ns, restarted, simulate_reads
+from tests.bench.line_runs import (
+    REFERENCE,
+    UTC_OFFSET_NS,
+    DatedSample,
+    after,
+    measurement,
+    run_sout,
+    share_honest,
+    sout_clock,
+    steepest,
+    syncs,
+    with_sout,
+)  # fmt: skip
+from tests.support.clock_feed import BEGIN_NS, make_clock, message, rises
+
+# --- slewing ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("age_ns", "rate"), [(0, SLEW_SETTLING), (SETTLED_AFTER_NS + 1, SLEW)])
+def test_the_rate_of_a_slew_is_bounded_and_it_ends_at_nothing(sign: int, age_ns: int, rate: float) -> None:
+    slew = Slew()
+    slew.set(sign * 10.0 * NS_PER_S)
+    before = slew.left_ns
+    assert before - slew.advance(10 * NS_PER_MS, age_ns) == pytest.approx(sign * rate * 10 * NS_PER_MS)
+    slew.set(sign * 3.0)
+    assert slew.advance(NS_PER_S, age_ns) == slew.left_ns == 0.0
+
+
+# --- edges ------------------------------------------------------------------------------------------------------------
+
+
+STEEPEST = 550e-6
+UNIX = 1 << 32
+JITTER_STEP_NS = 60_000
+HALF_LOST = LineFaults(pulse_loss=0.1, edge_loss=0.02, frame_loss=0.1, extra=0.02, loaded=True)
+
+
+def model(profile: ArrivalProfile, rate_hz: int = 100, seed: int = 1, crystal: Crystal | None = None) -> ArrivalModel:
+    return ArrivalModel(profile, rate_hz, seed, crystal or Crystal(50.0), BAUD_OF_RATE[rate_hz])
+
+
+@pytest.mark.parametrize(
+    ("profile", "rate_hz", "seconds", "rising_only"),
+    [(BARE_UART, 1000, 2, False), (USB_16MS, 100, 10, True), (LOADED, 100, 10, False), (LOADED, 1000, 3, True)],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_every_pair_is_right_under_loss_on_either_side(
+    profile: ArrivalProfile, rate_hz: int, seconds: int, rising_only: bool
+) -> None:
+    """The kernel reports and numbers all edges, or the rising edges only."""
+    m = model(profile, rate_hz, 3)
+    reads = simulate_reads(m.run(rate_hz * seconds), 3, HALF_LOST)
+    if rising_only:
+        reads = [
+            read._replace(
+                edges=[Edge(e.t_ns, True, (e.number + 1) // 2) for e in read.edges if e.rising],
+                numbers=[(number + 1) // 2 for number in read.numbers],
+            )
+            for read in reads
+        ]
+    dated = with_sout(sout_clock(m), reads)
+    paired = [t for t in dated if t.sample.edge_seq is not None]
+    assert len(paired) > 0.6 * len(dated)
+    assert all(t.sample.edge_seq == t.number for t in paired)
+    assert rises(t.sample for t in dated)
+    assert share_honest(dated) >= 0.95
+
+
+@pytest.mark.parametrize("crystal", [Crystal(-50_000.0), Crystal(20.0, 0.1)], ids=["-5 %", "drifting"])
+def test_with_edges_only_their_own_jitter_is_left(crystal: Crystal) -> None:
+    """Simulated stamps are late by 3 µs and an exponential law of 4 µs."""
+    dated = after(run_sout(model(USB_16MS, 100, 1, crystal), 30, LineFaults(pulse_loss=0.01, extra=0.01)), 5)
+    mean = sum(t.off_ns for t in dated) / len(dated)
+    assert sqrt(sum((t.off_ns - mean) ** 2 for t in dated) / len(dated)) < 5_000
+    assert syncs(dated) == {Sync.EDGE}
+
+
+def test_the_error_is_honest_without_a_bias() -> None:
+    dated = run_sout(model(BARE_UART), 30, HALF_LOST, SoutTiming(bias_us=0.0))
+    assert share_honest(dated) >= 0.95
+    assert sum(t.sample.t_err_ns for t in after(dated, 10)) / len(after(dated, 10)) < 20_000
+
+
+@pytest.mark.parametrize(
+    "profile", [USB_16MS_PACKET, pytest.param(BARE_UART, marks=pytest.mark.thorough)], ids=lambda p: p.name
+)
+def test_edges_that_stop_and_come_back_make_no_step(profile: ArrivalProfile) -> None:
+    m = model(profile, 100)
+    reads = simulate_reads(m.run(3600), 1, LineFaults())
+    silent = range(len(reads) // 3, 2 * len(reads) // 3)
+    dated = with_sout(sout_clock(m), reads, silent=silent)
+    begin = sum(len(read.arrivals) for read in reads[: silent.start])
+    end = sum(len(read.arrivals) for read in reads[: silent.stop])
+    assert {t.sample.sync for t in dated[begin - 300 : begin]} == {Sync.EDGE}
+    last = max(i for i, t in enumerate(dated[:end]) if t.sample.edge_seq is not None)  # of a pulse seen before
+    assert last <= begin + 2
+    assert syncs(dated[last + 3 : end]) == {Sync.REGRESSION}
+    assert syncs(dated[end + 50 :]) == {Sync.EDGE}
+    # the jitter of the stamps themselves, beyond which only slewing is allowed
+    assert max(abs(b.off_ns - a.off_ns) for a, b in pairwise(dated[1010:])) < JITTER_STEP_NS
+    assert steepest(dated[begin + 3 : end]) < 2 * STEEPEST
+    assert share_honest(dated) >= 0.95
+
+
+def test_device_time_that_creeps_does_not_throw_the_line_off() -> None:
+    """A device on UTC whose own crystal is 5 % slow: its milliseconds say little of which pulse is a sample's."""
+    m = model(LOADED, 1000, 3078, Crystal(-50_000.0))
+    clock, dated = sout_clock(m), []
+    clock.set_utc_reference(REFERENCE)
+    for read in simulate_reads(m.run(12_000), 3078, LineFaults(frame_loss=0.1, pulse_loss=0.1, loaded=True)):
+        clock.aiding.on_sout_edges(read.edges)
+        for a in read.arrivals:
+            truth_ns = measured_ns(a)
+            ticks = (truth_ns + UTC_OFFSET_NS) // NS_PER_MS % UNIX
+            dated.append(DatedSample(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), truth_ns, 0))
+    assert max(abs(t.off_ns) for t in after(dated, 1)) < 4 * NS_PER_MS
+    assert rises(t.sample for t in dated)
+
+
+def test_the_fit_keeps_the_delay_learned_from_edges() -> None:
+    """Behind this adapter the fit alone is 1.5 ms off."""
+    m = model(USB_16MS_PACKET, 100)
+    reads = simulate_reads(m.run(3000), 1, LineFaults())
+    dated = with_sout(sout_clock(m), reads, silent=range(len(reads) // 2, len(reads)))
+    assert abs(dated[-1].off_ns) < 300_000
+    assert dated[-1].sample.sync is Sync.REGRESSION
+
+
+def test_a_delay_learned_by_a_young_fit_adds_to_the_error() -> None:
+    """Pulses for 6 s only: the fit moves by a millisecond afterwards, and the learned delay does not follow."""
+    m = model(USB_16MS, 100, 1048, Crystal(-50.0))
+    reads = simulate_reads(m.run(4500), 1048, LineFaults())
+    begin = next(i for i, read in enumerate(reads) if read.arrivals[0].t_ns > m.begin_ns + 6 * NS_PER_S)
+    dated = with_sout(sout_clock(m), reads, silent=range(begin, len(reads)))
+    assert share_honest(dated) >= 0.95
+
+
+def test_a_restarted_device_is_paired_again() -> None:
+    m = model(USB_1MS, 100)
+    dated = with_sout(
+        clock := sout_clock(m), simulate_reads(restarted(m, 2500, 2 * NS_PER_S), 1, LineFaults(edge_loss=0.01))
+    )
+    assert clock.status().resets == 1
+    assert syncs(dated[-500:]) == {Sync.EDGE}
+    assert all(t.sample.edge_seq in (None, t.number) for t in dated)
+    assert rises(t.sample for t in dated)
+    assert share_honest(dated) >= 0.95
+
+
+def test_a_lost_rising_edge_is_counted_back_and_the_offset_of_the_edge_is_configured() -> None:
+    dated = after(run_sout(model(BARE_UART), 20, LineFaults(edge_loss=0.2)), 5)
+    unpaired = sum(t.sample.edge_seq is None for t in dated)
+    assert 0 < unpaired < 0.07 * len(dated)  # both edges lost: 4 %
+    assert all(t.sample.edge_seq in (None, t.number) for t in dated)
+    here = run_sout(model(BARE_UART), 10, LineFaults())
+    there = run_sout(model(BARE_UART), 10, LineFaults(), SoutTiming(offset_us=-200.0))
+    assert here[-1].sample.t_ns - there[-1].sample.t_ns == 200_000
+
+
+def test_what_was_lost_is_counted() -> None:
+    m = model(BARE_UART)
+    reads = simulate_reads(m.run(2000), 1, LineFaults(pulse_loss=0.1, frame_loss=0.05))
+    dated = with_sout(clock := sout_clock(m), reads)
+    status = clock.status()
+    seen = sum(edge.rising for read in reads for edge in read.edges)
+    assert status.edges == seen
+    paired = sum(t.sample.edge_seq is not None for t in dated)
+    assert 0.03 * seen < status.edges_unpaired < 0.07 * seen
+    assert seen - paired - status.edges_unpaired < 100  # those of the beginning
+    assert 0 <= len(dated) - paired - status.samples_unpaired < 100
+
+
+@pytest.mark.parametrize(("every", "bit"), [(5, 0x1000), (1, 0)], ids=["bit", "never set"])
+def test_the_status_bit_says_which_frames_have_a_pulse_unless_it_is_never_set(every: int, bit: int) -> None:
+    """100 Hz, a pulse and bit 12 for each n-th frame only."""
+    bits = TimeBits(sync_out=0x1000)
+    clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=10_850, hold_ns=0, bits=bits)
+    numbers = []
+    for i in range(2000):
+        at, pulse = BEGIN_NS + 10 * i * NS_PER_MS, i % every == 0
+        if pulse:
+            clock.aiding.on_sout_edges([Edge(at, True, 2 * i + 1), Edge(at + 80_000, False, 2 * i + 2)])
+        m = Measurement(82, 0, 10 * i, status=bit if pulse else 0)
+        numbers.append(clock.sample(m, at + 2 * NS_PER_MS, 0).edge_seq)
+    assert numbers[1000::every] == list(range(2001, 4001, 2 * every))
+    assert clock.status().samples_unpaired == 0
+
+
+STEP = st.tuples(
+    st.one_of(st.none(), st.integers(0, 999), st.integers(0, 20)),
+    st.one_of(st.integers(0, 3), st.integers(0, 50 * NS_PER_MS), st.integers(0, 100 * NS_PER_S)),
+    st.integers(0, 4096),
+    st.sampled_from(["", "edges", "pulses", "triggers", "divided", "reference", "nothing known", "regular"]),
+    st.integers(-20 * NS_PER_MS, 20 * NS_PER_MS),
+)
+
+
+@given(
+    st.lists(STEP, max_size=80), st.sampled_from([0, 1_085, 86_805]), st.sampled_from([0, NS_PER_MS, 16 * NS_PER_MS])
+)
+def test_any_input_gives_rising_stamps_before_arrival(
+    steps: list[tuple[int | None, int, int, str, int]], byte_ns: int, hold_ns: int
+) -> None:
+    clock = make_clock(tick_modulus=1000, byte_ns=byte_ns, hold_ns=hold_ns)
+    t_rx_ns, samples, tick = BEGIN_NS, [], 0
+    for number, (ticks, wait_ns, trailing, what, shift_ns) in enumerate(steps):
+        give(clock, what, t_rx_ns + shift_ns, number)
+        for _ in range(30 if what == "regular" else 1):
+            t_rx_ns += NS_PER_MS if what == "regular" else wait_ns
+            tick = tick + 1 if what == "regular" or ticks is None else ticks
+            if what == "regular":
+                give(clock, "edges", t_rx_ns + shift_ns // 16, 2 * tick)
+            m = Measurement(82, trailing, tick % 1000 if ticks is not None else None, pps_age_ms=abs(shift_ns) % 9000)
+            samples.append(clock.sample(m, t_rx_ns, 0))
+            assert clock.missed >= 0
+            assert samples[-1].t_rx_ns - t_rx_ns <= len(samples)
+    assert rises(samples)
+    assert all(0 < s.t_err_ns < 1 << 32 for s in samples)
+    assert [s.seq for s in samples] == list(range(1, len(samples) + 1))
+    clock.status()
+
+
+def give(clock: SampleClock, what: str, t_ns: int, number: int) -> None:
+    """One thing that is no message."""
+    edges = [Edge(t_ns, True, 2 * number + 1), Edge(t_ns + 80_000, False, 2 * number + 2)]
+    if what == "edges":
+        clock.aiding.on_sout_edges(edges)
+    elif what == "pulses":
+        clock.aiding.on_pps_edges(edges)
+    elif what == "divided":
+        clock.aiding.on_divided_edges(edges)
+    elif what == "triggers":
+        clock.aiding.on_trigger_stamps([TriggerStamp(t_ns, 1000, number)])
+    elif what == "reference":
+        clock.set_utc_reference(UtcReference(-t_ns % (1000 * NS_PER_MS), 1000))
+    elif what == "nothing known":
+        clock.set_utc_reference(None)
+
+
+def test_divided_pulses_find_their_samples() -> None:
+    clock = make_clock()
+    expected: list[tuple[int, int | None]] = []
+    for i in range(1000):
+        at = BEGIN_NS + 10 * i * NS_PER_MS
+        if i % 4 == 0:
+            clock.aiding.on_divided_edges([Edge(at + 3000, True, i + 1), Edge(at + 83_000, False, i + 2)])
+        if i % 100 == 48:
+            expected.append((i + 1, None))  # its sample is lost
+            continue
+        s = clock.sample(message(10 * i), at + 2 * NS_PER_MS, 0)
+        if i % 4 == 0:
+            expected.append((i + 1, s.seq))
+    marks = clock.take_marks()
+    assert [(m.number, m.seq) for m in marks][10:] == expected[10:]
+    assert len(marks) == 250
+    assert clock.take_marks() == []

@@ -1,0 +1,194 @@
+"""The relay between a daemon and a viewer: what is offered, what is sent, and when nothing is asked for."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from queue import Queue
+from threading import Thread
+from typing import Any, NamedTuple
+
+import msgspec
+import pytest
+
+from imud.bridges.channel import Dialect, MessageChannel
+from imud.bridges.json import JsonDialect
+from imud.bridges.ros2 import Ros2Dialect
+from imud.contracts.publisher import Batch
+from imud.contracts.status import Deviations
+from imud.model.event import Event, EventKind
+from imud.publishers.socket.server import SocketServer
+from imud.web.foxglove import Relay
+from tests.support import socket_rig
+from tests.support.daemon_process import LIMIT_S
+from tests.support.socket_rig import NOW_NS, batch, daemon
+
+pytestmark = pytest.mark.live
+
+OFFSET_NS = 1_000_000_000_000
+
+
+class Said(NamedTuple):
+    topic: str
+    message: dict[str, Any]
+    utc_ns: int
+
+
+class FakeViewer:
+    def __init__(self) -> None:
+        self.is_looked_at = True
+        self.said: Queue[Said] = Queue()
+
+    def open(self, channel: MessageChannel[Any]) -> None:
+        self.said.put(Said(f"open {channel.topic}", {}, 0))
+
+    def close_topic(self, topic: str) -> None:
+        self.said.put(Said(f"close {topic}", {}, 0))
+
+    def send(self, channel: MessageChannel[Any], item: object, utc_ns: int) -> None:
+        data = channel.encode(item)
+        if data is not None:
+            message = msgspec.json.decode(data) if channel.message_encoding == "json" else {"data": data}
+            self.said.put(Said(channel.topic, message, utc_ns))
+
+    def problem(self, text: str) -> None:
+        self.said.put(Said("problem", {"text": text}, 0))
+
+    def wait_for(self, topic: str, is_it: Callable[[Said], object] = lambda _said: True) -> Said:
+        while not ((said := self.said.get(timeout=LIMIT_S)).topic == topic and is_it(said)):
+            pass
+        return said
+
+
+@contextmanager
+def relaying(path: str | Path, viewer: FakeViewer, dialect: Dialect | None = None, **options: Any) -> Iterator[Relay]:
+    relay = Relay(str(path), viewer, dialect or JsonDialect(), utc_offset_ns=lambda _now_ns: OFFSET_NS, **options)
+    thread = Thread(target=relay.run)
+    thread.start()
+    try:
+        yield relay
+    finally:
+        relay.stop()
+        thread.join(LIMIT_S)
+        assert not thread.is_alive()
+
+
+def test_samples_events_and_status_come(tmp_path: Path) -> None:
+    viewer = FakeViewer()
+    noise = {"imu0": Deviations(gyro_rad_s=0.5)}
+    with daemon(tmp_path) as served, relaying(served.path, viewer, noise=noise):
+        status = viewer.wait_for("/imu0/status")
+        assert (status.message["state"], status.message["rate_hz"]) == ("running", 1000.0)
+        viewer.wait_for("/imu1/status")
+        served.do(lambda server: server.publish(batch("imu0", 7)))
+        imu = viewer.wait_for("/imu0/imu/data")
+        # sensor: x right, y forward; body: x forward, y left
+        assert imu.message["linear_acceleration"] == {"x": -0.5, "y": -0.125, "z": 9.75}
+        assert imu.message["angular_velocity"] == {"x": 0.5, "y": -0.25, "z": -0.75}
+        assert imu.message["angular_velocity_covariance"] == [0.25, 0, 0, 0, 0.25, 0, 0, 0, 0.25]
+        assert imu.message["linear_acceleration_covariance"] == [1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-4]  # of the status
+        assert imu.utc_ns == 1_790_000_000_007_000_000
+        stamp = viewer.wait_for("/imu0/stamp")
+        assert (stamp.message["seq"], stamp.message["t_err_ns"]) == (7, 12_000)
+        served.do(lambda server: server.event(Event(5, "imu1", EventKind.DOWN, "is gone")))
+        event = viewer.wait_for("/events")
+        assert (event.message["name"], event.message["message"]) == ("imu1", "down: is gone")
+        assert (event.message["level"], event.utc_ns) == (3, 5 + OFFSET_NS)
+
+
+def test_while_nobody_looks_no_samples_are_asked_for_and_events_still_come(tmp_path: Path) -> None:
+    viewer = FakeViewer()
+    viewer.is_looked_at = False
+    with daemon(tmp_path) as served, relaying(served.path, viewer):
+        viewer.wait_for("/imu1/status")
+        served.do(lambda server: server.publish(batch("imu0", 1)))
+        served.do(lambda server: server.event(Event(5, "imu1", EventKind.UP, "is there")))
+        missing = {"/events", "open /imu0/imu/data"}  # opened with the newest sample, before the event or after it
+        while missing:
+            missing.discard(viewer.said.get(timeout=LIMIT_S).topic)
+        assert not served.do(lambda server: any(client.encoding for client in server.hub.clients()))
+        viewer.is_looked_at = True
+        while not served.do(lambda server: any(client.encoding for client in server.hub.clients())):
+            viewer.said.get(timeout=LIMIT_S)  # until the relay watches, with one of the next statuses
+        served.do(lambda server: server.publish(batch("imu0", 2)))
+        viewer.wait_for("/imu0/stamp", lambda said: said.message["seq"] == 2)
+
+
+def test_only_the_wanted_device_is_shown(tmp_path: Path) -> None:
+    viewer = FakeViewer()
+    with daemon(tmp_path) as served, relaying(served.path, viewer, devices=["imu1"]):
+        first = viewer.said.get(timeout=LIMIT_S)
+        while first.topic != "/imu1/status":
+            assert not first.topic.startswith("/imu0")
+            first = viewer.said.get(timeout=LIMIT_S)
+        served.do(lambda server: server.publish(batch("imu0", 1)))
+        served.do(lambda server: server.publish(batch("imu1", 2)))
+        while (said := viewer.said.get(timeout=LIMIT_S)).topic != "/imu1/stamp":
+            assert not said.topic.startswith("/imu0")
+
+
+def test_it_goes_on_after_the_daemon_was_restarted(tmp_path: Path) -> None:
+    viewer = FakeViewer()
+    with daemon(tmp_path) as served:
+        path = served.path
+        relay = relaying(path, viewer)
+        relay.__enter__()
+        viewer.wait_for("/imu0/status")
+    try:
+        assert str(path) in viewer.wait_for("problem", lambda said: said.message["text"]).message["text"]
+        with daemon(tmp_path) as served:
+            viewer.wait_for("problem", lambda said: not said.message["text"])
+            viewer.wait_for("/imu1/status")
+            served.do(lambda server: server.publish(batch("imu0", 9)))
+            viewer.wait_for("/imu0/stamp", lambda said: said.message["seq"] == 9)
+    finally:
+        relay.__exit__(None, None, None)
+
+
+def levels(said: Said) -> dict[str, int]:
+    return {one["name"]: one["level"] for one in said.message["status"]}
+
+
+def test_diagnostics_come_and_are_stale_without_the_daemon(tmp_path: Path) -> None:
+    viewer = FakeViewer()
+    with relaying(tmp_path / "imud.sock", viewer):
+        with daemon(tmp_path):
+            said = viewer.wait_for("/diagnostics")
+            assert levels(said) == {"imud: imu0": 0, "imud: imu1": 0}
+            assert said.utc_ns == NOW_NS + OFFSET_NS
+        stale = viewer.wait_for("/diagnostics", lambda said: 0 not in levels(said).values())
+        assert levels(stale) == {"imud: imu0": 3, "imud: imu1": 3}
+        assert str(tmp_path) in stale.message["status"][0]["message"]
+        with daemon(tmp_path):
+            viewer.wait_for("/diagnostics", lambda said: set(levels(said).values()) == {0})
+
+
+def test_the_topic_of_transforms_stays_while_another_device_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    viewer = FakeViewer()
+
+    def until(topic: str) -> list[str]:
+        topics: list[str] = []
+        while topic not in topics:
+            topics.append(viewer.said.get(timeout=LIMIT_S).topic)
+        return topics
+
+    def publish(server: SocketServer, name: str) -> None:
+        (plain,) = batch(name).samples
+        turned = msgspec.structs.replace(plain, quat_wxyz=(1.0, 0.0, 0.0, 0.0))
+        server.publish(Batch(name, socket_rig.DEVICES[name], [turned]))
+
+    with relaying(tmp_path / "imud.sock", viewer, Ros2Dialect()):
+        with daemon(tmp_path) as served:
+            until("/imu1/status")
+            for name in socket_rig.DEVICES:
+                served.do(lambda server, name=name: publish(server, name))  # type: ignore[misc]
+                until("open /tf" if name == "imu0" else "open /imu1/imu/data")
+        monkeypatch.setattr(socket_rig, "DEVICES", {"imu1": 1})
+        with daemon(tmp_path):
+            topics = until("/imu1/status")
+            assert "close /imu0/imu/data" in topics
+            assert "close /tf" not in topics
+        monkeypatch.setattr(socket_rig, "DEVICES", {"imu2": 2})
+        with daemon(tmp_path):
+            assert "close /tf" in until("/imu2/status")

@@ -1,0 +1,334 @@
+"""The HTTP server: who may, what is answered, the WebSocket."""
+
+import asyncio
+import base64
+import hashlib
+import json
+import re
+import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from aiohttp import ClientWebSocketResponse, WSMsgType, WSServerHandshakeError
+from aiohttp.test_utils import TestClient, TestServer, get_port_socket
+
+from imud.model.event import Event, EventKind
+from imud.publishers.socket.server import SocketServer
+from imud.web import hub as mailbox
+from imud.web import server as web_app
+from imud.web.guard import COOKIE, WebGuard
+from imud.web.server import STATIC, WebServer
+from tests.support.socket_rig import batch, serving, until
+
+TOKEN = "correct-horse-battery-staple"
+BEARER = {"Authorization": f"Bearer {TOKEN}"}
+
+
+class Site:
+    def __init__(self, web: WebServer, client: Any, daemon: SocketServer) -> None:
+        self.web = web
+        self.client = client
+        self.daemon = daemon
+        self.origin = {"Origin": str(client.make_url("")).rstrip("/")}
+
+    async def post(self, path: str, body: object, **headers: str) -> tuple[int, Any]:
+        data = body if isinstance(body, bytes) else json.dumps(body).encode()
+        async with self.client.post(path, data=data, headers={**self.origin, **headers}) as response:
+            return response.status, json.loads(await response.read())
+
+    async def get(self, path: str, **headers: str) -> tuple[int, Any]:
+        async with self.client.get(path, headers=headers) as response:
+            return response.status, json.loads(await response.read())
+
+    async def stream(self, **look: Any) -> ClientWebSocketResponse:
+        socket: ClientWebSocketResponse = await self.client.ws_connect("/api/stream", headers=self.origin)
+        await socket.send_json(look)
+        return socket
+
+
+@asynccontextmanager
+async def running(
+    folder: Path, *, token: str = TOKEN, reading_needs_token: bool = False, small_buffers: bool = False
+) -> AsyncIterator[Site]:
+    async with serving(folder) as daemon:
+        web = WebServer(daemon.hub.path, WebGuard(token.encode(), lambda: 1e9, reading_needs_token=reading_needs_token))
+        server = TestServer(web.make_app(), socket_factory=small_socket if small_buffers else get_port_socket)
+        async with TestClient(server) as client:
+            yield Site(web, client, daemon)
+        await until(lambda: not daemon.hub.connections)
+
+
+def small_socket(host: str, port: int, family: socket.AddressFamily) -> socket.socket:
+    """A listening socket, whose connections have as little room for what is sent as there can be."""
+    listening = get_port_socket(host, port, family)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, StalledPage.BUFFER_BYTES)
+    return listening
+
+
+class StalledPage:
+    """A page whose connection takes nothing more: it goes on sending, as if it drew all, and reads no byte."""
+
+    BUFFER_BYTES = 4096
+    """Of its kernel, as little as there can be."""
+
+    def __init__(self, site: Site) -> None:
+        url = site.client.make_url("")
+        self._socket = socket.socket()
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self.BUFFER_BYTES)
+        self._socket.setblocking(False)
+        self._address = (url.host, url.port)
+        self._head = (
+            f"GET /api/stream HTTP/1.1\r\nHost: {url.host}:{url.port}\r\nOrigin: {site.origin['Origin']}\r\n"
+            "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            f"Sec-WebSocket-Key: {base64.b64encode(bytes(16)).decode()}\r\n\r\n"
+        )
+
+    async def open(self, **look: Any) -> None:
+        loop = asyncio.get_running_loop()
+        await loop.sock_connect(self._socket, self._address)
+        await loop.sock_sendall(self._socket, self._head.encode())
+        await self.send(**look)
+
+    async def send(self, **look: Any) -> None:
+        text = json.dumps(look).encode()
+        assert len(text) < 126
+        frame = bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text
+        await asyncio.get_running_loop().sock_sendall(self._socket, frame)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+async def message(socket: ClientWebSocketResponse, kind: str) -> dict[str, Any]:
+    while (found := json.loads((await socket.receive()).data))["kind"] != kind:
+        pass
+    assert isinstance(found, dict)
+    return found
+
+
+async def test_the_page_has_safe_headers_and_other_names_and_sites_are_refused(tmp_path: Path) -> None:
+    async with running(tmp_path) as site:
+        page = await site.client.get("/")
+        text = await page.text()
+        assert page.headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self'")
+        assert page.headers["X-Content-Type-Options"] == "nosniff"
+        for path in re.findall(r'(?:src|href)="(/[^"]+)"', text):
+            answer = await site.client.get(path)
+            assert answer.status == 200, path
+            assert "Content-Security-Policy" in answer.headers
+        assert (await site.client.get("/static/../app.py")).status == 404
+        assert (await site.client.get("/static/")).status in (403, 404)
+        missing = await site.client.get("/none")
+        assert missing.status == 404
+        assert "Content-Security-Policy" in missing.headers, "errors have them too"
+        assert (await site.get("/api/session", Host="attacker.example"))[0] == 421
+        call = {"method": "actions", "params": {"device": "imu0"}}
+        assert (await site.post("/api/call", call))[0] == 200
+        assert (await site.post("/api/call", call, Origin="http://attacker.example"))[0] == 403
+        assert (await site.client.post("/api/call", json=call)).status == 403, "a browser always has an Origin"
+        assert (await site.client.post("/api/call", json=call, headers=BEARER)).status == 200
+        for headers in ({"Origin": "http://attacker.example"}, {}, {**BEARER, "Origin": "null"}):
+            with pytest.raises(WSServerHandshakeError, match="403"):
+                await site.client.ws_connect("/api/stream", headers=headers)
+        answer = await site.client.options("/api/call", headers={"Origin": "http://attacker.example"})
+        assert not [name for name in answer.headers if name.startswith("Access-Control")]
+
+
+def test_nothing_is_loaded_from_elsewhere_and_the_bundled_library_is_the_published_one() -> None:
+    page = (STATIC / "index.html").read_text()
+    assert not re.search(r"<script(?![^>]*\bsrc=)|\son\w+=|style=|javascript:", page)
+    for file in STATIC.rglob("*"):
+        if file.suffix in (".html", ".js", ".css") and file.parent == STATIC:
+            text = file.read_text()
+            assert "innerHTML" not in text, file
+            assert not re.search(r"(?:src|href|import|url|fetch)\W*https?://", text), file
+    table = (STATIC / "uplot" / "README.md").read_text()
+    rows = re.findall(r"^\| (\S+) \| ([0-9a-f]{64}) \|$", table, re.MULTILINE)
+    assert {name for name, _ in rows} == {"uPlot.iife.min.js", "uPlot.min.css", "LICENSE"}
+    for name, digest in rows:
+        assert hashlib.sha256((STATIC / "uplot" / name).read_bytes()).hexdigest() == digest, name
+    assert "MIT" in (STATIC / "uplot" / "LICENSE").read_text()
+
+
+async def test_control_needs_the_token_and_a_cookie_does_for_it(tmp_path: Path) -> None:
+    orders: tuple[tuple[str, dict[str, object]], ...] = (
+        ("settings.plan", {}), ("settings.apply", {}),
+        ("command", {"name": "output", "arguments": {"message": "HI91", "rate_hz": 5}}),
+        ("calibrate", {"kind": "heading"}), ("stop_calibration", {}), ("settings.get", {"fresh": True}),
+    )  # fmt: skip
+    async with running(tmp_path) as site:
+        for method, params in orders:
+            call = {"method": method, "params": {"device": "imu0", **params}}
+            assert (await site.post("/api/call", call))[0] == 401, method
+            status, answer = await site.post("/api/call", call, **BEARER)
+            assert (status, "result" in answer) == (200, True), (method, answer)
+        assert (await site.get("/api/session"))[1] | {"version": ""} == {
+            "read": True, "control": False, "has_token": True, "version": "",
+        }  # fmt: skip
+        response = await site.client.post("/api/login", json={"token": TOKEN}, headers=site.origin)
+        cookie = response.headers["Set-Cookie"]
+        assert response.status == 200
+        assert "HttpOnly" in cookie
+        assert "SameSite=Strict" in cookie
+        assert TOKEN not in cookie
+        value = cookie.partition("=")[2].partition(";")[0]
+        as_browser = {"Cookie": f"{COOKIE}={value}"}
+        order = {"method": "calibrate", "params": {"device": "imu0", "kind": "heading"}}
+        status, answer = await site.post("/api/call", order, **as_browser)
+        assert (status, answer["result"]["verified"]) == (200, True)
+        assert (await site.post("/api/call", order, **as_browser, Origin="http://attacker.example"))[0] == 403
+        assert (await site.post("/api/logout", {}))[1] == {"control": False}
+
+
+async def test_reading_can_need_the_token_too(tmp_path: Path) -> None:
+    async with running(tmp_path, reading_needs_token=True) as site:
+        call = {"method": "actions", "params": {"device": "imu0"}}
+        assert (await site.post("/api/call", call))[0] == 401
+        with pytest.raises(WSServerHandshakeError, match="401"):
+            await site.client.ws_connect("/api/stream", headers=site.origin)
+        assert (await site.post("/api/call", call, **BEARER))[0] == 200
+        socket = await site.client.ws_connect("/api/stream", headers=BEARER)
+        await socket.send_json({"look": "overview"})
+        await message(socket, "overview")
+        await socket.close()
+
+
+async def test_wrong_tokens_are_answered_late_and_only_so_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web_app, "FAILURE_S", 3600.0)
+    async with running(tmp_path) as site:
+        guesses = [
+            asyncio.create_task(site.post("/api/login", {"token": "wrong"})) for _ in range(web_app.FAILURES_MAX + 1)
+        ]
+        done, waiting = await asyncio.wait(guesses, return_when=asyncio.FIRST_COMPLETED)
+        assert [one.result()[0] for one in done] == [429]
+        status, _ = await site.post("/api/login", {"token": TOKEN})
+        assert status == 200, "the right one is not held up"
+        for one in waiting:
+            one.cancel()
+    monkeypatch.setattr(web_app, "FAILURE_S", 0.0)
+    async with running(tmp_path) as site:
+        assert await site.post("/api/login", {"token": "wrong"}) == (401, {"error": "this is not the token"})
+    async with running(tmp_path, token="") as site:
+        assert (await site.post("/api/login", {"token": ""}))[0] == 403
+
+
+BAD_BODIES = (
+    b"", b"{", b"[]", b'{"method": 5}', b'{"method": "actions", "params": []}', b"\xff", b'{"x": 1}',
+    b'{"method":"actions","params":{"a":' + b"[" * 30_000, b'{"method":"\xff"}',
+)  # fmt: skip
+
+
+async def test_bad_bodies_and_errors_of_the_daemon_are_told_in_words(tmp_path: Path) -> None:
+    async with running(tmp_path) as site:
+        for bad in BAD_BODIES:
+            for path in ("/api/call", "/api/login"):
+                status, answer = await site.post(path, bad)
+                assert (status, answer["error"][:11]) == (400, "expected a "), (path, bad)
+        status, answer = await site.post("/api/call", {"method": "watch"})
+        assert status == 404
+        assert "settings.get" in answer["error"]
+        response = await site.client.post("/api/call", data=b" " * 100_000, headers=site.origin)
+        assert response.status == 413
+        status, answer = await site.post("/api/call", {"method": "actions", "params": {"device": "none"}})
+        assert (status, answer["code"]) == (200, -32602)
+        assert "no device named 'none'" in answer["error"]
+        site.daemon.close()
+        status, answer = await site.post("/api/call", {"method": "actions", "params": {"device": "imu0"}})
+        assert (status, "no daemon at" in answer["error"]) == (502, True)
+
+
+async def test_samples_statuses_and_events_come_while_a_page_is_open_and_nothing_is_read_without(
+    tmp_path: Path,
+) -> None:
+    async with running(tmp_path) as site:
+        assert not site.daemon.hub.connections
+        socket = await site.stream(look="device", device="imu0", rate_hz=50)
+        status = await message(socket, "status")
+        assert (status["device"], status["status"]["name"]) == ("imu0", "imu0")
+        assert len(site.daemon.hub.connections) == 1
+        site.daemon.publish(batch("imu0", 1, 100))
+        got = await message(socket, "samples")
+        assert sum(one["count"] for one in got["buckets"]) >= 19
+        site.daemon.event(Event(5, "imu0", EventKind.UP, "is there"))
+        assert (await message(socket, "events"))["events"][0]["message"] == "is there"
+        await socket.send_json({"look": "overview", "acknowledged": 3})
+        assert [row["name"] for row in (await message(socket, "overview"))["devices"]] == ["imu0", "imu1"]
+        others = [await site.stream(look="overview") for _ in range(5)]
+        for other in others:
+            await message(other, "overview")
+        assert len(site.daemon.hub.connections) == 1, "one connection for all pages"
+        for one in (socket, *others):
+            await one.close()
+        await until(lambda: not site.daemon.hub.connections)
+
+
+async def test_a_page_that_takes_nothing_holds_up_no_other_and_nothing_piles_up_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its connection is full, and it acknowledges all the same, so that nothing but the connection can stop it."""
+    rounds, samples, waiting_max = 50, 400, 20
+    look = {"look": "device", "device": "imu0", "rate_hz": 50, "spectrum": "accel_m_s2"}
+
+    async def watched(site: Site, stalled: StalledPage) -> None:
+        await stalled.open(**look)
+        quick = await site.stream(**look)
+        await message(quick, "status")
+        assert site.web.hub is not None
+        browsers = site.web.hub.browsers
+        await until(lambda: len(browsers) == 2)
+        seen: list[int] = []
+        most = {"mailbox": 0, "daemon": 0}
+        for number in range(rounds):
+            site.daemon.publish(batch("imu0", 1 + samples * number, samples))
+            while not seen or seen[-1] < samples * (number + 1):
+                seen += (await message(quick, "raw"))["seq"]
+            await quick.send_json({**look, "acknowledged": 1000})
+            await stalled.send(**look, acknowledged=1000)
+            most["mailbox"] = max(most["mailbox"], *(one.mailbox.waiting for one in browsers))
+            (connection,) = site.daemon.hub.connections.values()
+            most["daemon"] = max(most["daemon"], connection.status("").queue_samples)
+        assert seen == [*range(1, rounds * samples + 1)], "the quick one got every sample"
+        full = [one for one in browsers if one.mailbox.dropped]
+        assert len(full) == 1, "the stalled one, and the quick one missed nothing"
+        assert full[0].mailbox.dropped > rounds // 2, "of two messages a round"
+        assert most["mailbox"] <= waiting_max + 5, "state, status, dropped and such are there once each"
+        assert most["daemon"] <= samples, "the daemon's queue does not grow for it"
+        assert site.web.hub.dropped_samples == 0
+        await quick.close()
+
+    monkeypatch.setattr(mailbox, "FRAMES_MAX", waiting_max)
+    async with running(tmp_path, small_buffers=True) as site:
+        with closing(StalledPage(site)) as stalled:
+            await watched(site, stalled)
+
+
+async def test_what_a_page_sends_wrong_is_reported_to_it(tmp_path: Path) -> None:
+    async with running(tmp_path) as site:
+        socket = await site.stream(look="everything")
+        assert "reload it" in (await message(socket, "problem"))["message"]
+        for text in ("{", "[]", '{"look": "overview", "more": 1}', '{"rate_hz": 7}', '{"acknowledged": "x"}'):
+            await socket.send_str(text)
+            assert (await message(socket, "problem"))["message"]
+        await socket.send_json({"look": "overview"})
+        assert await message(socket, "overview")
+        await socket.send_str("x" * 5000)
+        while (last := await socket.receive()).type is WSMsgType.TEXT:
+            pass
+        assert last.type is WSMsgType.CLOSE
+        assert last.data == 1009, "too long a message ends the connection"
+
+
+async def test_pages_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web_app, "BROWSERS_MAX", 1)
+    async with running(tmp_path) as site:
+        socket = await site.stream(look="overview")
+        with pytest.raises(WSServerHandshakeError, match="503"):
+            await site.client.ws_connect("/api/stream", headers=site.origin)
+        await socket.close()
+        assert site.web.hub is not None
+        hub = site.web.hub
+        await until(lambda: not hub.browsers)
+        await (await site.stream(look="overview")).close()
