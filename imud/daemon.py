@@ -38,7 +38,7 @@ from imud.model.errors import CommandError, ConfigError, ServerError
 from imud.model.event import Event, EventKind
 from imud.model.units import NS_PER_S
 from imud.publishers import PUBLISHERS
-from imud.recording.observer import DeviceTaps
+from imud.recording.observer import RecordableDevices
 from imud.utc.system_clock import kernel_clock, system_reference
 
 log = logging.getLogger(__name__)
@@ -179,7 +179,7 @@ class Daemon:
         self._context = PublisherContext(
             self.status, secrets.randbits(63) | 1, host.now_ns, self._control, thread_time_ns, self.ledgers,
             status_in_turn=self.each_status, latencies=self._latencies,
-            recording=DeviceTaps(self._devices, host), utc_offset_ns=host.utc_offset_ns,
+            recording=RecordableDevices(self._devices, host), utc_offset_ns=host.utc_offset_ns,
             raise_event=self._send_event, watch_line=watching(lines, host.now_ns),
             utc_reference=lambda: system_reference(kernel_clock(), host.utc_offset_ns()),
         )  # fmt: skip

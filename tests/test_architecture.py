@@ -175,7 +175,7 @@ LARGE_CONSTRUCTORS = {
     "imud.device.settings.SettingsKeeper",
     "imud.device.stream_search.StreamRound",
     "imud.device.transport.SearchLoop",
-    "imud.device.utc.UtcKeeper",
+    "imud.device.utc.UtcFeed",
     "imud.fleet.sender.MqttSender",
     "imud.fleet.writer.SpoolWriter",
     "imud.lines.sync.SyncSignals",

@@ -50,7 +50,7 @@ from imud.attitude.rotation import (
     quat_product,
     transposed,
 )
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Quaternion, Sample, Vector3
 
 TO_QUAT: Final = {EulerOrder.ZXY: quat_from_euler312, EulerOrder.ZYX: quat_from_euler_zyx}
@@ -137,7 +137,7 @@ class Rotation:
 
 
 @dataclass(frozen=True)
-class PublishedFrame:
+class PublishedAxes:
     """Axes, angles and navigation frame of what is published of one device. Made by `published_frame`."""
 
     device: DeviceAxes
@@ -216,9 +216,9 @@ class PublishedFrame:
         return FrameWords(BODY_WORDS[convention], EULER_WORDS[convention], navigation)
 
 
-def as_sent(device: DeviceAxes = RFU_ENU) -> PublishedFrame:
+def as_sent(device: DeviceAxes = RFU_ENU) -> PublishedAxes:
     """Return what is published of a device without `frame` and `convention`."""
-    return PublishedFrame(device, device.to_body, None, None)
+    return PublishedAxes(device, device.to_body, None, None)
 
 
 def _about_up(angle_deg: float) -> Matrix3:
@@ -356,7 +356,7 @@ AxisName = Literal["x", "-x", "y", "-y", "z", "-z"]
 Turn = Annotated[float, Meta(ge=-360, le=360)]
 
 
-class MountingAxes(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class MountingAxes(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The axis of the sensor that each axis of the body is."""
 
     x: AxisName
@@ -367,7 +367,7 @@ class MountingAxes(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """The one that points up."""
 
 
-class MountingAngles(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class MountingAngles(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How the sensor is turned in the body, from its axes along the body's (x forward, y left, z up)."""
 
     roll_deg: Turn = 0.0
@@ -378,7 +378,7 @@ class MountingAngles(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """First, about z (up), right-handed: positive to the left."""
 
 
-class FrameSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class FrameOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a sensor lies in its body: one of `axes`, `euler`, `quat_wxyz`, or none: as its manual says."""
 
     axes: MountingAxes | None = None
@@ -406,16 +406,16 @@ class FrameSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=T
         return self.axes is not None or self.euler is not None or self.quat_wxyz is not None
 
 
-NO_FRAME: Final = FrameSettings()
+NO_FRAME: Final = FrameOptions()
 
 
-def axes_of(frame: FrameSettings, device: DeviceAxes) -> DeviceAxes:
+def axes_of(frame: FrameOptions, device: DeviceAxes) -> DeviceAxes:
     """Return the axes and angles of a device as the configuration has them, in place of those of its driver."""
     order = device.order if frame.euler_order is None else frame.euler_order
     return DeviceAxes(order=order, has_north=device.has_north, z_down=frame.z_down)
 
 
-def mounting_of(frame: FrameSettings, device: DeviceAxes) -> Matrix3:
+def mounting_of(frame: FrameOptions, device: DeviceAxes) -> Matrix3:
     """Return the rotation sensor → body (FLU) that the file gives, else that of `device`. Raises ValueError."""
     if frame.axes is not None:
         return matrix_from_axes(frame.axes.x, frame.axes.y, frame.axes.z)
@@ -427,19 +427,19 @@ def mounting_of(frame: FrameSettings, device: DeviceAxes) -> Matrix3:
     return device.to_body
 
 
-def rotation_of(frame: FrameSettings, device: DeviceAxes, convention: Convention) -> Matrix3:
+def rotation_of(frame: FrameOptions, device: DeviceAxes, convention: Convention) -> Matrix3:
     """Return the whole rotation sensor → body (FLU), errors of the mounting taken away. Raises ValueError."""
     level = levelling(convention, frame.level_roll_deg, frame.level_pitch_deg, frame.heading_offset_deg)
     return mounted(mounting_of(frame, device), level)
 
 
 def published_frame(
-    frame: FrameSettings | None, convention: Convention | None, declination_deg: float | None, device: DeviceAxes
-) -> PublishedFrame:
+    frame: FrameOptions | None, convention: Convention | None, declination_deg: float | None, device: DeviceAxes
+) -> PublishedAxes:
     """Return what is published of a device whose driver gives its axes as `device`. Raises ValueError."""
     if frame is None:
-        return PublishedFrame(device, device.to_body, convention, declination_deg)
+        return PublishedAxes(device, device.to_body, convention, declination_deg)
     wanted = convention or Convention.ENU_FLU
     own = axes_of(frame, device)
     from_angles = own.order is not device.order
-    return PublishedFrame(own, rotation_of(frame, own, wanted), wanted, declination_deg, from_angles)
+    return PublishedAxes(own, rotation_of(frame, own, wanted), wanted, declination_deg, from_angles)

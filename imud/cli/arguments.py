@@ -14,7 +14,7 @@ from imud.client.connection import Client, default_path
 from imud.contracts.status import Deviations, DeviceStatus
 from imud.host.files import read_regular
 from imud.model.errors import BadArgument, ImudError, reason_of
-from imud.model.options import Settings, unknown_name, value_problem, wrong_values
+from imud.model.options import Options, unknown_name, value_problem, wrong_values
 from imud.model.sample import SAMPLE_FIELDS
 
 FILE_BYTES_MAX: Final = 64 << 20
@@ -198,7 +198,7 @@ def given_options(driver: "Driver", words: Sequence[str]) -> dict[str, object]:
     return options
 
 
-def driver_settings(driver: "Driver", options: Mapping[str, object]) -> Settings:
+def driver_settings(driver: "Driver", options: Mapping[str, object]) -> Options:
     """Make the driver's settings from these options. Raises BadArgument for options that exclude each other."""
     for wrong in wrong_values(driver.settings, options, "option"):
         raise BadArgument(f"--option {wrong}")

@@ -23,7 +23,7 @@ from imud.formats.capture import CaptureReader
 from imud.host.files import NotRegularFile, open_stream
 from imud.model.errors import ImudError
 from imud.model.ledger import Ledger
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Measurement
 
 FIFO_WAIT_MS = 5000
@@ -63,7 +63,7 @@ def open_capture(name: str) -> BinaryIO:
         raise ImudError(f"{name}: {error.strerror}") from error
 
 
-def decode(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings | None = None) -> Iterator[str]:
+def decode(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options | None = None) -> Iterator[str]:
     """Decode `file` to JSON lines; `settings` default to the driver's own defaults.
 
     Raises ImudError for a driver without captures, or a file that is no capture.
@@ -73,7 +73,7 @@ def decode(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings | 
         yield msgspec.json.encode(as_object(event, times)).decode() + "\n"
 
 
-def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings) -> Iterator[CodecEvent]:
+def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options) -> Iterator[CodecEvent]:
     """Decode a capture to the events of the driver's codec."""
     if isinstance(driver, StreamDriver):
         codec = driver.make_codec(ledger, settings)

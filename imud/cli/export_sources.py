@@ -15,7 +15,7 @@ from typing import IO, Any, BinaryIO, Final, NamedTuple, Protocol, TextIO
 import msgspec
 
 from imud.attitude.conventions import Convention
-from imud.attitude.published import PublishedFrame
+from imud.attitude.published import PublishedAxes
 from imud.bridges import csv as table
 from imud.bridges.channel import (
     ByteWriter,
@@ -42,7 +42,7 @@ from imud.host.threads import rare_garbage_collection
 from imud.model.errors import BadArgument, ImudError, reason_of
 from imud.model.event import Event, kind_of
 from imud.model.ledger import Ledger
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import SAMPLE_FIELDS, Sample
 from imud.recording.capture_player import CapturePlayer, KnownTimes
 from imud.recording.player import PlayedDevice, Player, RecordedEvent
@@ -182,7 +182,7 @@ def play_beside(path: Path, sink: Sink, devices: Sequence[str], at: Callable[[in
 
 def _take(pipe: IO[bytes], path: Path, sink: Sink, at: Callable[[int], None]) -> Played:
     """Give a sink what comes through the pipe."""
-    frames: dict[int, tuple[str, PublishedFrame]] = {}
+    frames: dict[int, tuple[str, PublishedAxes]] = {}
     decode_samples = msgspec.msgpack.Decoder(list[Sample]).decode
     while len(head := pipe.read(HEAD.size)) == HEAD.size:
         kind, length, position = HEAD.unpack(head)
@@ -195,7 +195,7 @@ def _take(pipe: IO[bytes], path: Path, sink: Sink, at: Callable[[int], None]) ->
             at(position)
             sink.samples(Batch(name, device_id, decode_samples(data[2:]), frame))
         elif kind == DEVICE:
-            device_id, name, frame = msgspec.msgpack.decode(data, type=tuple[int, str, PublishedFrame])
+            device_id, name, frame = msgspec.msgpack.decode(data, type=tuple[int, str, PublishedAxes])
             frames[device_id] = name, frame
         elif kind == LOSSES:
             sink.losses(msgspec.msgpack.decode(data, type=LossCounts))
@@ -217,7 +217,7 @@ class PipeSink:
     def __init__(self, out: BinaryIO, position: Callable[[], int]) -> None:
         self._out = out
         self._position = position
-        self._frames: dict[int, PublishedFrame] = {}
+        self._frames: dict[int, PublishedAxes] = {}
         self._waiting: list[Sample] = []
         self._device_id = -1
         self._encode = msgspec.msgpack.Encoder().encode
@@ -230,7 +230,7 @@ class PipeSink:
             self._device_id, self._frames[device_id] = device_id, batch.frame
             frame = batch.frame
             words = (frame.device, frame.mounting, frame.convention, frame.declination_deg, frame.from_angles)
-            self._put(DEVICE, self._encode((device_id, batch.device, PublishedFrame(*words))))
+            self._put(DEVICE, self._encode((device_id, batch.device, PublishedAxes(*words))))
         self._waiting += batch.samples
         if len(self._waiting) >= SAMPLES:
             self.finish()
@@ -425,7 +425,7 @@ def recorded_noise(file: BinaryIO, name: str) -> dict[str, Deviations]:
 
 
 def export_capture(
-    file: BinaryIO, path: Path, feed: ExportFeed, driver: Driver, options: Settings, baud: int
+    file: BinaryIO, path: Path, feed: ExportFeed, driver: Driver, options: Options, baud: int
 ) -> Exported:
     """Play a capture. Raises ImudError."""
     watch = LossWatch(feed, ())

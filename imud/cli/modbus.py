@@ -17,7 +17,7 @@ from imud.cli.output import table
 from imud.contracts.driver import Identity
 from imud.contracts.script import Transfer, TransferScript, run_transfer_script
 from imud.device.settings import printable_identity
-from imud.drivers.hipnuc.modbus.codec import HipnucModbusSettings
+from imud.drivers.hipnuc.modbus.codec import HipnucModbusOptions
 from imud.drivers.hipnuc.modbus.commands import probe, save, set_id
 from imud.drivers.hipnuc.modbus.registers import (
     BAUD_RATES,
@@ -29,7 +29,7 @@ from imud.drivers.hipnuc.modbus.registers import (
     set_id_by_serial,
 )
 from imud.formats.modbus import BROADCAST, SLAVES
-from imud.links.rs485 import Rs485Link, Rs485Settings
+from imud.links.rs485 import Rs485Link, Rs485Options
 from imud.model.errors import BadArgument, CommandError, DeviceRefused, TransferError
 
 T = TypeVar("T")
@@ -54,7 +54,7 @@ class FoundModule(msgspec.Struct, frozen=True, omit_defaults=True):
 @contextmanager
 def opened(port: str, baud: int, reply_ms: int) -> Iterator[Rs485Link]:
     """Open the line for this program alone. Raises LinkError."""
-    link = Rs485Link(Rs485Settings(line=port, baud=baud, reply_ms=reply_ms))
+    link = Rs485Link(Rs485Options(line=port, baud=baud, reply_ms=reply_ms))
     link.open()
     try:
         yield link
@@ -120,7 +120,7 @@ def keep(link: Rs485Link, found: FoundModule) -> None:
 def _look(link: Rs485Link, baud: int, address: int) -> FoundModule | None:
     strange = link.heard.strange
     try:
-        who = printable_identity(_run(link, address, probe(HipnucModbusSettings())))
+        who = printable_identity(_run(link, address, probe(HipnucModbusOptions())))
     except DeviceRefused as error:
         return FoundModule(baud, address, problem=f"{error}; are there two modules with this address?")
     except TransferError as error:
@@ -133,7 +133,7 @@ def _identity(link: Rs485Link, address: int) -> Identity | None:
     problem: Exception | None = None
     for _ in range(TRIES):
         try:
-            return printable_identity(_run(link, address, probe(HipnucModbusSettings())))
+            return printable_identity(_run(link, address, probe(HipnucModbusOptions())))
         except TransferError:
             continue
         except DeviceRefused as error:

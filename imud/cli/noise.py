@@ -42,7 +42,7 @@ from imud.analysis.quantities import (
 )
 from imud.analysis.series import Grid, Readings
 from imud.cli.output import COLUMNS, paragraph, shortened
-from imud.cli.sample_set import Taken
+from imud.cli.sample_set import SampleSet
 from imud.contracts.driver import DataSheet, Figure, ModelFigures, SensorFigures, SensorName
 from imud.host.files import open_regular
 from imud.model.errors import BadArgument, ImudError, reason_of
@@ -62,13 +62,13 @@ WITHIN: Final = 1.1
 class NoiseReport:
     """All that the outputs are made of."""
 
-    taken: Taken
+    taken: SampleSet
     sensors: dict[SensorName, SensorNoise]
     sheet: ModelFigures | None
     """What to compare with; None for nothing."""
 
 
-def noise_report(taken: Taken, sheet: ModelFigures | None) -> NoiseReport:
+def noise_report(taken: SampleSet, sheet: ModelFigures | None) -> NoiseReport:
     """Analyse both sensors. Raises ImudError where neither has values."""
     readings = readings_of(taken)
     sensors: dict[SensorName, SensorNoise] = {}
@@ -81,7 +81,7 @@ def noise_report(taken: Taken, sheet: ModelFigures | None) -> NoiseReport:
     return NoiseReport(taken, sensors, sheet)
 
 
-def readings_of(taken: Taken) -> Readings:
+def readings_of(taken: SampleSet) -> Readings:
     """Return the samples. Raises ImudError where there are none."""
     if taken.readings is None or not len(taken.readings.t_ns):
         raise ImudError(f"{taken.source}: expected samples, found none")
@@ -91,7 +91,7 @@ def readings_of(taken: Taken) -> Readings:
 # --- the measurement --------------------------------------------------------------------------------------------------
 
 
-def circumstances(taken: Taken, *, full: bool = True) -> Iterator[tuple[str, str]]:
+def circumstances(taken: SampleSet, *, full: bool = True) -> Iterator[tuple[str, str]]:
     """Name and text of each thing to know about a measurement."""
     readings = readings_of(taken)
     begun = "not known"
@@ -306,7 +306,7 @@ def as_object(report: NoiseReport) -> dict[str, Any]:
     }
 
 
-def measurement_object(taken: Taken) -> dict[str, Any]:
+def measurement_object(taken: SampleSet) -> dict[str, Any]:
     """What is known of a measurement, for programs."""
     readings = readings_of(taken)
     warm = readings.temperature_c

@@ -46,7 +46,7 @@ _NONE3: Final = (nan, nan, nan)
 
 
 @dataclass(slots=True)
-class Taken:
+class SampleSet:
     """Samples and their provenance."""
 
     source: str
@@ -219,7 +219,7 @@ def _sensor(values: "array[float]") -> FloatArray | None:
 # --- files ------------------------------------------------------------------------------------------------------------
 
 
-def take_file(args: argparse.Namespace) -> Taken:
+def take_file(args: argparse.Namespace) -> SampleSet:
     """Read the samples of `args.input`, a recording or a capture. Raises ImudError, OSError."""
     with log_to(STDERR, "error"):
         taken = take_recording(args) if looks_like_recording(args.input) else take_capture(args)
@@ -233,13 +233,13 @@ def take_file(args: argparse.Namespace) -> Taken:
     return taken
 
 
-def take_recording(args: argparse.Namespace) -> Taken:
+def take_recording(args: argparse.Namespace) -> SampleSet:
     """Play a recording; the stamps are those of the live run."""
     for option, default in (("driver", None), ("option", []), ("baud", None)):
         if getattr(args, option) != default:
             raise BadArgument(f"--{option}: expected none with a recording, which has those of the live run")
     collector = Collector(args.device or "", skip_s=args.skip or 0.0, for_s=args.duration)
-    taken, tally = Taken(args.input), LossTally()
+    taken, tally = SampleSet(args.input), LossTally()
     with open_regular(args.input) as file:
         player = Player(collector.publish)
         reader = RecordingReader(file, args.input)
@@ -277,7 +277,7 @@ def played(player: Player, name: str) -> PlayedDevice | None:
     return next((device for device in player.devices.values() if device.described.name == name), None)
 
 
-def _describe(taken: Taken, player: Player, name: str) -> None:
+def _describe(taken: SampleSet, player: Player, name: str) -> None:
     """Note what the recording has of the device, and how it was replayed."""
     if (device := played(player, name)) is None:
         return
@@ -289,7 +289,7 @@ def _describe(taken: Taken, player: Player, name: str) -> None:
         taken.notes.append(f"replay: {len(device.differences)} of {device.checks} checks differ")
 
 
-def take_capture(args: argparse.Namespace) -> Taken:
+def take_capture(args: argparse.Namespace) -> SampleSet:
     """Run a capture through the daemon's whole path."""
     replayed = argparse.Namespace(
         file=args.input, driver=args.driver or DRIVER, speed="maximum", baud=args.baud or BAUD, socket=None,
@@ -306,7 +306,7 @@ def take_capture(args: argparse.Namespace) -> Taken:
     if not collector.done:
         collector.look()
     status = daemon.status()[0]
-    taken = Taken(args.input, driver=status.driver, link=status.link, identity=status.identity)
+    taken = SampleSet(args.input, driver=status.driver, link=status.link, identity=status.identity)
     taken.settings = status.settings
     if problem := problem_of(replayed)[0]:
         taken.notes.append(problem)
@@ -315,7 +315,7 @@ def take_capture(args: argparse.Namespace) -> Taken:
     return finished
 
 
-def _finished(taken: Taken, collector: Collector, lost: dict[str, int]) -> Taken:
+def _finished(taken: SampleSet, collector: Collector, lost: dict[str, int]) -> SampleSet:
     taken.device, taken.lost = collector.name, lost
     taken.readings, taken.stamps = collector.readings(), collector.stamps() if len(collector) else ""
     taken.begun_utc_ns = collector.first.utc_ns if collector.first is not None else None
@@ -325,7 +325,9 @@ def _finished(taken: Taken, collector: Collector, lost: dict[str, int]) -> Taken
 # --- a running daemon -------------------------------------------------------------------------------------------------
 
 
-def take_live(args: argparse.Namespace, note: Callable[[float, int], None] = lambda _passed_s, _count: None) -> Taken:
+def take_live(
+    args: argparse.Namespace, note: Callable[[float, int], None] = lambda _passed_s, _count: None
+) -> SampleSet:
     """Collect the samples of the device `args.input` for `args.duration`, or until interrupted.
 
     A device that falls silent is waited for until `args.duration` is over by the clock; what came is kept. `note` is
@@ -389,9 +391,9 @@ def status_of(found: Iterable[DeviceStatus], name: str) -> DeviceStatus:
     return known[name]
 
 
-def taken_of(status: DeviceStatus, socket: str) -> Taken:
+def taken_of(status: DeviceStatus, socket: str) -> SampleSet:
     """Begin the provenance of a live device."""
-    return Taken(f"live from {socket}", status.name, status.driver, status.link, status.identity, status.settings)
+    return SampleSet(f"live from {socket}", status.name, status.driver, status.link, status.identity, status.settings)
 
 
 def progress(passed_s: float, count: int) -> None:

@@ -29,7 +29,7 @@ from imud.analysis.spectrum import (
 from imud.cli.arguments import connect, statuses
 from imud.cli.noise import circumstances, grid_object, measurement_object, picture, readings_of
 from imud.cli.output import COLUMNS, paragraph, shortened
-from imud.cli.sample_set import LATENCY_MS, SILENCE_S, Collector, Taken, heard, status_of
+from imud.cli.sample_set import LATENCY_MS, SILENCE_S, Collector, SampleSet, heard, status_of
 from imud.contracts.driver import SensorName
 from imud.model.errors import BadArgument, ImudError
 from imud.model.units import NS_PER_S
@@ -41,7 +41,7 @@ GRAM_PART: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
-class SpectrumSettings:
+class SpectrumOptions:
     """What the user chose."""
 
     sensors: tuple[SensorName, ...] = ("accel", "gyro")
@@ -55,11 +55,11 @@ class SpectrumSettings:
 class SpectrumReport:
     """All that the outputs are made of."""
 
-    taken: Taken
+    taken: SampleSet
     sensors: dict[SensorName, SensorVibration]
 
 
-def spectrum_report(taken: Taken, settings: SpectrumSettings) -> SpectrumReport:
+def spectrum_report(taken: SampleSet, settings: SpectrumOptions) -> SpectrumReport:
     """Analyse the chosen sensors. Raises ImudError where none of them has values."""
     readings = readings_of(taken)
     sensors: dict[SensorName, SensorVibration] = {}
@@ -72,7 +72,7 @@ def spectrum_report(taken: Taken, settings: SpectrumSettings) -> SpectrumReport:
     return SpectrumReport(taken, sensors)
 
 
-def sensor_vibration(readings: Readings, values: FloatArray, settings: SpectrumSettings) -> SensorVibration:
+def sensor_vibration(readings: Readings, values: FloatArray, settings: SpectrumOptions) -> SensorVibration:
     """Analyse one sensor, values (n, 3). Raises BadArgument where the series is too short."""
     t_ns, values = with_values(readings.t_ns, values)
     grid = grid_of(t_ns)
@@ -89,7 +89,7 @@ def sensor_vibration(readings: Readings, values: FloatArray, settings: SpectrumS
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
-def limits(taken: Taken, name: SensorName, sensor: SensorVibration) -> Iterator[str]:
+def limits(taken: SampleSet, name: SensorName, sensor: SensorVibration) -> Iterator[str]:
     """Sentences about what limits the spectrum of a sensor."""
     half = sensor.spectrum.rate_hz / 2
     yield sensor.grid.words()
@@ -169,7 +169,7 @@ def as_object(report: SpectrumReport) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _sensor_object(taken: Taken, name: SensorName, sensor: SensorVibration) -> dict[str, Any]:
+def _sensor_object(taken: SampleSet, name: SensorName, sensor: SensorVibration) -> dict[str, Any]:
     spectrum = sensor.spectrum
     return {
         **grid_object(name, sensor.grid),
@@ -210,7 +210,7 @@ BARS: Final = " ▁▂▃▄▅▆▇█"
 CLEAR: Final = "\x1b[H\x1b[2J"
 
 
-def live(args: argparse.Namespace, settings: SpectrumSettings) -> int:
+def live(args: argparse.Namespace, settings: SpectrumOptions) -> int:
     """Redraw until interrupted. Raises ImudError."""
     name = settings.sensors[0]
     with connect(args) as asking, connect(args) as listening:
@@ -242,7 +242,7 @@ class LiveView:
         self._name: SensorName = name
         self._past: deque[str] = deque(maxlen=PAST_ROWS)
 
-    def page(self, collector: Collector, settings: SpectrumSettings) -> str:
+    def page(self, collector: Collector, settings: SpectrumOptions) -> str:
         """Format the view of what the collector has now, in 80 columns."""
         readings = collector.readings()
         values = readings.accel_m_s2 if self._name == "accel" else readings.gyro_rad_s

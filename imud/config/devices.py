@@ -10,21 +10,21 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from imud.attitude.conventions import RFU_ENU, Heading
-from imud.attitude.published import FrameSettings, MountingAngles, MountingAxes, mounting_of
+from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes, mounting_of
 from imud.config.model import DeviceConfig
 from imud.config.schema import DeviceGeneral, DriverRow, Keys, LinkRow, Tables
 from imud.config.yaml import Path as KeyPath
 from imud.config.yaml import no_pause
 from imud.contracts.command import Target
 from imud.contracts.driver import CanDriver, PolledDriver
-from imud.contracts.lines import LINE_SCHEMAS, DeviceLines, LineSettings
+from imud.contracts.lines import LINE_SCHEMAS, DeviceLines, LineOptions
 from imud.contracts.link import CanUse, Claim, conflict_of
-from imud.contracts.setting import DeviceSettings, declared_values
+from imud.contracts.setting import SettingsTable, declared_values
 from imud.contracts.status import Deviations
 from imud.model.errors import BadArgument
-from imud.model.options import Settings, got, shown, unknown_name
+from imud.model.options import Options, got, shown, unknown_name
 from imud.model.units import NS_PER_S, NS_PER_US
-from imud.utc.receivers import RmcSettings
+from imud.utc.receivers import RmcOptions
 
 
 class Clash(NamedTuple):
@@ -120,7 +120,7 @@ class DeclaredReader:
         self._keys = keys
         self._drivers = drivers
 
-    def read(self, path: KeyPath, device: Mapping[str, Any]) -> Settings | None:
+    def read(self, path: KeyPath, device: Mapping[str, Any]) -> Options | None:
         """Read `settings` among the keys of a device; None where there are none, or a problem is with them."""
         key = (*path, "settings")
         if device.get("settings") is None:
@@ -143,7 +143,7 @@ class DeclaredReader:
             return None
         return self._keys.part(table.declarable, device["settings"], key)
 
-    def check(self, path: KeyPath, driver: str, declared: Settings, options: Settings | None, link: Settings) -> None:
+    def check(self, path: KeyPath, driver: str, declared: Options, options: Options | None, link: Options) -> None:
         """Refuse settings that do not go together, or with the place where the device is to be found."""
         table = self._table(driver)
         if table is None:
@@ -161,14 +161,14 @@ class DeclaredReader:
         except BadArgument as error:
             self._keys.problem(key, str(error))
 
-    def check_lines(self, path: KeyPath, driver: str, declared: Settings, lines: DeviceLines) -> None:
+    def check_lines(self, path: KeyPath, driver: str, declared: Options, lines: DeviceLines) -> None:
         """Refuse lines that do nothing with the settings that are declared."""
         if self._table(driver) is not None:
             found = self._drivers[driver].declared_line_differences(declared_values(declared), lines)
             for key, words in found.items():
                 self._keys.problem((*path, "lines", key), f"with the settings declared here {words}", at_key=True)
 
-    def _table(self, driver: str) -> DeviceSettings | None:
+    def _table(self, driver: str) -> SettingsTable | None:
         try:
             return self._drivers[driver].device_settings
         except ImportError:  # reported with the driver
@@ -179,7 +179,7 @@ class DeclaredReader:
         return f"drivers with settings: {', '.join(names) or 'none'}"
 
 
-def _fixed(name: str, options: Settings | None, link: Settings) -> object:
+def _fixed(name: str, options: Options | None, link: Options) -> object:
     """The value with which the configuration finds the device; None where it searches, or has no such key."""
     for part in (link, options):
         value = getattr(part, name, None)
@@ -189,13 +189,13 @@ def _fixed(name: str, options: Settings | None, link: Settings) -> object:
 
 
 KEY: Final = "frame"
-NESTED: Final[Mapping[str, type[Settings]]] = {"axes": MountingAxes, "euler": MountingAngles}
+NESTED: Final[Mapping[str, type[Options]]] = {"axes": MountingAxes, "euler": MountingAngles}
 """Keys of `frame` with keys of their own."""
 WAYS: Final = ("axes", "euler", "quat_wxyz")
 """The ways in which a rotation can be given."""
 
 
-def read_frame(keys: Keys, path: KeyPath, device: Mapping[str, Any]) -> FrameSettings | None:
+def read_frame(keys: Keys, path: KeyPath, device: Mapping[str, Any]) -> FrameOptions | None:
     """Read the key `frame` of a device; None where it has none or has problems."""
     if KEY not in device:
         return None
@@ -209,7 +209,7 @@ def read_frame(keys: Keys, path: KeyPath, device: Mapping[str, Any]) -> FrameSet
     nested = _nested(keys, path, found)
     if nested is None:
         return None
-    settings = keys.part(FrameSettings, {name: value for name, value in found.items() if name not in NESTED}, path)
+    settings = keys.part(FrameOptions, {name: value for name, value in found.items() if name not in NESTED}, path)
     if settings is None:
         return None
     frame = msgspec.structs.replace(settings, **nested)
@@ -222,9 +222,9 @@ def read_frame(keys: Keys, path: KeyPath, device: Mapping[str, Any]) -> FrameSet
     return frame
 
 
-def _nested(keys: Keys, path: KeyPath, found: Mapping[str, Any]) -> dict[str, Settings] | None:
+def _nested(keys: Keys, path: KeyPath, found: Mapping[str, Any]) -> dict[str, Options] | None:
     """Read the keys that have keys of their own; None where one has a problem."""
-    made: dict[str, Settings] = {}
+    made: dict[str, Options] = {}
     for name, schema in NESTED.items():
         if found.get(name) is not None:
             part = keys.part(schema, found[name], (*path, name))
@@ -235,7 +235,7 @@ def _nested(keys: Keys, path: KeyPath, found: Mapping[str, Any]) -> dict[str, Se
 
 
 def check_declination(
-    keys: Keys, path: KeyPath, general: DeviceGeneral, options: Settings | None, drivers: Mapping[str, DriverRow]
+    keys: Keys, path: KeyPath, general: DeviceGeneral, options: Options | None, drivers: Mapping[str, DriverRow]
 ) -> None:
     """Refuse a declination where the heading is known not to be magnetic, or the driver is not named."""
     if general.declination_deg is None:
@@ -271,7 +271,7 @@ def read_lines(
     if found is None:
         return None
     _fit(keys, path, found, device.get("driver", "auto"), drivers)
-    made: dict[str, LineSettings] = {}
+    made: dict[str, LineOptions] = {}
     for name, schema in LINE_SCHEMAS.items():
         if name in found:
             inside = keys.mapping((*path, name), found[name])
@@ -283,7 +283,7 @@ def read_lines(
 
 def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
     """Refuse a GPIO line that is used twice, by one device or by two."""
-    owners: list[tuple[LineSettings, str]] = []
+    owners: list[tuple[LineOptions, str]] = []
     for device in devices:
         for name, settings in _lines_of_device(device):
             path: KeyPath = ("devices", device.name, "lines", name)
@@ -296,7 +296,7 @@ def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
 
 def read_rmc(
     keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, DriverRow]
-) -> RmcSettings | None:
+) -> RmcOptions | None:
     """Read the settings below the key `rmc` of a device; None where it has none."""
     if "rmc" not in device:
         return None
@@ -316,7 +316,7 @@ def read_rmc(
             f"(line {mark.line}): leave one of them out"
         )
         keys.problem(path, message, at_key=True)
-    return keys.part(RmcSettings, device["rmc"], path)
+    return keys.part(RmcOptions, device["rmc"], path)
 
 
 def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, drivers: Mapping[str, DriverRow]) -> None:
@@ -345,14 +345,14 @@ def _with_lines(drivers: Mapping[str, DriverRow]) -> Iterator[str]:
                 yield name
 
 
-def _lines_of_device(device: DeviceConfig) -> Iterator[tuple[str, LineSettings]]:
+def _lines_of_device(device: DeviceConfig) -> Iterator[tuple[str, LineOptions]]:
     for name in LINE_SCHEMAS if device.lines is not None else ():
         settings = getattr(device.lines, name)
         if settings is not None:
             yield name, settings
 
 
-def _same_line(one: LineSettings, other: LineSettings) -> bool:
+def _same_line(one: LineOptions, other: LineOptions) -> bool:
     """Whether both are the same line, as far as names show: a line name without a chip is taken as on any chip."""
     chips = {one.chip.removeprefix("/dev/"), other.chip.removeprefix("/dev/")}
     return one.line == other.line and (len(chips) == 1 or "" in chips)
@@ -442,7 +442,7 @@ class DeviceReader:
         made = DeviceConfig(name, *own_keys, line, lines, rmc, declared, general.on_difference, *frames, noise)
         return made, general.enabled
 
-    def _options(self, path: KeyPath, keys: Mapping[str, Any]) -> Settings | None:
+    def _options(self, path: KeyPath, keys: Mapping[str, Any]) -> Options | None:
         driver = keys.get("driver", "auto")
         if driver == "auto":
             if keys.get("options") is not None:
@@ -457,7 +457,7 @@ class DeviceReader:
             return None
         return self._keys.row(self._tables.drivers, driver, keys.get("options"), (*path, "options"))
 
-    def _link(self, path: KeyPath, keys: Mapping[str, Any]) -> tuple[str, Settings] | None:
+    def _link(self, path: KeyPath, keys: Mapping[str, Any]) -> tuple[str, Options] | None:
         names = [name for name in self._tables.links if name in keys]
         if len(names) != 1:
             found = " and ".join(names) or "none"
@@ -480,13 +480,13 @@ class DeviceReader:
             return False
         return True
 
-    def _go_together(self, path: KeyPath, driver: str, options: Settings, link: str, link_settings: Settings) -> None:
+    def _go_together(self, path: KeyPath, driver: str, options: Options, link: str, link_settings: Options) -> None:
         """Refuse values of options and link with which the driver cannot work."""
         for problem in self._tables.drivers[driver].problems(options, link_settings):
             part = link if problem.part == "link" else problem.part
             self._keys.problem((*path, part, problem.key), problem.message)
 
-    def _usable(self, path: KeyPath, driver: str, link: str, settings: Settings) -> None:
+    def _usable(self, path: KeyPath, driver: str, link: str, settings: Options) -> None:
         """Refuse settings that the link itself would refuse."""
         frames = False
         with suppress(ImportError, KeyError):  # reported elsewhere: the driver cannot be imported, or there is none

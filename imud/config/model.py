@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 from imud.attitude.conventions import Convention
-from imud.attitude.published import FrameSettings
+from imud.attitude.published import FrameOptions
 from imud.contracts.lines import DeviceLines
 from imud.contracts.setting import OnDifference
 from imud.contracts.status import Deviations
-from imud.model.options import Settings
-from imud.utc.receivers import RmcSettings
+from imud.model.options import Options
+from imud.utc.receivers import RmcOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,23 +19,23 @@ class DeviceConfig:
     name: str
     driver: str
     """A name in DRIVERS, or `auto`."""
-    options: Settings | None
+    options: Options | None
     """Settings of the driver; None with driver `auto`."""
     identify: bool
     link: str
     """A name in LINKS."""
-    link_settings: Settings
+    link_settings: Options
     line: int = 0
     """Line of its name in the file; no property of the device."""
     lines: DeviceLines | None = None
     """GPIO lines of the device; None without any."""
-    rmc: RmcSettings | None = None
+    rmc: RmcOptions | None = None
     """Source of the RMC sentences that are sent to it; None for none."""
-    declared: Settings | None = None
+    declared: Options | None = None
     """Values that its own settings should have, an instance of `DeviceSettings.declarable`; None for no declaration."""
     on_difference: OnDifference = OnDifference.REPORT
     """What imud does where they are others."""
-    frame: FrameSettings | None = None
+    frame: FrameOptions | None = None
     """How the sensor lies in its body; None to publish its own axes."""
     convention: Convention | None = None
     """Convention of what is published; None for the device's own, and for enu-flu beside `frame`."""
@@ -51,7 +51,7 @@ class Config:
 
     log_level: str
     state_dir: str
-    publishers: Mapping[str, Settings]
+    publishers: Mapping[str, Options]
     """Settings of every row of PUBLISHERS; defaults where the file has none."""
     devices: tuple[DeviceConfig, ...]
     """In the order of the file, without the disabled."""

@@ -17,14 +17,14 @@ from imud.config.yaml import Path as KeyPath
 from imud.contracts.driver import KeyProblem
 from imud.contracts.lines import DeviceLines
 from imud.contracts.link import Claim
-from imud.contracts.setting import DeviceSettings, OnDifference
+from imud.contracts.setting import OnDifference, SettingsTable
 from imud.drivers import DRIVERS
 from imud.links import LINKS
-from imud.model.options import Settings, disagreements, expected, got, unknown_name, value_problem
+from imud.model.options import Options, disagreements, expected, got, unknown_name, value_problem
 from imud.publishers import PUBLISHERS
 
 
-class General(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class General(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Keys of the daemon itself."""
 
     log_level: Literal["debug", "info", "warning", "error"] = "info"
@@ -34,7 +34,7 @@ class General(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     imud makes it where it is missing. A change counts from the next start. systemd's STATE_DIRECTORY wins over it."""
 
 
-class DeviceGeneral(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class DeviceGeneral(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Keys of a device itself, as opposed to those of its link and its driver."""
 
     driver: str = "auto"
@@ -57,7 +57,7 @@ class Row(Protocol):
     """Row of a table, as far as the configuration needs it."""
 
     @property
-    def settings(self) -> type[Settings]:
+    def settings(self) -> type[Options]:
         """The schema of the row's keys."""
         ...
 
@@ -71,7 +71,7 @@ class DriverRow(Row, Protocol):
         ...
 
     @property
-    def device_settings(self) -> DeviceSettings | None:
+    def device_settings(self) -> SettingsTable | None:
         """Settings that the device keeps itself; None for a driver that does not know them."""
         ...
 
@@ -129,7 +129,7 @@ class Tables:
 
 TABLES: Final = Tables(DRIVERS, LINKS, PUBLISHERS)
 
-S = TypeVar("S", bound=Settings)
+S = TypeVar("S", bound=Options)
 
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
@@ -159,7 +159,7 @@ class Keys:
             if key not in known and len(self.problems) < PROBLEMS_MAX:
                 self.problem((*path, key), unknown_name("a key", key, known), at_key=True)
 
-    def row(self, table: Mapping[str, Row], name: str, data: object, path: KeyPath | None = None) -> Settings | None:
+    def row(self, table: Mapping[str, Row], name: str, data: object, path: KeyPath | None = None) -> Options | None:
         """Read the settings of row `name`; an empty value means its defaults."""
         path = path or (name,)
         try:
@@ -215,7 +215,7 @@ class Keys:
     def _check_inside(self, path: KeyPath, values: Mapping[str, Any], field_type: Any) -> None:
         """Add the problems of keys and values in a mapping, each at its own place, where `field_type` has mappings."""
         for choice in _choices(field_type):
-            if isinstance(choice, type) and issubclass(choice, Settings):
+            if isinstance(choice, type) and issubclass(choice, Options):
                 self.part(choice, values, path)
             elif get_origin(choice) is dict:
                 key_type, value_type = get_args(choice)

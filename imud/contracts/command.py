@@ -11,7 +11,7 @@ from typing import Any, Final, cast, get_type_hints
 import msgspec
 
 from imud.model.errors import BadArgument
-from imud.model.options import Settings, expected, shown, wrong_values
+from imud.model.options import Options, expected, shown, wrong_values
 from imud.model.sample import Pair, Vector3
 from imud.model.units import RAD_PER_DEG
 
@@ -21,7 +21,7 @@ class Target:
     """The device that an action is carried out on."""
 
     settings: Any
-    """Settings of the device's driver."""
+    """Options of the device's driver."""
     baud: int
     """Present bit rate of the line, bit/s; 0 on a link without one."""
     fixed_baud: int = 0
@@ -62,31 +62,31 @@ class Action:
     """Whether it writes the device's flash, which is counted, and limited per day."""
 
     @property
-    def parameters(self) -> type[Settings]:
+    def parameters(self) -> type[Options]:
         """The parameters of `begin` as a struct type."""
         return _parameters(self.begin)
 
-    def arguments(self, given: Mapping[str, Any]) -> Settings:
+    def arguments(self, given: Mapping[str, Any]) -> Options:
         """Check and convert the arguments of a call. Raises BadArgument naming what was expected and what came."""
         if wrong := wrong_values(self.parameters, given, "argument"):
             known = ", ".join(str(parameter) for parameter in parameters_of(self)) or "none"
             raise BadArgument(f"{'; '.join(map(str, wrong))}; arguments: {known}")
         return msgspec.convert(dict(given), self.parameters)
 
-    def script(self, target: Target, arguments: Settings) -> Any:
+    def script(self, target: Target, arguments: Options) -> Any:
         """Make the script of the action, from the result of `arguments`."""
         return self.begin(target, **msgspec.structs.asdict(arguments))
 
 
 @cache
-def _parameters(begin: Callable[..., Any]) -> type[Settings]:
+def _parameters(begin: Callable[..., Any]) -> type[Options]:
     hints = get_type_hints(begin, include_extras=True)
     given = [p for p in signature(begin).parameters.values() if p.kind is p.KEYWORD_ONLY]
     fields = [(p.name, hints[p.name]) if p.default is p.empty else (p.name, hints[p.name], p.default) for p in given]
     made = msgspec.defstruct(
-        "Parameters", fields, bases=(Settings,), frozen=True, kw_only=True, forbid_unknown_fields=True
+        "Parameters", fields, bases=(Options,), frozen=True, kw_only=True, forbid_unknown_fields=True
     )
-    return cast(type[Settings], made)
+    return cast(type[Options], made)
 
 
 Actions = Mapping[str, Action]

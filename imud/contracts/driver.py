@@ -13,10 +13,10 @@ from imud.contracts.codec import CanCodec, PolledCodec, StreamCodec
 from imud.contracts.command import Actions, Calibrations
 from imud.contracts.lines import NO_TIME_BITS, AlarmRanges, DeviceLines, TimeBits
 from imud.contracts.script import RequestScript, TransferScript
-from imud.contracts.setting import DeviceSettings
+from imud.contracts.setting import SettingsTable
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame
 from imud.model.ledger import Ledger
-from imud.model.options import Settings
+from imud.model.options import Options
 
 SensorName = Literal["gyro", "accel"]
 Figure = Annotated[float, Meta(gt=0)] | None
@@ -129,7 +129,7 @@ class Driver:
     """Family and link, for example `hipnuc-uart`."""
     title: str
     """Vendor and products, for people."""
-    settings: type[Settings]
+    settings: type[Options]
     """Type of the driver's settings (`options` of a device)."""
     tick_ns: int
     """Length of one device tick in ns, or SAMPLE_COUNTER."""
@@ -150,7 +150,7 @@ class Driver:
     """Commands that the device executes, by name."""
     calibrations: Calibrations = field(default_factory=dict)
     """Guided calibrations, by kind."""
-    device_settings: DeviceSettings | None = None
+    device_settings: SettingsTable | None = None
     """Settings that the device keeps itself; None for a driver that does not know them."""
     lines: frozenset[str] = frozenset()
     """GPIO lines that such a device can have: names of `imud.contracts.lines.DeviceLines`."""
@@ -241,7 +241,7 @@ class CanDriver(Driver):
 
     Only for frames that carry samples; the codec must confirm it."""
     node_settings: Callable[[int], Any]
-    """Settings for the device of that number, the rest at its default."""
+    """Options for the device of that number, the rest at its default."""
     node_title: Callable[[int], str]
     """The device of that number for people, for example `node 8`."""
     identify: Callable[[Any], RequestScript[Identity]]

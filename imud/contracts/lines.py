@@ -16,7 +16,7 @@ from msgspec.structs import fields
 
 from imud.host.threads import BusThread, StartWorker
 from imud.model.errors import LinkError
-from imud.model.options import Settings
+from imud.model.options import Options
 
 SOUT_WIDTH_US: Final = 80.0
 """Length of a SOUT pulse; the first byte follows its falling edge (HiPNUC manual 1.2.2, PMUX2)."""
@@ -24,7 +24,7 @@ SIN_DELAY_US: Final = 125.0
 """From the rising edge on SIN to the frame leaving, on average (HiPNUC manual 1.2.1)."""
 
 
-class SoutTiming(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SoutTiming(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Position of the measurement on a SOUT pulse. No manual gives it: the rising edge itself is an assumption."""
 
     offset_us: Annotated[float, Meta(ge=-100_000, le=100_000)] = 0.0
@@ -36,7 +36,7 @@ class SoutTiming(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Length of the pulse, µs: the time of a lost rising edge is derived from the falling edge."""
 
 
-class TriggerTiming(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class TriggerTiming(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Position of the measurement after a trigger on SIN."""
 
     offset_us: Annotated[float, Meta(ge=-100_000, le=100_000)] = 0.0
@@ -106,7 +106,7 @@ class Edge(NamedTuple):
     opened again."""
 
 
-class LineSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LineOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Address of a line: chip and offset, or a line name that exists once."""
 
     line: Annotated[int, Meta(ge=0, le=1023)] | Annotated[str, Meta(min_length=1, max_length=31)]
@@ -121,14 +121,14 @@ class LineSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             raise ValueError("expected the key chip beside the number of a line, got none")
 
 
-class InputSettings(LineSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class InputOptions(LineOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An input: a line that the device drives."""
 
     bias: Literal["as-is", "pull-up", "pull-down", "disabled"] = "as-is"
     """Resistor inside the host's chip: a wire that is not driven floats, and a floating wire makes edges."""
 
 
-class SoutSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SoutOptions(InputOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """SOUT."""
 
     offset_us: Offset = 0.0
@@ -144,14 +144,14 @@ class SoutSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fiel
         return SoutTiming(offset_us=self.offset_us, bias_us=self.bias_us, width_us=self.width_us)
 
 
-class DividedSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class DividedOptions(InputOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """SOUT_DIV."""
 
     divisor: Annotated[int, Meta(ge=1, le=64)] = 8
     """Samples per pulse, as the device is set to (`CONFIG PMUX4 DIV8`; 8 as delivered)."""
 
 
-class PpsSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PpsOptions(InputOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The pulse per second."""
 
     chrony: str = ""
@@ -159,7 +159,7 @@ class PpsSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_field
     for none. The second of each pulse must be known from `rmc`."""
 
 
-class ReadySettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ReadyOptions(InputOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Data ready."""
 
     edge: Literal["rising", "falling"] = "rising"
@@ -170,14 +170,14 @@ class ReadySettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fie
     """Bound of the error of `offset_us`, µs; 0 if it was calibrated. No manual gives it: 100 is an assumption."""
 
 
-class OutputSettings(LineSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class OutputOptions(LineOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An output: a line that imud drives."""
 
     open_drain: bool = False
     """Whether high is left to a pull-up resistor, so that no current flows into a device without power."""
 
 
-class TriggerSettings(OutputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class TriggerOptions(OutputOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """SIN."""
 
     rate_hz: Annotated[float, Meta(ge=0, le=1000)] = 100.0
@@ -196,7 +196,7 @@ class TriggerSettings(OutputSettings, frozen=True, kw_only=True, forbid_unknown_
         return TriggerTiming(offset_us=self.offset_us, bias_us=self.bias_us)
 
 
-class ResetSettings(OutputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ResetOptions(OutputOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Reset."""
 
     active_low: bool = True
@@ -209,26 +209,26 @@ class ResetSettings(OutputSettings, frozen=True, kw_only=True, forbid_unknown_fi
     """Whether to pulse it once at the start of imud, before the device is asked for the first time."""
 
 
-class DeviceLines(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class DeviceLines(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The lines of one device."""
 
-    sout: SoutSettings | None = None
+    sout: SoutOptions | None = None
     """SOUT of the device: a pulse before each frame."""
-    sout_div: DividedSettings | None = None
+    sout_div: DividedOptions | None = None
     """SOUT_DIV of the device: a pulse every `divisor` samples."""
-    sin: TriggerSettings | None = None
+    sin: TriggerOptions | None = None
     """SIN of the device, driven by imud: one frame for each rising edge (ONMARK)."""
-    alarm: InputSettings | None = None
+    alarm: InputOptions | None = None
     """ALARM of the device: active while an angle is out of its range."""
-    reset: ResetSettings | None = None
+    reset: ResetOptions | None = None
     """Reset of the device, driven by imud."""
-    data_ready: ReadySettings | None = None
+    data_ready: ReadyOptions | None = None
     """Data ready of the device: it has new values."""
-    pps: PpsSettings | None = None
+    pps: PpsOptions | None = None
     """The pulse per second that the device's SIN receives, connected to the host as well."""
 
 
-LINE_SCHEMAS: Final[Mapping[str, type[LineSettings]]] = {
+LINE_SCHEMAS: Final[Mapping[str, type[LineOptions]]] = {
     field.name: get_args(field.type)[0] for field in fields(DeviceLines)
 }
 """Schema of each key of `DeviceLines`."""
@@ -310,7 +310,7 @@ class WatchedInput(Protocol):
         ...
 
 
-WatchLine = Callable[[InputSettings, str, OnEdges, Callable[[str], None]], WatchedInput]
+WatchLine = Callable[[InputOptions, str, OnEdges, Callable[[str], None]], WatchedInput]
 """Makes one from its settings, a purpose for people, what gets rising edges, and what gets a message when the line
 fails for a new reason and when it is open again."""
 
@@ -338,8 +338,8 @@ class LineFactory:
     """Factory of closed lines, from their settings and a purpose for people, for example `bow sout`."""
 
     make_input: Callable[[Any, str, bool], InputLine]
-    """From `InputSettings`; the last argument is True if only rising edges are needed."""
+    """From `InputOptions`; the last argument is True if only rising edges are needed."""
     make_output: Callable[[Any, str], OutputLine]
-    """From `OutputSettings`."""
+    """From `OutputOptions`."""
     start_worker: StartWorker = BusThread
     """Starts the thread that drives SIN."""

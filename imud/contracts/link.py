@@ -10,7 +10,7 @@ from imud.contracts.script import Transfer
 from imud.contracts.status import KernelCounters, SerialLineCounters
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame
 from imud.model.errors import LinkError
-from imud.model.options import Settings, shown
+from imud.model.options import Options, shown
 
 MIXED: Final = -1
 
@@ -30,7 +30,7 @@ class Claim:
     part_key: str = ""
     """Key of the settings that names the part."""
     terms: Mapping[str, object] = field(default_factory=dict)
-    """Settings on which all devices of a shared place must agree, by key."""
+    """Options on which all devices of a shared place must agree, by key."""
 
 
 class Conflict(NamedTuple):
@@ -103,7 +103,7 @@ def id_text(can_id: int, extended: bool) -> str:
     return f"0x{can_id:08X}" if extended else f"0x{can_id:03X}"
 
 
-S = TypeVar("S", bound=Settings)
+S = TypeVar("S", bound=Options)
 
 OnData = Callable[[bytes, int], None]
 """Called with bytes as read and CLOCK_MONOTONIC (ns) right after the read."""
@@ -245,27 +245,27 @@ class PolledLink(Link, Protocol):
         ...
 
 
-def _no_bus(_settings: Settings) -> str:
+def _no_bus(_settings: Options) -> str:
     return ""
 
 
-def _no_bytes(_settings: Settings) -> StreamLink:
+def _no_bytes(_settings: Options) -> StreamLink:
     raise LinkError("expected a link of bytes, got one without")
 
 
-def _no_frames(_settings: Settings) -> CanLink:
+def _no_frames(_settings: Options) -> CanLink:
     raise LinkError("expected a link to a CAN bus, got one that is none")
 
 
-def _no_transfers(_settings: Settings) -> PolledLink:
+def _no_transfers(_settings: Options) -> PolledLink:
     raise LinkError("expected a link to a bus that is polled, got one that is none")
 
 
-def _claims_nothing(_settings: Settings) -> Sequence[Claim]:
+def _claims_nothing(_settings: Options) -> Sequence[Claim]:
     return ()
 
 
-def _knows_no_problem(_settings: Settings, _frames: bool) -> str:
+def _knows_no_problem(_settings: Options, _frames: bool) -> str:
     return ""
 
 

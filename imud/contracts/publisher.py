@@ -7,7 +7,7 @@ from socket import socket
 from typing import Any, Final, Protocol
 
 from imud.attitude.conventions import Convention
-from imud.attitude.published import PublishedFrame, as_sent
+from imud.attitude.published import PublishedAxes, as_sent
 from imud.contracts.command import Actions, CalibrationResult, Calibrations
 from imud.contracts.lines import UtcReference, WatchedInput, WatchLine
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
@@ -15,7 +15,7 @@ from imud.contracts.status import ClientStatus, DeviceStatus, FlightStatus, Mqtt
 from imud.formats.slot import encode_slots
 from imud.model.errors import CommandError
 from imud.model.event import Event
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Sample
 
 PutRecord = Callable[[bytes], None]
@@ -85,7 +85,7 @@ class Batch:
 
     __slots__ = ("_converted", "_slots", "device", "device_id", "frame", "samples")
 
-    def __init__(self, device: str, device_id: int, samples: Sequence[Sample], frame: PublishedFrame = AS_SENT) -> None:
+    def __init__(self, device: str, device_id: int, samples: Sequence[Sample], frame: PublishedAxes = AS_SENT) -> None:
         self.device = device
         self.device_id = device_id
         """The daemon's number of the device, as in slots."""
@@ -300,7 +300,7 @@ class PublisherType:
 
     name: str
     """The top-level key in the configuration."""
-    settings: type[Settings]
+    settings: type[Options]
     make: Callable[[Any, PublisherContext], Publisher]
     wanted: Callable[[Any], bool] = attrgetter("enabled")
     """Whether there is anything to do with these settings."""

@@ -7,7 +7,7 @@ from typing import Generic, TypeVar, cast
 T = TypeVar("T")
 
 
-class Table(Mapping[str, T], Generic[T]):
+class Registry(Mapping[str, T], Generic[T]):
     """Mapping from a name to the object of its row. A new plug-in is one new file and one row.
 
     Raises KeyError for a name without a row; the message lists the names there are.

@@ -15,7 +15,7 @@ from typing import Any, cast
 import msgspec
 
 from imud.contracts.command import Risk, Target
-from imud.model.options import Settings
+from imud.model.options import Options
 
 
 class OnDifference(StrEnum):
@@ -77,7 +77,7 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DeviceSettings:
+class SettingsTable:
     """All settings of the devices of one driver. Steps of a plan have the order of the table."""
 
     table: Mapping[str, Setting]
@@ -96,7 +96,7 @@ class DeviceSettings:
     checked the declared ones alone. `target.baud` is 0 where it is not known."""
 
     @property
-    def declarable(self) -> type[Settings]:
+    def declarable(self) -> type[Options]:
         """The struct of a declaration: each setting that can be written, None for one that is not declared."""
         return _declarable(self)
 
@@ -105,7 +105,7 @@ class DeviceSettings:
         return id(self)
 
 
-def declared_values(declared: Settings | None) -> dict[str, Any]:
+def declared_values(declared: Options | None) -> dict[str, Any]:
     """Return the values of an instance of `declarable` by name, without those that are not declared."""
     if declared is None:
         return {}
@@ -113,12 +113,12 @@ def declared_values(declared: Settings | None) -> dict[str, Any]:
 
 
 @cache
-def _declarable(settings: DeviceSettings) -> type[Settings]:
+def _declarable(settings: SettingsTable) -> type[Options]:
     fields = [(name, one.type | None, None) for name, one in settings.table.items() if one.write is not None]
     made = msgspec.defstruct(
-        "Declared", fields, bases=(Settings,), frozen=True, kw_only=True, forbid_unknown_fields=True
+        "Declared", fields, bases=(Options,), frozen=True, kw_only=True, forbid_unknown_fields=True
     )
-    return cast(type[Settings], made)
+    return cast(type[Options], made)
 
 
 # --- what imud says of them -------------------------------------------------------------------------------------------
@@ -216,7 +216,7 @@ class SettingsPlan(msgspec.Struct, frozen=True):
     save: bool = False
     restart: bool = False
     left_out: dict[str, str] = {}  # msgspec copies a mutable default
-    """Settings that differ and are not written, each with why not."""
+    """Options that differ and are not written, each with why not."""
     risk: Risk = Risk.NONE
 
     @property

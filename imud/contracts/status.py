@@ -9,13 +9,13 @@ from msgspec import Meta
 from imud.attitude.conventions import Heading
 from imud.attitude.published import FrameWords
 from imud.contracts.setting import SettingsStatus
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Sync
 
 Sigma = Annotated[float, Meta(gt=0)] | None
 
 
-class Deviations(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Deviations(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One-sigma noise of one sample, the same for every axis, in SI units; None where it is not known."""
 
     accel_m_s2: Sigma = None

@@ -11,8 +11,8 @@ from imud.config.model import DeviceConfig
 from imud.contracts.command import Action
 from imud.contracts.lines import AlarmRanges, LineFactory
 from imud.contracts.status import LinesStatus, UtcStatus
-from imud.device.health import Notices
-from imud.device.utc import DevicePort, UtcKeeper, make_keeper
+from imud.device.health import DeviceEvents
+from imud.device.utc import DevicePort, UtcFeed, make_keeper
 from imud.host.clock import HostClock
 from imud.lines.reset import ResetLine, make_reset
 from imud.lines.sync import LineActions, SyncSignals
@@ -54,11 +54,11 @@ class Attachments:
     """Attachments of one device. Synchronization: the loop's thread only."""
 
     def __init__(
-        self, config: DeviceConfig, lines: LineFactory, hooks: AttachmentHooks, notices: Notices, host: HostClock
+        self, config: DeviceConfig, lines: LineFactory, hooks: AttachmentHooks, notices: DeviceEvents, host: HostClock
     ) -> None:
         """Make the attachments that `config` has; `lines` makes the GPIO lines."""
         raise_event = notices.raise_event
-        self._utc: UtcKeeper | None = make_keeper(config, hooks.port, host)
+        self._utc: UtcFeed | None = make_keeper(config, hooks.port, host)
         self._signals: SyncSignals | None = None
         if config.lines is not None:
             on_pulses = self._utc.on_pulses if self._utc is not None else None

@@ -26,7 +26,7 @@ from imud.contracts.command import (
     Target,
     Verdict,
 )
-from imud.device.health import Notices
+from imud.device.health import DeviceEvents
 from imud.model.errors import CommandError, ImudError
 from imud.model.event import EventKind
 from imud.model.sample import Pair, Sample, Vector3
@@ -309,10 +309,10 @@ RunScript = Callable[[Callable[[Target], Any]], Awaitable[Any]]
 """Runs a script that a function makes from the target. Raises CommandError, TransferError, DeviceRefused, LinkError."""
 
 
-class Guide:
+class CalibrationRun:
     """Guide of one device's calibrations, one at a time; an attachment. Synchronization: the loop's thread only."""
 
-    def __init__(self, run_script: RunScript, notices: Notices) -> None:
+    def __init__(self, run_script: RunScript, notices: DeviceEvents) -> None:
         self._run_script = run_script
         self._notices = notices
         self._running: asyncio.Task[CalibrationResult] | None = None

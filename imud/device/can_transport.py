@@ -20,7 +20,7 @@ from imud.drivers import DRIVERS
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame, frame_bits
 from imud.model.errors import LinkError
 from imud.model.event import EventKind
-from imud.model.options import Settings, shown
+from imud.model.options import Options, shown
 from imud.model.units import NS_PER_S
 from imud.recording.observer import PathParts
 from imud.sampling.path import CanPath, SamplePath
@@ -112,7 +112,7 @@ class CanTransport:
         )
         self._round: CanRound | None = None
         """The search that frames go to; None while they go to the path."""
-        self._options: Settings | None = None
+        self._options: Options | None = None
         self._codec: CanCodec | None = None
         self._node: int | None = None
         """The device that was found, as its driver numbers them; None for a driver that is named."""
@@ -189,7 +189,7 @@ class CanTransport:
         self._remembered.put(self._config.name, RememberedDevice(driver.name, 0, node))
         self._begin()
 
-    def _set_up(self, driver: CanDriver, options: Settings) -> None:
+    def _set_up(self, driver: CanDriver, options: Options) -> None:
         """Make codec, clock and path for a device."""
         if self.path is not None:
             self.path.reset()
@@ -281,7 +281,7 @@ class CanTransport:
             self.driver.apply_identity(self._codec, identity)
             self._context.tap.codec_changed()
 
-    def _follow(self, options: Settings) -> None:
+    def _follow(self, options: Options) -> None:
         """Follow a script that has given the device another number: filters, codec, and what other devices know."""
         driver = self.driver
         if driver is None or options == self._options:
@@ -399,7 +399,7 @@ class CanTransport:
         return self._config.identify and self.link.writable
 
 
-def _changed(before: Settings | None, after: Settings) -> str:
+def _changed(before: Options | None, after: Options) -> str:
     """Options that differ, for people, for example `options.node to 9`."""
     given = before if before is not None else type(after)()
     names = [name for name in type(after).__struct_fields__ if getattr(given, name) != getattr(after, name)]

@@ -24,21 +24,21 @@ from imud.contracts.publisher import Batch, PutRecord
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, LinesStatus
 from imud.device.attachments import AttachmentHooks, Attachments
-from imud.device.calibration import Guide
+from imud.device.calibration import CalibrationRun
 from imud.device.flash import SettingsFiles
-from imud.device.health import Health, Notices
+from imud.device.health import DeviceEvents, Health
 from imud.device.latency import Need
 from imud.device.settings import KnownIdentity, SettingsKeeper, identity_words
 from imud.device.transport import UNHEARD_NS, DeviceContext, Transport
 from imud.device.utc import DevicePort
-from imud.device.watches import FrameWatch, StatusWatch
+from imud.device.watches import AttitudeWatch, StatusWatch
 from imud.host.clock import HostClock
 from imud.host.log import printable, shown
 from imud.model.errors import BadArgument, CommandError, ImudError, LinkBusy, LinkError, LinkMissing
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.recording.observer import DeviceTap
+from imud.recording.observer import PathObserver
 from imud.sampling.path import LatencyMeter, RateMeter, SamplePath
 
 log = logging.getLogger(__name__)
@@ -79,20 +79,20 @@ class Device:
         self.ledger = Ledger()
         self._host = host
         self._suspends = host.suspends
-        self._notices = Notices(config.name, self.ledger, send_event)
+        self._notices = DeviceEvents(config.name, self.ledger, send_event)
         self._health = Health(self._notices)
         port = DevicePort(self._write, lambda: self._transport.bit_rate, self._is_busy)
         hooks = AttachmentHooks(port, self._on_reset)
         self._attachments = Attachments(config, lines, hooks, self._notices, host)
         self._identity = KnownIdentity(self._notices, host.now_ns, self._on_settings, self._described)
-        self._tap = DeviceTap(config, device_id, self.ledger, host)
+        self._tap = PathObserver(config, device_id, self.ledger, host)
         self._transport = make_transport(
             DeviceContext(
                 config, device_id, host, self.ledger, self._notices, self._health, self._identity, self._attachments,
                 publish, self._tap,
             )
         )  # fmt: skip
-        self._guide = Guide(self._transport.run_script, self._notices)
+        self._guide = CalibrationRun(self._transport.run_script, self._notices)
         self._attachments.add(self._guide)
         transport = self._transport
         self._settings = SettingsKeeper(
@@ -100,7 +100,7 @@ class Device:
             self._can_be_asked, transport.read_back,
         )  # fmt: skip
         self._attachments.add(self._settings)
-        self._frame = FrameWatch(config, self._notices)
+        self._frame = AttitudeWatch(config, self._notices)
         self._status = StatusWatch(self._notices)
         self._line_differences: Mapping[str, str] = {}
         self._rate = RateMeter()
@@ -114,7 +114,7 @@ class Device:
         return self._health.state
 
     @property
-    def tap(self) -> DeviceTap:
+    def tap(self) -> PathObserver:
         """Where a recording hears the device; it begins by `record`."""
         return self._tap
 

@@ -22,7 +22,7 @@ INTERVAL_NS = NS_PER_S
 RAW_SHOWN_BYTES = 32
 
 
-class Notices:
+class DeviceEvents:
     """Events of one device: `raise_event` sends one at once, `tick` those of counters."""
 
     def __init__(self, device: str, ledger: Ledger, send: Callable[[Event], None]) -> None:
@@ -102,7 +102,7 @@ STREAMING = (DeviceState.RUNNING, DeviceState.SILENT)
 class Health:
     """State and problem of one device; all times are CLOCK_MONOTONIC in ns. Synchronization: the loop's thread only."""
 
-    def __init__(self, notices: Notices) -> None:
+    def __init__(self, notices: DeviceEvents) -> None:
         self.state = DeviceState.MISSING
         self.problem = ""
         """Present fault, one sentence; empty for none."""

@@ -18,11 +18,11 @@ import msgspec
 from imud.contracts.codec import Poll, Reading
 from imud.contracts.command import Target
 from imud.contracts.driver import Identity, PolledDriver, of_kind
-from imud.contracts.lines import Edge, LineFactory, ReadySettings
+from imud.contracts.lines import Edge, LineFactory, ReadyOptions
 from imud.contracts.link import OnEnd, PolledLink
 from imud.contracts.script import Message
 from imud.contracts.status import DeviceState, DeviceStatus, LinesStatus, PollingStatus
-from imud.device.health import Notices
+from imud.device.health import DeviceEvents
 from imud.device.polled_bus import BusMember, Deadlines, PolledBuses, ReadySchedule
 from imud.device.transport import UNHEARD_NS, DeviceContext
 from imud.drivers import DRIVERS
@@ -30,7 +30,7 @@ from imud.lines.watched_line import WatchedLine
 from imud.links import LINKS
 from imud.model.errors import CommandError, DeviceRefused, ImudError, LinkError, TransferError, Trouble
 from imud.model.event import EventKind
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.recording.observer import PathParts
@@ -44,10 +44,10 @@ class DataReady:
     def __init__(
         self,
         device: str,
-        settings: ReadySettings,
+        settings: ReadyOptions,
         lines: LineFactory,
         rate_hz: float,
-        notices: Notices,
+        notices: DeviceEvents,
         now_ns: Callable[[], int],
     ) -> None:
         """`lines` makes the line; `rate_hz` is that of the reads while no edges come."""
@@ -161,7 +161,7 @@ class DataReady:
         self._notices.raise_event(self._now_ns(), EventKind.LINK, words, line="data_ready", **detail)
 
 
-def _rising(settings: ReadySettings) -> ReadySettings:
+def _rising(settings: ReadyOptions) -> ReadyOptions:
     """Return settings whose rising edge is the wanted one: of that alone the kernel reports the direction reliably."""
     if settings.edge == "rising":
         return settings
@@ -181,7 +181,7 @@ class IdentifiedDevice:
     """A device that answered on the bus."""
 
     driver: PolledDriver
-    options: Settings
+    options: Options
     target: int
     identity: Identity
 

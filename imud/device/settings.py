@@ -23,18 +23,18 @@ from imud.contracts.driver import Driver, Identity, PolledDriver
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import (
     AppliedSettings,
-    DeviceSettings,
     OnDifference,
     SettingDifference,
     SettingsPlan,
     SettingsReport,
     SettingsState,
     SettingsStatus,
+    SettingsTable,
     StepOutcome,
     declared_values,
 )
 from imud.device.flash import ModuleFlash, SettingsFiles, backup_text
-from imud.device.health import Notices
+from imud.device.health import DeviceEvents
 from imud.device.scripts import Exchange
 from imud.device.settings_plan import (
     DEVICE_ERRORS,
@@ -84,7 +84,7 @@ class KnownIdentity:
 
     def __init__(
         self,
-        notices: Notices,
+        notices: DeviceEvents,
         now_ns: Callable[[], int],
         on_settings: Callable[[Mapping[str, str]], None] = ignore_settings,
         describe: Callable[[Mapping[str, str]], Mapping[str, str]] = dict,
@@ -222,7 +222,7 @@ class SettingsKeeper:
         run: RunScript,
         driver: Callable[[], Driver | None],
         identity: KnownIdentity,
-        notices: Notices,
+        notices: DeviceEvents,
         host: HostClock,
         files: SettingsFiles,
         hears: Callable[[], bool],
@@ -451,7 +451,7 @@ class SettingsKeeper:
         if self._config.on_difference is not OnDifference.REPORT:
             await self._repair(table, actual)
 
-    async def _repair(self, table: DeviceSettings, actual: Values) -> None:
+    async def _repair(self, table: SettingsTable, actual: Values) -> None:
         """Set what differs, or note when it may be set again."""
         save = self._config.on_difference is OnDifference.APPLY_AND_SAVE
         try:
@@ -491,7 +491,7 @@ class SettingsKeeper:
         pause_s = PAUSES_S[min(len(self._repaired_ns), len(PAUSES_S) - 1)]
         return self._repaired_ns[-1] + pause_s * NS_PER_S - now_ns if self._repaired_ns else 0
 
-    async def _read(self, table: DeviceSettings) -> Values:
+    async def _read(self, table: SettingsTable) -> Values:
         def read(target: Target) -> Any:
             self._target = target
             return table.read(target)
@@ -501,7 +501,7 @@ class SettingsKeeper:
         return actual
 
     async def _apply(
-        self, table: DeviceSettings, wanted: Values, actual: Values, *, save: bool, asked: bool
+        self, table: SettingsTable, wanted: Values, actual: Values, *, save: bool, asked: bool
     ) -> AppliedSettings:
         plan = self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved)
         flash = ModuleFlash(self._writes, self._module, asked=asked)
@@ -525,12 +525,12 @@ class SettingsKeeper:
         return msgspec.structs.replace(done, advice=advice(self._config, done))
 
     def _make_plan(
-        self, table: DeviceSettings, wanted: Values, actual: Values, *, save: bool, unsaved: bool
+        self, table: SettingsTable, wanted: Values, actual: Values, *, save: bool, unsaved: bool
     ) -> SettingsPlan:
         assert self._target is not None
         return make_plan(table, self._target, wanted, actual, self._all_written(table), save=save, unsaved=unsaved)
 
-    def _all_written(self, table: DeviceSettings) -> dict[str, Any]:
+    def _all_written(self, table: SettingsTable) -> dict[str, Any]:
         """Values of settings that the device does not report, as written to it since its restart or before a save."""
         found: dict[str, Any] = {}
         for name, value in self._writes.unreadable(self._module).items():
@@ -595,23 +595,23 @@ class SettingsKeeper:
         serial_number = self._identity.identity.serial_number
         return f"{self._driver_name} {serial_number}" if serial_number else f"device {self._config.name}"
 
-    def _differences(self, table: DeviceSettings) -> dict[str, SettingDifference]:
+    def _differences(self, table: SettingsTable) -> dict[str, SettingDifference]:
         if self._actual is None:
             return {}
         return differences(table, self._declared, self._actual, self._all_written(table))
 
-    def _known_table(self) -> DeviceSettings | None:
+    def _known_table(self) -> SettingsTable | None:
         driver = self._driver()
         return driver.device_settings if driver is not None else None
 
-    def _table(self) -> DeviceSettings:
+    def _table(self) -> SettingsTable:
         table = self._known_table()
         if table is None:
             name = self._driver_name
             raise CommandError(f"{self._config.name}: driver {name} does not know the settings of its device")
         return table
 
-    def _wanted_values(self, table: DeviceSettings, given: Mapping[str, Any] | None) -> Values:
+    def _wanted_values(self, table: SettingsTable, given: Mapping[str, Any] | None) -> Values:
         if given is not None:
             return wanted_values(table, given)
         if not self._declared:

@@ -15,13 +15,13 @@ from imud.contracts.command import Risk, Target
 from imud.contracts.setting import (
     AppliedSettings,
     AppliedStep,
-    DeviceSettings,
     Effect,
     PlannedStep,
     Setting,
     SettingDifference,
     SettingInfo,
     SettingsPlan,
+    SettingsTable,
     StepOutcome,
     Written,
 )
@@ -32,7 +32,7 @@ Values = Mapping[str, Any]
 """Values of settings by name, in the types of the driver's table."""
 
 
-def has(table: DeviceSettings, name: str, wanted: Values, actual: Values, unreadable: Values) -> bool:
+def has(table: SettingsTable, name: str, wanted: Values, actual: Values, unreadable: Values) -> bool:
     """Whether a device has a wanted value: as it reports, or as was written to it where it does not."""
     setting = table.table[name]
     known = actual if name in actual else unreadable
@@ -40,7 +40,7 @@ def has(table: DeviceSettings, name: str, wanted: Values, actual: Values, unread
 
 
 def differences(
-    table: DeviceSettings, wanted: Values, actual: Values, unreadable: Values
+    table: SettingsTable, wanted: Values, actual: Values, unreadable: Values
 ) -> dict[str, SettingDifference]:
     """List the settings that can be read and are not as wanted, in the order of the table.
 
@@ -53,7 +53,7 @@ def differences(
     }
 
 
-def unverified(table: DeviceSettings, wanted: Values, actual: Values) -> tuple[str, ...]:
+def unverified(table: SettingsTable, wanted: Values, actual: Values) -> tuple[str, ...]:
     """List the wanted settings that the device does not tell, in the order of the table."""
     return tuple(name for name in table.table if name in wanted and name not in actual)
 
@@ -71,7 +71,7 @@ def as_json(value: Any) -> Any:
     return msgspec.to_builtins(value)
 
 
-def wanted_values(table: DeviceSettings, given: Mapping[str, Any]) -> dict[str, Any]:
+def wanted_values(table: SettingsTable, given: Mapping[str, Any]) -> dict[str, Any]:
     """Convert values of JSON or YAML to the types of the table, in its order.
 
     Raises BadArgument for a setting that is not known or cannot be set, and for a value that is not accepted.
@@ -84,7 +84,7 @@ def wanted_values(table: DeviceSettings, given: Mapping[str, Any]) -> dict[str, 
     return {name: _converted(name, given[name], table.table[name].type) for name in settable if name in given}
 
 
-def described_settings(table: DeviceSettings, declared: Values, actual: Values | None) -> tuple[SettingInfo, ...]:
+def described_settings(table: SettingsTable, declared: Values, actual: Values | None) -> tuple[SettingInfo, ...]:
     """Describe all settings of a table; `actual` is None where they were not read."""
     found = differences(table, declared, actual, {}) if actual is not None else {}
     return tuple(
@@ -127,7 +127,7 @@ CANNOT_SAVE: Final = "comes into force by save and restart only, and this driver
 
 
 def make_plan(
-    table: DeviceSettings,
+    table: SettingsTable,
     target: Target,
     wanted: Values,
     actual: Values,
@@ -169,7 +169,7 @@ def merged(actual: Values, wanted: Values) -> dict[str, Any]:
     return values
 
 
-def _why_left_out(table: DeviceSettings, setting: Setting, save: bool) -> str:
+def _why_left_out(table: SettingsTable, setting: Setting, save: bool) -> str:
     if setting.saves:
         return "" if save else SAVES_ITSELF
     if setting.effect is Effect.AT_ONCE:
@@ -212,7 +212,7 @@ class FlashBudget(Protocol):
 class Applying:
     """One plan under way. `wanted` has the values in the types of the table, `actual` what was read last."""
 
-    table: DeviceSettings
+    table: SettingsTable
     run: RunScript
     flash: FlashBudget
     wanted: Values

@@ -19,13 +19,13 @@ from imud.contracts.publisher import Batch
 from imud.contracts.script import Message
 from imud.contracts.status import DeviceStatus
 from imud.device.attachments import Attachments
-from imud.device.health import Health, Notices
+from imud.device.health import DeviceEvents, Health
 from imud.device.settings import KnownIdentity, pauses_s
 from imud.host.clock import HostClock
 from imud.model.errors import NothingHeard
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_S
-from imud.recording.observer import DeviceTap
+from imud.recording.observer import PathObserver
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import PathContext, SamplePath, make_clock
 
@@ -43,12 +43,12 @@ class DeviceContext:
     device_id: int
     host: HostClock
     ledger: Ledger
-    notices: Notices
+    notices: DeviceEvents
     health: Health
     identity: KnownIdentity
     attachments: Attachments
     publish: Callable[[Batch], None]
-    tap: DeviceTap
+    tap: PathObserver
     """Where a recording hears what goes into the path; the transport says when it makes another one."""
 
     def path_context(self, driver: Driver, link: Link, on_message: Callable[[Message, int], None]) -> PathContext:

@@ -39,7 +39,7 @@ class DevicePort:
     """Whether a request script is running on the device."""
 
 
-class UtcKeeper:
+class UtcFeed:
     """Feed of UTC to a device's port and clock. Synchronization: the loop's thread only."""
 
     def __init__(
@@ -157,7 +157,7 @@ def _better(one: UtcReference | None, other: UtcReference | None) -> UtcReferenc
     return one if one.error_ns <= other.error_ns else other
 
 
-def make_keeper(config: DeviceConfig, port: DevicePort, host: HostClock) -> UtcKeeper | None:
+def make_keeper(config: DeviceConfig, port: DevicePort, host: HostClock) -> UtcFeed | None:
     """Make the keeper that a device's configuration needs; None if it has neither sentences nor a pulse per second."""
     now_ns, utc_offset_ns, steady = host.now_ns, host.utc_offset_ns, host.steady
     rmc, pps = config.rmc, config.lines.pps if config.lines is not None else None
@@ -169,9 +169,9 @@ def make_keeper(config: DeviceConfig, port: DevicePort, host: HostClock) -> UtcK
         return system_reference(kernel_clock(), utc_offset_ns())
 
     if rmc is None:
-        return UtcKeeper(None, None, system, now_ns, chrony=chrony, steady=steady)
+        return UtcFeed(None, None, system, now_ns, chrony=chrony, steady=steady)
     source = RMC_SOURCES[rmc.source](rmc, SourceContext(_serial_port, now_ns, utc_offset_ns))
-    return UtcKeeper(source, port, system, now_ns, rate_hz=rmc.rate_hz, chrony=chrony, steady=steady)
+    return UtcFeed(source, port, system, now_ns, rate_hz=rmc.rate_hz, chrony=chrony, steady=steady)
 
 
 def _serial_port(path: str, baud: int) -> StreamLink:

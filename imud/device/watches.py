@@ -12,7 +12,7 @@ from imud.attitude.gravity import Contradiction, GravityCheck
 from imud.config.model import DeviceConfig
 from imud.contracts.driver import Driver, StatusBit
 from imud.contracts.status import FrameStatus
-from imud.device.health import Notices
+from imud.device.health import DeviceEvents
 from imud.model.event import EventKind
 from imud.model.units import NS_PER_S
 from imud.sampling.path import SamplePath
@@ -21,10 +21,10 @@ AS_DEVICE = "device"
 """Name of the convention where the configuration has none."""
 
 
-class FrameWatch:
+class AttitudeWatch:
     """Watches what is published of one device. Synchronization: the event loop's thread only."""
 
-    def __init__(self, config: DeviceConfig, notices: Notices) -> None:
+    def __init__(self, config: DeviceConfig, notices: DeviceEvents) -> None:
         self._config = config
         self._notices = notices
         self._path: SamplePath | None = None
@@ -92,7 +92,7 @@ INTERVAL_NS: Final = NS_PER_S
 class StatusWatch:
     """State of the notable status bits of one device. Synchronization: the loop's thread only."""
 
-    def __init__(self, notices: Notices) -> None:
+    def __init__(self, notices: DeviceEvents) -> None:
         self._notices = notices
         self._path: SamplePath | None = None
         self._bits: Mapping[int, StatusBit] = {}

@@ -1,9 +1,9 @@
 """Wire protocols, a folder each: codec, session, actions, and `driver.py` with the row that names them. No I/O."""
 
 from imud.contracts.driver import Driver
-from imud.contracts.registry import Table
+from imud.contracts.registry import Registry
 
-DRIVERS: Table[Driver] = Table(
+DRIVERS: Registry[Driver] = Registry(
     "driver",
     {
         "hipnuc-uart": "imud.drivers.hipnuc.uart.driver:DRIVER",

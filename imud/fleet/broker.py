@@ -15,7 +15,7 @@ from pathlib import Path
 from random import random
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
-from imud.fleet.settings import Broker, MqttSettings
+from imud.fleet.settings import Broker, MqttOptions
 from imud.host.files import read_regular
 from imud.model.errors import ServerError, reason_of
 from imud.model.units import NS_PER_S
@@ -43,7 +43,7 @@ class BrokerError(Exception):
 
 
 class BrokerAccess(Protocol):
-    """Who connects, and which certificates count; `MqttSettings` has all of it."""
+    """Who connects, and which certificates count; `MqttOptions` has all of it."""
 
     @property
     def user(self) -> str:
@@ -246,7 +246,7 @@ class Connect(Protocol):
     """Function that connects to a broker."""
 
     def __call__(
-        self, broker: Broker, settings: MqttSettings, client_id: str, will: Will, is_wanted: Callable[[], bool], /
+        self, broker: Broker, settings: MqttOptions, client_id: str, will: Will, is_wanted: Callable[[], bool], /
     ) -> BrokerConnection:
         """Return a connection that the broker has accepted. Raises BrokerError, also once `is_wanted` returns False."""
         ...
@@ -264,7 +264,7 @@ class PahoConnection:
     """A connection by paho-mqtt. Synchronization: as `BrokerConnection`."""
 
     def __init__(
-        self, broker: Broker, settings: MqttSettings, client_id: str, will: Will,
+        self, broker: Broker, settings: MqttOptions, client_id: str, will: Will,
         is_wanted: Callable[[], bool] = lambda: True,
     ) -> None:  # fmt: skip
         """Connect and wait for the answer. Raises BrokerError.
@@ -297,7 +297,7 @@ class PahoConnection:
             self.close()
             raise BrokerError(f"{broker.name}: {connection_problem(error)}") from error
 
-    def _made(self, settings: MqttSettings, client_id: str, will: Will) -> Any:
+    def _made(self, settings: MqttOptions, client_id: str, will: Will) -> Any:
         """A client of paho-mqtt with everything but a connection. Raises OSError for files, ValueError."""
         client = paho_client(self._broker, settings, client_id, is_v5=self._is_v5)
         client.will_set(will.topic, will.payload, qos=1, retain=True)

@@ -34,7 +34,7 @@ from imud.fleet.messages import (
     decode_request,
     parse_topic,
 )
-from imud.fleet.settings import CommandSettings
+from imud.fleet.settings import CommandOptions
 from imud.fleet.streams import Gateway
 from imud.host.log import SAME_AS, shown
 from imud.model.errors import ImudError
@@ -80,7 +80,7 @@ class CommandChannel:
     counters are read by any. What both change is changed under a lock, which is held for no I/O."""
 
     def __init__(
-        self, settings: CommandSettings, gateway: Gateway, control: Callable[[str], DeviceControl],
+        self, settings: CommandOptions, gateway: Gateway, control: Callable[[str], DeviceControl],
         now_ns: Callable[[], int], utc_offset_ns: Callable[[], int],
     ) -> None:  # fmt: skip
         self.run = 0

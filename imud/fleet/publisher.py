@@ -34,7 +34,7 @@ from imud.fleet.messages import (
     topic_of,
 )
 from imud.fleet.sender import MqttSender
-from imud.fleet.settings import DeviceSending, MqttSettings, broker_of
+from imud.fleet.settings import DeviceSending, MqttOptions, broker_of
 from imud.fleet.spool import Spool
 from imud.fleet.streams import Gateway
 from imud.fleet.writer import SentState, SpoolWriter, WriterQueue
@@ -140,7 +140,7 @@ class MqttPublisher:
     """The output. Synchronization: the event loop's thread only."""
 
     def __init__(
-        self, settings: MqttSettings, context: PublisherContext, *, connect: Connect = PahoConnection,
+        self, settings: MqttOptions, context: PublisherContext, *, connect: Connect = PahoConnection,
         start_worker: StartWorker = BusThread, host_name: Callable[[], str] = socket.gethostname,
     ) -> None:  # fmt: skip
         self._settings = settings
@@ -428,4 +428,4 @@ def settings_of(status: DeviceStatus) -> dict[str, object] | None:
     return found
 
 
-PUBLISHER = PublisherType("mqtt", MqttSettings, MqttPublisher, required=False)
+PUBLISHER = PublisherType("mqtt", MqttOptions, MqttPublisher, required=False)

@@ -15,8 +15,8 @@ from typing import Final
 from imud.fleet.broker import BrokerConnection, BrokerError, BrokerTurn, Connect, Will
 from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
-from imud.fleet.settings import MqttSettings
-from imud.fleet.spool import Spooled
+from imud.fleet.settings import MqttOptions
+from imud.fleet.spool import SpoolRow
 from imud.host.threads import WakeEvent
 from imud.model.units import NS_PER_S
 
@@ -36,7 +36,7 @@ class MqttSender:
     """The thread. Synchronization: methods from the writer's thread, counters read by any; `run` is the thread's."""
 
     def __init__(
-        self, settings: MqttSettings, client_id: str, will: Will, turn: BrokerTurn, connect: Connect,
+        self, settings: MqttOptions, client_id: str, will: Will, turn: BrokerTurn, connect: Connect,
         now_ns: Callable[[], int], commands: CommandChannel | None = None,
     ) -> None:  # fmt: skip
         self.session = 0
@@ -63,7 +63,7 @@ class MqttSender:
         self._sent_replies: dict[int, CommandReply] = {}
         """Answers without an acknowledgement, by the numbers of their messages."""
         self._lock = threading.Lock()
-        self._outbox: deque[Spooled] = deque()
+        self._outbox: deque[SpoolRow] = deque()
         self._in_flight: dict[int, int] = {}
         self._answers: list[tuple[int, int]] = []
         self._retained: dict[str, bytes] = {}
@@ -102,7 +102,7 @@ class MqttSender:
         with self._lock:
             return OUTBOX_MAX - len(self._outbox) - len(self._in_flight) if self.connected else 0
 
-    def give(self, session: int, rows: list[Spooled]) -> None:
+    def give(self, session: int, rows: list[SpoolRow]) -> None:
         """Have messages sent, in their order; ignored when the session is over."""
         with self._lock:
             if session != self.session:

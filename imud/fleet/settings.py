@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from imud.fleet.messages import NAME_PATTERN, is_name
-from imud.model.options import Settings, is_host, shown
+from imud.model.options import Options, is_host, shown
 from imud.model.units import NS_PER_S
 
 MEGABYTE: Final = 1_000_000
@@ -27,7 +27,7 @@ class Whole(StrEnum):
     SLOTS = "slots"
 
 
-class DeviceSending(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class DeviceSending(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is sent of a device."""
 
     rate_hz: Annotated[float, msgspec.Meta(ge=0.01, le=100)] | None = 1.0
@@ -53,8 +53,8 @@ class DeviceSending(Settings, frozen=True, kw_only=True, forbid_unknown_fields=T
         return round(self.batch_s * NS_PER_S)
 
 
-class CommandSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the command channel."""
+class CommandOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of the command channel."""
 
     enabled: bool = False
     """Whether actions of devices may be asked for over the broker, by whoever its rights let write to
@@ -123,7 +123,7 @@ def broker_of(url: str) -> Broker | None:
     return Broker(host, port or PORTS[parts.scheme], parts.scheme in ("mqtts", "wss"), websockets, path)
 
 
-class MqttSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class MqttOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of the output `mqtt`."""
 
     enabled: bool = False
@@ -167,7 +167,7 @@ class MqttSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """What waited for longer is dropped, hours."""
     status_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 60.0
     """How often the state of devices and of the gateway is sent, s."""
-    commands: CommandSettings = CommandSettings()
+    commands: CommandOptions = CommandOptions()
     """The command channel."""
     home_assistant: bool = False
     """Whether devices whose `status` is sent are announced to Home Assistant, in retained messages below

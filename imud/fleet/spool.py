@@ -48,7 +48,7 @@ _KINDS: Final = frozenset(kind.value for kind in MessageKind)
 _STREAMS: Final = frozenset(stream.value for stream in Stream)
 
 
-class Spooled(NamedTuple):
+class SpoolRow(NamedTuple):
     """A message that waits, as a row of the file."""
 
     id: int
@@ -77,15 +77,15 @@ class Spooled(NamedTuple):
         return self.topic.split("/")[2]
 
 
-def row_of(topic: str, stream: Stream, message: FleetMessage, payload: bytes, stored_utc_ns: int) -> Spooled:
+def row_of(topic: str, stream: Stream, message: FleetMessage, payload: bytes, stored_utc_ns: int) -> SpoolRow:
     """A message that is to be stored."""
-    return Spooled(
+    return SpoolRow(
         0, message.boot, message.device, stream.value, message.kind.value, topic, message.first, message.last,
         message.count, stored_utc_ns, payload,
     )  # fmt: skip
 
 
-def sound_row(values: Sequence[object]) -> Spooled | None:
+def sound_row(values: Sequence[object]) -> SpoolRow | None:
     """The row with these values; None for one that is damaged."""
     row = _numbered(values)
     if row is None or row.kind not in _KINDS:
@@ -98,7 +98,7 @@ def sound_row(values: Sequence[object]) -> Spooled | None:
     return row if (head.gateway, head.boot, head.device, head.first, head.last) == own else None
 
 
-def mended_row(values: Sequence[object]) -> Spooled | None:
+def mended_row(values: Sequence[object]) -> SpoolRow | None:
     """A note in place of a row that is damaged; None where it does not say which numbers it had."""
     row = _numbered([*values[:4], "", *values[5:-1], b""])
     if row is None or row.items != row.last - row.first + 1:
@@ -114,7 +114,7 @@ def is_position(values: Sequence[object]) -> bool:
     return False
 
 
-def note_of(row: Spooled, cause: DropCause) -> bytes:
+def note_of(row: SpoolRow, cause: DropCause) -> bytes:
     """The payload that says that a message was dropped."""
     try:
         message = decode_message(row.payload)
@@ -130,10 +130,10 @@ def note_of(row: Spooled, cause: DropCause) -> bytes:
     return encode_message(note)
 
 
-def _numbered(values: Sequence[object]) -> Spooled | None:
+def _numbered(values: Sequence[object]) -> SpoolRow | None:
     """The row, where it says of which stream it is and which numbers it has."""
     try:
-        row = msgspec.convert(values, Spooled)
+        row = msgspec.convert(values, SpoolRow)
     except msgspec.ValidationError:
         return None
     parts = parse_topic(row.topic)
@@ -334,7 +334,7 @@ class Spool:
 
     # --- messages ----------------------------------------------------------------------------------------------------
 
-    def commit(self, new: Sequence[Spooled], acknowledged: Collection[int], now_ns: int, utc_ns: int) -> None:
+    def commit(self, new: Sequence[SpoolRow], acknowledged: Collection[int], now_ns: int, utc_ns: int) -> None:
         """Store and remove messages, and keep within room and age, all or nothing. Raises SpoolError."""
         if self._base is None:
             self.open()
@@ -376,9 +376,9 @@ class Spool:
         finally:
             self._reserve()
 
-    def after(self, limit: int) -> list[Spooled]:
+    def after(self, limit: int) -> list[SpoolRow]:
         """The next messages, oldest first, which count as given from now on. Raises SpoolError."""
-        found: list[Spooled] = []
+        found: list[SpoolRow] = []
         if self._ahead_from:
             found = self._between(self._ahead, _ID_MAX, limit)
             self._ahead = found[-1].id if found else self._ahead
@@ -391,7 +391,7 @@ class Spool:
         self._given = found[-1].id if found else self._given
         return found
 
-    def _between(self, after_id: int, last_id: int, limit: int) -> list[Spooled]:
+    def _between(self, after_id: int, last_id: int, limit: int) -> list[SpoolRow]:
         """Messages after an id up to another, oldest first. Raises SpoolError."""
         if limit <= 0:
             return []
@@ -432,7 +432,7 @@ class Spool:
 
     # --- inside a transaction ----------------------------------------------------------------------------------------
 
-    def _store(self, base: sqlite3.Connection, new: Sequence[Spooled], utc_ns: int) -> None:
+    def _store(self, base: sqlite3.Connection, new: Sequence[SpoolRow], utc_ns: int) -> None:
         rows = []
         for row in new:
             rows.append(row._replace(id=self._next_id, stored_utc_ns=utc_ns))
@@ -471,7 +471,7 @@ class Spool:
         """What `_FREE` leaves out: all up to the first id, and all after the second up to the third."""
         return self._given, self._ahead_from, self._ahead
 
-    def _sound(self, base: sqlite3.Connection, where: str, values: Sequence[object]) -> list[Spooled]:
+    def _sound(self, base: sqlite3.Connection, where: str, values: Sequence[object]) -> list[SpoolRow]:
         """Rows that are not damaged; one that is becomes a note, or goes where it does not say of which numbers."""
         while True:
             rows = base.execute(f"SELECT {_COLUMNS} FROM message WHERE {where}", values).fetchall()
@@ -479,7 +479,7 @@ class Spool:
             if found or not rows:  # else all of them are gone, and others stand behind them
                 return found
 
-    def _mended(self, base: sqlite3.Connection, values: Sequence[Any]) -> Spooled | None:
+    def _mended(self, base: sqlite3.Connection, values: Sequence[Any]) -> SpoolRow | None:
         number, row, cause = values[0], mended_row(values), DropCause.DAMAGED.value
         self.dropped[cause] = self.dropped.get(cause, 0) + (row.items if row is not None else 1)
         if row is None:
@@ -536,7 +536,7 @@ class Spool:
             self._thin_from = row.id
         return bool(found)
 
-    def _thin(self, base: sqlite3.Connection, row: Spooled) -> None:
+    def _thin(self, base: sqlite3.Connection, row: SpoolRow) -> None:
         try:
             message = decode_message(row.payload)
         except ValueError:
@@ -559,12 +559,12 @@ class Spool:
             self._drop(base, row, DropCause.SPACE)
         return bool(found)
 
-    def _drop(self, base: sqlite3.Connection, row: Spooled, cause: DropCause) -> None:
+    def _drop(self, base: sqlite3.Connection, row: SpoolRow, cause: DropCause) -> None:
         """Put a note of what was dropped in the place of a message, or into the note before it. No-op for a note."""
         if row.kind == MessageKind.DROPPED.value:
             return
         self.dropped[cause.value] = self.dropped.get(cause.value, 0) + row.items
-        before: list[Spooled] = []
+        before: list[SpoolRow] = []
         marker_id = self._markers.get(row.key, 0)
         if marker_id > self._given and not self._ahead_from < marker_id <= self._ahead:
             before = self._sound(base, "id = ?", (marker_id,))

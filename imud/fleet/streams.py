@@ -27,7 +27,7 @@ from imud.fleet.messages import (
     topic_of,
 )
 from imud.fleet.settings import DeviceSending, Whole
-from imud.fleet.spool import Spooled, row_of
+from imud.fleet.spool import SpoolRow, row_of
 from imud.fleet.statistics import IntervalMaker, by_interval
 from imud.formats.slot import encode_slots
 from imud.model.event import Event
@@ -81,7 +81,7 @@ class _Numbered:
             samples=samples or [], intervals=intervals or [], events=events or [],
         )  # fmt: skip
 
-    def row(self, message: FleetMessage, stored_utc_ns: int, payload: bytes | None = None) -> Spooled:
+    def row(self, message: FleetMessage, stored_utc_ns: int, payload: bytes | None = None) -> SpoolRow:
         """The message as it is stored."""
         return row_of(self._topic, self._stream, message, payload or encode_message(message), stored_utc_ns)
 
@@ -89,7 +89,7 @@ class _Numbered:
         """Go on where the spool says that the stream came to."""
         self._begin, self.next = position.begin, position.last + 1
 
-    def missing(self, first: int, utc_ns: int, cause: DropCause) -> list[Spooled]:
+    def missing(self, first: int, utc_ns: int, cause: DropCause) -> list[SpoolRow]:
         """The message about numbers that are missing before `first`, if there are any."""
         if not self.next or first <= self.next:
             return []
@@ -130,9 +130,9 @@ class DeviceStreams:
         if found is not self._events:
             self.next_seq, self._gap_cause = max(self.next_seq, found.next), DropCause.OFF
 
-    def add(self, samples: Sequence[Sample]) -> list[Spooled]:
+    def add(self, samples: Sequence[Sample]) -> list[SpoolRow]:
         """Take samples in the order of their `seq`; return the messages that are whole."""
-        made: list[Spooled] = []
+        made: list[SpoolRow] = []
         begin = 0
         for at, sample in enumerate(samples):
             if self.next_seq and sample.seq > self.next_seq:
@@ -143,7 +143,7 @@ class DeviceStreams:
             self.next_seq, self._gap_cause = sample.seq + 1, DropCause.QUEUE
         return made + self._add_run(samples[begin:])
 
-    def event(self, event: Event, utc_ns: int) -> list[Spooled]:
+    def event(self, event: Event, utc_ns: int) -> list[SpoolRow]:
         """Take an event; return its message."""
         if not self._sending.events:
             return []
@@ -151,7 +151,7 @@ class DeviceStreams:
         message = self._events.message(MessageKind.EVENTS, number, number, 1, utc_ns, events=[event])
         return [self._events.row(message, utc_ns)]
 
-    def missed_events(self, count: int, utc_ns: int) -> list[Spooled]:
+    def missed_events(self, count: int, utc_ns: int) -> list[SpoolRow]:
         """Take the count of events that had no room in the queue; return the message about them."""
         if not self._sending.events:
             return []
@@ -161,9 +161,9 @@ class DeviceStreams:
         )
         return [self._events.row(message, utc_ns)]
 
-    def look(self, now_ns: int) -> list[Spooled]:
+    def look(self, now_ns: int) -> list[SpoolRow]:
         """Return messages that are due though no later sample has come."""
-        made: list[Spooled] = []
+        made: list[SpoolRow] = []
         late_ns = now_ns - LATE_NS
         if self._samples and self._is_over(self._samples[0].t_ns, late_ns):
             made += self._send_samples()
@@ -173,16 +173,16 @@ class DeviceStreams:
             made += self._send_intervals()
         return made
 
-    def flush(self) -> list[Spooled]:
+    def flush(self) -> list[SpoolRow]:
         """Return messages of all that there is, also of an interval that has not ended."""
         self._end_interval()
         return self._send_samples() + self._send_intervals()
 
     # --- samples -----------------------------------------------------------------------------------------------------
 
-    def _add_run(self, samples: Sequence[Sample]) -> list[Spooled]:
+    def _add_run(self, samples: Sequence[Sample]) -> list[SpoolRow]:
         """Take samples without a gap."""
-        made: list[Spooled] = []
+        made: list[SpoolRow] = []
         if not samples:
             return made
         if self._sending.whole is not Whole.NONE:
@@ -210,13 +210,13 @@ class DeviceStreams:
         if interval is not None:
             self._intervals.append(interval)
 
-    def _send_intervals_if_due(self, t_ns: int) -> list[Spooled]:
+    def _send_intervals_if_due(self, t_ns: int) -> list[SpoolRow]:
         held = self._intervals
         if held and (len(held) >= INTERVALS_MAX or self._is_over(held[0].begin_t_ns, t_ns)):
             return self._send_intervals()
         return []
 
-    def _send_samples(self) -> list[Spooled]:
+    def _send_samples(self) -> list[SpoolRow]:
         samples, self._samples = self._samples, []
         stream = self._whole
         if not samples or stream is None:
@@ -229,7 +229,7 @@ class DeviceStreams:
         payload = encode_slots_message(message, encode_slots(samples, self._device_id))
         return [stream.row(message, utc_ns, payload)]
 
-    def _send_intervals(self) -> list[Spooled]:
+    def _send_intervals(self) -> list[SpoolRow]:
         intervals, self._intervals = self._intervals, []
         stream = self._statistics
         if not intervals or stream is None:
@@ -241,7 +241,7 @@ class DeviceStreams:
         )
         return [stream.row(message, newest.end_utc_ns)]
 
-    def _note_gap(self, sample: Sample) -> list[Spooled]:
+    def _note_gap(self, sample: Sample) -> list[SpoolRow]:
         """Messages about samples that are missing before this one."""
         if self._gap_cause is DropCause.QUEUE:
             self.gaps += sample.seq - self.next_seq
@@ -253,10 +253,10 @@ class DeviceStreams:
         return made
 
 
-def notes_of(rows: Sequence[Spooled], cause: DropCause, gateway: str) -> list[Spooled]:
+def notes_of(rows: Sequence[SpoolRow], cause: DropCause, gateway: str) -> list[SpoolRow]:
     """Messages that say that others were dropped, one for each stream, in place of `rows`, whose numbers follow on."""
-    first: dict[tuple[str, str], Spooled] = {}
-    last: dict[tuple[str, str], Spooled] = {}
+    first: dict[tuple[str, str], SpoolRow] = {}
+    last: dict[tuple[str, str], SpoolRow] = {}
     count: dict[tuple[str, str], int] = {}
     for row in rows:
         first.setdefault(row.key, row)

@@ -22,8 +22,8 @@ from imud.contracts.status import DeviceStatus
 from imud.fleet.accounts import StreamPosition
 from imud.fleet.messages import DropCause, Stream
 from imud.fleet.sender import MqttSender
-from imud.fleet.settings import DeviceSending, MqttSettings
-from imud.fleet.spool import Spool, Spooled, SpoolError
+from imud.fleet.settings import DeviceSending, MqttOptions
+from imud.fleet.spool import Spool, SpoolError, SpoolRow
 from imud.fleet.streams import DeviceStreams, Gateway, ReadClock, no_clock, notes_of
 from imud.host.threads import END_LIMIT_S, StartWorker
 from imud.model.event import Event
@@ -155,7 +155,7 @@ class SpoolWriter:
     """The thread and what it owns. Synchronization: counters are read by any thread, the rest is the thread's own."""
 
     def __init__(
-        self, settings: MqttSettings, gateway: Gateway, queue: WriterQueue, spool: Spool, sender: MqttSender,
+        self, settings: MqttOptions, gateway: Gateway, queue: WriterQueue, spool: Spool, sender: MqttSender,
         now_ns: Callable[[], int], utc_offset_ns: Callable[[], int], start_worker: StartWorker,
         clock: ReadClock = no_clock,
     ) -> None:  # fmt: skip
@@ -179,7 +179,7 @@ class SpoolWriter:
         self._streams: dict[str, DeviceStreams] = {}
         self._resumable: dict[str, list[StreamPosition]] = {}
         self._boots: dict[str, int] = {}
-        self._rows: list[Spooled] = []
+        self._rows: list[SpoolRow] = []
         self._acknowledged: set[int] = set()
         self._session = 0
         self._due_ns = 0

@@ -18,7 +18,7 @@ from pathlib import Path
 from struct import Struct
 from typing import Any, Final, NamedTuple
 
-from imud.contracts.lines import Edge, InputSettings, LineFactory, LineSettings, OnEdges, OnLineEnd, OutputSettings
+from imud.contracts.lines import Edge, InputOptions, LineFactory, LineOptions, OnEdges, OnLineEnd, OutputOptions
 from imud.host.files import group_of, user_name
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 
@@ -58,7 +58,7 @@ def load_gpiod() -> Any:
     return gpiod
 
 
-def find_line(gpiod: Any, settings: LineSettings, devices: Path = DEVICES) -> LineLocation:
+def find_line(gpiod: Any, settings: LineOptions, devices: Path = DEVICES) -> LineLocation:
     """Find the configured line. Raises LinkMissing, LinkDenied, and LinkError if two lines match."""
     chips, denied = _chips(gpiod, settings.chip, devices)
     found = [
@@ -225,7 +225,7 @@ CONSUMER_CHARACTERS: Final = 31
 class _Line:
     """Request and release of a line."""
 
-    def __init__(self, settings: LineSettings, purpose: str, devices: Path) -> None:
+    def __init__(self, settings: LineOptions, purpose: str, devices: Path) -> None:
         """`purpose` follows `imud` in the consumer name that other programs see."""
         self._settings = settings
         self._purpose = purpose
@@ -265,7 +265,7 @@ class GpioInput(_Line):
     """Input line of a GPIO chip, an `InputLine`. Synchronization: the loop's thread only."""
 
     def __init__(
-        self, settings: InputSettings, purpose: str = "", rising_only: bool = False, *, devices: Path = DEVICES
+        self, settings: InputOptions, purpose: str = "", rising_only: bool = False, *, devices: Path = DEVICES
     ) -> None:
         super().__init__(settings, purpose, devices)
         self._edges = "RISING" if rising_only else "BOTH"
@@ -351,7 +351,7 @@ class GpioOutput(_Line):
 
     def __init__(
         self,
-        settings: OutputSettings,
+        settings: OutputOptions,
         purpose: str = "",
         *,
         devices: Path = DEVICES,

@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from typing import Final
 
-from imud.contracts.lines import DeviceLines, LineFactory, OutputLine, ResetSettings
+from imud.contracts.lines import DeviceLines, LineFactory, OutputLine, ResetOptions
 from imud.lines.watched_line import RETRY_NS
 from imud.model.errors import CommandError, LinkError
 from imud.model.event import EventKind, RaiseEvent
@@ -30,7 +30,7 @@ Sleep = Callable[[float], Awaitable[None]]
 """`asyncio.sleep`, or a replacement of it."""
 
 
-async def reset(line: OutputLine, settings: ResetSettings, sleep: Sleep = asyncio.sleep) -> None:
+async def reset(line: OutputLine, settings: ResetOptions, sleep: Sleep = asyncio.sleep) -> None:
     """Pulse the open line, and wait for the device's start-up. Raises LinkError.
 
     The line is left inactive, also when the coroutine is cancelled.
@@ -49,7 +49,7 @@ class ResetLine:
     def __init__(
         self,
         line: OutputLine,
-        settings: ResetSettings,
+        settings: ResetOptions,
         raise_event: RaiseEvent,
         now_ns: Callable[[], int],
         on_pulse: Callable[[], None],

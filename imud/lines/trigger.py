@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Final
 
-from imud.contracts.lines import OnLineEnd, OutputLine, TriggerSettings, TriggerStamp
+from imud.contracts.lines import OnLineEnd, OutputLine, TriggerOptions, TriggerStamp
 from imud.host.threads import BusThread, StartWorker, Worker
 from imud.lines.watched_line import RETRY_NS
 from imud.model.errors import LinkError
@@ -255,7 +255,7 @@ class SinTrigger:
     def __init__(
         self,
         line: OutputLine,
-        settings: TriggerSettings,
+        settings: TriggerOptions,
         on_stamps: OnStamps,
         report: Callable[[str], None],
         now_ns: Callable[[], int],

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from imud.contracts.lines import Edge, InputLine, InputSettings, LineFactory, OnEdges, WatchedInput, WatchLine
+from imud.contracts.lines import Edge, InputLine, InputOptions, LineFactory, OnEdges, WatchedInput, WatchLine
 from imud.model.errors import LinkError
 from imud.model.units import NS_PER_S
 
@@ -112,7 +112,7 @@ class WatchedLine:
 def watching(lines: LineFactory, now_ns: Callable[[], int]) -> WatchLine:
     """Return what keeps lines open that belong to no device."""
 
-    def watch(settings: InputSettings, purpose: str, on_edges: OnEdges, report: Callable[[str], None]) -> WatchedInput:
+    def watch(settings: InputOptions, purpose: str, on_edges: OnEdges, report: Callable[[str], None]) -> WatchedInput:
         return WatchedLine(lines.make_input(settings, purpose, True), on_edges, lambda _level: None, report, now_ns)
 
     return watch

@@ -3,9 +3,9 @@
 from typing import Any
 
 from imud.contracts.link import LinkType
-from imud.contracts.registry import Table
+from imud.contracts.registry import Registry
 
-LINKS: Table[LinkType[Any]] = Table(
+LINKS: Registry[LinkType[Any]] = Registry(
     "link",
     {
         "uart": "imud.links.uart:LINK",

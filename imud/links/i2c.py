@@ -16,7 +16,7 @@ from imud.contracts.script import Transfer
 from imud.contracts.status import KernelCounters
 from imud.links.device_node import DeviceNode, bus_open_problem, transfer_problem
 from imud.model.errors import LinkError
-from imud.model.options import Settings
+from imud.model.options import Options
 
 I2C_TIMEOUT: Final = 0x0702
 """ioctl: time-out of the adapter in units of 10 ms (<linux/i2c-dev.h>)."""
@@ -27,8 +27,8 @@ BLOCK_BYTES_MAX: Final = 32
 """Longest I2C block read of SMBus controllers."""
 
 
-class I2cSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of an I2C bus."""
+class I2cOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of an I2C bus."""
 
     bus: Annotated[int, Meta(ge=0, le=255)] = 1
     """Number of the bus: 1 for `/dev/i2c-1`."""
@@ -38,7 +38,7 @@ class I2cSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Rate of reads, per second."""
 
 
-def bus_of(settings: I2cSettings) -> str:
+def bus_of(settings: I2cOptions) -> str:
     """Return the path of the bus."""
     return f"/dev/i2c-{settings.bus}"
 
@@ -78,7 +78,7 @@ class I2cLink:
 
     def __init__(
         self,
-        settings: I2cSettings,
+        settings: I2cOptions,
         *,
         open_bus: Callable[[str], I2cBus] = SMBus,
         ioctl: Callable[[int, int, int], object] = fcntl.ioctl,
@@ -173,9 +173,9 @@ class I2cLink:
         return b""
 
 
-def _claims(settings: I2cSettings) -> list[Claim]:
+def _claims(settings: I2cOptions) -> list[Claim]:
     address = None if settings.address == "auto" else settings.address
     return [Claim(place=f"/dev/i2c-{settings.bus}", key="bus", shared=True, part=address, part_key="address")]
 
 
-LINK = LinkType("i2c", I2cSettings, make_polled=I2cLink, claims=_claims, bus_of=bus_of)
+LINK = LinkType("i2c", I2cOptions, make_polled=I2cLink, claims=_claims, bus_of=bus_of)

@@ -17,11 +17,11 @@ from imud.contracts.link import LinkType, OnBusNews, OnData, OnEnd, OnFrames
 from imud.contracts.status import KernelCounters
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame
 from imud.model.errors import LinkBusy, LinkError, LinkMissing
-from imud.model.options import Settings
+from imud.model.options import Options
 
 
-class MemorySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a link inside the process."""
+class MemoryOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of a link inside the process."""
 
     name: str = "memory"
     """Title of the link."""
@@ -38,7 +38,7 @@ class MemorySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 class MemoryPort:
     """Common part of both links. Synchronization: the loop's thread only."""
 
-    def __init__(self, settings: MemorySettings) -> None:
+    def __init__(self, settings: MemoryOptions) -> None:
         self.title = settings.name
         self.baud: int = 0 if settings.baud == "auto" else settings.baud
         self.writable = settings.writable
@@ -106,7 +106,7 @@ class MemoryPort:
 class MemoryLink(MemoryPort):
     """A `StreamLink` whose far end is the test."""
 
-    def __init__(self, settings: MemorySettings) -> None:
+    def __init__(self, settings: MemoryOptions) -> None:
         super().__init__(settings)
         self.auto_baud = settings.baud == "auto"
         self.hold_ns = settings.hold_ns
@@ -165,7 +165,7 @@ class MemoryLink(MemoryPort):
 class MemoryCanLink(MemoryPort):
     """A `CanLink` whose far end is the test."""
 
-    def __init__(self, settings: MemorySettings) -> None:
+    def __init__(self, settings: MemoryOptions) -> None:
         super().__init__(settings)
         self.bus = settings.name
         self.bitrate = self.baud
@@ -219,4 +219,4 @@ class MemoryCanLink(MemoryPort):
         self._on_frames = self._on_news = None
 
 
-LINK = LinkType("memory", MemorySettings, MemoryLink, MemoryCanLink)
+LINK = LinkType("memory", MemoryOptions, MemoryLink, MemoryCanLink)

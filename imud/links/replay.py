@@ -30,12 +30,12 @@ from imud.host.files import NotRegularFile
 from imud.host.files import open_regular as open_file
 from imud.links.device_node import wait_until
 from imud.model.errors import ImudError, LinkDenied, LinkError, LinkMissing
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 
-class ReplaySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a replayed capture."""
+class ReplayOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of a replayed capture."""
 
     path: Annotated[str, Meta(min_length=1)]
     """Raw or stamped capture file."""
@@ -60,7 +60,7 @@ class FileReplay:
 
     writable = False
 
-    def __init__(self, settings: ReplaySettings, now_ns: Callable[[], int]) -> None:
+    def __init__(self, settings: ReplayOptions, now_ns: Callable[[], int]) -> None:
         self.title = settings.path
         self._settings = settings
         self._now_ns = now_ns
@@ -127,7 +127,7 @@ def no_log(path: str) -> str:
 class CanReplayLink(FileReplay):
     """A log as a `CanLink`. Synchronization: the loop's thread only."""
 
-    def __init__(self, settings: ReplaySettings, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(self, settings: ReplayOptions, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         super().__init__(settings, now_ns)
         self._span_ns = 0
         self._frames: Iterator[CanFrame] = iter(())
@@ -217,7 +217,7 @@ LOOKED_AT_BYTES: Final = 65536
 class ReplayLink(FileReplay):
     """A capture as a `StreamLink`. Synchronization: the loop's thread only."""
 
-    def __init__(self, settings: ReplaySettings, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(self, settings: ReplayOptions, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         super().__init__(settings, now_ns)
         self._player: Iterator[tuple[bytes, int]] = iter(())
         self._span_ns = 0
@@ -340,7 +340,7 @@ class ReplayLink(FileReplay):
             raise LinkError(f"{self.title}: {error}") from error
 
 
-def _unplayable(settings: ReplaySettings, reader: CaptureReader) -> str:
+def _unplayable(settings: ReplayOptions, reader: CaptureReader) -> str:
     """Return why a capture cannot be played at the speed of the settings; empty if it can."""
     if settings.speed == "recorded" and not reader.stamped:
         return f"{settings.path} is a raw capture without times: use speed real with a baud, or maximum"
@@ -349,7 +349,7 @@ def _unplayable(settings: ReplaySettings, reader: CaptureReader) -> str:
     return ""
 
 
-def _problem(settings: ReplaySettings, frames: bool) -> str:
+def _problem(settings: ReplayOptions, frames: bool) -> str:
     """Return why the file cannot be played; empty if it can, or if it is not there now."""
     try:
         with open_regular(settings.path) as file:
@@ -368,4 +368,4 @@ def _without_frames(path: str, begin: bytes) -> str:
     return "" if found else no_log(path)
 
 
-LINK = LinkType("replay", ReplaySettings, ReplayLink, CanReplayLink, problem=_problem)
+LINK = LinkType("replay", ReplayOptions, ReplayLink, CanReplayLink, problem=_problem)

@@ -42,7 +42,7 @@ from imud.formats.modbus import (
 from imud.links.device_node import CABLE, PROC, DeviceNode
 from imud.links.serial_port import TtyCounters, hold_ns, open_port, port_problem, request_low_latency
 from imud.model.errors import LinkError, LinkMissing, TransferError, Trouble
-from imud.model.options import Settings, shown
+from imud.model.options import Options, shown
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 READ_BYTES: Final = 4096
@@ -96,7 +96,7 @@ class Direction:
 
 
 class PortSetup(NamedTuple):
-    """Settings that all devices of a line must agree on."""
+    """Options that all devices of a line must agree on."""
 
     path: str
     baud: int
@@ -340,7 +340,7 @@ SHARED_PORTS: Final = SharedPorts()
 """The open lines of this process."""
 
 
-class Rs485Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Rs485Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of an RS-485 line. All but `address`, `rate_hz` and `reply_ms` must be the same for all its devices."""
 
     line: Annotated[str, Meta(min_length=1)]
@@ -365,7 +365,7 @@ class Rs485Link:
 
     def __init__(
         self,
-        settings: Rs485Settings,
+        settings: Rs485Options,
         *,
         ports: SharedPorts = SHARED_PORTS,
         sys: Path = Path("/sys"),
@@ -442,14 +442,14 @@ class Rs485Link:
             self._ports.release(line)
 
 
-def _claims(settings: Rs485Settings) -> list[Claim]:
+def _claims(settings: Rs485Options) -> list[Claim]:
     address = None if settings.address == "auto" else settings.address
     terms = _setup(settings).terms
     return [Claim(place=settings.line, key="line", shared=True, part=address, part_key="address", terms=terms)]
 
 
-def _setup(settings: Rs485Settings) -> PortSetup:
+def _setup(settings: Rs485Options) -> PortSetup:
     return PortSetup(settings.line, settings.baud, settings.direction, settings.echo)
 
 
-LINK = LinkType("rs485", Rs485Settings, make_polled=Rs485Link, claims=_claims, bus_of=lambda settings: settings.line)
+LINK = LinkType("rs485", Rs485Options, make_polled=Rs485Link, claims=_claims, bus_of=lambda settings: settings.line)

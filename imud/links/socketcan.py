@@ -37,7 +37,7 @@ from imud.formats.can import (
 from imud.links import netlink
 from imud.links.cyclic_sender import NO_MANAGER, KernelSender, LoopSender, Sender
 from imud.model.errors import LinkDenied, LinkError, LinkMissing
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 CLASS_CONTROLLER: Final = 0x0004
@@ -331,8 +331,8 @@ SO_RCVBUFFORCE: Final = 33
 log = logging.getLogger(__name__)
 
 
-class SocketCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a CAN bus."""
+class SocketCanOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of a CAN bus."""
 
     interface: Annotated[str, Meta(min_length=1, max_length=63)]
     """Network interface, for example `can0` (`ip link` lists them); for another backend its channel."""
@@ -349,10 +349,10 @@ class SocketCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fiel
             raise ValueError("bitrate: expected none with backend socketcan, the system sets it (docs/can.md)")
 
 
-OpenSocket = Callable[[SocketCanSettings, Sequence[CanFilter]], socket.socket]
+OpenSocket = Callable[[SocketCanOptions, Sequence[CanFilter]], socket.socket]
 
 
-def open_raw(settings: SocketCanSettings, filters: Sequence[CanFilter]) -> socket.socket:
+def open_raw(settings: SocketCanOptions, filters: Sequence[CanFilter]) -> socket.socket:
     """A raw CAN socket bound to the interface, with filters and the error frames to watch. Raises OSError."""
     opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
     try:
@@ -366,7 +366,7 @@ def open_raw(settings: SocketCanSettings, filters: Sequence[CanFilter]) -> socke
     return opened
 
 
-def _enlarge(opened: socket.socket, settings: SocketCanSettings) -> None:
+def _enlarge(opened: socket.socket, settings: SocketCanOptions) -> None:
     """Enlarge the receive buffer as far as permitted; the kernel doubles the value and reports the double."""
     wanted = settings.receive_buffer_bytes
     try:
@@ -391,7 +391,7 @@ class SocketCanLink:
     """A CAN network interface as a `CanLink`. Synchronization: the loop's thread only."""
 
     def __init__(
-        self, settings: SocketCanSettings, *, sys: Path = netlink.SYS, open_socket: OpenSocket = open_raw
+        self, settings: SocketCanOptions, *, sys: Path = netlink.SYS, open_socket: OpenSocket = open_raw
     ) -> None:
         """`open_socket` makes a bound, non-blocking socket whose messages are `struct can_frame`."""
         self._settings = settings
@@ -591,7 +591,7 @@ def _ignore_end(_error: LinkError | None) -> None:
     """The receiver before `start`."""
 
 
-def make(settings: SocketCanSettings) -> CanLink:
+def make(settings: SocketCanOptions) -> CanLink:
     """The link for the backend that the settings name."""
     if settings.backend == NATIVE:
         return SocketCanLink(settings)
@@ -600,11 +600,11 @@ def make(settings: SocketCanSettings) -> CanLink:
     return PythonCanLink(settings.backend, settings.interface, settings.bitrate)
 
 
-def _claims(settings: SocketCanSettings) -> list[Claim]:
+def _claims(settings: SocketCanOptions) -> list[Claim]:
     """A bus, which devices share; the port of a serial adapter (`slcan` and others) is for one of them."""
     name, port = settings.interface, settings.interface.startswith("/")
     place = name if port or settings.backend == NATIVE else f"{name} ({settings.backend})"
     return [Claim(place=place, key="interface", shared=not port, terms={"bitrate": settings.bitrate})]
 
 
-LINK = LinkType("socketcan", SocketCanSettings, make_can=make, claims=_claims)
+LINK = LinkType("socketcan", SocketCanOptions, make_can=make, claims=_claims)

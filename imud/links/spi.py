@@ -22,7 +22,7 @@ from imud.contracts.script import Transfer
 from imud.contracts.status import KernelCounters
 from imud.links.device_node import DeviceNode, bus_open_problem, transfer_problem
 from imud.model.errors import LinkError
-from imud.model.options import Settings
+from imud.model.options import Options
 
 WR_MODE: Final = 0x40016B01
 """_IOW('k', 1, __u8)"""
@@ -40,8 +40,8 @@ PREPARED_MAX: Final = 64
 Ioctl = Callable[[int, int, bytes], object]
 
 
-class SpiSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of an SPI bus."""
+class SpiOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of an SPI bus."""
 
     port: Annotated[str, Meta(min_length=1)]
     """Path of the bus and chip select, for example `/dev/spidev0.0`."""
@@ -53,7 +53,7 @@ class SpiSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Rate of reads, per second."""
 
 
-def bus_of(settings: SpiSettings) -> str:
+def bus_of(settings: SpiOptions) -> str:
     """Return the path of the bus, without the chip select."""
     return settings.port.partition(".")[0]
 
@@ -63,7 +63,7 @@ class SpiLink:
 
     def __init__(
         self,
-        settings: SpiSettings,
+        settings: SpiOptions,
         *,
         ioctl: Ioctl = fcntl.ioctl,
         open_node: Callable[[str, int], int] = os.open,
@@ -203,8 +203,8 @@ def _byteswapped(data: bytes) -> bytes:
     return words.tobytes()
 
 
-def _claims(settings: SpiSettings) -> list[Claim]:
+def _claims(settings: SpiOptions) -> list[Claim]:
     return [Claim(place=settings.port, key="port")]
 
 
-LINK = LinkType("spi", SpiSettings, make_polled=SpiLink, claims=_claims, bus_of=bus_of)
+LINK = LinkType("spi", SpiOptions, make_polled=SpiLink, claims=_claims, bus_of=bus_of)

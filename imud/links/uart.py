@@ -19,7 +19,7 @@ from imud.contracts.status import KernelCounters
 from imud.links.device_node import CABLE, PROC, DeviceNode
 from imud.links.serial_port import TtyCounters, change_baud, hold_ns, open_port, port_problem, request_low_latency
 from imud.model.errors import LinkError, LinkMissing
-from imud.model.options import Settings
+from imud.model.options import Options
 
 READ_BYTES: Final = 65536
 FULL_READ_BYTES: Final = 2048
@@ -33,8 +33,8 @@ DEFAULT_BAUD: Final = 115200
 """Rate of a port that is opened for detection, until detection sets its own."""
 
 
-class UartSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a serial port."""
+class UartOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of a serial port."""
 
     port: Annotated[str, Meta(min_length=1)]
     """Path of the port. `/dev/serial/by-id/…` names the adapter and survives replugging; `/dev/ttyUSB0` does not."""
@@ -47,7 +47,7 @@ class UartSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 class UartLink:
     """A serial port as a `StreamLink`. Synchronization: the loop's thread only."""
 
-    def __init__(self, settings: UartSettings, *, sys: Path = Path("/sys"), proc: Path = PROC) -> None:
+    def __init__(self, settings: UartOptions, *, sys: Path = Path("/sys"), proc: Path = PROC) -> None:
         self._settings = settings
         self._sys = sys
         self._proc = proc
@@ -206,8 +206,8 @@ def _ignore_end(error: LinkError | None) -> None:
     """The receiver before `start`."""
 
 
-def _claims(settings: UartSettings) -> list[Claim]:
+def _claims(settings: UartOptions) -> list[Claim]:
     return [Claim(place=settings.port, key="port")]
 
 
-LINK = LinkType("uart", UartSettings, UartLink, claims=_claims)
+LINK = LinkType("uart", UartOptions, UartLink, claims=_claims)

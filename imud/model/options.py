@@ -26,12 +26,12 @@ UNKNOWN_STEP = "..."
 """The step to a value of a mapping, whose key msgspec does not tell."""
 
 
-class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of one part."""
+class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of one part."""
 
 
-class NoSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of parts that have none."""
+class NoOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of parts that have none."""
 
 
 def is_ip_address(text: str) -> bool:

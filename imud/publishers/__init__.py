@@ -1,9 +1,9 @@
 """Publishers: outputs of samples and events that never make the pipeline wait."""
 
 from imud.contracts.publisher import PublisherType
-from imud.contracts.registry import Table
+from imud.contracts.registry import Registry
 
-PUBLISHERS: Table[PublisherType] = Table(
+PUBLISHERS: Registry[PublisherType] = Registry(
     "publisher",
     {
         "socket": "imud.publishers.socket.server:PUBLISHER",

@@ -27,7 +27,7 @@ from imud.formats import nmea0183
 from imud.formats.nmea0183 import Transducer
 from imud.model.errors import ServerError, reason_of
 from imud.model.event import Event
-from imud.model.options import Settings, is_ip_address, shown
+from imud.model.options import Options, is_ip_address, shown
 from imud.model.sample import Sample, Vector3
 from imud.model.units import NS_PER_S
 from imud.publishers.thinning import MeanRate, Pace
@@ -501,8 +501,8 @@ Talker = Annotated[str, msgspec.Meta(pattern="^([A-Z]{2})?$", extra={"words": "t
 RateHz = Annotated[float, msgspec.Meta(ge=0.01, le=100)]
 
 
-class Nmea0183Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the NMEA 0183 output."""
+class Nmea0183Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of the NMEA 0183 output."""
 
     enabled: bool = False
     """Whether sentences are sent."""
@@ -559,7 +559,7 @@ def address_of(text: str) -> tuple[str, int] | None:
 class Nmea0183:
     """Sends the sentences of one device. Synchronization: the event loop's thread only."""
 
-    def __init__(self, settings: Nmea0183Settings, context: PublisherContext) -> None:
+    def __init__(self, settings: Nmea0183Options, context: PublisherContext) -> None:
         self._settings = settings
         self._context = context
         self._paces: Mapping[Formatter, Pace] = {
@@ -675,4 +675,4 @@ class Nmea0183:
             log.warning("%s", message)
 
 
-PUBLISHER = PublisherType("nmea0183", Nmea0183Settings, Nmea0183, required=False)
+PUBLISHER = PublisherType("nmea0183", Nmea0183Options, Nmea0183, required=False)

@@ -49,7 +49,7 @@ from imud.formats.slot import SEQ_INVALID, SLOT_BYTES
 from imud.host.files import user_name
 from imud.model.errors import ServerError
 from imud.model.event import Event
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_MS
 
@@ -416,7 +416,7 @@ SLOTS_MIN, SLOTS_MAX = 64, 1 << 20
 """64 slots are one 16 kB ring; 2²⁰ are 256 MB, more than a gateway should give to one device."""
 
 
-class ShmSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ShmOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Shared memory."""
 
     enabled: bool = True
@@ -459,7 +459,7 @@ class _Place:
 class ShmPublisher:
     """Writes every device's samples into its ring. Synchronization: the event loop's thread only."""
 
-    def __init__(self, settings: ShmSettings, context: PublisherContext) -> None:
+    def __init__(self, settings: ShmOptions, context: PublisherContext) -> None:
         self._settings = settings
         self._context = context
         self._directory: RingDirectory | None = None
@@ -616,4 +616,4 @@ class ShmPublisher:
         log.warning("shm: group %s %s; its members cannot read shared memory", self._settings.group, why)
 
 
-PUBLISHER = PublisherType("shm", ShmSettings, ShmPublisher)
+PUBLISHER = PublisherType("shm", ShmOptions, ShmPublisher)

@@ -20,7 +20,7 @@ from imud.formats.can import CandumpReader
 from imud.formats.capture import CaptureReader
 from imud.formats.records import DeviceRecord
 from imud.model.errors import BadArgument
-from imud.model.options import NoSettings, Settings
+from imud.model.options import NoOptions, Options
 from imud.model.sample import T_ERR_MOST, Sample, Sync
 from imud.model.units import uart_byte_ns
 from imud.recording.player import PlayedClock, PlayedDevice
@@ -62,7 +62,7 @@ class KnownTimes(Enum):
 class CapturePlayer:
     """Player of one capture of one device. Synchronization: one thread."""
 
-    def __init__(self, publish: Callable[[Batch], None], driver: Driver, options: Settings, where: str) -> None:
+    def __init__(self, publish: Callable[[Batch], None], driver: Driver, options: Options, where: str) -> None:
         """`where` names the file for people. Raises BadArgument for a driver whose devices cannot be captured."""
         if not isinstance(driver, StreamDriver | CanDriver):
             raise BadArgument(f"--driver {driver.name}: expected a driver of bytes or of CAN frames; it is polled")
@@ -132,7 +132,7 @@ class CapturePlayer:
         return path
 
     def _clock(self, byte_ns: int, hold_ns: int) -> SampleClock:
-        config = DeviceConfig(NAME, self._driver.name, self._options, False, "replay", NoSettings())
+        config = DeviceConfig(NAME, self._driver.name, self._options, False, "replay", NoOptions())
         return make_clock(
             config.name, config.lines, self._driver, None, host=self._host.steady, byte_ns=byte_ns, hold_ns=hold_ns,
             on_unknown_gap=self.device.ledger.add_unknown_gap,

@@ -23,7 +23,7 @@ from imud.formats.records import CallRecord, CheckRecord, ClocksRecord, DeviceRe
 from imud.host.clock import HostClock
 from imud.model.errors import Trouble
 from imud.model.ledger import Ledger
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.recording.state import StateError, StateWriter
 from imud.sampling.path import DeviceClock, ReadyEdges, SamplePath
 from imud.sampling.steering import AidingSources
@@ -50,14 +50,14 @@ class PathParts:
 
     path: SamplePath
     driver: str
-    options: Settings | None
+    options: Options | None
     period_ns: int = 0
     """Polled devices: time between two reads."""
     edges: ReadyEdges | None = None
     """Of a data-ready line."""
 
 
-class DeviceTap:
+class PathObserver:
     """Tap of one device; its transport says when there is another path."""
 
     def __init__(self, config: DeviceConfig, device_id: int, ledger: Ledger, host: HostClock) -> None:
@@ -280,7 +280,7 @@ class _HeardAiding:
         return observed
 
 
-class HostTap:
+class ClockObserver:
     """Tap of the host's clocks."""
 
     def __init__(self, host: HostClock) -> None:
@@ -318,7 +318,7 @@ class RecordedDevice(Protocol):
     """A device with its tap."""
 
     @property
-    def tap(self) -> DeviceTap:
+    def tap(self) -> PathObserver:
         """Where it is heard."""
         ...
 
@@ -327,13 +327,13 @@ class RecordedDevice(Protocol):
         ...
 
 
-class DeviceTaps:
+class RecordableDevices:
     """What can be recorded of a daemon. Synchronization: the event loop's thread only."""
 
     def __init__(self, devices: Mapping[str, RecordedDevice], host: HostClock) -> None:
         """`devices` are those that there are at the time of each call."""
         self._devices = devices
-        self._host = HostTap(host)
+        self._host = ClockObserver(host)
 
     def names(self) -> Sequence[str]:
         """Names of the devices there are."""

@@ -12,7 +12,7 @@ import msgspec
 
 from imud import __version__
 from imud.attitude.conventions import Convention
-from imud.attitude.published import FrameSettings, published_frame
+from imud.attitude.published import FrameOptions, published_frame
 from imud.config.model import DeviceConfig
 from imud.contracts.codec import BadFrame, Reading
 from imud.contracts.driver import CanDriver, Driver, PolledDriver, StreamDriver
@@ -27,7 +27,7 @@ from imud.host.log import printable
 from imud.model.errors import ImudError, TransferError, reason_of
 from imud.model.event import Event, kind_of
 from imud.model.ledger import LEDGER_FIELDS, Ledger
-from imud.model.options import NoSettings
+from imud.model.options import NoOptions
 from imud.recording.observer import LINE_CALLS, TROUBLES
 from imud.recording.state import StateError, StateReader
 from imud.sampling.path import (
@@ -268,8 +268,8 @@ def _config_of(described: DeviceRecord, driver: Driver, made: PathRecord) -> Dev
     try:
         return DeviceConfig(
             described.name, made.driver, msgspec.convert(made.options, driver.settings), False, described.link,
-            NoSettings(), lines=msgspec.convert(tree.get("lines"), DeviceLines | None),
-            frame=msgspec.convert(tree.get("frame"), FrameSettings | None),
+            NoOptions(), lines=msgspec.convert(tree.get("lines"), DeviceLines | None),
+            frame=msgspec.convert(tree.get("frame"), FrameOptions | None),
             convention=msgspec.convert(tree.get("convention"), Convention | None),
             declination_deg=msgspec.convert(tree.get("declination_deg"), float | None),
         )  # fmt: skip

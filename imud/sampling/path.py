@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from math import hypot, sqrt
 from typing import Final, NamedTuple, Protocol
 
-from imud.attitude.published import PublishedFrame
+from imud.attitude.published import PublishedAxes
 from imud.contracts.codec import BadFrame, BadReason, CanCodec, CodecEvent, PolledCodec, Reading, StreamCodec, Vanished
 from imud.contracts.driver import Driver
-from imud.contracts.lines import DeviceLines, Edge, ReadySettings
+from imud.contracts.lines import DeviceLines, Edge, ReadyOptions
 from imud.contracts.publisher import AS_SENT, Batch
 from imud.contracts.script import Message, ReplyFrame, TextLine
 from imud.contracts.status import LATENCY_BOUNDS_NS
@@ -125,7 +125,7 @@ class PathContext:
     overruns: Callable[[], int]
     """Overruns that the kernel counted since the link was opened."""
     host: HostClock
-    frame: PublishedFrame = AS_SENT
+    frame: PublishedAxes = AS_SENT
     """Axes and angles of what is published."""
 
 
@@ -440,7 +440,7 @@ class Stamp(NamedTuple):
 class ReadyEdges:
     """Edges of one data-ready line. Synchronization: the loop's thread only."""
 
-    def __init__(self, settings: ReadySettings, period_ns: int) -> None:
+    def __init__(self, settings: ReadyOptions, period_ns: int) -> None:
         """`period_ns` is the expected interval of edges, used until two have come."""
         self.missed = 0
         """Edges without a read: the next edge came first, or the kernel dropped the edge."""

@@ -1,10 +1,10 @@
 """Simulated devices with known truth, for `imud demo` and the tests."""
 
-from imud.contracts.registry import Table
+from imud.contracts.registry import Registry
 from imud.sim.can_module import CanSimulator
 from imud.sim.sensor import Simulator
 
-SIMULATORS: Table[Simulator] = Table(
+SIMULATORS: Registry[Simulator] = Registry(
     "simulator",
     {
         "hipnuc-uart": "imud.sim.hipnuc.uart:SIMULATOR",
@@ -14,7 +14,7 @@ SIMULATORS: Table[Simulator] = Table(
 )
 """Devices that stand behind a pseudo-terminal."""
 
-CAN_SIMULATORS: Table[CanSimulator] = Table(
+CAN_SIMULATORS: Registry[CanSimulator] = Registry(
     "simulator on CAN",
     {
         "hipnuc-canopen": "imud.sim.hipnuc.canopen:SIMULATOR",

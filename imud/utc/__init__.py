@@ -1,9 +1,9 @@
 """UTC: sources of RMC sentences, references from PPS pulses and the system clock, the feeds of device and chronyd."""
 
-from imud.contracts.registry import Table
+from imud.contracts.registry import Registry
 from imud.utc.receivers import MakeSource
 
-RMC_SOURCES: Table[MakeSource] = Table(
+RMC_SOURCES: Registry[MakeSource] = Registry(
     "RMC source",
     {
         "gpsd": "imud.utc.receivers:make_gpsd",

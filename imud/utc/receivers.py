@@ -18,7 +18,7 @@ from msgspec import Meta
 from imud.contracts.link import StreamLink
 from imud.formats.nmea0183 import RMC_BYTES_MAX
 from imud.model.errors import LinkError, reason_of
-from imud.model.options import Settings, is_host, shown
+from imud.model.options import Options, is_host, shown
 
 OnSentence = Callable[[bytes, int], None]
 """Called with one RMC sentence, including its line end, and CLOCK_MONOTONIC (ns) right after its arrival."""
@@ -26,8 +26,8 @@ MakePort = Callable[[str, int], StreamLink]
 """Makes a closed serial link from a path and a rate in bit/s."""
 
 
-class RmcSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the source of a device's RMC sentences."""
+class RmcOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of the source of a device's RMC sentences."""
 
     source: Literal["gpsd", "nmea", "system"]
     """`gpsd`: a GNSS receiver that gpsd owns. `nmea`: one on a serial port of its own. `system`: the system clock,
@@ -84,7 +84,7 @@ class SourceContext(NamedTuple):
     """CLOCK_REALTIME minus CLOCK_MONOTONIC, now."""
 
 
-MakeSource = Callable[[RmcSettings, SourceContext], RmcSource]
+MakeSource = Callable[[RmcOptions, SourceContext], RmcSource]
 """Makes a source; `imud.utc.RMC_SOURCES` has one for each value of `RmcSettings.source`."""
 
 LINE_BYTES_MAX: Final = 16384
@@ -208,7 +208,7 @@ KEEP_ALIVE: Final = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (sock
 class GpsdSource(ReconnectingSource):
     """A client of gpsd."""
 
-    def __init__(self, settings: RmcSettings, now_ns: Callable[[], int], retry: Retry | None = None) -> None:
+    def __init__(self, settings: RmcOptions, now_ns: Callable[[], int], retry: Retry | None = None) -> None:
         """`now_ns` is CLOCK_MONOTONIC."""
         super().__init__(f"gpsd at {settings.host}:{settings.tcp_port}", retry)
         self._now_ns = now_ns
@@ -289,11 +289,11 @@ def _keep_alive(sock: socket.socket) -> None:
         sock.setsockopt(socket.IPPROTO_TCP, option, value)
 
 
-def make_gpsd(settings: RmcSettings, context: SourceContext) -> GpsdSource:
+def make_gpsd(settings: RmcOptions, context: SourceContext) -> GpsdSource:
     """Make the source `gpsd`."""
     return GpsdSource(settings, context.now_ns)
 
 
-def make_nmea(settings: RmcSettings, context: SourceContext) -> NmeaPortSource:
+def make_nmea(settings: RmcOptions, context: SourceContext) -> NmeaPortSource:
     """Make the source `nmea`."""
     return NmeaPortSource(context.make_port(settings.port, settings.baud))

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 from imud.contracts.lines import UtcReference
 from imud.formats.nmea0183 import build
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
-from imud.utc.receivers import OnSentence, RmcSettings, SourceContext
+from imud.utc.receivers import OnSentence, RmcOptions, SourceContext
 
 STA_UNSYNC: Final = 0x40
 TIME_ERROR: Final = 5
@@ -87,7 +87,7 @@ class SystemClockSource:
 
     def __init__(
         self,
-        settings: RmcSettings,
+        settings: RmcOptions,
         now_ns: Callable[[], int],
         utc_offset_ns: Callable[[], int],
         ask: Callable[[], KernelClock] = kernel_clock,
@@ -157,6 +157,6 @@ class SystemClockSource:
         return ""
 
 
-def make(settings: RmcSettings, context: SourceContext) -> SystemClockSource:
+def make(settings: RmcOptions, context: SourceContext) -> SystemClockSource:
     """Make the source `system`."""
     return SystemClockSource(settings, context.now_ns, context.utc_offset_ns)

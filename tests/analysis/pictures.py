@@ -21,8 +21,8 @@ from imud.analysis.plots import SensorVibration, deviation_figure, spectrum_figu
 from imud.analysis.quantities import DEG_PER_RAD, ROOT_S_PER_ROOT_H, S_PER_H
 from imud.analysis.series import Readings
 from imud.cli.noise import figures_for, html, noise_report, picture
-from imud.cli.sample_set import Taken
-from imud.cli.spectrum import SpectrumSettings, sensor_vibration
+from imud.cli.sample_set import SampleSet
+from imud.cli.spectrum import SpectrumOptions, sensor_vibration
 from tests.analysis.synthetic import flicker, random_walk, stamps_ns, white
 from tests.support.files import ROOT
 
@@ -60,7 +60,7 @@ def page() -> str:
     random, count = np.random.default_rng(SEED + 1), len(gyro)
     axes = [white(random, count, RATE_HZ, VRW_M_S_SQRT_H / ROOT_S_PER_ROOT_H) for _ in range(3)]
     accel = np.stack(axes, axis=1) + np.array([0.0, 0.0, 9.8])
-    taken = Taken(
+    taken = SampleSet(
         "simulated", "bow", "hipnuc-uart", identity={"product": PRODUCT},
         readings=Readings(stamps_ns(count, RATE_HZ), gyro, accel, None), stamps="true",
     )  # fmt: skip
@@ -92,7 +92,7 @@ def machine() -> SensorVibration:
     values[:, 1] += 0.1 * np.sin(2 * np.pi * 100.0 * t_s)
     keep = np.sort(random.choice(count, round(0.99 * count), replace=False))
     readings = Readings(stamps_ns(count, VIBRATION_HZ)[keep], None, values[keep], None)
-    return sensor_vibration(readings, values[keep], SpectrumSettings(("accel",)))
+    return sensor_vibration(readings, values[keep], SpectrumOptions(("accel",)))
 
 
 def noise_svg() -> bytes:

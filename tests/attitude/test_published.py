@@ -9,10 +9,10 @@ from msgspec.structs import replace
 
 from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, Convention, DeviceAxes, EulerOrder, Heading
 from imud.attitude.published import (
-    FrameSettings,
+    FrameOptions,
     MountingAngles,
     MountingAxes,
-    PublishedFrame,
+    PublishedAxes,
     as_sent,
     published_frame,
 )
@@ -48,15 +48,15 @@ def sample(
 
 
 def frame(
-    settings: FrameSettings | None = None,
+    settings: FrameOptions | None = None,
     convention: Convention | None = None,
     declination_deg: float | None = None,
     device: DeviceAxes = FLU_LEVEL,
-) -> PublishedFrame:
+) -> PublishedAxes:
     return published_frame(settings, convention, declination_deg, device)
 
 
-def turned(one: Sample, published: PublishedFrame) -> Sample:
+def turned(one: Sample, published: PublishedAxes) -> Sample:
     assert published.rotation is not None
     return published.rotation.sample(one)
 
@@ -175,9 +175,9 @@ def test_a_mounting_is_taken_away(
 ) -> None:
     _, (x, y, z), (roll, pitch, yaw), quat, accel, gyro, said, body_accel, body_gyro, body_euler = case
     given_as = {
-        "axes": FrameSettings(axes=MountingAxes(x=x, y=y, z=z)),  # type: ignore[arg-type]  # names of axes
-        "euler": FrameSettings(euler=MountingAngles(roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw)),
-        "quat": FrameSettings(quat_wxyz=list(quat)),
+        "axes": FrameOptions(axes=MountingAxes(x=x, y=y, z=z)),  # type: ignore[arg-type]  # names of axes
+        "euler": FrameOptions(euler=MountingAngles(roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw)),
+        "quat": FrameOptions(quat_wxyz=list(quat)),
     }[way]
     one = sample(accel, said if members != "quat" else None, gyro=gyro, mag=gyro)
     if members != "euler":
@@ -198,7 +198,7 @@ def test_a_module_in_any_mounting_shows_the_same_as_one_that_is_mounted_straight
     matrix = matrix_from_quat(attitude)
     up = matrix[2]
     body_accel = (up[0] * G, up[1] * G, up[2] * G)
-    for given_frame in (FrameSettings(euler=MountingAngles(roll_deg=33, pitch_deg=-50, yaw_deg=170)), FrameSettings()):
+    for given_frame in (FrameOptions(euler=MountingAngles(roll_deg=33, pitch_deg=-50, yaw_deg=170)), FrameOptions()):
         for device in (RFU_ENU, FLU_LEVEL):
             mounting = frame(given_frame, ENU, device=device).mounting
             quat = quat_from_matrix(matrix_product(matrix, mounting))
@@ -216,13 +216,13 @@ def test_roll_and_pitch_that_were_read_level_are_taken_away(convention: Conventi
     """What imud shows without the keys, written into them, becomes zero; the heading stays."""
     one = sample((0, 0, G), (2, -3, 40))
     shown = degrees_of(turned(one, frame(convention=convention)).euler_rad)
-    settings = FrameSettings(level_roll_deg=shown[0], level_pitch_deg=shown[1])
+    settings = FrameOptions(level_roll_deg=shown[0], level_pitch_deg=shown[1])
     assert degrees_of(turned(one, frame(settings, convention)).euler_rad) == pytest.approx((0, 0, shown[2]), abs=1e-9)
 
 
 def test_a_heading_offset_is_added_clockwise() -> None:
     one = sample((0, 0, G), (0, 0, -40), mag=(1.0, 0.0, 0.0))
-    settings = FrameSettings(heading_offset_deg=15)
+    settings = FrameOptions(heading_offset_deg=15)
     assert degrees_of(turned(one, frame(settings, NED)).euler_rad)[2] == pytest.approx(40 + 15)
     assert degrees_of(turned(one, frame(settings, ENU)).euler_rad)[2] == pytest.approx(-40 - 15)
     # the sensor points 15° to the left of the front, so what it sees ahead is to the left of the front
@@ -262,23 +262,23 @@ Z_DOWN = sample((0.5, 0.25, -G), (10, 20, 30), gyro=(1, 2, 3))
     ("one", "published", "accel", "gyro", "euler"),
     [
         # as the vendor's driver publishes them
-        (Z_DOWN, frame(FrameSettings(z_down=True)), (0.5, -0.25, G), (1, -2, -3), (10, -20, -30)),
-        (Z_DOWN, frame(FrameSettings(z_down=True), NED), (0.5, 0.25, -G), (1, 2, 3), (10, 20, 30)),
+        (Z_DOWN, frame(FrameOptions(z_down=True)), (0.5, -0.25, G), (1, -2, -3), (10, -20, -30)),
+        (Z_DOWN, frame(FrameOptions(z_down=True), NED), (0.5, 0.25, -G), (1, 2, 3), (10, 20, 30)),
         # turned 90° to the left in the body: its x axis points left, its y axis (right of that) to the front; the body
         # is level, its front at 20° to the left. `axes` names axes of the device, z down
         (
-            sample((0, 0, -G), (0, 0, -110), gyro=(1, 2, 3)), frame(FrameSettings(z_down=True, axes=UPSIDE_DOWN)),
+            sample((0, 0, -G), (0, 0, -110), gyro=(1, 2, 3)), frame(FrameOptions(z_down=True, axes=UPSIDE_DOWN)),
             (0, 0, G), (2, 1, -3), (0, 0, 20),
         ),
         # a HiPNUC module upside down: its y axis still points forward, its x axis to the left, its z axis down
         (
             sample((0, 0, -G), (180, 0, 0), gyro=(0.1, 0.2, 0.3)),
-            frame(FrameSettings(axes=UPSIDE_DOWN), NED, device=RFU_ENU), (0, 0, -G), (0.2, -0.1, 0.3), (0, 0, 0),
+            frame(FrameOptions(axes=UPSIDE_DOWN), NED, device=RFU_ENU), (0, 0, -G), (0.2, -0.1, 0.3), (0, 0, 0),
         ),
     ],
 )  # fmt: skip
 def test_a_device_whose_z_axis_points_down(
-    one: Sample, published: PublishedFrame, accel: Vector3, gyro: Vector3, euler: Vector3
+    one: Sample, published: PublishedAxes, accel: Vector3, gyro: Vector3, euler: Vector3
 ) -> None:
     made = turned(one, published)
     assert (made.accel_m_s2, made.gyro_rad_s) == (accel, gyro)
@@ -288,7 +288,7 @@ def test_a_device_whose_z_axis_points_down(
 def test_another_order_of_angles() -> None:
     """The device says pitch 30° and means about its x axis, y forward: its quaternion is not used."""
     one = replace(sample((0, G * SIN30, G * COS30), (0, 30, 0)), quat_wxyz=quat_from_euler_zyx((0, radians(30), 0)))
-    made = turned(one, frame(FrameSettings(euler_order=EulerOrder.ZXY)))
+    made = turned(one, frame(FrameOptions(euler_order=EulerOrder.ZXY)))
     assert made.accel_m_s2 == pytest.approx((G * SIN30, 0, G * COS30)), "its y axis is the front, nose up"
     assert degrees_of(made.euler_rad)[:2] == pytest.approx((0, -30), abs=1e-9)
     assert matrix_from_quat(made.quat_wxyz or (0, 0, 0, 0))[2] == pytest.approx((SIN30, 0, COS30))
@@ -308,13 +308,13 @@ def known(euler: Vector3 | None) -> tuple[object, ...]:
         ((nan, nan, -90), None, (None, None, 90)),  # a compass: its heading
         ((10, nan, nan), None, (10, None, None)),
         ((10, 30, nan), None, (10, 30, None)),
-        ((10, 30, nan), FrameSettings(axes=MountingAxes(x="y", y="x", z="-z")), (-170, 30, None)),  # upside down
-        ((nan, nan, -90), FrameSettings(axes=MountingAxes(x="-x", y="-y", z="z")), (None, None, 0)),  # back to front
-        ((nan, nan, -90), FrameSettings(axes=MountingAxes(x="y", y="x", z="-z")), None),  # its tilt decides
-        ((10, nan, nan), FrameSettings(axes=MountingAxes(x="-x", y="-y", z="z")), None),
+        ((10, 30, nan), FrameOptions(axes=MountingAxes(x="y", y="x", z="-z")), (-170, 30, None)),  # upside down
+        ((nan, nan, -90), FrameOptions(axes=MountingAxes(x="-x", y="-y", z="z")), (None, None, 0)),  # back to front
+        ((nan, nan, -90), FrameOptions(axes=MountingAxes(x="y", y="x", z="-z")), None),  # its tilt decides
+        ((10, nan, nan), FrameOptions(axes=MountingAxes(x="-x", y="-y", z="z")), None),
     ],
 )  # fmt: skip
-def test_angles_in_part(said: Vector3, settings: FrameSettings | None, expected: tuple[float | None, ...]) -> None:
+def test_angles_in_part(said: Vector3, settings: FrameOptions | None, expected: tuple[float | None, ...]) -> None:
     """From a module with x right, y forward; published in ned-frd."""
     made = turned(sample(euler_deg=said), frame(settings, NED, device=RFU_ENU))
     assert made.quat_wxyz is None
@@ -330,7 +330,7 @@ def test_a_quaternion_counts_more_than_the_angles_unless_it_has_no_direction() -
 
 
 def test_an_element_that_is_nan_stays_one_element_in_quarter_turns() -> None:
-    made = turned(sample(gyro=(nan, 2, 3)), frame(FrameSettings(axes=MountingAxes(x="y", y="-x", z="z"))))
+    made = turned(sample(gyro=(nan, 2, 3)), frame(FrameOptions(axes=MountingAxes(x="y", y="-x", z="z"))))
     assert made.gyro_rad_s is not None
     assert (made.gyro_rad_s[0], made.gyro_rad_s[2]) == (2, 3)
     assert isnan(made.gyro_rad_s[1])
@@ -341,7 +341,7 @@ def test_an_element_that_is_nan_stays_one_element_in_quarter_turns() -> None:
 VECTORS = st.tuples(*[st.floats(-50, 50)] * 3)
 QUATS = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: hypot(*q) > 0.1).map(quat_normalized)
 MOUNTINGS = st.builds(
-    FrameSettings,
+    FrameOptions,
     euler=st.builds(
         MountingAngles, roll_deg=st.floats(-180, 180), pitch_deg=st.floats(-90, 90), yaw_deg=st.floats(-180, 180)
     ),
@@ -358,7 +358,7 @@ FRAMES = st.builds(
 
 @given(FRAMES, VECTORS, VECTORS, VECTORS, QUATS)
 def test_lengths_and_the_direction_of_gravity_are_kept(
-    published: PublishedFrame, accel: Vector3, gyro: Vector3, mag: Vector3, quat: Quaternion
+    published: PublishedAxes, accel: Vector3, gyro: Vector3, mag: Vector3, quat: Quaternion
 ) -> None:
     """How far a vector is from the vertical, and two vectors from each other, is the same before and after."""
     one = Sample("bow", 1, 1, 1, Sync.ARRIVAL, 1, 1, accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, quat_wxyz=quat)
@@ -383,7 +383,7 @@ def _triple(a: Vector3, b: Vector3, c: Vector3) -> float:
 
 @given(st.none() | MOUNTINGS, DEVICES, VECTORS, QUATS)
 def test_what_a_client_asks_for_is_what_the_device_would_be_configured_to(
-    settings: FrameSettings | None, device: DeviceAxes, accel: Vector3, quat: Quaternion
+    settings: FrameOptions | None, device: DeviceAxes, accel: Vector3, quat: Quaternion
 ) -> None:
     """Configured as one convention and asked for as the other, and back again. Levelling is read in one convention."""
     if settings is not None:
@@ -426,7 +426,7 @@ ANY3 = st.none() | st.tuples(ANY, ANY, ANY)
 
 @given(FRAMES, ANY3, ANY3, st.none() | st.tuples(ANY, ANY, ANY, ANY))
 def test_no_value_of_a_device_raises(
-    published: PublishedFrame, vector: Vector3 | None, euler: Vector3 | None, quat: Quaternion | None
+    published: PublishedAxes, vector: Vector3 | None, euler: Vector3 | None, quat: Quaternion | None
 ) -> None:
     one = Sample(
         "bow", 1, 1, 1, Sync.ARRIVAL, 1, 1, accel_m_s2=vector, gyro_rad_s=vector, quat_wxyz=quat, euler_rad=euler
@@ -442,8 +442,8 @@ def test_no_value_of_a_device_raises(
 def test_words_of_what_is_published() -> None:
     own = as_sent(RFU_ENU).words("312", "ENU")
     assert (own.frame, own.euler_convention, own.navigation_frame) == (RFU_ENU.words, "312", "ENU")
-    down = frame(FrameSettings(), NED, device=RFU_ENU).words("312", "ENU")
+    down = frame(FrameOptions(), NED, device=RFU_ENU).words("312", "ENU")
     assert "x forward, y right, z down" in down.frame
     assert down.navigation_frame == "NED"
     assert "clockwise" in down.euler_convention
-    assert frame(FrameSettings()).convention is ENU, "with frame, enu-flu unless the file says otherwise"
+    assert frame(FrameOptions()).convention is ENU, "with frame, enu-flu unless the file says otherwise"

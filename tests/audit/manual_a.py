@@ -35,7 +35,9 @@ MANUAL_A: Final = (
     Item("A 1.5 frame", "ID 0x0006, 24 bytes", "drivers.imu61x.uart.codec:PARAMETER_FRAME"),
     Item("A 1.5 parameter 3", "baud rate", "drivers.imu61x.uart.codec:Parameter"),
     Item(
-        "A 1.5 parameters 8 to 10", "results of the gyroscope's calibration", "drivers.imu61x.uart.settings:GYRO_OFFSETS"
+        "A 1.5 parameters 8 to 10",
+        "results of the gyroscope calibration",
+        "drivers.imu61x.uart.settings:GYRO_OFFSETS",
     ),
     Item("A 1.5 parameters 16 to 18", "mounting error angles", "drivers.imu61x.uart.settings:INSTALLATION_ANGLES"),
     Item("A 1.5 parameter 21", "output rate", "drivers.imu61x.uart.codec:Parameter"),
@@ -81,7 +83,7 @@ MANUAL_A: Final = (
     ),
     Item("A 1.8 one program", "the port has one user", "links.uart:UartLink"),
     Item("A 2.1 role", "the device is a slave", "links.spi:SpiLink"),
-    Item("A 2.1 clock", "0.2 to 2 MHz", "links.spi:SpiSettings"),
+    Item("A 2.1 clock", "0.2 to 2 MHz", "links.spi:SpiOptions"),
     Item("A 2.1 words", "16 bits, high bit first", "links.spi:SpiLink"),
     Item("A 2.1 mode", "idle low, rising edge: 0 (ERRATA A6)", "drivers.imu61x.spi:MODES"),
     Item("A 2.2 reset", "reset the device and wait for 3 s", "lines.reset:ResetLine"),
@@ -98,9 +100,7 @@ MANUAL_A: Final = (
         "drivers.imu61x.spi:READ_REGISTERS",
     ),
     Item("A 2.4.1 reading", "0x8000, then zeros, chip select held", "drivers.imu61x.spi:READ_STANDARD"),
-    Item(
-        "A 2.4.1 order", "gyroscope, accelerometer, checksum; low word first", "drivers.imu61x.spi:Imu61xSpiCodec"
-    ),
+    Item("A 2.4.1 order", "gyroscope, accelerometer, checksum; low word first", "drivers.imu61x.spi:Imu61xSpiCodec"),
     Item("A 2.4.1 checksum", "sum of all words before (ERRATA A9)", "drivers.imu61x.spi:Imu61xSpiCodec"),
     Item("A 2.4.1 extended burst", "table 18 (ERRATA A10)", "drivers.imu61x.spi:EXTENDED"),
     Item("A 2.4.1 scale of the gyroscope", "0.016 / 65536 °/s", "drivers.imu61x.registers:RAD_S_PER_COUNT"),

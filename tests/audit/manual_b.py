@@ -22,7 +22,9 @@ MANUAL_B: Final = (
     Item("B 2.2.2 SAVECONFIG", "all settings to flash", "drivers.hipnuc.uart.commands:save_config"),
     Item("B 2.2.3 SERIALCONFIG", "five rates", "drivers.hipnuc.uart.commands:serial_config"),
     Item(
-        "B 2.2.3 a wrong rate", "cuts the connection: the module is followed", "drivers.hipnuc.uart.commands:change_baud"
+        "B 2.2.3 a wrong rate",
+        "the connection is cut; imud follows the device",
+        "drivers.hipnuc.uart.commands:change_baud",
     ),
     Item("B 2.2.4 when CONFIG acts", "at once; kept by SAVECONFIG", "drivers.hipnuc.uart.settings:SETTINGS"),
     Item("B 2.2.4 ATT MODE 0", "six axes", "drivers.hipnuc.uart.commands:attitude_mode"),
@@ -30,7 +32,7 @@ MANUAL_B: Final = (
     Item("B 2.2.4 ATT RST 2", "relative level", "drivers.hipnuc.uart.commands:level_reset"),
     Item("B 2.2.4 ATT RST 3", "automatic level, the accelerometer too", "drivers.hipnuc.uart.commands:level_reset"),
     Item("B 2.2.4 ATT RST 5", "cancels the level", "drivers.hipnuc.uart.commands:level_reset"),
-    Item("B 2.2.4 rest", "ATT RST at rest only", "device.calibration:Guide"),
+    Item("B 2.2.4 rest", "ATT RST at rest only", "device.calibration:CalibrationRun"),
     Item("B 2.2.4 YAW 1", "absolute heading", "drivers.hipnuc.uart.commands:yaw"),
     Item("B 2.2.4 YAW 0", "relative heading", "drivers.hipnuc.uart.commands:yaw"),
     Item("B 2.2.4 YAW range", "±180°, lost at power-off", "drivers.hipnuc.uart.driver:ACTIONS"),
@@ -170,9 +172,7 @@ MANUAL_B: Final = (
     ),
     Item("B 8.1.1 procedure", "steps and conditions", "drivers.hipnuc.common:TURNING"),
     Item("B 8.1.1 result", "bias of MAGCONFIG, zero before", "drivers.hipnuc.uart.replies:parse_magconfig"),
-    Item(
-        "B 8.1.2 disturbance", "a field that does not turn with the module", "device.calibration:RESIDUAL_MAX"
-    ),
+    Item("B 8.1.2 disturbance", "a field that does not turn with the module", "device.calibration:RESIDUAL_MAX"),
     Item(
         "B 8.1.3 in the background", "collects, calibrates, saves by itself", "sim.hipnuc.uart_settings:SelfCalibration"
     ),

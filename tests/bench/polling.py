@@ -16,14 +16,14 @@ from tempfile import TemporaryDirectory
 
 import imud.links.spi as spi_link
 from imud.config.model import DeviceConfig
-from imud.contracts.lines import DeviceLines, LineFactory, ReadySettings
+from imud.contracts.lines import DeviceLines, LineFactory, ReadyOptions
 from imud.contracts.link import LinkType
 from imud.contracts.publisher import Batch
 from imud.device.factory import DeviceFactory
 from imud.drivers.imu61x import spi
 from imud.drivers.imu61x.spi import PIPELINE_BYTES
 from imud.host.clock import HostClock
-from imud.links.spi import SpiLink, SpiSettings
+from imud.links.spi import SpiLink, SpiOptions
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.pins import MemoryOutput
 from tests.bench.ready_line import PipeInput
@@ -64,7 +64,7 @@ class Stub:
             ctypes.memmove(row[1], answer, len(answer))
         return 0
 
-    def make(self, settings: SpiSettings) -> SpiLink:
+    def make(self, settings: SpiOptions) -> SpiLink:
         return SpiLink(settings, ioctl=self.ioctl, open_node=lambda _path, _flags: 0, close_node=lambda _fd: None)
 
 
@@ -76,8 +76,8 @@ async def _measured(port: Path, seconds: float, busy_ms: float, *, by_edges: boo
         nonlocal samples
         samples += len(batch.samples)
 
-    settings = SpiSettings(port=str(port), rate_hz=RATE_HZ, speed_hz=2_000_000, mode=0)
-    lines = DeviceLines(data_ready=ReadySettings(line="Y")) if by_edges else None
+    settings = SpiOptions(port=str(port), rate_hz=RATE_HZ, speed_hz=2_000_000, mode=0)
+    lines = DeviceLines(data_ready=ReadyOptions(line="Y")) if by_edges else None
     config = DeviceConfig("imu", "imu61x-spi", None, True, "spi", settings, lines=lines)
     maker = LineFactory(lambda *_: PipeInput(round(1e9 / RATE_HZ)), lambda *_: MemoryOutput())
     factory = DeviceFactory(publish, lambda _event: None, HostClock(), lines=maker)
@@ -122,7 +122,7 @@ def rows(*, quick: bool = False) -> list[Row]:
         (", data-ready edges, loop busy 10 %", WIRE_S, 2.0, True),
     ):
         stub = Stub(wire_s)
-        row, spi_link.LINK = spi_link.LINK, LinkType("spi", SpiSettings, make_polled=stub.make)
+        row, spi_link.LINK = spi_link.LINK, LinkType("spi", SpiOptions, make_polled=stub.make)
         try:
             with TemporaryDirectory() as folder:
                 port = Path(folder) / "spidev0.0"

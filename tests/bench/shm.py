@@ -10,7 +10,7 @@ from pathlib import Path
 from imud.client.ring import Ring
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.model.sample import Sample, Sync
-from imud.publishers.shm import ShmPublisher, ShmSettings
+from imud.publishers.shm import ShmOptions, ShmPublisher
 from tests.bench.rows import Row
 
 INCLUDE = Path(__file__).parents[2] / "imud" / "include"
@@ -52,7 +52,7 @@ def rows(quick: bool = False) -> Iterable[Row]:
     rounds = 2 if quick else ROUNDS
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as folder:
         context = PublisherContext(list, 1, time.monotonic_ns)
-        publisher = ShmPublisher(ShmSettings(directory=folder, slots=SAMPLES, group=""), context)
+        publisher = ShmPublisher(ShmOptions(directory=folder, slots=SAMPLES, group=""), context)
         publisher.add_device("bench", 0)
         given = list(samples())
         read = min(_read_ns(publisher, folder, given) for _ in range(rounds))

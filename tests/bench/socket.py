@@ -18,7 +18,7 @@ from time import perf_counter_ns
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.formats.jsonrpc import encode_request, line_of
 from imud.model.sample import Sample, Sync
-from imud.publishers.socket.server import SocketServer, SocketSettings
+from imud.publishers.socket.server import SocketOptions, SocketServer
 from tests.bench.rows import Row, at_most
 
 CLIENTS = (1, 10, 100)
@@ -81,7 +81,7 @@ async def measure(directory: str, clients: int, encoding: str, rate_hz: float, r
     """Cost of publish, and of the bare sends of the same bytes to as many sockets, ns per sample."""
     context = PublisherContext(list, 1, lambda: 0)  # with a clock that moves, so many clients would be put off
     own_group = grp.getgrgid(os.getegid()).gr_name
-    server = SocketServer(SocketSettings(path=str(Path(directory) / "s"), group=own_group), context)
+    server = SocketServer(SocketOptions(path=str(Path(directory) / "s"), group=own_group), context)
     server.start()
     server.add_device("imu0", 0)
     request = line_of(encode_request("watch", {"encoding": encoding, "rate_hz": rate_hz}, 1))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from imud import config
-from imud.contracts.lines import InputSettings, LineFactory
+from imud.contracts.lines import InputOptions, LineFactory
 from imud.daemon import Daemon
 from imud.host import event_loop
 from imud.host.log import STDERR, log_to
@@ -20,7 +20,7 @@ from imud.lines.gpio import GpioInput, GpioOutput
 class FifoInput(GpioInput):
     path = ""
 
-    def __init__(self, settings: InputSettings, purpose: str, rising_only: bool = False) -> None:
+    def __init__(self, settings: InputOptions, purpose: str, rising_only: bool = False) -> None:
         super().__init__(settings, purpose, rising_only)
 
     def _open(self, _config: Callable[[Any], Any], _events: int | None) -> None:

@@ -9,7 +9,7 @@ import pytest
 from imud.contracts.driver import Identity
 from imud.contracts.script import Transfer, says_nothing
 from imud.formats.modbus import BROADCAST, ReplyFinder, framed
-from imud.links.rs485 import LineCounters, Rs485Settings
+from imud.links.rs485 import LineCounters, Rs485Options
 from imud.model.errors import TransferError, Trouble
 from imud.model.units import NS_PER_MS, uart_byte_ns
 from imud.sim.hipnuc.modbus import Slave
@@ -28,7 +28,7 @@ class Bus(ModbusBench):
         self.is_open = False
         self.paused_s: list[float] = []
 
-    def opened(self, settings: Rs485Settings) -> "Bus":
+    def opened(self, settings: Rs485Options) -> "Bus":
         assert isinstance(settings.baud, int)
         assert settings.line == "/dev/ttyUSB0"
         self.baud, self.reply_ms = settings.baud, settings.reply_ms

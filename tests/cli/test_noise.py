@@ -7,7 +7,7 @@ from imud.analysis.noise import Coefficient
 from imud.analysis.quantities import ShownUnit
 from imud.analysis.series import FloatArray, Readings
 from imud.cli.noise import cell, comparisons, duration_words, limits, noise_report, text
-from imud.cli.sample_set import Taken
+from imud.cli.sample_set import SampleSet
 from imud.contracts.driver import ModelFigures, SensorFigures
 from imud.model.errors import ImudError
 from tests.analysis.synthetic import stamps_ns, white
@@ -17,9 +17,9 @@ COUNT = 10_000
 MILLI = ShownUnit("m", 1000.0)
 
 
-def taken_of(values: FloatArray, driver: str = "hipnuc-canopen") -> Taken:
+def taken_of(values: FloatArray, driver: str = "hipnuc-canopen") -> SampleSet:
     readings = Readings(stamps_ns(len(values), RATE_HZ), values, None, None)
-    return Taken("a file", "bow", driver, "can0", {"product": "HI14"}, readings=readings, stamps="edge")
+    return SampleSet("a file", "bow", driver, "can0", {"product": "HI14"}, readings=readings, stamps="edge")
 
 
 def noise_of_three(n: float = 1e-3) -> FloatArray:
@@ -76,6 +76,6 @@ def test_the_text_names_what_is_not_compared_and_a_device_without_sensors_is_ref
     assert "Not compared with a data sheet: HiPNUC" in words
     empty = Readings(stamps_ns(COUNT, RATE_HZ), None, None, None)
     with pytest.raises(ImudError, match="bow sends neither angular rate nor acceleration"):
-        noise_report(Taken("a file", "bow", readings=empty), None)
+        noise_report(SampleSet("a file", "bow", readings=empty), None)
     with pytest.raises(ImudError, match="expected samples, found none"):
-        noise_report(Taken("a file", "bow"), None)
+        noise_report(SampleSet("a file", "bow"), None)

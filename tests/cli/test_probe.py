@@ -9,9 +9,9 @@ import pytest
 from imud.cli import probe
 from imud.cli.probe import ProbeReport
 from imud.contracts.link import LinkType
-from imud.links.memory import MemorySettings
+from imud.links.memory import MemoryOptions
 from imud.model.errors import LinkError
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.sim.hipnuc.uart import HipnucModule
 from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings
 from tests.cli.conftest import Cli
@@ -22,7 +22,7 @@ from tests.support.wired_device import LinkedModule
 PORT = "/dev/ttyUSB0"
 
 
-class PortSettings(Settings, frozen=True, kw_only=True):
+class PortSettings(Options, frozen=True, kw_only=True):
     port: str
     baud: str
 
@@ -31,7 +31,7 @@ class Port(LinkedModule):
     def __init__(self, baud: int = 460_800, hardware: HipnucHardware = HIPNUC_STILL) -> None:
         clock = VirtualClock()
         module = HipnucModule(clock.now_ns(), ModuleSettings(baud=baud), hardware)
-        super().__init__(MemorySettings(name=PORT, baud="auto"), module, clock)
+        super().__init__(MemoryOptions(name=PORT, baud="auto"), module, clock)
         self.opened = 0
         self.is_deaf = False
         self._carrying: asyncio.Task[None] | None = None

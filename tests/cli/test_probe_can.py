@@ -14,9 +14,9 @@ from imud.contracts.link import LinkType, OnBusNews, OnEnd, OnFrames
 from imud.device import can_search as detection
 from imud.drivers import DRIVERS
 from imud.formats.can import CanFrame
-from imud.links.memory import MemoryCanLink, MemorySettings
+from imud.links.memory import MemoryCanLink, MemoryOptions
 from imud.links.netlink import CanDetails
-from imud.links.socketcan import ControllerState, SocketCanSettings
+from imud.links.socketcan import ControllerState, SocketCanOptions
 from imud.model.errors import LinkError
 from imud.model.units import NS_PER_MS
 from tests.support.fake_drivers import fake_can_driver, fake_can_frame
@@ -28,8 +28,8 @@ class Bus(MemoryCanLink):
     down = False
     made: ClassVar[list["Bus"]]
 
-    def __init__(self, settings: SocketCanSettings) -> None:
-        super().__init__(MemorySettings(name=settings.interface, baud=500_000))
+    def __init__(self, settings: SocketCanOptions) -> None:
+        super().__init__(MemoryOptions(name=settings.interface, baud=500_000))
         self.made.append(self)
 
     def absence(self) -> str:
@@ -49,7 +49,7 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> type[Bus]:
 
     table: dict[str, Driver] = {**dict(DRIVERS), "fake-can": fake_can_driver()}
     monkeypatch.setattr(probe_can, "DRIVERS", table)
-    monkeypatch.setattr(probe_can, "LINKS", {"socketcan": LinkType("socketcan", SocketCanSettings, make_can=Own)})
+    monkeypatch.setattr(probe_can, "LINKS", {"socketcan": LinkType("socketcan", SocketCanOptions, make_can=Own)})
     monkeypatch.setattr(probe_can, "can_details", lambda name: CanDetails(500_000, 0))
     monkeypatch.setattr(detection, "LISTEN_NS", 5 * NS_PER_MS)
     return Own

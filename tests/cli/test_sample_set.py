@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from imud.cli import sample_set as taking
-from imud.cli.sample_set import Collector, LossTally, Taken, status_of, take_live
+from imud.cli.sample_set import Collector, LossTally, SampleSet, status_of, take_live
 from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceStatus
 from imud.model.errors import BadArgument
@@ -143,12 +143,12 @@ class Live:
         self.now_s += taking.SILENCE_S
         raise TimeoutError
 
-    def take(self, **arguments: object) -> Taken:
+    def take(self, **arguments: object) -> SampleSet:
         given = {"input": "bow", "skip": None, "duration": None, "socket": "/s", **arguments}
         return take_live(Namespace(**given), lambda passed_s, count: self.notes.append((passed_s, count)))
 
 
-def kept(taken: Taken) -> int:
+def kept(taken: SampleSet) -> int:
     assert taken.readings is not None
     return len(taken.readings.t_ns)
 

@@ -14,7 +14,7 @@ import pytest
 from imud.analysis.spectrum import power_spectrum
 from imud.cli.output import COLUMNS
 from imud.cli.sample_set import Collector
-from imud.cli.spectrum import CLEAR, HEIGHT, SHADES, LiveView, SpectrumSettings, axis_line, curve_rows, in_columns
+from imud.cli.spectrum import CLEAR, HEIGHT, SHADES, LiveView, SpectrumOptions, axis_line, curve_rows, in_columns
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
 from tests.cli.captures import frame, shaken
@@ -37,7 +37,7 @@ def collected(frequency_hz: float, count: int = COUNT) -> Collector:
 
 def test_the_page() -> None:
     view = LiveView("bow", "accel")
-    pages = [view.page(collected(hz), SpectrumSettings(("accel",))).splitlines() for hz in (25.0, 75.0)]
+    pages = [view.page(collected(hz), SpectrumOptions(("accel",))).splitlines() for hz in (25.0, 75.0)]
     for page in pages:
         assert max(map(len, page)) <= COLUMNS
         assert page[0] == "bow accelerometer: 200.000 Hz, 0 missing, bins of 1.56 Hz"
@@ -53,9 +53,9 @@ def test_the_page() -> None:
 
 def test_too_few_samples_and_no_values_are_said() -> None:
     view = LiveView("bow", "accel")
-    assert "at least 64 samples" in view.page(collected(25.0, 10), SpectrumSettings(("accel",)))
+    assert "at least 64 samples" in view.page(collected(25.0, 10), SpectrumOptions(("accel",)))
     assert "sends no values of the gyroscope" in LiveView("bow", "gyro").page(
-        collected(25.0), SpectrumSettings(("gyro",))
+        collected(25.0), SpectrumOptions(("gyro",))
     )
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from imud import config
 from imud.attitude.conventions import Convention, EulerOrder
-from imud.attitude.published import FrameSettings, MountingAngles, MountingAxes
+from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes
 from imud.config.model import DeviceConfig
 from imud.contracts.status import Deviations
 from imud.model.errors import ConfigError
@@ -39,15 +39,15 @@ def test_without_the_keys_nothing_is_turned() -> None:
 
 def test_every_way() -> None:
     axes = device("    frame: {axes: {x: y, y: -x, z: z}}\n    convention: ned-frd\n    declination_deg: -3.5\n")
-    assert axes.frame == FrameSettings(axes=MountingAxes(x="y", y="-x", z="z"))
+    assert axes.frame == FrameOptions(axes=MountingAxes(x="y", y="-x", z="z"))
     assert (axes.convention, axes.declination_deg) == (Convention.NED_FRD, -3.5)
     angles = device("    frame: {euler: {roll_deg: 90, yaw_deg: -30.5}, level_roll_deg: 0.4}\n").frame
-    assert angles == FrameSettings(euler=MountingAngles(roll_deg=90.0, yaw_deg=-30.5), level_roll_deg=0.4)
+    assert angles == FrameOptions(euler=MountingAngles(roll_deg=90.0, yaw_deg=-30.5), level_roll_deg=0.4)
     quat = device("    frame: {quat_wxyz: [0, 1, 0, 0], heading_offset_deg: 3, level_at_rest: false}\n").frame
-    assert quat == FrameSettings(quat_wxyz=[0.0, 1.0, 0.0, 0.0], heading_offset_deg=3.0, level_at_rest=False)
+    assert quat == FrameOptions(quat_wxyz=[0.0, 1.0, 0.0, 0.0], heading_offset_deg=3.0, level_at_rest=False)
     down = device("    frame: {z_down: true, euler_order: zxy}\n", "imu61x-uart").frame
-    assert down == FrameSettings(z_down=True, euler_order=EulerOrder.ZXY)
-    assert device("    frame: {}\n").frame == FrameSettings()
+    assert down == FrameOptions(z_down=True, euler_order=EulerOrder.ZXY)
+    assert device("    frame: {}\n").frame == FrameOptions()
 
 
 @pytest.mark.parametrize(
@@ -102,8 +102,8 @@ def test_the_shipped_examples_show_the_defaults() -> None:
     devices = config.parse(uncommented(SHIPPED.read_text()), "etc/imud.yaml").devices
     frames = {device.name: device.frame for device in devices if device.frame is not None}
     assert frames == {
-        "crane": FrameSettings(axes=MountingAxes(x="y", y="-x", z="z")),
-        "pole": FrameSettings(euler=MountingAngles()),
-        "mirror": FrameSettings(quat_wxyz=[1.0, 0.0, 0.0, 0.0]),
+        "crane": FrameOptions(axes=MountingAxes(x="y", y="-x", z="z")),
+        "pole": FrameOptions(euler=MountingAngles()),
+        "mirror": FrameOptions(quat_wxyz=[1.0, 0.0, 0.0, 0.0]),
     }
     assert {(device.convention, device.declination_deg) for device in devices} == {(None, None)}

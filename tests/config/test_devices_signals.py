@@ -9,18 +9,18 @@ from imud.config.model import DeviceConfig
 from imud.contracts.lines import (
     LINE_SCHEMAS,
     DeviceLines,
-    DividedSettings,
-    InputSettings,
-    PpsSettings,
-    ReadySettings,
-    ResetSettings,
-    SoutSettings,
-    TriggerSettings,
+    DividedOptions,
+    InputOptions,
+    PpsOptions,
+    ReadyOptions,
+    ResetOptions,
+    SoutOptions,
+    TriggerOptions,
 )
 from imud.drivers import DRIVERS
 from imud.model.errors import ConfigError
 from imud.utc import RMC_SOURCES
-from imud.utc.receivers import RmcSettings
+from imud.utc.receivers import RmcOptions
 
 
 def parse(*devices: str) -> tuple[DeviceConfig, ...]:
@@ -52,22 +52,22 @@ def test_every_line() -> None:
         spi("reset: {line: R, hold_ms: 5, open_drain: true}, data_ready: {line: Y, edge: falling}"),
     )
     assert bow.lines == DeviceLines(
-        sout=SoutSettings(line=17, chip="gpiochip0", bias="pull-down"),
-        sout_div=DividedSettings(line="D", divisor=64),
-        sin=TriggerSettings(line="S", rate_hz=0.0),
-        alarm=InputSettings(line="A", active_low=True),
-        pps=PpsSettings(line="P", chrony="/run/chrony.imud.sock"),
+        sout=SoutOptions(line=17, chip="gpiochip0", bias="pull-down"),
+        sout_div=DividedOptions(line="D", divisor=64),
+        sin=TriggerOptions(line="S", rate_hz=0.0),
+        alarm=InputOptions(line="A", active_low=True),
+        pps=PpsOptions(line="P", chrony="/run/chrony.imud.sock"),
     )
     assert gimbal.lines == DeviceLines(
-        reset=ResetSettings(line="R", hold_ms=5.0, open_drain=True), data_ready=ReadySettings(line="Y", edge="falling")
+        reset=ResetOptions(line="R", hold_ms=5.0, open_drain=True), data_ready=ReadyOptions(line="Y", edge="falling")
     )
 
 
 def test_defaults() -> None:
-    reset = ResetSettings(line="R")
+    reset = ResetOptions(line="R")
     assert (reset.active_low, reset.hold_ms, reset.wait_s, reset.open_drain) == (True, 10.0, 3.0, False)
-    assert DividedSettings(line="D").divisor == 8
-    assert not TriggerSettings(line="S").active_low
+    assert DividedOptions(line="D").divisor == 8
+    assert not TriggerOptions(line="S").active_low
     for keys in ("driver: hipnuc-uart, uart: {port: x}", hipnuc("")):
         assert parse(keys)[0].lines is None
 
@@ -171,19 +171,19 @@ HIPNUC = "driver: hipnuc-uart, uart: {port: x}"
     ("keys", "rmc"),
     [
         (HIPNUC, None),
-        (HIPNUC + ", rmc: {source: gpsd}", RmcSettings(source="gpsd")),
+        (HIPNUC + ", rmc: {source: gpsd}", RmcOptions(source="gpsd")),
         (
             HIPNUC + ", rmc: {source: system, rate_hz: 5, error_ms: 10}",
-            RmcSettings(source="system", rate_hz=5, error_ms=10.0),
+            RmcOptions(source="system", rate_hz=5, error_ms=10.0),
         ),
         (
             HIPNUC + ", rmc: {source: nmea, port: /dev/ttyUSB1, baud: 38400}",
-            RmcSettings(source="nmea", port="/dev/ttyUSB1", baud=38400),
+            RmcOptions(source="nmea", port="/dev/ttyUSB1", baud=38400),
         ),
-        (hipnuc("pps: {line: GPIO17}") + ", rmc: {source: gpsd}", RmcSettings(source="gpsd")),
+        (hipnuc("pps: {line: GPIO17}") + ", rmc: {source: gpsd}", RmcOptions(source="gpsd")),
     ],
 )
-def test_each_rmc_source(keys: str, rmc: RmcSettings | None) -> None:
+def test_each_rmc_source(keys: str, rmc: RmcOptions | None) -> None:
     assert parse(keys)[0].rmc == rmc
 
 
@@ -212,5 +212,5 @@ def test_what_is_wrong_with_an_rmc_source(keys: str, said: str) -> None:
 
 
 def test_every_source_has_its_row() -> None:
-    assert set(RMC_SOURCES) == set(RmcSettings.__annotations__["source"].__args__)
+    assert set(RMC_SOURCES) == set(RmcOptions.__annotations__["source"].__args__)
     assert all(callable(RMC_SOURCES[name]) for name in RMC_SOURCES)

@@ -25,11 +25,11 @@ from imud.config.yaml import EVENTS_PER_TURN
 from imud.contracts.driver import KeyProblem
 from imud.contracts.lines import DeviceLines
 from imud.contracts.link import Claim
-from imud.contracts.setting import DeviceSettings
+from imud.contracts.setting import SettingsTable
 from imud.drivers import DRIVERS
 from imud.links import LINKS
 from imud.model.errors import ConfigError
-from imud.model.options import NoSettings, Settings, expected, got
+from imud.model.options import NoOptions, Options, expected, got
 from imud.publishers import PUBLISHERS
 from tests.support import references
 from tests.support.files import ROOT
@@ -37,13 +37,13 @@ from tests.support.files import ROOT
 SHIPPED = ROOT / "etc/imud.yaml"
 
 
-class PortSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PortSettings(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     port: Annotated[str, Meta(min_length=1)]
     baud: Annotated[int, Meta(ge=50, le=4_000_000)] | Literal["auto"] = "auto"
     wait_ms: Annotated[float, Meta(ge=0, le=100)] = 0.0
 
 
-class FileSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class FileSettings(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     path: str
     speed: Literal["real", "maximum"] = "real"
     repeat: bool = False
@@ -55,32 +55,32 @@ class FileSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             raise ValueError("this is no file")
 
 
-class OutSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class OutSettings(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     path: str = "/run/x"
     ids: tuple[int, ...] = ()
 
 
-class DriverSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class DriverSettings(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     range_g: Annotated[int, Meta(ge=2, le=16)] = 8
 
 
 @dataclass(frozen=True)
 class FakeRow:
-    settings: type[Settings]
+    settings: type[Options]
     searchable: bool = True
     lines: frozenset[str] = frozenset()
     heading: Callable[[Any, Mapping[str, str]], Heading] = lambda _settings, _read_back: Heading.UNKNOWN
-    refuses: type[Settings] | None = None
-    """Settings of a driver that does not fit this link."""
+    refuses: type[Options] | None = None
+    """Options of a driver that does not fit this link."""
     faults: tuple[KeyProblem, ...] = ()
     """Problems that a driver has with everything."""
-    device_settings: DeviceSettings | None = None
+    device_settings: SettingsTable | None = None
     declared_line_differences: Callable[[Mapping[str, Any], DeviceLines], Mapping[str, str]] = lambda _declared, _: {}
 
-    def bus_of(self, settings: Settings) -> str:
+    def bus_of(self, settings: Options) -> str:
         return ""
 
-    def problems(self, options: Settings, link: Settings) -> Sequence[KeyProblem]:
+    def problems(self, options: Options, link: Options) -> Sequence[KeyProblem]:
         return self.faults
 
     claims: Callable[[Any], Sequence[Claim]] = lambda _settings: ()
@@ -104,12 +104,12 @@ class Broken(Mapping[str, FakeRow]):
 
 
 FAKE = Tables(
-    drivers={"acme-uart": FakeRow(DriverSettings), "plain-uart": FakeRow(NoSettings)},
+    drivers={"acme-uart": FakeRow(DriverSettings), "plain-uart": FakeRow(NoOptions)},
     links={
         "port": FakeRow(PortSettings, claims=lambda port: [Claim(place=port.port, key="port")]),
         "file": FakeRow(FileSettings),
     },
-    publishers={"out": FakeRow(OutSettings), "none": FakeRow(NoSettings)},
+    publishers={"out": FakeRow(OutSettings), "none": FakeRow(NoOptions)},
 )
 GOOD = """\
 log_level: debug
@@ -143,7 +143,7 @@ def test_a_good_file() -> None:
     assert parse(GOOD) == Config(
         log_level="debug",
         state_dir="/var/lib/imud",
-        publishers={"out": OutSettings(path="/tmp/out"), "none": NoSettings()},
+        publishers={"out": OutSettings(path="/tmp/out"), "none": NoOptions()},
         devices=(
             DeviceConfig(
                 "front", "acme-uart", DriverSettings(range_g=4), True, "port",
@@ -158,7 +158,7 @@ def test_a_good_file() -> None:
 def test_defaults() -> None:
     made = parse("devices: {}")
     assert (made.log_level, made.state_dir, made.devices) == ("info", "/var/lib/imud", ())
-    assert made.publishers == {"out": OutSettings(), "none": NoSettings()}
+    assert made.publishers == {"out": OutSettings(), "none": NoOptions()}
     assert parse("out:\ndevices: {}").publishers["out"] == OutSettings()
     (device,) = parse("devices: {a: {driver: acme-uart, port: {port: x}}}").devices
     assert device.options == DriverSettings(), "options of a named driver need not be written"

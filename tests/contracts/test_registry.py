@@ -7,16 +7,16 @@ import pytest
 from imud.contracts.driver import Driver
 from imud.contracts.link import LinkType
 from imud.contracts.publisher import PublisherType
-from imud.contracts.registry import Table
+from imud.contracts.registry import Registry
 from imud.drivers import DRIVERS
 from imud.links import LINKS
 from imud.publishers import PUBLISHERS
 
-TABLES: list[tuple[Table[Any], type]] = [(DRIVERS, Driver), (LINKS, LinkType), (PUBLISHERS, PublisherType)]
+TABLES: list[tuple[Registry[Any], type]] = [(DRIVERS, Driver), (LINKS, LinkType), (PUBLISHERS, PublisherType)]
 
 
 @pytest.mark.parametrize(("table", "kind"), TABLES, ids=lambda value: getattr(value, "kind", ""))
-def test_rows_lead_to_objects_that_know_their_name(table: Table[Any], kind: type) -> None:
+def test_rows_lead_to_objects_that_know_their_name(table: Registry[Any], kind: type) -> None:
     assert len(table) > 0
     for name, row in table.items():
         assert isinstance(row, kind)
@@ -29,7 +29,7 @@ def test_unknown_name_lists_the_known_ones() -> None:
 
 
 def test_row_is_imported_on_first_use_only() -> None:
-    table: Table[object] = Table("thing", {"bad": "imud.no_such_module:X", "good": "imud.model.units:NS_PER_S"})
+    table: Registry[object] = Registry("thing", {"bad": "imud.no_such_module:X", "good": "imud.model.units:NS_PER_S"})
     assert table["good"] == 1_000_000_000
     with pytest.raises(ModuleNotFoundError):
         table["bad"]

@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 from imud.config.model import DeviceConfig
-from imud.contracts.lines import DeviceLines, Edge, ResetSettings, SoutSettings, TriggerSettings, TriggerStamp
+from imud.contracts.lines import DeviceLines, Edge, ResetOptions, SoutOptions, TriggerOptions, TriggerStamp
 from imud.contracts.status import DeviceState
 from imud.drivers.imu61x.uart.codec import encode_ahrs
 from imud.drivers.imu61x.uart.driver import DRIVER
 from imud.lines.sync import SyncSignals
-from imud.links.memory import MemorySettings
+from imud.links.memory import MemoryOptions
 from imud.model.errors import BadArgument, CommandError
 from imud.model.event import EventKind
 from imud.model.sample import Measurement, Sync
@@ -28,7 +28,7 @@ from tests.support.event_loops import VirtualClock, in_loop, run_virtually
 from tests.support.polled_bus_bench import PolledBusBench
 from tests.support.stories import in_bench, played
 
-LINES = DeviceLines(reset=ResetSettings(line="R"))
+LINES = DeviceLines(reset=ResetOptions(line="R"))
 BOOT_S = 2.9
 """A little less than the manual says."""
 
@@ -84,7 +84,7 @@ class Scene:
 @asynccontextmanager
 async def polled(bench: PolledBusBench, **more: Any) -> AsyncIterator[Scene]:
     config = replace(
-        bench.on_spi(burst="extended", gyro_filter=2), lines=DeviceLines(reset=ResetSettings(line="R", **more))
+        bench.on_spi(burst="extended", gyro_filter=2), lines=DeviceLines(reset=ResetOptions(line="R", **more))
     )
     scene = Scene(bench)
     async with bench.running(config) as (scene.rig,):
@@ -176,7 +176,7 @@ class Uart:
         self.wires = MemoryLines(clock.now_ns)
         reset_line(self.wires, clock.now_ns, self._boot)
         self.rigs = DeviceRigs(clock.host, lines=self.wires.maker)
-        config = DeviceConfig("imu", "imu61x-uart", None, False, "memory", MemorySettings(**link), lines=lines)
+        config = DeviceConfig("imu", "imu61x-uart", None, False, "memory", MemoryOptions(**link), lines=lines)
         self.rig = self.rigs.add(config)
         self.device, self.link, self.events = self.rig.device, self.rig.link, self.rig.events
         self.streams = False
@@ -223,7 +223,7 @@ async def test_a_uart_on_which_something_is_heard_is_left_alone(it: Uart) -> Non
 
 @in_loop
 async def test_a_trigger_is_offered_where_imud_drives_sin(monkeypatch: pytest.MonkeyPatch) -> None:
-    it = Uart(DeviceLines(sin=TriggerSettings(line="S")), baud=115200)
+    it = Uart(DeviceLines(sin=TriggerOptions(line="S")), baud=115200)
     assert list(it.device.actions) == ["trigger"]
     once: list[str] = []
     monkeypatch.setattr(SyncSignals, "trigger_once", lambda _self: once.append("edge"))
@@ -236,7 +236,7 @@ async def test_a_trigger_is_offered_where_imud_drives_sin(monkeypatch: pytest.Mo
 
 def test_where_the_measurement_is_reaches_the_clock() -> None:
     lines = DeviceLines(
-        sout=SoutSettings(line="O", offset_us=-7, bias_us=2, width_us=90), sin=TriggerSettings(line="I", offset_us=9)
+        sout=SoutOptions(line="O", offset_us=-7, bias_us=2, width_us=90), sin=TriggerOptions(line="I", offset_us=9)
     )
     by_sout, by_sin = (make_clock("imu", lines, DRIVER, None) for _ in range(2))
     for i in range(200):
@@ -267,7 +267,7 @@ async def test_at_the_start_a_device_on_a_bus_is_reset_before_it_is_asked(bench:
         assert it.told == ["reset by its line at the start"]
 
 
-@played(lambda: Uart(DeviceLines(reset=ResetSettings(line="R", at_start=True)), baud=115200))
+@played(lambda: Uart(DeviceLines(reset=ResetOptions(line="R", at_start=True)), baud=115200))
 async def test_at_the_start_a_device_on_a_uart_is_reset(it: Uart) -> None:
     begin_ns = it.clock.now_ns()
     await it.until(lambda: len(it.rig.samples) > 10)

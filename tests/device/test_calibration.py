@@ -10,8 +10,8 @@ import pytest
 
 from imud.contracts.command import GYRO_ZERO, Calibration, CalibrationResult, Handling, Kept, Target, Verdict
 from imud.contracts.lines import DeviceLines
-from imud.device.calibration import Guide
-from imud.device.health import Notices
+from imud.device.calibration import CalibrationRun
+from imud.device.health import DeviceEvents
 from imud.model.errors import BadArgument, CommandError, Rejected
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
@@ -34,7 +34,7 @@ class GuideRig:
         self.clock = VirtualClock()
         self.events: list[Event] = []
         self.ran: list[str] = []
-        self.guide = Guide(self._run, Notices("bow", Ledger(), self.events.append))
+        self.guide = CalibrationRun(self._run, DeviceEvents("bow", Ledger(), self.events.append))
         self.motion: Callable[[float], Vector3] = lambda _t_s: (0.0, 0.0, 0.0)
         """Angular rate by the time since the beginning."""
         self.mag_t: Callable[[float], Vector3 | None] = lambda _t_s: None

@@ -12,14 +12,14 @@ from imud.config.model import DeviceConfig
 from imud.contracts.driver import CanDriver
 from imud.contracts.status import DeviceState, KernelCounters
 from imud.drivers import DRIVERS
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
-from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
-from imud.drivers.imu61x.can import Imu61xCanSettings, encode_set
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
+from imud.drivers.imu61x.can import Imu61xCanOptions, encode_set
 from imud.formats.can import CanFrame
 from imud.host.clock import HostClock
-from imud.links.memory import MemorySettings
+from imud.links.memory import MemoryOptions
 from imud.model.event import EventKind
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.units import NS_PER_S
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
@@ -30,10 +30,10 @@ MS = 1_000_000
 
 
 def configured(
-    driver: str = "imu61x-can", settings: Settings | None = None, *, base_id: int = 101, bitrate: int = 0
+    driver: str = "imu61x-can", settings: Options | None = None, *, base_id: int = 101, bitrate: int = 0
 ) -> DeviceConfig:
-    link = MemorySettings(baud=bitrate, name="can0")
-    return DeviceConfig("mast", driver, settings or Imu61xCanSettings(base_id=base_id), True, "memory", link)
+    link = MemoryOptions(baud=bitrate, name="can0")
+    return DeviceConfig("mast", driver, settings or Imu61xCanOptions(base_id=base_id), True, "memory", link)
 
 
 class Frames:
@@ -98,7 +98,7 @@ async def test_samples_of_one_read_are_one_batch_with_their_own_times(bench: Can
     assert rig.can_link.written == []
 
 
-def delay_ns(name: str, settings: Settings, bitrate: int) -> int:
+def delay_ns(name: str, settings: Options, bitrate: int) -> int:
     """From the time of a sample to its arrival; four frames, 0.3 ms apart, every 10 ms."""
     driver = DRIVERS[name]
     assert isinstance(driver, CanDriver)
@@ -117,9 +117,9 @@ def delay_ns(name: str, settings: Settings, bitrate: int) -> int:
 
 @pytest.mark.parametrize(
     ("name", "settings", "bits"),
-    [("hipnuc-canopen", HipnucCanopenSettings(), 95), ("hipnuc-j1939", HipnucJ1939Settings(), 131)],
+    [("hipnuc-canopen", HipnucCanopenOptions(), 95), ("hipnuc-j1939", HipnucJ1939Options(), 131)],
 )
-def test_the_length_of_the_first_frame_is_taken_off(name: str, settings: Settings, bits: int) -> None:
+def test_the_length_of_the_first_frame_is_taken_off(name: str, settings: Options, bits: int) -> None:
     """TPDO1 has six bytes; a 29-bit identifier makes a frame 20 bits longer."""
     taken_ns = delay_ns(name, settings, 500_000) - delay_ns(name, settings, 0)
     assert taken_ns == pytest.approx(bits * 2000, abs=2000)
@@ -163,7 +163,7 @@ def test_a_device_that_has_not_answered_is_asked_on() -> None:
     """Nobody answers: after the first minutes one try in five, as on a serial line."""
     clock = VirtualClock()
     rigs = DeviceRigs(clock.host)
-    rig = rigs.add(configured("hipnuc-canopen", HipnucCanopenSettings(node=8)))
+    rig = rigs.add(configured("hipnuc-canopen", HipnucCanopenOptions(node=8)))
 
     async def story(_made: list[DeviceRig]) -> None:
         await rig.until(lambda: rig.can_link.listening)

@@ -12,12 +12,12 @@ from imud.config.model import DeviceConfig
 from imud.contracts.setting import OnDifference, SettingsState, Written
 from imud.contracts.status import DeviceState
 from imud.drivers import DRIVERS
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
-from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, CanFrame
 from imud.host.clock import HostClock
-from imud.links.memory import MemoryCanLink, MemorySettings
-from imud.model.options import Settings
+from imud.links.memory import MemoryCanLink, MemoryOptions
+from imud.model.options import Options
 from imud.sim.can_module import CanModule, CanModules
 from imud.sim.hipnuc.canopen import NODE_VARIANTS, HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
 from imud.sim.hipnuc.j1939 import J1939_VARIANTS, HipnucJ1939Module, J1939Hardware, J1939Settings
@@ -35,7 +35,7 @@ class BusInProcess:
         self,
         clock: VirtualClock,
         driver: str,
-        options: Settings | None,
+        options: Options | None,
         *modules: CanModule,
         identify: bool = True,
         **declared: object,
@@ -44,7 +44,7 @@ class BusInProcess:
         self.clock = clock
         self.modules = CanModules(modules)
         self.rigs = DeviceRigs(HostClock(clock.now_ns, clock.realtime_ns, clock.now_ns))
-        link = MemorySettings(baud=BIT_RATE, name="can0")
+        link = MemoryOptions(baud=BIT_RATE, name="can0")
         config = DeviceConfig("bow", driver, options, identify, "memory", link)
         if declared:
             table = DRIVERS[driver].device_settings
@@ -99,7 +99,7 @@ def test_a_canopen_node_is_made_as_declared(variant: str) -> None:
     module = HipnucCanopenModule(clock.now_ns(), HipnucCanopenHardware(boot_ms=200, variant=kind))
     other = NodeSettings(node=12)
     beside = HipnucCanopenModule(clock.now_ns(), HipnucCanopenHardware(factory=other, boot_ms=0))
-    bus = BusInProcess(clock, "hipnuc-canopen", HipnucCanopenSettings(), module, beside)
+    bus = BusInProcess(clock, "hipnuc-canopen", HipnucCanopenOptions(), module, beside)
 
     async def story() -> None:
         taken = await bus.done(bus.rig.device.settings_apply({"node": 12}, save=True))
@@ -120,7 +120,7 @@ def test_a_j1939_module_is_made_as_declared(variant: str) -> None:
     clock, kind = VirtualClock(), J1939_VARIANTS[variant]
     module = HipnucJ1939Module(clock.now_ns(), J1939Settings(), J1939Hardware(boot_ms=200, variant=kind))
     beside = HipnucJ1939Module(clock.now_ns(), J1939Settings(address=12), J1939Hardware(boot_ms=0))
-    bus = BusInProcess(clock, "hipnuc-j1939", HipnucJ1939Settings(), module, beside)
+    bus = BusInProcess(clock, "hipnuc-j1939", HipnucJ1939Options(), module, beside)
 
     async def story() -> None:
         taken = await bus.done(bus.rig.device.settings_apply({"address": 12}, save=True))
@@ -154,7 +154,7 @@ def test_a_node_is_set_as_declared_and_followed() -> None:
     clock = VirtualClock()
     module = HipnucCanopenModule(clock.now_ns(), HipnucCanopenHardware(boot_ms=0))
     bus = BusInProcess(
-        clock, "hipnuc-canopen", HipnucCanopenSettings(), module, tpdo1_interval_ms=20, tpdo2_interval_ms=20, node=9
+        clock, "hipnuc-canopen", HipnucCanopenOptions(), module, tpdo1_interval_ms=20, tpdo2_interval_ms=20, node=9
     )
 
     async def story() -> None:

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from imud.contracts.codec import BadFrame, BadReason
-from imud.device.health import Notices
+from imud.device.health import DeviceEvents
 from imud.host.log import RepeatFilter
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
@@ -13,10 +13,10 @@ from imud.model.sample import Sync
 S = 1_000_000_000
 
 
-def make() -> tuple[Notices, Ledger, list[Event]]:
+def make() -> tuple[DeviceEvents, Ledger, list[Event]]:
     events: list[Event] = []
     ledger = Ledger()
-    return Notices("bow", ledger, events.append), ledger, events
+    return DeviceEvents("bow", ledger, events.append), ledger, events
 
 
 def test_only_a_change_of_sync_is_told() -> None:

@@ -19,7 +19,7 @@ from imud.contracts.status import DeviceState, KernelCounters
 from imud.drivers.hipnuc.modbus import commands as session
 from imud.drivers.hipnuc.modbus import driver
 from imud.drivers.hipnuc.modbus.registers import BY_NAME
-from imud.links.rs485 import LineCounters, Rs485Link, Rs485Settings
+from imud.links.rs485 import LineCounters, Rs485Link, Rs485Options
 from imud.model.errors import BadArgument, TransferError
 from imud.model.event import EventKind
 from imud.model.units import NS_PER_MS
@@ -81,7 +81,7 @@ class LineBench:
         """Run a device for each module, or for each of the addresses `at`."""
         self.line = VirtualLine(self.clock, *modules)
         ports: Any = self.line
-        row = LinkType("rs485", Rs485Settings, make_polled=lambda settings: Rs485Link(settings, ports=ports))
+        row = LinkType("rs485", Rs485Options, make_polled=lambda settings: Rs485Link(settings, ports=ports))
         self._patch.setattr("imud.links.rs485.LINK", row)
         configs = [on(self.path, address, **link) for address in at or [one.settings.slave for one in modules]]
         async with running(*configs, rigs=DeviceRigs(self.clock.host, start_worker=LoopWorker)) as rigs:

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from imud.config.model import DeviceConfig
-from imud.contracts.lines import DeviceLines, LineFactory, OnEdges, OnLineEnd, ReadySettings
+from imud.contracts.lines import DeviceLines, LineFactory, OnEdges, OnLineEnd, ReadyOptions
 from imud.contracts.status import DeviceState
 from imud.device.polled_bus import Deadlines, ReadySchedule
 from imud.device.polled_transport import DataReady
@@ -101,7 +101,7 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PolledBusBench:
 
 def with_line(bench: PolledBusBench, **more: Any) -> DeviceConfig:
     return replace(
-        bench.on_spi(RATE_HZ, burst="standard"), lines=DeviceLines(data_ready=ReadySettings(line="Y", **more))
+        bench.on_spi(RATE_HZ, burst="standard"), lines=DeviceLines(data_ready=ReadyOptions(line="Y", **more))
     )
 
 
@@ -239,7 +239,7 @@ async def test_no_edges_any_more_and_edges_again(bench: PolledBusBench) -> None:
 
 @in_bench
 async def test_without_the_line_deadlines_serve_until_it_comes(bench: PolledBusBench) -> None:
-    bench.lines.input(ReadySettings(line="Y"), "imu data_ready", True).open_error = LinkMissing("no such line")
+    bench.lines.input(ReadyOptions(line="Y"), "imu data_ready", True).open_error = LinkMissing("no such line")
     async with scene(bench) as it:
         await it.rig.until(it.told("line data_ready: no such line"), "told")
         await it.rig.until(it.told("no edges"), "told")
@@ -304,7 +304,7 @@ async def test_the_thread_waits_for_a_line_with_a_descriptor_while_that_is_open_
     line, clock, member, told = DescriptorLine(), VirtualClock(), WatchingMember(), list[str]()
     notices: Any = SimpleNamespace(raise_event=lambda _t, _kind, message, **_detail: told.append(message))
     maker = LineFactory(lambda *_: line, lambda *_: MemoryOutput())
-    ready = DataReady("imu", ReadySettings(line="Y"), maker, RATE_HZ, notices, clock.now_ns)
+    ready = DataReady("imu", ReadyOptions(line="Y"), maker, RATE_HZ, notices, clock.now_ns)
     some: Any = member
     line.open_error = LinkMissing("not there")
     ready.read(some, (), Deadlines(), clock.now_ns())

@@ -17,8 +17,8 @@ from imud.device import can_transport
 from imud.device.search import Remembered, RememberedDevice
 from imud.drivers import DRIVERS
 from imud.formats.can import CyclicFrame
-from imud.links.memory import MemoryCanLink, MemorySettings
-from imud.model.options import Settings
+from imud.links.memory import MemoryCanLink, MemoryOptions
+from imud.model.options import Options
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_MS, NS_PER_S
 from tests.support.device_rig import DeviceRig, DeviceRigs
@@ -47,9 +47,9 @@ class Bus:
         self._started = False
 
     def add(
-        self, name: str = "mast", driver: str = "auto", options: Settings | None = None, *, writable: bool = True
+        self, name: str = "mast", driver: str = "auto", options: Options | None = None, *, writable: bool = True
     ) -> "OnBus":
-        settings = MemorySettings(name="can0", writable=writable)
+        settings = MemoryOptions(name="can0", writable=writable)
         config = DeviceConfig(name, driver, options, True, "memory", settings)
         return OnBus(self, self.rigs.add(config, MemoryCanLink(settings)))
 

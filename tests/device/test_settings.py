@@ -16,7 +16,7 @@ from imud.contracts.setting import AppliedSettings, OnDifference, SettingsState,
 from imud.contracts.status import DeviceState
 from imud.device import stream_transport
 from imud.drivers import DRIVERS
-from imud.links.memory import MemorySettings
+from imud.links.memory import MemoryOptions
 from imud.model.errors import BadArgument, CommandError
 from imud.model.event import Event, EventKind
 from imud.model.units import NS_PER_S
@@ -70,7 +70,7 @@ class ModuleBench:
             setattr(self.module, name, value)
         self.rigs = DeviceRigs(self.clock.host, state_dir=state_dir)
         config = DeviceConfig(
-            "bow", "fake-module", None, True, "memory", MemorySettings(name="/dev/fake", baud=115200),
+            "bow", "fake-module", None, True, "memory", MemoryOptions(name="/dev/fake", baud=115200),
             declared=msgspec.convert(declared, FAKE_SETTINGS.declarable) if declared else None,
             on_difference=OnDifference(on_difference),
         )  # fmt: skip

@@ -3,7 +3,7 @@
 import msgspec
 
 from imud.contracts.driver import Identity
-from imud.device.health import Notices
+from imud.device.health import DeviceEvents
 from imud.device.settings import KnownIdentity, identity_words
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
@@ -12,7 +12,7 @@ from imud.model.ledger import Ledger
 def test_only_differences_to_a_known_device_are_reported() -> None:
     events: list[Event] = []
     times_ns = iter((3, 4))  # one for each event
-    known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: next(times_ns))
+    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), lambda: next(times_ns))
     known.update(Identity("HI14", "A1"), {"ATT_MODE": "0", "BAUD": "115200"})
     known.update(Identity("HI14", "A1"), {"ATT_MODE": "0", "BAUD": "115200", "NEW": "1"})
     assert not events
@@ -24,7 +24,7 @@ def test_only_differences_to_a_known_device_are_reported() -> None:
     ]
     assert (known.identity.serial_number, known.settings) == ("B2", {"ATT_MODE": "1"})
     events = []
-    known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: 5)
+    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), lambda: 5)
     known.update(Identity("HI14"), {})
     known.update(Identity("HI14", "B2"), {})
     assert not events
@@ -33,7 +33,7 @@ def test_only_differences_to_a_known_device_are_reported() -> None:
 def test_what_an_answer_lost_is_known_from_before_of_the_same_device() -> None:
     """An adapter that was just plugged in: the first answers have lost bytes."""
     events: list[Event] = []
-    known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: 5)
+    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), lambda: 5)
     whole = Identity("HI14", "A1", "1.5.6", {"BUILD": "x"})
     known.update(whole, {})
     for damaged in (Identity("HI14"), Identity("", "A1", "1.5.6"), Identity()):
@@ -43,7 +43,7 @@ def test_what_an_answer_lost_is_known_from_before_of_the_same_device() -> None:
     known.update(Identity("HI14", "A1", "1.6.9", {"BUILD": "y"}), {})
     assert known.identity == Identity("HI14", "A1", "1.6.9", {"BUILD": "y"})
     events = []
-    known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: 5)
+    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), lambda: 5)
     known.update(Identity("HI14", "A1", "1.5.6"), {})
     known.update(Identity("", "B2"), {})
     assert known.identity == Identity("", "B2")
@@ -64,7 +64,7 @@ HOSTILE = "\x1b[2J\n\udc80\ud800\u202e" + "x" * 10_000
 def test_what_a_device_says_fits_every_output() -> None:
     """Long, unprintable, not UTF-8, and named as the arguments of our own functions."""
     events: list[Event] = []
-    known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: 5)
+    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), lambda: 5)
     names = ("message", "kind", "now_ns", "self", "device", HOSTILE)
     many = {f"n{number}": HOSTILE for number in range(10_000)}
     known.update(Identity(HOSTILE, HOSTILE, HOSTILE, many), dict.fromkeys(names, "old"))

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from imud.contracts.command import Target
-from imud.contracts.setting import AppliedSettings, DeviceSettings, Effect, Setting, StepOutcome, Written
+from imud.contracts.setting import AppliedSettings, Effect, Setting, SettingsTable, StepOutcome, Written
 from imud.device.settings_plan import Applying, make_plan
 from imud.model.errors import LinkMissing, NoReply
 
@@ -22,7 +22,7 @@ class TableOfOne:
         self.active: dict[str, Any] = {"x": 1} if readable else {}
         self.done: list[str] = []
         self.result = result
-        self.table = DeviceSettings(
+        self.table = SettingsTable(
             table={"x": Setting(type=int, write=self._write, effect=effect, **more)},
             read=self._read, save=lambda _target: self._do("save"), restart=lambda _target: self._restart(),
         )  # fmt: skip

@@ -19,7 +19,7 @@ from imud.contracts.status import DeviceState, KernelCounters
 from imud.device.search import RememberedDevice
 from imud.drivers.hipnuc.uart import driver
 from imud.links import LINKS
-from imud.links.memory import MemoryLink, MemorySettings
+from imud.links.memory import MemoryLink, MemoryOptions
 from imud.model.errors import LinkBusy, LinkError, Rejected
 from imud.model.event import EventKind
 from tests.support.device_rig import LIMIT_S, DeviceRig, DeviceRigs
@@ -36,7 +36,7 @@ Story = Callable[[DeviceRig], Coroutine[Any, Any, None]]
 
 
 def configured(*, identify: bool = False, baud: Any = 115200, driver: str = "hipnuc-uart", **link: Any) -> DeviceConfig:
-    return DeviceConfig("bow", driver, None, identify, "memory", MemorySettings(baud=baud, **link))
+    return DeviceConfig("bow", driver, None, identify, "memory", MemoryOptions(baud=baud, **link))
 
 
 def feed(rig: DeviceRig, data: bytes) -> None:
@@ -163,7 +163,7 @@ def test_port_that_is_busy_is_tried_again_and_says_why() -> None:
         rig.tick()
         assert rig.is_in(DeviceState.RUNNING)
 
-    play(story, link=Busy(MemorySettings(baud=115200)))
+    play(story, link=Busy(MemoryOptions(baud=115200)))
 
 
 @in_loop
@@ -382,7 +382,7 @@ def test_a_link_that_cannot_start_is_closed_before_it_is_opened_again() -> None:
         assert rig.is_in(DeviceState.RUNNING)
         assert rig.device.status().connects == 3
 
-    play(story, link=Failing(MemorySettings(baud=115200)))
+    play(story, link=Failing(MemoryOptions(baud=115200)))
 
 
 def test_bytes_that_come_before_the_search_begins_are_counted() -> None:
@@ -396,7 +396,7 @@ def test_bytes_that_come_before_the_search_begins_are_counted() -> None:
         feed(rig, hi91(10))
         assert (rig.ledger.bytes_in, rig.ledger.bytes_skipped, len(rig.samples)) == (8 + 82, 8, 1)
 
-    play(story, link=Early(MemorySettings(baud=115200)))
+    play(story, link=Early(MemoryOptions(baud=115200)))
 
 
 @pytest.mark.parametrize("baud", [115200, "auto"])
@@ -461,7 +461,7 @@ def test_a_port_that_another_device_of_the_configuration_has_names_it() -> None:
     )
     clock = VirtualClock()
     rigs = DeviceRigs(clock.host, configured=[first, replace(first, name="bow")])
-    rig = rigs.add(replace(first, name="bow"), Busy(MemorySettings(baud=115200)))
+    rig = rigs.add(replace(first, name="bow"), Busy(MemoryOptions(baud=115200)))
 
     async def story(_made: list[DeviceRig]) -> None:
         await rig.turn(lambda: rig.state is DeviceState.FAILED)

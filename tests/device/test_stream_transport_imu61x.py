@@ -11,8 +11,8 @@ import pytest
 from imud.config.model import DeviceConfig
 from imud.contracts.setting import StepOutcome
 from imud.contracts.status import DeviceState
-from imud.drivers.imu61x.uart.commands import Imu61xUartSettings
-from imud.links.memory import MemorySettings
+from imud.drivers.imu61x.uart.commands import Imu61xUartOptions
+from imud.links.memory import MemoryOptions
 from imud.model.errors import BadArgument, CommandError
 from imud.sim.imu61x.uart import REFUSING, VARIANTS, Imu61xBehaviour, Imu61xModule, Imu61xSettings
 from tests.support.device_rig import DeviceRigs, device_config, running
@@ -33,10 +33,10 @@ class VariantBench:
         self.clock = VirtualClock()
         hardware = imu61x_hardware(behaviour=behaviour, uptime_us=UPTIME_US)
         self.module = Imu61xModule(self.clock.now_ns(), settings, hardware)
-        memory = MemorySettings(baud=self.module.baud)
+        memory = MemoryOptions(baud=self.module.baud)
         self.line = Imu61xLine(memory, self.module, self.clock)
         self.rigs = DeviceRigs(self.clock.host)
-        options = Imu61xUartSettings(result_done=behaviour.result_done)
+        options = Imu61xUartOptions(result_done=behaviour.result_done)
         self.rig = self.rigs.add(DeviceConfig("bow", "imu61x-uart", options, True, "memory", memory), self.line)
         self.device = self.rig.device
 

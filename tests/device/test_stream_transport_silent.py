@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from imud.contracts.lines import DeviceLines, DividedSettings
+from imud.contracts.lines import DeviceLines, DividedOptions
 from imud.contracts.setting import StepOutcome
 from imud.contracts.status import DeviceState
 from imud.device.stream_transport import StreamTransport
@@ -215,7 +215,7 @@ async def test_status_bits_and_settings_are_shown_by_name(device: LinkedDevice) 
     assert alarms[-1] == "status: cleared: gyroscope bias not converged"
 
 
-@played(lambda: LinkedDevice(lines=DeviceLines(sout_div=DividedSettings(line="A", divisor=4))))
+@played(lambda: LinkedDevice(lines=DeviceLines(sout_div=DividedOptions(line="A", divisor=4))))
 async def test_lines_that_the_module_contradicts_are_events_and_shown(device: LinkedDevice) -> None:
     words = "divisor is 4 in the configuration, and the module divides SOUT by 8"
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)

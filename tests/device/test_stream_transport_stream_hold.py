@@ -11,7 +11,7 @@ import pytest
 from imud.config.model import DeviceConfig
 from imud.contracts.script import Request, RequestScript, never, of_text
 from imud.device.latency import Need
-from imud.links.memory import MemoryLink, MemorySettings
+from imud.links.memory import MemoryLink, MemoryOptions
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_MS, NS_PER_US
 from tests.support.device_rig import DeviceRigs
@@ -30,7 +30,7 @@ FIT_MS = 400
 class Takes(MemoryLink):
     """A link that notes its reads of what waited: when, and how many bytes."""
 
-    def __init__(self, settings: MemorySettings, clock: VirtualClock) -> None:
+    def __init__(self, settings: MemoryOptions, clock: VirtualClock) -> None:
         super().__init__(settings)
         self.taken: list[tuple[int, int]] = []
         self.resumed: list[int] = []
@@ -55,7 +55,7 @@ class HoldBench:
     ) -> None:
         """`anew`: the module's time begins anew in the story, or part of it is left out."""
         self.clock = VirtualClock()
-        settings = MemorySettings(baud=921_600, waiting_bytes=waiting_bytes, hold_ns=hold_ns)
+        settings = MemoryOptions(baud=921_600, waiting_bytes=waiting_bytes, hold_ns=hold_ns)
         self.link = Takes(settings, self.clock)
         rigs = self.rigs = DeviceRigs(self.clock.host)
         self.rig = rigs.add(DeviceConfig("bow", "hipnuc-uart", None, False, "memory", settings), self.link)

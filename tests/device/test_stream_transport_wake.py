@@ -8,7 +8,7 @@ import pytest
 from imud.config.model import DeviceConfig
 from imud.contracts.status import DeviceState
 from imud.drivers.imu61x.uart.commands import OutputMode
-from imud.links.memory import MemorySettings
+from imud.links.memory import MemoryOptions
 from imud.model.event import EventKind
 from imud.sim.imu61x.uart import Imu61xModule, Imu61xSettings
 from tests.support.device_rig import DeviceRigs
@@ -28,7 +28,7 @@ class WakeBench:
         baud: Any = 115200, **hardware: Any,
     ) -> None:  # fmt: skip
         self.clock = VirtualClock()
-        memory = MemorySettings(baud=baud)
+        memory = MemoryOptions(baud=baud)
         self.module = Imu61xModule(self.clock.now_ns(), settings, imu61x_hardware(**hardware))
         self.line = Imu61xLine(memory, self.module, self.clock)
         self.rigs = DeviceRigs(self.clock.host)

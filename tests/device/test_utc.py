@@ -5,16 +5,16 @@ from typing import cast
 import pytest
 
 from imud.config.model import DeviceConfig
-from imud.contracts.lines import DeviceLines, Edge, PpsSettings, UtcReference
+from imud.contracts.lines import DeviceLines, Edge, PpsOptions, UtcReference
 from imud.device import utc as utc_keeper
-from imud.device.utc import DevicePort, UtcKeeper, make_keeper
+from imud.device.utc import DevicePort, UtcFeed, make_keeper
 from imud.formats.nmea0183 import build
 from imud.host.clock import HostClock
-from imud.links.memory import MemorySettings
+from imud.links.memory import MemoryOptions
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
 from imud.utc.pps import ChronyFeed
-from imud.utc.receivers import RmcSettings
+from imud.utc.receivers import RmcOptions
 from imud.utc.system_clock import KernelClock
 from tests.support.rmc_sources import FakeSource
 
@@ -49,7 +49,7 @@ class KeeperBench:
         self.system = system
         self.source, self.chrony = FakeSource(), FakeChrony()
         port = DevicePort(self.written.append, lambda: 115_200, lambda: self.busy)
-        self.keeper = UtcKeeper(
+        self.keeper = UtcFeed(
             self.source if source else None,
             port if source else None,
             lambda: self.system,
@@ -155,9 +155,9 @@ def test_close_releases_source_and_socket_and_nothing_starts_again_or_at_all() -
     bench.source.started = 0
     bench.keeper.tick(BEGIN_NS, None)
     assert bench.source.started == 0
-    UtcKeeper(None, None, lambda: None, lambda: 0).close()
+    UtcFeed(None, None, lambda: None, lambda: 0).close()
     source = FakeSource()
-    keeper = UtcKeeper(source, None, lambda: None, lambda: 0)
+    keeper = UtcFeed(source, None, lambda: None, lambda: 0)
     keeper.close()
     keeper.tick(BEGIN_NS, None)
     assert source.started == 0
@@ -180,7 +180,7 @@ def test_the_system_clock_counts_only_while_something_keeps_it(monkeypatch: pyte
     port = DevicePort(lambda _data: None, lambda: 9600, lambda: False)
     offset_ns, now_ns = [OFFSET_NS], lambda: BEGIN_NS
     host = HostClock(now_ns, lambda: BEGIN_NS + offset_ns[0], now_ns)
-    keeper = make_keeper(configured(None, PpsSettings(line="A")), port, host)
+    keeper = make_keeper(configured(None, PpsOptions(line="A")), port, host)
     assert keeper is not None
     keeper.start(clock)
     monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 100, 100))
@@ -193,20 +193,20 @@ def test_the_system_clock_counts_only_while_something_keeps_it(monkeypatch: pyte
     keeper.close()
 
 
-def configured(rmc: RmcSettings | None, pps: PpsSettings | None) -> DeviceConfig:
+def configured(rmc: RmcOptions | None, pps: PpsOptions | None) -> DeviceConfig:
     return DeviceConfig(
-        "bow", "hipnuc-uart", None, False, "memory", MemorySettings(), lines=DeviceLines(pps=pps), rmc=rmc
+        "bow", "hipnuc-uart", None, False, "memory", MemoryOptions(), lines=DeviceLines(pps=pps), rmc=rmc
     )
 
 
-@pytest.mark.parametrize("rmc", [None, RmcSettings(source="gpsd", rate_hz=5)])
-@pytest.mark.parametrize("pps", [None, PpsSettings(line="A"), PpsSettings(line="A", chrony="/nowhere/imud.sock")])
+@pytest.mark.parametrize("rmc", [None, RmcOptions(source="gpsd", rate_hz=5)])
+@pytest.mark.parametrize("pps", [None, PpsOptions(line="A"), PpsOptions(line="A", chrony="/nowhere/imud.sock")])
 def test_a_device_gets_what_it_is_configured_for(
-    monkeypatch: pytest.MonkeyPatch, rmc: RmcSettings | None, pps: PpsSettings | None
+    monkeypatch: pytest.MonkeyPatch, rmc: RmcOptions | None, pps: PpsOptions | None
 ) -> None:
     now_ns, written, source = [BEGIN_NS], list[bytes](), FakeSource()
 
-    def make() -> UtcKeeper | None:
+    def make() -> UtcFeed | None:
         port = DevicePort(written.append, lambda: 9600, lambda: False)
         host = HostClock(lambda: now_ns[0], lambda: now_ns[0] + OFFSET_NS, lambda: now_ns[0])
         return make_keeper(configured(rmc, pps), port, host)

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, Convention, EulerOrder, Heading
-from imud.attitude.published import FrameSettings, MountingAngles, MountingAxes, mounting_of, published_frame
+from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes, mounting_of, published_frame
 from imud.attitude.rotation import (
     euler312_from_quat,
     matrix_from_quat,
@@ -21,11 +21,11 @@ from imud.attitude.rotation import (
 from imud.config.model import DeviceConfig
 from imud.contracts.publisher import Batch
 from imud.contracts.status import FrameStatus
-from imud.device.health import Notices
-from imud.device.watches import FrameWatch
+from imud.device.health import DeviceEvents
+from imud.device.watches import AttitudeWatch
 from imud.drivers import DRIVERS
-from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucSettings, encode_hi91
-from imud.links.memory import MemorySettings
+from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions, encode_hi91
+from imud.links.memory import MemoryOptions
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 from imud.model.sample import Sample, Sync, Vector3
@@ -43,7 +43,7 @@ BODY_DEG = (5.0, -10.0, 30.0)
 STEP_S = 0.01
 
 
-def in_body(frame: FrameSettings, euler_deg: Vector3 = BODY_DEG, device: Any = RFU_ENU) -> Still:
+def in_body(frame: FrameOptions, euler_deg: Vector3 = BODY_DEG, device: Any = RFU_ENU) -> Still:
     """The sensor at rest in a body of this attitude, as it is mounted; `Still` takes its angles in the order 312."""
     roll, pitch, yaw = euler_deg
     body = matrix_from_quat(quat_from_euler_zyx((radians(roll), radians(pitch), radians(yaw))))
@@ -91,7 +91,7 @@ def played(driver: str, motion: Motion, seconds: float = 12.0, identify: bool = 
     else:
         module = Imu61xModule(clock.now_ns(), hardware=Imu61xHardware(motion=motion, skew_ppm=0))
     rigs = DeviceRigs(clock.host)
-    rigs.add(DeviceConfig("bow", driver, None, identify, "memory", MemorySettings(baud=115_200), **keys))
+    rigs.add(DeviceConfig("bow", driver, None, identify, "memory", MemoryOptions(baud=115_200), **keys))
     results: list[Played] = []
 
     async def story(made: list[DeviceRig]) -> None:
@@ -113,24 +113,24 @@ def played(driver: str, motion: Motion, seconds: float = 12.0, identify: bool = 
     return results[0]
 
 
-def axes(x: str, y: str, z: str) -> FrameSettings:
-    return FrameSettings(axes=MountingAxes(x=x, y=y, z=z))  # type: ignore[arg-type]  # names of axes
+def axes(x: str, y: str, z: str) -> FrameOptions:
+    return FrameOptions(axes=MountingAxes(x=x, y=y, z=z))  # type: ignore[arg-type]  # names of axes
 
 
 MOUNTINGS = {
-    "as the manual draws it": FrameSettings(),
+    "as the manual draws it": FrameOptions(),
     "on its side": axes("y", "z", "x"),
     "upside down": axes("y", "x", "-z"),
     "turned 90° in yaw": axes("x", "y", "z"),  # of a module with x right, y forward
-    "by angles": FrameSettings(euler=MountingAngles(roll_deg=90, pitch_deg=20, yaw_deg=-70)),
-    "by a quaternion": FrameSettings(quat_wxyz=[0.5, -0.5, 0.5, -0.5]),
+    "by angles": FrameOptions(euler=MountingAngles(roll_deg=90, pitch_deg=20, yaw_deg=-70)),
+    "by a quaternion": FrameOptions(quat_wxyz=[0.5, -0.5, 0.5, -0.5]),
 }
 
 
 @pytest.mark.parametrize("name", MOUNTINGS)
 def test_a_module_in_any_mounting_shows_the_attitude_of_the_body(name: str) -> None:
     frame = MOUNTINGS[name]
-    straight = played("hipnuc-uart", in_body(FrameSettings()), 2.0, frame=FrameSettings())
+    straight = played("hipnuc-uart", in_body(FrameOptions()), 2.0, frame=FrameOptions())
     made = played("hipnuc-uart", in_body(frame), frame=frame)
     assert made.euler_deg == pytest.approx(BODY_DEG, abs=1e-3)
     assert made.newest.accel_m_s2 == pytest.approx(straight.newest.accel_m_s2, abs=1e-4)
@@ -149,7 +149,7 @@ def test_the_same_body_in_ned_frd_and_without_the_keys() -> None:
     assert (made.status.convention, made.status.navigation_frame) == ("ned-frd", "NED")
     assert "z down" in made.status.frame
     # Bit for bit: the published samples are those that the path without any rotation makes
-    motion = in_body(FrameSettings())
+    motion = in_body(FrameOptions())
     made = played("hipnuc-uart", motion, 2.0)
     truth = motion.at(0.0)
     assert made.newest.quat_wxyz == pytest.approx(truth.quat_wxyz, abs=1e-6)
@@ -163,7 +163,7 @@ def test_the_same_body_in_ned_frd_and_without_the_keys() -> None:
 
 def test_a_declination_and_what_the_heading_counts_from() -> None:
     """The mode is read back from the module: nine axes, so its heading is magnetic."""
-    motion = in_body(FrameSettings())
+    motion = in_body(FrameOptions())
     plain = played("hipnuc-uart", motion, 2.0, identify=True)
     assert plain.status.heading is Heading.MAGNETIC
     true = played("hipnuc-uart", motion, 2.0, identify=True, declination_deg=7.0)
@@ -181,25 +181,25 @@ def test_a_declination_and_what_the_heading_counts_from() -> None:
 
 def test_z_down_is_found_and_cured_either_way() -> None:
     """The axes of an IMU61x are not settled: with z down the event says what to set, and setting it is right."""
-    motion = ZDown(in_body(FrameSettings(), device=FLU_LEVEL))
+    motion = ZDown(in_body(FrameOptions(), device=FLU_LEVEL))
     wrong = played("imu61x-uart", motion, 20.0)
     (event,) = wrong.events
     assert event.detail["contradiction"] == "z-axis"
     assert event.detail["angle_deg"] == pytest.approx(180, abs=0.5)
     assert "set frame: {z_down: true}" in event.message
     assert wrong.status.problem == event.message, "as long as it is so"
-    right = played("imu61x-uart", motion, 20.0, frame=FrameSettings(z_down=True))
+    right = played("imu61x-uart", motion, 20.0, frame=FrameOptions(z_down=True))
     assert (right.events, right.status.problem) == ([], "")
     assert right.euler_deg == pytest.approx(BODY_DEG, abs=1e-3)
-    made = played("imu61x-uart", in_body(FrameSettings(), device=FLU_LEVEL), frame=FrameSettings(z_down=True))
+    made = played("imu61x-uart", in_body(FrameOptions(), device=FLU_LEVEL), frame=FrameOptions(z_down=True))
     (event,) = made.events
     assert "take z_down out of frame" in event.message
 
 
 def test_a_wrong_order_of_angles_is_found() -> None:
-    motion = in_body(FrameSettings(), (20.0, -15.0, 30.0), FLU_LEVEL)
+    motion = in_body(FrameOptions(), (20.0, -15.0, 30.0), FLU_LEVEL)
     assert played("imu61x-uart", motion).events == []
-    made = played("imu61x-uart", motion, frame=FrameSettings(euler_order=EulerOrder.ZXY))
+    made = played("imu61x-uart", motion, frame=FrameOptions(euler_order=EulerOrder.ZXY))
     (event,) = made.events
     assert event.detail["contradiction"] == "euler-order"
     assert "{euler_order: zyx}" in event.message
@@ -208,16 +208,16 @@ def test_a_wrong_order_of_angles_is_found() -> None:
 @pytest.mark.parametrize(
     ("is_so", "said"),
     [
-        ("upside down", FrameSettings()),
+        ("upside down", FrameOptions()),
         ("as the manual draws it", axes("y", "x", "-z")),
         ("on its side", axes("y", "-x", "z")),
         ("on its side", axes("y", "-z", "-x")),
-        ("by angles", FrameSettings(level_roll_deg=1.0)),
-        ("as the manual draws it", FrameSettings(euler=MountingAngles(roll_deg=90))),
-        ("as the manual draws it", FrameSettings(quat_wxyz=[0.5, -0.5, 0.5, -0.5])),
+        ("by angles", FrameOptions(level_roll_deg=1.0)),
+        ("as the manual draws it", FrameOptions(euler=MountingAngles(roll_deg=90))),
+        ("as the manual draws it", FrameOptions(quat_wxyz=[0.5, -0.5, 0.5, -0.5])),
     ],
 )
-def test_a_wrong_mounting_is_found(is_so: str, said: FrameSettings) -> None:
+def test_a_wrong_mounting_is_found(is_so: str, said: FrameOptions) -> None:
     motion = in_body(MOUNTINGS[is_so])
     made = played("hipnuc-uart", motion, frame=said)
     (event,) = made.events
@@ -230,11 +230,11 @@ def test_a_wrong_mounting_is_found(is_so: str, said: FrameSettings) -> None:
 def test_another_device_is_checked_anew() -> None:
     """The driver of a device that replaces another one makes another path: its contradictions are events again."""
     events: list[Event] = []
-    config = DeviceConfig("bow", "auto", None, False, "memory", MemorySettings(), frame=FrameSettings())
-    watch = FrameWatch(config, Notices("bow", Ledger(), events.append))
+    config = DeviceConfig("bow", "auto", None, False, "memory", MemoryOptions(), frame=FrameOptions())
+    watch = AttitudeWatch(config, DeviceEvents("bow", Ledger(), events.append))
     sensor = in_body(MOUNTINGS["upside down"]).at(0.0)
     paths: list[Any] = [
-        SimpleNamespace(frame=published_frame(FrameSettings(), None, None, RFU_ENU), newest=None) for _ in range(2)
+        SimpleNamespace(frame=published_frame(FrameOptions(), None, None, RFU_ENU), newest=None) for _ in range(2)
     ]
 
     def rest(path: Any) -> None:
@@ -261,7 +261,7 @@ def test_another_device_is_checked_anew() -> None:
 def test_in_motion_nothing_is_said() -> None:
     """A module that is mounted wrongly and swings without a rest."""
     swing = Swing(roll=(Sine(0.3, 0.5), Sine(3.1, 0.0, 1.57)), pitch=(Sine(0.3, 0.4),), yaw=(Sine(0.5, 0.3),))
-    made = played("hipnuc-uart", swing, 20.0, frame=FrameSettings())
+    made = played("hipnuc-uart", swing, 20.0, frame=FrameOptions())
     assert made.events == []
 
 
@@ -281,7 +281,7 @@ def test_every_sample_is_turned_once_and_the_newest_of_the_path_not_at_all() -> 
         frame,
     )
     driver = DRIVERS["hipnuc-uart"]
-    path = StreamPath(HipnucCodec(ledger, HipnucSettings()), make_clock("bow", None, driver, None), context)
+    path = StreamPath(HipnucCodec(ledger, HipnucOptions()), make_clock("bow", None, driver, None), context)
     data = encode_hi91(
         system_time_ms=1, word_1_2=0, accel_m_s2=(1, 2, 3), gyro_rad_s=(0.25, 0.5, 0.75), mag_t=(1e-5, 2e-5, 3e-5),
         euler_rad=(0.0, 0.0, 0.0), quat_wxyz=(1, 0, 0, 0), temperature_c=20.0, pressure_pa=1e5,

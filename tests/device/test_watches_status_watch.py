@@ -4,7 +4,7 @@ from itertools import pairwise
 from typing import Any
 
 from imud.contracts.driver import StatusBit, status_words
-from imud.device.health import Notices
+from imud.device.health import DeviceEvents
 from imud.device.watches import StatusWatch
 from imud.drivers import DRIVERS
 from imud.model.event import Event, EventKind
@@ -35,7 +35,7 @@ class FakePath:
 class WatchBench:
     def __init__(self) -> None:
         self.events: list[Event] = []
-        self.watch = StatusWatch(Notices("bow", Ledger(), self.events.append))
+        self.watch = StatusWatch(DeviceEvents("bow", Ledger(), self.events.append))
         self.path: Any = FakePath()
         self.now_ns = 1000 * NS_PER_S
 

@@ -17,7 +17,7 @@ from imud import config
 from imud.client.connection import Client
 from imud.config.yaml import yaml_block
 from imud.contracts.command import Target
-from imud.contracts.setting import DeviceSettings, Effect, SettingInfo, declared_values
+from imud.contracts.setting import Effect, SettingInfo, SettingsTable, declared_values
 from imud.device.settings_plan import described_settings, differences, make_plan, wanted_values
 from imud.drivers import DRIVERS
 from imud.formats.jsonrpc import RpcError
@@ -34,7 +34,7 @@ PLACES = ("baud", "address", "node", "bit_rate", "i2c_address")
 """Settings that would take a module away from its test."""
 
 
-def table_of(driver: str) -> DeviceSettings:
+def table_of(driver: str) -> SettingsTable:
     found = DRIVERS[driver].device_settings
     assert found is not None
     return found

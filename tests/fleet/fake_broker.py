@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 
 from imud.fleet.broker import BrokerError, Received, Will
-from imud.fleet.settings import Broker, MqttSettings
+from imud.fleet.settings import Broker, MqttOptions
 from tests.support.daemon_process import LIMIT_S
 
 
@@ -78,7 +78,7 @@ class FakeBroker:
         """What the sender said when the newest connection was accepted."""
 
     def connect(
-        self, broker: Broker, _settings: MqttSettings, _client_id: str, will: Will, is_wanted: Callable[[], bool]
+        self, broker: Broker, _settings: MqttOptions, _client_id: str, will: Will, is_wanted: Callable[[], bool]
     ) -> FakeConnection:
         """Accept, or not; with `accepts` unset once it is set, whether the connection is still wanted or not."""
         self.asked.append(broker.host)

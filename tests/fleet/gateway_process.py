@@ -17,7 +17,7 @@ import msgspec
 
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.fleet.publisher import MqttPublisher
-from imud.fleet.settings import MqttSettings
+from imud.fleet.settings import MqttOptions
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_MS
 
@@ -43,7 +43,7 @@ def main(
     if certificates:
         made |= {"ca_file": f"{certificates}/ca.pem", "cert_file": f"{certificates}/gateway.pem"}
         made |= {"key_file": f"{certificates}/gateway.key"}
-    settings = msgspec.convert(made, MqttSettings)
+    settings = msgspec.convert(made, MqttOptions)
     offset_ns = time.time_ns() - time.monotonic_ns()
     context = PublisherContext(list, int(epoch), time.monotonic_ns, utc_offset_ns=lambda: offset_ns)
     output = MqttPublisher(settings, context)

@@ -17,8 +17,8 @@ from imud.contracts.publisher import Batch, PublisherContext
 from imud.fleet.accounts import FleetLedger, StreamCounts, StreamPosition
 from imud.fleet.messages import Stream, decode_message
 from imud.fleet.publisher import MqttPublisher
-from imud.fleet.settings import MqttSettings
-from imud.fleet.spool import Spool, Spooled
+from imud.fleet.settings import MqttOptions
+from imud.fleet.spool import Spool, SpoolRow
 from imud.host.clock import HostClock
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
@@ -38,7 +38,7 @@ class LiveGateway:
             "retry_max_s": 1, "keep_alive_s": 5, "devices": {"*": {"whole": "slots", "rate_hz": 10, "batch_s": 0.1}},
         }  # fmt: skip
         context = PublisherContext(list, 7, self.host.now_ns, utc_offset_ns=self.host.utc_offset_ns)
-        self.output = MqttPublisher(msgspec.convert(made | settings, MqttSettings), context)
+        self.output = MqttPublisher(msgspec.convert(made | settings, MqttOptions), context)
         self.output.add_device("bow", 0)
         self.output.start()
         self.seq = 0
@@ -62,7 +62,7 @@ class LiveGateway:
             pause.wait(0.02)
 
 
-def in_spool(folder: Path) -> tuple[list[Spooled], list[StreamPosition]]:
+def in_spool(folder: Path) -> tuple[list[SpoolRow], list[StreamPosition]]:
     """What is in the spool of a gateway that has ended, and how far its streams came."""
     spool = Spool(folder, 1 << 40, 1 << 62)
     spool.open()

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from imud.fleet.broker import BrokerError, PahoConnection, Will
-from imud.fleet.settings import MqttSettings, broker_of
+from imud.fleet.settings import MqttOptions, broker_of
 from tests.fleet.authority import Authority
 from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, running_broker
 from tests.support.surroundings import free_port
@@ -22,7 +22,7 @@ WILL = Will("imud/s/g/state", b'{"online":false}')
 def connect(url: str, **settings: object) -> PahoConnection:
     broker = broker_of(url)
     assert broker is not None
-    return PahoConnection(broker, msgspec.convert(settings, MqttSettings), "gateway", WILL)
+    return PahoConnection(broker, msgspec.convert(settings, MqttOptions), "gateway", WILL)
 
 
 def send(connection: PahoConnection, payload: bytes = b"{}", topic: str = "imud/s/g/state") -> None:

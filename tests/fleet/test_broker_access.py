@@ -8,15 +8,15 @@ import msgspec
 import pytest
 
 from imud.fleet.broker import connection_problem, paho_client, properties_of
-from imud.fleet.settings import Broker, MqttSettings
+from imud.fleet.settings import Broker, MqttOptions
 from tests.fleet.authority import Authority
 
 BROKER = Broker("127.0.0.1", 1883, tls=False, websockets=False, path="/mqtt")
 TLS_BROKER = BROKER._replace(tls=True)
 
 
-def of_tls(authority: Authority) -> MqttSettings:
-    return MqttSettings(
+def of_tls(authority: Authority) -> MqttOptions:
+    return MqttOptions(
         user="reader",
         ca_file=authority["ca.pem"],
         cert_file=authority["gateway.pem"],
@@ -27,7 +27,7 @@ def of_tls(authority: Authority) -> MqttSettings:
 def test_a_password_file_has_the_password_in_its_first_line(tmp_path: Path) -> None:
     secret = tmp_path / "password"
     secret.write_text("first line\r\nsecond\n")
-    settings = MqttSettings(user="reader", password_file=str(secret))
+    settings = MqttOptions(user="reader", password_file=str(secret))
     client = paho_client(BROKER, settings, "one", is_v5=True, manual_ack=True)
     assert (client.username, client.password) == ("reader", "first line")
     secret.write_bytes(b"\xff\n")

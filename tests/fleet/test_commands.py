@@ -17,7 +17,7 @@ from imud.fleet.broker import Received
 from imud.fleet.commands import ANSWERS_KEPT, WAITING_MAX, CommandChannel, CommandReply
 from imud.fleet.messages import REQUEST_BYTES, CommandAnswer, Outcome, answer_topic
 from imud.fleet.publisher import MqttPublisher
-from imud.fleet.settings import CommandSettings, MqttSettings
+from imud.fleet.settings import CommandOptions, MqttOptions
 from imud.fleet.streams import Gateway
 from imud.host.clock import HostClock
 from imud.host.log import RepeatFilter
@@ -55,7 +55,7 @@ class ChannelBench:
         self.device = FakeDevice()
         self.offset_ns = UTC_NS
         self.replies: list[CommandReply] = []
-        made = msgspec.convert({"enabled": True, "actions": ["identity", "bow/turn"], **settings}, CommandSettings)
+        made = msgspec.convert({"enabled": True, "actions": ["identity", "bow/turn"], **settings}, CommandOptions)
         gateway = Gateway("mill", "gw", "b")
         self.channel = CommandChannel(made, gateway, self._control, self.clock.now_ns, lambda: self.offset_ns)
         self.channel.answer = self.replies.append
@@ -119,9 +119,9 @@ def test_what_is_not_in_the_list_is_denied() -> None:
     assert ChannelBench(actions=[]).ask() is Outcome.DENIED
     bench.run()
     assert (bench.device.done, bench.channel.refused, len(bench.replies)) == ([], 3, 2)
-    (wrong,) = wrong_values(CommandSettings, {"actions": ["a b"]})
+    (wrong,) = wrong_values(CommandOptions, {"actions": ["a b"]})
     assert "expected names of actions, or DEVICE/ACTION" in str(wrong)
-    assert wrong_values(CommandSettings, {"actions": ["a", "bow/a"]}) == []
+    assert wrong_values(CommandOptions, {"actions": ["a", "bow/a"]}) == []
 
 
 @pytest.mark.parametrize(
@@ -378,7 +378,7 @@ class Loop:
                 "user": "gw-17", "password_file": str(password), "spool_directory": str(folder / "spool"),
                 "commands": {"enabled": True, "actions": ["identity"]},
             },
-            MqttSettings,
+            MqttOptions,
         )  # fmt: skip
         context = PublisherContext(
             list, 7, host.now_ns, utc_offset_ns=host.utc_offset_ns, control=lambda _name: device  # type: ignore[arg-type,return-value]  # what the channel uses of it

@@ -18,7 +18,7 @@ from imud.contracts.setting import OnDifference, SettingDifference, SettingsStat
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.fleet.broker import EXTRA_MISSING
 from imud.fleet.publisher import MqttPublisher
-from imud.fleet.settings import Broker, MqttSettings, broker_of
+from imud.fleet.settings import Broker, MqttOptions, broker_of
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.options import wrong_values
@@ -46,7 +46,7 @@ class PublisherBench:
             self._status, 77, self.clock.now_ns, raise_event=self.events.append, utc_offset_ns=lambda: 99,
             utc_reference=lambda: self.reference,
         )  # fmt: skip
-        made = msgspec.convert({"spool_directory": str(path), "gateway": "gw", **settings}, MqttSettings)
+        made = msgspec.convert({"spool_directory": str(path), "gateway": "gw", **settings}, MqttOptions)
         self.output = MqttPublisher(
             made, self.context, connect=self.broker.connect, start_worker=self._start, host_name=lambda: "host.example"
         )
@@ -208,7 +208,7 @@ def test_the_name_of_the_host_is_the_gateway(tmp_path: Path) -> None:
     assert bench.broker.will is not None
     assert bench.broker.will.topic == "imud/default/host/state"
     odd = MqttPublisher(
-        MqttSettings(spool_directory=str(tmp_path)), bench.context, connect=bench.broker.connect,
+        MqttOptions(spool_directory=str(tmp_path)), bench.context, connect=bench.broker.connect,
         host_name=lambda: "Gerät",
     )  # fmt: skip
     with pytest.raises(ServerError, match=r"mqtt.gateway: expected a name .* 'Gerät'"):
@@ -220,7 +220,7 @@ def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monke
         raise ImportError(name)
 
     monkeypatch.setattr(importlib, "import_module", refuse)
-    output = MqttPublisher(MqttSettings(spool_directory=str(tmp_path)), PublisherBench(tmp_path).context)
+    output = MqttPublisher(MqttOptions(spool_directory=str(tmp_path)), PublisherBench(tmp_path).context)
     with pytest.raises(ServerError) as found:
         output.start()
     assert str(found.value) == EXTRA_MISSING == "the output mqtt needs the extra mqtt: pip install 'imud[mqtt]'"
@@ -251,7 +251,7 @@ def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monke
     ],
 )
 def test_bad_settings_are_named(given: Mapping[str, Any], words: str) -> None:
-    (wrong,) = wrong_values(MqttSettings, given)
+    (wrong,) = wrong_values(MqttOptions, given)
     assert words in str(wrong)
 
 
@@ -267,9 +267,9 @@ def test_bad_settings_are_named(given: Mapping[str, Any], words: str) -> None:
 def test_names_of_brokers_and_devices(url: str, broker: Broker) -> None:
     assert broker_of(url) == broker
     assert broker_of(broker.name) == broker
-    settings = msgspec.convert({"devices": {"bow": {"rate_hz": 5}, "*": {"rate_hz": 2}}}, MqttSettings)
+    settings = msgspec.convert({"devices": {"bow": {"rate_hz": 5}, "*": {"rate_hz": 2}}}, MqttOptions)
     assert [getattr(settings.sending(name), "rate_hz", None) for name in ("bow", "mast")] == [5, 2]
-    alone = msgspec.convert({"devices": {"bow": {}}}, MqttSettings)
+    alone = msgspec.convert({"devices": {"bow": {}}}, MqttOptions)
     assert alone.sending("mast") is None
 
 

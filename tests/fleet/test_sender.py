@@ -8,15 +8,15 @@ from imud.fleet.broker import BrokerTurn, Will
 from imud.fleet.commands import CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
 from imud.fleet.sender import OUTBOX_MAX, REPLIES_MAX, MqttSender
-from imud.fleet.settings import Broker, MqttSettings
-from imud.fleet.spool import Spooled
+from imud.fleet.settings import Broker, MqttOptions
+from imud.fleet.spool import SpoolRow
 from tests.fleet.fake_broker import FakeBroker
 from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock
 
 
-def row(number: int, payload: bytes = b"{}") -> Spooled:
-    return Spooled(number, "1", "bow", "samples", "samples", "topic", number, number, 1, 0, payload)
+def row(number: int, payload: bytes = b"{}") -> SpoolRow:
+    return SpoolRow(number, "1", "bow", "samples", "samples", "topic", number, number, 1, 0, payload)
 
 
 class SenderBench:
@@ -24,7 +24,7 @@ class SenderBench:
         self.broker, self.clock = FakeBroker(), VirtualClock()
         turn = BrokerTurn([Broker(host, 1, False, False, "") for host in hosts or ("a",)], 60.0, lambda: 0.5)
         will = Will("state", b"gone")
-        self.sender = MqttSender(MqttSettings(), "me", will, turn, self.broker.connect, self.clock.now_ns)
+        self.sender = MqttSender(MqttOptions(), "me", will, turn, self.broker.connect, self.clock.now_ns)
         self.wanted = 0
         self.sender.wanting = self._want
 

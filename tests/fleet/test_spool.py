@@ -21,7 +21,7 @@ from imud.fleet.messages import (
     encode_slots_message,
     topic_of,
 )
-from imud.fleet.spool import CLOCK_SET_NS, FILE, RESERVE_FILE, STEP, Spool, Spooled, SpoolError, row_of
+from imud.fleet.spool import CLOCK_SET_NS, FILE, RESERVE_FILE, STEP, Spool, SpoolError, SpoolRow, row_of
 from imud.formats.slot import encode_slots
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
@@ -30,7 +30,7 @@ HOUR_NS = 3600 * NS_PER_S
 UTC_NS = CLOCK_SET_NS + 10_000 * HOUR_NS
 
 
-def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = True) -> Spooled:
+def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = True) -> SpoolRow:
     stream = Stream.SAMPLES if whole else Stream.EVENTS
     last = first + count - 1
     samples = [
@@ -53,11 +53,11 @@ class SpoolBench:
         self.spool.open()
         self.now_ns = 0
 
-    def commit(self, *rows: Spooled, done: tuple[int, ...] = (), utc_ns: int = UTC_NS) -> None:
+    def commit(self, *rows: SpoolRow, done: tuple[int, ...] = (), utc_ns: int = UTC_NS) -> None:
         self.now_ns += NS_PER_S
         self.spool.commit(rows, done, self.now_ns, utc_ns)
 
-    def all(self) -> list[Spooled]:
+    def all(self) -> list[SpoolRow]:
         self.spool.rewind()
         found = self.spool.after(1_000_000)
         self.spool.rewind()
@@ -171,7 +171,7 @@ def test_messages_that_the_sender_has_are_not_changed(tmp_path: Path, newest_fir
 def test_everything_is_given_once_and_never_changed_afterwards(tmp_path: Path, seed: int, newest_first: bool) -> None:
     random = Random(seed)
     bench = SpoolBench(tmp_path, kilobytes=random.choice([120, 250, 100_000]), newest_first=newest_first)
-    ledger, first, given = FleetLedger(from_begin=True), 1, dict[int, Spooled]()
+    ledger, first, given = FleetLedger(from_begin=True), 1, dict[int, SpoolRow]()
     for _ in range(150):
         match random.randrange(8):
             case 0:

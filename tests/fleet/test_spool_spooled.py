@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from imud.fleet.messages import DropCause, MessageKind, Stream, decode_message
-from imud.fleet.spool import Spooled, is_position, mended_row, row_of, sound_row
+from imud.fleet.spool import SpoolRow, is_position, mended_row, row_of, sound_row
 from tests.fleet.test_spool import batch
 
 FOREIGN = (None, 1.5, "text", b"\xff", -1, 1 << 63)
@@ -16,7 +16,7 @@ def test_a_row_is_what_it_was() -> None:
     assert sound_row(tuple(batch(7, 1, whole=False))) == batch(7, 1, whole=False)
 
 
-@pytest.mark.parametrize("column", Spooled._fields[1:])
+@pytest.mark.parametrize("column", SpoolRow._fields[1:])
 def test_a_column_of_another_kind_is_found_or_is_as_good(column: str) -> None:
     """The time may be any number; `items` is of no message that is sent."""
     for value in FOREIGN:

@@ -6,7 +6,7 @@ import pytest
 from imud.fleet.accounts import FleetLedger, StreamCounts, StreamPosition
 from imud.fleet.messages import SAMPLES_MAX, SLOTS_MAX, DropCause, FleetMessage, MessageKind, Stream, decode_message
 from imud.fleet.settings import DeviceSending, Whole
-from imud.fleet.spool import Spooled
+from imud.fleet.spool import SpoolRow
 from imud.fleet.streams import LATE_NS, DeviceStreams, Gateway, notes_of
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample, Sync
@@ -26,11 +26,11 @@ def streams(**settings: object) -> DeviceStreams:
     return DeviceStreams(GATEWAY, "bow", 0, msgspec.convert(settings, DeviceSending))
 
 
-def messages(rows: list[Spooled]) -> list[FleetMessage]:
+def messages(rows: list[SpoolRow]) -> list[FleetMessage]:
     return [decode_message(row.payload) for row in rows]
 
 
-def ranges(rows: list[Spooled], stream: Stream) -> list[tuple[str, int, int]]:
+def ranges(rows: list[SpoolRow], stream: Stream) -> list[tuple[str, int, int]]:
     return [(row.kind, row.first, row.last) for row in rows if row.stream == stream]
 
 

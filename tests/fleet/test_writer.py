@@ -13,7 +13,7 @@ from imud.fleet.accounts import FleetLedger, StreamCounts
 from imud.fleet.broker import BrokerTurn, Will
 from imud.fleet.messages import GatewayClock, Stream, decode_message
 from imud.fleet.sender import MqttSender
-from imud.fleet.settings import Broker, MqttSettings
+from imud.fleet.settings import Broker, MqttOptions
 from imud.fleet.spool import Spool, SpoolError
 from imud.fleet.streams import Gateway
 from imud.fleet.writer import COMMIT_NS, DISK_RETRY_NS, MissedEvents, SentState, SpoolWriter, WriterQueue
@@ -48,7 +48,7 @@ class WriterBench:
         self.wall_clock: GatewayClock | None = None
         self.utc_offset_ns = 0
         devices = {"bow": {"rate_hz": None, "whole": "slots", **settings}}
-        made = msgspec.convert({"devices": devices, "messages_per_s": messages_per_s}, MqttSettings)
+        made = msgspec.convert({"devices": devices, "messages_per_s": messages_per_s}, MqttOptions)
         self.queue = queue or WriterQueue()
         self.disk = FailingSpool(path, 100_000_000, HOUR_NS)
         self.spool = spool or self.disk

@@ -7,14 +7,14 @@ from threading import Thread
 from typing import Final
 
 from imud.fleet.broker import BrokerError, PahoConnection, Will, check_extra
-from imud.fleet.settings import MqttSettings, broker_of
+from imud.fleet.settings import MqttOptions, broker_of
 from tests.fuzz.target import Target, check_printable
 
 WAITS: Final = 8
 """More than the packets that fit into an input of `BYTES_MAX` need."""
 BYTES_MAX: Final = 256
 LIMIT_S: Final = 60.0
-SETTINGS: Final = (MqttSettings(site="site", version="3.1.1"), MqttSettings(site="site", version="5"))
+SETTINGS: Final = (MqttOptions(site="site", version="3.1.1"), MqttOptions(site="site", version="5"))
 
 
 def names() -> Sequence[str]:

@@ -11,7 +11,7 @@ from imud.drivers import DRIVERS
 from imud.fleet.broker import Received
 from imud.fleet.commands import WAITING_MAX, CommandChannel, CommandReply
 from imud.fleet.messages import ANSWER, COMMAND, VERSION, CommandAnswer, Outcome, topic_of
-from imud.fleet.settings import CommandSettings
+from imud.fleet.settings import CommandOptions
 from imud.fleet.streams import Gateway
 from imud.model.errors import Rejected
 from imud.model.units import NS_PER_S
@@ -20,7 +20,7 @@ from tests.support.socket_rig import FakeControl
 
 UTC_NS: Final = 1_800_000_000 * NS_PER_S
 AGE_NS: Final = NS_PER_S
-SETTINGS: Final = CommandSettings(enabled=True, actions=["output", "mode", "bow/save"], per_minute=12)
+SETTINGS: Final = CommandOptions(enabled=True, actions=["output", "mode", "bow/save"], per_minute=12)
 GATEWAY: Final = Gateway("site", "gw", "0")
 TOPIC: Final = topic_of("site", "gw", "bow", COMMAND)
 OWN: Final = topic_of("site", "gw", "bow", ANSWER)

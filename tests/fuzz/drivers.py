@@ -8,7 +8,7 @@ from typing import Any, Final, Literal, TypeVar, get_args, get_origin, get_type_
 
 from imud import drivers as devices
 from imud.contracts.driver import Driver, of_kind
-from imud.model.options import Settings
+from imud.model.options import Options
 from tests.fuzz.target import as_it_is
 
 D = TypeVar("D", bound=Driver)
@@ -26,7 +26,7 @@ def row(name: str, kind: type[D]) -> D:
     return driver
 
 
-def variants(settings: type[Settings]) -> list[Any]:
+def variants(settings: type[Options]) -> list[Any]:
     """Settings with every combination of the values of those that are a choice; the first is the default."""
     hints = get_type_hints(settings)
     choices = {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}

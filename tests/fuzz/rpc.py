@@ -18,7 +18,7 @@ from imud.formats.jsonrpc import RpcError, encode_error, encode_result, parse_ob
 from imud.model.errors import Rejected
 from imud.model.event import Event, EventKind
 from imud.model.sample import SAMPLE_FIELDS
-from imud.publishers.socket.server import SocketServer, SocketSettings
+from imud.publishers.socket.server import SocketOptions, SocketServer
 from tests.fuzz.target import Target
 from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, FakeControl, batch, device_status
 
@@ -99,7 +99,7 @@ class _Rig:
     async def _start(self) -> SocketServer:
         statuses = [device_status(*item) for item in DEVICES.items()]
         context = PublisherContext(lambda: statuses, EPOCH, lambda: NOW_NS, _Control)
-        server = SocketServer(SocketSettings(path=str(Path(self._folder.name, "s")), group=_own_group()), context)
+        server = SocketServer(SocketOptions(path=str(Path(self._folder.name, "s")), group=_own_group()), context)
         server.start()
         for name, number in DEVICES.items():
             server.add_device(name, number)

@@ -11,9 +11,9 @@ from imud.contracts.status import DeviceState
 from imud.device.device import Device
 from imud.device.factory import DeviceFactory
 from imud.host.clock import HostClock
-from imud.links.socketcan import SocketCanSettings
+from imud.links.socketcan import SocketCanOptions
 from imud.model.event import Event
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Sample
 from imud.sim.can_module import CanModule, CanModules
 from imud.sim.ports.can_port import CanPort
@@ -24,11 +24,11 @@ LIMIT_S = 60.0
 class BusRig:
     """A device of the daemon on an interface, with the simulated modules of the bus; the first module is the device."""
 
-    def __init__(self, interface: str, driver: str, options: Settings, *modules: CanModule) -> None:
+    def __init__(self, interface: str, driver: str, options: Options, *modules: CanModule) -> None:
         self.port = CanPort(CanModules(modules), interface) if modules else None
         self.samples: list[Sample] = []
         self.events: list[Event] = []
-        config = DeviceConfig("bow", driver, options, True, "socketcan", SocketCanSettings(interface=interface))
+        config = DeviceConfig("bow", driver, options, True, "socketcan", SocketCanOptions(interface=interface))
         self.factory = DeviceFactory(lambda batch: self.samples.extend(batch.samples), self.events.append, HostClock())
         self.device: Device = self.factory.make(config, 1)
 

@@ -6,8 +6,8 @@ from time import monotonic_ns
 import pytest
 
 from imud.contracts.command import CalibrationResult
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
-from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
 from imud.model.errors import CommandError
 from imud.model.event import EventKind
 from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
@@ -22,14 +22,14 @@ SLOW = NodeSettings(bit_rate=0, periods_ms={1: 50, 2: 50, 3: 50, 4: 0, 6: 0, 7: 
 
 def canopen(interface: str, motion: Motion) -> BusRig:
     hardware = HipnucCanopenHardware(factory=SLOW, boot_ms=0, motion=motion)
-    return BusRig(interface, "hipnuc-canopen", HipnucCanopenSettings(), HipnucCanopenModule(monotonic_ns(), hardware))
+    return BusRig(interface, "hipnuc-canopen", HipnucCanopenOptions(), HipnucCanopenModule(monotonic_ns(), hardware))
 
 
 def j1939(interface: str, motion: Motion) -> BusRig:
     hardware = J1939Hardware(bitrate=0, boot_ms=0, motion=motion)
     settings = J1939Settings(intervals_ms={**J1939Settings().intervals_ms, 0xFF4A: 100})
     module = HipnucJ1939Module(monotonic_ns(), settings, hardware)
-    return BusRig(interface, "hipnuc-j1939", HipnucJ1939Settings(), module)
+    return BusRig(interface, "hipnuc-j1939", HipnucJ1939Options(), module)
 
 
 @pytest.mark.timeout(300)

@@ -15,7 +15,7 @@ from imud.device.factory import DeviceFactory
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_frame
 from imud.host.clock import HostClock
 from imud.links.cyclic_sender import KernelSender, LoopSender
-from imud.links.socketcan import FrameReader, SocketCanLink, SocketCanSettings
+from imud.links.socketcan import FrameReader, SocketCanLink, SocketCanOptions
 from imud.model.errors import LinkMissing
 from imud.sim.can_module import CanModules
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
@@ -41,7 +41,7 @@ def test_the_kernel_sends_cyclically_and_stops_with_the_link(vcan: CanInterface)
         reader = FrameReader(far, lambda classes, data: False)
 
         async def story() -> None:
-            link = SocketCanLink(SocketCanSettings(interface=vcan.name))
+            link = SocketCanLink(SocketCanOptions(interface=vcan.name))
             link.open()
             link.start(lambda frames: None, lambda news, problem: None, lambda error: None)
             link.send_cyclic([SYNC, CyclicFrame(0x18FEE9AA, True, b"\1\2", 50 * MS)])
@@ -73,7 +73,7 @@ def test_the_kernel_sends_cyclically_and_stops_with_the_link(vcan: CanInterface)
 
 def test_an_interface_that_is_gone_is_told(vcan: CanInterface) -> None:
     async def story() -> None:
-        link = SocketCanLink(SocketCanSettings(interface="vcan9"))
+        link = SocketCanLink(SocketCanOptions(interface="vcan9"))
         with pytest.raises(LinkMissing):
             link.send_cyclic([SYNC])
         link.close()
@@ -90,7 +90,7 @@ def test_a_kernel_without_the_manager_is_helped_by_the_loop(
     monkeypatch.setattr("imud.links.socketcan.KernelSender", without)
 
     async def story() -> None:
-        link = SocketCanLink(SocketCanSettings(interface=vcan.name))
+        link = SocketCanLink(SocketCanOptions(interface=vcan.name))
         link.open()
         heard: list[CanFrame] = []
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW) as far:
@@ -112,7 +112,7 @@ def test_a_kernel_without_the_manager_is_helped_by_the_loop(
 
 def test_filters_hold_from_the_moment_they_are_set(vcan: CanInterface) -> None:
     async def story() -> None:
-        link = SocketCanLink(SocketCanSettings(interface=vcan.name))
+        link = SocketCanLink(SocketCanOptions(interface=vcan.name))
         link.filters = EVERYTHING
         link.open()
         heard: list[CanFrame] = []
@@ -133,7 +133,7 @@ def test_filters_hold_from_the_moment_they_are_set(vcan: CanInterface) -> None:
 
 
 def test_a_device_is_found_by_listening_and_again_after_the_bus_was_down(vcan: CanInterface) -> None:
-    config = DeviceConfig("mast", "auto", None, True, "socketcan", SocketCanSettings(interface=vcan.name))
+    config = DeviceConfig("mast", "auto", None, True, "socketcan", SocketCanOptions(interface=vcan.name))
     runner = DeviceFactory(lambda batch: None, lambda event: None, HostClock()).make(config, 1)
 
     async def story() -> None:

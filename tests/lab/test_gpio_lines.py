@@ -11,7 +11,7 @@ from time import monotonic_ns
 
 import pytest
 
-from imud.contracts.lines import Edge, InputSettings, OutputSettings, ResetSettings, TriggerStamp
+from imud.contracts.lines import Edge, InputOptions, OutputOptions, ResetOptions, TriggerStamp
 from imud.lines.gpio import KERNEL_EVENTS, GpioInput, GpioOutput
 from imud.lines.reset import reset
 from imud.lines.trigger import Trigger
@@ -29,7 +29,7 @@ TRIGGERS = 20
 
 
 class Watcher:
-    def __init__(self, settings: InputSettings, purpose: str = "lab") -> None:
+    def __init__(self, settings: InputOptions, purpose: str = "lab") -> None:
         self.line = GpioInput(settings, purpose)
         self.edges: list[Edge] = []
         self.ends: list[LinkError] = []
@@ -56,7 +56,7 @@ class Watcher:
 
 @in_loop
 async def test_edges_have_stamps_and_numbers(gpio_chip: GpioChip) -> None:
-    watcher = Watcher(InputSettings(line="SOUT"))
+    watcher = Watcher(InputOptions(line="SOUT"))
     watcher.start()
     bounds_ns = [monotonic_ns()]
     for number, level in enumerate(islice(cycle((True, False)), 20), 1):
@@ -73,7 +73,7 @@ async def test_edges_have_stamps_and_numbers(gpio_chip: GpioChip) -> None:
 
 @in_loop
 async def test_drain_comes_before_the_loop(gpio_chip: GpioChip) -> None:
-    watcher = Watcher(InputSettings(line="SOUT", active_low=True))
+    watcher = Watcher(InputOptions(line="SOUT", active_low=True))
     watcher.start()
     watcher.line.drain()
     gpio_chip.drive("SOUT", True)
@@ -90,7 +90,7 @@ async def test_drain_comes_before_the_loop(gpio_chip: GpioChip) -> None:
 @in_loop
 async def test_overflow_is_counted(gpio_chip: GpioChip) -> None:
     """Nobody reads; the kernel keeps the newest edges. It may make one of two that come close together."""
-    watcher = Watcher(InputSettings(line="SOUT"))
+    watcher = Watcher(InputOptions(line="SOUT"))
     watcher.start()
     for level in islice(cycle((True, False)), 3 * KERNEL_EVENTS):
         gpio_chip.drive("SOUT", level)
@@ -103,7 +103,7 @@ async def test_overflow_is_counted(gpio_chip: GpioChip) -> None:
 
 
 def test_level(gpio_chip: GpioChip) -> None:
-    plain, inverted = GpioInput(InputSettings(line="ALARM")), GpioInput(InputSettings(line="PPS", active_low=True))
+    plain, inverted = GpioInput(InputOptions(line="ALARM")), GpioInput(InputOptions(line="PPS", active_low=True))
     levels = []
     for line, name in ((plain, "ALARM"), (inverted, "PPS")):
         line.open()
@@ -115,7 +115,7 @@ def test_level(gpio_chip: GpioChip) -> None:
 
 
 def test_bias(gpio_chip: GpioChip) -> None:
-    line = GpioInput(InputSettings(line=4, chip=gpio_chip.path.name, bias="pull-up"))
+    line = GpioInput(InputOptions(line=4, chip=gpio_chip.path.name, bias="pull-up"))
     line.open()
     assert line.level()
     line.close()
@@ -125,10 +125,10 @@ def test_bias(gpio_chip: GpioChip) -> None:
 def test_ways_to_name_a_line(gpio_chip: GpioChip, by: str) -> None:
     label = tool("gpiodetect").split("[")[1].split("]")[0]
     settings = {
-        "name": InputSettings(line="ALARM"),
-        "number": InputSettings(line=3, chip=gpio_chip.path.name),
-        "label": InputSettings(line="ALARM", chip=label),
-        "path": InputSettings(line=3, chip=str(gpio_chip.path)),
+        "name": InputOptions(line="ALARM"),
+        "number": InputOptions(line=3, chip=gpio_chip.path.name),
+        "label": InputOptions(line="ALARM", chip=label),
+        "path": InputOptions(line=3, chip=str(gpio_chip.path)),
     }[by]
     line = GpioInput(settings, "bow alarm")
     line.open()
@@ -140,41 +140,41 @@ def test_ways_to_name_a_line(gpio_chip: GpioChip, by: str) -> None:
 
 def test_a_name_on_two_chips(gpio_chip: GpioChip) -> None:
     with simulated_chip(["", "PPS"]) as other, pytest.raises(LinkError) as caught:
-        GpioInput(InputSettings(line="PPS")).open()
+        GpioInput(InputOptions(line="PPS")).open()
     assert f"{gpio_chip.path.name} line 2 (PPS) and {other.path.name} line 1 (PPS)" in str(caught.value)
 
 
 def test_a_busy_line_names_who_holds_it(gpio_chip: GpioChip) -> None:
     with running("gpiomon", gpio_chip.path.name, "3"):
         wait_until(lambda: "gpiomon" in INTERRUPTS.read_text(encoding="ascii"), "gpiomon has its interrupt")
-        for line in (GpioInput(InputSettings(line="ALARM")), GpioOutput(OutputSettings(line="ALARM"))):
+        for line in (GpioInput(InputOptions(line="ALARM")), GpioOutput(OutputOptions(line="ALARM"))):
             with pytest.raises(LinkBusy, match=r"line 3 \(ALARM\) is in use by gpiomon: stop that"):
                 line.open()
 
 
 def test_a_user_without_the_right(gpio_chip: GpioChip) -> None:
     gpio_chip.path.chmod(0o600)
-    GpioInput(InputSettings(line="ALARM")).close()
+    GpioInput(InputOptions(line="ALARM")).close()
     os.seteuid(65534)
     try:
         with pytest.raises(LinkDenied, match="may not be opened by user nobody: it must belong to group gpio"):
-            GpioInput(InputSettings(line="ALARM")).open()
+            GpioInput(InputOptions(line="ALARM")).open()
     finally:
         os.seteuid(0)
 
 
 def test_what_is_not_there(gpio_chip: GpioChip) -> None:
     with pytest.raises(LinkMissing, match=r"has no line 6: its lines are 0 to 5"):
-        GpioInput(InputSettings(line=6, chip=gpio_chip.path.name)).open()
+        GpioInput(InputOptions(line=6, chip=gpio_chip.path.name)).open()
     with pytest.raises(LinkMissing, match=rf"gpiochip99 is not there; there are: {gpio_chip.path.name} \("):
-        GpioInput(InputSettings(line=0, chip="gpiochip99")).open()
+        GpioInput(InputOptions(line=0, chip="gpiochip99")).open()
     with pytest.raises(LinkMissing, match="null is gone, or is no GPIO chip"):
-        GpioInput(InputSettings(line=0, chip="/dev/null")).open()
+        GpioInput(InputOptions(line=0, chip="/dev/null")).open()
 
 
 @in_loop
 async def test_a_chip_that_is_pulled_out_and_comes_back(gpio_chip: GpioChip) -> None:
-    watcher, output = Watcher(InputSettings(line="PPS")), GpioOutput(OutputSettings(line="SIN"))
+    watcher, output = Watcher(InputOptions(line="PPS")), GpioOutput(OutputOptions(line="SIN"))
     watcher.start()
     output.open()
     gpio_chip.drive("PPS", True)
@@ -201,8 +201,8 @@ def test_outputs_are_inactive_before_and_after(gpio_chip: GpioChip) -> None:
     """A released line of gpio-sim has the level of its pull: here that of the resistor which a board has there."""
     gpio_chip.drive("RESET", True)
     for settings, name, inactive in (
-        (OutputSettings(line="SIN"), "SIN", False),
-        (ResetSettings(line="RESET"), "RESET", True),
+        (OutputOptions(line="SIN"), "SIN", False),
+        (ResetOptions(line="RESET"), "RESET", True),
     ):
         line = GpioOutput(settings)
         line.open()
@@ -216,7 +216,7 @@ def test_outputs_are_inactive_before_and_after(gpio_chip: GpioChip) -> None:
 
 def test_open_drain(gpio_chip: GpioChip) -> None:
     """gpio-sim does not show the pull of a line that was let go of; what the kernel was asked for shows."""
-    line = GpioOutput(ResetSettings(line="RESET", open_drain=True))
+    line = GpioOutput(ResetOptions(line="RESET", open_drain=True))
     line.open()
     assert re.search(r"output\s+active-low \[used open-drain\]", tool("gpioinfo", gpio_chip.path.name))
     line.set(True)
@@ -227,19 +227,19 @@ def test_open_drain(gpio_chip: GpioChip) -> None:
 @in_loop
 async def test_reset(gpio_chip: GpioChip) -> None:
     gpio_chip.drive("RESET", True)
-    line, levels = GpioOutput(ResetSettings(line="RESET")), list[bool]()
+    line, levels = GpioOutput(ResetOptions(line="RESET")), list[bool]()
     line.open()
 
     async def sleep(_seconds: float) -> None:
         levels.append(gpio_chip.level("RESET"))
 
-    await reset(line, ResetSettings(line="RESET"), sleep)
+    await reset(line, ResetOptions(line="RESET"), sleep)
     line.close()
     assert levels == [False, True]
 
 
 class WiredOutput(GpioOutput):
-    def __init__(self, chip: GpioChip, settings: OutputSettings) -> None:
+    def __init__(self, chip: GpioChip, settings: OutputOptions) -> None:
         super().__init__(settings, "bow sin")
         self._chip = chip
 
@@ -251,7 +251,7 @@ class WiredOutput(GpioOutput):
 @in_loop
 async def test_sin_has_its_period_and_its_stamps_are_true(gpio_chip: GpioChip) -> None:
     """gpiomon, which is not ours, reads the wire; its stamps are the kernel's, and lie within the errors of ours."""
-    line, stamps, enough = WiredOutput(gpio_chip, OutputSettings(line="SIN")), list[TriggerStamp](), asyncio.Event()
+    line, stamps, enough = WiredOutput(gpio_chip, OutputOptions(line="SIN")), list[TriggerStamp](), asyncio.Event()
 
     def on_stamps(found: Sequence[TriggerStamp]) -> None:
         stamps.extend(found)

@@ -12,10 +12,10 @@ import pytest
 from imud.config.model import DeviceConfig
 from imud.contracts.status import DeviceState
 from imud.device.factory import DeviceFactory
-from imud.drivers.imu61x.can import Imu61xCanSettings, encode_set
+from imud.drivers.imu61x.can import Imu61xCanOptions, encode_set
 from imud.formats.can import pack_frame
 from imud.host.clock import HostClock
-from imud.links.socketcan import SocketCanSettings
+from imud.links.socketcan import SocketCanOptions
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
@@ -29,8 +29,8 @@ BUS_OFF, CONTROLLER = 0x2000_0040, 0x2000_0004
 
 class Rig:
     def __init__(self, near: str, far: str, *, base_id: int = 101, **link: Any) -> None:
-        settings = SocketCanSettings(interface=near, **link)
-        config = DeviceConfig("mast", "imu61x-can", Imu61xCanSettings(base_id=base_id), True, "socketcan", settings)
+        settings = SocketCanOptions(interface=near, **link)
+        config = DeviceConfig("mast", "imu61x-can", Imu61xCanOptions(base_id=base_id), True, "socketcan", settings)
         self.samples: list[Sample] = []
         self.events: list[Event] = []
         self.runner = DeviceFactory(
@@ -197,7 +197,7 @@ def test_interface_down_and_up_again(vcan: CanInterface) -> None:
 
 
 def test_interface_that_is_missing_is_waited_for() -> None:
-    config = SocketCanSettings(interface="vcan7")
+    config = SocketCanOptions(interface="vcan7")
     tool("ip", "link", "add", "dev", "vcan7", "type", "vcan")
     rig = Rig("vcan7", "vcan7")
     tool("ip", "link", "delete", "vcan7")

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from imud.config.model import DeviceConfig
-from imud.contracts.lines import DeviceLines, LineFactory, OutputSettings, ReadySettings, ResetSettings
+from imud.contracts.lines import DeviceLines, LineFactory, OutputOptions, ReadyOptions, ResetOptions
 from imud.lines.gpio import GpioInput, GpioOutput
 from imud.model.event import EventKind
 from imud.model.sample import Sample, Sync
@@ -37,7 +37,7 @@ FALLBACK_HZ = 10.0
 
 
 class WiredReset(GpioOutput):
-    def __init__(self, chip: GpioChip, boot: Callable[[], None], settings: OutputSettings, purpose: str) -> None:
+    def __init__(self, chip: GpioChip, boot: Callable[[], None], settings: OutputOptions, purpose: str) -> None:
         super().__init__(settings, purpose)
         self._chip, self._boot = chip, boot
 
@@ -53,7 +53,7 @@ def test_a_device_that_hangs_is_reset_by_its_line(i2c: Bus[I2cTransfer], gpio_ch
     device = registers()
     i2c.attach(0x18, on_i2c(device))
     config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 0, "rate_hz": 20}, gyro_filter=3)
-    settings = ResetSettings(line="RESET", hold_ms=HOLD_MS, wait_s=WAIT_S)
+    settings = ResetOptions(line="RESET", hold_ms=HOLD_MS, wait_s=WAIT_S)
     gpio_chip.drive("PPS", True)
 
     def boot() -> None:
@@ -145,7 +145,7 @@ def stepped(request: pytest.FixtureRequest, gpio_chip: GpioChip) -> tuple[Steppe
         far.attach(0, on_spi(it.device))
         link = {"port": "/dev/spidev0.0", "rate_hz": FALLBACK_HZ, "speed_hz": 500_000}
         config = device_config("imu", "imu61x-spi", "spi", link, burst="standard")
-    return it, replace(config, lines=DeviceLines(data_ready=ReadySettings(line="SOUT")))
+    return it, replace(config, lines=DeviceLines(data_ready=ReadyOptions(line="SOUT")))
 
 
 async def first(rig: DeviceRig) -> None:

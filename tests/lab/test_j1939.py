@@ -12,8 +12,8 @@ import pytest
 
 from imud.contracts.status import DeviceState
 from imud.drivers.hipnuc.j1939 import codec, commands
-from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
-from imud.drivers.hipnuc.nmea2000 import HipnucNmea2000Settings
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
+from imud.drivers.hipnuc.nmea2000 import HipnucNmea2000Options
 from imud.model.errors import NoReply
 from imud.model.sample import Sample
 from imud.sim.hipnuc.j1939 import J1939_VARIANTS, HipnucJ1939Module, J1939Hardware, J1939Settings
@@ -56,7 +56,7 @@ def rolls(samples: list[Sample]) -> list[int]:
 
 def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
     """It sends samples and answers requests; another node's samples are on the bus, too."""
-    rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Settings())
+    rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Options())
     requests: list[tuple[int, bytes]] = []
     intervals = {0x0137: 100, commands.ADDRESS: 8}
 
@@ -145,7 +145,7 @@ def test_driver_and_simulator_with_every_message_and_all_actions(vcan: CanInterf
     quiet = J1939Hardware(bitrate=0, boot_ms=0)
     module = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast), quiet)
     other = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast, address=9), quiet)
-    rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Settings(), module, other)
+    rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Options(), module, other)
     results: dict[str, object] = {}
 
     async def told(name: str, **arguments: object) -> None:
@@ -185,7 +185,7 @@ def test_driver_and_simulator_with_every_message_and_all_actions(vcan: CanInterf
 
 def test_nmea_2000_from_the_simulator(vcan: CanInterface) -> None:
     module = HipnucNmea2000Module(monotonic_ns(), Nmea2000Hardware(rate_hz=20, bitrate=0, boot_ms=0))
-    rig = BusRig(vcan.name, "hipnuc-nmea2000", HipnucNmea2000Settings(), module)
+    rig = BusRig(vcan.name, "hipnuc-nmea2000", HipnucNmea2000Options(), module)
 
     async def story() -> None:
         await rig.until(lambda: len(rig.samples) >= 40, "forty samples")

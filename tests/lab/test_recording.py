@@ -20,7 +20,7 @@ import msgspec
 import pytest
 
 from imud.cli.replay import play_to_end
-from imud.contracts.lines import DeviceLines, ReadySettings
+from imud.contracts.lines import DeviceLines, ReadyOptions
 from imud.contracts.status import DeviceState
 from imud.model.event import Event, EventKind
 from imud.model.ledger import lost
@@ -164,7 +164,7 @@ def test_samples_of_a_data_ready_line_are_replayed(i2c: Bus[I2cTransfer], gpio_c
     rigs.recording = True
 
     async def body() -> None:
-        lines = DeviceLines(data_ready=ReadySettings(line="SOUT"))
+        lines = DeviceLines(data_ready=ReadyOptions(line="SOUT"))
         async with running(replace(config, lines=lines), rigs=rigs) as (rig,):
             await first(rig)
             for number in range(1, EDGES + 1):

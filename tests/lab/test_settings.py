@@ -9,8 +9,8 @@ from time import monotonic_ns
 
 import pytest
 
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
-from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
 from imud.sim.hipnuc.canopen import NODE_VARIANTS, HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
 from imud.sim.hipnuc.j1939 import J1939_VARIANTS, HipnucJ1939Module, J1939Hardware, J1939Settings
 from tests.lab.can_device import BusRig
@@ -39,7 +39,7 @@ def test_a_canopen_node_is_made_as_declared(vcan: CanInterface, variant: str) ->
     rare = NodeSettings(node=12, bit_rate=0, periods_ms={1: 500, 2: 0, 3: 0, 4: 0, 6: 0, 7: 0})
     module = HipnucCanopenModule(now_ns, HipnucCanopenHardware(factory=slow, boot_ms=200, variant=kind))
     beside = HipnucCanopenModule(now_ns, HipnucCanopenHardware(factory=rare, boot_ms=0))
-    rig = BusRig(vcan.name, "hipnuc-canopen", HipnucCanopenSettings(), module, beside)
+    rig = BusRig(vcan.name, "hipnuc-canopen", HipnucCanopenOptions(), module, beside)
 
     async def story() -> None:
         taken = await rig.done(rig.device.settings_apply({"node": 12}, save=True))
@@ -61,7 +61,7 @@ def test_a_j1939_module_is_made_as_declared(vcan: CanInterface, variant: str) ->
     now_ns, kind = monotonic_ns(), J1939_VARIANTS[variant]
     module = HipnucJ1939Module(now_ns, J1939Settings(), J1939Hardware(bitrate=0, boot_ms=200, variant=kind))
     beside = HipnucJ1939Module(now_ns, J1939Settings(address=12), J1939Hardware(bitrate=0, boot_ms=0))
-    rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Settings(), module, beside)
+    rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Options(), module, beside)
 
     async def story() -> None:
         taken = await rig.done(rig.device.settings_apply({"address": 12}, save=True))

@@ -15,9 +15,9 @@ import pytest
 
 from imud.config.model import DeviceConfig
 from imud.device.factory import DeviceFactory
-from imud.drivers.hipnuc.uart.codec import HipnucSettings, encode_hi91
+from imud.drivers.hipnuc.uart.codec import HipnucOptions, encode_hi91
 from imud.host.clock import HostClock
-from imud.links.uart import UartSettings
+from imud.links.uart import UartOptions
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 from imud.utc.system_clock import Timex
@@ -101,8 +101,8 @@ def test_stamps_stay_right_while_the_kernel_steers(pty: PseudoTerminal) -> None:
     samples: list[Sample] = []
     host = HostClock()
     factory = DeviceFactory(lambda batch: samples.extend(batch.samples), lambda _event: None, host)
-    settings = UartSettings(port=str(pty.path), baud=115_200)
-    runner = factory.make(DeviceConfig("bow", "hipnuc-uart", HipnucSettings(), False, "uart", settings), 1)
+    settings = UartOptions(port=str(pty.path), baud=115_200)
+    runner = factory.make(DeviceConfig("bow", "hipnuc-uart", HipnucOptions(), False, "uart", settings), 1)
     module = Device(pty)
     rates: list[float] = []
     ends = [monotonic_ns()]

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from imud.contracts.lines import DeviceLines, DividedSettings, InputSettings, PpsSettings, SoutSettings, TriggerSettings
+from imud.contracts.lines import DeviceLines, DividedOptions, InputOptions, PpsOptions, SoutOptions, TriggerOptions
 from imud.lines.sync import ALARM_STATUS
 from imud.model.event import EventKind
 from imud.model.sample import Sample, Sync
@@ -13,11 +13,11 @@ from imud.sim.hipnuc.uart_settings import AlarmSetting, HipnucHardware, ModuleSe
 from imud.sim.physics import Still
 from imud.sim.ports.faults import FaultRates, Faults
 from imud.sim.ports.pins import Pin, PinFaultRates, PinFaults
-from imud.utc.receivers import RmcSettings
+from imud.utc.receivers import RmcOptions
 from tests.support.stories import played
 from tests.support.wired_device import BEGIN_NS, EDGE_LATE_NS, WiredDevice
 
-SOUT = DeviceLines(sout=SoutSettings(line="A"))
+SOUT = DeviceLines(sout=SoutOptions(line="A"))
 HI92 = ModuleSettings(hi91=Output(), hi92=Output(10))
 """Messages without device time, dated by their stamp of 13 bits."""
 FEW_US = 4_000
@@ -113,7 +113,7 @@ async def test_pairing_is_right_under_loss(wired: WiredDevice, edges: float, fra
 @pytest.mark.manual("B 2.2.4 PMUX4 SOUT_DIV")
 @played(
     lambda: WiredDevice(
-        DeviceLines(sout=SOUT.sout, sout_div=DividedSettings(line="B", divisor=8)),
+        DeviceLines(sout=SOUT.sout, sout_div=DividedOptions(line="B", divisor=8)),
         frame_faults=Faults(5, FaultRates(lose=0.05)),
     )
 )
@@ -138,7 +138,7 @@ async def test_marks_name_the_samples_of_a_camera(wired: WiredDevice) -> None:
     assert lost > 0
 
 
-ALARM = DeviceLines(alarm=InputSettings(line="C"))
+ALARM = DeviceLines(alarm=InputOptions(line="C"))
 RANGE = ModuleSettings(alarm_y=AlarmSetting(-5, 5, True))
 
 
@@ -183,7 +183,7 @@ async def test_an_alarm_wire_that_is_cut_is_reported(wired: WiredDevice) -> None
 @pytest.mark.manual("B 1.2.1 trigger")
 @played(
     lambda: WiredDevice(
-        DeviceLines(sin=TriggerSettings(line="D", rate_hz=50)),
+        DeviceLines(sin=TriggerOptions(line="D", rate_hz=50)),
         ModuleSettings(hi91=Output(on_mark=True)),
         frame_faults=Faults(6, FaultRates(lose=0.05)),
     )
@@ -204,7 +204,7 @@ async def test_frames_answer_the_triggers_on_sin(wired: WiredDevice) -> None:
     assert status.clock.triggers_missed > 10
 
 
-PPS = DeviceLines(pps=PpsSettings(line="E"))
+PPS = DeviceLines(pps=PpsOptions(line="E"))
 UTC_S = 1_795_000_000
 FIRST_PULSE_NS = BEGIN_NS + 2 * NS_PER_S
 WITHOUT_S = 30
@@ -218,7 +218,7 @@ WITHOUT_S = 30
 )
 @pytest.mark.manual("B 1.2.1 UTC by PPS and RMC")
 @played(
-    lambda lines, skew_ppm: WiredDevice(lines, None, HipnucHardware(skew_ppm=skew_ppm), rmc=RmcSettings(source="gpsd"))
+    lambda lines, skew_ppm: WiredDevice(lines, None, HipnucHardware(skew_ppm=skew_ppm), rmc=RmcOptions(source="gpsd"))
 )
 async def test_a_module_that_is_fed_utc_is_on_utc_and_stays_in_time(
     wired: WiredDevice, lines: DeviceLines, skew_ppm: float

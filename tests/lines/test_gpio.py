@@ -10,13 +10,13 @@ import pytest
 from gpiod.line import Bias, Clock, Direction, Drive, Value
 from gpiod.line import Edge as Detection
 
-from imud.contracts.lines import Edge, InputSettings, OutputSettings, ResetSettings
+from imud.contracts.lines import Edge, InputOptions, OutputOptions, ResetOptions
 from imud.lines.gpio import EVENT, GPIO_LINES, KERNEL_EVENTS, READ_EVENTS, GpioInput, GpioOutput
 from imud.model.errors import LinkBusy, LinkError, LinkMissing
 from tests.support.event_loops import in_loop
 from tests.support.signal_bench import FakeGpiod
 
-SOUT = InputSettings(line="SOUT")
+SOUT = InputOptions(line="SOUT")
 LIMIT_S = 60
 
 
@@ -44,7 +44,7 @@ class Sink:
 
 def test_an_input_asks_for_both_edges_and_a_large_buffer(gpiod: FakeGpiod, tmp_path: Path) -> None:
     line = GpioInput(
-        InputSettings(line="SOUT", active_low=True, bias="pull-down"), "bow sout " + "x" * 40, devices=tmp_path
+        InputOptions(line="SOUT", active_low=True, bias="pull-down"), "bow sout " + "x" * 40, devices=tmp_path
     )
     line.open()
     assert line.title == "gpiochip0 line 0 (SOUT)"
@@ -162,7 +162,7 @@ def test_level(gpiod: FakeGpiod, tmp_path: Path) -> None:
 
 def test_a_busy_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
     gpiod.refusal, gpiod.holder = errno.EBUSY, "spi0 CS0"
-    for line in (GpioInput(SOUT, devices=tmp_path), GpioOutput(OutputSettings(line="SOUT"), devices=tmp_path)):
+    for line in (GpioInput(SOUT, devices=tmp_path), GpioOutput(OutputOptions(line="SOUT"), devices=tmp_path)):
         with pytest.raises(LinkBusy, match="in use by spi0 CS0"):
             line.open()
         line.close()
@@ -171,7 +171,7 @@ def test_a_busy_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
 def test_an_output_is_inactive_from_its_first_moment_to_its_last(gpiod: FakeGpiod, tmp_path: Path) -> None:
     done: list[tuple[int, bool, bool]] = []
     line = GpioOutput(
-        ResetSettings(line="RESET", open_drain=True), "bow reset", devices=tmp_path,
+        ResetOptions(line="RESET", open_drain=True), "bow reset", devices=tmp_path,
         drive=lambda fd, active: done.append((fd, active, gpiod.requests[0].released)),
     )  # fmt: skip
     with pytest.raises(LinkError, match="not open"):
@@ -192,7 +192,7 @@ def test_an_output_whose_chip_vanishes_or_that_is_no_line(gpiod: FakeGpiod, tmp_
     def gone(_fd: int, _active: bool) -> None:
         raise OSError(errno.ENODEV, "by the test")
 
-    line = GpioOutput(OutputSettings(line="RESET"), devices=tmp_path, drive=gone)
+    line = GpioOutput(OutputOptions(line="RESET"), devices=tmp_path, drive=gone)
     line.open()
     with pytest.raises(LinkMissing, match="gpiochip10 line 0"):
         line.set(True)
@@ -200,8 +200,8 @@ def test_an_output_whose_chip_vanishes_or_that_is_no_line(gpiod: FakeGpiod, tmp_
     assert gpiod.requests[0].released
     assert gpiod.requests[0].settings.drive is Drive.PUSH_PULL
     # The kernel's own answer to the ioctl on a pipe
-    assert isinstance(GPIO_LINES.make_output(OutputSettings(line="RESET"), "x"), GpioOutput)
-    line = GpioOutput(OutputSettings(line="RESET"), devices=tmp_path)
+    assert isinstance(GPIO_LINES.make_output(OutputOptions(line="RESET"), "x"), GpioOutput)
+    line = GpioOutput(OutputOptions(line="RESET"), devices=tmp_path)
     line.open()
     with pytest.raises(LinkError, match="cannot be used: Inappropriate ioctl"):
         line.set(True)

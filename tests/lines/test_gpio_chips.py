@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from imud.contracts.lines import LineSettings
+from imud.contracts.lines import LineOptions
 from imud.lines.gpio import LineLocation, find_line, load_gpiod, request_error
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 from tests.support.signal_bench import FakeGpiod
@@ -18,16 +18,16 @@ from tests.support.signal_bench import FakeGpiod
 @pytest.mark.parametrize("chip", ["gpiochip0", "pinctrl-bcm2711"])
 @pytest.mark.parametrize(("line", "offset", "name"), [(0, 0, "SOUT"), (1, 1, ""), ("SOUT", 0, "SOUT")])
 def test_by_chip(gpiod: FakeGpiod, tmp_path: Path, chip: str, line: int | str, offset: int, name: str) -> None:
-    place = find_line(gpiod, LineSettings(line=line, chip=chip), tmp_path)
+    place = find_line(gpiod, LineOptions(line=line, chip=chip), tmp_path)
     assert place == LineLocation(str(tmp_path / "gpiochip0"), offset, name)
 
 
 def test_by_path_or_by_name_alone_whatever_other_names_a_chip_has(gpiod: FakeGpiod, tmp_path: Path) -> None:
-    place = find_line(gpiod, LineSettings(line="TWIN", chip=str(tmp_path / "gpiochip10")))
+    place = find_line(gpiod, LineOptions(line="TWIN", chip=str(tmp_path / "gpiochip10")))
     assert str(place) == "gpiochip10 line 1 (TWIN)"
-    assert str(find_line(gpiod, LineSettings(line="RESET"), tmp_path)) == "gpiochip10 line 0 (RESET)"
+    assert str(find_line(gpiod, LineOptions(line="RESET"), tmp_path)) == "gpiochip10 line 0 (RESET)"
     (tmp_path / "gpiochip4").symlink_to(tmp_path / "gpiochip0")
-    assert find_line(gpiod, LineSettings(line="SOUT"), tmp_path).path == str(tmp_path / "gpiochip0")
+    assert find_line(gpiod, LineOptions(line="SOUT"), tmp_path).path == str(tmp_path / "gpiochip0")
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_what_is_not_there(
     gpiod: FakeGpiod, tmp_path: Path, line: int | str, chip: str, kind: type[LinkError], message: str
 ) -> None:
     with pytest.raises(LinkError) as caught:
-        find_line(gpiod, LineSettings(line=line, chip=chip), tmp_path)
+        find_line(gpiod, LineOptions(line=line, chip=chip), tmp_path)
     assert type(caught.value) is kind
     assert message in str(caught.value)
 
@@ -53,20 +53,20 @@ def test_no_chip_at_all_or_two_of_a_label(tmp_path: Path, gpiod: FakeGpiod) -> N
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(LinkMissing, match="on any chip, as there is none"):
-        find_line(gpiod, LineSettings(line="SOUT"), empty)
+        find_line(gpiod, LineOptions(line="SOUT"), empty)
     with pytest.raises(LinkMissing, match="there are: none"):
-        find_line(gpiod, LineSettings(line=0, chip="gpiochip0"), empty)
+        find_line(gpiod, LineOptions(line=0, chip="gpiochip0"), empty)
     gpiod.chips["gpiochip10"] = gpiod.chips["gpiochip0"]
     with pytest.raises(LinkError, match=r"on one GPIO chip, got it on gpiochip0 \(.*\) and gpiochip10 \("):
-        find_line(gpiod, LineSettings(line=0, chip="pinctrl-bcm2711"), tmp_path)
+        find_line(gpiod, LineOptions(line=0, chip="pinctrl-bcm2711"), tmp_path)
 
 
 def test_a_chip_that_may_not_be_opened_matters_only_if_the_line_is_not_elsewhere(
     gpiod: FakeGpiod, tmp_path: Path
 ) -> None:
     gpiod.errors["gpiochip0"] = errno.EACCES
-    assert find_line(gpiod, LineSettings(line="RESET"), tmp_path).offset == 0
-    for settings in (LineSettings(line="SOUT"), LineSettings(line=0, chip="gpiochip0"), LineSettings(line=0, chip="x")):
+    assert find_line(gpiod, LineOptions(line="RESET"), tmp_path).offset == 0
+    for settings in (LineOptions(line="SOUT"), LineOptions(line=0, chip="gpiochip0"), LineOptions(line=0, chip="x")):
         with pytest.raises(LinkDenied, match=r"gpiochip0 may not be opened by user .*: it must belong to group"):
             find_line(gpiod, settings, tmp_path)
 
@@ -75,12 +75,12 @@ def test_a_chip_that_goes_away_or_is_none_matters_only_if_the_line_is_not_elsewh
     gpiod: FakeGpiod, tmp_path: Path
 ) -> None:
     gpiod.errors["gpiochip0"] = errno.ENODEV
-    assert find_line(gpiod, LineSettings(line="RESET"), tmp_path).offset == 0
+    assert find_line(gpiod, LineOptions(line="RESET"), tmp_path).offset == 0
     with pytest.raises(LinkMissing, match="gpiochip0 is gone, or is no GPIO chip: No such device"):
-        find_line(gpiod, LineSettings(line=0, chip="gpiochip0"), tmp_path)
+        find_line(gpiod, LineOptions(line=0, chip="gpiochip0"), tmp_path)
     (tmp_path / "ttyS0").touch()
     with pytest.raises(LinkError, match="ttyS0 cannot be used as a GPIO chip"):
-        find_line(gpiod, LineSettings(line=0, chip="ttyS0"), tmp_path)
+        find_line(gpiod, LineOptions(line=0, chip="ttyS0"), tmp_path)
 
 
 @pytest.mark.parametrize(

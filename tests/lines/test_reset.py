@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from imud.contracts.lines import DeviceLines, ResetSettings
+from imud.contracts.lines import DeviceLines, ResetOptions
 from imud.lines.reset import ResetLine, make_reset, reset
 from imud.model.errors import CommandError, LinkBusy, LinkMissing
 from imud.model.units import NS_PER_S
@@ -19,7 +19,7 @@ from tests.support.stories import played
 AGAIN_NS = 60 * 10**9
 RETRY_NS = 5 * 10**9
 
-SETTINGS = ResetSettings(line="RESET", hold_ms=20)
+SETTINGS = ResetOptions(line="RESET", hold_ms=20)
 
 
 @in_loop
@@ -61,7 +61,7 @@ async def test_cancelled_while_it_is_held() -> None:
 
 
 class Scene:
-    def __init__(self, settings: ResetSettings = SETTINGS) -> None:
+    def __init__(self, settings: ResetOptions = SETTINGS) -> None:
         signals = SignalBench()
         self.clock, self.events = signals.clock, signals.events
         self.announced = 0
@@ -184,7 +184,7 @@ async def test_a_line_that_fails_when_it_is_driven() -> None:
 
 
 @pytest.mark.parametrize("at_start", [True, False])
-@played(lambda at_start: Scene(ResetSettings(line="RESET", hold_ms=20, at_start=at_start)))
+@played(lambda at_start: Scene(ResetOptions(line="RESET", hold_ms=20, at_start=at_start)))
 async def test_at_the_start_it_is_pulsed_once_before_the_device_is_asked(it: Scene, at_start: bool) -> None:
     it.tick()
     await it.reset.settled()
@@ -196,7 +196,7 @@ async def test_at_the_start_it_is_pulsed_once_before_the_device_is_asked(it: Sce
     assert [event.message for event in it.events] == ["reset by its line at the start"] * at_start
 
 
-@played(lambda: Scene(ResetSettings(line="RESET", at_start=True)))
+@played(lambda: Scene(ResetOptions(line="RESET", at_start=True)))
 async def test_a_line_that_cannot_be_driven_at_the_start_holds_nothing_up(it: Scene) -> None:
     it.line.set_error = LinkMissing("gone")
     it.tick()

@@ -6,12 +6,12 @@ import pytest
 
 from imud.contracts.lines import (
     DeviceLines,
-    DividedSettings,
+    DividedOptions,
     Edge,
-    InputSettings,
-    PpsSettings,
-    SoutSettings,
-    TriggerSettings,
+    InputOptions,
+    PpsOptions,
+    SoutOptions,
+    TriggerOptions,
 )
 from imud.lines.sync import ALARM_STATUS, SyncSignals
 from imud.model.errors import CommandError, LinkBusy, LinkError
@@ -25,11 +25,11 @@ from tests.support.signal_bench import DEVICE, SignalBench
 RETRY_NS = 5 * 10**9
 
 ALL = DeviceLines(
-    sout=SoutSettings(line="A"),
-    sout_div=DividedSettings(line="B"),
-    pps=PpsSettings(line="C"),
-    alarm=InputSettings(line="D"),
-    sin=TriggerSettings(line="E", rate_hz=0, pulse_ms=2),
+    sout=SoutOptions(line="A"),
+    sout_div=DividedOptions(line="B"),
+    pps=PpsOptions(line="C"),
+    alarm=InputOptions(line="D"),
+    sin=TriggerOptions(line="E", rate_hz=0, pulse_ms=2),
 )
 
 
@@ -86,7 +86,7 @@ async def test_lines_are_watched_before_there_is_a_clock_and_delivered_to_it_aft
 
 @in_loop
 async def test_the_alarm_is_in_the_samples_of_whatever_clock() -> None:
-    bench = SyncBench(DeviceLines(alarm=InputSettings(line="D")))
+    bench = SyncBench(DeviceLines(alarm=InputOptions(line="D")))
     bench.start()
     assert bench.status_of_sample(None) is None
     assert bench.status_of_sample(5) == 5
@@ -132,7 +132,7 @@ async def test_one_edge_by_command_where_there_is_sin() -> None:
     assert (status.sin, status.triggers, bench.sample_clock.status().edges) == (True, 1, 1)
     bench.signals.close()
     assert not bench.output("sin").is_open
-    bench = SyncBench(DeviceLines(sout=SoutSettings(line="A")))
+    bench = SyncBench(DeviceLines(sout=SoutOptions(line="A")))
     assert not bench.signals.can_trigger
     with pytest.raises(CommandError, match="expected the key sin"):
         bench.signals.trigger_once()
@@ -198,7 +198,7 @@ async def test_at_the_end_of_the_link_sin_is_released_and_closed_lines_stay_clos
 
 @in_loop
 async def test_marks_are_raised_with_their_samples() -> None:
-    bench = SyncBench(DeviceLines(sout_div=DividedSettings(line="B")))
+    bench = SyncBench(DeviceLines(sout_div=DividedOptions(line="B")))
     bench.start()
     for i in range(60):
         bench.clock.advance(10 * NS_PER_MS)

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from imud.contracts.lines import Edge, InputSettings, OnEdges, OnLineEnd
+from imud.contracts.lines import Edge, InputOptions, OnEdges, OnLineEnd
 from imud.lines.watched_line import WatchedLine, watching
 from imud.model.errors import LinkBusy, LinkError, LinkMissing
 from imud.sim.ports.pins import MemoryInput, MemoryLines
@@ -144,7 +144,7 @@ async def test_a_line_of_no_device_is_kept_open_by_its_settings() -> None:
     clock, edges, reports = VirtualClock(), list[Edge](), list[str]()
     memory = MemoryLines(clock.now_ns)
     watch = watching(memory.maker, clock.now_ns)
-    watched = watch(InputSettings(line="GPIO5"), "flight recorder", edges.extend, reports.append)
+    watched = watch(InputOptions(line="GPIO5"), "flight recorder", edges.extend, reports.append)
     line = memory.inputs["flight recorder"]
     line.open_error = BUSY
     watched.tick(0)

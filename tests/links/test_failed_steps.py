@@ -11,7 +11,7 @@ import pytest
 from imud.formats.can import CyclicFrame, pack_frame
 from imud.links import netlink
 from imud.links.cyclic_sender import KernelSender, LoopSender
-from imud.links.socketcan import SO_RCVBUFFORCE, SocketCanLink, SocketCanSettings, open_raw
+from imud.links.socketcan import SO_RCVBUFFORCE, SocketCanLink, SocketCanOptions, open_raw
 from imud.model.errors import LinkDenied, LinkError, LinkMissing
 from tests.support.event_loops import in_loop
 
@@ -47,7 +47,7 @@ def test_a_raw_socket_is_closed_when_a_step_fails(monkeypatch: pytest.MonkeyPatc
     made = FakeSocket(fails_at)
     monkeypatch.setattr(socket, "socket", lambda *_: made)
     with pytest.raises(OSError, match="No such device"):
-        open_raw(SocketCanSettings(interface="can0"), [])
+        open_raw(SocketCanOptions(interface="can0"), [])
     assert made.closed
     assert len(made.calls) == fails_at
 
@@ -56,7 +56,7 @@ def test_a_raw_socket_has_the_permitted_buffer(monkeypatch: pytest.MonkeyPatch) 
     """Without CAP_NET_ADMIN the third call fails: the usual option then sets the buffer."""
     made = FakeSocket(3, errno.EPERM)
     monkeypatch.setattr(socket, "socket", lambda *_: made)
-    assert open_raw(SocketCanSettings(interface="can0"), []) is made  # type: ignore[comparison-overlap]  # the fake
+    assert open_raw(SocketCanOptions(interface="can0"), []) is made  # type: ignore[comparison-overlap]  # the fake
     assert made.calls[2] == (socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES // 2), "the kernel doubles the value"
     assert made.calls[3] == (socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES // 2)
     assert (made.calls[-1], made.closed) == ((("can0",),), False)
@@ -74,7 +74,7 @@ def sys_with_can0(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def link_of(made: FakeSocket, sys: Path) -> SocketCanLink:
     """Return a link whose socket is `made`."""
-    settings = SocketCanSettings(interface="can0")
+    settings = SocketCanOptions(interface="can0")
     return SocketCanLink(settings, sys=sys, open_socket=lambda *_: made)  # type: ignore[arg-type]  # the fake
 
 

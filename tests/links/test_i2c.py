@@ -7,7 +7,7 @@ from smbus2 import I2cFunc
 
 from imud.contracts.script import Transfer
 from imud.links import LINKS
-from imud.links.i2c import I2C_TIMEOUT, I2cLink, I2cSettings
+from imud.links.i2c import I2C_TIMEOUT, I2cLink, I2cOptions
 from imud.model.errors import LinkDenied, LinkError, LinkMissing, TransferError, Trouble
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.in_process_bus import InProcessI2c
@@ -20,7 +20,7 @@ def device() -> Imu61xRegisters:
 
 
 def opened(bus: InProcessI2c, address: int = 0x19) -> I2cLink:
-    link = I2cLink(I2cSettings(bus=1), open_bus=bus.open, ioctl=bus.ioctl)
+    link = I2cLink(I2cOptions(bus=1), open_bus=bus.open, ioctl=bus.ioctl)
     link.open()
     link.select(address)
     return link
@@ -67,7 +67,7 @@ def test_open_that_fails_says_why_and_leaves_nothing_open(number: int, kind: typ
 
     bus = InProcessI2c({})
     with pytest.raises(kind, match=r"/dev/i2c-1"):
-        I2cLink(I2cSettings(bus=1), open_bus=bus.open, ioctl=refuse).open()
+        I2cLink(I2cOptions(bus=1), open_bus=bus.open, ioctl=refuse).open()
     assert (bus.opened, bus.fd) == (1, None), "the bus was opened, and closed after the failed ioctl"
     bus.open_error = number
     with pytest.raises(kind, match=r"/dev/i2c-1"):
@@ -76,7 +76,7 @@ def test_open_that_fails_says_why_and_leaves_nothing_open(number: int, kind: typ
 
 def test_names_time_out_and_close() -> None:
     bus, requests = InProcessI2c({}), list[tuple[int, int]]()
-    link = I2cLink(I2cSettings(), open_bus=bus.open, ioctl=lambda _fd, *request: requests.append(request))
+    link = I2cLink(I2cOptions(), open_bus=bus.open, ioctl=lambda _fd, *request: requests.append(request))
     link.open()
     assert requests == [(I2C_TIMEOUT, 5)]
     link.close()
@@ -84,7 +84,7 @@ def test_names_time_out_and_close() -> None:
     assert bus.fd is None
     with pytest.raises(LinkError, match="not open"):
         link.transfer(READ_ID)
-    row_link = LINKS["i2c"].make_polled(I2cSettings(bus=3, address=0x1B))
+    row_link = LINKS["i2c"].make_polled(I2cOptions(bus=3, address=0x1B))
     assert (row_link.title, row_link.bus, row_link.target, row_link.shared) == ("/dev/i2c-3", "/dev/i2c-3", 0x1B, True)
     assert row_link.place(0x1B) == "address 0x1b"
     with pytest.raises(LinkError):

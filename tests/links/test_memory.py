@@ -8,7 +8,7 @@ import pytest
 from imud.contracts.link import StreamLink
 from imud.contracts.status import KernelCounters
 from imud.links import LINKS
-from imud.links.memory import MemoryLink, MemorySettings
+from imud.links.memory import MemoryLink, MemoryOptions
 from imud.model.errors import LinkBusy, LinkError, LinkMissing
 from tests.support.event_loops import in_loop
 
@@ -26,7 +26,7 @@ class Listener:
 
 
 def opened() -> tuple[MemoryLink, Listener]:
-    link, listener = MemoryLink(MemorySettings()), Listener()
+    link, listener = MemoryLink(MemoryOptions()), Listener()
     link.open()
     link.start(listener.on_data, listener.on_end)
     return link, listener

@@ -12,7 +12,7 @@ from imud.contracts.link import CanLink
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_frame
 from imud.links import LINKS
 from imud.links.python_can import PythonCanLink
-from imud.links.socketcan import LINK, SocketCanSettings, pack_filters
+from imud.links.socketcan import LINK, SocketCanOptions, pack_filters
 from imud.model.errors import LinkError
 from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.event_loops import in_loop
@@ -70,9 +70,9 @@ def test_commands_go_out() -> None:
 
 def test_settings_of_other_backends_and_filters() -> None:
     with pytest.raises(msgspec.ValidationError, match="the system sets it"):
-        msgspec.convert({"interface": "can0", "bitrate": 500000}, SocketCanSettings)
+        msgspec.convert({"interface": "can0", "bitrate": 500000}, SocketCanOptions)
     assert make("rate", bitrate=250000).bitrate == 250000
-    assert LINK.make_can(SocketCanSettings(interface="can0")).title == "can0"
+    assert LINK.make_can(SocketCanOptions(interface="can0")).title == "can0"
     with pytest.raises(LinkError, match="cannot be opened"):
         PythonCanLink("nosuch", "x").open()
     packed = pack_filters([CanFilter(0x65, 0x7FF, False), CanFilter(0x18FEE900, 0x03FFFF00, True)])

@@ -13,7 +13,7 @@ import pytest
 
 from imud.contracts.link import StreamLink
 from imud.links import LINKS
-from imud.links.replay import PIECE_BYTES_MAX, PIECE_NS, CanReplayLink, ReplayLink, ReplaySettings
+from imud.links.replay import PIECE_BYTES_MAX, PIECE_NS, CanReplayLink, ReplayLink, ReplayOptions
 from imud.model.errors import LinkDenied, LinkError, LinkMissing
 from imud.model.units import NS_PER_MS, uart_byte_ns
 from tests.support.event_loops import VirtualClock, in_loop, run_virtually
@@ -44,7 +44,7 @@ class Played:
 
     def __init__(self, path: Path, **settings: Any) -> None:
         self.clock = VirtualClock()
-        self.link = ReplayLink(ReplaySettings(path=str(path), **settings), self.clock.now_ns)
+        self.link = ReplayLink(ReplayOptions(path=str(path), **settings), self.clock.now_ns)
         self.chunks: list[tuple[bytes, int]] = []
         self.delivered_ns: list[int] = []
         self.started_ns = 0
@@ -142,7 +142,7 @@ def test_maximum_speed_is_virtual_time(tmp_path: Path, stamped: Path) -> None:
 async def test_others_get_their_turn_at_maximum_speed(tmp_path: Path) -> None:
     path = tmp_path / "long"
     path.write_bytes(bytes(1 << 20))
-    link = ReplayLink(ReplaySettings(path=str(path), speed="maximum"))
+    link = ReplayLink(ReplayOptions(path=str(path), speed="maximum"))
     order: list[str] = []
     done = asyncio.Event()
     link.open()
@@ -182,23 +182,23 @@ def test_a_capture_without_an_end_plays_its_whole_records(
 
 def test_captures_that_cannot_be_played(raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(LinkError, match="raw capture without times"):
-        ReplayLink(ReplaySettings(path=str(raw))).open()
+        ReplayLink(ReplayOptions(path=str(raw))).open()
     with pytest.raises(LinkError, match="needs the key baud"):
-        ReplayLink(ReplaySettings(path=str(raw), speed="real")).open()
+        ReplayLink(ReplayOptions(path=str(raw), speed="real")).open()
     raw.write_bytes(b"#imud-capture 9\n")
     with pytest.raises(LinkError, match="version '9'"):
-        ReplayLink(ReplaySettings(path=str(raw))).open()
+        ReplayLink(ReplayOptions(path=str(raw))).open()
     with pytest.raises(LinkMissing, match="expected a capture file"):
-        ReplayLink(ReplaySettings(path=str(tmp_path / "none"))).open()
+        ReplayLink(ReplayOptions(path=str(tmp_path / "none"))).open()
     with pytest.raises(LinkError, match="not a regular file"):
-        ReplayLink(ReplaySettings(path=str(tmp_path))).open()
+        ReplayLink(ReplayOptions(path=str(tmp_path))).open()
 
     def refuse(path: str) -> None:
         raise PermissionError
 
     monkeypatch.setattr("imud.host.files.os.stat", refuse)
     with pytest.raises(LinkDenied):
-        ReplayLink(ReplaySettings(path=str(tmp_path))).open()
+        ReplayLink(ReplayOptions(path=str(tmp_path))).open()
 
 
 class BrokenFile(BytesIO):
@@ -215,7 +215,7 @@ def test_a_file_whose_read_fails_is_closed(
     file = BrokenFile()
     monkeypatch.setattr(f"imud.links.replay.{module}.open_regular", lambda _path: file)
     with pytest.raises(LinkError, match="a cannot be read: Input/output error"):
-        kind(ReplaySettings(path="a")).open()
+        kind(ReplayOptions(path="a")).open()
     assert file.closed
 
 
@@ -223,7 +223,7 @@ def test_a_capture_that_is_refused_is_closed(raw: Path, monkeypatch: pytest.Monk
     file = raw.open("rb")
     monkeypatch.setattr("imud.links.replay.open_regular", lambda _path: file)
     with pytest.raises(LinkError, match="raw capture without times"):
-        ReplayLink(ReplaySettings(path=str(raw))).open()
+        ReplayLink(ReplayOptions(path=str(raw))).open()
     assert file.closed
 
 
@@ -233,7 +233,7 @@ def test_a_replay_has_settings_and_refuses_commands(stamped: Path) -> None:
     assert (link.title, link.auto_baud) == ("a", False)
     with pytest.raises(msgspec.ValidationError, match="repeat: expected false at speed maximum"):
         msgspec.convert({"path": "a", "speed": "maximum", "repeat": True}, row.settings)
-    link = ReplayLink(ReplaySettings(path=str(stamped)))
+    link = ReplayLink(ReplayOptions(path=str(stamped)))
     with pytest.raises(LinkError, match="nothing can be sent"):
         link.write(b"x")
     with pytest.raises(LinkError, match="cannot be changed"):

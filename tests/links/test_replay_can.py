@@ -12,7 +12,7 @@ import pytest
 from imud.contracts.link import CanLink
 from imud.formats.can import CanFilter, CanFrame
 from imud.links import LINKS
-from imud.links.replay import TURN_FRAMES, CanReplayLink, ReplaySettings
+from imud.links.replay import TURN_FRAMES, CanReplayLink, ReplayOptions
 from imud.model.errors import LinkError, LinkMissing
 from tests.support.event_loops import VirtualClock, run_virtually
 from tests.support.files import candump_line
@@ -37,7 +37,7 @@ def make(path: Path, **keys: object) -> CanLink:
 def play(path: Path, enough: int = 1 << 30, **keys: Any) -> tuple[list[CanFrame], list[LinkError | None], int]:
     """Play in virtual time until the end, or until `enough` frames; return the frames, the ends and the duration."""
     clock = VirtualClock()
-    link = CanReplayLink(ReplaySettings(path=str(path), **keys), clock.now_ns)
+    link = CanReplayLink(ReplayOptions(path=str(path), **keys), clock.now_ns)
     link.filters = [CanFilter(101, 0x7FF, False), CanFilter(102, 0x7FF, False)]
     frames: list[CanFrame] = []
     ends: list[LinkError | None] = []

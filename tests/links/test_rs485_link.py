@@ -28,7 +28,7 @@ from imud.links.rs485 import (
     Direction,
     Rs485Line,
     Rs485Link,
-    Rs485Settings,
+    Rs485Options,
     SharedPorts,
 )
 from imud.links.serial_port import TtyCounters, open_port
@@ -47,7 +47,7 @@ pytestmark = pytest.mark.live
 @contextmanager
 def opened(path: Path | str, ports: SharedPorts | None = None, address: int = 1, **more: Any) -> Iterator[Rs485Link]:
     settings = {"line": str(path), "baud": BAUD, "reply_ms": 1000, **more}
-    link = Rs485Link(msgspec.convert(settings, Rs485Settings), ports=ports or SharedPorts())
+    link = Rs485Link(msgspec.convert(settings, Rs485Options), ports=ports or SharedPorts())
     link.open()
     link.select(address)
     try:
@@ -272,8 +272,8 @@ def test_request_to_all_expects_no_reply(tmp_path: Path) -> None:
 
 def test_cable_pulled_and_back(pty: PtyPort) -> None:
     ports = SharedPorts()
-    link_a = Rs485Link(Rs485Settings(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
-    link_b = Rs485Link(Rs485Settings(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
+    link_a = Rs485Link(Rs485Options(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
+    link_b = Rs485Link(Rs485Options(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
     link_a.open()
     link_b.open()
     pty.unplug()
@@ -288,7 +288,7 @@ def test_cable_pulled_and_back(pty: PtyPort) -> None:
 
 
 def test_missing_port_and_what_a_link_cannot_do(tmp_path: Path) -> None:
-    link = Rs485Link(Rs485Settings(line=str(tmp_path / "none")))
+    link = Rs485Link(Rs485Options(line=str(tmp_path / "none")))
     with pytest.raises(LinkMissing):
         link.open()
     with pytest.raises(LinkError):
@@ -364,7 +364,7 @@ def test_direction_that_the_kernel_cannot_switch(monkeypatch: pytest.MonkeyPatch
         Direction(3, "x", required=False)
     monkeypatch.undo()
     before, ports = len(os.listdir("/proc/self/fd")), SharedPorts()
-    link = Rs485Link(Rs485Settings(line=pty.path, baud=BAUD, direction="kernel"), ports=ports)
+    link = Rs485Link(Rs485Options(line=pty.path, baud=BAUD, direction="kernel"), ports=ports)
     with pytest.raises(LinkError, match="direction: none") as caught:
         link.open()
     assert len(os.listdir("/proc/self/fd")) == before, f"{caught} keeps the port object: only close() releases it"

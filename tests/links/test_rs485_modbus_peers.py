@@ -20,11 +20,11 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from imud.contracts.codec import Vanished
 from imud.contracts.script import run_transfer_script
 from imud.drivers.hipnuc.common import AttitudeMode
-from imud.drivers.hipnuc.modbus.codec import READ_BLOCK, READ_SHORT_BLOCK, HipnucModbusCodec, HipnucModbusSettings
+from imud.drivers.hipnuc.modbus.codec import READ_BLOCK, READ_SHORT_BLOCK, HipnucModbusCodec, HipnucModbusOptions
 from imud.drivers.hipnuc.modbus.commands import LineMounting, set_heading_mode, set_mounting
 from imud.drivers.hipnuc.modbus.driver import DRIVER
 from imud.drivers.hipnuc.modbus.registers import pack_identity
-from imud.links.rs485 import Rs485Link, Rs485Settings, SharedPorts
+from imud.links.rs485 import Rs485Link, Rs485Options, SharedPorts
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from tests.drivers.hipnuc.modbus.test_codec import SENSORS
@@ -114,7 +114,7 @@ def served(*devices: SimDevice) -> Iterator[str]:
 
 @contextmanager
 def linked(path: str) -> Iterator[Rs485Link]:
-    link = Rs485Link(Rs485Settings(line=path, baud=BAUD, reply_ms=1000), ports=SharedPorts())
+    link = Rs485Link(Rs485Options(line=path, baud=BAUD, reply_ms=1000), ports=SharedPorts())
     link.open()
     try:
         yield link
@@ -123,7 +123,7 @@ def linked(path: str) -> Iterator[Rs485Link]:
 
 
 def test_pymodbus_server_as_modules_under_our_driver() -> None:
-    settings = HipnucModbusSettings()
+    settings = HipnucModbusOptions()
     with served(device(1, new=False), device(80, new=True)) as path, linked(path) as link:
         for address, firmware in ((80, "1.6.9"), (1, "1.5.2")):
             link.select(address)

@@ -11,7 +11,7 @@ import pytest
 
 from imud.formats.can import CanFrame, pack_frame
 from imud.links import netlink
-from imud.links.socketcan import BATCH_FRAMES, FrameReader, SocketCanLink, SocketCanSettings
+from imud.links.socketcan import BATCH_FRAMES, FrameReader, SocketCanLink, SocketCanOptions
 from imud.model.errors import LinkError, LinkMissing
 from tests.support.daemon_process import LIMIT_S
 
@@ -25,7 +25,7 @@ class Bus:
 
     def __init__(self, ends: Ends, gather_ms: int) -> None:
         receiver, sender, sys = ends
-        settings = SocketCanSettings(interface="lo")
+        settings = SocketCanOptions(interface="lo")
         self.link = SocketCanLink(settings, sys=sys, open_socket=lambda _settings, _filters: receiver.dup())
         self.link.gather_ns = gather_ms * 1_000_000
         self.batches: list[list[CanFrame]] = []

@@ -9,7 +9,7 @@ import pytest
 
 from imud.contracts.script import Transfer
 from imud.links import LINKS
-from imud.links.spi import WR_MAX_SPEED_HZ, SpiLink, SpiSettings
+from imud.links.spi import WR_MAX_SPEED_HZ, SpiLink, SpiOptions
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble
 from imud.sim.ports.in_process_bus import InProcessSpi
 
@@ -20,7 +20,7 @@ def echo(selections: object, _mode: int) -> list[bytes]:
 
 
 def link_to(bus: InProcessSpi, **settings: object) -> SpiLink:
-    made = SpiSettings(port="/dev/spidev0.1", **settings)  # type: ignore[arg-type]  # passed on as given
+    made = SpiOptions(port="/dev/spidev0.1", **settings)  # type: ignore[arg-type]  # passed on as given
     return SpiLink(made, ioctl=bus.ioctl, open_node=bus.open, close_node=bus.close)
 
 
@@ -65,7 +65,7 @@ def test_controller_that_refuses_16_bits_in_a_message_only() -> None:
 @pytest.mark.manual("A 2.1 clock")
 def test_speed_is_set_at_open() -> None:
     calls: list[tuple[int, bytes]] = []
-    settings = SpiSettings(port="/dev/spidev0.1", speed_hz=250_000)
+    settings = SpiOptions(port="/dev/spidev0.1", speed_hz=250_000)
     ioctl = lambda _fd, *request: calls.append(request)  # noqa: E731
     SpiLink(settings, ioctl=ioctl, open_node=lambda *_: 3, close_node=lambda _: None).open()
     assert calls[0] == (WR_MAX_SPEED_HZ, (250_000).to_bytes(4, "little"))
@@ -95,7 +95,7 @@ def test_a_step_after_open_that_fails_closes_the_node(step: int) -> None:
             raise OSError(number, "by the test")
         return bus.ioctl(fd, request, argument)
 
-    link = SpiLink(SpiSettings(port="/dev/spidev0.1"), ioctl=ioctl, open_node=bus.open, close_node=bus.close)
+    link = SpiLink(SpiOptions(port="/dev/spidev0.1"), ioctl=ioctl, open_node=bus.open, close_node=bus.close)
     with pytest.raises(LinkError, match="cannot be used"):
         link.open()
     assert not bus.opened
@@ -123,10 +123,10 @@ def test_transfer_that_fails_says_whether_the_bus_is_gone(number: int, expected:
 def test_row_and_names(tmp_path: Path) -> None:
     row = LINKS["spi"]
     node = tmp_path / "spidev3.1"
-    link = row.make_polled(SpiSettings(port=str(node), mode=3))
+    link = row.make_polled(SpiOptions(port=str(node), mode=3))
     assert (link.bus, link.target, link.shared) == (str(tmp_path / "spidev3"), 3, False)
     assert link.place(3) == "mode 3"
-    assert row.make_polled(SpiSettings(port="/dev/spidev0.0")).target is None
+    assert row.make_polled(SpiOptions(port="/dev/spidev0.0")).target is None
     with pytest.raises(LinkError):
         link.write(b"x")
     node.touch()

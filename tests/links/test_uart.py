@@ -17,7 +17,7 @@ from imud.contracts.link import StreamLink
 from imud.contracts.status import KernelCounters
 from imud.links import LINKS
 from imud.links.serial_port import baud_of
-from imud.links.uart import FULL_READ_BYTES, WRITE_QUEUE_BYTES, UartLink, UartSettings
+from imud.links.uart import FULL_READ_BYTES, WRITE_QUEUE_BYTES, UartLink, UartOptions
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 from imud.model.units import NS_PER_MS
 from tests.support.daemon_process import LIMIT_S, wait_until
@@ -81,11 +81,11 @@ def test_bytes_pass_as_they_are(pty: PtyPort) -> None:
         await receiver.until(lambda: len(receiver.data) == 256)
 
     before_ns = time.monotonic_ns()
-    receiver = play(UartLink(UartSettings(port=pty.path, baud=115200)), scene)
+    receiver = play(UartLink(UartOptions(port=pty.path, baud=115200)), scene)
     assert receiver.data == everything
     assert all(before_ns < t_rx_ns <= time.monotonic_ns() for _, t_rx_ns in receiver.chunks)
     assert receiver.ends == []
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     link.open()
     link.write(everything)
     assert pty.received() == everything
@@ -109,7 +109,7 @@ async def drained(pty: PtyPort, count: int, received: bytes = b"") -> bytes:
 
 
 def test_what_the_port_does_not_take_is_queued_in_order_and_bounded(pty: PtyPort) -> None:
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     blocks = [bytes([number % 251]) * 1000 for number in range(200)]
 
     async def scene(_receiver: Receiver) -> None:
@@ -134,7 +134,7 @@ def test_what_is_sent_later_waits_behind_the_queue(pty: PtyPort) -> None:
         link.write(b"last")
         assert await drained(pty, sent + 1004, received) == bytes(sent + 1000) + b"last"
 
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     play(link, scene)
 
 
@@ -154,7 +154,7 @@ def test_the_queue_has_a_largest_size_and_ends_with_the_link(pty: PtyPort) -> No
         link.write(b"new")
         assert await drained(pty, 3) == b"new"
 
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     play(link, scene)
 
 
@@ -165,7 +165,7 @@ def test_unplugging_ends_the_link_once(pty: PtyPort) -> None:
         for _ in range(20):
             await asyncio.sleep(0)
 
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     receiver = play(link, scene)
     assert len(receiver.ends) == 1
     assert isinstance(receiver.ends[0], LinkMissing)
@@ -185,13 +185,13 @@ def test_a_spurious_wake_up_is_no_end(pty: PtyPort) -> None:
         assert stolen == [b"x"]
 
     failures: list[dict[str, object]] = []
-    receiver = play(UartLink(UartSettings(port=pty.path)), scene)
+    receiver = play(UartLink(UartOptions(port=pty.path)), scene)
     assert (receiver.data, receiver.ends, failures) == (b"", [], [])
 
 
 def test_closing_releases_everything_and_may_be_repeated(pty: PtyPort) -> None:
     before = open_descriptors()
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     for _ in range(3):
         link.open()
         link.close()
@@ -204,7 +204,7 @@ def test_closing_releases_everything_and_may_be_repeated(pty: PtyPort) -> None:
 
 
 def test_closing_inside_the_receiver_is_allowed(pty: PtyPort) -> None:
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
 
     async def scene(receiver: Receiver) -> None:
         got = asyncio.Event()
@@ -228,7 +228,7 @@ def test_the_port_is_raw_8n1_at_the_rate(pty: PtyPort) -> None:
     tty_settings[2] |= termios.HUPCL
     tty_settings[3] |= termios.ICANON | termios.ECHO | termios.ISIG
     termios.tcsetattr(pty.slave, termios.TCSANOW, tty_settings)
-    link = UartLink(UartSettings(port=pty.path, baud=921600))
+    link = UartLink(UartOptions(port=pty.path, baud=921600))
     link.open()
     iflag, oflag, cflag, lflag, _, _, characters = termios.tcgetattr(pty.slave)
     link.close()
@@ -243,7 +243,7 @@ def test_the_port_is_raw_8n1_at_the_rate(pty: PtyPort) -> None:
 @pytest.mark.parametrize("baud", [9600, 115200, 256000, 460800, 921600, 250_001])
 @pytest.mark.manual("A 1.1 rates")
 def test_every_rate_is_set_when_opening_and_later_and_old_bytes_are_discarded(pty: PtyPort, baud: int) -> None:
-    link = UartLink(UartSettings(port=pty.path, baud=baud))
+    link = UartLink(UartOptions(port=pty.path, baud=baud))
     link.open()
     assert baud_of(pty.slave) == baud
     link.set_baud(57600)
@@ -258,7 +258,7 @@ def test_every_rate_is_set_when_opening_and_later_and_old_bytes_are_discarded(pt
 
 
 def test_a_rate_that_the_driver_changes_is_refused(pty: PtyPort, monkeypatch: pytest.MonkeyPatch) -> None:
-    link = UartLink(UartSettings(port=pty.path, baud=115200))
+    link = UartLink(UartOptions(port=pty.path, baud=115200))
     link.open()
     monkeypatch.setattr("imud.links.serial_port.baud_of", lambda fd: 115200)
     with pytest.raises(LinkError, match="cannot do 256000 baud: asked for it, its driver set 115200"):
@@ -270,14 +270,14 @@ def test_a_rate_that_the_driver_changes_is_refused(pty: PtyPort, monkeypatch: py
     link.close()
     before = open_descriptors()
     with pytest.raises(LinkError, match="cannot do 230400") as caught:
-        UartLink(UartSettings(port=pty.path, baud=230400)).open()
+        UartLink(UartOptions(port=pty.path, baud=230400)).open()
     assert open_descriptors() == before
     assert caught.value.__cause__ is None
 
 
 @pytest.mark.manual("A 1.8 one program")
 def test_a_second_open_is_refused_and_names_the_holder(pty: PtyPort) -> None:
-    first, second = (UartLink(UartSettings(port=pty.path)) for _ in range(2))
+    first, second = (UartLink(UartOptions(port=pty.path)) for _ in range(2))
     first.open()
     with pytest.raises(LinkBusy, match=rf"\(pid {os.getpid()}\)"):
         second.open()
@@ -285,7 +285,7 @@ def test_a_second_open_is_refused_and_names_the_holder(pty: PtyPort) -> None:
     second.open()
     second.close()
     os.chmod(pty.path, 0o666)
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     link.open()
     with unprivileged(), pytest.raises(OSError, match="busy"):
         os.open(pty.path, os.O_RDWR | os.O_NOCTTY)
@@ -301,7 +301,7 @@ def test_a_step_after_open_that_fails_releases_the_port(
         raise kind(errno.EIO, "by the test")
 
     before = open_descriptors()
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     with monkeypatch.context() as patch:
         if step == "fcntl.ioctl":  # of TIOCEXCL: the library needs the others
             real = fcntl.ioctl
@@ -320,15 +320,15 @@ def test_a_step_after_open_that_fails_releases_the_port(
 
 def test_ports_that_cannot_be_opened(pty: PtyPort, tmp_path: Path) -> None:
     os.chmod(pty.path, 0)
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     with unprivileged(), pytest.raises(LinkDenied, match=r"user \w+: it is for no group \(mode 0000, group \w+\); "):
         link.open()
     with pytest.raises(LinkMissing, match="/dev/no-such-port is not there"):
-        UartLink(UartSettings(port="/dev/no-such-port")).open()
+        UartLink(UartOptions(port="/dev/no-such-port")).open()
     path = tmp_path / "file"
     path.touch()
     with pytest.raises(LinkError, match="is not a serial port"):
-        UartLink(UartSettings(port=str(path))).open()
+        UartLink(UartOptions(port=str(path))).open()
 
 
 @in_loop
@@ -337,7 +337,7 @@ async def test_a_port_that_is_unplugged_and_comes_back_is_noticed(tmp_path: Path
     path.parent.mkdir()
     first, second = PtyPort(), PtyPort()
     path.symlink_to(first.path)
-    link = UartLink(UartSettings(port=str(path)))
+    link = UartLink(UartOptions(port=str(path)))
 
     async def life(port: PtyPort) -> None:
         receiver = Receiver()
@@ -363,7 +363,7 @@ async def test_a_port_that_is_unplugged_and_comes_back_is_noticed(tmp_path: Path
 @in_loop
 async def test_after_a_refusal_access_is_waited_for(pty: PtyPort) -> None:
     os.chmod(pty.path, 0)
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     with unprivileged():
         with pytest.raises(LinkDenied):
             link.open()
@@ -402,7 +402,7 @@ def test_a_paused_port_keeps_what_comes_until_it_is_taken(pty: PtyPort) -> None:
             taken += link.take()
         assert taken == sent
 
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     assert play(link, scene).ends == []
 
 
@@ -414,7 +414,7 @@ def test_a_full_read_is_followed_by_another(pty: PtyPort, monkeypatch: pytest.Mo
             patch.setattr(os, "read", lambda _fd, _size: next(pieces))
             assert link.take() == bytes(FULL_READ_BYTES) + b"last"
 
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     play(link, scene)
 
 
@@ -431,7 +431,7 @@ def test_the_end_of_a_paused_port_is_reported_once(pty: PtyPort, resumed: bool) 
             link.resume()
         assert link.take() == b""
 
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     assert len(play(link, scene).ends) == 1
 
 
@@ -440,12 +440,12 @@ def test_adapters_hold_bytes_back(pty: PtyPort, tmp_path: Path) -> None:
     timer.parent.mkdir(parents=True)
     for low_latency, left_ms in ((False, 16), (True, 1)):
         timer.write_text("16\n")
-        link = UartLink(UartSettings(port=pty.path, low_latency=low_latency), sys=tmp_path)
+        link = UartLink(UartOptions(port=pty.path, low_latency=low_latency), sys=tmp_path)
         link.open()
         link.close()
         assert link.hold_ns == left_ms * NS_PER_MS
         assert int(timer.read_text()) == left_ms
-    link = UartLink(UartSettings(port=pty.path))
+    link = UartLink(UartOptions(port=pty.path))
     assert link.kernel_counters() == KernelCounters()
     link.open()
     assert link.hold_ns == 0
@@ -461,4 +461,4 @@ def test_the_row_and_its_settings() -> None:
     assert not row.make(msgspec.convert({"port": "a", "baud": 9600}, row.settings)).auto_baud
     for wrong in ({}, {"port": ""}, {"baud": 0}, {"baud": "fast"}, {"speed": 9600}):
         with pytest.raises(msgspec.ValidationError):
-            msgspec.convert({"port": "a", **wrong} if wrong else {}, UartSettings)
+            msgspec.convert({"port": "a", **wrong} if wrong else {}, UartOptions)

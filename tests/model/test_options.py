@@ -10,7 +10,7 @@ from msgspec import Meta
 
 from imud.contracts.lines import LINE_SCHEMAS
 from imud.drivers import DRIVERS
-from imud.model.options import Settings, WrongValue, wrong_values
+from imud.model.options import Options, WrongValue, wrong_values
 from imud.publishers.socket.methods import METHODS
 from tests.support import references
 
@@ -47,7 +47,7 @@ def test_every_wrong_value_is_described_in_words(schema: type[msgspec.Struct]) -
             assert problem.message.startswith("expected "), (given, str(problem))
 
 
-class Trip(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Trip(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     rate_hz: Annotated[float, Meta(gt=0)]
     names: tuple[str, ...] = ()
     groups: dict[str, list[int]] = msgspec.field(default_factory=dict)

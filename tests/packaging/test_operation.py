@@ -19,9 +19,9 @@ from imud.config.schema import General
 from imud.device.flash import FILE_NAME as FLASH
 from imud.device.flash import FOLDER as BACKUPS
 from imud.device.search import FILE_NAME as FOUND
-from imud.fleet.settings import MqttSettings
+from imud.fleet.settings import MqttOptions
 from imud.fleet.spool import FILE as SPOOL_FILE
-from imud.publishers.recorder.directory import RecorderSettings
+from imud.publishers.recorder.directory import RecorderOptions
 from tests.support.daemon_process import LIMIT_S
 from tests.support.files import ROOT
 
@@ -40,8 +40,8 @@ KEPT: Final = {
 }
 """By path: what the page says is in a backup."""
 LEFT_OUT: Final = (
-    f"{RecorderSettings().directory}/one.imudrec",
-    f"{MqttSettings().spool_directory}/{SPOOL_FILE}",
+    f"{RecorderOptions().directory}/one.imudrec",
+    f"{MqttOptions().spool_directory}/{SPOOL_FILE}",
     f"{SETUP_FOLDER}/journal.json",
     "/etc/systemd/network/10-other.network",
     "/etc/hostname",

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from imud.cli import build_parser
-from imud.publishers.recorder.directory import FlightSettings
-from imud.publishers.shm import ShmSettings
+from imud.publishers.recorder.directory import FlightOptions
+from imud.publishers.shm import ShmOptions
 from imud.web.guard import is_loopback
 from tests.support.daemon_process import LIMIT_S
 from tests.support.files import ROOT
@@ -91,8 +91,8 @@ def test_every_directive_of_the_unit_has_its_reason_in_the_document_and_nothing_
 def test_the_rings_are_where_removing_ipc_does_not_reach_unless_the_configuration_says_so() -> None:
     """RemoveIPC= of systemd.exec(5): System V and POSIX IPC, which is /dev/shm and message queues."""
     assert values("RemoveIPC") == ["yes"]
-    assert not any(folder.startswith("/dev/shm") for folder in (ShmSettings().directory, FlightSettings().directory))
-    assert f"/run/{values('RuntimeDirectory')[1]}" == ShmSettings().directory
+    assert not any(folder.startswith("/dev/shm") for folder in (ShmOptions().directory, FlightOptions().directory))
+    assert f"/run/{values('RuntimeDirectory')[1]}" == ShmOptions().directory
 
 
 @judged

@@ -16,7 +16,7 @@ import pytest
 from pynmea2.types.proprietary.ash import ASHRATT
 
 from imud.attitude.conventions import Convention, Heading
-from imud.attitude.published import PublishedFrame, published_frame
+from imud.attitude.published import PublishedAxes, published_frame
 from imud.contracts.publisher import AS_SENT, Batch, PublisherContext
 from imud.contracts.status import FrameStatus
 from imud.model.options import wrong_values
@@ -28,7 +28,7 @@ from imud.publishers.nmea0183 import (
     Formatter,
     HeadingReference,
     Nmea0183,
-    Nmea0183Settings,
+    Nmea0183Options,
     address_of,
     make,
 )
@@ -66,7 +66,7 @@ class OutputBench:
             msgspec.structs.replace(device_status(name, n), frame=frame) for n, name in enumerate(("bow", "mast"))
         ]
         self.context = PublisherContext(lambda: statuses, 1, self.clock.now_ns, latencies=self.asked)
-        made = msgspec.convert({"tcp_port": 0, **settings}, Nmea0183Settings)
+        made = msgspec.convert({"tcp_port": 0, **settings}, Nmea0183Options)
         self.output = Nmea0183(made, self.context)
         self.output.start()
         self.output.add_device("bow", 0)
@@ -82,7 +82,7 @@ class OutputBench:
         return int(self.output.status()[0].name.rpartition(":")[2])
 
     def publish(
-        self, count: int = 1, device: str = "bow", euler: Vector3 | None = LEFT_45, frame: PublishedFrame = AS_SENT,
+        self, count: int = 1, device: str = "bow", euler: Vector3 | None = LEFT_45, frame: PublishedAxes = AS_SENT,
         gyro_z: float = 0.0,
     ) -> None:  # fmt: skip
         """Samples at 1 kHz."""
@@ -244,7 +244,7 @@ async def test_the_only_device_is_sent_and_of_several_the_named_one(caplog: pyte
     ],
 )
 def test_settings_that_are_refused(given: dict[str, object], words: str) -> None:
-    assert words in "; ".join(map(str, wrong_values(Nmea0183Settings, given)))
+    assert words in "; ".join(map(str, wrong_values(Nmea0183Options, given)))
 
 
 def test_addresses() -> None:

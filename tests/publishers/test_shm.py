@@ -27,14 +27,14 @@ from imud.model.event import Event, EventKind
 from imud.model.ledger import LEDGER_FIELDS
 from imud.publishers import PUBLISHERS
 from imud.publishers import shm as ring
-from imud.publishers.shm import PUBLISHER, ShmPublisher, ShmSettings
+from imud.publishers.shm import PUBLISHER, ShmOptions, ShmPublisher
 from tests.support.files import ROOT
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample, slot_at
 
 
 def make(folder: Path, **settings: Any) -> ShmPublisher:
     context = PublisherContext(list, 1, lambda: START_NS)
-    return ShmPublisher(ShmSettings(directory=str(folder), slots=SLOTS, **settings), context)
+    return ShmPublisher(ShmOptions(directory=str(folder), slots=SLOTS, **settings), context)
 
 
 def test_row_and_defaults() -> None:
@@ -42,7 +42,7 @@ def test_row_and_defaults() -> None:
     assert PUBLISHER.name == "shm"
     settings = PUBLISHER.settings()
     assert isinstance(PUBLISHER.make(settings, PublisherContext(list, 1, lambda: 0)), ShmPublisher)
-    assert settings == ShmSettings(enabled=True, directory="/run/imud/shm", slots=4096, group="imud", mode=0o640)
+    assert settings == ShmOptions(enabled=True, directory="/run/imud/shm", slots=4096, group="imud", mode=0o640)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_row_and_defaults() -> None:
 )
 def test_settings_that_cannot_be(values: dict[str, object], message: str) -> None:
     with pytest.raises(msgspec.ValidationError, match=message):
-        msgspec.convert(values, ShmSettings)
+        msgspec.convert(values, ShmOptions)
 
 
 def test_file_of_a_new_ring(board: Board) -> None:
@@ -227,7 +227,7 @@ def test_a_tick_asks_for_ledgers_and_not_for_the_state_where_they_have_a_source(
     context = PublisherContext(
         whole_state, 1, lambda: START_NS, ledger_source=lambda: [(DEVICE, "imu61x-uart", counts)]
     )
-    publisher = ShmPublisher(ShmSettings(directory=str(tmp_path), slots=SLOTS), context)
+    publisher = ShmPublisher(ShmOptions(directory=str(tmp_path), slots=SLOTS), context)
     publisher.add_device(DEVICE, 3)
     publisher.tick(START_NS)
     block = ledger_in(tmp_path / f"imud.{DEVICE}")

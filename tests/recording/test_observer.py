@@ -8,8 +8,8 @@ from imud.contracts.lines import Edge
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.formats.records import CheckRecord, Kind, decode_object, records_of
 from imud.model.ledger import Ledger
-from imud.model.options import NoSettings
-from imud.recording.observer import DeviceTap, DeviceTaps, HostTap, PathParts, RecordedDevice
+from imud.model.options import NoOptions
+from imud.recording.observer import ClockObserver, PathObserver, PathParts, RecordableDevices, RecordedDevice
 from imud.sampling.path import PathContext, StreamPath, make_clock
 from tests.support.event_loops import VirtualClock
 from tests.support.files import hi91
@@ -20,7 +20,7 @@ class TappedPath:
         self.clock = VirtualClock()
         self.host = self.clock.host
         self.ledger = Ledger()
-        config = DeviceConfig("bow", "hipnuc-uart", None, False, "uart", NoSettings())
+        config = DeviceConfig("bow", "hipnuc-uart", None, False, "uart", NoOptions())
         context = PathContext(
             "bow", 3, self.ledger, lambda _batch: None, lambda _message, _t: None, lambda _frame: None, lambda: 0,
             self.host,
@@ -31,7 +31,7 @@ class TappedPath:
             make_clock(config.name, config.lines, DRIVER, None, host=self.host.steady, on_unknown_gap=gap),
             context,
         )
-        self.tap = DeviceTap(config, 3, self.ledger, self.host)
+        self.tap = PathObserver(config, 3, self.ledger, self.host)
         self.tap.path_made(PathParts(self.path, DRIVER.name, options))
         self.heard: list[bytes] = []
 
@@ -93,7 +93,7 @@ def test_two_recorders_hear_the_same_and_another_path_is_described() -> None:
 def test_readings_of_the_clocks_are_heard() -> None:
     clock = VirtualClock()
     host, heard = clock.host, list[bytes]()
-    tap = HostTap(host)
+    tap = ClockObserver(host)
     tap.begin(heard.append)
     assert [record.kind for one in heard for record in records_of(one)] == [Kind.CALL]
     clock.advance(2_000_000_000)
@@ -107,7 +107,7 @@ def test_readings_of_the_clocks_are_heard() -> None:
 
 def test_the_taps_of_the_devices_pass_on_what_there_is() -> None:
     one, put = TappedPath(), list[bytes]()
-    taps = DeviceTaps({"bow": cast("RecordedDevice", SimpleNamespace(tap=one.tap))}, one.host)
+    taps = RecordableDevices({"bow": cast("RecordedDevice", SimpleNamespace(tap=one.tap))}, one.host)
     assert taps.names() == ["bow"]
     for name in ("stern", "bow"):
         taps.check(name, put.append)

@@ -4,13 +4,13 @@ from math import sqrt
 
 import pytest
 
-from imud.contracts.lines import Edge, ReadySettings
+from imud.contracts.lines import Edge, ReadyOptions
 from imud.sampling.path import ReadyEdges
 
 KEPT = 1024
 
 MS = 1_000_000
-EXACT = ReadySettings(line="Y", bias_us=0)
+EXACT = ReadyOptions(line="Y", bias_us=0)
 
 
 def edge(number: int, t_ns: int | None = None) -> Edge:
@@ -18,7 +18,7 @@ def edge(number: int, t_ns: int | None = None) -> Edge:
     return Edge(number * MS if t_ns is None else t_ns, True, number)
 
 
-def edges(*numbers: int, settings: ReadySettings = EXACT) -> ReadyEdges:
+def edges(*numbers: int, settings: ReadyOptions = EXACT) -> ReadyEdges:
     made = ReadyEdges(settings, MS)
     made.on_edges([edge(number) for number in numbers])
     return made
@@ -75,7 +75,7 @@ def test_reads_without_an_edge_or_too_late_for_it_are_of_none() -> None:
 
 
 def test_the_error_is_that_of_the_stamp_and_of_the_assumption() -> None:
-    plain, assumed = edges(1).match(MS, MS + 1), edges(1, settings=ReadySettings(line="Y")).match(MS, MS + 1)
+    plain, assumed = edges(1).match(MS, MS + 1), edges(1, settings=ReadyOptions(line="Y")).match(MS, MS + 1)
     assert plain is not None
     assert assumed is not None
     assert plain.err_ns == pytest.approx(3_000, abs=2)
@@ -92,6 +92,6 @@ def test_new_values_during_a_read_may_be_those_that_were_read(end_ms: float, eit
 
 @pytest.mark.parametrize(("offset_us", "t_ns"), [(-400, 600_000), (50, 1_050_000), (500, 1_100_000)])
 def test_the_offset_moves_the_stamp_but_not_behind_the_read(offset_us: float, t_ns: int) -> None:
-    stamp = edges(1, settings=ReadySettings(line="Y", offset_us=offset_us)).match(round(1.1 * MS), 2 * MS)
+    stamp = edges(1, settings=ReadyOptions(line="Y", offset_us=offset_us)).match(round(1.1 * MS), 2 * MS)
     assert stamp is not None
     assert stamp.t_ns == t_ns

@@ -29,7 +29,7 @@ from imud.links.memory import MemoryCanLink, MemoryLink
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 from imud.model.sample import Sample
-from imud.recording.observer import HostTap
+from imud.recording.observer import ClockObserver
 from imud.recording.player import PlayedDevice, Player
 from tests.support.event_loops import VirtualClock, run_virtually
 
@@ -139,7 +139,7 @@ class DeviceRigs:
     ) -> None:
         """Time, lines and workers are the real ones unless given; `configured` are all devices of the file."""
         self.host = host or HostClock()
-        self._host_tap = HostTap(self.host)
+        self._host_tap = ClockObserver(self.host)
         self.rigs: dict[str, DeviceRig] = {}
         self.factory = DeviceFactory(
             self._publish,

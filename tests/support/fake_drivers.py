@@ -29,12 +29,12 @@ from imud.contracts.script import (
     pause,
     says_nothing,
 )
-from imud.contracts.setting import DeviceSettings, Effect, Setting
+from imud.contracts.setting import Effect, Setting, SettingsTable
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
-from imud.links.memory import MemoryLink, MemorySettings
+from imud.links.memory import MemoryLink, MemoryOptions
 from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.ledger import Ledger
-from imud.model.options import NoSettings, Settings
+from imud.model.options import NoOptions, Options
 from imud.model.sample import Measurement
 
 SYNC: Final = b"\x5a\xa5"
@@ -133,7 +133,7 @@ FAKE_DRIVER: Final = StreamDriver(
     name="fake-uart",
     title="a fake",
     baud_rates=BAUD_RATES,
-    settings=NoSettings,
+    settings=NoOptions,
     make_codec=lambda ledger, options: FakeCodec(ledger),
     tick_ns=1_000_000,
     tick_modulus=1 << 32,
@@ -150,7 +150,7 @@ BASE: Final = 0x180
 SYNC_ID: Final = 0x080
 
 
-class FakeCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class FakeCanSettings(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Which device, and whether it wants a SYNC."""
 
     node: Annotated[int, Meta(ge=1, le=127)] = 1
@@ -282,7 +282,7 @@ class FakeModule(MemoryLink):
     """
 
     def __init__(self, now_ns: Callable[[], int], *, serial: str = "A1", baud: int | Literal["auto"] = 115200) -> None:
-        super().__init__(MemorySettings(name="/dev/fake", baud=baud))
+        super().__init__(MemoryOptions(name="/dev/fake", baud=baud))
         self.baud = self.baud or 115200
         self.serial = serial
         self.set = dict(FACTORY)
@@ -427,7 +427,7 @@ def _told(words: str, section: str, unit: str = "") -> Meta:
 
 
 OutputRates = dict[Literal["a", "b"], Annotated[int, Meta(ge=0, le=1000)]]
-FAKE_SETTINGS: Final = DeviceSettings(
+FAKE_SETTINGS: Final = SettingsTable(
     table={
         "baud": Setting(
             type=Annotated[Literal[9600, 115200, 921600], _told("rate of the line", "3.1", "bit/s")],

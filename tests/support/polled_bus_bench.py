@@ -11,8 +11,8 @@ import pytest
 from imud.config.model import DeviceConfig
 from imud.contracts.link import LinkType
 from imud.host.clock import HostClock
-from imud.links.i2c import I2cLink, I2cSettings
-from imud.links.spi import SpiLink, SpiSettings
+from imud.links.i2c import I2cLink, I2cOptions
+from imud.links.spi import SpiLink, SpiOptions
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.in_process_bus import InProcessI2c, InProcessSpi
 from imud.sim.ports.pins import MemoryLines
@@ -38,8 +38,8 @@ class PolledBusBench:
         self.lines = MemoryLines(self.clock.now_ns)
         self.before_next_time: Callable[[], None] | None = None
         """What happens right before a device or its bus looks at the time again."""
-        monkeypatch.setattr("imud.links.spi.LINK", LinkType("spi", SpiSettings, make_polled=self._make_spi))
-        monkeypatch.setattr("imud.links.i2c.LINK", LinkType("i2c", I2cSettings, make_polled=self._make_i2c))
+        monkeypatch.setattr("imud.links.spi.LINK", LinkType("spi", SpiOptions, make_polled=self._make_spi))
+        monkeypatch.setattr("imud.links.i2c.LINK", LinkType("i2c", I2cOptions, make_polled=self._make_i2c))
 
     def registers(self, **more: Any) -> Imu61xRegisters:
         return Imu61xRegisters(self.clock.now_ns, **more)
@@ -60,11 +60,11 @@ class PolledBusBench:
             before()
         return self.clock.now_ns()
 
-    def _make_spi(self, settings: SpiSettings) -> SpiLink:
+    def _make_spi(self, settings: SpiOptions) -> SpiLink:
         bus = self.spi
         return SpiLink(settings, ioctl=self._taking_time(bus.ioctl), open_node=bus.open, close_node=bus.close)
 
-    def _make_i2c(self, settings: I2cSettings) -> I2cLink:
+    def _make_i2c(self, settings: I2cOptions) -> I2cLink:
         self.i2c.i2c_rdwr = self._taking_time(InProcessI2c.i2c_rdwr.__get__(self.i2c))  # type: ignore[method-assign]  # the wire takes time
         return _ReadyI2c(settings, open_bus=self.i2c.open, ioctl=self.i2c.ioctl)
 

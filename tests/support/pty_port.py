@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from imud.contracts.command import Target
 from imud.contracts.script import Transfer, TransferScript
-from imud.drivers.hipnuc.modbus.codec import HipnucModbusSettings
+from imud.drivers.hipnuc.modbus.codec import HipnucModbusOptions
 from imud.formats.modbus import BROADCAST, SLAVES, ReplyFinder, frame_gap_ns, framed
 from imud.model.errors import TransferError, Trouble
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
@@ -183,7 +183,7 @@ class ModbusBench:
 
     @property
     def target(self) -> Target:
-        return Target(HipnucModbusSettings(), self.baud, places=tuple(dict.fromkeys((self.at, 7))))
+        return Target(HipnucModbusOptions(), self.baud, places=tuple(dict.fromkeys((self.at, 7))))
 
     def run(self, script: TransferScript[T]) -> T:
         return _run_transfers(script, self)

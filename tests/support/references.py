@@ -15,7 +15,7 @@ from typing import Final
 
 import msgspec
 
-from imud.attitude.published import FrameSettings, MountingAngles, MountingAxes
+from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes
 from imud.config.schema import TABLES, DeviceGeneral, General
 from imud.contracts.command import Action, Actions, Handling, parameters_of
 from imud.contracts.driver import Driver
@@ -37,8 +37,8 @@ from imud.formats.ring import (
 from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES, SlotField
 from imud.lines.sync import RESET, TRIGGER
 from imud.model.ledger import LEDGER_FIELDS
-from imud.model.options import Settings, expected, shown
-from imud.utc.receivers import RmcSettings
+from imud.model.options import Options, expected, shown
+from imud.utc.receivers import RmcOptions
 from tests.bench import clock_figures
 from tests.monitoring.alert_table import alert_table
 from tests.publishers.socket.schema import socket_schema
@@ -47,16 +47,16 @@ from tests.support.files import ROOT
 # --- docs/configuration.md --------------------------------------------------------------------------------------------
 
 
-def docs_of(schema: type[Settings]) -> dict[str, str]:
+def docs_of(schema: type[Options]) -> dict[str, str]:
     """The docstring below each field, its own and those it has from a base class."""
     found: dict[str, str] = {}
     for base in reversed(schema.__mro__):
-        if issubclass(base, Settings):
+        if issubclass(base, Options):
             found |= _own_docs_of(base)
     return found
 
 
-def _own_docs_of(schema: type[Settings]) -> dict[str, str]:
+def _own_docs_of(schema: type[Options]) -> dict[str, str]:
     (made,) = ast.parse(textwrap.dedent(inspect.getsource(schema))).body
     assert isinstance(made, ast.ClassDef)
     found, name = {}, ""
@@ -72,12 +72,12 @@ def _own_docs_of(schema: type[Settings]) -> dict[str, str]:
 LINE_TITLES = {name: text.rstrip(".") for name, text in docs_of(DeviceLines).items()}
 
 
-def settings_parts() -> Iterator[tuple[str, str, type[Settings]]]:
+def settings_parts() -> Iterator[tuple[str, str, type[Options]]]:
     yield "The daemon", "", General
     for name, publisher in TABLES.publishers.items():
         yield f"Output `{name}`", f"{name}.", publisher.settings
         for field in msgspec.structs.fields(publisher.settings):
-            if isinstance(field.default, Settings):
+            if isinstance(field.default, Options):
                 yield f"Output `{name}`: `{field.name}`", f"{name}.{field.name}.", type(field.default)
     yield "What the output `mqtt` sends of a device (`docs/fleet.md`)", "mqtt.devices.NAME.", DeviceSending
     yield "Each device", "devices.NAME.", DeviceGeneral
@@ -87,18 +87,18 @@ def settings_parts() -> Iterator[tuple[str, str, type[Settings]]]:
         yield f"Options of driver `{name}`", "devices.NAME.options.", driver.settings
     for name, schema in LINE_SCHEMAS.items():
         yield f"Line `{name}`: {LINE_TITLES[name]}", f"devices.NAME.lines.{name}.", schema
-    yield "How the sensor lies in its body (`docs/frames.md`)", "devices.NAME.frame.", FrameSettings
+    yield "How the sensor lies in its body (`docs/frames.md`)", "devices.NAME.frame.", FrameOptions
     yield "Axes of the sensor in the body", "devices.NAME.frame.axes.", MountingAxes
     yield "Angles of the sensor in the body", "devices.NAME.frame.euler.", MountingAngles
     yield "Noise of the device's samples, for covariances (`docs/export.md`)", "devices.NAME.noise.", Deviations
-    yield "RMC sentences for a device (`docs/time.md`)", "devices.NAME.rmc.", RmcSettings
+    yield "RMC sentences for a device (`docs/time.md`)", "devices.NAME.rmc.", RmcOptions
 
 
 def default_of(field: msgspec.structs.FieldInfo) -> str:
     if field.required:
         return "needed"
     default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
-    if isinstance(default, Settings):
+    if isinstance(default, Options):
         return "below"
     octal = field.name == "mode" and isinstance(default, int)
     return f"`{default:#o}`" if octal else f"`{shown(default)}`"
@@ -110,7 +110,7 @@ def settings_tables() -> str:
         text += [f"### {title}", "", "| key | expected | default | meaning |", "|---|---|---|---|"]
         docs = docs_of(schema)
         for field in msgspec.structs.fields(schema):
-            is_part = isinstance(field.default, Settings)
+            is_part = isinstance(field.default, Options)
             words = "keys and values" if is_part else expected(field.type).replace("|", "\\|")
             text.append(f"| `{path}{field.name}` | {words} | {default_of(field)} | {docs[field.name]} |")
         if not msgspec.structs.fields(schema):

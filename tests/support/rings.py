@@ -11,7 +11,7 @@ from imud.formats.ring import HEADER_BYTES, OFFSETS
 from imud.formats.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, SlotField, encode_slot
 from imud.model.ledger import Ledger
 from imud.model.sample import Sample, Sync
-from imud.publishers.shm import ShmPublisher, ShmSettings
+from imud.publishers.shm import ShmOptions, ShmPublisher
 
 DEVICE = "imu0"
 SLOTS = 64
@@ -56,7 +56,7 @@ class Board:
         self.now_ns = now_ns
         self.ledger = Ledger()
         self.driver = "hipnuc-uart"
-        self.settings = ShmSettings(directory=str(folder), slots=slots, group="")
+        self.settings = ShmOptions(directory=str(folder), slots=slots, group="")
         self.context = PublisherContext(lambda: [self.status()], epoch, lambda: self.now_ns)
         self.publisher = ShmPublisher(self.settings, self.context)
         self.publisher.start()

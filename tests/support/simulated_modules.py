@@ -18,11 +18,11 @@ from imud.contracts.driver import CanDriver
 from imud.contracts.script import Outcome, Reply, ReplyFrame, Request, RequestScript, Transfer
 from imud.contracts.setting import Written
 from imud.device.scripts import Session
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.canopen.driver import DRIVER as CANOPEN_DRIVER
-from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
 from imud.drivers.hipnuc.j1939.driver import DRIVER as J1939_DRIVER
-from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucSettings
+from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions
 from imud.drivers.hipnuc.uart.driver import ACTIONS
 from imud.drivers.imu61x.uart.codec import Imu61xCodec
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, CanFilter
@@ -183,7 +183,7 @@ def hardware_of(behaviour: Behaviour, **hardware: Any) -> HipnucHardware:
 class HipnucLine(SerialLine[HipnucModule]):
     def __init__(self, settings: ModuleSettings | None = None, hardware: HipnucHardware = HIPNUC_STILL) -> None:
         ledger = Ledger()
-        super().__init__(HipnucModule(BEGIN_NS, settings, hardware), HipnucCodec(ledger, HipnucSettings()), ledger)
+        super().__init__(HipnucModule(BEGIN_NS, settings, hardware), HipnucCodec(ledger, HipnucOptions()), ledger)
         self.wait(hardware.boot_ms)
 
     def act(self, name: str, *, fixed_baud: int = 0, **arguments: Any) -> Any:
@@ -311,7 +311,7 @@ class CanopenBench(CanBench):
             HipnucCanopenModule(BEGIN_NS, HipnucCanopenHardware(factory=NodeSettings(node=node), boot_ms=0))
             for node in others
         ]
-        settings = HipnucCanopenSettings(node=self.module.node)
+        settings = HipnucCanopenOptions(node=self.module.node)
         super().__init__(CANOPEN_DRIVER, self.module, settings, self.others)
 
 
@@ -327,7 +327,7 @@ class J1939Bench(CanBench):
         flash = settings or J1939Settings()
         self.module = HipnucJ1939Module(BEGIN_NS, flash, hardware)
         beside = [HipnucJ1939Module(BEGIN_NS, J1939Settings(address=one), J1939Hardware(boot_ms=0)) for one in others]
-        super().__init__(J1939_DRIVER, self.module, HipnucJ1939Settings(address=flash.address), beside)
+        super().__init__(J1939_DRIVER, self.module, HipnucJ1939Options(address=flash.address), beside)
 
 
 # --- IMU61x -----------------------------------------------------------------------------------------------------------

@@ -55,7 +55,7 @@ from imud.host import event_loop
 from imud.model.errors import Rejected
 from imud.model.sample import Sample, Sync
 from imud.publishers.socket.methods import METHODS
-from imud.publishers.socket.server import SocketServer, SocketSettings
+from imud.publishers.socket.server import SocketOptions, SocketServer
 from tests.publishers.socket.schema import MessageChecker
 
 T = TypeVar("T")
@@ -242,7 +242,7 @@ async def serving(
     path = directory / "imud.sock"
     own_group = grp.getgrgid(os.getgid()).gr_name
     server = SocketServer(
-        SocketSettings(**{"path": str(path), "group": own_group, **settings}), context(now_ns, latencies, recording)
+        SocketOptions(**{"path": str(path), "group": own_group, **settings}), context(now_ns, latencies, recording)
     )
     server.start()
     for name, number in DEVICES.items():

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from imud.config.model import DeviceConfig
-from imud.contracts.lines import DeviceLines, LineFactory, OutputSettings
+from imud.contracts.lines import DeviceLines, LineFactory, OutputOptions
 from imud.device import utc as utc_keeper
 from imud.formats.nmea0183 import build
-from imud.links.memory import MemoryLink, MemorySettings
+from imud.links.memory import MemoryLink, MemoryOptions
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_MS, NS_PER_S
@@ -22,7 +22,7 @@ from imud.sim.imu61x.uart import Imu61xModule
 from imud.sim.ports.faults import Faults
 from imud.sim.ports.pins import MemoryInput, MemoryLines, MemoryOutput, OnEdge, Pin, PinFaults, Pins
 from imud.sim.ports.uart_wire import heard
-from imud.utc.receivers import RmcSettings
+from imud.utc.receivers import RmcOptions
 from imud.utc.system_clock import KernelClock
 from tests.support.device_rig import DeviceRigs
 from tests.support.event_loops import LoopWorker, VirtualClock, run_virtually
@@ -49,7 +49,7 @@ class WiredDevice:
         frame_faults: Faults | None = None,
         pin_faults: PinFaults | None = None,
         identify: bool = False,
-        rmc: RmcSettings | None = None,
+        rmc: RmcOptions | None = None,
     ) -> None:
         self.clock = VirtualClock(BEGIN_NS)
         self.source = FakeSource()
@@ -59,7 +59,7 @@ class WiredDevice:
         """Instant of measurement by device time (ms) of the frames that arrived."""
         self.frames: list[int] = []
         self._config = DeviceConfig(
-            "bow", "hipnuc-uart", None, identify, "memory", MemorySettings(baud=BAUD), lines=lines, rmc=rmc
+            "bow", "hipnuc-uart", None, identify, "memory", MemoryOptions(baud=BAUD), lines=lines, rmc=rmc
         )
         self._rigs = DeviceRigs(self.clock.host, lines=LineFactory(self.memory.input, self._output, LoopWorker))
         self._settings, self._hardware = settings, hardware
@@ -176,7 +176,7 @@ class WiredDevice:
             pulses = self._pulses[pin]
             pulses[len(pulses) + 1] = t_ns - EDGE_LATE_NS
 
-    def _output(self, _settings: OutputSettings, purpose: str) -> MemoryOutput:
+    def _output(self, _settings: OutputOptions, purpose: str) -> MemoryOutput:
         return self.memory.outputs.setdefault(
             purpose, MemoryOutput(purpose, now_ns=self.clock.now_ns, on_change=self._on_sin)
         )
@@ -196,7 +196,7 @@ class WiredDevice:
 
 
 class LinkedModule(MemoryLink):
-    def __init__(self, settings: MemorySettings, module: HipnucModule, clock: VirtualClock) -> None:
+    def __init__(self, settings: MemoryOptions, module: HipnucModule, clock: VirtualClock) -> None:
         super().__init__(settings)
         self.module = module
         self.clock = clock
@@ -226,7 +226,7 @@ class LinkedDevice:
         driver, identify = config.pop("driver", "hipnuc-uart"), config.pop("identify", True)
         lines: DeviceLines | None = config.pop("lines", None)
         declared = config.pop("declared", None)
-        memory = MemorySettings(**{"baud": 115200, **config})
+        memory = MemoryOptions(**{"baud": 115200, **config})
         self.module = HipnucModule(clock.now_ns(), settings, hardware)
         self.link = LinkedModule(memory, self.module, clock)
         self.rigs = DeviceRigs(clock.host)
@@ -283,7 +283,7 @@ LINE_STEP_S = 0.001
 class Imu61xLine(MemoryLink):
     """A line in virtual time with a device at its far end; `carry` must run."""
 
-    def __init__(self, settings: MemorySettings, module: Imu61xModule, clock: VirtualClock) -> None:
+    def __init__(self, settings: MemoryOptions, module: Imu61xModule, clock: VirtualClock) -> None:
         super().__init__(settings)
         self.module = module
         self.clock = clock

@@ -10,7 +10,7 @@ from imud.contracts.status import KernelCounters
 from imud.formats.nmea0183 import build
 from imud.model.errors import LinkError, LinkMissing
 from imud.model.units import NS_PER_S
-from imud.utc.receivers import FIRST_PAUSE_S, GpsdSource, NmeaPortSource, Retry, RmcSettings, SourceContext, make_nmea
+from imud.utc.receivers import FIRST_PAUSE_S, GpsdSource, NmeaPortSource, Retry, RmcOptions, SourceContext, make_nmea
 from tests.support.event_loops import in_loop
 from tests.support.rmc_sources import LIMIT_S, Sentences, soon
 
@@ -31,7 +31,7 @@ def play(serve: Serve, scene: Scene, gps: str = "", retry: Retry | None = None) 
         server = await asyncio.start_server(one, "127.0.0.1", 0)
         port = server.sockets[0].getsockname()[1]
         sentences = Sentences()
-        source = GpsdSource(RmcSettings(source="gpsd", tcp_port=port, gps=gps), time.monotonic_ns, retry or Retry(soon))
+        source = GpsdSource(RmcOptions(source="gpsd", tcp_port=port, gps=gps), time.monotonic_ns, retry or Retry(soon))
         async with server:
             source.start(sentences)
             try:
@@ -108,7 +108,7 @@ async def test_an_unreachable_server_is_a_problem_and_not_the_end() -> None:
         paused.set()
         await asyncio.sleep(0)
 
-    source = GpsdSource(RmcSettings(source="gpsd", tcp_port=port), time.monotonic_ns, Retry(sleep))
+    source = GpsdSource(RmcOptions(source="gpsd", tcp_port=port), time.monotonic_ns, Retry(sleep))
     source.start(Sentences())
     async with asyncio.timeout(LIMIT_S):
         await paused.wait()
@@ -233,6 +233,6 @@ async def test_the_row_makes_it_of_the_port_that_is_named() -> None:
         return Port()
 
     context = SourceContext(make_port, time.monotonic_ns, lambda: 0)
-    source = make_nmea(RmcSettings(source="nmea", port="/dev/ttyGNSS", baud=38400), context)
+    source = make_nmea(RmcOptions(source="nmea", port="/dev/ttyGNSS", baud=38400), context)
     assert source.title == "NMEA receiver on /dev/ttyGNSS"
     assert asked == [("/dev/ttyGNSS", 38400)]

@@ -8,7 +8,7 @@ import pytest
 from imud.formats.nmea0183 import Rmc, parse
 from imud.host.clock import HostClock
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.utc.receivers import RmcSettings
+from imud.utc.receivers import RmcOptions
 from imud.utc.system_clock import (
     AFTER_NS,
     LATEST_NS,
@@ -82,7 +82,7 @@ class SystemClockBench:
         self.clock = clock
         self.got: list[tuple[bytes, int]] = []
         self.source = SystemClockSource(
-            RmcSettings(source="system", rate_hz=rate_hz),
+            RmcOptions(source="system", rate_hz=rate_hz),
             lambda: self.now_ns,
             lambda: OFFSET_NS,
             lambda: self.clock,
@@ -146,7 +146,7 @@ async def test_a_clock_that_is_not_good_enough_gives_none_and_says_why(clock: Ke
 
 def test_it_runs_in_the_loop_and_stops() -> None:
     clock, sentences = VirtualClock(), Sentences()
-    settings = RmcSettings(source="system", rate_hz=10)
+    settings = RmcOptions(source="system", rate_hz=10)
     source = SystemClockSource(settings, clock.now_ns, clock.host.utc_offset_ns, lambda: GOOD)
 
     async def scene() -> None:

@@ -11,9 +11,9 @@ from imud.cli.doctor.surroundings import DoctorFinding, Findings, Surroundings, 
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.model.errors import LinkDenied, reason_of
 from imud.model.units import NS_PER_S, NS_PER_US
-from imud.publishers.metrics.publisher import MetricsSettings, Scrapes
-from imud.publishers.recorder.directory import RecorderSettings
-from imud.publishers.shm import ShmSettings
+from imud.publishers.metrics.publisher import MetricsOptions, Scrapes
+from imud.publishers.recorder.directory import RecorderOptions
+from imud.publishers.shm import ShmOptions
 
 ENABLED: Final = ("enabled", "enabled-runtime", "linked", "static", "alias")
 EXIT_ADVICE: Final = {
@@ -199,9 +199,9 @@ def _in_shared_memory(at: Surroundings) -> list[tuple[str, str]]:
     publishers = at.config.publishers if at.config is not None else {}
     shm, recorder = publishers.get("shm"), publishers.get("recorder")
     found = []
-    if isinstance(shm, ShmSettings) and shm.enabled:
+    if isinstance(shm, ShmOptions) and shm.enabled:
         found.append(("shm.directory", shm.directory))
-    if isinstance(recorder, RecorderSettings) and recorder.flight.enabled:
+    if isinstance(recorder, RecorderOptions) and recorder.flight.enabled:
         found.append(("recorder.flight.directory", recorder.flight.directory))
     return [(key, folder) for key, folder in found if f"{folder}/".startswith(f"{SHARED_MEMORY}/")]
 
@@ -209,7 +209,7 @@ def _in_shared_memory(at: Surroundings) -> list[tuple[str, str]]:
 def prometheus(at: Surroundings) -> Findings:
     """Ask the metrics endpoint how often it was scraped."""
     settings = at.config.publishers.get("metrics") if at.config is not None else None
-    if not isinstance(settings, MetricsSettings):
+    if not isinstance(settings, MetricsOptions):
         yield not_checked("the address of the metrics is not known without a configuration")
         return
     if not settings.enabled:

@@ -12,7 +12,7 @@ from fnmatch import fnmatch
 from typing import Final, NamedTuple
 
 from imud.cli.doctor.surroundings import DoctorFinding, Findings, Surroundings, error, not_checked, note, ok, warning
-from imud.contracts.lines import DeviceLines, LineSettings
+from imud.contracts.lines import DeviceLines, LineOptions
 from imud.host.files import GROUP_ACCESS
 from imud.links.device_node import holders_of
 from imud.links.serial_port import list_ports, read_latency_timer_ms
@@ -121,7 +121,7 @@ def _nodes(at: Surroundings) -> Iterator[str]:
 def _chips(lines: DeviceLines) -> Iterator[str]:
     for name in lines.__struct_fields__:
         line = getattr(lines, name)
-        if isinstance(line, LineSettings) and line.chip.removeprefix("/dev/").startswith("gpiochip"):
+        if isinstance(line, LineOptions) and line.chip.removeprefix("/dev/").startswith("gpiochip"):
             yield f"/dev/{line.chip.removeprefix('/dev/')}"
 
 

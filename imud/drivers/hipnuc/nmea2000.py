@@ -34,7 +34,7 @@ from imud.drivers.hipnuc.common import FLOATS
 from imud.formats.can import CanFilter, CanFrame
 from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, sender_of
 from imud.model.ledger import Ledger
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
 from imud.model.units import NS_PER_S
 
@@ -153,8 +153,8 @@ _PGNS: Final = {join(J1939Id(0, pgn, 0)): pgn for pgn in PGNS}
 _REFERENCES: Final = {"true": Reference.TRUE, "magnetic": Reference.MAGNETIC, "auto": None}
 
 
-class HipnucNmea2000Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a heading or attitude sensor."""
+class HipnucNmea2000Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of a heading or attitude sensor."""
 
     source: Literal["auto"] | Annotated[int, Meta(ge=0, le=ADDRESS_MAX)] = "auto"
     """Address of the sender; `auto` for the first who is heard, and another one when that is silent."""
@@ -165,7 +165,7 @@ class HipnucNmea2000Settings(Settings, frozen=True, kw_only=True, forbid_unknown
 class HipnucNmea2000Codec:
     """Decoder of the frames of one sender. Synchronization: one thread."""
 
-    def __init__(self, ledger: Ledger, settings: HipnucNmea2000Settings) -> None:
+    def __init__(self, ledger: Ledger, settings: HipnucNmea2000Options) -> None:
         self.ledger = ledger
         self._fixed = None if settings.source == "auto" else settings.source
         self._wanted_reference = _REFERENCES[settings.heading]
@@ -281,7 +281,7 @@ def _example_frames(random: Random) -> list[CanFrame]:
     return [CanFrame(can_id, True, data, 0) for can_id, data in made]
 
 
-def _filters(settings: HipnucNmea2000Settings) -> list[CanFilter]:
+def _filters(settings: HipnucNmea2000Options) -> list[CanFilter]:
     """The three messages, of one sender or of any."""
     source = None if settings.source == "auto" else settings.source
     return [filter_of(pgn, source) for pgn in PGNS]
@@ -294,14 +294,14 @@ def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
 
 def _heading(settings: object, _read_back: Mapping[str, str]) -> Heading:
     """By the heading that is used; with `auto` the first that is received, which is not known beforehand."""
-    chosen = settings.heading if isinstance(settings, HipnucNmea2000Settings) else "auto"
+    chosen = settings.heading if isinstance(settings, HipnucNmea2000Options) else "auto"
     return Heading.UNKNOWN if chosen == "auto" else Heading(chosen)
 
 
 DRIVER: Final = CanDriver(
     name="hipnuc-nmea2000",
     title="HiPNUC CH0x0, CH10x, HI14, other heading and attitude sensors (CAN, NMEA 2000)",
-    settings=HipnucNmea2000Settings,
+    settings=HipnucNmea2000Options,
     make_codec=HipnucNmea2000Codec,
     filters=_filters,
     tick_ns=SAMPLE_COUNTER,
@@ -312,7 +312,7 @@ DRIVER: Final = CanDriver(
     data_sheet=FLOATS,
     heading=_heading,
     node_of=_node_of,
-    node_settings=lambda source: HipnucNmea2000Settings(source=source),
+    node_settings=lambda source: HipnucNmea2000Options(source=source),
     node_title=lambda source: f"source {source}",
     identify=lambda _settings: says_nothing(Identity()),
     read_settings=lambda _settings: says_nothing({}),

@@ -52,7 +52,7 @@ from imud.drivers.imu61x.common import (
 )
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame
 from imud.model.ledger import Ledger
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
 from imud.model.units import RAD_PER_DEG
 
@@ -77,8 +77,8 @@ _FLOATS: Final = tuple(struct.Struct(layout) for layout in ("<2f", "<2f", "<2f",
 _IN_ORDER: Final = (0, 1, 2, 3)
 
 
-class Imu61xCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of an IMU61x on CAN."""
+class Imu61xCanOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of an IMU61x on CAN."""
 
     base_id: Annotated[int, Meta(ge=0, le=STANDARD_ID_MAX - _CLOSING)] = BASE_ID
     """Identifier of the first of the five frames, decimal; the others follow it."""
@@ -120,7 +120,7 @@ def _moved(mean_ns: int, new_ns: int) -> int:
 class Imu61xCanCodec:
     """Decoder of the frames of one device. Synchronization: one thread."""
 
-    def __init__(self, ledger: Ledger, settings: Imu61xCanSettings) -> None:
+    def __init__(self, ledger: Ledger, settings: Imu61xCanOptions) -> None:
         self.ledger = ledger
         self._slots = {settings.base_id + slot: slot for slot in range(SET_FRAMES)}
         self._held: dict[int, bytes] = {}
@@ -264,7 +264,7 @@ def _example_frames(random: Random) -> list[CanFrame]:
     return [CanFrame(can_id, False, data, 0) for can_id, data in frames]
 
 
-def _filters(settings: Imu61xCanSettings) -> list[CanFilter]:
+def _filters(settings: Imu61xCanOptions) -> list[CanFilter]:
     """The five identifiers, each by itself: other devices may have those next to them."""
     return [CanFilter(settings.base_id + slot, STANDARD_ID_MAX, False) for slot in range(SET_FRAMES)]
 
@@ -278,7 +278,7 @@ def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
 DRIVER: Final = CanDriver(
     name="imu61x-can",
     title="Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B (CAN)",
-    settings=Imu61xCanSettings,
+    settings=Imu61xCanOptions,
     make_codec=Imu61xCanCodec,
     filters=_filters,
     tick_ns=SAMPLE_COUNTER,
@@ -289,7 +289,7 @@ DRIVER: Final = CanDriver(
     axes=FLU_LEVEL,
     heading=relative_heading,
     node_of=_node_of,
-    node_settings=lambda base_id: Imu61xCanSettings(base_id=base_id),
+    node_settings=lambda base_id: Imu61xCanOptions(base_id=base_id),
     node_title=lambda base_id: f"base_id {base_id}",
     identify=lambda _settings: says_nothing(Identity()),
     read_settings=lambda _settings: says_nothing({}),

@@ -17,7 +17,7 @@ from imud.contracts.codec import BadReason, Poll, PolledEvent, Vanished
 from imud.contracts.command import Target
 from imud.contracts.driver import Identity
 from imud.contracts.script import Transfer, TransferScript
-from imud.contracts.setting import DeviceSettings
+from imud.contracts.setting import SettingsTable
 from imud.drivers.imu61x.common import (
     I2C_ADDRESSES,
     M_S2_PER_G,
@@ -33,7 +33,7 @@ from imud.drivers.imu61x.registers import (
     I2C_BURST,
     PROD_ID,
     FilterControl,
-    RegisterSettings,
+    RegisterOptions,
     check_filter,
     check_settings,
     filter_settings,
@@ -56,12 +56,12 @@ def write_filter(control: int) -> Transfer:
     return Transfer((bytes([FILTER_CTRL, control]),))
 
 
-def probe(_settings: RegisterSettings) -> TransferScript[Identity]:
+def probe(_settings: RegisterOptions) -> TransferScript[Identity]:
     """Read PROD_ID. Raises DeviceRefused for anything but an IMU61x."""
     return identity_of((yield READ_ID))
 
 
-def set_up(settings: RegisterSettings) -> TransferScript[Mapping[str, str]]:
+def set_up(settings: RegisterOptions) -> TransferScript[Mapping[str, str]]:
     """Write FILTER_CTRL where it differs, read it back. Raises DeviceRefused if it is not the value written."""
     present = yield from read_control()
     wanted = wanted_filter(settings, present)
@@ -86,7 +86,7 @@ def id_problem(data: bytes) -> str:
     return "" if product_of(data) is not None else f"wrong product id {data.hex(' ')}"
 
 
-def filter_problem(data: bytes, settings: RegisterSettings) -> str:
+def filter_problem(data: bytes, settings: RegisterOptions) -> str:
     """Compare a FILTER_CTRL that was read later; an empty string if it is as set up."""
     wanted = wanted_filter(settings, _only(data))
     if data == bytes([wanted]):
@@ -111,7 +111,7 @@ class Imu61xI2cCodec:
 
     polls: Sequence[Poll] = (Poll(READ_BURST), Poll(READ_ID, CHECK_NS), Poll(READ_FILTER, CHECK_NS))
 
-    def __init__(self, ledger: Ledger, settings: RegisterSettings) -> None:
+    def __init__(self, ledger: Ledger, settings: RegisterOptions) -> None:
         self.ledger = ledger
         self._settings = settings
         self._frames = PolledFrameDecoder(ledger, FRAME.size)
@@ -169,7 +169,7 @@ def _read(_target: Target) -> TransferScript[Mapping[str, Any]]:
     return filter_words((yield from read_control()))
 
 
-SETTINGS: Final = DeviceSettings(
+SETTINGS: Final = SettingsTable(
     table=filter_settings(FilterControl(read_control, write_control)), read=_read, check=check_settings
 )
 """Lost when the device restarts; what it starts with is parameter 31 of its UART."""
@@ -189,7 +189,7 @@ OVERHEAD_BITS: Final = 2 * BITS_PER_BYTE + 3
 """The address twice, start, repeated start and stop."""
 
 
-def _read_ns(_options: RegisterSettings, _link: Any) -> int:
+def _read_ns(_options: RegisterOptions, _link: Any) -> int:
     """318 bits, 795 µs."""
     (register,) = READ_BURST.sends
     bits = OVERHEAD_BITS + (len(register) + READ_BURST.read_bytes) * BITS_PER_BYTE
@@ -197,5 +197,5 @@ def _read_ns(_options: RegisterSettings, _link: Any) -> int:
 
 
 DRIVER: Final = register_driver(
-    "i2c", RegisterSettings, I2C_ADDRESSES, probe, set_up, Imu61xI2cCodec, _example_reading, _read_ns, SETTINGS
+    "i2c", RegisterOptions, I2C_ADDRESSES, probe, set_up, Imu61xI2cCodec, _example_reading, _read_ns, SETTINGS
 )

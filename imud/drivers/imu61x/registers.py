@@ -15,7 +15,7 @@ from imud.contracts.codec import PolledCodec
 from imud.contracts.command import Action, Target
 from imud.contracts.driver import Identity, KeyProblem, PolledDriver
 from imud.contracts.script import TransferScript
-from imud.contracts.setting import DeviceSettings, Setting
+from imud.contracts.setting import Setting, SettingsTable
 from imud.drivers.imu61x.common import (
     ACCEL_FILTER,
     EULER_CONVENTION,
@@ -37,15 +37,15 @@ from imud.drivers.imu61x.common import (
 from imud.drivers.polled_frames import absence
 from imud.model.errors import BadArgument, DeviceRefused
 from imud.model.ledger import Ledger
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.units import NS_PER_S
 
 CHECK_NS: Final = 10 * NS_PER_S
 """Interval of reading identity and settings again: a device that restarted by itself has lost unsaved settings."""
 
 
-class RegisterSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of an IMU61x on a polled bus."""
+class RegisterOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of an IMU61x on a polled bus."""
 
     accel_filter: FilterChoice | None = None
     """Low-pass filter of the accelerometer, by name, or by its code in the order of these names (11: 47 Hz); null
@@ -56,7 +56,7 @@ class RegisterSettings(Settings, frozen=True, kw_only=True, forbid_unknown_field
     """Rate at which the device renews its registers, per second, for the error of time stamps; 0 if not known."""
 
 
-S = TypeVar("S", bound=RegisterSettings)
+S = TypeVar("S", bound=RegisterOptions)
 SetUp = Callable[[S], TransferScript[Mapping[str, str]]]
 
 
@@ -72,7 +72,7 @@ def identity_of(product_id: bytes) -> Identity:
     return Identity(product=product)
 
 
-def wanted_filter(settings: RegisterSettings, present: int) -> int:
+def wanted_filter(settings: RegisterOptions, present: int) -> int:
     """The value that FILTER_CTRL should have, from the value that it has."""
     accel, gyro = filter_codes(present)
     return filter_control(
@@ -134,12 +134,12 @@ def filter_settings(control: FilterControl) -> Mapping[str, Setting]:
 
 def check_settings(target: Target, values: Mapping[str, Any]) -> None:
     """Raise BadArgument for a filter that `options` fix otherwise."""
-    if isinstance(target.settings, RegisterSettings):
+    if isinstance(target.settings, RegisterOptions):
         filters = {name: values.get(name) for name in ("accel_filter", "gyro_filter")}
         _require_as_configured(target.settings, **filters)
 
 
-def _require_as_configured(settings: RegisterSettings, **wanted: FilterChoice | None) -> None:
+def _require_as_configured(settings: RegisterOptions, **wanted: FilterChoice | None) -> None:
     """Raise BadArgument for a filter that `options` fix otherwise: they would soon be written again."""
     for name, choice in wanted.items():
         configured: FilterChoice | None = getattr(settings, name)
@@ -184,7 +184,7 @@ def register_driver(
     make_codec: Callable[[Ledger, Any], PolledCodec],
     example_reading: Callable[[Random], bytes],
     read_ns: Callable[[Any, Any], int],
-    device_settings: DeviceSettings,
+    device_settings: SettingsTable,
 ) -> PolledDriver:
     """The row of the driver on `bus` (`i2c` or `spi`)."""
 
@@ -221,7 +221,7 @@ def register_driver(
     )
 
 
-def _update_ns(settings: RegisterSettings) -> int:
+def _update_ns(settings: RegisterOptions) -> int:
     """Time between two updates of the registers; 0 for not known."""
     return int(NS_PER_S / settings.update_hz) if settings.update_hz else 0
 

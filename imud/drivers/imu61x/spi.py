@@ -15,7 +15,7 @@ from imud.contracts.codec import BadReason, Poll, PolledEvent, Vanished
 from imud.contracts.command import Target
 from imud.contracts.driver import Identity
 from imud.contracts.script import Transfer, TransferScript
-from imud.contracts.setting import DeviceSettings, Setting
+from imud.contracts.setting import Setting, SettingsTable
 from imud.drivers.imu61x.common import M_S2_PER_G, RAD_S_PER_DEG_S, crc32, random_vector, scaled
 from imud.drivers.imu61x.registers import (
     BURST,
@@ -30,7 +30,7 @@ from imud.drivers.imu61x.registers import (
     WIN_CTRL,
     ZACCEL_LOW,
     FilterControl,
-    RegisterSettings,
+    RegisterOptions,
     check_filter,
     check_settings,
     filter_settings,
@@ -175,7 +175,7 @@ BURST_TRIES: Final = 3
 """One damaged burst, or one write that was lost, is no refusal."""
 
 
-class SpiDeviceSettings(RegisterSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SpiDeviceOptions(RegisterOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of an IMU61x on SPI."""
 
     burst: Literal["standard", "extended", "registers"] = "standard"
@@ -198,7 +198,7 @@ class State:
         """The words at 0x0C and 0x0D."""
         self.window = window & WINDOW_ID
 
-    def differences(self, settings: SpiDeviceSettings) -> str:
+    def differences(self, settings: SpiDeviceOptions) -> str:
         """Compare filter and window with the settings; an empty string if all agrees. Bursts show by themselves."""
         wanted = wanted_filter(settings, self.filter)
         if self.filter != wanted:
@@ -215,12 +215,12 @@ class State:
 # --- scripts ---------------------------------------------------------------------------------------------------------
 
 
-def probe(_settings: SpiDeviceSettings) -> TransferScript[Identity]:
+def probe(_settings: SpiDeviceOptions) -> TransferScript[Identity]:
     """Read PROD_ID1 … 4, and close the window in any case. Raises DeviceRefused for anything but an IMU61x."""
     return identity_of((yield from read_state()).product_id)
 
 
-def set_up(settings: SpiDeviceSettings) -> TransferScript[Mapping[str, str]]:
+def set_up(settings: SpiDeviceOptions) -> TransferScript[Mapping[str, str]]:
     """Write FILTER_CTRL and BURST_CTRL where they differ and read back. Raises DeviceRefused if they differ still.
 
     Where BURST_CTRL reads back is not certain, so a burst itself decides which kind is selected.
@@ -301,7 +301,7 @@ class Imu61xSpiCodec:
     word at most).
     """
 
-    def __init__(self, ledger: Ledger, settings: SpiDeviceSettings) -> None:
+    def __init__(self, ledger: Ledger, settings: SpiDeviceOptions) -> None:
         self.ledger = ledger
         self.polls: Sequence[Poll] = POLLS[settings.burst]
         self._settings = settings
@@ -421,7 +421,7 @@ def _read(_target: Target) -> TransferScript[Mapping[str, Any]]:
     return {**filter_words(state.filter), "burst": state.kind}
 
 
-SETTINGS: Final = DeviceSettings(
+SETTINGS: Final = SettingsTable(
     table={**filter_settings(FilterControl(read_control, write_control)), "burst": Setting(type=Burst)},
     read=_read,
     check=check_settings,
@@ -435,7 +435,7 @@ def _example_reading(random: Random) -> bytes:
     return pipeline + encode_standard(accel_m_s2=random_vector(random, 9.8), gyro_rad_s=random_vector(random, 2))
 
 
-def _read_ns(options: SpiDeviceSettings, link: Any) -> int:
+def _read_ns(options: SpiDeviceOptions, link: Any) -> int:
     """The bits at the bus's clock, and the pauses between words: 256 µs for a standard burst at 1 MHz."""
     transfer = POLLS[options.burst][0].transfer
     bits = 8 * sum(map(len, transfer.sends))
@@ -444,5 +444,5 @@ def _read_ns(options: SpiDeviceSettings, link: Any) -> int:
 
 
 DRIVER: Final = register_driver(
-    "spi", SpiDeviceSettings, MODES, probe, set_up, Imu61xSpiCodec, _example_reading, _read_ns, SETTINGS
+    "spi", SpiDeviceOptions, MODES, probe, set_up, Imu61xSpiCodec, _example_reading, _read_ns, SETTINGS
 )

@@ -30,7 +30,7 @@ from imud.contracts.publisher import PublisherContext, PublisherType
 from imud.contracts.status import ClientStatus, DeviceStatus
 from imud.host.log import messages_dropped
 from imud.model.event import Event
-from imud.model.options import Settings, is_ip_address, shown
+from imud.model.options import Options, is_ip_address, shown
 from imud.model.units import NS_PER_S
 from imud.publishers.metrics.families import (
     FAMILIES,
@@ -60,8 +60,8 @@ JSON: Final = "application/json"
 ABOUT: Final = b"imud: metrics for Prometheus are at /metrics\n"
 
 
-class MetricsSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the Prometheus endpoint."""
+class MetricsOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of the Prometheus endpoint."""
 
     enabled: bool = True
     """Whether metrics are served at all."""
@@ -187,7 +187,7 @@ class MetricsPublisher:
     publish: Final = None
     """Samples are counted by the pipeline."""
 
-    def __init__(self, settings: MetricsSettings, context: PublisherContext, *, snapshot_s: float = SNAPSHOT_S) -> None:
+    def __init__(self, settings: MetricsOptions, context: PublisherContext, *, snapshot_s: float = SNAPSHOT_S) -> None:
         self._settings = settings
         self._context = context
         self._snapshot_s = snapshot_s
@@ -323,4 +323,4 @@ class MetricsPublisher:
             )
 
 
-PUBLISHER = PublisherType("metrics", MetricsSettings, MetricsPublisher, required=False)
+PUBLISHER = PublisherType("metrics", MetricsOptions, MetricsPublisher, required=False)

@@ -11,8 +11,8 @@ from typing import Annotated, Final, NamedTuple
 
 import msgspec
 
-from imud.contracts.lines import InputSettings
-from imud.model.options import Settings
+from imud.contracts.lines import InputOptions
+from imud.model.options import Options
 from imud.model.units import NS_PER_S
 
 SUFFIX: Final = ".imudrec"
@@ -108,8 +108,8 @@ class RecordingDirectory:
 MEGABYTE: Final = 1_000_000
 
 
-class FlightSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the flight recorder."""
+class FlightOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of the flight recorder."""
 
     enabled: bool = False
     """Whether imud keeps the last minutes, to be saved by an alert or by `imud record --snapshot`."""
@@ -126,15 +126,15 @@ class FlightSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """An acceleration above which a sample is an alert, m/s², gravity included; null for none."""
     device_lost: bool = True
     """Whether it is an alert that a device that was running is gone or silent."""
-    line: InputSettings | None = None
+    line: InputOptions | None = None
     """A GPIO line whose becoming active is an alert, with the keys `line`, `chip`, `active_low` and `bias` as those of
     a device; null for none."""
     per_hour: Annotated[int, msgspec.Meta(ge=1, le=3600)] = 6
     """At most so many snapshots are saved by alerts within an hour."""
 
 
-class RecorderSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the recorder."""
+class RecorderOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of the recorder."""
 
     enabled: bool = False
     """Whether imud records always, to files that follow one another."""
@@ -148,7 +148,7 @@ class RecorderSettings(Settings, frozen=True, kw_only=True, forbid_unknown_field
     """A new file begins at this size, MB (10⁶ bytes), …"""
     file_minutes: Annotated[float, msgspec.Meta(ge=1, le=10_080)] = 60.0
     """… or after this time, whichever comes first."""
-    flight: FlightSettings = FlightSettings()
+    flight: FlightOptions = FlightOptions()
     """The flight recorder: the last minutes, saved when something happens."""
 
     def __post_init__(self) -> None:

@@ -31,7 +31,7 @@ from imud.publishers.recorder.directory import (
     RETRY_NS,
     SNAPSHOT,
     SUFFIX,
-    RecorderSettings,
+    RecorderOptions,
     RecordingDirectory,
 )
 from imud.publishers.recorder.writer import FLAGS, WRITE_NS, RecordFeed, RecordQueue
@@ -488,7 +488,7 @@ class FlightRecorder:
 
     def __init__(
         self,
-        settings: RecorderSettings,
+        settings: RecorderOptions,
         context: PublisherContext,
         directory: RecordingDirectory,
         start_worker: StartWorker = BusThread,

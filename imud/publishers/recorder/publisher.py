@@ -10,7 +10,7 @@ from imud.host.threads import BusThread, StartWorker
 from imud.model.errors import ServerError, reason_of
 from imud.model.event import Event, EventKind
 from imud.model.units import NS_PER_S
-from imud.publishers.recorder.directory import MEGABYTE, RETRY_NS, RecorderSettings, RecordingDirectory
+from imud.publishers.recorder.directory import MEGABYTE, RETRY_NS, RecorderOptions, RecordingDirectory
 from imud.publishers.recorder.flight import FlightRecorder
 from imud.publishers.recorder.writer import RecordFeed, RecordingWriter, RecordQueue
 
@@ -22,7 +22,7 @@ class Recorder:
 
     def __init__(
         self,
-        settings: RecorderSettings,
+        settings: RecorderOptions,
         context: PublisherContext,
         directory: RecordingDirectory,
         start_worker: StartWorker = BusThread,
@@ -188,7 +188,7 @@ class RecorderOutput:
     """What the settings ask for. Synchronization: the event loop's thread only."""
 
     def __init__(
-        self, settings: RecorderSettings, context: PublisherContext, start_worker: StartWorker = BusThread
+        self, settings: RecorderOptions, context: PublisherContext, start_worker: StartWorker = BusThread
     ) -> None:
         directory = RecordingDirectory(Path(settings.directory), settings.keep_bytes)
         self._flight = FlightRecorder(settings, context, directory, start_worker) if settings.flight.enabled else None
@@ -236,8 +236,8 @@ class RecorderOutput:
             part.close()
 
 
-def _wanted(settings: RecorderSettings) -> bool:
+def _wanted(settings: RecorderOptions) -> bool:
     return settings.enabled or settings.flight.enabled
 
 
-PUBLISHER = PublisherType("recorder", RecorderSettings, RecorderOutput, _wanted, required=False)
+PUBLISHER = PublisherType("recorder", RecorderOptions, RecorderOutput, _wanted, required=False)

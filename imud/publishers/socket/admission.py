@@ -293,7 +293,7 @@ class Quota:
             raise _too_many("the daemon has no descriptor to spare for clients")
 
 
-class Seldom:
+class RateLimitedLog:
     """Says when a message that may come very often is to be logged: once a minute, with the count."""
 
     def __init__(self, now_ns: Callable[[], int]) -> None:

@@ -159,8 +159,8 @@ LINGER_TICKS: Final = 20
 class ServerSide:
     """What a connection needs of the server."""
 
-    on_line: Callable[["Connection", bytes], None]
-    on_close: Callable[["Connection"], None]
+    on_line: Callable[["ClientConnection", bytes], None]
+    on_close: Callable[["ClientConnection"], None]
     on_evicted: Callable[[], None]
     on_failed: Callable[[Exception], None]
     limits: Limits
@@ -168,7 +168,7 @@ class ServerSide:
     scheduler: Scheduler
 
 
-class Connection:
+class ClientConnection:
     """A connected client with at least the right to read. Synchronization: the event loop's thread."""
 
     def __init__(

@@ -12,8 +12,8 @@ from imud.formats.jsonrpc import Code, RpcError, encode_notification
 from imud.model.errors import ImudError, reason_of
 from imud.model.event import Event
 from imud.publishers.recorder.client_stream import ClientRecording, stream_pair
-from imud.publishers.socket.admission import Quota, Seldom
-from imud.publishers.socket.client import Connection
+from imud.publishers.socket.admission import Quota, RateLimitedLog
+from imud.publishers.socket.client import ClientConnection
 from imud.publishers.socket.messages import DeviceNotice
 from imud.publishers.socket.outbox import Pool
 from imud.publishers.socket.scheduler import TokenBucket
@@ -42,7 +42,7 @@ class ClientRecordings:
 
     # --- the clients' side -------------------------------------------------------------------------------------------
 
-    def start(self, connection: Connection, devices: Collection[str] | None) -> int:
+    def start(self, connection: ClientConnection, devices: Collection[str] | None) -> int:
         """Record for a client; return the descriptor for it, which goes with the reply. Raises RpcError."""
         if connection.number in self._running:
             raise RpcError(Code.UNAVAILABLE, "record.start: this connection records already; record.stop ends that")
@@ -63,7 +63,7 @@ class ClientRecordings:
         log.info("client %d (pid %d, uid %d) records", connection.number, connection.peer.pid, connection.peer.uid)
         return fd
 
-    def stop(self, connection: Connection) -> tuple[bool, int]:
+    def stop(self, connection: ClientConnection) -> tuple[bool, int]:
         """End the recording of a client regularly; return whether there was one, and the records that it lost."""
         made = self._running.pop(connection.number, None)
         if made is None:
@@ -72,7 +72,7 @@ class ClientRecordings:
         self._ending.append(made)
         return True, made.records_dropped
 
-    def snapshot(self, connection: Connection) -> tuple[float, int]:
+    def snapshot(self, connection: ClientConnection) -> tuple[float, int]:
         """Send a client what the flight recorder has: its length, s, and the descriptor. Raises RpcError."""
         if not self._context.snapshots:
             raise RpcError(
@@ -87,14 +87,14 @@ class ClientRecordings:
             ours.close()
             raise RpcError(Code.UNAVAILABLE, f"record.snapshot: {error}") from None
 
-    def remove(self, connection: Connection) -> None:
+    def remove(self, connection: ClientConnection) -> None:
         """End the recording of a client that has gone; no-op if absent."""
         made = self._running.pop(connection.number, None)
         if made is not None:
             made.close()
             log.info("client %d records no more: its connection has ended", connection.number)
 
-    def _lend(self, connection: Connection, method: str) -> tuple[socket.socket, int]:
+    def _lend(self, connection: ClientConnection, method: str) -> tuple[socket.socket, int]:
         """Make a pair of sockets; return the daemon's, and the client's descriptor. Raises RpcError."""
         try:
             ours, theirs = stream_pair()
@@ -169,14 +169,14 @@ class Hub:
         self._pool = pool
         self._devices: dict[str, int] = {}
         self._newest: dict[str, Batch] = {}
-        self._connections: dict[int, Connection] = {}
+        self._connections: dict[int, ClientConnection] = {}
         self._subscriptions: dict[int, Subscription] = {}
         self._events: dict[int, Collection[str] | None] = {}
         """Devices whose events a client gets, None for all; clients without events are absent."""
         self._plans: dict[str, DeliveryPlan] = {}
         self._work: dict[int, asyncio.Future[None]] = {}
         """Requests that take their time, by the number of the client."""
-        self._wanting_wake: dict[str, dict[Connection, None]] = {}
+        self._wanting_wake: dict[str, dict[ClientConnection, None]] = {}
         """Clients that have a descriptor to be woken by, by device."""
         self.recordings = ClientRecordings(context, quota.check_fds)
         """What clients record."""
@@ -184,8 +184,8 @@ class Hub:
         self._refused = 0
         self._evicted = 0
         self._failed = 0
-        self._failures = Seldom(context.now_ns)
-        self._to_wake: dict[str, list[Connection]] = {}
+        self._failures = RateLimitedLog(context.now_ns)
+        self._to_wake: dict[str, list[ClientConnection]] = {}
         """Clients that are still to be woken for the newest batch of a device."""
 
     @property
@@ -199,7 +199,7 @@ class Hub:
         return self._newest
 
     @property
-    def connections(self) -> Mapping[int, Connection]:
+    def connections(self) -> Mapping[int, ClientConnection]:
         """The clients by number."""
         return self._connections
 
@@ -279,14 +279,14 @@ class Hub:
                 asyncio.get_running_loop().call_soon(self._wake_some, device)
                 return
 
-    def _wake(self, connection: Connection, device: str) -> None:
+    def _wake(self, connection: ClientConnection, device: str) -> None:
         try:
             if not connection.wakers.wake(device):
                 self._forget_waker(connection, device)
         except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
             connection.on_failure(error)
 
-    def _forget_waker(self, connection: Connection, device: str) -> None:
+    def _forget_waker(self, connection: ClientConnection, device: str) -> None:
         wanting = self._wanting_wake.get(device)
         if wanting is not None:
             if connection in wanting:
@@ -297,7 +297,7 @@ class Hub:
 
     # --- what a client asks for ---------------------------------------------------------------------------------------
 
-    def subscribe(self, connection: Connection, subscription: Subscription) -> None:
+    def subscribe(self, connection: ClientConnection, subscription: Subscription) -> None:
         """Send samples to a client from now on, in place of those it watched before.
 
         Raises RpcError when its user has too many forms of samples.
@@ -311,14 +311,14 @@ class Hub:
             if subscription.matches(device):
                 plan.add(subscription, connection.outbox)
 
-    def unsubscribe(self, connection: Connection) -> None:
+    def unsubscribe(self, connection: ClientConnection) -> None:
         """Send no more samples to a client; no-op if it watches none."""
         subscription = self._stop_sending(connection)
         if subscription is not None:
             self._quota.exchange_form(connection.peer.uid, subscription.key, None)
             self.context.latencies.release(_asker(connection))
 
-    def _stop_sending(self, connection: Connection) -> Subscription | None:
+    def _stop_sending(self, connection: ClientConnection) -> Subscription | None:
         """Send what the client watches no more; returns what that was."""
         subscription = self._subscriptions.pop(connection.number, None)
         if subscription is not None:
@@ -327,15 +327,15 @@ class Hub:
                     plan.discard(subscription, connection.outbox)
         return subscription
 
-    def subscribe_events(self, connection: Connection, devices: Collection[str] | None) -> None:
+    def subscribe_events(self, connection: ClientConnection, devices: Collection[str] | None) -> None:
         """Send events of `devices` (None for all) to a client from now on, in place of those before."""
         self._events[connection.number] = devices
 
-    def unsubscribe_events(self, connection: Connection) -> None:
+    def unsubscribe_events(self, connection: ClientConnection) -> None:
         """Send no more events to a client; no-op if it gets none."""
         self._events.pop(connection.number, None)
 
-    def make_waker(self, connection: Connection, device: str, latency_ns: int = 0) -> int:
+    def make_waker(self, connection: ClientConnection, device: str, latency_ns: int = 0) -> int:
         """Make a descriptor that wakes a client after batches of `device`, so late at most.
 
         Raises RpcError as `ClientWakers.make`.
@@ -350,11 +350,11 @@ class Hub:
         """Whether batches of `device` wake any client."""
         return device in self._wanting_wake
 
-    def busy(self, connection: Connection) -> bool:
+    def busy(self, connection: ClientConnection) -> bool:
         """Whether a request of the client is still being carried out."""
         return connection.number in self._work
 
-    def do_later(self, connection: Connection, work: Coroutine[Any, Any, None]) -> None:
+    def do_later(self, connection: ClientConnection, work: Coroutine[Any, Any, None]) -> None:
         """Carry out a request that takes its time. It goes on when the client leaves."""
         number = connection.number
         task = self._work[number] = asyncio.ensure_future(work)
@@ -372,11 +372,11 @@ class Hub:
         """Connections accepted since start; the number of the newest."""
         return self._accepted
 
-    def add(self, connection: Connection) -> None:
+    def add(self, connection: ClientConnection) -> None:
         """Add a client that was accepted."""
         self._connections[connection.number] = connection
 
-    def remove(self, connection: Connection) -> None:
+    def remove(self, connection: ClientConnection) -> None:
         """Remove a client and all it asked for; no-op if absent."""
         number = connection.number
         self._connections.pop(number, None)
@@ -437,7 +437,7 @@ class Hub:
         return str(wanted.form) if wanted else ""
 
 
-def post_all(connections: Iterable[Connection], body: bytes) -> None:
+def post_all(connections: Iterable[ClientConnection], body: bytes) -> None:
     """Send one JSON object to several clients."""
     for connection in connections:
         try:
@@ -446,6 +446,6 @@ def post_all(connections: Iterable[Connection], body: bytes) -> None:
             connection.on_failure(error)
 
 
-def _asker(connection: Connection, notified: str = "") -> str:
+def _asker(connection: ClientConnection, notified: str = "") -> str:
     """A client as who asks for a latency: for what it watches, or for being woken by a device."""
     return f"client {connection.number}" + (f", notify {notified}" if notified else "")

@@ -30,7 +30,7 @@ from imud.model.options import wrong_values
 from imud.model.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, Sample
 from imud.model.units import NS_PER_MS
 from imud.publishers.socket.admission import Rights
-from imud.publishers.socket.client import Connection
+from imud.publishers.socket.client import ClientConnection
 from imud.publishers.socket.hub import Hub
 from imud.publishers.socket.messages import (
     BigNumbers,
@@ -90,7 +90,7 @@ Pieces = Generator[int, None, Answer]
 """An answer that is made in pieces; each yields the bytes that it holds by then."""
 
 
-def devices(hub: Hub, connection: Connection, _params: NoParams) -> Pieces:
+def devices(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces:
     """The devices, each in one line."""
     rings = hub.context.rings
     lines = (
@@ -104,7 +104,7 @@ def devices(hub: Hub, connection: Connection, _params: NoParams) -> Pieces:
     return Answer(made, big_numbers=False)
 
 
-def status(hub: Hub, connection: Connection, _params: NoParams) -> Pieces:
+def status(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces:
     """The full state: each device with its clock and ledger, the socket with its clients."""
     texts = connection.text_numbers
     made = yield from _encoded(hub.context.each_status(), DEVICES_PER_PIECE, texts)
@@ -115,7 +115,7 @@ def status(hub: Hub, connection: Connection, _params: NoParams) -> Pieces:
     return Answer({"now_ns": str(now_ns) if texts else now_ns, "devices": made, "socket": socket}, big_numbers=False)
 
 
-def schema(hub: Hub, _connection: Connection, _params: NoParams) -> Pieces:
+def schema(hub: Hub, _connection: ClientConnection, _params: NoParams) -> Pieces:
     """What the members of samples mean, per device where that differs, and how a slot is laid out."""
     names: list[str] = []
 
@@ -189,7 +189,7 @@ class Method(Generic[P]):
     """A row of the table."""
 
     params: type[P]
-    run: Callable[[Hub, Connection, P], Answer | Pieces | Later]
+    run: Callable[[Hub, ClientConnection, P], Answer | Pieces | Later]
     right: Rights = Rights.READ
     """The permission that the client needs."""
     acts: bool = False
@@ -198,13 +198,13 @@ class Method(Generic[P]):
     """Type of the result."""
 
 
-def hello(hub: Hub, connection: Connection) -> bytes:
+def hello(hub: Hub, connection: ClientConnection) -> bytes:
     """The notification that greets a client."""
     rights = [right.name.lower() for right in Rights if right in connection.rights and right.name]
     return encode_notification("hello", Greeting(PROTOCOL, __version__, hub.context.epoch, rights))
 
 
-def handle_line(hub: Hub, connection: Connection, line: bytes) -> None:
+def handle_line(hub: Hub, connection: ClientConnection, line: bytes) -> None:
     """Carry out the request in `line` and send the reply. The connection stays open whatever the line is."""
     try:
         request = parse_request(line)
@@ -227,7 +227,7 @@ def handle_line(hub: Hub, connection: Connection, line: bytes) -> None:
         hub.do_later(connection, _answer_later(connection, request, answer))
 
 
-def _send(connection: Connection, request: RpcRequest, answer: Answer) -> None:
+def _send(connection: ClientConnection, request: RpcRequest, answer: Answer) -> None:
     if request.wants_reply:
         texts = connection.text_numbers and answer.big_numbers
         connection.post(encode_result(request.request_id, answer.result, texts=texts), answer.fd)
@@ -235,13 +235,13 @@ def _send(connection: Connection, request: RpcRequest, answer: Answer) -> None:
         connection.use_frames()
 
 
-def _answer_in_pieces(connection: Connection, request: RpcRequest, pieces: Pieces) -> Iterator[int]:
+def _answer_in_pieces(connection: ClientConnection, request: RpcRequest, pieces: Pieces) -> Iterator[int]:
     """Make the answer and send it at the end."""
     answer = yield from pieces
     _send(connection, request, answer)
 
 
-async def _answer_later(connection: Connection, request: RpcRequest, later: Later) -> None:
+async def _answer_later(connection: ClientConnection, request: RpcRequest, later: Later) -> None:
     """Wait for the result and send it."""
     try:
         try:
@@ -255,7 +255,7 @@ async def _answer_later(connection: Connection, request: RpcRequest, later: Late
         connection.on_failure(error)
 
 
-def _call(hub: Hub, connection: Connection, request: RpcRequest) -> Answer | Pieces | Later | None:
+def _call(hub: Hub, connection: ClientConnection, request: RpcRequest) -> Answer | Pieces | Later | None:
     method = METHODS.get(request.method)
     if method is None:
         message = f"no method {request.method[:64]!r}; there are: {', '.join(METHODS)}"
@@ -275,7 +275,7 @@ def _call(hub: Hub, connection: Connection, request: RpcRequest) -> Answer | Pie
 # --- questions ------------------------------------------------------------------------------------------------------
 
 
-def _options(hub: Hub, connection: Connection, params: OptionsParams) -> Answer:
+def _options(hub: Hub, connection: ClientConnection, params: OptionsParams) -> Answer:
     """Set how messages are written on this connection; a `watch` that runs goes on as it is."""
     if params.big_numbers is not None:
         connection.text_numbers = params.big_numbers is BigNumbers.STRING
@@ -286,7 +286,7 @@ def _options(hub: Hub, connection: Connection, params: OptionsParams) -> Answer:
 # --- samples --------------------------------------------------------------------------------------------------------
 
 
-def _watch(hub: Hub, connection: Connection, params: WatchParams) -> Answer:
+def _watch(hub: Hub, connection: ClientConnection, params: WatchParams) -> Answer:
     """Send samples from now on; replaces what the client watched before."""
     devices = _known_devices(hub, params.devices)
     fields = _known_fields(params.fields)
@@ -304,13 +304,13 @@ def _watch(hub: Hub, connection: Connection, params: WatchParams) -> Answer:
     return Answer(result, framed_from_here=form is Form.BINARY)
 
 
-def _unwatch(hub: Hub, connection: Connection, _params: NoParams) -> Answer:
+def _unwatch(hub: Hub, connection: ClientConnection, _params: NoParams) -> Answer:
     """Send no more samples; what already waits for the client is still sent."""
     hub.unsubscribe(connection)
     return Answer(NothingMore())
 
 
-def _poll(hub: Hub, _connection: Connection, params: PollParams) -> Answer:
+def _poll(hub: Hub, _connection: ClientConnection, params: PollParams) -> Answer:
     """The newest sample of each device that has one."""
     names = _known_devices(hub, params.devices) or tuple(hub.devices)
     fields = _known_fields(params.fields)
@@ -326,7 +326,7 @@ def _newest_of(batch: Batch, convention: Convention | None) -> Sample:
     return sample if rotation is None else rotation.sample(sample)
 
 
-def _events(hub: Hub, connection: Connection, params: EventsParams) -> Answer:
+def _events(hub: Hub, connection: ClientConnection, params: EventsParams) -> Answer:
     """Send events from now on, or no more; replaces what was asked before."""
     devices = _known_devices(hub, params.devices)
     enable = params.enable is not False
@@ -337,7 +337,7 @@ def _events(hub: Hub, connection: Connection, params: EventsParams) -> Answer:
     return Answer(EventsResult(enable))
 
 
-def _notify(hub: Hub, connection: Connection, params: NotifyParams) -> Answer:
+def _notify(hub: Hub, connection: ClientConnection, params: NotifyParams) -> Answer:
     """Send a descriptor that becomes readable with each batch of one device; it replaces an earlier one."""
     _known_devices(hub, [params.device])
     latency_ms = _latency_ms(params.latency_ms, 0.0)
@@ -348,13 +348,13 @@ def _notify(hub: Hub, connection: Connection, params: NotifyParams) -> Answer:
 # --- commands -------------------------------------------------------------------------------------------------------
 
 
-def _actions(hub: Hub, _connection: Connection, params: DeviceParams) -> Answer:
+def _actions(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> Answer:
     """The actions of a device."""
     _known_devices(hub, [params.device])
     return Answer(described(hub.context.control(params.device).actions))
 
 
-def _command(hub: Hub, connection: Connection, params: CommandParams) -> Later:
+def _command(hub: Hub, connection: ClientConnection, params: CommandParams) -> Later:
     """Run an action of a device; the reply comes when it is done."""
     _known_devices(hub, [params.device])
     _refuse_second(hub, connection, "command")
@@ -366,13 +366,13 @@ async def _done(hub: Hub, params: CommandParams) -> object:
     return await hub.context.control(params.device).act(params.name, params.arguments or {})
 
 
-def _calibrations(hub: Hub, _connection: Connection, params: DeviceParams) -> Answer:
+def _calibrations(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> Answer:
     """The guided calibrations of a device."""
     _known_devices(hub, [params.device])
     return Answer(infos(hub.context.control(params.device).calibrations))
 
 
-def _calibrate(hub: Hub, connection: Connection, params: CalibrateParams) -> Later:
+def _calibrate(hub: Hub, connection: ClientConnection, params: CalibrateParams) -> Later:
     """Run a guided calibration; its progress goes out as events, and the reply comes at its end."""
     _known_devices(hub, [params.device])
     _refuse_second(hub, connection, "calibrate")
@@ -384,13 +384,13 @@ async def _calibrated(hub: Hub, params: CalibrateParams) -> object:
     return await hub.context.control(params.device).calibrate(params.kind, save=bool(params.save))
 
 
-def _stop_calibration(hub: Hub, _connection: Connection, params: DeviceParams) -> Answer:
+def _stop_calibration(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> Answer:
     """End the calibration that runs, whoever began it."""
     _known_devices(hub, [params.device])
     return Answer(StopResult(hub.context.control(params.device).stop_calibration()))
 
 
-def _settings(hub: Hub, connection: Connection, params: SettingsParams) -> Later:
+def _settings(hub: Hub, connection: ClientConnection, params: SettingsParams) -> Later:
     """The device's own settings, as reported last or asked for now."""
     _known_devices(hub, [params.device])
     if params.fresh:
@@ -401,14 +401,14 @@ def _settings(hub: Hub, connection: Connection, params: SettingsParams) -> Later
     return hub.context.control(params.device).settings_report(fresh=bool(params.fresh))
 
 
-def _settings_plan(hub: Hub, connection: Connection, params: SettingsChangeParams) -> Later:
+def _settings_plan(hub: Hub, connection: ClientConnection, params: SettingsChangeParams) -> Later:
     """What would make the device as wanted; nothing is written."""
     _known_devices(hub, [params.device])
     _refuse_second(hub, connection, "settings.plan")
     return hub.context.control(params.device).settings_plan(params.settings, save=bool(params.save))
 
 
-def _settings_apply(hub: Hub, connection: Connection, params: SettingsChangeParams) -> Later:
+def _settings_apply(hub: Hub, connection: ClientConnection, params: SettingsChangeParams) -> Later:
     """Make the device as wanted; the reply comes when it is done or has failed, with how the device is then."""
     _known_devices(hub, [params.device])
     _refuse_second(hub, connection, "settings.apply")
@@ -418,25 +418,25 @@ def _settings_apply(hub: Hub, connection: Connection, params: SettingsChangePara
 # --- recordings -----------------------------------------------------------------------------------------------------
 
 
-def _record_start(hub: Hub, connection: Connection, params: RecordParams) -> Answer:
+def _record_start(hub: Hub, connection: ClientConnection, params: RecordParams) -> Answer:
     """Send a descriptor from which the client reads a recording of what happens from now on."""
     devices = _known_devices(hub, params.devices)
     fd = hub.recordings.start(connection, devices)
     return Answer(RecordResult(None if devices is None else list(devices)), fd)
 
 
-def _record_stop(hub: Hub, connection: Connection, _params: NoParams) -> Answer:
+def _record_stop(hub: Hub, connection: ClientConnection, _params: NoParams) -> Answer:
     """End the recording of this connection."""
     return Answer(RecordStopResult(*hub.recordings.stop(connection)))
 
 
-def _record_snapshot(hub: Hub, connection: Connection, _params: NoParams) -> Answer:
+def _record_snapshot(hub: Hub, connection: ClientConnection, _params: NoParams) -> Answer:
     """Send a descriptor from which the client reads what the flight recorder has."""
     seconds, fd = hub.recordings.snapshot(connection)
     return Answer(SnapshotResult(seconds), fd)
 
 
-def _refuse_second(hub: Hub, connection: Connection, method: str) -> None:
+def _refuse_second(hub: Hub, connection: ClientConnection, method: str) -> None:
     if hub.busy(connection):
         raise RpcError(Code.UNAVAILABLE, f"{method}: the one before is not done yet; wait for its reply")
 

@@ -124,7 +124,7 @@ class _User:
         self.run_ns = run_ns
         self.served_ns = 0
         """Run time of the client that was served last."""
-        self.line: list[tuple[bool, int, int, Place]] = []
+        self.line: list[tuple[bool, int, int, Turn]] = []
         """A heap: whether the client is not a light one, its run time, its number."""
 
     def urgency(self) -> tuple[bool, int]:
@@ -132,7 +132,7 @@ class _User:
         return self.line[0][0], self.run_ns
 
 
-class Place:
+class Turn:
     """A client's place in the schedule, for that client's own use."""
 
     __slots__ = ("_cpu", "_data", "_scheduler", "client", "fd", "number", "over_ticks", "run_ns", "state", "user")
@@ -211,25 +211,25 @@ class Scheduler:
         self._next_turn: asyncio.Handle | None = None
         self._pausing = False
         """Whether the next turn comes after a pause."""
-        self._places: dict[int, Place] = {}
+        self._places: dict[int, Turn] = {}
         self._users: dict[int, _User] = {}
         self._in_line: dict[_User, None] = {}
         """Users with clients in line."""
         self._served_ns = 0
         """Run time of the user that was served last."""
-        self._parked: dict[Place, None] = {}
+        self._parked: dict[Turn, None] = {}
 
-    def add(self, client: ServedClient, fd: int, number: int, uid: int) -> Place:
+    def add(self, client: ServedClient, fd: int, number: int, uid: int) -> Turn:
         """Wait for requests of a client from now on; clients of one user have the same `uid`."""
         self._epoll.register(fd, select.EPOLLIN | select.EPOLLONESHOT)
         user = self._users.get(uid)
         if user is None:
             user = self._users[uid] = _User(uid, self._served_ns)
         user.clients += 1
-        place = self._places[fd] = Place(self, client, fd, number, user, self._now_ns())
+        place = self._places[fd] = Turn(self, client, fd, number, user, self._now_ns())
         return place
 
-    def remove(self, place: Place) -> None:
+    def remove(self, place: Turn) -> None:
         """Serve a client no more."""
         place.state = _State.GONE
         self._places.pop(place.fd, None)
@@ -241,7 +241,7 @@ class Scheduler:
             del self._users[place.user.uid]
             self._in_line.pop(place.user, None)
 
-    def line_up(self, place: Place) -> None:
+    def line_up(self, place: Turn) -> None:
         """Put a client that waits for nothing in line."""
         user = place.user
         place.state = _State.IN_LINE
@@ -253,7 +253,7 @@ class Scheduler:
         if self._next_turn is None:
             self._schedule(True)
 
-    def arm(self, place: Place) -> None:
+    def arm(self, place: Turn) -> None:
         """Wait for the events that a client wants."""
         events = place.client.wanted_events()
         if events:
@@ -273,7 +273,7 @@ class Scheduler:
                 place.state = _State.IDLE
                 self.line_up(place)
 
-    def _overload(self, place: Place) -> None:
+    def _overload(self, place: Turn) -> None:
         try:
             place.client.on_overload()
         except Exception as error:  # noqa: BLE001 - whatever one client meets ends that client, not the daemon
@@ -338,14 +338,14 @@ class Scheduler:
             if place is not None:
                 self._on_ready(place, events)
 
-    def _on_ready(self, place: Place, events: int) -> None:
+    def _on_ready(self, place: Turn, events: int) -> None:
         try:
             place.client.on_ready(events)
             place.line_up()
         except Exception as error:  # noqa: BLE001 - as above
             self._fail(place, error)
 
-    def _next(self, all_of_them: bool) -> Place | None:
+    def _next(self, all_of_them: bool) -> Turn | None:
         """Take the next client out of the line; None if there is none, or none of those that may be served now."""
         while self._in_line:
             user = min(self._in_line, key=_User.urgency) if len(self._in_line) > 1 else next(iter(self._in_line))
@@ -363,7 +363,7 @@ class Scheduler:
                 return place
         return None
 
-    def _serve(self, place: Place) -> None:
+    def _serve(self, place: Turn) -> None:
         place.state = _State.SERVED
         client, begun_ns = place.client, self._cpu_ns()
         try:
@@ -386,7 +386,7 @@ class Scheduler:
         else:
             self.line_up(place)
 
-    def _fail(self, place: Place, error: Exception) -> None:
+    def _fail(self, place: Turn, error: Exception) -> None:
         """End a client after an internal error; one that cannot even be ended is served no more."""
         try:
             place.client.on_failure(error)

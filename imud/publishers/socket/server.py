@@ -25,9 +25,19 @@ from imud.contracts.publisher import PublisherContext, PublisherType
 from imud.formats.jsonrpc import DEFAULT_PATH, Code, RpcError, encode_error, line_of
 from imud.model.errors import ServerError, reason_of
 from imud.model.event import Event
-from imud.model.options import Settings, shown
-from imud.publishers.socket.admission import Guard, Peer, Quota, Rights, Seldom, Shares, gid_of, peer_of, raise_fd_limit
-from imud.publishers.socket.client import Connection, ServerSide
+from imud.model.options import Options, shown
+from imud.publishers.socket.admission import (
+    Guard,
+    Peer,
+    Quota,
+    RateLimitedLog,
+    Rights,
+    Shares,
+    gid_of,
+    peer_of,
+    raise_fd_limit,
+)
+from imud.publishers.socket.client import ClientConnection, ServerSide
 from imud.publishers.socket.hub import Hub
 from imud.publishers.socket.methods import handle_line, hello
 from imud.publishers.socket.outbox import Limits, Pool
@@ -235,8 +245,8 @@ ACCEPT_NS: Final = 300_000
 MIB: Final = 1 << 20
 
 
-class SocketSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the UNIX socket."""
+class SocketOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of the UNIX socket."""
 
     enabled: bool = True
     """Whether imud serves the socket."""
@@ -267,7 +277,7 @@ class SocketSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 class SocketServer:
     """Serves clients on a UNIX socket. Synchronization: the event loop's thread."""
 
-    def __init__(self, settings: SocketSettings, context: PublisherContext) -> None:
+    def __init__(self, settings: SocketOptions, context: PublisherContext) -> None:
         self._settings = settings
         self._context = context
         shares = Shares(settings.clients_max, settings.clients_per_user)
@@ -281,7 +291,7 @@ class SocketServer:
         self._listener: Listener | None = None
         self._guard = Guard(os.geteuid(), None, None)
         self._paused = False
-        self._pauses = Seldom(context.now_ns)
+        self._pauses = RateLimitedLog(context.now_ns)
 
     def start(self) -> None:
         """Listen. Raises ServerError and leaves nothing behind when that is not possible."""
@@ -398,7 +408,7 @@ class SocketServer:
             _refuse(sock, refusal)
             return
         assert self._side is not None
-        connection = Connection(self.hub.next_number(), sock, peer, rights, self._side, reserved)
+        connection = ClientConnection(self.hub.next_number(), sock, peer, rights, self._side, reserved)
         self.hub.add(connection)
         connection.post(hello(self.hub, connection))
 
@@ -409,7 +419,7 @@ class SocketServer:
             raise RpcError(Code.DENIED, message)
         return self._quota.admit(peer, rights, fd, self.hub.connections.values())
 
-    def _on_line(self, connection: Connection, line: bytes) -> None:
+    def _on_line(self, connection: ClientConnection, line: bytes) -> None:
         handle_line(self.hub, connection, line)
 
 
@@ -422,4 +432,4 @@ def _refuse(sock: socket.socket, error: RpcError) -> None:
     sock.close()
 
 
-PUBLISHER = PublisherType("socket", SocketSettings, SocketServer)
+PUBLISHER = PublisherType("socket", SocketOptions, SocketServer)

@@ -17,7 +17,7 @@ from random import Random
 from time import sleep
 from typing import Final, NamedTuple, Protocol, TextIO, runtime_checkable
 
-from imud.contracts.lines import Edge, InputSettings, LineFactory, OnEdges, OnLineEnd, OutputSettings
+from imud.contracts.lines import Edge, InputOptions, LineFactory, OnEdges, OnLineEnd, OutputOptions
 from imud.model.errors import LinkError
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.ports.faults import parse_rates
@@ -329,11 +329,11 @@ class MemoryLines:
         self._now_ns = now_ns
         self.maker = LineFactory(self.input, self.output)
 
-    def input(self, _settings: InputSettings, purpose: str, rising_only: bool = False) -> MemoryInput:
+    def input(self, _settings: InputOptions, purpose: str, rising_only: bool = False) -> MemoryInput:
         """Return the input of that purpose; the same one every time."""
         return self.inputs.setdefault(purpose, MemoryInput(purpose, rising_only))
 
-    def output(self, _settings: OutputSettings, purpose: str) -> MemoryOutput:
+    def output(self, _settings: OutputOptions, purpose: str) -> MemoryOutput:
         """Return the output of that purpose; the same one every time."""
         return self.outputs.setdefault(purpose, MemoryOutput(purpose, now_ns=self._now_ns))
 

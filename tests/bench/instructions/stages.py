@@ -15,9 +15,9 @@ from typing import Final
 
 from imud.contracts.codec import StreamCodec
 from imud.contracts.publisher import Batch, PublisherContext
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings, encode_tpdos
-from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucSettings
-from imud.drivers.imu61x.can import BASE_ID, Imu61xCanCodec, Imu61xCanSettings, encode_set
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenOptions, encode_tpdos
+from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions
+from imud.drivers.imu61x.can import BASE_ID, Imu61xCanCodec, Imu61xCanOptions, encode_set
 from imud.drivers.imu61x.uart.codec import Imu61xCodec, encode_ahrs
 from imud.fleet.writer import WriterQueue
 from imud.formats.can import pack_frame
@@ -28,8 +28,8 @@ from imud.links.socketcan import FrameReader
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Sample
 from imud.model.units import NS_PER_MS, uart_byte_ns
-from imud.publishers.shm import ShmPublisher, ShmSettings
-from imud.publishers.socket.server import SocketServer, SocketSettings
+from imud.publishers.shm import ShmOptions, ShmPublisher
+from imud.publishers.socket.server import SocketOptions, SocketServer
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import PathContext, StreamPath
 from tests.bench.instructions import virtual_time
@@ -94,7 +94,7 @@ def _hi91_frames(count: int) -> list[bytes]:
 
 
 def _hi91_single(total: int, _directory: str) -> Run:
-    return _feeding(HipnucCodec(Ledger(), HipnucSettings()), _hi91_frames(total))
+    return _feeding(HipnucCodec(Ledger(), HipnucOptions()), _hi91_frames(total))
 
 
 HI91_BLOCK: Final = 50
@@ -104,7 +104,7 @@ HI91_BLOCK: Final = 50
 def _hi91_bulk(total: int, _directory: str) -> Run:
     stream = b"".join(_hi91_frames(total * HI91_BLOCK + 1))
     size = len(stream) // (total * HI91_BLOCK + 1) * HI91_BLOCK
-    return _feeding(HipnucCodec(Ledger(), HipnucSettings()), _cut(stream, size))
+    return _feeding(HipnucCodec(Ledger(), HipnucOptions()), _cut(stream, size))
 
 
 def _cut(stream: bytes, size: int) -> list[bytes]:
@@ -142,7 +142,7 @@ TPDO_IDS: Final = {1: 0x180, 2: 0x280, 3: 0x380, 4: 0x480, 6: 0x680, 7: 0x780}
 
 
 def _imu61x_can(total: int, _directory: str) -> Run:
-    codec = Imu61xCanCodec(Ledger(), Imu61xCanSettings())
+    codec = Imu61xCanCodec(Ledger(), Imu61xCanOptions())
     frames = [
         (can_id, data, number * 5 * NS_PER_MS + place * 200_000)
         for number in range(total // 5 + 1)
@@ -154,7 +154,7 @@ def _imu61x_can(total: int, _directory: str) -> Run:
 
 
 def _canopen(total: int, _directory: str) -> Run:
-    codec = HipnucCanopenCodec(Ledger(), HipnucCanopenSettings())
+    codec = HipnucCanopenCodec(Ledger(), HipnucCanopenOptions())
     tpdos = encode_tpdos(
         accel_m_s2=VECTOR, gyro_rad_s=VECTOR, euler_rad=VECTOR, quat_wxyz=(1.0, 0.0, 0.0, 0.0), pressure_pa=101_325.0,
         incli_rad=VECTOR[:2],
@@ -187,7 +187,7 @@ def _can_read(frames: int, total: int, _directory: str) -> Run:
 
 
 def _measured(reads: Sequence[Read]) -> list[tuple[Measurement, int]]:
-    codec = HipnucCodec(Ledger(), HipnucSettings())
+    codec = HipnucCodec(Ledger(), HipnucOptions())
     return [(event, read.t_rx_ns) for read in reads for event in codec.feed(read.data) if type(event) is Measurement]
 
 
@@ -224,7 +224,7 @@ def _context() -> PublisherContext:
 
 
 def _ring_publisher(directory: str) -> ShmPublisher:
-    publisher = ShmPublisher(ShmSettings(directory=directory, group=own_group()), _context())
+    publisher = ShmPublisher(ShmOptions(directory=directory, group=own_group()), _context())
     publisher.add_device("d0", 0)
     return publisher
 
@@ -244,7 +244,7 @@ def _ring(frames: int, total: int, directory: str) -> Run:
 async def _serve(directory: str, clients: int, encoding: str) -> tuple[SocketServer, list[socket.socket]]:
     """A server whose clients watch `d0`, over real sockets."""
     path = f"{directory}/s"
-    server = SocketServer(SocketSettings(path=path, group=own_group()), _context())
+    server = SocketServer(SocketOptions(path=path, group=own_group()), _context())
     server.start()
     server.add_device("d0", 0)
     socks = []
@@ -308,7 +308,7 @@ def _path(frames: int, total: int, directory: str) -> Run:
 
     ledger, module = Ledger(), Module()
     context = PathContext("d0", 0, ledger, publish, _ignore, _ignore, int, HostClock())
-    path = StreamPath(HipnucCodec(ledger, HipnucSettings()), _clock_of_module(), context)
+    path = StreamPath(HipnucCodec(ledger, HipnucOptions()), _clock_of_module(), context)
 
     def process(reads: Sequence[Read]) -> None:
         for number, (data, t_rx_ns) in enumerate(reads):

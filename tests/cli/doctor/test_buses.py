@@ -9,7 +9,7 @@ from imud.cli.doctor.buses import bus_nodes, i2c_transfers, spi_transfers
 from imud.cli.doctor.surroundings import DoctorCheck
 from imud.contracts.status import DeviceState, DeviceStatus, PollingStatus
 from imud.drivers.imu61x.registers import identity_of
-from imud.links.spi import WR_BITS_PER_WORD, WR_MODE, SpiLink, SpiSettings
+from imud.links.spi import WR_BITS_PER_WORD, WR_MODE, SpiLink, SpiOptions
 from imud.model.errors import DeviceRefused, LinkError
 from tests.support.metrics import device
 from tests.support.surroundings import Machine
@@ -91,7 +91,7 @@ def unusable(**refuse: int) -> str:
         if request == refuse["request"] and argument[0] >= refuse.get("least", 0):
             raise OSError(errno.EINVAL, "Invalid argument")
 
-    link = SpiLink(SpiSettings(port="/dev/spidev0.0"), ioctl=ioctl, open_node=lambda *_: 0, close_node=lambda _: None)
+    link = SpiLink(SpiOptions(port="/dev/spidev0.0"), ioctl=ioctl, open_node=lambda *_: 0, close_node=lambda _: None)
     try:
         link.open()
         link.select(3)

@@ -12,7 +12,7 @@ from imud.cli.setup import hardware as finders
 from imud.cli.setup.hardware import FINDERS
 from imud.contracts.driver import StreamDriver
 from imud.drivers import DRIVERS
-from imud.links.i2c import I2cLink, I2cSettings
+from imud.links.i2c import I2cLink, I2cOptions
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.in_process_bus import InProcessI2c
 from tests.support.pty_port import BAUD, PtyPort, slave, wired
@@ -53,7 +53,7 @@ def test_a_line_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 def on_bus(monkeypatch: pytest.MonkeyPatch, bus: InProcessI2c) -> None:
     row = SimpleNamespace(
-        settings=I2cSettings, make_polled=lambda settings: I2cLink(settings, open_bus=bus.open, ioctl=bus.ioctl)
+        settings=I2cOptions, make_polled=lambda settings: I2cLink(settings, open_bus=bus.open, ioctl=bus.ioctl)
     )
     monkeypatch.setattr(finders, "LINKS", {"i2c": row})
 

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 from imud.contracts.command import Action, RestMeans, Target
 from imud.drivers import DRIVERS
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.common import inclinometer_zero
-from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
 from tests.support.simulated_modules import CanopenBench
 
 
@@ -36,10 +36,10 @@ def test_it_is_made_of_actions() -> None:
 def test_on_both_buses() -> None:
     bench = CanopenBench()
     zero = DRIVERS["hipnuc-canopen"].calibrations["zero"]
-    bench.run_script(zero.begin(Target(HipnucCanopenSettings(node=bench.module.node), 500_000)))
+    bench.run_script(zero.begin(Target(HipnucCanopenOptions(node=bench.module.node), 500_000)))
     assert len(bench.sent) >= 1
     assert zero.section[0] == "5"
     zero = DRIVERS["hipnuc-j1939"].calibrations["zero"]
-    request = next(zero.begin(Target(HipnucJ1939Settings(), 250_000)))
+    request = next(zero.begin(Target(HipnucJ1939Options(), 250_000)))
     assert request.payload
     assert zero.section[0] == "6"

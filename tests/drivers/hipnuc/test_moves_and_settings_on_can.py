@@ -12,13 +12,13 @@ import pytest
 
 from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Reply, Request, RequestScript, Silence
-from imud.contracts.setting import DeviceSettings, Effect, Written
+from imud.contracts.setting import Effect, SettingsTable, Written
 from imud.drivers.hipnuc.canopen import commands as canopen
 from imud.drivers.hipnuc.canopen.cia301 import Aborted
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.canopen.driver import SETTINGS as CANOPEN_SETTINGS
 from imud.drivers.hipnuc.j1939 import commands as j1939
-from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
 from imud.drivers.hipnuc.j1939.driver import SETTINGS as J1939_SETTINGS
 from imud.formats.can import EXTENDED_ID_MAX, RAW_FRAME
 from imud.model.errors import BadArgument, DeviceRefused, NoReply, Rejected
@@ -50,7 +50,7 @@ class Protocol(NamedTuple):
     """Settings that every kind of module must take; the other settings have the same forms."""
     delivered: Mapping[str, object]
     wrong: Mapping[str, object]
-    settings: DeviceSettings
+    settings: SettingsTable
     options: Callable[[int], Any]
     session: Any
     place: Any
@@ -87,7 +87,7 @@ CANOPEN = Protocol(
     },
     wrong={"tpdo1_interval_ms": 1001, "tpdo1_by": "remote", "bit_rate": 800_000, "node": 128, "incli_x_reversed": 1},
     settings=CANOPEN_SETTINGS,
-    options=lambda number: HipnucCanopenSettings(node=number),
+    options=lambda number: HipnucCanopenOptions(node=number),
     session=canopen,
     place=(canopen.NODE_ID, 0),
     number_of=lambda module: module.node,
@@ -117,7 +117,7 @@ J1939 = Protocol(
     },
     wrong={"ff34_interval_ms": 0, "ff41_interval_ms": 1001, "bit_rate": 100_000, "address": 129},
     settings=J1939_SETTINGS,
-    options=lambda number: HipnucJ1939Settings(address=number),
+    options=lambda number: HipnucJ1939Options(address=number),
     session=j1939,
     place=j1939.ADDRESS,
     number_of=lambda module: module.settings.address,

@@ -16,7 +16,7 @@ from imud.drivers.hipnuc.nmea2000 import (
     RATE_OF_TURN,
     SID_DOUBTS,
     HipnucNmea2000Codec,
-    HipnucNmea2000Settings,
+    HipnucNmea2000Options,
     Reference,
     encode,
 )
@@ -32,7 +32,7 @@ def measured(*rows: tuple[int, str]) -> Measurement:
 
 
 def make(**options: object) -> HipnucNmea2000Codec:
-    return HipnucNmea2000Codec(Ledger(), msgspec.convert(options, HipnucNmea2000Settings))
+    return HipnucNmea2000Codec(Ledger(), msgspec.convert(options, HipnucNmea2000Options))
 
 
 def burst(
@@ -210,7 +210,7 @@ def test_a_burst_makes_a_sample_and_other_frames_do_not() -> None:
     assert DRIVER.node_of(0x0DF11905, True, bytes(8)) == 5
     for can_id, extended, size in [(0x0DF11905, False, 8), (0x0DF11905, True, 7), (0x0DF119FF, True, 8)]:
         assert DRIVER.node_of(can_id, extended, bytes(size)) is None
-    assert DRIVER.node_settings(5) == HipnucNmea2000Settings(source=5)
+    assert DRIVER.node_settings(5) == HipnucNmea2000Options(source=5)
     assert DRIVER.node_title(5) == "source 5"
 
 
@@ -226,8 +226,8 @@ def test_sids_and_senders_are_never_mixed() -> None:
     for n in range(60):
         assert feed(codec, burst(n), n * 100 * MS) == []
     assert codec.ledger.bytes_in == codec.ledger.bytes_skipped
-    assert {f.can_id & 0xFF for f in DRIVER.filters(HipnucNmea2000Settings(source=36))} == {36}
-    assert all(f.mask & 0xFF == 0 for f in DRIVER.filters(HipnucNmea2000Settings()))
+    assert {f.can_id & 0xFF for f in DRIVER.filters(HipnucNmea2000Options(source=36))} == {36}
+    assert all(f.mask & 0xFF == 0 for f in DRIVER.filters(HipnucNmea2000Options()))
 
     codec = make()
     found = [value for n in range(20) for value in feed(codec, burst(n, sids=(255, 255, 255)), n * 100 * MS)]

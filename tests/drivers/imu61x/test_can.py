@@ -7,7 +7,7 @@ import msgspec
 import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
-from imud.drivers.imu61x.can import DRIVER, Imu61xCanCodec, Imu61xCanSettings, encode_set
+from imud.drivers.imu61x.can import DRIVER, Imu61xCanCodec, Imu61xCanOptions, encode_set
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 
@@ -27,7 +27,7 @@ GOLDEN = [
 
 
 def make(base_id: int = 101) -> Imu61xCanCodec:
-    return Imu61xCanCodec(Ledger(), Imu61xCanSettings(base_id=base_id))
+    return Imu61xCanCodec(Ledger(), Imu61xCanOptions(base_id=base_id))
 
 
 def feed(codec: Imu61xCanCodec, frames: list[tuple[int, bytes]]) -> list[CodecEvent]:
@@ -83,11 +83,11 @@ def test_golden_set_in_si_units_and_back() -> None:
     moved = [(can_id - 101 + 600, data) for can_id, data in GOLDEN]
     assert indices(feed(make(600), moved)) == [65535]
     assert feed(make(600), GOLDEN) == []
-    wanted = DRIVER.filters(Imu61xCanSettings(base_id=600))
+    wanted = DRIVER.filters(Imu61xCanOptions(base_id=600))
     assert [f.can_id for f in wanted] == [600, 601, 602, 603, 604]
     assert not any(f.matches(605, False) or f.matches(600, True) for f in wanted)
     with pytest.raises(msgspec.ValidationError):
-        msgspec.convert({"base_id": 2044}, Imu61xCanSettings)
+        msgspec.convert({"base_id": 2044}, Imu61xCanOptions)
 
 
 @pytest.mark.manual("A 4.2 temperature")

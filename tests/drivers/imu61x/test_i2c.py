@@ -6,7 +6,7 @@ import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, Vanished
 from imud.drivers.imu61x.i2c import Imu61xI2cCodec
-from imud.drivers.imu61x.registers import RegisterSettings
+from imud.drivers.imu61x.registers import RegisterOptions
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from tests.drivers.imu61x.test_spi import RAD_S, G, slow_crc
@@ -17,7 +17,7 @@ GOLDEN = VALUES + struct.pack("<I", slow_crc(VALUES))
 
 
 def codec(**settings: int) -> Imu61xI2cCodec:
-    return Imu61xI2cCodec(Ledger(), RegisterSettings(**settings))
+    return Imu61xI2cCodec(Ledger(), RegisterOptions(**settings))
 
 
 @pytest.mark.manual("A 3.3.1 reading", "A 3.3.1 order")

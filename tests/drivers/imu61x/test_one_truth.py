@@ -12,12 +12,12 @@ import pytest
 from imud.attitude.rotation import euler_zyx_from_quat
 from imud.contracts.codec import CodecEvent, PolledCodec, PolledEvent
 from imud.contracts.script import Transfer, TransferScript, run_transfer_script
-from imud.drivers.imu61x.can import Imu61xCanCodec, Imu61xCanSettings
+from imud.drivers.imu61x.can import Imu61xCanCodec, Imu61xCanOptions
 from imud.drivers.imu61x.i2c import DRIVER as I2C
 from imud.drivers.imu61x.i2c import Imu61xI2cCodec
-from imud.drivers.imu61x.registers import RegisterSettings
+from imud.drivers.imu61x.registers import RegisterOptions
 from imud.drivers.imu61x.spi import DRIVER as SPI
-from imud.drivers.imu61x.spi import Imu61xSpiCodec, SpiDeviceSettings
+from imud.drivers.imu61x.spi import Imu61xSpiCodec, SpiDeviceOptions
 from imud.drivers.imu61x.uart.codec import Imu61xCodec
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -66,7 +66,7 @@ def by_uart() -> list[Measurement]:
 
 def by_can() -> list[Measurement]:
     hardware = Imu61xCanHardware(rate_hz=100, motion=MOTION, skew_ppm=0, boot_ms=510)
-    module, codec = Imu61xCanModule(EPOCH_NS, hardware), Imu61xCanCodec(Ledger(), Imu61xCanSettings())
+    module, codec = Imu61xCanModule(EPOCH_NS, hardware), Imu61xCanCodec(Ledger(), Imu61xCanOptions())
     sets = [module.advance(instant_ns + STEP_NS - 1) for instant_ns in INSTANTS]
     return [only([e for f in one for e in codec.feed_frame(f.can_id, f.extended, f.data, f.due_ns)]) for one in sets]
 
@@ -98,8 +98,8 @@ def read(name: str) -> list[Measurement]:
     if name in ("uart", "can"):
         return by_uart() if name == "uart" else by_can()
     if name == "i2c":
-        return by_polls(I2C.set_up(RegisterSettings()), Imu61xI2cCodec(Ledger(), RegisterSettings()), over_i2c)
-    settings = SpiDeviceSettings(burst=name.removeprefix("spi "))  # type: ignore[arg-type]  # a kind of burst
+        return by_polls(I2C.set_up(RegisterOptions()), Imu61xI2cCodec(Ledger(), RegisterOptions()), over_i2c)
+    settings = SpiDeviceOptions(burst=name.removeprefix("spi "))  # type: ignore[arg-type]  # a kind of burst
     return by_polls(SPI.set_up(settings), Imu61xSpiCodec(Ledger(), settings), over_spi)
 
 

@@ -9,9 +9,9 @@ from imud.contracts.command import Target
 from imud.contracts.driver import PolledDriver
 from imud.contracts.script import Transfer, run_transfer_script
 from imud.drivers.imu61x.i2c import DRIVER as I2C
-from imud.drivers.imu61x.registers import RegisterSettings
+from imud.drivers.imu61x.registers import RegisterOptions
 from imud.drivers.imu61x.spi import DRIVER as SPI
-from imud.drivers.imu61x.spi import SpiDeviceSettings
+from imud.drivers.imu61x.spi import SpiDeviceOptions
 from imud.model.errors import BadArgument, DeviceRefused
 from imud.sim.imu61x.registers import Imu61xRegisters
 from tests.support.simulated_modules import over_i2c, over_spi
@@ -24,7 +24,7 @@ class Wires:
         self.device = Imu61xRegisters(lambda: 0)
         self.transfers = 0
 
-    def act(self, driver: PolledDriver, settings: RegisterSettings, **given: object) -> object:
+    def act(self, driver: PolledDriver, settings: RegisterOptions, **given: object) -> object:
         action = driver.actions["filter"]
         return run_transfer_script(action.script(Target(settings, 0), action.arguments(given)), self.over(driver))
 
@@ -38,11 +38,11 @@ class Wires:
         return transfer
 
 
-BUSES = [(I2C, RegisterSettings()), (SPI, SpiDeviceSettings())]
+BUSES = [(I2C, RegisterOptions()), (SPI, SpiDeviceOptions())]
 
 
 @pytest.mark.parametrize(("driver", "settings"), BUSES)
-def test_filters_are_set_and_answered(driver: PolledDriver, settings: RegisterSettings) -> None:
+def test_filters_are_set_and_answered(driver: PolledDriver, settings: RegisterOptions) -> None:
     wires = Wires()
     answer = wires.act(driver, settings, accel_filter=4)
     assert wires.device.filter == 0x4B
@@ -89,7 +89,7 @@ def read_table(wires: Wires, driver: PolledDriver, target: Target) -> Mapping[st
 
 
 @pytest.mark.parametrize(("driver", "settings"), BUSES)
-def test_each_filter_is_a_setting_of_its_own(driver: PolledDriver, settings: RegisterSettings) -> None:
+def test_each_filter_is_a_setting_of_its_own(driver: PolledDriver, settings: RegisterOptions) -> None:
     wires, target = Wires(), Target(settings, 0)
     table = driver.device_settings
     assert table is not None

@@ -11,7 +11,7 @@ from imud.drivers.imu61x import spi
 from imud.drivers.imu61x import spi as bursts
 from imud.drivers.imu61x import spi as words
 from imud.drivers.imu61x.registers import temperature_c
-from imud.drivers.imu61x.spi import READ_STATE, BurstKind, SpiDeviceSettings, burst_problem
+from imud.drivers.imu61x.spi import READ_STATE, BurstKind, SpiDeviceOptions, burst_problem
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.sim.imu61x.registers import Imu61xRegisters
@@ -29,7 +29,7 @@ G = 9.80665
 
 
 def codec(burst: str = "standard", **more: object) -> spi.Imu61xSpiCodec:
-    return spi.Imu61xSpiCodec(Ledger(), SpiDeviceSettings(burst=burst, **more))  # type: ignore[arg-type]  # passed on as given
+    return spi.Imu61xSpiCodec(Ledger(), SpiDeviceOptions(burst=burst, **more))  # type: ignore[arg-type]  # passed on as given
 
 
 def words_of(data: bytes) -> tuple[int, ...]:

@@ -5,7 +5,7 @@ from typing import Literal
 import pytest
 
 from imud.contracts.script import Transfer, run_transfer_script
-from imud.drivers.imu61x.spi import SpiDeviceSettings, probe, set_up
+from imud.drivers.imu61x.spi import SpiDeviceOptions, probe, set_up
 from imud.model.errors import DeviceRefused, TransferError, Trouble
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.imu61x.uart import REGISTER_VARIANTS, RegisterBehaviour
@@ -38,15 +38,15 @@ class Wire:
 )
 def test_probe_and_set_up() -> None:
     wire = Wire()
-    assert run_transfer_script(probe(SpiDeviceSettings()), wire.transfer).product == "IMU614"
+    assert run_transfer_script(probe(SpiDeviceOptions()), wire.transfer).product == "IMU614"
     assert wire.device.window == 0
     assert len(wire.sent) == 1
 
     wire = Wire()
-    words = run_transfer_script(set_up(SpiDeviceSettings()), wire.transfer)
+    words = run_transfer_script(set_up(SpiDeviceOptions()), wire.transfer)
     assert words == {"accel_filter": "47 Hz", "gyro_filter": "47 Hz", "burst": "standard"}
     assert len(wire.sent) == 2  # the state, and a burst
-    settings = SpiDeviceSettings(accel_filter=4, gyro_filter=4, burst="extended")
+    settings = SpiDeviceOptions(accel_filter=4, gyro_filter=4, burst="extended")
     words = run_transfer_script(set_up(settings), wire.transfer)
     assert words == {"accel_filter": "10 Hz", "gyro_filter": "10 Hz", "burst": "extended"}
     assert wire.sent[3] == "fe01 8644 fe00 7e00 7e00"  # the manual's example of 10 Hz: 0x8644
@@ -62,7 +62,7 @@ def test_probe_and_set_up() -> None:
         wire.device.faults.flips = next(flips)
         return wire.transfer(one)
 
-    assert run_transfer_script(set_up(SpiDeviceSettings()), transfer)["burst"] == "standard"
+    assert run_transfer_script(set_up(SpiDeviceOptions()), transfer)["burst"] == "standard"
     assert wire.device.extended == 0
 
 
@@ -71,23 +71,23 @@ def test_probe_and_set_up() -> None:
 def test_window_is_closed_after_a_failure(fail_at: int) -> None:
     wire = Wire(fail_at=fail_at)
     with pytest.raises(TransferError):
-        run_transfer_script(set_up(SpiDeviceSettings(gyro_filter=1)), wire.transfer)
+        run_transfer_script(set_up(SpiDeviceOptions(gyro_filter=1)), wire.transfer)
     assert wire.sent[-1] == "fe00 7e00 7e00"
     assert wire.device.window == 0
     wire = Wire(fail_at=3)  # the burst that shows its kind
     with pytest.raises(TransferError):
-        run_transfer_script(set_up(SpiDeviceSettings(gyro_filter=1)), wire.transfer)
+        run_transfer_script(set_up(SpiDeviceOptions(gyro_filter=1)), wire.transfer)
     assert len(wire.sent) == 4
 
 
 def test_setting_that_does_not_take_is_refused() -> None:
     with pytest.raises(DeviceRefused, match="FILTER_CTRL: wrote 0xb1, read back 0xbb"):
-        run_transfer_script(set_up(SpiDeviceSettings(gyro_filter=1)), Wire(deaf=True).transfer)
+        run_transfer_script(set_up(SpiDeviceOptions(gyro_filter=1)), Wire(deaf=True).transfer)
     words = (
         "expected a burst of kind extended, .* check value does not match: .* reads 0x0000 at 0x0C and 0x0000 at 0x0D"
     )
     with pytest.raises(DeviceRefused, match=words):
-        run_transfer_script(set_up(SpiDeviceSettings(burst="extended")), Wire(deaf=True).transfer)
+        run_transfer_script(set_up(SpiDeviceOptions(burst="extended")), Wire(deaf=True).transfer)
 
 
 @pytest.mark.parametrize("variant", REGISTER_VARIANTS)
@@ -98,7 +98,7 @@ def test_kind_of_burst_wherever_it_reads_back(
 ) -> None:
     wire = Wire(behaviour=REGISTER_VARIANTS[variant])
     wire.device.extended = before
-    words = run_transfer_script(set_up(SpiDeviceSettings(burst=burst)), wire.transfer)
+    words = run_transfer_script(set_up(SpiDeviceOptions(burst=burst)), wire.transfer)
     if burst != "registers":
         assert words["burst"] == burst
         assert wire.device.extended == (burst == "extended")
@@ -112,4 +112,4 @@ def test_another_id_is_refused(product_id: bytes, why: str) -> None:
     wire = Wire()
     wire.device.faults.product_id = product_id
     with pytest.raises(DeviceRefused, match=why):
-        run_transfer_script(probe(SpiDeviceSettings()), wire.transfer)
+        run_transfer_script(probe(SpiDeviceOptions()), wire.transfer)

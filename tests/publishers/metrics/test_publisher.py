@@ -19,7 +19,7 @@ from imud.contracts.status import DeviceStatus
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.publishers import PUBLISHERS
-from imud.publishers.metrics.publisher import MetricsPublisher, MetricsSettings
+from imud.publishers.metrics.publisher import MetricsOptions, MetricsPublisher
 from tests.support.event_loops import in_loop
 from tests.support.metrics import LIMIT_S, ask, device, read_all
 from tests.support.rings import DEVICE, Board
@@ -37,7 +37,7 @@ def context(status: Callable[[], Sequence[DeviceStatus]] = lambda: DEVICES) -> P
 async def publisher(
     context: PublisherContext, snapshot_s: float = LIMIT_S, **settings: object
 ) -> AsyncIterator[MetricsPublisher]:
-    made = MetricsPublisher(MetricsSettings(**{"port": 0, **settings}), context, snapshot_s=snapshot_s)  # type: ignore[arg-type]  # any key
+    made = MetricsPublisher(MetricsOptions(**{"port": 0, **settings}), context, snapshot_s=snapshot_s)  # type: ignore[arg-type]  # any key
     made.start()
     try:
         yield made
@@ -206,7 +206,7 @@ async def test_a_loop_that_does_not_answer_gives_503() -> None:
 
 @in_loop
 async def test_close_while_a_scrape_waits_for_the_loop_does_not_wait() -> None:
-    served = MetricsPublisher(MetricsSettings(port=0), context(), snapshot_s=3600)
+    served = MetricsPublisher(MetricsOptions(port=0), context(), snapshot_s=3600)
     served.start()
     with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
         connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
@@ -223,7 +223,7 @@ async def test_disabled_opens_nothing_and_closes_twice() -> None:
 @in_loop
 async def test_port_in_use_is_told() -> None:
     async with publisher(context()) as first:
-        second = MetricsPublisher(MetricsSettings(port=first.port), context())
+        second = MetricsPublisher(MetricsOptions(port=first.port), context())
         with pytest.raises(ServerError, match=rf"127\.0\.0\.1 port {first.port}: Address already in use; .*ss -ltnp"):
             second.start()
         second.close()
@@ -242,5 +242,5 @@ async def test_port_is_free_after_close() -> None:
 def test_row() -> None:
     row = PUBLISHERS["metrics"]
     assert row.name == "metrics"
-    assert row.settings is MetricsSettings
-    assert MetricsSettings().port == 9321
+    assert row.settings is MetricsOptions
+    assert MetricsOptions().port == 9321

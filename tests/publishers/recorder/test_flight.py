@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from imud.contracts.lines import Edge, InputSettings, OnEdges
+from imud.contracts.lines import Edge, InputOptions, OnEdges
 from imud.contracts.publisher import Batch, NoLine
 from imud.formats import records
 from imud.formats.recording import RecordingReader
@@ -15,7 +15,7 @@ from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.units import NS_PER_S
 from imud.publishers.recorder.client_stream import stream_pair
-from imud.publishers.recorder.directory import FlightSettings, RecorderSettings, RecordingDirectory
+from imud.publishers.recorder.directory import FlightOptions, RecorderOptions, RecordingDirectory
 from imud.publishers.recorder.flight import FlightRecorder
 from tests.publishers.recorder.recording_bench import RecordingBench, records_in
 from tests.support.socket_rig import sample
@@ -29,9 +29,9 @@ class FlightBench(RecordingBench):
     def __init__(self, folder: Path, devices: list[str] | None = None, **flight: Any) -> None:
         super().__init__()
         self.folder = folder / "recordings"
-        settings = RecorderSettings(
+        settings = RecorderOptions(
             directory=str(self.folder), devices=devices,
-            flight=FlightSettings(**{"enabled": True, "minutes": 1, "after_s": 10, **flight}),
+            flight=FlightOptions(**{"enabled": True, "minutes": 1, "after_s": 10, **flight}),
         )  # fmt: skip
         self.edges: list[OnEdges] = []
         self.reports: list[Callable[[str], None]] = []
@@ -41,9 +41,7 @@ class FlightBench(RecordingBench):
         self.flight.start()
         self.tick()
 
-    def _watch(
-        self, _settings: InputSettings, purpose: str, on_edges: OnEdges, report: Callable[[str], None]
-    ) -> NoLine:
+    def _watch(self, _settings: InputOptions, purpose: str, on_edges: OnEdges, report: Callable[[str], None]) -> NoLine:
         assert purpose == "flight recorder"
         self.edges.append(on_edges)
         self.reports.append(report)
@@ -139,7 +137,7 @@ def test_a_device_that_is_lost_is_an_alert_unless_it_is_not_recorded(tmp_path: P
 
 
 def test_a_line_that_becomes_active_is_an_alert(tmp_path: Path) -> None:
-    bench = FlightBench(tmp_path, line=InputSettings(line="GPIO5"), after_s=0)
+    bench = FlightBench(tmp_path, line=InputOptions(line="GPIO5"), after_s=0)
     bench.edges[0]([Edge(1, False, 1)])
     bench.tick(2)
     assert bench.files == []
@@ -245,8 +243,8 @@ def test_a_directory_that_cannot_be_made_and_a_budget_without_room_for_a_snapsho
     with pytest.raises(ServerError, match="flight recorder"):
         FlightBench(tmp_path, directory=str(tmp_path / "a" / "b"))
     with pytest.raises(ValueError, match="room for a snapshot"):
-        RecorderSettings(keep_gb=0.25, enabled=True, flight=FlightSettings(enabled=True))
-    RecorderSettings(keep_gb=0.25, flight=FlightSettings(enabled=True))
+        RecorderOptions(keep_gb=0.25, enabled=True, flight=FlightOptions(enabled=True))
+    RecorderOptions(keep_gb=0.25, flight=FlightOptions(enabled=True))
     assert records.VERSION == 1
 
 

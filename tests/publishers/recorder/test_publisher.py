@@ -7,7 +7,7 @@ import pytest
 from imud.formats.records import Kind
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
-from imud.publishers.recorder.directory import FlightSettings, RecorderSettings
+from imud.publishers.recorder.directory import FlightOptions, RecorderOptions
 from imud.publishers.recorder.publisher import PUBLISHER
 from tests.publishers.recorder.recording_bench import RecordingBench, kinds_in
 from tests.support.socket_rig import batch
@@ -15,7 +15,7 @@ from tests.support.socket_rig import batch
 
 def test_files_are_written(tmp_path: Path) -> None:
     bench = RecordingBench()
-    made = PUBLISHER.make(RecorderSettings(enabled=True, directory=str(tmp_path / "a")), bench.context)
+    made = PUBLISHER.make(RecorderOptions(enabled=True, directory=str(tmp_path / "a")), bench.context)
     made.start()
     made.add_device("bow", 0)
     made.tick(bench.advance(0.1))
@@ -27,9 +27,9 @@ def test_files_are_written(tmp_path: Path) -> None:
 
 def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_path: Path) -> None:
     bench = RecordingBench()
-    flight = FlightSettings(enabled=True, acceleration_m_s2=1, after_s=0)
+    flight = FlightOptions(enabled=True, acceleration_m_s2=1, after_s=0)
     for enabled in (True, False):
-        settings = RecorderSettings(enabled=enabled, directory=str(tmp_path / str(enabled)), flight=flight)
+        settings = RecorderOptions(enabled=enabled, directory=str(tmp_path / str(enabled)), flight=flight)
         made = PUBLISHER.make(settings, bench.context)
         made.start()
         made.add_device("imu0", 0)
@@ -44,16 +44,16 @@ def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_
 
 
 def test_it_is_wanted_for_either() -> None:
-    assert not PUBLISHER.wanted(RecorderSettings())
-    assert PUBLISHER.wanted(RecorderSettings(enabled=True))
-    assert PUBLISHER.wanted(RecorderSettings(flight=FlightSettings(enabled=True)))
+    assert not PUBLISHER.wanted(RecorderOptions())
+    assert PUBLISHER.wanted(RecorderOptions(enabled=True))
+    assert PUBLISHER.wanted(RecorderOptions(flight=FlightOptions(enabled=True)))
 
 
 def test_where_one_cannot_start_nothing_runs(tmp_path: Path) -> None:
     bench = RecordingBench()
     (tmp_path / "file").write_bytes(b"")
-    flight = FlightSettings(enabled=True, directory=str(tmp_path / "file" / "no"))
-    made = PUBLISHER.make(RecorderSettings(enabled=True, directory=str(tmp_path / "a"), flight=flight), bench.context)
+    flight = FlightOptions(enabled=True, directory=str(tmp_path / "file" / "no"))
+    made = PUBLISHER.make(RecorderOptions(enabled=True, directory=str(tmp_path / "a"), flight=flight), bench.context)
     with pytest.raises(ServerError):
         made.start()
     assert bench.context.recorder_sources == []

@@ -12,7 +12,7 @@ from imud.model.errors import ServerError
 from imud.model.event import EventKind
 from imud.model.units import NS_PER_S
 from imud.publishers.recorder import publisher as module
-from imud.publishers.recorder.directory import RecorderSettings, RecordingDirectory
+from imud.publishers.recorder.directory import RecorderOptions, RecordingDirectory
 from imud.publishers.recorder.publisher import Recorder
 from imud.publishers.recorder.writer import RecordQueue
 from tests.publishers.recorder.recording_bench import RecordingBench
@@ -24,7 +24,7 @@ class RecorderBench(RecordingBench):
     def __init__(self, folder: Path, **settings: object) -> None:
         super().__init__()
         self.folder = folder / "recordings"
-        made = RecorderSettings(directory=str(self.folder), **settings)  # type: ignore[arg-type]  # by its keys
+        made = RecorderOptions(directory=str(self.folder), **settings)  # type: ignore[arg-type]  # by its keys
         directory = RecordingDirectory(self.folder, made.keep_bytes)
         self.recorder = Recorder(made, self.context, directory, self.start_worker)
         self.recorder.start()
@@ -174,7 +174,7 @@ def test_a_directory_that_cannot_be_made_and_a_budget_for_less_than_two_files_ar
     with pytest.raises(ServerError, match="recordings"):
         RecorderBench(tmp_path)
     with pytest.raises(ValueError, match="room for two files of file_mb"):
-        RecorderSettings(keep_gb=0.1)
+        RecorderOptions(keep_gb=0.1)
 
 
 def test_a_mistake_in_the_thread_ends_the_daemon(tmp_path: Path) -> None:

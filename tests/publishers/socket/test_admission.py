@@ -7,7 +7,7 @@ import pytest
 
 from imud.formats.jsonrpc import Code, RpcError
 from imud.publishers.socket import admission as quota
-from imud.publishers.socket.admission import Peer, Quota, Rights, Seldom, Shares, raise_fd_limit
+from imud.publishers.socket.admission import Peer, Quota, RateLimitedLog, Rights, Shares, raise_fd_limit
 from imud.publishers.socket.scheduler import TokenBucket
 
 READ, ALL = Rights.READ, Rights.READ | Rights.CONTROL
@@ -218,7 +218,7 @@ def test_selections_of_fields_are_limited() -> None:
 
 def test_a_frequent_message_is_logged_once_a_minute_with_its_count() -> None:
     now_ns = 0
-    seldom = Seldom(lambda: now_ns)
+    seldom = RateLimitedLog(lambda: now_ns)
     assert [seldom.count() for _ in range(5)] == [1, 0, 0, 0, 0]
     now_ns = 60_000 * MS - 1
     assert seldom.count() == 0

@@ -12,7 +12,7 @@ from imud.formats.jsonrpc import DEFAULT_PATH, LINE_MAX_BYTES, Code
 from imud.model.event import Event, EventKind
 from imud.publishers.socket.methods import METHODS, RATE_MAX_HZ, RATE_MIN_HZ
 from imud.publishers.socket.outbox import Limits
-from imud.publishers.socket.server import SocketServer, SocketSettings
+from imud.publishers.socket.server import SocketOptions, SocketServer
 from tests.support.files import ROOT
 from tests.support.socket_rig import LIMIT_S, NOW_NS, Peer, batch, daemon, in_server, until
 
@@ -85,7 +85,7 @@ async def publish_on_watch(server: SocketServer) -> None:
 
 
 def test_numbers_and_codes_of_the_text() -> None:
-    settings = SocketSettings()
+    settings = SocketOptions()
     limits = Limits(settings.queue_samples, settings.queue_bytes)
     for words in (
         f"at most {LINE_MAX_BYTES:,} bytes",

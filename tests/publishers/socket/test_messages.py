@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from imud.model.event import Event, EventKind
-from imud.publishers.shm import ShmPublisher, ShmSettings
+from imud.publishers.shm import ShmOptions, ShmPublisher
 from imud.publishers.socket.messages import NOTIFICATIONS
 from imud.publishers.socket.methods import METHODS
 from imud.publishers.socket.server import SocketServer
@@ -129,7 +129,7 @@ async def test_clients_that_watch_a_device_are_told_that_it_left(server: SocketS
 
 @in_server()
 async def test_the_path_of_the_ring_is_with_the_device(server: SocketServer, tmp_path: Path) -> None:
-    shm = ShmPublisher(ShmSettings(directory=str(tmp_path), slots=64), server.hub.context)
+    shm = ShmPublisher(ShmOptions(directory=str(tmp_path), slots=64), server.hub.context)
     shm.start()
     shm.add_device("imu0", 0)
     peer = await Peer.greeted(server)

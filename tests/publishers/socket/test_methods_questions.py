@@ -11,7 +11,7 @@ import pytest
 
 from imud.contracts.status import DeviceStatus
 from imud.publishers.socket.methods import DEVICES_PER_PIECE
-from imud.publishers.socket.server import SocketServer, SocketSettings
+from imud.publishers.socket.server import SocketOptions, SocketServer
 from tests.support.socket_rig import NOW_NS, Peer, batch, context, device_status, in_context, until
 
 TURN_NS = 1_000_000
@@ -29,7 +29,7 @@ class Fleet:
         self.taken = 0
         self.names = [f"imu{number}" for number in range(DEVICES)]
         known = dataclasses.replace(context(lambda: self.now_ns), status_in_turn=self.each_status)
-        self.server = SocketServer(SocketSettings(path=str(directory / "s")), known)
+        self.server = SocketServer(SocketOptions(path=str(directory / "s")), known)
 
     def each_status(self) -> Iterator[DeviceStatus]:
         for number, name in enumerate(list(self.names)):

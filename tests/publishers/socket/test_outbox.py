@@ -14,7 +14,7 @@ import pytest
 
 from imud.formats.jsonrpc import encode_notification
 from imud.formats.slot import SLOT_BYTES, decode_slot
-from imud.publishers.socket.client import BYTE, Connection
+from imud.publishers.socket.client import BYTE, ClientConnection
 from imud.publishers.socket.outbox import (
     REPLY_BYTES,
     SAMPLE_BYTES,
@@ -216,7 +216,7 @@ def fill(server: SocketServer) -> None:
         server.publish(batch("imu0", seq))
 
 
-async def descriptors(peer: Peer, connection: Connection) -> int:
+async def descriptors(peer: Peer, connection: ClientConnection) -> int:
     """Read until the reply with id 7; count the descriptors that came."""
     found: list[int] = []
     data = bytearray()

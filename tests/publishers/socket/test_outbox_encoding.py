@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from imud.attitude.conventions import RFU_ENU, Convention
-from imud.attitude.published import FrameSettings, MountingAxes, PublishedFrame, as_sent, published_frame
+from imud.attitude.published import FrameOptions, MountingAxes, PublishedAxes, as_sent, published_frame
 from imud.contracts.publisher import Batch
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.model.sample import Sample
@@ -40,7 +40,7 @@ EXPECTED: dict[str | None, dict[str, Any]] = {
 """By the convention that a client asks for."""
 
 
-def published(samples: Sequence[Sample], frame: PublishedFrame | None = None) -> Batch:
+def published(samples: Sequence[Sample], frame: PublishedAxes | None = None) -> Batch:
     frame = frame or as_sent(RFU_ENU)
     rotation = frame.rotation
     return Batch("imu0", 0, list(samples) if rotation is None else rotation.samples(samples), frame)
@@ -69,7 +69,7 @@ FRAMES = {
             SENT, accel_m_s2=(-0.125, 9.75, 0.5), gyro_rad_s=(-0.25, 0.5, 0.75), mag_t=(-1e-5, 2e-5, -3e-5),
             quat_wxyz=(0.0, 0.0, 1.0, 0.0), euler_rad=(radians(180), 0.0, 0.0),
         ),
-        published_frame(FrameSettings(axes=MountingAxes(x="y", y="x", z="-z")), None, None, RFU_ENU),
+        published_frame(FrameOptions(axes=MountingAxes(x="y", y="x", z="-z")), None, None, RFU_ENU),
     ),
 }  # fmt: skip
 """The same body, seen by modules whose samples are published in three ways."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from imud.publishers.socket import scheduler as serving
-from imud.publishers.socket.scheduler import Place, Scheduler, TokenBucket
+from imud.publishers.socket.scheduler import Scheduler, TokenBucket, Turn
 from tests.support.socket_rig import in_context, until
 
 MS = 1_000_000
@@ -67,7 +67,7 @@ class SchedulerBench:
         self.scheduler = Scheduler(self.clock, self.clock, time)
         self.socks: list[socket.socket] = []
 
-    def add(self, name: str, uid: int, pieces: int, cost_ns: int) -> tuple[Worker, Place]:
+    def add(self, name: str, uid: int, pieces: int, cost_ns: int) -> tuple[Worker, Turn]:
         ours, theirs = socket.socketpair()
         self.socks += [ours, theirs]
         worker = Worker(name, self, pieces, cost_ns)

@@ -16,7 +16,7 @@ from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.model.event import Event, EventKind
 from imud.model.sample import SAMPLE_FIELDS
 from imud.publishers import PUBLISHERS
-from imud.publishers.socket.server import PUBLISHER, SocketServer, SocketSettings
+from imud.publishers.socket.server import PUBLISHER, SocketOptions, SocketServer
 from tests.support.socket_rig import (
     DEVICES,
     EPOCH,
@@ -37,7 +37,7 @@ FORMS_PER_USER = 16
 def test_row_is_the_table_s() -> None:
     assert PUBLISHERS["socket"] is PUBLISHER
     assert PUBLISHER.name == "socket"
-    assert PUBLISHER.settings() == SocketSettings()
+    assert PUBLISHER.settings() == SocketOptions()
 
 
 @in_server()

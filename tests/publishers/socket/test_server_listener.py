@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from imud.model.errors import ServerError
-from imud.publishers.socket.server import PATH_MAX_BYTES, SOCKET_MODE, Listener, SocketServer, SocketSettings
+from imud.publishers.socket.server import PATH_MAX_BYTES, SOCKET_MODE, Listener, SocketOptions, SocketServer
 from tests.support.socket_rig import Peer, alone, context, in_server, serving
 
 
@@ -18,7 +18,7 @@ async def test_a_stale_socket_is_replaced_and_a_live_one_left_alone(tmp_path: Pa
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(tmp_path / "imud.sock"))
     async with serving(tmp_path) as server:
-        second = SocketServer(SocketSettings(path=server.hub.path), context())
+        second = SocketServer(SocketOptions(path=server.hub.path), context())
         with pytest.raises(ServerError, match="another daemon serves"):
             second.start()
         second.close()
@@ -28,10 +28,10 @@ async def test_a_stale_socket_is_replaced_and_a_live_one_left_alone(tmp_path: Pa
 @alone()
 async def test_close_leaves_a_socket_alone_that_is_another_daemon_s(tmp_path: Path) -> None:
     path = tmp_path / "imud.sock"
-    server = SocketServer(SocketSettings(path=str(path)), context())
+    server = SocketServer(SocketOptions(path=str(path)), context())
     server.start()
     path.unlink()
-    successor = SocketServer(SocketSettings(path=str(path)), context())
+    successor = SocketServer(SocketOptions(path=str(path)), context())
     successor.start()
     server.close()
     server.close()
@@ -43,7 +43,7 @@ async def test_close_leaves_a_socket_alone_that_is_another_daemon_s(tmp_path: Pa
 
 @alone()
 async def test_the_directory_is_made_or_the_error_says_what_to_do(tmp_path: Path) -> None:
-    server = SocketServer(SocketSettings(path=str(tmp_path / "run" / "imud" / "s")), context())
+    server = SocketServer(SocketOptions(path=str(tmp_path / "run" / "imud" / "s")), context())
     server.start()
     assert (tmp_path / "run" / "imud").stat().st_mode & 0o777 == 0o755
     server.close()
@@ -52,7 +52,7 @@ async def test_the_directory_is_made_or_the_error_says_what_to_do(tmp_path: Path
         (tmp_path / "file" / "s", "cannot make the directory"),
         (tmp_path / "file", "another kind of file"),
     ):
-        blocked = SocketServer(SocketSettings(path=str(path)), context())
+        blocked = SocketServer(SocketOptions(path=str(path)), context())
         with pytest.raises(ServerError, match=words):
             blocked.start()
         blocked.close()
@@ -69,7 +69,7 @@ async def test_a_failed_start_leaves_nothing(tmp_path: Path, monkeypatch: pytest
 
     owner = {"chmod": os, "listen": socket.socket, "rename": Path}[step]
     descriptors = len(os.listdir("/proc/self/fd"))
-    server = SocketServer(SocketSettings(path=str(tmp_path / "imud.sock")), context())
+    server = SocketServer(SocketOptions(path=str(tmp_path / "imud.sock")), context())
     with monkeypatch.context() as patch:
         patch.setattr(owner, step, refuse)
         with pytest.raises(ServerError, match="Cannot allocate memory"):

@@ -10,7 +10,7 @@ import pytest
 
 from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
 from imud.drivers.hipnuc.j1939 import codec, commands
-from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Settings, J1939Node
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Options, J1939Node
 from imud.formats.can import EXTENDED_ID_MAX, RAW_FRAME
 from imud.formats.j1939 import split
 from imud.model.errors import NoReply, Rejected
@@ -36,7 +36,7 @@ def made(**options: object) -> HipnucJ1939Module:
 
 def decoded(frames: Sequence[SentFrame], address: int = 8) -> list[tuple[Measurement, int]]:
     """Measurements, each with its instant."""
-    codec = HipnucJ1939Codec(Ledger(), HipnucJ1939Settings(address=address))
+    codec = HipnucJ1939Codec(Ledger(), HipnucJ1939Options(address=address))
     found: list[tuple[Measurement, int]] = []
     for frame in frames:
         for event in codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.due_ns):
@@ -65,7 +65,7 @@ class J1939Host:
         return new
 
     def talk(self, begin: Callable[[J1939Node], RequestScript[object]], address: int = 8) -> object:
-        codec = HipnucJ1939Codec(Ledger(), HipnucJ1939Settings(address=address, host_address=self.host))
+        codec = HipnucJ1939Codec(Ledger(), HipnucJ1939Options(address=address, host_address=self.host))
 
         def ask(request: Request) -> Outcome:
             can_id, size, data = RAW_FRAME.unpack(request.payload)

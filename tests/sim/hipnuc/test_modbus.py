@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from imud.drivers.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusSettings
+from imud.drivers.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusOptions
 from imud.drivers.hipnuc.modbus.registers import randomise_ids, read_registers, set_id_by_serial, write_register
 from imud.formats.modbus import framed, is_exception, is_whole
 from imud.model.ledger import Ledger
@@ -72,7 +72,7 @@ def test_time_of_bytes_pieces_and_echo() -> None:
 def test_values_are_the_truth_of_that_instant() -> None:
     for firmware, resolution in ((152, 2**-15), (169, 1e-4)):
         rig = ModbusMaster(here(1, firmware=firmware, inclinometer="dual"))
-        codec = HipnucModbusCodec(Ledger(), HipnucModbusSettings())
+        codec = HipnucModbusCodec(Ledger(), HipnucModbusOptions())
         request = READ_BLOCK if firmware == 169 else read_registers(0x34, 24).sends[0]
         if firmware == 152:
             assert is_exception(rig.ask(1, READ_BLOCK))

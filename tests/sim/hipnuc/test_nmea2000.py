@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from imud.drivers.hipnuc.nmea2000 import HipnucNmea2000Codec, HipnucNmea2000Settings
+from imud.drivers.hipnuc.nmea2000 import HipnucNmea2000Codec, HipnucNmea2000Options
 from imud.formats.j1939 import split
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -24,7 +24,7 @@ def made(**options: object) -> HipnucNmea2000Module:
 
 def test_values_are_the_truth_of_the_sample_instant() -> None:
     module = made()
-    codec = HipnucNmea2000Codec(Ledger(), HipnucNmea2000Settings())
+    codec = HipnucNmea2000Codec(Ledger(), HipnucNmea2000Options())
     found = 0
     for frame in module.advance(BEGIN_NS + 5 * SECOND_NS):
         for event in codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.due_ns):

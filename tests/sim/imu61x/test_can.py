@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from imud.attitude.rotation import euler_zyx_from_quat
-from imud.drivers.imu61x.can import Imu61xCanCodec, Imu61xCanSettings
+from imud.drivers.imu61x.can import Imu61xCanCodec, Imu61xCanOptions
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.sim.can_module import SentFrame
@@ -25,7 +25,7 @@ def run(module: Imu61xCanModule, until_ns: int, step_ns: int = 700_000) -> list[
 
 
 def decoded(frames: list[SentFrame]) -> list[Measurement]:
-    codec = Imu61xCanCodec(Ledger(), Imu61xCanSettings())
+    codec = Imu61xCanCodec(Ledger(), Imu61xCanOptions())
     events = [event for f in frames for event in codec.feed_frame(f.can_id, f.extended, f.data, f.due_ns)]
     return [event for event in events if isinstance(event, Measurement)]
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from imud.contracts.lines import Edge, InputLine, InputSettings, OutputLine, OutputSettings
+from imud.contracts.lines import Edge, InputLine, InputOptions, OutputLine, OutputOptions
 from imud.model.errors import LinkBusy, LinkError, LinkMissing
 from imud.sim.ports.pins import MemoryInput, MemoryLines, MemoryOutput
 from tests.support.event_loops import in_loop
@@ -30,10 +30,10 @@ def test_lines_and_levels() -> None:
         assert not busy.is_open
 
     memory = MemoryLines(now_ns=lambda: 5)
-    made = memory.maker.make_input(InputSettings(line="A"), "bow sout", True)
+    made = memory.maker.make_input(InputOptions(line="A"), "bow sout", True)
     assert made is memory.inputs["bow sout"]
-    assert memory.maker.make_input(InputSettings(line="A"), "bow sout", True) is made
-    output = memory.maker.make_output(OutputSettings(line="B"), "bow sin")
+    assert memory.maker.make_input(InputOptions(line="A"), "bow sout", True) is made
+    output = memory.maker.make_output(OutputOptions(line="B"), "bow sin")
     output.open()
     output.set(True)
     assert memory.outputs["bow sin"].history == [(5, True)]

@@ -41,7 +41,7 @@ from imud.drivers.hipnuc.canopen.cia301 import (
 )
 from imud.drivers.hipnuc.common import M_S2_PER_G, QUAT_PER_LSB, pressure_of
 from imud.model.ledger import Ledger
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Measurement, Pair, Quaternion, Vector3
 from imud.model.units import RAD_PER_DEG
 
@@ -60,8 +60,8 @@ INCLI_RAD_PER_LSB: Final = 0.01 * RAD_PER_DEG
 SYNC_HZ_MIN, SYNC_HZ_MAX = 0.01, 200.0
 
 
-class HipnucCanopenSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a node, and of SYNC."""
+class HipnucCanopenOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of a node, and of SYNC."""
 
     node: Annotated[int, Meta(ge=1, le=NODE_MAX)] = NODE_DEFAULT
     """The node's number; 8 as delivered."""
@@ -79,7 +79,7 @@ class HipnucCanopenSettings(Settings, frozen=True, kw_only=True, forbid_unknown_
 class HipnucCanopenCodec:
     """Decoder of the TPDOs of one node. Synchronization: one thread."""
 
-    def __init__(self, ledger: Ledger, settings: HipnucCanopenSettings) -> None:
+    def __init__(self, ledger: Ledger, settings: HipnucCanopenOptions) -> None:
         self.ledger = ledger
         node, wanted = settings.node, settings.tpdos
         self._tpdos = {function + node: (number, LAYOUTS[number].size) for number, function in TPDO_FUNCTIONS.items()}

@@ -42,7 +42,7 @@ from imud.drivers.hipnuc.canopen.cia301 import (
     write_frame,
     write_object,
 )
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, pack_frame
 from imud.model.errors import BadArgument, DeviceRefused, NoReply
 from imud.model.units import NS_PER_MS, NS_PER_S
@@ -281,7 +281,7 @@ BOOT_NS: Final = 3 * NS_PER_S
 ALL_BOOTS: Final = (CanFilter(HEARTBEAT, FUNCTION_MASK, False),)
 
 
-def change_node(settings: HipnucCanopenSettings, new: int) -> RequestScript[Written]:
+def change_node(settings: HipnucCanopenOptions, new: int) -> RequestScript[Written]:
     """Give a node another number, 1 … 127, and follow it where that is in force at once.
 
     Raises BadArgument for a number that is heard on the bus, DeviceRefused, Aborted, and NoReply for a node that is
@@ -306,7 +306,7 @@ def change_node(settings: HipnucCanopenSettings, new: int) -> RequestScript[Writ
     raise NoReply(f"the node {confirmed}answers neither as node {new} nor as node {node}: it was commanded to go back")
 
 
-def restart(settings: HipnucCanopenSettings, bus_bit_s: int) -> RequestScript[str]:
+def restart(settings: HipnucCanopenOptions, bus_bit_s: int) -> RequestScript[str]:
     """Restart, as by power-on, and follow the node to the number that it has then; return what became of it.
 
     `bus_bit_s` is the rate of the bus, 0 where it is not known. Raises NoReply for a node that is not heard afterwards.
@@ -314,12 +314,12 @@ def restart(settings: HipnucCanopenSettings, bus_bit_s: int) -> RequestScript[st
     return (yield from _reset(settings, bus_bit_s, restart_request(settings.node)))
 
 
-def reset(settings: HipnucCanopenSettings, bus_bit_s: int, command: NmtCommand) -> RequestScript[str]:
+def reset(settings: HipnucCanopenOptions, bus_bit_s: int, command: NmtCommand) -> RequestScript[str]:
     """The same by an NMT command that resets."""
     return (yield from _reset(settings, bus_bit_s, nmt_request(settings.node, command)))
 
 
-def factory_reset_and_find(settings: HipnucCanopenSettings) -> RequestScript[str]:
+def factory_reset_and_find(settings: HipnucCanopenOptions) -> RequestScript[str]:
     """Restore the factory settings, in force after a restart: node 8 and 500 kbit/s.
 
     Raises BadArgument where another node has number 8, Aborted, NoReply.
@@ -330,7 +330,7 @@ def factory_reset_and_find(settings: HipnucCanopenSettings) -> RequestScript[str
     return f"restored; it is node {NODE_DEFAULT} at 500 kbit/s after the next restart"
 
 
-def _reset(settings: HipnucCanopenSettings, bus_bit_s: int, request: Request) -> RequestScript[str]:
+def _reset(settings: HipnucCanopenOptions, bus_bit_s: int, request: Request) -> RequestScript[str]:
     node = settings.node
     saved = yield from read_values(node, ((NODE_ID, 0), (BIT_RATE, 0)), silent_is_fine=True)
     number = saved.get((NODE_ID, 0), node)
@@ -393,7 +393,7 @@ def _number_frame(node: int, value: int) -> bytes:
     return pack_frame(SDO_REQUEST + node, False, write_frame(NODE_ID, 0, value.to_bytes(4, "little")))
 
 
-def _follow(settings: HipnucCanopenSettings, node: int) -> Request:
+def _follow(settings: HipnucCanopenOptions, node: int) -> Request:
     """Listen to the node under another number from now on."""
     moved = replace(settings, node=node)
     return Request(b"", f"node {settings.node}, now {node}", never, never, never, silent=True, settings=moved)

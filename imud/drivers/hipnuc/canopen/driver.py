@@ -10,7 +10,7 @@ from msgspec import Meta
 from imud.contracts.command import Action, Actions, Risk, Target
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, DataSheet
 from imud.contracts.script import RequestScript
-from imud.contracts.setting import DeviceSettings, Effect, Setting, Written
+from imud.contracts.setting import Effect, Setting, SettingsTable, Written
 from imud.drivers.hipnuc.bus_load import MS_PER_S, CyclicMessage, refuse_other_rate, refuse_overload
 from imud.drivers.hipnuc.canopen import commands as moves
 from imud.drivers.hipnuc.canopen import commands as session
@@ -32,7 +32,7 @@ from imud.drivers.hipnuc.canopen.codec import (
     GYRO_RAD_S_PER_LSB,
     LAYOUTS,
     HipnucCanopenCodec,
-    HipnucCanopenSettings,
+    HipnucCanopenOptions,
     encode_tpdos,
 )
 from imud.drivers.hipnuc.canopen.commands import (
@@ -161,7 +161,7 @@ def _sign(axis: Literal["x", "y"]) -> Setting:
     )
 
 
-SETTINGS: Final = DeviceSettings(
+SETTINGS: Final = SettingsTable(
     table={
         **{interval_name(tpdo): _interval_setting(tpdo) for tpdo in TPDOS},
         **{transmission_name(tpdo): _transmission_setting(tpdo) for tpdo in TPDOS},
@@ -340,7 +340,7 @@ def _example_frames(random: Random) -> list[CanFrame]:
     return [CanFrame(TPDO_FUNCTIONS[number] + NODE_DEFAULT, False, data, 0) for number, data in frames.items()]
 
 
-def _filters(settings: HipnucCanopenSettings) -> list[CanFilter]:
+def _filters(settings: HipnucCanopenOptions) -> list[CanFilter]:
     functions = (*TPDO_FUNCTIONS.values(), SDO_REPLY, HEARTBEAT, EMERGENCY)
     return [CanFilter(function + settings.node, STANDARD_ID_MAX, False) for function in functions]
 
@@ -354,14 +354,14 @@ def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
     return node if node and not extended and _SIZES.get(can_id & FUNCTION_MASK) == len(data) else None
 
 
-def _cyclic(settings: HipnucCanopenSettings) -> list[CyclicFrame]:
+def _cyclic(settings: HipnucCanopenOptions) -> list[CyclicFrame]:
     return [CyclicFrame(SYNC, False, b"", round(US_PER_S / settings.sync_hz) * NS_PER_US)] if settings.sync_hz else []
 
 
 DRIVER: Final = CanDriver(
     name="hipnuc-canopen",
     title="HiPNUC CH0x0, CH10x, HI14 (CANopen)",
-    settings=HipnucCanopenSettings,
+    settings=HipnucCanopenOptions,
     make_codec=HipnucCanopenCodec,
     filters=_filters,
     tick_ns=SAMPLE_COUNTER,
@@ -373,7 +373,7 @@ DRIVER: Final = CanDriver(
     calibrations=inclinometer_zero("5.4.1", ACTIONS),
     device_settings=SETTINGS,
     node_of=_node_of,
-    node_settings=lambda node: HipnucCanopenSettings(node=node),
+    node_settings=lambda node: HipnucCanopenOptions(node=node),
     node_title=lambda node: f"node {node}",
     identify=lambda settings: identify(settings.node),
     read_settings=lambda settings: read_settings(settings.node),

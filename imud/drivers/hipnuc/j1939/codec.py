@@ -35,7 +35,7 @@ from imud.drivers.hipnuc.common import (
 )
 from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, join
 from imud.model.ledger import Ledger
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
 
 MeasuredName = Literal["FF34", "FF37", "FF3A", "FF3D", "FF41", "FF43", "FF46", "FF4A"]
@@ -248,8 +248,8 @@ FACTORY_ADDRESS: Final = 8
 Address = Annotated[int, Meta(ge=0, le=ADDRESS_MAX)]
 
 
-class HipnucJ1939Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a module on J1939."""
+class HipnucJ1939Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of a module on J1939."""
 
     address: Address = FACTORY_ADDRESS
     """The module's address on the bus (J1939 source address); it can be set to 1 … 128."""
@@ -273,7 +273,7 @@ class HipnucJ1939Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fi
 class HipnucJ1939Codec:
     """Decoder of the frames of one module. Synchronization: one thread."""
 
-    def __init__(self, ledger: Ledger, settings: HipnucJ1939Settings) -> None:
+    def __init__(self, ledger: Ledger, settings: HipnucJ1939Options) -> None:
         self.ledger = ledger
         taken = (UTC, *settings.measured())
         self._pgns = {join(J1939Id(0, pgn, settings.address)): pgn for pgn in taken}

@@ -33,7 +33,7 @@ from imud.drivers.hipnuc.j1939.codec import (
     FACTORY_ADDRESS,
     PGNS,
     PRIORITY,
-    HipnucJ1939Settings,
+    HipnucJ1939Options,
     J1939Node,
 )
 from imud.formats.can import CanFilter, pack_frame
@@ -304,7 +304,7 @@ BOOT_NS: Final = 3 * NS_PER_S
 SOURCE_MASK: Final = 0xFF
 
 
-def change_address(settings: HipnucJ1939Settings, new: int) -> RequestScript[Written]:
+def change_address(settings: HipnucJ1939Options, new: int) -> RequestScript[Written]:
     """Give a module another address, 1 … 128, and follow it where that is in force at once.
 
     Raises BadArgument for an address that is heard on the bus, Rejected, and NoReply for a module that is heard at
@@ -330,7 +330,7 @@ def change_address(settings: HipnucJ1939Settings, new: int) -> RequestScript[Wri
     )
 
 
-def restart(settings: HipnucJ1939Settings, bus_bit_s: int) -> RequestScript[str]:
+def restart(settings: HipnucJ1939Options, bus_bit_s: int) -> RequestScript[str]:
     """Restart, and follow the module to the address that it has then; return what became of it.
 
     `bus_bit_s` is the rate of the bus, 0 where it is not known. Raises Rejected, and NoReply for a module that is not
@@ -359,7 +359,7 @@ def restart(settings: HipnucJ1939Settings, bus_bit_s: int) -> RequestScript[str]
     return f"restarted, at address {found}"
 
 
-def factory_reset_and_find(settings: HipnucJ1939Settings) -> RequestScript[str]:
+def factory_reset_and_find(settings: HipnucJ1939Options) -> RequestScript[str]:
     """Restore the factory settings, address 8 and its bit rate included; in force after a restart at the latest.
 
     Raises BadArgument where another module has address 8, Rejected.
@@ -390,7 +390,7 @@ def _claim(request: Request, places: Sequence[int] | None) -> RequestScript[int 
     return split(outcome.frames[-1].frame_id).source if isinstance(outcome, Reply) else None
 
 
-def _heard(settings: HipnucJ1939Settings, address: int) -> RequestScript[int]:
+def _heard(settings: HipnucJ1939Options, address: int) -> RequestScript[int]:
     """Ask a module for its address; return the identifier of the first frame from there, of any kind, 0 for none."""
     asked = exchange(J1939Node(address, settings.host_address), ADDRESS, READ, READ_VALUE, f"address {address}")
     also = (CanFilter(address, SOURCE_MASK, True),)
@@ -407,7 +407,7 @@ def _write_address(peer: J1939Node, value: int) -> RequestScript[bool]:
     return isinstance(outcome, Reply)
 
 
-def _follow(settings: HipnucJ1939Settings, address: int) -> Request:
+def _follow(settings: HipnucJ1939Options, address: int) -> Request:
     """Listen to the module at another address from now on."""
     moved = with_fields(settings, address=address)
     return Request(b"", f"now at address {address}", never, never, never, silent=True, settings=moved)

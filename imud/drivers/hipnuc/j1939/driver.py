@@ -11,7 +11,7 @@ from imud.attitude.rotation import euler312_from_quat, quat_normalized
 from imud.contracts.command import Action, Actions, Risk, Target
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver
 from imud.contracts.script import RequestScript
-from imud.contracts.setting import DeviceSettings, Effect, Setting, Written
+from imud.contracts.setting import Effect, Setting, SettingsTable, Written
 from imud.drivers.hipnuc.bus_load import CyclicMessage, refuse_other_rate, refuse_overload
 from imud.drivers.hipnuc.common import REGISTERS, inclinometer_zero
 from imud.drivers.hipnuc.j1939 import codec as messages
@@ -21,7 +21,7 @@ from imud.drivers.hipnuc.j1939.codec import (
     CONFIGURE,
     HOST_ADDRESS,
     HipnucJ1939Codec,
-    HipnucJ1939Settings,
+    HipnucJ1939Options,
     J1939Node,
     PgnName,
     encode,
@@ -124,7 +124,7 @@ def _sign(axis: Literal["X", "Y"]) -> Setting:
     )
 
 
-SETTINGS: Final = DeviceSettings(
+SETTINGS: Final = SettingsTable(
     table={
         **{interval_name(pgn): _interval_setting(pgn) for pgn in INTERVALS},
         "x_reversed": _sign("X"),
@@ -267,7 +267,7 @@ def _example_frames(random: Random) -> list[CanFrame]:
     return [CanFrame(can_id, True, data, 0) for can_id, data in made]
 
 
-def _filters(settings: HipnucJ1939Settings) -> list[CanFilter]:
+def _filters(settings: HipnucJ1939Options) -> list[CanFilter]:
     """The messages of one module, and its replies."""
     wanted = [filter_of(pgn, settings.address) for pgn in (messages.UTC, *settings.measured())]
     hosts = sorted({settings.host_address, HOST_ADDRESS})
@@ -282,7 +282,7 @@ def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
 DRIVER: Final = CanDriver(
     name="hipnuc-j1939",
     title="HiPNUC CH0x0, CH10x, HI14 (CAN, SAE J1939)",
-    settings=HipnucJ1939Settings,
+    settings=HipnucJ1939Options,
     make_codec=HipnucJ1939Codec,
     filters=_filters,
     tick_ns=SAMPLE_COUNTER,
@@ -295,7 +295,7 @@ DRIVER: Final = CanDriver(
     device_settings=SETTINGS,
     calibrations=inclinometer_zero("6.2.2", ACTIONS),
     node_of=_node_of,
-    node_settings=lambda address: HipnucJ1939Settings(address=address),
+    node_settings=lambda address: HipnucJ1939Options(address=address),
     node_title=lambda address: f"address {address}",
     identify=lambda settings: session.identify(settings.peer),
     read_settings=lambda settings: session.read_settings(settings.peer),

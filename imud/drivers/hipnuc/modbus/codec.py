@@ -58,7 +58,7 @@ from imud.formats.modbus import (
     is_whole,
 )
 from imud.model.ledger import Ledger
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Measurement, Pair, Quaternion, Vector3
 from imud.model.units import NS_PER_S
 
@@ -85,7 +85,7 @@ STATUS_NS: Final = NS_PER_S
 _SAMPLE, _SERIAL, _STATUS = 0, 1, 2
 
 
-class HipnucModbusSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class HipnucModbusOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of a module on RS-485."""
 
     inclinometer: Literal["auto", "single", "dual"] = "auto"
@@ -95,7 +95,7 @@ class HipnucModbusSettings(Settings, frozen=True, kw_only=True, forbid_unknown_f
     """Rate at which the device renews its registers, per second, for the error of time stamps; 0 if not known."""
 
 
-def update_ns(settings: HipnucModbusSettings) -> int:
+def update_ns(settings: HipnucModbusOptions) -> int:
     """Longest time between two updates of the registers, 0 for not known."""
     return int(NS_PER_S / settings.update_hz) if settings.update_hz else 0
 
@@ -106,7 +106,7 @@ class HipnucModbusCodec:
     What the module said of its registers stays, after `reset` too; scales and serial number are learned anew.
     """
 
-    def __init__(self, ledger: Ledger, settings: HipnucModbusSettings) -> None:
+    def __init__(self, ledger: Ledger, settings: HipnucModbusOptions) -> None:
         self.ledger = ledger
         self._fixed_incli = _INCLI[settings.inclinometer]
         self._stale_before = 0

@@ -11,7 +11,7 @@ from imud.attitude.rotation import euler312_from_quat, quat_normalized
 from imud.contracts.command import Action, Actions, Calibrations, Risk, Target, Verdict
 from imud.contracts.driver import PolledDriver
 from imud.contracts.script import TransferScript
-from imud.contracts.setting import DeviceSettings, Effect, Setting
+from imud.contracts.setting import Effect, Setting, SettingsTable
 from imud.drivers.hipnuc.common import (
     MAIN_STATUS,
     NINE_AXES_NEEDED,
@@ -23,7 +23,7 @@ from imud.drivers.hipnuc.common import (
     magnetometer,
 )
 from imud.drivers.hipnuc.modbus import commands as session
-from imud.drivers.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusSettings, pack_block, update_ns
+from imud.drivers.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusOptions, pack_block, update_ns
 from imud.drivers.hipnuc.modbus.commands import LineMounting, probe, set_up
 from imud.drivers.hipnuc.modbus.registers import (
     BAUD_RATES,
@@ -184,7 +184,7 @@ def _check(target: Target, values: Mapping[str, Any]) -> None:
         )
 
 
-SETTINGS: Final = DeviceSettings(
+SETTINGS: Final = SettingsTable(
     table={
         "mode": Setting(
             type=Annotated[
@@ -250,7 +250,7 @@ def _example_reading(random: Random) -> bytes:
 DRIVER: Final = PolledDriver(
     name="hipnuc-modbus",
     title="HiPNUC CH0x0, CH10x, HI14 (RS-485, Modbus RTU)",
-    settings=HipnucModbusSettings,
+    settings=HipnucModbusOptions,
     tick_ns=NS_PER_MS,
     tick_modulus=2**32,
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",

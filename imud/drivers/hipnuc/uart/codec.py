@@ -43,7 +43,7 @@ from imud.drivers.hipnuc.common import (
 )
 from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, LineFinder
 from imud.model.ledger import Ledger
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
 from imud.model.units import RAD_PER_DEG, T_PER_UT
 
@@ -257,8 +257,8 @@ _IDLE_LINE: Final = re.compile(rb"[\t\x20-\x7e]{2,%d}\r\n\Z" % LINE_CHARACTERS_M
 device always sends. Less comes by chance inside half a frame, which would then be dropped."""
 
 
-class HipnucSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a module on a UART."""
+class HipnucOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of a module on a UART."""
 
     hi91_word: Literal["auto", "pps", "status"] = "auto"
     """Meaning of bytes 1-2 of HI91: time since the last PPS edge (firmware before 1.6.9) or status bits (since).
@@ -274,7 +274,7 @@ class HipnucCodec:
     itself count as good.
     """
 
-    def __init__(self, ledger: Ledger, settings: HipnucSettings) -> None:
+    def __init__(self, ledger: Ledger, settings: HipnucOptions) -> None:
         self.ledger = ledger
         self.word_is_status = settings.hi91_word == "status"
         """Whether bytes 1-2 of HI91 are status bits."""

@@ -16,7 +16,7 @@ from imud.attitude.rotation import Matrix3
 from imud.contracts.command import Target
 from imud.contracts.lines import AlarmRange, AlarmRanges, DeviceLines
 from imud.contracts.script import RequestScript
-from imud.contracts.setting import DeviceSettings, Effect, Setting
+from imud.contracts.setting import Effect, Setting, SettingsTable
 from imud.drivers.hipnuc.common import AttitudeMode
 from imud.drivers.hipnuc.uart import commands
 from imud.drivers.hipnuc.uart import commands as session
@@ -38,7 +38,7 @@ from imud.drivers.hipnuc.uart.commands import (
 )
 from imud.drivers.hipnuc.uart.replies import lines_of, parse_comconfig, parse_magconfig, parse_usrconfig
 from imud.model.errors import BadArgument
-from imud.model.options import Settings
+from imud.model.options import Options
 
 PIN_SETTING: Final = "PMUX5"
 """Selects what the pin does."""
@@ -75,7 +75,7 @@ Pin = Annotated[int, Meta(ge=1, le=PIN_MAX)]
 Angle = Annotated[float, Meta(ge=-180, le=180, extra={"unit": "°"})]
 
 
-class AngleAlarm(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class AngleAlarm(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Range of one angle; the alarm pin is high outside of it."""
 
     min_deg: Angle
@@ -267,7 +267,7 @@ def _described(value_type: Any, description: str, section: str, unit: str = "") 
     return Annotated[value_type, Meta(description=description, extra={"section": section, "unit": unit})]
 
 
-SETTINGS: Final = DeviceSettings(
+SETTINGS: Final = SettingsTable(
     table={
         "mode": Setting(
             type=_described(Modes, "six axes, or nine with the magnetometer for the heading", "2.2.4"), write=_mode

@@ -30,7 +30,7 @@ from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.contracts.script import Message, ReplyFrame
 from imud.drivers.imu61x.common import CRC_INVERSION, CRC_START, M_S2_PER_G, RAD_S_PER_DEG_S, crc32, scaled
 from imud.model.ledger import Ledger
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
 from imud.model.units import RAD_PER_DEG
 
@@ -366,7 +366,7 @@ class Imu61xCodec:
     reports it; its bytes and itself count as good.
     """
 
-    def __init__(self, ledger: Ledger, _settings: Settings | None = None) -> None:
+    def __init__(self, ledger: Ledger, _settings: Options | None = None) -> None:
         self.ledger = ledger
         self._finder = FrameFinder(ledger, DEVICE_SYNC)
 

@@ -32,7 +32,7 @@ from imud.drivers.imu61x.uart.codec import (
     parse_status,
 )
 from imud.model.errors import BadArgument, CommandError, NoReply, Rejected
-from imud.model.options import Settings
+from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
 from imud.model.units import BITS_PER_UART_BYTE, NS_PER_MS, NS_PER_S
 
@@ -276,7 +276,7 @@ STREAM: Final = output_mode(OutputMode.STREAM).payload
 """The bytes that make it stream: the undo of every script that may leave it in command mode."""
 
 
-class Imu61xUartSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Imu61xUartOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of an IMU61x on a UART: codes that the manual does not give."""
 
     result_done: Annotated[int, Meta(ge=0, le=0xFFFF)] = RESULT_DONE

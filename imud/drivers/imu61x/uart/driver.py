@@ -47,7 +47,7 @@ from imud.drivers.imu61x.uart.codec import (
 from imud.drivers.imu61x.uart.commands import (
     BAUD_RATES,
     BusMode,
-    Imu61xUartSettings,
+    Imu61xUartOptions,
     acknowledged,
     answered,
     in_contact,
@@ -349,7 +349,7 @@ DRIVER: Final = StreamDriver(
     name="imu61x-uart",
     title="Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B (UART)",
     baud_rates=BAUD_RATES,
-    settings=Imu61xUartSettings,
+    settings=Imu61xUartOptions,
     make_codec=Imu61xCodec,
     tick_ns=NS_PER_US,
     tick_modulus=TIMER_MODULUS,

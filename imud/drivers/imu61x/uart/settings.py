@@ -14,7 +14,7 @@ from msgspec import Meta
 from imud.contracts.command import Target
 from imud.contracts.driver import Identity
 from imud.contracts.script import Reply, Request, RequestScript, pause, with_undo
-from imud.contracts.setting import DeviceSettings, Setting
+from imud.contracts.setting import Setting, SettingsTable
 from imud.drivers.imu61x.common import (
     ACCEL_FILTER,
     FILTER_DEFAULT,
@@ -37,7 +37,7 @@ from imud.drivers.imu61x.uart.commands import (
     STREAM,
     BaudRate,
     BusMode,
-    Imu61xUartSettings,
+    Imu61xUartOptions,
     OutputMode,
     RateHz,
     acknowledged,
@@ -584,9 +584,9 @@ InstallationAngles = Annotated[
 ]
 
 
-def codes_of(target: Target) -> Imu61xUartSettings:
+def codes_of(target: Target) -> Imu61xUartOptions:
     """The codes that the configuration gives, or the assumed ones."""
-    return target.settings if isinstance(target.settings, Imu61xUartSettings) else Imu61xUartSettings()
+    return target.settings if isinstance(target.settings, Imu61xUartOptions) else Imu61xUartOptions()
 
 
 # --- scripts ----------------------------------------------------------------------------------------------------------
@@ -636,7 +636,7 @@ def _check(target: Target, values: Mapping[str, Any]) -> None:
             raise BadArgument(f"output_rate_hz and baud: {error}") from None
 
 
-SETTINGS: Final = DeviceSettings(
+SETTINGS: Final = SettingsTable(
     table={
         "output_rate_hz": Setting(type=OutputRate, write=lambda _target, hz: write_parameter(Parameter.AHRS_RATE, hz)),
         "accel_filter": Setting(

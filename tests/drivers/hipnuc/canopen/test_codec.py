@@ -10,7 +10,7 @@ import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.contracts.script import ReplyFrame
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings, encode_tpdos
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenOptions, encode_tpdos
 from imud.drivers.hipnuc.canopen.driver import DRIVER
 from imud.formats.can import CyclicFrame
 from imud.model.ledger import Ledger
@@ -30,7 +30,7 @@ FUNCTIONS = {1: 0x180, 2: 0x280, 3: 0x380, 4: 0x480, 6: 0x680, 7: 0x780}
 
 
 def make(**settings: object) -> HipnucCanopenCodec:
-    return HipnucCanopenCodec(Ledger(), msgspec.convert(settings, HipnucCanopenSettings))
+    return HipnucCanopenCodec(Ledger(), msgspec.convert(settings, HipnucCanopenOptions))
 
 
 def feed_bursts(codec: HipnucCanopenCodec, numbers: list[int], bursts: int = 6, node: int = 8) -> list[CodecEvent]:
@@ -144,13 +144,13 @@ def test_heartbeats_are_news_when_the_state_changes_or_is_not_operational() -> N
 
 @pytest.mark.manual("B 5.4.2 SYNC", "B 5.1 defaults")
 def test_filters_sync_and_names_of_the_row() -> None:
-    filters = DRIVER.filters(HipnucCanopenSettings(node=1))
+    filters = DRIVER.filters(HipnucCanopenOptions(node=1))
     taken = [can_id for can_id in range(0x800) if any(wanted.matches(can_id, False) for wanted in filters)]
     assert taken == [0x081, 0x181, 0x281, 0x381, 0x481, 0x581, 0x681, 0x701, 0x781]
-    assert DRIVER.cyclic(HipnucCanopenSettings()) == []
-    assert DRIVER.cyclic(HipnucCanopenSettings(sync_hz=150)) == [CyclicFrame(0x80, False, b"", 6_667_000)]
-    assert DRIVER.cyclic(HipnucCanopenSettings(sync_hz=0.01)) == [CyclicFrame(0x80, False, b"", 100_000_000_000)]
-    assert DRIVER.node_settings(12) == HipnucCanopenSettings(node=12)
+    assert DRIVER.cyclic(HipnucCanopenOptions()) == []
+    assert DRIVER.cyclic(HipnucCanopenOptions(sync_hz=150)) == [CyclicFrame(0x80, False, b"", 6_667_000)]
+    assert DRIVER.cyclic(HipnucCanopenOptions(sync_hz=0.01)) == [CyclicFrame(0x80, False, b"", 100_000_000_000)]
+    assert DRIVER.node_settings(12) == HipnucCanopenOptions(node=12)
     assert DRIVER.node_title(12) == "node 12"
 
 
@@ -192,7 +192,7 @@ def test_random_payloads_decode_alike() -> None:
     database = cantools.database.load_file(shared("hipnuc-canopen.dbc"))
     assert isinstance(database, cantools.database.Database)
     assert {message.frame_id: message.length for message in database.messages} == SIZES
-    codec, random = HipnucCanopenCodec(Ledger(), HipnucCanopenSettings()), Random(7)
+    codec, random = HipnucCanopenCodec(Ledger(), HipnucCanopenOptions()), Random(7)
     compared = 0
     for burst in range(BURSTS):
         values: dict[str, float] = {}

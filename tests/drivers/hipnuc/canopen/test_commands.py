@@ -10,7 +10,7 @@ from imud.drivers.hipnuc.canopen import cia301
 from imud.drivers.hipnuc.canopen import commands as moves
 from imud.drivers.hipnuc.canopen import commands as session
 from imud.drivers.hipnuc.canopen.cia301 import Aborted, NmtCommand, TpdoNumber
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.model.errors import BadArgument, DeviceRefused, NoReply
 from imud.sim.hipnuc.canopen import NodeSettings, NodeVariant
 from tests.support.simulated_modules import QUIET, CanopenBench, run_script, unpack
@@ -117,7 +117,7 @@ def test_which_frames_make_a_number_taken() -> None:
     bench.run(100_000_000)
     with pytest.raises(BadArgument, match=r"frame 0x58C of it"):
         bench.run_script(moves.change_node(bench.settings, 12))
-    request = next(moves.change_node(HipnucCanopenSettings(node=8), 12))
+    request = next(moves.change_node(HipnucCanopenOptions(node=8), 12))
     assert {wanted.can_id for wanted in request.also} == {
         0x08C, 0x18C, 0x28C, 0x38C, 0x48C, 0x58C, 0x68C, 0x70C, 0x78C,
     }  # fmt: skip

@@ -7,7 +7,7 @@ import pytest
 from imud.contracts.command import Target
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import Written
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.canopen.driver import DRIVER
 from imud.model.errors import BadArgument
 from imud.sim.hipnuc.canopen import NodeSettings
@@ -18,7 +18,7 @@ def begun(name: str, at: int = 8, /, **given: object) -> RequestScript[Any]:
     """The conversation of an action with the node that the settings name."""
     action = DRIVER.actions[name]
     conversation: RequestScript[Any] = action.script(
-        Target(HipnucCanopenSettings(node=at), 500_000), action.arguments(given)
+        Target(HipnucCanopenOptions(node=at), 500_000), action.arguments(given)
     )
     return conversation
 

@@ -18,7 +18,7 @@ from imud.device.scripts import Session
 from imud.drivers.hipnuc.canopen import cia301
 from imud.drivers.hipnuc.canopen import commands as session
 from imud.drivers.hipnuc.canopen.cia301 import NmtCommand
-from imud.drivers.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenOptions
 from imud.drivers.hipnuc.canopen.commands import Transmission
 from imud.model.errors import NoReply
 from imud.model.ledger import Ledger
@@ -178,7 +178,7 @@ class Host:
 
     def __init__(self, channel: str) -> None:
         self.bus = can.Bus(channel, interface="virtual")
-        self.codec = HipnucCanopenCodec(Ledger(), HipnucCanopenSettings(node=NODE))
+        self.codec = HipnucCanopenCodec(Ledger(), HipnucCanopenOptions(node=NODE))
         self.session = Session(self.codec.ledger)
         self.periods = 0
         self.limit_s = LIMIT_S

@@ -10,7 +10,7 @@ from imud.attitude.rotation import quat_normalized
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.contracts.script import ReplyFrame
 from imud.drivers.hipnuc.j1939 import codec as messages
-from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Settings, encode
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Options, encode
 from imud.drivers.hipnuc.j1939.driver import DRIVER
 from imud.formats.j1939 import J1939Id, join
 from imud.model.ledger import Ledger
@@ -26,7 +26,7 @@ def measured(pgn: int, data: str) -> Measurement:
 
 
 def make(**options: object) -> HipnucJ1939Codec:
-    return HipnucJ1939Codec(Ledger(), msgspec.convert(options, HipnucJ1939Settings))
+    return HipnucJ1939Codec(Ledger(), msgspec.convert(options, HipnucJ1939Options))
 
 
 def feed(codec: HipnucJ1939Codec, frames: list[tuple[int, bytes]], t_ns: int) -> list[CodecEvent]:
@@ -300,7 +300,7 @@ def test_which_frames_count() -> None:
     assert isinstance(sample, Measurement)
     assert sample.gyro_rad_s is None
     assert sample.size_bytes == 16
-    assert [f.can_id >> 8 for f in DRIVER.filters(HipnucJ1939Settings(pgns=("FF34", "FF3D")))] == [
+    assert [f.can_id >> 8 for f in DRIVER.filters(HipnucJ1939Options(pgns=("FF34", "FF3D")))] == [
         0xFF2F, 0xFF34, 0xFF3D, 0xEF55,
     ]  # fmt: skip
 
@@ -310,7 +310,7 @@ def test_which_frames_count() -> None:
         (0x0CFF34FE, True, 8),
     ]:  # fmt: skip
         assert DRIVER.node_of(can_id, extended, bytes(size)) is None
-    assert DRIVER.node_settings(5) == HipnucJ1939Settings(address=5)
+    assert DRIVER.node_settings(5) == HipnucJ1939Options(address=5)
     assert DRIVER.node_title(5) == "address 5"
 
 

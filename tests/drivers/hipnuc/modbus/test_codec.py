@@ -12,7 +12,7 @@ from imud.drivers.hipnuc.modbus.codec import (
     READ_SERIAL,
     READ_SHORT_BLOCK,
     HipnucModbusCodec,
-    HipnucModbusSettings,
+    HipnucModbusOptions,
     pack_block,
 )
 from imud.drivers.hipnuc.modbus.commands import probe, set_up
@@ -37,7 +37,7 @@ EXCEPTION = framed(0x50, b"\x83\x02")
 
 
 def codec(**options: object) -> HipnucModbusCodec:
-    return HipnucModbusCodec(Ledger(), HipnucModbusSettings(**options))  # type: ignore[arg-type]  # passed on
+    return HipnucModbusCodec(Ledger(), HipnucModbusOptions(**options))  # type: ignore[arg-type]  # passed on
 
 
 def short(**options: object) -> HipnucModbusCodec:
@@ -84,7 +84,7 @@ def measured(made: HipnucModbusCodec, data: bytes) -> Measurement:
 )
 def test_identity_sensors_and_the_block_of_newer_firmware() -> None:
     """26 registers by hand: uptime 0x00012345 ms is 74.565 s, 2512 is 25.12 °C, 10132500 is 101325 Pa."""
-    identity = run_transfer_script(probe(HipnucModbusSettings()), lambda _: IDENTITY)
+    identity = run_transfer_script(probe(HipnucModbusOptions()), lambda _: IDENTITY)
     assert identity.product == "HI14R2N-485-000"
     assert identity.firmware == "1.5.2"
     assert identity.serial_number == "047D955F8D2A1708"
@@ -261,13 +261,13 @@ def test_identity_is_watched_and_settings_are_read() -> None:
     for name in (b"\x00" * 16, b"\xff" * 16, b"AB\x01" + b"\x00" * 13):
         reply = framed(3, registers_reply(name + bytes(24)))
         with pytest.raises(DeviceRefused, match="name of a product"):
-            run_transfer_script(probe(HipnucModbusSettings()), lambda _, reply=reply: reply)  # type: ignore[misc]  # bound now
+            run_transfer_script(probe(HipnucModbusOptions()), lambda _, reply=reply: reply)  # type: ignore[misc]  # bound now
     asked: list[Transfer] = []
 
     def answer(transfer: Transfer) -> bytes:
         asked.append(transfer)
         return framed(7, registers_reply(bytes.fromhex("0008 0007 0001")))
 
-    found = run_transfer_script(set_up(HipnucModbusSettings()), answer)
+    found = run_transfer_script(set_up(HipnucModbusOptions()), answer)
     assert found == {"baud": "921600", "id": "7", "heading_mode": "nine axes"}
     assert [transfer.sends[0][0] for transfer in asked] == [3]

@@ -3,7 +3,7 @@
 import pytest
 
 from imud.contracts.command import Target, parameters_of
-from imud.drivers.hipnuc.modbus.codec import HipnucModbusSettings
+from imud.drivers.hipnuc.modbus.codec import HipnucModbusOptions
 from imud.drivers.hipnuc.modbus.driver import DRIVER
 from imud.model.errors import BadArgument
 from tests.support.pty_port import ModbusBench
@@ -44,7 +44,7 @@ def test_what_is_sent(name: str, given: dict[str, object], sent: str) -> None:
 def test_actions_without_an_address_and_reading_by_name() -> None:
     action = DRIVER.actions["address"]
     with pytest.raises(BadArgument, match="expected the address of the module"):
-        action.script(Target(HipnucModbusSettings(), 0), action.arguments({"address": 9}))
+        action.script(Target(HipnucModbusOptions(), 0), action.arguments({"address": 9}))
     bench = ModbusBench(module(7))
     assert act(bench, "read", register="MD_ID") == (7,)
     assert act(bench, "read", register="sn") == (0xA000, 0, 0, 7)

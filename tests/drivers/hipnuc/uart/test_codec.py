@@ -21,7 +21,7 @@ from imud.drivers.hipnuc.uart.codec import (
     HI92,
     PPS_STAMP_MODULUS_MS,
     HipnucCodec,
-    HipnucSettings,
+    HipnucOptions,
     encode_frame,
     encode_hi91,
     encode_hi92,
@@ -72,7 +72,7 @@ def framed(payload: bytes, length: int | None = None) -> bytes:
 
 
 def make(**settings: Any) -> HipnucCodec:
-    return HipnucCodec(Ledger(), HipnucSettings(**settings))
+    return HipnucCodec(Ledger(), HipnucOptions(**settings))
 
 
 def one(events: Sequence[CodecEvent]) -> Measurement:
@@ -406,7 +406,7 @@ def test_clipping_the_check_value_and_a_driver_of_other_settings() -> None:
     assert m.accel_m_s2[0] == pytest.approx(3.4028e38 * 9.8, rel=1e-4)
     assert crc_hqx(b"123456789", 0) == 0x31C3
     assert crc_hqx(b"6789", crc_hqx(b"12345", 0)) == 0x31C3
-    codec = replace(DRIVER, name="other").make_codec(Ledger(), HipnucSettings(hi91_word="status"))
+    codec = replace(DRIVER, name="other").make_codec(Ledger(), HipnucOptions(hi91_word="status"))
     assert one(codec.feed(hi91(word_1_2=3))).status == 3
     assert DRIVER.example_frame(Random(0))
 
@@ -426,7 +426,7 @@ def test_damaged_frames_among_lines() -> None:
     assert events[1:] == [TextLine("OK")]
     assert codec.ledger.closes()
 
-    codec = HipnucCodec(Ledger(), HipnucSettings())
+    codec = HipnucCodec(Ledger(), HipnucOptions())
     frame = encode_frame(b"\x91" + b'\x01"Cs\n' + bytes(70))
     cut = frame.index(b"\n") + 1
     assert codec.feed(frame[:cut]) == []

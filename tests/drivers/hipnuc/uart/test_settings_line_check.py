@@ -4,18 +4,18 @@ import pytest
 
 from imud import config
 from imud.config.schema import TABLES
-from imud.contracts.lines import DeviceLines, DividedSettings, InputSettings, PpsSettings, SoutSettings, TriggerSettings
+from imud.contracts.lines import DeviceLines, DividedOptions, InputOptions, PpsOptions, SoutOptions, TriggerOptions
 from imud.drivers.hipnuc.uart.commands import read_settings
 from imud.drivers.hipnuc.uart.settings import declared_line_differences, line_differences, message_limits
 from imud.model.errors import ConfigError
 from imud.sim.hipnuc.uart_settings import AlarmSetting, ModuleSettings, Output
 from tests.support.simulated_modules import HipnucLine
 
-SOUT = DeviceLines(sout=SoutSettings(line="A"))
-DIVIDED = DeviceLines(sout_div=DividedSettings(line="B", divisor=4))
-SIN = DeviceLines(sin=TriggerSettings(line="C", rate_hz=200))
-PPS = DeviceLines(pps=PpsSettings(line="D"))
-ALARM = DeviceLines(alarm=InputSettings(line="E"))
+SOUT = DeviceLines(sout=SoutOptions(line="A"))
+DIVIDED = DeviceLines(sout_div=DividedOptions(line="B", divisor=4))
+SIN = DeviceLines(sin=TriggerOptions(line="C", rate_hz=200))
+PPS = DeviceLines(pps=PpsOptions(line="D"))
+ALARM = DeviceLines(alarm=InputOptions(line="E"))
 MARKED = Output(on_mark=True)
 
 
@@ -91,7 +91,7 @@ def test_check_refuses_a_line_that_declared_settings_contradict() -> None:
         ({"output": {"hi91": 100, "hi92": 0}}, DeviceLines(), True, []),
         ({"output": {"hi92": 100}}, DeviceLines(), False, []),
         ({"output": {"hi92": 100}}, DeviceLines(), True, ["HI92 never shows UTC"]),
-        ({"output": {"hi92": 100}}, DeviceLines(pps=PpsSettings(line="GPIO1")), False, ["HI92 never shows UTC"]),
+        ({"output": {"hi92": 100}}, DeviceLines(pps=PpsOptions(line="GPIO1")), False, ["HI92 never shows UTC"]),
         ({"output": {"hi91": 50, "hi92": 50}}, DeviceLines(), False, ["HI92 beside HI91 is dated by its arrival"]),
     ],
 )

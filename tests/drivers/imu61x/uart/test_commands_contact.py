@@ -6,7 +6,7 @@ from imud.contracts.script import Reply, RequestScript, Silence
 from imud.drivers.imu61x.uart import commands
 from imud.drivers.imu61x.uart import commands as contact
 from imud.drivers.imu61x.uart.codec import Parameter
-from imud.drivers.imu61x.uart.commands import Imu61xUartSettings, OutputMode
+from imud.drivers.imu61x.uart.commands import Imu61xUartOptions, OutputMode
 from imud.model.errors import NoReply, Rejected
 from imud.sim.imu61x.uart import Imu61xSettings
 from tests.support.simulated_modules import every_variant, imu61x_bench, variant_bench
@@ -46,7 +46,7 @@ def test_result_is_judged_by_the_option() -> None:
         far.run(contact.ordered(commands.reset_heading(0), 0))
     far = imu61x_bench(Imu61xSettings(mode=OutputMode.COMMAND), acknowledges=False)
     assert far.run(contact.ordered(commands.reset_heading(0), 0)) is False
-    assert Imu61xUartSettings() == Imu61xUartSettings(result_done=0, calibration_done=0)
+    assert Imu61xUartOptions() == Imu61xUartOptions(result_done=0, calibration_done=0)
     assert contact.result_of(Silence(())) is None
     assert contact.result_of(Reply(("text",))) is None
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from imud.contracts.command import Target
-from imud.drivers.imu61x.uart.commands import Imu61xUartSettings
+from imud.drivers.imu61x.uart.commands import Imu61xUartOptions
 from imud.drivers.imu61x.uart.driver import ACTIONS
 from imud.drivers.imu61x.uart.settings import BaudChange
 from imud.model.errors import BadArgument, CommandError
@@ -14,7 +14,7 @@ from imud.sim.imu61x.uart import REFUSING, VARIANTS, Imu61xSettings
 from tests.support.simulated_modules import Imu61xBench, done, imu61x_bench, variant_bench
 
 
-def act(far: Imu61xBench, name: str, options: Imu61xUartSettings | None = None, **arguments: Any) -> Any:
+def act(far: Imu61xBench, name: str, options: Imu61xUartOptions | None = None, **arguments: Any) -> Any:
     action = ACTIONS[name]
     return far.run(action.script(Target(options, far.baud), action.arguments(arguments)))
 
@@ -38,7 +38,7 @@ WITHOUT_K1 = ("save", "heading", "calibrate_gyro", "calibrate_installation", "in
 def test_every_action(variant: str, name: str) -> None:
     """The scripts of the actions are tested in every variant; here an action must reach them with its arguments."""
     far = variant_bench(variant, uptime_us=20_000_000)
-    options = Imu61xUartSettings(result_done=done(variant))
+    options = Imu61xUartOptions(result_done=done(variant))
     if variant == "no K1" and name in WITHOUT_K1 and name != "installation_status":
         with pytest.raises(CommandError, match="whether it is done is not known"):
             act(far, name, options, **ARGUMENTS.get(name, {}))
@@ -91,7 +91,7 @@ def test_answers_of_actions() -> None:
         assert len(act(far, name)) == 3
 
     far = imu61x_bench(result_done=4)
-    act(far, "save", Imu61xUartSettings(result_done=4))
+    act(far, "save", Imu61xUartOptions(result_done=4))
     with pytest.raises(CommandError, match=r"options\.result_done"):
         act(far, "save")
 

@@ -7,7 +7,7 @@ import pytest
 
 from imud.contracts.command import Target
 from imud.drivers.imu61x.uart.codec import Parameter
-from imud.drivers.imu61x.uart.commands import Command, Imu61xUartSettings, OutputMode
+from imud.drivers.imu61x.uart.commands import Command, Imu61xUartOptions, OutputMode
 from imud.drivers.imu61x.uart.settings import SETTINGS, settings_of
 from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.sim.imu61x.uart import Imu61xSettings
@@ -27,7 +27,7 @@ FACTORY = {
 
 
 def target(far: Imu61xBench, variant: str = "obeys while it streams") -> Target:
-    return Target(Imu61xUartSettings(result_done=done(variant)), far.baud)
+    return Target(Imu61xUartOptions(result_done=done(variant)), far.baud)
 
 
 def read(far: Imu61xBench, variant: str = "obeys while it streams") -> dict[str, Any]:
