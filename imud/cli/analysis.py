@@ -65,7 +65,7 @@ def spectrum_arguments(parser: argparse.ArgumentParser) -> None:
 def part(name: str) -> Any:
     """Import a module of this package. Raises BadArgument where a library of the extra is missing."""
     try:
-        return import_module(f"imud.cli.analysis.{name}")
+        return import_module(f"imud.cli.{name}")
     except ModuleNotFoundError as error:
         library = (error.name or "a library").partition(".")[0]
         if library == "imud":
@@ -75,31 +75,31 @@ def part(name: str) -> Any:
 
 def noise(args: argparse.Namespace) -> int:
     """Print the noise of a device; with `-o` write the report."""
-    report_of, page, sheet = part("noise_report"), part("noise_page"), part("sheet")
-    kind = page.kind_of(args.output) if args.output is not None else ""
-    given = sheet.read_sheet(args.sheet) if args.sheet is not None else None
+    module = part("noise")
+    kind = module.kind_of(args.output) if args.output is not None else ""
+    given = module.read_sheet(args.sheet) if args.sheet is not None else None
     taken = take(args)
     product = taken.identity.get("product", "")
-    report = report_of.noise_report(taken, sheet.figures_for(taken.sheet, product, given))
+    report = module.noise_report(taken, module.figures_for(taken.sheet, product, given))
     if args.output is not None:
-        page.write_file(args.output, page.noise_file(report, kind))
-    return show(args, report, report_of)
+        module.write_file(args.output, module.noise_file(report, kind))
+    return show(args, report, module)
 
 
 def spectrum(args: argparse.Namespace) -> int:
     """Print the vibration of a device, live until interrupted where no duration is given; with `-o` write a picture."""
-    report_of, page = part("spectrum_report"), part("noise_page")
+    module, page = part("spectrum"), part("noise")
     kind = page.kind_of(args.output) if args.output is not None else ""
     if kind == ".html":
         raise BadArgument(f"{args.output}: expected a name that ends in .svg or .png")
     sensors = SENSORS if args.sensor is None else (args.sensor,)
-    settings = report_of.SpectrumSettings(sensors, args.resolution, args.bands)
+    settings = module.SpectrumOptions(sensors, args.resolution, args.bands)
     if is_live(args) and args.duration is None and not args.json and args.output is None and sys.stdout.isatty():
-        return int(part("spectrum_live").live(args, settings))
-    report = report_of.spectrum_report(take(args), settings)
+        return int(module.live(args, settings))
+    report = module.spectrum_report(take(args), settings)
     if args.output is not None:
-        page.write_file(args.output, report_of.spectrum_file(report, kind))
-    return show(args, report, report_of)
+        page.write_file(args.output, module.spectrum_file(report, kind))
+    return show(args, report, module)
 
 
 def is_live(args: argparse.Namespace) -> bool:
@@ -109,13 +109,13 @@ def is_live(args: argparse.Namespace) -> bool:
 
 def take(args: argparse.Namespace) -> Any:
     """Read the samples. Raises BadArgument for options that are for files only."""
-    taking = part("taking")
+    samples = part("sample_set")
     if not is_live(args):
-        return taking.take_file(args)
+        return samples.take_file(args)
     for option, default in (("device", None), ("driver", None), ("baud", None), ("option", [])):
         if getattr(args, option) != default:
             raise BadArgument(f"--{option}: expected none with a device of the daemon; {args.input} is no file")
-    return taking.take_live(args, taking.progress)
+    return samples.take_live(args, samples.progress)
 
 
 def show(args: argparse.Namespace, report: Any, module: Any) -> int:

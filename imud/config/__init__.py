@@ -6,7 +6,7 @@
       NAME:
         driver, identify, enabled, options        (`DeviceGeneral`; options are the driver's settings)
         lines                     GPIO lines (`imud.contracts.lines.DeviceLines`), as far as the driver has them
-        rmc                       source of RMC sentences (`imud.utc.source.RmcSettings`), for devices with SIN/PPS
+        rmc                       source of RMC sentences (`imud.utc.receivers.RmcOptions`), for devices with SIN/PPS
         frame                     how the sensor lies in its body (`imud.attitude.published.FrameOptions`)
         uart | replay | …         one key per row of LINKS, with that row's settings
 

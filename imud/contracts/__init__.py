@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""Agreements between the parts of imud: types only."""

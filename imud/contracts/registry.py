@@ -1,4 +1,4 @@
-"""Table: name → "module:NAME", imported on first use, so that one missing library costs one row only."""
+"""Registry: name → "module:NAME". imud imports a row at its first use, so a missing library disables one row only."""
 
 from collections.abc import Iterator, Mapping
 from importlib import import_module
@@ -8,9 +8,9 @@ T = TypeVar("T")
 
 
 class Registry(Mapping[str, T], Generic[T]):
-    """Mapping from a name to the object of its row. A new plug-in is one new file and one row.
+    """Mapping from a name to the object of its row. A new plug-in needs one module and one row.
 
-    Raises KeyError for a name without a row; the message lists the names there are.
+    Raises KeyError for an unknown name; the message lists the known names.
     """
 
     def __init__(self, kind: str, rows: Mapping[str, str]) -> None:
@@ -21,7 +21,7 @@ class Registry(Mapping[str, T], Generic[T]):
         try:
             module, _, attribute = self.rows[name].partition(":")
         except KeyError:
-            raise KeyError(f"no {self.kind} named {name!r}; there are: {', '.join(sorted(self.rows))}") from None
+            raise KeyError(f"no {self.kind} named {name!r}; expected one of: {', '.join(sorted(self.rows))}") from None
         return cast(T, getattr(import_module(module), attribute))
 
     def __iter__(self) -> Iterator[str]:

@@ -208,12 +208,12 @@ class BrokenFile(BytesIO):
     readline = read
 
 
-@pytest.mark.parametrize(("kind", "module"), [(ReplayLink, "link"), (CanReplayLink, "can")])
+@pytest.mark.parametrize("kind", [ReplayLink, CanReplayLink])
 def test_a_file_whose_read_fails_is_closed(
-    monkeypatch: pytest.MonkeyPatch, kind: type[ReplayLink | CanReplayLink], module: str
+    monkeypatch: pytest.MonkeyPatch, kind: type[ReplayLink | CanReplayLink]
 ) -> None:
     file = BrokenFile()
-    monkeypatch.setattr(f"imud.links.replay.{module}.open_regular", lambda _path: file)
+    monkeypatch.setattr("imud.links.replay.open_regular", lambda _path: file)
     with pytest.raises(LinkError, match="a cannot be read: Input/output error"):
         kind(ReplayOptions(path="a")).open()
     assert file.closed

@@ -5,7 +5,7 @@
 The daemon opens no file for a client, and never waits for one: the socket is written with MSG_DONTWAIT, and while it
 is full records wait in the queue, which is bounded; what has no room there is dropped, and stands in the recording as
 lost.
-A pipe would not do (`imud.publishers.socket.waker` has the reason).
+A pipe would not do (`imud.publishers.socket.client` has the reason).
 """
 
 import select

@@ -6,7 +6,7 @@ device sent with `advance`. What it does, and what of it is assumed because the 
 - In stream mode it sends AHRS frames at 1 … 400 Hz, at whole multiples of the period of its own timer, which runs
   `skew_ppm` fast and counts µs from power-on. What does not fit the transmit buffer is never sent.
 - In command mode it only replies. Questions are answered with S1, P1 or an AHRS frame, orders with K1. What else it
-  does, and when, is one of several ways to read the manual (`imud.sim.imu61x.behaviour`).
+  does, and when, is one of several ways to read the manual (`imud.sim.imu61x.uart`).
 - A baud rate acts once its acknowledgement has left the wire, or at the next start.
 - CMD 5 saves everything, the mode included. CMD 9 and power-off lose what was not saved. CMD 15 restores flash, and RAM
   at once or at the next start.

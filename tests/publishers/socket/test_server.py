@@ -366,7 +366,7 @@ def broken(*_args: object, **_names: object) -> bytes:
 
 
 @pytest.mark.parametrize(
-    "place", ["Quota.admit", "Connection.__init__", "hello", "peer_of"], ids=lambda place: place.split(".")[0]
+    "place", ["Quota.admit", "ClientConnection.__init__", "hello", "peer_of"], ids=lambda place: place.split(".")[0]
 )
 @in_server()
 async def test_an_error_while_a_client_is_welcomed_ends_that_client_only(
