@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 from imud import __version__
 from imud.cli.output import complain, discard_output, open_standard_streams
-from imud.model.errors import ConfigError, ImudError, reason_of
+from imud.model.errors import BadArgument, ConfigError, ImudError, reason_of
 
 if TYPE_CHECKING:
     from imud.cli.arguments import CliCommand
@@ -23,11 +23,18 @@ class Subcommand(NamedTuple):
     target: str
     """`module:NAME` of its `CliCommand`."""
     help: str
+    extra: str = ""
+    """Extra of the package whose libraries the module imports."""
 
     def load(self) -> "CliCommand":
-        """Import the command's module and return the command."""
+        """Import the module of the command. Raises BadArgument if a library of the extra is missing."""
         module, _, name = self.target.partition(":")
-        return cast("CliCommand", getattr(import_module(module), name))
+        try:
+            return cast("CliCommand", getattr(import_module(module), name))
+        except ModuleNotFoundError as error:
+            if not self.extra:
+                raise
+            raise BadArgument(f"it needs {error.name}: pip install 'imud[{self.extra}]'") from None
 
 
 COMMANDS = {
@@ -49,7 +56,7 @@ COMMANDS = {
     "export": Subcommand("imud.cli.export:EXPORT", "write a recording or a capture as CSV or MCAP"),
     "devices": Subcommand("imud.cli.devices:DEVICES", "list the devices of the running daemon"),
     "status": Subcommand("imud.cli.status:STATUS", "show state, rate, clock and ledger of each device"),
-    "top": Subcommand("imud.cli.top:TOP", "watch all devices in the terminal, redrawn in place"),
+    "top": Subcommand("imud.cli.top:TOP", "watch all devices in the terminal, redrawn in place", "top"),
     "foxglove": Subcommand(
         "imud.cli.foxglove:FOXGLOVE", "serve samples, attitude, events and status to Foxglove and PlotJuggler"
     ),

@@ -677,13 +677,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show the table until `q`. Raises BadArgument without a terminal, or without the library that draws."""
+    """Show the table until `q`. Raises BadArgument without a terminal."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise BadArgument("expected a terminal; `imud status` and `imud watch` write to anything")
-    try:
-        pass
-    except ModuleNotFoundError as error:
-        raise BadArgument(f"it needs {error.name}: pip install 'imud[top]'") from None
     TopApp(lambda on_news: TopFeed(args.socket, on_news)).run()
     return 0
 

@@ -29,7 +29,7 @@ from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock, in_loop
 
 UTC_NS = 1_800_000_000 * NS_PER_S
-DOCS = Path(__file__).parents[3] / "docs" / "fleet.md"
+DOCS = Path(__file__).parents[2] / "docs" / "fleet.md"
 
 
 class FakeDevice:

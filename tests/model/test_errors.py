@@ -12,7 +12,7 @@ import serial
 
 from imud.model.errors import reason_of
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 FOREIGN = {
     "OSError", "PermissionError", "FileNotFoundError", "ConnectionError", "error", "ValidationError", "DecodeError",
     "UnicodeDecodeError", "UnicodeError", "SerialException", "CanError", "TypeError",

@@ -8,10 +8,13 @@ from typing import Final
 import pytest
 from selenium.common.exceptions import WebDriverException
 
+from tests.cli.conftest import cli
 from tests.support.daemon_process import RunningDaemon, daemon_with_module
 from tests.support.files import ROOT
 from tests.support.socket_rig import run
 from tests.web.browser import Page, browser, serving_web
+
+__all__ = ["cli"]
 
 PICTURES: Final = ROOT / "build/web"
 """Where what the browser showed goes when a test failed, by the name of the test."""

@@ -439,7 +439,7 @@ def test_a_full_disk_stops_before_the_change_that_could_not_be_recorded(
 
     def full(path: Path, content: bytes, **more: object) -> None:
         count[0] += 1
-        if count[0] == 5:
+        if count[0] == 7:
             raise OSError(28, "No space left on device", str(path))
         replace(path, content, **more)  # type: ignore[arg-type]
 

@@ -19,13 +19,19 @@ from tests.lab_debian.host import user_mode
 from tests.lab_debian.host.release import PYTHONS, Release
 
 NAME = "unit-tests"
-CLOCK = ("arrival_fit", "arrival_time", "device_utc", "edge_pairing", "even_arrivals", "even_run", "intervals",
-         "link_delay", "stamp_time")  # fmt: skip
+CLOCK = (
+    "arrival_fit", "arrival_time", "arrival_time_even_arrivals", "arrival_time_link_delay", "clock_even_run",
+    "device_time_stamp_time", "device_utc", "device_utc_intervals", "edge_pairing",
+)  # fmt: skip
 """Tests of the clock but for those that play hours of arrivals: several minutes each where they are emulated."""
 PARTS = {
     "codecs": (
-        *("tests/formats", "tests/drivers/hipnuc/common", "tests/drivers/imu61x/common"),
-        *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("tests/drivers/**/test_codec.py")),
+        "tests/formats",
+        *sorted(
+            str(path.relative_to(ROOT))
+            for name in ("test_codec*", "test_common*", "test_can", "test_i2c", "test_spi", "test_nmea2000")
+            for path in ROOT.glob(f"tests/drivers/**/{name}.py")
+        ),
         *(f"tests/drivers/test_every_{kind}_driver.py" for kind in ("stream", "can", "polled")),
     ),
     "clock": tuple(f"tests/sampling/test_{name}.py" for name in CLOCK),
