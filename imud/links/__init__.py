@@ -1,4 +1,4 @@
-"""Table: the links by name, each for one kind of port."""
+"""Registry of the links, one for each kind of port."""
 
 from typing import Any
 

@@ -1,10 +1,10 @@
-"""Cyclic frames: sent by the kernel's broadcast manager, or by the event loop where there is none.
+"""Cyclic CAN frames: sent by the broadcast manager of the kernel, or by the event loop if the kernel has no such
+manager.
 
-The broadcast manager (CAN_BCM, linux/can/bcm.h) sends from a high-resolution timer of the kernel, independent of this
-process, and stops when its socket closes. It sets the timer anew each time, so that a period is longer by the
-latency of the interrupt: microseconds on a real machine (0.25 ms of 10 ms in the lab's emulated one). The event loop's
-timer has absolute deadlines, so that its error does not add up, but a busy process delays it;
-periods that it missed are left out.
+The broadcast manager (CAN_BCM, linux/can/bcm.h) uses a high-resolution timer and does not depend on this process. It
+starts the timer again for each frame, so that a period is longer by the latency of the interrupt: microseconds on
+hardware, 0.25 ms of 10 ms in the emulated lab. The timer of the event loop has absolute deadlines, so that its error
+does not accumulate. A busy process delays it. The event loop skips missed periods.
 """
 
 import asyncio
@@ -24,26 +24,26 @@ TX_SETUP: Final = 1
 SETTIMER: Final = 0x0001
 """Flag: the intervals in this message hold."""
 STARTTIMER: Final = 0x0002
-"""Flag: start now, with a frame sent at once."""
+"""Flag: start now and send one frame immediately."""
 NO_MANAGER: Final = frozenset({errno.EPROTONOSUPPORT, errno.ESOCKTNOSUPPORT, errno.EAFNOSUPPORT})
 """Errors of a kernel without CAN_BCM."""
 
 _HEAD: Final = struct.Struct("@3I4l2I")
 """`struct bcm_msg_head`: operation, flags, count, s and us of the first and second interval, identifier, frames."""
 _PAD: Final = bytes(-_HEAD.size % 8)
-"""The frames behind it are aligned to eight bytes."""
+"""Padding: the frames after the head are aligned to eight bytes."""
 
 
 class Sender(Protocol):
     """Sender of cyclic frames until it is closed."""
 
     def close(self) -> None:
-        """Stop; may be called twice."""
+        """Stop. A second call does nothing."""
         ...
 
 
 def setup(frame: CyclicFrame) -> bytes:
-    """The TX_SETUP message for a frame, which is sent until the socket closes."""
+    """Return the TX_SETUP message for a frame. The kernel sends the frame until the socket closes."""
     seconds, rest_ns = divmod(frame.every_ns, NS_PER_S)
     can_id = frame.can_id | EXTENDED_FLAG * frame.extended
     head = _HEAD.pack(TX_SETUP, SETTIMER | STARTTIMER, 0, 0, 0, seconds, rest_ns // NS_PER_US, can_id, 1)
@@ -51,7 +51,7 @@ def setup(frame: CyclicFrame) -> bytes:
 
 
 class KernelSender:
-    """Frames sent by the broadcast manager on one interface."""
+    """Cyclic frames of the broadcast manager on one interface."""
 
     def __init__(self, interface: str, frames: Sequence[CyclicFrame]) -> None:
         """Start sending. Raises OSError, one of NO_MANAGER when the kernel has no broadcast manager."""
@@ -65,12 +65,11 @@ class KernelSender:
             raise
 
     def close(self) -> None:
-        """Stop; may be called twice."""
         self._socket.close()
 
 
 class LoopSender:
-    """Frames sent by the event loop through a link's `write`. Synchronization: the loop's thread only."""
+    """Cyclic frames of the event loop, sent with the `write` of a link. Synchronization: the loop's thread only."""
 
     def __init__(
         self,
@@ -79,7 +78,8 @@ class LoopSender:
         frames: Sequence[CyclicFrame],
         now_ns: Callable[[], int] = monotonic_ns,
     ) -> None:
-        """Start sending. An error of a later `write` stops it and goes to `on_error`. Raises LinkError."""
+        """Start sending. If a later `write` fails, the sender stops and passes the error to `on_error`. Raises
+        LinkError."""
         self._write = write
         self._on_error = on_error
         self._now_ns = now_ns
@@ -90,11 +90,10 @@ class LoopSender:
                 write(pack_frame(frame.can_id, frame.extended, frame.data))
                 self._wait(number, frame, begin_ns + frame.every_ns)
         except LinkError:
-            self.close()  # the timers of the frames before
+            self.close()  # stop the timers of the earlier frames
             raise
 
     def close(self) -> None:
-        """Stop; may be called twice."""
         for timer in self._timers.values():
             timer.cancel()
         self._timers.clear()
@@ -105,7 +104,7 @@ class LoopSender:
 
     def _send(self, number: int, frame: CyclicFrame, due_ns: int) -> None:
         now_ns = self._now_ns()
-        if now_ns < due_ns:  # the loop's timer may fire a little early against CLOCK_MONOTONIC
+        if now_ns < due_ns:  # the loop's timer can fire slightly early in CLOCK_MONOTONIC
             self._wait(number, frame, due_ns)
             return
         try:

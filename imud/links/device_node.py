@@ -1,7 +1,7 @@
-"""Device nodes in /dev: waiting for one, and imud's errors for a failed open or transfer.
+"""Device nodes in /dev: waiting for a node, and the errors of imud for a failed open or transfer.
 
-A node is missing until its driver makes it, and refused until udev sets its group. Messages name its group and the
-processes that have it open, read from the file system and /proc.
+The driver of the kernel makes the node; udev sets its group later. Error messages name the group of the node and the
+processes that hold the node, from the file system and /proc.
 """
 
 import asyncio
@@ -26,12 +26,12 @@ IN_DELETE_SELF: Final = 0x0400
 IN_MOVE_SELF: Final = 0x0800
 IN_ONLYDIR: Final = 0x0100_0000
 WATCH_MASK: Final = IN_ATTRIB | IN_MOVED_TO | IN_CREATE | IN_DELETE | IN_DELETE_SELF | IN_MOVE_SELF | IN_ONLYDIR
-"""IN_ATTRIB because udev sets group and mode of a fresh node after the kernel made it."""
+"""Events to watch. IN_ATTRIB: udev sets group and mode after the kernel made the node."""
 
 EVENT_BUFFER_BYTES: Final = 4096
-"""Room for at least 15 events: 16 bytes and a name of at most 256 each (inotify(7))."""
+"""Size of the event buffer: at least 15 events of 16 bytes plus a name of at most 256 bytes (inotify(7))."""
 LINKS_MAX: Final = 40
-"""Symbolic links followed, as the kernel does (path_resolution(7))."""
+"""Maximum number of symbolic links to follow, as in the kernel (path_resolution(7))."""
 
 libc = ctypes.CDLL(None, use_errno=True)
 
@@ -40,7 +40,7 @@ class DirectoryWatch:
     """An inotify descriptor that watches some directories. Synchronization: the loop's thread only."""
 
     def __init__(self) -> None:
-        """Raises LinkError when the user's inotify instances are used up."""
+        """Raises LinkError if the user has no inotify instance left."""
         self._fd: int = libc.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
         if self._fd < 0:
             raise LinkError(
@@ -48,11 +48,11 @@ class DirectoryWatch:
             )
 
     def add(self, directory: Path) -> bool:
-        """Watch a directory; False when it is gone or may not be read."""
+        """Watch a directory. Return False if the directory does not exist or the user may not read it."""
         return int(libc.inotify_add_watch(self._fd, os.fsencode(directory), WATCH_MASK)) >= 0
 
     async def changed(self) -> None:
-        """Return when something happened in a watched directory since it was added, or since the last call."""
+        """Return after a change in a watched directory since the call of `add` or since the last call."""
         loop = asyncio.get_running_loop()
         readable = loop.create_future()
         loop.add_reader(self._fd, lambda: None if readable.done() else readable.set_result(None))
@@ -63,17 +63,18 @@ class DirectoryWatch:
         os.read(self._fd, EVENT_BUFFER_BYTES)
 
     def close(self) -> None:
-        """Release the descriptor; may be called twice. A thread does it: the kernel needs 8 ms and more."""
+        """Release the descriptor. A second call does nothing. A thread closes it, because the kernel needs 8 ms or
+        more."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
             asyncio.get_running_loop().run_in_executor(None, os.close, fd)
 
 
 async def wait_until(path: Path, ready: Callable[[], bool]) -> None:
-    """Return as soon as `ready()` holds; it is asked again after every change on the way to `path`.
+    """Return as soon as `ready()` is true. imud calls `ready` again after each change of a directory of `path`.
 
-    The watch is set before `ready` is asked, so no change is missed. Raises LinkError when inotify is not to be had,
-    LinkDenied when the directory may not be read.
+    imud sets the watch before the first call of `ready`, so that no change is lost. Raises LinkError if inotify is not
+    available, LinkDenied if the user may not read the directory.
     """
     if ready():
         return
@@ -83,7 +84,7 @@ async def wait_until(path: Path, ready: Callable[[], bool]) -> None:
             directories = directories_of(path)
             watched = [watch.add(directory) for directory in directories]
             if directories_of(path) != directories:
-                await asyncio.sleep(0)  # it changed while the watches were set: look again
+                await asyncio.sleep(0)  # a directory changed while imud set the watches: check again
                 continue
             if not any(watched):
                 raise LinkDenied(f"cannot watch {directories[0]} for {path.name}: may this user read that directory?")
@@ -95,7 +96,7 @@ async def wait_until(path: Path, ready: Callable[[], bool]) -> None:
 
 
 def directories_of(path: Path) -> list[Path]:
-    """The directories whose changes can make `path` appear, vanish, or become another file."""
+    """Return the directories whose changes can create, remove or replace `path`."""
     directories: list[Path] = []
     for _ in range(LINKS_MAX):
         directory = _nearest_directory(path.parent)
@@ -105,7 +106,7 @@ def directories_of(path: Path) -> list[Path]:
             break
         try:
             path = path.parent / path.readlink()
-        except OSError:  # the link went away in between
+        except OSError:  # the link was removed in the meantime
             break
     return directories
 
@@ -117,44 +118,44 @@ def _nearest_directory(directory: Path) -> Path:
 
 
 MISSING: Final = frozenset({errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.ENOTDIR, errno.ESHUTDOWN})
-"""Errors of `open` without a device behind the path."""
+"""Error numbers of `open` if no device exists at the path."""
 REFUSED: Final = frozenset({errno.EACCES, errno.EPERM})
 HELD: Final = frozenset({errno.EBUSY, errno.EAGAIN})
-"""Errors of `open` and of the locks after it where another process or a kernel driver has the device."""
+"""Error numbers of `open` and of its locks if another process or a kernel driver uses the device."""
 GONE: Final = frozenset({errno.ENOENT, errno.ENODEV, errno.ENOTDIR, errno.ESHUTDOWN, errno.EBADF})
 """Errors of a transfer after the adapter was removed."""
 NOT_ACKNOWLEDGED: Final = frozenset({errno.ENXIO, errno.EREMOTEIO})
-"""Documentation/i2c/fault-codes.rst has ENXIO; the Raspberry Pi's controller returns EREMOTEIO."""
+"""Error numbers of a missing acknowledge: ENXIO (Documentation/i2c/fault-codes.rst), EREMOTEIO (Raspberry Pi)."""
 STUCK: Final = frozenset({errno.ETIMEDOUT})
 
 ACCESS_WAIT_S: Final = 1.0
-"""Time to wait for access before a refusal counts: udev sets a node's group some ms after it makes the node."""
+"""Time to wait for access, s. udev sets the group of a node some milliseconds after the kernel made it."""
 SERIAL_GROUP: Final = "dialout"
-"""Group of serial ports on Debian and its relatives; named where the node cannot be looked at."""
+"""Group of serial ports on Debian. Error messages name it if imud cannot read the group of the node."""
 PROC: Final = Path("/proc")
 OWN_PROCESS: Final = "this imud"
 COMMAND_BYTES: Final = 1024
-"""Of a command line that are looked at."""
+"""Maximum number of bytes to read of a command line."""
 CABLE: Final = "is the cable plugged in, and is the path right?"
-"""Question to a user whose serial port is absent."""
+"""Hint for a user whose serial port does not exist."""
 
 
 class DeviceNode:
-    """The node of one link: waits until it can be opened. Synchronization: the loop's thread only."""
+    """The device node of one link. Synchronization: the loop's thread only."""
 
     def __init__(self, path: str, missing: str) -> None:
-        """`missing` is the question to a user whose node is absent."""
+        """`missing` is the hint for a user whose node does not exist."""
         self._path = Path(path)
         self._missing = missing
 
     def absence(self) -> str:
-        """Return that the node is not there, one sentence; empty when it is."""
+        """Return an error text if the node does not exist, otherwise an empty text."""
         return "" if self._path.exists() else f"{self._path} is not there: {self._missing}"
 
     async def wait_present(self) -> None:
-        """Return when the node exists and may be opened, ACCESS_WAIT_S after it exists at the latest.
+        """Return when the node exists and the user may open it, at the latest ACCESS_WAIT_S after the node appeared.
 
-        Raises LinkError when inotify cannot be had, LinkDenied when the directory may not be read.
+        Raises LinkError if inotify is not available, LinkDenied if the user may not read the directory.
         """
         await wait_until(self._path, self._path.exists)
         if self._accessible():
@@ -170,14 +171,16 @@ class DeviceNode:
 
 
 def open_problem(error: Exception, path: str, missing: str, proc: Path = PROC) -> LinkError | None:
-    """The LinkError for an `open` whose node is absent, refused or held; None for any other error.
+    """Return the LinkError of a failed `open`; None if the error has another cause than a missing, refused or used
+    node.
 
-    `missing` is the question to a user whose node is absent. Holders are looked up in `proc`.
+    `missing` is the hint for a user whose node does not exist. `proc` is the folder to search for the processes that
+    use the node.
     """
     number = errno_of(error)
     if number in MISSING:
         return LinkMissing(f"{path} is not there: {missing}")
-    if number == errno.EPERM:  # of a group it would be EACCES
+    if number == errno.EPERM:  # EPERM: a device cgroup refuses the node; missing group rights would be EACCES
         return LinkDenied(
             f"{path} may not be opened: the control group of this process does not allow the device (EPERM, "
             f"not its group); add a line `DeviceAllow={path} rw` to the unit (`systemctl edit imud`), and restart imud"
@@ -191,7 +194,7 @@ def open_problem(error: Exception, path: str, missing: str, proc: Path = PROC) -
 
 
 def _refusal(path: str) -> str:
-    """Whose the node is, and what gives access: its group, or a udev rule where no group may open it."""
+    """Return the owner of a node and how to get access: its group, or a udev rule if no group may open the node."""
     with suppress(OSError):
         node = os.stat(path)
         if node.st_gid == 0 or node.st_mode & GROUP_ACCESS != GROUP_ACCESS:
@@ -202,19 +205,19 @@ def _refusal(path: str) -> str:
 
 
 def bus_open_problem(error: OSError, path: str, missing: str) -> LinkError:
-    """The LinkError for an I2C or SPI bus that cannot be opened; `missing` as for `open_problem`."""
+    """Return the LinkError of an I2C or SPI bus that cannot be opened. `missing` as in `open_problem`."""
     return open_problem(error, path, missing) or LinkError(f"{path} cannot be used: {reason_of(error)}")
 
 
 def errno_of(error: Exception) -> int | None:
-    """The error number of an OSError, or of a termios.error, which has it among its arguments."""
+    """Return the error number of an OSError or of a termios.error."""
     if isinstance(error, OSError):
         return error.errno
     return next((argument for argument in error.args if isinstance(argument, int)), None)
 
 
 def transfer_problem(error: OSError, path: str, place: str) -> LinkError | TransferError:
-    """The error for a failed transfer: LinkMissing when the bus is gone, TransferError for this transfer only."""
+    """Return the error of a failed transfer: LinkMissing if the bus was removed, otherwise TransferError."""
     if error.errno in GONE:
         return LinkMissing(f"{path} is gone ({os.strerror(error.errno or 0)}): was an adapter pulled out?")
     if error.errno in NOT_ACKNOWLEDGED:
@@ -225,7 +228,8 @@ def transfer_problem(error: OSError, path: str, place: str) -> LinkError | Trans
 
 
 def holders_of(path: str, proc: Path = PROC) -> str:
-    """List the processes that have the node open, as `minicom (pid 123)`, as far as /proc lets this user see."""
+    """Return the processes that use the node, for example `minicom (pid 123)`, as far as /proc shows them to this
+    user."""
     target = os.path.realpath(path)
     holders = []
     for process in sorted(proc.glob("[0-9]*")):
@@ -235,7 +239,7 @@ def holders_of(path: str, proc: Path = PROC) -> str:
 
 
 def _words(process: Path) -> list[str]:
-    """Return the command line of a process, its first words; empty where that cannot be read."""
+    """Return the first words of the command line of a process; empty if it cannot be read."""
     try:
         return (process / "cmdline").read_bytes()[:COMMAND_BYTES].decode("utf-8", "replace").split("\0")
     except OSError:
@@ -245,7 +249,7 @@ def _words(process: Path) -> list[str]:
 def _has_open(process: Path, target: str) -> bool:
     try:
         descriptors = os.listdir(process / "fd")
-    except OSError:  # another user's process, or one that just ended
+    except OSError:  # a process of another user, or an ended process
         return False
     return any(_target(process / "fd" / descriptor) == target for descriptor in descriptors)
 
@@ -253,7 +257,7 @@ def _has_open(process: Path, target: str) -> bool:
 def _target(descriptor: Path) -> str:
     try:
         return os.readlink(descriptor)
-    except OSError:  # closed in between
+    except OSError:  # closed in the meantime
         return ""
 
 
@@ -262,7 +266,7 @@ def _name(process: Path) -> str:
         return OWN_PROCESS
     words = _words(process)
     for place, word in enumerate(words[:-1]):
-        if os.path.basename(word) == "imud":  # an interpreter may stand before it, and its options
+        if os.path.basename(word) == "imud":  # the word can follow an interpreter and its options
             return f"imud {printable(words[place + 1])}"
     try:
         return printable((process / "comm").read_text("utf-8", "backslashreplace").strip())

@@ -1,7 +1,8 @@
-"""An I2C bus through i2c-dev: a register is written and read in one transaction with a repeated start (I2C_RDWR).
+"""An I2C bus through i2c-dev: one transaction writes and reads a register with a repeated start (I2C_RDWR).
 
-Controllers that are SMBus only (I2C_FUNCS without I2C_FUNC_I2C) get block reads of at most 32 bytes instead, which put
-the same bits on the bus. The bus's time-out is shortened, so that one that hangs does not hold up its devices for long.
+If a controller supports SMBus only (no I2C_FUNC_I2C), the link uses block reads of at most 32 bytes. The bits on the
+bus are the same. The link shortens the timeout of the bus, so that a blocked bus delays its devices only for a short
+time.
 """
 
 import fcntl
@@ -19,12 +20,12 @@ from imud.model.errors import LinkError
 from imud.model.options import Options
 
 I2C_TIMEOUT: Final = 0x0702
-"""ioctl: time-out of the adapter in units of 10 ms (<linux/i2c-dev.h>)."""
+"""ioctl: timeout of the adapter in units of 10 ms (<linux/i2c-dev.h>)."""
 TIMEOUT_10MS: Final = 5
-"""50 ms: 40 times the 1.2 ms that 48 bytes take at 400 kHz."""
+"""Timeout of the bus, 10 ms: 40 times the 1.2 ms of 48 bytes at 400 kHz."""
 SWITCHED_ON: Final = "is I2C switched on (`dtparam=i2c_arm=on` on a Raspberry Pi), is module i2c-dev loaded?"
 BLOCK_BYTES_MAX: Final = 32
-"""Longest I2C block read of SMBus controllers."""
+"""Maximum length of an I2C block read of an SMBus controller, bytes."""
 
 
 class I2cOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -33,48 +34,39 @@ class I2cOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
     bus: Annotated[int, Meta(ge=0, le=255)] = 1
     """Number of the bus: 1 for `/dev/i2c-1`."""
     address: Annotated[int, Meta(ge=0x08, le=0x77)] | Literal["auto"] = "auto"
-    """7-bit address, for example 0x18, or `auto`: ask at every address that the device can have."""
+    """7-bit address, for example 0x18. `auto`: imud tries each address that the device supports."""
     rate_hz: Annotated[float, Meta(ge=0.1, le=4000)] = 100.0
-    """Rate of reads, per second."""
+    """Rate of the reads, Hz."""
 
 
 def bus_of(settings: I2cOptions) -> str:
-    """Return the path of the bus."""
     return f"/dev/i2c-{settings.bus}"
 
 
 class I2cBus(Protocol):
-    """The part of smbus2.SMBus that the link uses."""
+    """Part of smbus2.SMBus that the link uses."""
 
     @property
-    def fd(self) -> int | None:
-        """File descriptor of the bus."""
-        ...
+    def fd(self) -> int | None: ...
 
     @property
-    def funcs(self) -> int:
-        """I2C_FUNCS."""
-        ...
+    def funcs(self) -> int: ...
 
-    def i2c_rdwr(self, *messages: i2c_msg) -> None:
-        """Carry out one transaction."""
-        ...
+    def i2c_rdwr(self, *messages: i2c_msg) -> None: ...
 
     def read_i2c_block_data(self, i2c_addr: int, register: int, length: int) -> list[int]:
-        """Write a register's number, repeated start, read."""
+        """Write a register number, send a repeated start, read."""
         ...
 
     def write_i2c_block_data(self, i2c_addr: int, register: int, data: list[int]) -> None:
-        """Write a register's number and data."""
+        """Write a register number and data."""
         ...
 
-    def close(self) -> None:
-        """Release the node."""
-        ...
+    def close(self) -> None: ...
 
 
 class I2cLink:
-    """A `PolledLink` on i2c-dev. `open_bus` and `ioctl` are the real ones, or a test's."""
+    """A `PolledLink` on i2c-dev. Tests replace `open_bus` and `ioctl`."""
 
     def __init__(
         self,
@@ -97,28 +89,26 @@ class I2cLink:
         self.bit_rate = 0
 
     def absence(self) -> str:
-        """Return why the port cannot be opened now; empty when it is there."""
         return self._node.absence()
 
     async def wait_present(self) -> None:
-        """Return when the node is there."""
         await self._node.wait_present()
 
     def open(self) -> None:
-        """Open the node. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+        """Open the node. Raises LinkMissing, LinkDenied, LinkBusy or LinkError."""
         self._open()
 
     def select(self, target: int) -> None:
-        """Address the next transfers, 7 bits."""
+        """Set the 7-bit address of the next transfers."""
         self._address = target
         self._place = self.place(target)
 
     def place(self, target: int) -> str:
-        """An address in messages."""
+        """Return an address in the form of messages."""
         return f"address {target:#04x}"
 
     def transfer(self, transfer: Transfer) -> bytes:
-        """Write, and read after a repeated start. Raises TransferError, LinkMissing, LinkError."""
+        """Write, then read after a repeated start. Raises TransferError, LinkMissing or LinkError."""
         bus, (sent,) = self._bus, transfer.sends
         if bus is None:
             raise LinkError(f"{self.title} is not open")
@@ -130,18 +120,17 @@ class I2cLink:
             raise transfer_problem(error, self.title, self._place) from error
 
     def write(self, data: bytes) -> None:
-        """Raises LinkError: bytes are sent in transfers only."""
+        """Raises LinkError: the link sends bytes in transfers only."""
         raise LinkError(f"{self.title} cannot send {len(data)} bytes outside of a transfer")
 
     def kernel_counters(self) -> KernelCounters:
-        """Zeros: the kernel counts no errors of this bus."""
+        """Return zeros: the kernel does not count errors of this bus."""
         return KernelCounters()
 
     def serial_line(self) -> None:
-        """None: a bus with a clock carries nothing unasked."""
+        """Return None: this bus carries no data without a request."""
 
     def close(self) -> None:
-        """Release the node; may be called twice."""
         bus, self._bus = self._bus, None
         if bus is not None:
             bus.close()
@@ -164,7 +153,7 @@ class I2cLink:
         return bytes(read)
 
     def _block(self, bus: I2cBus, sent: bytes, read_bytes: int) -> bytes:
-        """The same by SMBus calls, for one register number and at most 32 bytes. Never a read of unknown length."""
+        """Make the transfer with SMBus calls: one register number, at most 32 bytes."""
         if not sent or len(sent) - 1 > BLOCK_BYTES_MAX or read_bytes > BLOCK_BYTES_MAX or (read_bytes and sent[1:]):
             raise LinkError(f"{self.title} is an SMBus controller and cannot make this transfer")
         if read_bytes:

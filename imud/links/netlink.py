@@ -1,4 +1,4 @@
-"""Network interfaces by rtnetlink(7): waiting for changes without polling; bit rate and state of a CAN interface."""
+"""Network interfaces by rtnetlink(7): waiting for changes, bit rate and state of a CAN interface."""
 
 import asyncio
 import socket
@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from imud.model.errors import LinkError
 
 RTMGRP_LINK: Final = 1
-"""Multicast group of news about interfaces (RTNLGRP_LINK as a bit)."""
+"""Multicast group for changes of interfaces (RTNLGRP_LINK as a bit)."""
 RTM_NEWLINK: Final = 16
 RTM_GETLINK: Final = 18
 NLM_F_REQUEST: Final = 1
@@ -23,7 +23,7 @@ IFF_UP: Final = 1
 ARPHRD_CAN: Final = 280
 NEWS_BYTES: Final = 65536
 ANSWER_S: Final = 1.0
-"""The kernel answers within the system call; this only keeps a broken one from hanging us."""
+"""Maximum time to wait for a reply, s. The kernel replies within the system call."""
 SYS: Final = Path("/sys")
 
 _HEADER: Final = struct.Struct("=IHHII")
@@ -32,7 +32,7 @@ _ATTRIBUTE: Final = struct.Struct("=HH")
 
 
 class CanDetails(NamedTuple):
-    """Settings and state that the driver of a CAN interface reports; None where it reports none (virtual ones)."""
+    """Bit rate and state of a CAN interface; None if the driver does not report the value (virtual interfaces)."""
 
     bitrate: int | None
     """Bit rate of the bus, bit/s."""
@@ -41,7 +41,8 @@ class CanDetails(NamedTuple):
 
 
 def absence(name: str, sys: Path = SYS) -> str:
-    """Why a CAN interface cannot be used now, one sentence; empty when it can. Raises LinkError for another kind."""
+    """Return why a CAN interface cannot be used now; empty if it can. Raises LinkError if the interface is of another
+    kind."""
     folder = sys / "class/net" / name
     try:
         kind = int((folder / "type").read_text())
@@ -54,7 +55,7 @@ def absence(name: str, sys: Path = SYS) -> str:
 
 
 def can_interfaces(sys: Path = SYS, *, down: bool = False) -> list[str]:
-    """Names of the CAN interfaces that are up, in order; with `down` of those that are not as well."""
+    """Return the names of the CAN interfaces that are up, sorted. With `down`, include the interfaces that are down."""
     found = []
     for folder in sorted((sys / "class/net").glob("*")):
         with suppress(LinkError):
@@ -64,7 +65,7 @@ def can_interfaces(sys: Path = SYS, *, down: bool = False) -> list[str]:
 
 
 async def wait_until(holds: Callable[[], bool]) -> None:
-    """Return when `holds()` is true; it is evaluated again after every change of any interface."""
+    """Return when `holds()` is true. imud calls `holds` again after each change of an interface."""
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.NETLINK_ROUTE) as news:
         news.bind((0, RTMGRP_LINK))
         changed = asyncio.Event()
@@ -80,7 +81,7 @@ async def wait_until(holds: Callable[[], bool]) -> None:
 
 
 def _drain(news: socket.socket) -> None:
-    """Discard the messages: their arrival is all that matters, even if they overran the buffer (ENOBUFS)."""
+    """Discard the messages. Only their arrival matters, also if they overran the buffer (ENOBUFS)."""
     while True:
         try:
             news.recv(NEWS_BYTES)
@@ -91,7 +92,7 @@ def _drain(news: socket.socket) -> None:
 
 
 def can_details(name: str) -> CanDetails:
-    """Bit rate and state of a CAN interface. Raises LinkError when it is gone."""
+    """Return bit rate and state of a CAN interface. Raises LinkError if the interface does not exist."""
     try:
         index = socket.if_nametoindex(name)
         with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as asking:
@@ -105,7 +106,7 @@ def can_details(name: str) -> CanDetails:
 
 
 def parse_details(answer: bytes) -> CanDetails:
-    """The details in an answer to RTM_GETLINK."""
+    """Return the details in a reply to RTM_GETLINK."""
     size, kind, *_ = _HEADER.unpack_from(answer)
     if kind != RTM_NEWLINK:
         return CanDetails(None, None)
@@ -115,7 +116,7 @@ def parse_details(answer: bytes) -> CanDetails:
 
 
 def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Type and content of each attribute, as far as they are whole."""
+    """Yield type and content of each complete attribute."""
     at = 0
     while at + _ATTRIBUTE.size <= len(data):
         size, kind = _ATTRIBUTE.unpack_from(data, at)

@@ -1,7 +1,8 @@
-"""A CAN bus through python-can, for adapters without a network interface: serial ones, vendors' drivers, `virtual`.
+"""A CAN bus through python-can, for adapters without a network interface: serial adapters, drivers of vendors,
+`virtual`.
 
-A thread receives frames and hands them to the event loop in batches. A frame's time stamp is the moment python-can
-returns it: the stamps of adapters have no common time base.
+A thread receives frames and passes them to the event loop in batches. The time stamp of a frame is the time at which
+python-can returns it, because the time stamps of adapters have no common time base.
 """
 
 import asyncio
@@ -20,12 +21,12 @@ from imud.links.cyclic_sender import LoopSender
 from imud.model.errors import LinkError, reason_of
 
 LOOK_S: Final = 0.05
-"""Time-out of a read, after which the thread checks whether to end, s."""
+"""Timeout of a read, s. After it, the thread checks whether to end."""
 BATCH_FRAMES: Final = 64
 
 
 class PythonCanLink:
-    """A bus of python-can as a `CanLink`. Synchronization: the loop's thread; the receiving thread is its own."""
+    """A bus of python-can as a `CanLink`. Synchronization: the loop's thread. The link has its own receiving thread."""
 
     def __init__(self, backend: str, channel: str, bitrate: int = 0) -> None:
         self._backend = backend
@@ -39,12 +40,11 @@ class PythonCanLink:
         self.title = self.bus = f"{channel} ({backend})"
         self.bitrate = bitrate
         self.gather_ns = 0
-        """No-op: the receiving thread decides how many frames it hands over at once."""
+        """Time for which the link holds frames, ns. This link ignores it: the receiving thread decides."""
         self.writable = True
 
     @property
     def filters(self) -> Sequence[CanFilter]:
-        """Frames to deliver."""
         return self._filters
 
     @filters.setter
@@ -54,11 +54,10 @@ class PythonCanLink:
             self._bus.set_filters(_as_python_can(filters))
 
     def absence(self) -> str:
-        """Empty: unknown before the bus is opened."""
+        """Return an empty text: the state is unknown before the bus is open."""
         return ""
 
-    async def wait_present(self) -> None:
-        """Return at once."""
+    async def wait_present(self) -> None: ...
 
     def open(self) -> None:
         """Open the bus. Raises LinkError with the message of python-can."""
@@ -70,7 +69,7 @@ class PythonCanLink:
             raise LinkError(f"{self.title} cannot be opened: {reason_of(error)}") from error
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
-        """Deliver frames from now on; python-can reports no changes of the bus state."""
+        """Start the delivery of frames. python-can does not report changes of the bus state."""
         assert self._bus is not None
         self._on_end = on_end
         self._stop = threading.Event()
@@ -93,20 +92,20 @@ class PythonCanLink:
             raise LinkError(f"{self.title} does not send: {reason_of(error)}") from error
 
     def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
-        """Send these from the event loop; the link ends when one cannot be sent. Raises LinkError.
+        """Send the frames from the event loop. The link ends if it cannot send a frame. Raises LinkError.
 
-        python-can's own `send_periodic` needs a thread for each frame and does not report failures.
+        `send_periodic` of python-can needs a thread for each frame and does not report failures.
         """
         if self._sender is not None:
             self._sender.close()
         self._sender = LoopSender(self.write, self._failed, frames)
 
     def kernel_counters(self) -> KernelCounters:
-        """Zeros: python-can counts no errors."""
+        """Return zeros: python-can does not count errors."""
         return KernelCounters()
 
     def close(self) -> None:
-        """Release the bus; may be called twice. Waits for the thread, LOOK_S at most."""
+        """Release the bus and wait for the thread, at most LOOK_S. A second call does nothing."""
         self._stop.set()
         sender, self._sender = self._sender, None
         if sender is not None:
@@ -130,7 +129,7 @@ class PythonCanLink:
         on_frames: OnFrames,
         on_end: OnEnd,
     ) -> None:
-        """Receive frames; the body of the thread."""
+        """Receive frames in the thread."""
 
         def deliver(frames: list[CanFrame]) -> None:
             if not stop.is_set():
@@ -155,7 +154,7 @@ def _as_python_can(filters: Sequence[CanFilter]) -> CanFilters:
 
 
 def _batch(bus: can.BusABC) -> list[CanFrame]:
-    """Data frames that are there, waiting for the first."""
+    """Wait for the first data frame. Return all data frames that python-can has now."""
     frames: list[CanFrame] = []
     message = bus.recv(LOOK_S)
     while message is not None:

@@ -1,13 +1,13 @@
 """A capture file as a source of bytes, through the same path as a port.
 
-Speeds, and what `t_rx_ns` is (it never decreases and never lies in the future):
+The key `speed` selects the arrival times `t_rx_ns`. They never decrease and are never in the future:
 
-- `recorded`: each read of a stamped capture comes as long after the first as it did then; `t_rx_ns` is that due time,
-  so the recorded arrival jitter is what the clock sees, not the jitter of this process.
-- `real`: bytes come as fast as the wire at `baud` carries them, PIECE_NS at a time; `t_rx_ns` is the due time.
-- `maximum`: as fast as the receiver decodes. Time is virtual: recorded stamps, or wire time at `baud` (all the same
-  instant where neither is known), shifted so that the end of the capture is the moment of the start. It can be negative
-  where the capture is longer than the machine is up.
+- `recorded`: each read of a capture with time stamps arrives with its recorded distance from the first read. `t_rx_ns`
+  is this due time, so that the clock sees the recorded jitter of the arrivals, not the jitter of this process.
+- `real`: bytes arrive at the speed of the wire at `baud`, PIECE_NS at a time. `t_rx_ns` is the due time.
+- `maximum`: bytes arrive as fast as the receiver decodes them. `t_rx_ns` is the recorded time or the time on the wire,
+  shifted so that the end of the capture is the start of the replay. It is one constant if neither time is known. It can
+  be negative if the capture is longer than the uptime of the host.
 """
 
 import asyncio
@@ -38,13 +38,14 @@ class ReplayOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Options of a replayed capture."""
 
     path: Annotated[str, Meta(min_length=1)]
-    """Raw or stamped capture file."""
+    """Path of a capture file, raw or with time stamps."""
     speed: Literal["recorded", "real", "maximum"] = "recorded"
-    """`recorded`: by the stamps in the file; `real`: by wire time at `baud`; `maximum`: as fast as possible."""
+    """`recorded`: by the time stamps of the file. `real`: by the time on the wire at `baud`. `maximum`: as fast as
+    possible."""
     baud: Annotated[int, Meta(ge=0, le=4_000_000)] = 0
-    """Rate of the wire in bit/s; 0 for that of the capture. A raw capture at speed `real` needs it."""
+    """Rate of the wire, bit/s; 0: the rate of the capture. A raw capture at speed `real` needs this key."""
     repeat: bool = False
-    """Start again at the end of the file; not at speed `maximum`."""
+    """Start again at the end of the file. Not possible at speed `maximum`."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for keys that exclude each other."""
@@ -55,7 +56,7 @@ class ReplayOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 class FileReplay:
     """Common part of both kinds of replay. Synchronization: the loop's thread only.
 
-    `close` drops the timer and the file: a turn that finds another file in `_file` than at its begin has ended.
+    `close` drops the timer and the file. A turn has ended if `_file` is another file than at the start of the turn.
     """
 
     writable = False
@@ -68,24 +69,21 @@ class FileReplay:
         self._timer: asyncio.Handle | None = None
 
     def absence(self) -> str:
-        """Return that the file is missing; empty when it is there."""
         return "" if Path(self.title).exists() else f"{self.title} is not there: expected a capture file"
 
     async def wait_present(self) -> None:
-        """Return when the file is there."""
         path = Path(self.title)
         await wait_until(path, path.exists)
 
     def write(self, data: bytes) -> None:
-        """Raises LinkError: a file has no far end."""
+        """Raises LinkError: a file cannot receive data."""
         raise LinkError(f"{self.title} is a replay: nothing can be sent to it")
 
     def kernel_counters(self) -> KernelCounters:
-        """Zeros: the kernel counts no errors of a file."""
+        """Return zeros: the kernel does not count errors of a file."""
         return KernelCounters()
 
     def close(self) -> None:
-        """Release the file; may be called twice."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -95,7 +93,7 @@ class FileReplay:
 
 
 def open_regular(path: str) -> BinaryIO:
-    """Open a capture for reading. Raises LinkMissing, LinkDenied, LinkError."""
+    """Open a capture for reading. Raises LinkMissing, LinkDenied or LinkError."""
     try:
         return open_file(path)
     except FileNotFoundError as error:
@@ -109,23 +107,23 @@ def open_regular(path: str) -> BinaryIO:
 
 
 def unreadable(path: str, error: OSError) -> LinkError:
-    """Format the error for a file that cannot be read."""
+    """Return the error of a file that cannot be read."""
     return LinkError(f"{path} cannot be read: {error.strerror}")
 
 
 TURN_FRAMES: Final = 512
-"""Delivered in one turn of the event loop, 1 ms of decoding: others get their turn between."""
+"""Maximum number of frames in one turn of the event loop: 1 ms of decoding."""
 
 log = logging.getLogger(__name__)
 
 
 def no_log(path: str) -> str:
-    """Format the error for a file without frames."""
+    """Return the error text of a file without frames."""
     return f"{path} is no CAN log: expected frames as `candump -L` writes them, found none"
 
 
 class CanReplayLink(FileReplay):
-    """A log as a `CanLink`. Synchronization: the loop's thread only."""
+    """A log of CAN frames as a `CanLink`. Synchronization: the loop's thread only."""
 
     def __init__(self, settings: ReplayOptions, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         super().__init__(settings, now_ns)
@@ -135,10 +133,10 @@ class CanReplayLink(FileReplay):
         self.bus = settings.path
         self.bitrate = 0
         self.gather_ns = 0
-        """No-op: the recording decides what is delivered together."""
+        """Time for which the link holds frames, ns. This link ignores it: the recording decides."""
 
     def open(self) -> None:
-        """Open the log and check that it has frames. Raises LinkMissing, LinkDenied, LinkError."""
+        """Open the log and check that it contains frames. Raises LinkMissing, LinkDenied or LinkError."""
         self._file = open_regular(self.title)
         reader = CandumpReader(self._file)
         first_ns = newest_ns = -1
@@ -157,16 +155,15 @@ class CanReplayLink(FileReplay):
         self._span_ns = newest_ns - first_ns
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
-        """Play from the beginning."""
         self._frames = self._play(self._now_ns() - self._span_ns)
         self._timer = asyncio.get_running_loop().call_soon(self._turn, on_frames, on_end, None)
 
     def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
-        """Raises LinkError: a file has no far end."""
+        """Raises LinkError: a file cannot receive data."""
         raise LinkError(f"{self.title} is a replay: nothing can be sent to it")
 
     def _turn(self, on_frames: OnFrames, on_end: OnEnd, waiting: CanFrame | None) -> None:
-        """Deliver what is due, at most TURN_FRAMES, then give way."""
+        """Deliver the due frames, at most TURN_FRAMES, then return to the event loop."""
         file, frames, now_ns = self._file, list[CanFrame](), self._now_ns()
         while (frame := waiting or next(self._frames, None)) is not None:
             waiting = frame if frame.t_rx_ns > now_ns or len(frames) >= TURN_FRAMES else None
@@ -175,7 +172,7 @@ class CanReplayLink(FileReplay):
             frames.append(frame)
         if frames:
             on_frames(frames)
-        if self._file is not file:  # closed by the receiver
+        if self._file is not file:  # the receiver closed the link
             return
         if waiting is None:
             self.close()
@@ -185,7 +182,7 @@ class CanReplayLink(FileReplay):
         self._timer = asyncio.get_running_loop().call_later(delay_s, self._turn, on_frames, on_end, waiting)
 
     def _play(self, origin_ns: int) -> Iterator[CanFrame]:
-        """Frames that pass the filters, with the CLOCK_MONOTONIC at which each is due."""
+        """Yield the frames that pass the filters, each with its due time in CLOCK_MONOTONIC."""
         while self._file is not None:
             self._file.seek(0)
             reader = CandumpReader(self._file)
@@ -204,14 +201,14 @@ class CanReplayLink(FileReplay):
 
 
 PIECE_NS: Final = 2 * NS_PER_MS
-"""Wire time of one piece at speed `real`; a native UART hands over about as much at a time."""
+"""Time on the wire of one piece at speed `real`, ns. A native UART delivers pieces of about this size."""
 PIECE_BYTES_MAX: Final = 65536
-"""Bytes per chunk of a capture without times: the size of a read from a port."""
+"""Maximum size of a piece of a capture without times, bytes: the size of a read from a port."""
 TURN_BYTES: Final = 16384
-"""Delivered in one turn of the event loop, 0.5 ms of decoding: others get their turn between."""
+"""Maximum number of bytes in one turn of the event loop: 0.5 ms of decoding."""
 
 LOOKED_AT_BYTES: Final = 65536
-"""Begin of a log in which the check of a configuration looks for a frame."""
+"""Number of bytes at the start of a log in which the check of a configuration looks for a frame."""
 
 
 class ReplayLink(FileReplay):
@@ -227,17 +224,16 @@ class ReplayLink(FileReplay):
         self.waiting_bytes = 0
 
     def pause(self) -> None:
-        """No-op: a recording is not paused, for nothing wakes up for it but itself."""
+        """Do nothing: a recording needs no wake-ups that a pause could save."""
 
     def take(self) -> bytes:
-        """Nothing waits."""
+        """Return no bytes: a replay holds no bytes back."""
         return b""
 
-    def resume(self) -> None:
-        """No-op, as `pause`."""
+    def resume(self) -> None: ...
 
     def open(self) -> None:
-        """Open and check the capture. Raises LinkMissing, LinkDenied, LinkError."""
+        """Open and check the capture. Raises LinkMissing, LinkDenied or LinkError."""
         path, settings = self.title, self._settings
         self._file = open_regular(path)
         try:
@@ -255,18 +251,17 @@ class ReplayLink(FileReplay):
             raise unreadable(path, error) from error
 
     def start(self, on_data: OnData, on_end: OnEnd) -> None:
-        """Play from the beginning."""
         self._player = self._play(self._now_ns() - self._span_ns)
         self._timer = asyncio.get_running_loop().call_soon(self._turn, on_data, on_end, None)
 
     def set_baud(self, baud: int) -> None:
-        """Raises LinkError: a recording has the rate it has."""
+        """Raises LinkError: the rate of a recording is fixed."""
         raise LinkError(f"{self.title} is a replay: its rate cannot be changed")
 
     def _turn(self, on_data: OnData, on_end: OnEnd, waiting: tuple[bytes, int] | None) -> None:
-        """Deliver what is due, at most TURN_BYTES, then give way."""
+        """Deliver the due bytes, at most TURN_BYTES, then return to the event loop."""
         loop, file, room, now_ns = asyncio.get_running_loop(), self._file, TURN_BYTES, self._now_ns()
-        while self._file is file:  # until the receiver closes it
+        while self._file is file:  # False after the receiver closed the link
             data, due_ns = item = waiting or next(self._player, (b"", 0))
             waiting = None
             if not data:
@@ -284,7 +279,7 @@ class ReplayLink(FileReplay):
             on_data(data, due_ns)
 
     def _play(self, origin_ns: int) -> Iterator[tuple[bytes, int]]:
-        """Pieces with the CLOCK_MONOTONIC at which each is due."""
+        """Yield pieces of bytes, each with its due time in CLOCK_MONOTONIC."""
         while True:
             offset_ns = pieces = 0
             reader = self._reader()
@@ -298,7 +293,7 @@ class ReplayLink(FileReplay):
             origin_ns += offset_ns + max(offset_ns // pieces, NS_PER_MS)
 
     def _pieces(self, reader: CaptureReader) -> Iterator[tuple[bytes, int]]:
-        """Pieces of bounded size with the time each was complete, from 0."""
+        """Yield pieces of limited size, each with the time of its last byte from the start of the capture, ns."""
         if reader.stamped and self._settings.speed != "real":
             return self._stamped_pieces(reader)
         return self._wire_pieces(reader)
@@ -325,7 +320,7 @@ class ReplayLink(FileReplay):
                 yield piece, sent * byte_ns
 
     def _measure(self, reader: CaptureReader) -> int:
-        """Duration of the capture in its own time, ns."""
+        """Return the duration of the capture in its own time, ns."""
         if self._file is not None and not reader.stamped:
             return os.fstat(self._file.fileno()).st_size * uart_byte_ns(self.baud)
         return max((offset_ns for _, offset_ns in self._pieces(reader)), default=0)
@@ -341,7 +336,7 @@ class ReplayLink(FileReplay):
 
 
 def _unplayable(settings: ReplayOptions, reader: CaptureReader) -> str:
-    """Return why a capture cannot be played at the speed of the settings; empty if it can."""
+    """Return why a capture cannot be played at the configured speed; empty if it can."""
     if settings.speed == "recorded" and not reader.stamped:
         return f"{settings.path} is a raw capture without times: use speed real with a baud, or maximum"
     if settings.speed == "real" and not (settings.baud or reader.baud):
@@ -350,7 +345,7 @@ def _unplayable(settings: ReplayOptions, reader: CaptureReader) -> str:
 
 
 def _problem(settings: ReplayOptions, frames: bool) -> str:
-    """Return why the file cannot be played; empty if it can, or if it is not there now."""
+    """Return why the file cannot be played; empty if it can be played or does not exist now."""
     try:
         with open_regular(settings.path) as file:
             if frames:
@@ -363,7 +358,7 @@ def _problem(settings: ReplayOptions, frames: bool) -> str:
 
 
 def _without_frames(path: str, begin: bytes) -> str:
-    """Return that a log has no frames, if its begin is all of it."""
+    """Return an error text if `begin` is the whole log and contains no frame."""
     found = len(begin) == LOOKED_AT_BYTES or next(iter(CandumpReader(BytesIO(begin))), None) is not None
     return "" if found else no_log(path)
 

@@ -1,14 +1,15 @@
-"""An RS-485 line: a serial port opened once for all devices on it, its direction control, requests and replies.
+"""An RS-485 bus: one serial port for all its devices, direction control, requests and replies.
 
     silence ▸ request ▸ (echo) ▸ silence ▸ reply ▸ silence …
 
-One request is under way at a time. The silence between frames is kept, counted from when the last byte was read. A
-module that did not reply in time owes a reply: before its next request one register is read, whose reply has another
-length than the one owed, so that a late reply is never mistaken for the one to the new request.
+One request is in progress at a time. The link keeps the silence between frames, measured from the last received byte. A
+late reply must not count as the reply to the next request. After a timeout, the link therefore first reads one register
+of the device. The length of this reply differs from the length of the missing reply.
 
-The transmitter is switched by the kernel's driver with RTS (TIOCSRS485, Documentation/driver-api/serial/
-serial-rs485.rst), or by the adapter: drivers without that ioctl, USB adapters and ptys among them, say ENOTTY.
-pyserial's own `rs485_mode` is not used: where the driver refuses it, every later setting of that object fails.
+The driver of the kernel switches the transmitter with RTS (TIOCSRS485,
+Documentation/driver-api/serial/serial-rs485.rst), or the adapter does. A driver without this ioctl returns ENOTTY, for
+example of a USB adapter or a pty. imud does not use `rs485_mode` of pyserial: if the driver refuses the mode, all later
+settings of the object fail.
 """
 
 import contextlib
@@ -47,13 +48,13 @@ from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 READ_BYTES: Final = 4096
 BROADCAST_NS: Final = 100 * NS_PER_MS
-"""Pause after a broadcast: "MODBUS over Serial Line" 2.4.1 gives 100 to 200 ms."""
+"""Pause after a broadcast, ns: 100 to 200 ms in "MODBUS over Serial Line" 2.4.1."""
 ASLEEP_SHARE: Final = 0.9
-"""Share of the wire time of the missing bytes that is slept: fewer wake-ups, none late."""
+"""Share of the wire time of the missing bytes for which the thread sleeps. It saves wake-ups and is never late."""
 TIOCGRS485: Final = 0x542E
 TIOCSRS485: Final = 0x542F
 SERIAL_RS485: Final = struct.Struct("8I")
-"""flags, delay_rts_before_send ms, delay_rts_after_send ms, padding (linux/serial.h)."""
+"""`struct serial_rs485`: flags, delay_rts_before_send ms, delay_rts_after_send ms, padding (linux/serial.h)."""
 ENABLED: Final = 1 << 0
 RTS_ON_SEND: Final = 1 << 1
 UNSUPPORTED: Final = frozenset({errno.ENOTTY, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP})
@@ -63,17 +64,18 @@ DirectionWish = Literal["auto", "kernel", "none"]
 
 
 class Direction:
-    """Direction control of one open port by its driver, where it has it."""
+    """Direction control of one open port by its driver, if the driver supports it."""
 
     def __init__(self, fd: int, title: str, *, required: bool) -> None:
-        """Enable the driver's direction control. Raises LinkError if it is `required` and the driver has none.
+        """Enable the direction control of the driver. Raises LinkError if it is `required` and the driver does not
+        support it.
 
-        A port where it is enabled already (device tree) is left as it is.
+        If the direction control is already enabled (device tree), the port stays unchanged.
         """
         self._fd = fd
         self._before: bytes | None = None
         self.by_kernel = False
-        """Whether the driver switches the direction."""
+        """True if the driver switches the direction."""
         try:
             before = fcntl.ioctl(fd, TIOCGRS485, bytes(SERIAL_RS485.size))
             if not SERIAL_RS485.unpack(before)[0] & ENABLED:
@@ -88,7 +90,7 @@ class Direction:
                 ) from error
 
     def restore(self) -> None:
-        """Leave the port as it was; may be called twice, and on a port that is gone."""
+        """Restore the state of the port. A second call, or a call after the port was removed, does nothing."""
         before, self._before = self._before, None
         if before is not None:
             with contextlib.suppress(OSError):
@@ -96,46 +98,47 @@ class Direction:
 
 
 class PortSetup(NamedTuple):
-    """Options that all devices of a line must agree on."""
+    """Options that all devices of a bus share."""
 
     path: str
     baud: int
-    """Rate in bit/s."""
+    """Baud rate, bit/s."""
     direction: DirectionWish = "auto"
     echo: Echo = "auto"
 
     @property
     def terms(self) -> dict[str, object]:
-        """All but the path, by the keys of the configuration."""
+        """Return all options except the path, by the keys of the configuration."""
         return {"baud": self.baud, "direction": self.direction, "echo": self.echo}
 
 
 class LineCounters:
-    """Traffic on a line other than replies, in bytes unless stated otherwise."""
+    """Traffic on a bus except for replies, bytes if not stated otherwise."""
 
     __slots__ = ("echoed", "late", "strange", "timeouts")
 
     def __init__(self) -> None:
         self.echoed = 0
-        """Requests whose echo was received."""
+        """Number of requests whose echo was received."""
         self.late = 0
-        """Received while no request was pending."""
+        """Bytes received without a pending request."""
         self.strange = 0
-        """Received before a reply, or in place of one."""
+        """Bytes received before a reply or in place of a reply."""
         self.timeouts = 0
-        """Requests without a reply."""
+        """Number of requests without a reply."""
 
 
 class Rs485Line:
-    """An open port. Synchronization: the bus's thread makes the transfers; open and close hold `SharedPorts`' lock."""
+    """An open port. Synchronization: the thread of the bus makes the transfers; open and close hold the lock of
+    `SharedPorts`."""
 
     def __init__(self, setup: PortSetup, sys: Path, proc: Path, now_ns: Callable[[], int]) -> None:
-        """Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+        """Open the port. Raises LinkMissing, LinkDenied, LinkBusy or LinkError."""
         path, baud = setup.path, setup.baud
         self.setup = setup
         self.counters = LineCounters()
         self.echoes: bool | None = None if setup.echo == "auto" else setup.echo
-        """Whether the port receives what it sends; None until that was observed."""
+        """True if the port receives its own transmission; None until imud has observed it."""
         self._path = path
         self._now_ns = now_ns
         self._port: serial.Serial | None = open_port(path, baud, proc)
@@ -158,11 +161,10 @@ class Rs485Line:
 
     @property
     def counted(self) -> TtyCounters:
-        """Errors the kernel counts."""
+        """Return the errors that the kernel counts."""
         return self._tty
 
     def close(self) -> None:
-        """Release the port; may be called twice."""
         port, self._port = self._port, None
         if port is not None:
             if self._direction is not None:
@@ -172,9 +174,10 @@ class Rs485Line:
                 port.close()
 
     def transfer(self, target: int, request: bytes, reply_bytes: int, reply_ns: int) -> bytes:
-        """Return the whole reply to a request, damaged or not, or an exception. Raises TransferError, LinkError.
+        """Return the complete reply to a request, also a damaged reply or a Modbus exception. Raises TransferError or
+        LinkError.
 
-        `reply_ns` is the module's time to begin its reply.
+        `reply_ns` is the maximum time until the device starts its reply, ns.
         """
         if self._port is None:
             raise LinkError(f"{self._path} is not open")
@@ -189,7 +192,7 @@ class Rs485Line:
         return self._ask(target, request, reply_bytes, reply_ns)
 
     def _settle(self, target: int, owed: bytes, reply_ns: int) -> None:
-        """Read so few registers that the reply differs in length from an outstanding one, which may come before it."""
+        """Read a register with a reply of another length than the missing reply, which can arrive first."""
         first, count = owed[1:3], owed[3:5]
         few = 2 if owed[0] == READ_HOLDING and count == b"\0\1" else 1
         request = bytes([READ_HOLDING]) + first + few.to_bytes(2, "big")
@@ -199,7 +202,9 @@ class Rs485Line:
         frame = framed(target, request)
         finder = ReplyFinder(frame, reply_bytes, echoes=self.echoes)
         self._send(frame)
-        wire_ns = (2 * len(frame) + reply_bytes) * self._byte_ns  # an echo comes with the request, not after it
+        wire_ns = (
+            2 * len(frame) + reply_bytes
+        ) * self._byte_ns  # wire time of the request and of its echo, which the port receives at the same time
         deadline_ns = self._now_ns() + wire_ns + 2 * self._gap_ns + reply_ns + self._hold_ns
         reply = self._wait(finder, deadline_ns)
         self._note_echo(finder, reply)
@@ -215,7 +220,7 @@ class Rs485Line:
         return reply
 
     def _wait(self, finder: ReplyFinder, deadline_ns: int) -> bytes | None:
-        """Read until the reply is complete or the deadline has passed."""
+        """Read until the reply is complete or the deadline has passed. Return None after the deadline."""
         while (left_ns := deadline_ns - self._now_ns()) > 0:
             if not self._poll.poll(left_ns / NS_PER_MS):
                 break
@@ -224,10 +229,11 @@ class Rs485Line:
                 return reply
             if finder.missing > 1:
                 time.sleep(finder.missing * self._byte_ns * ASLEEP_SHARE / NS_PER_S)
-        return finder.feed(self._read())  # this thread itself may have been late
+        return finder.feed(self._read())  # this thread may be late: read once more
 
     def _note_echo(self, finder: ReplyFinder, reply: bytes | None) -> None:
-        """An echo behind noise is not seen: only a reply with nothing before it shows that there is none."""
+        """Note whether the port echoes. Noise before an echo hides it: only a reply without bytes before it shows that
+        there is no echo."""
         if finder.echo_seen:
             self.counters.echoed += 1
         if self.echoes is None and (finder.echo_seen or (reply is not None and not finder.strange)):
@@ -238,14 +244,14 @@ class Rs485Line:
         if rest or finder.strange:
             message = f"no reply from address {target} on {self._path}, but other bytes: {rest[:16].hex(' ')}"
             return TransferError(Trouble.DISTURBED, f"{message}; is the baud rate right, is an address given twice?")
-        # DISTURBED, not ABSENT: a request hit by noise has no reply either; three in a row mean that the module is lost
+        # DISTURBED, not ABSENT: noise can destroy a request; after three failures in a row the device counts as lost
         return TransferError(
             Trouble.DISTURBED,
             f"no reply from address {target} on {self._path}: is it powered, are A and B not swapped?",
         )
 
     def _send(self, frame: bytes) -> None:
-        """Write a frame after the silence that must be before it. Raises TransferError, LinkError."""
+        """Write a frame after the required silence. Raises TransferError or LinkError."""
         self._await_silence()
         try:
             sent = os.write(self._fd, frame)
@@ -258,7 +264,7 @@ class Rs485Line:
         self._quiet_ns = self._now_ns() + len(frame) * self._byte_ns
 
     def _await_silence(self) -> None:
-        """Return when the line was silent for a frame gap; bytes received until then are counted as late."""
+        """Return after a silence of one frame gap. Count the bytes received before it as late."""
         limit_ns = self._now_ns() + 2 * ADU_BYTES_MAX * self._byte_ns + self._gap_ns
         while True:
             late = len(self._read())
@@ -271,7 +277,7 @@ class Rs485Line:
             self._sleep_until(self._quiet_ns + self._gap_ns)
 
     def _read(self) -> bytes:
-        """The bytes received so far. Raises LinkMissing when the port is gone."""
+        """Return the received bytes. Raises LinkMissing if the port was removed."""
         try:
             data = os.read(self._fd, READ_BYTES)
         except BlockingIOError:
@@ -293,7 +299,7 @@ class Rs485Line:
 
 
 class SharedPorts:
-    """The lines that are open, by path. Synchronization: any thread."""
+    """Open buses by path. Synchronization: any thread."""
 
     def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._lock = threading.Lock()
@@ -302,7 +308,8 @@ class SharedPorts:
         self._now_ns = now_ns
 
     def share(self, setup: PortSetup, sys: Path = Path("/sys"), proc: Path = PROC) -> Rs485Line:
-        """The line of that path, opened if it is not open. Raises LinkError, also for another rate or setting."""
+        """Return the bus of a path; open it if necessary. Raises LinkError, also if the options differ from the open
+        bus."""
         with self._lock:
             line = self._open.get(setup.path)
             if line is None:
@@ -312,13 +319,13 @@ class SharedPorts:
             return line
 
     def discard(self, line: Rs485Line) -> None:
-        """Forget a line whose port is gone: the next `share` opens it anew."""
+        """Remove a bus whose port was removed. The next `share` opens it again."""
         with self._lock:
             if self._open.get(line.setup.path) is line:
                 del self._open[line.setup.path]
 
     def release(self, line: Rs485Line) -> None:
-        """Remove one user; the last one closes the port."""
+        """Remove one user. The last user closes the port."""
         with self._lock:
             self._users[line] -= 1
             if self._users[line]:
@@ -337,31 +344,32 @@ def _check_agreement(first: PortSetup, other: PortSetup) -> None:
 
 
 SHARED_PORTS: Final = SharedPorts()
-"""The open lines of this process."""
+"""Open buses of this process."""
 
 
 class Rs485Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of an RS-485 line. All but `address`, `rate_hz` and `reply_ms` must be the same for all its devices."""
+    """Options of a device on an RS-485 bus. All but `address`, `rate_hz` and `reply_ms` must be the same for all
+    devices of the bus."""
 
     line: Annotated[str, Meta(min_length=1)]
-    """Path of the port. Several devices may have the same one."""
+    """Path of the port. Several devices can have the same path."""
     baud: Annotated[int, Meta(ge=300, le=4_000_000)] = 115200
-    """Rate in bit/s of the line."""
+    """Baud rate of the bus, bit/s."""
     address: Annotated[int, Meta(ge=1, le=247)] | Literal["auto"] = "auto"
-    """Modbus address, or `auto`: ask at every address. Give it where a line has more than one device."""
+    """Modbus address. `auto`: imud tries each address. Set it if the bus has more than one device."""
     rate_hz: Annotated[float, Meta(ge=0, le=1000)] = 0.0
-    """Rate of reads, per second; 0 for as often as the line allows, in turns with the other devices."""
+    """Rate of the reads, Hz. 0: as often as the bus allows, in turns with the other devices."""
     reply_ms: Annotated[int, Meta(ge=1, le=1000)] = 20
-    """Longest delay of the device before it answers. Time on the wire is added."""
+    """Maximum time until the device starts its reply, ms, without the time on the wire."""
     direction: Literal["auto", "kernel", "none"] = "auto"
-    """Control of the direction: `kernel` by its driver (RTS), `none` by the adapter, `auto` by the driver if
-    it can."""
+    """Direction control: `kernel` by the driver (RTS), `none` by the adapter, `auto` by the driver if it supports
+    it."""
     echo: Literal["auto"] | bool = "auto"
-    """Whether the adapter receives what it sends; `auto` detects it."""
+    """True if the adapter receives its own transmission. `auto`: imud detects it."""
 
 
 class Rs485Link:
-    """A `PolledLink` on a serial port that others may share."""
+    """A `PolledLink` on a serial port that devices can share."""
 
     def __init__(
         self,
@@ -387,31 +395,30 @@ class Rs485Link:
 
     @property
     def heard(self) -> LineCounters:
-        """Bytes other than replies, received on the line since it was opened."""
+        """Return the traffic on the bus except for replies, since the port was opened."""
         return self._line.counters if self._line else LineCounters()
 
     def absence(self) -> str:
-        """Return why the port cannot be opened now; empty when it is there."""
         return self._node.absence()
 
     async def wait_present(self) -> None:
-        """Return when the port is there."""
         await self._node.wait_present()
 
     def open(self) -> None:
-        """Open the port exclusively, or share it. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+        """Open the port exclusively, or share an open port. Raises LinkMissing, LinkDenied, LinkBusy or LinkError."""
         self._line = self._ports.share(_setup(self._settings), self._sys, self._proc)
 
     def select(self, target: int) -> None:
-        """Address the next transfers; 0 is a broadcast, which has no reply."""
+        """Set the address of the next transfers. 0 is a broadcast, which has no reply."""
         self._address = target
 
     def place(self, target: int) -> str:
-        """An address in messages, as the vendor's documents and programs write it."""
+        """Return an address in the notation of the vendor's documents and programs."""
         return f"address {target}"
 
     def transfer(self, transfer: Transfer) -> bytes:
-        """Return the whole reply to a request, an exception or a damaged reply. Raises TransferError, LinkError."""
+        """Return the complete reply to a request, also a damaged reply or a Modbus exception. Raises TransferError or
+        LinkError."""
         line, (request,) = self._line, transfer.sends
         if line is None:
             raise LinkError(f"{self.title} is not open")
@@ -423,20 +430,20 @@ class Rs485Link:
             raise
 
     def write(self, data: bytes) -> None:
-        """Raises LinkError: bytes are sent in transfers only."""
+        """Raises LinkError: the link sends bytes in transfers only."""
         raise LinkError(f"{self.title} cannot send {len(data)} bytes outside of a transfer")
 
     def kernel_counters(self) -> KernelCounters:
-        """Errors the kernel counted on the line since it was opened."""
+        """Return the errors that the kernel counted since the port was opened."""
         return self._line.counted.read() if self._line else KernelCounters()
 
     def serial_line(self) -> SerialLineCounters:
-        """Bytes other than replies, received on the line since it was opened, for any of its devices."""
+        """Return the traffic on the bus except for replies, for all devices, since the port was opened."""
         heard = self.heard
         return SerialLineCounters(heard.timeouts, heard.late, heard.strange, heard.echoed)
 
     def close(self) -> None:
-        """Leave the line, whose last user closes the port; may be called twice."""
+        """Leave the bus. The last device closes the port. A second call does nothing."""
         line, self._line = self._line, None
         if line is not None:
             self._ports.release(line)

@@ -1,12 +1,12 @@
-"""A serial port: exclusive raw access, the rate read back, the latency of its adapter lowered, errors counted.
+"""A serial port: exclusive raw access, verified baud rate, low latency of the adapter, counted errors.
 
-What pyserial leaves undone is done here: TIOCEXCL beside its flock (programs that do not lock are refused too), no
-BRKINT (with it, a break, which is what a wrong baud rate looks like, discards everything received), no HUPCL (DTR
-stays as it is between close and open, and a board that resets on DTR is left alone), and the rate is read back.
+pyserial lacks four settings that imud makes: TIOCEXCL in addition to flock, so that programs without locks are refused
+too. No BRKINT: a wrong baud rate looks like a break, and BRKINT would discard all received bytes. No HUPCL: DTR keeps
+its state between close and open, so that boards with a reset on DTR keep running. imud reads the baud rate back.
 
-FTDI-like USB adapters send a packet when 62 bytes are there or their latency timer (16 ms as delivered) runs out.
-ASYNC_LOW_LATENCY (linux/serial.h) or sysfs `latency_timer` sets it to 1 ms. Native UARTs and ptys hold nothing back;
-CDC ACM devices answer the host's polls of 1 ms (USB full-speed frame).
+USB adapters like FTDI send a packet after 62 bytes or when the latency timer ends (16 ms by default). ASYNC_LOW_LATENCY
+(linux/serial.h) or `latency_timer` in sysfs sets it to 1 ms. Native UARTs and ptys do not hold bytes. CDC ACM devices
+reply to the polls of the host, one per 1 ms (USB full-speed frame).
 """
 
 import array
@@ -28,32 +28,35 @@ from imud.model.errors import LinkError, reason_of
 from imud.model.units import NS_PER_MS
 
 TCGETS2: Final = 0x802C542A
-"""ioctl: struct termios2, which has the rate as a number (asm-generic/termbits.h)."""
+"""ioctl: struct termios2, with the baud rate as a number (asm-generic/termbits.h)."""
 TERMIOS2_INTS: Final = 11
 OSPEED_INDEX: Final = 10
-"""c_iflag c_oflag c_cflag c_lflag, c_line and c_cc[19] in five words, c_ispeed, c_ospeed."""
+"""Place of the output rate in termios2: c_iflag c_oflag c_cflag c_lflag, c_line and c_cc[19] in five words, c_ispeed,
+c_ospeed."""
 BAUD_TOLERANCE: Final = 0.03
-"""8N1 is sampled 9.5 bits after its start edge: half a bit there is 5 %, of which the far end may use some."""
+"""Maximum relative error of the baud rate. A receiver samples 8N1 until 9.5 bits after the start edge: half a bit is 5
+%, and the device can use a part of it."""
 UNKNOWN_USB_HOLD_NS: Final = 16 * NS_PER_MS
-"""Assumed hold time of USB adapters whose driver does not report one: the longest common one."""
+"""Assumed latency timer of USB adapters whose driver does not report it, ns: the longest usual value."""
 ACM_HOLD_NS: Final = 1 * NS_PER_MS
 TIOCGICOUNT: Final = 0x545D
-"""ioctl: errors that the kernel's serial driver counts (ioctl_tty(2))."""
+"""ioctl: error counters of the serial driver (ioctl_tty(2))."""
 ICOUNTER_INTS: Final = 20
-"""struct serial_icounter_struct: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun reserved[9], all int."""
+"""Number of integers in serial_icounter_struct: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun
+reserved[9]."""
 FRAME, OVERRUN, PARITY, BREAK, BUFFER_OVERRUN = 6, 7, 8, 9, 10
 
 
 PIPE_ENDS: Final = ("pipe_abort_read_r", "pipe_abort_read_w", "pipe_abort_write_r", "pipe_abort_write_w")
-"""Of pyserial's two pipes, by which another thread can end a wait in its `read` and `write`."""
+"""Attributes of pyserial for its two pipes, with which another thread can end a wait in `read` or `write`."""
 
 
 class DescriptorPort(serial.Serial):
-    """A port that is read and written by its descriptor, not by pyserial: without its pipes, one descriptor instead of
-    five."""
+    """A port without the pipes of pyserial: one descriptor instead of five. The link reads and writes the descriptor
+    itself."""
 
     def open(self) -> None:
-        """Open the port. Raises OSError, ValueError, termios.error."""
+        """Open the port. Raises OSError, ValueError or termios.error."""
         super().open()
         for name in PIPE_ENDS:
             descriptor = getattr(self, name, None)
@@ -62,7 +65,6 @@ class DescriptorPort(serial.Serial):
                 setattr(self, name, None)
 
     def close(self) -> None:
-        """Close the port; may be called twice."""
         if self.is_open:
             descriptor = self.fileno()
             self.fd, self.is_open = None, False
@@ -70,9 +72,10 @@ class DescriptorPort(serial.Serial):
 
 
 def open_port(path: str, baud: int, proc: Path) -> serial.Serial:
-    """Open `path` exclusively as raw 8N1 without flow control. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+    """Open `path` exclusively as raw 8N1 without flow control. Raises LinkMissing, LinkDenied, LinkBusy or
+    LinkError."""
     try:
-        # inter_byte_timeout=0 gives VMIN=1: then a read without data is EAGAIN, and 0 bytes always means hung up.
+        # inter_byte_timeout=0 sets VMIN=1: a read without data then gives EAGAIN, and 0 bytes always mean a hang-up
         port = DescriptorPort(path, baud, exclusive=True, timeout=0, write_timeout=0, inter_byte_timeout=0)
     except (OSError, ValueError, termios.error) as error:
         raise port_problem(error, path, proc) from error
@@ -90,7 +93,8 @@ def open_port(path: str, baud: int, proc: Path) -> serial.Serial:
 
 
 def change_baud(port: serial.Serial, path: str, baud: int, proc: Path) -> None:
-    """Set another rate and discard bytes received at the old one. Raises LinkError if the port cannot do it."""
+    """Set another rate and discard the bytes of the old rate. Raises LinkError if the port does not support the
+    rate."""
     try:
         port.baudrate = baud
         termios.tcflush(port.fileno(), termios.TCIFLUSH)
@@ -100,14 +104,14 @@ def change_baud(port: serial.Serial, path: str, baud: int, proc: Path) -> None:
 
 
 def baud_of(fd: int) -> int:
-    """The rate the driver really set, in bit/s (TCGETS2)."""
+    """Return the rate that the driver has set, bit/s (TCGETS2)."""
     settings = array.array("I", [0] * (TERMIOS2_INTS + 5))
     fcntl.ioctl(fd, TCGETS2, settings)
     return settings[OSPEED_INDEX]
 
 
 def port_problem(error: Exception, path: str, proc: Path = PROC) -> LinkError:
-    """The LinkError for what the system reports of a serial port, with what to check."""
+    """Return the LinkError of an error of a serial port, with the next step for the user."""
     if known := open_problem(error, path, CABLE, proc):
         return known
     if errno_of(error) == errno.EIO:
@@ -132,17 +136,17 @@ def _check_rate(port: serial.Serial, path: str, baud: int) -> None:
 
 
 def request_low_latency(port: serial.Serial, path: str, sys: Path) -> None:
-    """Ask driver and adapter to hand over bytes at once. Absent support is normal (ptys, many drivers)."""
-    with contextlib.suppress(ValueError):  # pyserial's word for a driver without TIOCSSERIAL
+    """Request low latency from driver and adapter. Many drivers and ptys do not support it."""
+    with contextlib.suppress(ValueError):  # ValueError of pyserial: the driver has no TIOCSSERIAL
         port.set_low_latency_mode(True)
     timer_ms = read_latency_timer_ms(path, sys)
     if timer_ms is not None and timer_ms > 1:
-        with contextlib.suppress(OSError):  # writable for root only
+        with contextlib.suppress(OSError):  # only root can write the file
             _timer(path, sys).write_text("1")
 
 
 def hold_ns(path: str, sys: Path) -> int:
-    """Read the latency timer of the adapter behind `path`, ns; 0 without one."""
+    """Return the latency timer of the adapter of `path`, ns; 0 without a timer."""
     timer_ms = read_latency_timer_ms(path, sys)
     if timer_ms is not None:
         return timer_ms * NS_PER_MS
@@ -153,7 +157,7 @@ def hold_ns(path: str, sys: Path) -> int:
 
 
 def read_latency_timer_ms(path: str, sys: Path) -> int | None:
-    """The adapter's latency timer in ms, or None where it has none."""
+    """Return the latency timer of the adapter, ms; None without a timer."""
     try:
         return int(_timer(path, sys).read_text())
     except (OSError, ValueError):
@@ -169,7 +173,7 @@ def _node(path: str) -> str:
 
 
 def read_counters(fd: int) -> tuple[int, ...] | None:
-    """The driver's ICOUNTER_INTS counters since boot, or None where it has none."""
+    """Return the ICOUNTER_INTS counters of the driver since boot; None if the driver has no counters."""
     buffer = array.array("i", [0] * ICOUNTER_INTS)
     try:
         fcntl.ioctl(fd, TIOCGICOUNT, buffer)
@@ -179,7 +183,7 @@ def read_counters(fd: int) -> tuple[int, ...] | None:
 
 
 def relative(start: tuple[int, ...] | None, now: tuple[int, ...] | None) -> KernelCounters:
-    """Subtract counters from `start` to `now`; modulo 2³², because the kernel's ints wrap."""
+    """Return the difference of two sets of counters, modulo 2³², because the integers of the kernel wrap."""
     if start is None or now is None:
         return KernelCounters()
     counted = [(b - a) & 0xFFFF_FFFF for a, b in zip(start, now, strict=True)]
@@ -192,17 +196,17 @@ def relative(start: tuple[int, ...] | None, now: tuple[int, ...] | None) -> Kern
 
 
 class TtyCounters:
-    """The counters of one open port relative to when this object was made; zeros where the driver has none (ptys)."""
+    """Error counters of one open port since this object was made; zeros if the driver has no counters (ptys)."""
 
     def __init__(self, fd: int, read: Callable[[int], tuple[int, ...] | None] = read_counters) -> None:
-        """`read` gives the driver's counters of a descriptor, None where there are none."""
+        """`read` returns the counters of a descriptor; None if the driver has no counters."""
         self._fd = fd
         self._read_counters = read
         self._start = read(fd)
         self._newest = self._start
 
     def read(self) -> KernelCounters:
-        """Counted since the start; the last known state once the port is gone."""
+        """Return the counters since the start; the last known values after the port was removed."""
         now = self._read_counters(self._fd)
         if now is not None:
             self._newest = now
@@ -210,7 +214,8 @@ class TtyCounters:
 
 
 NODE_KINDS: Final = ("ttyUSB", "ttyACM", "ttyAMA", "ttyS", "ttySC", "ttyTHS", "ttymxc", "ttyO")
-"""USB adapters, USB virtual ports, PL011 (Raspberry Pi), 8250 and mini-UART, SC16IS7xx, Tegra, i.MX, OMAP."""
+"""Names of nodes: USB adapters, USB virtual ports, PL011 (Raspberry Pi), 8250 and mini-UART, SC16IS7xx, Tegra, i.MX,
+OMAP."""
 UNKNOWN_TYPE: Final = "0"
 """PORT_UNKNOWN of linux/serial_core.h: the driver made a node (ttyS4…) but found no UART."""
 ALIAS_DIRECTORIES: Final = ("by-id", "by-path")
@@ -218,22 +223,19 @@ ALIAS_DIRECTORIES: Final = ("by-id", "by-path")
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
-    """A serial port."""
-
     path: str
-    """Device path for the configuration: the by-id name where there is one and it is this adapter's alone, else
-    by-path, else the node."""
+    """Path for the configuration: the by-id name if it is unique, otherwise by-path, otherwise the node."""
     node: str
-    """The device node, for example `/dev/ttyUSB0`."""
+    """Device node, for example `/dev/ttyUSB0`."""
     title: str
-    """Manufacturer, product and serial number of a USB adapter; else empty."""
+    """Manufacturer, product and serial number of a USB adapter; empty for other ports."""
 
 
 def list_ports(dev: Path = Path("/dev"), sys: Path = Path("/sys")) -> list[SerialPort]:
-    """List all ports that have hardware, by node name in natural order.
+    """List all ports with hardware, by node name in natural order.
 
-    Of equal adapters without serial numbers, all have the same by-id name, and which of them it leads to changes with
-    the order in which they were plugged in: they are named by the socket that they are in.
+    Equal adapters without serial numbers have the same by-id name. The adapter that it names depends on the order of
+    plugging. For such adapters the path is the name of the USB socket.
     """
     ids, paths = (_aliases(dev / "serial" / directory) for directory in ALIAS_DIRECTORIES)
     nodes = sorted(_nodes(dev, sys), key=lambda node: (node.name.rstrip("0123456789"), len(node.name), node.name))
@@ -255,13 +257,13 @@ def _nodes(dev: Path, sys: Path) -> Iterator[Path]:
 
 
 def _is_real(entry: Path) -> bool:
-    """Whether hardware was found: USB ports exist only with it; the others have `type` in /sys."""
+    """Return whether the driver found hardware. USB ports exist only with hardware; other ports have `type` in /sys."""
     kind = _text(entry / "type")
     return kind != UNKNOWN_TYPE if kind else (entry / "device").exists()
 
 
 def _aliases(directory: Path) -> dict[str, str]:
-    """Stable names by node name."""
+    """Return stable names by node name."""
     found: dict[str, str] = {}
     for link in sorted(directory.glob("*")):
         found.setdefault(os.path.basename(os.path.realpath(link)), str(link))
@@ -269,7 +271,7 @@ def _aliases(directory: Path) -> dict[str, str]:
 
 
 def _usb_title(sys: Path, node: str) -> str:
-    """From the USB device that the port hangs on: the nearest parent in /sys with a product name."""
+    """Return the title of the USB device of a port: the nearest parent in /sys with a product name."""
     device = (sys / "class" / "tty" / node / "device").resolve()
     for parent in (device, *device.parents):
         if product := _text(parent / "product"):

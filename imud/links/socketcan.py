@@ -1,8 +1,8 @@
-"""A CAN bus: a raw SocketCAN socket, or any other interface of python-can.
+"""A CAN bus: a raw SocketCAN socket, or another interface of python-can.
 
-Every device opens its own socket with filters for its frames, so that several share a bus without seeing the
-frames of the others. Bit rate and state of the interface belong to the system (docs/can.md): imud reads them and
-changes nothing. It needs no privilege, only the receive buffer may be larger than net.core.rmem_max with CAP_NET_ADMIN.
+Each device opens its own socket with filters for its frames. Several devices share a bus and do not see the frames of
+the others. The system sets bit rate and state of the interface (docs/can.md). imud reads both and changes neither. imud
+needs no privilege. With CAP_NET_ADMIN, the receive buffer can be larger than net.core.rmem_max.
 """
 
 import asyncio
@@ -44,7 +44,8 @@ CLASS_CONTROLLER: Final = 0x0004
 CLASS_BUS_OFF: Final = 0x0040
 CLASS_RESTARTED: Final = 0x0100
 WATCHED: Final = CLASS_CONTROLLER | CLASS_BUS_OFF | CLASS_RESTARTED
-"""Classes to subscribe to. Single errors of the bus are not among them: a bad cable makes thousands a second."""
+"""Classes of error frames to receive. Single errors of the bus are excluded: a bad cable causes thousands per
+second."""
 
 RECEIVE_OVERFLOW: Final = 0x01
 WARNING: Final = 0x04 | 0x08
@@ -54,16 +55,16 @@ ACTIVE: Final = 0x40
 
 
 class ControllerState(IntEnum):
-    """Error states of a CAN controller, numbered as `enum can_state` of linux/can/netlink.h."""
+    """Error states of a CAN controller, with the numbers of `enum can_state` (linux/can/netlink.h)."""
 
     ACTIVE = 0
-    """Takes part in all traffic."""
+    """The controller takes part in all traffic."""
     WARNING = 1
     """An error counter is above 96."""
     PASSIVE = 2
-    """An error counter is above 127: it may not disturb others any more."""
+    """An error counter is above 127. The controller does not send active error flags."""
     BUS_OFF = 3
-    """The transmit error counter is above 255: it has left the bus."""
+    """The transmit error counter is above 255. The controller has left the bus."""
 
 
 _WORDS: Final = {
@@ -82,26 +83,26 @@ _HELP: Final = {
 
 
 class BusState:
-    """The state of one interface's controller, with counts of its error-passive and bus-off states."""
+    """State of the controller of one interface, with counts of its error-passive and bus-off states."""
 
     def __init__(self, name: str, state: int | None = None) -> None:
-        """`state` as the kernel numbers it; None where it reports none (virtual interfaces)."""
+        """`state` is the number of the kernel; None if the driver does not report it (virtual interfaces)."""
         self._name = name
         known = state is not None and state in ControllerState.__members__.values()
         self.state = ControllerState(state) if known else ControllerState.ACTIVE  # type: ignore[arg-type]  # not None
         self.passive_count = 0
         self.bus_off_count = 0
         self.overflows = 0
-        """Times the controller's own receive buffer ran over."""
+        """Number of overflows of the controller's receive buffer."""
 
     @property
     def problem(self) -> str:
-        """Describe the fault in one sentence; empty in the states error-active and warning."""
+        """Return the fault in one sentence; empty in the states error-active and warning."""
         advice = _HELP.get(self.state)
         return f"{self._name} is {_WORDS[self.state]}: {advice.format(name=self._name)}" if advice else ""
 
     def add_error_frame(self, classes: int, data: bytes) -> str:
-        """Record an error frame; return the change of state in it, one sentence, or an empty text."""
+        """Record an error frame. Return the change of state in one sentence; empty without a change."""
         status = data[1] if classes & CLASS_CONTROLLER else 0
         if status & RECEIVE_OVERFLOW:
             self.overflows += 1
@@ -114,7 +115,7 @@ class BusState:
         return self.problem or f"{self._name} is {_WORDS[state]}"
 
     def _named(self, classes: int, status: int) -> ControllerState | None:
-        """The state that an error frame names, or None."""
+        """Return the state that an error frame names; None if it names no state."""
         if classes & CLASS_BUS_OFF:
             return ControllerState.BUS_OFF
         if status & PASSIVE:
@@ -127,13 +128,14 @@ class BusState:
 
 
 BATCH_FRAMES: Final = 64
-"""Frames per read: 8 ms of a full bus at 1 Mbit/s. What is left is read at the next turn of the loop."""
+"""Maximum number of frames per read: 8 ms of a full bus at 1 Mbit/s. The next turn of the loop reads the rest."""
 SO_TIMESTAMPNS_NEW: Final = 64
-"""Ask for arrival stamps, and the type they come under: two 64-bit integers, s and ns (Linux 5.1, asm-generic)."""
+"""Socket option and message type of arrival times: two 64-bit integers, s and ns (Linux 5.1, asm-generic)."""
 SO_RXQ_OVFL: Final = 40
-"""Ask for the count of frames dropped because the receive buffer was full, and its type: u32."""
+"""Socket option and message type of the number of frames that a full receive buffer dropped: u32."""
 STEADY_NS: Final = 20 * NS_PER_US
-"""Two clocks read further apart than this were interrupted: read again, and use the closest of STEADY_TRIES."""
+"""Maximum distance of two clock reads, ns. A longer distance means an interruption: imud reads again, at most
+STEADY_TRIES times."""
 STEADY_TRIES: Final = 3
 _COUNT_MASK: Final = 0xFFFF_FFFF
 _NO_DATA_FLAGS: Final = ERROR_FLAG | REMOTE_FLAG
@@ -143,17 +145,17 @@ _CONTROL_BYTES: Final = 64
 _STAMP: Final = f"{_WORD_BYTES + 4}xiqq"  # length, level, type, s, ns
 _DROPS: Final = f"{_WORD_BYTES + 4}xiI"  # length, level, type, count
 _CONTROL: Final = struct.Struct(f"={_STAMP}{_DROPS}{_CONTROL_BYTES - struct.calcsize(f'={_STAMP}{_DROPS}')}x")
-"""Two control messages as the kernel writes them, without their lengths and levels."""
+"""Layout of the two control messages of the kernel, without lengths and levels."""
 
 _Rows = Iterable[tuple[tuple[Any, ...], tuple[Any, ...]]]
-"""Frames and their control messages, as unpacked."""
+"""Frames and their control messages."""
 OnErrorFrame = Callable[[int, bytes], bool]
-"""Called with class bits and data of an error frame; returns whether frames are missing since."""
+"""Function for class bits and data of an error frame. It returns whether frames are lost."""
 
 
 libc: Final = ctypes.CDLL(None, use_errno=True)
 _receive: Final = ctypes.PyDLL(None, use_errno=True).recvmmsg
-"""For calls that never block: other threads need not be let in meanwhile."""
+"""`recvmmsg` that keeps the interpreter lock. The calls never block."""
 
 
 class MessageHeader(ctypes.Structure):
@@ -184,19 +186,21 @@ class Vector(ctypes.Structure):
 
 _MESSAGE_BYTES: Final = ctypes.sizeof(MessageBuffers)
 _CONTROL_SIZE_WORD: Final = MessageHeader.control_bytes.offset // _WORD_BYTES
-"""Place of `control_bytes` in a header: of all that `recvmmsg` writes there, it reads this again."""
+"""Place of `control_bytes` in a header. `recvmmsg` reads only this field of its own output again."""
 _new_frame: Final[Callable[[tuple[int, bool, bytes, int, bool]], CanFrame]] = partial(tuple.__new__, CanFrame)
-"""`CanFrame` at a third of the cost of its own constructor."""
+"""Constructor of `CanFrame` at a third of the usual cost."""
 
 
 STEP_NS: Final = 100 * NS_PER_US
-"""A smaller change of the offset may be the error of its two readings."""
+"""Minimum change of the clock offset that counts as a step, ns. A smaller change can be an error of the two
+readings."""
 BACKLOG_NS: Final = 5 * NS_PER_MS
-"""A frame is stamped so long at most before it is in the queue of the socket: the kernel's own queue is before it."""
+"""Maximum time between the time stamp of a frame and its arrival in the queue of the socket, ns. The queue of the
+kernel delays it."""
 
 
 class FrameReader:
-    """The receiving side of a socket whose messages are `struct can_frame`. The caller keeps and closes the socket."""
+    """Receiving side of a socket with messages `struct can_frame`. The caller owns and closes the socket."""
 
     def __init__(
         self,
@@ -205,11 +209,11 @@ class FrameReader:
         now_ns: Callable[[], int] = time.monotonic_ns,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Enable time stamps and the drop count on the socket."""
+        """Enable time stamps and the drop counter of the socket."""
         receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS_NEW, 1)
         receiver.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         self.dropped = 0
-        """Frames that the kernel dropped because they were not read in time."""
+        """Number of frames that the kernel dropped because the receive buffer was full."""
         self._on_error = on_error
         self._now_ns = now_ns
         self._wall_ns = wall_ns
@@ -220,24 +224,24 @@ class FrameReader:
         self._messages = (MessageBuffers * BATCH_FRAMES).from_buffer(self._headers)
         self._assign_buffers()
         self._fresh_headers = bytes(self._headers)
-        self._header_words = memoryview(self._headers).cast("L")  # as size_t on Linux
+        self._header_words = memoryview(self._headers).cast("L")  # size_t on Linux
         self._receive = partial(
             _receive, receiver.fileno(), self._messages, BATCH_FRAMES, int(socket.MSG_DONTWAIT), None
         )
         self._empty_ns = now_ns()
         self._newest_ns = self._empty_ns
         self._empty_offset_ns = self._clocks()[0]
-        """CLOCK_REALTIME less CLOCK_MONOTONIC when frames were read and none was left."""
+        """CLOCK_REALTIME minus CLOCK_MONOTONIC at the last read that emptied the queue, ns."""
         self._lost = False
 
     def read(self) -> list[CanFrame]:
-        """Data frames that are there, at most BATCH_FRAMES, oldest first. Raises OSError as the kernel names it."""
+        """Return the waiting data frames, at most BATCH_FRAMES, oldest first. Raises OSError of the kernel."""
         begun_ns = self._now_ns()
         count: int = self._receive()
         if count < 0:
             return self._failed(ctypes.get_errno(), begun_ns)
         offset_ns, now_ns = self._clocks()
-        if count == 1:  # as on a quiet bus: not worth two iterators
+        if count == 1:  # usual on a quiet bus: saves two iterators
             only = RAW_FRAME.unpack_from(self._frames), _CONTROL.unpack_from(self._control)
             frames = self._decoded((only,), offset_ns, now_ns)
             self._header_words[_CONTROL_SIZE_WORD] = _CONTROL_BYTES
@@ -286,7 +290,7 @@ class FrameReader:
         return frames
 
     def _clocks(self) -> tuple[int, int]:
-        """CLOCK_REALTIME less CLOCK_MONOTONIC, and CLOCK_MONOTONIC."""
+        """Return CLOCK_REALTIME minus CLOCK_MONOTONIC, and CLOCK_MONOTONIC, ns."""
         before_ns, wall_ns, now_ns = self._now_ns(), self._wall_ns(), self._now_ns()
         best_ns, offset_ns, tries = now_ns - before_ns, wall_ns - (before_ns + now_ns) // 2, 1
         while best_ns > STEADY_NS and tries < STEADY_TRIES:
@@ -303,7 +307,7 @@ class FrameReader:
         raise OSError(number, os.strerror(number))
 
     def _assign_buffers(self) -> None:
-        """Give each message one frame's bytes and its share of the control buffer."""
+        """Give each message the bytes of one frame and its part of the control buffer."""
         frames = ctypes.addressof(ctypes.c_char.from_buffer(self._frames))
         control = ctypes.addressof(ctypes.c_char.from_buffer(self._control))
         vector = ctypes.addressof(self._vectors)
@@ -317,16 +321,17 @@ class FrameReader:
 
 NATIVE: Final = "socketcan"
 FRAME_BUFFER_BYTES: Final = 960
-"""Bytes that the kernel charges a socket for one queued frame, about (222 fit the usual 208 KiB)."""
+"""Memory that the kernel charges for one queued frame, bytes, about (222 frames fit the usual 208 KiB)."""
 FRAME_BITS: Final = 95
-"""A data frame of six bytes, without stuff bits: a full bus of these fills half the buffer while frames gather."""
+"""Length of a data frame of six bytes without stuff bits, bit. A full bus of these frames fills half the buffer during
+a hold."""
 HIGHEST_BITRATE: Final = 1_000_000
 TURN_FRAMES: Final = 1024
-"""Frames that are read in one turn of the event loop at most."""
+"""Maximum number of frames in one turn of the event loop."""
 CAN_RAW_ERR_FILTER: Final = 2
 """Option of SOL_CAN_RAW: classes of error frames to receive (linux/can/raw.h)."""
 SO_RCVBUFFORCE: Final = 33
-"""Receive buffer above net.core.rmem_max, with CAP_NET_ADMIN (asm-generic)."""
+"""Socket option: receive buffer above net.core.rmem_max, with CAP_NET_ADMIN (asm-generic)."""
 
 log = logging.getLogger(__name__)
 
@@ -335,13 +340,14 @@ class SocketCanOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields
     """Options of a CAN bus."""
 
     interface: Annotated[str, Meta(min_length=1, max_length=63)]
-    """Network interface, for example `can0` (`ip link` lists them); for another backend its channel."""
+    """Network interface, for example `can0` (`ip link` lists them). For another backend: its channel."""
     receive_buffer_bytes: Annotated[int, Meta(ge=4096, le=1 << 26)] = 1 << 20
-    """Kernel memory for frames that wait to be read, about 960 bytes each. The system may allow less."""
+    """Kernel memory for waiting frames, bytes; a frame needs about 960. The system can allow less."""
     backend: Annotated[str, Meta(min_length=1)] = NATIVE
-    """`socketcan`, or the name of another interface of python-can, for example `virtual` or `slcan`."""
+    """`socketcan`, or another interface of python-can, for example `virtual` or `slcan`."""
     bitrate: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
-    """Bit rate that another backend is to set, bit/s; 0 leaves it alone. For a network interface the system sets it."""
+    """Bit rate that imud sets for another backend, bit/s; 0: unchanged. The system sets the rate of a network
+    interface."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for keys that exclude each other."""
@@ -353,7 +359,7 @@ OpenSocket = Callable[[SocketCanOptions, Sequence[CanFilter]], socket.socket]
 
 
 def open_raw(settings: SocketCanOptions, filters: Sequence[CanFilter]) -> socket.socket:
-    """A raw CAN socket bound to the interface, with filters and the error frames to watch. Raises OSError."""
+    """Open a raw CAN socket on the interface, with filters and the error frames WATCHED. Raises OSError."""
     opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
     try:
         opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(filters))
@@ -367,7 +373,7 @@ def open_raw(settings: SocketCanOptions, filters: Sequence[CanFilter]) -> socket
 
 
 def _enlarge(opened: socket.socket, settings: SocketCanOptions) -> None:
-    """Enlarge the receive buffer as far as permitted; the kernel doubles the value and reports the double."""
+    """Enlarge the receive buffer as far as permitted. The kernel doubles the value and reports the doubled value."""
     wanted = settings.receive_buffer_bytes
     try:
         opened.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, wanted // 2)
@@ -382,7 +388,7 @@ def _enlarge(opened: socket.socket, settings: SocketCanOptions) -> None:
 
 
 def pack_filters(filters: Sequence[CanFilter]) -> bytes:
-    """Filters as `struct can_filter`: data frames only, and only of the named length of identifier."""
+    """Pack filters as `struct can_filter`: data frames only, with the given length of the identifier."""
     flags = EXTENDED_FLAG | REMOTE_FLAG
     return b"".join(struct.pack("=II", f.can_id | EXTENDED_FLAG * f.extended, f.mask | flags) for f in filters)
 
@@ -393,7 +399,7 @@ class SocketCanLink:
     def __init__(
         self, settings: SocketCanOptions, *, sys: Path = netlink.SYS, open_socket: OpenSocket = open_raw
     ) -> None:
-        """`open_socket` makes a bound, non-blocking socket whose messages are `struct can_frame`."""
+        """`open_socket` returns a bound, non-blocking socket with messages `struct can_frame`."""
         self._settings = settings
         self._open_socket = open_socket
         self._gather_wanted_ns = self._gather_most_ns = self._gather_ns = 0
@@ -414,7 +420,6 @@ class SocketCanLink:
 
     @property
     def filters(self) -> Sequence[CanFilter]:
-        """Frames to deliver."""
         return self._filters
 
     @filters.setter
@@ -425,7 +430,7 @@ class SocketCanLink:
 
     @property
     def gather_ns(self) -> int:
-        """Time for which frames gather before they are read, ns; 0: they are read at once."""
+        """Time for which the link holds frames before a read, ns; 0: the link reads immediately."""
         return self._gather_ns
 
     @gather_ns.setter
@@ -437,15 +442,15 @@ class SocketCanLink:
             self._read_on_time()
 
     def absence(self) -> str:
-        """Return why the interface cannot be used now; empty when it can. Raises LinkError if it is not of kind CAN."""
+        """Return why the interface cannot be used now; empty if it can. Raises LinkError if it is not a CAN
+        interface."""
         return netlink.absence(self._settings.interface, self._sys)
 
     async def wait_present(self) -> None:
-        """Return when the interface is there and up."""
         await netlink.wait_until(lambda: not self.absence())
 
     def open(self) -> None:
-        """Open a socket on the interface. Raises LinkMissing, LinkDenied, LinkError."""
+        """Open a socket on the interface. Raises LinkMissing, LinkDenied or LinkError."""
         if reason := self.absence():
             raise LinkMissing(reason)
         details = netlink.can_details(self._settings.interface)
@@ -463,7 +468,7 @@ class SocketCanLink:
         self._gather_ns = min(self._gather_wanted_ns, self._gather_most_ns)
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
-        """Deliver frames from now on; a present problem of the bus is reported at once."""
+        """Start the delivery of frames. The link reports a present problem of the bus immediately."""
         assert self._socket is not None
         self._on_frames, self._on_news, self._on_end = on_frames, on_news, on_end
         self._loop = asyncio.get_running_loop()
@@ -484,7 +489,8 @@ class SocketCanLink:
             raise self._explained(error) from error
 
     def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
-        """Have the kernel send these; by the event loop, less exactly, where it cannot. Raises LinkError."""
+        """Send frames cyclically from the kernel, or from the event loop if the kernel has no broadcast manager. Raises
+        LinkError."""
         self._end_sender()
         try:
             self._sender = KernelSender(self._settings.interface, frames)
@@ -495,13 +501,12 @@ class SocketCanLink:
             self._sender = LoopSender(self.write, self._on_end, frames)
 
     def kernel_counters(self) -> KernelCounters:
-        """Frames that the kernel or the controller dropped, and states of the controller, since `open`."""
+        """Return the frames that kernel and controller dropped, and the states of the controller, since `open`."""
         dropped = self._reader.dropped if self._reader else 0
         state = self._state
         return KernelCounters(dropped + state.overflows, error_passive=state.passive_count, bus_off=state.bus_off_count)
 
     def close(self) -> None:
-        """Release the socket; may be called twice."""
         self._end_sender()
         if self._timer is not None:
             self._timer.cancel()
@@ -520,7 +525,8 @@ class SocketCanLink:
             sender.close()
 
     def _read(self) -> None:
-        """Read one batch; the loop calls again for the rest. Where frames may gather, those that follow do."""
+        """Read one batch. The event loop calls again for the rest. With a hold, the next read follows after
+        `gather_ns`."""
         loop, opened = self._loop, self._socket
         count = self._read_batch()
         if self._gather_ns and count and loop is not None and opened is not None and opened is self._socket:
@@ -528,14 +534,14 @@ class SocketCanLink:
             self._timer = loop.call_later(self._gather_ns / NS_PER_S, self._read_on_time)
 
     def _read_on_time(self) -> None:
-        """Read all that has gathered. A bus without frames is watched again."""
+        """Read all held frames. Watch the socket again if no frame was waiting."""
         self._timer = None
         loop, opened = self._loop, self._socket
         count = total = self._read_batch()
-        while count >= BATCH_FRAMES // 2 and total < TURN_FRAMES:  # some of the batch may be no data frames
+        while count >= BATCH_FRAMES // 2 and total < TURN_FRAMES:  # the batch can contain error frames
             count = self._read_batch()
             total += count
-        if loop is None or opened is None or opened is not self._socket or count < 0:  # ended, or was closed
+        if loop is None or opened is None or opened is not self._socket or count < 0:  # the link ended or was closed
             return
         if total and self._gather_ns:
             self._timer = loop.call_later(self._gather_ns / NS_PER_S, self._read_on_time)
@@ -543,7 +549,7 @@ class SocketCanLink:
             loop.add_reader(opened.fileno(), self._read)
 
     def _read_batch(self) -> int:
-        """Read and deliver one batch; returns its number of frames, -1 when the bus ended."""
+        """Read and deliver one batch. Return the number of frames; -1 if the bus ended."""
         if self._reader is None:
             return -1
         try:
@@ -579,20 +585,17 @@ class SocketCanLink:
         return LinkError(f"{name}: {os.strerror(error.errno or 0)}")
 
 
-def _ignore_frames(_frames: object) -> None:
-    """The receiver before `start`."""
+def _ignore_frames(_frames: object) -> None: ...
 
 
-def _ignore_news(_news: str, _problem: str) -> None:
-    """The receiver before `start`."""
+def _ignore_news(_news: str, _problem: str) -> None: ...
 
 
-def _ignore_end(_error: LinkError | None) -> None:
-    """The receiver before `start`."""
+def _ignore_end(_error: LinkError | None) -> None: ...
 
 
 def make(settings: SocketCanOptions) -> CanLink:
-    """The link for the backend that the settings name."""
+    """Return the link for the backend of the options."""
     if settings.backend == NATIVE:
         return SocketCanLink(settings)
     from imud.links.python_can import PythonCanLink
@@ -601,7 +604,8 @@ def make(settings: SocketCanOptions) -> CanLink:
 
 
 def _claims(settings: SocketCanOptions) -> list[Claim]:
-    """A bus, which devices share; the port of a serial adapter (`slcan` and others) is for one of them."""
+    """Return the claim of a device: a bus that devices share. The port of a serial adapter (`slcan`) is for one device
+    only."""
     name, port = settings.interface, settings.interface.startswith("/")
     place = name if port or settings.backend == NATIVE else f"{name} ({settings.backend})"
     return [Claim(place=place, key="interface", shared=not port, terms={"bitrate": settings.bitrate})]

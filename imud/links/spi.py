@@ -1,8 +1,8 @@
 """An SPI bus through spidev: SPI_IOC_MESSAGE(n), one ioctl for a whole transaction (<linux/spi/spidev.h>).
 
-Words of 16 bits where the controller has them; where it refuses (EINVAL, as the Raspberry Pi's do), words of 8 bits
-with the high byte first, which puts the same bits on the same wires. spidev keeps words of more than 8 bits in the
-host's byte order. Chip select is held through each item of a transfer and released between items.
+The link uses 16-bit words. If the controller rejects them with EINVAL (Raspberry Pi), the link uses 8-bit words, high
+byte first. The bits on the wires are the same. spidev stores words of more than 8 bits in the byte order of the host.
+Chip select is active during each item of a transfer and inactive between two items.
 """
 
 import array
@@ -25,17 +25,18 @@ from imud.model.errors import LinkError
 from imud.model.options import Options
 
 WR_MODE: Final = 0x40016B01
-"""_IOW('k', 1, __u8)"""
+"""ioctl _IOW('k', 1, __u8): set the SPI mode."""
 WR_BITS_PER_WORD: Final = 0x40016B03
 WR_MAX_SPEED_HZ: Final = 0x40046B04
 ROW: Final = struct.Struct("=QQIIHBBBBBB")
-"""struct spi_ioc_transfer: tx_buf, rx_buf, len, speed_hz, delay_usecs, bits_per_word, cs_change, tx_nbits, rx_nbits,
+"""`struct spi_ioc_transfer`: tx_buf, rx_buf, len, speed_hz, delay_usecs, bits_per_word, cs_change, tx_nbits, rx_nbits,
 word_delay_usecs, pad."""
 ROWS_MAX: Final = 32
-"""fcntl.ioctl lets other threads run for arguments of up to 1024 bytes only."""
+"""Maximum number of rows in one ioctl. A row has 32 bytes. fcntl.ioctl blocks all other threads if the argument is
+longer than 1024 bytes."""
 SWITCHED_ON: Final = "is SPI switched on (`dtparam=spi=on` on a Raspberry Pi)?"
 PREPARED_MAX: Final = 64
-"""Transfers whose buffers are kept; a device has some ten different ones."""
+"""Maximum number of transfers with stored buffers. A device uses about ten different transfers."""
 
 Ioctl = Callable[[int, int, bytes], object]
 
@@ -44,22 +45,22 @@ class SpiOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Options of an SPI bus."""
 
     port: Annotated[str, Meta(min_length=1)]
-    """Path of the bus and chip select, for example `/dev/spidev0.0`."""
+    """Path of bus and chip select, for example `/dev/spidev0.0`."""
     speed_hz: Annotated[int, Meta(ge=200_000, le=2_000_000)] = 1_000_000
-    """Clock of the bus in Hz."""
+    """Clock of the bus, Hz."""
     mode: Literal[0, 3, "auto"] = "auto"
-    """SPI mode; `auto` tries 0, then 3, and decides by the product id."""
+    """SPI mode. `auto` tries 0, then 3, and checks the product ID."""
     rate_hz: Annotated[float, Meta(ge=0.1, le=4000)] = 100.0
-    """Rate of reads, per second."""
+    """Rate of the reads, Hz."""
 
 
 def bus_of(settings: SpiOptions) -> str:
-    """Return the path of the bus, without the chip select."""
+    """Return the path of the bus without the chip select."""
     return settings.port.partition(".")[0]
 
 
 class SpiLink:
-    """A `PolledLink` on spidev. `ioctl` and `open_node` are the kernel's, or a test's."""
+    """A `PolledLink` on spidev. Tests replace `ioctl` and `open_node`."""
 
     def __init__(
         self,
@@ -85,19 +86,17 @@ class SpiLink:
         self.bit_rate = 0
 
     def absence(self) -> str:
-        """Return why the port cannot be opened now; empty when it is there."""
         return self._node.absence()
 
     async def wait_present(self) -> None:
-        """Return when the node is there."""
         await self._node.wait_present()
 
     def open(self) -> None:
-        """Open the node and set the clock. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+        """Open the node and set the clock. Raises LinkMissing, LinkDenied, LinkBusy or LinkError."""
         self._open()
 
     def select(self, target: int) -> None:
-        """Use an SPI mode, 0 to 3. Raises LinkError."""
+        """Set the SPI mode of the next transfers, 0 to 3. Raises LinkError if the controller rejects the mode."""
         self._place = self.place(target)
         try:
             self._ioctl(self._fd, WR_MODE, bytes([target]))
@@ -105,34 +104,36 @@ class SpiLink:
             raise LinkError(f"{self.title} cannot do mode {target}: {os.strerror(error.errno or 0)}") from error
 
     def place(self, target: int) -> str:
-        """A mode in messages."""
+        """Return a mode in the form of messages."""
         return f"mode {target}"
 
     def transfer(self, transfer: Transfer) -> bytes:
-        """Send words and return those read at the same time. Raises TransferError, LinkMissing, LinkError."""
+        """Send the words of `transfer`. Return the words that the link received at the same time. Raises TransferError,
+        LinkMissing or LinkError."""
         message = self._prepared.get(transfer) or self._prepare(transfer)
         try:
             self._ioctl(self._fd, message.request, message.rows)
         except OSError as error:
-            if error.errno == errno.EINVAL and self._bits == 16:  # a driver that looks at the words only now
+            if (
+                error.errno == errno.EINVAL and self._bits == 16
+            ):  # some drivers check the word size only during a transfer
                 self._set_bits(8)
                 return self.transfer(transfer)
             raise transfer_problem(error, self.title, self._place) from error
         return message.read()
 
     def write(self, data: bytes) -> None:
-        """Raises LinkError: bytes are sent in transfers only."""
+        """Raises LinkError: the link sends bytes in transfers only."""
         raise LinkError(f"{self.title} cannot send {len(data)} bytes outside of a transfer")
 
     def kernel_counters(self) -> KernelCounters:
-        """Zeros: the kernel counts no errors of this bus."""
+        """Return zeros: the kernel does not count errors of this bus."""
         return KernelCounters()
 
     def serial_line(self) -> None:
-        """None: a bus with a clock carries nothing unasked."""
+        """Return None: this bus carries no data without a request."""
 
     def close(self) -> None:
-        """Release the node; may be called twice."""
         fd, self._fd = self._fd, -1
         self._prepared.clear()
         if fd >= 0:
@@ -148,7 +149,7 @@ class SpiLink:
             raise bus_open_problem(error, self.title, SWITCHED_ON) from error
 
     def _accepted_bits(self) -> int:
-        """16 if the controller has such words, otherwise 8."""
+        """Return 16 if the controller supports 16-bit words, otherwise 8."""
         try:
             self._ioctl(self._fd, WR_BITS_PER_WORD, b"\x10")
         except OSError as error:
@@ -170,12 +171,12 @@ class SpiLink:
 
 
 class _Message:
-    """The argument of one SPI_IOC_MESSAGE with its buffers, made once and used again."""
+    """Argument of one SPI_IOC_MESSAGE with its buffers, made once for many transfers."""
 
     __slots__ = ("_rx", "_swapped", "_tx", "request", "rows")
 
     def __init__(self, transfer: Transfer, bits: int, speed_hz: int) -> None:
-        """Raises LinkError for more items than an ioctl may have."""
+        """Raises LinkError for more items than an ioctl supports."""
         sends = transfer.sends
         if not 0 < len(sends) <= ROWS_MAX:
             raise LinkError(f"expected 1 to {ROWS_MAX} items in one SPI message, got {len(sends)}")
@@ -186,14 +187,14 @@ class _Message:
         rows, at = [], 0
         for number, item in enumerate(sends):
             tx, rx = ctypes.addressof(self._tx) + at, ctypes.addressof(self._rx) + at
-            release = number + 1 < len(sends)  # cs_change of the last would keep the chip selected
+            release = number + 1 < len(sends)  # cs_change in the last row would keep chip select active
             rows.append(ROW.pack(tx, rx, len(item), speed_hz, transfer.gap_us, bits, release, 0, 0, 0, 0))
             at += len(item)
         self.rows = b"".join(rows)
         self.request = 0x40006B00 | len(self.rows) << 16  # _IOW('k', 0, char[n])
 
     def read(self) -> bytes:
-        """The received bytes, in the order of the wire."""
+        """Return the received bytes in the order of the wire."""
         return _byteswapped(self._rx.raw) if self._swapped else self._rx.raw
 
 

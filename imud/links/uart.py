@@ -1,8 +1,8 @@
-"""A serial port: UART, RS-232, USB adapter or USB virtual port, read inside the event loop.
+"""A serial port in the event loop: UART, RS-232, USB adapter or USB virtual port.
 
-At 1 kHz the cost is the number of wake-ups and system calls (measured), so a wake-up is one read of all that is
-there and one time stamp. A link that is paused does not watch its descriptor at all: bytes wait in the kernel until
-they are taken, or until the link is resumed.
+At 1 kHz, wake-ups and system calls cause the CPU time (measured). A wake-up therefore makes one read of all waiting
+bytes and takes one time stamp. A paused link does not watch its descriptor: bytes wait in the kernel until `take` or
+`resume`.
 """
 
 import asyncio
@@ -23,14 +23,14 @@ from imud.model.options import Options
 
 READ_BYTES: Final = 65536
 FULL_READ_BYTES: Final = 2048
-"""A read of this size may leave more behind (n_tty hands over at most 4095): read again."""
+"""A read of this size can leave bytes behind (n_tty delivers at most 4095 bytes): the link reads again."""
 WAITING_BYTES: Final = 2048
-"""Half of what the kernel's line discipline keeps (n_tty: 4095): at three quarters it stops a USB adapter's driver from
-taking bytes, and what the adapter itself keeps can be 256."""
+"""Maximum number of waiting bytes: half of the buffer of n_tty (4095 bytes). At three quarters, n_tty stops the driver
+of a USB adapter, and the adapter itself can hold only 256 bytes."""
 WRITE_QUEUE_BYTES: Final = 4096
-"""Commands are some dozens of bytes; more waiting means that the port does not send."""
+"""Maximum number of bytes to send. Requests have some dozens of bytes: more bytes mean that the port does not send."""
 DEFAULT_BAUD: Final = 115200
-"""Rate of a port that is opened for detection, until detection sets its own."""
+"""Baud rate of a port that imud opens for detection, bit/s."""
 
 
 class UartOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -39,9 +39,9 @@ class UartOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
     port: Annotated[str, Meta(min_length=1)]
     """Path of the port. `/dev/serial/by-id/…` names the adapter and survives replugging; `/dev/ttyUSB0` does not."""
     baud: Annotated[int, Meta(ge=50, le=4_000_000)] | Literal["auto"] = "auto"
-    """Rate in bit/s, or `auto`: search at every rate of the device."""
+    """Baud rate, bit/s. `auto`: imud tries each rate of the device."""
     low_latency: bool = True
-    """Ask driver and USB adapter to hand bytes over at once."""
+    """Request low latency from driver and USB adapter."""
 
 
 class UartLink:
@@ -67,15 +67,13 @@ class UartLink:
         self.hold_ns = 0
 
     def absence(self) -> str:
-        """Return why the port cannot be opened now; empty when it is there."""
         return self._node.absence()
 
     async def wait_present(self) -> None:
-        """Return when the port is there and may be opened, ACCESS_WAIT_S after it is there at the latest."""
         await self._node.wait_present()
 
     def open(self) -> None:
-        """Open the port exclusively, raw 8N1. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+        """Open the port exclusively, raw 8N1. Raises LinkMissing, LinkDenied, LinkBusy or LinkError."""
         path = self._settings.port
         self._port = open_port(path, self.baud, self._proc)
         self._fd = self._port.fileno()
@@ -85,18 +83,18 @@ class UartLink:
         self.hold_ns = hold_ns(path, self._sys)
 
     def start(self, on_data: OnData, on_end: OnEnd) -> None:
-        """Deliver bytes from now on."""
         self._on_data, self._on_end = on_data, on_end
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._fd, self._read)
 
     def pause(self) -> None:
-        """Deliver nothing until `resume`: bytes wait in the kernel, and an end of the port is not seen."""
+        """Stop the delivery until `resume`. Bytes wait in the kernel. imud does not notice a removed port in this
+        time."""
         if self._loop is not None:
             self._loop.remove_reader(self._fd)
 
     def take(self) -> bytes:
-        """Return all bytes that wait. The end of the port is reported, with what came before it returned."""
+        """Return all waiting bytes. If the port was removed, return the last bytes and report the end."""
         data = b""
         while self._loop is not None:
             try:
@@ -115,12 +113,13 @@ class UartLink:
         return data
 
     def resume(self) -> None:
-        """Deliver again as bytes come; no-op for a port that ended or is closed."""
+        """Continue the delivery. Do nothing if the port has ended or is closed."""
         if self._loop is not None:
             self._loop.add_reader(self._fd, self._read)
 
     def write(self, data: bytes) -> None:
-        """Send bytes; what the port does not accept at once is queued, up to WRITE_QUEUE_BYTES. Raises LinkError."""
+        """Send bytes. Queue the bytes that the port does not accept now, at most WRITE_QUEUE_BYTES. Raises
+        LinkError."""
         if self._fd < 0:
             raise LinkError(f"{self.title} is not open: nothing can be sent")
         if len(self._unsent) + len(data) > WRITE_QUEUE_BYTES:
@@ -135,18 +134,18 @@ class UartLink:
             self._loop.add_writer(self._fd, self._write_more)
 
     def set_baud(self, baud: int) -> None:
-        """Change the rate; bytes received at the old one are discarded. Raises LinkError if the port cannot do it."""
+        """Change the rate and discard the bytes of the old rate. Raises LinkError if the port does not support the
+        rate."""
         if self._port is None:
             raise LinkError(f"{self.title} is not open: its rate cannot be set")
         change_baud(self._port, self._settings.port, baud, self._proc)
         self.baud = baud
 
     def kernel_counters(self) -> KernelCounters:
-        """Errors the kernel counted since `open`; zeros where the driver counts none."""
+        """Return the errors that the kernel counted since `open`; zeros if the driver has no counters."""
         return self._counters.read() if self._counters else KernelCounters()
 
     def close(self) -> None:
-        """Release the port; may be called twice."""
         self._stop()
         self._fd = -1
         self._unsent.clear()
@@ -156,7 +155,6 @@ class UartLink:
             port.close()
 
     def _read(self) -> None:
-        """Read once, and deliver what was read."""
         try:
             data = os.read(self._fd, READ_BYTES)
         except BlockingIOError:
@@ -185,7 +183,7 @@ class UartLink:
     def _write_more(self) -> None:
         try:
             sent = self._send(self._unsent)
-        except LinkError:  # the reader sees the same end, and reports it
+        except LinkError:  # the reader receives the same error and reports it
             sent = len(self._unsent)
         del self._unsent[:sent]
         if not self._unsent and self._loop is not None:
@@ -198,12 +196,10 @@ class UartLink:
         self._loop = None
 
 
-def _ignore_data(data: bytes, t_rx_ns: int) -> None:
-    """The receiver before `start`."""
+def _ignore_data(data: bytes, t_rx_ns: int) -> None: ...
 
 
-def _ignore_end(error: LinkError | None) -> None:
-    """The receiver before `start`."""
+def _ignore_end(error: LinkError | None) -> None: ...
 
 
 def _claims(settings: UartOptions) -> list[Claim]:
