@@ -1,17 +1,17 @@
-"""The configuration file: read and checked as a whole before any port is opened. Loading opens only that file.
+"""The configuration file: imud reads and checks the whole file before it opens a port.
 
     log_level, state_dir          keys of the daemon (`General`)
-    socket, shm, metrics, …       one key per row of PUBLISHERS, with that row's settings
+    socket, shm, metrics, …       a key per row of PUBLISHERS, with the options of this row
     devices:
       NAME:
-        driver, identify, enabled, options        (`DeviceGeneral`; options are the driver's settings)
-        lines                     GPIO lines (`imud.contracts.lines.DeviceLines`), as far as the driver has them
+        driver, identify, enabled, options        (`DeviceGeneral`; `options` are the options of the driver)
+        lines                     GPIO lines (`imud.contracts.lines.DeviceLines`) that the driver supports
         rmc                       source of RMC sentences (`imud.utc.receivers.RmcOptions`), for devices with SIN/PPS
-        frame                     how the sensor lies in its body (`imud.attitude.published.FrameOptions`)
-        uart | replay | …         one key per row of LINKS, with that row's settings
+        frame                     mounting of the sensor (`imud.attitude.published.FrameOptions`)
+        uart | replay | …         a key per row of LINKS, with the options of this row
 
-A new row of a table is configurable without a change here. Errors name file, line and column, what was expected and
-what is there; all that one pass finds are reported together.
+A new row of a registry needs no change here. Errors name file, line, column, the expected and the received value. imud
+reports all problems together.
 """
 
 from imud.config.devices import DEVICE_NAME, DEVICES_MAX

@@ -1,4 +1,5 @@
-"""Reading of the devices: each has a driver, one link, and perhaps lines and a source of RMC sentences."""
+"""Devices of the configuration: each has a driver and one link, and can have GPIO lines and a source of RMC
+sentences."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -28,12 +29,12 @@ from imud.utc.receivers import RmcOptions
 
 
 class Clash(NamedTuple):
-    """A device that cannot have what another one has."""
+    """Two devices that cannot have the same port, address or frames."""
 
     path: KeyPath
-    """The key that has to change."""
+    """Key to change."""
     message: str
-    """What was expected, what came, and who has it."""
+    """Expected value, received value, and the owner."""
 
 
 class _Owned(NamedTuple):
@@ -47,7 +48,7 @@ def clashes(
     drivers: Mapping[str, DriverRow],
     pause: Callable[[], None] = no_pause,
 ) -> Iterator[Clash]:
-    """List what each device claims that one before it has. Symbolic links are followed; no port is opened."""
+    """Return the conflicts of each device with the devices before it. imud follows symbolic links and opens no port."""
     places: dict[str, list[_Owned]] = {}
     buses: dict[str, list[tuple[CanUse, str]]] = {}
     for device in devices:
@@ -68,7 +69,8 @@ def clashes(
 
 
 def owner_of(device: DeviceConfig, others: Sequence[DeviceConfig], links: Mapping[str, LinkRow]) -> str:
-    """Return the name of one of `others` that has the port of `device` for itself, or that cannot share it with it."""
+    """Return the name of a device in `others` that uses the port of `device` exclusively or cannot share it; empty if
+    no device does."""
     mine = _claims(device, links)
     for other in others:
         for _, theirs in _claims(other, links) if other.name != device.name else ():
@@ -78,7 +80,7 @@ def owner_of(device: DeviceConfig, others: Sequence[DeviceConfig], links: Mappin
 
 
 def _claims(device: DeviceConfig, links: Mapping[str, LinkRow]) -> list[tuple[str, Claim]]:
-    """List the claims of a device, each with the part of its configuration that it comes from."""
+    """Return the claims of a device, each with its part of the configuration."""
     found = [(device.link, claim) for claim in links[device.link].claims(device.link_settings)]
     if device.rmc is not None and device.rmc.port:
         found.append(("rmc", Claim(place=device.rmc.port, key="port")))
@@ -90,7 +92,7 @@ def _place(claim: Claim) -> str:
 
 
 def _can_use(device: DeviceConfig, links: Mapping[str, LinkRow], drivers: Mapping[str, DriverRow]) -> CanUse | None:
-    """Return what a device needs of a bus that others can share; None where that is not known before it is found."""
+    """Return the frames that a device needs on a shared bus; None if they are unknown before the detection."""
     claims = _claims(device, links)
     if device.options is None or not claims:
         return None
@@ -101,7 +103,7 @@ def _can_use(device: DeviceConfig, links: Mapping[str, LinkRow], drivers: Mappin
 
 
 def _can_clash(name: str, use: CanUse, uses: Sequence[tuple[CanUse, str]]) -> Iterator[Clash]:
-    """List the frames that a device needs and another one has; the first owner is enough."""
+    """Yield the conflicts of the frames that a device needs. The first owner of a frame is enough."""
     path: KeyPath = ("devices", name, "options")
     for other, owner in uses:
         if both := use.both_receive(other):
@@ -114,14 +116,14 @@ def _can_clash(name: str, use: CanUse, uses: Sequence[tuple[CanUse, str]]) -> It
 
 
 class DeclaredReader:
-    """Reader of the declared settings of devices. `drivers` is the table of drivers."""
+    """Reader of the declared settings of devices. `drivers` is the registry of drivers."""
 
     def __init__(self, keys: Keys, drivers: Mapping[str, DriverRow]) -> None:
         self._keys = keys
         self._drivers = drivers
 
     def read(self, path: KeyPath, device: Mapping[str, Any]) -> Options | None:
-        """Read `settings` among the keys of a device; None where there are none, or a problem is with them."""
+        """Read the key `settings` of a device; None if the key is absent or invalid."""
         key = (*path, "settings")
         if device.get("settings") is None:
             return None
@@ -131,7 +133,7 @@ class DeclaredReader:
             self._keys.problem(key, message, at_key=True)
             return None
         if not isinstance(driver, str) or driver not in self._drivers:
-            return None  # reported with the driver
+            return None  # the driver reports this problem
         table = self._table(driver)
         if table is None:
             message = f"expected settings only of a driver that knows those of its device, got them with {driver}; "
@@ -144,7 +146,7 @@ class DeclaredReader:
         return self._keys.part(table.declarable, device["settings"], key)
 
     def check(self, path: KeyPath, driver: str, declared: Options, options: Options | None, link: Options) -> None:
-        """Refuse settings that do not go together, or with the place where the device is to be found."""
+        """Refuse settings that exclude each other or contradict the address of the device."""
         table = self._table(driver)
         if table is None:
             return
@@ -162,7 +164,7 @@ class DeclaredReader:
             self._keys.problem(key, str(error))
 
     def check_lines(self, path: KeyPath, driver: str, declared: Options, lines: DeviceLines) -> None:
-        """Refuse lines that do nothing with the settings that are declared."""
+        """Refuse lines that have no function with the declared settings."""
         if self._table(driver) is not None:
             found = self._drivers[driver].declared_line_differences(declared_values(declared), lines)
             for key, words in found.items():
@@ -171,7 +173,7 @@ class DeclaredReader:
     def _table(self, driver: str) -> SettingsTable | None:
         try:
             return self._drivers[driver].device_settings
-        except ImportError:  # reported with the driver
+        except ImportError:  # the driver reports this problem
             return None
 
     def _known(self) -> str:
@@ -180,7 +182,7 @@ class DeclaredReader:
 
 
 def _fixed(name: str, options: Options | None, link: Options) -> object:
-    """The value with which the configuration finds the device; None where it searches, or has no such key."""
+    """Return the value with which imud opens the device; None if imud searches for it or the key does not exist."""
     for part in (link, options):
         value = getattr(part, name, None)
         if value is not None and value != "auto":
@@ -192,11 +194,11 @@ KEY: Final = "frame"
 NESTED: Final[Mapping[str, type[Options]]] = {"axes": MountingAxes, "euler": MountingAngles}
 """Keys of `frame` with keys of their own."""
 WAYS: Final = ("axes", "euler", "quat_wxyz")
-"""The ways in which a rotation can be given."""
+"""Keys for a rotation."""
 
 
 def read_frame(keys: Keys, path: KeyPath, device: Mapping[str, Any]) -> FrameOptions | None:
-    """Read the key `frame` of a device; None where it has none or has problems."""
+    """Read the key `frame` of a device; None if the key is absent or invalid."""
     if KEY not in device:
         return None
     found = keys.mapping(path, device[KEY])
@@ -223,7 +225,7 @@ def read_frame(keys: Keys, path: KeyPath, device: Mapping[str, Any]) -> FrameOpt
 
 
 def _nested(keys: Keys, path: KeyPath, found: Mapping[str, Any]) -> dict[str, Options] | None:
-    """Read the keys that have keys of their own; None where one has a problem."""
+    """Read the keys that contain keys; None if a key is invalid."""
     made: dict[str, Options] = {}
     for name, schema in NESTED.items():
         if found.get(name) is not None:
@@ -237,7 +239,7 @@ def _nested(keys: Keys, path: KeyPath, found: Mapping[str, Any]) -> dict[str, Op
 def check_declination(
     keys: Keys, path: KeyPath, general: DeviceGeneral, options: Options | None, drivers: Mapping[str, DriverRow]
 ) -> None:
-    """Refuse a declination where the heading is known not to be magnetic, or the driver is not named."""
+    """Refuse a declination if the heading is not magnetic or the configuration does not name the driver."""
     if general.declination_deg is None:
         return
     place = (*path, "declination_deg")
@@ -246,7 +248,7 @@ def check_declination(
         return
     heading = Heading.UNKNOWN
     if general.driver in drivers:
-        with suppress(ImportError):  # reported elsewhere
+        with suppress(ImportError):  # another check reports this problem
             heading = drivers[general.driver].heading(options, {})
     if heading in (Heading.TRUE, Heading.RELATIVE):
         why = "counts from power-on" if heading is Heading.RELATIVE else "is true already"
@@ -256,15 +258,15 @@ def check_declination(
 
 LINK: Final = "uart"
 PULSE: Final = "pps"
-"""A device with this line synchronises to a pulse per second and RMC sentences."""
+"""Key of the line for a pulse per second. A device with this line uses PPS and RMC sentences."""
 TRIGGER: Final = "sin"
-"""Key of the line by which imud drives the input of the pulse."""
+"""Key of the line with which imud drives the pulse input of the device."""
 
 
 def read_lines(
     keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, DriverRow]
 ) -> DeviceLines | None:
-    """Read the GPIO lines below the key `lines` of a device; None where it has none."""
+    """Read the key `lines` of a device; None if the key is absent."""
     if "lines" not in device:
         return None
     found = keys.mapping(path, device["lines"])
@@ -282,7 +284,7 @@ def read_lines(
 
 
 def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
-    """Refuse a GPIO line that is used twice, by one device or by two."""
+    """Refuse a GPIO line that is used twice, by one device or by two devices."""
     owners: list[tuple[LineOptions, str]] = []
     for device in devices:
         for name, settings in _lines_of_device(device):
@@ -297,7 +299,7 @@ def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
 def read_rmc(
     keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, DriverRow]
 ) -> RmcOptions | None:
-    """Read the settings below the key `rmc` of a device; None where it has none."""
+    """Read the key `rmc` of a device; None if the key is absent."""
     if "rmc" not in device:
         return None
     driver = device.get("driver", "auto")
@@ -320,7 +322,7 @@ def read_rmc(
 
 
 def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, drivers: Mapping[str, DriverRow]) -> None:
-    """Refuse lines that no device has, and lines that devices of this driver do not have."""
+    """Refuse unknown lines, and lines that devices of this driver do not have."""
     keys.unknown_keys(path, found, list(LINE_SCHEMAS))
     if driver == "auto":
         message = "expected lines only beside a named driver, got them with driver auto; drivers that have lines"
@@ -330,7 +332,7 @@ def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, dr
     try:
         lines = drivers[driver].lines
     except ImportError:
-        return  # reported elsewhere: the driver cannot be imported
+        return  # the driver reports its failed import
     for name in found:
         if name in LINE_SCHEMAS and name not in lines:
             known = ", ".join(key for key in LINE_SCHEMAS if key in lines) or "none"
@@ -353,7 +355,7 @@ def _lines_of_device(device: DeviceConfig) -> Iterator[tuple[str, LineOptions]]:
 
 
 def _same_line(one: LineOptions, other: LineOptions) -> bool:
-    """Whether both are the same line, as far as names show: a line name without a chip is taken as on any chip."""
+    """Return whether both options name the same line. A line name without a chip matches a line of any chip."""
     chips = {one.chip.removeprefix("/dev/"), other.chip.removeprefix("/dev/")}
     return one.line == other.line and (len(chips) == 1 or "" in chips)
 
@@ -362,28 +364,26 @@ def _lines_of_driver(drivers: Mapping[str, DriverRow], driver: object) -> frozen
     try:
         return drivers[driver].lines if isinstance(driver, str) and driver in drivers else frozenset({PULSE})
     except ImportError:
-        return frozenset({PULSE})  # reported elsewhere, as is an unknown driver
+        return frozenset({PULSE})  # another check reports this problem and an unknown driver
 
 
 DEVICES_MAX: Final = 256
-"""Far more than one process serves at any useful rate; a file with more was generated by mistake."""
+"""Maximum number of devices, more than one process can serve. A longer file is a mistake of a generator."""
 NOISE: Final = "noise"
 DEVICE_NAME: Final = pattern(r"[a-z0-9][a-z0-9_-]{0,31}")
-"""Device names are file names of shared memory, label values and words on a command line."""
+"""Pattern of device names. They are file names of shared memory, label values and words on a command line."""
 
 
 class DeviceReader:
-    """Reader of the devices of one file."""
-
     def __init__(self, keys: Keys, tables: Tables, pause: Callable[[], None]) -> None:
-        """`pause` is called after every device."""
+        """imud calls `pause` after each device."""
         self._keys = keys
         self._tables = tables
         self._declared = DeclaredReader(keys, tables.drivers)
         self._pause = pause
 
     def devices(self, top: Mapping[str, Any]) -> list[tuple[DeviceConfig, bool]] | None:
-        """Read the devices without a problem, each with whether it is enabled; None if the key is missing or empty."""
+        """Read the valid devices, each with its key `enabled`; None if the key is missing or empty."""
         path: KeyPath = ("devices",)
         if "devices" not in top:
             self._keys.problem((), "expected the key devices with a name and keys for each device, got none")
@@ -468,7 +468,7 @@ class DeviceReader:
         return None if settings is None else (names[0], settings)
 
     def _driver_fits(self, path: KeyPath, driver: str, link: str) -> bool:
-        """Refuse a driver on a link that cannot carry its protocol."""
+        """Refuse a driver if the link cannot carry its protocol."""
         links, drivers = self._tables.links, self._tables.drivers
         if driver == "auto" and not links[link].searchable:
             known = ", ".join(self._fitting((name, name, link) for name in drivers))
@@ -481,21 +481,21 @@ class DeviceReader:
         return True
 
     def _go_together(self, path: KeyPath, driver: str, options: Options, link: str, link_settings: Options) -> None:
-        """Refuse values of options and link with which the driver cannot work."""
+        """Refuse values of options and link that the driver does not support."""
         for problem in self._tables.drivers[driver].problems(options, link_settings):
             part = link if problem.part == "link" else problem.part
             self._keys.problem((*path, part, problem.key), problem.message)
 
     def _usable(self, path: KeyPath, driver: str, link: str, settings: Options) -> None:
-        """Refuse settings that the link itself would refuse."""
+        """Refuse options that the link does not support."""
         frames = False
-        with suppress(ImportError, KeyError):  # reported elsewhere: the driver cannot be imported, or there is none
+        with suppress(ImportError, KeyError):  # another check reports a missing or failing driver
             frames = isinstance(self._tables.drivers[driver], CanDriver)
         if problem := self._tables.links[link].problem(settings, frames):
             self._keys.problem((*path, link), problem)
 
     def _fitting(self, pairs: Iterable[tuple[str, str, str]]) -> list[str]:
-        """List the names of those (name, driver, link) that fit, as far as their libraries are installed."""
+        """Return the names of the fitting (name, driver, link), as far as their libraries are installed."""
         found = []
         for name, driver, link in pairs:
             with suppress(ImportError):
@@ -504,14 +504,14 @@ class DeviceReader:
         return found
 
     def _buses_carry(self, devices: Sequence[DeviceConfig]) -> None:
-        """Refuse rates whose reads take more time than a bus has, all of its devices together."""
+        """Refuse rates whose reads take more time than a bus has for all its devices."""
         shares: dict[tuple[str, str], float] = {}
         for device in devices:
             driver = self._tables.drivers.get(device.driver)
             bus = self._tables.links[device.link].bus_of(device.link_settings)
             rate_hz = getattr(device.link_settings, "rate_hz", 0.0)
             if not isinstance(driver, PolledDriver) or device.options is None or not bus or not rate_hz:
-                continue  # without options, these have a problem of their own
+                continue  # another check reports invalid options
             if not self._tables.links[device.link].fits(driver):
                 continue
             read_ns = driver.read_ns(device.options, device.link_settings)

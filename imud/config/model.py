@@ -1,4 +1,4 @@
-"""A configuration after reading and checking, and the differences between two of them."""
+"""A checked configuration, and the differences between two configurations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -14,70 +14,68 @@ from imud.utc.receivers import RmcOptions
 
 @dataclass(frozen=True, slots=True)
 class DeviceConfig:
-    """One device of the configuration."""
-
     name: str
     driver: str
-    """A name in DRIVERS, or `auto`."""
+    """Name in DRIVERS, or `auto`."""
     options: Options | None
-    """Settings of the driver; None with driver `auto`."""
+    """Options of the driver; None with driver `auto`."""
     identify: bool
     link: str
-    """A name in LINKS."""
+    """Name in LINKS."""
     link_settings: Options
     line: int = 0
-    """Line of its name in the file; no property of the device."""
+    """Line number of the name in the file. It is not a property of the device."""
     lines: DeviceLines | None = None
-    """GPIO lines of the device; None without any."""
+    """GPIO lines of the device; None if it has no lines."""
     rmc: RmcOptions | None = None
-    """Source of the RMC sentences that are sent to it; None for none."""
+    """Source of the RMC sentences for the device; None if imud sends no sentences."""
     declared: Options | None = None
-    """Values that its own settings should have, an instance of `DeviceSettings.declarable`; None for no declaration."""
+    """Declared settings, an instance of `SettingsTable.declarable`; None if the configuration declares no settings."""
     on_difference: OnDifference = OnDifference.REPORT
-    """What imud does where they are others."""
+    """Reaction of imud if a setting differs from its declaration."""
     frame: FrameOptions | None = None
-    """How the sensor lies in its body; None to publish its own axes."""
+    """Mounting of the sensor in its body; None to publish the sensor axes."""
     convention: Convention | None = None
-    """Convention of what is published; None for the device's own, and for enu-flu beside `frame`."""
+    """Convention of the published samples; None: the convention of the device, or enu-flu if `frame` is set."""
     declination_deg: float | None = None
-    """True heading minus magnetic heading; None to leave the heading as it is."""
+    """True heading minus magnetic heading, degrees; None: the heading stays unchanged."""
     noise: Deviations | None = None
-    """What is known of the noise of its samples; None for nothing."""
+    """Standard deviations of the samples; None if they are unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """A whole configuration, checked."""
+    """A complete and checked configuration."""
 
     log_level: str
     state_dir: str
     publishers: Mapping[str, Options]
-    """Settings of every row of PUBLISHERS; defaults where the file has none."""
+    """Options of each row of PUBLISHERS, with defaults for absent keys."""
     devices: tuple[DeviceConfig, ...]
-    """In the order of the file, without the disabled."""
+    """Enabled devices in the order of the file."""
     disabled: tuple[str, ...] = ()
     """Names of devices with `enabled: false`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Differences:
-    """Changes from one configuration to another, by name. `str()` of it is a sentence for the log."""
+    """Changes between two configurations, by name. `str()` returns a sentence for the log."""
 
     devices_added: tuple[str, ...]
     devices_removed: tuple[str, ...]
     devices_changed: tuple[str, ...]
     publishers_changed: tuple[str, ...]
     keys_changed: tuple[str, ...]
-    """Of `log_level` and `state_dir`."""
+    """Changed keys of the daemon: `log_level`, `state_dir`."""
 
     def __str__(self) -> str:
-        """For example `devices added: front, rear; publishers changed: metrics`, or `nothing differs`."""
+        """Return for example `devices added: front, rear; publishers changed: metrics`, or `nothing differs`."""
         parts = ((field.name.replace("_", " "), getattr(self, field.name)) for field in fields(self))
         return "; ".join(f"{title}: {', '.join(names)}" for title, names in parts if names) or "nothing differs"
 
 
 def differences(old: Config, new: Config) -> Differences:
-    """List the changes in `new`. The order of devices in the file makes no difference."""
+    """Return the changes in `new`. The order of devices in the file has no effect."""
     before, after = ({d.name: _without_line(d) for d in config.devices} for config in (old, new))
     return Differences(
         devices_added=tuple(name for name in after if name not in before),

@@ -1,4 +1,4 @@
-"""Reading and checking of a whole file, which makes a `Config`."""
+"""Load a configuration file: read and check the whole file, then make a `Config`."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,10 +20,10 @@ def load(
     pause: Callable[[], None] = no_pause,
     missing: str = "is the path right?",
 ) -> Config:
-    """Read a configuration file. Raises ConfigError with every problem that was found, one per line.
+    """Read a configuration file. Raises ConfigError with all problems, one per line.
 
-    `pause` is called after every piece of work of less than a millisecond; `missing` is the hint where no such
-    file is.
+    imud calls `pause` after each piece of work of less than a millisecond. `missing` is the hint if the file does not
+    exist.
     """
     try:
         content = read_regular(path, FILE_BYTES_MAX + 1)
@@ -34,7 +34,7 @@ def load(
 
 
 def parse(text: str | bytes, filename: str, tables: Tables = TABLES, pause: Callable[[], None] = no_pause) -> Config:
-    """Read a configuration from text; `filename` is for messages, `pause` as for `load`. Raises ConfigError."""
+    """Read a configuration from text. `filename` is for messages, `pause` as in `load`. Raises ConfigError."""
     tree = read_yaml(text.encode() if isinstance(text, str) else text, pause)
     keys = Keys(tree)
     config = _config(keys, tables, pause) if tree.complete else None
@@ -45,7 +45,7 @@ def parse(text: str | bytes, filename: str, tables: Tables = TABLES, pause: Call
 
 
 def _config(keys: Keys, tables: Tables, pause: Callable[[], None]) -> Config | None:
-    """Make the configuration; None where problems prevent it."""
+    """Make the configuration; None if it has problems."""
     top = keys.mapping((), keys.tree.data)
     if top is None:
         return None

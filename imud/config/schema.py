@@ -1,6 +1,6 @@
-"""Schema of the configuration file: keys of the daemon and of a device, and the tables that the rest comes from.
+"""Schema of the configuration file: keys of the daemon and of a device, and the registries of the other keys.
 
-A new row of a table (DRIVERS, LINKS, PUBLISHERS) is configurable without a change here.
+A new row of a registry (DRIVERS, LINKS, PUBLISHERS) needs no change here.
 """
 
 import re
@@ -25,32 +25,33 @@ from imud.publishers import PUBLISHERS
 
 
 class General(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Keys of the daemon itself."""
+    """Keys of the daemon."""
 
     log_level: Literal["debug", "info", "warning", "error"] = "info"
-    """Lowest level of messages in the log."""
+    """Lowest level of log messages."""
     state_dir: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud"
-    """Folder of what imud remembers: at which rate each device was found, writes to flash, backups of settings.
-    imud makes it where it is missing. A change counts from the next start. systemd's STATE_DIRECTORY wins over it."""
+    """Folder of the state: found baud rates, writes to flash, backups of device settings. imud creates the folder. A
+    change needs a restart. STATE_DIRECTORY of systemd overrides this key."""
 
 
 class DeviceGeneral(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Keys of a device itself, as opposed to those of its link and its driver."""
+    """Keys of a device, without the keys of its link and its driver."""
 
     driver: str = "auto"
-    """Wire protocol of the device, or `auto`: detect it by listening."""
+    """Wire protocol of the device. `auto`: imud listens and detects it."""
     enabled: bool = True
-    """Whether imud uses the device; if not, its keys are checked all the same."""
+    """False: imud ignores the device, but checks its keys."""
     identify: bool = True
-    """Whether imud may send queries (nothing that changes the device) to learn product, serial number and firmware. A
-    device that does not answer is asked again after 5, 30 and 120 s, then every five minutes."""
+    """True: imud can send queries to learn product, serial number and firmware. Queries do not change the device. imud
+    repeats a query without a reply after 5, 30 and 120 s, then every five minutes."""
     on_difference: OnDifference = OnDifference.REPORT
-    """What imud does where the device is not as `settings` declare: report it, apply them, or apply and save to the
-    device's flash."""
+    """Reaction if the device differs from `settings`: report the difference, apply the settings, or apply the settings
+    and save them to the flash of the device."""
     convention: Convention | None = None
-    """Axes and angles of what is published; null for the device's own, or with `frame` for enu-flu (docs/frames.md)."""
+    """Axes and angles of the published samples; null: the convention of the device, or enu-flu if `frame` is set
+    (docs/frames.md)."""
     declination_deg: Annotated[float, msgspec.Meta(ge=-180, le=180)] | None = None
-    """True north as seen from magnetic north, east positive: makes a magnetic heading true; null to leave it."""
+    """True north relative to magnetic north, east positive. imud adds it to a magnetic heading; null: no change."""
 
 
 class Row(Protocol):
@@ -135,14 +136,14 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
 
 class Keys:
-    """The keys of a file and the problems found with them so far."""
+    """Keys of a file, and the problems found so far."""
 
     def __init__(self, tree: YamlTree) -> None:
         self.tree = tree
         self.problems: list[Problem] = []
 
     def problems_besides(self, known: Sequence[Problem]) -> Iterator[Problem]:
-        """List the problems, without those that only follow from a `known` one at the same place or inside it."""
+        """Yield the problems, without the consequences of a `known` problem at the same place or inside it."""
         paths = [problem.path for problem in known]
         return (p for p in self.problems if not any(path[: len(p.path)] == p.path for path in paths))
 
@@ -160,7 +161,7 @@ class Keys:
                 self.problem((*path, key), unknown_name("a key", key, known), at_key=True)
 
     def row(self, table: Mapping[str, Row], name: str, data: object, path: KeyPath | None = None) -> Options | None:
-        """Read the settings of row `name`; an empty value means its defaults."""
+        """Read the options of row `name`. An empty value means the defaults."""
         path = path or (name,)
         try:
             schema = table[name].settings
@@ -170,7 +171,7 @@ class Keys:
         return self.part(schema, data, path)
 
     def part(self, schema: type[S], data: object, path: KeyPath) -> S | None:
-        """Read the settings of one part by its schema; an empty value means its defaults."""
+        """Read the options of one part by its schema. An empty value means the defaults."""
         keys = self.mapping(path, {} if data is None else data)
         if keys is None:
             return None
@@ -178,7 +179,7 @@ class Keys:
         return self.settings(schema, path, {key: keys[key] for key in schema.__struct_fields__ if key in keys})
 
     def settings(self, schema: type[S], path: KeyPath, keys: Mapping[str, Any]) -> S | None:
-        """Convert the known `keys` to `schema`, each by itself, so that every bad value is reported."""
+        """Convert each of the known `keys` to `schema` separately, so that the reader reports every invalid value."""
         good = True
         for field in msgspec.structs.fields(schema):
             if field.name in keys:
@@ -213,7 +214,8 @@ class Keys:
         return text is None
 
     def _check_inside(self, path: KeyPath, values: Mapping[str, Any], field_type: Any) -> None:
-        """Add the problems of keys and values in a mapping, each at its own place, where `field_type` has mappings."""
+        """Add the problems of the keys and values of a mapping, each at its own place, if `field_type` contains
+        mappings."""
         for choice in _choices(field_type):
             if isinstance(choice, type) and issubclass(choice, Options):
                 self.part(choice, values, path)
@@ -228,7 +230,7 @@ class Keys:
 
 
 def _choices(field_type: Any) -> Iterator[Any]:
-    """List the types of a union, or the one type, without annotations."""
+    """Yield the types of a union or the single type, without annotations."""
     origin = get_origin(field_type)
     if origin is Annotated:
         yield from _choices(get_args(field_type)[0])
@@ -240,7 +242,8 @@ def _choices(field_type: Any) -> Iterator[Any]:
 
 
 def _controlling(value: object) -> str | None:
-    """A text in `value` that has control characters (no path or name has any, the kernel refuses NUL); else None."""
+    """Return a text in `value` that contains control characters; None if there is no such text. No path or name
+    contains them."""
     if isinstance(value, str):
         return value if _CONTROL.search(value) else None
     parts = value if isinstance(value, list) else value.values() if isinstance(value, dict) else ()

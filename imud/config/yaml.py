@@ -1,11 +1,13 @@
-"""YAML as plain data with the position of each value, without YAML's implicit conversions.
+"""YAML as plain data with the position of each value, without the implicit conversions of YAML.
 
-Read from parser events into a tree with an explicit stack: `yaml.compose` recurses in C and ends the process with a
-segmentation fault at 200 000 open brackets (measured, PyYAML 6.0.3 with libyaml), and YAML's own rules for plain words
-turn `1:20` into 80, `010` into 8, `no` into false and let the last of two equal keys win. What one reader of YAML
-takes for a number or a truth value and another for text is refused here, with its line and column, unless it is quoted.
-No library does this: 500 devices (124 kB) take 63 ms here, 809 ms by ruamel.yaml 0.19.1 and 10.7 s by strictyaml 1.7.3;
-both end in RecursionError after seconds at 1000 brackets, stop at the first problem, and accept `010`, `no` and `1:20`.
+The module builds a tree from parser events with an explicit stack. `yaml.compose` recurses in C and ends the process
+with a segmentation fault at 200 000 open brackets (measured, PyYAML 6.0.3 with libyaml). The rules of YAML for plain
+words turn `1:20` into 80, `010` into 8 and `no` into false, and the last of two equal keys wins. The module refuses
+such words with line and column, unless they are quoted.
+
+No library meets these needs. 500 devices (124 kB) take 63 ms here, 809 ms in ruamel.yaml 0.19.1 and 10.7 s in
+strictyaml 1.7.3. Both libraries end with RecursionError at 1000 brackets, stop at the first problem, and accept `010`,
+`no` and `1:20`.
 """
 
 import codecs
@@ -22,13 +24,13 @@ import yaml
 from imud.model.options import shown
 
 FILE_BYTES_MAX: Final = 1 << 20
-"""256 devices with every key written out take 0.1 MB."""
+"""Maximum size of a file, bytes. 256 devices with all keys need 0.1 MB."""
 DEPTH_MAX: Final = 32
-"""A configuration needs five."""
+"""Maximum depth of the tree. A configuration needs five levels."""
 PROBLEMS_MAX: Final = 1000
-"""A file with more is not a configuration; comparing their places takes time by the square of their number."""
+"""Maximum number of problems. The comparison of their places takes time in proportion to the square of their number."""
 EVENTS_PER_TURN: Final = 64
-"""Events of the parser between two calls of `pause`: a third of a millisecond."""
+"""Number of parser events between two calls of `pause`: a third of a millisecond."""
 
 Path = tuple[str | int, ...]
 """Keys and indices from the top of the file to a value."""
@@ -36,7 +38,7 @@ Path = tuple[str | int, ...]
 
 @dataclass(frozen=True, slots=True, order=True)
 class SourcePosition:
-    """A place in a file; lines and columns (in characters) count from 1."""
+    """Position in a file. Lines and columns (characters) count from 1."""
 
     line: int
     column: int
@@ -44,7 +46,7 @@ class SourcePosition:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Problem:
-    """A problem of a file and its position."""
+    """Problem of a file with its position."""
 
     mark: SourcePosition
     path: Path
@@ -53,12 +55,12 @@ class Problem:
 
 @dataclass(slots=True)
 class YamlTree:
-    """The one document of a file: mappings with text keys, lists, text, numbers, true, false, null."""
+    """The document of a file: mappings with text keys, lists, text, numbers, true, false, null."""
 
     data: object = None
-    """Null where a problem left nothing readable."""
+    """Root of the tree; None if a problem prevents reading."""
     complete: bool = True
-    """False where reading ended at the last problem: what is behind it is not in `data`."""
+    """False if the reader stopped at the last problem. Then `data` contains only the values before it."""
     problems: list[Problem] = field(default_factory=list)
     values: dict[Path, SourcePosition] = field(default_factory=dict)
     """Position of the value at each path."""
@@ -72,18 +74,18 @@ class YamlTree:
         return self.values.get(path, SourcePosition(1, 1))
 
     def key_mark(self, path: Path) -> SourcePosition:
-        """Return the position of the key of the value at `path`, or in a list of the value itself."""
+        """Return the position of the key of the value at `path`. In a list, return the position of the value."""
         return self.keys.get(path) or self.mark(path)
 
 
 def no_pause() -> None:
-    """Return at once: no other thread waits for this one."""
+    """Return immediately: no other thread waits."""
 
 
 def read_yaml(content: bytes, pause: Callable[[], None] = no_pause) -> YamlTree:
-    """Read one YAML document. Never raises: all that is wrong, as far as it could be read, is in `problems`.
+    """Read one YAML document. Never raises: `problems` contains all problems of the readable part.
 
-    `pause` is called after every EVENTS_PER_TURN events.
+    imud calls `pause` after each EVENTS_PER_TURN events.
     """
     tree = YamlTree()
     try:
@@ -96,18 +98,18 @@ def read_yaml(content: bytes, pause: Callable[[], None] = no_pause) -> YamlTree:
 
 
 def path_text(path: Path) -> str:
-    """Format a path for people: `devices.front.uart.baud`, `devices.front.ids[2]`."""
+    """Format a path for messages: `devices.front.uart.baud`, `devices.front.ids[2]`."""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{_name(part)}" for part in path)
     return text.removeprefix(".")
 
 
 def _name(key: str) -> str:
-    """Format a key as it is, or in quotes and with escapes if it could be taken for more than a word."""
+    """Format a key, in quotes and with escapes if it is not one word."""
     return key if re.fullmatch(r"[\w()-]+", key) else shown(key)
 
 
 class _Refused(Exception):
-    """A problem after which reading cannot continue."""
+    """A problem that stops the reader."""
 
     def __init__(self, mark: SourcePosition, message: str, path: Path = ()) -> None:
         super().__init__(message)
@@ -115,7 +117,7 @@ class _Refused(Exception):
 
 
 class _Event(Protocol):
-    """The fields of PyYAML's events that are used here; its stubs leave them untyped."""
+    """Fields of PyYAML's events that this module uses. The stubs of PyYAML do not type them."""
 
     start_mark: yaml.Mark
     anchor: str | None
@@ -159,7 +161,7 @@ def _syntax_problem(error: yaml.MarkedYAMLError, text: str) -> _Refused:
     mark = SourcePosition(at.line + 1, at.column + 1) if at else SourcePosition(1, 1)
     lines = text.splitlines() or [""]
     for number in range(mark.line, min(mark.line + 2, len(lines) + 1)):
-        tab = re.match(r" *\t", lines[number - 1])  # libyaml points at the line before when it meets the tab late
+        tab = re.match(r" *\t", lines[number - 1])  # libyaml reports the previous line if it detects the tab late
         if tab:
             return _Refused(
                 SourcePosition(number, tab.end()), "expected spaces at the beginning of the line, got a tab"
@@ -170,18 +172,18 @@ def _syntax_problem(error: yaml.MarkedYAMLError, text: str) -> _Refused:
 
 @dataclass(slots=True)
 class _Open:
-    """A mapping or list that is being filled."""
+    """An open mapping or list."""
 
     path: Path
     into: dict[str, object] | list[object]
     key: str | None = None
-    """Of a mapping: the key whose value comes next."""
+    """Key of the next value in a mapping."""
     again: bool = False
-    """Whether that key stood there before; then the value is read for its own problems only."""
+    """True if the mapping already contains the key. The reader then only checks the value."""
 
 
 class _Builder:
-    """Builder of the tree from events. The stack is a list, so that no nesting can overflow the process's own."""
+    """Builder of the tree from events. The explicit stack cannot overflow the stack of the process."""
 
     def __init__(self, tree: YamlTree) -> None:
         self._tree = tree
@@ -210,7 +212,7 @@ class _Builder:
             raise _Refused(SourcePosition(1, 1), "expected keys and values, got an empty file")
 
     def _at(self) -> Path:
-        """Path of the value that the next event is, or belongs to."""
+        """Return the path of the value of the next event."""
         if not self._stack:
             return ()
         top = self._stack[-1]
@@ -235,7 +237,7 @@ class _Builder:
     def _scalar(self, event: _Event, mark: SourcePosition) -> None:
         path = self._at()
         self._refuse_tag(event, mark, path)
-        quoted = bool(event.style)  # None or empty for plain words, by parser
+        quoted = bool(event.style)  # None or an empty text for plain words, depending on the parser
         top = self._stack[-1] if self._stack else None
         try:
             value = event.value if quoted else plain(event.value)
@@ -292,7 +294,7 @@ _BOOL = re.compile(r"true|True|TRUE|false|False|FALSE")
 _INT = re.compile(r"[-+]?(0|[1-9][0-9]*)|0x[0-9a-fA-F]+|0o[0-7]+")
 _FLOAT = re.compile(r"[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
 _NUMBER_CHARACTERS_MAX = 40
-"""Longer than any number that fits 64 bits in any notation; Python itself refuses from 4300 digits on."""
+"""Maximum length of a number. All 64-bit numbers are shorter in any notation. Python refuses more than 4300 digits."""
 _TRAPS = (
     (re.compile(r"yes|no|on|off", re.IGNORECASE), "expected true or false, or text in quotes, got {0}"),
     (
@@ -309,7 +311,8 @@ _TRAPS = (
 
 
 def plain(word: str) -> object:
-    """Resolve an unquoted word: null, a truth value, a number, or text. Raises ValueError for ambiguous words."""
+    """Return the value of an unquoted word: null, a truth value, a number, or text. Raises ValueError for ambiguous
+    words."""
     for trap, message in _TRAPS:
         if trap.fullmatch(word):
             raise ValueError(message.format(word[:_NUMBER_CHARACTERS_MAX]))
@@ -331,11 +334,11 @@ def plain(word: str) -> object:
 
 PLAIN_KEY: Final = pattern(r"[A-Za-z_][A-Za-z0-9_]*")
 WORDS: Final = frozenset({"yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "y", "n"})
-"""What some readers of YAML do not take for text."""
+"""Words that some readers of YAML do not read as text."""
 
 
 def yaml_block(values: Mapping[str, object], indent: int = 0) -> str:
-    """Format keys and values, each mapping of the first level as a block and everything inside as flow."""
+    """Format keys and values: each mapping of the first level as a block, all deeper values in flow style."""
     lines = []
     for name, value in values.items():
         head = f"{' ' * indent}{_key(name)}:"
@@ -347,7 +350,7 @@ def yaml_block(values: Mapping[str, object], indent: int = 0) -> str:
 
 
 def yaml_flow(value: object) -> str:
-    """Format a value in one line."""
+    """Format a value in one line of flow style."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(str(name))}: {yaml_flow(one)}" for name, one in value.items()) + "}"
     if isinstance(value, Sequence) and not isinstance(value, str):
@@ -365,7 +368,7 @@ def _key(name: str) -> str:
 
 
 def _scalar(value: object) -> str:
-    """A scalar as JSON, which is YAML too, with what some readers refuse escaped."""
+    """Format a scalar as JSON, which is valid YAML. Escape characters that some readers refuse."""
     text = msgspec.json.encode(value).decode()
     return "".join(one if one.isprintable() else _escaped(one) for one in text)
 
