@@ -12,7 +12,7 @@ SIMULATORS: Registry[Simulator] = Registry(
         "imu61x-uart": "imud.sim.imu61x.uart:SIMULATOR",
     },
 )
-"""Devices that stand behind a pseudo-terminal."""
+"""Simulated devices on a pseudo-terminal."""
 
 CAN_SIMULATORS: Registry[CanSimulator] = Registry(
     "simulator on CAN",
@@ -23,4 +23,4 @@ CAN_SIMULATORS: Registry[CanSimulator] = Registry(
         "imu61x-can": "imud.sim.imu61x.can:SIMULATOR",
     },
 )
-"""Devices that stand on a CAN interface."""
+"""Simulated devices on a CAN interface."""

@@ -1,12 +1,12 @@
-"""`python -m imud.sim`: a simulated device behind a pseudo-terminal, or one or more on a CAN interface, as a process.
+"""`python -m imud.sim`: a process that simulates a device on a pseudo-terminal, or several devices on a CAN interface.
 
-The first line on stdout is the path to open, or the name of the interface. It runs until stdin ends, or SIGTERM or
-SIGINT comes; its last line is what it counted, as JSON. Lines on stdin command it:
+The first line on stdout is the path of the port or the name of the interface. The process runs until stdin ends, or
+until SIGTERM or SIGINT. Its last line contains the counters as JSON. stdin accepts these lines:
 
-    unplug SECONDS    the port disappears for so long, the module loses power
-    reboot            the module restarts, the port stays
-    mark              a pulse on SIN/PPS, where the device has such an input
-    stats             print what was counted so far, as JSON on one line
+    unplug SECONDS    remove the port for this time and cut the power of the device
+    reboot            restart the device, keep the port
+    mark              send a pulse to SIN/PPS, if the device has this input
+    stats             print the counters as one line of JSON
     quit
 """
 
@@ -31,9 +31,9 @@ from imud.sim.sensor import StreamModule
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run; return the exit code."""
+    """Run. Return the exit status."""
     options = make_parser().parse_args(arguments)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # both end as KeyboardInterrupt
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # both signals end as KeyboardInterrupt
     now_ns = time.monotonic_ns()
     devices: list[tuple[str, int]] = options.device or [(DEVICE, 0)]
     if all(name in CAN_SIMULATORS for name, _ in devices):
@@ -82,7 +82,7 @@ def _run_on_can(options: argparse.Namespace, devices: list[tuple[str, int]], now
 
 
 def _lines(options: argparse.Namespace, module: StreamModule) -> SimulatedLines:
-    """The lines that the options name. Raises ValueError for pins or faults that do not exist, OSError."""
+    """Return the lines of the options. Raises ValueError for unknown pins or faults, OSError."""
     files = pull_files(options.pins, options.pin_settle / 1e3)
     faults = PinFaults(options.seed, pin_rates(options.pin_faults)) if files and options.pin_faults else None
     truth = options.pin_truth.open("w") if options.pin_truth else None

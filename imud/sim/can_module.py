@@ -1,9 +1,8 @@
 """Simulated devices on a CAN bus: their contract, their wire, and their common parts.
 
-CanModule           the contract: frames of others in, frames that crossed the wire out
-FrameWire           one frame after the other at the bit rate of the bus
-PeriodicCanModule   a module that only sends, the same frames at every period
-CanModules          several modules on one bus, in the shape of a single one
+CanModule           contract: receives frames of other nodes, returns sent frames FrameWire           sends frames one
+after the other at the bit rate of the bus PeriodicCanModule   device that only sends, with the same frames in each
+period CanModules          several devices on one bus, with the interface of one device
 """
 
 from collections import deque
@@ -18,50 +17,50 @@ from imud.sim.physics import Truth
 from imud.sim.sensor import SensorHardware, SimulatorOptions
 
 STUFF_BITS: Final = 9
-"""Of a frame with average data. Frames with fewer than eight bytes take as long here as those with eight."""
+"""Mean number of stuff bits in a frame. The model ignores that frames with fewer than eight bytes are shorter."""
 BITRATE: Final = 500_000
 
 
 class SentFrame(NamedTuple):
-    """A frame that has crossed the wire."""
+    """A frame that was sent completely."""
 
     due_ns: int
-    """CLOCK_MONOTONIC of its end."""
+    """CLOCK_MONOTONIC of the end of the frame."""
     can_id: int
     extended: bool
     data: bytes
     sample_ns: int | None = None
-    """CLOCK_MONOTONIC of the instant of measurement; None for what is no measurement."""
+    """CLOCK_MONOTONIC of the measurement; None if the frame contains no measurement."""
 
 
 class CanModule(Protocol):
     """A simulated device. Times are CLOCK_MONOTONIC in ns and never go backwards. Synchronization: one thread."""
 
     epoch_ns: int
-    """Zero of its motion: truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
+    """Zero of the motion, ns: the truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
 
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
-        """Receive a frame of another device."""
+        """Receive a frame of another node."""
         ...
 
     def advance(self, now_ns: int) -> list[SentFrame]:
-        """Return what has crossed the wire since the last call, in order."""
+        """Return the frames sent since the last call, in order."""
         ...
 
     def next_ns(self) -> int | None:
-        """Time of the next output of `advance`; None for none."""
+        """Return the time of the next frame of `advance`; None if no frame is due."""
         ...
 
     def counters(self) -> dict[str, int]:
-        """Return the module's own counters, by name."""
+        """Return the counters of the device by name."""
         ...
 
     def mark(self, now_ns: int) -> None:
-        """Pulse its sync input (a rising edge); ignored by a device without one."""
+        """Send a rising edge to the sync input. A device without this input ignores it."""
         ...
 
     def reboot(self, now_ns: int) -> None:
-        """Restart after a loss of power: unsaved settings are lost."""
+        """Restart after a power failure. The device loses unsaved settings."""
         ...
 
 
@@ -72,16 +71,18 @@ class CanSimulator:
     name: str
     """Name of the driver of the device."""
     title: str
-    """The product, for people."""
+    """Name of the product."""
     make: Callable[[SimulatorOptions, int], CanModule]
-    """Makes the module, powered on at the given CLOCK_MONOTONIC. Raises ValueError for options it cannot have."""
+    """Function that makes the device, with power on at the given CLOCK_MONOTONIC. Raises ValueError for unsupported
+    options."""
 
 
 class FrameWire:
-    """The wire of a CAN bus: one frame after the other at the bit rate; frames of one device never overlap."""
+    """The wire of a CAN bus. It sends the frames of one device one after the other at the bit rate."""
 
     def __init__(self, bitrate: int, free_ns: int) -> None:
-        """`bitrate` 0: frames take no time, so that those of one instant leave together. `free_ns`: nothing before."""
+        """`bitrate` 0: frames take no time, so that frames of one instant leave together. The wire is busy until
+        `free_ns`."""
         self.frame_ns, self.extended_ns = (
             (frame_bits(extended, DATA_BYTES_MAX) + STUFF_BITS) * NS_PER_S // bitrate if bitrate else 0
             for extended in (False, True)
@@ -90,26 +91,27 @@ class FrameWire:
         self._waiting: deque[SentFrame] = deque()
 
     def send(self, ready_ns: int, can_id: int, extended: bool, data: bytes, sample_ns: int | None = None) -> None:
-        """Queue a frame that is ready then."""
+        """Queue a frame that is ready at `ready_ns`."""
         self._free_ns = max(ready_ns, self._free_ns) + (self.extended_ns if extended else self.frame_ns)
         self._waiting.append(SentFrame(self._free_ns, can_id, extended, data, sample_ns))
 
     def sent(self, now_ns: int) -> list[SentFrame]:
-        """Return and remove the frames that have crossed the wire by now."""
+        """Return and remove the frames that were sent completely until now."""
         done: list[SentFrame] = []
         while self._waiting and self._waiting[0].due_ns <= now_ns:
             done.append(self._waiting.popleft())
         return done
 
     def next_ns(self) -> int | None:
-        """Time at which the next frame is through; None if none waits."""
+        """Return the end of the next frame; None if the queue is empty."""
         return self._waiting[0].due_ns if self._waiting else None
 
 
 class PeriodicCanModule:
-    """A device that samples at whole periods of its own crystal, sends every sample at once, and takes no commands.
+    """A device that samples at whole periods of its own crystal, sends each sample immediately, and accepts no
+    commands.
 
-    It is powered on when it is made. Synchronization: one thread.
+    Its power is on from the start. Synchronization: one thread.
     """
 
     def __init__(
@@ -123,8 +125,8 @@ class PeriodicCanModule:
         extended: bool = False,
         first_number: int = 0,
     ) -> None:
-        """`encode` makes the frames (identifier, data) of a sample from its number and reading. Numbers count from
-        `first_number` after the first power-on, from 0 after a restart."""
+        """`encode` returns the frames (identifier, data) of a sample from its number and its measurement. Numbers start
+        at `first_number` after the first power-on, at 0 after a restart."""
         self.epoch_ns = now_ns
         self.samples_sent = 0
         self.frames_sent = 0
@@ -133,18 +135,16 @@ class PeriodicCanModule:
         self._bitrate = bitrate
         self._power_on(now_ns, first_number)
 
-    def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
-        """Ignore frames of other devices."""
+    def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None: ...
 
     def mark(self, now_ns: int) -> None:
-        """Ignore the edge: there is no sync input on this port."""
+        """Do nothing: the device has no sync input."""
 
     def reboot(self, now_ns: int) -> None:
-        """Restart after a loss of power: samples are numbered from 0 again."""
+        """Restart after a power failure. Sample numbers start at 0 again."""
         self._power_on(now_ns, 0)
 
     def advance(self, now_ns: int) -> list[SentFrame]:
-        """Return what has crossed the wire since the last call, in order."""
         while (sample_ns := self._sample_ns()) <= now_ns:
             reading = self._hardware.reading((sample_ns - self.epoch_ns) / NS_PER_S)
             for can_id, data in self._encode(self._first_number + self._sampled, reading):
@@ -155,7 +155,6 @@ class PeriodicCanModule:
         return self._wire.sent(now_ns)
 
     def next_ns(self) -> int | None:
-        """Time of the next output of `advance`; None for none."""
         waiting = self._wire.next_ns()
         if waiting is not None:
             return waiting
@@ -163,7 +162,6 @@ class PeriodicCanModule:
         return self._sample_ns() + self._hardware.processing_ns + frame_ns
 
     def counters(self) -> dict[str, int]:
-        """Samples and frames sent."""
         return {"samples_sent": self.samples_sent, "frames_sent": self.frames_sent}
 
     def _power_on(self, now_ns: int, first_number: int) -> None:
@@ -177,22 +175,21 @@ class PeriodicCanModule:
 
 
 class CanModules:
-    """Modules that share a bus, in the shape of a single one (`CanModule`). Synchronization: one thread."""
+    """Several devices on a bus with the interface of one device (`CanModule`). Synchronization: one thread."""
 
     def __init__(self, modules: Sequence[CanModule]) -> None:
-        """Raises ValueError without any module."""
+        """Raises ValueError if `modules` is empty."""
         if not modules:
             raise ValueError("expected at least one module")
         self.modules = tuple(modules)
         self.epoch_ns = modules[0].epoch_ns
 
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
-        """Pass a frame to every module."""
         for module in self.modules:
             module.receive(can_id, extended, data, now_ns)
 
     def advance(self, now_ns: int) -> list[SentFrame]:
-        """Return the frames through since the last call; those of the same moment in the order of the modules."""
+        """Return the frames sent since the last call. Frames of one instant are in the order of the devices."""
         sent = [module.advance(now_ns) for module in self.modules]
         for sender, frames in zip(self.modules, sent, strict=True):
             for frame in frames:
@@ -200,11 +197,10 @@ class CanModules:
         return list(merge(*sent, key=lambda frame: frame.due_ns))
 
     def next_ns(self) -> int | None:
-        """Earliest time of output of all modules."""
         return min((due_ns for module in self.modules if (due_ns := module.next_ns()) is not None), default=None)
 
     def counters(self) -> dict[str, int]:
-        """Sums of the modules' counters."""
+        """Return the sums of the counters."""
         total: dict[str, int] = {}
         for module in self.modules:
             for name, value in module.counters().items():
@@ -212,12 +208,12 @@ class CanModules:
         return total
 
     def mark(self, now_ns: int) -> None:
-        """Pulse the sync inputs, which are wired together."""
+        """Send a rising edge to the sync inputs. One wire connects them."""
         for module in self.modules:
             module.mark(now_ns)
 
     def reboot(self, now_ns: int) -> None:
-        """Power all modules off."""
+        """Restart all devices after a power failure."""
         for module in self.modules:
             module.reboot(now_ns)
 

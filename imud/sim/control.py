@@ -22,7 +22,7 @@ COMMAND_BYTES_MAX: Final = 4096
 
 
 class BadCommand(ValueError):
-    """A line on stdin that is no command."""
+    """A line on stdin that is not a command."""
 
 
 class StandardInputControl:
@@ -57,7 +57,7 @@ class StandardInputControl:
             # select, because epoll and poll round up to milliseconds
             watched = [commands, node.fileno()] if is_open else [commands]
             ready = select.select(watched, [], [], max(wait_ns, 0) / NS_PER_S)[0]
-            readable = not is_open or node.fileno() in ready  # a program may write and be gone
+            readable = not is_open or node.fileno() in ready  # a program can write and close the port
             if commands in ready:
                 self._on_input(os.read(commands, COMMAND_BYTES_MAX))
 
@@ -99,11 +99,11 @@ def _duration_ns(text: str) -> int:
 
 ADAPTERS: Final = {profile.name: profile for profile in (BARE_UART, USB_1MS, USB_16MS)}
 DEVICE: Final = "hipnuc-uart"
-"""The device that is simulated where no other is named."""
+"""Driver of the device that is simulated by default."""
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The parser of the command line."""
+    """Return the parser of the command line."""
     default = SimulatorOptions()
     parser = argparse.ArgumentParser("python -m imud.sim", description="A simulated sensor behind a pseudo-terminal.")
     add = parser.add_argument
@@ -145,7 +145,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def simulated(text: str) -> tuple[str, int]:
-    """Name and node of NAME or NAME:NODE, node 0 where none is given. Raises ArgumentTypeError."""
+    """Return name and node of NAME or NAME:NODE. The default node is 0. Raises ArgumentTypeError."""
     name, _, node = text.partition(":")
     known = sorted([*SIMULATORS, *CAN_SIMULATORS])
     if name not in known or (node and not node.isdecimal()):
@@ -154,7 +154,7 @@ def simulated(text: str) -> tuple[str, int]:
 
 
 def module_options(options: argparse.Namespace, node: int) -> SimulatorOptions:
-    """The options of one device from parsed arguments; `node` 0: of all devices."""
+    """Return the options of one device. `node` 0 means all devices."""
     return SimulatorOptions(
         rate_hz=options.rate,
         baud=options.baud,

@@ -1,10 +1,10 @@
 """Ground truth: position, attitude and ideal measurements of a simulated sensor, as a pure function of time.
 
-Attitude is given as Euler angles in the order of HiPNUC manual chapter 9.1 (312: yaw about Z, then pitch about X, then
-roll about Y, navigation frame ENU), each a sum of sines, so that the angular rate is their exact derivative and not a
-difference. Position is a sum of sines as well; specific force is its exact second derivative less gravity, turned into
-the sensor frame. All frames are right-handed. Everything follows from `at(t_s)` alone: two calls with the same time
-give the same truth.
+The attitude is in Euler angles with the order of HiPNUC manual chapter 9.1 (312: yaw about Z, then pitch about X, then
+roll about Y, navigation frame ENU). Each angle is a sum of sines, so that the angular rate is the exact derivative. The
+position is a sum of sines, too. The specific force is its exact second derivative minus gravity, rotated into the
+sensor frame. All frames are right-handed. `at(t_s)` is the only source of values: two calls with the same time return
+the same truth.
 
     R(body → ENU) = Rz(yaw) · Rx(pitch) · Ry(roll)
     rate in body  = roll' · y + Ry(roll)ᵀ · (pitch' · x + Rx(pitch)ᵀ · yaw' · z)
@@ -22,28 +22,28 @@ from imud.attitude.rotation import Matrix3, euler312_from_quat, quat_from_euler3
 from imud.model.sample import Quaternion, Vector3
 
 GRAVITY_M_S2: Final = 9.8
-"""HiPNUC's 1 G: a module at rest then reads |accel| = 1."""
+"""1 G of HiPNUC, m/s². A device at rest then reads |accel| = 1."""
 FIELD_ENU_T: Final[Vector3] = (-3.0e-6, 36.0e-6, -27.0e-6)
-"""Earth's magnetic field, east, north, up: about 45 µT, pointing north and down as in the northern subtropics."""
+"""Earth's magnetic field, east, north, up, T: about 45 µT, to the north and down as in the northern subtropics."""
 SEA_LEVEL_PA: Final = 101_325.0
 PA_PER_M: Final = -12.0
-"""Change of air pressure with height near sea level."""
+"""Change of air pressure with height near sea level, Pa/m."""
 TEMPERATURE_C: Final = 35.0
 WARMING_C: Final = 1.5
 WARMING_PERIOD_S: Final = 600.0
 
 
 class Truth(NamedTuple):
-    """Measurement of an ideal sensor at one instant; vectors in the right-handed sensor frame."""
+    """Measurement of an ideal sensor at one instant. Vectors are in the right-handed sensor frame."""
 
     accel_m_s2: Vector3
-    """Specific force: +g on the axis that points up when at rest."""
+    """Specific force, m/s²: +g on the axis that points up at rest."""
     gyro_rad_s: Vector3
     mag_t: Vector3
     euler_rad: Vector3
     """Roll (about Y), pitch (about X), yaw (about Z, counter-clockwise), order 312."""
     quat_wxyz: Quaternion
-    """Body to ENU."""
+    """Rotation from body to ENU."""
     temperature_c: float
     pressure_pa: float
 
@@ -52,7 +52,7 @@ class Motion(Protocol):
     """A known motion."""
 
     def at(self, t_s: float) -> Truth:
-        """The truth at `t_s` seconds after the motion's own zero."""
+        """Return the truth at `t_s` seconds after the zero of the motion."""
         ...
 
 
@@ -72,7 +72,7 @@ _Turn = tuple[float, float, float, float, float, float]
 
 
 class Swing:
-    """Smooth known motion: each angle and each coordinate is its own sum of sines."""
+    """Smooth known motion. Each angle and each coordinate is a sum of sines."""
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ class Swing:
         gravity_m_s2: float = GRAVITY_M_S2,
         field_enu_t: Vector3 = FIELD_ENU_T,
     ) -> None:
-        """Angles in rad, position in m. Pitch must stay within ±90°, where order 312 is unique."""
+        """Angles in rad, position in m. Pitch stays within ±90°, where order 312 is unique."""
         if sum(abs(term.amplitude) for term in pitch) >= pi / 2:
             raise ValueError("pitch would reach 90°, where roll and yaw are no longer defined")
         self._roll, self._pitch, self._yaw = _terms(roll), _terms(pitch), _terms(yaw)
@@ -93,7 +93,6 @@ class Swing:
         self.field_enu_t = field_enu_t
 
     def at(self, t_s: float) -> Truth:
-        """The truth at `t_s` seconds after the motion's own zero."""
         roll, roll_rate = _value_and_rate(self._roll, t_s)
         pitch, pitch_rate = _value_and_rate(self._pitch, t_s)
         yaw, yaw_rate = _value_and_rate(self._yaw, t_s)
@@ -104,7 +103,7 @@ class Swing:
             _value_and_acceleration(self._north, t_s)[1],
             up_m_s2 + self.gravity_m_s2,
         )
-        yaw_y, yaw_z = yaw_rate * sin_p, yaw_rate * cos_p  # yaw rate seen after the turn about X
+        yaw_y, yaw_z = yaw_rate * sin_p, yaw_rate * cos_p  # yaw rate after the rotation about X
         return Truth(
             _into_body(force, turn),
             (cos_r * pitch_rate - sin_r * yaw_z, roll_rate + yaw_y, sin_r * pitch_rate + cos_r * yaw_z),
@@ -139,7 +138,7 @@ def _value_and_acceleration(terms: _Terms, t_s: float) -> tuple[float, float]:
 
 
 def _into_body(v: Vector3, turn: _Turn) -> Vector3:
-    """Ry(roll)ᵀ · Rx(pitch)ᵀ · Rz(yaw)ᵀ · v."""
+    """Return Ry(roll)ᵀ · Rx(pitch)ᵀ · Rz(yaw)ᵀ · v."""
     sin_r, cos_r, sin_p, cos_p, sin_y, cos_y = turn
     east, north, up = v
     x, y = cos_y * east + sin_y * north, cos_y * north - sin_y * east
@@ -148,7 +147,8 @@ def _into_body(v: Vector3, turn: _Turn) -> Vector3:
 
 
 def swing(gravity_m_s2: float = GRAVITY_M_S2) -> Motion:
-    """The default motion: all axes turn by tens of degrees and shake by a few tenths of m/s²; it never repeats soon."""
+    """Return the default motion. All axes turn by tens of degrees and shake by some tenths of m/s². The period is very
+    long."""
     return Swing(
         roll=(Sine(0.44, 0.23), Sine(0.07, 1.3, 0.4)),
         pitch=(Sine(0.35, 0.31, 1.0), Sine(0.09, 0.97)),
@@ -159,15 +159,15 @@ def swing(gravity_m_s2: float = GRAVITY_M_S2) -> Motion:
 
 
 def tumble(gravity_m_s2: float = GRAVITY_M_S2) -> Motion:
-    """A slow turning by hand into all directions, as for the calibration of a magnetometer: within a minute about each
-    axis through more than 360°."""
+    """Return a slow rotation in all directions, as for the calibration of a magnetometer: more than 360° about each
+    axis within a minute."""
     return Swing(
         roll=(Sine(3.1, 0.043),), pitch=(Sine(1.4, 0.071),), yaw=(Sine(3.1, 0.037),), gravity_m_s2=gravity_m_s2
     )
 
 
 class Still:
-    """A sensor at rest in a fixed attitude; only its temperature moves."""
+    """A sensor at rest in a fixed attitude. Only its temperature changes."""
 
     def __init__(
         self,
@@ -177,12 +177,11 @@ class Still:
         gravity_m_s2: float = GRAVITY_M_S2,
         field_enu_t: Vector3 = FIELD_ENU_T,
     ) -> None:
-        roll, pitch, yaw = ((Sine(angle, 0.0, pi / 2),) for angle in (roll_rad, pitch_rad, yaw_rad))  # constants
+        roll, pitch, yaw = ((Sine(angle, 0.0, pi / 2),) for angle in (roll_rad, pitch_rad, yaw_rad))  # constant angles
         swing = Swing(roll=roll, pitch=pitch, yaw=yaw, gravity_m_s2=gravity_m_s2, field_enu_t=field_enu_t)
         self._truth = swing.at(0.0)
 
     def at(self, t_s: float) -> Truth:
-        """The truth at `t_s` seconds after the motion's own zero."""
         warming_c = WARMING_C * sin(2 * pi / WARMING_PERIOD_S * t_s)
         return self._truth._replace(temperature_c=TEMPERATURE_C + warming_c)
 
@@ -192,13 +191,13 @@ MOTIONS: Final[dict[str, Callable[[float], Motion]]] = {
     "tumble": tumble,
     "still": lambda gravity_m_s2: Still(gravity_m_s2=gravity_m_s2),
 }
-"""Motions by name; each is made with the local gravity in m/s²."""
+"""Motions by name. The argument is the local gravity, m/s²."""
 
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 
 class MountingRotation:
-    """The rotations in force. Without any it is not `active`, and `turned` returns its argument."""
+    """Active rotations of the mounting. Without a rotation, `active` is False and `turned` returns its argument."""
 
     def __init__(
         self,
@@ -214,7 +213,7 @@ class MountingRotation:
         self._heading = (cos(yaw_rad / 2), 0.0, 0.0, sin(yaw_rad / 2))
 
     def turned(self, truth: Truth) -> Truth:
-        """Rotate a truth from the chip's frame to that of the mounted module."""
+        """Rotate a truth from the frame of the chip to the frame of the mounted device."""
         if not self.active:
             return truth
         quat_wxyz = quat_product(quat_product(self._heading, truth.quat_wxyz), self._body)
@@ -228,21 +227,21 @@ class MountingRotation:
 
 
 def frame_of(matrix: Matrix3) -> Quaternion:
-    """The rotation nearest to a nearly orthonormal right-handed matrix, first row kept in direction."""
+    """Return the rotation nearest to a nearly orthonormal right-handed matrix. The direction of the first row stays."""
     x = _unit(matrix[0])
     z = _unit(_cross(x, matrix[1]))
     return quat_from_matrix((x, _cross(z, x), z))
 
 
 def level_of(quat_wxyz: Quaternion, upside_down: bool = False) -> Quaternion:
-    """The turn about the body after which roll and pitch read 0° (or 180° and 0°) and yaw what it was."""
+    """Return the rotation about the body after which roll and pitch are 0° (or 180° and 0°) and yaw is unchanged."""
     yaw = euler312_from_quat(quat_wxyz)[2]
     w, x, y, z = quat_wxyz
     return quat_product((w, -x, -y, -z), quat_from_euler312((pi if upside_down else 0.0, 0.0, yaw)))
 
 
 def turned_back(quat_wxyz: Quaternion, vector: Vector3) -> Vector3:
-    """Cᵀ · v, where C is the matrix of the unit quaternion."""
+    """Return Cᵀ · v, where C is the matrix of the unit quaternion."""
     w, x, y, z = quat_wxyz
     _, vx, vy, vz = quat_product(quat_product((w, -x, -y, -z), (0.0, *vector)), quat_wxyz)
     return vx, vy, vz
@@ -260,15 +259,16 @@ def _cross(a: Vector3, b: Vector3) -> Vector3:
 NORMAL_BITS: Final = 12
 NORMAL_MASK: Final = (1 << NORMAL_BITS) - 1
 NORMAL: Final = tuple(NormalDist().inv_cdf((i + 0.5) / (1 << NORMAL_BITS)) for i in range(1 << NORMAL_BITS))
-"""Equally likely values of the normal distribution: picking one takes a fifth of the time of `random.gauss`."""
+"""Equally likely values of the normal distribution. The choice of one value takes a fifth of the time of
+`random.gauss`."""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseLevels:
-    """One-sigma white noise per sample and axis, and the largest bias.
+    """White noise per sample and axis, one sigma, and the maximum bias.
 
-    The white noise is what a HiPNUC module showed in one second at rest at 100 Hz: 0.0006 G, 0.036 °/s, 0.2 µT,
-    0.2 Pa. The biases are assumed.
+    The white noise is the noise of a HiPNUC device at rest at 100 Hz during one second: 0.0006 G, 0.036 °/s, 0.2 µT,
+    0.2 Pa. The biases are assumptions.
     """
 
     accel_m_s2: float = 0.006
@@ -279,12 +279,12 @@ class NoiseLevels:
     mag_bias_t: float = 0.3e-6
     pressure_pa: float = 0.2
     bias_period_s: float = 300.0
-    """Time in which the bias of the first axis repeats; the other axes take a little longer each."""
+    """Period of the bias of the first axis, s. The periods of the other axes are slightly longer."""
 
 
 class Noise:
-    """Adds noise to a truth. The same seed and the same calls give the same noise. Attitude stays true: it is the
-    module's own filter output, and what it should be is what tests compare with."""
+    """Adds noise to a truth. The same seed and the same calls give the same noise. The attitude stays true, because
+    tests compare the output of the device's filter with it."""
 
     def __init__(self, seed: int, levels: NoiseLevels | None = None) -> None:
         self._levels = levels = levels or NoiseLevels()
@@ -294,14 +294,13 @@ class Noise:
         ]
 
     def bias(self, t_s: float) -> tuple[Vector3, Vector3, Vector3]:
-        """Bias of accelerometer (m/s²), gyroscope (rad/s) and magnetometer (T) at a time."""
+        """Return the bias of accelerometer (m/s²), gyroscope (rad/s) and magnetometer (T) at a time."""
         a, b, c, d, e, f, g, h, i = (sin(omega * t_s + phase) for omega, phase in self._waves)
         levels = self._levels
         accel, gyro, mag = levels.accel_bias_m_s2, levels.gyro_bias_rad_s, levels.mag_bias_t
         return (accel * a, accel * b, accel * c), (gyro * d, gyro * e, gyro * f), (mag * g, mag * h, mag * i)
 
     def add(self, truth: Truth, t_s: float) -> Truth:
-        """Add noise to `truth`."""
         levels = self._levels
         accel_bias, gyro_bias, mag_bias = self.bias(t_s)
         accel, gyro, mag, euler, quat, temperature_c, pressure_pa = truth

@@ -1,4 +1,4 @@
-"""Sensor of a simulated device: the motion that it measures, its noise and its crystal; made from the options."""
+"""Sensor of a simulated device: its motion, its noise and its crystal, from the options."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,12 +11,12 @@ class Burst(NamedTuple):
     """Bytes that leave the device in one piece."""
 
     due_ns: int
-    """CLOCK_MONOTONIC at which the last byte has crossed the wire."""
+    """CLOCK_MONOTONIC of the end of the last byte on the wire."""
     data: bytes
     sample_ns: int | None = None
-    """CLOCK_MONOTONIC of the instant of measurement; None for text."""
+    """CLOCK_MONOTONIC of the measurement; None for text."""
     device_ms: int | None = None
-    """Device time of that instant in ms of its own crystal since power-on, not wrapped."""
+    """Device time of the measurement since power-on, ms, without wrap."""
 
 
 class StreamModule(Protocol):
@@ -24,34 +24,34 @@ class StreamModule(Protocol):
 
     @property
     def baud(self) -> int:
-        """Rate in bit/s at which it sends and listens now."""
+        """Current baud rate, bit/s."""
         ...
 
     epoch_ns: int
-    """Zero of its motion: truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
+    """Zero of the motion, ns: the truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Receive bytes that the host sent, already sampled at the device's rate."""
+        """Receive bytes from the host, sampled at the baud rate of the device."""
         ...
 
     def advance(self, now_ns: int) -> list[Burst]:
-        """Return what has left the wire since the last call, in order."""
+        """Return the bursts sent since the last call, in order."""
         ...
 
     def next_ns(self) -> int | None:
-        """Time of the next output of `advance`; None for none."""
+        """Return the time of the next burst of `advance`; None if no burst is due."""
         ...
 
     def counters(self) -> dict[str, int]:
-        """Return the module's own counters, by name."""
+        """Return the counters of the device by name."""
         ...
 
     def mark(self, now_ns: int) -> None:
-        """Pulse its sync input (a rising edge); ignored by a device without one."""
+        """Send a rising edge to the sync input. A device without this input ignores it."""
         ...
 
     def reboot(self, now_ns: int) -> None:
-        """Restart after a loss of power or by a command: unsaved settings are lost."""
+        """Restart after a power failure or a command. The device loses unsaved settings."""
         ...
 
 
@@ -60,32 +60,31 @@ class SimulatorOptions:
     """Options of every simulated device."""
 
     rate_hz: float = 100.0
-    """Samples per second of the device's own time."""
+    """Samples per second of device time."""
     baud: int = 0
-    """Rate of the port in bit/s; 0 for the slowest common one that carries the samples."""
+    """Baud rate of the port, bit/s; 0: the slowest usual rate that carries the samples."""
     message: str = ""
-    """Name of the message to send, empty for the factory's choice."""
+    """Name of the message to send; empty: the default of the factory."""
     motion: str = "swing"
-    """A row of `imud.sim.physics.MOTIONS`."""
+    """Row of `imud.sim.physics.MOTIONS`."""
     gravity_m_s2: float = GRAVITY_M_S2
     noise: Literal["real", "none"] = "real"
     skew_ppm: float = 20.0
-    """Rate error of the device's crystal against the host's clock, 1e-6."""
+    """Rate error of the crystal relative to the host clock, 1e-6."""
     firmware: int = 0
-    """Firmware version as the device states it, 0 for a common one."""
+    """Firmware version that the device reports; 0: a usual version."""
     boot_ms: int = 500
-    """Silence after power-on and reboot."""
+    """Silence after power-on and restart, ms."""
     processing_ns: int = 125_000
-    """Time from the instant of measurement to the first bit on the wire."""
+    """Time from the measurement to the first bit on the wire, ns."""
     seed: int = 1
     node: int = 0
-    """Which of several devices of a bus it is: node, address or first identifier, as its driver counts; 0 for the
-    factory's."""
+    """Node, address or first identifier of the device on its bus; 0: the default of the factory."""
     at_once: bool = False
-    """Whether the frames of a CAN device leave without the pauses that a bit rate makes, as on a virtual bus."""
+    """True: the frames of a CAN device take no time on the wire, as on a virtual bus."""
 
     def bitrate(self, common: int) -> int:
-        """Bit rate of a CAN device, bit/s: `baud`, or the common one; 0 for frames that take no time."""
+        """Return the bit rate of a CAN device, bit/s: `baud` or `common`; 0 for frames that take no time."""
         return 0 if self.at_once else self.baud or common
 
 
@@ -96,33 +95,32 @@ class Simulator:
     name: str
     """Name of the driver of the device."""
     title: str
-    """The product, for people."""
+    """Name of the product."""
     make: Callable[[SimulatorOptions, int], StreamModule]
-    """Makes the module, powered on at the given CLOCK_MONOTONIC. Raises ValueError for options it cannot have."""
+    """Function that makes the device, with power on at the given CLOCK_MONOTONIC. Raises ValueError for unsupported
+    options."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorHardware:
-    """Hardware of every simulated sensor, whatever its link."""
+    """Hardware of each simulated sensor, for all links."""
 
     motion: Motion = field(default_factory=swing)
     noise: Noise | None = None
     skew_ppm: float = 20.0
-    """Rate error of the crystal against the host's clock, 1e-6."""
+    """Rate error of the crystal relative to the host clock, 1e-6."""
     boot_ms: int = 500
-    """Silence after power-on and reboot."""
+    """Silence after power-on and restart, ms."""
     processing_ns: int = 125_000
-    """From the instant of measurement to the first bit on the wire."""
+    """Time from the measurement to the first bit on the wire, ns."""
 
     def reading(self, t_s: float) -> Truth:
-        """Measured values `t_s` seconds after the zero of the motion."""
+        """Return the measured values at `t_s` seconds after the zero of the motion."""
         truth = self.motion.at(t_s)
         return self.noise.add(truth, t_s) if self.noise else truth
 
 
 class SensorFields(TypedDict):
-    """Fields of `SensorHardware` by name."""
-
     motion: Motion
     noise: Noise | None
     skew_ppm: float
@@ -131,7 +129,7 @@ class SensorFields(TypedDict):
 
 
 def sensor_of(options: SimulatorOptions) -> SensorFields:
-    """The sensor from the common options. Raises ValueError for an unknown motion."""
+    """Return the sensor of the options. Raises ValueError for an unknown motion."""
     return {
         "motion": motion_of(options),
         "noise": noise_of(options),
@@ -142,12 +140,12 @@ def sensor_of(options: SimulatorOptions) -> SensorFields:
 
 
 def motion_of(options: SimulatorOptions) -> Motion:
-    """The motion by its name. Raises ValueError for an unknown one."""
+    """Return the motion of the options. Raises ValueError for an unknown name."""
     if options.motion not in MOTIONS:
         raise ValueError(f"motion {options.motion!r}: expected {' or '.join(MOTIONS)}")
     return MOTIONS[options.motion](options.gravity_m_s2)
 
 
 def noise_of(options: SimulatorOptions, number: int = 0) -> Noise | None:
-    """The noise of the device with this number, None for a perfect one."""
+    """Return the noise of the device with this number; None for a perfect device."""
     return Noise(options.seed + number) if options.noise == "real" else None

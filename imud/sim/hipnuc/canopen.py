@@ -1,14 +1,14 @@
-"""A HiPNUC module on a CAN bus with CANopen. Manual "IMU配置手冊" V1.5.9, chapter 5; for the rest CiA 301.
+"""A HiPNUC device on a CAN bus with CANopen. Manual "IMU配置手冊" V1.5.9, chapter 5; CiA 301.
 
-Without I/O and without a clock of its own. Its timers count milliseconds of its own crystal, which runs `skew_ppm`
-fast; what is due at one instant is measured then and sent back to back `processing_ns` later, TPDO1 first. After
-power-on it sends its boot-up message and is operational by itself (section 5.1). A heartbeat (0x1017) is off as
-delivered.
+The module contains no I/O and reads no clock. Its timers count milliseconds of its own crystal, which runs `skew_ppm`
+fast. The device measures all due values of one instant together and sends them back to back `processing_ns` later,
+TPDO1 first. After power-on it sends its boot-up message and becomes operational (section 5.1). The heartbeat (0x1017)
+is off by default.
 
-Section 5.4 names no object for reading; that settings can be read, and that 0x2000 and 0x20A5 cannot, is a guess. TPDO
-parameters, signs, zero and heartbeat apply at once; node number and bit rate when the module starts again. What is not
-saved is lost then. A factory reset clears the flash and changes nothing before that. Other behaviour that no manual
-rules out is in `NodeVariant`.
+Section 5.4 describes no reads of objects. Assumption: settings can be read, but 0x2000 and 0x20A5 cannot. TPDO
+parameters, signs, zero and heartbeat apply immediately; node number and bit rate apply after a restart. A restart loses
+unsaved settings. A factory reset clears the flash and has no effect before the restart. `NodeVariant` contains other
+behavior that the manuals allow.
 """
 
 from collections.abc import Callable, Container, Mapping
@@ -63,7 +63,7 @@ BAD_COMMAND: Final = 0x0504_0001
 DEVICE_TYPE: Final = 0
 NAME: Final = b"HI14"
 IDENTITY_VALUES: Final = {1: 0x0000_03E8, 2: 0x0000_0E14, 3: 0x0000_009C, 4: 0x1708_0042}
-"""Made up, as the manual shows none."""
+"""Identity values, invented: the manual contains none."""
 PERIODS_MS: Final = (0, *range(5, 1001))
 _BIT_RATE_OF: Final = {code: bit_s for bit_s, code in BIT_RATES.items()}
 _COMMANDS: Final = {size: command for command, size in reversed(READ_SIZES.items())}
@@ -80,22 +80,22 @@ class Control(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeVariant:
-    """Behaviour that differs between modules, or that no manual settles."""
+    """Behavior that differs between devices or that the manuals do not define."""
 
     reads: Literal["answered", "ignored", "aborted"] = "answered"
-    """Answer to SDO uploads."""
+    """Reply to SDO uploads."""
     number_at_once: bool = False
-    """Whether a new node number is in force at once; else after saving and restarting, as the manual says."""
+    """True: a new node number applies immediately. False: after save and restart, as in the manual."""
     confirms_from: Literal["old", "new"] = "old"
-    """Number from which a new number is confirmed that is in force at once."""
+    """Node number of the confirmation if a new number applies immediately."""
     sends_boot_up: bool = True
     confirms_restart: bool = True
     flash_ms: int = 0
-    """Time that saving takes before it is confirmed."""
+    """Time of a save until its confirmation, ms."""
     refuses: frozenset[int] = frozenset()
-    """Objects of which a write is aborted."""
+    """Objects whose write the device aborts."""
     ignores: frozenset[int] = frozenset()
-    """Objects of which a write is confirmed and changes nothing."""
+    """Objects whose write the device confirms without an effect."""
 
 
 NODE_VARIANTS: Final[Mapping[str, NodeVariant]] = {
@@ -109,7 +109,7 @@ NODE_VARIANTS: Final[Mapping[str, NodeVariant]] = {
     "restarts without a word": NodeVariant(sends_boot_up=False, confirms_restart=False),
     "slow flash": NodeVariant(flash_ms=1900),
 }
-"""One for each behaviour that is not settled: drivers work with all of them."""
+"""A variant for each undefined behavior. Drivers support all of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ class NodeSettings:
 
     node: int = NODE_DEFAULT
     bit_rate: int = 500_000
-    """In bit/s; 0: frames take no time."""
+    """Bit rate, bit/s; 0: frames take no time."""
     periods_ms: Mapping[int, int] = field(default_factory=lambda: {1: 10, 2: 10, 3: 10, 4: 10, 6: 50, 7: 10})
     types: Mapping[int, int] = field(default_factory=lambda: dict.fromkeys(TPDO_FUNCTIONS, 0xFF))
     invert_x: int = 0
@@ -126,7 +126,7 @@ class NodeSettings:
     heartbeat_ms: int = 0
 
     def signed(self, tilt: Pair, zero: Pair) -> Pair:
-        """The inclinometer's angles as they are sent."""
+        """Return the angles of the inclinometer in the form that the device sends."""
         x, y = tilt[0] - zero[0], tilt[1] - zero[1]
         return (-x if self.invert_x else x, -y if self.invert_y else y)
 
@@ -135,12 +135,12 @@ class _Entry(NamedTuple):
     size: int
     read: Callable[[NodeSettings], int] | None
     values: Container[int] = ()
-    """Accepted values; empty for read-only."""
+    """Accepted values; empty if the object is read-only."""
     write: Callable[[NodeSettings, int], NodeSettings] | None = None
 
 
 class ObjectDictionary:
-    """Live settings, those in flash, and the SDO server in front of them."""
+    """Active settings, settings in flash, and the SDO server."""
 
     def __init__(self, factory: NodeSettings, variant: NodeVariant | None = None) -> None:
         self.settings = self.saved = factory
@@ -149,11 +149,12 @@ class ObjectDictionary:
         self._variant = variant or NodeVariant()
 
     def restore(self) -> None:
-        """Restore the saved settings: the module starts."""
+        """Restore the saved settings at the start of the device."""
         self.settings = self.saved
 
     def serve(self, data: bytes) -> tuple[bytes, Control]:
-        """Answer an SDO request of eight bytes: the reply's data, empty for none, and its side effect."""
+        """Process an SDO request of eight bytes. Return the data of the reply, empty for no reply, and the side
+        effect."""
         index, sub = int.from_bytes(data[1:3], "little"), data[3]
         entry = _ENTRIES.get((index, sub))
         if entry is None:
@@ -257,7 +258,7 @@ _ENTRIES: Final = _entries()
 RATE_MIN_HZ, RATE_MAX_HZ = 1, 200
 TICKS_PER_S: Final = 1000
 TPDOS_DEFAULT: Final = (1, 2, 3, 4, 7)
-"""Sent at the rate of the options; the pressure comes at 20 Hz (section 5.2) or slower."""
+"""TPDOs that the device sends at the rate of the options. The pressure has a rate of at most 20 Hz (section 5.2)."""
 PRESSURE_PERIOD_MS: Final = 50
 
 
@@ -282,11 +283,9 @@ class HipnucCanopenModule:
 
     @property
     def node(self) -> int:
-        """Node number that it answers to."""
         return self._node
 
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
-        """Receive a frame of another node."""
         if extended or now_ns < self._begin_ns:
             return
         self._run(now_ns)
@@ -298,27 +297,23 @@ class HipnucCanopenModule:
             self._serve(data, now_ns)
 
     def mark(self, now_ns: int) -> None:
-        """No-op: the module has no sync input on this port."""
+        """Do nothing: the device has no sync input on this port."""
 
     def reboot(self, now_ns: int) -> None:
-        """Restart after a loss of power: unsaved settings are lost."""
         self._leaving = FrameWire(0, now_ns)
         self._power_on(now_ns)
 
     def advance(self, now_ns: int) -> list[SentFrame]:
-        """Return what has crossed the wire since the last call, in order."""
         self._run(now_ns)
         return [*self._leaving.sent(now_ns), *self._wire.sent(now_ns)]
 
     def next_ns(self) -> int | None:
-        """Time of the next output of `advance`; None for none."""
         waiting, tick = self._leaving.next_ns() or self._wire.next_ns(), self._next_tick()
         if waiting is not None or tick is None:
             return waiting
         return self._tick_ns(tick) + self.hardware.processing_ns + self._wire.frame_ns
 
     def counters(self) -> dict[str, int]:
-        """Instants of measurement and frames sent."""
         return {"samples_sent": self.samples_sent, "frames_sent": self.frames_sent}
 
     # --- time ----------------------------------------------------------------------------------------------------
@@ -339,7 +334,7 @@ class HipnucCanopenModule:
         return self._begin_ns + round(tick * NS_PER_MS / (1 + self.hardware.skew_ppm * 1e-6))
 
     def _run(self, now_ns: int) -> None:
-        """Send what the timers have made due by now."""
+        """Send all TPDOs whose timer has ended."""
         while (tick := self._next_tick()) is not None and (t_ns := self._tick_ns(tick)) <= now_ns:
             heartbeat_ms = self.objects.settings.heartbeat_ms
             if heartbeat_ms and tick % heartbeat_ms == 0:
@@ -348,14 +343,14 @@ class HipnucCanopenModule:
             self._tick = tick + 1
 
     def _timers(self) -> list[tuple[int, int]]:
-        """TPDOs that a timer sends now, with its period in ms."""
+        """Return the TPDOs with a timer, each with its period, ms."""
         if self._state is not NmtState.OPERATIONAL:
             return []
         periods = self.objects.settings.periods_ms.items()
         return [(n, period_ms) for n, period_ms in sorted(periods) if period_ms and not self._is_synchronous(n)]
 
     def _next_tick(self) -> int | None:
-        """End of the next timer, in ticks; None if none runs."""
+        """Return the end of the next timer, ticks; None if no timer runs."""
         periods_ms = [period_ms for _, period_ms in self._timers()]
         periods_ms += [self.objects.settings.heartbeat_ms] if self.objects.settings.heartbeat_ms else []
         return min((-(-self._tick // period_ms) * period_ms for period_ms in periods_ms), default=None)
@@ -392,7 +387,7 @@ class HipnucCanopenModule:
         return self.hardware.reading((t_ns - self.epoch_ns) / NS_PER_S)
 
     def _tilt(self, reading: Truth) -> Pair:
-        """X and Y of the inclinometer: taken to be pitch and roll, which the manual leaves open."""
+        """Return X and Y of the inclinometer. Assumption: pitch and roll; the manual does not define them."""
         roll, pitch, _ = euler312_from_quat(reading.quat_wxyz)
         return (pitch, roll)
 
@@ -414,7 +409,7 @@ class HipnucCanopenModule:
         elif control is Control.CANCEL_ZERO:
             self._incli_zero = (0.0, 0.0)
         elif control is Control.RESTART:
-            self._leaving = self._wire  # the reply still goes out
+            self._leaving = self._wire  # the device still sends the reply
             self._power_on(now_ns)
 
     def _manage(self, code: int, now_ns: int) -> None:
@@ -430,7 +425,7 @@ class HipnucCanopenModule:
 
 
 def make(options: SimulatorOptions, now_ns: int) -> HipnucCanopenModule:
-    """A module from the common options. Raises ValueError naming the option that it cannot have."""
+    """Return a device for the options. Raises ValueError for an unsupported option."""
     period_ms = TICKS_PER_S / options.rate_hz if options.rate_hz else 0
     if not RATE_MIN_HZ <= options.rate_hz <= RATE_MAX_HZ or period_ms % 1:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected a period of 5 … 1000 whole milliseconds")

@@ -1,13 +1,13 @@
-"""A HiPNUC module on SAE J1939: IMU configuration manual V1.5.9, chapter 6.
+"""A HiPNUC device on SAE J1939: IMU configuration manual V1.5.9, chapter 6.
 
-Without I/O and without a clock of its own. It samples at whole milliseconds of its own crystal, which runs `skew_ppm`
-fast; messages due in the same millisecond are of one instant and leave back to back, lowest PGN first, `processing_ns`
-later. Requests on PGN EF00 are obeyed at once and answered to 0x55, whatever the sender; a restart is not answered, nor
-is a message that is sent once, which answers by itself. After power-on, and when asked (PGN EA00), it claims its
-address (J1939-81). Registers 0x70 to 0x78 are those of Modbus. What else no manual settles is in `J1939Variant`.
-Assumed, where the manual is silent: an unknown register is not answered, a value out of range is answered with the
-value that stays, an interval applies from the next whole multiple of it, the zero concerns the inclinometer only, and
-the direction is turned after it.
+The module contains no I/O and reads no clock. The device samples at whole milliseconds of its own crystal, which runs
+`skew_ppm` fast. Messages that are due in the same millisecond belong to one instant. They leave back to back, lowest
+PGN first, `processing_ns` later. The device processes requests on PGN EF00 of any sender immediately and replies to
+0x55. It does not reply to a restart, nor to a request for one message, because the message is the reply. After power-on
+and after a request (PGN EA00), it claims its address (J1939-81). Registers 0x70 to 0x78 are the Modbus registers.
+`J1939Variant` contains behavior that the manuals do not define. Assumptions: no reply for an unknown register; a value
+out of range is answered with the unchanged value; an interval applies from its next whole multiple; the zero concerns
+the inclinometer only; the direction applies after the zero.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,7 +25,7 @@ from imud.sim.physics import Truth
 from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
 INTERVAL_MS: Final = 100
-"""Factory's interval of every message."""
+"""Default interval of each message, ms."""
 REPLY_NS: Final = 200_000
 """Time from a request to its reply (assumed)."""
 MESSAGES: Final = {
@@ -33,32 +33,32 @@ MESSAGES: Final = {
     "all": codec.PGNS,
     "inclinometer": (codec.INCLINOMETER,),
 }
-"""PGNs that are on, by the name of a message; `` is what every module has."""
+"""PGNs that are on, by the name of a message; empty name: the default of the factory."""
 SLOW: Final = (codec.TEMPERATURE, codec.UTC)
 SLOW_MS: Final = 1000
-"""Interval of those in `all`."""
+"""Interval of the slow messages of `all`, ms."""
 YEAR: Final = 2025
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class J1939Variant:
-    """Behaviour that differs between modules, or that no manual settles."""
+    """Behavior that differs between devices or that the manuals do not define."""
 
     reads: Literal["answered", "value_one", "ignored"] = "answered"
-    """Reads that are answered: all, those with the value 1, or none."""
+    """Reads with a reply: all reads, reads with the value 1, or none."""
     address_at_once: bool = False
-    """Whether a new address is in force at once; else after saving and restarting."""
+    """True: a new address applies immediately. False: after save and restart."""
     confirms_from: Literal["old", "new"] = "old"
-    """Address from which a new address is confirmed that is in force at once."""
+    """Source address of the confirmation if a new address applies immediately."""
     claims_address: bool = True
     confirms_restart: bool = False
     confirms_once: bool = False
     flash_ms: int = 0
-    """Time that saving takes before it is confirmed."""
+    """Time of a save until its confirmation, ms."""
     refuses: frozenset[int] = frozenset()
-    """Registers of which a write is answered with a status."""
+    """Registers whose write the device refuses with a status."""
     ignores: frozenset[int] = frozenset()
-    """Registers of which a write is confirmed and changes nothing."""
+    """Registers whose write the device confirms without an effect."""
 
 
 J1939_VARIANTS: Final[Mapping[str, J1939Variant]] = {
@@ -72,14 +72,14 @@ J1939_VARIANTS: Final[Mapping[str, J1939Variant]] = {
     "claims no address": J1939Variant(claims_address=False),
     "slow flash": J1939Variant(flash_ms=1900),
 }
-"""One for each behaviour that is not settled: drivers work with all of them."""
+"""A variant for each undefined behavior. Drivers support all of them."""
 
 REFUSED: Final = 1
-"""Status of a refusal (assumed: the vendor's programs say other than 0)."""
+"""Status of a refusal. Assumption: the programs of the vendor accept only 0."""
 PRODUCT: Final = "HI14R2N-CAN-000"
 FIRMWARE: Final = 169
 NAME: Final = (1 << 63 | 0x2A_1708).to_bytes(8, "little")
-"""Made up: arbitrary address capable, an identity number, nothing else."""
+"""NAME of the device, invented: arbitrary address capable, an identity number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,13 +87,13 @@ class J1939Settings:
     """Settings in flash."""
 
     intervals_ms: Mapping[int, int] = field(default_factory=lambda: dict.fromkeys(MESSAGES[""], INTERVAL_MS))
-    """Of the messages that are on."""
+    """Interval of each message that is on, ms."""
     bitrate_code: int = commands.BITRATES.index(BITRATE)
     address: int = FACTORY_ADDRESS
     x_reversed: int = 0
     y_reversed: int = 0
     zero_rad: tuple[float, float] = (0.0, 0.0)
-    """Physical angles that read as zero."""
+    """Physical angles that read as zero, rad."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,19 +101,19 @@ class J1939Hardware(SensorHardware):
     """Hardware of a module."""
 
     bitrate: int | None = None
-    """Of the bus in bit/s, 0 for frames that take no time; None for what it is set to."""
+    """Bit rate of the bus, bit/s; 0: frames take no time; None: the rate of the settings."""
     sends_heading_twice: bool = True
-    """As newer firmware does."""
+    """True: the heading message appears twice, as in newer firmware."""
     variant: J1939Variant = field(default_factory=J1939Variant)
 
 
 class HipnucJ1939Module:
-    """A simulated module, powered on from construction."""
+    """A simulated device. Its power is on from the start."""
 
     def __init__(
         self, now_ns: int, settings: J1939Settings | None = None, hardware: J1939Hardware | None = None
     ) -> None:
-        """`settings` are what its flash holds; after a factory reset they are `J1939Settings()`."""
+        """`settings` are the settings in flash. A factory reset restores `J1939Settings()`."""
         self.flash = self.settings = settings or J1939Settings()
         self.hardware = hardware or J1939Hardware()
         self.epoch_ns = now_ns
@@ -121,12 +121,11 @@ class HipnucJ1939Module:
         self.frames_sent = 0
         self.requests = self.writes_to_flash = 0
         self._leaving: list[SentFrame] = []
-        """Frames that were on their way when the restart was requested, the reply to that too."""
+        """Frames that were queued at the request of a restart, with its reply."""
         self._ns_per_ms = NS_PER_MS / (1 + self.hardware.skew_ppm * 1e-6)
         self._power_on(now_ns)
 
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
-        """Receive a frame of another node."""
         parts = split(can_id)
         asks_claim = extended and parts.pgn == commands.REQUEST and data[:3] == commands.CLAIMED.to_bytes(3, "little")
         if asks_claim and parts.destination in (self._address, GLOBAL) and now_ns >= self._begin_ns:
@@ -138,29 +137,26 @@ class HipnucJ1939Module:
             self._obey(register, command, value, now_ns)
 
     def mark(self, now_ns: int) -> None:
-        """No-op: the module has no sync input on this port."""
+        """Do nothing: the device has no sync input on this port."""
 
     def reboot(self, now_ns: int) -> None:
-        """Restart, on request or after a loss of power: unsaved settings are lost."""
+        """Restart after a request or a power failure. The device loses unsaved settings."""
         self.settings = self.flash
         self._power_on(now_ns)
 
     def advance(self, now_ns: int) -> list[SentFrame]:
-        """Return what has crossed the wire since the last call, in order."""
         self._sample(now_ns)
         left = [frame for frame in self._leaving if frame.due_ns <= now_ns]
         self._leaving = self._leaving[len(left) :]
         return left + self._wire.sent(now_ns)
 
     def next_ns(self) -> int | None:
-        """Time of the next output of `advance`; None for none."""
         waiting = self._leaving[0].due_ns if self._leaving else self._wire.next_ns()
         if waiting is not None or not self._next_ms:
             return waiting
         return self._instant_ns(min(self._next_ms.values())) + self.hardware.processing_ns + self._wire.extended_ns
 
     def counters(self) -> dict[str, int]:
-        """Instants, frames and requests."""
         return {"samples_sent": self.instants_sent, "frames_sent": self.frames_sent, "requests": self.requests}
 
     # --- messages ------------------------------------------------------------------------------------------------
@@ -207,7 +203,6 @@ class HipnucJ1939Module:
         self.frames_sent += 1
 
     def _packed(self, pgn: int, reading: Truth, sample_ns: int) -> bytes:
-        """The data of a message."""
         roll, pitch, yaw = reading.euler_rad
         rows: dict[int, Callable[[], bytes]] = {
             codec.ACCEL: lambda: codec.pack_accel(reading.accel_m_s2),
@@ -223,7 +218,7 @@ class HipnucJ1939Module:
         return rows[pgn]()
 
     def _inclination(self, reading: Truth) -> tuple[float, float]:
-        """The angles that FF4A carries."""
+        """Return the angles of FF4A."""
         settings = self.settings
         (x, y), (zero_x, zero_y) = physical_inclination(reading), settings.zero_rad
         return _within_pi(x - zero_x) * (-1) ** settings.x_reversed, _within_pi(y - zero_y) * (
@@ -250,7 +245,7 @@ class HipnucJ1939Module:
             self._write(register, value, now_ns)
 
     def _write(self, register: int, value: int, now_ns: int) -> None:
-        """Write a register, confirm it, and move to another address where that is in force at once."""
+        """Write a register and confirm it. Change the address if a new address applies immediately."""
         variant, before = self.hardware.variant, self._address
         if register not in variant.ignores:
             self._set(register, value, now_ns)
@@ -262,7 +257,7 @@ class HipnucJ1939Module:
         self._reply(register, WRITE, confirmed, now_ns, source=source)
 
     def _present(self, register: int) -> int | None:
-        """The value of a register that can be read."""
+        """Return the value of a readable register; None for other registers."""
         settings = self.settings
         for pgn, interval_register in commands.INTERVALS.items():
             if register == interval_register:
@@ -280,7 +275,7 @@ class HipnucJ1939Module:
         }.get(register)
 
     def _set(self, register: int, value: int, now_ns: int) -> None:
-        """Set a register to a value that is in range."""
+        """Set a register if the value is in range."""
         settings = self.settings
         pgn = next((pgn for pgn, address in commands.INTERVALS.items() if address == register), None)
         if pgn is not None and commands.INTERVAL_MIN_MS <= value <= commands.INTERVAL_MAX_MS:
@@ -327,7 +322,8 @@ class HipnucJ1939Module:
 
 
 def physical_inclination(reading: Truth) -> tuple[float, float]:
-    """Tilt about the sensor's Y and X as a dual-axis inclinometer shows it: the vertical in the sensor frame."""
+    """Return the tilt about Y and X of the sensor, as a dual-axis inclinometer measures it: the vertical in the sensor
+    frame."""
     roll, pitch, _ = reading.euler_rad
     up_x, up_y, up_z = -cos(pitch) * sin(roll), sin(pitch), cos(pitch) * cos(roll)
     return atan2(-up_x, up_z), atan2(up_y, up_z)
@@ -338,7 +334,7 @@ def _within_pi(angle: float) -> float:
 
 
 def make(options: SimulatorOptions, now_ns: int) -> HipnucJ1939Module:
-    """A module from the common options. Raises ValueError naming the option that it cannot have."""
+    """Return a device for the options. Raises ValueError for an unsupported option."""
     interval_ms = round(1000 / options.rate_hz) if options.rate_hz > 0 else 0
     if not commands.INTERVAL_MIN_MS <= interval_ms <= commands.INTERVAL_MAX_MS:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … {1000 // commands.INTERVAL_MIN_MS}")

@@ -1,16 +1,17 @@
-"""HiPNUC modules on one RS-485 line at the far end of a serial port. IMU configuration manual V1.5.9, chapter 4.
+"""HiPNUC devices on one RS-485 bus behind a serial port. IMU configuration manual V1.5.9, chapter 4.
 
-Without I/O and without a clock of its own. What the line does as a real one does:
+The module contains no I/O and reads no clock. It behaves as a real bus:
 
-- Every byte takes its time on the wire, in both directions. A frame ends with a silence of 3.5 characters; a module
-  answers `processing_ns` later. With `chunk_bytes` a reply arrives in pieces of so many bytes, each when it is through.
-- Two modules with the same ID answer at the same time: what arrives is the AND of both, as on a line that either pulls.
-- Requests to address 0 are obeyed by all and answered by none. A frame with a wrong CRC is not answered.
-- A new ID is in force at once, a new baud rate after saving and restarting. What is not saved is lost at a restart.
-- What no manual settles is in `SlaveVariant`.
+- Each byte takes its time on the wire, in both directions. A frame ends with a silence of 3.5 characters. A device
+  replies `processing_ns` later. With `chunk_bytes`, a reply arrives in pieces of this size.
+- Two devices with the same ID reply at the same time. The port receives the AND of both replies, as on a bus with open
+  drivers.
+- All devices process requests to address 0, and none replies. No device replies to a frame with a wrong CRC.
+- A new ID applies immediately, a new baud rate after save and restart. A restart loses unsaved settings.
+- `SlaveVariant` contains behavior that the manuals do not define.
 
-Assumed of a module: firmware from 1.6.9 on has MAIN_STATUS, UPTIME and a quaternion of 0.0001 per count, older has not.
-The attitude is the truth; mounting and levelling are confirmed and change nothing.
+Assumptions: firmware 1.6.9 and newer has MAIN_STATUS, UPTIME and a quaternion of 0.0001 per count. The attitude is the
+truth. The device confirms mounting and levelling without an effect.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -70,7 +71,7 @@ SHORT_BLOCK_END: Final = BY_NAME["UPTIME"].address
 
 @dataclass(frozen=True, slots=True)
 class SlaveSettings:
-    """Settings that CTRL saves."""
+    """Settings that the register CTRL saves."""
 
     slave: int = FACTORY_ID
     baud: int = FACTORY_BAUD
@@ -79,24 +80,24 @@ class SlaveSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlaveVariant:
-    """Behaviour that differs between modules, or that no manual settles."""
+    """Behavior that differs between devices or that the manuals do not define."""
 
     long_block: Literal["answered", "illegal_address", "failure", "silent"] = "answered"
-    """Answer of new firmware to a block that reaches beyond 0x4B; older firmware has illegal_address or worse."""
+    """Reply of new firmware to a block that extends beyond 0x4B. Older firmware replies illegal_address or worse."""
     address_at_once: bool = True
-    """Whether a new ID is in force at once, as the manual says; else after saving and restarting."""
+    """True: a new ID applies immediately, as in the manual. False: after save and restart."""
     address_reply: Literal["old", "new", "none"] = "old"
-    """From which address the confirmation of a new ID comes, where it is in force at once."""
+    """Address of the confirmation of a new ID that applies immediately."""
     rate_at_once: bool = False
     flash_ms: int = 0
-    """Time that saving takes before it is confirmed."""
+    """Time of a save until its confirmation, ms."""
     refuses: frozenset[str] = frozenset()
-    """Names of registers that answer a write with exception 3."""
+    """Names of registers whose write the device refuses with exception 3."""
     ignores: frozenset[str] = frozenset()
-    """Names of registers whose write is confirmed and changes nothing."""
+    """Names of registers whose write the device confirms without an effect."""
     confirms_restart: bool = True
     boot_ms: int = 0
-    """Silence after a restart."""
+    """Silence after a restart, ms."""
 
 
 SLAVE_VARIANTS: Final[Mapping[str, SlaveVariant]] = {
@@ -112,12 +113,12 @@ SLAVE_VARIANTS: Final[Mapping[str, SlaveVariant]] = {
     "restarts without a word": SlaveVariant(confirms_restart=False, boot_ms=800),
     "slow to boot": SlaveVariant(boot_ms=1500),
 }
-"""One for each behaviour that is not settled: drivers work with all of them."""
+"""A variant for each undefined behavior. Drivers support all of them."""
 
 
 @dataclass(slots=True)
 class Slave:
-    """A simulated module. Its fault settings may be changed at any time."""
+    """A simulated device. Tests can change its faults at any time."""
 
     serial: bytes
     settings: SlaveSettings = field(default_factory=SlaveSettings)
@@ -129,9 +130,9 @@ class Slave:
     noise: Noise | None = None
     skew_ppm: float = 20.0
     inclinometer: str = ""
-    """`single`, `dual`, or empty for a product without."""
+    """`single`, `dual`, or empty if the product has no inclinometer."""
     processing_ns: int = 300_000
-    """Time from the end of a request to the beginning of its reply (assumed)."""
+    """Time from the end of a request to the start of its reply, ns (assumption)."""
     dead: bool = False
     bad_crc: int = 0
     """Number of next replies with a wrong CRC."""
@@ -139,18 +140,18 @@ class Slave:
     """Number of next requests without a reply."""
     answered: int = 0
     hard_iron_t: Vector3 = (0.0, 0.0, 0.0)
-    """Field of what turns with it."""
+    """Magnetic field of parts that turn with the device, T."""
     magnetometer: SelfCalibration = field(init=False)
     flash: SlaveSettings = field(init=False)
     writes_to_flash: int = field(init=False, default=0)
     address: int = field(init=False)
-    """Address that it answers to now."""
+    """Current address."""
     baud: int = field(init=False)
-    """Rate that it has now."""
+    """Current baud rate, bit/s."""
     since_ns: int = field(init=False, default=0)
     """Power-on time (CLOCK_MONOTONIC)."""
     ready_ns: int = field(init=False, default=0)
-    """Until then it boots, and hears nothing."""
+    """Time at which the device has started and accepts requests, ns."""
 
     def __post_init__(self) -> None:
         self.flash = self.settings
@@ -158,18 +159,17 @@ class Slave:
         self.magnetometer = SelfCalibration(self.hard_iron_t, (0.0, 0.0, 0.0))
 
     def restart(self, now_ns: int) -> None:
-        """Restart: unsaved settings are lost."""
         self.settings, self.since_ns = self.flash, now_ns
         self.address, self.baud = self.settings.slave, self.settings.baud
         self.ready_ns = now_ns + self.variant.boot_ms * NS_PER_MS
 
     def delay_ns(self, request: bytes) -> int:
-        """Time from the end of a request to the beginning of its reply."""
         saves = request == WRITE.pack(WRITE_SINGLE, BY_NAME["CTRL"].address, SAVE)
         return self.processing_ns + (self.variant.flash_ms * NS_PER_MS if saves else 0)
 
     def replies_from(self, request: bytes, before: int) -> int | None:
-        """Address from which a request is answered that was obeyed; None where it is not. `before`: address before."""
+        """Return the address of the reply to a request; None for no reply. `before` is the address before the
+        request."""
         if request[0] == WRITE_SINGLE and len(request) == WRITE.size:
             _, register, value = WRITE.unpack(request)
             if register == BY_NAME["CTRL"].address and value == RESTART and not self.variant.confirms_restart:
@@ -182,11 +182,11 @@ class Slave:
         return before
 
     def uptime_ms(self, now_ns: int) -> int:
-        """Time since power-on, ms of its own crystal."""
+        """Return the time since power-on, ms of its own crystal."""
         return int((now_ns - self.since_ns) * (1 + self.skew_ppm * 1e-6)) // NS_PER_MS
 
     def obey(self, request: bytes, now_ns: int, epoch_ns: int, random: Random) -> bytes:
-        """Carry out a request (function and data); return the reply without address and CRC."""
+        """Process a request (function and data). Return the reply without address and CRC."""
         match request[0]:
             case function if function == READ_HOLDING and len(request) == READ.size:
                 _, first, count = READ.unpack(request)
@@ -207,7 +207,7 @@ class Slave:
         return bytes([function | EXCEPTION_BIT, code])
 
     def _read(self, first: int, count: int, now_ns: int, epoch_ns: int) -> bytes:
-        """Read registers; empty where one of them does not exist."""
+        """Read registers. Return no bytes if one of them does not exist."""
         new = self.firmware >= NEW_FIRMWARE
         settings = self.settings
         state, percent = self.magnetometer.state, int(100 * self.magnetometer.progress)
@@ -241,7 +241,7 @@ class Slave:
         )  # fmt: skip
 
     def _write(self, register: int, value: int, now_ns: int) -> int:
-        """Write a register; return 0, or the code of an exception."""
+        """Write a register. Return 0 or the code of an exception."""
         known = [one for one in BY_NAME.values() if one.address == register and "W" in one.access]
         if not known:
             return ILLEGAL_ADDRESS
@@ -283,7 +283,8 @@ class Slave:
 
 
 def incli_counts(truth: Truth, kind: str) -> tuple[int, int]:
-    """INCLI_X and INCLI_Y of a product of that kind: the angles of the vertical as the manual's example has them."""
+    """Return INCLI_X and INCLI_Y of a product of this kind: the angles of the vertical as in the example of the
+    manual."""
     if not kind:
         return 0, 0
     roll, pitch, _ = truth.euler_rad
@@ -295,12 +296,13 @@ def incli_counts(truth: Truth, kind: str) -> tuple[int, int]:
 
 
 class ModbusLine:
-    """The line and its modules, as a `StreamModule`: its output is what the host's port receives."""
+    """The bus and its devices as a `StreamModule`. Its output is the input of the port of the host."""
 
     def __init__(
         self, now_ns: int, slaves: Sequence[Slave], *, echo: bool = False, chunk_bytes: int = 0, seed: int = 1
     ) -> None:
-        """`echo`: the host's adapter receives what it sends. `chunk_bytes`: 0 for whole frames."""
+        """`echo`: the adapter of the host receives its own transmission. `chunk_bytes`: size of pieces; 0 for complete
+        frames."""
         self.slaves = list(slaves)
         self.epoch_ns = now_ns
         self.echo, self.chunk_bytes = echo, chunk_bytes
@@ -316,11 +318,10 @@ class ModbusLine:
 
     @property
     def baud(self) -> int:
-        """Rate of most modules: the first one's. Those of another rate receive and send garbage."""
+        """Baud rate of the first device. Devices with another rate receive and send invalid bytes."""
         return self._baud
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Receive bytes that the host sent."""
         self._finish(now_ns)
         begin_ns = max(now_ns, self._heard_ns)
         self._heard_ns = begin_ns + len(data) * uart_byte_ns(self.baud)
@@ -329,29 +330,25 @@ class ModbusLine:
             self._send(data, begin_ns, None)
 
     def advance(self, now_ns: int) -> list[Burst]:
-        """Return what has crossed the wire since the last call."""
         self._finish(now_ns)
         through = [burst for burst in self._waiting if burst.due_ns <= now_ns]
         del self._waiting[: len(through)]
         return through
 
     def next_ns(self) -> int | None:
-        """Time of the next byte on the line."""
         times = [self._waiting[0].due_ns] if self._waiting else []
         if self._heard:
             times.append(self._heard_ns + frame_gap_ns(self.baud))
         return min(times, default=None)
 
     def counters(self) -> dict[str, int]:
-        """Requests heard whole, damaged ones, and those answered."""
         answered = sum(slave.answered for slave in self.slaves)
         return {"requests": self.requests, "damaged": self.damaged, "answered": answered}
 
     def mark(self, _now_ns: int) -> None:
-        """No-op: these modules have no sync input."""
+        """Do nothing: the devices have no sync input."""
 
     def reboot(self, now_ns: int) -> None:
-        """Power all modules off."""
         self._waiting, self._heard, self._free_ns = [], b"", now_ns
         for slave in self.slaves:
             slave.restart(now_ns)
@@ -362,7 +359,7 @@ class ModbusLine:
             self._baud = self.slaves[0].baud
 
     def _finish(self, now_ns: int) -> None:
-        """Finish the frame if the line was silent for long enough."""
+        """Process the frame if the silence on the bus was long enough."""
         end_ns = self._heard_ns + frame_gap_ns(self.baud)
         if self._heard and now_ns >= end_ns:
             frame, self._heard = self._heard, b""
@@ -413,7 +410,7 @@ class ModbusLine:
 
 
 def _together(replies: Iterable[bytes]) -> bytes:
-    """Combine the replies of several modules that send at once."""
+    """Combine the replies of several devices that send at the same time."""
     whole = b""
     for reply in replies:
         whole = bytes(a & b for a, b in zip_longest(whole or reply, reply, fillvalue=0xFF))
@@ -421,7 +418,7 @@ def _together(replies: Iterable[bytes]) -> bytes:
 
 
 def slaves_at(addresses: Iterable[int], options: SimulatorOptions) -> list[Slave]:
-    """Modules with these addresses and consecutive serial numbers."""
+    """Return devices with these addresses and consecutive serial numbers."""
     return [
         Slave(
             (0x047D_955F_8D2A_1700 + number).to_bytes(8, "big"),
@@ -436,7 +433,8 @@ def slaves_at(addresses: Iterable[int], options: SimulatorOptions) -> list[Slave
 
 
 def make(options: SimulatorOptions, now_ns: int) -> ModbusLine:
-    """A line from the common options: `message` has the addresses of its modules, with commas. Raises ValueError."""
+    """Return a bus for the options. `message` contains the addresses of the devices, separated by commas. Raises
+    ValueError."""
     if options.baud and options.baud not in BAUD_RATES:
         raise ValueError(f"baud {options.baud}: expected one of {', '.join(map(str, BAUD_RATES))}")
     words = options.message.split(",") if options.message else [str(FACTORY_ID)]

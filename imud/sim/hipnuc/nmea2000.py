@@ -1,9 +1,9 @@
-"""A HiPNUC module, or any heading and attitude sensor, on NMEA 2000: PGNs 127250, 127251 and 127257.
+"""A HiPNUC device or another heading and attitude sensor on NMEA 2000: PGNs 127250, 127251 and 127257.
 
-Without I/O and without a clock of its own. It samples at whole periods of its own crystal, which runs `skew_ppm` fast,
-and sends the three messages of an instant, with the same SID, back to back `processing_ns` later. It ignores all other
-nodes and claims no address. Vessel and sensor frame: see `imud.drivers.hipnuc.nmea2000`. The rate of turn is
-the sensor's rate about its own z.
+The module contains no I/O and reads no clock. The device samples at whole periods of its own crystal, which runs
+`skew_ppm` fast. It sends the three messages of an instant back to back with the same SID, `processing_ns` later. It
+ignores other nodes and claims no address. Vessel and sensor frame: see `imud.drivers.hipnuc.nmea2000`. The rate of turn
+is the angular rate about z of the sensor.
 """
 
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ from imud.sim.physics import Truth
 from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
 BITRATE: Final = 250_000
-"""Of every NMEA 2000 bus."""
+"""Bit rate of NMEA 2000, bit/s."""
 RATE_MAX_HZ: Final = 100.0
 MESSAGES: Final = ("", "heading", "attitude")
-"""All three, or one alone."""
+"""Messages to send: empty for all three, or the name of one."""
 SIDS: Final = messages.SID_MOST + 1
 
 
@@ -37,8 +37,6 @@ class Nmea2000Hardware(SensorHardware):
 
 
 class HipnucNmea2000Module(PeriodicCanModule):
-    """A simulated sensor, powered on from construction."""
-
     def __init__(self, now_ns: int, hardware: Nmea2000Hardware | None = None) -> None:
         self.hardware = hardware = hardware or Nmea2000Hardware()
         frames = partial(_frames, hardware)
@@ -46,7 +44,7 @@ class HipnucNmea2000Module(PeriodicCanModule):
 
 
 def _frames(hardware: Nmea2000Hardware, number: int, reading: Truth) -> list[tuple[int, bytes]]:
-    """The messages of one instant, with the same SID; SIDs start anew at power-on."""
+    """Return the messages of one instant with the same SID. SIDs start again at power-on."""
     sid = number % SIDS
     heading = messages.HEADING, messages.pack_heading(sid, reading.euler_rad[2], hardware.reference)
     rate = messages.RATE_OF_TURN, messages.pack_rate_of_turn(sid, reading.gyro_rad_s[2])
@@ -56,7 +54,7 @@ def _frames(hardware: Nmea2000Hardware, number: int, reading: Truth) -> list[tup
 
 
 def make(options: SimulatorOptions, now_ns: int) -> HipnucNmea2000Module:
-    """A sensor from the common options. Raises ValueError naming the option that it cannot have."""
+    """Return a sensor for the options. Raises ValueError for an unsupported option."""
     if not 1 <= options.rate_hz <= RATE_MAX_HZ:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … {RATE_MAX_HZ:g}")
     if options.message not in MESSAGES:
