@@ -118,7 +118,12 @@ def make_parser() -> argparse.ArgumentParser:
     add("--node", type=int, default=default.node, metavar="N", help="node, address or first identifier on a CAN bus")
     add("--at-once", action="store_true", help="CAN frames of one instant leave together, not paced by the bit rate")
     add("--rate", type=float, default=default.rate_hz, metavar="HZ", help="samples per second (%(default)s)")
-    add("--baud", type=int, default=0, help="rate of the port (the slowest common one that carries the samples)")
+    add(
+        "--baud",
+        type=int,
+        default=0,
+        help="baud rate of the port, bit/s (default: the slowest usual rate that carries the samples)",
+    )
     add("--message", default="", help="message to send (the factory's)")
     add("--motion", choices=sorted(MOTIONS), default=default.motion, help="known motion (%(default)s)")
     add("--gravity", type=float, default=GRAVITY_M_S2, metavar="M_S2", help="local gravity (%(default)s m/s²)")
@@ -133,7 +138,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--pins", default="", metavar="NAME=PATH,…", help="pins by name (sout sout_div alarm), each on a `pull` file "
         "of a gpio-sim line")  # fmt: skip
     add("--pin-faults", default="", metavar="KIND=P,…", help="probability per pulse: lose_pulse lose_edge extra")
-    add("--pin-settle", type=float, default=0.0, metavar="MS", help="nothing else happens so long after a rising edge")
+    add("--pin-settle", type=float, default=0.0, metavar="MS", help="wait this time after each rising edge")
     add("--pin-truth", type=Path, metavar="FILE", help="write edges, CSV: pin,level,due_ns,sample_ns,step_ns")
     add("--sin", type=Path, metavar="PATH", help="SIN: the `value` file of a gpio-sim line, looked at every "
         f"{SIN_LOOK_NS / NS_PER_MS:g} ms")  # fmt: skip

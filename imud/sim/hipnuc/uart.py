@@ -1,19 +1,22 @@
-"""A HiPNUC module (CH0x0, CH10x, HI14) at the far end of a UART: IMU configuration manual V1.5.9, chapters 1-3, 8.
+"""A HiPNUC device (CH0x0, CH10x, HI14) on a UART: IMU configuration manual V1.5.9, chapters 1-3, 8.
 
-Without I/O and without a clock of its own: the owner passes what the host sent to `receive` and collects what the
-module sent with `advance`. What it does as a real one does:
+The module contains no I/O and reads no clock: its owner passes the bytes of the host to `receive` and gets the bytes of
+the device from `advance`. It behaves as a real device:
 
-- It samples at whole milliseconds of its own crystal, which runs `skew_ppm` fast; `system_time` counts from power-on.
-- A frame leaves `processing_ns` after its sample, when the wire is free; text goes between whole frames. What does not
-  fit the transmit buffer is never sent: at 115200 baud and 1 kHz six frames of seven are missing.
-- Commands are lines of ASCII, obeyed at once; a known one is answered with `OK` or `ERR`, an unknown one not at all.
-  URFR acts after SAVECONFIG and REBOOT only. What is not saved is lost at a reboot. YAW is never saved. When
-  SERIALCONFIG and FRESET act, and other things that the manual leaves open, is in `behaviour.py`.
-- SOUT pulses before every frame, a rising edge on SIN sends messages set to ONMARK, the other pins and UTC are in
-  `pins.py` and `utc.py`; `pins` returns edges as `advance` returns bytes.
-- LOG DISABLE silences frames, not replies, and is forgotten at a reboot (assumed; the manual calls ENABLE the default).
+- It samples at whole milliseconds of its own crystal, which runs `skew_ppm` fast. `system_time` counts from power-on.
+- A frame leaves `processing_ns` after its sample, when the wire is free. Text is sent between complete frames. The
+  device drops a frame that does not fit into the transmit buffer: at 115200 baud and 1 kHz it drops six of seven
+  frames.
+- Commands are lines of ASCII, processed immediately. The reply to a known command is `OK` or `ERR`; an unknown command
+  has no reply. URFR acts only after SAVECONFIG and REBOOT. A restart loses unsaved settings. The device never saves
+  YAW. The class `Behaviour` contains the moments at which SERIALCONFIG and FRESET act, and other behavior that the
+  manual does not define.
+- SOUT has a pulse before each frame. A rising edge on SIN sends the messages that are set to ONMARK. `pins` returns
+  edges as `advance` returns bytes.
+- LOG DISABLE stops frames, not replies. It ends at a restart (assumption: the manual calls ENABLE the default).
 
-Attitude is the truth in both modes; heading does not start at zero in six-axis mode, as it would in a real module.
+The attitude is the truth in both modes. In six-axis mode, the heading of a real device starts at zero; here it does
+not.
 """
 
 from bisect import bisect_right, insort
@@ -49,25 +52,25 @@ from imud.sim.sensor import Burst, Simulator, SimulatorOptions, sensor_of
 SOUT_HIGH_NS: Final = 80 * NS_PER_US
 ALARM_PERIOD_MS: Final = 10
 EDGES_MAX: Final = 8192
-"""Edges kept for an owner that does not ask for them, the newest."""
+"""Maximum number of stored edges. The newest edges stay if the owner does not collect them."""
 
 
 class HipnucPins:
-    """Pending edges and present levels. Synchronization: one thread."""
+    """Pending edges and current levels. Synchronization: one thread."""
 
     def __init__(self) -> None:
         self._waiting: list[PinEdge] = []
         self._alarm = False
-        """Level of ALARM after all edges that wait."""
+        """Level of ALARM after all pending edges."""
         self._pulses = 0
-        """SOUT pulses since the last that SOUT_DIV repeated."""
+        """Number of SOUT pulses since the last pulse of SOUT_DIV."""
 
     def restart_divider(self) -> None:
-        """Restart the count of the divider: it was set anew."""
+        """Restart the counter of the divider after a change of its setting."""
         self._pulses = 0
 
     def frame(self, start_ns: int, high_ns: int, divider: int, sample_ns: int) -> None:
-        """Schedule the pulse, `high_ns` long, before a frame that begins on the wire at `start_ns`."""
+        """Schedule a pulse of `high_ns` before a frame that starts on the wire at `start_ns`."""
         pins = [Pin.SOUT]
         self._pulses += 1
         if self._pulses >= divider:
@@ -78,23 +81,23 @@ class HipnucPins:
             self._add(PinEdge(start_ns, pin, False, sample_ns))
 
     def alarm(self, at_ns: int, active: bool) -> None:
-        """Set the level of ALARM from now on."""
+        """Set the level of ALARM at `at_ns`."""
         if active != self._alarm:
             self._alarm = active
             self._add(PinEdge(at_ns, Pin.ALARM, active))
 
     def edges(self, now_ns: int) -> list[PinEdge]:
-        """Return and remove the edges that have happened by now."""
+        """Return and remove the edges up to now."""
         count = bisect_right(self._waiting, now_ns, key=_due_ns)
         done, self._waiting = self._waiting[:count], self._waiting[count:]
         return done
 
     def next_ns(self) -> int | None:
-        """Time of the next edge that is known."""
+        """Return the time of the next scheduled edge; None if there is none."""
         return self._waiting[0].due_ns if self._waiting else None
 
     def power_lost(self, now_ns: int) -> None:
-        """Cancel pending edges; pins that are high fall."""
+        """Cancel pending edges. High pins become low."""
         count = bisect_right(self._waiting, now_ns, key=_due_ns)
         dropped = self._waiting[count:]
         del self._waiting[count:]
@@ -114,7 +117,7 @@ class HipnucPins:
 
 
 def is_alarming(settings: ModuleSettings, euler_rad: Vector3) -> bool:
-    """Whether an angle is out of the range that PMUX5 has set for it."""
+    """Return whether an angle is outside the range of PMUX5."""
     roll, pitch, _ = euler_rad
     return any(
         alarm.enabled and not alarm.low_deg <= degrees(angle_rad) <= alarm.high_deg
@@ -128,37 +131,38 @@ def _due_ns(edge: PinEdge) -> int:
 
 FACTORY_BAUD: Final = ModuleSettings().baud
 MAIN_STATUS_FIRMWARE: Final = 169
-"""From here on HI91 bytes 1-2 are MAIN_STATUS instead of the PPS stamp."""
+"""Firmware since which HI91 bytes 1-2 are MAIN_STATUS and not the PPS time."""
 TX_BUFFER_BYTES: Final = 512
-"""A frame that would make more than this wait for the wire is not sent."""
+"""Maximum number of bytes that wait for the wire. The device drops a frame that exceeds it."""
 COMMAND_BYTES_MAX: Final = 128
-"""Assumed; the longest command of the manual, URFR, has 123 with nine decimals."""
+"""Maximum length of a command, bytes (assumption). The longest command of the manual, URFR, has 123 with nine
+decimals."""
 REPLY_NS: Final = 200_000
-"""Time from the end of a command to its reply (assumed)."""
+"""Time from the end of a command to its reply, ns (assumption)."""
 WRITES_FLASH: Final = ("SAVECONFIG", "FRESET")
 RATE_CHANGE_NS: Final = 5 * NS_PER_MS
-"""From an answer to the change of the rate, where that follows the answer (assumed)."""
+"""Time from a reply to the change of the baud rate, ns, if the change follows the reply (assumption)."""
 PPS_MODULUS_MS: Final = 8192
-"""The PPS stamp free-runs 0 … 8191 without edges (recorded so)."""
+"""Modulus of the PPS time without edges, ms. A recording shows 0 to 8191."""
 NEAR_LEVEL_RAD: Final = radians(5)
-"""ATT RST 3 acts within this of level."""
+"""Maximum tilt at which ATT RST 3 acts, rad."""
 _PRINTABLE = range(0x20, 0x7F)
 _FRAME_BYTES: Final = {OutputMessage.HI91: 82, OutputMessage.HI92: 54}
 
 
 class HipnucModule:
-    """A simulated module, powered on from construction."""
+    """A simulated device. Its power is on from the start."""
 
     def __init__(
         self, now_ns: int, settings: ModuleSettings | None = None, hardware: HipnucHardware | None = None
     ) -> None:
-        """`settings` are what its flash holds."""
+        """`settings` are the settings in flash."""
         self.hardware = hardware or HipnucHardware()
         self.flash = self.settings = settings or ModuleSettings()
         self.epoch_ns = now_ns
         self.frames_sent = 0
         self.frames_dropped = 0
-        """Frames that did not fit the wire."""
+        """Number of frames that did not fit into the transmit buffer."""
         self._scale = NS_PER_S + round(self.hardware.skew_ppm * 1000)  # device ns per 1e9 ns of the host
         self._before_reboot: list[Burst] = []
         self._pins = HipnucPins()
@@ -170,11 +174,10 @@ class HipnucModule:
 
     @property
     def baud(self) -> int:
-        """Rate in bit/s in force."""
         return self._wire.baud
 
     def reboot(self, now_ns: int) -> None:
-        """Restart, by REBOOT or after a loss of power: unsaved settings are lost."""
+        """Restart after REBOOT or a power failure. The device loses unsaved settings."""
         self._sample(now_ns)
         self._before_reboot += self._wire.stopped(now_ns)
         self._pins.power_lost(now_ns)
@@ -182,9 +185,8 @@ class HipnucModule:
         self._power_on(now_ns, 0)
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Receive bytes that the host sent, already sampled at the module's rate."""
         self._sample(now_ns)
-        if now_ns < self._ready_ns:  # still booting
+        if now_ns < self._ready_ns:  # the device still starts
             return
         for byte in data:
             if byte == 0x0A:
@@ -200,9 +202,9 @@ class HipnucModule:
                 self._line.clear()
 
     def mark(self, now_ns: int) -> None:
-        """Pulse SIN/PPS (a rising edge): the PPS stamp starts anew, and messages set to ONMARK are sent."""
+        """Process a rising edge on SIN/PPS: restart the PPS time and send the messages that are set to ONMARK."""
         self._sample(now_ns)
-        if now_ns < self._ready_ns:  # still booting
+        if now_ns < self._ready_ns:  # the device still starts
             return
         self._pps_ns = self._device_ns(now_ns)
         self._utc.pulse(self._pps_ns)
@@ -210,13 +212,11 @@ class HipnucModule:
             self._send_marked(message, now_ns)
 
     def advance(self, now_ns: int) -> list[Burst]:
-        """Return what has left the wire since the last call, in order."""
         self._sample(now_ns)
         done, self._before_reboot = self._before_reboot, []
         return done + self._wire.sent(now_ns)
 
     def next_ns(self) -> int | None:
-        """Time of the next output of `advance`; None for none."""
         if self._before_reboot:
             return self._before_reboot[0].due_ns
         if (due_ns := self._wire.next_ns()) is not None or not self._next_ms:
@@ -231,7 +231,7 @@ class HipnucModule:
         return self._pins.edges(now_ns)
 
     def next_pin_ns(self) -> int | None:
-        """Time of the next output of `pins`; None for none."""
+        """Return the time of the next edge of `pins`; None if no edge is due."""
         times = [] if (next_ns := self._pins.next_ns()) is None else [next_ns]
         if self._next_ms:
             times.append(self._instant_ns(min(self._next_ms.values())))
@@ -240,7 +240,7 @@ class HipnucModule:
         return min(times, default=None)
 
     def counters(self) -> dict[str, int]:
-        """Counters of frames by their fate."""
+        """Return the numbers of sent and dropped frames."""
         return {"frames_sent": self.frames_sent, "frames_dropped": self.frames_dropped}
 
     def _power_on(self, now_ns: int, uptime_ms: int) -> None:
@@ -258,7 +258,7 @@ class HipnucModule:
         self._settings_changed(self._ready_ns)
 
     def _settings_changed(self, now_ns: int) -> None:
-        """Schedule the messages after `now_ns` and put the turns of the attitude in force."""
+        """Schedule the messages after `now_ns` and apply the rotations of the attitude."""
         settings, device_ms = self.settings, self._device_ms(now_ns)
         self._outputs = {OutputMessage.HI91: settings.hi91, OutputMessage.HI92: settings.hi92}
         self._mounting = MountingRotation(self._frame, settings.level, settings.level_accel, self._yaw_rad)
@@ -272,18 +272,18 @@ class HipnucModule:
                 self._next_ms[message] = (device_ms // output.period_ms + 1) * output.period_ms
 
     def _device_ms(self, now_ns: int) -> int:
-        """Device time, not wrapped."""
+        """Return the device time without wrap, ms."""
         return self._device_ns(now_ns) // NS_PER_MS
 
     def _device_ns(self, now_ns: int) -> int:
         return self._on_ms * NS_PER_MS + (now_ns - self._on_ns) * self._scale // NS_PER_S
 
     def _instant_ns(self, device_ms: int) -> int:
-        """First host time at which the device's clock shows `device_ms`."""
+        """Return the first host time at which the device time is `device_ms`."""
         return self._on_ns - (self._on_ms - device_ms) * NS_PER_MS * NS_PER_S // self._scale
 
     def _sample(self, now_ns: int) -> None:
-        """Sample up to now and queue the frames; check the angles for ALARM as often as is due."""
+        """Sample up to now and queue the frames. Check the angles for ALARM at its interval."""
         if 0 < self._rate_at_ns <= now_ns:
             self._change_rate(self._rate_at_ns)
         self._watch_angles(now_ns)
@@ -308,7 +308,7 @@ class HipnucModule:
             )
 
     def _queue_frame(self, message: OutputMessage, sample_ns: int, device_ms: int, later_ns: int = 0) -> None:
-        """Queue a frame; `later_ns`: its delay in addition to the usual one."""
+        """Queue a frame. `later_ns` is an additional delay."""
         processing_ns = max(self.hardware.processing_ns + later_ns, 0)
         ready_ns, size = sample_ns + processing_ns, _FRAME_BYTES[message]
         if ready_ns < self._quiet_until_ns or not self._wire.fits(ready_ns, size):
@@ -344,12 +344,12 @@ class HipnucModule:
         )  # fmt: skip
 
     def _reading(self, sample_ns: int) -> Truth:
-        """Return the measurement at an instant, noise and mounting included."""
+        """Return the measurement at an instant with noise and mounting."""
         truth = self._truth(sample_ns)
         return self.hardware.noise.add(truth, self._t_s(sample_ns)) if self.hardware.noise else truth
 
     def _truth(self, at_ns: int) -> Truth:
-        """Return the measurement of an ideal module that is mounted and levelled like this one."""
+        """Return the measurement of an ideal device with the same mounting and levelling."""
         truth = self.hardware.motion.at(self._t_s(at_ns))
         return self._mounting.turned(truth) if self._mounting.active else truth
 
@@ -381,7 +381,7 @@ class HipnucModule:
                 self._rate_at_ns = self._wire.due_ns(now_ns, 0) + RATE_CHANGE_NS
 
     def _change(self, settings: ModuleSettings, now_ns: int) -> None:
-        """Put settings in force that a command has changed."""
+        """Apply the settings that a command changed."""
         before, self.settings = self.settings, settings
         if settings.sout_div != before.sout_div:
             self._pins.restart_divider()
@@ -390,7 +390,7 @@ class HipnucModule:
         self._settings_changed(now_ns)
 
     def _change_rate(self, now_ns: int) -> None:
-        """Put the baud rate in force; what waits for the wire is lost."""
+        """Apply the baud rate. Bytes that wait for the wire are lost."""
         self._rate_at_ns = 0
         self._before_reboot += self._wire.stopped(now_ns)
         self._wire = Transmitter(self.settings.baud, TX_BUFFER_BYTES, now_ns)
@@ -401,7 +401,8 @@ class HipnucModule:
         self._quiet_until_ns = now_ns + self.hardware.behaviour.quiet_ms * NS_PER_MS
 
     def _make_actions(self) -> dict[str, Callable[[int], list[str] | None]]:
-        """Commands without a value that do more than change settings: reply lines before `OK`, None for no reply."""
+        """Return the commands without a value that do more than change settings. They return the lines before `OK`;
+        None for no reply."""
         hardware = self.hardware
         version = [
             f"PNAME={hardware.product}",
@@ -458,25 +459,25 @@ class HipnucModule:
         return []
 
     def _attitude(self, now_ns: int) -> Truth:
-        """The attitude without levelling and without CONFIG YAW."""
+        """Return the attitude without levelling and without CONFIG YAW."""
         return MountingRotation(self._frame).turned(self.hardware.motion.at(self._t_s(now_ns)))
 
     def _level(self, kind: str, now_ns: int) -> list[str]:
-        """Carry out CONFIG ATT RST: 2 levels here, 3 only where nearly level (upside down allowed), 5 cancels."""
+        """Process CONFIG ATT RST: 2 levels here, 3 only near level (also upside down), 5 cancels."""
         if kind not in ("2", "3", "5"):
             raise CommandRefused(kind)
         attitude = self._attitude(now_ns)
         roll, pitch, _ = attitude.euler_rad
         upside_down = kind == "3" and abs(roll) > pi / 2
         if kind == "3" and max(abs(pitch), pi - abs(roll) if upside_down else abs(roll)) >= NEAR_LEVEL_RAD:
-            raise CommandRefused(kind)  # the manual says it does nothing; that it answers ERR is assumed
+            raise CommandRefused(kind)  # the manual: no effect; assumption: the reply is ERR
         level = ModuleSettings().level if kind == "5" else level_of(attitude.quat_wxyz, upside_down)
         self.settings = replace(self.settings, level=level, level_accel=kind == "3")
         self._settings_changed(now_ns)
         return []
 
     def _set_yaw(self, mode: str, value: str, now_ns: int) -> list[str]:
-        """Carry out CONFIG YAW: 0 adds to the heading, 1 sets it."""
+        """Process CONFIG YAW: 0 adds to the heading, 1 sets the heading."""
         angle_rad = radians(number(value, -180.0, 180.0))
         if mode not in ("0", "1"):
             raise CommandRefused(mode)
@@ -488,7 +489,7 @@ class HipnucModule:
 
 
 def make(options: SimulatorOptions, now_ns: int) -> HipnucModule:
-    """A module from the common options. Raises ValueError naming the option that it cannot have."""
+    """Return a device for the options. Raises ValueError for an unsupported option."""
     period_ms = round(1000 / options.rate_hz) if options.rate_hz > 0 else 0
     if not 1 <= period_ms <= 1000 or abs(period_ms * options.rate_hz - 1000) > 10:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … 1000 Hz, and 1000 divided by a whole number")

@@ -1,7 +1,7 @@
-"""Hardware of a simulated HiPNUC module, its settings in RAM and flash, the commands that change them, status bits.
+"""Hardware of a simulated HiPNUC device, its settings in RAM and flash, the commands that change them, status bits.
 
-IMU configuration manual V1.5.9, chapters 2.2.3 to 2.2.6 and 8.2. The forms of the USRCONFIG and COMCONFIG replies
-beyond `ATT_MODE: 0` are assumed: the manual does not print them.
+IMU configuration manual V1.5.9, chapters 2.2.3 to 2.2.6 and 8.2. The manual prints only `ATT_MODE: 0` of the replies to
+USRCONFIG and COMCONFIG. The other lines are assumptions.
 """
 
 import re
@@ -21,41 +21,41 @@ from imud.sim.sensor import SensorHardware
 
 
 class RateChange(Enum):
-    """Moments at which SERIALCONFIG changes the rate of the line."""
+    """Moments at which SERIALCONFIG changes the baud rate."""
 
     AFTER_RESTART = "after restart"
     """After SAVECONFIG and REBOOT."""
     BEFORE_ANSWER = "before answer"
-    """At once: the answer comes at the new rate."""
+    """Immediately: the reply has the new rate."""
     AFTER_ANSWER = "after answer"
-    """At once: the answer comes at the old rate."""
+    """Immediately after the reply: the reply has the old rate."""
 
 
 class ResetEffect(Enum):
-    """Moments at which FRESET puts the factory settings in force."""
+    """Moments at which FRESET applies the factory settings."""
 
     RATE_AFTER_RESTART = "rate after restart"
-    """All settings at once, but the baud rate after a restart."""
+    """All settings immediately, the baud rate after a restart."""
     AFTER_RESTART = "after restart"
-    """Nothing changes until a restart."""
+    """All settings after a restart."""
     BEFORE_ANSWER = "before answer"
-    """Everything at once: the answer comes at the factory's rate."""
+    """All settings immediately: the reply has the rate of the factory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Behaviour:
-    """One way to read the manual."""
+    """One interpretation of the manual."""
 
     rate_change: RateChange = RateChange.AFTER_RESTART
     factory_reset: ResetEffect = ResetEffect.RATE_AFTER_RESTART
     flash_ms: int = 0
-    """Time of SAVECONFIG and FRESET until their answer; no frame is sent meanwhile."""
+    """Time of SAVECONFIG and FRESET until their reply, ms. The device sends no frame in this time."""
     quiet_ms: int = 0
-    """Time after an answer in which no frame is sent."""
+    """Time after a reply without frames, ms."""
     refuses: tuple[str, ...] = ()
-    """Beginnings of commands that are answered with ERR."""
+    """First words of commands that the device refuses with ERR."""
     ignores: tuple[str, ...] = ()
-    """Beginnings of commands that are unknown: they get no answer."""
+    """First words of commands that the device does not know. It sends no reply."""
 
 
 AS_IN_MANUAL: Final = Behaviour()
@@ -74,7 +74,7 @@ VARIANTS: Final[Mapping[str, Behaviour]] = {
         rate_change=RateChange.BEFORE_ANSWER, factory_reset=ResetEffect.BEFORE_ANSWER, flash_ms=2000, quiet_ms=300
     ),
 }
-"""The simulated variants by name."""
+"""Simulated variants by name."""
 
 Epoch = Literal["unix", "day"]
 MODULUS_MS: Final[dict[Epoch, int]] = {"unix": 2**32, "day": 86_400_000}
@@ -83,27 +83,28 @@ STEP_TOLERANCE_NS: Final = 10 * NS_PER_MS
 INTERVALS_NEEDED: Final = 2
 SENTENCES_NEEDED: Final = 2
 REGAIN_NS: Final = 100 * NS_PER_MS
-"""Largest distance of a pulse from a full second at which it counts without a sentence."""
+"""Maximum distance of a pulse from a full second at which it counts without a sentence, ns."""
 LOST_NS: Final = 2 * NS_PER_S
 UPTIME_MODULUS_MS: Final = 2**32
 
 
 class UtcTime:
-    """Time in the module's frames. Arguments are ns of its own clock since power-on. Synchronization: one thread."""
+    """UTC in the frames of the device. Arguments are ns of its own clock since power-on. Synchronization: one
+    thread."""
 
     def __init__(self, epoch: Epoch) -> None:
         self._modulus_ms = MODULUS_MS[epoch]
         self._anchor: tuple[int, int] | None = None
-        """The module's clock at a pulse, and the UTC second of that."""
+        """Device time of a pulse and the UTC second of this pulse."""
         self._pulse_ns: int | None = None
         self._intervals = 0
-        """Intervals in step up to the last pulse."""
+        """Number of correct intervals up to the last pulse."""
         self._claim_s: int | None = None
-        """The second that sentences give the last pulse."""
+        """UTC second that sentences give for the last pulse."""
         self._agreed = 0
 
     def pulse(self, device_ns: int) -> None:
-        """Note a rising edge on SIN/PPS."""
+        """Process a rising edge on SIN/PPS."""
         in_step = self._pulse_ns is not None and abs(device_ns - self._pulse_ns - NS_PER_S) <= STEP_TOLERANCE_NS
         if in_step and self._claim_s is not None:
             self._claim_s += 1
@@ -118,7 +119,7 @@ class UtcTime:
                 self._anchor = device_ns, second + seconds
 
     def sentence(self, line: bytes, device_ns: int) -> None:
-        """Process a line that begins with `$`; all but valid RMC sentences are ignored."""
+        """Process a line that starts with `$`. Ignore all lines except valid RMC sentences."""
         rmc = parse(line)
         if not isinstance(rmc, Rmc) or not rmc.valid or self._pulse_ns is None:
             return
@@ -131,11 +132,11 @@ class UtcTime:
             self._anchor = self._pulse_ns, rmc.unix_s
 
     def synchronised(self, device_ns: int) -> bool:
-        """Whether the time is UTC and pulses keep it so."""
+        """Return whether the time is UTC and pulses keep it correct."""
         return self._anchor is not None and device_ns - self._anchor[0] < LOST_NS
 
     def shown_ms(self, device_ns: int) -> int:
-        """`system_time` of a frame sampled now."""
+        """Return `system_time` of a frame sampled now."""
         if self._anchor is None:
             return device_ns // NS_PER_MS % UPTIME_MODULUS_MS
         anchor_ns, second = self._anchor
@@ -143,18 +144,18 @@ class UtcTime:
 
 
 PMUX_FIRMWARE: Final = 155
-"""PMUX commands need firmware 1.5.5 (chapter 2.2.4)."""
+"""Minimum firmware for PMUX commands, 1.5.5 (chapter 2.2.4)."""
 URFR_TOLERANCE: Final = 1e-3
-"""Assumed: how far from a rotation a URFR matrix may be. Users type three or four digits."""
+"""Maximum deviation of a URFR matrix from a rotation (assumption). Users type three or four digits."""
 
 
 class CommandRefused(ValueError):
-    """A known command with a value out of range; the module answers `ERR`."""
+    """A known command with a value out of range. The reply is `ERR`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """An output message: sent every `period_ms` (0: never), or with each pulse on SIN."""
+    """Output of one message: every `period_ms` (0: off), or with each pulse on SIN."""
 
     period_ms: int = 0
     on_mark: bool = False
@@ -165,7 +166,7 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class AlarmSetting:
-    """Angle alarm of one axis (PMUX5), angles in degrees."""
+    """Angle alarm of one axis (PMUX5), degrees."""
 
     low_deg: float = -5.0
     high_deg: float = 5.0
@@ -177,17 +178,17 @@ class AlarmSetting:
 
 @dataclass(frozen=True, slots=True)
 class ModuleSettings:
-    """Settings that SAVECONFIG saves. The defaults are the factory's (chapter 3.2: HI91 at 100 Hz)."""
+    """Settings that SAVECONFIG saves. The defaults are the defaults of the factory (chapter 3.2: HI91 at 100 Hz)."""
 
     baud: int = 115_200
     att_mode: int = 0
     """0: six axes; 1: nine axes, heading from the magnetic field."""
     urfr: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    """C in v_before = C · v_after, rows first (CONFIG IMU URFR)."""
+    """Matrix C in v_before = C · v_after, row by row (CONFIG IMU URFR)."""
     level: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """Turn of the attitude about the body that ATT RST found."""
+    """Rotation of the attitude about the body from ATT RST."""
     level_accel: bool = False
-    """Whether the accelerometer is turned as well (ATT RST 3)."""
+    """True if the rotation also applies to the accelerometer (ATT RST 3)."""
     mag_calibration: bool = True
     hi91: Output = Output(10)
     hi92: Output = Output()
@@ -198,7 +199,7 @@ class ModuleSettings:
     alarm_y: AlarmSetting = AlarmSetting()
 
     def user_lines(self) -> list[str]:
-        """Reply to LOG USRCONFIG."""
+        """Return the lines of the reply to LOG USRCONFIG."""
         return [
             f"ATT_MODE: {self.att_mode}",
             "URFR: " + ",".join(f"{value:g}" for value in self.urfr),
@@ -210,12 +211,12 @@ class ModuleSettings:
         ]
 
     def port_lines(self) -> list[str]:
-        """Reply to LOG COMCONFIG."""
+        """Return the lines of the reply to LOG COMCONFIG."""
         return [f"BAUD: {self.baud}", f"LOG HI91 {self.hi91}", f"LOG HI92 {self.hi92}"]
 
 
 def changed(settings: ModuleSettings, line: str, firmware: int) -> ModuleSettings | None:
-    """The settings after the command in `line`; None if it changes none. Raises CommandRefused."""
+    """Return the settings after the command in `line`; None if it changes no setting. Raises CommandRefused."""
     for pattern, change in _CHANGES:
         if match := pattern.fullmatch(line):
             if "PMUX" in line and firmware < PMUX_FIRMWARE:
@@ -231,12 +232,12 @@ def _whole(text: str, allowed: range | tuple[int, ...]) -> int:
 
 
 def number(text: str, low: float, high: float) -> float:
-    """A finite number within bounds. Raises CommandRefused."""
+    """Return a finite number within the limits. Raises CommandRefused."""
     try:
         value = float(text)
     except ValueError:
         raise CommandRefused(text) from None
-    if not low <= value <= high:  # NaN is refused too
+    if not low <= value <= high:  # also refuses NaN
         raise CommandRefused(text)
     return value
 
@@ -257,7 +258,7 @@ def _urfr(settings: ModuleSettings, text: str) -> ModuleSettings:
 
 
 def rows(urfr: tuple[float, ...]) -> Matrix3:
-    """The nine numbers of URFR as a matrix."""
+    """Return the nine numbers of URFR as a matrix."""
     c00, c01, c02, c10, c11, c12, c20, c21, c22 = urfr
     return (c00, c01, c02), (c10, c11, c12), (c20, c21, c22)
 
@@ -287,7 +288,7 @@ def _alarm(settings: ModuleSettings, axis: str, values: str) -> ModuleSettings:
 
 def _on_time(settings: ModuleSettings, message: str, period: str) -> ModuleSettings:
     period_s = number(period, 0.0, 1.0)
-    if 0 < period_s < 0.001:  # the fastest is 1 kHz (table 3.7)
+    if 0 < period_s < 0.001:  # the maximum rate is 1 kHz (table 3.7)
         raise CommandRefused(period)
     return _with_output(settings, message, Output(round(period_s * 1000)))
 
@@ -317,16 +318,16 @@ _CHANGES: Final[tuple[tuple[re.Pattern[str], Callable[..., ModuleSettings]], ...
     (re.compile(r"LOG (IMU91|HI91|HI92) ONMARK (?!ONCE$)(\S+)"), _on_mark),
     (re.compile(r"UNLOGALL"), _unlog_all),
 )
-"""Commands that change settings and nothing else."""
+"""Commands that only change settings."""
 
 
 MARK_SPREAD_NS: Final = 15_000
-"""Assumed: the manual (section 1.2.1) gives the mean only."""
+"""Spread of the processing time, ns (assumption). Section 1.2.1 of the manual gives only the mean."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HipnucHardware(SensorHardware):
-    """Hardware of a module; settings are in `ModuleSettings`. `processing_ns` counts from an edge on SIN too."""
+    """Hardware of a device. Its settings are in `ModuleSettings`. `processing_ns` also counts from an edge on SIN."""
 
     product: str = "HI14R3"
     build: str = "Oct 15 2024"
@@ -334,31 +335,31 @@ class HipnucHardware(SensorHardware):
     firmware: int = 156
     bootloader: int = 109
     mark_spread_ns: int = MARK_SPREAD_NS
-    """Largest deviation of the processing time after an edge on SIN."""
+    """Maximum deviation of the processing time after an edge on SIN, ns."""
     mark_seed: int = 1
     utc_epoch: Epoch = "unix"
     """Epoch of UTC in ms."""
     uptime_ms: int = 0
-    """Device time at the first power-on, to begin near the end of a counter's range."""
+    """Device time at the first power-on, ms, for a start near the end of the counter."""
     mag_bias_t: Vector3 = (0.0, 0.0, 0.0)
-    """Result of its magnetic calibration before it was powered on; zero: never calibrated."""
+    """Result of an earlier magnetic calibration, T; zero: never calibrated."""
     hard_iron_t: Vector3 = (0.0, 0.0, 0.0)
-    """Field of what turns with it: the result of a calibration while it is powered on."""
+    """Magnetic field of parts that turn with the device, T. A calibration finds it."""
     behaviour: Behaviour = AS_IN_MANUAL
-    """What it does where the manual leaves it open."""
+    """Behavior that the manual does not define."""
 
 
 STATIC_GYRO_RAD_S: Final = 0.02
 GYRO_SETTLED_MS: Final = 5000
 ATTITUDE_SETTLED_MS: Final = 1000
-"""Assumed times after power-on until bias and attitude count as converged."""
+"""Time after power-on until bias and attitude count as converged, ms (assumption)."""
 
 GYRO_UNSETTLED, ATTITUDE_UNSETTLED = 1 << 3, 1 << 7
 STATIC, MAG_AIDING, NO_UTC, SYNC_OUT = 1 << 9, 1 << 10, 1 << 11, 1 << 12
 
 
 def main_status(reading: Truth, uptime_ms: int, *, nine_axis: bool, utc: bool) -> int:
-    """MAIN_STATUS (HI91 bytes 1-2 since firmware 1.6.9); a SOUT pulse goes before every frame."""
+    """Return MAIN_STATUS (HI91 bytes 1-2 since firmware 1.6.9). A SOUT pulse precedes each frame."""
     status = SYNC_OUT
     if not utc:
         status |= NO_UTC
@@ -372,39 +373,40 @@ def main_status(reading: Truth, uptime_ms: int, *, nine_axis: bool, utc: bool) -
 
 
 NOT_CALIBRATED, CALIBRATED = 0, 1
-"""State as register 0x0A shows it; the true numbers are in no source."""
+"""States of register 0x0A. No source contains the true numbers."""
 TURN_RAD: Final = tau
 STEP_MAX_NS: Final = NS_PER_S
-"""A longer time between two samples adds no turn."""
+"""Maximum time between two samples that adds to the rotation, ns."""
 _NO_TURN: Final[Vector3] = (0.0, 0.0, 0.0)
 
 
 class SelfCalibration:
-    """Bias of one magnetometer, and what the module knows of it."""
+    """Bias of one magnetometer, and the part of it that the device knows."""
 
     def __init__(self, hard_iron_t: Vector3, found_t: Vector3) -> None:
-        """`hard_iron_t` is the field of what turns with the module; `found_t` is what it knows of that already."""
+        """`hard_iron_t` is the field of parts that turn with the device; `found_t` is the part that the device already
+        knows."""
         self._hard_iron_t = hard_iron_t
         self.found_t = found_t
         self.finished = any(found_t)
-        """Whether it was calibrated."""
+        """True after a calibration."""
         self._turned: Vector3 = _NO_TURN
         self._before_ns: int | None = None
 
     @property
     def state(self) -> int:
-        """NOT_CALIBRATED or CALIBRATED."""
+        """Return NOT_CALIBRATED or CALIBRATED."""
         return CALIBRATED if self.finished else NOT_CALIBRATED
 
     @property
     def progress(self) -> float:
-        """Share of the turning that it needs, 0 … 1; 1 once it was calibrated."""
+        """Return the completed share of the required rotation, 0 to 1; 1 after a calibration."""
         return 1.0 if self.finished else min(self._turned) / TURN_RAD
 
     def sample(self, device_ns: int, gyro_rad_s: Vector3) -> None:
-        """Take one sample in 9-axis mode while the calibration in the background is on.
+        """Process one sample in 9-axis mode while the background calibration is on.
 
-        `device_ns` is the time of the module's own clock.
+        `device_ns` is the device time.
         """
         before, self._before_ns = self._before_ns, device_ns
         if before is None or not 0 < device_ns - before <= STEP_MAX_NS:
@@ -416,6 +418,6 @@ class SelfCalibration:
             self.finished, self.found_t, self._turned = True, self._hard_iron_t, _NO_TURN
 
     def measured(self, field_t: Vector3) -> Vector3:
-        """The field as the module sends it: with what it does not know of its bias."""
+        """Return the field that the device sends: the field with the unknown part of the bias."""
         (a, b, c), (d, e, f), (x, y, z) = self._hard_iron_t, self.found_t, field_t
         return (x + a - d, y + b - e, z + c - f)

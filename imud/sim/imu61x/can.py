@@ -1,8 +1,8 @@
 """A Forsense IMU61x on a CAN bus: manual "IMU61X Interface Protocol and Instructions", chapter 4.
 
-Without I/O and without a clock of its own. It samples at whole periods of its own crystal, which runs `skew_ppm` fast,
-and sends the five frames of a sample back to back `processing_ns` later. INDEX counts samples from power-on. It takes
-no commands. Heading starts as the truth has it.
+The module contains no I/O and reads no clock. The device samples at whole periods of its own crystal, which runs
+`skew_ppm` fast. It sends the five frames of a sample back to back `processing_ns` later. INDEX counts samples from
+power-on. The device accepts no commands. The heading starts at the truth.
 """
 
 from dataclasses import dataclass
@@ -27,12 +27,10 @@ class Imu61xCanHardware(SensorHardware):
     base_id: int = BASE_ID
     bitrate: int = BITRATE
     index: int = 0
-    """INDEX of the first sample after the first power-on, to begin near the end of its range."""
+    """INDEX of the first sample after the first power-on, for a start near the end of its range."""
 
 
 class Imu61xCanModule(PeriodicCanModule):
-    """A simulated device, powered on from construction."""
-
     def __init__(self, now_ns: int, hardware: Imu61xCanHardware | None = None) -> None:
         self.hardware = hardware = hardware or Imu61xCanHardware()
         encode = partial(_frames, hardware.base_id)
@@ -51,7 +49,7 @@ def _frames(base_id: int, index: int, reading: Truth) -> list[tuple[int, bytes]]
 
 
 def make(options: SimulatorOptions, now_ns: int) -> Imu61xCanModule:
-    """A device from the common options. Raises ValueError naming the option that it cannot have."""
+    """Return a device for the options. Raises ValueError for an unsupported option."""
     if not 1 <= options.rate_hz <= RATE_MAX_HZ:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … {RATE_MAX_HZ:g}")
     if options.message:

@@ -1,12 +1,12 @@
-"""A Forsense IMU61x at the far end of SPI or I2C: windows, the pipeline of SPI, latching, and faults on demand.
+"""A Forsense IMU61x on SPI or I2C: windows, pipeline of SPI, latched values, and faults on request.
 
-Manual "IMU61X Interface Protocol and Instructions", chapters 2 and 3. Without I/O: the owner passes what crossed the
-wires of one transaction and gets what the device answers.
+Manual "IMU61X Interface Protocol and Instructions", chapters 2 and 3. The module contains no I/O: its owner passes the
+bytes of one transaction and gets the bytes of the device.
 
-- Registers are renewed every `update_ns` of the device; a transaction sees those of its beginning (latched).
-- SPI: the answer to a word comes with the second word after it, across selections too. A burst lasts as long as its
-  selection. In an SPI mode that it does not have, every bit is read one late.
-- A restart forgets window, filter and kind of burst (assumed: they are saved by a command of the UART only).
+- The device updates its registers every `update_ns`. A transaction reads the values of its start (latched).
+- SPI: the reply to a word is the second word after it, also across selections. A burst lasts as long as its selection.
+  In an unsupported SPI mode, the device samples each bit one bit late.
+- A restart resets window, filter and kind of burst (assumption: only a command of the UART saves them).
 """
 
 import errno
@@ -25,26 +25,27 @@ from imud.sim.imu61x.uart import RegisterBehaviour
 from imud.sim.physics import Motion, Truth, swing
 
 UPDATE_NS: Final = NS_PER_MS
-"""Time between two renewals of the registers (assumed)."""
+"""Time between two updates of the registers, ns (assumption)."""
 _WINDOW_0, _WINDOW_1 = 0, 1
 
 
 @dataclass(slots=True)
 class RegisterFaults:
-    """Faults of the device or its wires; may be changed at any time."""
+    """Faults of the device or its wires. Tests can change them at any time."""
 
     error: int = 0
-    """The errno that every transaction fails with: ENXIO not acknowledged, ETIMEDOUT bus stuck; 0 for none."""
+    """Error number of each transaction: ENXIO for a missing acknowledge, ETIMEDOUT for a blocked bus; 0 for no
+    error."""
     line: int | None = None
-    """Value of all bytes read: 0xFF or 0x00 for a data line that no device drives."""
+    """Value of all read bytes: 0xFF or 0x00 for a data line without a driver; None for no fault."""
     flips: int = 0
-    """Number of next transactions with one wrong bit in the bytes read."""
+    """Number of next transactions with one wrong bit."""
     frozen: bool = False
-    """The registers are not renewed."""
+    """True: the device does not update its registers."""
     ignores_writes: bool = False
-    """Settings that are written have no effect."""
+    """True: writes of settings have no effect."""
     product_id: bytes = b""
-    """Product id of another device in its place."""
+    """Product ID of another device at this place; empty for this device."""
 
 
 class Imu61xRegisters:
@@ -61,18 +62,18 @@ class Imu61xRegisters:
         behaviour: RegisterBehaviour | None = None,
         seed: int = 1,
     ) -> None:
-        """`now_ns` is CLOCK_MONOTONIC; `modes` are the SPI modes that it understands."""
+        """`now_ns` returns CLOCK_MONOTONIC. `modes` are the supported SPI modes."""
         self.faults = RegisterFaults()
         self.behaviour = behaviour or RegisterBehaviour()
         self.epoch_ns = now_ns()
-        """Zero of its motion: truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
+        """Zero of the motion, ns: the truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
         self.motion = motion or swing(STANDARD_GRAVITY_M_S2)
         self.transactions = 0
         self.filter = FILTER_DEFAULT
         self.extended = 0
         self.window = _WINDOW_0
         self.latched_ns = self.epoch_ns
-        """Instant of measurement of the values that the newest transaction saw."""
+        """Time of the measurement that the newest transaction read, ns."""
         self._now_ns = now_ns
         self._product_id = product_id_of(product)
         self._modes = modes
@@ -83,18 +84,18 @@ class Imu61xRegisters:
         self._truth = self.motion.at(0.0)
 
     def restart(self) -> None:
-        """Restart after a loss of power."""
         self.filter, self.extended, self.window = FILTER_DEFAULT, 0, _WINDOW_0
         self._pipeline.extend((0, 0))
 
     def truth_at(self, instant_ns: int) -> Truth:
-        """Return the measurement of an ideal sensor at CLOCK_MONOTONIC `instant_ns`."""
+        """Return the measurement of an ideal sensor at `instant_ns` (CLOCK_MONOTONIC)."""
         return self.motion.at((instant_ns - self.epoch_ns) / NS_PER_S)
 
     # --- SPI ---------------------------------------------------------------------------------------------------------
 
     def spi(self, selections: Sequence[bytes], mode: int = 0) -> list[bytes]:
-        """Carry out a transaction: MOSI of each assertion of chip select → MISO. Raises OSError by `faults.error`."""
+        """Make a transaction. `selections` are the MOSI bytes of each active chip select. Return the MISO bytes. Raises
+        OSError by `faults.error`."""
         self._begin()
         answers = [self._selection(selection) for selection in selections]
         if mode not in self._modes:
@@ -124,7 +125,7 @@ class Imu61xRegisters:
         return [int.from_bytes(data[at : at + 2], "big") for at in range(0, len(data), 2)]
 
     def _answer(self, word: int) -> int:
-        """Carry out a word; return the word that answers it."""
+        """Process a word. Return the word of its reply."""
         address = word >> 8 & 0x7F
         if word & 0x8000:
             self._write(address, word & 0xFF)
@@ -167,7 +168,8 @@ class Imu61xRegisters:
     # --- I2C ---------------------------------------------------------------------------------------------------------
 
     def i2c(self, parts: Sequence[bytes | int]) -> bytes:
-        """Carry out a transaction between start and stop: bytes written, or number to read; returns all bytes read.
+        """Make a transaction between start and stop. `parts` are written bytes or numbers of bytes to read. Return all
+        read bytes.
 
         Raises OSError by `faults.error`.
         """
@@ -200,11 +202,11 @@ class Imu61xRegisters:
 
     @property
     def product_id(self) -> bytes:
-        """The eight bytes of PROD_ID."""
+        """Return the eight bytes of PROD_ID."""
         return self.faults.product_id or self._product_id
 
     def _begin(self) -> None:
-        """Latch the registers at the begin of a transaction."""
+        """Latch the registers at the start of a transaction."""
         self.transactions += 1
         if self.faults.error:
             raise OSError(self.faults.error, errno.errorcode.get(self.faults.error, "?"))
@@ -224,12 +226,12 @@ class Imu61xRegisters:
         return answers or [b""]
 
     def _flipped(self, data: bytes) -> bytes:
-        """Invert one bit, not in the words of an SPI pipeline that carry no answer."""
+        """Invert one bit, but not in words of the SPI pipeline without a reply."""
         first = PIPELINE_BYTES if len(data) > PIPELINE_BYTES else 0
         at = self._random.randrange(first, len(data))
         return data[:at] + bytes([data[at] ^ 1 << self._random.randrange(8)]) + data[at + 1 :]
 
 
 def _one_bit_late(data: bytes) -> bytes:
-    """Sample the bits at the wrong edge."""
+    """Return the bits as sampled at the wrong edge."""
     return (int.from_bytes(data, "big") >> 1).to_bytes(len(data), "big")

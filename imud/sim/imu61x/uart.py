@@ -1,19 +1,20 @@
-"""A Forsense IMU61x at the far end of a UART: manual "IMU61X Interface Protocol and Instructions", chapter 1.
+"""A Forsense IMU61x on a UART: manual "IMU61X Interface Protocol and Instructions", chapter 1.
 
-Without I/O and without a clock of its own: the owner passes what the host sent to `receive` and collects what the
-device sent with `advance`. What it does, and what of it is assumed because the manual is silent:
+The module contains no I/O and reads no clock: its owner passes the bytes of the host to `receive` and gets the bytes of
+the device from `advance`. Behavior, with assumptions where the manual defines nothing:
 
-- In stream mode it sends AHRS frames at 1 … 400 Hz, at whole multiples of the period of its own timer, which runs
-  `skew_ppm` fast and counts µs from power-on. What does not fit the transmit buffer is never sent.
-- In command mode it only replies. Questions are answered with S1, P1 or an AHRS frame, orders with K1. What else it
-  does, and when, is one of several ways to read the manual (`imud.sim.imu61x.uart`).
-- A baud rate acts once its acknowledgement has left the wire, or at the next start.
-- CMD 5 saves everything, the mode included. CMD 9 and power-off lose what was not saved. CMD 15 restores flash, and RAM
-  at once or at the next start.
-- CMD 7 takes some seconds and finds the attitude it stands in; meanwhile S1 says that it calibrates, and CMD 8 with a
-  result other than that for done. The angles found can be read but turn nothing. CMD 10 takes as long, takes the
-  gyroscope's bias off, and is refused while it moves (all assumed).
-- Heading starts as the truth has it and is not saved.
+- In stream mode, the device sends AHRS frames at 1 to 400 Hz, at whole multiples of the period of its own timer. The
+  timer runs `skew_ppm` fast and counts µs from power-on. The device drops frames that do not fit into the transmit
+  buffer.
+- In command mode, it only replies: to queries with S1, P1 or an AHRS frame, to other commands with K1.
+  `Imu61xBehaviour` contains different interpretations of the manual.
+- A baud rate applies after its acknowledge, or after the next start.
+- CMD 5 saves all settings with the mode. CMD 9 and a power failure lose unsaved settings. CMD 15 restores the flash
+  immediately, and the RAM immediately or after the next start.
+- CMD 7 takes some seconds and measures the present attitude. In this time, S1 reports a calibration and the result of
+  CMD 8 differs from "done". The measured angles can be read but have no effect. CMD 10 takes the same time, subtracts
+  the bias of the gyroscope, and is refused while the device moves (all assumptions).
+- The heading starts at the truth and is not saved.
 """
 
 from collections.abc import Callable, Mapping
@@ -46,43 +47,43 @@ from imud.sim.ports.uart_wire import Transmitter
 from imud.sim.sensor import Burst, SensorHardware, Simulator, SimulatorOptions, sensor_of
 
 CALIBRATION_NS: Final = 3 * NS_PER_S
-"""Length of either calibration."""
+"""Duration of each calibration, ns."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Imu61xBehaviour:
-    """One way to read the manual."""
+    """One interpretation of the manual."""
 
     answers_while_streaming: bool = True
-    """Whether it obeys more than CMD 3 in stream mode."""
+    """True: the device processes all commands in stream mode. False: only CMD 3."""
     baud_acts_at_start: bool = False
-    """Whether a new baud rate waits for the next start."""
+    """True: a new baud rate applies after the next start."""
     reset_acts_at_start: bool = False
-    """Whether CMD 15 changes flash only, and acts at the next start."""
+    """True: CMD 15 changes only the flash and applies after the next start."""
     changes_mode: bool = True
-    """Whether it obeys the output mode it acknowledges."""
+    """True: the device applies the output mode that it acknowledges."""
     acknowledges: bool = True
-    """Whether it sends K1 at all."""
+    """True: the device sends K1."""
     result_done: int = 0
-    """Result of K1 for what was carried out."""
+    """Result in K1 for a processed command."""
     result_refused: int = 2
-    """Result of K1 for what was not."""
+    """Result in K1 for a refused command."""
     refuses: frozenset[Command] = frozenset()
-    """Commands that are answered with `result_refused` and not carried out."""
+    """Commands that the device refuses with `result_refused`."""
     ignores: frozenset[Command] = frozenset()
-    """Commands that are neither answered nor carried out."""
+    """Commands that the device ignores without a reply."""
     flash_ms: int = 0
-    """Time of CMD 5 and CMD 15 until their answer; nothing is sent and nothing heard meanwhile."""
+    """Time of CMD 5 and CMD 15 until their reply, ms. The device sends and receives no bytes in this time."""
     quiet_ms: int = 0
-    """Time after K1 in which nothing is sent and nothing heard."""
+    """Time after K1 in which the device sends and receives no bytes, ms."""
     acknowledges_at_end: bool = False
-    """Whether K1 of a calibration comes at its end."""
+    """True: the device sends K1 of a calibration at its end."""
     reports_calibration: bool = True
-    """Whether S1 is long enough to have a calibration status."""
+    """True: S1 is long enough for a calibration status."""
 
 
 ORDERS: Final = frozenset(Command) - {Command.STATUS, Command.AHRS, Command.READ_PARAMETER}
-"""Commands without an answer of their own."""
+"""Commands whose reply is only K1."""
 
 VARIANTS: Final[Mapping[str, Imu61xBehaviour]] = {
     "obeys while it streams": Imu61xBehaviour(),
@@ -100,24 +101,24 @@ VARIANTS: Final[Mapping[str, Imu61xBehaviour]] = {
         baud_acts_at_start=True, reset_acts_at_start=True,
     ),
 }  # fmt: skip
-"""The simulated variants by name, each of which carries out its commands."""
+"""Simulated variants by name. Each variant processes its commands."""
 REFUSING: Final = Imu61xBehaviour(refuses=ORDERS)
-"""A device that answers questions and refuses every order."""
+"""A device that replies to queries and refuses all other commands."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegisterBehaviour:
-    """One way to read the manual's chapter 2."""
+    """One interpretation of chapter 2 of the manual."""
 
     low_address: bool = True
-    """Whether BURST_CTRL reads back in the high byte of the word at 0x0C, as the manual's layout has it."""
+    """True: BURST_CTRL is the high byte of the word at 0x0C, as in the manual."""
     high_address: bool = True
-    """Whether it reads back in the low byte of the word at 0x0D, as the vendor's program has it."""
+    """True: BURST_CTRL is the low byte of the word at 0x0D, as in the program of the vendor."""
     window_bits: int = 0
-    """Bits of WIN_CTRL that are set next to its WINDOW_ID."""
+    """Bits of WIN_CTRL that are set next to WINDOW_ID."""
 
     def burst_ctrl(self, address: int, extended: int) -> int:
-        """The word that is read at 0x0C or 0x0D."""
+        """Return the word at 0x0C or 0x0D."""
         if address == BURST_CTRL:
             return extended << 8 if self.low_address else 0
         return extended if self.high_address else 0
@@ -130,19 +131,19 @@ REGISTER_VARIANTS: Final[Mapping[str, RegisterBehaviour]] = {
     "BURST_CTRL reads zero": RegisterBehaviour(low_address=False, high_address=False),
     "other bits in WIN_CTRL": RegisterBehaviour(window_bits=0xA5FE),
 }
-"""The simulated variants by name."""
+"""Simulated variants by name."""
 
 GYRO_OFFSETS: Final = (Parameter.GYRO_X_OFF, Parameter.GYRO_Y_OFF, Parameter.GYRO_Z_OFF)
 INSTALLATION_ANGLES: Final = (Parameter.INSTALL_X_OFF, Parameter.INSTALL_Y_OFF, Parameter.INSTALL_Z_OFF)
 
 
 class ParameterRefused(ValueError):
-    """A parameter or value that the device does not have."""
+    """An unknown parameter or an invalid value."""
 
 
 @dataclass(frozen=True, slots=True)
 class Imu61xSettings:
-    """Settings that CMD 5 saves. The defaults are the factory's."""
+    """Settings that CMD 5 saves. The defaults are the defaults of the factory."""
 
     mode: OutputMode = OutputMode.STREAM
     baud: int = 115_200
@@ -151,11 +152,11 @@ class Imu61xSettings:
     i2c_address: int = I2C_ADDRESSES[0]
     filter_control: int = FILTER_DEFAULT
     gyro_off_deg_s: Vector3 = (0.0, 0.0, 0.0)
-    """Taken off what the gyroscope measures."""
+    """Bias that the device subtracts from the angular rate, °/s."""
     install_off_deg: Vector3 = (0.0, 0.0, 0.0)
 
     def value(self, index: int) -> float:
-        """A parameter by its index. Raises ParameterRefused."""
+        """Return a parameter by its index. Raises ParameterRefused."""
         values: dict[int, float] = {
             Parameter.BAUD: self.baud,
             Parameter.AHRS_RATE: self.rate_hz,
@@ -171,7 +172,7 @@ class Imu61xSettings:
 
 
 def changed(settings: Imu61xSettings, index: int, value: float) -> Imu61xSettings:
-    """The settings after CMD 14. Raises ParameterRefused."""
+    """Return the settings after CMD 14. Raises ParameterRefused."""
     factory = Imu61xSettings()
     match index:
         case Parameter.BAUD:
@@ -188,11 +189,11 @@ def changed(settings: Imu61xSettings, index: int, value: float) -> Imu61xSetting
 
 
 TX_BUFFER_BYTES: Final = 512
-"""A frame that would make more than this wait for the wire is not sent."""
+"""Maximum number of bytes that wait for the wire. The device drops a frame that exceeds it."""
 REPLY_NS: Final = 200_000
-"""Time from the end of a command to its reply (assumed)."""
+"""Time from the end of a command to its reply, ns (assumption)."""
 CALIBRATING: Final = 1
-"""`calibration_status` of S1 during a calibration, otherwise 0 (assumed)."""
+"""`calibration_status` of S1 during a calibration, otherwise 0 (assumption)."""
 RESULT_BUSY: Final = 9
 """Result of CMD 8 during a calibration."""
 STATIC_GYRO_RAD_S: Final = 0.02
@@ -205,70 +206,65 @@ STATUS: Final = Status(
     system_status=0, cpu_load=120, drop_rate=0, i2c_master=0, voltage=50, user_config_status=0,
     calibration_status=0, imu_health=bytes(32),
 )  # fmt: skip
-"""Contents of S1; model number and units are made up."""
+"""Contents of S1. Model number and units are invented."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Imu61xHardware(SensorHardware):
-    """A device, and its behaviour where the manual is silent."""
+    """A device, and its behavior where the manual defines nothing."""
 
     status: Status = STATUS
     uptime_us: int = 0
-    """Timer at the first power-on, to begin near the end of its range."""
+    """Timer at the first power-on, µs, for a start near the end of its range."""
     behaviour: Imu61xBehaviour = field(default_factory=Imu61xBehaviour)
 
 
 class Imu61xModule:
-    """A simulated device, powered on from construction."""
+    """A simulated device. Its power is on from the start."""
 
     def __init__(
         self, now_ns: int, settings: Imu61xSettings | None = None, hardware: Imu61xHardware | None = None
     ) -> None:
-        """`settings` are what its flash holds."""
+        """`settings` are the settings in flash."""
         self.hardware = hardware or Imu61xHardware()
         self.flash = self.settings = settings or Imu61xSettings()
         self.epoch_ns = now_ns
         self.frames_sent = 0
         self.frames_dropped = 0
-        """AHRS frames that did not fit the wire."""
+        """Number of AHRS frames that did not fit into the transmit buffer."""
         self._scale = NS_PER_S + round(self.hardware.skew_ppm * 1000)  # device ns per 1e9 ns of the host
         self._cut_off: list[Burst] = []
         self._power_on(now_ns, self.hardware.uptime_us)
 
     @property
     def baud(self) -> int:
-        """Rate in bit/s in force."""
         return self._wire.baud
 
     def reboot(self, now_ns: int) -> None:
-        """Restart after a loss of power: unsaved settings are lost."""
         self._sample(now_ns)
         self._cut_off += self._wire.stopped(now_ns)
         self.settings = self.flash
         self._power_on(now_ns, 0)
 
     def mark(self, now_ns: int) -> None:
-        """No-op: the device has no sync input."""
+        """Do nothing: the device has no sync input."""
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Receive bytes that the host sent, already sampled at the device's rate."""
         self._sample(now_ns)
-        if now_ns < max(self._ready_ns, self._busy_ns):  # still booting, or writing to flash
+        if now_ns < max(self._ready_ns, self._busy_ns):  # the device starts or writes to flash
             return
         for frame in self._finder.feed(data):
             if isinstance(frame, Frame) and len(frame.payload) == PARAMETERS.size:
                 self._obey(frame, now_ns)
-            if now_ns < max(self._ready_ns, self._busy_ns):  # a command restarted it, or takes its time
+            if now_ns < max(self._ready_ns, self._busy_ns):  # a command restarted the device, or takes its time
                 return
 
     def advance(self, now_ns: int) -> list[Burst]:
-        """Return what has left the wire since the last call, in order."""
         self._sample(now_ns)
         done, self._cut_off = self._cut_off, []
         return done + self._wire.sent(now_ns)
 
     def next_ns(self) -> int | None:
-        """Time of the next output of `advance`; None for none."""
         if self._cut_off:
             return self._cut_off[0].due_ns
         if (due_ns := self._wire.next_ns()) is not None:
@@ -279,7 +275,7 @@ class Imu61xModule:
         return self._wire.due_ns(ready_ns, AHRS_FRAME_BYTES)
 
     def counters(self) -> dict[str, int]:
-        """Counters of frames by their fate."""
+        """Return the numbers of sent and dropped frames."""
         return {"frames_sent": self.frames_sent, "frames_dropped": self.frames_dropped}
 
     # --- time --------------------------------------------------------------------------------------------------------
@@ -297,28 +293,28 @@ class Imu61xModule:
         self._schedule(self._ready_ns)
 
     def _schedule(self, now_ns: int) -> None:
-        """The next sample after `now_ns`, if it streams."""
+        """Schedule the next sample after `now_ns` in stream mode."""
         period_us = US_PER_S // self.settings.rate_hz
         streams = self.settings.mode is OutputMode.STREAM
         self._next_us = (self._device_us(now_ns) // period_us + 1) * period_us if streams else None
 
     def _device_us(self, now_ns: int) -> int:
-        """The timer, not wrapped."""
+        """Return the timer without wrap, µs."""
         return self._on_us + (now_ns - self._on_ns) * self._scale // (NS_PER_S * NS_PER_US)
 
     def _instant_ns(self, device_us: int) -> int:
-        """First host time at which the timer shows `device_us`."""
+        """Return the first host time at which the timer is `device_us`."""
         return self._on_ns - (self._on_us - device_us) * NS_PER_US * NS_PER_S // self._scale
 
     def _sample(self, now_ns: int) -> None:
-        """Do all that is due: samples, a new baud rate, the end of a calibration, a restart."""
+        """Process all due events: samples, a new baud rate, the end of a calibration, a restart."""
         self._finish_orders(now_ns)
         while self._next_us is not None and (sample_ns := self._instant_ns(self._next_us)) <= now_ns:
             self._queue_ahrs(sample_ns, self._next_us)
             self._next_us += US_PER_S // self.settings.rate_hz
 
     def _finish_orders(self, now_ns: int) -> None:
-        # a rate acts when its acknowledgement has left and was collected, which no caller puts off for long
+        # a rate applies after its acknowledge was sent and collected
         if self._new_baud_ns is not None and now_ns > self._new_baud_ns and self._wire.next_ns() is None:
             self._new_baud_ns = None
             self._wire = Transmitter(self.settings.baud, TX_BUFFER_BYTES, now_ns)
@@ -333,7 +329,7 @@ class Imu61xModule:
     def _queue_ahrs(self, sample_ns: int, device_us: int) -> None:
         ready_ns = sample_ns + self.hardware.processing_ns
         if self._new_baud_ns is not None or self._restart_ns is not None or sample_ns < self._busy_ns:
-            self.frames_dropped += 1  # the port is being set up anew, or the device has no time
+            self.frames_dropped += 1  # a new baud rate is pending, or the device is busy
             return
         if not self._wire.fits(ready_ns, AHRS_FRAME_BYTES):
             self.frames_dropped += 1
@@ -355,7 +351,7 @@ class Imu61xModule:
         )
 
     def _reading(self, sample_ns: int) -> Truth:
-        """Return the measurement at an instant, noise included."""
+        """Return the measurement at an instant with noise."""
         return self.hardware.reading((sample_ns - self.epoch_ns) / NS_PER_S)
 
     def _say(self, data: bytes, now_ns: int) -> None:
@@ -393,7 +389,7 @@ class Imu61xModule:
         self._after(command, now_ns)
 
     def _acknowledge(self, command: Command, result: int, now_ns: int) -> None:
-        """Answer an order, after the time that it takes, and be quiet for a while."""
+        """Reply to a command after its duration, then stay silent for `quiet_ms`."""
         behaviour = self.hardware.behaviour
         flash = command in (Command.SAVE, Command.FACTORY_RESET) and result == behaviour.result_done
         done_ns = now_ns + (behaviour.flash_ms if flash else 0) * NS_PER_MS
@@ -403,7 +399,7 @@ class Imu61xModule:
             self._busy_ns = max(self._busy_ns, done_ns + behaviour.quiet_ms * NS_PER_MS)
 
     def _questions(self, command: Command, param3: int, now_ns: int) -> bytes | None:
-        """The answer to a question; None for an order. Raises ParameterRefused."""
+        """Return the reply to a query; None for other commands. Raises ParameterRefused."""
         match command:
             case Command.STATUS:
                 return encode_status(self._status())
@@ -423,7 +419,7 @@ class Imu61xModule:
         return replace(status, calibration_status=CALIBRATING if self._calibration is not None else 0)
 
     def _order(self, command: Command, param1: float, param3: int, now_ns: int) -> None:
-        """Carry out a command without an answer of its own. Raises ParameterRefused."""
+        """Process a command whose reply is only K1. Raises ParameterRefused."""
         orders: dict[Command, Callable[[], None]] = {
             Command.OUTPUT_MODE: lambda: self._set_mode(param1, now_ns),
             Command.HEADING: lambda: self._set_heading(param1, now_ns),
@@ -437,7 +433,7 @@ class Imu61xModule:
         orders[command]()
 
     def _after(self, command: Command, now_ns: int) -> None:
-        """Carry out what is postponed until the acknowledgement has left."""
+        """Process the part of a command that follows its acknowledge."""
         if command is Command.RESTART:
             self._next_us = None
             self._restart_ns = self._wire.due_ns(now_ns, 0)
@@ -452,12 +448,13 @@ class Imu61xModule:
         self._schedule(now_ns)
 
     def _set_heading(self, heading_deg: float, now_ns: int) -> None:
-        if not 0 <= heading_deg <= 360:  # NaN is refused too
+        if not 0 <= heading_deg <= 360:  # also refuses NaN
             raise ParameterRefused(f"heading {heading_deg}")
         self._heading_rad = radians(heading_deg) - euler_zyx_from_quat(self._reading(now_ns).quat_wxyz)[2]
 
     def _save(self) -> None:
-        """Save all but command mode where CMD 5 is obeyed in that only: the device would never start streaming."""
+        """Save all settings. Do not save command mode if the device processes CMD 5 only in this mode: it would never
+        stream again."""
         keeps_mode = self.hardware.behaviour.answers_while_streaming
         self.flash = self.settings if keeps_mode else replace(self.settings, mode=self.flash.mode)
 
@@ -491,7 +488,7 @@ class Imu61xModule:
 
 
 def make(options: SimulatorOptions, now_ns: int) -> Imu61xModule:
-    """A device from the common options. Raises ValueError naming the option that it cannot have."""
+    """Return a device for the options. Raises ValueError for an unsupported option."""
     if options.rate_hz not in RATES_HZ:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected one of {', '.join(map(str, RATES_HZ))}")
     if options.message.upper() not in ("", "AHRS"):

@@ -1,12 +1,12 @@
-"""Model of arrival times with the truth known: the reference that the clock is measured against.
+"""Model of arrival times with a known truth: the reference for the clock of imud.
 
-A device with a crystal of its own samples at even steps of its own time; each message crosses the wire (in turn, if
-the wire is slower than the samples); an adapter may hold bytes until a latency timer fires or a USB packet is full;
-the reader wakes some time later and takes everything that is there in one read:
+A device with its own crystal samples at regular steps of its own time. Each frame crosses the wire; frames wait if the
+wire is slower than the samples. An adapter can hold bytes until a latency timer fires or a USB packet is full. The
+reader wakes up later and reads all waiting bytes at the same time:
 
-    truth ──▶ wire (size × byte time) ──▶ adapter (FIFO time-out | latency timer) ──▶ wake-up ──▶ t_rx
+    truth ──▶ wire (size × byte time) ──▶ adapter (FIFO timeout | latency timer) ──▶ wake-up ──▶ t_rx
 
-Times are ns of the host's CLOCK_MONOTONIC. Everything random comes from one seed.
+Times are ns of CLOCK_MONOTONIC of the host. All random values follow from one seed.
 """
 
 from bisect import bisect_left
@@ -19,45 +19,43 @@ from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, uart_byte_ns
 
 @dataclass(frozen=True, slots=True)
 class Crystal:
-    """The device's clock against the host's."""
+    """Clock of the device relative to the clock of the host."""
 
     skew_ppm: float = 0.0
-    """Rate error against the host's clock at the start, 1e-6."""
+    """Rate error at the start relative to the host clock, 1e-6."""
     drift_ppm_s: float = 0.0
-    """Change of the skew per second (temperature)."""
+    """Change of the rate error per second, 1e-6 (temperature)."""
     drift_limit_ppm: float = 10.0
-    """The drift turns round when it has come this far, and again on the other side."""
+    """Maximum change of the rate error, 1e-6. The drift reverses at this limit."""
     start_ns: int = 5_000_000_123_456
-    """Device time at the first sample."""
+    """Device time of the first sample, ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArrivalProfile:
-    """Delays between the wire and the reader."""
-
     name: str
     timer_ns: int = 0
-    """Period of a latency timer that hands bytes over, 0 for none."""
+    """Period of the latency timer, ns; 0 for no timer."""
     timer_ppm: float = 0.0
-    """Rate error of the timer against the host's clock; 0 beats in lockstep with an exact device."""
+    """Rate error of the timer relative to the host clock, 1e-6; 0 runs in lockstep with an exact device."""
     packet_bytes: int = 0
-    """Bytes after which the timer's adapter hands over and restarts the timer (FT232: 62); 0 for never."""
+    """Number of bytes after which the adapter sends a packet and restarts its timer (FT232: 62); 0: never."""
     poll_ns: int = 0
-    """Longest wait for the bus to ask the adapter, evenly spread."""
+    """Maximum time until the bus polls the adapter, ns, uniform distribution."""
     fifo_bytes: float = 0.0
-    """Byte times after which a receive FIFO reports a tail below its trigger level (16550: 4)."""
+    """Number of byte times after which a receive FIFO reports bytes below its trigger level (16550: 4)."""
     floor_ns: int = 0
-    """Shortest wake-up."""
+    """Minimum wake-up time, ns."""
     wake_ns: int = 0
-    """Mean of the exponential part of the wake-up."""
+    """Mean of the exponential part of the wake-up time, ns."""
     stall_share: float = 0.0
-    """Share of reads that also wait for something else."""
+    """Share of reads with an additional delay."""
     stall_ns: int = 0
-    """Mean of that wait, exponential."""
+    """Mean of the additional delay, ns, exponential distribution."""
 
     @property
     def hold_ns(self) -> int:
-        """Hold time of the adapter as a link reports it: its latency timer."""
+        """Return the latency timer of the adapter, ns, as a link reports it."""
         return self.timer_ns
 
 
@@ -81,17 +79,17 @@ LOADED = ArrivalProfile(
     "loaded", fifo_bytes=4, floor_ns=40 * NS_PER_US, wake_ns=300 * NS_PER_US, stall_share=0.05, stall_ns=8 * NS_PER_MS
 )
 PROFILES = (PERFECT, BARE_UART, USB_1MS, USB_16MS, USB_16MS_PACKET, LOADED)
-"""All profiles, best first."""
+"""All profiles, the best profile first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """A message as the reader receives it, and its true times."""
+    """A frame at the reader, with its true times."""
 
     t_ns: int
-    """The truth: host time of the instant of measurement."""
+    """Truth: host time of the measurement, ns."""
     dev_ns: int
-    """Device time of that instant, unwrapped; `dev_ns // tick_ns % tick_modulus` is what the device sends."""
+    """Device time of the measurement without wrap, ns. The device sends `dev_ns // tick_ns % tick_modulus`."""
     size_bytes: int
     trailing_bytes: int
     t_rx_ns: int
@@ -99,25 +97,24 @@ class Arrival:
 
 @dataclass(slots=True)
 class ArrivalModel:
-    """A stream of arrivals: a device at `rate_hz` of its own time behind a profile."""
+    """Arrivals of a device with `rate_hz` in its own time behind a profile."""
 
     profile: ArrivalProfile
     rate_hz: float
     seed: int
     crystal: Crystal = field(default_factory=Crystal)
     baud: int = 921_600
-    """0 for a wire without a time of its own."""
+    """Baud rate, bit/s; 0: frames take no time on the wire."""
     size_bytes: int = 82
-    """HI91: six bytes of frame head, 76 of payload (manual B §3)."""
+    """Size of a frame, bytes. HI91: six bytes of head, 76 of payload (manual B §3)."""
     begin_ns: int = 1_000 * NS_PER_S
 
     @property
     def byte_ns(self) -> int:
-        """Time of one byte on the wire."""
         return uart_byte_ns(self.baud)
 
     def run(self, count: int) -> Iterator[Arrival]:
-        """The first `count` messages, in order of arrival."""
+        """Yield the first `count` frames in order of arrival."""
         random = Random(f"{self.profile.name} {self.rate_hz} {self.seed}")
         truth = list(self._truth(count, random))
         begins = self._on_wire([t for t, _ in truth])
@@ -135,7 +132,7 @@ class ArrivalModel:
             first = last + 1
 
     def _truth(self, count: int, random: Random) -> Iterator[tuple[float, float]]:
-        """(host time, device time) of each sample."""
+        """Yield the pairs (host time, device time) of the samples."""
         crystal, period_ns = self.crystal, NS_PER_S / self.rate_hz
         ppm, slope, limit = 0.0, crystal.drift_ppm_s, crystal.drift_limit_ppm
         t_ns = self.begin_ns + random.random() * 50 * NS_PER_MS
@@ -148,7 +145,7 @@ class ArrivalModel:
                 slope = -abs(slope) if ppm > 0 else abs(slope)
 
     def _on_wire(self, truth: list[float]) -> list[float]:
-        """Compute when the first byte of each message leaves: at once, or when the one before is through."""
+        """Return the time at which the first byte of each frame leaves: immediately, or after the previous frame."""
         duration_ns = self.size_bytes * self.byte_ns
         begins: list[float] = []
         free_ns = 0.0
@@ -158,7 +155,7 @@ class ArrivalModel:
         return begins
 
     def _handed_over(self, begins: list[float], random: Random) -> list[float]:
-        """Compute when the adapter has handed over the last byte of each message."""
+        """Return the time at which the adapter has delivered the last byte of each frame."""
         profile, duration_ns = self.profile, self.size_bytes * self.byte_ns
         if not profile.timer_ns:
             return [begin + duration_ns + profile.fifo_bytes * self.byte_ns for begin in begins]
@@ -169,7 +166,8 @@ class ArrivalModel:
         return [end - (end - phase_ns) % step_ns + step_ns for end in (begin + duration_ns for begin in begins)]
 
     def _packets(self, begins: list[float], timer_from_ns: float) -> list[float]:
-        """Compute the same for an adapter that sends full packets at once and restarts its timer with each."""
+        """Return the same times for an adapter that sends full packets immediately and restarts its timer with each
+        packet."""
         byte_ns, size, full, step_ns = self.byte_ns, self.size_bytes, self.profile.packet_bytes, self._timer_step_ns()
         handed = [0.0] * len(begins)
         sent = done = 0
@@ -198,7 +196,7 @@ class ArrivalModel:
         return wait_ns
 
     def _newest_hand_over(self, handed_ns: float, t_rx_ns: int) -> float:
-        """Instant up to which the bytes on the wire are in a read at `t_rx_ns` that holds what came at `handed_ns`."""
+        """Return the time of the newest byte in a read at `t_rx_ns` that contains bytes delivered at `handed_ns`."""
         profile = self.profile
         if not profile.timer_ns:
             return t_rx_ns - profile.fifo_bytes * self.byte_ns
@@ -208,13 +206,13 @@ class ArrivalModel:
         return handed_ns + (t_rx_ns - handed_ns) // step_ns * step_ns
 
     def _begun_bytes(self, begins: list[float], index: int, until_ns: float) -> int:
-        """Bytes of message `index` that have come by `until_ns`, less than a whole message."""
+        """Return the number of bytes of frame `index` that arrived until `until_ns`, less than a complete frame."""
         if index >= len(begins) or not self.byte_ns:
             return 0
         return min(max(int((until_ns - begins[index]) / self.byte_ns), 0), self.size_bytes - 1)
 
     def _bytes_by(self, begins: list[float], until_ns: float) -> int:
-        """Bytes of the whole stream that have come by `until_ns`."""
+        """Return the number of bytes of the whole stream that arrived until `until_ns`."""
         index = bisect_left(begins, until_ns)
         if index == 0:
             return 0

@@ -1,8 +1,8 @@
 """A simulated device on a CAN network interface: `vcan`, or a controller with a real bus.
 
-The simulator's frames leave when they would have crossed the wire of the simulated device; all that is due goes out in
-one system call, so that a stall of the simulator's process falls between bursts and not into one. What the interface's
-queue does not accept is lost and counted, as on a bus that is too full.
+A frame leaves when it would have crossed the wire of the simulated device. One system call sends all due frames, so
+that a stall of this process falls between bursts. The port counts the frames that the queue of the interface does not
+accept as lost, as on a bus that is too full.
 """
 
 import ctypes
@@ -22,38 +22,38 @@ READ_BYTES: Final = 4096
 
 
 class CanPort:
-    """A module, or several as one (`CanModules`), on one interface. Synchronization: one thread."""
+    """One device or several devices (`CanModules`) on one interface. Synchronization: one thread."""
 
     is_open = True
-    """A bus needs no reader."""
+    """Always True: a bus needs no reader."""
 
     def __init__(
         self, module: CanModule, interface: str, *, open_socket: Callable[[str], socket.socket] | None = None
     ) -> None:
-        """`open_socket` is `open_can_socket`, or makes a substitute for tests; what it raises is raised."""
+        """`open_socket` is `open_can_socket` or a substitute of a test. Raises the errors of `open_socket`."""
         self.module = module
         self.interface = interface
         self._unplugged_until_ns = 0
         self.frames_refused = 0
-        """Frames that the interface's queue did not accept."""
+        """Number of frames that the queue of the interface did not accept."""
         self._socket = (open_socket or open_can_socket)(interface)
 
     def fileno(self) -> int:
-        """The descriptor to wait on for frames of others."""
+        """Return the descriptor to wait for frames of other nodes."""
         return self._socket.fileno()
 
     @property
     def node(self) -> "CanPort":
-        """The object to wait on."""
+        """Return the object to wait for."""
         return self
 
     def unplug(self, now_ns: int, duration_ns: int) -> None:
-        """Take the device from the bus and cut its power."""
+        """Remove the device from the bus and cut its power."""
         self._unplugged_until_ns = now_ns + duration_ns
         self.module.reboot(self._unplugged_until_ns)
 
     def step(self, now_ns: int, readable: bool) -> None:
-        """Pass frames of others on, and send what is due."""
+        """Pass frames of other nodes to the device, and send due frames."""
         if readable:
             self._receive(now_ns)
         if now_ns >= self._unplugged_until_ns:
@@ -61,17 +61,16 @@ class CanPort:
             self.frames_refused += len(send_all(self._socket.fileno(), due))
 
     def next_ns(self, now_ns: int) -> int:
-        """Time of the next call of `step`."""
+        """Return the time of the next call of `step`."""
         due_ns = self.module.next_ns()
         return max(self._unplugged_until_ns, now_ns if due_ns is None else due_ns)
 
     def summary(self) -> dict[str, int]:
-        """Return the counters, and the zero of the motion, CLOCK_MONOTONIC."""
+        """Return the counters and the zero of the motion, CLOCK_MONOTONIC."""
         counters = {**self.module.counters(), "frames_refused": self.frames_refused}
         return {**counters, "epoch_ns": self.module.epoch_ns}
 
     def close(self) -> None:
-        """Leave the bus; may be called twice."""
         self._socket.close()
 
     def _receive(self, now_ns: int) -> None:
@@ -80,7 +79,7 @@ class CanPort:
                 raw = os.read(self._socket.fileno(), RAW_FRAME.size)
             except BlockingIOError:
                 return
-            except OSError:  # the interface went down; it may come up again
+            except OSError:  # the interface is down; it can return
                 return
             can_id, size, data = RAW_FRAME.unpack(raw)
             if not can_id & (ERROR_FLAG | REMOTE_FLAG):
@@ -88,7 +87,7 @@ class CanPort:
 
 
 def open_can_socket(interface: str) -> socket.socket:
-    """A raw CAN socket on an interface. Raises LinkError where there is none, or it is down."""
+    """Open a raw CAN socket on an interface. Raises LinkError if the interface does not exist or is down."""
     try:
         opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
     except OSError as error:
@@ -104,7 +103,7 @@ def open_can_socket(interface: str) -> socket.socket:
 
 
 def default_interface() -> str:
-    """The first CAN interface that is up. Raises LinkError when there is none."""
+    """Return the first CAN interface that is up. Raises LinkError if there is none."""
     found = can_interfaces()
     if not found:
         raise LinkError(
@@ -115,9 +114,10 @@ def default_interface() -> str:
 
 
 def send_all(fd: int, datagrams: Sequence[bytes]) -> list[OSError]:
-    """Send datagrams in order by sendmmsg(2), one system call if all are accepted; return an error for each refused.
+    """Send datagrams in order with sendmmsg(2), one system call if all are accepted. Return an error for each refused
+    datagram.
 
-    No other sender comes between two of them unless one is refused, and a stall of this process cannot part them.
+    No other sender comes between two datagrams, and no stall of this process separates them, unless one is refused.
     """
     count = len(datagrams)
     if not count:

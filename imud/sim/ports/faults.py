@@ -1,7 +1,7 @@
-"""Seeded faults on a stream of bursts, as bad wires cause them; each fault is recorded with its kind.
+"""Faults of bad wires on a stream of bursts, from a seed. The log contains each fault with its kind.
 
-Each burst (a frame or a reply) meets each kind of fault with its own probability, so that a test can say how many
-damaged frames, missing samples and skipped bytes the ledger at the other end must show.
+Each kind of fault affects a burst (a frame or a reply) with its own probability. A test can therefore compute the
+numbers of damaged frames, lost samples and skipped bytes in the ledger of the receiver.
 """
 
 from collections import Counter
@@ -19,30 +19,28 @@ from imud.sim.sensor import Burst
 R = TypeVar("R")
 
 LOG_MAX: Final = 100_000
-"""Faults kept in `Faults.log`; the counts go on."""
+"""Maximum number of faults in `Faults.log`. The counters have no limit."""
 INSERT_BYTES_MAX: Final = 16
 WRONG_BAUDS: Final = (9600, 115_200, 230_400, 256_000, 460_800, 921_600)
 
 
 class FaultKind(StrEnum):
-    """Kinds of fault of a burst."""
-
     CUT = "cut"
-    """The end is missing, at least one byte of it."""
+    """The end of the burst is missing, at least one byte."""
     FLIP = "flip"
     """One bit is wrong."""
     DROP = "drop"
     """One byte is missing."""
     INSERT = "insert"
-    """Up to 16 random bytes come before one of its bytes."""
+    """Up to 16 random bytes precede one of its bytes."""
     DELAY = "delay"
-    """The burst is held back, and with it all that follows."""
+    """The burst and all later bursts are late."""
     UNPLUG = "unplug"
-    """The port disappears; this burst and those of the next `unplug_ns` are gone."""
+    """The port disappears. This burst and the bursts of the next `unplug_ns` are lost."""
     WRONG_BAUD = "wrong_baud"
-    """The burst is sent at another rate."""
+    """The burst has another baud rate."""
     LOSE = "lose"
-    """The whole burst is missing."""
+    """The complete burst is missing."""
 
 
 _Order = (
@@ -53,7 +51,7 @@ _Order = (
 
 @dataclass(frozen=True, slots=True)
 class FaultRates:
-    """Probability of each fault per burst, 0 … 1, and the duration of lasting faults."""
+    """Probability of each fault per burst, 0 to 1, and the duration of lasting faults."""
 
     cut: float = 0.0
     flip: float = 0.0
@@ -64,7 +62,7 @@ class FaultRates:
     wrong_baud: float = 0.0
     lose: float = 0.0
     delay_ns: int = 5 * NS_PER_MS
-    """Longest delay."""
+    """Maximum delay, ns."""
     unplug_ns: int = 300 * NS_PER_MS
 
     def __post_init__(self) -> None:
@@ -73,40 +71,38 @@ class FaultRates:
                 raise ValueError(f"fault {kind.value}: expected a probability 0 … 1, got {getattr(self, kind.value)}")
 
     def any(self) -> bool:
-        """Whether there is any fault to expect."""
+        """Return whether a fault is possible."""
         return any(getattr(self, kind.value) for kind in FaultKind)
 
 
 class Fault(NamedTuple):
-    """A fault that happened."""
-
     kind: FaultKind
     due_ns: int
-    """Time at which the burst would have been through."""
+    """Time of the end of the undisturbed burst, ns."""
     burst: int
     """Number of the burst, from 0."""
     sample_ns: int | None
-    """Instant of measurement of the frame that was hit; None for text."""
+    """Time of the measurement in the disturbed frame, ns; None for text."""
 
 
 class Faults:
-    """Injector of faults into bursts. Same seed, same bursts: same faults."""
+    """Injector of faults into bursts. The same seed and the same bursts give the same faults."""
 
     def __init__(self, seed: int, rates: FaultRates, baud: int = 115_200) -> None:
         self.rates = rates
         self.baud = baud
-        """Rate at which the device sends; a wrong baud is any other."""
+        """Baud rate of the device, bit/s. A wrong baud rate is any other rate."""
         self.log: list[Fault] = []
         self.counts: Counter[FaultKind] = Counter()
         self.bursts = 0
         self.bursts_hit = 0
-        """Bursts that did not arrive as they were sent (late ones do)."""
+        """Number of changed or lost bursts, without late bursts."""
         self.unplugged_until_ns = 0
         self._random = Random(seed)
         self._held_until_ns = 0
 
     def pass_on(self, burst: Burst) -> Burst | None:
-        """Pass a burst on as it arrives, None if it is lost. Bursts never overtake each other."""
+        """Return a burst as it arrives; None if it is lost. Bursts keep their order."""
         number, self.bursts = self.bursts, self.bursts + 1
         kinds = self._strike()
         if burst.due_ns < self.unplugged_until_ns:
@@ -128,9 +124,10 @@ class Faults:
         return burst._replace(due_ns=due_ns, data=data) if data else None
 
     def _strike(self) -> list[FaultKind]:
-        """Choose the faults of one burst, in the order they act. Draws the same number of times for every burst.
+        """Choose the faults of one burst, in the order of their effect. The number of random values is the same for
+        each burst.
 
-        For losses it draws only where there are any: seeds of older tests go on to mean the same.
+        The method draws values for losses only if losses are possible, so that seeds of older tests keep their meaning.
         """
         rates, random = self.rates, self._random
         kinds = _Order if rates.lose else _Order[:-1]
@@ -163,12 +160,13 @@ class Faults:
 
 
 def rates_from(text: str) -> FaultRates:
-    """Rates from `flip=0.01,drop=0.002`; names are those of `FaultRates`. Raises ValueError."""
+    """Return the rates in `flip=0.01,drop=0.002` with the names of `FaultRates`. Raises ValueError."""
     return parse_rates(FaultRates, text)
 
 
 def parse_rates(kind: Callable[..., R], text: str, where: str = "") -> R:
-    """A dataclass of rates from `name=number,…`; `where` ends the name of a fault in errors. Raises ValueError."""
+    """Return a dataclass of rates from `name=number,…`. Errors contain `where` after the name of a fault. Raises
+    ValueError."""
     known = list(signature(kind).parameters)
     values: dict[str, float] = {}
     for part in filter(None, text.split(",")):

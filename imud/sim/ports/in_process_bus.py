@@ -1,6 +1,6 @@
-"""I2C and SPI inside the process: simulated devices behind substitutes of smbus2 and spidev's ioctl.
+"""I2C and SPI inside the process: simulated devices behind substitutes for smbus2 and the ioctl of spidev.
 
-For tests and measurements without the kernel's buses: `SpiLink(settings, ioctl=bus.ioctl, open_node=bus.open, …)` and
+For tests and measurements without a bus of the kernel: `SpiLink(settings, ioctl=bus.ioctl, open_node=bus.open, …)` and
 `I2cLink(settings, open_bus=bus.open, ioctl=bus.ioctl)`.
 """
 
@@ -14,13 +14,13 @@ from imud.links import spi
 from imud.sim.imu61x.registers import Imu61xRegisters
 
 I2C_M_RD = 0x0001
-"""Flag of a message that is read (<linux/i2c.h>)."""
+"""Flag of a read message (<linux/i2c.h>)."""
 FD = 1_000_000
-"""Descriptors that no process has."""
+"""First number of the simulated descriptors. No process has such descriptors."""
 
 
 class InProcessI2c:
-    """An I2C bus with devices by address; it replaces `SMBus` and its opener."""
+    """An I2C bus with devices by address. It replaces `SMBus` and its opener."""
 
     def __init__(self, devices: dict[int, Imu61xRegisters], funcs: int = I2cFunc.I2C) -> None:
         self.devices = devices
@@ -28,23 +28,20 @@ class InProcessI2c:
         self.fd: int | None = None
         self.opened = 0
         self.open_error = 0
-        """The errno that `open` fails with, 0 for none."""
+        """Error number of `open`; 0 for no error."""
         self.calls: list[tuple[int, tuple[bytes | int, ...]]] = []
-        """Address and parts of every transaction."""
+        """Address and parts of each transaction."""
 
     def open(self, _path: str) -> "InProcessI2c":
-        """Open the bus, as `SMBus(path)` does."""
         if self.open_error:
             raise OSError(self.open_error, "by the test")
         self.fd, self.opened = FD, self.opened + 1
         return self
 
     def ioctl(self, _fd: int, _request: int, _argument: int) -> int:
-        """Accept the setting of the time-out."""
         return 0
 
     def i2c_rdwr(self, *messages: i2c_msg) -> None:
-        """Carry out one transaction."""
         reads = [message for message in messages if message.flags & I2C_M_RD]
         parts = [message.len if message in reads else bytes(message) for message in messages]
         data = self._transact(messages[0].addr, parts)
@@ -52,15 +49,12 @@ class InProcessI2c:
             ctypes.memmove(message.buf, data, message.len)
 
     def read_i2c_block_data(self, i2c_addr: int, register: int, length: int) -> list[int]:
-        """Read as SMBus does."""
         return list(self._transact(i2c_addr, [bytes([register]), length]))
 
     def write_i2c_block_data(self, i2c_addr: int, register: int, data: list[int]) -> None:
-        """Write as SMBus does."""
         self._transact(i2c_addr, [bytes([register, *data])])
 
     def close(self) -> None:
-        """Close the bus."""
         self.fd = None
 
     def _transact(self, address: int, parts: Sequence[bytes | int]) -> bytes:
@@ -72,19 +66,20 @@ class InProcessI2c:
 
 
 class InProcessSpi:
-    """A chip select of an SPI bus, seen through spidev's ioctl."""
+    """A chip select of an SPI bus behind the ioctl of spidev."""
 
     def __init__(
         self, device: Callable[[Sequence[bytes], int], Sequence[bytes]] | None = None, *, word_bits: int = 8
     ) -> None:
-        """`device` as `Imu61xRegisters.spi`; without one, zeros are read. `word_bits` is the controller's most."""
+        """`device` is `Imu61xRegisters.spi`; without a device, all read bytes are zero. `word_bits` is the maximum word
+        size of the controller."""
         self.device = device
         self.mode = 0
         self.opened: list[int] = []
         self.open_error = 0
-        """The errno that `open` fails with, 0 for none."""
+        """Error number of `open`; 0 for no error."""
         self.messages: list[tuple[tuple[bytes, ...], int, int]] = []
-        """MOSI of each selection, word size and speed of every message."""
+        """MOSI of each selection, word size and speed of each message."""
         self.keep_messages = True
         self.word_bits = word_bits
 
@@ -129,7 +124,7 @@ class InProcessSpi:
 
 
 def _swapped(data: bytes, bits: int) -> bytes:
-    """Words of 16 bits between memory of a little-endian host and the wire."""
+    """Convert 16-bit words between a little-endian memory and the wire."""
     if bits <= 8:
         return data
     return b"".join(data[at : at + 2][::-1] for at in range(0, len(data), 2))

@@ -1,9 +1,8 @@
-"""Pins of a simulated device, single wires next to its data, and their connection to lines, with faults.
+"""Pins of a simulated device and their connection to lines, with faults.
 
     module.pins() ──▶ faults ──▶ when it is due: on_edge[pin](due_ns, rising)
 
-The owner calls `step` right before it moves the bytes of the same device, so that the edge of a pulse is there before
-the frame that follows it.
+The owner calls `step` before it moves the bytes of the same device, so that the edge of a pulse precedes its frame.
 """
 
 import asyncio
@@ -24,22 +23,22 @@ from imud.sim.ports.faults import parse_rates
 from imud.sim.sensor import StreamModule
 
 OnEdge = Callable[[int, bool], None]
-"""Called with the time at which an edge is due (CLOCK_MONOTONIC, ns) and whether it is a rising one."""
+"""Function for an edge: its due time (CLOCK_MONOTONIC, ns), and True for a rising edge."""
 EXTRA_HIGH_NS: Final = 80_000
 EXTRA_WITHIN_NS: Final = NS_PER_MS
 LOST_MAX: Final = 100_000
-"""Lost pulses kept in `PinFaults.lost`; the counts go on."""
+"""Maximum number of pulses in `PinFaults.lost`. The counters have no limit."""
 
 
 class Pin(StrEnum):
-    """Outputs, by the names that lines have in the configuration."""
+    """Output pins with the names of lines in the configuration."""
 
     SOUT = "sout"
-    """High before each frame; the frame follows the falling edge."""
+    """High before each frame. The frame follows the falling edge."""
     SOUT_DIV = "sout_div"
     """Every n-th pulse of SOUT."""
     ALARM = "alarm"
-    """High while an angle is out of range."""
+    """High while an angle is out of its range."""
 
 
 class PinEdge(NamedTuple):
@@ -50,32 +49,32 @@ class PinEdge(NamedTuple):
     pin: Pin
     rising: bool
     sample_ns: int | None = None
-    """CLOCK_MONOTONIC of the measurement whose frame follows; None where none does."""
+    """CLOCK_MONOTONIC of the measurement in the next frame; None if no frame follows."""
 
 
 @runtime_checkable
 class PinModule(Protocol):
-    """A simulated device with pins. Its inputs are methods (`mark`), times as in `StreamModule`."""
+    """A simulated device with pins. Its inputs are methods (`mark`). Times as in `StreamModule`."""
 
     def pins(self, now_ns: int) -> list[PinEdge]:
-        """Return the edges since the last call, in order. All pins are low in the beginning."""
+        """Return the edges since the last call, in order. All pins are low at the start."""
         ...
 
     def next_pin_ns(self) -> int | None:
-        """Time of the next output of `pins`; None for none."""
+        """Return the time of the next edge of `pins`; None if no edge is due."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class PinFaultRates:
-    """Probabilities, 0 … 1."""
+    """Probabilities of faults, 0 to 1."""
 
     lose_pulse: float = 0.0
-    """Of a pulse: both its edges are missing."""
+    """Probability that both edges of a pulse are missing."""
     lose_edge: float = 0.0
-    """Of an edge: it alone is missing."""
+    """Probability that an edge is missing."""
     extra: float = 0.0
-    """Of a pulse: another one follows it within a millisecond, as a disturbance would make."""
+    """Probability of an additional pulse within a millisecond, as from a disturbance."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -84,18 +83,18 @@ class PinFaultRates:
 
 
 class PinFaults:
-    """Injector of faults into edges. Same seed, same edges: same faults."""
+    """Injector of faults into edges. The same seed and the same edges give the same faults."""
 
     def __init__(self, seed: int, rates: PinFaultRates) -> None:
         self.rates = rates
         self.counts: Counter[str] = Counter()
         self.lost: list[tuple[Pin, int | None]] = []
-        """Pin and instant of measurement of the pulses of which an edge is missing."""
+        """Pin and measurement time of the pulses with a missing edge."""
         self._random = Random(seed)
         self._losing: set[Pin] = set()
 
     def pass_on(self, edge: PinEdge) -> list[PinEdge]:
-        """Pass an edge on, with extra edges, or drop it. Draws three times for every edge."""
+        """Return an edge with additional edges, or no edge. Draws three random values for each edge."""
         rates, pin = self.rates, edge.pin
         pulse, alone, extra = (self._random.random() for _ in fields(rates))
         if edge.rising and pulse < rates.lose_pulse:
@@ -121,7 +120,7 @@ class PinFaults:
 
 
 class Pins:
-    """Connection of a module's pins to lines: delivers edges when they are due. Synchronization: one thread."""
+    """Connection of the pins of a device to lines. It delivers edges at their due time. Synchronization: one thread."""
 
     def __init__(
         self,
@@ -130,17 +129,17 @@ class Pins:
         faults: PinFaults | None = None,
         truth: TextIO | None = None,
     ) -> None:
-        """`truth` gets one line per edge that is handed over: pin, level, due_ns, sample_ns (empty: of no sample), and
-        step_ns, the time of the step that did it."""
+        """`truth` gets one line per delivered edge: pin, level, due_ns, sample_ns (empty if no sample follows), and
+        step_ns, the time of the step."""
         self._module, self._on_edge, self._faults, self._truth = module, on_edge, faults, truth
         self._held: list[PinEdge] = []
         self.edges = 0
-        """Edges handed over."""
+        """Number of delivered edges."""
         if truth:
             truth.write("pin,level,due_ns,sample_ns,step_ns\n")
 
     def step(self, now_ns: int) -> None:
-        """Do all that is due."""
+        """Deliver all due edges."""
         for edge in self._module.pins(now_ns):
             if edge.pin in self._on_edge:
                 for passed in self._faults.pass_on(edge) if self._faults else [edge]:
@@ -155,20 +154,19 @@ class Pins:
         self.edges += len(done)
 
     def next_ns(self) -> int | None:
-        """Time of the next output of `step`; None for none."""
+        """Return the time of the next edge of `step`; None if no edge is due."""
         times = [edge.due_ns for edge in self._held[:1]]
         if (next_ns := self._module.next_pin_ns()) is not None:
             times.append(next_ns)
         return min(times, default=None)
 
     def summary(self) -> dict[str, int]:
-        """Counters by name."""
         faults = self._faults.counts if self._faults else {}
         return {"pin_edges": self.edges} | {f"pin_fault_{kind}": count for kind, count in sorted(faults.items())}
 
 
 def pin_rates(text: str) -> PinFaultRates:
-    """Rates from `lose_pulse=0.1,extra=0.01`; names are those of `PinFaultRates`. Raises ValueError."""
+    """Return the rates in `lose_pulse=0.1,extra=0.01` with the names of `PinFaultRates`. Raises ValueError."""
     return parse_rates(PinFaultRates, text, " of pins")
 
 
@@ -177,12 +175,12 @@ def _due_ns(edge: PinEdge) -> int:
 
 
 class MemoryInput:
-    """An `InputLine` that the simulated device drives by `edge`. Synchronization: the loop's thread only."""
+    """An `InputLine` that the simulated device drives with `edge`. Synchronization: the loop's thread only."""
 
     def __init__(self, title: str = "memory line", rising_only: bool = False) -> None:
         self.title = title
         self.open_error: LinkError | None = None
-        """Error that `open` raises."""
+        """Error of `open`; None for no error."""
         self.is_open = False
         self._rising_only = rising_only
         self._watch = True
@@ -196,13 +194,13 @@ class MemoryInput:
 
     @property
     def edges_lost(self) -> int:
-        """Number of edges that `lose` simulated."""
+        """Return the number of edges of `lose`."""
         return self._lost
 
     # --- the device's side -------------------------------------------------------------------------------------------
 
     def edge(self, t_ns: int, rising: bool) -> None:
-        """Change the level at that time. Delivered by the loop in its next round, or by `drain`."""
+        """Change the level at this time. The next turn of the loop or `drain` delivers the edge."""
         self._level = rising
         if self.is_open and (rising or not self._rising_only):
             self._number += 1
@@ -211,7 +209,7 @@ class MemoryInput:
                 self._loop.call_soon(self.drain)
 
     def pulse(self, t_ns: int, width_ns: int) -> None:
-        """Pulse the line: up at that time, and down again."""
+        """Make a pulse: a rising edge at `t_ns`, a falling edge after `width_ns`."""
         self.edge(t_ns, True)
         self.edge(t_ns + width_ns, False)
 
@@ -221,7 +219,7 @@ class MemoryInput:
         self._lost += count
 
     def vanish(self, error: LinkError) -> None:
-        """End the line with an error: the chip is removed."""
+        """End the line with an error, as if the chip was removed."""
         on_end = self._on_end
         self.close()
         if on_end is not None:
@@ -230,13 +228,13 @@ class MemoryInput:
     # --- imud's side -------------------------------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Open the line; edges count from now on. Raises `open_error`."""
+        """Open the line. Edges count after this call. Raises `open_error`."""
         if self.open_error is not None:
             raise self.open_error
         self.is_open = True
 
     def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
-        """Deliver edges from now on, and those since `open`; without `watch` only when `drain` is called."""
+        """Start the delivery of edges, with the edges since `open`. Without `watch`, only `drain` delivers edges."""
         self._on_edges, self._on_end = on_edges, on_end
         self._loop = asyncio.get_running_loop()
         self._watch = watch
@@ -244,11 +242,10 @@ class MemoryInput:
             self._loop.call_soon(self.drain)
 
     def fileno(self) -> int:
-        """Return -1: edges come without the kernel."""
+        """Return -1: edges do not come from the kernel."""
         return -1
 
     def drain(self) -> None:
-        """Deliver the buffered edges."""
         if self._on_edges is not None and self._waiting:
             found, self._waiting = self._waiting, []
             self._on_edges(found)
@@ -260,15 +257,12 @@ class MemoryInput:
         return self._level
 
     def close(self) -> None:
-        """Stop the delivery of edges; may be called twice."""
         self.is_open = False
         self._waiting = []
         self._loop = self._on_edges = self._on_end = None
 
 
 class MemoryOutput:
-    """An `OutputLine` that records its changes."""
-
     def __init__(
         self,
         title: str = "memory line",
@@ -276,37 +270,37 @@ class MemoryOutput:
         now_ns: Callable[[], int] = lambda: 0,
         on_change: Callable[[int, bool], None] | None = None,
     ) -> None:
-        """`now_ns` dates changes; without it, all are at 0.
+        """`now_ns` gives the time of changes; without it, all times are 0.
 
-        `on_change` is the device: called with the time and the new level, in the thread that drives the line.
+        `on_change` is the device. It receives the time and the new level in the thread that drives the line.
         """
         self.title = title
         self.open_error: LinkError | None = None
-        """Error that `open` raises."""
+        """Error of `open`; None for no error."""
         self.set_error: LinkError | None = None
-        """Error that `set` raises."""
+        """Error of `set`; None for no error."""
         self.is_open = False
         self.active = False
         self.history: list[tuple[int, bool]] = []
-        """Time (ns) and level of every change."""
+        """Time (ns) and level of each change."""
         self._now_ns = now_ns
         self._on_change = on_change
 
     def open(self) -> None:
-        """Open the line, inactive. Raises `open_error`."""
+        """Open the line with the inactive level. Raises `open_error`."""
         if self.open_error is not None:
             raise self.open_error
         self.is_open = True
         self._become(False)
 
     def set(self, active: bool) -> None:
-        """Set the level. Raises `set_error`, and LinkError where the line is not open."""
+        """Set the level. Raises `set_error`, and LinkError if the line is not open."""
         if self.set_error is not None or not self.is_open:
             raise self.set_error or LinkError(f"{self.title} is not open")
         self._become(active)
 
     def close(self) -> None:
-        """Release the line, inactive; may be called twice."""
+        """Release the line with the inactive level. A second call does nothing."""
         if self.is_open:
             self._become(False)
         self.is_open = False
@@ -321,7 +315,7 @@ class MemoryOutput:
 
 
 class MemoryLines:
-    """Factory of lines inside the process, which keeps them by their purpose, for example `bow sout`."""
+    """Factory of lines inside the process. It stores them by their purpose, for example `bow sout`."""
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
         self.inputs: dict[str, MemoryInput] = {}
@@ -330,58 +324,58 @@ class MemoryLines:
         self.maker = LineFactory(self.input, self.output)
 
     def input(self, _settings: InputOptions, purpose: str, rising_only: bool = False) -> MemoryInput:
-        """Return the input of that purpose; the same one every time."""
+        """Return the input of this purpose, always the same object."""
         return self.inputs.setdefault(purpose, MemoryInput(purpose, rising_only))
 
     def output(self, _settings: OutputOptions, purpose: str) -> MemoryOutput:
-        """Return the output of that purpose; the same one every time."""
+        """Return the output of this purpose, always the same object."""
         return self.outputs.setdefault(purpose, MemoryOutput(purpose, now_ns=self._now_ns))
 
 
 SIN_LOOK_NS: Final = 4 * NS_PER_MS
-"""Interval of reading SIN: a pulse has to be longer."""
+"""Interval between two reads of SIN, ns. A pulse must be longer."""
 
 
 class MarkedModule(Protocol):
     """A device with a sync input."""
 
     def mark(self, now_ns: int) -> None:
-        """Pulse its sync input (a rising edge)."""
+        """Send a rising edge to the sync input."""
         ...
 
 
 class PullFile:
-    """A line of a gpio-sim chip, driven through its `pull` file in sysfs; the kernel stamps the edge at the write."""
+    """A line of a gpio-sim chip, driven with its file `pull` in sysfs. The kernel time-stamps the edge at the write."""
 
     def __init__(self, path: Path, settle_s: float = 0.0) -> None:
-        """Wait `settle_s` after each rising edge: an edge that comes before the kernel has reported the last one is
-        not seen, and a frame must not come before its edge. Raises OSError."""
+        """Wait `settle_s` after each rising edge. The kernel ignores an edge before it has reported the previous edge,
+        and a frame must not precede its edge. Raises OSError."""
         self._file = path.open("wb", buffering=0)
         self._settle_s = settle_s
 
     def __call__(self, _due_ns: int, rising: bool) -> None:
-        """Drive the line. Raises OSError."""
         self._file.write(b"pull-up" if rising else b"pull-down")
         if rising and self._settle_s:
             sleep(self._settle_s)
 
     def close(self) -> None:
-        """Close the file; the level stays. May be called twice."""
+        """Close the file. The level stays. A second call does nothing."""
         self._file.close()
 
 
 class SinFile:
-    """SIN of a device, read from the `value` file of a gpio-sim line that the program under test drives.
+    """SIN of a device, read from the file `value` of a gpio-sim line that the tested program drives.
 
-    sysfs reports no change there, so the owner looks as often as it likes; the edge is as late as the look.
+    sysfs does not report changes of this file. The owner therefore reads it at an interval, and an edge is late by up
+    to this interval.
     """
 
     def __init__(self, path: Path, module: MarkedModule) -> None:
         self._path, self._module = path, module
-        self._level = True  # a line that is high from the beginning has no edge
+        self._level = True  # a line that is high at the start has no edge
 
     def look(self, now_ns: int) -> None:
-        """Pass a rising edge since the last call to the module. Raises OSError."""
+        """Pass a rising edge since the last call to the device. Raises OSError."""
         level = self._path.read_bytes().strip() == b"1"
         if level and not self._level:
             self._module.mark(now_ns)
@@ -389,40 +383,38 @@ class SinFile:
 
 
 class SimulatedLines:
-    """The lines next to a device's data: its pins on the way out, SIN on the way in. Synchronization: one thread."""
+    """Lines next to the data of a device: its output pins and SIN. Synchronization: one thread."""
 
     def __init__(
         self, module: StreamModule, files: Mapping[Pin, PullFile], faults: PinFaults | None = None,
         truth: TextIO | None = None, sin: Path | None = None,
     ) -> None:  # fmt: skip
-        """`files` and `truth` are closed by `close`. Raises ValueError for pins that this device does not have."""
+        """`close` closes `files` and `truth`. Raises ValueError for pins that the device does not have."""
         self._files, self._truth = files, truth
         self._pins: Pins | None = None
         if files:
             if not isinstance(module, PinModule):
-                raise ValueError("pins: this device has none that are simulated")
+                raise ValueError("pins: expected a device with simulated pins, got one without pins")
             self._pins = Pins(module, files, faults, truth)
         self._sin = SinFile(sin, module) if sin else None
 
     def step(self, now_ns: int) -> None:
-        """Do all that is due, right before the port does. Raises OSError."""
+        """Deliver all due edges before the port sends its bytes. Raises OSError."""
         if self._sin is not None:
             self._sin.look(now_ns)
         if self._pins is not None:
             self._pins.step(now_ns)
 
     def next_ns(self, now_ns: int) -> int:
-        """Latest time of the next call of `step`."""
+        """Return the latest time of the next call of `step`."""
         next_ns = self._pins.next_ns() if self._pins is not None else None
         latest_ns = now_ns + (SIN_LOOK_NS if self._sin is not None else NS_PER_S)
         return latest_ns if next_ns is None else min(next_ns, latest_ns)
 
     def summary(self) -> dict[str, int]:
-        """Counters by name."""
         return self._pins.summary() if self._pins is not None else {}
 
     def close(self) -> None:
-        """Close the files; may be called twice."""
         for file in self._files.values():
             file.close()
         if self._truth is not None:
@@ -430,7 +422,7 @@ class SimulatedLines:
 
 
 def pull_files(text: str, settle_s: float = 0.0) -> dict[Pin, PullFile]:
-    """Files by pin from `sout=PATH,alarm=PATH`. Raises ValueError, OSError."""
+    """Return files by pin from `sout=PATH,alarm=PATH`. Raises ValueError, OSError."""
     files: dict[Pin, PullFile] = {}
     for part in filter(None, text.split(",")):
         name, _, path = part.partition("=")

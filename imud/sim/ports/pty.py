@@ -1,12 +1,12 @@
-"""A simulated device behind a real pseudo-terminal: a node to open, a rate to set, a cable to pull.
+"""A simulated device behind a real pseudo-terminal, with a port to open, a baud rate to set, and a cable to remove.
 
     module ──▶ faults ──▶ adapter ──▶ line (rate) ──▶ master │ slave ◀── the program under test, through a stable link
     module ◀───────────── line (rate) ◀────────────── master │
 
-The program's rate is read from the terminal at every write: when it is not the module's, both sides hear garbage. A
-pty keeps few bytes: with no reader, or with one that does not keep up, what does not fit is lost and counted.
-Unplugging closes the pseudo-terminal and removes the link; plugging makes a new one under the same name and powers the
-module on again.
+The port reads the baud rate of the program at each write. If it differs from the rate of the device, both sides receive
+invalid bytes. A pty stores few bytes. Without a reader, or with a slow reader, the port counts the bytes that do not
+fit as lost. `unplug` closes the pseudo-terminal and removes the link. A plug makes a new pseudo-terminal with the same
+name and switches the power of the device on.
 """
 
 import fcntl
@@ -30,30 +30,31 @@ from imud.sim.sensor import Burst, StreamModule
 TCGETS2: Final = 0x802C542A
 TCSETS2: Final = 0x402C542B
 TERMIOS2: Final = struct.Struct("4I20s2I")
-"""c_iflag c_oflag c_cflag c_lflag, c_line with c_cc[19], c_ispeed c_ospeed (asm-generic/termbits.h)."""
+"""`struct termios2`: c_iflag c_oflag c_cflag c_lflag, c_line with c_cc[19], c_ispeed c_ospeed
+(asm-generic/termbits.h)."""
 BOTHER: Final = 0o010000
 CBAUD: Final = 0o010017
 READ_BYTES: Final = 4096
 LOOK_NS: Final = 20 * NS_PER_MS
-"""Interval of checks whether a program has opened the port: a pty reports no such event."""
+"""Interval of the checks whether a program has opened the port, ns. A pty does not report this event."""
 
 
 @dataclass(slots=True)
 class PtyCounters:
-    """Counts of the module's bytes by their fate."""
+    """Numbers of sent and lost bytes of the device."""
 
     bytes_written: int = 0
     bytes_unheard: int = 0
-    """Lost: no program had the port open."""
+    """Number of bytes that were lost because no program had opened the port."""
     bytes_lost_full: int = 0
-    """The reader did not keep up."""
+    """Number of bytes that were lost because the reader was too slow."""
     bursts_wrong_baud: int = 0
-    """Sent while the reader listened at another rate."""
+    """Number of bursts that were sent while the reader had another baud rate."""
     unplugs: int = 0
 
 
 class PtyNode:
-    """A pseudo-terminal under a name that stays the same from plug to plug."""
+    """A pseudo-terminal with a name that stays the same after each plug."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -61,7 +62,7 @@ class PtyNode:
         self._poll = select.poll()
 
     def plug(self, baud: int) -> None:
-        """Make the terminal, raw and at `baud`, and its link. Raises OSError."""
+        """Make the terminal in raw mode at `baud`, and its link. Raises OSError."""
         self._master, slave = os.openpty()
         try:
             os.set_blocking(self._master, False)
@@ -74,48 +75,47 @@ class PtyNode:
             fresh.symlink_to(os.ttyname(slave))
             fresh.rename(self.path)
         finally:
-            os.close(slave)  # from here on POLLHUP means that no program has it open
+            os.close(slave)  # now POLLHUP means that no program has opened the terminal
 
     def unplug(self) -> None:
-        """Make the terminal disappear; may be called twice."""
+        """Remove the terminal. A second call does nothing."""
         self.path.unlink(missing_ok=True)
         if self._master >= 0:
             os.close(self._master)
             self._master = -1
 
     def fileno(self) -> int:
-        """The master's descriptor, -1 while unplugged."""
+        """Return the descriptor of the master; -1 while the port is unplugged."""
         return self._master
 
     @property
     def is_open(self) -> bool:
-        """Whether some program has the port open."""
+        """Return whether a program has opened the port."""
         if self._master < 0:
             return False
         return not self._poll.poll(0)  # POLLHUP while no slave is open
 
     @property
     def baud(self) -> int:
-        """The rate that the program set, in bit/s."""
+        """Return the baud rate of the program, bit/s."""
         return int(TERMIOS2.unpack(fcntl.ioctl(self._master, TCGETS2, bytes(TERMIOS2.size)))[6])
 
     def read(self) -> bytes:
-        """Read the bytes that the program sent."""
         try:
             return os.read(self._master, READ_BYTES)
-        except OSError:  # nothing there, or the program closed the port (EIO)
+        except OSError:  # no bytes, or the program closed the port (EIO)
             return b""
 
     def write(self, data: bytes) -> int:
-        """Send, and return how many bytes fitted."""
+        """Send bytes. Return the number of accepted bytes."""
         try:
             return os.write(self._master, data)
-        except OSError:  # full, or no reader
+        except OSError:  # the terminal is full or has no reader
             return 0
 
 
 def set_baud(fd: int, baud: int) -> None:
-    """Set any rate on a terminal, standard or not."""
+    """Set any baud rate on a terminal, also a rate without a constant."""
     *flags, rest, _, _ = TERMIOS2.unpack(fcntl.ioctl(fd, TCGETS2, bytes(TERMIOS2.size)))
     flags[2] = flags[2] & ~CBAUD | BOTHER
     fcntl.ioctl(fd, TCSETS2, TERMIOS2.pack(*flags, rest, baud, baud))
@@ -123,20 +123,20 @@ def set_baud(fd: int, baud: int) -> None:
 
 
 class Adapter:
-    """Delay between wire and terminal: none, or until a USB adapter's latency timer fires."""
+    """Delay between wire and terminal: zero, or until the latency timer of a USB adapter fires."""
 
     def __init__(self, profile: ArrivalProfile, begin_ns: int) -> None:
         self._begin_ns = begin_ns
         self._step_ns = round(profile.timer_ns / (1 + profile.timer_ppm * 1e-6))
 
     def handed_over_ns(self, due_ns: int) -> int:
-        """Return the time at which a burst whose last byte came at `due_ns` is handed over."""
+        """Return the time at which a burst whose last byte arrived at `due_ns` is delivered."""
         step_ns = self._step_ns
         return due_ns + step_ns - (due_ns - self._begin_ns) % step_ns if step_ns else due_ns
 
 
 class SimulatedPort:
-    """Connection between a module and its terminal. It reads no clock: the owner gives the time and waits.
+    """Connection between a device and its terminal. It reads no clock: the owner passes the time and waits.
 
     Synchronization: one thread.
     """
@@ -149,7 +149,7 @@ class SimulatedPort:
         faults: Faults | None = None,
         truth: TextIO | None = None,
     ) -> None:
-        """`truth` gets one line per frame that went out whole: sample_ns, device_ms, written_ns."""
+        """`truth` gets one line per completely sent frame: sample_ns, device_ms, written_ns."""
         self.module, self.node = module, node
         self.counters = PtyCounters()
         self._adapter, self._faults, self._truth = adapter, faults, truth
@@ -160,7 +160,7 @@ class SimulatedPort:
             truth.write(f"# epoch_ns={module.epoch_ns}\nsample_ns,device_ms,written_ns\n")
 
     def step(self, now_ns: int, readable: bool = True) -> None:
-        """Do all that is due; with `readable`, look for bytes of the program as well."""
+        """Process all due events. With `readable`, also read the bytes of the program."""
         if self._replug_ns is not None and now_ns >= self._replug_ns:
             self._plug(now_ns)
         self._receive_from_module(now_ns)
@@ -169,7 +169,7 @@ class SimulatedPort:
         self._hand_over(now_ns)
 
     def next_ns(self, now_ns: int) -> int:
-        """Latest time of the next call of `step`."""
+        """Return the latest time of the next call of `step`."""
         times = [now_ns + NS_PER_S]
         if self._held:
             times.append(self._held[0].due_ns)
@@ -182,7 +182,7 @@ class SimulatedPort:
         return min(times)
 
     def unplug(self, now_ns: int, duration_ns: int) -> None:
-        """Pull the cable: the node vanishes, the module loses power; both return after `duration_ns`."""
+        """Remove the cable: the node disappears and the device loses its power. Both return after `duration_ns`."""
         self.node.unplug()
         self.counters.unplugs += 1
         self.counters.bytes_unheard += sum(len(burst.data) for burst in self._held)
@@ -190,11 +190,10 @@ class SimulatedPort:
         self._replug_ns = now_ns + duration_ns
 
     def close(self) -> None:
-        """Remove the node; may be called twice."""
         self.node.unplug()
 
     def summary(self) -> dict[str, int]:
-        """Counters by name, faults included."""
+        """Return the counters by name, with the faults."""
         faults = self._faults.counts if self._faults else {}
         return (
             self.module.counters()
@@ -208,7 +207,7 @@ class SimulatedPort:
         self.node.plug(self.module.baud)
 
     def _receive_from_module(self, now_ns: int) -> None:
-        """Pass the module's output through faults and adapter."""
+        """Pass the output of the device through faults and adapter."""
         faults = self._faults
         for burst in self.module.advance(now_ns):
             arriving: Burst | None = burst
@@ -226,7 +225,7 @@ class SimulatedPort:
             self.module.receive(heard(data, self.node.baud, self.module.baud), now_ns)
 
     def _hand_over(self, now_ns: int) -> None:
-        """Write what is due in one piece; what does not fit is lost."""
+        """Write all due bytes in one piece. Bytes that do not fit are lost."""
         held, due = self._held, []
         while held and held[0].due_ns <= now_ns:
             due.append(held.popleft())
@@ -254,6 +253,6 @@ class SimulatedPort:
 
 
 def sharpen_timers() -> None:
-    """Ask the kernel to wake this process within 1 µs instead of 50 µs; without the right to, jitter stays."""
+    """Request wake-ups with an accuracy of 1 µs instead of 50 µs. Without the permission, the jitter stays."""
     with suppress(OSError):
         Path("/proc/self/timerslack_ns").write_text("1")
