@@ -1,4 +1,4 @@
-"""What the devices of one file cannot have together is refused with its place, by the real tables."""
+"""Conflicts between the devices of one file: each error has its place. The test uses the real registries."""
 
 # ruff: noqa: E501 - a row of the table is a whole device and the whole message for it
 
@@ -16,7 +16,7 @@ RAW = bytes(range(200))
 
 
 def problems(*devices: str) -> list[str]:
-    """The lines for a file with these devices, without its name and without columns; empty where it is good."""
+    """Return the error lines of a file with these devices, without file name and column; empty for a valid file."""
     text = "devices:\n" + "".join(f"  {name}: {keys}\n" for name, _, keys in (one.partition(" ") for one in devices))
     try:
         config.parse(text, "f")

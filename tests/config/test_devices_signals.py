@@ -1,4 +1,4 @@
-"""The wires of a device in the configuration: what is read, and every refusal with its place."""
+"""GPIO lines of a device in the configuration: accepted values, and each error with its place."""
 
 # ruff: noqa: E501 - a row of the table is a device and the whole message for it
 

@@ -1,4 +1,4 @@
-"""Configuration: what is accepted, every error with its place, the shipped file, and what a change changes."""
+"""Configuration: accepted values, each error with its place, the shipped file, and changes between two files."""
 
 # ruff: noqa: E501 - a row of the table is a whole file and the whole message for it
 
@@ -493,7 +493,7 @@ def test_a_link_on_which_nothing_is_searched_needs_a_driver() -> None:
 
 @pytest.mark.parametrize("line", ["d{0}: no", "d{0}: {{baud: 1}}", "same: 1", "? {0}", "d{0}: [!a b, !c d]"])
 def test_a_file_of_nothing_but_problems_is_refused_soon(line: str) -> None:
-    """What comes after 1000 problems is not read: their number squared was an hour of work."""
+    """The reader stops after 1000 problems. Without this limit, the comparison of their places takes an hour."""
     found = errors("\n".join(line.format(number) for number in range(10_000)))
     assert len(found) == PROBLEMS_SHOWN + 1
     assert "more problems" in found[-1]
@@ -501,7 +501,7 @@ def test_a_file_of_nothing_but_problems_is_refused_soon(line: str) -> None:
 
 
 def test_pauses_between_pieces_of_work() -> None:
-    """At least one for every device, and one for so many events of the parser."""
+    """imud pauses at least once per device, and once per EVENTS_PER_TURN events of the parser."""
     text = "devices:\n" + "".join(f"  d{n}: {{uart: {{port: /dev/tty{n}}}}}\n" for n in range(DEVICES_MAX))
     pauses = 0
 

@@ -1,4 +1,4 @@
-"""YAML with positions: what is refused, where, and that plain data comes out right."""
+"""YAML with positions: refused words with their place, and the values of plain data."""
 
 import math
 from typing import Any
@@ -14,7 +14,7 @@ from imud.config.yaml import DEPTH_MAX, FILE_BYTES_MAX, SourcePosition, path_tex
 
 @pytest.fixture(params=["C", "Python"], autouse=True)
 def parser(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every test runs with libyaml and with the parser in plain Python, which stands in where libyaml is absent."""
+    """Run each test with libyaml and with the parser in plain Python, which replaces a missing libyaml."""
     if request.param == "Python":
         monkeypatch.delattr(yaml, "CSafeLoader")
 

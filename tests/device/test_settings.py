@@ -543,7 +543,7 @@ def test_another_rate_is_followed_unless_the_device_is_not_heard_at_it() -> None
     assert bench.rig.kinds.count(EventKind.UP) == 1
     bench, applied = applied_with({"baud": 921600, "mode": "9-axis"}, lambda module: module.forgets.add("baud"))
     assert outcomes(applied) == {"mode": StepOutcome.DONE, "baud": StepOutcome.FAILED}
-    assert "is not heard at 921600 baud; the line is at 115200 again" in applied.problem
+    assert "does not reply at 921600 baud; the bus has 115200 baud again" in applied.problem
     assert bench.module.baud == 115200
     assert list(applied.differences) == ["baud"]  # it was asked after it, and told
     assert bench.status.flash_writes == 1  # the attempt counts

@@ -25,7 +25,7 @@ def test_the_message_to_the_broadcast_manager() -> None:
 
 
 class Clock:
-    """Time that goes on when the loop's timer fires, late by what `late_ns` says."""
+    """Clock that moves when the timer of the loop fires, late by `late_ns`."""
 
     def __init__(self) -> None:
         self.now_ns = 0

@@ -1,4 +1,4 @@
-"""What is reported of a node that cannot be opened, with holders from a made-up /proc."""
+"""Errors of a node that cannot be opened, with the processes of a simulated /proc."""
 
 import asyncio
 import errno

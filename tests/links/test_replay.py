@@ -40,7 +40,7 @@ def raw(tmp_path: Path) -> Path:
 
 
 class Played:
-    """A link that plays a capture in virtual time; what came, and when."""
+    """A link that plays a capture in virtual time, with the delivered data and its times."""
 
     def __init__(self, path: Path, **settings: Any) -> None:
         self.clock = VirtualClock()
@@ -59,7 +59,7 @@ class Played:
         return [t_rx_ns - self.chunks[0][1] for _, t_rx_ns in self.chunks]
 
     def play(self, pieces_max: int) -> None:
-        """Play to the end, or until so many pieces came."""
+        """Play to the end, or until `pieces_max` pieces arrived."""
         run_virtually(self.clock, self._play(pieces_max))
 
     async def _play(self, pieces_max: int) -> None:
@@ -134,7 +134,7 @@ def test_maximum_speed_is_virtual_time(tmp_path: Path, stamped: Path) -> None:
     assert set(play(path, speed="maximum").offsets_ns) == {0}
     played = play(stamped, speed="maximum")
     assert played.offsets_ns == [t_ns - READS[0][1] for _, t_ns in READS]
-    assert {*played.delivered_ns} == {played.started_ns} == {played.chunks[-1][1]}  # nothing was waited for
+    assert {*played.delivered_ns} == {played.started_ns} == {played.chunks[-1][1]}  # the replay did not wait
     check_times(played)
 
 

@@ -125,7 +125,7 @@ def test_adapter_that_echoes(tmp_path: Path, setting: str | bool, chunk_bytes: i
             assert sure(link, SERIAL)
             link.select(1)
             with pytest.raises(TransferError):
-                link.transfer(write)  # what comes back is the echo and nothing else
+                link.transfer(write)  # the port receives only the echo
 
 
 def test_noise_before_the_first_echo_does_not_hide_that_there_are_echoes(pty: PtyPort) -> None:
@@ -187,7 +187,8 @@ def test_silent_module_costs_its_time_out_and_comes_back(tmp_path: Path) -> None
 
 
 def test_late_reply_is_never_taken_for_the_next(tmp_path: Path) -> None:
-    """The reply that says 0 comes 100 ms after its time-out, when the same has been asked again and is 1."""
+    """The late reply with the value 0 arrives 100 ms after its timeout, when a second request is pending whose value is
+    1."""
     late = slave(1, processing_ns=100_000_000)
     with wired(tmp_path, late, slave(2)) as (path, line), opened(path, reply_ms=1) as link:
         time_out(link, SETTINGS)

@@ -21,7 +21,7 @@ Ends = tuple[socket.socket, socket.socket, Path]
 
 
 class Bus:
-    """A link whose socket is one of the loop device, what it delivered, and when it meant to look again."""
+    """A link with a socket of the loop device, the delivered frames, and the times of its timers."""
 
     def __init__(self, ends: Ends, gather_ms: int) -> None:
         receiver, sender, sys = ends
@@ -31,11 +31,11 @@ class Bus:
         self.batches: list[list[CanFrame]] = []
         self.ends: list[LinkError | None] = []
         self.delays_s: list[float] = []
-        """Of the timers that were set."""
+        """Delays of the started timers, s."""
         self.looks = 0
-        """How often a timer of the link ended."""
+        """Number of ended timers of the link."""
         self.by_timer: list[bool] = []
-        """Of each batch, whether it was read when a timer ended."""
+        """True for each batch that a timer read."""
         self.then: Callable[[], None] = lambda: None
         """Done once, right after the next delivery."""
         self._sender = sender
@@ -143,7 +143,7 @@ def test_a_bus_that_fell_silent_is_watched_again(ends: Ends) -> None:
             bus.then = lambda: bus.send(0x100)
             bus.send(number)
             await bus.until(lambda: bus.looks == 2 * number)  # noqa: B023 - called before the number changes
-            assert len(bus.delays_s) == 2 * number  # no timer runs while nothing comes
+            assert len(bus.delays_s) == 2 * number  # no timer runs while no frame arrives
 
     bus = Bus(ends, 1)
     bus.run(story)

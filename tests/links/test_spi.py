@@ -1,4 +1,4 @@
-"""The SPI link on a simulated spidev: what goes into the ioctl, words of either size, failures."""
+"""The SPI link on a simulated spidev: arguments of the ioctl, both word sizes, failures."""
 
 import asyncio
 import errno

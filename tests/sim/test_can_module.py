@@ -20,7 +20,7 @@ PERIOD_NS = 10 * MS
 
 
 class Parrot:
-    """Sends one frame at a time of its own, and keeps what it hears."""
+    """A device that sends one frame at a time and stores the received frames."""
 
     def __init__(self, can_id: int, due_ns: int | None) -> None:
         self.epoch_ns = can_id

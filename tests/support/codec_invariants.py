@@ -1,4 +1,5 @@
-"""What holds for every codec after every piece of input: the ledger closes, memory is bounded, events are counted."""
+"""Rules for every codec after every piece of input: the ledger balances, the memory is limited, the codec counts its
+events."""
 
 from collections.abc import Iterable, Sequence
 from math import isnan
@@ -20,7 +21,7 @@ PENDING_FRAMES_MAX: Final = 16
 
 
 def untimed(events: Iterable[CodecEvent]) -> list[CodecEvent]:
-    """Events without what depends on the split: how many bytes of the same read follow."""
+    """Return events without the number of the following bytes in the same read, which depends on the split."""
     return [
         msgspec.structs.replace(event, trailing_bytes=0) if isinstance(event, Measurement) else event
         for event in events
@@ -95,7 +96,7 @@ def check_closed(ledger: Ledger) -> None:
 
 
 def check_counted(ledger: Ledger, events: Sequence[CodecEvent]) -> None:
-    """Fail unless `events`, all since the ledger's start, are those that it counts."""
+    """Fail unless the ledger counts `events`, which are all events since its start."""
     bad = [event for event in events if isinstance(event, BadFrame)]
     assert ledger.frames_bad() == sum(event.reason is not BadReason.NOT_FINITE for event in bad)
     assert ledger.frames_not_finite == sum(event.reason is BadReason.NOT_FINITE for event in bad)
@@ -103,7 +104,7 @@ def check_counted(ledger: Ledger, events: Sequence[CodecEvent]) -> None:
 
 
 def finite(measurement: Measurement, partial: bool) -> bool:
-    """Whether all numbers are; `partial`: but for those of a vector that has others."""
+    """Return whether all numbers are finite. `partial`: a vector can contain non-finite numbers."""
     values = (measurement.accel_m_s2, measurement.gyro_rad_s, measurement.euler_rad, measurement.quat_wxyz)
     for vector in values:
         if vector is None:

@@ -66,7 +66,7 @@ def write_config(folder: Path, devices: Mapping[str, Any], **more: Any) -> Path:
 
 
 def inode_of(path: Path) -> int | None:
-    """Inode of a file; None where there is none."""
+    """Return the inode of a file; None if the file does not exist."""
     return path.stat().st_ino if path.exists() else None
 
 
@@ -113,9 +113,9 @@ def running_daemon(
 def daemon_with_module(
     folder: Path, *options: str, driver: str = "hipnuc-uart", **device: Any
 ) -> Iterator[RunningDaemon]:
-    """A daemon that runs `bow`, a simulated module on a pseudo-terminal, or on RS-485 for Modbus.
+    """Run a daemon with `bow`, a simulated device on a pseudo-terminal, or on RS-485 for Modbus.
 
-    `options` are those of the simulator, `device` keys of the configuration.
+    `options` are options of the simulator, `device` are keys of the configuration.
     """
     port = str(folder / "port")
     uart, rs485 = {"port": port, "baud": 115200}, {"line": port, "baud": 115200, "address": 80}
@@ -135,9 +135,9 @@ def daemon_with_module(
 
 @contextmanager
 def sending_daemon(folder: Path, frame: Callable[[int], bytes], every_s: float = 0.01) -> Iterator[RunningDaemon]:
-    """A daemon with one HiPNUC module, `bow`, that sends `frame(n)`, n from 1 on, 100 times a second.
+    """Run a daemon with one HiPNUC device, `bow`, that sends `frame(n)`, n from 1, 100 times a second.
 
-    What a busy machine sends late is made up for, so that the rate is true over any longer time.
+    After a stall of the host, the device sends the missing frames, so that the mean rate is correct.
     """
     port, ended = PtyPort(), Event()
 

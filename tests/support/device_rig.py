@@ -48,7 +48,7 @@ class DeviceRig:
         """Each batch with the time of its publication."""
         self.events: list[Event] = []
         self.recorded: list[bytes] = []
-        """Records of what it delivered, where `DeviceRigs.recording` says so."""
+        """Records of the device, if `DeviceRigs.recording` is True."""
         self.now_ns = now_ns
         self.device: Device
 
@@ -112,7 +112,7 @@ class DeviceRig:
             await asyncio.sleep(TURN_S)
 
     async def until_samples(self, more: int, limit_s: float = LIMIT_S) -> None:
-        """Wait for more samples, and until the state says so."""
+        """Wait for more samples, and until the state is running."""
         wanted = len(self.samples) + more
         await self.until(
             lambda: len(self.samples) >= wanted and self.state is DeviceState.RUNNING, f"{more} more samples", limit_s
@@ -123,10 +123,11 @@ class DeviceRigs:
     """Makes devices that share time, buses and lines, and keeps apart what comes out of them."""
 
     recording = bool(os.environ.get("IMUD_RECORD_RIGS"))
-    """Whether devices are recorded from their begin to their end, and the replay is compared with what came out.
+    """True: the rig records each device from start to end, and compares the replay with the live run.
 
-    `IMUD_RECORD_RIGS=1 pytest tests/device tests/lines` does that in every test with rigs, but those of fake
-    drivers, which a replay cannot find."""
+    `IMUD_RECORD_RIGS=1 pytest tests/device tests/lines` does it in every test with rigs, except for fake drivers, which
+    a replay does not know.
+    """
 
     def __init__(
         self,
@@ -211,7 +212,7 @@ def is_replayed(rig: DeviceRig) -> bool:
 
 
 def check_replay(rig: DeviceRig) -> PlayedDevice:
-    """Replay what was recorded of a device, and compare samples and ledger with those of the run."""
+    """Replay the records of a device, and compare samples and ledger with the live run."""
     rig.device.tap.check(rig.recorded.append)
     samples: list[Sample] = []
     player = Player(lambda batch: samples.extend(batch.samples))

@@ -38,7 +38,7 @@ async def _without_readers_left(body: Coroutine[Any, Any, None]) -> None:
 
 
 DESCRIPTOR_LIMIT_S = 60.0
-"""How long, in real time, a loop that waits for nothing but descriptors may wait."""
+"""Maximum real time of a loop that waits only for descriptors, s."""
 
 
 UTC_AHEAD_NS = 1_795_000_000 * NS_PER_S
@@ -64,7 +64,7 @@ class VirtualClock:
 
 
 class _JumpingSelector(selectors.DefaultSelector):
-    """Where it would wait for time to pass, time passes at once."""
+    """Selector that jumps to the deadline of a wait."""
 
     def __init__(self, clock: VirtualClock) -> None:
         super().__init__()
@@ -97,7 +97,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
 
 class LoopWorker:
-    """A `Worker` of a bus that is no thread: its rounds are callbacks of the loop."""
+    """A `Worker` of a bus without a thread. Callbacks of the loop make its turns."""
 
     def __init__(self, _name: str, work: Round, failed: Callable[[BaseException], None]) -> None:
         self._work, self._failed = work, failed
@@ -112,8 +112,7 @@ class LoopWorker:
     def watch(self, _fd: int, _callback: Callable[[], None]) -> bool:
         return False
 
-    def unwatch(self, _fd: int) -> None:
-        """Nothing is watched."""
+    def unwatch(self, _fd: int) -> None: ...
 
     def end(self) -> bool:
         if self._next is not None:

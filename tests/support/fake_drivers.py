@@ -1,7 +1,6 @@
-"""Three small drivers for tests. `fake-uart`: frames of `5A A5`, u16 length, u16 CRC (XMODEM over all else), payload;
-and text lines. `fake-can`: a device of node n sends 0x180 + n, eight bytes, each frame a sample.
-`fake-module`: lines of text, and settings of every kind (`FakeModule` is the device).
-"""
+"""Three small drivers for tests. `fake-uart`: frames of `5A A5`, u16 length, u16 CRC (XMODEM over all other bytes),
+payload; and lines of text. `fake-can`: a device of node n sends 0x180 + n, eight bytes, one sample per frame.
+`fake-module`: lines of text, and settings of every kind (`FakeModule` is the device)."""
 
 import asyncio
 import binascii
@@ -125,8 +124,7 @@ def _read_settings() -> Generator[Request, Outcome, Mapping[str, str]]:
     return {}
 
 
-def _apply(codec: StreamCodec, identity: Identity) -> None:
-    """Nothing depends on the identity."""
+def _apply(codec: StreamCodec, identity: Identity) -> None: ...
 
 
 FAKE_DRIVER: Final = StreamDriver(
@@ -158,7 +156,8 @@ class FakeCanSettings(Options, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class FakeCanCodec:
-    """Every own frame is a sample, numbered by its first byte, but for those that begin with 0xFF."""
+    """Each frame of the node is a sample with its first byte as its number. Frames that start with 0xFF are not
+    samples."""
 
     def __init__(self, ledger: Ledger, settings: FakeCanSettings) -> None:
         self.ledger = ledger
@@ -180,8 +179,7 @@ class FakeCanCodec:
     def flush(self) -> Sequence[CodecEvent]:
         return ()
 
-    def reset(self) -> None:
-        """Nothing waits."""
+    def reset(self) -> None: ...
 
 
 def _cyclic(settings: FakeCanSettings) -> Sequence[CyclicFrame]:
@@ -224,7 +222,7 @@ def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
 
 
 def fake_can_frame(node: int, number: int = 0, t_ns: int = 0) -> CanFrame:
-    """A frame of a device; number 255 is one that is no sample."""
+    """Return a frame of a device. A frame with number 255 is not a sample."""
     return CanFrame(BASE + node, False, bytes([number, *bytes(7)]), t_ns)
 
 
@@ -276,9 +274,9 @@ class LinesCodec:
 
 
 class FakeModule(MemoryLink):
-    """A module at the far end of a line: settings in force, settings set, settings in flash.
+    """A device at the end of a wire, with active settings, changed settings and settings in flash.
 
-    `mounting` comes into force by save and restart, everything else at once.
+    `mounting` applies after save and restart, all other settings apply immediately.
     """
 
     def __init__(self, now_ns: Callable[[], int], *, serial: str = "A1", baud: int | Literal["auto"] = 115200) -> None:
@@ -296,7 +294,7 @@ class FakeModule(MemoryLink):
         self.commands: list[str] = []
         self.saves = 0
         self.pauses_clock = False
-        """Whether its clock begins anew with every answer to GET."""
+        """True: its clock starts again with each reply to GET."""
         self._now_ns = now_ns
         self._boot_ns = now_ns()
 
@@ -351,7 +349,7 @@ class FakeModule(MemoryLink):
         elif name == "offset_deg":
             value = round(value, 2)
         if name == "baud" and name not in self.forgets:
-            self.flash[name] = value  # in force by the restart, whatever is saved
+            self.flash[name] = value  # active after the restart, also without a save
         elif name != "baud" and name not in self.forgets:
             self.set[name] = value
         return ["OK"]
@@ -409,7 +407,7 @@ def _write_baud(target: Target, baud: int) -> RequestScript[None]:
         yield from _who()
     except NoReply:
         yield pause(1_000_000, baud=target.baud)
-        raise Rejected(f"the module is not heard at {baud} baud; the line is at {target.baud} again") from None
+        raise Rejected(f"the device does not reply at {baud} baud; the bus has {target.baud} baud again") from None
 
 
 def _parts_agree(declared: Mapping[str, int], actual: Mapping[str, int]) -> bool:

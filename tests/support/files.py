@@ -1,4 +1,4 @@
-"""Files that tests read and write: those of the repository, shared recordings, captures and logs of frames."""
+"""Files of tests: files of the repository, shared recordings, captures and logs of frames."""
 
 import os
 from collections.abc import Iterable, Mapping
@@ -22,7 +22,7 @@ FOLDER: Final = SHARED / "data"
 
 
 def shared(name: str) -> Path:
-    """The path of a file; skips the test where it is not there."""
+    """Return the path of a shared file. Skip the test if the file does not exist."""
     path = FOLDER / name
     if not path.is_file():
         pytest.skip(f"{path} is not there: set IMUD_SHARED to the folder with {name}")
@@ -59,7 +59,8 @@ class CaptureWriter:
         self._room -= self._file.write(header)
 
     def write(self, data: bytes, t_ns: int) -> bool:
-        """Append one read; False once the bound is reached, and from then on. A time that ran back is held."""
+        """Append one read. Return False after the limit. A time that runs backwards is replaced by the previous
+        time."""
         if not data:
             return self.bytes_refused == 0
         if self.bytes_refused or RECORD.size + len(data) > self._room:

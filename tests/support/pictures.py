@@ -1,8 +1,8 @@
 """Draws the pictures of README.md and docs/frames.md: `python -m tests.support.pictures` (`make pictures`).
 
-`terminal.svg` is what the commands print, run on a simulated module; `time_stamps.svg` is a simulation whose truth is
-known: a module at 100 Hz behind a USB adapter that holds bytes for up to 16 ms. `frame_axes.svg` and
-`frame_mountings.svg` of docs/frames.md are drawn from the rotations that imud uses.
+`terminal.svg` shows the output of commands for a simulated device. `time_stamps.svg` shows a simulation with a known
+truth: a device at 100 Hz behind a USB adapter that holds bytes for up to 16 ms. `frame_axes.svg` and
+`frame_mountings.svg` of docs/frames.md show the rotations of imud.
 """
 
 import subprocess
@@ -67,7 +67,7 @@ def terminal(lines: Sequence[str], title: str = "imud devices, status and watch 
 
 
 def session() -> list[str]:
-    """What is typed and printed while the daemon runs on a simulated module."""
+    """Return the commands and their output for a daemon with a simulated device."""
     lines: list[str] = []
     with tempfile.TemporaryDirectory(prefix="imud-") as name:
         folder = Path(name)
@@ -180,7 +180,7 @@ def time_stamps(samples: Sequence[Stamp]) -> str:
 
 COLOURS = ("#c0392b", "#2e8b57", "#1f5fa8")
 FORWARD, LEFT, UP = (0.80, -0.42), (-0.76, -0.34), (0.0, -0.95)
-"""Where the body's axes point on the page, per unit of length."""
+"""Directions of the axes of the body on the page, per unit of length."""
 BODY_PANEL, MOUNTING_PANEL = (250, 275), (250, 260)
 
 

@@ -1,4 +1,4 @@
-"""Polled devices on buses inside the process, in virtual time: what is read when follows from the deadlines alone."""
+"""Polled devices on buses inside the process, in virtual time. The deadlines alone decide the order of the reads."""
 
 import asyncio
 from collections.abc import Callable, Coroutine
@@ -21,7 +21,7 @@ from tests.support.event_loops import LoopWorker, VirtualClock, run_virtually
 
 RATE_HZ = 250.0
 TRANSFER_NS = 160_000
-"""What every transfer takes: 32 bytes at 1.6 Mbit/s."""
+"""Duration of each transfer, ns: 32 bytes at 1.6 Mbit/s."""
 
 
 class PolledBusBench:
@@ -79,7 +79,7 @@ class PolledBusBench:
 
 
 class _ReadyI2c(I2cLink):
-    """Its node need not be waited for."""
+    """An I2C link whose node exists immediately."""
 
     def absence(self) -> str:
         return ""

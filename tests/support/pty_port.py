@@ -35,7 +35,7 @@ SETTLED_S = 0.05
 
 
 class PtyPort:
-    """The far end is `master`; `path` is what a link opens."""
+    """A pseudo-terminal: the test uses `master`, a link opens `path`."""
 
     def __init__(self) -> None:
         self.master, slave = os.openpty()
@@ -81,7 +81,7 @@ def waiting_bytes(fd: int) -> int:
 
 @contextmanager
 def unprivileged() -> Iterator[None]:
-    """Without root's right to open everything; no change for other users."""
+    """Remove the right of root to open every file. No effect for other users."""
     if os.geteuid():
         yield
         return

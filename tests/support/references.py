@@ -1,10 +1,10 @@
 """Makes the generated parts of the documents from the code: `python -m tests.support.references`.
 
-The tables of docs/configuration.md come from the settings classes, those of docs/commands.md, docs/calibration.md
-and docs/settings.md from the drivers' actions, calibrations and device settings, and those of
-docs/shm.md from the layout of shared memory; the one of docs/monitoring.md comes from the rules for Prometheus.
+The classes of options give the tables of docs/configuration.md. The drivers give the tables of docs/commands.md,
+docs/calibration.md and docs/settings.md. The layout of shared memory gives the tables of docs/shm.md, and the
+Prometheus rules give the table of docs/monitoring.md.
 
-docs/socket.schema.json has the JSON Schema of every message of the UNIX socket (tests/publishers/socket/schema.py).
+docs/socket.schema.json contains the JSON Schema of each message of the UNIX socket (tests/publishers/socket/schema.py).
 """
 
 import ast

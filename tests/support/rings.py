@@ -24,7 +24,7 @@ def slot_at(seq: int) -> int:
 
 
 def make_sample(seq: int, device: str = DEVICE) -> Sample:
-    """A sample whose every part says which one it is."""
+    """Return a sample with values that identify it."""
     value = float(seq)
     return Sample(
         device, seq, seq * 1_000_000, 1000 + seq % 1000, Sync.REGRESSION, seq * 1_000_000 + 500, 10**18 + seq,
@@ -86,7 +86,7 @@ class Board:
         return int.from_bytes(self.path.read_bytes()[OFFSETS[name] :][:size_bytes], "little")
 
     def die(self) -> None:
-        """Leave the directory as a daemon that was killed: its ring as it was, unlocked, and nobody to write it."""
+        """Leave the directory in the state after a kill: the ring stays, unlocked and without a writer."""
         copy = self.path.with_name("copy")
         copy.write_bytes(self.path.read_bytes())
         copy.rename(self.path)
@@ -99,7 +99,8 @@ class Board:
 
 
 def check_layout(fields: Iterable[SlotField], size_bytes: int) -> None:
-    """Each field begins where the one before it ends, on a multiple of its size; together they fill the record."""
+    """Check that each field starts at the end of the previous field, on a multiple of its size, and that the fields
+    fill the record."""
     at = 0
     for field in fields:
         assert field.offset == at, field.name

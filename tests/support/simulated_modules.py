@@ -125,7 +125,7 @@ FAST = ModuleSettings(baud=921_600, hi91=Output(1))
 
 
 class Hi91(NamedTuple):
-    """HI91 as it stands on the wire, units of the manual."""
+    """HI91 with the values on the wire, in the units of the manual."""
 
     word_1_2: int
     temperature_c: int
@@ -166,7 +166,7 @@ class HipnucUartBench:
         return self.text(duration_ms)
 
     def text(self, duration_ms: float) -> list[str]:
-        """Let time pass; return the lines of text that came."""
+        """Let time pass. Return the received lines of text."""
         text = b"".join(burst.data for burst in self.wait(duration_ms) if burst.sample_ns is None)
         assert not text or text.endswith(b"\r\n")
         return text.decode("ascii").split("\r\n")[:-1]
@@ -204,7 +204,7 @@ def unpack(payload: bytes) -> tuple[int, bytes]:
 
 
 class CanBench:
-    """A module on a CAN bus, others beside it, a codec that hears it, and a session."""
+    """A device on a CAN bus, other devices on the same bus, a codec that receives its frames, and a script runner."""
 
     def __init__(self, driver: CanDriver, module: CanModule, settings: Any, others: Sequence[CanModule] = ()) -> None:
         self.now_ns = BEGIN_NS

@@ -60,7 +60,7 @@ from tests.publishers.socket.schema import MessageChecker
 
 T = TypeVar("T")
 CHECKER = MessageChecker()
-"""Every message that a `Peer` receives is what docs/socket.schema.json has."""
+"""Checker of all messages that a `Peer` receives against docs/socket.schema.json."""
 
 EPOCH = 4886718345
 NOW_NS = 80_000_123_456_789
@@ -200,7 +200,7 @@ class FakeControl:
         return SettingsReport(self._device, "hipnuc-uart", {"product": "HI13"}, status, (mode,))
 
     async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
-        """One step, of what is given or of what is declared."""
+        """Make one step of a plan: for the given settings or for the declared settings."""
         mode = {"mode": "9-axis"} if given is None else given
         return SettingsPlan(tuple(PlannedStep(name, value, "6-axis") for name, value in mode.items()), save=save)
 
@@ -422,7 +422,7 @@ class Peer:
         return body
 
     async def ended(self) -> bool:
-        """Whether the server closed, with nothing more to read."""
+        """Return whether the server has closed the connection and all data is read."""
         try:
             return not self.buffer and await asyncio.get_running_loop().sock_recv(self.sock, 1) == b""
         except ConnectionResetError:

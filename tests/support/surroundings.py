@@ -1,7 +1,6 @@
-"""The machine around a test: what a daemon must withstand, ports for servers, and machines for `imud doctor`.
+"""Surroundings of a test: hostile processes, ports for servers, and simulated hosts for `imud doctor`.
 
-A daemon must withstand processes of other users, which only root can start, and pipes that nothing reads. The machines
-that `imud doctor` looks at are made up.
+A daemon must withstand processes of other users, which only root can start, and pipes without a reader.
 """
 
 import os
@@ -76,7 +75,7 @@ def pipe(*, full: bool = False) -> Iterator[tuple[int, int]]:
 
 
 def read_until(descriptor: int, end: bytes) -> bytes:
-    """What can be read, up to some text."""
+    """Read until some text."""
     data = b""
     while end not in data:
         assert select.select([descriptor], [], [], 60)[0], data[-200:]
@@ -85,7 +84,7 @@ def read_until(descriptor: int, end: bytes) -> bytes:
 
 
 LOWEST_PORT: Final = 15000
-"""Above those that servers of tests have by custom, as 1883, 2947 and 9090."""
+"""Lowest port of a test. Usual ports of servers, for example 1883, 2947 and 9090, are lower."""
 PORT_TRIES_MAX: Final = 100
 
 
@@ -134,14 +133,14 @@ class Machine:
         self.write("/etc/imud.yaml", more + "\n".join(lines) + "\n")
 
     def port(self, name: str, *, gid: int = 20, mode: int = 0o660) -> Path:
-        """A serial port with hardware. Its group is `gid` where the test may set it."""
+        """Make a serial port with hardware. Its group is `gid` if the test may set it."""
         self.write(f"/sys/class/tty/{name}/device/uevent")
         node = self.write(f"/dev/{name}")
         node.chmod(mode)
         return node
 
     def unit(self, *lines: str) -> None:
-        """What `systemctl show` prints of a unit that is there."""
+        """Set the output of `systemctl show` for an existing unit."""
         self.outputs["systemctl show"] = CommandOutput(0, "\n".join(("LoadState=loaded", *lines)), "")
 
     def prints(self, command: str, text: str, status: int = 0, complaint: str = "") -> None:

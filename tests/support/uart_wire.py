@@ -1,8 +1,8 @@
-"""A device on a serial line in virtual time, seen by a UART at any baud rate: what a wrong rate makes of the bits.
+"""A device on a serial wire in virtual time, received by a UART at any baud rate.
 
-The line is modelled bit by bit: 8N1 at the device's rate, sampled as a UART does at the host's rate (start edge, half
-a bit later still low, then the middle of each bit). A byte with a wrong stop bit is delivered as sampled, as Linux does
-without INPCK.
+The model works bit by bit: 8N1 at the rate of the device, sampled by a UART at the rate of the host (start edge, still
+low half a bit later, then the middle of each bit). The UART delivers a byte with a wrong stop bit as sampled, as Linux
+does without INPCK.
 """
 
 from bisect import bisect_left
@@ -19,7 +19,7 @@ from imud.device.stream_search import Search, Step, StreamFound
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 SET_BAUD_NS: Final = 3 * NS_PER_MS
-"""What setting a rate costs on a USB adapter; bytes that begin before are lost."""
+"""Duration of a change of the baud rate on a USB adapter, ns. Bytes that start in this time are lost."""
 REPLY_DELAY_NS: Final = 20 * NS_PER_MS
 TimedByte = tuple[int, int]
 """End of the byte on the wire, ns; its value."""
@@ -32,7 +32,7 @@ def levels(data: bytes) -> list[int]:
 
 @lru_cache(maxsize=4096)
 def received(data: bytes, device_baud: int, host_baud: int) -> tuple[TimedByte, ...]:
-    """What a UART at `host_baud` makes of `data` sent at `device_baud` from time 0 on."""
+    """Return the bytes that a UART at `host_baud` receives of `data`, sent at `device_baud` from time 0."""
     if device_baud == host_baud:
         byte_ns = uart_byte_ns(host_baud)
         return tuple(((index + 1) * byte_ns, byte) for index, byte in enumerate(data))
@@ -68,7 +68,7 @@ class FakeDevice:
     reply: bytes = b""
     query: bytes = b""
     make_frame: Callable[[Random], bytes] | None = None
-    """What it sends; the driver's example frames by default."""
+    """Frames that the device sends; None for the example frames of the driver."""
     noise: bytes = b""
     damage: float = 0.0
     """Share of frames with one bit flipped."""
@@ -132,7 +132,7 @@ def run_search(search: Search, device: FakeDevice, start_ns: int = 0) -> tuple[S
 
 
 def _stay(search: Search, reads: Iterator[tuple[int, bytes]], listen: Listen) -> tuple[Step, int]:
-    """One stay at one rate, prolonged as the search wants; returns the step that ends it and when it came."""
+    """Make one stay at one rate, as long as the search requests. Return the step that ends it, and its time."""
     until_ns = listen.until_ns
     t_ns, data = next(reads, (1 << 62, b""))
     while True:

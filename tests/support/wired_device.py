@@ -34,9 +34,9 @@ BAUD = 115_200
 STEP_S = 0.002
 TICK_S = 0.1
 WAKE_NS = 30_000
-"""From the last byte to the program that reads it."""
+"""Time from the last byte to the program that reads it, ns."""
 EDGE_LATE_NS = 45_000
-"""From the measurement to the rising edge: 125 µs to the frame, of which 80 µs are the pulse."""
+"""Time from the measurement to the rising edge, ns: 125 µs to the frame minus 80 µs of the pulse."""
 
 
 class WiredDevice:
@@ -135,7 +135,7 @@ class WiredDevice:
         return self.instants[sample.t_dev_ns // NS_PER_MS]
 
     def pulses(self, pin: Pin) -> dict[int, int]:
-        """Instant of measurement by the number of the pulse, of those that the host saw."""
+        """Return the measurement times by pulse number, for the pulses that the host received."""
         return self._pulses[pin]
 
     def of_kind(self, kind: EventKind) -> list[Event]:

@@ -104,7 +104,7 @@ def test_sync_sends_what_is_of_type_1() -> None:
     bench.heard.clear()
     bench.run(50 * MS)
     assert bench.heard == []
-    assert bench.run_script(session.identify(8)).product == "HI14"  # SDO goes on
+    assert bench.run_script(session.identify(8)).product == "HI14"  # SDO still works
     bench.send(0x000, b"\2\0")  # stop all
     bench.heard.clear()
     bench.send(0x608, cia301.read_frame(0x1000, 0))

@@ -215,7 +215,7 @@ def test_a_restart_is_answered_before_it_happens_or_not_at_all(confirms: bool) -
 
 
 def test_an_address_is_claimed_after_power_on_and_when_asked() -> None:
-    """Request for PGN 0xEE00 as J1939-21 has it, low byte first, to the module and to all."""
+    """The request for PGN 0xEE00 has the format of J1939-21, low byte first, to the device and to all nodes."""
     module = HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0))
     claims = [f for f in module.advance(BEGIN_NS + 10 * MS) if f.can_id == 0x18EEFF08]
     assert len(claims) == 1

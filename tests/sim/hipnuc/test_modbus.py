@@ -1,4 +1,4 @@
-"""Simulated modules on one line: what a byte costs, who answers, what is kept. No clock, no waiting."""
+"""Simulated devices on one bus: time of a byte, replies, saved settings. No clock, no waiting."""
 
 from math import dist
 from typing import Any

@@ -1,4 +1,4 @@
-"""The simulated module sends what manual chapter 3 says when it says it, and the codec understands it."""
+"""The simulated device follows chapter 3 of the manual, and the codec decodes its frames."""
 
 from itertools import pairwise
 from math import degrees, hypot

@@ -47,7 +47,7 @@ def test_which_frames_have_a_pulse_and_how_long_it_is() -> None:
     bench = HipnucUartBench(ModuleSettings(baud=115_200, hi91=Output(1)))
     _, edges = run(bench, 1000.0)
     assert bench.module.frames_dropped > 800
-    assert len(pulses(edges, Pin.SOUT)) == pytest.approx(bench.module.frames_sent, abs=6)  # those in the buffer
+    assert len(pulses(edges, Pin.SOUT)) == pytest.approx(bench.module.frames_sent, abs=6)  # frames in the buffer
 
     bench = HipnucUartBench(ModuleSettings(baud=921_600, hi91=Output(10), hi92=Output(10)))
     bursts, edges = run(bench, 1000.0)

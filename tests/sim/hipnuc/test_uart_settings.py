@@ -1,4 +1,4 @@
-"""Commands that change settings: the manual's examples, the host's encoders, and what is refused."""
+"""Commands that change settings: examples of the manual, encoders of the host, and refused commands."""
 
 from dataclasses import replace
 

@@ -1,4 +1,5 @@
-"""Each way to read the manual is what the simulated module does: rate, factory reset, flash, silence, refusals."""
+"""Each interpretation of the manual as a behavior of the simulated device: rate, factory reset, flash, silence,
+refusals."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The simulated register file: pipeline, windows, latching, and that its faults are what they say."""
+"""The simulated register file: pipeline, windows, latched values, and its faults."""
 
 import errno
 

@@ -223,7 +223,7 @@ def test_behaviour_of_the_variants() -> None:
     far.send(c.save().payload)
     assert len(far.samples(1990)) <= 1  # the frame that was on its way
     ((at_ms, result),) = heard(far, c.ask_status(), 100)
-    assert (at_ms < 30, result) == (True, 0)  # the status request was not heard
+    assert (at_ms < 30, result) == (True, 0)  # the device did not receive the status request
     assert len(far.samples(500)) >= 48
 
     far = imu61x_bench(quiet_ms=700)

@@ -1,4 +1,4 @@
-"""The arrival model keeps to what its profiles say, and its truth is a truth."""
+"""The arrival model: limits of its profiles, and its truth."""
 
 from dataclasses import replace
 from itertools import pairwise

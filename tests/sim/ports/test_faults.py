@@ -1,4 +1,4 @@
-"""Every fault is noted with its kind, does what its name says, and comes from the seed."""
+"""The log contains each fault with its kind, each fault has its effect, and the seed decides the faults."""
 
 from random import Random
 

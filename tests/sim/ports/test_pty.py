@@ -64,7 +64,7 @@ class PluggedPort:
     def read(self) -> bytes:
         try:
             return os.read(self.fd, 65536) if self.fd >= 0 else b""
-        except OSError:  # nothing there, or the other end is gone
+        except OSError:  # no data, or the other end is closed
             return b""
 
 
@@ -143,7 +143,7 @@ def test_a_silent_module_notices_soon_that_a_program_opened_the_port(rig: Plugge
     assert rig.module.next_ns() is None
     assert rig.port.next_ns(rig.now_ns) == rig.now_ns + 20 * NS_PER_MS
     rig.open()
-    assert rig.port.next_ns(rig.now_ns) == rig.now_ns + NS_PER_S  # from now on select reports its bytes
+    assert rig.port.next_ns(rig.now_ns) == rig.now_ns + NS_PER_S  # select reports its bytes after this step
 
 
 def test_a_command_of_a_program_that_left_at_once_is_obeyed(rig: PluggedPort) -> None:

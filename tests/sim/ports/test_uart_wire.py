@@ -1,4 +1,4 @@
-"""The wire of a UART: bursts take their time, and ends at different rates hear what follows from the bits."""
+"""The wire of a UART: duration of bursts, and bytes at ends with different rates."""
 
 from random import Random
 
