@@ -24,7 +24,7 @@ def test_rows_lead_to_objects_that_know_their_name(table: Registry[Any], kind: t
 
 
 def test_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(KeyError, match=r"no driver named 'bno055'; there are: .*hipnuc-uart"):
+    with pytest.raises(KeyError, match=r"no driver named 'bno055'; expected one of: .*hipnuc-uart"):
         DRIVERS["bno055"]
 
 

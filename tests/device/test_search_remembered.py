@@ -16,10 +16,11 @@ FOUND = RememberedDevice("hipnuc-uart", 9600)
 
 def remember(folder: Path, **found: RememberedDevice) -> None:
     """Remember devices as one daemon does from its start to its end."""
+    before = set(threading.enumerate())
     with closing(Remembered(folder)) as memory:
         for name, one in found.items():
             memory.put(name, one)
-    assert "remembered" not in {thread.name for thread in threading.enumerate()}
+    assert "remembered" not in {thread.name for thread in set(threading.enumerate()) - before}
 
 
 def recalled(folder: Path, device: str) -> RememberedDevice | None:
