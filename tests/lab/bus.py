@@ -22,9 +22,9 @@ OneTransfer = TypeVar("OneTransfer", wire.I2cTransfer, wire.SpiTransfer)
 
 
 class Bus(Generic[OneTransfer]):
-    """The far end of one bus. Use as a context manager; what a device raised besides its faults, close() raises.
+    """The devices of one bus, as a context manager. `close()` raises the unexpected exceptions of devices.
 
-    Synchronization: devices run in the serving thread; `attach`, `detach` and `transfers` may be used from any.
+    Synchronization: devices run in the serving thread; any thread can call `attach`, `detach` and `transfers`.
     """
 
     def __init__(self, path: Path, select_of: Callable[[OneTransfer], int]) -> None:

@@ -42,7 +42,7 @@ class BusRig:
             await asyncio.sleep(0.002)
 
     async def done(self, work: Coroutine[Any, Any, Any]) -> Any:
-        """What comes of something that the device does, while the modules go on."""
+        """Wait for work of the device while the simulated devices run. Return its result."""
         task = asyncio.create_task(work)
         await self.until(task.done, "its end")
         return task.result()

@@ -79,7 +79,7 @@ class Sender:
     def __init__(self, interface: str) -> None:
         self.refused = 0
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
-        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # hears nothing
+        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # receives no frames
         self._socket.bind((interface,))
         self._frames = bytearray(FRAMES_MAX * RAW_FRAME.size)
         frames = ctypes.addressof(ctypes.c_char.from_buffer(self._frames))

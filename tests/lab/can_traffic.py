@@ -23,7 +23,7 @@ ANGLE_RAD: Final = 0.002
 """Some counts of the coarsest protocol, and less than the motion `swing` changes between two samples at 100 Hz."""
 BEGIN_S: Final = 1.0
 LATE_SAMPLES: Final = 12
-"""So late may the first sample be, where the guest has stalled."""
+"""Maximum delay of the first sample after a stall of the guest, samples."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Module:
 
 
 def fleet() -> list[Module]:
-    """Four CANopen nodes, four J1939 nodes and one IMU61x; more IMU61x in place of what has no simulator."""
+    """Return four CANopen nodes, four J1939 nodes and one IMU61x; more IMU61x if a simulator does not exist."""
     spare = iter(range(201, 2000, 100))
     return [
         Module(driver, node) if driver in CAN_SIMULATORS and driver in DRIVERS else Module("imu61x-can", next(spare))
@@ -80,7 +80,7 @@ class Traffic:
 
 @contextmanager
 def traffic(interface: str, modules: Sequence[Module], rate_hz: float, seconds: float) -> Iterator[Traffic]:
-    """All modules in one process that nothing of ours can stall: it has the priority of a real bus."""
+    """Run all devices in one process with the priority of a real bus, so that no other process of imud delays it."""
     argv = ["chrt", "-f", "10", sys.executable, "-m", "tests.lab.can_player", interface, str(rate_hz), str(seconds)]
     argv += [f"{module.driver}:{module.node}" for module in modules]
     pipe = subprocess.PIPE
@@ -97,8 +97,8 @@ class Against:
     """Holds the samples of one device against the truth of its motion, each at its own instant."""
 
     def __init__(self, number: int, first: Sample, rate_hz: float, begin_ns: int) -> None:
-        """`number` of the module; `begin_ns` of the play. Finds the instant of the first sample, at or before its
-        stamp, where the truth is nearest."""
+        """Find the time of the first sample, at or before its time stamp, with the smallest deviation from the truth.
+        `number` is the number of the device, `begin_ns` the start of the run."""
         self._motion = Phased(number)
         self._rate_hz = rate_hz
         self._seq = first.seq
@@ -108,7 +108,7 @@ class Against:
         )
 
     def is_true(self, sample: Sample) -> bool:
-        """Whether every value of the sample is of the instant that its number says."""
+        """Return whether every value of the sample belongs to the instant of its number."""
         return self._worst(sample, self._instant_s(self._first + sample.seq - self._seq)) <= 1
 
     def _instant_s(self, number: int) -> float:
@@ -116,7 +116,7 @@ class Against:
         return BEGIN_S + number / self._rate_hz % LOOP_S
 
     def _worst(self, sample: Sample, t_s: float) -> float:
-        """The largest deviation from the truth at an instant, in units of what is allowed."""
+        """Return the largest deviation from the truth at an instant, in units of the permitted deviation."""
         truth = self._motion.at(t_s)
         found = [
             _distance(sample.gyro_rad_s, truth.gyro_rad_s) / GYRO_RAD_S,

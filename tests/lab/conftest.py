@@ -1,4 +1,4 @@
-"""Fixtures of the lab. Outside the lab's guest nothing here is collected: `make lab` runs it."""
+"""Fixtures of the lab. pytest collects these tests only in the guest of the lab: `make lab` runs it."""
 
 import os
 import threading
@@ -66,7 +66,7 @@ def can_pair() -> Iterator[tuple[CanInterface, CanInterface]]:
 
 @pytest.fixture
 def gpio_chip() -> Iterator[GpioChip]:
-    """A chip with the lines SOUT, SIN, PPS, ALARM, one without a name, and RESET."""
+    """A chip with the lines SOUT, SIN, PPS, ALARM, a line without a name, and RESET."""
     with simulated_chip(GPIO_LINES) as chip:
         yield chip
 

@@ -51,7 +51,7 @@ class Diagnosis(msgspec.Struct, frozen=True):
 
 
 def diagnose(config: Path, socket: Path, *prefix: str) -> Diagnosis:
-    """Run it, behind the words `prefix`; see that its exit status is that of its worst finding."""
+    """Run `imud doctor` after the words `prefix`. Check that the exit status matches the worst finding."""
     doctor = (sys.executable, "-m", "imud", "doctor", "--json", "--socket", str(socket), "--config", str(config))
     result = subprocess.run([*prefix, *doctor], capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert not result.stderr, result.stderr

@@ -16,7 +16,7 @@ _numbers = itertools.count()
 @dataclass(frozen=True)
 class GpioChip:
     path: Path
-    """Its character device, such as /dev/gpiochip0."""
+    """Character device of the chip, for example /dev/gpiochip0."""
     names: tuple[str, ...]
     sysfs: Path
     """Folder with one sim_gpio<offset> per line."""
@@ -38,7 +38,7 @@ class GpioChip:
         _set(self.device / "live", "0")
 
     def plug_in(self) -> None:
-        """Brings it back, perhaps under another number: only the names of its lines are what they were."""
+        """Plug the chip in again. Its number can change; the names of its lines stay."""
         _set(self.device / "live", "1")
 
     def _attribute(self, line: str | int, name: str) -> Path:

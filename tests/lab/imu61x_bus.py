@@ -1,4 +1,4 @@
-"""The simulated IMU61x behind the kernel module's buses, and what both buses' tests have in common."""
+"""The simulated IMU61x behind the buses of the kernel module, and common parts of the tests of both buses."""
 
 from collections.abc import Callable
 from math import dist

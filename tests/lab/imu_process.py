@@ -21,7 +21,7 @@ class Pulse(NamedTuple):
     sample_ns: int
     """Instant of measurement of its sample."""
     late_ns: int
-    """How much later than it should the module's process made it."""
+    """Delay of the process of the device, ns."""
 
 
 class Imu(NamedTuple):

@@ -37,7 +37,7 @@ def pseudo_terminal() -> Iterator[PseudoTerminal]:
 
 
 def uart_pair() -> tuple[Path, Path]:
-    """The devices of the two UARTs (16550A on PCI, driver 8250); what one sends the other receives."""
+    """Return the device nodes of two connected UARTs (16550A on PCI, driver 8250)."""
     first, second = sorted(
         Path("/dev") / port.name
         for port in Path("/sys/class/tty").glob("ttyS*")

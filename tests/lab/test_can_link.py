@@ -98,7 +98,7 @@ def test_a_kernel_without_the_manager_is_helped_by_the_loop(
             reader = FrameReader(far, lambda classes, data: False)
             link.start(lambda frames: None, lambda news, problem: None, lambda error: None)
             link.send_cyclic([SYNC])
-            assert isinstance(link._sender, LoopSender)  # what is tested
+            assert isinstance(link._sender, LoopSender)  # the tested case
 
             def five() -> bool:
                 heard.extend(reader.read())
@@ -139,7 +139,7 @@ def test_a_device_is_found_by_listening_and_again_after_the_bus_was_down(vcan: C
     async def story() -> None:
         now_ns = monotonic_ns()
         modules = [Imu61xCanModule(now_ns, Imu61xCanHardware(rate_hz=50, boot_ms=0, base_id=n)) for n in (101, 900)]
-        port = CanPort(CanModules(modules), vcan.name)  # the second is nobody that a driver knows
+        port = CanPort(CanModules(modules), vcan.name)  # no driver knows the frames of the second device
         task = asyncio.create_task(runner.run())
 
         def running() -> bool:
@@ -154,7 +154,9 @@ def test_a_device_is_found_by_listening_and_again_after_the_bus_was_down(vcan: C
         assert skipped > 0
         samples = runner.ledger.samples
         await until(lambda: running() and runner.ledger.samples > samples + 50, "a second of samples")
-        assert runner.ledger.bytes_skipped - skipped <= 64 * 8  # what waited in the socket when the filters were set
+        assert (
+            runner.ledger.bytes_skipped - skipped <= 64 * 8
+        )  # frames in the queue of the socket before the filters were set
         vcan.down()
         await until(lambda: runner.state is DeviceState.MISSING, "missing")
         vcan.up()

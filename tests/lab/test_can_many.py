@@ -16,7 +16,7 @@ from tests.support.daemon_process import RunningDaemon, running_daemon
 
 SECONDS = float(os.environ.get("IMUD_LAB_SECONDS", "6"))
 RATE_HZ = float(os.environ.get("IMUD_LAB_RATE_HZ", "20"))
-"""Whole hertz, of which the period is whole milliseconds."""
+"""Rate in whole hertz, with a period in whole milliseconds."""
 LATENCY_MS = float(os.environ.get("IMUD_LAB_LATENCY_MS", "50"))
 LIMIT_S = 60.0
 ASK_S = 0.5

@@ -1,8 +1,8 @@
-"""Complaints that `imud doctor` is for, provoked on the kernel's own buses and diagnosed beside the real daemon.
+"""Faults for `imud doctor`, caused on the buses of the kernel and diagnosed next to the real daemon.
 
-Every diagnosis is that of the command in a process of its own, and its exit status is compared with its findings.
-QEMU's buses make no electrical errors: the error counters of a CAN controller are those that the lab's module has its
-driver report (README.md), and bytes of a UART at a wrong rate are those of the simulator behind a pseudo terminal.
+Each diagnosis runs the command in its own process and compares its exit status with its findings. The buses of QEMU
+have no electrical errors. The kernel module of the lab sets the error counters of a CAN controller (README.md). Bytes
+of a UART at a wrong rate come from the simulator behind a pseudo-terminal.
 """
 
 import errno
@@ -42,7 +42,7 @@ pytestmark = pytest.mark.timeout(600)
 METRICS_PORT = 19322
 DEAF_RATE_HZ = 10
 ANSWERED_AFTER_S = 60
-"""Of imud.cli.doctor.daemon: a device that was silent on requests for so long does not hear them."""
+"""Time in imud.cli.doctor.daemon, s: a device without a reply for this time does not receive requests."""
 DIALOUT = 20
 
 
@@ -382,7 +382,7 @@ def test_lines_and_restarts(gpio_chip: GpioChip, tmp_path: Path) -> None:
         assert imu.process.stdin is not None
         for number in range(1, 4):
             seen = made.statuses()["bow"].ledger["samples"]
-            # a restart right after another one cannot be told from it by the device's time
+            # the device time cannot distinguish two restarts that follow each other directly
             wait_for(made, "bow", lambda one, least=seen + 20: one.ledger["samples"] >= least, "samples")  # type: ignore[misc]  # a lambda's default
             imu.process.stdin.write("reboot\n")
             imu.process.stdin.flush()

@@ -1,4 +1,4 @@
-"""imud's lines on gpio-sim: what the kernel really does with them."""
+"""GPIO lines of imud on gpio-sim, with the real behavior of the kernel."""
 
 import asyncio
 import os
@@ -89,7 +89,7 @@ async def test_drain_comes_before_the_loop(gpio_chip: GpioChip) -> None:
 
 @in_loop
 async def test_overflow_is_counted(gpio_chip: GpioChip) -> None:
-    """Nobody reads; the kernel keeps the newest edges. It may make one of two that come close together."""
+    """Without a reader, the kernel keeps the newest edges. It can join two edges that are close together."""
     watcher = Watcher(InputOptions(line="SOUT"))
     watcher.start()
     for level in islice(cycle((True, False)), 3 * KERNEL_EVENTS):
@@ -215,7 +215,7 @@ def test_outputs_are_inactive_before_and_after(gpio_chip: GpioChip) -> None:
 
 
 def test_open_drain(gpio_chip: GpioChip) -> None:
-    """gpio-sim does not show the pull of a line that was let go of; what the kernel was asked for shows."""
+    """gpio-sim does not show the pull of a released line. The test therefore checks the request to the kernel."""
     line = GpioOutput(ResetOptions(line="RESET", open_drain=True))
     line.open()
     assert re.search(r"output\s+active-low \[used open-drain\]", tool("gpioinfo", gpio_chip.path.name))

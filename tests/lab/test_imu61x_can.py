@@ -57,7 +57,8 @@ class Rig:
         self.far.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
 
     def send_error(self, classes: int, status: int) -> None:
-        """An error frame as a controller's driver makes it; on vcan it reaches those who asked for its class."""
+        """Send an error frame as the driver of a controller does. On vcan, it reaches the sockets that subscribed to
+        its class."""
         self.far.send(struct.pack("=IB3x8s", classes, 8, bytes([0, status])))
 
     async def until(self, condition: Callable[[], object], what: str) -> None:
@@ -145,7 +146,7 @@ def test_frames_dropped_by_a_small_buffer_are_overruns(vcan: CanInterface) -> No
 
     async def story(rig: Rig) -> None:
         await rig.running()
-        rig.send(*range(10))  # nobody reads meanwhile: the buffer runs over
+        rig.send(*range(10))  # no program reads: the buffer overflows
         await rig.until(lambda: rig.runner.ledger.bytes_in, "the first frames")
         rig.send(10)
         await rig.until(lambda: rig.samples and rig.samples[-1].seq, "a sample")
@@ -298,7 +299,7 @@ def test_error_passive_of_a_real_controller(can_pair: tuple[CanInterface, CanInt
 def test_bus_off_of_a_real_controller_and_its_restart(
     can_pair: tuple[CanInterface, CanInterface], restart_ms: int
 ) -> None:
-    """By an administrator, or by the kernel after `restart-ms`. What came meanwhile is lost and counted."""
+    """Restart by an administrator, or by the kernel after `restart-ms`. Frames in between are lost and counted."""
     near, far = can_pair
     near.restart_by_itself(restart_ms)
     rig = Rig(near.name, far.name)

@@ -93,7 +93,7 @@ def test_unplugged_and_plugged(i2c: Bus[I2cTransfer]) -> None:
             await rig.until_samples(3, LIMIT_S)
             i2c.detach(0x18)
             await vanishes(rig, "no acknowledgement")
-            i2c.attach(0x1B, on_i2c(device))  # its address was changed meanwhile
+            i2c.attach(0x1B, on_i2c(device))  # the address of the device changes
             await comes_back(rig)
             assert rig.device.status().link == "/dev/i2c-0, address 0x1b"
 

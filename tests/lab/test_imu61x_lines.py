@@ -1,4 +1,5 @@
-"""The IMU61x's wires on gpio-sim beside its buses: reset as an independent reader sees it, data ready edge by edge."""
+"""GPIO lines of the IMU61x on gpio-sim next to its buses: reset as seen by an independent reader, and each data-ready
+edge."""
 
 import asyncio
 import threading
@@ -175,7 +176,7 @@ def test_every_edge_is_one_sample(stepped: tuple[Stepped, DeviceConfig]) -> None
 
 
 def test_edges_that_come_faster_than_reads_are_missed_and_counted(stepped: tuple[Stepped, DeviceConfig]) -> None:
-    """Ten renewals at once: a read goes on during some of them, and there is none for others."""
+    """Ten updates without a pause: a read is active during some updates, and other updates have no read."""
     it, config = stepped
 
     async def body() -> None:
@@ -198,7 +199,7 @@ def test_edges_that_come_faster_than_reads_are_missed_and_counted(stepped: tuple
             rig.device.tick(monotonic_ns())
             polling = rig.device.status().polling
             assert polling is not None
-            lost, stale = rig.device.ledger.lost_queue, polling.stale  # what a read took early is stale at its edge
+            lost, stale = rig.device.ledger.lost_queue, polling.stale  # an early read makes the value stale at its edge
             assert 0 < lost <= missed <= lost + stale
             assert numbers[-1] <= len(it.stamps_ns) <= numbers[-1] + stale
 

@@ -63,7 +63,7 @@ def test_streams_the_truth(bus: tuple[Bus[SpiTransfer], str], burst: str) -> Non
 @pytest.mark.parametrize("variant", cases(REGISTER_VARIANTS, "BURST_CTRL reads zero"))
 @pytest.mark.parametrize("burst", ["standard", "extended"])
 def test_kind_of_burst_in_every_variant(spi8: Bus[SpiTransfer], variant: str, burst: str) -> None:
-    """Wherever BURST_CTRL reads back, and whatever the undefined bits of WIN_CTRL are, the burst decides."""
+    """The driver selects the burst for each place of BURST_CTRL and each value of the undefined bits of WIN_CTRL."""
     device = registers(behaviour=REGISTER_VARIANTS[variant])
     device.extended = 1 if burst == "standard" else 0
     spi8.attach(0, on_spi(device))

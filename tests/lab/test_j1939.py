@@ -55,7 +55,7 @@ def rolls(samples: list[Sample]) -> list[int]:
 
 
 def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
-    """It sends samples and answers requests; another node's samples are on the bus, too."""
+    """The node sends samples and replies to requests. Samples of another node are on the same bus."""
     rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Options())
     requests: list[tuple[int, bytes]] = []
     intervals = {0x0137: 100, commands.ADDRESS: 8}

@@ -1,6 +1,7 @@
-"""A real daemon, a simulated module behind a pty, and its pins on lines of the kernel's gpio-sim.
+"""A real daemon, a simulated device behind a pty, and its pins on lines of gpio-sim.
 
-The lab's processor is emulated: stamps are late by milliseconds, so what is looked at is what belongs to what.
+The processor of the lab is emulated, and time stamps are late by milliseconds. The tests therefore check only the pairs
+of edges and samples.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -32,10 +33,10 @@ LIMIT_S = 150.0
 METRICS_PORT = 19321
 SAMPLES = 70
 FOLLOWS = 8
-"""So many samples later, at 20 Hz, what the alarm line says has reached the samples."""
+"""Number of samples at 20 Hz after which the level of the alarm line is in the samples."""
 ANSWERS = 15
 LATE_NS = 25 * NS_PER_MS
-"""A quarter of a period. Now and then the emulated processor stands still for longer: no pairing could be right."""
+"""A quarter of a period, ns. Sometimes the emulated processor stops for longer, and no pairing is possible."""
 
 
 @contextmanager

@@ -1,8 +1,8 @@
-"""Recordings of real links, replayed: every sample with every member, and every ledger, as the live run had them.
+"""Recordings of real links, replayed: all members of all samples, and all ledgers, are equal to the live run.
 
-Devices of all link kinds at once (tests/lab/chaos/far_side.py): a HiPNUC module on a pseudo-terminal with SOUT on
-gpio-sim, IMU61x modules on a 16550A, vcan, an SJA1000 pair, i2c-dev and spidev, Modbus. The client's samples came over
-the socket, or out of shared memory for those before it could connect; it has no part in the recording.
+The test uses all kinds of links together (tests/lab/chaos/far_side.py): a HiPNUC device on a pseudo-terminal with SOUT
+on gpio-sim, IMU61x devices on a 16550A, vcan, an SJA1000 pair, i2c-dev and spidev, and Modbus. The client reads samples
+from the socket, and from shared memory before its connection. It does not use the recording.
 """
 
 import asyncio
@@ -68,7 +68,7 @@ def test_every_link_is_replayed_as_it_ran(tmp_path: Path) -> None:
             life.wait_running()
             record(life, asked_for)
             sleep(RUN_S)
-        at_end = at_rest(life)  # all far ends are away: what the ledgers say now stays
+        at_end = at_rest(life)  # all devices are removed: the ledgers do not change any more
         life.terminate()
     live = received(life)
     assert life.recorder.dropped == []

@@ -1,7 +1,7 @@
-"""Stamps while a real kernel's CLOCK_MONOTONIC is steered: by frequency (500 ppm) and by the length of its tick (10 %).
+"""Time stamps while a real kernel steers CLOCK_MONOTONIC: by frequency (500 ppm) and by the length of its tick (10 %).
 
-The device takes its samples at even steps of CLOCK_MONOTONIC_RAW. The truth in CLOCK_MONOTONIC is interpolated between
-readings of both clocks around each sample, which nothing of the package takes part in.
+The device samples at equal steps of CLOCK_MONOTONIC_RAW. The test interpolates the truth in CLOCK_MONOTONIC between
+readings of both clocks around each sample, without code of imud.
 """
 
 import asyncio
@@ -79,7 +79,7 @@ class Device:
         number = (raw_ns() - self._begin_ns - WIRE_NS) // PERIOD_NS
         if number <= self._number:
             return
-        self._number = number  # a machine that was too busy for the one before loses it
+        self._number = number  # a host that was too busy for the previous reading loses it
         self.pairs.append(tight_pair())
         frame = encode_hi91(
             system_time_ms=self._number * PERIOD_NS // NS_PER_MS, accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0),

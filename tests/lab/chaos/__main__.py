@@ -36,7 +36,7 @@ CI_SECONDS: Final = 45.0
 STATE_SIZE: Final = "64k"
 CATCH_UP_S: Final = 30.0
 CALM_S: Final = 1.0
-"""After all devices run again: connections that asked are closed, and the clocks have seen what came."""
+"""Time after all devices run again, s: pending connections are closed and the clocks have processed all samples."""
 NEVER_NS: Final = 1 << 62
 SPARE: Final = {"driver": "hipnuc-uart", "uart": {"port": "/dev/imud-chaos-nothing", "baud": 115200}}
 
@@ -195,7 +195,8 @@ class Chaos:
         return found[0]
 
     def _received(self, before: Snapshot, now: Snapshot, what: str) -> dict[str, list[Sample]]:
-        """The samples between two states, once the recorder has them; with the one before, if it has that too."""
+        """Return the samples between two states, after the recorder received them, with the previous sample if it
+        exists."""
         newest = {name: now.devices[name].newest_seq for name in self.accounts}
         first = {name: before.devices[name].newest_seq for name in self.accounts}
 

@@ -1,21 +1,21 @@
 """The account of one device over one life of the daemon: samples and losses against the truth.
 
-Rule. A hole is the number of true samples between two received ones. The ledger counts each hole, exactly, where the
-daemon can know its size: by the counter of a device that ran on, also while the link was away, and by the deadlines at
-which a polled device was read. Its size cannot be known
+Rule. A hole is the number of true samples between two received samples. The ledger counts each hole exactly if the
+daemon can know its size: from the counter of a device that kept running, also while the link was away, and from the
+deadlines of the reads of a polled device. The daemon cannot know the size
 
-- where the device began anew: its counter says nothing about the time before;
-- before the daemon knows the rate of a device that gives time and no numbers, or what it needs to recognise a counter
-  over a link that was away (`KNOWN`);
-- where a polled device was away: it is not read then, and has no counter.
+- if the device restarted: its counter contains nothing about the time before;
+- before it knows the rate of a device that sends time but no numbers, or the values that it needs to recognise a
+  counter after a missing link (`KNOWN`);
+- if a polled device was away: imud does not read it then, and the device has no counter.
 
-Such a hole is uncertain. It counts as one of the ledger's gaps of unknown size, and what `lost` has of it is anything
-from nothing to all, or it is counted within one sample. Hence, with the ledger's number of unknown gaps U,
+Such a hole is uncertain. It counts as one of the ledger's gaps of unknown size, and its part in `lost` is between
+nothing and all, or it is counted within one sample. Therefore, with the ledger's number of unknown gaps U,
 
     holes - (the U largest uncertain ones) - (one for each of the rest) <= lost <= holes + (one for each uncertain one)
 
-and U is at most what there are uncertain ones. Without an uncertain hole `lost` is exactly the truth. A polled device
-whose first reads failed has such a gap before its first sample; the time after the newest sample is in no gap yet.
+and U is at most the number of uncertain holes. Without an uncertain hole, `lost` is exactly the truth. A polled device
+whose first reads failed has such a gap before its first sample. The time after the newest sample belongs to no gap.
 """
 
 from collections.abc import Sequence
@@ -27,20 +27,21 @@ from imud.model.ledger import bytes_open, frames_open
 from imud.model.sample import Sample
 
 LEARNED: Final = 4
-"""So many equal steps in a row are a rate (imud.sampling.device_time.CONSISTENT); before that no loss can be known."""
+"""Number of equal steps in a row that define a rate (imud.sampling.device_time.CONSISTENT). No loss is known before."""
 KNOWN: Final = 80
-"""After so many samples since the device began, its counter is known over a link that was away. A fit needs 8
-(imud.sampling.clock.ENOUGH_POINTS), the pace of numbered samples four windows of 16 where one is disturbed
-(imud.sampling.gaps.WINDOW_MESSAGES); one more window for SIGSTOP."""
+"""Number of samples after a restart of the device until imud recognises its counter after a missing link. A fit needs 8
+(imud.sampling.clock.ENOUGH_POINTS), the period of numbered samples needs four windows of 16 with one disturbed window
+(imud.sampling.gaps.WINDOW_MESSAGES), and SIGSTOP one more window."""
 UNKNOWN_MOST: Final = 2
-"""A hole before the rate is known is seen twice: as a step longer than the one before, and than the one after."""
+"""A hole before the rate is known counts twice: as a step longer than the previous step and longer than the next
+step."""
 
 
 class Interval(NamedTuple):
     begin_ns: int
     end_ns: int
     restarts: bool = False
-    """Whether the device began anew in it, or is one that is polled."""
+    """True if the device restarted in the hole or is polled."""
 
     def touches(self, before: Sample, after: Sample) -> bool:
         return self.begin_ns <= after.t_rx_ns and self.end_ns >= before.t_ns
@@ -51,9 +52,10 @@ class Hole(NamedTuple):
     is_certain: bool
     """Whether the daemon can know how many."""
     unknown_most: int = 1
-    """So many unknown gaps it may count for."""
+    """Maximum number of unknown gaps for the hole."""
     is_open: bool = False
-    """Whether there is a sample on one side of it only: no other one came yet (`unknown_most` is 0), or none before."""
+    """True if the hole has a sample on one side only: no sample after it (`unknown_most` is 0), or no sample before
+    it."""
 
 
 class Account(NamedTuple):
@@ -65,7 +67,7 @@ class Account(NamedTuple):
     """Bounds of `lost` by the rule."""
     unknown: int = 0
     unknown_most: int = 0
-    """Their number by the rule."""
+    """Maximum number of unknown gaps by the rule."""
     outages: int = 0
 
     @property
@@ -78,7 +80,8 @@ class Account(NamedTuple):
 
 
 def sequence_faults(samples: Sequence[Sample], first_seq: int) -> list[str]:
-    """What is wrong with numbers and stamps: numbers follow each other, stamps rise and are not after the arrival."""
+    """Return the faults of numbers and time stamps: numbers are consecutive, time stamps increase and are not after the
+    arrival."""
     found = []
     numbers = [sample.seq for sample in samples]
     if numbers != list(range(first_seq, first_seq + len(numbers))):
@@ -92,7 +95,7 @@ def sequence_faults(samples: Sequence[Sample], first_seq: int) -> list[str]:
 
 
 def open_ledger(status: DeviceStatus) -> str:
-    """By how much the ledger does not close; empty if it does."""
+    """Return the difference by which the ledger does not balance; empty if it balances."""
     byte, frame = bytes_open(status.ledger), frames_open(status.ledger)
     return f"{byte} bytes and {frame} frames unaccounted for" if byte or frame else ""
 

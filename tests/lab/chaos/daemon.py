@@ -33,13 +33,13 @@ ID_AT: Final = next(field.offset for field in SLOT_FIELDS if field.name == "devi
 class Snapshot(NamedTuple):
     devices: Mapping[str, DeviceStatus]
     at_ns: int
-    """CLOCK_MONOTONIC, right before it was asked for."""
+    """CLOCK_MONOTONIC before the request, ns."""
 
 
 class Recorder:
-    """Receives every sample of one life in a thread; decoded only when it is asked for.
+    """Receives every sample of one life in a thread. It decodes samples only on request.
 
-    Synchronization: the thread appends to a list, which others only read.
+    Synchronization: the thread appends to a list that other threads only read.
     """
 
     def __init__(self, path: Path, rings: Path) -> None:
@@ -117,7 +117,7 @@ class Life:
             return _snapshot(client)
 
     def wait_running(self) -> Snapshot:
-        """Wait until every device runs. Raises AssertionError with those that do not."""
+        """Wait until every device runs. Raises AssertionError with the other devices."""
         end = monotonic() + BACK_LIMIT_S
         while True:
             found = self.snapshot()
@@ -145,7 +145,7 @@ class Life:
 
     def run_out_of_memory(self) -> None:
         """Take its memory away by its cgroup until the kernel kills it."""
-        with suppress(OSError):  # EBUSY and the like: what counts is that it dies
+        with suppress(OSError):  # EBUSY and similar errors: only the end of the process matters
             (CGROUP / "memory.max").write_text(TOO_LITTLE)
         try:
             self._gone(-signal.SIGKILL)

@@ -99,7 +99,7 @@ class PortThread:
     def __init__(self) -> None:
         self.changing = threading.Lock()
         self.slowest_ns = 0
-        """The longest time between two steps: so late may a burst have been."""
+        """Longest time between two steps, ns. A burst can be late by this time."""
         self._ports: list[tuple[Port, SimulatedLines | None]] = []
         self._stop = threading.Event()
         self._failure: BaseException | None = None
@@ -128,7 +128,7 @@ class PortThread:
                 with self.changing:
                     wait_s = self._step()
                     watched = [port.node.fileno() for port, _ in self._ports if port.node.is_open]
-                with suppress(OSError, ValueError):  # one was unplugged meanwhile: its descriptor is closed
+                with suppress(OSError, ValueError):  # a device was unplugged: its descriptor is closed
                     select.select(watched, [], [], wait_s)
         except BaseException as error:  # noqa: BLE001 - the main thread raises it
             self._failure = error

@@ -1,4 +1,5 @@
-"""The faults: what each does, to which resources, how long; and the plan of a run, which its seed alone decides."""
+"""The faults: effect, resources and duration of each fault; and the plan of a run, which follows from its seed
+alone."""
 
 import ctypes
 import struct
@@ -47,16 +48,16 @@ class Scene(Protocol):
 class Fault:
     name: str
     resources: frozenset[str]
-    """No other fault that has one of these goes on at the same time."""
+    """Resources of the fault. Two faults with a common resource are never active at the same time."""
     begin: Callable[[Scene, float], None]
     """Gets the time that it will last, s."""
     end: Callable[[Scene], None] = lambda scene: None
     shortest_s: float = 0.2
     longest_s: float = 2.5
     outage: tuple[str, ...] = ()
-    """Devices whose link is away meanwhile, or that begin anew. Those on I2C and SPI say by themselves when."""
+    """Devices whose link is away or that restart. Devices on I2C and SPI report the time themselves."""
     restarts: bool = False
-    """Whether these devices begin anew, or lose their power; else they run on."""
+    """True if these devices restart or lose their power; False if they keep running."""
     weight: float = 1.0
 
 
@@ -67,14 +68,14 @@ class Planned(NamedTuple):
 
 
 def plan(seed: int, seconds: float, faults: list[Fault]) -> Iterator[list[Planned]]:
-    """Rounds of faults for about so long; the same for the same arguments."""
+    """Yield rounds of faults for about this time. The same arguments give the same rounds."""
     random = Random(seed)
     for _ in range(max(round(seconds / ROUND_S), 1)):
         yield _round(random, faults)
 
 
 def _round(random: Random, faults: list[Fault]) -> list[Planned]:
-    """Faults in the order of their beginnings, none two of which share a resource at the same time."""
+    """Return faults in the order of their start. Two active faults never share a resource."""
     planned: list[Planned] = []
     free_s: dict[str, float] = {}
     at_s = random.expovariate(1 / EVERY_S)
@@ -111,9 +112,9 @@ def play(
     now_s: Callable[[], float] = monotonic,
     wait: Callable[[float], None] = sleep,
 ) -> None:
-    """One round: each fault begins and ends when it is due.
+    """Play one round: each fault starts and ends at its time.
 
-    One that begins late, because the host or the guest was busy, ends late, and what shares a resource with it waits.
+    A fault that starts late, because host or guest was busy, ends late. Faults with the same resources wait for it.
     """
     begin_s = now_s()
     going: list[tuple[float, Fault]] = []
@@ -145,7 +146,7 @@ STEP_MOST_S: Final = 3600.0
 ADJ_FREQUENCY: Final = 0x2
 TIMEX_BYTES: Final = 208
 FREQUENCY_AT: Final = 16
-"""Of `freq` in struct timex (64 bits), in units of 2^-16 ppm."""
+"""Place of `freq` in struct timex (64 bits), in units of 2^-16 ppm."""
 SLEW_PPM: Final = 400
 
 

@@ -1,8 +1,8 @@
-"""What the far ends of polled links were asked and answered, and how received samples are found in it.
+"""Requests and replies of polled devices, and the search for received samples in them.
 
-A polled device makes a sample when it is read, so the truth has two sides: the deadlines, which follow each other at
-the period of the configuration from the first read on, and the answers. What the device renewed meanwhile and nobody
-read is no sample, and values that are read twice before they are renewed are one.
+A polled device makes a sample when it is read. The truth therefore has two sides: the deadlines, which follow the
+period of the configuration from the first read, and the replies. An update of the device that no read saw is not a
+sample. A value that is read twice before its update is one sample.
 """
 
 import threading
@@ -22,7 +22,8 @@ from tests.lab.chaos.account import Interval
 from tests.lab.wire import Refuse
 
 SEARCH_PART: Final = 2
-"""A device that is found again is read at once, and again at the first deadline: less than half a period later."""
+"""imud reads a device immediately after its detection, and again at the first deadline: less than half a period
+later."""
 BLOCK_REPLY_BYTES: Final = READ_OVERHEAD_BYTES + 2 * BLOCK_REGISTERS
 
 
@@ -36,10 +37,10 @@ class Answer(Enum):
 
 class Asked(NamedTuple):
     t_ns: int
-    """CLOCK_MONOTONIC, between its begin and its end."""
+    """CLOCK_MONOTONIC between start and end of the transfer, ns."""
     answer: Answer
     is_sample: bool
-    """Whether a sample was asked for, and not identity or settings."""
+    """True if the transfer requested a sample, False for identity and settings."""
     measured_ns: int
     """When the device renewed the values that it answered."""
 
@@ -67,21 +68,22 @@ class PollLog:
         return " ".join(words)
 
     def strange(self, samples: Sequence[Sample]) -> list[int]:
-        """`seq` of samples in whose read the device gave no good answer."""
+        """Return `seq` of the samples in whose read the device gave no valid reply."""
         with self._lock:
             times = [asked.t_ns for asked in self._asked if asked.is_sample and asked.answer is Answer.GOOD]
         return [s.seq for s in samples if bisect_left(times, s.t_ns) == bisect_right(times, s.t_rx_ns)]
 
     def troubles(self, begin_ns: int, end_ns: int) -> list[Interval]:
-        """Moments at which the device was not there, or seemed not to be: it may have been looked for."""
+        """Return the times at which the device was missing or seemed to be missing, so that imud could search for
+        it."""
         asked = self.between(begin_ns, end_ns)
         return [Interval(a.t_ns, a.t_ns, restarts=True) for a in asked if a.answer is not Answer.GOOD]
 
     def numbers_of(self, samples: Sequence[Sample], troubles: Sequence[Interval]) -> list[int]:
-        """Return the number of each sample by deadlines, those left out at which a value was read once more.
+        """Return the number of each sample by deadlines, without the deadlines at which a value was read again.
 
-        From one trouble to the next the deadlines are one series, in which reads are hardly late; after a trouble
-        another series begins.
+        Between two troubles, the deadlines are one series whose reads are rarely late. After a trouble, another series
+        starts.
         """
         numbers, begin = [0], 0
         for n, (before, after) in enumerate(pairwise(samples), 1):
@@ -106,7 +108,7 @@ class LoggedRegisters:
         self.log = PollLog(period_ns)
 
     def logged(self, answer: Callable[[Any], bytes], is_sample: Callable[[Any], bool]) -> Callable[[Any], bytes]:
-        """Return the device as the bus has it; `is_sample` says whether a transfer asks for a sample."""
+        """Return the device in the form of the bus. `is_sample` returns whether a transfer requests a sample."""
 
         def logging(transfer: Any) -> bytes:
             device, got, t_ns = self.device, Answer.GOOD, monotonic_ns()

@@ -1,7 +1,7 @@
-"""What simulated devices measured, in order, and how received samples are found in it.
+"""Measurements of simulated devices, in order, and the search for received samples in them.
 
-A device that sends by itself numbers its samples here, whether they arrive or not. Samples are recognised by the
-device's own time where they carry one, and by their acceleration where they do not (`encoded`).
+A device that sends without requests numbers its samples here, also lost samples. The test recognises samples by the
+device time, or by their acceleration if they contain no time (`encoded`).
 """
 
 import threading
@@ -57,7 +57,7 @@ class TruthLog:
         return found
 
     def _find(self, measured: Sequence[Measured], begin: int, sample: Sample) -> int | None:
-        """The newest sample before its arrival that has its key: device time begins anew at a restart."""
+        """Return the newest sample with the key before the arrival. The device time starts again at a restart."""
         key = self._key_of(sample)
         for number in range(bisect_right(measured, sample.t_rx_ns, key=_instant) - 1, begin - 1, -1):
             if abs(measured[number].key - key) <= self._tolerance:
@@ -75,7 +75,7 @@ def time_key(sample: Sample) -> int:
 
 
 def encoded(number: int) -> Vector3:
-    """An acceleration that says which sample it is of."""
+    """Return an acceleration that identifies its sample."""
     return (number % BASE * STEP_M_S2, number // BASE % BASE * STEP_M_S2, 9.80665)
 
 
@@ -127,10 +127,10 @@ class LoggedModule:
 
 
 def by_device_time(log: TruthLog, period_ns: int) -> Callable[[Burst, int], None]:
-    """Return what logs the samples in bursts by their device time.
+    """Return a function that logs the samples in bursts by their device time.
 
-    A module drops what its transmitter has no room for while this process stands still. It took these samples too: they
-    are logged with the next one.
+    While this process is stalled, a device drops frames that do not fit into its transmitter. It measured these samples
+    too: the log contains them with the next sample.
     """
     newest_key, newest_power_ns = 0, -1
 

@@ -1,7 +1,7 @@
 """`tests/lab/run`: boots the lab and runs pytest on tests/lab in it.
 
-Exit status: pytest's own (0 all passed, 1 some failed, ... 5 none selected), or that of the --exec command;
-10 if the lab itself failed, with one line on standard error that says why; 130 and 143 after SIGINT and SIGTERM.
+Exit status: the status of pytest (0 all passed, 1 some failed, ... 5 none selected) or of the --exec command; 10 with
+one line on standard error if the lab itself failed; 130 and 143 after SIGINT and SIGTERM.
 """
 
 import argparse

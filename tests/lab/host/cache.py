@@ -28,9 +28,9 @@ LOCK_POLL_S = 0.2
 
 
 def cache_root(suffix: str = "") -> Path:
-    """The cache folder; with a suffix one beside it, which has a lock of its own.
+    """Return the cache folder. With a suffix, return a folder next to it with its own lock.
 
-    LabError if its path has characters that make cannot carry.
+    LabError if its path contains characters that make does not support.
     """
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     root = Path(f"{os.environ.get('IMUD_LAB_CACHE') or Path(base) / 'imud-lab'}{suffix}").absolute()
@@ -59,7 +59,7 @@ def require_space(folder: Path, needed_bytes: int) -> None:
 
 @contextlib.contextmanager
 def locked(root: Path, say: Callable[[str], None], wait_s: float = LOCK_WAIT_S) -> Iterator[None]:
-    """Holds the build lock; says so once if another build has it, and gives up (LabError) after `wait_s`."""
+    """Hold the build lock. Report once if another build holds it. Raises LabError after `wait_s`."""
     with open(root / "lock", "w", encoding="ascii") as file:
         give_up_s = time.monotonic() + wait_s
         told = False
@@ -90,10 +90,11 @@ def find(name: str, root: Path | None = None) -> Path | None:
 def get(
     name: str, make: Callable[[Path], None], needed_bytes: int, say: Callable[[str], None], root: Path | None = None
 ) -> Path:
-    """The folder `name` of `root` (cache_root()); if it is absent, `make(folder)` fills a new one that is then renamed.
+    """Return the folder `name` of `root` (cache_root()). If it is absent, `make(folder)` fills a new folder, which is
+    then renamed.
 
-    Safe against any number of processes at once: one makes, the others wait and take its result. A failed
-    or killed make leaves nothing under `name`. The lock is not recursive: `make` must not call this.
+    Safe for any number of processes: one process makes the folder, the others wait and use the result. A failed or
+    killed make leaves no folder `name`. The lock is not recursive: `make` must not call this function.
     """
     root = root or cache_root()
     try:
@@ -122,7 +123,7 @@ def _make_locked(root: Path, name: str, make: Callable[[Path], None], needed_byt
 
 
 def _keep_log(root: Path, fresh: Path) -> str:
-    """Saves the log of a failed build and says where, for the end of the error's line."""
+    """Save the log of a failed build. Return its place for the end of the error line."""
     log = fresh / "build.log"
     if not log.exists():
         return ""

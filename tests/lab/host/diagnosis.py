@@ -12,7 +12,7 @@ CAUSES = (
     (r"Kernel panic", "kernel panic in the guest"),
     (r"lab init failed", "guest set-up failed"),
 )
-"""Pattern of a console line and what it means, the most telling first."""
+"""Patterns of console lines with their meaning, the most significant pattern first."""
 
 KILLED = re.compile(r"Out of memory: Killed process")
 

@@ -1,8 +1,8 @@
-"""What the guest runs: the script that starts pytest, or another command, in the project's own Python.
+"""Program of the guest: the script that starts pytest or another command in the Python of the project.
 
-From start to first test the guest is busy importing, several times slower than the host, hence `precompile` and
-pytest without hypothesis's plugin, whose import alone took half of the collection (12 of 25 s on a busy machine,
-`python -X importtime -m pytest` in the guest). Tests that use hypothesis work without it.
+Until the first test, the guest imports modules, several times slower than the host. Therefore `precompile` compiles
+them, and pytest runs without the plugin of hypothesis, whose import took half of the collection (12 of 25 s on a busy
+host, `python -X importtime -m pytest` in the guest). Tests with hypothesis work without the plugin.
 """
 
 import contextlib

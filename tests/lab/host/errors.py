@@ -2,8 +2,9 @@
 
 
 class LabError(Exception):
-    """The lab cannot go on. Its text is the one line the user sees: what happened and what to look at."""
+    """The lab cannot continue. Its text is one line for the user: the event and the next step."""
 
 
 class HungGuest(LabError):
-    """The guest runs nothing any more, not even the loop of process 1, which no test can stop: another boot may do."""
+    """The guest does not run any more, not even the loop of process 1, which no test can stop. Another boot can
+    help."""

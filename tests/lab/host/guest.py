@@ -28,13 +28,13 @@ STEADY_SILENCE_S = 300.0
 
 @dataclass(frozen=True)
 class Limits:
-    """How long the runner waits for what."""
+    """Time limits of the runner."""
 
     total_s: float = 1200.0
     boot_s: float = 300.0
-    """From the start to the first sign of life; it is about 5 s on an idle machine."""
+    """Maximum time from the start to the first sign of life, s; about 5 s on an idle host."""
     silence_s: float = 60.0
-    """Between two signs of life; the guest gives one every 5 s."""
+    """Maximum time between two signs of life, s. The guest sends one every 5 s."""
     restart_s: float = 30.0
     """Silence after which QEMU is told to stop the guest and to continue it, and again after each such time."""
 

@@ -74,7 +74,7 @@ def build_module(folder: Path, kernel: Path) -> None:
 
 
 def module_sources() -> list[Path]:
-    """The files the module is built from, and nothing that an earlier build left beside them."""
+    """Return the source files of the module, without files of an earlier build."""
     written = [path for path in MODULE_SOURCE.glob("[!.]*.[ch]") if not path.name.endswith(".mod.c")]
     return [*sorted(written), MODULE_SOURCE / "Makefile"]
 

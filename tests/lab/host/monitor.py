@@ -1,8 +1,8 @@
-"""QEMU's monitor: a guest that stands still is continued, and a hung one is examined.
+"""The monitor of QEMU: it continues a stopped guest, and examines a hung guest.
 
-The examination asks the monitor, and the guest's kernel says what its tasks wait for. Questions and answers go to a
-file. The last command is a non-maskable interrupt, which the guest's kernel takes whatever it does (`PANIC_BY_NMI` of
-the command line): it prints its tasks and timers on the console, and its panic ends QEMU.
+The examination sends commands to the monitor, and the kernel of the guest prints the wait states of its tasks. A file
+contains commands and replies. The last command is a non-maskable interrupt, which the kernel of the guest always
+accepts (`PANIC_BY_NMI` of the command line): it prints its tasks and timers on the console, and its panic ends QEMU.
 """
 
 import socket

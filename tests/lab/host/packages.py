@@ -36,7 +36,7 @@ PACKAGES = {
 
 
 def installed_versions(names: list[str]) -> dict[str, str]:
-    """The versions of those of `names` that are installed; needs dpkg (LabError without it)."""
+    """Return the versions of the installed packages in `names`. Raises LabError without dpkg."""
     if shutil.which("dpkg-query") is None:
         raise LabError("dpkg-query is not there: the lab knows Debian 12 and its relatives only")
     query = ["dpkg-query", "--show", "--showformat=${Package} ${db:Status-Status} ${Version}\n", *names]
@@ -64,7 +64,7 @@ def kernel_source_version() -> str:
 
 
 def without_candidate(names: list[str]) -> list[str]:
-    """Those of `names` that apt knows no version of."""
+    """Return the packages in `names` without a version in apt."""
     policy = subprocess.run(
         ["apt-cache", "policy", *names], capture_output=True, text=True, check=False, env={**os.environ, "LC_ALL": "C"}
     ).stdout

@@ -7,16 +7,18 @@ QEMU = "qemu-system-x86_64"
 INIT = Path(__file__).resolve().parents[1] / "guest" / "init"
 SHARING = "security_model=none"
 ROOT_FLAGS = "trans=virtio,version=9p2000.L,msize=262144,cache=loose"
-"""cache=loose: nobody writes through this mount, and without it each import asks the host again."""
+"""Options of the root file system. cache=loose: no program writes through this mount, and without it each import
+requests the file again."""
 PANIC_BY_NMI = "unknown_nmi_panic panic_print=0x5"
-"""A panic says what every task waits for, and which timers are set; `examine` causes one in a hung guest."""
+"""Kernel options: a panic prints the wait state of every task and the active timers. `examine` causes a panic in a hung
+guest."""
 STEADY = ("-icount", "shift=0")
 """An instruction takes 2^0 ns; a guest that waits, waits as long by the host's clock."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What differs from run to run."""
+    """Options of a run."""
 
     image: Path
     share: Path
@@ -29,7 +31,7 @@ class Machine:
     monitor_fd: int
     """A socket on which QEMU answers questions about the machine."""
     steady: bool = False
-    """Whether time in the guest is what its instructions make it, 1 ns each, and not the host's."""
+    """True: an instruction of the guest takes 1 ns. False: the guest uses the time of the host."""
 
     def command(self) -> list[str]:
         first_fd, second_fd = self.uart_fds

@@ -1,4 +1,4 @@
-"""The output folder: one folder per run while it lasts, and what stays of it."""
+"""The output folder: one folder per active run, and the kept files of ended runs."""
 
 import contextlib
 import os
@@ -17,7 +17,7 @@ LEFTOVER_S = 86400
 
 @contextlib.contextmanager
 def run_folder(output: Path) -> Iterator[Path]:
-    """A new folder for one run below `output`, removed afterwards; any number of runs at once."""
+    """Make a new folder below `output` for one run and remove it afterwards. Any number of runs can be active."""
     try:
         output.mkdir(parents=True, exist_ok=True)
         _remove_leftovers(output)

@@ -1,7 +1,7 @@
-"""The daemon on I2C, SPI and GPIO nodes of Debian's kernel, and its feed to Debian's chronyd, confined by its unit.
+"""The daemon on I2C, SPI and GPIO nodes of the kernel of Debian, and its feed to chronyd, confined by its unit.
 
-Nothing answers on these buses: what is checked is that the daemon has the nodes and says so. The lab's own kernel
-(`make lab`) has devices on them.
+These buses have no devices: the test checks that the daemon opens the nodes and reports the missing devices. The kernel
+of the lab (`make lab`) has devices on such buses.
 """
 
 import platform
@@ -163,7 +163,7 @@ def check_chrony(checks: Checks) -> None:
 
 @contextmanager
 def configured_chronyd() -> Iterator[None]:
-    """Run chronyd as docs/time.md has it, for as long as the block; nothing of it is left."""
+    """Run chronyd with the configuration of docs/time.md during the block, then remove it."""
     CHRONY.unlink(missing_ok=True)  # masked by the rig
     for name, text in CHRONY_FILES.items():
         Path(name).parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
-"""Named checks with their times, and waiting for what has no event. Runs in the guest, on the system's own Python.
+"""Named checks with their durations, and waits for conditions. Runs in the guest with the Python of the system.
 
 with checks("the service is READY after its start"):
-    ...                                              any exception is a failure; the run goes on
+    ...                                              each exception is a failure; the run continues
 checks.figure("start to READY", 8.1, "s")            measured, printed with the results
 """
 
@@ -22,7 +22,7 @@ LINES_SHOWN = 12
 
 
 class Failed(Exception):
-    """A check did not find what it expected; its text says what came instead."""
+    """A failed check. Its text contains the received value."""
 
 
 class Checks:
@@ -37,7 +37,7 @@ class Checks:
 
     @contextlib.contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """One check: an exception fails it and is printed; the run goes on after the block."""
+        """Run one check. An exception fails the check and is printed; the run continues after the block."""
         start_s = time.monotonic()
         why = ""
         try:
@@ -87,7 +87,7 @@ def wait_until(found: Callable[[], T | None], what: str, limit_s: float = LIMIT_
 
 
 def expect(what: str, got: object, wanted: object) -> None:
-    """Failed unless `got` is what is wanted."""
+    """Raise Failed unless `got` is equal to `wanted`."""
     if got != wanted:
         raise Failed(f"{what}: expected {wanted!r}, got {got!r}")
 

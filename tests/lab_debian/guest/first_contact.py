@@ -1,4 +1,4 @@
-"""`imud doctor` on a system that is in order and on one that is not; `imud setup --yes` from nothing to samples."""
+"""`imud doctor` on a correct system and on a system with faults; `imud setup --yes` from an empty system to samples."""
 
 import json
 import os
@@ -41,14 +41,14 @@ RULES = Path("/etc/udev/rules.d/61-imud-setup.rules")
 JOURNAL = Path("/var/lib/imud-setup/journal.json")
 MODEM_MANAGER = Path("/etc/systemd/system/ModemManager.service")
 LATENCY_MS = 1
-"""What the rules set. Without them it is what the adapter has: 16 of an FTDI chip, 0 of QEMU's."""
+"""Latency timer that the udev rules set, ms. Without the rules: 16 for an FTDI chip, 0 for the adapter of QEMU."""
 
 
 class AdapterNow(NamedTuple):
-    """What udev's rules make of the USB adapter."""
+    """State of the USB adapter under the udev rules."""
 
     latency_ms: int
-    """How long it holds bytes back (`latency_timer` of ftdi_sio)."""
+    """Latency timer, ms (`latency_timer` of ftdi_sio)."""
     ignored: bool
     """Whether ModemManager leaves it alone (`ID_MM_DEVICE_IGNORE`)."""
 
@@ -58,7 +58,7 @@ def check_doctor(checks: Checks, host: Host) -> None:
     ensure_running(USB + CAN)
     wait_streaming("can")
     with checks("imud doctor finds no error while everything runs"):
-        # on a busy host a simulator stands still for a second, which is an error while it lasts
+        # on a busy host, a simulator can stop for a second, which is an error during this time
         wait_until(lambda: not errors(), "no error of imud doctor")
     with checks("imud doctor tells that the adapter is gone"):
         host.unplug()
@@ -115,7 +115,7 @@ def check_complaints(checks: Checks, _host: Host) -> None:
 def open_files() -> list[str]:
     holder = int(shown("MainPID", HOLDER))
     found: list[str] = []
-    with suppress(FileNotFoundError):  # one was closed meanwhile, or the holder is no more
+    with suppress(FileNotFoundError):  # a descriptor was closed, or its process ended
         found.extend(os.readlink(one) for one in Path(f"/proc/{holder}/fd").iterdir())
     return found
 
@@ -150,7 +150,7 @@ def expect_finding(check: str, severity: str, seen: str, advice: str) -> None:
 
 
 def errors() -> list[dict[str, str]]:
-    """The errors that `imud doctor --json` finds, printed so that a run shows those that pass."""
+    """Return the errors of `imud doctor --json`, and print them, so that the log of a run contains passing errors."""
     examined = json.loads(run("imud", "doctor", "--json").stdout)
     found = [one for check in examined["checks"] for one in check["findings"] if one["severity"] == "error"]
     for one in found:
@@ -188,7 +188,8 @@ def check_setup(checks: Checks, host: Host) -> None:
 
 
 def check_made(checks: Checks, host: Host, before: AdapterNow) -> None:
-    """What `imud setup` changed beside configuration and service; `before`: the adapter as it was without."""
+    """Check the changes of `imud setup` except for configuration and service. `before` is the adapter without the
+    rules."""
     with checks("the user that runs sudo may read samples after imud setup"):
         expect("groups", groups(), {OPERATOR, "imud"})
     with checks("after imud setup udev keeps ModemManager from the adapter, and has its bytes sent at once"):
@@ -197,7 +198,7 @@ def check_made(checks: Checks, host: Host, before: AdapterNow) -> None:
         expect("as it is", adapter().ignored, True)
         must(
             "systemctl", "stop", UNIT
-        )  # a daemon that asks the driver for low latency has it show 1, whatever udev set
+        )  # a request of the daemon for low latency makes the driver report 1 for any value of udev
         try:
             expect("plugged in again", replugged(host), AdapterNow(LATENCY_MS, ignored=True))
         finally:
@@ -208,7 +209,7 @@ def check_made(checks: Checks, host: Host, before: AdapterNow) -> None:
 
 @contextmanager
 def modem_manager() -> Iterator[None]:
-    """A service of that name that runs, for as long as the block: the rig's Debian has none."""
+    """Run a service with this name during the block: Debian in the rig does not contain it."""
     MODEM_MANAGER.write_text("[Service]\nExecStart=/bin/sleep infinity\n")
     must("systemctl", "daemon-reload")
     must("systemctl", "start", MODEM_MANAGER.name)

@@ -1,4 +1,4 @@
-"""The system is up, and the package installs on it as README.md says."""
+"""The system is running, and the package installs as in README.md."""
 
 import re
 import time
@@ -7,7 +7,7 @@ from tests.lab_debian.guest.checks import Checks, Failed, expect
 from tests.lab_debian.guest.system import CONFIG, EXAMPLE, NODE, SHARE, Host, must, run, shown, uptime_s
 
 LEFT_OUT = re.compile(r"^missing +/usr/share/(doc|man)\b")
-"""What the rig's dpkg does not unpack (image.py)."""
+"""Files that dpkg of the rig does not unpack (image.py)."""
 
 
 def check(checks: Checks, _host: Host) -> None:

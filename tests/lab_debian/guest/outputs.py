@@ -1,4 +1,4 @@
-"""What imud works with, under the unit's confinement: metrics on another address, gpsd over TCP."""
+"""Outputs and sources of imud in the confinement of the unit: metrics on another address, gpsd over TCP."""
 
 import os
 from pathlib import Path

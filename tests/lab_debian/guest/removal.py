@@ -8,10 +8,10 @@ from tests.lab_debian.guest.system import CONFIG, Host, must, pid, run, shown, s
 
 STATE = Path("/var/lib/imud")
 KEPT = STATE / "kept"
-"""Stands for what the daemon may or may not have to remember."""
+"""File in place of the state of the daemon, which can exist or not."""
 LIMIT_S = 900
 SETUP_LOCK = "/run/imud-setup.lock"
-"""Of `imud setup`; it is gone with the next start of the machine."""
+"""Lock of `imud setup`. The next boot removes it."""
 
 
 def check(checks: Checks, _host: Host) -> None:

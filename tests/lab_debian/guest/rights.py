@@ -5,8 +5,8 @@ from tests.lab_debian.guest.system import PYTHON, RINGS, SOCKET, Host, add_user,
 
 READ_RING = "from imud.client import Ring\nwith Ring('usb') as ring: print(ring.latest().seq > 0)"
 RATE_HZ = 10
-"""What the module on USB is set to. At 100 Hz QEMU's adapter, which keeps 384 bytes, would lose replies of the module
-whenever the host stalls for 40 ms, for the rest of the run."""
+"""Rate of the device on USB, Hz. At 100 Hz, the adapter of QEMU, which stores 384 bytes, would lose replies of the
+device at each stall of the host of 40 ms."""
 WRITE_RING = f"open('{RINGS}/imud.usb', 'r+b')"
 
 

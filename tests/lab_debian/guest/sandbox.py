@@ -1,7 +1,8 @@
-"""The unit's confinement: systemd's own score, what the process may not do, and that nodes of all kinds open.
+"""The confinement of the unit: the score of systemd, forbidden operations of the process, and nodes of all kinds.
 
-What it may not do is tried three times: by root without the unit's settings, who must be able to (else the refusal
-would say nothing); by the service's user with them; and by root with them, whom modes and groups of files let in.
+The test tries each forbidden operation three times: as root without the settings of the unit, which must succeed,
+because a refusal has no meaning otherwise; as the user of the service with the settings; and as root with the settings,
+because file modes do not stop root.
 """
 
 import json
@@ -20,7 +21,7 @@ from tests.lab_debian.guest.system import (
 )
 
 SCORE_MAX = 2.0
-"""Of the rest 0.4 are for adjtimex, which tells whether the clock is synchronised (docs/operate.md)."""
+"""Maximum score. 0.4 of it belong to adjtimex, which reports whether the clock is synchronised (docs/operate.md)."""
 PUBLIC, PRIVATE = "192.0.2.1", "10.9.8.7"
 """Addresses that the guest gives itself; the first is of TEST-NET-1 (RFC 5737), outside of every private network."""
 INIT_MODULE = {"x86_64": 175, "aarch64": 105}[platform.machine()]
@@ -47,7 +48,8 @@ FORBIDDEN = {
     "make a node": "import os, stat; os.mknod('/dev/shm/n', stat.S_IFCHR | 0o600, os.makedev(1, 3))",
     "make a set-uid file": "import os; open('/dev/shm/s', 'w'); os.chmod('/dev/shm/s', 0o4755)",
 }
-"""What the confined user must not be able to do, as Python that raises when it is refused."""
+"""Forbidden operations of the confined user, as Python code that raises an exception if the kernel refuses the
+operation."""
 LEFT = ("/usr/probe", "/etc/probe", "/dev/shm/n", "/dev/shm/s")
 FREE_FOR_ROOT = {"see other users' processes"}
 """hidepid= of /proc, by which ProtectProc= works, leaves members of group root alone (proc(5), `gid=`)."""
@@ -63,7 +65,8 @@ NEEDED = {
     "send a packet to a private network": f"import socket; socket.socket(2, 2).sendto(b'', ('{PRIVATE}', 9))",
     "read when the machine was started, for the metrics of the process": "open('/proc/stat').read()",
 }
-"""What imud does besides opening devices; a setting that breaks it would be seen late or never."""
+"""Necessary operations of imud except for opening devices. A setting that breaks one of them would show late or
+never."""
 TRY_ALL = """
 import json, os
 said = {}
@@ -143,7 +146,7 @@ def refused(who: str, result: str) -> None:
 
 
 def present_nodes(checks: Checks) -> list[str]:
-    """One node of each kind that this machine is promised to have; a check that fails for each that is not there."""
+    """Return one node of each required kind. Add a failed check for each kind without a node."""
     found = []
     for pattern in buses.NODES[platform.machine()]:
         nodes = sorted(str(path) for path in Path("/dev").glob(pattern))
@@ -155,9 +158,9 @@ def present_nodes(checks: Checks) -> list[str]:
 
 
 def tried(snippets: dict[str, str], settings: list[str], user: str = "imud") -> dict[str, str]:
-    """Run each piece of Python in a process of its own under the settings; what it raised, empty for nothing.
+    """Run each piece of Python in its own process under the settings. Return its exception; empty if it succeeded.
 
-    What a piece left behind is removed.
+    The function removes all traces of a piece.
     """
     try:
         said = confined(f"SNIPPETS = {snippets!r}\n{TRY_ALL}", *settings, user=user)

@@ -42,7 +42,7 @@ CAN_RATE_HZ = 20
 NOTIFY_RELOAD_SINCE = 253
 """Version of systemd; trixie has 257, bookworm 252."""
 START_LIMIT_S = 400
-"""Above TimeoutStartSec=, so that systemd's own limit is the one that is seen."""
+"""Time limit, s, above TimeoutStartSec=, so that the limit of systemd acts first."""
 
 
 def check(checks: Checks, host: Host) -> None:
@@ -53,7 +53,7 @@ def check(checks: Checks, host: Host) -> None:
 
 
 def check_reload(checks: Checks) -> None:
-    """`systemctl reload`, with a file that can be used and with one that cannot."""
+    """Check `systemctl reload` with a valid file and with an invalid file."""
     with checks("a reload is waited for where systemd can"):
         waits = int(must("systemctl", "--version").split()[1]) >= NOTIFY_RELOAD_SINCE
         expect("type", shown("Type"), "notify-reload" if waits else "notify")
