@@ -417,7 +417,7 @@ CROSS_CUTTING = {
     "web/test_page.py": "imud/web/static in a real browser, with the daemon and a device",
     "web/test_spectrum_page.py": "the spectrum of imud/web/static in a real browser, with a device that loses samples",
 }
-"""Test modules of no single module, and what they test."""
+"""Test modules without a single module, and their subjects."""
 
 TESTED_IN = {
     "imud.cli.setup.changes": "cli/setup/test_steps.py",

@@ -131,7 +131,7 @@ def test_a_device_that_there_is_not_is_an_error_of_who_asks() -> None:
 
 
 class EndingOutput:
-    """An output that fails at the end where it is asked to."""
+    """An output that raises an exception in `close` on request."""
 
     def __init__(self, *failing: str) -> None:
         self.failing = failing

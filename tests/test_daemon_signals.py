@@ -56,7 +56,7 @@ def test_a_log_that_nobody_reads_costs_no_sample(tmp_path: Path) -> None:
 
 
 class Manager:
-    """A service manager's socket, and what came over it with the time."""
+    """Socket of a service manager, and the received messages with their times."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -193,7 +193,8 @@ def test_killed_at_any_moment_it_starts_again(tmp_path: Path) -> None:
 
 @pytest.mark.live
 def test_a_holder_of_the_port_with_a_name_that_is_no_text(tmp_path: Path) -> None:
-    """Its name is in the problem of the device, in the log and in answers; it ended the process."""
+    """The name of the process is in the problem of the device, in the log and in replies. Before, it ended the
+    daemon."""
     name = b"\xff\n\x1b[31m"
     with cable(tmp_path) as port:
         holder = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Every example in README.md and docs/ is run or read by what it is meant for; every link leads somewhere."""
+"""The tests run or read every example in README.md and docs/, and check that every link has a target."""
 
 import os
 import re
@@ -39,7 +39,7 @@ def examples(*languages: str) -> list[Example]:
 
 
 def imud_lines() -> Iterator[list[str]]:
-    """Every `imud …` command line of the shell examples, without comments and without where its output goes."""
+    """Yield every `imud …` command line of the shell examples, without comments and redirections."""
     for example in examples("sh"):
         for line in example.text.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True)

@@ -78,7 +78,7 @@ def frame(row: Row) -> bytes:
 
 
 def check(sample: Sample, row: Row) -> None:
-    """The sample says what the row says, to the precision of 32-bit floats."""
+    """Check that the sample is equal to the row, with the precision of 32-bit floats."""
     assert sample.t_dev_ns is not None
     assert sample.t_dev_ns == int(row["sys_time"]) * 1_000_000
     expected = {
@@ -133,9 +133,9 @@ def test_every_row_of_a_real_recording_arrives_on_both_ways(tmp_path: Path) -> N
 BODY = (radians(5.0), radians(-10.0), radians(30.0))
 """Roll, pitch, yaw of the body in enu-flu: left side up by 5°, nose up by 10°, its front 30° to the left of east."""
 IN_NED = (radians(5.0), radians(10.0), radians(60.0))
-"""The same in ned-frd, by hand: right side down by 5°, nose up by 10°, 60° clockwise from north."""
+"""The same attitude in ned-frd, computed by hand: right side down by 5°, nose up by 10°, 60° clockwise from north."""
 MOUNTINGS: dict[str, tuple[dict[str, object], Matrix3]] = {
-    # what stands in the configuration; rows: the axis of the sensor that points forward, left, up
+    # lines of the configuration; rows: the axis of the sensor that points forward, left, up
     "side": ({"axes": {"x": "y", "y": "z", "z": "x"}}, ((0, 1, 0), (0, 0, 1), (1, 0, 0))),
     "upside_down": ({"quat_wxyz": [0, 1, 0, 0]}, ((1, 0, 0), (0, -1, 0), (0, 0, -1))),
     "turned_left": ({"euler": {"yaw_deg": 90}}, ((0, -1, 0), (1, 0, 0), (0, 0, 1))),

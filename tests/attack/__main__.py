@@ -1,4 +1,4 @@
-"""`make attack`: hostile clients beside a 1 kHz device and a good client; 1 when a bound was exceeded.
+"""`make attack`: hostile clients next to a 1 kHz device and a good client. Exit status 1 if a limit was exceeded.
 
 `python -m tests.attack [--short] [--scheduling unit|real-time] [--seconds S] [NAME …]`. Traffic stays on UNIX sockets
 of a folder of its own, and on the loopback address.

@@ -16,13 +16,15 @@ WAKERS_PER_USER: Final = 4 * 128
 """4 × `socket.clients_per_user` (docs/socket.md): descriptors by `notify` of one user."""
 HOSTILE_USERS: Final = 2
 FDS_OTHERS: Final = 64
-"""32 connections of scrapes, 5 of a device that is plugged in again, clients of this program, what is just closed."""
+"""Descriptors of other users: 32 scrape connections, 5 of a device that is plugged in again, clients of this program,
+closing connections."""
 FDS_LIMIT: Final = CLIENTS + HOSTILE_USERS * WAKERS_PER_USER + FDS_OTHERS
 """Descriptors above idle: one for each hostile client, and one for each of the wakers that their users may have."""
 FDS_LEFT_LIMIT: Final = 4
-"""Above those of before, a while after the attack: connections of this program; more is a leak."""
+"""Maximum number of descriptors above the number before the attack. More descriptors are a leak."""
 LEDGER_TOLERANCE: Final = 1
-"""Samples by which losses in the ledger may differ from what the port refused, over any number of stops."""
+"""Maximum difference of the losses in the ledger and the frames that the port refused, samples, for any number of
+stops."""
 
 
 @dataclass
@@ -31,7 +33,7 @@ class Measured:
     samples: int = 0
     lost: int = 0
     dropped: int = 0
-    """Of these, what the daemon says that it dropped."""
+    """Number of these samples that the daemon reports as dropped."""
     reply_p50_ms: float = 0.0
     reply_p99_ms: float = 0.0
     reply_max_ms: float = 0.0
@@ -52,9 +54,10 @@ class Measured:
 
 
 def exceeded(seen: Measured, *, delays: bool = True) -> list[str]:
-    """The bounds that were exceeded; those of delays only where they are judged.
+    """Return the exceeded limits. Include limits of delays only if `delays` is True.
 
-    An attack that stops the daemon has losses and delays as its aim: losses must be those of the port then.
+    An attack that stops the daemon aims at losses and delays. Then the losses must be equal to the frames that the port
+    refused.
     """
     starves = seen.stops > 0
     p99_limit_ms = P99_LIMIT_MS if delays and not starves else inf

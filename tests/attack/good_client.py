@@ -1,8 +1,8 @@
-"""A well-behaved client: watches every sample, asks `poll` every 10 ms; prints its figures when it gets a line.
+"""A good client: watches every sample, requests `poll` every 10 ms, and prints its figures after it receives a line.
 
-`python -m tests.attack.good_client SOCKET [UID GID]`, as that user where one is given. Frame i of the writer, at 1 kHz,
-carries i ms as its time, so a gap there is a sample that is lost wherever it was lost: in the port, in the daemon, or
-on the way to this client.
+`python -m tests.attack.good_client SOCKET [UID GID]`, as this user if given. Frame i of the writer, at 1 kHz, contains
+the time i ms. A gap in these times is therefore a lost sample, in the port, in the daemon, or on the way to this
+client.
 """
 
 import json

@@ -1,7 +1,7 @@
 """A process full of hostile clients: `python -m tests.attack.hostile KIND --socket PATH --clients N --seconds S`.
 
-Each kind says what its clients send and how they read. The engine writes and reads as fast as that allows, connects
-again when it is disconnected, ends after the given time, and prints what it did as JSON (`Deeds`).
+Each kind defines the data of its clients and their way to read. The engine writes and reads as fast as possible,
+connects again after a disconnect, ends after the given time, and prints its work as JSON (`Deeds`).
 """
 
 import argparse
@@ -31,7 +31,7 @@ class Reading(Enum):
 @dataclass(frozen=True)
 class Kind:
     sends: Callable[[random.Random], bytes]
-    """What a client sends next; empty for nothing more."""
+    """Function that returns the next data of a client; empty for no more data."""
     reading: Reading = Reading.ALL
     once: bool = False
     """Whether it sends only once per connection."""

@@ -1,7 +1,7 @@
-"""The attack on shared memory beside a running daemon, with a reader that must not be misled.
+"""The attack on shared memory next to a running daemon, with a reader that must not get false samples.
 
-The directory is one where only the daemon may make names, or a sticky one. In a sticky one the daemon makes rings of
-other sizes meanwhile, so that names become free that the hostile user is after.
+The directory is a directory of the daemon, or a sticky directory. In a sticky directory, the daemon changes the size of
+its rings, so that names become free for the hostile user.
 """
 
 import subprocess
@@ -22,9 +22,9 @@ STICKY_MODE: Final = 0o1777
 OTHER_SLOTS: Final = 2 * SLOTS
 READ_S: Final = 0.02
 SETTLE_S: Final = 0.3
-"""Rings that were made anew have samples, and a heartbeat."""
+"""Time until new rings contain samples and a heartbeat, s."""
 REMADE_MISSED_MAX: Final = 500
-"""Samples that a reader may miss while all rings are made anew twice, of a device with 1 kHz: half a second."""
+"""Maximum number of samples that a reader may miss while the daemon makes all rings twice, 1 kHz: half a second."""
 HOSTILE: Final = """
 import sys, time
 from pathlib import Path
@@ -77,7 +77,7 @@ class Witness:
 
 
 def attack(stage: AttackedDaemon, uid: int, seconds: float, sticky: bool) -> tuple[list[str], int]:
-    """Let user `uid` act in the directory of the rings; what went wrong, and the number of his acts."""
+    """Let user `uid` act in the directory of the rings. Return the faults and the number of his operations."""
     stage.rings.chmod(STICKY_MODE if sticky else PRIVATE_MODE)
     witness = Witness(stage)
     reading = Thread(target=witness.run)

@@ -1,7 +1,8 @@
-"""What a user without rights does to a directory of rings, as fast as he can, until he is stopped.
+"""Operations of a user without rights in a directory of rings, as fast as possible, until the process is stopped.
 
-`attack` runs in a process of its own, which it changes to the hostile user. In `/run/imud/shm` every act is refused;
-in a sticky directory such as /dev/shm he may make names, and lock and map what he may read. The daemon must not care.
+`attack` runs in its own process, which it changes to the hostile user. In `/run/imud/shm`, the kernel refuses every
+operation. In a sticky directory such as /dev/shm, the user can make names, and lock and map readable files. The daemon
+must keep working.
 """
 
 import errno
@@ -19,7 +20,7 @@ from imud.formats.ring import HEADER_BYTES, STATE_LIVE, RingHeader, encode_heade
 from imud.formats.slot import SLOT_BYTES
 
 DEVICES: Final = ("a", "bow", "demo", "imu", "imu0", "stern")
-"""Names that may be a device's; those of the rings that are there are attacked too."""
+"""Names of possible devices. The attack also uses the names of the existing rings."""
 SLOTS: Final = 64
 HELD_MAX: Final = 64
 """Descriptors that he keeps open, with their locks."""
@@ -28,7 +29,7 @@ FILLERS: Final = 8
 
 
 class Attacker:
-    """A user who may at most read. Counts what he tried; errors are what he expects."""
+    """A user with at most the right to read. It counts its operations and expects errors."""
 
     def __init__(self, directory: Path, seed: int = 1) -> None:
         self.acts = 0

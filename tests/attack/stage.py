@@ -38,7 +38,7 @@ SETTLE_S = 3.0
 IDLE_DEVICES = 3
 REPLUG_LIMIT_S = 5.0
 CLIENTS_MAX = 320
-"""Room for 256 hostile clients beside the reserved places."""
+"""Maximum number of clients: 256 hostile clients and the reserved places."""
 FDS_MAX = 16_384
 PIPE_BYTES = 4096
 """The least that a pipe has room for, so that it is full soon."""
@@ -48,7 +48,8 @@ SLOTS = 1024
 LOST_SETTLE_S = 1.0
 """A loss is known with the sample after it."""
 QUIET_LIMIT_S = 10.0
-"""Closed connections are gone by then, those that waited to be accepted at 64 per second and user included."""
+"""Time until closed connections are gone, s, with the connections that wait for acceptance at 64 per second and
+user."""
 LOG_SPOILT = b"the configuration stays as it was"
 LOG_FILLER = b"-" * 63
 LOG_EXPECTED = (b"nothing is heard on", LOG_SPOILT, LOG_FILLER, b" is gone (hung up)")
@@ -56,12 +57,12 @@ PROBLEMS = 20
 
 
 class Scheduling(Enum):
-    """How the daemon runs; the device and the good client, which measure, are real-time in both."""
+    """Scheduling of the daemon. Device and good client, which measure, are real-time in both cases."""
 
     UNIT = "unit"
-    """As the unit has it: the default policy, nice 0, any core; so do hostile clients."""
+    """As in the unit: the default policy, nice 0, any core. The same for hostile clients."""
     REAL_TIME = "real-time"
-    """Real-time on a core of its own, hostile clients at nice 10 on the others: what the daemon itself takes."""
+    """Real-time on its own core, with hostile clients at nice 10 on the other cores: the load of the daemon itself."""
 
     @property
     def daemon_cores(self) -> set[int]:
@@ -77,7 +78,7 @@ class Scheduling(Enum):
 
 
 def before_others(pid: int) -> bool:
-    """Let a process run before those of the machine that have nothing to do with this, real-time; whether it may be."""
+    """Give a process priority over unrelated processes of the host. Return whether the kernel permits it."""
     try:
         for task in Path(f"/proc/{pid}/task").iterdir():
             os.sched_setscheduler(int(task.name), os.SCHED_RR, os.sched_param(PRIORITY))
@@ -123,11 +124,11 @@ class LogPipe:
         return int.from_bytes(size, sys.byteorder)
 
     def stop_reading(self) -> None:
-        """Leave in it what comes from now on, and fill it, so that nothing that comes from now on can go into it."""
+        """Stop reading and fill the socket, so that no later data fits into it."""
         self._reads.clear()
         writer = os.open(f"/proc/self/fd/{self.writer}", os.O_WRONLY | os.O_NONBLOCK)  # the daemon's blocks
         try:
-            end_s = monotonic() + FILL_S  # what the reader still had in hand takes one turn
+            end_s = monotonic() + FILL_S  # the reader processes its last data in one turn
             while monotonic() < end_s:
                 with suppress(BlockingIOError):
                     os.write(writer, LOG_FILLER + b"\n")
@@ -254,7 +255,7 @@ class AttackedDaemon:
         return lost(ledger), ledger["lost_unknown"]
 
     def fds_above(self, before: int, limit: int) -> int:
-        """Open descriptors above `before`, once they are at most `limit` or have had the time to become so few."""
+        """Return the number of open descriptors above `before`, after it is at most `limit` or after a timeout."""
         end_s = monotonic() + QUIET_LIMIT_S
         while (above := self.fds - before) > limit and monotonic() < end_s:
             sleep(0.05)
@@ -268,7 +269,7 @@ class AttackedDaemon:
         self._file.write_bytes(msgspec.json.encode({f"no-such-key-{number}": 1 for number in range(PROBLEMS)}))
 
     def change(self, *, devices: int = 0, slots: int = SLOTS) -> None:
-        """Reload with so many more idle devices and with rings of another size; wait until the devices are there."""
+        """Reload with this number of additional idle devices and with rings of this size. Wait for the devices."""
         for number in range(len(self._ports) - 1 - IDLE_DEVICES, devices):
             port = IdlePort(self.folder / f"more{number}")
             self._ports.append(str(port.path))

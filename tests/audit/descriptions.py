@@ -15,7 +15,7 @@ _SECTION: Final = re.compile(r"^(\d+(?:\.\d+)*)")
 
 
 def described() -> dict[str, list[str]]:
-    """What the drivers describe, by section, for example `B 2.2.4: hipnuc-uart: action mode (axes)`."""
+    """Return the descriptions of the drivers by section, for example `B 2.2.4: hipnuc-uart: action mode (axes)`."""
     found: dict[str, list[str]] = {}
     for driver in DRIVERS.values():
         letter = MANUALS[driver.name.partition("-")[0]]

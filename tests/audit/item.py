@@ -1,7 +1,7 @@
-"""Items of the vendors' manuals: what imud does with each, where, and which tests show it.
+"""Items of the manuals: the reaction of imud to each item, its place in the code, and its tests.
 
-A test says which items it shows with a mark, `@pytest.mark.manual("B 2.2.3 SERIALCONFIG", …)`. The marks are read from
-the source of the tests; nothing is imported or run for it.
+A test names its items with a mark, `@pytest.mark.manual("B 2.2.3 SERIALCONFIG", …)`. The audit reads the marks from the
+source of the tests, without imports.
 """
 
 import ast
@@ -22,9 +22,9 @@ class Item:
     """Letter of the manual, section, and a short name; as in the marks."""
     words: str
     code: str = ""
-    """`module:name` below `imud`, where the work is done; empty for what is left."""
+    """`module:name` below `imud` of the code for the item; empty for an item without code."""
     left: str = ""
-    """Why nothing is done about it; empty for what works."""
+    """Reason why imud does not implement the item; empty for an implemented item."""
 
     @property
     def section(self) -> str:
@@ -33,7 +33,7 @@ class Item:
 
     @property
     def code_exists(self) -> bool:
-        """Whether `code` names something that is there."""
+        """Return whether the name in `code` exists."""
         module, _, name = self.code.partition(":")
         try:
             return hasattr(importlib.import_module(f"imud.{module}"), name)
@@ -68,7 +68,7 @@ def _keys(decorator: ast.expr) -> Iterator[str]:
 
 
 def faults(items: Mapping[str, Item], marked: Mapping[str, list[str]]) -> Iterator[str]:
-    """What is wrong with the account, a line each: items without code or tests, marks without an item."""
+    """Yield the faults of the account, one line each: items without code or tests, marks without an item."""
     for key, item in items.items():
         if item.left and (item.code or key in marked):
             yield f"{key}: left, although it has code or a test"

@@ -113,7 +113,8 @@ def _log(target: str) -> Path:
 
 
 def plan(wanted: Sequence[str], engine: str) -> list[tuple[str, str]]:
-    """Targets with their engines; says what is left out, and why. Raises SystemExit where nothing may be."""
+    """Return the targets with their engines. Print the skipped targets with the reason. Raises SystemExit if no target
+    may be skipped."""
     chosen = [name for name in all_names() if not wanted or any(part in name for part in wanted)]
     if engine == "auto":
         engine = "atheris" if importlib.util.find_spec("atheris") else "hypothesis"

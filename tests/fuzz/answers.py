@@ -1,4 +1,5 @@
-"""What a daemon, or something in its place, sends to its clients: answers, notifications, frames, or anything else."""
+"""Data from a daemon, or from a program in its place, to its clients: replies, notifications, frames, or any other
+bytes."""
 
 import asyncio
 import atexit
@@ -23,7 +24,7 @@ from tests.fuzz.target import Target
 
 ITEMS: Final = 8
 WAIT_S: Final = 60.0
-"""The server ends the connection after the input: nobody waits so long."""
+"""Maximum wait of the client, s. The server ends the connection after the input, so that no wait takes this time."""
 HELLO: Final = line_of(
     encode_notification("hello", {"protocol": PROTOCOL, "version": "0", "epoch": 1, "rights": ["read"]})
 )
@@ -105,7 +106,7 @@ def _daemon() -> _Daemon:
 
 
 def run(data: bytes) -> None:
-    """The first byte says what the client asks, and whether the greeting is the daemon's; the rest is what comes."""
+    """The first byte selects the request of the client and whether the greeting is valid; the rest is the data."""
     head, rest = data[0] if data else 0, data[1:]
     daemon = _daemon()
     use = head % (CALLS + 1)

@@ -1,4 +1,4 @@
-"""What an MQTT broker sends: whatever it is, the connection goes on or ends with a BrokerError."""
+"""Data from an MQTT broker: for any data, the connection continues or ends with a BrokerError."""
 
 import socket
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ def make(_name: str) -> Target:
 
 
 def run(data: bytes) -> None:
-    """The lowest bit of the first byte says which version of MQTT is spoken; the broker sends the others."""
+    """The lowest bit of the first byte selects the version of MQTT; the broker sends the other bytes."""
     settings = SETTINGS[data[0] & 1 if data else 0]
     with socket.create_server(("127.0.0.1", 0)) as listener:
         thread = Thread(target=_serve, args=(listener, data[1:]), name="hostile broker")

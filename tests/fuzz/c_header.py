@@ -55,5 +55,5 @@ def run_once(folder: Path, inputs: list[Path]) -> subprocess.CompletedProcess[st
 
 
 def environment(folder: Path = Path("build/fuzz")) -> dict[str, str]:
-    """What the fuzzer needs: the ring that programs change."""
+    """Return the environment of the fuzzer: the ring that programs change."""
     return {**os.environ, "IMUD_FUZZ_RING": str(folder / _BASE)}

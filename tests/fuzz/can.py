@@ -59,7 +59,7 @@ def own_identifiers(driver: CanDriver) -> list[tuple[int, bool]]:
 
 
 def decoded(data: bytes, own: Sequence[tuple[int, bool]]) -> list[CanFrame]:
-    """The frames of an input; what is cut short at its end is left out."""
+    """Return the frames of an input without an incomplete frame at its end."""
     frames: list[CanFrame] = []
     at, t_ns = 0, 0
     while at + 3 <= len(data):
@@ -79,7 +79,7 @@ def decoded(data: bytes, own: Sequence[tuple[int, bool]]) -> list[CanFrame]:
 
 
 def encoded(frames: Iterable[tuple[int, CanFrame]], own: Sequence[tuple[int, bool]]) -> bytes:
-    """The input for frames, each with the steps since the one before."""
+    """Return the input for frames, each with its distance from the previous frame."""
     parts = [b"\0"]
     for steps, frame in frames:
         identifier = frame.can_id, frame.extended

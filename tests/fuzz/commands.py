@@ -1,4 +1,4 @@
-"""The command channel over MQTT: whatever comes on its topics, what runs is in the list, fresh, and runs once."""
+"""The command channel over MQTT: for any messages, an executed request is permitted, fresh, and executed once."""
 
 import asyncio
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ GATEWAY: Final = Gateway("site", "gw", "0")
 TOPIC: Final = topic_of("site", "gw", "bow", COMMAND)
 OWN: Final = topic_of("site", "gw", "bow", ANSWER)
 SEPARATOR: Final = b"\t"
-"""Between topic, wanted response topic and payload; messages are lines. JSON needs neither."""
+"""Separator between topic, response topic and payload. Messages are lines, and JSON needs no tab."""
 ACTIONS: Final = DRIVERS["hipnuc-uart"].actions
 
 
@@ -38,7 +38,7 @@ def make(_name: str) -> Target:
 
 
 class _Control(FakeControl):
-    """A device that notes what it is asked, after the check of the arguments that the daemon makes."""
+    """A device that notes its requests after the check of their arguments."""
 
     def __init__(self, device: str, asked: list[tuple[str, str]]) -> None:
         super().__init__(device)
@@ -58,7 +58,7 @@ def _loop() -> asyncio.AbstractEventLoop:
 
 
 def run(data: bytes) -> None:
-    """Take each message, carry out what may be, and look at all that came of it."""
+    """Pass each message, execute the permitted requests, and check all results."""
     asked: list[tuple[str, str]] = []
     replies: list[CommandReply] = []
     channel = CommandChannel(SETTINGS, GATEWAY, lambda name: _Control(name, asked), lambda: AGE_NS, lambda: UTC_NS)

@@ -15,7 +15,7 @@ from tests.support.files import ROOT
 
 FILENAME: Final = "imud.yaml"
 MESSAGE_BYTES_MAX: Final = 64 * 1024
-"""An error is for people: a log line of a megabyte is none."""
+"""Maximum length of an error message, bytes: a user must be able to read it."""
 
 
 _CONTROL: Final = re.compile(r"\\x[0189][0-9a-f]|\\x7f|\\[nrt]|\\u202[89]")

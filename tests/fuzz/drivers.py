@@ -1,4 +1,4 @@
-"""What the targets of stream, CAN and polled codecs share: rows of one kind, variants of settings, check values."""
+"""Common parts of the targets of stream, CAN and polled codecs: rows of one kind, variants of options, check values."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -27,7 +27,7 @@ def row(name: str, kind: type[D]) -> D:
 
 
 def variants(settings: type[Options]) -> list[Any]:
-    """Settings with every combination of the values of those that are a choice; the first is the default."""
+    """Return options with every combination of the values of choices. The first options are the defaults."""
     hints = get_type_hints(settings)
     choices = {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
     combinations = [dict(zip(choices, values, strict=True)) for values in product(*choices.values())]

@@ -1,4 +1,5 @@
-"""Files of captures: raw and stamped ones, and logs of candump. What is read is in the file, whatever the file is."""
+"""Files of captures: raw captures, captures with time stamps, and logs of candump. The readers return only data of the
+file."""
 
 import io
 import zlib
@@ -27,7 +28,7 @@ PERIOD_NS: Final = 10_000_000
 
 
 class ShortReads(io.RawIOBase):
-    """A file that gives fewer bytes than are asked for, as pipes do."""
+    """A file that returns fewer bytes than requested, as a pipe does."""
 
     def __init__(self, data: bytes, random: Random) -> None:
         self._data = data

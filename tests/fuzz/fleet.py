@@ -31,7 +31,8 @@ from tests.fuzz.target import Target
 PLAIN: Final = b"\0"
 """First byte of an input: the rest is one payload."""
 PACKED: Final = b"\1"
-"""The rest is header and slots, compressed here: a mutation of what is compressed would get nowhere."""
+"""First byte of an input whose rest is header and slots. The target compresses them, because a mutation of compressed
+data fails early."""
 SEVERAL: Final = b"\2"
 """The rest is payloads as JSON, one in a line, which the ledger takes one after another."""
 
@@ -73,7 +74,7 @@ def run_message(data: bytes) -> None:
 
 
 def run_topic(data: bytes) -> None:
-    """What is taken apart is made again."""
+    """The topic made from the parts of a topic is equal to the topic."""
     topic = data.decode("utf-8", "replace")
     parts = parse_topic(topic)
     if parts is not None:

@@ -19,7 +19,7 @@ from tests.support.codec_invariants import check_closed, decode_polled
 CONVERSATION = 0x80
 FAILS = 0x40
 TRANSFERS_MAX = 20
-"""No conversation has more, whatever it is answered."""
+"""Maximum number of transfers of a script, for any replies."""
 
 
 def names() -> Sequence[str]:

@@ -81,7 +81,7 @@ class _Rig:
         atexit.register(self._close)
 
     def do(self, work: Coroutine[Any, Any, T]) -> T:
-        """Run `work` in the loop; raises for whatever the loop had to catch."""
+        """Run `work` in the loop. Raises the exceptions that the loop caught."""
         result = self._loop.run_until_complete(asyncio.wait_for(work, ANSWER_S))
         strays, self._strays = self._strays, []
         for stray in strays:
@@ -107,7 +107,7 @@ class _Rig:
         return server
 
     async def serve(self, data: bytes) -> None:
-        """Connect, send, end the own side, and read to the end, while samples and events go on."""
+        """Connect, send, close the own side, and read to the end, while samples and events arrive."""
         received = await self._talk(data)
         await asyncio.sleep(0)
         assert not self.server.hub.connections

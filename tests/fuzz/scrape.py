@@ -1,5 +1,5 @@
-"""Requests over HTTP: any head of a scrape gives an answer in a format that Prometheus knows, or none; and `imud web`
-lets nobody control without the token, and refuses what a page cannot have sent."""
+"""Requests over HTTP: each head of a scrape gives a reply in a format of Prometheus, or none. `imud web` permits no
+control without the token, and refuses requests that a page cannot have sent."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -29,7 +29,7 @@ def make(_name: str) -> Target:
 
 
 def run(data: bytes) -> None:
-    """The server gives `parse_request` what stands in front of the first empty line."""
+    """The server passes the bytes before the first empty line to `parse_request`."""
     look_at_page_request(data)
     request = parse_request(data.partition(b"\r\n\r\n")[0])
     if request is None:

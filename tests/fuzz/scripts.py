@@ -1,7 +1,7 @@
-"""Request scripts of stream and CAN drivers, answered by any bytes: they end, and raise nothing but what is documented.
+"""Scripts of stream and CAN drivers, with any bytes as replies: they end, and raise only the documented exceptions.
 
-The first byte of an input chooses the script: `identify`, `read_settings`, `wake`, or an action that needs no
-arguments. The rest is what the device sends, as in `streams` and `can`.
+The first byte of an input selects the script: `identify`, `read_settings`, `wake`, or an action without arguments. The
+rest is the data of the device, as in `streams` and `can`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +20,7 @@ from tests.fuzz.drivers import mender, names_of, row
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target
 
 REQUESTS_MAX = 500
-"""No script asks more often, whatever it is answered."""
+"""Maximum number of requests of a script, for any replies."""
 BAUD = 115200
 
 Script = Callable[[], RequestScript[Any]]

@@ -1,7 +1,7 @@
-"""Readers of shared memory: one slot, and a ring whose file changes in any way while it is read.
+"""Readers of shared memory: one slot, and a ring whose file changes while it is read.
 
-An input for a ring is a program. Byte 0: how many steps come before the reader opens the file; byte 1: how many times
-CUT_BYTES are missing at the file's end. A step is a byte, of which the low three bits count:
+An input for a ring is a program. Byte 0: number of steps before the reader opens the file. Byte 1: number of missing
+CUT_BYTES at the end of the file. A step is a byte, of which the low three bits count:
 
     0 read  1 latest  2 ledger  3 health  7 the file is replaced by a copy, and reopened
     4 write: offset u16, modulo the size; length u8, modulo 32; bytes    5 slot's CRC-32 made right: number u8

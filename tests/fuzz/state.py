@@ -1,4 +1,5 @@
-"""Files of the state directory: whatever is in `found.json` and `settings.json`, the daemon starts and goes on."""
+"""Files of the state directory: for any content of `found.json` and `settings.json`, the daemon starts and
+continues."""
 
 import atexit
 import tempfile
@@ -36,7 +37,7 @@ def _folder() -> Path:
 
 
 def run(data: bytes) -> None:
-    """What the daemon makes of the file as either; what it then writes is read again."""
+    """Read the file as both kinds. Read the files again that the daemon then writes."""
     folder = _folder()
     (folder / remembered.FILE_NAME).write_bytes(data)
     devices = Remembered(folder)

@@ -50,7 +50,7 @@ def seeds(driver: StreamDriver) -> list[bytes]:
 
 
 def _flush_and_reset(codec: StreamCodec, data: bytes) -> None:
-    """A pause loses nothing; a reset leaves nothing pending, and what came before changes nothing."""
+    """A pause loses no frames. A reset leaves no pending bytes, and earlier bytes have no effect after it."""
     codec.flush()
     check_closed(codec.ledger)
     assert codec.flush() == []

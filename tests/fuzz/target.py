@@ -1,4 +1,4 @@
-"""Contract: what a fuzz target is, and what a module with targets has."""
+"""Contract of a fuzz target, and of a module with targets."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ FRAMES_BYTES_MAX: Final = 2048
 @dataclass(frozen=True, slots=True)
 class Target:
     run: Callable[[bytes], None]
-    """Raises for an input that violates an invariant; whatever it raises is a finding."""
+    """Function that raises an exception for an input that violates an invariant. Each exception is a finding."""
     seeds: Callable[[], Sequence[bytes]]
     """Valid inputs to begin with, made by encoders; a few dozen, the same at each call."""
     mend: Callable[[bytes, Random], bytes] = as_it_is
-    """Makes check values right after a mutation, so that what stands behind them is reached too."""
+    """Function that corrects check values after a mutation, so that the fuzzer reaches the code behind them."""
     words: Callable[[], Sequence[bytes]] = tuple
     bytes_max: int = INPUT_BYTES_MAX
 

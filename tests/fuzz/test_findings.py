@@ -1,4 +1,4 @@
-"""What fuzzing found, one test each."""
+"""Findings of the fuzzers, one test each."""
 
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,8 @@ def test_a_line_that_is_too_long_is_skipped_in_any_split(size: int) -> None:
 
 @pytest.mark.parametrize("version", ["x", "1.x", "", "1.0.0"])
 def test_a_scrape_with_any_version_is_answered(version: str) -> None:
-    """http/request: prometheus_client raised TypeError for a version that is no number, and nothing was answered."""
+    """http/request: prometheus_client raised TypeError for a version that is not a number, and the server sent no
+    reply."""
     _, content_type = encoder_for(f"application/openmetrics-text; version={version}")
     assert content_type.startswith(("text/plain", "application/openmetrics-text"))
 
@@ -77,7 +78,7 @@ def test_a_body_that_is_no_text_or_too_deep_is_refused_in_one_way(kind: type, bo
 
 @pytest.mark.parametrize("method", ["{}", "[]", "5", "null"])
 def test_a_method_that_is_no_text_is_a_server_error(method: str) -> None:
-    """client/answers: a TypeError came out of the iterators, because an object cannot be looked up among names."""
+    """client/answers: the iterators raised TypeError, because an object cannot be a key of a mapping."""
     watched = line_of(encode_result(1, {"devices": {"bow": 0}}))
     for use in (1, 2):  # events, samples
         answers.run(bytes([use]) + watched + b'{"jsonrpc":"2.0","method":%s}\n' % method.encode())
@@ -109,7 +110,7 @@ def test_a_notification_of_another_form_is_a_server_error(name: str, params: obj
 
 @pytest.mark.parametrize("params", [[], {"t_ns": "x", "device": "bow", "kind": "up", "message": ""}])
 def test_an_event_of_another_form_is_a_server_error(params: object) -> None:
-    """client/answers: as it came, or a TypeError."""
+    """client/answers: the client returned the event unchanged or raised TypeError."""
     with pytest.raises(ServerError, match="understood"):
         next(EventStream(_Once({"method": "event", "params": params}), None))
 

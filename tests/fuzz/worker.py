@@ -59,10 +59,10 @@ def fuzz_with_atheris(name: str, seconds: float, seed: int, folder: Path, grown:
 
 
 def libfuzzer_options(seconds: float, seed: int, folder: Path, inputs: Sequence[str]) -> list[str]:
-    """What the fuzzers of Python and of C have in common; a seed of 0 is that of the clock.
+    """Return the common options of the fuzzers of Python and C. A seed of 0 means the clock.
 
-    For a seed to decide what is tried, inputs are named in order (that of a folder is chance), the corpus is not read
-    again every second, and how rare a feature is has no weight, for a few of them come and go.
+    For a reproducible run, the options name the inputs in order, because the order of a folder is random. They switch
+    off reloading of the corpus and the weight of rare features, because some features are not reproducible.
     """
     options = [f"-max_total_time={max(int(seconds), 1)}", f"-artifact_prefix={folder}/", "-print_final_stats=1"]
     if seed:
@@ -139,7 +139,7 @@ def escaped(word: bytes) -> str:
 
 
 def main() -> int:
-    logging.disable()  # what targets report of bad input, thousands of times a second
+    logging.disable()  # targets report invalid input thousands of times per second
     engine, name, seconds, seed, folder, grown, *inputs = sys.argv[1:]
     if engine == "atheris":
         fuzz_with_atheris(name, float(seconds), int(seed), Path(folder), Path(grown), inputs)

@@ -96,7 +96,7 @@ def _reader(build: Build, board: Board) -> Iterator[Reader]:
 
 
 def layout_program() -> tuple[str, list[str]]:
-    """A C program that prints the layout as the compiler sees it, and what the Python tables say it must print."""
+    """Return a C program that prints the layout of the compiler, and the expected output from the Python tables."""
     lines, expected = [], []
 
     def add(name: str, expression: str, value: int) -> None:
@@ -190,7 +190,7 @@ def test_number_that_changes_during_the_copy_and_gaps(board: Board, reader: Read
     board.publish([5000])
     assert reader.next() == (5000, 4999 - 1)
     board.publish([1])
-    assert reader.next() == (1, 0)  # numbers that begin anew
+    assert reader.next() == (1, 0)  # the numbers start again
     for now_ns, health in (
         (START_NS + 999_999_999, "0"), (START_NS + 1_000_000_000, "2"), (START_NS - 999_999_999, "0"),
         (START_NS - 1_000_000_000, "2"), (-(1 << 63), "2"),
@@ -214,7 +214,7 @@ def test_restarted_daemon(board: Board, reader: Reader, tmp_path: Path) -> None:
 
 
 def test_removed_ring(board: Board, reader: Reader) -> None:
-    """The same daemon goes on with its numbers in a new file: nothing is counted as missed that was read."""
+    """The same daemon continues its numbers in a new file: the reader counts no read sample as missed."""
     board.publish([1, 2])
     assert reader.next() == (1, 0)
     board.path.unlink()
@@ -234,7 +234,7 @@ def test_removed_ring(board: Board, reader: Reader) -> None:
 
 @pytest.mark.parametrize("size_bytes", [0, 1, shm_layout.HEADER_BYTES, shm_layout.HEADER_BYTES + SLOT_BYTES])
 def test_cut_ring(board: Board, reader: Reader, size_bytes: int) -> None:
-    """`health` says so before a page is touched that is not there."""
+    """`health` reports the cut before the reader touches a missing page."""
     board.publish([1])
     os.truncate(board.path, size_bytes)
     assert reader.ask(f"health {board.now_ns}") == ["health", "1"]
@@ -278,7 +278,8 @@ def run_reader(build: Build, *arguments: str, language: str = "c99", **environme
 
 
 def test_directories_of_names(build: Build, tmp_path: Path) -> None:
-    """IMUD_SHM alone where it is set, else the user's own directory where the system's has no such ring."""
+    """If IMUD_SHM is set, it is the only directory. Otherwise the directory of the user is used if the system directory
+    has no such ring."""
     own = tmp_path / "imud" / "shm"
     own.mkdir(parents=True)
     device = "no-such-device-of-the-tests"
@@ -401,7 +402,7 @@ def test_names_that_cannot_be_opened(build: Build, name: str, code: int) -> None
 @pytest.mark.live
 @pytest.mark.parametrize("slots_in_ring", [1, SLOTS])
 def test_no_torn_sample_and_none_unaccounted_under_stress(build: Build, tmp_path: Path, slots_in_ring: int) -> None:
-    """In a ring of one slot, reader and writer meet all the time."""
+    """In a ring of one slot, reader and writer always use the same slot."""
     board = Board(tmp_path, slots=slots_in_ring)
     batches = stress_batches()
     command = [str(build(READER, "c99")), "stress", str(board.path)]

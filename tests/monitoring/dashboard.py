@@ -23,7 +23,7 @@ LATENCY: Final = f"imud_sample_latency_seconds_bucket{DEVICE}"
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """An expression and what its lines are called."""
+    """An expression and the legend of its lines."""
 
     expression: str
     legend: str = ""
@@ -52,7 +52,7 @@ class Row:
 
 
 def device(metric: str, legend: str, wrap: str = "{}", labels: str = "") -> Query:
-    """A metric of the chosen device; `wrap` is what is computed of it."""
+    """Return a metric of the selected device. `wrap` is an expression around the metric."""
     return Query(wrap.format(metric + DEVICE.replace("}", f"{labels}}}")), legend)
 
 
@@ -220,7 +220,7 @@ def _panel(panel: Panel, x: int, y: int) -> dict[str, Any]:
 
 
 def text() -> str:
-    """The file as it stands."""
+    """Return the text of the file."""
     return json.dumps(dashboard(), indent=1, ensure_ascii=False) + "\n"
 
 

@@ -54,19 +54,19 @@ DISK_BYTES: Final = 16_384
 
 
 class Wire(Cable):
-    """A device that sends HI91 at 20 Hz, and what is wrong with it. Synchronization: the feeder's thread."""
+    """A device that sends HI91 at 20 Hz, with faults. Synchronization: the feeder's thread."""
 
     plugged = True
     silent = False
     lose_every = flip_every = 0
-    """Of so many frames one."""
+    """Interval of lost or damaged frames, frames; 0 for no fault."""
     temperature_c = 20
     hold = 1
-    """Frames that are kept back until there are so many."""
+    """Number of frames that the wire holds before it delivers them."""
     jump_ms = 0
-    """The device's time begins anew after so long."""
+    """Time after which the device time starts again, ms; 0 for never."""
     behind_ms = 0
-    """How much earlier the device's time is than it was."""
+    """Offset of the device time into the past, ms."""
     up_m_s2 = 9.8
 
     def __init__(self, name: Path) -> None:
@@ -90,7 +90,7 @@ class Wire(Cable):
         held, self._held = self._held, b""
         if self.plugged:
             os.set_blocking(self.master, False)
-            with suppress(BlockingIOError):  # nobody reads now
+            with suppress(BlockingIOError):  # no program reads now
                 os.write(self.master, held)
 
     def _frame(self, ms: int) -> bytes:
@@ -196,7 +196,7 @@ class Site:
         self._stack.close()
 
     def scrape_s(self) -> float:
-        """How long a scrape takes once all devices run, the longest of three."""
+        """Return the longest of three scrape times while all devices run, s."""
         wait_until(lambda: self._running() == len(WIRES) + 2, "all devices run", LIMIT_S)
 
         def once() -> float:
@@ -216,7 +216,7 @@ class Site:
         wires["lossy"].lose_every = 5
         wires["noisy"].flip_every = 10
         wires["hot"].temperature_c = 90
-        wires["late"].hold, wires["late"].behind_ms = 12, 5000  # the clock's fit begins anew, with late frames
+        wires["late"].hold, wires["late"].behind_ms = 12, 5000  # the fit of the clock starts again, with late frames
         wires["jumping"].jump_ms = 2 * PERIOD_MS
         wires["tilted"].up_m_s2 = -9.8
         self._pps = False
@@ -325,7 +325,8 @@ class Site:
             self.in_loop(lambda: self.memory.inputs["lines pps"].pulse(t_ns, 100 * NS_PER_MS))
 
     def _write(self, *, faulty: bool) -> Path:
-        """The configuration; the faulty one declares what the modules are not, and a source that is not there."""
+        """Write the configuration. The faulty configuration declares other settings than the devices have, and a
+        missing source."""
 
         def uart(name: str, **more: Any) -> dict[str, Any]:
             port = str(self.folder / name / "port")
@@ -380,7 +381,7 @@ def _log_without_reader() -> Iterator[LogWriter]:
 
 @contextmanager
 def site(folder: Path, port: int, beside: Sequence[Wire] = ()) -> Iterator[Site]:
-    """Run it; `port` is that of its metrics."""
+    """Run the site. `port` is the port of its metrics."""
     one = Site(folder, port, beside)
     try:
         one.start()

@@ -1,8 +1,8 @@
 """The picture of the dashboard in docs/monitoring.md: `python -m tests.monitoring.picture` writes it (four minutes).
 
-A real Prometheus scrapes the real daemon, which runs on two simulated sensors: the link of the one is disturbed, and
-its sensor is silent for SILENT_S. Places, titles, queries and legends are those of the dashboard; Grafana draws them
-nicer. `--seconds` makes it shorter or longer.
+A real Prometheus scrapes the real daemon, which runs on two simulated sensors. The link of one sensor is disturbed, and
+the sensor is silent for SILENT_S. Places, titles, queries and legends come from the dashboard. Grafana draws them in
+another style. `--seconds` changes the duration.
 """
 
 import argparse
@@ -35,7 +35,7 @@ SENSORS: Final = {
 }
 """Name in the configuration, and words for `python -m imud.sim`."""
 CELL_X, CELL_Y, MARGIN = 50, 30, 6
-"""Of a unit of Grafana's grid, and between panels, px."""
+"""Size of a unit of Grafana's grid, and distance between panels, px."""
 COLOURS: Final = ("#73bf69", "#f2cc0c", "#5794f2", "#ff780a", "#f2495c", "#b877d9", "#8ab8ff", "#c4162a")
 UNITS: Final = {
     "s": ((1, "s"), (1e-3, "ms"), (1e-6, "µs")), "bytes": ((2**20, "MiB"), (2**10, "KiB")),
@@ -72,7 +72,7 @@ def sensors(folder: Path) -> Iterator[Mapping[str, subprocess.Popen[str]]]:
 
 
 def observed(seconds: float) -> tuple[list[str], int]:
-    """Run everything for so long; the picture's parts, and its height."""
+    """Run all parts for this time. Return the parts of the picture and its height."""
     with tempfile.TemporaryDirectory(prefix="imud-") as name, ExitStack() as stack:
         folder = Path(name)
         modules = stack.enter_context(sensors(folder))
@@ -98,7 +98,7 @@ def observed(seconds: float) -> tuple[list[str], int]:
 
 
 def _renamed(part: str, names: Mapping[str, str]) -> str:
-    """With the port and the paths of a real machine instead of those of this run."""
+    """Replace the port and the paths of this run by values of a real host."""
     for name, real in names.items():
         part = part.replace(name, real)
     return part
@@ -122,7 +122,7 @@ def drawn(prometheus: RealPrometheus, span: Span) -> tuple[list[str], int]:
 
 
 def found(prometheus: RealPrometheus, panel: Mapping[str, Any], span: Span) -> list[Series]:
-    """What the panel's queries give, with the names that its legends make."""
+    """Return the results of the panel's queries with the names of its legends."""
     series = []
     for target in panel["targets"]:
         expression = filled_in(target["expr"], device=CHOSEN if "$device" in target["expr"] else ".+", window="10s")
@@ -147,7 +147,7 @@ def shown(value: float, unit: str) -> str:
 
 
 class Box(NamedTuple):
-    """Where a panel is, px."""
+    """Place of a panel, px."""
 
     x: float
     y: float
@@ -155,7 +155,7 @@ class Box(NamedTuple):
     height: float
 
     def frame(self) -> str:
-        """Its ground."""
+        """Return the background of the panel."""
         return (
             f"<rect x='{self.x + MARGIN / 2:g}' y='{self.y + MARGIN / 2:g}' width='{self.width - MARGIN:g}' "
             f"height='{self.height - MARGIN:g}' rx='3' fill='#181b1f' stroke='#2c3235'/>"
@@ -167,7 +167,7 @@ class Box(NamedTuple):
                                                                  f"font-size='{size}' fill='{fill}'")  # fmt: skip
 
     def chart(self) -> "Box":
-        """Where the lines are."""
+        """Return the area of the lines."""
         return Box(self.x + 62, self.y + 34, self.width - 80, self.height - 34 - 38)
 
 
@@ -238,7 +238,7 @@ def _table(box: Box, _panel: Mapping[str, Any], series: list[Series], _span: Spa
 
 
 def _heatmap(box: Box, panel: Mapping[str, Any], series: list[Series], span: Span) -> list[str]:
-    """Counts of each bucket, which Prometheus gives with those of all lower ones."""
+    """Return the counts of each bucket. The buckets of Prometheus contain the counts of all lower buckets."""
     rows = sorted((one for one in series if one.name != "+Inf"), key=lambda one: float(one.name))
     if not rows:
         return _nothing(box)

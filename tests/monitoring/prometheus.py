@@ -23,13 +23,13 @@ from tests.support.surroundings import free_port
 RULES: Final = ROOT / "etc/prometheus/imud.rules.yml"
 LIMIT_S: Final = 120.0
 INTERVAL_MS: Final = 250
-"""Between scrapes, and between evaluations of the rules; where a scrape takes long, `Pace` makes it longer."""
+"""Time between scrapes and between evaluations of the rules, ms. `Pace` makes it longer if a scrape takes long."""
 DURATION: Final = re.compile(r"\b(\d+)([smh])\b")
 UNIT_MS: Final = {"s": 1000, "m": 60_000, "h": 3_600_000}
 
 
 def needs(*programs: str) -> pytest.MarkDecorator:
-    """Skip a test, with the reason, where a program is not installed."""
+    """Skip a test with the reason if a program is not installed."""
     missing = [program for program in programs if shutil.which(program) is None]
     return pytest.mark.skipif(
         bool(missing), reason=f"{', '.join(missing)} not installed: `make monitoring-deps` installs it"
@@ -58,7 +58,7 @@ def shortened(text: str, divisor: int) -> str:
 
 
 class Pace(NamedTuple):
-    """How fast a test lets the time of the rules pass on this machine."""
+    """Speed at which a test lets the time of the rules pass on this host."""
 
     interval_ms: int = INTERVAL_MS
     divisor: int = 90
@@ -90,7 +90,7 @@ class RealPrometheus:
         self._url = f"http://127.0.0.1:{port}"
 
     def scrape(self, *ports: int) -> None:
-        """Scrape these ports of this machine from now on, and no others."""
+        """Scrape these ports of this host and no other ports."""
         fresh = self._targets.with_suffix(".new")
         fresh.write_text(json.dumps([{"targets": [f"127.0.0.1:{port}" for port in ports]}]))
         fresh.rename(self._targets)

@@ -1,10 +1,11 @@
-"""Every alert by a real Prometheus: quiet without a fault, fires with it, clears after it. Two daemons are scraped:
+"""Every alert in a real Prometheus: silent without a fault, active with it, clear after it. Prometheus scrapes two
+daemons:
 
     site    in this process, a device per fault (`tests.monitoring.faults`)
-    spare   `imud run`, which is killed and started again, has no devices, and has few files to open
+    spare   `imud run`, which is killed and started again, has no devices, and can open few files
 
-The test divides all times of the rules, by 90 on an idle host: 15 minutes are 10 s. The undivided times run in
-tests/monitoring/imud.rules.test.yml. The table that the test prints (`pytest -s`) says how long each alert took.
+The test divides all times of the rules, by 90 on an idle host: 15 minutes become 10 s.
+tests/monitoring/imud.rules.test.yml tests the undivided times. The test prints the time of each alert (`pytest -s`).
 """
 
 import os
@@ -87,7 +88,7 @@ class Spare:
             self.process.stdin.flush()
 
     def kill(self) -> None:
-        """As the kernel does where memory is short."""
+        """Kill the daemon, as the kernel does if memory is short."""
         assert self.process is not None
         _end(self.process)
         self.process = None
@@ -217,7 +218,7 @@ def test_every_alert_fires_and_clears(tmp_path: Path) -> None:
         begin = time.monotonic()
         while "ImudLoopLate" not in watcher.after_s:  # alone: scrapes fail while the loop is stuck
             one.block_loop(max(STUCK_S, 1.5 * pace.interval_ms / 1000))
-            time.sleep(2.17 * STUCK_S)  # out of step with the scrapes, of which one has to be in time
+            time.sleep(2.17 * STUCK_S)  # out of step with the scrapes: one scrape must be in time
             watcher.look()
             assert time.monotonic() < begin + LIMIT_S
         fired["ImudLoopLate"] = watcher.after_s["ImudLoopLate"]

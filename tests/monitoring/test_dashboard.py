@@ -1,4 +1,4 @@
-"""The dashboard: its file is that of its description, and a real Prometheus has data for every query."""
+"""The dashboard: its file matches its description, and a real Prometheus has data for every query."""
 
 import json
 import re
@@ -70,7 +70,7 @@ def without_data(prometheus: RealPrometheus) -> list[str]:
 @needs("prometheus")
 @pytest.mark.live
 def test_every_query_has_data(tmp_path: Path) -> None:
-    """Of a daemon with a device on RS-485, one with lines, and others."""
+    """The daemon has a device on RS-485, a device with lines, and other devices."""
     port = free_port()
     (tmp_path / "site").mkdir()
     with site(tmp_path / "site", port) as one, real_prometheus(tmp_path, pace=Pace.of(one.scrape_s())) as prometheus:

@@ -1,4 +1,4 @@
-"""The picture of the dashboard: it is of the dashboard as it is, and numbers and names are as Grafana has them."""
+"""The picture of the dashboard: it matches the dashboard, with numbers and names in the format of Grafana."""
 
 import re
 from html import unescape

@@ -36,7 +36,7 @@ LINES_MAX: Final = 40
 
 @cache
 def source_of(path: str) -> bytes:
-    """Return a file as it was at its first use: somebody may edit the tree in the meantime."""
+    """Return a file as it was at its first use, because a user can edit the tree in the meantime."""
     return (ROOT / path).read_bytes()
 
 

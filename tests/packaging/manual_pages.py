@@ -56,9 +56,9 @@ FILES: Final = (
 )
 
 RAGGED: Final = ".ad l"
-"""From here on lines end where they end: some words of a synopsis are longer than half a line."""
+"""Request for left-aligned lines: some words of a synopsis are longer than half a line."""
 EVEN: Final = ".ad b"
-"""From here on both margins are even again."""
+"""Request for lines with both margins aligned."""
 
 # --- roff -------------------------------------------------------------------------------------------------------------
 
@@ -160,7 +160,7 @@ def commands_of(parser: argparse.ArgumentParser) -> Mapping[str, argparse.Argume
 
 
 def synopsis(parser: argparse.ArgumentParser) -> str:
-    """How a command is called, as `--help` has it: what excludes each other stands between bars."""
+    """Return the synopsis of a command as in `--help`, with bars between alternatives."""
     words = " ".join(parser.format_usage().split()).removeprefix("usage: ").removeprefix(parser.prog)
     return bold(parser.prog) + inside(words)
 

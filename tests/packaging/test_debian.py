@@ -222,7 +222,7 @@ def library(folder: Path, name: str, **texts: str) -> None:
 
 
 def copyright_of(folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run copyright.py on a folder of installed wheels, among them imud with what it bundles."""
+    """Run copyright.py on a folder of installed wheels with imud and its bundled files."""
     shutil.copytree(ROOT / "imud/web/static/uplot", folder / "imud/web/static/uplot", dirs_exist_ok=True)
     argv = [sys.executable, str(DEBIAN / "copyright.py"), str(folder)]
     return subprocess.run(argv, capture_output=True, text=True, check=False, timeout=LIMIT_S)

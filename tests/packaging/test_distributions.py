@@ -20,7 +20,7 @@ from tests.support.files import ROOT
 
 BUILD: Final = "from hatchling import build; print(build.build_{1}({0!r}))"
 NOT_DISTRIBUTED: Final = {".git", ".venv", "PKG-INFO"}
-"""Of the top folder: the repository, an environment, and what an sdist has besides."""
+"""Names in the top folder that are not distributed: the repository, an environment, and the metadata of an sdist."""
 pytestmark = [
     pytest.mark.live,
     pytest.mark.skipif(
@@ -46,7 +46,8 @@ def build(tree: Path, folder: Path, what: str) -> Path:
 
 
 def repository() -> set[str]:
-    """Paths of all files of the repository that are to be distributed: those that .gitignore does not name."""
+    """Return the paths of all files of the repository that are distributed: all files that .gitignore does not
+    exclude."""
     patterns = [line for line in (ROOT / ".gitignore").read_text().splitlines() if line]
 
     def is_kept(name: str, *, folder: bool) -> bool:
@@ -103,7 +104,7 @@ def test_the_wheel_starts_the_command_and_needs_what_the_project_says(distributi
 
 
 def test_the_sdist_has_every_file_of_the_repository_as_it_is(distributions: tuple[Path, Path]) -> None:
-    """So that `make check` finds there what it finds here."""
+    """`make check` finds the same files in the sdist as in the repository."""
     content = members(distributions[1])
     assert content.keys() - {"PKG-INFO"} == repository()
     assert {"Makefile", ".ci/run", "tests/lab_debian/run", "docs/pictures/time_stamps.svg"} <= content.keys()

@@ -22,7 +22,7 @@ PAGES = pages()
 
 
 def plain(text: str) -> str:
-    """What a reader sees of a page, on one line."""
+    """Return the visible text of a page as one line."""
     words = re.sub(r"\\f[BIR]|\\&", "", text).replace("\\-", "-").replace("\\(ha", "^").replace("\\(ti", "~")
     return " ".join(words.replace("\\e", "\\").split())
 

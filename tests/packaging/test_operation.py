@@ -1,6 +1,7 @@
-"""The commands of docs/operate.md: backup and restore are run on a made-up machine; what else it names is there.
+"""The commands of docs/operate.md: the tests run backup and restore on a simulated host, and check that all other names
+exist.
 
-Upgrade and the way back are run on a booted Debian (tests/lab_debian/guest/removal.py).
+Upgrade and downgrade run on a booted Debian (tests/lab_debian/guest/removal.py).
 """
 
 import os
@@ -38,7 +39,7 @@ KEPT: Final = {
     f"{STATE}/{FLASH}": "{}",
     f"{STATE}/{BACKUPS}/bow.20261123T011234.000000Z.yaml": "device: bow\n",
 }
-"""By path: what the page says is in a backup."""
+"""Files of a backup by path, as in the page."""
 LEFT_OUT: Final = (
     f"{RecorderOptions().directory}/one.imudrec",
     f"{MqttOptions().spool_directory}/{SPOOL_FILE}",

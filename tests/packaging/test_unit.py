@@ -1,6 +1,6 @@
-"""The service unit as a file: how exposed systemd judges it, which system calls and networks it leaves open.
+"""The service unit as a file: its exposure according to systemd, and its permitted system calls and networks.
 
-What the settings do is checked on a booted system (tests/lab_debian/guest/sandbox.py).
+The effects of the settings are tested on a booted system (tests/lab_debian/guest/sandbox.py).
 """
 
 import re
@@ -24,13 +24,13 @@ UNIT = ROOT / "systemd" / "imud.service"
 WEB_UNIT = ROOT / "systemd" / "imud-web.service"
 FLEET_UNIT = ROOT / "systemd" / "imud-fleet-collect.service"
 EXPOSURE_MAX = 2.0
-"""docs/operate.md says what it is made of; the guest's check has the same limit."""
+"""Maximum exposure. docs/operate.md explains its parts. The check in the guest has the same limit."""
 REASON_WORDS = 5
 """Of the shortest reason: fewer words repeat the directive's name."""
 PAGE = ROOT / "docs" / "operate.md"
 DROP_INS = re.findall(r"^```ini\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
 COLLECTOR_EXPOSURE_MAX = 2.5
-"""It reaches brokers and databases anywhere: no IPAddressDeny."""
+"""Maximum exposure of the collector. It connects to brokers and databases anywhere: no IPAddressDeny."""
 OFFLINE_SINCE = 250
 """Version of systemd whose systemd-analyze judges a file."""
 

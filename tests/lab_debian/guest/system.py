@@ -24,7 +24,7 @@ FRESH_NS = 1_000_000_000
 
 
 def run(*command: str, limit_s: float = LIMIT_S, user: str = "", text: str = "") -> subprocess.CompletedProcess[str]:
-    """Run a program to its end, as `user` where one is given, with its two outputs as one."""
+    """Run a program to its end, as `user` if given. Return both outputs as one."""
     words = ["runuser", "-u", user, "--", *command] if user else list(command)
     return subprocess.run(
         words, input=text, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=limit_s, check=False
@@ -58,7 +58,7 @@ def journal(since: str = "") -> str:
 
 
 def console() -> str:
-    """What kernel and systemd said; systemd's own messages are there, and not in the journal (machine.py)."""
+    """Return the messages of kernel and systemd. The messages of systemd are here, not in the journal (machine.py)."""
     return (SHARE / "console.log").read_text("utf-8", "replace")
 
 
@@ -70,7 +70,7 @@ def mark() -> str:
 
 
 def ask(method: str, **params: object) -> Any:
-    """The daemon's answer to one request. Raises OSError when nobody listens, Failed for an error."""
+    """Return the reply of the daemon to one request. Raises OSError without a daemon, Failed for an error."""
     with socket.socket(socket.AF_UNIX) as sock, sock.makefile("r", encoding="utf-8") as lines:
         sock.settimeout(LIMIT_S)
         sock.connect(SOCKET)
@@ -110,7 +110,7 @@ def wait_streaming(name: str, limit_s: float = LIMIT_S) -> dict[str, Any]:
 
 
 def start_service() -> None:
-    """Start the service from scratch, whatever it did before."""
+    """Start the service again from any state."""
     run("systemctl", "reset-failed", UNIT)
     must("systemctl", "restart", UNIT, limit_s=400)
 

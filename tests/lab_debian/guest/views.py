@@ -49,7 +49,7 @@ except urllib.error.HTTPError as error:
 except OSError as error:
     print(0, error)
 """
-"""Asks as the page of this server does. Prints the status of an answer and its text; 0 for none."""
+"""Program that sends a request as the page does. It prints status and text of the reply; 0 without a reply."""
 LOOK = json.dumps({"method": "actions", "params": {"device": "usb"}})
 CHANGE = json.dumps(
     {
@@ -62,7 +62,7 @@ STAYS_S = 30.0
 
 
 def fetch(path: str, address: str = "127.0.0.1", token: str = "", body: str = "") -> tuple[int, str]:
-    """Status and text of an answer of the page's server; a status of 0 where there is none."""
+    """Return status and text of a reply of the web server; status 0 without a reply."""
     said = run("/usr/bin/python3", "-c", FETCH, f"http://{address}:{PORT}{path}", token, body).stdout
     status, _, text = said.partition(" ")
     return int(status), text
@@ -144,7 +144,7 @@ def check_token(checks: Checks) -> None:
 
 
 def check_no_broker(checks: Checks) -> None:
-    """The output is on, and nobody is there to take it."""
+    """Check the enabled output without a broker."""
     with checks("a daemon whose MQTT broker is not there streams on, keeps its messages, and is not restarted"):
         since = mark()
         configure(NO_BROKER + USB + CAN)

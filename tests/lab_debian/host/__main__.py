@@ -24,7 +24,7 @@ from tests.lab_debian.host.release import AMD64, ARM64, Release
 
 GUEST = Path(__file__).resolve().parents[1] / "guest"
 LIMITS = guest.Limits(total_s=3600.0, boot_s=1800.0, silence_s=300.0)
-"""On a busy host an emulated arm64 takes minutes to its first sign of life."""
+"""Time limits, s. On a busy host, an emulated arm64 system takes minutes to its first sign of life."""
 SIMULATOR_LIMIT_S = 60.0
 POLL_S = 0.05
 SIMULATED_RATE_HZ = 20

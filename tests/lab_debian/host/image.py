@@ -1,9 +1,9 @@
-"""Makes what QEMU boots, once per change of its inputs: a disk with Debian, its kernel, an initramfs.
+"""Makes the image for QEMU once per change of its inputs: a disk with Debian, its kernel, an initramfs.
 
-Packages come from where the host's apt takes them. Nothing of the guest runs but Debian's own maintainer scripts in a
-chroot. Those of another architecture took more than 40 minutes under qemu-user: there the system is set up for the
-host's, and programs, libraries and dpkg's records are then exchanged. The kernel package is only unpacked, and the
-initramfs is made here: initramfs-tools takes minutes where it is emulated. Needs root.
+Packages come from the archives of apt on the host. Only the maintainer scripts of Debian run in a chroot. With
+qemu-user, maintainer scripts of another architecture took more than 40 minutes. Therefore the system is set up for the
+architecture of the host, and then programs, libraries and the records of dpkg are exchanged. The kernel package is only
+unpacked. This module makes the initramfs, because initramfs-tools takes minutes in emulation. Needs root.
 """
 
 import gzip
@@ -24,7 +24,7 @@ DISK = "disk.ext4"
 KERNEL = "kernel"
 INITRAMFS = "initramfs.gz"
 DISK_BYTES = 2 << 30
-"""Of a sparse file; what is written goes elsewhere (`snapshot=on`)."""
+"""Size of the sparse disk file, bytes. Writes of the guest go to another file (`snapshot=on`)."""
 NEEDED_BYTES = 3 << 30
 STEP_LIMIT_S = 40 * 60
 CLEAN = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root", "LC_ALL": "C"}
@@ -108,9 +108,9 @@ def make_image(release: Release, folder: Path) -> None:
 
 
 def exchange(release: Release, root: Path, other: Path, log: Path) -> None:
-    """Put the programs of the release's architecture into a root file system that is set up for the host's.
+    """Put the programs of the release's architecture into a root file system that is set up for the host.
 
-    What maintainer scripts have made (users, links, what is enabled, bytecode) is the same on both.
+    The results of maintainer scripts (users, links, enabled units, bytecode) are the same on both.
     """
     query = ["dpkg-query", f"--admindir={root}/var/lib/dpkg", "--show", "--showformat=${Package}\n"]
     names = subprocess.run(query, capture_output=True, text=True, check=False).stdout.split()
@@ -143,7 +143,7 @@ def enable_emulation(architecture: str) -> None:
 
 
 def bootstrap(release: Release, folder: Path, log: Path, variant: str, packages: tuple[str, ...]) -> None:
-    """Put `packages` and what they need into `folder`, by mmdebstrap."""
+    """Install `packages` with their dependencies into `folder` with mmdebstrap."""
     main, security = archives()
     suites = ((main, release.suite), (main, f"{release.suite}-updates"), (security, f"{release.suite}-security"))
     sources = "".join(f"deb {uri} {suite} main\n" for uri, suite in suites)
@@ -151,7 +151,7 @@ def bootstrap(release: Release, folder: Path, log: Path, variant: str, packages:
         *("mmdebstrap", "--verbose", "--mode=root", f"--variant={variant}", f"--architectures={release.architecture}"),
         *(f"--include={','.join(packages)}", '--aptopt=Acquire::Languages "none"'),
         *('--aptopt=APT::Install-Recommends "false"', '--aptopt=Acquire::Check-Valid-Until "false"'),
-        "--dpkgopt=force-unsafe-io",  # what is half made is thrown away
+        "--dpkgopt=force-unsafe-io",  # an interrupted image is deleted
         *(f"--dpkgopt=path-exclude=/usr/share/{part}/*" for part in ("man", "doc", "locale")),
         *(release.suite, str(folder), "-"),
     ]
@@ -159,7 +159,8 @@ def bootstrap(release: Release, folder: Path, log: Path, variant: str, packages:
 
 
 def archives() -> tuple[str, str]:
-    """URIs of Debian's archive and of its security updates, as the host's apt has them. LabError if it has none."""
+    """Return the URIs of Debian's archive and of its security updates in the configuration of apt. Raises LabError
+    without them."""
     query = ["apt-get", "indextargets", "--format", "$(CODENAME) $(REPO_URI)", "Created-By: Packages", "Origin: Debian"]
     rows = subprocess.run(query, capture_output=True, text=True, check=False).stdout.splitlines()
     uris = dict(row.split(" ", 1) for row in reversed(rows))
@@ -188,7 +189,7 @@ def write_initramfs(tree: Path, version: str, work: Path, out: Path, log: Path) 
 
 
 def files_of(tree: Path, version: str, modules: tuple[str, ...]) -> list[Path]:
-    """Files of the modules and of what they need, in the order of loading; what the kernel has built in is left out."""
+    """Return the files of the modules and their dependencies, in the order of loading, without built-in modules."""
     found: list[Path] = []
     for name in modules:
         query = ["modprobe", "--dirname", str(tree), "--set-version", version, "--show-depends", name]
@@ -204,7 +205,7 @@ def unpacked(module: Path) -> bytes:
 
 
 def copy_modules(tree: Path, version: str, root: Path, log: Path) -> None:
-    """Copy MODULES and BOOT_MODULES with what they need into the root file system."""
+    """Copy MODULES and BOOT_MODULES with their dependencies into the root file system."""
     source = tree / "lib/modules" / version
     target = root / "usr/lib/modules" / version
     for module in files_of(tree, version, (*BOOT_MODULES, *MODULES)):

@@ -32,7 +32,7 @@ the machine for a board whose GPIO registers are at an address where QEMU has no
 spi-butterfly makes an SPI bus of a parallel port: one on which nothing answers. On arm64 `-M virt` has a PL061, and no
 SPI."""
 REQUESTS = "requests"
-"""Socket: what the guest asks the rig for, one line each."""
+"""Name of the socket for requests of the guest to the rig, one line each."""
 QMP = "qmp"
 SENSOR = "sensor"
 CONSOLE_OPTIONS = "systemd.show_status=yes systemd.log_target=console"
@@ -113,7 +113,7 @@ class Qmp:
         self.ask({"execute": "device_del", "arguments": {"id": ADAPTER["id"]}}, event="DEVICE_DELETED")
 
     def ask(self, command: dict[str, object], event: str = "") -> None:
-        """Give a command; return after its answer and, where one is named, after the event. LabError on an error."""
+        """Send a command. Return after its reply and, if given, after the event. Raises LabError for an error."""
         self._socket.sendall(json.dumps(command).encode() + b"\n")
         answered = happened = False
         while not (answered and (happened or not event)):
@@ -135,7 +135,7 @@ class Qmp:
 
 
 def connected(path: Path, limit_s: float) -> socket.socket:
-    """A connection to the socket at `path`, as soon as somebody listens there. LabError after `limit_s`."""
+    """Return a connection to the socket at `path` as soon as a program listens. Raises LabError after `limit_s`."""
     give_up_s = time.monotonic() + limit_s
     while True:
         sock = socket.socket(socket.AF_UNIX)
@@ -144,7 +144,7 @@ def connected(path: Path, limit_s: float) -> socket.socket:
         except OSError as error:
             sock.close()
             if time.monotonic() >= give_up_s:
-                raise LabError(f"nobody listens at {path} after {limit_s:.0f} s") from error
+                raise LabError(f"no program listens at {path} after {limit_s:.0f} s") from error
             time.sleep(POLL_S)
         else:
             sock.settimeout(ANSWER_LIMIT_S)

@@ -18,7 +18,7 @@ EMULATORS = {
     "amd64": ("qemu-system-x86",),
     "arm64": ("qemu-system-arm", "qemu-user-static", "binfmt-support", "arch-test"),
 }
-"""The machine; and for an architecture that the host has not, what runs its maintainer scripts."""
+"""Names of the machine, and of the emulator of maintainer scripts for an architecture that the host does not have."""
 BUILD = ROOT / "packaging" / "debian" / "build"
 BUILT = ROOT / "build" / "deb"
 BUILD_LIMIT_S = 30 * 60
@@ -33,7 +33,7 @@ def missing(release: Release) -> list[str]:
 
 
 def obstacle(release: Release) -> str:
-    """Why `release` cannot be run here, one line; empty when it can."""
+    """Return why this host cannot run `release`, one line; empty if it can."""
     if platform.machine() != "x86_64":
         return f"the rig is for x86_64, not {platform.machine()}"
     if os.geteuid() != 0:
@@ -84,7 +84,7 @@ def next_version(package: Path, folder: Path) -> Path:
 
 
 def later(control: str) -> str:
-    """A control file with a later version. LabError if it has none."""
+    """Return a control file with a later version. Raises LabError if the file has no version."""
     changed, count = re.subn(r"^(Version: .*)$", rf"\1{NEXT}", control, flags=re.MULTILINE)
     if count != 1:
         raise LabError(f"the package has {count} versions, expected one")

@@ -1,4 +1,4 @@
-"""Table: what the rig boots: release, architecture, and which packages and kernel modules are in it."""
+"""Table of the systems of the rig: release, architecture, packages and kernel modules."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ SYSTEM = (
     *("systemd", "systemd-sysv", "dbus", "udev", "kmod", "iproute2", "procps", "python3"),
     *("can-utils", "gpiod", "i2c-tools", "pps-tools", "gpsd", "chrony"),
 )
-"""Debian's packages in the guest: the system itself, what sets it up, and the programs that imud works with."""
+"""Debian packages of the guest: the system, its installation, and the programs that imud uses."""
 
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "crc32c_generic", "ext4", "virtio_console", "9pnet_virtio", "9p", "autofs4")
 """Loaded by the initramfs, in this order; some are built into some kernels."""
@@ -18,8 +18,8 @@ MODULES = (
     *("ftdi_sio", "cdc-acm", "xhci-pci", "virtio-rng", "8250_pci", "rng-core", "gpio-pl061"),
     *("pcengines-apuv2", "parport_pc", "spi-butterfly"),
 )
-"""Left to udev and the checks; what a kernel does not have is left out. The last row makes GPIO lines and an SPI bus on
-amd64 (machine.py)."""
+"""Modules for udev and the checks. Modules that a kernel does not have are skipped. The last row makes GPIO lines and
+an SPI bus on amd64 (machine.py)."""
 
 
 @dataclass(frozen=True)

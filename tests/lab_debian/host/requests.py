@@ -1,4 +1,4 @@
-"""What the guest asks for while it runs: `plug` and `unplug` the USB adapter, a line each, answered by a line."""
+"""Requests of the guest while it runs: `plug` and `unplug` the USB adapter, one line each. The reply is one line."""
 
 import contextlib
 import os
@@ -15,7 +15,7 @@ from tests.lab_debian.host.machine import CONNECT_LIMIT_S, QMP, REQUESTS, Qmp, c
 
 LINE_BYTES = 200
 DRAIN_S = 0.5
-"""For the bytes that the sensor wrote before it was stopped."""
+"""Time for the bytes that the sensor sent before it stopped, s."""
 
 
 @contextlib.contextmanager

@@ -23,7 +23,7 @@ CLOCK = (
     "arrival_fit", "arrival_time", "arrival_time_even_arrivals", "arrival_time_link_delay", "clock_even_run",
     "device_time_stamp_time", "device_utc", "device_utc_intervals", "edge_pairing",
 )  # fmt: skip
-"""Tests of the clock but for those that play hours of arrivals: several minutes each where they are emulated."""
+"""Tests of the clock without tests that simulate hours of arrivals, which take several minutes each in emulation."""
 PARTS = {
     "codecs": (
         "tests/formats",
@@ -38,8 +38,8 @@ PARTS = {
     "ring": ("tests/publishers/test_shm.py", "tests/client/test_ring.py"),
     "C header": ("tests/include",),
 }
-"""What is run: folders and files of tests by what they test. Not those of sessions, settings and simulators, which have
-no layout of bytes of their own."""
+"""Folders and files of tests by subject, without tests of scripts, settings and simulators, which contain no layout of
+bytes."""
 TEST_LIMIT_S = 600
 """Per test: ten times the ordinary limit."""
 LIMIT_S = 3600.0
@@ -111,7 +111,7 @@ def counted(report: str) -> dict[str, Tally]:
     """Results by part, of pytest's report (JUnit XML)."""
     tallies = {name: Tally() for name in PARTS}
     for case in ElementTree.fromstring(report).iter("testcase"):
-        # the error of a file that cannot be read has no class, and its name is that of the file
+        # pytest gives an unreadable file no class, and its name is the name of the file
         place = (case.get("classname") or str(case.get("name"))).replace(".", "/")
         part = next((name for name, paths in PARTS.items() if place.startswith(stems(paths))), "")
         if not part:

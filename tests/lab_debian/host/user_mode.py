@@ -1,8 +1,9 @@
-"""Programs of an architecture that the host has not: the host's kernel runs them by qemu-user (binfmt_misc).
+"""Programs of an architecture that the host does not have: the kernel of the host runs them with qemu-user
+(binfmt_misc).
 
-`built` makes what they run in, once per change of its inputs: the release's Python and compiler, only unpacked, so that
-no maintainer script has to be emulated, and pytest beside them. `command` runs a program there, where it can change
-nothing but its own folder of the run.
+`built` makes their root file system once per change of its inputs: Python and compiler of the release, only unpacked,
+so that no maintainer script needs emulation, and pytest. `command` runs a program there. It can change only the folder
+of its run.
 """
 
 import os
@@ -18,7 +19,7 @@ from tests.lab_debian.host.release import PYTHONS, Release
 
 PACKAGES = ("base-files", "base-passwd", "dash", "coreutils", "python3", "gcc", "g++", "libc6-dev")
 WHEELS = ("pytest>=8.2", "pytest-timeout>=2.3", "hypothesis>=6.100", "canopen>=2.3", "cantools>=39", "pynmea2>=1.19")
-"""Of the Python Package Index: what the tests import beside imud and what its package has."""
+"""Packages of the Python Package Index that the tests import, in addition to imud and its package."""
 MACHINES = {"arm64": "aarch64"}
 TAGS = ("manylinux_2_17", "manylinux2014", "manylinux_2_28")
 ROOT_NAME = "root"
@@ -99,7 +100,7 @@ def command(made: Path, work: Path, tree: Path, words: list[str]) -> list[str]:
 
 
 def environment(*paths: str) -> dict[str, str]:
-    """The environment of such a program: nothing of the host's, and `paths` for Python."""
+    """Return the environment of such a program, without variables of the host, and with `paths` for Python."""
     return {
         **CLEAN,
         "LC_ALL": "C.UTF-8",
