@@ -253,7 +253,7 @@ PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
     "docs/settings.md": lambda: {"settings": "\n" + device_settings_tables()},
     "docs/shm.md": layout_tables,
     "docs/monitoring.md": lambda: {"alerts": alert_table()},
-    "docs/clock.md": clock_figures.tables,
+    "docs/measurements.md": clock_figures.tables,
 }
 
 
