@@ -226,11 +226,11 @@ def constants() -> str:
         ("`header_bytes`", str(HEADER_BYTES)),
         ("`slot_bytes`", str(SLOT_BYTES)),
         ("`state`", f"{STATE_LIVE} live, {STATE_CLOSED} closed"),
-        ("`seq`, `ledger_update` while their block is written", "18446744073709551615 (2⁶⁴ - 1)"),
-        ("no sign of life after", f"{HEARTBEAT_LIMIT_NS} ns without a heartbeat"),
-        ("room for counters in `ledger`", str(LEDGER_ROOM)),
+        ("`seq`, `ledger_update` during a write", "18446744073709551615 (2⁶⁴ - 1)"),
+        ("maximum age of the heartbeat", f"{HEARTBEAT_LIMIT_NS} ns"),
+        ("maximum number of counters in `ledger`", str(LEDGER_ROOM)),
     ]
-    return "\n".join(["| what | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)])
+    return "\n".join(["| constant | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)])
 
 
 def layout_tables() -> dict[str, str]:
