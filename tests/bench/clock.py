@@ -2,7 +2,7 @@
 
 A row is one profile of arrival, rate and crystal; figures are of all its seeds, after the fit has settled for 70 s.
 The second table, of lines and UTC, is `clock_lines`. `--quick` takes one seed and fewer rows; `--keep` keeps them for
-docs/clock.md.
+docs/measurements.md.
 """
 
 import sys
@@ -145,7 +145,7 @@ def _spread_us(values: Sequence[float]) -> Spread:
 
 
 def table(seeds: Sequence[int], rates: Sequence[int]) -> Iterator[ArrivalFigures]:
-    """The rows of the table of docs/clock.md: each from the best to the worst of all crystals."""
+    """The rows of the table of docs/measurements.md: each from the best to the worst of all crystals."""
     for profile in PROFILES:
         for rate_hz in rates:
             all_of = [over_seeds(profile, rate_hz, crystal, seeds) for crystal in CRYSTALS.values()]

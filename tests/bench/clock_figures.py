@@ -1,4 +1,4 @@
-"""Figures of docs/clock.md as they were measured, kept in `clock_figures.json`: its two long tables and both plots.
+"""Measured figures of docs/measurements.md, stored in `clock_figures.json`: two tables and two plots.
 
 `python -m tests.bench.clock --keep` and `python -m tests.bench.clock_lines --keep` measure and keep them;
 `python -m tests.support.references` makes the tables of them, `python -m tests.bench.clock_pictures` the plots.
@@ -19,6 +19,15 @@ LINE_HEAD: Final = (
     + "---|" * 10
 )
 WHOLE_FROM_US: Final = 10.0
+ARRIVAL_COLUMNS: Final = (0, 1, 3, 5, 7)
+"""Columns of docs/measurements.md: arrival, rate, rms, mean t_err, settling."""
+LINE_COLUMNS: Final = (0, 1, 2, 3, 4, 6)
+"""Columns of docs/measurements.md: source, over, rate, σ, mean, mean t_err."""
+SAME_WITH_SOUT: Final = {
+    "usb-1ms", "usb-16ms, crystal +5 %", "usb-16ms, crystal -5 %", "usb-16ms, crystal drift",
+    "usb-16ms, 1 % of edges lost", "usb-16ms, 5 % extra edges",
+}  # fmt: skip
+"""Rows that docs/measurements.md omits: SOUT has the same error on each link."""
 
 Spread = tuple[float, float]
 """The best and the worst of all crystals."""
@@ -92,9 +101,15 @@ def markdown(head: str, found: Iterable[ArrivalFigures | LineFigures]) -> Iterat
 
 
 def tables() -> dict[str, str]:
-    """Both tables for docs/clock.md, by their marks; with blank lines around, or they are no tables in <details>."""
+    """Return the tables of docs/measurements.md by their markers, with the most important columns and rows."""
     figures = kept()
     return {
-        "arrivals": "\n" + "\n".join(markdown(ARRIVAL_HEAD, figures.arrivals)) + "\n",
-        "lines": "\n" + "\n".join(markdown(LINE_HEAD, figures.lines)) + "\n",
+        "arrivals": _table(ARRIVAL_HEAD, figures.arrivals, ARRIVAL_COLUMNS),
+        "lines": _table(LINE_HEAD, (one for one in figures.lines if one.over not in SAME_WITH_SOUT), LINE_COLUMNS),
     }
+
+
+def _table(head: str, found: Iterable[ArrivalFigures | LineFigures], columns: Sequence[int]) -> str:
+    """Return a table with some columns, with blank lines around it: <details> requires them."""
+    rows = [line.split("|") for line in "\n".join(markdown(head, found)).splitlines()]
+    return "\n" + "\n".join("|" + "|".join(row[1 + column] for column in columns) + "|" for row in rows) + "\n"

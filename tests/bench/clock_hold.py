@@ -1,4 +1,4 @@
-"""What it does to the stamps that samples wait: `python -m tests.bench.clock_hold` prints the table of docs/latency.md.
+"""Measures the time stamp errors of held samples: `python -m tests.bench.clock_hold` (docs/measurements.md).
 
 Three ways to read 1,000 samples a second a latency apart, from the same simulated arrivals:
 

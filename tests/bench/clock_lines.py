@@ -1,4 +1,4 @@
-"""How right the clock is with lines and UTC (as a program: the second table of docs/clock.md); its speed with SOUT."""
+"""Measures the time stamp errors with GPIO lines and UTC (docs/measurements.md), and the speed with SOUT."""
 
 import sys
 from collections.abc import Callable, Iterator, Sequence

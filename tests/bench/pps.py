@@ -1,4 +1,4 @@
-"""How well late pulses tell UTC, in simulation: `python -m tests.bench.pps` prints the table of docs/time.md."""
+"""Simulates late pulses per second: `python -m tests.bench.pps` prints a table of docs/measurements.md."""
 
 from statistics import mean, pstdev
 
