@@ -14,7 +14,7 @@ def alert_table() -> str:
     rows = ["| alert | severity, after | meaning | likely causes | next step |", "|---|---|---|---|---|"]
     for alert in alerts_of(RULES.read_text()):
         name, wait = alert["alert"], alert.get("for", "")
-        severity = alert["labels"]["severity"] + (f", {wait}" if wait else ", at once")
+        severity = alert["labels"]["severity"] + (f", {wait}" if wait else "")
         cells = [_cell(alert["annotations"][part]) for part in PARTS]
         rows.append(f'| <a id="{name}"></a>`{name}` | {severity} | {" | ".join(cells)} |')
     return "\n".join(rows)
