@@ -9,6 +9,7 @@ docs/socket.schema.json contains the JSON Schema of each message of the UNIX soc
 
 import ast
 import inspect
+import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
@@ -43,6 +44,32 @@ from tests.bench import clock_figures
 from tests.monitoring.alert_table import alert_table
 from tests.publishers.socket.schema import socket_schema
 from tests.support.files import ROOT
+
+# --- values in cells --------------------------------------------------------------------------------------------------
+
+SHORT_WORDS: Final = (
+    (r"\ba whole number from (\S+) to (\S+?)(?=[,);]|\s|$)", r"integer \1 to \2"),
+    (r"\ba whole number from (\S+?)(?=[,);]|\s|$)", r"integer from \1"),
+    (r"\ba number from (\S+) to (\S+?)(?=[,);]|\s|$)", r"\1 to \2"),
+    (r"\ba number to (\S+) above (\S+)", r"above \2 to \1"),
+    (r"\ba number above", "above"),
+    (r"\ba list of (\S+), each of it a number\b", r"list of \1 numbers"),
+    (r"\ba list( of [\w ]+)?, each of it text\b", r"list\1: strings"),
+    (r"\ba list( of [\w ]+)?, each of it (a )?", r"list\1: "),
+    (r"\btext that is not empty\b", "string, not empty"),
+    (r"\btext\b", "string"),
+    (r"\btrue or false\b", "boolean"),
+    (r"\bone of (?=\S)", ""),
+)
+"""Pattern and replacement of the words of `expected`, for table cells."""
+
+
+def short(words: str) -> str:
+    """Shorten the description of accepted values for a table cell."""
+    for pattern, replacement in SHORT_WORDS:
+        words = re.sub(pattern, replacement, words)
+    return re.sub(r'"([^"]+)"', r"`\1`", words)
+
 
 # --- docs/configuration.md --------------------------------------------------------------------------------------------
 
@@ -79,7 +106,7 @@ def settings_parts() -> Iterator[tuple[str, str, type[Options]]]:
         for field in msgspec.structs.fields(publisher.settings):
             if isinstance(field.default, Options):
                 yield f"Output `{name}`: `{field.name}`", f"{name}.{field.name}.", type(field.default)
-    yield "What the output `mqtt` sends of a device (`docs/fleet.md`)", "mqtt.devices.NAME.", DeviceSending
+    yield "Output `mqtt`: entries of `devices` (`docs/fleet.md`)", "mqtt.devices.NAME.", DeviceSending
     yield "Each device", "devices.NAME.", DeviceGeneral
     for name, link in TABLES.links.items():
         yield f"Link `{name}`", f"devices.NAME.{name}.", link.settings
@@ -87,16 +114,16 @@ def settings_parts() -> Iterator[tuple[str, str, type[Options]]]:
         yield f"Options of driver `{name}`", "devices.NAME.options.", driver.settings
     for name, schema in LINE_SCHEMAS.items():
         yield f"Line `{name}`: {LINE_TITLES[name]}", f"devices.NAME.lines.{name}.", schema
-    yield "How the sensor lies in its body (`docs/frames.md`)", "devices.NAME.frame.", FrameOptions
-    yield "Axes of the sensor in the body", "devices.NAME.frame.axes.", MountingAxes
-    yield "Angles of the sensor in the body", "devices.NAME.frame.euler.", MountingAngles
-    yield "Noise of the device's samples, for covariances (`docs/export.md`)", "devices.NAME.noise.", Deviations
+    yield "Mounting of the sensor (`docs/frames.md`)", "devices.NAME.frame.", FrameOptions
+    yield "Mounting by axes", "devices.NAME.frame.axes.", MountingAxes
+    yield "Mounting by angles", "devices.NAME.frame.euler.", MountingAngles
+    yield "Noise of a device, for covariances (`docs/export.md`)", "devices.NAME.noise.", Deviations
     yield "RMC sentences for a device (`docs/time.md`)", "devices.NAME.rmc.", RmcOptions
 
 
 def default_of(field: msgspec.structs.FieldInfo) -> str:
     if field.required:
-        return "needed"
+        return "required"
     default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
     if isinstance(default, Options):
         return "below"
@@ -105,19 +132,32 @@ def default_of(field: msgspec.structs.FieldInfo) -> str:
 
 
 def settings_tables() -> str:
-    text = []
+    """Make a table for each section of the configuration.
+
+    A row that an earlier line, link or driver has with the same words is replaced by a reference to that table.
+    """
+    text, first_of = [], dict[tuple[str, ...], str]()
     for title, path, schema in settings_parts():
-        text += [f"### {title}", "", "| key | expected | default | meaning |", "|---|---|---|---|"]
-        docs = docs_of(schema)
+        docs, rows, repeated = docs_of(schema), [], dict[str, list[str]]()
         for field in msgspec.structs.fields(schema):
             is_part = isinstance(field.default, Options)
-            words = "keys and values" if is_part else expected(field.type).replace("|", "\\|")
-            text.append(f"| `{path}{field.name}` | {words} | {default_of(field)} | {docs[field.name]} |")
-        if not msgspec.structs.fields(schema):
-            text.append("| (none) | | | |")
-        text.append("")
-    declared = "[the driver's settings](settings.md#the-settings-of-each-driver)"
-    text += [f"### `devices.NAME.settings.…`: {declared} that the device should have", ""]
+            words = "keys below" if is_part else cell(short(expected(field.type)))
+            cells = f"{words} | {default_of(field)} | {docs[field.name]} |"
+            group = title.partition(" ")[0]  # Link, Line, Options, …
+            first = first_of.setdefault((group, field.name, cells), title)
+            if first == title:
+                rows.append(f"| `{path}{field.name}` | {cells}")
+            else:
+                repeated.setdefault(first.partition(":")[0], []).append(f"`{field.name}`")
+        text += [f"### {title}", ""]
+        if rows:
+            text += ["| key | values | default | meaning |", "|---|---|---|---|", *rows, ""]
+        for first, names in repeated.items():
+            text += [f'{", ".join(names)}: as in "{first}".', ""]
+        if not rows and not repeated:
+            text += ["No keys.", ""]
+    declared = "[device settings of each driver](settings.md#the-settings-of-each-driver)"
+    text += [f"### `devices.NAME.settings.…`: {declared}", ""]
     return "\n".join(text)
 
 
@@ -147,12 +187,12 @@ def arguments_of(action: Action) -> str:
     for parameter in parameters_of(action):
         default = "" if parameter.default is None else f"; default `{parameter.default}`"
         meaning = f": {docs[parameter.name].rstrip('.')}" if parameter.name in docs else ""
-        words.append(f"`{parameter.name}` ({parameter.values}{default}){meaning}")
+        words.append(f"`{parameter.name}` ({short(parameter.values)}{default}){meaning}")
     return cell(".<br>".join(words)) or "none"
 
 
 def actions_table(actions: Actions) -> Iterator[str]:
-    yield "| action | arguments | what it does |"
+    yield "| action | arguments | effect |"
     yield "|---|---|---|"
     for name, action in actions.items():
         yield f"| `{name}` | {arguments_of(action)} | {cell(action.help.rstrip('.'))} |"
@@ -165,7 +205,12 @@ def actions_part(driver: Driver) -> list[str]:
 
 def actions_tables() -> str:
     lines = [line for driver in DRIVERS.values() for line in actions_part(driver)]
-    by_lines = ["### Any device whose `lines` have it", "", *actions_table({"reset": RESET, "trigger": TRIGGER}), ""]
+    by_lines = [
+        "### Any device with the line `reset` or `sin`",
+        "",
+        *actions_table({"reset": RESET, "trigger": TRIGGER}),
+        "",
+    ]
     return "\n".join([*lines, *by_lines])
 
 
@@ -173,7 +218,7 @@ def actions_tables() -> str:
 
 
 def calibrations_table() -> str:
-    rows = ["| driver | kind | effect | section of the manual | device | result lasts |", "|---|---|---|---|---|---|"]
+    rows = ["| driver | kind | effect | manual | device | result lasts |", "|---|---|---|---|---|---|"]
     for driver in DRIVERS.values():
         for kind, one in driver.calibrations.items():
             hold = {Handling.REST: "at rest", Handling.TURN: "turned"}[one.handling]
@@ -184,22 +229,31 @@ def calibrations_table() -> str:
 # --- docs/settings.md -------------------------------------------------------------------------------------------------
 
 
-def device_settings_part(driver: Driver) -> list[str]:
-    """Title and table of the settings that the devices of a driver keep."""
+REPEATED_CHARACTERS: Final = 100
+"""Minimum length of a list of values that a later table does not repeat, characters."""
+
+
+def device_settings_part(driver: Driver, first_of: dict[str, str]) -> list[str]:
+    """Return title and table of the device settings of a driver; `first_of`: first driver with a list of values."""
     title = [f"### `{driver.name}`: {driver.title}", ""]
     if driver.device_settings is None:
-        return [*title, "None: this driver does not know them.", ""]
+        return [*title, "This driver has no device settings.", ""]
     rows = ["| setting | values | unit | manual | in force | readable | meaning |", "|---|---|---|---|---|---|---|"]
     for one in described_settings(driver.device_settings, {}, None):
         force = str(one.effect) + (", last" if one.connection else "") if one.declarable else "only read"
         readable = "yes" if one.readable else "no"
-        cells = (cell(one.values), one.unit, one.section, force, readable, cell(one.description))
+        values = cell(short(one.values))
+        first = first_of.setdefault(values, f"`{one.name}` of `{driver.name}`")
+        if len(values) >= REPEATED_CHARACTERS and first != f"`{one.name}` of `{driver.name}`":
+            values = f"as {first}"
+        cells = (values, one.unit, one.section, force, readable, cell(one.description))
         rows.append(f"| `{one.name}` | {' | '.join(cells)} |")
     return [*title, *rows, ""]
 
 
 def device_settings_tables() -> str:
-    return "\n".join(line for driver in DRIVERS.values() for line in device_settings_part(driver))
+    first_of: dict[str, str] = {}
+    return "\n".join(line for driver in DRIVERS.values() for line in device_settings_part(driver, first_of))
 
 
 # --- docs/shm.md ------------------------------------------------------------------------------------------------------
