@@ -6,6 +6,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -23,8 +24,9 @@ from tests.support.files import ROOT, hi91
 
 FIRST_PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")]
 PAGES = [*FIRST_PAGES, *sorted((ROOT / "docs").glob("*.md"))]
-FENCE = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+FENCE = re.compile(r"^ *```(\w+)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
+ANCHOR_LINK = re.compile(r"\]\(([^)#:]*)#([^)]+)\)")
 
 
 class Example(NamedTuple):
@@ -36,8 +38,8 @@ class Example(NamedTuple):
 
 
 def examples(*languages: str) -> list[Example]:
-    found = [Example(page, *match.groups()) for page in PAGES for match in FENCE.finditer(page.read_text())]
-    return [example for example in found if example.language in languages]
+    found = [(page, match[1], match[2]) for page in PAGES for match in FENCE.finditer(page.read_text())]
+    return [Example(page, name, textwrap.dedent(text)) for page, name, text in found if name in languages]
 
 
 def imud_lines() -> Iterator[list[str]]:
@@ -52,6 +54,24 @@ def imud_lines() -> Iterator[list[str]]:
 def test_links_lead_somewhere() -> None:
     targets = [(page, target) for page in PAGES for target in LINK.findall(page.read_text()) if "://" not in target]
     assert [(page.name, target) for page, target in targets if not (page.parent / target).exists()] == []
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of the titles of a page, as GitHub makes them."""
+    text = re.sub(r"^ *```.*?^ *```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    named = re.findall(r'<a (?:id|name)="([^"]+)"', text)
+    return {
+        re.sub(r"[^\w\- ]", "", re.sub(r"\]\([^)]*\)", "", title).lower()).replace(" ", "-") for title in titles
+    } | {*named}
+
+
+def test_anchors_of_links_exist() -> None:
+    for page in PAGES:
+        for target, anchor in ANCHOR_LINK.findall(page.read_text()):
+            linked = page.parent / target if target else page
+            if linked.suffix == ".md":
+                assert anchor in anchors(linked), f"{page.name}: {target}#{anchor}"
 
 
 def test_command_lines_are_accepted(capsys: pytest.CaptureFixture[str]) -> None:
