@@ -1,7 +1,7 @@
-"""Prints debian/copyright for a folder of installed wheels: `copyright.py SITE-PACKAGES`.
+"""Print debian/copyright for a folder of installed wheels: `copyright.py SITE-PACKAGES`.
 
-Each library gets a paragraph with the lines of its licence files. The long texts that Debian has in
-/usr/share/common-licenses are named instead. A library without any licence text is an error: it has to be looked at.
+Each library has a paragraph with its license texts. For texts in /usr/share/common-licenses, the paragraph contains
+only the path. A library without a license text is an error.
 """
 
 import re
@@ -14,7 +14,7 @@ COMMON = (
     ("GNU LESSER GENERAL PUBLIC LICENSE Version 2.1", "LGPL-2.1", "LGPL-2.1"),
     ("GNU LESSER GENERAL PUBLIC LICENSE Version 3", "LGPL-3", "LGPL-3"),
 )
-"""How a text begins, its name, and its file in /usr/share/common-licenses."""
+"""First words of a text, its name, and its file in /usr/share/common-licenses."""
 BSD_3_CLAUSE = """
 Redistribution and use in source and binary forms, with or without modification, are permitted provided that the
 following conditions are met:
@@ -49,12 +49,15 @@ COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER LIABILITY, WHETHER I
 OTHERWISE, ARISING FROM, OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE SOFTWARE.
 """
 KNOWN = {"pyserial": BSD_3_CLAUSE, "mcap": MIT}
-"""Texts of libraries whose wheel has none: the files of pyserial say "SPDX-License-Identifier: BSD-3-Clause", the
-metadata of mcap "License :: OSI Approved :: MIT License"."""
+"""License texts of libraries without a text in the wheel.
+
+Sources: "SPDX-License-Identifier: BSD-3-Clause" in the files of pyserial, the classifier of the MIT license in the
+metadata of mcap.
+"""
 
 
 def licence_texts(distribution: Distribution) -> list[str]:
-    """The licence texts of a library, from the folder of its metadata."""
+    """Return the license texts in the metadata folder of a library."""
     return [
         Path(str(file.locate())).read_text(errors="replace")
         for file in distribution.files or []
@@ -63,12 +66,12 @@ def licence_texts(distribution: Distribution) -> list[str]:
 
 
 def indented(text: str) -> str:
-    """Text as the body of a field."""
+    """Indent `text` as the body of a field."""
     return "\n".join(f" {line.rstrip()}" if line.strip() else " ." for line in text.strip().splitlines())
 
 
 def paragraph(distribution: Distribution) -> str:
-    """The paragraph of a library. Raises SystemExit where nothing says what its licence is."""
+    """Return the paragraph of a library. Raises SystemExit if the library has no license text."""
     name = distribution.metadata["Name"]
     holders, bodies = [], []
     for text in licence_texts(distribution):
@@ -80,7 +83,7 @@ def paragraph(distribution: Distribution) -> str:
         else:
             bodies.append(f"The text of {common[1]} is in /usr/share/common-licenses/{common[2]}.")
     if not bodies and name not in KNOWN:
-        raise SystemExit(f"copyright.py: expected a licence text in the wheel of {name}, found none; add it to KNOWN")
+        raise SystemExit(f"copyright.py: expected a license text in the wheel of {name}, got none; add it to KNOWN")
     bodies = bodies or [KNOWN[name]]
     author = distribution.metadata["Author"] or distribution.metadata["Author-email"] or f"the authors of {name}"
     files = sorted({str(file).split("/")[0] for file in distribution.files or [] if not str(file).startswith("..")})
@@ -95,11 +98,11 @@ def paragraph(distribution: Distribution) -> str:
 
 
 def bundled(folder: Path, name: str) -> str:
-    """The paragraph of a library that stands in imud itself. Raises SystemExit where its licence is missing."""
+    """Return the paragraph of a library inside imud. Raises SystemExit if its license is missing."""
     try:
         text = (folder / "LICENSE").read_text()
     except OSError as error:
-        raise SystemExit(f"copyright.py: expected the licence of {name}: {error}") from error
+        raise SystemExit(f"copyright.py: cannot read the license of {name}: {error}") from error
     holders = [line.strip() for line in text.splitlines() if line.startswith("Copyright")]
     files = f"*/site-packages/{folder.relative_to(folder.parents[3])}/*"
     owners = "\n ".join(holders)
@@ -107,7 +110,7 @@ def bundled(folder: Path, name: str) -> str:
 
 
 def main(folder: str) -> None:
-    """Print the whole file."""
+    """Print the complete file."""
     print("Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/")
     print("Upstream-Name: imud")
     print("\nFiles: *\nCopyright: the authors of imud\nLicense: Apache-2.0")

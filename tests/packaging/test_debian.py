@@ -245,4 +245,4 @@ def test_copyright_has_each_library_with_its_text_or_refuses_it(tmp_path: Path) 
     library(tmp_path, "bare")
     done = copyright_of(tmp_path)
     assert done.returncode == 1
-    assert "expected a licence text in the wheel of bare" in done.stderr
+    assert "expected a license text in the wheel of bare" in done.stderr
