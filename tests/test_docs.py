@@ -1,4 +1,4 @@
-"""The tests run or read every example in README.md and docs/, and check that every link has a target."""
+"""Test the documents: commands, configurations, programs, links, generated tables."""
 
 import os
 import re
@@ -43,7 +43,7 @@ def examples(*languages: str) -> list[Example]:
 
 
 def imud_lines() -> Iterator[list[str]]:
-    """Yield every `imud …` command line of the shell examples, without comments and redirections."""
+    """Yield the words of each `imud …` command line in the shell examples, without comments and redirection."""
     for example in examples("sh"):
         for line in example.text.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True)

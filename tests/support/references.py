@@ -1,10 +1,13 @@
-"""Makes the generated parts of the documents from the code: `python -m tests.support.references`.
+"""Generate parts of the documents from the code: `python -m tests.support.references`.
 
-The classes of options give the tables of docs/configuration.md. The drivers give the tables of docs/commands.md,
-docs/calibration.md and docs/settings.md. The layout of shared memory gives the tables of docs/shm.md, and the
-Prometheus rules give the table of docs/monitoring.md.
-
-docs/socket.schema.json contains the JSON Schema of each message of the UNIX socket (tests/publishers/socket/schema.py).
+| document | source |
+|---|---|
+| docs/configuration.md | classes of the configuration |
+| docs/commands.md, docs/calibration.md, docs/settings.md | actions, calibrations and device settings of the drivers |
+| docs/shm.md | layout of shared memory |
+| docs/monitoring.md | rules for Prometheus |
+| docs/measurements.md | measured figures (tests/bench/clock_figures.py) |
+| docs/socket.schema.json | messages of the socket (tests/publishers/socket/schema.py) |
 """
 
 import ast
@@ -51,7 +54,7 @@ SHORT_WORDS: Final = (
     (r"\ba whole number from (\S+) to (\S+?)(?=[,);]|\s|$)", r"integer \1 to \2"),
     (r"\ba whole number from (\S+?)(?=[,);]|\s|$)", r"integer from \1"),
     (r"\ba number from (\S+) to (\S+?)(?=[,);]|\s|$)", r"\1 to \2"),
-    (r"\ba number to (\S+) above (\S+)", r"above \2 to \1"),
+    (r"\ba number to (\S+) above (\S+?)(?=[,);]|\s|$)", r"above \2 to \1"),
     (r"\ba number above", "above"),
     (r"\ba list of (\S+), each of it a number\b", r"list of \1 numbers"),
     (r"\ba list( of [\w ]+)?, each of it text\b", r"list\1: strings"),
@@ -64,18 +67,43 @@ SHORT_WORDS: Final = (
 """Pattern and replacement of the words of `expected`, for table cells."""
 
 
+REPEATED_CHARACTERS: Final = 100
+"""Minimum length of a list of values that a page does not repeat, characters."""
+PARTS_CHARACTERS: Final = 80
+"""Maximum length of the description of an entry with keys, characters; a longer one contains only the names."""
+
+
 def short(words: str) -> str:
     """Shorten the description of accepted values for a table cell."""
     for pattern, replacement in SHORT_WORDS:
         words = re.sub(pattern, replacement, words)
+    if "the keys " in words and len(words) > PARTS_CHARACTERS:
+        words = re.sub(r" \((?:[^()]|\([^()]*\))*\)", "", words)
     return re.sub(r'"([^"]+)"', r"`\1`", words)
+
+
+class LongLists:
+    """Long lists of values of a page: the second cell with the same list refers to the first cell."""
+
+    def __init__(self) -> None:
+        self._first_of: dict[str, str] = {}
+
+    def cell(self, words: str, owner: str) -> str:
+        """Return the cell for a description of values; `owner`: name of the key, argument or setting."""
+        values, null, _ = cell(short(words)).partition(", or null")
+        if len(values) < REPEATED_CHARACTERS:
+            return values + null
+        if values in self._first_of:
+            return f"as {self._first_of[values]} above{null}"
+        self._first_of[values] = owner
+        return values + null
 
 
 # --- docs/configuration.md --------------------------------------------------------------------------------------------
 
 
 def docs_of(schema: type[Options]) -> dict[str, str]:
-    """The docstring below each field, its own and those it has from a base class."""
+    """Return the docstring below each field of a class and of its base classes."""
     found: dict[str, str] = {}
     for base in reversed(schema.__mro__):
         if issubclass(base, Options):
@@ -127,6 +155,8 @@ def default_of(field: msgspec.structs.FieldInfo) -> str:
     default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
     if isinstance(default, Options):
         return "below"
+    if isinstance(default, dict) and len(shown(default)) > PARTS_CHARACTERS:
+        return "see [imud.yaml](../etc/imud.yaml)"
     octal = field.name == "mode" and isinstance(default, int)
     return f"`{default:#o}`" if octal else f"`{shown(default)}`"
 
@@ -136,17 +166,17 @@ def settings_tables() -> str:
 
     A row that an earlier line, link or driver has with the same words is replaced by a reference to that table.
     """
-    text, first_of = [], dict[tuple[str, ...], str]()
+    text, first_of, lists = [], dict[tuple[str, ...], str](), LongLists()
     for title, path, schema in settings_parts():
         docs, rows, repeated = docs_of(schema), [], dict[str, list[str]]()
         for field in msgspec.structs.fields(schema):
             is_part = isinstance(field.default, Options)
-            words = "keys below" if is_part else cell(short(expected(field.type)))
-            cells = f"{words} | {default_of(field)} | {docs[field.name]} |"
+            words = "keys below" if is_part else expected(field.type)
+            rest = f"{default_of(field)} | {docs[field.name]} |"
             group = title.partition(" ")[0]  # Link, Line, Options, …
-            first = first_of.setdefault((group, field.name, cells), title)
+            first = first_of.setdefault((group, field.name, words, rest), title)
             if first == title:
-                rows.append(f"| `{path}{field.name}` | {cells}")
+                rows.append(f"| `{path}{field.name}` | {lists.cell(words, f'`{field.name}`')} | {rest}")
             else:
                 repeated.setdefault(first.partition(":")[0], []).append(f"`{field.name}`")
         text += [f"### {title}", ""]
@@ -165,7 +195,7 @@ def settings_tables() -> str:
 
 
 def cell(text: str) -> str:
-    """Text that does not end the cell of a actions_table."""
+    """Escape the characters that end a table cell."""
     return text.replace("|", "\\|")
 
 
@@ -180,35 +210,37 @@ def meanings_of(action: Action) -> dict[str, str]:
     return found
 
 
-def arguments_of(action: Action) -> str:
-    """List the arguments, each with its values and its meaning."""
+def arguments_of(action: Action, lists: LongLists) -> str:
+    """Return the cell of the arguments of an action: name, values and meaning."""
     docs = meanings_of(action)
     words = []
     for parameter in parameters_of(action):
         default = "" if parameter.default is None else f"; default `{parameter.default}`"
         meaning = f": {docs[parameter.name].rstrip('.')}" if parameter.name in docs else ""
-        words.append(f"`{parameter.name}` ({short(parameter.values)}{default}){meaning}")
-    return cell(".<br>".join(words)) or "none"
+        values = lists.cell(parameter.values, f"`{parameter.name}`")
+        words.append(f"`{parameter.name}` ({values}{default}){cell(meaning)}")
+    return ".<br>".join(words) or "none"
 
 
-def actions_table(actions: Actions) -> Iterator[str]:
+def actions_table(actions: Actions, lists: LongLists) -> Iterator[str]:
     yield "| action | arguments | effect |"
     yield "|---|---|---|"
     for name, action in actions.items():
-        yield f"| `{name}` | {arguments_of(action)} | {cell(action.help.rstrip('.'))} |"
+        yield f"| `{name}` | {arguments_of(action, lists)} | {cell(action.help.rstrip('.'))} |"
 
 
-def actions_part(driver: Driver) -> list[str]:
-    lines = list(actions_table(driver.actions)) if driver.actions else ["No actions."]
+def actions_part(driver: Driver, lists: LongLists) -> list[str]:
+    lines = list(actions_table(driver.actions, lists)) if driver.actions else ["No actions."]
     return [f"### `{driver.name}`: {driver.title}", "", *lines, ""]
 
 
 def actions_tables() -> str:
-    lines = [line for driver in DRIVERS.values() for line in actions_part(driver)]
+    lists = LongLists()
+    lines = [line for driver in DRIVERS.values() for line in actions_part(driver, lists)]
     by_lines = [
         "### Any device with the line `reset` or `sin`",
         "",
-        *actions_table({"reset": RESET, "trigger": TRIGGER}),
+        *actions_table({"reset": RESET, "trigger": TRIGGER}, lists),
         "",
     ]
     return "\n".join([*lines, *by_lines])
@@ -229,12 +261,8 @@ def calibrations_table() -> str:
 # --- docs/settings.md -------------------------------------------------------------------------------------------------
 
 
-REPEATED_CHARACTERS: Final = 100
-"""Minimum length of a list of values that a later table does not repeat, characters."""
-
-
-def device_settings_part(driver: Driver, first_of: dict[str, str]) -> list[str]:
-    """Return title and table of the device settings of a driver; `first_of`: first driver with a list of values."""
+def device_settings_part(driver: Driver, lists: LongLists) -> list[str]:
+    """Return title and table of the device settings of a driver."""
     title = [f"### `{driver.name}`: {driver.title}", ""]
     if driver.device_settings is None:
         return [*title, "This driver has no device settings.", ""]
@@ -242,18 +270,15 @@ def device_settings_part(driver: Driver, first_of: dict[str, str]) -> list[str]:
     for one in described_settings(driver.device_settings, {}, None):
         force = str(one.effect) + (", last" if one.connection else "") if one.declarable else "only read"
         readable = "yes" if one.readable else "no"
-        values = cell(short(one.values))
-        first = first_of.setdefault(values, f"`{one.name}` of `{driver.name}`")
-        if len(values) >= REPEATED_CHARACTERS and first != f"`{one.name}` of `{driver.name}`":
-            values = f"as {first}"
+        values = lists.cell(one.values, f"`{one.name}`")
         cells = (values, one.unit, one.section, force, readable, cell(one.description))
         rows.append(f"| `{one.name}` | {' | '.join(cells)} |")
     return [*title, *rows, ""]
 
 
 def device_settings_tables() -> str:
-    first_of: dict[str, str] = {}
-    return "\n".join(line for driver in DRIVERS.values() for line in device_settings_part(driver, first_of))
+    lists = LongLists()
+    return "\n".join(line for driver in DRIVERS.values() for line in device_settings_part(driver, lists))
 
 
 # --- docs/shm.md ------------------------------------------------------------------------------------------------------
