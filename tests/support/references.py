@@ -15,7 +15,8 @@ import inspect
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Final
+from itertools import groupby
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -57,7 +58,9 @@ SHORT_WORDS: Final = (
     (r"\ba number to (\S+) above (\S+?)(?=[,);]|\s|$)", r"above \2 to \1"),
     (r"\ba number above", "above"),
     (r"\ba list of (\S+), each of it a number\b", r"list of \1 numbers"),
-    (r"\ba list( of [\w ]+)?, each of it text\b", r"list\1: strings"),
+    (r"\ba list, each of it a number(?! )", "list of numbers"),
+    (r"\ba list( of [\w ]+), each of it text\b", r"list\1 strings"),
+    (r"\ba list, each of it text\b", "list of strings"),
     (r"\ba list( of [\w ]+)?, each of it (a )?", r"list\1: "),
     (r"\btext that is not empty\b", "string, not empty"),
     (r"\btext\b", "string"),
@@ -261,19 +264,60 @@ def calibrations_table() -> str:
 # --- docs/settings.md -------------------------------------------------------------------------------------------------
 
 
+class SettingRow(NamedTuple):
+    """A row of the table of device settings."""
+
+    name: str
+    cells: tuple[str, ...]
+    """Values with unit, section of the manual, effect."""
+    meaning: str
+
+    @property
+    def group(self) -> tuple[str, tuple[str, ...]]:
+        """Key of the rows that one row can replace: `tpdo1_by`, `tpdo2_by`, …"""
+        return self.name.partition("_")[2], self.cells
+
+    def __str__(self) -> str:
+        return f"| {self.name} | {' | '.join(self.cells)} | {self.meaning} |"
+
+
+def setting_rows(driver: Driver, lists: LongLists) -> Iterator[SettingRow]:
+    assert driver.device_settings is not None
+    for one in described_settings(driver.device_settings, {}, None):
+        force = str(one.effect) + (", last" if one.connection else "") if one.declarable else "read only"
+        if not one.readable:
+            force += ", not readable"
+        values = lists.cell(one.values, f"`{one.name}`") + (f" ({one.unit})" if one.unit else "")
+        yield SettingRow(one.name, (values, one.section, force), cell(one.description))
+
+
+def common_words(texts: Sequence[list[str]]) -> int:
+    """Return the number of first words that all texts have in common."""
+    return next((n for n, words in enumerate(zip(*texts, strict=False)) if len(set(words)) > 1), min(map(len, texts)))
+
+
+def merged(rows: Sequence[SettingRow]) -> Iterator[SettingRow]:
+    """Replace three or more rows that differ only in some words by one row."""
+    for _, same in groupby(rows, lambda row: row.group):
+        group = list(same)
+        texts = [row.meaning.split() for row in group]
+        first = common_words(texts)
+        last = common_words([words[first:][::-1] for words in texts])
+        if len(group) >= 3:
+            different = [" ".join(words[first : len(words) - last]).rstrip(",") for words in texts]
+            comma = "," * texts[0][-last - 1].endswith(",")
+            words = [*texts[0][:first], " / ".join(different) + comma, *texts[0][len(texts[0]) - last :]]
+            group = [SettingRow("`, `".join(row.name for row in group), group[0].cells, " ".join(words))]
+        yield from (row._replace(name=f"`{row.name}`") for row in group)
+
+
 def device_settings_part(driver: Driver, lists: LongLists) -> list[str]:
     """Return title and table of the device settings of a driver."""
     title = [f"### `{driver.name}`: {driver.title}", ""]
     if driver.device_settings is None:
         return [*title, "This driver has no device settings.", ""]
-    rows = ["| setting | values | unit | manual | in force | readable | meaning |", "|---|---|---|---|---|---|---|"]
-    for one in described_settings(driver.device_settings, {}, None):
-        force = str(one.effect) + (", last" if one.connection else "") if one.declarable else "only read"
-        readable = "yes" if one.readable else "no"
-        values = lists.cell(one.values, f"`{one.name}`")
-        cells = (values, one.unit, one.section, force, readable, cell(one.description))
-        rows.append(f"| `{one.name}` | {' | '.join(cells)} |")
-    return [*title, *rows, ""]
+    rows = merged(list(setting_rows(driver, lists)))
+    return [*title, "| setting | values | manual | in force | meaning |", "|---|---|---|---|---|", *map(str, rows), ""]
 
 
 def device_settings_tables() -> str:
