@@ -18,13 +18,21 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from time import thread_time_ns
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 from imud import __version__
 from imud import config as configuration
 from imud.config.model import Config, DeviceConfig
 from imud.contracts.lines import LineFactory
-from imud.contracts.publisher import Batch, DeviceControl, DeviceLedger, Publisher, PublisherContext
+from imud.contracts.publisher import (
+    Batch,
+    DeviceControl,
+    DeviceLedger,
+    OutputFacts,
+    Publisher,
+    PublisherClock,
+    PublisherContext,
+)
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.device.device import Device
 from imud.device.factory import DeviceFactory
@@ -47,22 +55,10 @@ PAUSE_S: Final = 100e-6
 """Long enough for the kernel to wake the loop's thread, which takes some ten microseconds."""
 
 
-class Reconfigurable(Protocol):
-    """What follows a configuration that was read again."""
-
-    async def change_to(self, new: Config) -> None:
-        """Apply `new`, and let the event loop run after every device."""
-        ...
-
-    def refuse(self, error: ConfigError) -> None:
-        """Note that the file cannot be used: everything stays as it is."""
-        ...
-
-
 class Reloader:
     """Reads `file` on request and applies it to `target`. Synchronization: the event loop's thread only."""
 
-    def __init__(self, file: Path, target: Reconfigurable, now_ns: Callable[[], int]) -> None:
+    def __init__(self, file: Path, target: "Daemon", now_ns: Callable[[], int]) -> None:
         """`now_ns` reads CLOCK_MONOTONIC."""
         self._file = file
         self._target = target
@@ -176,13 +172,22 @@ class Daemon:
         )  # fmt: skip
         self._devices: dict[str, Device] = {}
         self._latencies = LatencyBudget()
+        self.recording = RecordableDevices(self._devices, host)
+        clock = PublisherClock(
+            host.now_ns,
+            host.utc_offset_ns,
+            lambda: system_reference(kernel_clock(), host.utc_offset_ns()),
+            thread_time_ns,
+        )
         self._context = PublisherContext(
-            self.status, secrets.randbits(63) | 1, host.now_ns, self._control, thread_time_ns, self.ledgers,
-            status_in_turn=self.each_status, latencies=self._latencies,
-            recording=RecordableDevices(self._devices, host), utc_offset_ns=host.utc_offset_ns,
-            raise_event=self._send_event, watch_line=watching(lines, host.now_ns),
-            utc_reference=lambda: system_reference(kernel_clock(), host.utc_offset_ns()),
-        )  # fmt: skip
+            epoch=secrets.randbits(63) | 1,
+            clock=clock,
+            devices=self,
+            outputs=OutputFacts(),
+            latencies=self._latencies,
+            watch_line=watching(lines, host.now_ns),
+            raise_event=self._send_event,
+        )
         self._extra = dict(extra or {})
         self._until_finished = until_finished
         self._publishers: dict[str, Publisher] = {}
@@ -308,8 +313,8 @@ class Daemon:
 
     # --- devices and outputs ----------------------------------------------------------------------------------------
 
-    def _control(self, name: str) -> DeviceControl:
-        """A device by its name, for outputs that command it. Raises CommandError where there is none."""
+    def control(self, name: str) -> DeviceControl:
+        """Return the device of this name. Raises CommandError if the device does not exist."""
         device = self._devices.get(name)
         if device is None:
             raise CommandError(f"{name}: no such device")

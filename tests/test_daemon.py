@@ -118,7 +118,7 @@ async def test_the_thread_that_closes_is_there_from_the_beginning() -> None:
 @pytest.mark.parametrize("is_kept", [True, False])
 def test_outputs_learn_whether_the_clock_is_kept(monkeypatch: pytest.MonkeyPatch, is_kept: bool) -> None:
     monkeypatch.setattr("imud.daemon.kernel_clock", lambda: KernelClock(is_kept, 50, 0))
-    found = Daemon(Config("info", "", {}, ()))._context.utc_reference()
+    found = Daemon(Config("info", "", {}, ()))._context.clock.utc_reference()
     assert (found is not None) == is_kept
     if found is not None:
         assert found.error_ns == 50_000
@@ -127,7 +127,7 @@ def test_outputs_learn_whether_the_clock_is_kept(monkeypatch: pytest.MonkeyPatch
 
 def test_a_device_that_there_is_not_is_an_error_of_who_asks() -> None:
     with pytest.raises(CommandError, match=r"^nobody: no such device$"):
-        Daemon(Config("info", "", {}, ()))._context.control("nobody")
+        Daemon(Config("info", "", {}, ())).control("nobody")
 
 
 class EndingOutput:

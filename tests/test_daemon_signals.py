@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from imud.config.model import Config
-from imud.daemon import Reloader
+from imud.daemon import Daemon, Reloader
 from imud.model.errors import ConfigError
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, running_daemon, wait_until, write_config
 from tests.support.event_loops import in_loop
@@ -82,7 +82,7 @@ class Manager:
         self._socket.close()
 
 
-class SlowTarget:
+class SlowTarget(Daemon):
     """A daemon that applies a configuration when `go` is set."""
 
     def __init__(self) -> None:

@@ -9,11 +9,10 @@ from typing import Any, Final, Protocol
 from imud.attitude.conventions import Convention
 from imud.attitude.published import PublishedAxes, as_sent
 from imud.contracts.command import Actions, CalibrationResult, Calibrations
-from imud.contracts.lines import UtcReference, WatchedInput, WatchLine
+from imud.contracts.lines import UtcReference, WatchLine
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClientStatus, DeviceStatus, FlightStatus, MqttStatus, OutputStatus, RecorderStatus
 from imud.formats.slot import encode_slots
-from imud.model.errors import CommandError
 from imud.model.event import Event
 from imud.model.options import Options
 from imud.model.sample import Sample
@@ -50,32 +49,8 @@ class RecordingSource(Protocol):
         ...
 
 
-class NothingRecorded:
-    """Where nothing can be recorded."""
-
-    def names(self) -> Sequence[str]:
-        """None."""
-        return ()
-
-    def begin_host(self, put: PutRecord) -> None:
-        """Ignore it."""
-
-    def begin(self, device: str, put: PutRecord) -> None:
-        """Ignore it."""
-
-    def check(self, device: str, put: PutRecord) -> None:
-        """Ignore it."""
-
-    def end(self, put: PutRecord) -> None:
-        """Ignore it."""
-
-
 AS_SENT: Final = as_sent()
 """Axes and angles of HiPNUC modules: what a batch has of which nothing else is said."""
-StatusSource = Callable[[], Sequence[DeviceStatus]]
-"""The state of every device now. To be called in the event loop's thread only."""
-
-
 DeviceLedger = tuple[str, str, Mapping[str, int]]
 """Name of a device, its driver as in `DeviceStatus.driver`, its ledger now."""
 
@@ -190,24 +165,6 @@ class DeviceControl(Protocol):
         ...
 
 
-def _no_device(name: str) -> DeviceControl:
-    raise CommandError(f"{name}: no such device")
-
-
-class NoLine:
-    """Where there are no lines."""
-
-    def tick(self, now_ns: int) -> None:
-        """Ignore it."""
-
-    def close(self) -> None:
-        """Nothing is open."""
-
-
-def _no_line(*_: object) -> WatchedInput:
-    return NoLine()
-
-
 class Latencies(Protocol):
     """Where consumers of samples ask for the latency they need: samples of a device may wait for the strictest."""
 
@@ -220,78 +177,85 @@ class Latencies(Protocol):
         ...
 
 
-class NoLatencies:
-    """Where nothing waits, nothing need be asked for."""
+class Devices(Protocol):
+    """The devices of the daemon. Only `imud.daemon`, which no output may import, implements this type.
 
-    def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
-        """Ignore it."""
+    Synchronization: the event loop's thread only, the iterator included.
+    """
 
-    def release(self, who: str) -> None:
-        """Ignore it."""
+    @property
+    def recording(self) -> RecordingSource:
+        """The source of records of all devices."""
+        ...
+
+    def status(self) -> Sequence[DeviceStatus]:
+        """Return the state of every device."""
+        ...
+
+    def each_status(self) -> Iterator[DeviceStatus]:
+        """Return an iterator that makes the state of a device in each step. Use it for a reply in several pieces."""
+        ...
+
+    def ledgers(self) -> Sequence[DeviceLedger]:
+        """Return the ledger of every device. The complete state costs five times as much CPU time."""
+        ...
+
+    def control(self, name: str) -> DeviceControl:
+        """Return the device of this name. Raises CommandError if the device does not exist."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class PublisherClock:
+    """Clocks of the host and of the event loop."""
+
+    now_ns: Callable[[], int]
+    """Returns CLOCK_MONOTONIC, ns. Any thread may call it."""
+    utc_offset_ns: Callable[[], int]
+    """Returns CLOCK_REALTIME minus CLOCK_MONOTONIC, ns."""
+    utc_reference: Callable[[], UtcReference | None]
+    """Returns this offset with its error; None if CLOCK_REALTIME is not synchronized. Any thread may call it."""
+    cpu_ns: Callable[[], int]
+    """Returns the CPU time of the event loop's thread, ns."""
+
+
+@dataclass(frozen=True, slots=True)
+class OutputFacts:
+    """Facts that outputs publish about themselves for other outputs. An output removes its facts when it closes.
+
+    Synchronization: the event loop's thread only.
+    """
+
+    clients: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
+    """Functions that return the clients of an output."""
+    recorders: list[Callable[[], RecorderStatus]] = field(default_factory=list)
+    flights: list[Callable[[], FlightStatus]] = field(default_factory=list)
+    sentences: list[Callable[[], Sequence[OutputStatus]]] = field(default_factory=list)
+    """Functions that return the state of the ports of an output that sends sentences."""
+    mqtts: list[Callable[[], MqttStatus]] = field(default_factory=list)
+    snapshots: list[TakeSnapshot] = field(default_factory=list)
+    """Functions of flight recorders that send a snapshot."""
+    rings: dict[str, str] = field(default_factory=dict)
+    """Path of the ring file of each device in shared memory."""
+    without_ring: set[str] = field(default_factory=set)
+    """Devices that have no ring file because imud cannot create it now."""
 
 
 @dataclass(frozen=True, slots=True)
 class PublisherContext:
-    """The parts of the daemon that publishers may use."""
+    """The parts of the daemon that outputs may use."""
 
-    status: StatusSource
     epoch: int
-    """Random number of this start of the daemon, 64 bits: readers see a restart by it."""
-    now_ns: Callable[[], int]
-    """CLOCK_MONOTONIC."""
-    control: Callable[[str], DeviceControl] = _no_device
-    """A device by its name, to command it."""
-    cpu_ns: Callable[[], int] = lambda: 0
-    """CPU time of the event loop's thread."""
-    ledger_source: Callable[[], Sequence[DeviceLedger]] | None = None
-    """`ledgers` without the rest of the state, which costs five times as much; None: from `status`."""
-    status_in_turn: Callable[[], Iterator[DeviceStatus]] | None = None
-    """`each_status`; None: `status` at once."""
-    client_sources: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
-    """Publishers that serve clients add a callable while they are open, so that another can show them."""
-    recorder_sources: list[Callable[[], RecorderStatus]] = field(default_factory=list)
-    """The same of a recorder."""
-    flight_sources: list[Callable[[], FlightStatus]] = field(default_factory=list)
-    """The same of a flight recorder."""
-    output_sources: list[Callable[[], Sequence[OutputStatus]]] = field(default_factory=list)
-    """The same of outputs that send sentences."""
-    mqtt_sources: list[Callable[[], MqttStatus]] = field(default_factory=list)
-    """The same of the output `mqtt`."""
-    recording: RecordingSource = field(default_factory=NothingRecorded)
-    """What there is to record."""
-    snapshots: list[TakeSnapshot] = field(default_factory=list)
-    """A flight recorder adds a callable while it is open."""
-    utc_offset_ns: Callable[[], int] = lambda: 0
-    """CLOCK_REALTIME minus CLOCK_MONOTONIC."""
-    utc_reference: Callable[[], UtcReference | None] = lambda: None
-    """The same with its error; None while nothing keeps CLOCK_REALTIME. May be called in any thread."""
-    watch_line: WatchLine = _no_line
+    """Random number of this start of the daemon, 64 bits. Readers use it to recognize a restart."""
+    clock: PublisherClock
+    devices: Devices
+    outputs: OutputFacts
+    latencies: Latencies
+    """Register of the latencies that readers need."""
+    watch_line: WatchLine
     """Watches a GPIO line that belongs to no device."""
-    raise_event: Callable[[Event], None] = lambda _event: None
-    """Sends an event of the daemon itself to all publishers."""
-    latencies: Latencies = field(default_factory=NoLatencies)
-    """How late samples may be; a publisher asks for what its readers need."""
-    rings: dict[str, str] = field(default_factory=dict)
-    """Path of the shared memory of each device that has some; kept by the publisher that makes it."""
-    without_ring: set[str] = field(default_factory=set)
-    """Devices whose shared memory cannot be made now; kept by the same."""
-
-    def ledgers(self) -> Sequence[DeviceLedger]:
-        """The ledger of every device now. To be called in the event loop's thread only."""
-        if self.ledger_source is not None:
-            return self.ledger_source()
-        return [(status.name, status.driver, status.ledger) for status in self.status()]
-
-    def each_status(self) -> Iterator[DeviceStatus]:
-        """The state of every device, each taken when its turn comes: for answers that are made in pieces.
-
-        To be called, and gone through, in the event loop's thread only.
-        """
-        return iter(self.status()) if self.status_in_turn is None else self.status_in_turn()
-
-    def clients(self) -> list[ClientStatus]:
-        """The clients of all publishers now. To be called in the event loop's thread only."""
-        return [client for source in self.client_sources for client in source()]
+    raise_event: Callable[[Event], None]
+    """Sends an event of the daemon to all outputs."""
 
 
 @dataclass(frozen=True, slots=True)

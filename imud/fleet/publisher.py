@@ -189,22 +189,26 @@ class MqttPublisher:
         )  # fmt: skip
         if settings.commands.enabled:
             self._commands = CommandChannel(
-                settings.commands, self._gateway, context.control, context.now_ns, context.utc_offset_ns
+                settings.commands,
+                self._gateway,
+                context.devices.control,
+                context.clock.now_ns,
+                context.clock.utc_offset_ns,
             )
         self._sender = MqttSender(
-            settings, f"imud-{settings.site}-{gateway}", will, turn, self._connect, context.now_ns, self._commands
+            settings, f"imud-{settings.site}-{gateway}", will, turn, self._connect, context.clock.now_ns, self._commands
         )  # fmt: skip
         if self._commands is not None:
             self._commands.answer = self._sender.reply
         self._writer = SpoolWriter(
-            settings, self._gateway, self._queue, self._spool, self._sender, context.now_ns, context.utc_offset_ns,
-            self._start_worker, self._clock,
+            settings, self._gateway, self._queue, self._spool, self._sender, context.clock.now_ns,
+            context.clock.utc_offset_ns, self._start_worker, self._clock,
         )  # fmt: skip
         lock, self._lock = self._lock, -1
         self._writer.closed = lambda: os.close(lock)  # a thread that hangs in the disk keeps it
         self._sender.retain({will.topic: self._state(online=True)})
         self._sender.start()
-        context.mqtt_sources.append(self.status)
+        context.outputs.mqtts.append(self.status)
         log.info("mqtt: %s as imud/%s/%s", ", ".join(broker.name for broker in brokers), settings.site, gateway)
 
     def add_device(self, name: str, device_id: int) -> None:
@@ -257,8 +261,8 @@ class MqttPublisher:
         """End both threads; may be called twice."""
         sender, self._sender = self._sender, None
         writer, self._writer = self._writer, None
-        if self.status in self._context.mqtt_sources:
-            self._context.mqtt_sources.remove(self.status)
+        if self.status in self._context.outputs.mqtts:
+            self._context.outputs.mqtts.remove(self.status)
         if self._commands is not None:
             self._commands.close()
         if sender is not None:
@@ -294,7 +298,7 @@ class MqttPublisher:
         self._is_changed = False
         statuses: dict[str, DeviceStatus] = {}
         other: dict[str, object] = {}
-        for status in self._context.status():
+        for status in self._context.devices.status():
             sending = self._settings.sending(status.name)
             if status.name not in self._sent or sending is None:
                 continue
@@ -343,10 +347,10 @@ class MqttPublisher:
     def _clock(self) -> GatewayClock:
         """The wall clock now. Called in the writer's thread as well."""
         context = self._context
-        reference = context.utc_reference()
+        reference = context.clock.utc_reference()
         if reference is None:
-            return GatewayClock(context.now_ns(), context.utc_offset_ns(), synchronised=False)
-        return GatewayClock(context.now_ns(), reference.offset_ns, synchronised=True, error_ns=reference.error_ns)
+            return GatewayClock(context.clock.now_ns(), context.clock.utc_offset_ns(), synchronised=False)
+        return GatewayClock(context.clock.now_ns(), reference.offset_ns, synchronised=True, error_ns=reference.error_ns)
 
     # --- what goes wrong ---------------------------------------------------------------------------------------------
 

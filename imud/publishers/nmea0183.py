@@ -575,7 +575,7 @@ class Nmea0183:
 
     def start(self) -> None:
         """Open the ways out. Raises ServerError when the TCP port cannot be had."""
-        settings, now_ns = self._settings, self._context.now_ns
+        settings, now_ns = self._settings, self._context.clock.now_ns
         if settings.tcp_port is not None:
             server = TcpOutput(settings.tcp_address, settings.tcp_port, now_ns)
             server.open()
@@ -584,7 +584,7 @@ class Nmea0183:
         self._outputs += [UdpOutput(*found) for text in settings.udp if (found := address_of(text)) is not None]
         if settings.serial_port is not None:
             self._outputs.append(SerialOutput(settings.serial_port, settings.serial_baud, now_ns))
-        self._context.output_sources.append(self.status)
+        self._context.outputs.sentences.append(self.status)
 
     def add_device(self, name: str, device_id: int) -> None:
         """Note the device; it is the one whose attitude is sent if it is named, or the only one."""
@@ -635,8 +635,8 @@ class Nmea0183:
             output.close()
         self._outputs.clear()
         self._context.latencies.release(WHO)
-        if self.status in self._context.output_sources:
-            self._context.output_sources.remove(self.status)
+        if self.status in self._context.outputs.sentences:
+            self._context.outputs.sentences.remove(self.status)
 
     def status(self) -> list[OutputStatus]:
         """Return the state of every way out."""
@@ -664,7 +664,7 @@ class Nmea0183:
 
     def _look_up(self, device: str) -> None:
         """Look up what the heading of the device counts from."""
-        found = next((status for status in self._context.status() if status.name == device), None)
+        found = next((status for status in self._context.devices.status() if status.name == device), None)
         if found is None or found.frame is None:
             return
         self._reference = HeadingReference(found.frame.heading, found.frame.declination_deg)

@@ -492,14 +492,14 @@ class ShmPublisher:
                 self.close()
             raise
         self._places[name] = _Place(device_id)
-        self._make(name, directory, self._context.now_ns())
+        self._make(name, directory, self._context.clock.now_ns())
 
     def remove_device(self, name: str) -> None:
         """Close the device's ring and remove its file; no-op if absent."""
         self._places.pop(name, None)
         ring = self._rings.pop(name, None)
-        self._context.rings.pop(name, None)
-        self._context.without_ring.discard(name)
+        self._context.outputs.rings.pop(name, None)
+        self._context.outputs.without_ring.discard(name)
         if ring is not None:
             ring.close()
 
@@ -527,7 +527,7 @@ class ShmPublisher:
         """Show the final ledgers, then close every ring; may be called twice."""
         self._context.latencies.release(ASKER)
         if self._rings:
-            self._show(self._context.now_ns())
+            self._show(self._context.clock.now_ns())
         for name in list(self._places):
             self.remove_device(name)
         if self._directory is not None:
@@ -535,7 +535,7 @@ class ShmPublisher:
             self._directory = None
 
     def _show(self, now_ns: int) -> None:
-        for name, driver, ledger in self._context.ledgers():
+        for name, driver, ledger in self._context.devices.ledgers():
             ring = self._rings.get(name)
             if ring is not None:
                 ring.set_ledger(driver, ledger)
@@ -590,8 +590,8 @@ class ShmPublisher:
             self._put_off(name, error, now_ns)
             return False
         place.problem = ""
-        context.rings[name] = str(ring_path(directory.path, name))
-        context.without_ring.discard(name)
+        context.outputs.rings[name] = str(ring_path(directory.path, name))
+        context.outputs.without_ring.discard(name)
         if self._group_id is not None and not ring.group_given:
             self._warn_of_group(f"cannot be given files by user {os.geteuid()}, who is not in it")
         return True
@@ -601,7 +601,7 @@ class ShmPublisher:
         if str(error) != place.problem:
             log.error("shm: no ring for %s: %s; trying again every second", name, error)
         place.problem, place.retry_ns = str(error), now_ns + RETRY_NS
-        self._context.without_ring.add(name)
+        self._context.outputs.without_ring.add(name)
 
     def _find_group(self) -> int | None:
         try:

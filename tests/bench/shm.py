@@ -8,10 +8,11 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from imud.client.ring import Ring
-from imud.contracts.publisher import Batch, PublisherContext
+from imud.contracts.publisher import Batch
 from imud.model.sample import Sample, Sync
 from imud.publishers.shm import ShmOptions, ShmPublisher
 from tests.bench.rows import Row
+from tests.support.publisher_context import publisher_context
 
 INCLUDE = Path(__file__).parents[2] / "imud" / "include"
 ROUNDS = 5
@@ -51,7 +52,7 @@ def rows(quick: bool = False) -> Iterable[Row]:
     """The figures; the best of ROUNDS, because the rest of the machine only ever adds."""
     rounds = 2 if quick else ROUNDS
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as folder:
-        context = PublisherContext(list, 1, time.monotonic_ns)
+        context = publisher_context(list, 1, time.monotonic_ns)
         publisher = ShmPublisher(ShmOptions(directory=folder, slots=SAMPLES, group=""), context)
         publisher.add_device("bench", 0)
         given = list(samples())

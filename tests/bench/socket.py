@@ -15,11 +15,12 @@ from pathlib import Path
 from statistics import median
 from time import perf_counter_ns
 
-from imud.contracts.publisher import Batch, PublisherContext
+from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import encode_request, line_of
 from imud.model.sample import Sample, Sync
 from imud.publishers.socket.server import SocketOptions, SocketServer
 from tests.bench.rows import Row, at_most
+from tests.support.publisher_context import publisher_context
 
 CLIENTS = (1, 10, 100)
 SAMPLES_PER_ROUND = 10
@@ -79,7 +80,7 @@ def per_sample_ns(kinds: Sequence[Callable[[], None]], after: Callable[[], objec
 
 async def measure(directory: str, clients: int, encoding: str, rate_hz: float, rounds: int) -> tuple[float, float]:
     """Cost of publish, and of the bare sends of the same bytes to as many sockets, ns per sample."""
-    context = PublisherContext(list, 1, lambda: 0)  # with a clock that moves, so many clients would be put off
+    context = publisher_context(list, 1, lambda: 0)  # with a clock that moves, so many clients would be put off
     own_group = grp.getgrgid(os.getegid()).gr_name
     server = SocketServer(SocketOptions(path=str(Path(directory) / "s"), group=own_group), context)
     server.start()

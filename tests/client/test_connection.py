@@ -139,7 +139,7 @@ def test_a_snapshot_is_a_descriptor_and_its_length(served: Daemon) -> None:
             sock.send(b"a snapshot")
         return 299.5
 
-    served.do(lambda server: server.hub.context.snapshots.append(take))
+    served.do(lambda server: server.hub.context.outputs.snapshots.append(take))
     with Client(served.path) as client:
         fd, seconds = client.snapshot()
         assert seconds == 299.5

@@ -15,11 +15,12 @@ from typing import Any
 
 import msgspec
 
-from imud.contracts.publisher import Batch, PublisherContext
+from imud.contracts.publisher import Batch
 from imud.fleet.publisher import MqttPublisher
 from imud.fleet.settings import MqttOptions
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_MS
+from tests.support.publisher_context import publisher_context
 
 TICK_S = 0.05
 EVERY = {"*": {"whole": "slots", "rate_hz": 10, "batch_s": 0.2}}
@@ -45,7 +46,7 @@ def main(
         made |= {"key_file": f"{certificates}/gateway.key"}
     settings = msgspec.convert(made, MqttOptions)
     offset_ns = time.time_ns() - time.monotonic_ns()
-    context = PublisherContext(list, int(epoch), time.monotonic_ns, utc_offset_ns=lambda: offset_ns)
+    context = publisher_context(list, int(epoch), time.monotonic_ns, utc_offset_ns=lambda: offset_ns)
     output = MqttPublisher(settings, context)
     output.add_device("bow", 0)
     output.start()

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from imud.contracts.publisher import Batch, PublisherContext
+from imud.contracts.publisher import Batch
 from imud.fleet.accounts import FleetLedger, StreamCounts, StreamPosition
 from imud.fleet.messages import Stream, decode_message
 from imud.fleet.publisher import MqttPublisher
@@ -25,6 +25,7 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from tests.fleet.authority import Authority
 from tests.fleet.mosquitto import Collector
 from tests.support.daemon_process import LIMIT_S
+from tests.support.publisher_context import publisher_context
 
 
 class LiveGateway:
@@ -37,7 +38,7 @@ class LiveGateway:
             "brokers": [f"mqtt://127.0.0.1:{port}"], "gateway": "gw", "spool_directory": str(folder),
             "retry_max_s": 1, "keep_alive_s": 5, "devices": {"*": {"whole": "slots", "rate_hz": 10, "batch_s": 0.1}},
         }  # fmt: skip
-        context = PublisherContext(list, 7, self.host.now_ns, utc_offset_ns=self.host.utc_offset_ns)
+        context = publisher_context(list, 7, self.host.now_ns, utc_offset_ns=self.host.utc_offset_ns)
         self.output = MqttPublisher(msgspec.convert(made | settings, MqttOptions), context)
         self.output.add_device("bow", 0)
         self.output.start()

@@ -13,7 +13,7 @@ import pytest
 import zstandard
 
 from imud.contracts.lines import UtcReference
-from imud.contracts.publisher import Batch, PublisherContext
+from imud.contracts.publisher import Batch
 from imud.contracts.setting import OnDifference, SettingDifference, SettingsState, SettingsStatus
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.fleet.broker import EXTRA_MISSING
@@ -26,6 +26,7 @@ from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
 from tests.fleet.fake_broker import FakeBroker
 from tests.support.event_loops import VirtualClock
+from tests.support.publisher_context import publisher_context
 from tests.support.signal_bench import HandWorker
 from tests.support.socket_rig import device_status, sample
 
@@ -42,7 +43,7 @@ class PublisherBench:
         self.asked = 0
         self.workers: list[HandWorker] = []
         self.reference: UtcReference | None = None
-        self.context = PublisherContext(
+        self.context = publisher_context(
             self._status, 77, self.clock.now_ns, raise_event=self.events.append, utc_offset_ns=lambda: 99,
             utc_reference=lambda: self.reference,
         )  # fmt: skip
@@ -163,9 +164,9 @@ def test_only_declared_devices_are_queued(tmp_path: Path) -> None:
     assert bench.output.status().queued == 3
     bench.output.event(Event(0, "", EventKind.CONFIGURATION, "x"))
     assert bench.output.status().queued == 4
-    assert bench.context.mqtt_sources == [bench.output.status]
+    assert bench.context.outputs.mqtts == [bench.output.status]
     bench.close()
-    assert bench.context.mqtt_sources == []
+    assert bench.context.outputs.mqtts == []
 
 
 def test_a_spool_that_fails_is_an_event_and_no_end(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from imud.contracts.publisher import PublisherContext
 from imud.drivers import DRIVERS
 from imud.formats.jsonrpc import RpcError, encode_error, encode_result, parse_object, parse_request
 from imud.model.errors import Rejected
@@ -20,6 +19,7 @@ from imud.model.event import Event, EventKind
 from imud.model.sample import SAMPLE_FIELDS
 from imud.publishers.socket.server import SocketOptions, SocketServer
 from tests.fuzz.target import Target
+from tests.support.publisher_context import publisher_context
 from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, FakeControl, batch, device_status
 
 T = TypeVar("T")
@@ -98,7 +98,7 @@ class _Rig:
 
     async def _start(self) -> SocketServer:
         statuses = [device_status(*item) for item in DEVICES.items()]
-        context = PublisherContext(lambda: statuses, EPOCH, lambda: NOW_NS, _Control)
+        context = publisher_context(lambda: statuses, EPOCH, lambda: NOW_NS, _Control)
         server = SocketServer(SocketOptions(path=str(Path(self._folder.name, "s")), group=_own_group()), context)
         server.start()
         for name, number in DEVICES.items():

@@ -17,7 +17,7 @@ from pynmea2.types.proprietary.ash import ASHRATT
 
 from imud.attitude.conventions import Convention, Heading
 from imud.attitude.published import PublishedAxes, published_frame
-from imud.contracts.publisher import AS_SENT, Batch, PublisherContext
+from imud.contracts.publisher import AS_SENT, Batch
 from imud.contracts.status import FrameStatus
 from imud.model.options import wrong_values
 from imud.model.sample import Sample, Sync, Vector3
@@ -33,6 +33,7 @@ from imud.publishers.nmea0183 import (
     make,
 )
 from tests.support.event_loops import VirtualClock, in_loop
+from tests.support.publisher_context import publisher_context
 from tests.support.socket_rig import device_status, in_context
 from tests.support.surroundings import free_port
 
@@ -65,7 +66,7 @@ class OutputBench:
         statuses = [
             msgspec.structs.replace(device_status(name, n), frame=frame) for n, name in enumerate(("bow", "mast"))
         ]
-        self.context = PublisherContext(lambda: statuses, 1, self.clock.now_ns, latencies=self.asked)
+        self.context = publisher_context(lambda: statuses, 1, self.clock.now_ns, latencies=self.asked)
         made = msgspec.convert({"tcp_port": 0, **settings}, Nmea0183Options)
         self.output = Nmea0183(made, self.context)
         self.output.start()
@@ -191,7 +192,7 @@ async def test_the_rate_of_turn_is_the_mean_since_the_last(bench: OutputBench) -
 @in_output(heading=Heading.RELATIVE, declination_deg=None, sentences={"HDT": 100.0})
 async def test_the_reference_is_looked_up_again(bench: OutputBench) -> None:
     bench.publish()
-    statuses = bench.context.status()
+    statuses = bench.context.devices.status()
     known = FrameStatus("", "device", "", "", Heading.TRUE, None, {})
     statuses[0] = msgspec.structs.replace(statuses[0], frame=known)  # type: ignore[index]  # it is a list
     bench.publish(20)
@@ -211,7 +212,7 @@ async def test_the_only_device_is_sent_and_of_several_the_named_one(caplog: pyte
     assert bench.asked.of == {WHO: (10 * NS_PER_MS, ("mast",))}
     bench.output.close()
     assert bench.asked.of == {}
-    assert bench.context.output_sources == []
+    assert bench.context.outputs.sentences == []
 
     named = OutputBench(device="mast", sentences={"HDT": 100.0})
     assert named.asked.of == {}

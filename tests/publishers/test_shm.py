@@ -18,7 +18,7 @@ import msgspec
 import pytest
 
 from imud.client.ring import Ring
-from imud.contracts.publisher import Batch, PublisherContext
+from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceStatus
 from imud.formats import ring as layout
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, encode_slot
@@ -29,11 +29,12 @@ from imud.publishers import PUBLISHERS
 from imud.publishers import shm as ring
 from imud.publishers.shm import PUBLISHER, ShmOptions, ShmPublisher
 from tests.support.files import ROOT
+from tests.support.publisher_context import publisher_context
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample, slot_at
 
 
 def make(folder: Path, **settings: Any) -> ShmPublisher:
-    context = PublisherContext(list, 1, lambda: START_NS)
+    context = publisher_context(list, 1, lambda: START_NS)
     return ShmPublisher(ShmOptions(directory=str(folder), slots=SLOTS, **settings), context)
 
 
@@ -41,7 +42,7 @@ def test_row_and_defaults() -> None:
     assert PUBLISHERS["shm"] is PUBLISHER
     assert PUBLISHER.name == "shm"
     settings = PUBLISHER.settings()
-    assert isinstance(PUBLISHER.make(settings, PublisherContext(list, 1, lambda: 0)), ShmPublisher)
+    assert isinstance(PUBLISHER.make(settings, publisher_context(list, 1, lambda: 0)), ShmPublisher)
     assert settings == ShmOptions(enabled=True, directory="/run/imud/shm", slots=4096, group="imud", mode=0o640)
 
 
@@ -224,9 +225,7 @@ def test_a_tick_asks_for_ledgers_and_not_for_the_state_where_they_have_a_source(
         raise AssertionError("the state of every device was made for its ledger")
 
     counts = dict.fromkeys(LEDGER_FIELDS, 7)
-    context = PublisherContext(
-        whole_state, 1, lambda: START_NS, ledger_source=lambda: [(DEVICE, "imu61x-uart", counts)]
-    )
+    context = publisher_context(whole_state, 1, lambda: START_NS, ledgers=lambda: [(DEVICE, "imu61x-uart", counts)])
     publisher = ShmPublisher(ShmOptions(directory=str(tmp_path), slots=SLOTS), context)
     publisher.add_device(DEVICE, 3)
     publisher.tick(START_NS)
@@ -393,7 +392,7 @@ def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: py
         board.publish([1, 2, 3])
     assert [(at - START_NS) // 1_000_000 for at in tries] == [0, 1000, 2000, 3000]
     assert len(os.listdir("/proc/self/fd")) == descriptors + 1  # of the directory
-    assert (board.context.rings, board.context.without_ring) == ({}, {DEVICE})
+    assert (board.context.outputs.rings, board.context.outputs.without_ring) == ({}, {DEVICE})
     [record] = (record for record in caplog.records if record.levelno == logging.ERROR)
     assert re.search(r"imud.imu0 cannot be made, 20480 bytes: No space left .* fewer `slots`", record.getMessage())
     assert not list(tmp_path.iterdir())
@@ -402,13 +401,13 @@ def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: py
         board.publish([4])
         assert [s.seq for s in reader.read().samples] == [4]
         assert reader.missed == 0
-    assert (board.context.rings, board.context.without_ring) == ({DEVICE: str(board.path)}, set())
+    assert (board.context.outputs.rings, board.context.outputs.without_ring) == ({DEVICE: str(board.path)}, set())
     monkeypatch.setattr(os, "posix_fallocate", refuse)
     board.path.unlink()
     board.tick(1_000_000_000)
-    assert board.context.without_ring == {DEVICE}
+    assert board.context.outputs.without_ring == {DEVICE}
     board.publisher.close()
-    assert not board.context.without_ring
+    assert not board.context.outputs.without_ring
 
 
 def test_directory_that_is_not_there_or_not_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

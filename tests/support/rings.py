@@ -5,13 +5,14 @@ import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from imud.contracts.publisher import Batch, PublisherContext
+from imud.contracts.publisher import Batch
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
 from imud.formats.ring import HEADER_BYTES, OFFSETS
 from imud.formats.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, SlotField, encode_slot
 from imud.model.ledger import Ledger
 from imud.model.sample import Sample, Sync
 from imud.publishers.shm import ShmOptions, ShmPublisher
+from tests.support.publisher_context import publisher_context
 
 DEVICE = "imu0"
 SLOTS = 64
@@ -57,7 +58,7 @@ class Board:
         self.ledger = Ledger()
         self.driver = "hipnuc-uart"
         self.settings = ShmOptions(directory=str(folder), slots=slots, group="")
-        self.context = PublisherContext(lambda: [self.status()], epoch, lambda: self.now_ns)
+        self.context = publisher_context(lambda: [self.status()], epoch, lambda: self.now_ns)
         self.publisher = ShmPublisher(self.settings, self.context)
         self.publisher.start()
         try:

@@ -31,8 +31,6 @@ from imud.contracts.publisher import (
     AS_SENT,
     Batch,
     Latencies,
-    NoLatencies,
-    NothingRecorded,
     PublisherContext,
     RecordingSource,
 )
@@ -57,6 +55,7 @@ from imud.model.sample import Sample, Sync
 from imud.publishers.socket.methods import METHODS
 from imud.publishers.socket.server import SocketOptions, SocketServer
 from tests.publishers.socket.schema import MessageChecker
+from tests.support.publisher_context import publisher_context
 
 T = TypeVar("T")
 CHECKER = MessageChecker()
@@ -134,9 +133,8 @@ def context(
     recording: RecordingSource | None = None,
 ) -> PublisherContext:
     statuses = [device_status(*item) for item in DEVICES.items()]
-    return PublisherContext(
-        lambda: statuses, EPOCH, now_ns, FakeControl, latencies=latencies or NoLatencies(),
-        recording=recording or NothingRecorded(),
+    return publisher_context(
+        lambda: statuses, EPOCH, now_ns, FakeControl, latencies=latencies, recording=recording,
     )  # fmt: skip
 
 

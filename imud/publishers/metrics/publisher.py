@@ -192,13 +192,13 @@ class MetricsPublisher:
         self._context = context
         self._snapshot_s = snapshot_s
         self._events: Counter[tuple[str, str]] = Counter()
-        self._tick_ns = context.now_ns()
+        self._tick_ns = context.clock.now_ns()
         self._renderer = Renderer()
         self._rings = RingReader(pause, motion=settings.motion)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._server: ScrapeServer | None = None
         self._scrapes = 0
-        self._scraped_ns = context.now_ns()
+        self._scraped_ns = context.clock.now_ns()
         self._turn = asyncio.Lock()
         """Of the HTTP thread: 32 snapshots at once would be 32 in one turn of the daemon's event loop."""
         self._pages: dict[str, asyncio.Task[HttpResponse]] = {}
@@ -247,12 +247,12 @@ class MetricsPublisher:
         if request.path == "/":
             return HttpResponse("200 OK", ABOUT)
         if request.path == "/scrapes":
-            age_ns = self._context.now_ns() - self._scraped_ns
+            age_ns = self._context.clock.now_ns() - self._scraped_ns
             return HttpResponse("200 OK", msgspec.json.encode(Scrapes(self._scrapes, age_ns / NS_PER_S)), JSON)
         if request.path != "/metrics":
             return HttpResponse("404 Not Found", b"there is only /metrics\n")
         self._scrapes += 1
-        self._scraped_ns = self._context.now_ns()
+        self._scraped_ns = self._context.clock.now_ns()
         return await self._page(request.accept)
 
     async def _page(self, accept: str) -> HttpResponse:
@@ -291,7 +291,7 @@ class MetricsPublisher:
 
     def _begin_snapshot(self, answer: "Future[Snapshot]") -> None:
         """Begin with how late the loop is: in its next turn it has ticked, and is late no more."""
-        self._gather(answer, self._context.now_ns() - self._tick_ns, self._context.each_status(), [])
+        self._gather(answer, self._context.clock.now_ns() - self._tick_ns, self._context.devices.each_status(), [])
 
     def _gather(
         self, answer: "Future[Snapshot]", late_ns: int, rest: Iterator[DeviceStatus], found: list[DeviceStatus]
@@ -306,19 +306,19 @@ class MetricsPublisher:
 
     def _give_snapshot(self, answer: "Future[Snapshot]", late_ns: int, devices: list[DeviceStatus]) -> None:
         if answer.set_running_or_notify_cancel():
-            context = self._context
+            outputs = self._context.outputs
             answer.set_result(
                 Snapshot(
                     devices,
-                    context.clients(),
+                    [client for source in outputs.clients for client in source()],
                     tuple(self._events.items()),
                     late_ns,
                     messages_dropped(),
-                    rings=dict.fromkeys(context.without_ring, "") | context.rings,
-                    recorders=tuple(status() for status in context.recorder_sources),
-                    flights=tuple(status() for status in context.flight_sources),
-                    mqtts=tuple(status() for status in context.mqtt_sources),
-                    outputs=tuple(output for source in context.output_sources for output in source()),
+                    rings=dict.fromkeys(outputs.without_ring, "") | outputs.rings,
+                    recorders=tuple(status() for status in outputs.recorders),
+                    flights=tuple(status() for status in outputs.flights),
+                    mqtts=tuple(status() for status in outputs.mqtts),
+                    outputs=tuple(output for source in outputs.sentences for output in source()),
                 )
             )
 

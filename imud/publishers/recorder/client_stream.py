@@ -171,9 +171,9 @@ class ClientRecording:
         """`devices` are names, None for all; `sock` is the daemon's end of the client's socket."""
         self._queue = RecordQueue[LastRecords]()
         self._feed = RecordFeed(context, self._queue, devices)
-        self._writer = StreamWriter(self._queue, sock, context.now_ns, start_worker)
+        self._writer = StreamWriter(self._queue, sock, context.clock.now_ns, start_worker)
         self._stopped = False
-        self._feed.put(self._feed.session(0, context.now_ns()))
+        self._feed.put(self._feed.session(0, context.clock.now_ns()))
         self._feed.describe(at_once=True)
         self._feed.follow()
 

@@ -535,14 +535,14 @@ class FlightRecorder:
         except OSError as error:
             raise ServerError(f"flight recorder: {error.filename or ''}: {reason_of(error)}") from error
         context = self._context
-        self._writer = FlightWriter(self._queue, self._ring, self._directory, context.now_ns, self._start_worker)
+        self._writer = FlightWriter(self._queue, self._ring, self._directory, context.clock.now_ns, self._start_worker)
         for mark in left:
             self._queue.mark(mark)
-        self._begin_segment(context.now_ns())
+        self._begin_segment(context.clock.now_ns())
         if self._settings.line is not None:
             self._line = context.watch_line(self._settings.line, "flight recorder", self._on_edges, self._on_line)
-        context.snapshots.append(self.snapshot)
-        context.flight_sources.append(self.status)
+        context.outputs.snapshots.append(self.snapshot)
+        context.outputs.flights.append(self.status)
         where = f"in {self._settings.directory}" if self._own is not None else "in memory"
         log.info("flight recorder: the last %g minutes are kept %s", self._settings.minutes, where)
 
@@ -599,11 +599,11 @@ class FlightRecorder:
         writer, self._writer = self._writer, None
         if writer is None:
             return
-        self._context.snapshots.remove(self.snapshot)
-        self._context.flight_sources.remove(self.status)
+        self._context.outputs.snapshots.remove(self.snapshot)
+        self._context.outputs.flights.remove(self.status)
         if self._line is not None:
             self._line.close()
-        now_ns = self._context.now_ns()
+        now_ns = self._context.clock.now_ns()
         self._save_due(now_ns, at_once=True)
         self._feed.stop()
         writer.close()
@@ -620,12 +620,12 @@ class FlightRecorder:
         self._sends += 1
         self._feed.check()
         self._queue.mark(Send(sock, self._feed.ending("a snapshot for a client")))
-        return (self._context.now_ns() - oldest_ns) / NS_PER_S
+        return (self._context.clock.now_ns() - oldest_ns) / NS_PER_S
 
     def status(self) -> FlightStatus:
         """Return the state of the flight recorder."""
         oldest_ns = self._ring.oldest_ns
-        kept_ns = self._context.now_ns() - oldest_ns if oldest_ns and not self._problem else 0
+        kept_ns = self._context.clock.now_ns() - oldest_ns if oldest_ns and not self._problem else 0
         return FlightStatus(
             self._problem, kept_ns, self._ring.bytes, self._queue.dropped, self._saved, self._failed,
             self._gate.left_out_total, self._sends, self._directory.kept_bytes,
@@ -637,7 +637,7 @@ class FlightRecorder:
         context, pending = self._context, self._gate.pending
         path = None
         if self._own is not None:
-            path = self._own.new_file(now_ns + context.utc_offset_ns(), context.epoch, self._segments)
+            path = self._own.new_file(now_ns + context.clock.utc_offset_ns(), context.epoch, self._segments)
         keep_from_ns = (now_ns if pending is None else pending.t_ns) - self._keep_ns
         self._queue.mark(SegmentBegin(now_ns, self._feed.session(0, now_ns), path, keep_from_ns))
         self._segments += 1
@@ -657,7 +657,7 @@ class FlightRecorder:
         ]
 
     def _alert(self, device: str, reason: str) -> None:
-        now_ns = self._context.now_ns()
+        now_ns = self._context.clock.now_ns()
         if not self._gate.add(Alert(now_ns, device, reason)):
             self._raise(now_ns, f"not saved: {reason}; {self._settings.per_hour} snapshots were within an hour", device)
 
@@ -666,7 +666,7 @@ class FlightRecorder:
         if alert is None:
             return
         context = self._context
-        begun_ns = (self._ring.oldest_ns or now_ns) + context.utc_offset_ns()
+        begun_ns = (self._ring.oldest_ns or now_ns) + context.clock.utc_offset_ns()
         path = self._directory.new_file(begun_ns, context.epoch, self._snapshots, SNAPSHOT)
         self._snapshots += 1
         self._saving[path] = alert
@@ -697,7 +697,7 @@ class FlightRecorder:
             self._alert("", "the line of the flight recorder became active")
 
     def _on_line(self, problem: str) -> None:
-        self._raise(self._context.now_ns(), f"flight recorder: its line: {problem}")
+        self._raise(self._context.clock.now_ns(), f"flight recorder: its line: {problem}")
 
     def _raise(self, now_ns: int, message: str, device: str = "", **detail: str | int) -> None:
         log.warning("%s", message)

@@ -51,9 +51,9 @@ class Recorder:
             self._directory.make_room(self._file_bytes)
         except OSError as error:
             raise ServerError(f"recordings in {self._settings.directory}: {reason_of(error)}") from error
-        self._writer = RecordingWriter(self._queue, self._context.now_ns, self._start_worker)
+        self._writer = RecordingWriter(self._queue, self._context.clock.now_ns, self._start_worker)
         self._begin_file()
-        self._context.recorder_sources.append(self.status)
+        self._context.outputs.recorders.append(self.status)
         log.info("recording to %s", self._settings.directory)
 
     def add_device(self, name: str, device_id: int) -> None:
@@ -98,8 +98,8 @@ class Recorder:
         writer, self._writer = self._writer, None
         if writer is None:
             return
-        if self.status in self._context.recorder_sources:
-            self._context.recorder_sources.remove(self.status)
+        if self.status in self._context.outputs.recorders:
+            self._context.outputs.recorders.remove(self.status)
         if not self._problem:
             self._feed.check()
             self._end_file("imud stopped")
@@ -128,8 +128,8 @@ class Recorder:
 
         Each look at the clocks may record a reading of them: all come before the end of the last file.
         """
-        context, now_ns = self._context, self._context.now_ns()
-        utc_ns = now_ns + context.utc_offset_ns()
+        context, now_ns = self._context, self._context.clock.now_ns()
+        utc_ns = now_ns + context.clock.utc_offset_ns()
         self._directory.in_use.discard(self._path.name)
         self._path = self._directory.new_file(utc_ns, context.epoch, self._number)
         self._directory.in_use.add(self._path.name)

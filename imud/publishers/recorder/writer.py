@@ -204,7 +204,7 @@ class RecordFeed:
     ) -> None:
         """`devices` are the names of those that are recorded, None for all."""
         self._context = context
-        self._source = context.recording
+        self._source = context.devices.recording
         self._queue = queue
         self._put: PutRecord = queue.put
         self._devices = devices
@@ -231,7 +231,7 @@ class RecordFeed:
 
     def follow(self) -> None:
         """Begin to record devices that are new, and describe those again that are due."""
-        now_ns = self._context.now_ns
+        now_ns = self._context.clock.now_ns
         end_ns = now_ns() + BEGIN_NS
         for name in self._source.names():
             if (name not in self._recorded or name in self._due) and self.wants(name):
@@ -261,7 +261,7 @@ class RecordFeed:
         """Return the record that a file begins with."""
         context = self._context
         host = f"{platform.node()}, {platform.system()} {platform.release()} {platform.machine()}"
-        utc_ns = now_ns + context.utc_offset_ns()
+        utc_ns = now_ns + context.clock.utc_offset_ns()
         python = platform.python_version()
         session = SessionRecord(
             records.VERSION, __version__, python, host, context.epoch, number, now_ns, utc_ns
@@ -270,8 +270,8 @@ class RecordFeed:
 
     def ending(self, reason: str) -> bytes:
         """Return the record that a file ends with."""
-        now_ns = self._context.now_ns()
-        end = EndRecord(now_ns, now_ns + self._context.utc_offset_ns(), reason)
+        now_ns = self._context.clock.now_ns()
+        end = EndRecord(now_ns, now_ns + self._context.clock.utc_offset_ns(), reason)
         return records.encode_object(Kind.END, NO_DEVICE, end)
 
     def put(self, record: bytes) -> None:
@@ -314,7 +314,7 @@ class RecordFeed:
         if self._queue.dropped == self._dropped[0]:
             self.check()
         self.stop()
-        lost = self._new_losses(self._context.now_ns())
+        lost = self._new_losses(self._context.clock.now_ns())
         return (records.encode_lost(lost) if lost.records else b"") + self.ending(reason)
 
     def _new_losses(self, now_ns: int) -> LostRecord:

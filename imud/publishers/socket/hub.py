@@ -74,7 +74,7 @@ class ClientRecordings:
 
     def snapshot(self, connection: ClientConnection) -> tuple[float, int]:
         """Send a client what the flight recorder has: its length, s, and the descriptor. Raises RpcError."""
-        if not self._context.snapshots:
+        if not self._context.outputs.snapshots:
             raise RpcError(
                 Code.UNAVAILABLE,
                 "record.snapshot: there is no flight recorder; `recorder: {flight: {enabled: true}}` in the "
@@ -82,7 +82,7 @@ class ClientRecordings:
             )
         ours, fd = self._lend(connection, "record.snapshot")
         try:
-            return self._context.snapshots[0](ours), fd
+            return self._context.outputs.snapshots[0](ours), fd
         except ImudError as error:
             ours.close()
             raise RpcError(Code.UNAVAILABLE, f"record.snapshot: {error}") from None
@@ -184,7 +184,7 @@ class Hub:
         self._refused = 0
         self._evicted = 0
         self._failed = 0
-        self._failures = RateLimitedLog(context.now_ns)
+        self._failures = RateLimitedLog(context.clock.now_ns)
         self._to_wake: dict[str, list[ClientConnection]] = {}
         """Clients that are still to be woken for the newest batch of a device."""
 
@@ -231,7 +231,7 @@ class Hub:
         plan = self._plans.get(device)
         if plan is None:
             plan = self._plans[device] = self._new_plan(device)
-        plan.send(batch, self.context.now_ns, self._time)
+        plan.send(batch, self.context.clock.now_ns, self._time)
         if device in self._wanting_wake:
             # Not now: a client that wakes reads shared memory, whose publisher may have its turn after this one.
             asyncio.get_running_loop().call_soon(self._wake_all, device)
@@ -270,7 +270,7 @@ class Hub:
 
     def _wake_some(self, device: str) -> None:
         """Wake clients, from the end of the list, for WAKE_NS, then go on in the next turn of the event loop."""
-        now_ns, waiting = self.context.now_ns, self._to_wake[device]
+        now_ns, waiting = self.context.clock.now_ns, self._to_wake[device]
         end_ns = now_ns() + WAKE_NS
         while waiting:
             for _ in range(min(CLIENTS_PER_LOOK, len(waiting))):

@@ -92,13 +92,13 @@ Pieces = Generator[int, None, Answer]
 
 def devices(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces:
     """The devices, each in one line."""
-    rings = hub.context.rings
+    rings = hub.context.outputs.rings
     lines = (
         DeviceSummary(
             one.name, one.device_id, one.driver, one.link, one.state, one.problem, one.identity, one.rate_hz,
             one.clock.sync, rings.get(one.name),
         )
-        for one in hub.context.each_status()
+        for one in hub.context.devices.each_status()
     )  # fmt: skip
     made = yield from _encoded(lines, DEVICES_PER_PIECE, connection.text_numbers)
     return Answer(made, big_numbers=False)
@@ -107,10 +107,10 @@ def devices(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces
 def status(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces:
     """The full state: each device with its clock and ledger, the socket with its clients."""
     texts = connection.text_numbers
-    made = yield from _encoded(hub.context.each_status(), DEVICES_PER_PIECE, texts)
+    made = yield from _encoded(hub.context.devices.each_status(), DEVICES_PER_PIECE, texts)
     held_bytes = sum(map(len, made))
     clients = yield from _encoded(hub.each_client(), CLIENTS_PER_PIECE, texts, held_bytes)
-    now_ns = hub.context.now_ns()
+    now_ns = hub.context.clock.now_ns()
     socket = msgspec.structs.asdict(hub.status(())) | {"clients": clients}
     return Answer({"now_ns": str(now_ns) if texts else now_ns, "devices": made, "socket": socket}, big_numbers=False)
 
@@ -120,7 +120,7 @@ def schema(hub: Hub, _connection: ClientConnection, _params: NoParams) -> Pieces
     names: list[str] = []
 
     def frames() -> Iterator[DeviceFrame]:
-        for device in hub.context.each_status():
+        for device in hub.context.devices.each_status():
             names.append(device.name)
             yield _frame_of(device)
 
@@ -316,7 +316,7 @@ def _poll(hub: Hub, _connection: ClientConnection, params: PollParams) -> Answer
     fields = _known_fields(params.fields)
     newest = [_newest_of(hub.newest[name], params.convention) for name in names if name in hub.newest]
     samples = newest if fields is None else list(map(selector(fields), newest))
-    return Answer(PollResult(hub.context.now_ns(), samples, params.convention))
+    return Answer(PollResult(hub.context.clock.now_ns(), samples, params.convention))
 
 
 def _newest_of(batch: Batch, convention: Convention | None) -> Sample:
@@ -351,7 +351,7 @@ def _notify(hub: Hub, connection: ClientConnection, params: NotifyParams) -> Ans
 def _actions(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> Answer:
     """The actions of a device."""
     _known_devices(hub, [params.device])
-    return Answer(described(hub.context.control(params.device).actions))
+    return Answer(described(hub.context.devices.control(params.device).actions))
 
 
 def _command(hub: Hub, connection: ClientConnection, params: CommandParams) -> Later:
@@ -363,13 +363,13 @@ def _command(hub: Hub, connection: ClientConnection, params: CommandParams) -> L
 
 
 async def _done(hub: Hub, params: CommandParams) -> object:
-    return await hub.context.control(params.device).act(params.name, params.arguments or {})
+    return await hub.context.devices.control(params.device).act(params.name, params.arguments or {})
 
 
 def _calibrations(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> Answer:
     """The guided calibrations of a device."""
     _known_devices(hub, [params.device])
-    return Answer(infos(hub.context.control(params.device).calibrations))
+    return Answer(infos(hub.context.devices.control(params.device).calibrations))
 
 
 def _calibrate(hub: Hub, connection: ClientConnection, params: CalibrateParams) -> Later:
@@ -381,13 +381,13 @@ def _calibrate(hub: Hub, connection: ClientConnection, params: CalibrateParams) 
 
 
 async def _calibrated(hub: Hub, params: CalibrateParams) -> object:
-    return await hub.context.control(params.device).calibrate(params.kind, save=bool(params.save))
+    return await hub.context.devices.control(params.device).calibrate(params.kind, save=bool(params.save))
 
 
 def _stop_calibration(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> Answer:
     """End the calibration that runs, whoever began it."""
     _known_devices(hub, [params.device])
-    return Answer(StopResult(hub.context.control(params.device).stop_calibration()))
+    return Answer(StopResult(hub.context.devices.control(params.device).stop_calibration()))
 
 
 def _settings(hub: Hub, connection: ClientConnection, params: SettingsParams) -> Later:
@@ -398,21 +398,21 @@ def _settings(hub: Hub, connection: ClientConnection, params: SettingsParams) ->
             message = f"settings.get: for fresh, expected root or a member of {hub.control_group}"
             raise RpcError(Code.DENIED, message)
         _refuse_second(hub, connection, "settings.get")
-    return hub.context.control(params.device).settings_report(fresh=bool(params.fresh))
+    return hub.context.devices.control(params.device).settings_report(fresh=bool(params.fresh))
 
 
 def _settings_plan(hub: Hub, connection: ClientConnection, params: SettingsChangeParams) -> Later:
     """What would make the device as wanted; nothing is written."""
     _known_devices(hub, [params.device])
     _refuse_second(hub, connection, "settings.plan")
-    return hub.context.control(params.device).settings_plan(params.settings, save=bool(params.save))
+    return hub.context.devices.control(params.device).settings_plan(params.settings, save=bool(params.save))
 
 
 def _settings_apply(hub: Hub, connection: ClientConnection, params: SettingsChangeParams) -> Later:
     """Make the device as wanted; the reply comes when it is done or has failed, with how the device is then."""
     _known_devices(hub, [params.device])
     _refuse_second(hub, connection, "settings.apply")
-    return hub.context.control(params.device).settings_apply(params.settings, save=bool(params.save))
+    return hub.context.devices.control(params.device).settings_apply(params.settings, save=bool(params.save))
 
 
 # --- recordings -----------------------------------------------------------------------------------------------------

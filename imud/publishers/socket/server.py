@@ -281,17 +281,17 @@ class SocketServer:
         self._settings = settings
         self._context = context
         shares = Shares(settings.clients_max, settings.clients_per_user)
-        self._quota = Quota(shares, os.geteuid(), raise_fd_limit(), context.now_ns)
+        self._quota = Quota(shares, os.geteuid(), raise_fd_limit(), context.clock.now_ns)
         self.pool = Pool(settings.memory_mb * MIB)
         """What is held for clients."""
-        self._time = TokenBucket(SERVING_PER_S_NS, SERVING_BURST_NS, context.now_ns())
+        self._time = TokenBucket(SERVING_PER_S_NS, SERVING_BURST_NS, context.clock.now_ns())
         self.hub = Hub(settings.path, context, self._quota, self._time, self.pool)
         self.publish: Final = self.hub.publish
         self._side: ServerSide | None = None
         self._listener: Listener | None = None
         self._guard = Guard(os.geteuid(), None, None)
         self._paused = False
-        self._pauses = RateLimitedLog(context.now_ns)
+        self._pauses = RateLimitedLog(context.clock.now_ns)
 
     def start(self) -> None:
         """Listen. Raises ServerError and leaves nothing behind when that is not possible."""
@@ -306,10 +306,10 @@ class SocketServer:
             self.hub.count_failed,
             Limits(settings.queue_samples, settings.queue_bytes),
             self.pool,
-            Scheduler(self._context.now_ns, self._context.cpu_ns, self._time),
+            Scheduler(self._context.clock.now_ns, self._context.clock.cpu_ns, self._time),
         )
         asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)
-        self._context.client_sources.append(self.hub.clients)
+        self._context.outputs.clients.append(self.hub.clients)
 
     def _name_control_group(self, group: str) -> None:
         """Name the group in refusals, and say what to do where it does not exist."""
@@ -352,12 +352,12 @@ class SocketServer:
         self._listener = None
         self.hub.close()
         self._side.scheduler.close()
-        self._context.client_sources.remove(self.hub.clients)
+        self._context.outputs.clients.remove(self.hub.clients)
 
     # --- clients ----------------------------------------------------------------------------------------------------
 
     def _accept(self) -> None:
-        now_ns = self._context.now_ns
+        now_ns = self._context.clock.now_ns
         end_ns = now_ns() + ACCEPT_NS
         for _ in range(ACCEPTS_PER_TURN):
             if self._listener is None or now_ns() > end_ns:

@@ -36,6 +36,7 @@ from tests.bench.instructions import virtual_time
 from tests.bench.instructions.daemon import BUFFER, DRAIN_EVERY, VirtualDaemon, own_group
 from tests.bench.instructions.figures import INTERPRETER
 from tests.bench.instructions.module import BAUD, SETTLE_READS, Module, Read
+from tests.support.publisher_context import publisher_context
 
 Run = Callable[[int], None]
 
@@ -220,7 +221,7 @@ def _slots(frames: int, total: int, _directory: str) -> Run:
 
 
 def _context() -> PublisherContext:
-    return PublisherContext(list, 1, virtual_time.now_ns, cpu_ns=virtual_time.now_ns)
+    return publisher_context(list, 1, virtual_time.now_ns, cpu_ns=virtual_time.now_ns)
 
 
 def _ring_publisher(directory: str) -> ShmPublisher:

@@ -7,9 +7,9 @@ import pytest
 from imud.cli.doctor.command import examine, exit_status
 from imud.cli.doctor.daemon import prometheus, shared_memory
 from imud.cli.doctor.surroundings import DoctorCheck, fetch_over_http
-from imud.contracts.publisher import PublisherContext
 from imud.publishers.metrics.publisher import MetricsOptions, MetricsPublisher
 from tests.support.metrics import ask
+from tests.support.publisher_context import publisher_context
 from tests.support.surroundings import Machine
 
 PROMETHEUS, SHARED = DoctorCheck("p", prometheus), DoctorCheck("s", shared_memory)
@@ -60,7 +60,7 @@ def test_without_daemon_or_configuration(machine: Machine) -> None:
 
 def test_the_endpoint_itself_is_understood(running: Machine) -> None:
     async def serve() -> list[str]:
-        made = MetricsPublisher(MetricsOptions(port=0), PublisherContext(lambda: (), 1, lambda: 5_000_000_000))
+        made = MetricsPublisher(MetricsOptions(port=0), publisher_context(lambda: (), 1, lambda: 5_000_000_000))
         made.start()
         pages = []
         try:

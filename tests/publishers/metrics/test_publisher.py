@@ -22,6 +22,7 @@ from imud.publishers import PUBLISHERS
 from imud.publishers.metrics.publisher import MetricsOptions, MetricsPublisher
 from tests.support.event_loops import in_loop
 from tests.support.metrics import LIMIT_S, ask, device, read_all
+from tests.support.publisher_context import publisher_context
 from tests.support.rings import DEVICE, Board
 
 DEVICES_PER_TURN = 8
@@ -30,7 +31,7 @@ DEVICES = (device("front", 0), device("rear", 1))
 
 
 def context(status: Callable[[], Sequence[DeviceStatus]] = lambda: DEVICES) -> PublisherContext:
-    return PublisherContext(status, 1, lambda: 5_000_000_000)
+    return publisher_context(status, 1, lambda: 5_000_000_000)
 
 
 @asynccontextmanager
@@ -80,7 +81,7 @@ async def test_scrape_over_http_reads_the_status_in_the_loops_thread() -> None:
 @in_loop
 async def test_scrapes_are_counted_and_asking_for_the_count_is_none() -> None:
     async with publisher(
-        PublisherContext(lambda: DEVICES, 1, iter(range(10**11, 10**12, 2 * 10**9)).__next__)
+        publisher_context(lambda: DEVICES, 1, iter(range(10**11, 10**12, 2 * 10**9)).__next__)
     ) as served:
         assert (await ask(served.port, "/scrapes"))[2] == '{"scrapes":0,"age_s":2.0}', "since the start"
         await ask(served.port)
@@ -137,7 +138,7 @@ async def test_a_scrape_of_many_devices_takes_some_of_them_in_each_turn_of_the_l
             turn += 1
             await asyncio.sleep(0)
 
-    async with publisher(replace(context(), status_in_turn=each_status)) as served:
+    async with publisher(publisher_context(each_status=each_status)) as served:
         counting = asyncio.create_task(count_turns())
         _, _, body = await ask(served.port)
         counting.cancel()
@@ -157,7 +158,7 @@ async def test_a_loop_that_stood_still_is_late_though_it_ticks_while_devices_are
             yield device(f"imu{number}")
             published[0].tick(now_ns)
 
-    async with publisher(replace(context(), now_ns=lambda: now_ns, status_in_turn=each_status)) as served:
+    async with publisher(publisher_context(now_ns=lambda: now_ns, each_status=each_status)) as served:
         published.append(served)
         now_ns += 1_500_000_000
         _, _, body = await ask(served.port)
@@ -170,8 +171,8 @@ async def test_rings_of_the_daemon_are_read(board: Board) -> None:
     board.now_ns = 20_000_000
     board.publish(range(1, 11))
     board.tick(0)
-    context = PublisherContext(
-        lambda: [newest], 1, lambda: board.now_ns, rings=board.context.rings, without_ring={"other"}
+    context = publisher_context(
+        lambda: [newest], 1, lambda: board.now_ns, outputs=replace(board.context.outputs, without_ring={"other"})
     )
 
     for motion in (True, False):

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from imud.contracts.publisher import PublisherContext, PutRecord
+from imud.contracts.publisher import PutRecord
 from imud.formats import records
 from imud.formats.recording import RecordingReader
 from imud.formats.records import Kind, Record
@@ -12,6 +12,7 @@ from imud.host.threads import Round
 from imud.model.event import Event
 from imud.model.units import NS_PER_S
 from tests.support.event_loops import VirtualClock
+from tests.support.publisher_context import publisher_context
 from tests.support.signal_bench import HandWorker
 
 UTC_OFFSET_NS = 1_763_717_507 * NS_PER_S
@@ -58,7 +59,7 @@ class RecordingBench:
         self.workers: list[HandWorker] = []
         self.on_clocks_read: Callable[[], None] = lambda: None
         """Called where the recorder looks at the host's clocks, which may record a reading."""
-        self.context = PublisherContext(
+        self.context = publisher_context(
             list, EPOCH, self.clock.now_ns, recording=self.source, utc_offset_ns=self._utc_offset_ns,
             raise_event=self.events.append,
         )  # fmt: skip

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from imud.contracts.lines import Edge, InputOptions, OnEdges
-from imud.contracts.publisher import Batch, NoLine
+from imud.contracts.publisher import Batch
 from imud.formats import records
 from imud.formats.recording import RecordingReader
 from imud.formats.records import EndRecord, Kind, SessionRecord, decode_object
@@ -18,6 +18,7 @@ from imud.publishers.recorder.client_stream import stream_pair
 from imud.publishers.recorder.directory import FlightOptions, RecorderOptions, RecordingDirectory
 from imud.publishers.recorder.flight import FlightRecorder
 from tests.publishers.recorder.recording_bench import RecordingBench, records_in
+from tests.support.publisher_context import NoLine
 from tests.support.socket_rig import sample
 
 SENDS_MAX, RETRY_NS = 4, 60 * NS_PER_S
@@ -103,7 +104,7 @@ def test_an_acceleration_over_the_bound_is_saved_with_what_came_before_and_after
     assert kinds[:4] == [Kind.SESSION, Kind.CALL, Kind.DEVICE, Kind.DEVICE]
     assert kinds[-3:] == [Kind.CHECK, Kind.CHECK, Kind.END]
     assert kinds.count(Kind.SESSION) == 1
-    (status,) = [source() for source in bench.context.flight_sources]
+    (status,) = [source() for source in bench.context.outputs.flights]
     assert 60 <= status.kept_ns / NS_PER_S <= 79
     assert status.kept_bytes >= file.stat().st_size // 2
     (event,) = bench.events
@@ -112,8 +113,8 @@ def test_an_acceleration_over_the_bound_is_saved_with_what_came_before_and_after
     assert event.detail == {"file": str(file), "bytes": file.stat().st_size}
     bench.flight.close()
     assert bench.source.listening == []
-    assert not bench.context.snapshots
-    assert not bench.context.flight_sources
+    assert not bench.context.outputs.snapshots
+    assert not bench.context.outputs.flights
 
 
 def test_a_device_that_is_lost_is_an_alert_unless_it_is_not_recorded(tmp_path: Path) -> None:
@@ -200,7 +201,7 @@ def test_a_client_gets_what_there_is(tmp_path: Path) -> None:
     bench = FlightBench(tmp_path)
     bench.tick(30)
     ours, theirs = stream_pair()
-    assert 29 < bench.context.snapshots[0](ours) < 31
+    assert 29 < bench.context.outputs.snapshots[0](ours) < 31
     bench.workers[0].work()
     with theirs, theirs.makefile("rb") as file:
         reader = RecordingReader(file, "")

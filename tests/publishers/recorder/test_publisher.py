@@ -56,5 +56,5 @@ def test_where_one_cannot_start_nothing_runs(tmp_path: Path) -> None:
     made = PUBLISHER.make(RecorderOptions(enabled=True, directory=str(tmp_path / "a"), flight=flight), bench.context)
     with pytest.raises(ServerError):
         made.start()
-    assert bench.context.recorder_sources == []
-    assert bench.context.snapshots == []
+    assert bench.context.outputs.recorders == []
+    assert bench.context.outputs.snapshots == []

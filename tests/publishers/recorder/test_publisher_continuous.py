@@ -53,7 +53,7 @@ def test_a_file_begins_with_session_host_and_devices_and_ends_regularly(tmp_path
         Kind.SESSION, Kind.CALL, Kind.DEVICE, Kind.DEVICE, *checks, Kind.DATA, *checks, Kind.END
     ]  # fmt: skip
     assert bench.source.listening == []
-    assert bench.context.recorder_sources == []
+    assert bench.context.outputs.recorders == []
 
 
 def test_only_the_named_devices_are_recorded_and_new_ones_as_they_come(tmp_path: Path) -> None:

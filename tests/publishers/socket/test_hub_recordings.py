@@ -226,7 +226,7 @@ def test_a_request_that_fails_leaves_no_descriptor(
                 code, message = await peer.error(method)
                 assert code == -32004
                 assert "`recorder: {flight: {enabled: true}}`" in message
-                server.hub.context.snapshots.append(refuse)
+                server.hub.context.outputs.snapshots.append(refuse)
                 why = "nothing is kept: it has just begun"
             else:
                 monkeypatch.setattr(BusThread, "__init__", fail)
@@ -253,7 +253,7 @@ async def test_a_snapshot_is_what_the_flight_recorder_sends(server: SocketServer
         return 299.5
 
     peer = await RecordingPeer.greeted(server)
-    server.hub.context.snapshots.append(take)
+    server.hub.context.outputs.snapshots.append(take)
     assert await peer.result("record.snapshot") == {"seconds": 299.5}
     assert os.read(peer.fds[0], 100) == b"a snapshot"
     assert os.read(peer.fds[0], 100) == b""

@@ -1,7 +1,6 @@
 """Answers about many devices are made in pieces, with samples in between, and are whole in the end."""
 
 import asyncio
-import dataclasses
 import json
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -12,7 +11,8 @@ import pytest
 from imud.contracts.status import DeviceStatus
 from imud.publishers.socket.methods import DEVICES_PER_PIECE
 from imud.publishers.socket.server import SocketOptions, SocketServer
-from tests.support.socket_rig import NOW_NS, Peer, batch, context, device_status, in_context, until
+from tests.support.publisher_context import publisher_context
+from tests.support.socket_rig import NOW_NS, Peer, batch, device_status, in_context, until
 
 TURN_NS = 1_000_000
 
@@ -28,7 +28,7 @@ class Fleet:
         self.now_ns = NOW_NS
         self.taken = 0
         self.names = [f"imu{number}" for number in range(DEVICES)]
-        known = dataclasses.replace(context(lambda: self.now_ns), status_in_turn=self.each_status)
+        known = publisher_context(now_ns=lambda: self.now_ns, each_status=self.each_status)
         self.server = SocketServer(SocketOptions(path=str(directory / "s")), known)
 
     def each_status(self) -> Iterator[DeviceStatus]:

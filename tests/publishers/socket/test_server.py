@@ -281,16 +281,15 @@ async def test_one_client_too_many_gets_an_error(server: SocketServer) -> None:
 
 @in_server()
 async def test_clients_are_seen_through_the_context(server: SocketServer) -> None:
-    known = server.hub.context
-    assert known.clients() == []
+    known = server.hub.context.outputs.clients
+    assert not known[0]()
     peer = await Peer.greeted(server)
     await peer.result("watch", encoding="binary")
     server.publish(batch("imu0", 1, 3))
-    (client,) = known.clients()
+    (client,) = known[0]()
     assert (client.encoding, client.sent, client.dropped, client.queue_samples) == ("binary", 3, 0, 0)
     server.close()
-    assert known.clients() == []
-    assert known.client_sources == []
+    assert known == []
 
 
 @in_server()

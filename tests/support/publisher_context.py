@@ -1,0 +1,104 @@
+"""`PublisherContext` for tests of outputs. Without arguments it has no device, no line and no recording."""
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+
+from imud.contracts.lines import UtcReference, WatchedInput, WatchLine
+from imud.contracts.publisher import (
+    DeviceControl,
+    DeviceLedger,
+    Latencies,
+    OutputFacts,
+    PublisherClock,
+    PublisherContext,
+    PutRecord,
+    RecordingSource,
+)
+from imud.contracts.status import DeviceStatus
+from imud.model.errors import CommandError
+from imud.model.event import Event
+
+
+class NothingRecorded:
+    def names(self) -> Sequence[str]:
+        return ()
+
+    def begin_host(self, put: PutRecord) -> None:
+        pass
+
+    def begin(self, device: str, put: PutRecord) -> None:
+        pass
+
+    def check(self, device: str, put: PutRecord) -> None:
+        pass
+
+    def end(self, put: PutRecord) -> None:
+        pass
+
+
+class NoLine:
+    def tick(self, now_ns: int) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+class NoLatencies:
+    def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
+        pass
+
+    def release(self, who: str) -> None:
+        pass
+
+
+def _no_device(name: str) -> DeviceControl:
+    raise CommandError(f"{name}: no such device")
+
+
+def _no_line(*_: object) -> WatchedInput:
+    return NoLine()
+
+
+@dataclass(frozen=True)
+class FakeDevices:
+    status: Callable[[], Sequence[DeviceStatus]]
+    control: Callable[[str], DeviceControl]
+    recording: RecordingSource
+    each_status: Callable[[], Iterator[DeviceStatus]]
+    ledgers: Callable[[], Sequence[DeviceLedger]]
+
+
+def publisher_context(
+    status: Callable[[], Sequence[DeviceStatus]] = list,
+    epoch: int = 1,
+    now_ns: Callable[[], int] = lambda: 0,
+    control: Callable[[str], DeviceControl] = _no_device,
+    *,
+    cpu_ns: Callable[[], int] = lambda: 0,
+    utc_offset_ns: Callable[[], int] = lambda: 0,
+    utc_reference: Callable[[], UtcReference | None] = lambda: None,
+    each_status: Callable[[], Iterator[DeviceStatus]] | None = None,
+    ledgers: Callable[[], Sequence[DeviceLedger]] | None = None,
+    recording: RecordingSource | None = None,
+    outputs: OutputFacts | None = None,
+    latencies: Latencies | None = None,
+    watch_line: WatchLine = _no_line,
+    raise_event: Callable[[Event], None] = lambda _event: None,
+) -> PublisherContext:
+    devices = FakeDevices(
+        status,
+        control,
+        recording or NothingRecorded(),
+        each_status or (lambda: iter(status())),
+        ledgers or (lambda: [(one.name, one.driver, one.ledger) for one in status()]),
+    )
+    return PublisherContext(
+        epoch,
+        PublisherClock(now_ns, utc_offset_ns, utc_reference, cpu_ns),
+        devices,
+        outputs or OutputFacts(),
+        latencies or NoLatencies(),
+        watch_line,
+        raise_event,
+    )
