@@ -17,7 +17,7 @@ reports all problems together.
 from imud.config.devices import DEVICE_NAME, DEVICES_MAX
 from imud.config.model import Config, DeviceConfig, Differences, differences
 from imud.config.reading import PROBLEMS_SHOWN, load, parse
-from imud.config.schema import TABLES, DeviceGeneral, DriverRow, General, LinkRow, Row, Tables
+from imud.config.schema import TABLES, DeviceGeneral, General, Tables
 
 __all__ = [
     "DEVICES_MAX",
@@ -28,10 +28,7 @@ __all__ = [
     "DeviceConfig",
     "DeviceGeneral",
     "Differences",
-    "DriverRow",
     "General",
-    "LinkRow",
-    "Row",
     "Tables",
     "differences",
     "load",

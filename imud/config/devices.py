@@ -13,13 +13,13 @@ import msgspec
 from imud.attitude.conventions import RFU_ENU, Heading
 from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes, mounting_of
 from imud.config.model import DeviceConfig
-from imud.config.schema import DeviceGeneral, DriverRow, Keys, LinkRow, Tables
+from imud.config.schema import DeviceGeneral, Keys, Tables
 from imud.config.yaml import Path as KeyPath
 from imud.config.yaml import no_pause
 from imud.contracts.command import Target
-from imud.contracts.driver import CanDriver, PolledDriver
+from imud.contracts.driver import CanDriver, Driver, PolledDriver
 from imud.contracts.lines import LINE_SCHEMAS, DeviceLines, LineOptions
-from imud.contracts.link import CanUse, Claim, conflict_of
+from imud.contracts.link import CanUse, Claim, LinkType, conflict_of
 from imud.contracts.setting import SettingsTable, declared_values
 from imud.contracts.status import Deviations
 from imud.model.errors import BadArgument
@@ -44,8 +44,8 @@ class _Owned(NamedTuple):
 
 def clashes(
     devices: Sequence[DeviceConfig],
-    links: Mapping[str, LinkRow],
-    drivers: Mapping[str, DriverRow],
+    links: Mapping[str, LinkType[Any]],
+    drivers: Mapping[str, Driver],
     pause: Callable[[], None] = no_pause,
 ) -> Iterator[Clash]:
     """Return the conflicts of each device with the devices before it. imud follows symbolic links and opens no port."""
@@ -68,7 +68,7 @@ def clashes(
         pause()
 
 
-def owner_of(device: DeviceConfig, others: Sequence[DeviceConfig], links: Mapping[str, LinkRow]) -> str:
+def owner_of(device: DeviceConfig, others: Sequence[DeviceConfig], links: Mapping[str, LinkType[Any]]) -> str:
     """Return the name of a device in `others` that uses the port of `device` exclusively or cannot share it; empty if
     no device does."""
     mine = _claims(device, links)
@@ -79,7 +79,7 @@ def owner_of(device: DeviceConfig, others: Sequence[DeviceConfig], links: Mappin
     return ""
 
 
-def _claims(device: DeviceConfig, links: Mapping[str, LinkRow]) -> list[tuple[str, Claim]]:
+def _claims(device: DeviceConfig, links: Mapping[str, LinkType[Any]]) -> list[tuple[str, Claim]]:
     """Return the claims of a device, each with its part of the configuration."""
     found = [(device.link, claim) for claim in links[device.link].claims(device.link_settings)]
     if device.rmc is not None and device.rmc.port:
@@ -91,7 +91,7 @@ def _place(claim: Claim) -> str:
     return os.path.realpath(claim.place) if claim.place.startswith("/") else claim.place
 
 
-def _can_use(device: DeviceConfig, links: Mapping[str, LinkRow], drivers: Mapping[str, DriverRow]) -> CanUse | None:
+def _can_use(device: DeviceConfig, links: Mapping[str, LinkType[Any]], drivers: Mapping[str, Driver]) -> CanUse | None:
     """Return the frames that a device needs on a shared bus; None if they are unknown before the detection."""
     claims = _claims(device, links)
     if device.options is None or not claims:
@@ -118,7 +118,7 @@ def _can_clash(name: str, use: CanUse, uses: Sequence[tuple[CanUse, str]]) -> It
 class DeclaredReader:
     """Reader of the declared settings of devices. `drivers` is the registry of drivers."""
 
-    def __init__(self, keys: Keys, drivers: Mapping[str, DriverRow]) -> None:
+    def __init__(self, keys: Keys, drivers: Mapping[str, Driver]) -> None:
         self._keys = keys
         self._drivers = drivers
 
@@ -237,7 +237,7 @@ def _nested(keys: Keys, path: KeyPath, found: Mapping[str, Any]) -> dict[str, Op
 
 
 def check_declination(
-    keys: Keys, path: KeyPath, general: DeviceGeneral, options: Options | None, drivers: Mapping[str, DriverRow]
+    keys: Keys, path: KeyPath, general: DeviceGeneral, options: Options | None, drivers: Mapping[str, Driver]
 ) -> None:
     """Refuse a declination if the heading is not magnetic or the configuration does not name the driver."""
     if general.declination_deg is None:
@@ -264,7 +264,7 @@ TRIGGER: Final = "sin"
 
 
 def read_lines(
-    keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, DriverRow]
+    keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, Driver]
 ) -> DeviceLines | None:
     """Read the key `lines` of a device; None if the key is absent."""
     if "lines" not in device:
@@ -296,9 +296,7 @@ def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
             owners.append((settings, f"{device.name}.lines.{name} (line {keys.tree.key_mark(path).line})"))
 
 
-def read_rmc(
-    keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, DriverRow]
-) -> RmcOptions | None:
+def read_rmc(keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, Driver]) -> RmcOptions | None:
     """Read the key `rmc` of a device; None if the key is absent."""
     if "rmc" not in device:
         return None
@@ -321,7 +319,7 @@ def read_rmc(
     return keys.part(RmcOptions, device["rmc"], path)
 
 
-def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, drivers: Mapping[str, DriverRow]) -> None:
+def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, drivers: Mapping[str, Driver]) -> None:
     """Refuse unknown lines, and lines that devices of this driver do not have."""
     keys.unknown_keys(path, found, list(LINE_SCHEMAS))
     if driver == "auto":
@@ -340,7 +338,7 @@ def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, dr
             keys.problem((*path, name), message, at_key=True)
 
 
-def _with_lines(drivers: Mapping[str, DriverRow]) -> Iterator[str]:
+def _with_lines(drivers: Mapping[str, Driver]) -> Iterator[str]:
     for name in drivers:
         with suppress(ImportError):
             if drivers[name].lines:
@@ -360,7 +358,7 @@ def _same_line(one: LineOptions, other: LineOptions) -> bool:
     return one.line == other.line and (len(chips) == 1 or "" in chips)
 
 
-def _lines_of_driver(drivers: Mapping[str, DriverRow], driver: object) -> frozenset[str]:
+def _lines_of_driver(drivers: Mapping[str, Driver], driver: object) -> frozenset[str]:
     try:
         return drivers[driver].lines if isinstance(driver, str) and driver in drivers else frozenset({PULSE})
     except ImportError:

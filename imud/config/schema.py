@@ -4,20 +4,20 @@ A new row of a registry (DRIVERS, LINKS, PUBLISHERS) needs no change here.
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import UnionType
-from typing import Annotated, Any, Final, Literal, Protocol, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
-from imud.attitude.conventions import Convention, Heading
+from imud.attitude.conventions import Convention
 from imud.config.yaml import PROBLEMS_MAX, Problem, YamlTree
 from imud.config.yaml import Path as KeyPath
-from imud.contracts.driver import KeyProblem
-from imud.contracts.lines import DeviceLines
-from imud.contracts.link import Claim
-from imud.contracts.setting import OnDifference, SettingsTable
+from imud.contracts.driver import Driver
+from imud.contracts.link import LinkType
+from imud.contracts.publisher import PublisherType
+from imud.contracts.setting import OnDifference
 from imud.drivers import DRIVERS
 from imud.links import LINKS
 from imud.model.options import Options, disagreements, expected, got, unknown_name, value_problem
@@ -54,78 +54,16 @@ class DeviceGeneral(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """True north relative to magnetic north, east positive. imud adds it to a magnetic heading; null: no change."""
 
 
-class Row(Protocol):
-    """Row of a table, as far as the configuration needs it."""
-
-    @property
-    def settings(self) -> type[Options]:
-        """The schema of the row's keys."""
-        ...
-
-
-class DriverRow(Row, Protocol):
-    """Row of a driver, as far as the configuration needs it."""
-
-    @property
-    def lines(self) -> frozenset[str]:
-        """GPIO lines that such a device can have."""
-        ...
-
-    @property
-    def device_settings(self) -> SettingsTable | None:
-        """Settings that the device keeps itself; None for a driver that does not know them."""
-        ...
-
-    @property
-    def declared_line_differences(self) -> Callable[[Mapping[str, Any], DeviceLines], Mapping[str, str]]:
-        """Finds lines that declared settings contradict: why, by the line's key."""
-        ...
-
-    def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
-        """Return what does not work in the driver's options together with a link's settings."""
-        ...
-
-    @property
-    def heading(self) -> Callable[[Any, Mapping[str, str]], Heading]:
-        """Reference of yaw, from an instance of `settings` and the device's own settings (empty: not known yet)."""
-        ...
-
-
-class LinkRow(Row, Protocol):
-    """Row of a link, as far as the configuration needs it."""
-
-    @property
-    def searchable(self) -> bool:
-        """Whether `driver: auto` can identify the device on it."""
-        ...
-
-    @property
-    def bus_of(self) -> Callable[[Any], str]:
-        """Returns the name of the bus that settings of the link name, which devices share; empty without one."""
-        ...
-
-    @property
-    def claims(self) -> Callable[[Any], Sequence[Claim]]:
-        """What a link with these settings uses."""
-        ...
-
-    @property
-    def problem(self) -> Callable[[Any, bool], str]:
-        """Why these settings cannot be used, as far as that shows without opening a port."""
-        ...
-
-    def fits(self, driver: Any) -> bool:
-        """Whether a driver can use such a link."""
-        ...
+Row = Driver | LinkType[Any] | PublisherType
 
 
 @dataclass(frozen=True, slots=True)
 class Tables:
     """The tables that the schema is made from."""
 
-    drivers: Mapping[str, DriverRow]
-    links: Mapping[str, LinkRow]
-    publishers: Mapping[str, Row]
+    drivers: Mapping[str, Driver]
+    links: Mapping[str, LinkType[Any]]
+    publishers: Mapping[str, PublisherType]
 
 
 TABLES: Final = Tables(DRIVERS, LINKS, PUBLISHERS)

@@ -11,10 +11,10 @@ from imud.config.model import Config, differences
 from imud.config.schema import Tables
 from imud.contracts.setting import OnDifference, declared_values
 from imud.model.errors import ConfigError
-from tests.config.test_reading import FakeRow, PortSettings
+from tests.config.test_reading import PortSettings, fake_row
 from tests.support.fake_drivers import FAKE_DRIVER, FAKE_MODULE_DRIVER
 
-TABLES = Tables({"fake-module": FAKE_MODULE_DRIVER, "fake-uart": FAKE_DRIVER}, {"wire": FakeRow(PortSettings)}, {})
+TABLES = Tables({"fake-module": FAKE_MODULE_DRIVER, "fake-uart": FAKE_DRIVER}, {"wire": fake_row(PortSettings)}, {})
 HEAD = "devices:\n  bow:\n    driver: {driver}\n    wire: {{port: x, baud: {baud}}}\n"
 
 

@@ -90,10 +90,15 @@ class FakeRow:
         return driver.settings is not self.refuses
 
 
-class Broken(Mapping[str, FakeRow]):
+def fake_row(*args: Any, **kwargs: Any) -> Any:
+    """Return a `FakeRow`, typed as the row of any table."""
+    return FakeRow(*args, **kwargs)
+
+
+class Broken(Mapping[str, Any]):
     """A table with a row whose library is not installed."""
 
-    def __getitem__(self, name: str) -> FakeRow:
+    def __getitem__(self, name: str) -> Any:
         raise ModuleNotFoundError(f"No module named {name!r}")
 
     def __iter__(self) -> Iterator[str]:
@@ -104,12 +109,12 @@ class Broken(Mapping[str, FakeRow]):
 
 
 FAKE = Tables(
-    drivers={"acme-uart": FakeRow(DriverSettings), "plain-uart": FakeRow(NoOptions)},
+    drivers={"acme-uart": fake_row(DriverSettings), "plain-uart": fake_row(NoOptions)},
     links={
-        "port": FakeRow(PortSettings, claims=lambda port: [Claim(place=port.port, key="port")]),
-        "file": FakeRow(FileSettings),
+        "port": fake_row(PortSettings, claims=lambda port: [Claim(place=port.port, key="port")]),
+        "file": fake_row(FileSettings),
     },
-    publishers={"out": FakeRow(OutSettings), "none": FakeRow(NoOptions)},
+    publishers={"out": fake_row(OutSettings), "none": fake_row(NoOptions)},
 )
 GOOD = """\
 log_level: debug
@@ -431,7 +436,7 @@ def test_loading_opens_only_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("part", ["link", "options"])
 def test_what_a_driver_says_of_options_and_link_stands_at_their_keys(part: str) -> None:
-    row = FakeRow(DriverSettings, faults=(KeyProblem(part, "range_g" if part == "options" else "baud", "too much"),))
+    row = fake_row(DriverSettings, faults=(KeyProblem(part, "range_g" if part == "options" else "baud", "too much"),))
     tables = Tables({"acme-uart": row}, FAKE.links, FAKE.publishers)
     text = "devices:\n  a:\n    driver: acme-uart\n    options: {range_g: 4}\n    port: {port: x, baud: 9600}\n"
     place = {"link": "5:27: devices.a.port.baud", "options": "4:24: devices.a.options.range_g"}[part]
@@ -486,7 +491,7 @@ def test_what_a_device_and_a_bus_can_do_is_accepted(devices: list[str], driver: 
 
 
 def test_a_link_on_which_nothing_is_searched_needs_a_driver() -> None:
-    tables = Tables(FAKE.drivers, {"port": FakeRow(PortSettings, searchable=False)}, FAKE.publishers)
+    tables = Tables(FAKE.drivers, {"port": fake_row(PortSettings, searchable=False)}, FAKE.publishers)
     (line,) = errors("devices:\n  a: {port: {port: x}}", tables)
     assert "expected a driver to be named for port (acme-uart, plain-uart), got auto" in line
 
