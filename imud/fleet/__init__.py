@@ -1,5 +1,17 @@
-"""Readers of a fleet: what gateways send over MQTT, with a ledger across the network. Reference: docs/fleet.md."""
+"""Readers of a fleet: samples that gateways send over MQTT, with a ledger of each stream. Reference: docs/fleet.md."""
 
-from imud.fleet.reader import Fleet, FleetBatch, FleetSession, ReaderAccess
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from imud.fleet.reader import Fleet, FleetBatch, FleetSession, ReaderAccess
 
 __all__ = ["Fleet", "FleetBatch", "FleetSession", "ReaderAccess"]
+
+
+def __getattr__(name: str) -> Any:
+    # The daemon imports this package for the output `mqtt` and does not need the reader.
+    if name in __all__:
+        from imud.fleet import reader
+
+        return getattr(reader, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -34,6 +34,8 @@ REFUSED: Final = 0x80
 """Reason codes of MQTT 5 from here on are refusals (section 2.4)."""
 PEM_BYTES: Final = 4 << 20
 """Of a file of certificates: Debian's with all authorities has 0.2 MB."""
+MQTT_5: Final = 5
+"""Value of `MQTTv5` of paho-mqtt, the version of the protocol in CONNECT (MQTT 5.0, section 3.1.2.2)."""
 PASSWORD_BYTES: Final = 65_535
 """Of a password (MQTT 5.0, section 3.1.3.6)."""
 
@@ -71,13 +73,18 @@ class BrokerAccess(Protocol):
         ...
 
 
+CALLBACKS: Final = ("on_connect", "on_disconnect", "on_message", "on_publish", "on_subscribe")
+"""Names of the callbacks of paho-mqtt. An owner of a client has a method `_on_connect`, …, if it needs one."""
+
+
 def paho_client(
-    broker: Broker, access: BrokerAccess, client_id: str, *, is_v5: bool, keeps_session: bool = False,
+    broker: Broker, access: BrokerAccess, client_id: str, owner: object = None, *, is_v5: bool, session_s: int = 0,
     manual_ack: bool = False,
 ) -> Any:  # fmt: skip
-    """A client of paho-mqtt that has not connected yet. Raises ValueError for files, which names them.
+    """Return a client of paho-mqtt without a connection. It calls the methods of `owner` that CALLBACKS names.
 
-    `keeps_session` is for MQTT 3.1.1; with 5 the connection says it.
+    The broker keeps the session for `session_s` after the connection ended. With MQTT 3.1.1 the broker decides how
+    long. Raises ValueError, which names the key and the file, if a file of `access` cannot be used.
     """
     from paho.mqtt import client as paho
     from paho.mqtt.enums import CallbackAPIVersion
@@ -85,7 +92,7 @@ def paho_client(
     client = paho.Client(
         CallbackAPIVersion.VERSION2,
         client_id,
-        clean_session=None if is_v5 else not keeps_session,
+        clean_session=None if is_v5 else not session_s,
         protocol=paho.MQTTv5 if is_v5 else paho.MQTTv311,
         transport="websockets" if broker.websockets else "tcp",
         reconnect_on_failure=False,
@@ -98,7 +105,35 @@ def paho_client(
         client.tls_set_context(_tls_context(access))
     if access.user:
         client.username_pw_set(access.user, _password(access.password_file))
+    for name in CALLBACKS:
+        setattr(client, name, getattr(owner, f"_{name}", None))
     return client
+
+
+def open_client(
+    client: Any, broker: Broker, keep_alive_s: int, receive_max: int, packet_bytes: int, session_s: int = 0
+) -> None:
+    """Connect a client of `paho_client` and send CONNECT. Raises OSError or ValueError.
+
+    With MQTT 5 the broker sends at most `receive_max` messages without an acknowledgement, and no packet longer than
+    `packet_bytes`.
+    """
+    if client.protocol != MQTT_5:
+        client.connect(broker.host, broker.port, keep_alive_s)
+        return
+    bounds = properties_of("CONNECT", ReceiveMaximum=receive_max, MaximumPacketSize=packet_bytes)
+    if session_s:
+        bounds.SessionExpiryInterval = session_s
+    client.connect(broker.host, broker.port, keep_alive_s, clean_start=not session_s, properties=bounds)
+
+
+def close_client(client: Any) -> None:
+    """Send DISCONNECT and close the socket. Do nothing if the connection is already lost."""
+    with suppress(OSError, ValueError):
+        client.disconnect()
+        # paho-mqtt keeps the socket open if DISCONNECT waits behind unsent data
+        if (sock := client.socket()) is not None:
+            sock.close()
 
 
 def properties_of(packet: str, **values: object) -> Any:
@@ -242,14 +277,11 @@ class BrokerConnection(Protocol):
         ...
 
 
-class Connect(Protocol):
-    """Function that connects to a broker."""
+Connect = Callable[[Broker, MqttOptions, str, Will, Callable[[], bool]], BrokerConnection]
+"""Function that returns a connection which the broker has accepted, for the arguments of `PahoConnection`.
 
-    def __call__(
-        self, broker: Broker, settings: MqttOptions, client_id: str, will: Will, is_wanted: Callable[[], bool], /
-    ) -> BrokerConnection:
-        """Return a connection that the broker has accepted. Raises BrokerError, also once `is_wanted` returns False."""
-        ...
+Raises BrokerError if the broker cannot be used, or if the last argument returned False.
+"""
 
 
 def check_extra() -> None:
@@ -280,15 +312,15 @@ class PahoConnection:
         self._problem = ""
         self._topics: dict[int, str] = {}
         self._packet_bytes = PACKET_BYTES_MOST
+        self._client: Any = None
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._bell_lock = threading.Lock()
         """Held while the bell is rung: it is closed by another thread, and its number may then be another file's."""
         try:
-            self._client = self._made(settings, client_id, will)
+            self._client = paho_client(broker, settings, client_id, self, is_v5=self._is_v5)
+            self._client.will_set(will.topic, will.payload, qos=1, retain=True)
             self._client.on_socket_open = lambda *_: self._check_wanted(is_wanted)
-            self._client.connect(
-                broker.host, broker.port, keepalive=settings.keep_alive_s, properties=self._connect_properties()
-            )
+            open_client(self._client, broker, settings.keep_alive_s, IN_FLIGHT_MAX, PACKET_BYTES)
             self._wait_for_answer(is_wanted)
         except BrokerError as error:
             self.close()
@@ -296,17 +328,6 @@ class PahoConnection:
         except (OSError, ValueError) as error:
             self.close()
             raise BrokerError(f"{broker.name}: {connection_problem(error)}") from error
-
-    def _made(self, settings: MqttOptions, client_id: str, will: Will) -> Any:
-        """A client of paho-mqtt with everything but a connection. Raises OSError for files, ValueError."""
-        client = paho_client(self._broker, settings, client_id, is_v5=self._is_v5)
-        client.will_set(will.topic, will.payload, qos=1, retain=True)
-        client.on_connect = self._on_connect
-        client.on_publish = self._on_publish
-        client.on_disconnect = self._on_disconnect
-        client.on_message = self._on_message
-        client.on_subscribe = self._on_subscribe
-        return client
 
     def _wait_for_answer(self, is_wanted: Callable[[], bool]) -> None:
         """Raises BrokerError for a refusal, without an answer, and where it is not wanted any more."""
@@ -325,14 +346,6 @@ class PahoConnection:
     def _check_wanted(self, is_wanted: Callable[[], bool]) -> None:
         if not is_wanted():
             raise BrokerError("the output ends")
-
-    def _connect_properties(self) -> Any:
-        """How much the broker may send at once; None with MQTT 3.1.1."""
-        return (
-            properties_of("CONNECT", MaximumPacketSize=PACKET_BYTES, ReceiveMaximum=IN_FLIGHT_MAX)
-            if self._is_v5
-            else None
-        )
 
     # --- as a connection ---------------------------------------------------------------------------------------------
 
@@ -383,13 +396,8 @@ class PahoConnection:
             if self._closed:
                 return
             self._closed = True
-        client = getattr(self, "_client", None)
-        if client is not None:
-            with suppress(OSError, ValueError):  # it is gone already
-                client.disconnect()
-                sock = client.socket()
-                if sock is not None:  # what the farewell would follow was not sent: nothing is read at the other end
-                    sock.close()
+        if self._client is not None:
+            close_client(self._client)
         os.close(self._bell)
 
     # --- the socket --------------------------------------------------------------------------------------------------

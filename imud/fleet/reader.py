@@ -42,9 +42,10 @@ from imud.fleet.broker import (
     BrokerError,
     BrokerTurn,
     check_extra,
+    close_client,
     connection_problem,
+    open_client,
     paho_client,
-    properties_of,
 )
 from imud.fleet.messages import ROOT, STATE, FleetMessage, Stream, TopicParts, decode_message, is_name, parse_topic
 from imud.fleet.settings import Broker, broker_of
@@ -133,14 +134,10 @@ class ReaderConnection:
         return self
 
     async def _connect(self, access: BrokerAccess, client_id: str, session_s: int, *, is_v5: bool) -> None:
-        client = paho_client(self._broker, access, client_id, is_v5=is_v5, keeps_session=session_s > 0, manual_ack=True)
+        client = paho_client(self._broker, access, client_id, self, is_v5=is_v5, session_s=session_s, manual_ack=True)
         client.max_inflight_messages_set(RECEIVE_MAX)
-        client.on_connect, client.on_subscribe = self._on_connect, self._on_subscribe
-        client.on_message, client.on_disconnect = self._on_message, self._on_disconnect
         self._client = client
-        await asyncio.to_thread(
-            client.connect, self._broker.host, self._broker.port, KEEP_ALIVE_S, **(_of_v5(session_s) if is_v5 else {})
-        )
+        await asyncio.to_thread(open_client, client, self._broker, KEEP_ALIVE_S, RECEIVE_MAX, PACKET_BYTES, session_s)
         self._socket = client.socket()
         if self._socket is None:
             raise BrokerError(f"{self._broker.name}: {LOST}")
@@ -183,11 +180,7 @@ class ReaderConnection:
                 timer.cancel()
         self._forget_socket()
         if client is not None:
-            with suppress(OSError, ValueError):  # it is gone already
-                client.disconnect()
-                sock = client.socket()
-                if sock is not None:
-                    sock.close()
+            close_client(client)
 
     # --- the socket --------------------------------------------------------------------------------------------------
 
@@ -314,14 +307,6 @@ class ReaderConnection:
     def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: Any, _properties: Any) -> None:
         if flags.is_disconnect_packet_from_server:
             self._problem = self._problem or f"the broker ended the connection: {reason}"
-
-
-def _of_v5(session_s: int) -> dict[str, Any]:
-    """What a connection says of its session and its room with MQTT 5."""
-    properties = properties_of(
-        "CONNECT", SessionExpiryInterval=session_s, ReceiveMaximum=RECEIVE_MAX, MaximumPacketSize=PACKET_BYTES
-    )
-    return {"clean_start": session_s == 0, "properties": properties}
 
 
 log = logging.getLogger(__name__)

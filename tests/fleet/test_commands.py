@@ -12,7 +12,6 @@ from typing import Any
 import msgspec
 import pytest
 
-from imud.contracts.publisher import PublisherContext
 from imud.fleet.broker import Received
 from imud.fleet.commands import ANSWERS_KEPT, WAITING_MAX, CommandChannel, CommandReply
 from imud.fleet.messages import REQUEST_BYTES, CommandAnswer, Outcome, answer_topic
@@ -27,6 +26,7 @@ from imud.model.units import NS_PER_S
 from tests.fleet.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
 from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock, in_loop
+from tests.support.publisher_context import publisher_context
 
 UTC_NS = 1_800_000_000 * NS_PER_S
 DOCS = Path(__file__).parents[2] / "docs" / "fleet.md"
@@ -380,7 +380,7 @@ class Loop:
             },
             MqttOptions,
         )  # fmt: skip
-        context = PublisherContext(
+        context = publisher_context(
             list, 7, host.now_ns, utc_offset_ns=host.utc_offset_ns, control=lambda _name: device  # type: ignore[arg-type,return-value]  # what the channel uses of it
         )  # fmt: skip
         self.output = MqttPublisher(settings, context)
