@@ -13,10 +13,11 @@ from typing import Final, Protocol
 from imud.cli.arguments import CliCommand, duration_s
 from imud.cli.output import complain, table
 from imud.fleet.accounts import GatewayState, StreamAccount, StreamKey
+from imud.fleet.broker import ReaderAccess
 from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, FleetStore, JsonLines, Selection
 from imud.fleet.messages import GatewayClock, Stream
 from imud.fleet.postgres import PostgresStore
-from imud.fleet.reader import VERSIONS, Fleet, FleetBatch, ReaderAccess
+from imud.fleet.reader import VERSIONS, Fleet, FleetBatch
 from imud.host.threads import rare_garbage_collection
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US

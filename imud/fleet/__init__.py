@@ -3,7 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from imud.fleet.reader import Fleet, FleetBatch, FleetSession, ReaderAccess
+    from imud.fleet.broker import ReaderAccess
+    from imud.fleet.reader import Fleet, FleetBatch, FleetSession
 
 __all__ = ["Fleet", "FleetBatch", "FleetSession", "ReaderAccess"]
 

@@ -1,9 +1,9 @@
-"""The ledger of a reader: every number of every stream is whole, thinned, dropped by the gateway, or missing.
+"""Ledger of a reader: each number of a stream is whole, thinned, dropped by the gateway, or missing.
 
-    whole + thinned + dropped + missing = newest - begin + 1        duplicates are counted beside it
+    whole + thinned + dropped + missing = newest - begin + 1        (duplicates are a separate counter)
 
-Numbers of a stream come in order. A message may come again, as a whole or with others (a note of what was dropped can
-cover numbers whose message had come though its acknowledgement was lost): what is known already is a duplicate.
+The numbers of a stream arrive in order. A gateway can send a message again, alone or as part of a message with the kind
+`dropped`, if it did not receive the acknowledgement. Numbers that the ledger already contains count as duplicates.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from imud.fleet.messages import (
+    CLOCK_SET_NS,
     FleetMessage,
     GatewayClock,
     MessageKind,
@@ -21,16 +22,15 @@ from imud.fleet.messages import (
     checked_json,
     clock_numbers,
 )
-from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.model.units import NS_PER_MS
 
-RANGES_MAX: Final = 1000
-"""Ranges of missing numbers that are kept, to be filled; older ones stay missing."""
+RANGES_MAX: Final = 1000  # Maximum number of stored gaps per stream. Numbers of older gaps stay missing.
 STREAMS_MAX: Final = 100_000
-"""Streams of all gateways and boots; beyond it a reader raises instead of growing without end."""
+"""Maximum number of streams of all gateways and boots. A reader with more streams raises an error."""
 
 
 class StreamKey(NamedTuple):
-    """What the numbers of a stream count in."""
+    """Key of a stream. Sequence numbers are unique within a stream."""
 
     gateway: str
     boot: str
@@ -39,62 +39,56 @@ class StreamKey(NamedTuple):
 
 
 def key_of(message: FleetMessage, stream: Stream) -> StreamKey:
-    """What the numbers of a message count in."""
+    """Return the key of the stream of a message."""
     return StreamKey(message.gateway, message.boot, message.device, stream.value)
 
 
 class StreamCounts(msgspec.Struct):
-    """The account of one stream, in numbers: samples by `seq`, or events."""
+    """Ledger of one stream, in numbers: `seq` of samples, or number of events."""
 
     begin: int
-    newest: int
-    """The highest number that any message covered."""
-    whole: int = 0
-    """Came as they were; of the stream `statistics`: came in intervals as declared."""
-    thinned: int = 0
-    """Came as statistics because the spool had no room for more."""
+    newest: int  # highest number that a message covered
+    whole: int = 0  # numbers of complete samples; in the stream `statistics`, numbers of declared intervals
+    thinned: int = 0  # numbers that arrived as statistics because the spool was full
     dropped: dict[str, int] = {}  # msgspec copies a mutable default
-    """Dropped by the gateway, by cause."""
-    missing: int = 0
-    """No message has covered them."""
-    duplicates: int = 0
-    """Came again."""
+    """Numbers that the gateway dropped, by cause."""
+    missing: int = 0  # numbers that no message covers
+    duplicates: int = 0  # numbers that arrived again
 
     @property
     def balance(self) -> int:
-        """0: the account closes."""
+        """Return the difference of both sides of the equation; 0 if the ledger balances."""
         covered = self.whole + self.thinned + sum(self.dropped.values()) + self.missing
         return self.newest - self.begin + 1 - covered
 
 
 class StoredAccount(msgspec.Struct, frozen=True):
-    """The account of one stream as it is kept: a reader that was restarted goes on with it."""
+    """Ledger of one stream as a store keeps it. A reader continues with it after a restart."""
 
     counts: StreamCounts
-    gaps: list[tuple[int, int]]
-    """First and last of each range that is missing and may still come."""
+    gaps: list[tuple[int, int]]  # first and last number of each gap that a later message can fill
 
 
-Accounts = Mapping[StreamKey, StoredAccount]
-"""Accounts as they are kept, by stream."""
+Accounts = Mapping[StreamKey, StoredAccount]  # stored ledgers by stream
 
 
 class _Account:
-    """The account of one stream, with the ranges that are missing."""
+    """Ledger of one stream with its gaps."""
 
     def __init__(self, counts: StreamCounts, gaps: Sequence[tuple[int, int]] = ()) -> None:
         self.counts = counts
         self._gaps = list(gaps)
 
     def stored(self) -> StoredAccount:
-        """A copy that does not change any more."""
+        """Return a copy of the present state."""
         return StoredAccount(msgspec.structs.replace(self.counts, dropped=dict(self.counts.dropped)), list(self._gaps))
 
     def take(self, message: FleetMessage, stream: Stream) -> list[tuple[int, int]]:
-        """Enter a message; return the ranges of numbers that are new."""
+        """Add a message. Return the ranges of new numbers."""
         counts = self.counts
         fresh = self._filled(message.first, min(message.last, counts.newest))
         if message.last > counts.newest:
+            # a gap before the message
             first = max(message.first, counts.newest + 1)
             if first > counts.newest + 1:
                 self._gaps.append((counts.newest + 1, first - 1))
@@ -103,6 +97,7 @@ class _Account:
             fresh.append((first, message.last))
             counts.newest = message.last
         number = sum([last - first + 1 for first, last in fresh])
+        # the part that is not new
         counts.duplicates += message.last - message.first + 1 - number
         if message.kind is MessageKind.DROPPED:
             cause = message.cause.value if message.cause is not None else "unknown"
@@ -114,7 +109,7 @@ class _Account:
         return fresh
 
     def _filled(self, first: int, last: int) -> list[tuple[int, int]]:
-        """Take what is in a range out of what is missing; return it."""
+        """Remove a range from the gaps. Return the removed parts."""
         found, left = [], []
         for begin, end in self._gaps:
             low, high = max(begin, first), min(end, last)
@@ -129,32 +124,34 @@ class _Account:
 
 
 class FleetLedger:
-    """The accounts of all streams that a reader sees. Synchronization: one thread."""
+    """Ledgers of all streams of a reader. Synchronization: one thread."""
 
     def __init__(self, *, from_begin: bool = False) -> None:
-        """`from_begin`: numbers before the first message that comes are missing; without, the account begins there."""
+        """Create an empty ledger. With `from_begin`, numbers before the first received message count as missing."""
         self._from_begin = from_begin
         self._accounts: dict[StreamKey, _Account] = {}
 
     @property
     def counts(self) -> Mapping[StreamKey, StreamCounts]:
-        """The account of each stream."""
+        """Return the counters of each stream."""
         return {key: account.counts for key, account in self._accounts.items()}
 
     def stored(self, key: StreamKey) -> StoredAccount:
-        """The account of a stream, to be kept. Raises KeyError for one of which nothing came."""
+        """Return the ledger of a stream for a store. Raises KeyError if no message of the stream arrived."""
         return self._accounts[key].stored()
 
     def restore(self, key: StreamKey, account: StoredAccount) -> None:
-        """Go on with an account that was kept. Raises OverflowError beyond STREAMS_MAX streams."""
+        """Continue with a stored ledger. Raises OverflowError if there are more than STREAMS_MAX streams."""
         if key not in self._accounts and len(self._accounts) >= STREAMS_MAX:
             raise OverflowError(f"expected at most {STREAMS_MAX} streams, got one more: {key}")
         self._accounts[key] = _Account(account.counts, account.gaps)
 
     def take(self, message: FleetMessage, stream: Stream) -> FleetMessage | None:
-        """Enter a message; return what of it is new, None for nothing. Raises OverflowError beyond STREAMS_MAX streams.
+        """Add a message.
 
-        Statistics that are partly new are returned as they are.
+        Return its new part, or None if all of it is a duplicate. Raises OverflowError at STREAMS_MAX streams.
+
+        If only a part of a message with statistics is new, return the complete message.
         """
         key = key_of(message, stream)
         account = self._accounts.get(key)
@@ -173,11 +170,11 @@ class FleetLedger:
 
 
 POSITIONS_MAX: Final = 100_000
-"""Streams of which a state may have spoken; beyond it a reader raises instead of growing without end."""
+"""Maximum number of streams in the states of all gateways. A reader with more streams raises an error."""
 
 
 class StreamPosition(msgspec.Struct, frozen=True):
-    """How far a stream of a boot has come into the spool of its gateway."""
+    """Newest number of a stream of one boot that reached the spool of its gateway."""
 
     boot: str
     device: str
@@ -187,56 +184,52 @@ class StreamPosition(msgspec.Struct, frozen=True):
 
 
 class GatewayState(msgspec.Struct, frozen=True, kw_only=True):
-    """What is retained of a gateway: birth, death or last will."""
+    """Retained state of a gateway: birth, death or last will."""
 
     v: int
     online: bool
     boot: str
-    imud: str = ""
-    """Version."""
-    reason: str = ""
-    """Why it is not online."""
+    imud: str = ""  # version of imud
+    reason: str = ""  # reason of an offline gateway
     devices: list[str] = []  # msgspec copies a mutable default
     positions: list[StreamPosition] = []
-    clock: GatewayClock | None = None
-    """Its wall clock; None of one that is not online, or of a version that did not say."""
-    mqtt: dict[str, object] = {}
-    """Counters of the output, as `imud status --json` has them."""
+    clock: GatewayClock | None = None  # wall clock; None if the gateway is offline or its version does not send it
+    mqtt: dict[str, object] = {}  # counters of the output `mqtt`, as in `imud status --json`
 
 
 class StreamAccount(msgspec.Struct, frozen=True):
-    """The account of one stream between gateway and reader, in numbers: samples by `seq`, or events."""
+    """Ledger of one stream between gateway and reader, in numbers: `seq` of samples, or number of events."""
 
-    sent: int
-    """Numbered by the gateway since `begin` of the reader's account."""
-    in_spool: int
-    """Of these, not sent yet or on the way."""
+    sent: int  # numbers that the gateway assigned since `begin` of the reader's ledger
+    in_spool: int  # numbers in the spool or on the way to the reader
     counts: StreamCounts
 
     @property
     def received(self) -> int:
-        """Came as they were, or as statistics in their place."""
+        """Return the numbers that arrived as complete samples or as statistics."""
         return self.counts.whole + self.counts.thinned
 
     @property
     def balance(self) -> int:
-        """0: the account closes."""
+        """Return the difference of both sides of the equation; 0 if the ledger balances."""
         gaps = sum(self.counts.dropped.values()) + self.counts.missing
         return self.sent - self.received - gaps - self.in_spool
 
 
 class SpoolPositions:
-    """What gateways said last of their streams. Synchronization: one thread."""
+    """Newest stream positions of all gateways. Synchronization: one thread."""
 
     def __init__(self, *, from_begin: bool = False) -> None:
-        """`from_begin`: what a stream had when a state first spoke of it is to come, too; else it is not counted."""
+        """Create an empty table.
+
+        With `from_begin`, numbers before the first state of a stream count as not yet received.
+        """
         self._from_begin = from_begin
         self._positions: dict[StreamKey, StreamPosition] = {}
-        self._begins: dict[StreamKey, int] = {}
-        """Where the account of a stream begins as long as nothing of it has come."""
+        self._begins: dict[StreamKey, int] = {}  # first number of the ledger of each stream without a message
 
     def take(self, gateway: str, state: GatewayState) -> None:
-        """Note what a state says. Raises OverflowError beyond POSITIONS_MAX streams."""
+        """Store the positions of a state. Raises OverflowError if there are more than POSITIONS_MAX streams."""
         for one in state.positions:
             key = StreamKey(gateway, one.boot, one.device, one.stream)
             known = self._positions.get(key)
@@ -248,12 +241,13 @@ class SpoolPositions:
                 self._positions[key] = one
 
     def accounts(self, ledger: FleetLedger) -> Mapping[StreamKey, StreamAccount]:
-        """The account of every stream that a message or a state has named."""
+        """Return the ledger of each stream that appeared in a message or a state."""
         counts = dict(ledger.counts)
         for key, begin in self._begins.items():
             counts.setdefault(key, StreamCounts(begin, begin - 1))
         found = {}
         for key, count in counts.items():
+            # the gateway sends its state less often than messages: a message can have a higher number
             position = self._positions.get(key)
             last = count.newest if position is None else max(position.last, count.newest)
             found[key] = StreamAccount(last - count.begin + 1, last - count.newest, count)
@@ -264,7 +258,7 @@ _STATE: Final = msgspec.json.Decoder(GatewayState)
 
 
 def decode_state(payload: bytes) -> GatewayState:
-    """The state in a payload. Raises ValueError for anything else."""
+    """Return the state of a payload. Raises ValueError if the payload is invalid."""
     try:
         state = _STATE.decode(checked_json(payload))
     except (msgspec.DecodeError, RecursionError) as error:
@@ -277,58 +271,50 @@ def decode_state(payload: bytes) -> GatewayState:
     return state
 
 
-CLOCK_SET_NS: Final = 1_577_836_800 * NS_PER_S
-"""2020: of a message that does not speak of the clock, because it was made by an earlier version, a `utc_ns` before it
-is of a clock that is not set."""
 STEP_NS: Final = NS_PER_MS
-"""A `utc_ns` that is further from the offset in its message was made before the clock was stepped: offsets are read
-within microseconds."""
+"""Maximum deviation of `utc_ns` from the clock in its message, ns. A larger deviation means a step of the clock after
+the sample. The gateway reads the clock within microseconds."""
 DRIFT: Final = 2000
-"""500 ppm: the kernel's own bound of how far a clock that nothing keeps is off in frequency (adjtimex(2))."""
+"""Divisor for the drift, 500 ppm: maximum frequency error that the kernel assumes for an unsynchronized clock
+(adjtimex(2))."""
 BOOTS_MAX: Final = 100_000
-"""Boots whose offset is kept; the oldest go first. As many as there may be streams."""
+"""Maximum number of boots with a stored offset, equal to STREAMS_MAX. imud removes the oldest."""
 
 
 class BootKey(NamedTuple):
-    """A start of the daemon of a gateway."""
+    """Key of one start of a gateway's daemon."""
 
     gateway: str
-    boot: str
-    """Without the number of a device that was made anew."""
+    boot: str  # boot without the suffix `-N` of a device that restarted its counter
 
 
 class BootOffset(NamedTuple):
-    """The wall clock of a boot, from a moment at which it was synchronised."""
+    """Offset of the wall clock of a boot at a moment with a synchronized clock."""
 
-    t_ns: int
-    """CLOCK_MONOTONIC of that moment."""
-    utc_offset_ns: int
-    """CLOCK_REALTIME less CLOCK_MONOTONIC."""
-    utc_err_ns: int | None
-    """One-sigma error of it; None where the gateway does not say."""
+    t_ns: int  # CLOCK_MONOTONIC of the reading
+    utc_offset_ns: int  # CLOCK_REALTIME minus CLOCK_MONOTONIC
+    utc_err_ns: int | None  # One-sigma error of the offset; None if the gateway does not send it
 
     def error_at(self, t_ns: int) -> int | None:
-        """The error of a time that is placed by it."""
+        """Return the one-sigma error of the UTC time at `t_ns`."""
         return None if self.utc_err_ns is None else self.utc_err_ns + abs(t_ns - self.t_ns) // DRIFT
 
 
 class PlacedTime(NamedTuple):
-    """Where a record lies on UTC."""
+    """UTC time of a record."""
 
     utc_ns: int
-    is_set: bool
-    """Whether that is so; otherwise it is only what a clock said that nothing had set."""
-    error_ns: int | None
-    """One-sigma error of the clock; None where it is not known."""
+    is_set: bool  # False if the clock of the gateway was not set. Then `utc_ns` is only the value of that clock.
+    error_ns: int | None  # One-sigma error of the clock; None if it is unknown
 
 
 def boot_of(message: FleetMessage) -> BootKey:
-    """The boot of a message."""
+    """Return the boot of a message."""
     return BootKey(message.gateway, message.boot.partition("-")[0])
 
 
 def offset_of(message: FleetMessage) -> BootOffset | None:
-    """What a message says of the wall clock of its boot; None while the clock is not set."""
+    """Return the clock offset in a message; None if the clock is not set."""
     if message.clock is not None:
         return _offset(message.clock)
     pairs = [(one.t_ns, one.utc_ns) for one in message.samples[-1:]]
@@ -340,13 +326,14 @@ def offset_of(message: FleetMessage) -> BootOffset | None:
 
 
 def placed(utc_ns: int, t_ns: int | None, clock: GatewayClock | None, known: BootOffset | None) -> PlacedTime:
-    """Where a record of a message lies. `clock` is that of the message, `known` what is known of the boot now.
+    """Return the UTC time of a record. `clock` is the clock of its message, `known` the newest offset of its boot.
 
-    `t_ns` is None where the message does not say it.
+    `t_ns` is None if the message does not contain it.
     """
     if clock is None and utc_ns >= CLOCK_SET_NS:
         return PlacedTime(utc_ns, True, None)
     if clock is not None and clock.synchronised:
+        # the clock stepped between the sample and the message: use the offset of the message
         if t_ns is not None and abs(utc_ns - t_ns - clock.utc_offset_ns) > STEP_NS:
             utc_ns = t_ns + clock.utc_offset_ns
         return PlacedTime(utc_ns, True, clock.error_ns)
@@ -356,7 +343,7 @@ def placed(utc_ns: int, t_ns: int | None, clock: GatewayClock | None, known: Boo
 
 
 class BootClocks:
-    """What is known of the wall clocks of all boots. Synchronization: one thread."""
+    """Clock offsets of all boots. Synchronization: one thread."""
 
     def __init__(self) -> None:
         self._known: dict[BootKey, BootOffset] = {}
@@ -364,22 +351,22 @@ class BootClocks:
 
     @property
     def offsets(self) -> Mapping[BootKey, BootOffset]:
-        """The newest offset of each boot whose clock was synchronised."""
+        """Return the newest offset of each boot whose clock was synchronized."""
         return self._known
 
     def take(self, message: FleetMessage) -> BootOffset | None:
-        """Note what a message says; return what is known of its boot."""
+        """Store the clock offset of a message. Return the newest offset of its boot."""
         key = boot_of(message)
         self._note(key, offset_of(message))
         return self._known.get(key)
 
     def take_state(self, gateway: str, state: GatewayState) -> None:
-        """Note what a state says."""
+        """Store the clock offset of a state."""
         if state.clock is not None:
             self._note(BootKey(gateway, state.boot), _offset(state.clock))
 
     def take_fresh(self) -> Mapping[BootKey, BootOffset]:
-        """Offsets of boots of which none was known the last time."""
+        """Return the first offsets of boots since the last call."""
         fresh, self._fresh = self._fresh, {}
         return fresh
 
@@ -388,6 +375,7 @@ class BootClocks:
             return
         if key not in self._known:
             self._fresh[key] = offset
+            # a dict iterates in insertion order: the first key is the oldest
             while len(self._known) >= BOOTS_MAX:
                 oldest = next(iter(self._known))
                 del self._known[oldest]

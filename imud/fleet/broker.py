@@ -1,7 +1,7 @@
-"""One connection to a broker, by paho-mqtt, without a thread of its own: the sender's thread waits on its socket.
+"""Connection to one MQTT broker with paho-mqtt. The thread of the sender waits on the socket.
 
-A connection is used once: after a loss a new one is made, which begins without any state of the old one. What the old
-one had sent without an answer is in the spool and is sent again.
+After a lost connection, imud makes a new object without old state. The spool contains the messages without an
+acknowledgement, and the sender sends them again.
 """
 
 import importlib
@@ -15,6 +15,8 @@ from pathlib import Path
 from random import random
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
+import msgspec
+
 from imud.fleet.settings import Broker, MqttOptions
 from imud.host.files import read_regular
 from imud.model.errors import ServerError, reason_of
@@ -23,68 +25,47 @@ from imud.model.units import NS_PER_S
 if TYPE_CHECKING:
     import ssl
 
-CONNECT_S: Final = 4.0
-"""TCP, TLS and the broker's answer take so long each at most; satellite links take 2 s."""
+CONNECT_S: Final = 4.0  # Time limit for each of TCP, TLS and CONNACK, s. Satellite links take 2 s.
 LOST: Final = "the connection was lost"
 UNANSWERED: Final = (
-    "the broker ended the connection without an answer: look at its log, and whether its port expects TLS and a "
-    "certificate of the client"
+    "the broker closed the connection without a reply; check the log of the broker, and whether the port requires TLS "
+    "or a client certificate"
 )
-REFUSED: Final = 0x80
-"""Reason codes of MQTT 5 from here on are refusals (section 2.4)."""
+REFUSED: Final = 0x80  # lowest reason code of a refusal (MQTT 5.0, section 2.4)
 PEM_BYTES: Final = 4 << 20
-"""Of a file of certificates: Debian's with all authorities has 0.2 MB."""
-MQTT_5: Final = 5
-"""Value of `MQTTv5` of paho-mqtt, the version of the protocol in CONNECT (MQTT 5.0, section 3.1.2.2)."""
-PASSWORD_BYTES: Final = 65_535
-"""Of a password (MQTT 5.0, section 3.1.3.6)."""
+"""Maximum length of a file of certificates, bytes. The file with all authorities of Debian has 0.2 MB."""
+MQTT_5: Final = 5  # value of `MQTTv5` in paho-mqtt: protocol version in CONNECT (MQTT 5.0, section 3.1.2.2)
+PASSWORD_BYTES: Final = 65_535  # maximum length of a password, bytes (MQTT 5.0, section 3.1.3.6)
 
 
 class BrokerError(Exception):
-    """A broker cannot be reached, or ended the connection. Example: connection refused."""
+    """Cannot connect to a broker, or the broker ended the connection. Example: connection refused."""
 
 
-class BrokerAccess(Protocol):
-    """Who connects, and which certificates count; `MqttOptions` has all of it."""
+class ReaderAccess(msgspec.Struct, frozen=True):
+    """User and certificates of a reader. The keys of `mqtt` with the same names describe the fields."""
 
-    @property
-    def user(self) -> str:
-        """Name for the broker; empty for none."""
-        ...
+    user: str = ""
+    password_file: str | None = None
+    ca_file: str | None = None
+    cert_file: str | None = None
+    key_file: str | None = None
 
-    @property
-    def password_file(self) -> str | None:
-        """File that has the password in its first line; None for none."""
-        ...
 
-    @property
-    def ca_file(self) -> str | None:
-        """Certificates (PEM) that the broker's is to be signed by; None for those that the system trusts."""
-        ...
-
-    @property
-    def cert_file(self) -> str | None:
-        """Certificate (PEM) of the client; None for none."""
-        ...
-
-    @property
-    def key_file(self) -> str | None:
-        """Its key (PEM); None where the certificate's file has it."""
-        ...
-
+BrokerAccess = MqttOptions | ReaderAccess
 
 CALLBACKS: Final = ("on_connect", "on_disconnect", "on_message", "on_publish", "on_subscribe")
-"""Names of the callbacks of paho-mqtt. An owner of a client has a method `_on_connect`, …, if it needs one."""
+"""Callbacks of paho-mqtt. The owner of a client implements the callbacks that it needs as `_on_connect`, …."""
 
 
 def paho_client(
     broker: Broker, access: BrokerAccess, client_id: str, owner: object = None, *, is_v5: bool, session_s: int = 0,
     manual_ack: bool = False,
 ) -> Any:  # fmt: skip
-    """Return a client of paho-mqtt without a connection. It calls the methods of `owner` that CALLBACKS names.
+    """Return an unconnected client of paho-mqtt. The client calls the methods of `owner` that CALLBACKS lists.
 
-    The broker keeps the session for `session_s` after the connection ended. With MQTT 3.1.1 the broker decides how
-    long. Raises ValueError, which names the key and the file, if a file of `access` cannot be used.
+    The broker keeps the session for `session_s` after the end of the connection. With MQTT 3.1.1 the broker decides the
+    time. Raises ValueError with the key and the path if a file of `access` is invalid.
     """
     from paho.mqtt import client as paho
     from paho.mqtt.enums import CallbackAPIVersion
@@ -115,7 +96,7 @@ def open_client(
 ) -> None:
     """Connect a client of `paho_client` and send CONNECT. Raises OSError or ValueError.
 
-    With MQTT 5 the broker sends at most `receive_max` messages without an acknowledgement, and no packet longer than
+    With MQTT 5, the broker sends at most `receive_max` messages without an acknowledgement, and no packet longer than
     `packet_bytes`.
     """
     if client.protocol != MQTT_5:
@@ -137,7 +118,7 @@ def close_client(client: Any) -> None:
 
 
 def properties_of(packet: str, **values: object) -> Any:
-    """Properties of a packet of MQTT 5, for example of `CONNECT`."""
+    """Return properties of a packet of MQTT 5, for example of `CONNECT`."""
     from paho.mqtt.packettypes import PacketTypes
     from paho.mqtt.properties import Properties
 
@@ -148,7 +129,10 @@ def properties_of(packet: str, **values: object) -> Any:
 
 
 def connection_problem(error: BaseException) -> str:
-    """Describe an error; those of TLS in the words of the TLS library, which say what is wrong with a certificate."""
+    """Return the cause of an error.
+
+    For a TLS error, use the message of OpenSSL, because it describes the problem of the certificate.
+    """
     import ssl
 
     if isinstance(error, ssl.SSLError):
@@ -157,7 +141,6 @@ def connection_problem(error: BaseException) -> str:
 
 
 def _password(path: str | None) -> str | None:
-    """The first line of the file. Raises ValueError."""
     if path is None:
         return None
     try:
@@ -168,10 +151,10 @@ def _password(path: str | None) -> str | None:
 
 
 def _tls_context(access: BrokerAccess) -> "ssl.SSLContext":
-    """What counts in a connection by TLS. Raises ValueError, which names the key and the file."""
+    """Return the TLS configuration of a client. Raises ValueError with the key and the path."""
     import ssl
 
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # asks for a certificate of the broker, and checks its name
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # requires a certificate of the broker and checks its name
     ca, cert, key = access.ca_file, access.cert_file, access.key_file
     for name, path in (("ca_file", ca), ("cert_file", cert), ("key_file", key)):
         if path is not None:
@@ -182,7 +165,7 @@ def _tls_context(access: BrokerAccess) -> "ssl.SSLContext":
         else:
             context.load_verify_locations(ca)
     except ssl.SSLError as error:
-        raise ValueError(f"ca_file {ca}: expected certificates (PEM), got others or none") from error
+        raise ValueError(f"ca_file {ca}: expected certificates (PEM), got no valid certificate") from error
     try:
         if cert is not None:
             context.load_cert_chain(cert, key, _no_passphrase)
@@ -194,12 +177,11 @@ def _tls_context(access: BrokerAccess) -> "ssl.SSLContext":
 
 
 def _no_passphrase() -> str:
-    """Raises ValueError; without it the TLS library asks on the terminal, and waits."""
-    raise ValueError("key_file: expected a key without a passphrase, got one with it")
+    # without this function, OpenSSL would request the passphrase on the terminal and wait
+    raise ValueError("key_file: expected a key without a passphrase, got an encrypted key")
 
 
 def _read(name: str, path: str, most: int) -> bytes:
-    """A file that a key names. Raises ValueError, which says which."""
     try:
         return read_regular(Path(path), most)
     except OSError as error:
@@ -208,84 +190,78 @@ def _read(name: str, path: str, most: int) -> bytes:
 
 log = logging.getLogger(__name__)
 
-IN_FLIGHT_MAX: Final = 20
-"""Messages without an acknowledgement, unless the broker allows fewer: what brokers usually allow."""
+IN_FLIGHT_MAX: Final = 20  # Maximum number of messages without an acknowledgement. A broker can set a lower limit.
 LOOK_S: Final = 0.1
-"""While the broker's answer is waited for, the end of the output is looked at so often: less than it waits itself."""
-PACKET_BYTES: Final = 16_384
-"""The broker may send so much at once: four times the longest request."""
+"""Time between two checks for the end of the output, s, while imud waits for CONNACK. It is shorter than CLOSE_S of the
+sender."""
+PACKET_BYTES: Final = 16_384  # maximum length of a packet from the broker, bytes: four times the longest request
 PACKET_BYTES_MOST: Final = 268_435_460
-"""The longest packet that MQTT has (MQTT 5.0, section 2.1.4), where the broker does not say less."""
+"""Maximum length of an MQTT packet, bytes (MQTT 5.0, section 2.1.4), if the broker does not set a lower limit."""
 OVERHEAD_BYTES: Final = 200
-"""Of a message besides topic and payload: type, lengths, number, content type, and correlation data of 128 bytes."""
+"""Bytes of a packet without topic and payload: type, lengths, packet identifier, content type, and correlation data of
+128 bytes."""
 EXTRA_MISSING: Final = "the output mqtt needs the extra mqtt: pip install 'imud[mqtt]'"
 
 
 class Will(NamedTuple):
-    """What the broker publishes, retained, when the connection ends without a farewell."""
+    """Retained message that the broker publishes if the connection ends without DISCONNECT."""
 
     topic: str
     payload: bytes
 
 
 class Received(NamedTuple):
-    """A message from the broker."""
+    """Message from the broker."""
 
     topic: str
     payload: bytes
-    retain: bool
-    """Whether the broker had kept it."""
-    response_topic: str
-    """Where the answer is to go; empty where the message says nothing, and with MQTT 3.1.1."""
-    correlation: bytes | None
-    """To be sent back with the answer; with MQTT 5 only."""
+    retain: bool  # true if the broker stored the message (retained)
+    response_topic: str  # topic for the reply; empty if the message does not contain it, and with MQTT 3.1.1
+    correlation: bytes | None  # correlation data for the reply (MQTT 5 only)
 
 
 class BrokerConnection(Protocol):
-    """A connection to one broker. Synchronization: one thread; `ring` from any."""
+    """Connection to one broker.
 
-    acknowledged: list[int]
-    """Numbers of messages that the broker has taken; whoever reads them clears them."""
-    in_flight_max: int
-    """Messages that may be without an acknowledgement."""
-    received: list[Received]
-    """Messages of subscriptions; whoever reads them clears them."""
+    Tests supply another implementation. Synchronization: one thread; any thread may call `ring`.
+    """
+
+    acknowledged: list[int]  # Packet identifiers of acknowledged messages. The reader clears the list.
+    in_flight_max: int  # maximum number of messages without an acknowledgement
+    received: list[Received]  # Messages received from subscriptions. The reader clears the list.
 
     def subscribe(self, topic: str) -> None:
-        """Ask for messages of a topic. Raises BrokerError."""
+        """Subscribe to a topic. Raises BrokerError."""
         ...
 
     def publish(
         self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
     ) -> int:
-        """Send a message with QoS 1; return its number. Raises BrokerError."""
+        """Send a message with QoS 1. Return its packet identifier. Raises BrokerError."""
         ...
 
     def wait(self, seconds: float) -> None:
-        """Read and write what is there; return after so much time, after something came, or on `ring`.
+        """Read and write pending data. Return after `seconds`, after data arrived, or after `ring`.
 
-        Raises BrokerError when the connection is lost, or a message was refused.
+        Raises BrokerError if the connection is lost or if the broker refused a message.
         """
         ...
 
     def ring(self) -> None:
-        """End the present wait, or the next."""
+        """Wake `wait`. If no call is waiting, the next call returns immediately."""
         ...
 
     def close(self) -> None:
-        """End the connection with a farewell; may be called twice."""
+        """Send DISCONNECT and close the connection. A second call does nothing."""
         ...
 
 
 Connect = Callable[[Broker, MqttOptions, str, Will, Callable[[], bool]], BrokerConnection]
-"""Function that returns a connection which the broker has accepted, for the arguments of `PahoConnection`.
-
-Raises BrokerError if the broker cannot be used, or if the last argument returned False.
-"""
+"""Function that returns an accepted connection, with the arguments of `PahoConnection`. Raises BrokerError."""
 
 
 def check_extra() -> None:
-    """Raise ServerError where paho-mqtt is missing."""
+    """Raise ServerError if paho-mqtt is not installed."""
     try:
         importlib.import_module("paho.mqtt.client")
     except ImportError as error:
@@ -293,15 +269,16 @@ def check_extra() -> None:
 
 
 class PahoConnection:
-    """A connection by paho-mqtt. Synchronization: as `BrokerConnection`."""
+    """`BrokerConnection` with paho-mqtt."""
 
     def __init__(
         self, broker: Broker, settings: MqttOptions, client_id: str, will: Will,
         is_wanted: Callable[[], bool] = lambda: True,
     ) -> None:  # fmt: skip
-        """Connect and wait for the answer. Raises BrokerError.
+        """Connect and wait for CONNACK. Raises BrokerError.
 
-        `is_wanted` is asked when the socket is open and then every LOOK_S: the name of the client is another's soon.
+        This method calls `is_wanted` after the socket is open and then every LOOK_S. If it returns False, another
+        output may use the same client ID soon.
         """
         self.acknowledged: list[int] = []
         self.in_flight_max = IN_FLIGHT_MAX
@@ -314,8 +291,8 @@ class PahoConnection:
         self._packet_bytes = PACKET_BYTES_MOST
         self._client: Any = None
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        # another thread closes the descriptor, and its number may then belong to another file
         self._bell_lock = threading.Lock()
-        """Held while the bell is rung: it is closed by another thread, and its number may then be another file's."""
         try:
             self._client = paho_client(broker, settings, client_id, self, is_v5=self._is_v5)
             self._client.will_set(will.topic, will.payload, qos=1, retain=True)
@@ -330,8 +307,9 @@ class PahoConnection:
             raise BrokerError(f"{broker.name}: {connection_problem(error)}") from error
 
     def _wait_for_answer(self, is_wanted: Callable[[], bool]) -> None:
-        """Raises BrokerError for a refusal, without an answer, and where it is not wanted any more."""
+        """Raise BrokerError if the broker refuses the connection, does not reply, or if the output ends."""
         silent = 0
+        # the number of turns is limited: a broker that sends data without CONNACK must not block the thread
         for _ in range(1000):
             if self._answered or self._problem:
                 break
@@ -350,7 +328,7 @@ class PahoConnection:
     # --- as a connection ---------------------------------------------------------------------------------------------
 
     def subscribe(self, topic: str) -> None:
-        """Ask for messages of a topic. Raises BrokerError."""
+        """Subscribe to a topic. Raises BrokerError."""
         try:
             self._client.subscribe(topic, qos=1)
         except (OSError, ValueError) as error:
@@ -359,15 +337,15 @@ class PahoConnection:
     def publish(
         self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
     ) -> int:
-        """Send a message. Raises BrokerError."""
+        """Send a message with QoS 1. Return its packet identifier. Raises BrokerError."""
         properties = None
         if self._is_v5:
             given = {"ContentType": content_type or None, "CorrelationData": correlation}
             properties = properties_of("PUBLISH", **{name: one for name, one in given.items() if one is not None})
         if len(topic) + len(payload) + OVERHEAD_BYTES > self._packet_bytes:
             self._fail(
-                f"expected messages of at most {self._packet_bytes} bytes, which is what the broker takes, got one of "
-                f"{topic} with {len(payload)}: raise the broker's limit"
+                f"the broker accepts messages of at most {self._packet_bytes} bytes, got a message of {topic} with "
+                f"{len(payload)}: raise the limit of the broker"
             )
         try:
             info = self._client.publish(topic, payload, qos=1, retain=retain, properties=properties)
@@ -379,19 +357,19 @@ class PahoConnection:
         return int(info.mid)
 
     def wait(self, seconds: float) -> None:
-        """Read and write what is there. Raises BrokerError."""
+        """Read and write pending data. Raises BrokerError."""
         self._turn(seconds)
         if self._problem:
             raise BrokerError(f"{self._broker.name}: {self._problem}")
 
     def ring(self) -> None:
-        """End the present wait, or the next."""
+        """Wake `wait`."""
         with self._bell_lock:
             if not self._closed:
                 os.eventfd_write(self._bell, 1)
 
     def close(self) -> None:
-        """End the connection; may be called twice."""
+        """Send DISCONNECT and close the connection. A second call does nothing."""
         with self._bell_lock:
             if self._closed:
                 return
@@ -400,10 +378,10 @@ class PahoConnection:
             close_client(self._client)
         os.close(self._bell)
 
-    # --- the socket --------------------------------------------------------------------------------------------------
+    # --- socket -------------------------------------------------------------------------------------------------------
 
     def _turn(self, seconds: float) -> None:
-        """Wait for the socket once and do what paho-mqtt has to do."""
+        """Wait once for the socket or for `ring`, then process pending data."""
         client, sock = self._client, self._client.socket()
         if sock is None:
             self._problem = self._problem or (LOST if self._answered else UNANSWERED)
@@ -411,6 +389,7 @@ class PahoConnection:
         poll = select.poll()
         poll.register(sock.fileno(), select.POLLIN | (select.POLLOUT if client.want_write() else 0))
         poll.register(self._bell, select.POLLIN)
+        # bytes that the TLS library already read: poll does not report them
         pending = getattr(sock, "pending", lambda: 0)()
         ready = dict(poll.poll(0 if pending else seconds * 1000))
         self._woke = bool(ready) or bool(pending)
@@ -432,7 +411,8 @@ class PahoConnection:
         self._problem = self._problem or problem
         raise BrokerError(f"{self._broker.name}: {self._problem}")
 
-    # --- what paho-mqtt calls, in `_turn` ----------------------------------------------------------------------------
+    # --- callbacks of paho-mqtt, called in `_turn`
+    # -----------------------------------------------------------------------
 
     def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, properties: Any) -> None:
         if reason.is_failure:
@@ -472,17 +452,16 @@ class PahoConnection:
             self._problem = self._problem or f"the broker ended the connection: {reason}"
 
 
-FIRST_S: Final = 4.0
-"""Length of the first pause: 500 gateways come back at 125 a second."""
+FIRST_S: Final = 4.0  # Maximum length of the first pause, s. 500 gateways then reconnect at 125 per second.
 STABLE_NS: Final = 30 * NS_PER_S
-"""A connection that held for so long was a good one: pauses begin anew."""
+"""Minimum duration of a stable connection, ns. After it, pauses start with FIRST_S again."""
 
 
 class BrokerTurn:
-    """The list of brokers and its pauses. Synchronization: one thread."""
+    """Order of the brokers and pauses between attempts. Synchronization: one thread."""
 
     def __init__(self, brokers: list[Broker], most_s: float, draw: Callable[[], float] = random) -> None:
-        """`draw` gives numbers from 0 to below 1."""
+        """`draw` returns random numbers from 0 to below 1."""
         self._brokers = brokers
         self._most_s = most_s
         self._draw = draw
@@ -492,17 +471,17 @@ class BrokerTurn:
 
     @property
     def broker(self) -> Broker:
-        """The one whose turn it is."""
+        """Return the broker of the next attempt."""
         return self._brokers[self._at]
 
     def connected(self, now_ns: int) -> None:
-        """Note that the broker has accepted the connection."""
+        """Store the time of an accepted connection."""
         self._up_ns = now_ns
 
     def failed(self, now_ns: int) -> float:
-        """Note that it did not, or that the connection was lost; return how long to wait, s.
+        """Store a failed attempt or a lost connection. Return the pause before the next attempt, s.
 
-        After a loss the same broker is tried again first; after an attempt that failed, the next one.
+        After a lost connection, imud tries the same broker again. After a failed attempt, it tries the next broker.
         """
         up_ns, self._up_ns = self._up_ns, None
         if up_ns is not None and now_ns - up_ns >= STABLE_NS:

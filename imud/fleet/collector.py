@@ -1,10 +1,10 @@
-"""The collector: batches of all gateways into a store, acknowledged when the store has them.
+"""Collector: writes the batches of all gateways into a store and acknowledges them after the write.
 
     session ──delivery──▶ ledger ──batch──▶ store.write (one transaction, in a thread) ──▶ acknowledge
 
-A transaction has what came within COMMIT_S, at most BATCHES_MAX messages or TURN_BYTES; the next one is taken while it
-is written. A store that keeps the ledger beside the rows gives it back after a restart, so that what comes again is
-known. A collector whose store fails ends: what it had not acknowledged is sent to the next one.
+A transaction contains the messages of COMMIT_S, at most BATCHES_MAX messages or TURN_BYTES. imud receives the next
+messages during the write. A store can keep the ledger, so that a collector recognizes duplicates after a restart. A
+collector ends if its store fails. The broker sends messages without an acknowledgement to the next collector.
 """
 
 import asyncio
@@ -20,38 +20,38 @@ from imud.model.units import NS_PER_S
 
 COMMIT_S: Final = 0.5
 BATCHES_MAX: Final = RECEIVE_MAX // 2
-"""Messages of one transaction: while it runs, the broker can send as many again."""
+"""Maximum number of messages in one transaction. The broker can send the same number during the transaction."""
 TURN_BYTES: Final = 8 << 20
-"""Bytes of the messages of one transaction: two are in memory at a time."""
+"""Maximum size of the messages in one transaction, bytes. Two transactions are in memory at a time."""
 GC_ALLOCATIONS: Final = 100_000
-"""Objects between two runs of the garbage collector, of which a turn of large messages makes as many."""
+"""Number of allocations between two runs of the garbage collector. A transaction of large messages allocates this
+number."""
 
 
-Offsets = Mapping[BootKey, BootOffset]
-"""Wall clocks that are known from now on, by boot."""
+Offsets = Mapping[BootKey, BootOffset]  # clock offsets of boots whose clock is known now
 
 
 class FleetStore(Protocol):
-    """Where batches go. Synchronization: one thread at a time."""
+    """Destination of the batches. Synchronization: one thread at a time."""
 
     def restore(self, ledger: FleetLedger) -> None:
-        """Enter the accounts that are kept into a ledger. Raises ServerError."""
+        """Add the stored ledgers to `ledger`. Raises ServerError."""
         ...
 
     def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
-        """Keep batches and the accounts that they changed, and place what waits for `offsets`, all or nothing.
+        """Store batches, changed ledgers and clock offsets in one transaction. Raises ServerError or OSError.
 
-        Raises ServerError, OSError.
+        Records without UTC time of a boot in `offsets` get their UTC time.
         """
         ...
 
     def close(self) -> None:
-        """End; may be called twice."""
+        """Close the store. A second call does nothing."""
         ...
 
 
 class _Turn(NamedTuple):
-    """What is written in one transaction."""
+    """Content of one transaction."""
 
     deliveries: list[FleetDelivery]
     batches: list[FleetBatch]
@@ -60,7 +60,7 @@ class _Turn(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """What is collected; None stands for all."""
+    """Selected gateways; None selects all."""
 
     site: str | None = None
     gateway: str | None = None
@@ -71,22 +71,21 @@ EVERYTHING: Final = Selection()
 
 
 class FleetCollector:
-    """One run of the collector. Synchronization: one event loop; `stop` from it too."""
+    """One run of the collector. Synchronization: one event loop, also for `stop`."""
 
     def __init__(
         self, fleet: Fleet, store: FleetStore, selection: Selection = EVERYTHING,
     ) -> None:  # fmt: skip
-        self.written = 0
-        """Messages that the store has."""
+        self.written = 0  # number of stored messages
         self._fleet, self._store, self._selection, self._now_ns = fleet, store, selection, fleet.now_ns
         self._stopped = False
 
     def stop(self) -> None:
-        """End after the present message; what has come is written."""
+        """End after the present message. `run` stores the received messages first."""
         self._stopped = True
 
     async def run(self, *, stop_after_s: float | None = None) -> None:
-        """Collect until `stop`, or for so long. Raises ServerError and OSError when the store fails."""
+        """Collect until `stop`, or for `stop_after_s`. Raises ServerError or OSError if the store fails."""
         self._store.restore(self._fleet.ledger)
         end_ns = None if stop_after_s is None else self._now_ns() + round(stop_after_s * NS_PER_S)
         site, gateway, device = self._selection
@@ -96,6 +95,7 @@ class FleetCollector:
                 while not self._stopped and (end_ns is None or self._now_ns() < end_ns):
                     turn = await self._take(session)
                     if writing is not None:
+                        # a cancelled `run` must not stop the write that is running
                         await asyncio.shield(writing)
                     writing = asyncio.ensure_future(self._write(session, turn))
             finally:
@@ -103,7 +103,7 @@ class FleetCollector:
                     await writing
 
     async def _take(self, session: FleetSession) -> _Turn:
-        """Take what comes within COMMIT_S."""
+        """Receive messages for COMMIT_S."""
         turn = _Turn([], [], {}, {})
         changed: set[StreamKey] = set()
         due_ns = self._now_ns() + round(COMMIT_S * NS_PER_S)
@@ -118,13 +118,14 @@ class FleetCollector:
             size += len(delivery.payload)
             turn.deliveries.append(delivery)
             batch = self._fleet.take(delivery, changed)
+            # None for a state, or a message with duplicates only
             if batch is not None:
                 turn.batches.append(batch)
         accounts = {key: self._fleet.ledger.stored(key) for key in sorted(changed)}
         return turn._replace(accounts=accounts, offsets=self._fleet.clocks.take_fresh())
 
     async def _write(self, session: FleetSession, turn: _Turn) -> None:
-        """Write what was taken, and acknowledge it."""
+        """Store the messages of a turn and acknowledge them."""
         if turn.batches or turn.accounts or turn.offsets:
             await asyncio.to_thread(self._store.write, turn.batches, turn.accounts, turn.offsets)
             self.written += len(turn.batches)
@@ -137,16 +138,16 @@ _ENCODER: Final = msgspec.json.Encoder()
 
 
 class JsonLines:
-    """A store that prints. Synchronization: as `FleetStore`."""
+    """Store that prints lines of JSON. Synchronization: see `FleetStore`."""
 
     def __init__(self, out: TextIO) -> None:
         self._out = out
 
     def restore(self, ledger: FleetLedger) -> None:
-        """Nothing: a stream of lines keeps no accounts."""
+        """Do nothing: the output does not contain the ledger."""
 
     def write(self, batches: Sequence[FleetBatch], _accounts: Accounts, offsets: Offsets) -> None:
-        """Print everything in the batches, then clocks that are known now. Raises OSError."""
+        """Print all records of the batches, then new clock offsets. Raises OSError."""
         for batch in batches:
             for line in lines_of(batch):
                 self._out.write(line + "\n")
@@ -155,11 +156,11 @@ class JsonLines:
         self._out.flush()
 
     def close(self) -> None:
-        """Nothing: who gave the output closes it."""
+        """Do nothing: the caller closes the output."""
 
 
 def lines_of(batch: FleetBatch) -> Iterator[str]:
-    """The lines of a message. Values that JSON does not have (not a number, infinity) are null."""
+    """Yield the lines of a message. Values that JSON cannot represent (not a number, infinity) are null."""
     message = batch.message
     head: dict[str, object] = {
         "site": batch.site, "gateway": message.gateway, "boot": message.boot, "device": message.device,
@@ -179,7 +180,7 @@ def lines_of(batch: FleetBatch) -> Iterator[str]:
 
 
 def clock_lines(offsets: Offsets) -> Iterator[str]:
-    """A line for each boot whose wall clock is known from now on."""
+    """Yield a line for each boot whose wall clock is known now."""
     for key, offset in sorted(offsets.items()):
         members: dict[str, object] = {"kind": "clock"}
         yield _line(members | key._asdict() | offset._asdict())
@@ -203,7 +204,7 @@ def _clock(at: PlacedTime) -> dict[str, object]:
 
 
 def _members(record: msgspec.Struct) -> dict[str, object]:
-    """Members of a record that it has, by name."""
+    """Return the members of a record that are not None."""
     values = ((name, getattr(record, name)) for name in record.__struct_fields__)
     return {name: value for name, value in values if value is not None}
 

@@ -1,15 +1,14 @@
-"""The command channel: requests from the broker, checked, carried out one at a time, and answered.
+"""Command channel: checks requests from the broker, runs them one at a time, and sends replies.
 
-    broker ──▶ sender's thread: take (size, form, age, id, list, rate) ──▶ queue ──▶ event loop: run ──▶ device
-    broker ◀── sender ◀───────────────────── answer ◀─────────────────────────────────────┘
+    broker ──▶ sender's thread: take (size, form, age, ID, list, rate) ──▶ queue ──▶ event loop: run ──▶ device
+    broker ◀── sender ◀───────────────────── reply ◀──────────────────────────────────────┘
 
-Who may ask is the broker's to decide, by its rights on the topic; what may be asked is in the list of the gateway's
-configuration. The arguments are checked by the device's own description of the action, as those of the socket are.
-The event loop does of it what it does for a client of the socket: it starts the action, and sends its result away.
+The access rights of the broker decide who may send requests. The configuration of the gateway decides which commands
+are allowed. The device checks the arguments, as for the socket.
 
-A request is carried out once: its id is remembered for as long as its age would let it be taken again, and what was
-issued before the output started is too old. An answer can be lost with its connection, and who asked then asks again:
-the same request with the same id is answered with the answer that it has.
+imud runs each request once. It stores the ID of a request until the request is too old, and rejects requests from
+before its start. A reply can be lost with its connection. If the sender repeats the same request with the same ID, imud
+sends the stored reply again.
 """
 
 import asyncio
@@ -24,6 +23,7 @@ import msgspec
 from imud.contracts.publisher import DeviceControl
 from imud.fleet.broker import Received
 from imud.fleet.messages import (
+    CLOCK_SET_NS,
     COMMAND,
     ROOT,
     VERSION,
@@ -42,19 +42,14 @@ from imud.model.units import NS_PER_S
 
 log = logging.getLogger(__name__)
 
-WAITING_MAX: Final = 8
-"""Requests that wait for the one before: actions take a second each at most, calibrations longer."""
-CLOCK_SET_NS: Final = 1_577_836_800 * NS_PER_S
-"""2020: a wall clock before it is not set, and says nothing of ages."""
+WAITING_MAX: Final = 8  # Maximum number of waiting requests. A command takes at most one second, a calibration longer.
 MINUTE_NS: Final = 60 * NS_PER_S
-ANSWERS_KEPT: Final = 32
-"""Answers that are kept for requests that come again, the newest."""
-ANSWER_BYTES: Final = 65_536
-"""Of an answer that is kept: 2 MB of all. What actions return has some kB."""
+ANSWERS_KEPT: Final = 32  # number of stored replies for repeated requests
+ANSWER_BYTES: Final = 65_536  # Maximum length of a stored reply, bytes: 2 MB for all. Commands return some kB.
 
 
 class CommandReply(NamedTuple):
-    """An answer on its way to the broker."""
+    """Reply on its way to the broker."""
 
     topic: str
     payload: bytes
@@ -62,7 +57,7 @@ class CommandReply(NamedTuple):
 
 
 class _Asked(NamedTuple):
-    """A request that may be carried out."""
+    """Request that passed its checks."""
 
     device: str
     request: CommandRequest
@@ -70,52 +65,51 @@ class _Asked(NamedTuple):
     correlation: bytes | None
 
     def is_same(self, other: "_Asked") -> bool:
-        """Whether both ask for the same."""
+        """Return whether both requests are equal."""
         mine, theirs = self.request, other.request
         return (self.device, mine.action, mine.arguments) == (other.device, theirs.action, theirs.arguments)
 
 
 class CommandChannel:
-    """The channel. Synchronization: `take` by the sender's thread, `run_next` and `close` by the event loop's; the
-    counters are read by any. What both change is changed under a lock, which is held for no I/O."""
+    """Queue of requests with their checks and replies.
+
+    Synchronization: the sender's thread calls `take`, the event loop calls `run_next` and `close`, any thread reads the
+    counters. A lock protects shared members and is never held during I/O.
+    """
 
     def __init__(
         self, settings: CommandOptions, gateway: Gateway, control: Callable[[str], DeviceControl],
         now_ns: Callable[[], int], utc_offset_ns: Callable[[], int],
     ) -> None:  # fmt: skip
-        self.run = 0
-        """Requests that were carried out, or tried."""
-        self.refused = 0
-        """Requests that were not."""
+        self.run = 0  # number of requests that imud ran
+        self.refused = 0  # number of rejected requests
         self.answer: Callable[[CommandReply], None] = lambda _reply: None
-        """Takes answers, from both threads; set by who sends them."""
+        """Sends replies, called from both threads. The output sets it."""
         self._settings, self._gateway, self._control = settings, gateway, control
         self._now_ns, self._utc_offset_ns = now_ns, utc_offset_ns
         self._start_ns = now_ns()
         self._asked: deque[_Asked] = deque()
         self._times_ns: deque[int] = deque()
-        self._known: dict[str, int] = {}
-        """When each id came, CLOCK_MONOTONIC; as many as the rate allows."""
+        self._known: dict[str, int] = {}  # arrival of each ID, CLOCK_MONOTONIC; `per_minute` limits their number
         self._lock = threading.Lock()
-        self._answers: dict[str, tuple[_Asked, bytes]] = {}
-        """Requests that ended and their answers, by id, the newest last."""
+        self._answers: dict[str, tuple[_Asked, bytes]] = {}  # finished requests and their replies by ID, newest last
         self._task: asyncio.Task[None] | None = None
 
     @property
     def subscription(self) -> str:
-        """The topics of requests."""
+        """Return the topic filter of requests."""
         return f"{ROOT}/{self._gateway.site}/{self._gateway.gateway}/+/{COMMAND}"
 
-    # --- the sender's thread -----------------------------------------------------------------------------------------
+    # --- sender's thread ----------------------------------------------------------------------------------------------
 
     def take(self, received: Received) -> None:
-        """Check a message of the subscription, and queue or refuse it."""
+        """Check a message of the subscription, then queue or reject it."""
         parts = parse_topic(received.topic)
         if parts is None or parts.leaf != COMMAND or parts[:2] != self._gateway[:2]:
             self._ignore(f"expected a topic of {self.subscription}, got {shown(received.topic)}")
             return
         if received.retain:
-            self._ignore("the broker kept it (retained), it would be carried out at each connection")
+            self._ignore("the message is retained, so imud would run the request at each connection")
             return
         try:
             request = decode_request(received.payload)
@@ -137,71 +131,83 @@ class CommandChannel:
         self._asked.append(asked)
 
     def _judged(self, asked: _Asked) -> tuple[Outcome | None, str]:
-        """Why a request is not carried out, if it is not."""
+        """Return the outcome and the cause if imud rejects a request, otherwise None."""
         now_ns, request = self._now_ns(), asked.request
         while self._times_ns and now_ns - self._times_ns[0] >= MINUTE_NS:
             self._times_ns.popleft()
         if len(self._times_ns) >= self._settings.per_minute:
-            return Outcome.BUSY, f"expected at most {self._settings.per_minute} requests a minute"
+            return (
+                Outcome.BUSY,
+                f"the limit of {self._settings.per_minute} requests per minute is reached; try again later",
+            )
         self._times_ns.append(now_ns)
         if problem := self._age_problem(request.issued_utc_ns):
             return Outcome.STALE, problem
+        # twice the maximum age: a request may be in the future by max_age_s
         kept_ns = 2 * self._settings.max_age_ns
         while self._known and now_ns - next(iter(self._known.values())) > kept_ns:
             del self._known[next(iter(self._known))]
         if request.id in self._known:
-            return Outcome.DUPLICATE, "a request with this id came before"
+            return Outcome.DUPLICATE, "the gateway already received a request with this id"
         if not self._settings.allows(asked.device, request.action):
-            return Outcome.DENIED, "the gateway's configuration (mqtt.commands.actions) does not have it"
+            return (
+                Outcome.DENIED,
+                "mqtt.commands.actions in the configuration of the gateway does not allow the command",
+            )
         if len(self._asked) >= WAITING_MAX:
-            return Outcome.BUSY, f"{WAITING_MAX} requests wait"
+            return Outcome.BUSY, f"the limit of {WAITING_MAX} waiting requests is reached; try again later"
         return None, ""
 
     def _age_problem(self, issued_utc_ns: int) -> str:
-        """Why a request of that time is not carried out now; empty where it is."""
+        """Return why the age of a request is not acceptable; empty if it is."""
         utc_ns = self._now_ns() + self._utc_offset_ns()
         most_ns = self._settings.max_age_ns
         if utc_ns < CLOCK_SET_NS:
-            return "the gateway's clock is not set, and the age of the request is not known"
+            return "the clock of the gateway is not set, so the age of the request is unknown"
         if abs(utc_ns - issued_utc_ns) > most_ns:
             age_s = (utc_ns - issued_utc_ns) / NS_PER_S
             return f"expected an age of at most {self._settings.max_age_s:g} s, got {age_s:.1f} s"
         if issued_utc_ns < self._start_ns + self._utc_offset_ns():
-            return "it was issued before the gateway's start, and may have been carried out then"
+            return "the request is older than the start of imud, and may already have run"
         return ""
 
     def _repeat(self, asked: _Asked) -> bool:
-        """Give the answer that the request had when it came before; return whether there is one."""
+        """Send the stored reply of an equal request. Return whether there is one."""
         with self._lock:
             kept = self._answers.get(asked.request.id)
         if kept is None or not asked.is_same(kept[0]):
             return False
-        log.info("mqtt: %s: request %s came again, and is answered again", asked.device, asked.request.id)
+        log.info("mqtt: %s: request %s was repeated; sending the stored reply", asked.device, asked.request.id)
         self.answer(CommandReply(asked.topic, kept[1], asked.correlation))
         return True
 
     def _ignore(self, problem: str) -> None:
         with self._lock:
             self.refused += 1
-        log.warning("mqtt: a request is ignored: %s", problem)
+        log.warning("mqtt: ignoring a request: %s", problem)
 
     def _refuse(self, asked: _Asked, outcome: Outcome, problem: str) -> None:
         with self._lock:
             self.refused += 1
         log.warning(
-            "mqtt: %s: request %s for %s is refused (%s): %s",
+            "mqtt: %s: rejecting request %s for %s (%s): %s",
             asked.device, asked.request.id, shown(asked.request.action), outcome, problem,
             extra=None if outcome is Outcome.BUSY else _by_itself(asked),
         )  # fmt: skip
         self._give_answer(asked, outcome, error=problem)
 
-    # --- the event loop's thread -------------------------------------------------------------------------------------
+    # --- event loop
+    # -----------------------------------------------------------------------------------------------------
 
     def run_next(self) -> None:
-        """Begin the next request where none runs; called ten times a second. Needs a running loop if any waits."""
+        """Start the next request if none is running.
+
+        The output calls this method ten times a second in the event loop.
+        """
         if not self._asked or (self._task is not None and not self._task.done()):
             return
         asked = self._asked.popleft()
+        # the request waited in the queue
         problem = self._age_problem(asked.request.issued_utc_ns)
         if problem:
             self._refuse(asked, Outcome.STALE, problem)
@@ -209,7 +215,7 @@ class CommandChannel:
         self._task = asyncio.get_running_loop().create_task(self._run(asked))
 
     async def _run(self, asked: _Asked) -> None:
-        """Carry a request out and answer it."""
+        """Run a request and send its reply."""
         request = asked.request
         self.run += 1
         log.warning(
@@ -222,20 +228,20 @@ class CommandChannel:
             log.warning("mqtt: %s: request %s failed: %s", asked.device, request.id, error, extra=_by_itself(asked))
             self._end(asked, Outcome.FAILED, error=str(error))
         except Exception:
-            log.exception("mqtt: %s: request %s ended by an internal error", asked.device, request.id)
-            self._end(asked, Outcome.FAILED, error="an internal error; the log of imud has a traceback")
+            log.exception("mqtt: %s: request %s failed because of an internal error", asked.device, request.id)
+            self._end(asked, Outcome.FAILED, error="internal error; see the traceback in the log of imud")
         else:
             log.info("mqtt: %s: request %s is done: %s", asked.device, request.id, shown(result))
             self._end(asked, Outcome.DONE, result=result)
 
     def close(self) -> None:
-        """End what runs, without an answer; may be called twice."""
+        """Stop the running request without a reply. A second call does nothing."""
         self._asked.clear()
         if self._task is not None:
             self._task.cancel()
 
     def _end(self, asked: _Asked, outcome: Outcome, *, result: object = None, error: str = "") -> None:
-        """Answer what was carried out, and keep the answer."""
+        """Send the reply of a finished request and store it."""
         payload = self._give_answer(asked, outcome, result=result, error=error)
         if len(payload) > ANSWER_BYTES:
             return
@@ -245,7 +251,7 @@ class CommandChannel:
                 del self._answers[next(iter(self._answers))]
 
     def _give_answer(self, asked: _Asked, outcome: Outcome, *, result: object = None, error: str = "") -> bytes:
-        """Have an answer sent; return its payload."""
+        """Send a reply. Return its payload."""
         answer = CommandAnswer(
             v=VERSION, id=asked.request.id, gateway=self._gateway.gateway, device=asked.device,
             action=asked.request.action, outcome=outcome, result=result, error=error,
@@ -256,5 +262,5 @@ class CommandChannel:
 
 
 def _by_itself(asked: _Asked) -> dict[str, str]:
-    """The `extra` of a message that the log does not sum up with those of other requests; the rate bounds them."""
+    """Return the `extra` of log messages that the log must not merge with messages of other requests."""
     return {SAME_AS: asked.request.id}

@@ -1,14 +1,16 @@
-"""Payloads of gateways: every one of a stream begins with a header by which a reader keeps the ledger.
+"""Topics and payloads of the fleet: messages of streams, requests and replies.
 
     JSON      {"v": 1, "gateway": …, "boot": …, "device": …, "kind": …, "first": 1, "last": 200, …}
     slots     "IMUB" | version, u8 | 0 | header bytes, u16 | header, JSON | Zstandard frame of slots, 256 bytes each
 
-Little-endian. Numbers `first` to `last` of a stream are covered by exactly one message, whatever its kind: whole
-samples, what is left of them when the spool had no room (`intervals` in the stream `samples`), or that they were
-dropped and why (`dropped`). What no message covers was lost on the way, and what two cover came twice.
+Integers are little-endian. Exactly one message covers each sequence number of a stream. The message contains complete
+samples, or statistics that replaced them in a full spool (`intervals` in the stream `samples`), or only the cause of
+the loss (`dropped`). If no message covers a number, the network lost it. If two messages cover it, the second is a
+duplicate.
 
-Whoever may publish on a broker can send anything, and what is decoded here goes into databases: numbers are so small
-that two of them add up within 64 bits, texts have no NUL, which PostgreSQL does not store.
+Every client with write access to the broker can send any payload, and the collector stores decoded values in databases.
+The decoder therefore accepts only numbers below NUMBER_MOST and strings without NUL, because PostgreSQL cannot store
+NUL.
 """
 
 import math
@@ -25,22 +27,21 @@ from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.model.errors import reason_of
 from imud.model.event import Event
 from imud.model.sample import Sample, Sync
+from imud.model.units import NS_PER_S
 
 ROOT: Final = "imud"
 NAME_PATTERN: Final = "[A-Za-z0-9_-]{1,64}"
-"""64 characters: of a topic of 65,535 bytes every name takes a small part, and a client id of three stays short."""
+"""Pattern of a name, at most 64 characters. MQTT limits a topic to 65,535 bytes, and a client ID contains three
+names."""
 _NAME: Final = re.compile(NAME_PATTERN)
 
 
 class Stream(StrEnum):
-    """What is counted by itself: each stream of each device has numbers without gaps."""
+    """Streams of a device. Each stream has its own sequence numbers without gaps."""
 
-    SAMPLES = "samples"
-    """Whole samples, by their `seq`."""
-    STATISTICS = "statistics"
-    """Intervals, by the `seq` of the samples in them."""
-    EVENTS = "events"
-    """Events, counted from 1 since the start of the daemon."""
+    SAMPLES = "samples"  # complete samples, numbered by `seq`
+    STATISTICS = "statistics"  # statistics of intervals, numbered by the `seq` of their samples
+    EVENTS = "events"  # events, numbered from 1 since the start of the daemon
 
 
 STATE: Final = "state"
@@ -54,34 +55,35 @@ _GATEWAY_TOPICS: Final = frozenset((STATE, Stream.EVENTS))
 
 
 class TopicParts(NamedTuple):
-    """A topic, taken apart."""
+    """Parts of a topic."""
 
     site: str
     gateway: str
-    device: str
-    """Empty for what is of the gateway itself."""
-    leaf: str
-    """`state`, `status`, `settings`, `schema`, `command`, `answer`, or the name of a `Stream`."""
+    device: str  # device name; empty for a topic of the gateway
+    leaf: str  # `state`, `status`, `settings`, `schema`, `command`, `answer`, or the name of a `Stream`
 
 
 def is_name(text: str) -> bool:
-    """Whether a text can be the name of a site, a gateway or a device."""
+    """Return whether `text` is a valid name of a site, a gateway or a device."""
     return _NAME.fullmatch(text) is not None
 
 
 def topic_of(site: str, gateway: str, device: str, leaf: str) -> str:
-    """Make a topic; without a device that of the gateway. Raises ValueError for a name that is none."""
+    """Return the topic of a device, or of the gateway if `device` is empty.
+
+    Raises ValueError if a name or `leaf` is invalid.
+    """
     names = (site, gateway, device) if device else (site, gateway)
     for name in names:
         if not is_name(name):
             raise ValueError(f"expected a name of 1 to 64 letters, digits, '_' or '-', got {name!r}")
     if leaf not in (_DEVICE_TOPICS if device else _GATEWAY_TOPICS):
-        raise ValueError(f"expected the end of a topic of a {'device' if device else 'gateway'}, got {leaf!r}")
+        raise ValueError(f"expected the last level of a topic of a {'device' if device else 'gateway'}, got {leaf!r}")
     return "/".join((ROOT, *names, leaf))
 
 
 def parse_topic(topic: str) -> TopicParts | None:
-    """Take a topic apart; None for one that is no gateway's."""
+    """Return the parts of a topic; None if the topic does not belong to a gateway."""
     parts = topic.split("/")
     if parts[0] != ROOT or len(parts) not in (4, 5) or not all(map(is_name, parts)):
         return None
@@ -94,56 +96,47 @@ def parse_topic(topic: str) -> TopicParts | None:
 VERSION: Final = 1
 MAGIC: Final = b"IMUB"
 SLOTS_MAX: Final = 500
-"""Slots in one message: 128 kB before compression, which is the smallest limit of the large brokers' services."""
-SAMPLES_MAX: Final = 200
-"""Samples in one JSON message: about 100 kB."""
+"""Maximum number of slots in one message: 128 kB before compression, the smallest limit of the large cloud brokers."""
+SAMPLES_MAX: Final = 200  # maximum number of samples in one JSON message, about 100 kB
 HEADER_MAX: Final = 4096
-LEVEL: Final = 3
-"""Of Zstandard, its own default."""
+LEVEL: Final = 3  # compression level of Zstandard, its default
 NUMBER_MOST: Final = 1 << 62
-"""Numbers are smaller, either way; ns since 1970 reach it in 2116."""
-_NUL: Final = b"\\u0000"
-"""NUL in a text of JSON, or a backslash and five characters."""
+"""Limit of the absolute value of integers. The sum of two such numbers fits into 64 bits. ns since 1970 reach it in
+2116."""
+CLOCK_SET_NS: Final = 1_577_836_800 * NS_PER_S
+"""Start of 2020 as CLOCK_REALTIME, ns. A clock with an earlier time is not set."""
+_NUL: Final = b"\\u0000"  # escaped NUL in a JSON string, or an escaped backslash followed by `u0000`
 _NUL_ALONE: Final = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
-"""Only the first of these; looking for it takes ten times as long as the decoding."""
+"""Pattern of an escaped NUL only. This search takes ten times as long as the decoding."""
 _PREFIX: Final = struct.Struct("<4sBBH")
 JSON_TYPE: Final = "application/json"
 SLOTS_TYPE: Final = "application/vnd.imud.slots+zstd"
 
 
 class MessageKind(StrEnum):
-    """Kinds of messages of a stream."""
+    """Kinds of stream messages."""
 
-    SAMPLES = "samples"
-    """Whole samples as JSON."""
-    SLOTS = "slots"
-    """Whole samples as compressed slots."""
-    INTERVALS = "intervals"
-    """Statistics of intervals."""
+    SAMPLES = "samples"  # complete samples as JSON
+    SLOTS = "slots"  # complete samples as compressed slots
+    INTERVALS = "intervals"  # statistics of intervals
     EVENTS = "events"
-    DROPPED = "dropped"
-    """Nothing but the numbers of what was dropped by the gateway, and why."""
+    DROPPED = "dropped"  # only the numbers and the cause of dropped samples or events
 
 
 class DropCause(StrEnum):
-    """Reasons for which a gateway drops what it was to send."""
+    """Causes for which a gateway drops samples or events."""
 
-    QUEUE = "queue"
-    """The writer of the spool was too slow."""
-    SPACE = "space"
-    """The spool was full of what cannot be thinned any more."""
-    AGE = "age"
-    """It waited for longer than the spool keeps anything."""
-    DISK = "disk"
-    """The disk was full, or failed."""
-    OFF = "off"
-    """The output did not run, for example while its settings were changed."""
-    DAMAGED = "damaged"
-    """The spool gave back what it was not given."""
+    QUEUE = "queue"  # the queue of the spool writer was full
+    SPACE = "space"  # the spool was full and contained only statistics
+    AGE = "age"  # the message was older than the maximum age in the spool
+    DISK = "disk"  # the disk was full or failed
+    OFF = "off"  # the output did not run, for example during a change of its configuration
+    DAMAGED = "damaged"  # the message in the spool was damaged
 
 
 class Measures(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
-    """Statistics of one quantity over an interval, a value for each of its components; left out are those not asked."""
+    """Statistics of one quantity over an interval, one value per component; None if the configuration excludes a
+    measure."""
 
     mean: tuple[float, ...] | None = None
     min: tuple[float, ...] | None = None
@@ -152,77 +145,60 @@ class Measures(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
 
 
 class Interval(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
-    """Samples of one interval of time, summed up."""
+    """Statistics of the samples of one interval."""
 
-    first: int
-    """`seq` of its first sample."""
+    first: int  # `seq` of the first sample
     last: int
-    count: int
-    """Samples in it."""
-    begin_t_ns: int
-    """`t_ns` of the first sample."""
+    count: int  # number of samples
+    begin_t_ns: int  # `t_ns` of the first sample
     end_t_ns: int
     begin_utc_ns: int
     end_utc_ns: int
-    t_err_ns: int
-    """The largest of all samples."""
-    sync: Sync
-    """The worst of all samples."""
-    values: dict[str, Measures]
-    """By the names that samples have."""
-    status: int | None = None
-    """Status bits that any of the samples had."""
+    t_err_ns: int  # maximum time stamp error of the samples
+    sync: Sync  # worst synchronization of the samples
+    values: dict[str, Measures]  # statistics by the names of the sample fields
+    status: int | None = None  # bitwise OR of the status bits of all samples
 
 
 class GatewayClock(msgspec.Struct, frozen=True, gc=False):
-    """The wall clock of a gateway, as its kernel reports it (adjtimex(2))."""
+    """Wall clock of a gateway, as its kernel reports it (adjtimex(2))."""
 
-    t_ns: int
-    """CLOCK_MONOTONIC when it was read."""
-    utc_offset_ns: int
-    """CLOCK_REALTIME less CLOCK_MONOTONIC then."""
+    t_ns: int  # CLOCK_MONOTONIC of the reading
+    utc_offset_ns: int  # CLOCK_REALTIME minus CLOCK_MONOTONIC at the reading
     synchronised: bool
-    """Whether something keeps it: STA_UNSYNC is not set. Otherwise it can be wrong by any amount."""
-    error_ns: int | None = None
-    """One-sigma error of the offset; None while it is not synchronised."""
+    """True if the kernel reports a synchronized clock (STA_UNSYNC not set). Otherwise the clock can have any error."""
+    error_ns: int | None = None  # One-sigma error of the offset; None if the clock is not synchronized
 
 
 class FleetMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True, kw_only=True):
-    """A message of a stream."""
+    """Message of a stream."""
 
-    v: int
-    """VERSION."""
+    v: int  # version of the format, VERSION
     gateway: str
     boot: str
-    """Number of the daemon's start, 16 hexadecimal digits: `epoch` on the socket and in shared memory."""
-    device: str
-    """Empty for the gateway itself."""
+    """Identifier of the start of the daemon, 16 hexadecimal digits: `epoch` on the socket and in shared memory."""
+    device: str  # device name; empty for the gateway
     kind: MessageKind
-    begin: int
-    """Number with which the stream began in this boot."""
-    first: int
-    """The first number that this message covers."""
+    begin: int  # first number of the stream in this boot
+    first: int  # first number that this message covers
     last: int
-    count: int
-    """Samples, or events, that the numbers stand for."""
-    utc_ns: int
-    """CLOCK_REALTIME of the newest of it."""
+    count: int  # number of samples or events that the numbers stand for
+    utc_ns: int  # CLOCK_REALTIME of the newest sample or event
     clock: GatewayClock | None = None
-    """The wall clock when the message was made; None of one by a version that did not say."""
-    cause: DropCause | None = None
-    """Why it was dropped."""
+    """Wall clock when the message was made; None if the version of the gateway does not send it."""
+    cause: DropCause | None = None  # cause of the loss, for the kind `dropped`
     samples: list[Sample] = []  # msgspec copies a mutable default
     intervals: list[Interval] = []
     events: list[Event] = []
 
     @property
     def newest_t_ns(self) -> int | None:
-        """CLOCK_MONOTONIC of the newest of it; None of a message that does not speak of the clock."""
+        """Return CLOCK_MONOTONIC of the newest sample or event; None if the message has no `clock`."""
         return None if self.clock is None else self.utc_ns - self.clock.utc_offset_ns
 
 
 class MessageHead(msgspec.Struct, frozen=True, gc=False):
-    """What a message says of itself, as `FleetMessage` does."""
+    """Fields of a `FleetMessage` that identify it."""
 
     gateway: str
     boot: str
@@ -237,27 +213,31 @@ _HEAD_DECODER: Final = msgspec.json.Decoder(MessageHead)
 
 
 def boot_text(epoch: int) -> str:
-    """The number of a start as text: JSON of other languages has no integers above 2⁵³."""
+    """Return the epoch as a string, because JSON in other languages has no integers above 2⁵³."""
     return f"{epoch & 0xFFFF_FFFF_FFFF_FFFF:016x}"
 
 
 def encode_message(message: FleetMessage) -> bytes:
-    """The payload as JSON. Values that JSON does not have (not a number, infinity) are left out of samples."""
+    """Return the payload as JSON.
+
+    It omits sample fields with a value that JSON cannot represent (not a number, infinity).
+    """
     payload = _ENCODER.encode(message)
+    # "null" can also be a value that the device sent as None; this check avoids a search in most messages
     if message.samples and b"null" in payload:
         payload = _ENCODER.encode(msgspec.structs.replace(message, samples=[finite(one) for one in message.samples]))
     return payload
 
 
 def encode_slots_message(message: FleetMessage, slots: Sequence[bytes]) -> bytes:
-    """The payload with slots, 1 to SLOTS_MAX of them."""
+    """Return the payload with 1 to SLOTS_MAX slots."""
     header = _ENCODER.encode(message)
     compressed = zstandard.ZstdCompressor(level=LEVEL).compress(b"".join(slots))
     return _PREFIX.pack(MAGIC, VERSION, 0, len(header)) + header + compressed
 
 
 def decode_message(payload: bytes) -> FleetMessage:
-    """The message in a payload, slots as samples. Raises ValueError for anything else."""
+    """Return the message of a payload, with its slots as samples. Raises ValueError if the payload is invalid."""
     try:
         message = _decode_slots(payload) if payload.startswith(MAGIC) else _DECODER.decode(checked_json(payload))
     except (msgspec.DecodeError, RecursionError, zstandard.ZstdError, struct.error) as error:
@@ -268,16 +248,16 @@ def decode_message(payload: bytes) -> FleetMessage:
         raise ValueError(f"expected numbers in order, got {message.begin}, {message.first} and {message.last}")
     numbers = message.last - message.first + 1
     if len(message.events) > numbers:
-        raise ValueError(f"expected an event per number, got {len(message.events)} events for {numbers} numbers")
+        raise ValueError(f"expected one event per number, got {len(message.events)} events for {numbers} numbers")
     check_boot(message.boot)
     check_numbers(_numbers(message))
     return message
 
 
 def check_payload(payload: bytes) -> MessageHead:
-    """What a payload says of itself, where its JSON and its slots can be read. Raises ValueError for anything else.
+    """Return the head of a payload after checking its JSON and its slots. Raises ValueError if they are invalid.
 
-    It costs a third of `decode_message` at most, and does not look at values.
+    This function does not check values. It takes at most a third of the time of `decode_message`.
     """
     try:
         if not payload.startswith(MAGIC):
@@ -290,32 +270,33 @@ def check_payload(payload: bytes) -> MessageHead:
 
 
 def checked_json(payload: bytes) -> bytes:
-    """The payload itself. Raises ValueError for JSON with NUL in a text."""
+    """Return `payload`. Raises ValueError if a JSON string contains NUL."""
+    # the first test is cheap and excludes nearly all payloads
     if _NUL in payload and _NUL_ALONE.search(payload):
-        raise ValueError("expected text without NUL, got one with it")
+        raise ValueError("expected strings without NUL, got a string with NUL")
     return payload
 
 
 def check_boot(boot: str) -> None:
-    """Raises ValueError for what cannot be the number of a start."""
+    """Raise ValueError if `boot` cannot identify a start of the daemon."""
     if not is_name(boot):
-        raise ValueError(f"expected the number of a start, 1 to 64 letters, digits, '_' or '-', got {boot[:100]!r}")
+        raise ValueError(f"expected a boot of 1 to 64 letters, digits, '_' or '-', got {boot[:100]!r}")
 
 
 def check_numbers(numbers: Iterable[int | None]) -> None:
-    """Raises ValueError for a number from NUMBER_MOST on."""
+    """Raise ValueError if the absolute value of a number is NUMBER_MOST or more."""
     for number in numbers:
         if number is not None and abs(number) >= NUMBER_MOST:
-            raise ValueError(f"expected numbers below 2**62, got one of {number.bit_length()} bits")
+            raise ValueError(f"expected numbers below 2**62, got a number of {number.bit_length()} bits")
 
 
 def clock_numbers(clock: GatewayClock | None) -> tuple[int | None, ...]:
-    """The numbers in what a gateway says of its clock."""
+    """Return the numbers of a gateway clock."""
     return () if clock is None else (clock.t_ns, clock.utc_offset_ns, clock.error_ns)
 
 
 def _numbers(message: FleetMessage) -> Iterable[int | None]:
-    """All numbers that are no component of a physical value."""
+    """Return all integers of a message except components of physical values."""
     yield from (message.last, message.count, message.utc_ns, *clock_numbers(message.clock))
     for sample in message.samples:
         yield from (
@@ -332,7 +313,7 @@ def _numbers(message: FleetMessage) -> Iterable[int | None]:
 
 
 def _parts_of_slots(payload: bytes) -> tuple[bytes, bytes]:
-    """The header, and the frame of slots."""
+    """Return the header and the compressed slots."""
     _, version, _, size = _PREFIX.unpack_from(payload)
     if version != VERSION or size > HEADER_MAX:
         raise ValueError(f"expected slots of version {VERSION}, got {version} and a header of {size} bytes")
@@ -341,7 +322,8 @@ def _parts_of_slots(payload: bytes) -> tuple[bytes, bytes]:
 
 
 def _decompressed(frame: bytes) -> bytes:
-    if not 0 < zstandard.frame_content_size(frame) <= SLOTS_MAX * SLOT_BYTES:  # it decides how much is allocated
+    # the sender declares this size, and the decompressor allocates it
+    if not 0 < zstandard.frame_content_size(frame) <= SLOTS_MAX * SLOT_BYTES:
         raise ValueError(f"expected 1 to {SLOTS_MAX} slots, got {zstandard.frame_content_size(frame)} bytes")
     slots = zstandard.ZstdDecompressor().decompress(frame)
     if len(slots) % SLOT_BYTES:
@@ -360,7 +342,7 @@ def _decode_slots(payload: bytes) -> FleetMessage:
 
 
 def finite(sample: Sample) -> Sample:
-    """The sample without vectors and values that have a component which is not finite."""
+    """Return the sample without fields that contain a value that is not finite."""
     bad: dict[str, None] = {}
     for name in sample.__struct_fields__:
         value = getattr(sample, name)
@@ -371,43 +353,36 @@ def finite(sample: Sample) -> Sample:
 
 
 REQUEST_BYTES: Final = 4096
-"""Of a request: the longest arguments of any action have some hundred."""
+"""Maximum length of a request, bytes. The longest arguments of a command have some hundred bytes."""
 Id = Annotated[str, msgspec.Meta(pattern=f"^{NAME_PATTERN}$")]
 
 
 class Outcome(StrEnum):
-    """Ends of a request."""
+    """Outcomes of a request."""
 
-    DONE = "done"
-    """The action ran; `result` has what it returned."""
+    DONE = "done"  # the command ran; `result` contains its return value
     FAILED = "failed"
-    """The action was refused by the device or by its checks, or did not end; `error` says why."""
-    DENIED = "denied"
-    """The gateway's configuration does not have the action in its list."""
+    """The device or a check rejected the command, or the command did not end; `error` contains the cause."""
+    DENIED = "denied"  # the configuration of the gateway does not allow the command
     STALE = "stale"
-    """The request is too old, of the future, or of before the gateway's start; or the gateway's clock is not set."""
-    DUPLICATE = "duplicate"
-    """A request with this id came before, and has or will have its answer."""
-    BUSY = "busy"
-    """Too many requests wait, or came within a minute."""
+    """The request is too old, from the future, or from before the start of the gateway, or the gateway clock is not
+    set."""
+    DUPLICATE = "duplicate"  # The gateway already received a request with this ID. It has sent or will send the reply.
+    BUSY = "busy"  # too many requests are waiting, or too many requests arrived within a minute
 
 
 class CommandRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A request for one action of one device."""
+    """Request for one command of one device."""
 
-    v: int
-    """VERSION."""
-    id: Id
-    """Chosen by who asks, another one for each request."""
-    action: Id
-    """As `imud command` takes it."""
+    v: int  # version of the format, VERSION
+    id: Id  # Identifier of the request. The sender must use a new ID for each request.
+    action: Id  # name of the command, as in `imud command`
     arguments: dict[str, Any] = {}  # msgspec copies a mutable default
-    issued_utc_ns: int
-    """CLOCK_REALTIME of who asks: an old request is not carried out."""
+    issued_utc_ns: int  # CLOCK_REALTIME of the sender. The gateway rejects old requests.
 
 
 class CommandAnswer(msgspec.Struct, frozen=True, omit_defaults=True, kw_only=True):
-    """The answer to a request."""
+    """Reply to a request."""
 
     v: int
     id: str
@@ -416,15 +391,14 @@ class CommandAnswer(msgspec.Struct, frozen=True, omit_defaults=True, kw_only=Tru
     action: str
     outcome: Outcome
     result: Any = None
-    error: str = ""
-    """Why it is not done, one sentence."""
+    error: str = ""  # cause of the failure, one sentence
 
 
 _REQUEST_DECODER: Final = msgspec.json.Decoder(CommandRequest)
 
 
 def decode_request(payload: bytes) -> CommandRequest:
-    """The request in a payload. Raises ValueError for anything else."""
+    """Return the request of a payload. Raises ValueError if the payload is invalid."""
     if len(payload) > REQUEST_BYTES:
         raise ValueError(f"expected at most {REQUEST_BYTES} bytes, got {len(payload)}")
     try:
@@ -437,9 +411,10 @@ def decode_request(payload: bytes) -> CommandRequest:
 
 
 def answer_topic(site: str, gateway: str, device: str, wanted: str = "") -> str | None:
-    """The topic of an answer: the device's own, or below it the one that is wanted; None where that is elsewhere.
+    """Return the topic of a reply: `wanted` if it is below the reply topic of the device, otherwise None.
 
-    A gateway answers nowhere else: who may ask it could otherwise make it write where only it may write.
+    An empty `wanted` means the reply topic of the device. A sender of requests must not be able to make the gateway
+    write to other topics.
     """
     own = topic_of(site, gateway, device, ANSWER)
     if not wanted or wanted == own:

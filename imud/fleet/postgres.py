@@ -1,15 +1,14 @@
-"""`imud fleet collect --to postgresql://…`: rows of samples, intervals, events, and the ledger, in one transaction.
+"""Store of `imud fleet collect --to postgresql://…`: rows of samples, intervals, events and the ledger.
 
-    COPY of rows ──▶ ledger ──▶ rows that waited for their clock ──▶ COMMIT ──▶ (the collector) acknowledge
+    COPY of rows ──▶ ledger ──▶ rows without UTC time ──▶ COMMIT ──▶ (the collector) acknowledge
 
-Exactly once: the ledger is kept beside the rows, so that a collector that was killed, or whose server was, knows what
-it has. Gateway, boot, device and number, with the time, are the primary key: should rows be there that the ledger does
-not know, COPY fails, and the transaction is done again through temporary tables with ON CONFLICT DO NOTHING, which
-takes twice as long.
+Each record is stored exactly once, because one transaction contains the rows and the ledger. The primary key is
+gateway, boot, device, number and time. If the database contains rows that the ledger does not, COPY fails. Then imud
+repeats the transaction with temporary tables and ON CONFLICT DO NOTHING, which takes twice as long.
 
-A gateway without a battery for its clock starts with any time. Its rows have that (`utc_set` is false) until a message
-or the state of the same boot says that the clock is synchronised; the same transaction moves all rows of the boot to
-where they belong: DELETE and INSERT, because a row changes its time, by which TimescaleDB divides tables.
+A gateway without a battery-backed clock starts with a wrong time. Its rows have the time of this clock and `utc_set`
+false, until a message or a state of the same boot contains a synchronized clock. The same transaction then moves all
+rows of the boot to their UTC time. It uses DELETE and INSERT, because TimescaleDB partitions tables by time.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -49,27 +48,26 @@ _OF_SAMPLE: Final = (
     *((name, "bigint") for name in NUMBERS),
 )  # fmt: skip
 _SAMPLE_NAMES: Final = tuple(name for name, _ in _OF_SAMPLE)
-_EPOCH: Final = datetime(1970, 1, 1)  # noqa: DTZ001  # its text has no offset, which stands behind the fraction
+# its ISO text has no offset; the offset follows the fraction of the second
+_EPOCH: Final = datetime(1970, 1, 1)  # noqa: DTZ001
 
-Row = tuple[object, ...]
-"""Values of all columns, in the order of `FleetTable.names`."""
+Row = tuple[object, ...]  # values of all columns, in the order of `FleetTable.names`
 
 
 class FleetTable(NamedTuple):
-    """A table of rows that have a time."""
+    """Table of rows with a time."""
 
     name: str
-    columns: tuple[tuple[str, str], ...]
-    """Name and type, without those of time and key."""
+    columns: tuple[tuple[str, str], ...]  # name and type of the columns, without time and key
     primary: str
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All columns, in the order of COPY."""
+        """Return all columns in the order of COPY."""
         return ("time", "site", "gateway", "boot", "device", *(name for name, _ in self.columns))
 
     def statement(self) -> str:
-        """The statement that makes it where it is missing."""
+        """Return the statement that creates the table if it does not exist."""
         columns = ", ".join(f"{name} {kind}" for name, kind in self.columns)
         return (
             f"CREATE TABLE IF NOT EXISTS {self.name} (time timestamptz NOT NULL, {KEY}, {columns}, "
@@ -89,17 +87,17 @@ BOOTS: Final = "imud_boots"
 SCHEMA: Final = {
     SAMPLES.name: SAMPLES.statement(),
     RECORDS.name: RECORDS.statement(),
-    # half of each page is free, so that an account is replaced in its page, without a change of the index
+    # half of each page stays free: PostgreSQL can then update a ledger within its page, without an index update
     LEDGER: f"CREATE TABLE IF NOT EXISTS {LEDGER} (gateway text, boot text, device text, stream text, "
     "account jsonb NOT NULL, PRIMARY KEY (gateway, boot, device, stream)) WITH (fillfactor = 50);",
     BOOTS: f"CREATE TABLE IF NOT EXISTS {BOOTS} (gateway text, boot text, t_ns bigint NOT NULL, "
     "utc_offset_ns bigint NOT NULL, utc_err_ns bigint, PRIMARY KEY (gateway, boot));",
 }
-"""Statements that make the tables, by their names."""
+"""Statements that create the tables, by table name."""
 
 
 def sample_rows(batch: FleetBatch) -> Iterable[Row]:
-    """Rows of the samples of a message."""
+    """Yield the rows of the samples of a message."""
     head = _head(batch)
     for one in batch.message.samples:
         values = [getattr(one, name) for name in _SAMPLE_NAMES]
@@ -110,7 +108,7 @@ def sample_rows(batch: FleetBatch) -> Iterable[Row]:
 
 
 def record_rows(batch: FleetBatch) -> Iterable[Row]:
-    """Rows of intervals, events and what was dropped."""
+    """Yield the rows of intervals, events and dropped records."""
     message, stream, head = batch.message, batch.stream.value, _head(batch)
     for one in message.intervals:
         at = batch.time_of(one.begin_utc_ns, one.begin_t_ns)
@@ -126,7 +124,6 @@ def record_rows(batch: FleetBatch) -> Iterable[Row]:
 
 
 def json_of(value: object) -> str:
-    """A value as JSON."""
     return msgspec.json.encode(value).decode()
 
 
@@ -142,22 +139,20 @@ def _times(head: Row, at: PlacedTime) -> Row:
 
 @lru_cache(1024)
 def _second_text(second: int) -> str:
-    """A second as text, UTC: many rows are of the same one."""
+    """Return a second as UTC text. Many rows share the same second."""
     return (_EPOCH + timedelta(seconds=second)).isoformat()
 
 
 def _placed(batch: FleetBatch, one: Interval, begin: PlacedTime) -> Interval:
-    """An interval with the times at which it lies: where its begin stays, the clock was not stepped after it."""
+    """Return an interval with its UTC times. If the time of its start is correct, the clock did not step later."""
     if begin.utc_ns == one.begin_utc_ns:
         return one
     end = batch.time_of(one.end_utc_ns, one.end_t_ns)
     return msgspec.structs.replace(one, begin_utc_ns=begin.utc_ns, end_utc_ns=end.utc_ns)
 
 
-LOCK: Final = 0x696D7564
-"""Number of the advisory lock ("imud"): one collector at a time writes to a database."""
-LOCK_S: Final = 20
-"""The lock of a collector that was killed goes with its last statement."""
+LOCK: Final = 0x696D7564  # Number of the advisory lock, "imud". One collector at a time writes to a database.
+LOCK_S: Final = 20  # Maximum wait for the lock, s. The lock of a killed collector ends with its last statement.
 EXTRA_MISSING: Final = "--to postgresql needs the extra fleet: pip install 'imud[fleet]'"
 _UTC_NS: Final = "t_ns + %(utc_offset_ns)s"
 _PLACED: Final = {
@@ -169,22 +164,21 @@ _PLACED: Final = {
     "'begin_utc_ns', (content->>'begin_t_ns')::bigint + %(utc_offset_ns)s, "
     "'end_utc_ns', (content->>'end_t_ns')::bigint + %(utc_offset_ns)s) ELSE content END",
 }
-"""Columns that change when the clock of a boot is known: the same as `boots.placed` does, in SQL."""
+"""SQL expressions of the columns that change when the clock of a boot is known, equal to `accounts.placed`."""
 
 
 class PostgresStore:
-    """The store. Synchronization: one thread at a time."""
+    """Store in a PostgreSQL database. Synchronization: one thread at a time."""
 
     def __init__(self, url: str) -> None:
-        """Connect and make the tables. Raises ServerError."""
+        """Connect and create the tables. Raises ServerError."""
         try:
             import psycopg
         except ImportError as error:
             raise ServerError(EXTRA_MISSING) from error
         self._error: type[Exception] = psycopg.Error
         self._conflict: type[Exception] = psycopg.errors.UniqueViolation
-        self._offsets: dict[BootKey, BootOffset] = {}
-        """Wall clocks of boots, as the table has them."""
+        self._offsets: dict[BootKey, BootOffset] = {}  # clock offsets in the table `imud_boots`
         try:
             self._connection: Any = psycopg.connect(url, connect_timeout=10, application_name="imud fleet collect")
             with self._connection.transaction(), self._connection.cursor() as cursor:
@@ -196,22 +190,22 @@ class PostgresStore:
         except psycopg.errors.LockNotAvailable as error:
             self.close()
             raise ServerError(
-                f"PostgreSQL: expected that no other collector writes to this database, got one that still does after "
-                f"{LOCK_S} s: look at application_name in pg_stat_activity"
+                f"PostgreSQL: another collector still writes to this database after {LOCK_S} s; see "
+                f"application_name in pg_stat_activity"
             ) from error
         except psycopg.ProgrammingError as error:
             self.close()
-            if error.sqlstate is not None:  # of the server
+            if error.sqlstate is not None:  # an error of the server, not of the URL
                 raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
             raise ServerError(
-                f"PostgreSQL: the URL cannot be read: {_unquoted(error)}; it may have a password and is not shown"
+                f"PostgreSQL: cannot parse the URL: {_unquoted(error)}; imud does not show it because of its password"
             ) from None
         except psycopg.Error as error:
             self.close()
             raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
 
     def restore(self, ledger: FleetLedger) -> None:
-        """Enter the accounts that are kept into a ledger. Raises ServerError."""
+        """Add the stored ledgers to `ledger`. Raises ServerError."""
         try:
             with self._connection.transaction(), self._connection.cursor() as cursor:
                 cursor.execute(f"SELECT gateway, boot, device, stream, account::text FROM {LEDGER}")
@@ -223,10 +217,7 @@ class PostgresStore:
             raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
 
     def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
-        """Keep batches and the accounts that they changed, place rows of `offsets`, all or nothing.
-
-        Raises ServerError.
-        """
+        """Store batches, changed ledgers and clock offsets in one transaction. Raises ServerError."""
         known = [batch._replace(offset=batch.offset or self._offsets.get(boot_of(batch.message))) for batch in batches]
         fresh = {key: offset for key, offset in offsets.items() if key not in self._offsets}
         try:
@@ -239,7 +230,7 @@ class PostgresStore:
         self._offsets |= fresh
 
     def close(self) -> None:
-        """End the connection; may be called twice."""
+        """Close the connection. A second call does nothing."""
         connection = getattr(self, "_connection", None)
         if connection is not None:
             with suppress(self._error):
@@ -251,7 +242,7 @@ class PostgresStore:
         self, insert: Callable[[Any, FleetTable, Iterable[Row]], None], batches: Sequence[FleetBatch],
         accounts: Accounts, fresh: Offsets,
     ) -> None:  # fmt: skip
-        """Write everything; `insert` says how rows come into their table."""
+        """Write all rows in one transaction. `insert` is `_copy` or `_insert`."""
         with self._connection.transaction(), self._connection.cursor() as cursor:
             insert(cursor, SAMPLES, (row for batch in batches for row in sample_rows(batch)))
             insert(cursor, RECORDS, (row for batch in batches for row in record_rows(batch)))
@@ -264,11 +255,11 @@ class PostgresStore:
             self._place(cursor, fresh)
 
     def _copy(self, cursor: Any, table: FleetTable, rows: Iterable[Row]) -> None:
-        """Give rows to their table, none of which is there."""
+        """Copy new rows into their table."""
         _copy_rows(cursor, f"{table.name} ({', '.join(table.names)})", rows)
 
     def _insert(self, cursor: Any, table: FleetTable, rows: Iterable[Row]) -> None:
-        """Give rows to their table, but for those that are there."""
+        """Copy rows into their table except rows that it already contains."""
         columns = ", ".join(table.names)
         _copy_rows(cursor, f"new_{table.name} ({columns})", rows)
         cursor.execute(
@@ -276,7 +267,7 @@ class PostgresStore:
         )
 
     def _place(self, cursor: Any, fresh: Offsets) -> None:
-        """Note clocks that are known from now on, and move the rows of their boots to where they belong."""
+        """Store new clock offsets and give the rows of their boots a UTC time."""
         for key, offset in fresh.items():
             cursor.execute(
                 "INSERT INTO imud_boots (gateway, boot, t_ns, utc_offset_ns, utc_err_ns) "
@@ -294,7 +285,7 @@ class PostgresStore:
 
 
 def _place_statement(table: FleetTable) -> str:
-    """Move rows of the boots of a gateway to where they belong."""
+    """Return the statement that gives the rows of the boots of a gateway a UTC time."""
     return (
         f"WITH gone AS (DELETE FROM {table.name} WHERE gateway = %(gateway)s AND boot = ANY(%(boots)s) "
         f"AND NOT utc_set AND t_ns IS NOT NULL RETURNING *) INSERT INTO {table.name} ({', '.join(table.names)}) "
@@ -303,14 +294,13 @@ def _place_statement(table: FleetTable) -> str:
 
 
 def _copy_rows(cursor: Any, target: str, rows: Iterable[Row]) -> None:
-    """COPY rows into a table."""
     with cursor.copy(f"COPY {target} FROM STDIN") as copy:
         for row in rows:
             copy.write_row(row)
 
 
 def _make_tables(cursor: Any) -> None:
-    """Make the tables that are missing; where none is, that needs no right to make any."""
+    """Create missing tables. Without a missing table, the user needs no right to create tables."""
     for name, statement in SCHEMA.items():
         cursor.execute("SELECT to_regclass(%s)", (name,))
         if cursor.fetchone()[0] is None:
@@ -318,7 +308,7 @@ def _make_tables(cursor: Any) -> None:
 
 
 def _make_new(cursor: Any, name: str) -> None:
-    """Make the temporary table whose rows go into a table."""
+    """Create the temporary table for the rows of a table."""
     cursor.execute(f"CREATE TEMPORARY TABLE new_{name} ON COMMIT DELETE ROWS AS SELECT * FROM {name} WITH NO DATA")
 
 
@@ -327,5 +317,5 @@ def _sentence(error: BaseException) -> str:
 
 
 def _unquoted(error: BaseException) -> str:
-    """The problem without the part of the URL that libpq quotes."""
+    """Return the problem without the part of the URL that libpq quotes."""
     return _sentence(error).partition('"')[0].rstrip(": ")

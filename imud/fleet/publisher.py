@@ -1,8 +1,8 @@
-"""The output `mqtt`: what the event loop does of it, which is to put things into a queue.
+"""Output `mqtt`: the part in the event loop, which only puts samples, events and states into a queue.
 
     loop: publish, event, tick ──▶ WriterQueue ──▶ writer (thread: messages, spool) ──▶ sender (thread: broker)
 
-On the broker: docs/fleet.md. The spool is of one daemon: a lock keeps a second one out.
+docs/fleet.md describes the messages. A lock file prevents that two daemons use the same spool.
 """
 
 import fcntl
@@ -45,21 +45,21 @@ from imud.model.event import Event, EventKind
 from imud.model.sample import SAMPLE_SCHEMA
 from imud.model.units import NS_PER_S
 
-PREFIX: Final = "homeassistant"
-"""The prefix of discovery that Home Assistant has unless it was changed there."""
-DEG_PER_RAD: Final = "57.29577951308232"
-"""180 / π, in templates."""
-ANGLES: Final = ("roll", "pitch", "yaw")
-"""Components of `euler_rad`."""
+PREFIX: Final = "homeassistant"  # default prefix of the discovery topics of Home Assistant
+DEG_PER_RAD: Final = "57.29577951308232"  # 180 / π, for templates
+ANGLES: Final = ("roll", "pitch", "yaw")  # components of `euler_rad`
 
 
 def discovery_topic(gateway: Gateway, device: str) -> str:
-    """The topic of a device's configuration. The check sum keeps `a_b` of `c` apart from `a` of `b_c`."""
+    """Return the discovery topic of a device.
+
+    Its checksum distinguishes device `b` of gateway `a_b` from `b_b` of `a`.
+    """
     return f"{PREFIX}/device/{_unique_id(gateway, device)}/config"
 
 
 def discovery_of(gateway: Gateway, status: DeviceStatus, sending: DeviceSending) -> Mapping[str, object]:
-    """The configuration of a device with all its parts."""
+    """Return the discovery message of a device with all entities."""
     unique_id = _unique_id(gateway, status.name)
     parts = _status_parts(topic_of(gateway.site, gateway.gateway, status.name, STATUS))
     if sending.rate_hz and "mean" in sending.values:
@@ -89,7 +89,7 @@ def _unique_id(gateway: Gateway, device: str) -> str:
 
 
 def _status_parts(topic: str) -> dict[str, dict[str, object]]:
-    """What the retained state has."""
+    """Return the entities of the retained state."""
     diagnostic = {"state_topic": topic, "entity_category": "diagnostic"}
     return {
         "running": {
@@ -109,8 +109,11 @@ def _status_parts(topic: str) -> dict[str, dict[str, object]]:
 
 
 def _attitude_parts(topic: str) -> dict[str, dict[str, object]]:
-    """Means of the newest interval. A message without intervals, or a device without angles, gives an empty value,
-    which Home Assistant leaves out."""
+    """Return the entities of the mean attitude in the newest interval.
+
+    Their templates return an empty value for a message without intervals and for a device without angles. Home
+    Assistant ignores empty values.
+    """
     found: dict[str, dict[str, object]] = {}
     for at, name in enumerate(ANGLES):
         newest = "value_json.intervals[-1]['values']"
@@ -129,15 +132,15 @@ log = logging.getLogger(__name__)
 
 LOCK: Final = "lock"
 STATE_NS: Final = NS_PER_S
-"""After an event of STATE_KINDS the state of devices is looked at so soon: that of one takes the loop 0.6 ms."""
+"""Minimum time between two state messages, ns. The state of one device costs the event loop 0.6 ms."""
 STATE_KINDS: Final = frozenset(
     (EventKind.UP, EventKind.DOWN, EventKind.SYNC, EventKind.CONFIGURATION, EventKind.ALARM, EventKind.ATTITUDE)
 )
-"""Events after which the state of a device is not what it was."""
+"""Events that change the state of a device."""
 
 
 class MqttPublisher:
-    """The output. Synchronization: the event loop's thread only."""
+    """Output `mqtt`. Synchronization: the event loop's thread only."""
 
     def __init__(
         self, settings: MqttOptions, context: PublisherContext, *, connect: Connect = PahoConnection,
@@ -153,19 +156,15 @@ class MqttPublisher:
         self._writer: SpoolWriter | None = None
         self._commands: CommandChannel | None = None
         self._names: set[str] = set()
-        self._sent: set[str] = set()
-        """Devices of which something is sent."""
-        self._known: dict[str, tuple[str, str, str]] = {}
-        """What was published of a device: its state, problem and frame."""
-        self._settings_known: dict[str, dict[str, object]] = {}
-        """The settings of devices as they were published."""
+        self._sent: set[str] = set()  # devices with messages
+        self._known: dict[str, tuple[str, str, str]] = {}  # published state, problem and axes of each device
+        self._settings_known: dict[str, dict[str, object]] = {}  # published settings of each device
         self._state_ns = self._all_ns = 0
-        self._is_changed = True
-        """Whether states are to be looked at before the next time."""
+        self._is_changed = True  # True after an event of STATE_KINDS
         self._spool_problem = self._problem = ""
         self._lock = -1
 
-    # --- the publisher -----------------------------------------------------------------------------------------------
+    # --- publisher ----------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
         """Open the spool and start both threads. Raises ServerError."""
@@ -175,8 +174,8 @@ class MqttPublisher:
         gateway = settings.gateway or self._host_name().partition(".")[0]
         if not is_name(gateway):
             raise ServerError(
-                f"mqtt.gateway: expected a name of 1 to 64 letters, digits, '_' or '-', and the host's name is "
-                f"{gateway!r}; set it"
+                f"mqtt.gateway: expected 1 to 64 letters, digits, '_' or '-', got the host name {gateway!r}; "
+                f"set mqtt.gateway"
             )
         self._gateway = Gateway(settings.site, gateway, boot_text(context.epoch))
         directory = Path(settings.spool_directory)
@@ -205,20 +204,19 @@ class MqttPublisher:
             context.clock.utc_offset_ns, self._start_worker, self._clock,
         )  # fmt: skip
         lock, self._lock = self._lock, -1
-        self._writer.closed = lambda: os.close(lock)  # a thread that hangs in the disk keeps it
+        self._writer.closed = lambda: os.close(lock)  # if the disk blocks the writer, its thread keeps the lock
         self._sender.retain({will.topic: self._state(online=True)})
         self._sender.start()
         context.outputs.mqtts.append(self.status)
         log.info("mqtt: %s as imud/%s/%s", ", ".join(broker.name for broker in brokers), settings.site, gateway)
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Note the device."""
         self._names.add(name)
         if is_name(name) and self._settings.sending(name) is not None:
             self._sent.add(name)
 
     def remove_device(self, name: str) -> None:
-        """Forget a device that left the configuration, and take its state off the broker."""
+        """Remove a device, and its retained messages from the broker."""
         self._names.discard(name)
         self._sent.discard(name)
         topics = []
@@ -243,7 +241,7 @@ class MqttPublisher:
             self._queue.put_event(event)
 
     def tick(self, now_ns: int) -> None:
-        """Look after both threads, and publish states."""
+        """Check both threads and publish states. Raises the exception that ended a thread."""
         writer, sender = self._writer, self._sender
         if writer is None or sender is None:
             return
@@ -258,7 +256,7 @@ class MqttPublisher:
             self._send_states(now_ns)
 
     def close(self) -> None:
-        """End both threads; may be called twice."""
+        """End both threads. A second call does nothing."""
         sender, self._sender = self._sender, None
         writer, self._writer = self._writer, None
         if self.status in self._context.outputs.mqtts:
@@ -291,7 +289,7 @@ class MqttPublisher:
     # --- states ------------------------------------------------------------------------------------------------------
 
     def _send_states(self, now_ns: int) -> None:
-        """Publish what changed of devices, and all of it now and then."""
+        """Publish changed states of devices, and every `status_s` all states."""
         is_due = now_ns - self._all_ns >= self._settings.status_s * NS_PER_S
         if not is_due and not self._is_changed:
             return
@@ -322,7 +320,7 @@ class MqttPublisher:
             self._queue.put_state(SentState(statuses, other))
 
     def _changed_settings(self, status: DeviceStatus) -> dict[str, object]:
-        """The message about the settings of a device, where they are not what was published."""
+        """Return the message about the settings of a device; empty if they did not change."""
         found = settings_of(status)
         if found is None or self._settings_known.get(status.name) == found:
             return {}
@@ -336,7 +334,7 @@ class MqttPublisher:
         return topic_of(self._settings.site, self._gateway.gateway, device, leaf)
 
     def _state(self, *, online: bool, reason: str = "") -> bytes:
-        """The state of the gateway: birth, death, or last will."""
+        """Return the state of the gateway: birth, death or last will."""
         found: dict[str, object] = {"v": VERSION, "online": online, "boot": boot_text(self._context.epoch)}
         if online:
             found |= {"imud": __version__, "devices": sorted(self._sent), "clock": self._clock()}
@@ -345,31 +343,33 @@ class MqttPublisher:
         return msgspec.json.encode(found)
 
     def _clock(self) -> GatewayClock:
-        """The wall clock now. Called in the writer's thread as well."""
+        """Return the wall clock. The writer's thread also calls this method."""
         context = self._context
         reference = context.clock.utc_reference()
         if reference is None:
             return GatewayClock(context.clock.now_ns(), context.clock.utc_offset_ns(), synchronised=False)
         return GatewayClock(context.clock.now_ns(), reference.offset_ns, synchronised=True, error_ns=reference.error_ns)
 
-    # --- what goes wrong ---------------------------------------------------------------------------------------------
+    # --- problems -----------------------------------------------------------------------------------------------------
 
     def _look_at_problems(self, now_ns: int, writer: SpoolWriter, sender: MqttSender) -> None:
-        """Tell of a spool that stopped or went on, and log what the broker says, each once."""
+        """Report changes of the spool as events, and changes of the connection in the log."""
         if writer.problem != self._spool_problem:
             before, self._spool_problem = self._spool_problem, writer.problem
             if not before:
-                self._raise(now_ns, f"nothing is spooled: {writer.problem}; samples go on")
+                self._raise(now_ns, f"the spool failed: {writer.problem}; the other outputs continue")
             elif not writer.problem:
-                self._raise(now_ns, f"spooling again; it was not possible before: {before}")
+                self._raise(now_ns, f"the spool works again after: {before}")
         spool = self._spool
         if spool is not None and spool.set_aside:
-            self._raise(now_ns, f"the spool was damaged and begins anew; the old one is {spool.set_aside}")
+            self._raise(
+                now_ns, f"the spool was damaged; imud created a new spool and renamed the old one to {spool.set_aside}"
+            )
             spool.set_aside = ""
         if sender.problem != self._problem:
             self._problem = sender.problem
             if sender.problem:
-                log.warning("mqtt: nothing is sent: %s", sender.problem)
+                log.warning("mqtt: cannot send: %s", sender.problem)
             else:
                 log.info("mqtt: connected to %s", sender.broker)
 
@@ -378,7 +378,7 @@ class MqttPublisher:
         self._context.raise_event(Event(now_ns, "", EventKind.MQTT, message))
 
     def _lock_spool(self, directory: Path) -> None:
-        """Keep another daemon from the same spool. Raises ServerError."""
+        """Lock the spool against another daemon. Raises ServerError."""
         try:
             directory.mkdir(mode=0o750, parents=True, exist_ok=True)
             self._lock = os.open(directory / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640)
@@ -386,13 +386,15 @@ class MqttPublisher:
         except BlockingIOError:
             os.close(self._lock)
             self._lock = -1
-            raise ServerError(f"{directory}: another running imud has this spool; set mqtt.spool_directory") from None
+            raise ServerError(
+                f"{directory}: another imud process uses this spool; set mqtt.spool_directory to another folder"
+            ) from None
         except OSError as error:
             raise ServerError(f"spool in {directory}: {reason_of(error)}") from error
 
 
 def schema_of(status: DeviceStatus) -> Mapping[str, object]:
-    """What a reader needs to understand samples and slots of a device."""
+    """Return the description of samples and slots of a device for readers."""
     return {
         "v": VERSION,
         "device": status.name,
@@ -416,7 +418,7 @@ def schema_of(status: DeviceStatus) -> Mapping[str, object]:
 
 
 def settings_of(status: DeviceStatus) -> dict[str, object] | None:
-    """A device's own settings and how they differ from what is declared; None while nothing is known of them."""
+    """Return the settings of a device and their differences from the declared settings; None if they are unknown."""
     declared = status.declared
     if declared is None and not status.settings:
         return None

@@ -1,10 +1,11 @@
-"""The reading side: batches of all gateways, with the ledger; connections are made again as often as it takes.
+"""Reader of a fleet: batches of all gateways with their ledger. The reader reconnects after each lost connection.
 
     async for batch in Fleet("mqtts://broker.example", name="archive").watch(gateway="gw-17"):
         store(batch.message.samples)
 
-A batch is acknowledged when the loop asks for the next one. With a `name` the broker keeps the session: what was not
-acknowledged, and what comes while the reader is away, is sent when it is back. Such a name is of one reader at a time.
+The reader acknowledges a batch when the loop requests the next batch. With a `name`, the broker keeps the session. It
+stores messages while the reader is not connected, and sends messages without an acknowledgement again. Only one reader
+can use a name at a time.
 """
 
 import asyncio
@@ -16,8 +17,6 @@ from contextlib import suppress
 from secrets import token_hex
 from types import TracebackType
 from typing import Any, Final, NamedTuple, Self
-
-import msgspec
 
 from imud.fleet.accounts import (
     BootClocks,
@@ -41,6 +40,7 @@ from imud.fleet.broker import (
     BrokerAccess,
     BrokerError,
     BrokerTurn,
+    ReaderAccess,
     check_extra,
     close_client,
     connection_problem,
@@ -53,52 +53,49 @@ from imud.model.errors import BadArgument, ServerError
 from imud.model.units import NS_PER_S
 
 RECEIVE_MAX: Final = 2000
-"""Messages without an acknowledgement: what 1,000 gateways with two devices send in a second."""
+"""Maximum number of messages without an acknowledgement. 1,000 gateways with two devices send this number per
+second."""
 WAITING_BYTES: Final = 16 << 20
-"""Bytes of messages that wait to be taken: 4 kB each is usual for statistics, but they can have 130 kB."""
+"""Maximum size of the waiting messages, bytes. A message with statistics usually has 4 kB, at most 130 kB."""
 PACKET_BYTES: Final = 1_000_000
-"""Longest message: those of gateways have 130 kB, states of a hundred devices less."""
+"""Maximum length of a message, bytes. A message of a gateway has at most 130 kB; the state of a hundred devices is
+shorter."""
 KEEP_ALIVE_S: Final = 30
 GATHER_S: Final = 0.01
-"""Pause after messages: those that come meanwhile are read together, which costs less than half as much for each."""
-MISC_S: Final = 1.0
-"""Keep-alives are looked at so often."""
+"""Pause after received messages, s. Reading several messages together costs less than half of the CPU time per
+message."""
+MISC_S: Final = 1.0  # interval of the keep-alive checks, s
 
 
 class FleetDelivery(NamedTuple):
-    """A message as it came."""
+    """Message as the broker delivered it."""
 
     topic: str
     payload: bytes
-    retain: bool
-    """Whether the broker had kept it."""
-    number: int
-    """By which it is acknowledged, in the connection it came by."""
+    retain: bool  # true if the broker stored the message (retained)
+    number: int  # packet identifier for the acknowledgement, valid in `connection`
     connection: "ReaderConnection"
 
 
 class ReaderConnection:
-    """A connection. Made by `open`. Synchronization: the thread of the event loop."""
+    """Connection to one broker. `open` creates it. Synchronization: the event loop's thread."""
 
     def __init__(self, broker: Broker) -> None:
         self.refused = 0
-        """Messages of QoS 0, which are left out: nothing bounds how many come."""
+        """Number of rejected messages with QoS 0. A broker can send any number of them without an acknowledgement."""
         self._broker = broker
         self._queue: deque[FleetDelivery] = deque()
-        self._bytes = 0
-        """Of the messages in the queue."""
+        self._bytes = 0  # bytes of the messages in the queue
         self._came = asyncio.Event()
         self._problem = ""
         self._answered = False
-        self._awaited = 0
-        """Topics whose subscription the broker has not answered."""
+        self._awaited = 0  # number of topics without a SUBACK
         self._client: Any = None
         self._socket: Any = None
+        # True while the socket is not read: after received messages, or because the queue is full
         self._is_paused = False
-        """Whether the socket is not read, because messages gather or because enough of them wait."""
         self._gathering: asyncio.TimerHandle | None = None
-        self._number = -1
-        """Of the socket: paho-mqtt may close it before the event loop has forgotten it."""
+        self._number = -1  # descriptor of the socket: paho-mqtt can close the socket before the event loop removes it
         self._timer: asyncio.TimerHandle | None = None
 
     @classmethod
@@ -112,9 +109,10 @@ class ReaderConnection:
         *,
         is_v5: bool = True,
     ) -> "ReaderConnection":
-        """Connect and subscribe. `session_s`: how long the broker keeps the session without a connection, s; 0: none.
+        """Connect and subscribe. Raises BrokerError.
 
-        With MQTT 3.1.1 the broker's own settings say how long. Raises BrokerError.
+        `session_s` is the time for which the broker keeps the session without a connection, s; 0: no session. With MQTT
+        3.1.1 the configuration of the broker decides the time.
         """
         self = cls(broker)
         try:
@@ -123,7 +121,7 @@ class ReaderConnection:
             self._awaited = len(topics)
             self._guarded(lambda: self._client.subscribe([(topic, 1) for topic in topics]))
             self._look_at_writing()
-            # a session can have more messages than are read at once, and the answer stands behind them
+            # a session can contain more messages than the reader accepts at once, and SUBACK follows them
             await self._until(lambda: not self._awaited or not self._has_room(), "no answer to the subscription")
         except (OSError, ValueError) as error:
             self.close()
@@ -148,13 +146,11 @@ class ReaderConnection:
 
     @property
     def waiting(self) -> int:
-        """Messages that came and that nobody has taken."""
+        """Return the number of waiting messages."""
         return len(self._queue)
 
-    # --- as a connection ---------------------------------------------------------------------------------------------
-
     async def next(self, timeout_s: float | None = None) -> FleetDelivery | None:
-        """The next message; None when none came in time. Raises BrokerError when the connection is lost."""
+        """Return the next message; None after `timeout_s`. Raises BrokerError if the connection is lost."""
         if not self._queue:
             with suppress(TimeoutError):
                 await self._until(lambda: bool(self._queue), "", timeout_s)
@@ -164,14 +160,14 @@ class ReaderConnection:
         return found
 
     def acknowledge(self, number: int) -> None:
-        """Tell the broker that a message is done with; no-op when the connection is lost, which may show here first."""
+        """Acknowledge a message. Do nothing if the connection is lost."""
         client = self._client
         if client is not None and not self._problem:
             self._guarded(lambda: client.ack(number, 1))
             self._look_at_writing()
 
     def close(self) -> None:
-        """End the connection with a farewell, keeping the session; may be called twice."""
+        """Send DISCONNECT and close the connection. The broker keeps the session. A second call does nothing."""
         client, self._client = self._client, None
         self._problem = self._problem or "the connection is closed"
         self._came.set()
@@ -182,10 +178,10 @@ class ReaderConnection:
         if client is not None:
             close_client(client)
 
-    # --- the socket --------------------------------------------------------------------------------------------------
+    # --- socket -------------------------------------------------------------------------------------------------------
 
     async def _until(self, true: Any, problem: str, timeout_s: float | None = CONNECT_S) -> None:
-        """Wait until something holds. Raises BrokerError; TimeoutError where `problem` is empty."""
+        """Wait until `true` returns True. Raises BrokerError; raises TimeoutError if `problem` is empty."""
         try:
             async with asyncio.timeout(timeout_s):
                 while not true():
@@ -199,7 +195,7 @@ class ReaderConnection:
             raise BrokerError(f"{self._broker.name}: {problem} within {timeout_s:g} s") from None
 
     def _read(self) -> None:
-        """Let paho-mqtt read all that is there, then leave the socket alone for a moment if that was messages."""
+        """Let paho-mqtt read all pending data. After received messages, pause reading for GATHER_S."""
         client, before = self._client, len(self._queue)
         while client is not None:
             known = len(self._queue)
@@ -219,19 +215,19 @@ class ReaderConnection:
         self._look_at_reading()
 
     def _look_at_reading(self) -> None:
-        """Read on after a pause, unless enough messages wait."""
+        """Continue to read after a pause if the queue has room."""
         if self._is_paused and self._gathering is None and self._has_room() and self._socket is not None:
             loop = asyncio.get_running_loop()
             self._is_paused = False
             loop.add_reader(self._number, self._read)
-            if self._pending():  # of which the kernel knows nothing
+            if self._pending():  # the event loop cannot see bytes that the TLS library already read
                 loop.call_soon(self._read)
 
     def _has_room(self) -> bool:
         return len(self._queue) <= RECEIVE_MAX // 2 and self._bytes <= WAITING_BYTES // 2
 
     def _pending(self) -> int:
-        """Bytes that the TLS library has read from the socket already."""
+        """Return the number of bytes that the TLS library read from the socket but did not decode."""
         return int(getattr(self._socket, "pending", lambda: 0)())
 
     def _write(self) -> None:
@@ -240,7 +236,7 @@ class ReaderConnection:
             self._look_at_writing()
 
     def _look_at_writing(self) -> None:
-        """Wait for room in the socket while paho-mqtt has something to write."""
+        """Wait until the socket is writable if paho-mqtt has data to write."""
         if self._problem or self._socket is None:
             return
         loop = asyncio.get_running_loop()
@@ -250,14 +246,15 @@ class ReaderConnection:
             loop.remove_writer(self._number)
 
     def _look_after(self) -> None:
-        """Send and expect keep-alives."""
+        """Send and check keep-alives."""
         self._timer = asyncio.get_running_loop().call_later(MISC_S, self._look_after)
-        if self._has_room():  # else what it would miss may be in what is not read
+        # otherwise PINGRESP can be in the data that was not read, and paho-mqtt would report a timeout
+        if self._has_room():
             self._guarded(self._client.loop_misc)
         self._look_at_writing()
 
     def _guarded(self, work: Any) -> None:
-        """Call paho-mqtt, and note a connection that is lost: whatever writes or reads can close the socket."""
+        """Call paho-mqtt. Store the problem if the call or the closed socket shows a lost connection."""
         try:
             work()
         except (OSError, ValueError) as error:
@@ -269,14 +266,14 @@ class ReaderConnection:
             self._came.set()
 
     def _forget_socket(self) -> None:
-        """Stop waiting for the socket, whose descriptor may be closed, or be another file's by now."""
+        """Remove the socket from the event loop. Its descriptor may be closed and belong to another file."""
         sock, self._socket = self._socket, None
         if sock is not None:
             for forget in ("remove_reader", "remove_writer"):
-                with suppress(OSError, RuntimeError):  # RuntimeError: the loop has ended, and with it the waiting
+                with suppress(OSError, RuntimeError):  # RuntimeError: the event loop has ended
                     getattr(asyncio.get_running_loop(), forget)(self._number)
 
-    # --- what paho-mqtt calls ----------------------------------------------------------------------------------------
+    # --- callbacks of paho-mqtt ---------------------------------------------------------------------------------------
 
     def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
@@ -300,7 +297,7 @@ class ReaderConnection:
         self._came.set()
 
     def _on_socket_close(self, _client: Any, _data: Any, _sock: Any) -> None:
-        """Forget the socket while its descriptor is still its own: paho-mqtt closes it next."""
+        """Remove the socket from the event loop before paho-mqtt closes its descriptor."""
         self._forget_socket()
         self._came.set()
 
@@ -312,44 +309,32 @@ class ReaderConnection:
 log = logging.getLogger(__name__)
 
 SESSION_S: Final = 7 * 24 * 3600
-"""A session with a name outlives so long an absence of its reader, unless the broker allows less."""
+"""Time for which the broker keeps a named session without a connection, s. A broker can have a lower limit."""
 RETRY_MAX_S: Final = 60.0
-VERSIONS: Final = ("5", "3.1.1")
-"""Of MQTT; the first is taken without asking."""
-
-
-class ReaderAccess(msgspec.Struct, frozen=True):
-    """Who connects, and which certificates count; the keys of `mqtt` with these names say more."""
-
-    user: str = ""
-    password_file: str | None = None
-    ca_file: str | None = None
-    cert_file: str | None = None
-    key_file: str | None = None
+VERSIONS: Final = ("5", "3.1.1")  # Supported versions of MQTT. The first is the default.
 
 
 class FleetBatch(NamedTuple):
-    """A message of a stream, without what had come before."""
+    """New part of a stream message."""
 
     site: str
     stream: Stream
-    message: FleetMessage
-    """Its samples are those that `imud.client` gives."""
+    message: FleetMessage  # message with samples of the same type as in `imud.client`
     offset: BootOffset | None = None
-    """The wall clock of its boot, as far as it is known: with it, what came before can be placed, too."""
+    """Newest clock offset of the boot; None before the first. It gives older records of the boot a UTC time."""
 
     def time_of(self, utc_ns: int, t_ns: int) -> PlacedTime:
-        """Where a record of the message with these two times lies on UTC, and whether its gateway knew the time."""
+        """Return the UTC time of a record with these two times."""
         return placed(utc_ns, t_ns, self.message.clock, self.offset)
 
     def time_of_newest(self) -> PlacedTime:
-        """The same of the newest of the message, which is all there is of what was dropped."""
+        """Return the UTC time of the newest record. It is the only time of dropped samples."""
         message, t_ns = self.message, self.message.newest_t_ns
         return placed(message.utc_ns, t_ns, message.clock, self.offset)
 
 
 def brokers_of(urls: Sequence[str]) -> list[Broker]:
-    """The brokers that URLs name. Raises BadArgument for one that names none, and for no URL."""
+    """Return the brokers of URLs. Raises BadArgument if a URL is invalid or the list is empty."""
     found = []
     for url in urls:
         broker = broker_of(url)
@@ -365,17 +350,17 @@ def brokers_of(urls: Sequence[str]) -> list[Broker]:
 
 
 class Fleet:
-    """The gateways of a broker, or of a cluster of them. Synchronization: one event loop."""
+    """Gateways of a broker or of a cluster of brokers. Synchronization: one event loop."""
 
     def __init__(
         self, *urls: str, access: ReaderAccess | None = None, name: str = "", version: str = VERSIONS[0],
         from_begin: bool = False, retry_max_s: float = RETRY_MAX_S, now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:  # fmt: skip
-        """`urls`: mqtt, mqtts, ws or wss, without user and password; several are of one cluster, tried in turn.
+        """Create a reader for the URLs `mqtt`, `mqtts`, `ws` or `wss` of one cluster, without user and password.
 
-        `name`: of the session that the broker keeps. `version`: of MQTT, 5 or 3.1.1. `from_begin`: numbers that the
-        first message of a stream leaves out count as missing. `retry_max_s`: longest pause between two attempts, s.
-        Raises BadArgument, and ServerError without the extra `mqtt`.
+        `name` is the name of the session on the broker, `version` the version of MQTT (5 or 3.1.1). With `from_begin`,
+        numbers before the first received message count as missing. `retry_max_s` is the maximum pause between two
+        attempts, s. Raises BadArgument, and ServerError without the extra `mqtt`.
         """
         if version not in VERSIONS:
             raise BadArgument(f"expected MQTT {' or '.join(VERSIONS)}, got {version!r}")
@@ -389,35 +374,30 @@ class Fleet:
         self.client_id = f"imud-reader-{name or token_hex(8)}"
         self.retry_max_s, self.now_ns = retry_max_s, now_ns
         self.ledger = FleetLedger(from_begin=from_begin)
-        self.states: dict[tuple[str, str], GatewayState] = {}
-        """The last state of each gateway, by site and gateway."""
-        self.ignored = 0
-        """Messages of these topics that no gateway of a version known here has sent."""
-        self.connections = 0
-        """Connections that a broker has accepted, with their subscriptions."""
-        self.problem = ""
-        """Why nothing comes now, one sentence; empty while the connection is there."""
-        self.clocks = BootClocks()
-        """What gateways said of their wall clocks."""
+        self.states: dict[tuple[str, str], GatewayState] = {}  # newest state of each gateway, by site and gateway
+        self.ignored = 0  # number of messages that no gateway of a supported version sent
+        self.connections = 0  # number of accepted connections
+        self.problem = ""  # cause of a missing connection, one sentence; empty while the reader is connected
+        self.clocks = BootClocks()  # clock offsets of the gateways
         self._positions = SpoolPositions(from_begin=from_begin)
 
     @property
     def accounts(self) -> Mapping[StreamKey, StreamAccount]:
-        """The account of every stream: sent, received, gaps by cause, still in the spool."""
+        """Return the ledger of each stream: sent, received, gaps by cause, and numbers in the spool."""
         return self._positions.accounts(self.ledger)
 
     @property
     def offsets(self) -> Mapping[BootKey, BootOffset]:
-        """CLOCK_REALTIME less CLOCK_MONOTONIC of each gateway and boot whose clock was synchronised, with its error."""
+        """Return the newest clock offset of each boot whose clock was synchronized."""
         return self.clocks.offsets
 
     async def watch(
         self, *, site: str | None = None, gateway: str | None = None, device: str | None = None
     ) -> AsyncGenerator[FleetBatch, None]:
-        """Batches as they come, each acknowledged when the next one is asked for. None stands for all.
+        """Yield batches. Acknowledge each batch when the caller requests the next. None selects all.
 
-        Raises BadArgument for what is no name, ServerError for more streams than a ledger holds. What is wrong with
-        the connection is in `problem`, and it is tried again.
+        The reader tries again after connection problems and stores them in `problem`. Raises BadArgument if a name is
+        invalid, and ServerError if there are too many streams for the ledger.
         """
         async with FleetSession(self, site=site, gateway=gateway, device=device) as session:
             while True:
@@ -430,12 +410,12 @@ class Fleet:
                 session.acknowledge(delivery)
 
     def take(self, delivery: FleetDelivery, changed: set[StreamKey] | None = None) -> FleetBatch | None:
-        """Enter a message into the ledger; return what of it is new. Raises ServerError for too many streams.
+        """Add a message to the ledger. Return its new part. Raises ServerError if there are too many streams.
 
-        The key of an account that changed, be it by a duplicate, is put into `changed`.
+        This method adds the key of a changed ledger to `changed`, also after a duplicate.
         """
         parts = parse_topic(delivery.topic)
-        assert parts is not None  # the session gives no other
+        assert parts is not None  # FleetSession.next checks the topic
         try:
             if parts.leaf == STATE:
                 state = decode_state(delivery.payload)
@@ -445,7 +425,9 @@ class Fleet:
                 return None
             message, stream = decode_message(delivery.payload), Stream(parts.leaf)
             if (message.gateway, message.device) != (parts.gateway, parts.device):
-                raise ValueError(f"expected a message of {parts.gateway}/{parts.device}, got one of another")
+                raise ValueError(
+                    f"expected a message of {parts.gateway}/{parts.device}, got a message of another device"
+                )
             fresh = self.ledger.take(message, stream)
             if changed is not None:
                 changed.add(key_of(message, stream))
@@ -460,10 +442,10 @@ class Fleet:
 
 
 class FleetSession:
-    """A session with the broker over as many connections as it takes. Synchronization: one event loop."""
+    """Session with the broker over several connections. Synchronization: one event loop."""
 
     def __init__(self, fleet: Fleet, *, site: str | None, gateway: str | None, device: str | None) -> None:
-        """None stands for all. Raises BadArgument for what is no name."""
+        """None selects all. Raises BadArgument if a name is invalid."""
         for what, given in (("site", site), ("gateway", gateway), ("device", device)):
             if given is not None and not is_name(given):
                 raise BadArgument(f"{what}: expected 1 to 64 letters, digits, '_' or '-', got {given!r}")
@@ -482,7 +464,7 @@ class FleetSession:
         self.close()
 
     async def next(self, timeout_s: float | None = None) -> FleetDelivery | None:
-        """The next message of a gateway; None when none came in time, and now and then while there is no connection."""
+        """Return the next message of a gateway; None after `timeout_s`, and sometimes while there is no connection."""
         fleet = self._fleet
         try:
             if self._connection is None and not await self._connected(timeout_s):
@@ -496,24 +478,24 @@ class FleetSession:
             return None
         parts = parse_topic(delivery.topic)
         if parts is None or not self._is_wanted(parts):
-            fleet.ignored += 1  # of a subscription that this session had once
+            fleet.ignored += 1  # the session still has the subscription of an earlier reader with the same name
             self.acknowledge(delivery)
             return None
         return delivery
 
     def acknowledge(self, delivery: FleetDelivery) -> None:
-        """Tell the broker that a message is done with; one of an earlier connection comes again."""
+        """Acknowledge a message. The broker sends a message of an earlier connection again."""
         if delivery.connection is self._connection:
             self._connection.acknowledge(delivery.number)
 
     def close(self) -> None:
-        """End the connection; may be called twice. The broker keeps a session that has a name."""
+        """Close the connection. The broker keeps a named session. A second call does nothing."""
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.close()
 
     async def _connected(self, timeout_s: float | None) -> bool:
-        """Connect, when it is time for it. Raises BrokerError."""
+        """Connect if the pause is over. Return whether there is a connection. Raises BrokerError."""
         fleet = self._fleet
         pause_s = (self._again_ns - fleet.now_ns()) / NS_PER_S
         if pause_s > 0:
@@ -541,14 +523,14 @@ class FleetSession:
             log.warning("%s; trying again", error)
 
     def _topics(self) -> list[str]:
-        """What is subscribed to: states, and the streams that are wanted."""
+        """Return the topics of the subscription: states and selected streams."""
         site, gateway, device = (name or "+" for name in self._wanted)
         base = f"{ROOT}/{site}/{gateway}"
         topics = [f"{base}/{STATE}", *(f"{base}/{device}/{stream}" for stream in Stream)]
         return topics if self._wanted[2] is not None else [*topics, f"{base}/{Stream.EVENTS}"]
 
     def _is_wanted(self, parts: TopicParts) -> bool:
-        """Whether a topic is one of those that are wanted; a session can have others from an earlier reader."""
+        """Return whether the selection contains a topic. A session can contain topics of an earlier reader."""
         if parts.leaf != STATE and parts.leaf not in Stream.__members__.values():
             return False
         given = (parts.site, parts.gateway, parts.device if parts.leaf != STATE else self._wanted[2])

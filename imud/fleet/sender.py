@@ -1,10 +1,11 @@
-"""The thread that talks to the broker: connects, sends what it is given, and passes on what was acknowledged.
+"""Thread that connects to the broker, sends messages, and passes the acknowledgements to the writer.
 
     writer ──give──▶ outbox ──▶ connection ──▶ broker
     writer ◀──acknowledged── … ◀── PUBACK
 
-It holds a few messages at a time, so that the spool keeps all others. Each connection has a number, its session: what
-was given in one is given again in the next, and an acknowledgement of an earlier one does not count.
+The sender holds only a few messages; the spool contains all others. Each connection has a number, the session. In the
+next session the writer gives messages without an acknowledgement again. The sender ignores acknowledgements of earlier
+sessions.
 """
 
 import threading
@@ -20,54 +21,46 @@ from imud.fleet.spool import SpoolRow
 from imud.host.threads import WakeEvent
 from imud.model.units import NS_PER_S
 
-REPLIES_MAX: Final = 32
-"""Answers that wait for a connection; the oldest go first."""
-OUTBOX_MAX: Final = 60
-"""Messages that are held in memory: three windows of those without an acknowledgement, 6 MB at most."""
-WAIT_S: Final = 1.0
-"""Longest sleep: keep-alives and the end are looked at so often."""
+REPLIES_MAX: Final = 32  # Maximum number of replies that wait for a connection. The sender drops the oldest.
+OUTBOX_MAX: Final = 60  # maximum number of messages in memory, 6 MB at most: three times IN_FLIGHT_MAX
+WAIT_S: Final = 1.0  # Maximum wait, s. The thread then checks keep-alives and the end.
 CLOSE_S: Final = 0.5
-"""The end waits so long for the farewell: samples wait for it when the configuration is read again."""
-FAREWELL_S: Final = 0.3
-"""Of that, for the acknowledgement of the farewell."""
+"""Maximum wait of `close` for the thread, s. Samples wait for it during a reload of the configuration."""
+FAREWELL_S: Final = 0.3  # part of CLOSE_S for the acknowledgement of the farewell, s
 
 
 class MqttSender:
-    """The thread. Synchronization: methods from the writer's thread, counters read by any; `run` is the thread's."""
+    """Thread of the connection.
+
+    Synchronization: the writer calls the methods, any thread reads counters, the thread calls `work`.
+    """
 
     def __init__(
         self, settings: MqttOptions, client_id: str, will: Will, turn: BrokerTurn, connect: Connect,
         now_ns: Callable[[], int], commands: CommandChannel | None = None,
     ) -> None:  # fmt: skip
-        self.session = 0
-        """Number of the connection; changes when it is made and when it is lost."""
+        self.session = 0  # Number of the connection. It changes at each connection and each loss.
         self.connected = False
-        self.broker = ""
-        """Name of the broker that is connected; empty while there is none."""
+        self.broker = ""  # name of the connected broker; empty if there is none
         self.problem = ""
-        """Why nothing is sent now, one sentence; empty while all is well, or before the first attempt."""
-        self.sent = 0
-        """Messages of the spool that were sent, those sent again included."""
-        self.acknowledged = 0
-        """Messages of the spool that the broker has taken."""
-        self.reconnects = 0
-        """Connections after the first."""
-        self.failure: BaseException | None = None
-        """The exception that ended the thread, which is an internal error."""
+        """Cause of a missing connection, one sentence; empty if the connection works, and before the first attempt."""
+        self.sent = 0  # number of sent messages of the spool, including repeated messages
+        self.acknowledged = 0  # number of acknowledged messages of the spool
+        self.reconnects = 0  # number of connections after the first
+        self.failure: BaseException | None = None  # internal error that ended the thread
         self.wanting: Callable[[], None] = lambda: None
-        """Called in the thread when there is room for messages, or acknowledgements wait; set by the writer."""
+        """Called by the thread if messages are wanted or acknowledgements wait. The writer sets it."""
         self._settings, self._client_id, self._will = settings, client_id, will
         self._turn, self._connect, self._now_ns = turn, connect, now_ns
         self._commands = commands
         self._replies: deque[CommandReply] = deque(maxlen=REPLIES_MAX)
-        self._sent_replies: dict[int, CommandReply] = {}
-        """Answers without an acknowledgement, by the numbers of their messages."""
+        self._sent_replies: dict[int, CommandReply] = {}  # replies without an acknowledgement, by packet identifier
         self._lock = threading.Lock()
-        self._outbox: deque[SpoolRow] = deque()
-        self._in_flight: dict[int, int] = {}
+        self._outbox: deque[SpoolRow] = deque()  # rows of the spool
+        self._in_flight: dict[int, int] = {}  # row ID by packet identifier, 0 for other messages
         self._answers: list[tuple[int, int]] = []
-        self._retained: dict[str, bytes] = {}
-        self._due: dict[str, None] = {}
+        self._retained: dict[str, bytes] = {}  # newest payload by topic
+        self._due: dict[str, None] = {}  # topics of retained messages to send, in order
         self._connection: BrokerConnection | None = None
         self._wake = WakeEvent()
         self._ended = False
@@ -76,14 +69,16 @@ class MqttSender:
         self._was_connected = False
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread = threading.Thread(target=self._main, name="mqtt sender", daemon=True)
         self._thread.start()
 
     def close(self, last_words: bytes) -> None:
-        """Publish the retained farewell and end; may be called twice. What is not acknowledged stays in the spool.
+        """Publish the retained farewell and end the thread.
 
-        A thread that is still connecting makes no connection any more: its name may be that of the next output's.
+        Messages without an acknowledgement stay in the spool. A second call does nothing.
+
+        A thread that is still connecting does not complete its connection, because the next output may use the same
+        client ID.
         """
         self._last_words = last_words
         self._ended = True
@@ -91,19 +86,19 @@ class MqttSender:
         self.join(CLOSE_S)
 
     def join(self, seconds: float) -> None:
-        """Return when the thread has ended, or after so much time."""
+        """Wait for the end of the thread, at most `seconds`."""
         if self._thread is not None:
             self._thread.join(seconds)
 
-    # --- the writer's side -------------------------------------------------------------------------------------------
+    # --- methods for the writer ---------------------------------------------------------------------------------------
 
     def room(self) -> int:
-        """How many messages may be given now."""
+        """Return how many messages the sender accepts now."""
         with self._lock:
             return OUTBOX_MAX - len(self._outbox) - len(self._in_flight) if self.connected else 0
 
     def give(self, session: int, rows: list[SpoolRow]) -> None:
-        """Have messages sent, in their order; ignored when the session is over."""
+        """Send messages in their order. Do nothing if the session is over."""
         with self._lock:
             if session != self.session:
                 return
@@ -111,7 +106,7 @@ class MqttSender:
         self._ring()
 
     def retain(self, messages: Mapping[str, bytes]) -> None:
-        """Publish messages that the broker keeps, by topic: now, and at each new connection. An empty one removes."""
+        """Publish retained messages by topic, now and at each new connection. An empty payload removes the message."""
         with self._lock:
             for topic, payload in messages.items():
                 if self._retained.get(topic) != payload:
@@ -120,13 +115,16 @@ class MqttSender:
         self._ring()
 
     def reply(self, reply: CommandReply) -> None:
-        """Send an answer to a request, before all else, and again if its connection is lost. From any thread."""
+        """Send a reply before all other messages, and again after a lost connection.
+
+        Any thread may call this method.
+        """
         with self._lock:
             self._replies.append(reply)
         self._ring()
 
     def take_acknowledged(self) -> list[tuple[int, int]]:
-        """Return session and id of what was acknowledged since the last call."""
+        """Return session and row ID of each acknowledgement since the last call."""
         with self._lock:
             answers, self._answers = self._answers, []
             return answers
@@ -137,7 +135,7 @@ class MqttSender:
         if connection is not None:
             connection.ring()
 
-    # --- the thread --------------------------------------------------------------------------------------------------
+    # --- thread -------------------------------------------------------------------------------------------------------
 
     def _main(self) -> None:
         try:
@@ -150,13 +148,13 @@ class MqttSender:
             self.failure = error
 
     def _wake_after(self, seconds: float) -> None:
-        """Sleep between attempts: only the end is a reason to wake."""
+        """Sleep between two attempts. Only the end wakes the thread earlier."""
         due_ns = self._now_ns() + round(seconds * NS_PER_S)
         while not self._ended and (rest_ns := due_ns - self._now_ns()) > 0:
             self._wake.wait(min(rest_ns / NS_PER_S, WAIT_S))
 
     def work(self) -> float:
-        """Connect, or send and wait for the broker once; return how long nothing is to be done, s."""
+        """Connect, or send and wait for the broker once. Return the time until the next call, s."""
         connection = self._connection
         try:
             if connection is None:
@@ -190,7 +188,7 @@ class MqttSender:
         self.wanting()
 
     def _send(self, connection: BrokerConnection) -> None:
-        """Send what the window has room for, what is retained first."""
+        """Send messages up to the window of the broker: replies first, then retained messages, then the spool."""
         while len(self._in_flight) < connection.in_flight_max:
             if self._send_reply(connection):
                 continue
@@ -212,21 +210,21 @@ class MqttSender:
                 return
 
     def _send_reply(self, connection: BrokerConnection) -> bool:
-        """Send the oldest answer; return whether there was one."""
+        """Send the oldest reply. Return whether there was one."""
         with self._lock:
             if not self._replies:
                 return False
             reply = self._replies[0]
         number = connection.publish(reply.topic, reply.payload, JSON_TYPE, retain=False, correlation=reply.correlation)
         with self._lock:
-            if self._replies and self._replies[0] is reply:  # it is not where newer ones took its room meanwhile
+            if self._replies and self._replies[0] is reply:  # newer replies can have removed it from the full queue
                 self._replies.popleft()
             self._sent_replies[number] = reply
             self._in_flight[number] = 0
         return True
 
     def _pass_on(self, connection: BrokerConnection) -> None:
-        """Pass on what was acknowledged."""
+        """Pass the acknowledgements to the writer."""
         if not connection.acknowledged:
             return
         numbers = connection.acknowledged[:]
@@ -242,7 +240,7 @@ class MqttSender:
             self.wanting()
 
     def _take_requests(self, connection: BrokerConnection) -> None:
-        """Check what came; the event loop carries it out."""
+        """Check received requests. The event loop runs them."""
         received, connection.received = connection.received, []
         for one in received:
             if self._commands is not None:

@@ -1,4 +1,4 @@
-"""Contract of the configuration: settings of the output `mqtt`, and what is sent of a device."""
+"""Options of the output `mqtt`."""
 
 from enum import StrEnum
 from typing import Annotated, Final, Literal, NamedTuple
@@ -12,15 +12,15 @@ from imud.model.units import NS_PER_S
 
 MEGABYTE: Final = 1_000_000
 BROKERS_MAX: Final = 16
-"""Brokers in the list: each is tried in turn, and a turn of more would take minutes."""
+"""Maximum number of brokers. imud tries one after the other; more brokers would take minutes."""
 EVERY: Final = "*"
-"""Stands for the devices that are not named."""
+"""Key for all devices without an entry of their own."""
 Measure = Literal["mean", "min", "max", "rms"]
 Name = Annotated[str, msgspec.Meta(pattern=f"^({NAME_PATTERN})?$", extra={"words": "letters, digits, _ and -"})]
 
 
 class Whole(StrEnum):
-    """Forms of whole samples."""
+    """Formats of complete samples."""
 
     NONE = "none"
     JSON = "json"
@@ -28,28 +28,28 @@ class Whole(StrEnum):
 
 
 class DeviceSending(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is sent of a device."""
+    """Messages that imud sends for a device."""
 
     rate_hz: Annotated[float, msgspec.Meta(ge=0.01, le=100)] | None = 1.0
-    """Intervals a second that statistics are made of, from all samples in each; null for none."""
+    """Number of statistics intervals per second; each interval uses all of its samples. null: no statistics."""
     values: Annotated[list[Measure], msgspec.Meta(min_length=1)] = msgspec.field(
         default_factory=lambda: list[Measure](("mean", "min", "max", "rms"))
     )
-    """What is sent of each interval: its `mean`, `min`, `max`, `rms` (root mean square)."""
+    """Statistics of each interval: `mean`, `min`, `max`, `rms` (root mean square)."""
     whole: Whole = Whole.NONE
-    """Whether every sample is sent as well: as `json`, as compressed `slots`, or not (`none`)."""
+    """Format of complete samples: `json`, compressed `slots`, or `none` to send statistics only."""
     batch_s: Annotated[float, msgspec.Meta(ge=0.1, le=60)] = 1.0
-    """Intervals and samples of so much time are sent in one message, s."""
+    """Time that one message covers, s."""
     events: bool = True
-    """Whether its events are sent."""
+    """Send the events of the device."""
     status: bool = True
-    """Whether its state is sent, retained, when it changes and every `status_s`."""
+    """Send the state of the device as a retained message, after each change and every `status_s`."""
     settings: bool = True
-    """Whether its own settings are sent, retained, when they change: what it reports, and what is not as declared."""
+    """Send the device settings and their differences from the declared settings, as a retained message after each
+    change."""
 
     @property
     def batch_ns(self) -> int:
-        """`batch_s` in nanoseconds."""
         return round(self.batch_s * NS_PER_S)
 
 
@@ -57,57 +57,56 @@ class CommandOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Options of the command channel."""
 
     enabled: bool = False
-    """Whether actions of devices may be asked for over the broker, by whoever its rights let write to
+    """Accept commands for devices over the broker. The access rights of the broker decide who may write to
     `imud/SITE/GATEWAY/DEVICE/command`."""
     actions: Annotated[list[str], msgspec.Meta(max_length=256)] = msgspec.field(default_factory=list[str])
-    """What may be asked for: names of actions, as `imud command DEVICE` lists them, for all devices, or `DEVICE/ACTION`
-    for one. All others are refused."""
+    """Allowed commands: `COMMAND` for all devices or `DEVICE/COMMAND` for one device. `imud command DEVICE` lists the
+    names. imud rejects all other commands."""
     max_age_s: Annotated[float, msgspec.Meta(ge=1, le=600)] = 30.0
-    """A request that is older by its `issued_utc_ns`, or so far ahead of the gateway's clock, is refused, s."""
+    """Maximum age of a request by its `issued_utc_ns`, and maximum time ahead of the gateway's clock, s."""
     per_minute: Annotated[int, msgspec.Meta(ge=1, le=600)] = 30
-    """Requests within a minute; more are refused."""
+    """Maximum number of requests per minute."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what is no name of an action."""
+        """Raise ValueError if an entry is not the name of a command."""
         for entry in self.actions:
             device, slash, action = entry.rpartition("/")
             if not is_name(action) or (slash and not is_name(device)):
                 raise ValueError(f"actions: expected names of actions, or DEVICE/ACTION, got {shown(entry)}")
 
     def allows(self, device: str, action: str) -> bool:
-        """Whether a request for it is carried out."""
+        """Return whether the configuration allows this command."""
         return action in self.actions or f"{device}/{action}" in self.actions
 
     @property
     def max_age_ns(self) -> int:
-        """`max_age_s` in nanoseconds."""
         return round(self.max_age_s * NS_PER_S)
 
 
 class Broker(NamedTuple):
-    """A broker, taken from its URL."""
+    """Address of a broker from its URL."""
 
     host: str
     port: int
     tls: bool
     websockets: bool
     path: str
-    """Of websockets."""
+    """Path of the WebSocket."""
 
     @property
     def name(self) -> str:
-        """The URL without anything secret."""
+        """Return the URL without user and password."""
         scheme = ("wss" if self.tls else "ws") if self.websockets else ("mqtts" if self.tls else "mqtt")
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{scheme}://{host}:{self.port}{self.path if self.websockets else ''}"
 
 
 PORTS: Final = {"mqtt": 1883, "mqtts": 8883, "ws": 80, "wss": 443}
-"""Schemes of URLs and their usual ports."""
+"""Supported URL schemes and their default ports."""
 
 
 def broker_of(url: str) -> Broker | None:
-    """The broker that a URL names; None for a URL that names none. User and password are not taken from it."""
+    """Return the broker of a URL; None if the URL is invalid or contains a user or a password."""
     try:
         parts = urlsplit(url)
         port = parts.port
@@ -124,60 +123,61 @@ def broker_of(url: str) -> Broker | None:
 
 
 class MqttOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the output `mqtt`."""
+    """Options of the output `mqtt`."""
 
     enabled: bool = False
-    """Whether imud sends to an MQTT broker. Needs the extra `imud[mqtt]`."""
+    """Send to an MQTT broker. Needs the extra `imud[mqtt]`."""
     brokers: Annotated[list[str], msgspec.Meta(min_length=1, max_length=BROKERS_MAX)] = msgspec.field(
         default_factory=lambda: ["mqtt://127.0.0.1:1883"]
     )
-    """Brokers in the order in which they are tried, each as `mqtts://HOST:PORT`: `mqtt`, `mqtts` with TLS, `ws` and
-    `wss` by websockets. All of one cluster: what one acknowledged is not sent to another."""
+    """Brokers of one cluster, in the order of the attempts: `mqtt://HOST:PORT`, `mqtts` (TLS), `ws` or `wss`
+    (WebSocket). imud does not send a message to a second broker after an acknowledgement."""
     version: Literal["5", "3.1.1"] = "5"
-    """Version of MQTT. With 3.1.1 a broker cannot say that it refuses a message, and what it refuses is lost."""
+    """Version of MQTT. A broker with 3.1.1 cannot report rejected messages, so they are lost."""
     site: Name = "default"
     """Name of the place, second level of all topics."""
     gateway: Name = ""
-    """Name of this gateway, third level; unique on the broker. Empty: the host's name up to the first dot."""
+    """Name of this gateway, third level of all topics. It must be unique on the broker. Empty: the host name up to the
+    first dot."""
     user: str = ""
-    """Name for the broker; empty for none."""
+    """User name for the broker; empty: no user name."""
     password_file: str | None = None
-    """File that has the password in its first line; null for none. It is read at each connection."""
+    """File with the password in its first line; null: no password. imud reads it at each connection."""
     ca_file: str | None = None
-    """Certificates (PEM) that the broker's is to be signed by; null for those that the system trusts."""
+    """CA certificates (PEM) for the certificate of the broker; null: the certificates that the system trusts."""
     cert_file: str | None = None
-    """Certificate (PEM) of this gateway, for a broker that asks for one; null for none."""
+    """Client certificate (PEM) of this gateway; null: no certificate."""
     key_file: str | None = None
-    """Its key (PEM, without a passphrase); null where the certificate's file has it."""
+    """Key of the certificate (PEM, without a passphrase); null if `cert_file` contains the key."""
     keep_alive_s: Annotated[int, msgspec.Meta(ge=5, le=3600)] = 30
-    """A connection that is dead is noticed within twice this time, s."""
+    """Keep-alive time, s. imud detects a dead connection within twice this time."""
     retry_max_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 60.0
-    """Longest pause between two attempts to connect, s; pauses grow from 4 s and are drawn at random."""
+    """Maximum pause between two connection attempts, s. Pauses are random and grow from 4 s."""
     messages_per_s: Annotated[float, msgspec.Meta(ge=0.1, le=100_000)] | None = None
-    """Most messages of streams that are sent in a second, so that a gateway that was away for long does not take the
-    whole link when it is back; more than it makes. null for as many as broker and link take."""
+    """Maximum number of stream messages per second; null: no limit. A limit prevents that a gateway fills the network
+    link after a long interruption. It must be higher than the rate of new messages."""
     newest_first: bool = False
-    """Whether what is new is sent before what waited while there was no connection; streams are not in order then."""
+    """Send new messages before messages that waited for a connection. Streams are then not in order."""
     spool_directory: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud/mqtt"
-    """Where the spool is; imud makes it where it is missing."""
+    """Folder of the spool. imud creates it."""
     spool_mb: Annotated[float, msgspec.Meta(ge=1, le=1_000_000)] = 256.0
-    """Room for the spool, MB (10⁶ bytes). Where it does not suffice the oldest whole samples become statistics of their
-    batch, and when there are none left the oldest messages are dropped."""
+    """Maximum size of the spool, MB (10⁶ bytes). If the spool is full, imud replaces the oldest complete samples by
+    statistics, and then drops the oldest messages."""
     spool_hours: Annotated[float, msgspec.Meta(ge=0.01, le=8760)] = 168.0
-    """What waited for longer is dropped, hours."""
+    """Maximum age of a message in the spool, hours. imud drops older messages."""
     status_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 60.0
-    """How often the state of devices and of the gateway is sent, s."""
+    """Interval of the state messages of devices and gateway, s."""
     commands: CommandOptions = CommandOptions()
-    """The command channel."""
+    """Options of the command channel."""
     home_assistant: bool = False
-    """Whether devices whose `status` is sent are announced to Home Assistant, in retained messages below
-    `homeassistant/device/`, which the broker must let this gateway write."""
+    """Announce devices with `status` to Home Assistant in retained messages below `homeassistant/device/`. The broker
+    must allow the gateway to write there."""
     devices: dict[str, DeviceSending] = msgspec.field(default_factory=lambda: {EVERY: DeviceSending()})
-    """What is sent, by the names of devices; `*` stands for all that are not named. The keys of each are under
-    `mqtt.devices.NAME`."""
+    """Messages by device name; `*` is for all other devices. The table `mqtt.devices.NAME` contains the keys of an
+    entry."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what is no broker, and for a key without its certificate."""
+        """Raise ValueError if a URL, a device name, or a combination of keys is invalid."""
         for url in self.brokers:
             if broker_of(url) is None:
                 raise ValueError(
@@ -193,15 +193,13 @@ class MqttOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
                 raise ValueError(f"devices: expected names of devices or *, got {shown(name)}")
 
     def sending(self, device: str) -> DeviceSending | None:
-        """What is sent of a device; None for nothing."""
+        """Return the options of a device; None if imud sends nothing."""
         return self.devices.get(device, self.devices.get(EVERY))
 
     @property
     def spool_bytes(self) -> int:
-        """`spool_mb` in bytes."""
         return round(self.spool_mb * MEGABYTE)
 
     @property
     def spool_age_ns(self) -> int:
-        """`spool_hours` in nanoseconds."""
         return round(self.spool_hours * 3600 * NS_PER_S)

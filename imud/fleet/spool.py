@@ -1,18 +1,21 @@
-"""The spool: messages on disk, in their order, from the moment they are made until the broker has acknowledged them.
+"""Spool: an ordered file of messages that the broker has not acknowledged.
 
     commit(new, acknowledged) ──one transaction──▶ SQLite, write-ahead log ──after(id)──▶ sender
 
-- What is in a transaction that was committed survives the end of the process at any moment; it is on the disk within
-  SYNC_NS, which a power failure can take away.
-- Room: the pages that are in use, within a number of bytes. Where they do not suffice, the oldest whole samples become
-  statistics of their batch; when there are none left, the oldest messages are dropped. What is older than the age
-  allows is dropped too. In the place of what was dropped there is a message that says so, and neighbours share it.
-- Messages that were given to the sender are left alone until `rewind`. They are given in their order; with
-  `newest_first` those that are new since `rewind` go before those that waited then.
-- A full disk (SpoolError) leaves the spool as it was before the transaction. What is removed needs room in the log as
-  well: a reserve is given up for that, and taken again.
-- A file that is damaged is set aside, and a new one begun. A row that is damaged in a file that can be read becomes a
-  note that says so.
+- A committed transaction survives the end of the process. imud synchronizes the log with the disk every SYNC_NS, so a
+power failure can lose the transactions of this time.
+
+- If the pages in use exceed the configured size, imud replaces the oldest complete samples by statistics. If there are
+none left, it drops the oldest messages. It also drops messages that are too old. A message of the kind `dropped`
+replaces dropped messages; adjacent ones are joined.
+
+- imud does not change messages that the sender received until `rewind`. `after` returns messages in their order. With
+`newest_first`, messages that are newer than `rewind` come first.
+
+- A full disk (SpoolError) does not change the spool. Removing messages also needs room in the log. imud therefore keeps
+a reserve file, removes it if necessary, and creates it again later.
+
+- imud renames a damaged file and creates a new one. A damaged row becomes a message of the kind `dropped`.
 """
 
 import logging
@@ -28,6 +31,7 @@ import msgspec
 
 from imud.fleet.accounts import StreamPosition
 from imud.fleet.messages import (
+    CLOCK_SET_NS,
     NUMBER_MOST,
     VERSION,
     DropCause,
@@ -49,10 +53,9 @@ _STREAMS: Final = frozenset(stream.value for stream in Stream)
 
 
 class SpoolRow(NamedTuple):
-    """A message that waits, as a row of the file."""
+    """Message in the spool, a row of the file."""
 
-    id: int
-    """Counts messages of this file, in their order; 0 for one that is not stored yet."""
+    id: int  # row ID, in the order of the messages; 0 before the message is stored
     boot: str
     device: str
     stream: str
@@ -60,25 +63,23 @@ class SpoolRow(NamedTuple):
     topic: str
     first: int
     last: int
-    items: int
-    """Samples or events that the numbers stand for."""
-    stored_utc_ns: int
-    """CLOCK_REALTIME when it was stored; before that, of the newest of it."""
+    items: int  # number of samples or events that the numbers stand for
+    stored_utc_ns: int  # CLOCK_REALTIME of the transaction; before it, of the newest sample or event
     payload: bytes
 
     @property
     def key(self) -> tuple[str, str]:
-        """What its numbers count in: boot and topic, which has the names of gateway, device and stream."""
+        """Return the key of the numbers: boot and topic. The topic contains gateway, device and stream."""
         return self.boot, self.topic
 
     @property
     def gateway(self) -> str:
-        """Name that the gateway had when the message was made."""
+        """Return the name of the gateway when the message was made."""
         return self.topic.split("/")[2]
 
 
 def row_of(topic: str, stream: Stream, message: FleetMessage, payload: bytes, stored_utc_ns: int) -> SpoolRow:
-    """A message that is to be stored."""
+    """Return a message as a row that is not stored yet."""
     return SpoolRow(
         0, message.boot, message.device, stream.value, message.kind.value, topic, message.first, message.last,
         message.count, stored_utc_ns, payload,
@@ -86,7 +87,7 @@ def row_of(topic: str, stream: Stream, message: FleetMessage, payload: bytes, st
 
 
 def sound_row(values: Sequence[object]) -> SpoolRow | None:
-    """The row with these values; None for one that is damaged."""
+    """Return a row; None if the values are damaged."""
     row = _numbered(values)
     if row is None or row.kind not in _KINDS:
         return None
@@ -99,7 +100,7 @@ def sound_row(values: Sequence[object]) -> SpoolRow | None:
 
 
 def mended_row(values: Sequence[object]) -> SpoolRow | None:
-    """A note in place of a row that is damaged; None where it does not say which numbers it had."""
+    """Return a `dropped` message in place of a damaged row; None if its numbers are unknown."""
     row = _numbered([*values[:4], "", *values[5:-1], b""])
     if row is None or row.items != row.last - row.first + 1:
         return None
@@ -107,7 +108,7 @@ def mended_row(values: Sequence[object]) -> SpoolRow | None:
 
 
 def is_position(values: Sequence[object]) -> bool:
-    """Whether these are boot, device, stream, begin and last of a stream; damaged ones are not."""
+    """Return whether the values are boot, device, stream, begin and last of a stream."""
     match values:
         case (str() as boot, str(), str() as stream, int() as begin, int() as last):
             return is_name(boot) and stream in _STREAMS and 0 < begin <= last < NUMBER_MOST
@@ -115,7 +116,7 @@ def is_position(values: Sequence[object]) -> bool:
 
 
 def note_of(row: SpoolRow, cause: DropCause) -> bytes:
-    """The payload that says that a message was dropped."""
+    """Return the payload of a `dropped` message in place of a row."""
     try:
         message = decode_message(row.payload)
     except ValueError:
@@ -131,7 +132,7 @@ def note_of(row: SpoolRow, cause: DropCause) -> bytes:
 
 
 def _numbered(values: Sequence[object]) -> SpoolRow | None:
-    """The row, where it says of which stream it is and which numbers it has."""
+    """Return a row with a valid stream and valid numbers, otherwise None."""
     try:
         row = msgspec.convert(values, SpoolRow)
     except msgspec.ValidationError:
@@ -146,30 +147,24 @@ log = logging.getLogger(__name__)
 
 FILE: Final = "spool.db"
 SYNC_NS: Final = 5 * NS_PER_S
-"""The log is synchronised with the disk so often: so much is lost when the power fails."""
+"""Interval of the synchronization of the log with the disk, ns. A power failure loses the messages of this time."""
 PAGE_BYTES: Final = 1024
-"""Room is in pages: with SQLite's usual 4096 bytes, most of what thinning frees would stay in the message's page."""
-LOG_PAGES: Final = 4000
-"""Pages of the log before it goes into the file: 4 MB, as many bytes as is SQLite's own default."""
-LOG_PART: Final = 16
-"""Of the disk, where that is less: on a disk of 8 MB the log has 0.5 MB."""
+"""Size of a page, bytes. The pages of a message that becomes statistics are only free if pages are small: with 4096
+bytes, the default of SQLite, most messages have only a few pages."""
+LOG_PAGES: Final = 4000  # maximum number of pages in the log, 4 MB, the same size as the default of SQLite
+LOG_PART: Final = 16  # maximum share of the disk for the log, 1/16: 0.5 MB on a disk of 8 MB
 LOG_PAGES_LEAST: Final = 64
 RESERVE_FILE: Final = "spool.reserve"
 RESERVE_LOGS: Final = 2
-"""Logs that the reserve has room for: one that goes into the file, which can grow by as much, and a transaction."""
-LONGEST_BYTES: Final = 1 << 18
-"""Twice the longest message."""
-STEP: Final = 32
-"""Messages that are thinned or dropped between two looks at the room."""
-STEPS_MAX: Final = 64
-"""Steps in one transaction, so that it ends: 2,048 messages, more than ever come in one second."""
-CLOCK_SET_NS: Final = 1_577_836_800 * NS_PER_S
-"""2020: a wall clock before it is not set, and says nothing of ages."""
+"""Size of the reserve in logs: a checkpoint can grow the file by the size of one log, and one transaction needs
+another."""
+LONGEST_BYTES: Final = 1 << 18  # twice the maximum length of a message, bytes
+STEP: Final = 32  # number of messages that imud thins or drops between two checks of the size
+STEPS_MAX: Final = 64  # maximum number of steps in one transaction: 2,048 messages, more than arrive in one second
 POSITIONS_MAX: Final = 1024
-"""Streams of which the last number is kept: three of each of 256 devices, which is the most there are, and those of a
-few boots before. A state of the gateway with all of them has 120 kB, no more than the longest message."""
-BUSY_S: Final = 1.0
-"""Another program looks at the file: it is waited for so long."""
+"""Maximum number of streams with a stored position: three streams of each of 256 devices, and streams of earlier boots.
+A state message with all positions has 120 kB, not more than the longest message."""
+BUSY_S: Final = 1.0  # time to wait for a program that has locked the file, s
 
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS message (
@@ -186,14 +181,13 @@ _TAKE_OVER: Final = """
 INSERT OR IGNORE INTO progress (gateway, boot, device, stream, begin, last, stored_utc_ns)
     SELECT ?, boot, device, stream, begin, last, stored_utc_ns FROM position
 """
-"""Earlier versions kept positions without the name of the gateway, in a table `position`."""
+"""Earlier versions stored positions without the name of the gateway, in the table `position`."""
 _COLUMNS: Final = "id, boot, device, stream, kind, topic, first, last, items, stored_utc_ns, payload"
 _FREE: Final = "id > ? AND NOT (id > ? AND id <= ?)"
-"""Messages that were not given: what may become statistics or be dropped."""
+"""Condition for messages that the sender did not receive. imud may thin or drop only these."""
 _ID_MAX: Final = (1 << 63) - 1
 _THICK: Final = (MessageKind.SAMPLES.value, MessageKind.SLOTS.value)
-_OF_DAMAGE: Final = (sqlite3.DatabaseError, sqlite3.IntegrityError)
-"""Errors that only a damaged file brings about."""
+_OF_DAMAGE: Final = (sqlite3.DatabaseError, sqlite3.IntegrityError)  # errors that only a damaged file causes
 
 
 class SpoolError(Exception):
@@ -201,46 +195,38 @@ class SpoolError(Exception):
 
 
 class Spool:
-    """The file. Synchronization: one thread; the counters may be read by any."""
+    """File of messages. Synchronization: one thread; any thread may read the counters."""
 
     def __init__(
         self, directory: Path, bytes_max: int, age_ns: int, *, newest_first: bool = False, gateway: str = ""
     ) -> None:
-        """`gateway`: whose positions are given; empty for those of all names that this one had."""
-        self.messages = 0
-        """Messages in the file."""
-        self.used_bytes = 0
-        """Room that is used, of `bytes_max`."""
-        self.spooled = 0
-        """Messages that were stored since the start."""
-        self.thinned: int = 0
-        """Samples of which only statistics are left."""
-        self.dropped: dict[str, int] = {}
-        """Samples and events that were dropped from the spool, by `DropCause`."""
-        self.set_aside = ""
-        """Name of a damaged file that was set aside; empty for none."""
+        """`gateway` selects the positions of one gateway name; empty selects the positions of all names."""
+        self.messages = 0  # number of messages in the file
+        self.used_bytes = 0  # size of the pages in use, bytes
+        self.spooled = 0  # number of messages stored since the start
+        self.thinned: int = 0  # number of samples that imud replaced by statistics
+        self.dropped: dict[str, int] = {}  # number of dropped samples and events, by `DropCause`
+        self.set_aside = ""  # path of a renamed damaged file; empty if there is none
         self._path = directory / FILE
         self._bytes_max, self._age_ns = bytes_max, age_ns
         self._gateway = gateway
         self._base: sqlite3.Connection | None = None
         self._next_id = 1
-        self._given = 0
-        """Messages up to this id were given."""
+        self._given = 0  # the sender received messages up to this ID
         self._newest_first = newest_first
+        # with newest_first: the sender received the messages from the first ID (exclusive) to the second ID before
+        # older messages; 0 if no older message waits
         self._ahead_from = self._ahead = 0
-        """Those after the first id up to the second were given ahead of what waited; 0 while nothing waits behind."""
-        self._thin_from = 0
-        """Messages up to this id need not be looked at for thinning."""
+        self._thin_from = 0  # all messages up to this ID are already thinned
         self._synced_ns = 0
+        # maximum size of the file, pages, while the disk has no room for the reserve
         self._pages_max: int | None = None
-        """The file may not grow beyond, while the disk was full and has no room for the reserve."""
-        self._markers: dict[tuple[str, str], int] = {}
-        """Id of the newest message about dropped ones, by stream."""
+        self._markers: dict[tuple[str, str], int] = {}  # ID of the newest `dropped` message, by stream
 
     # --- life --------------------------------------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Open the file, or make it. Raises SpoolError."""
+        """Open or create the file. Raises SpoolError."""
         try:
             self._path.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
             try:
@@ -255,7 +241,7 @@ class Spool:
             raise SpoolError(f"{self._path}: {reason_of(error)}") from error
 
     def close(self) -> None:
-        """Close the file; may be called twice."""
+        """Close the file. A second call does nothing."""
         self._drop_connection()
 
     def _open(self) -> None:
@@ -284,7 +270,7 @@ class Spool:
         return max(LOG_PAGES_LEAST, min(LOG_PAGES, disk.f_blocks * disk.f_frsize // LOG_PART // PAGE_BYTES))
 
     def _reserve(self) -> None:
-        """Take the reserve, unless it is there, or the disk has no room for it and a log beside it."""
+        """Create the reserve file if the disk has room for it and for a log."""
         path, log_bytes = self._path.with_name(RESERVE_FILE), self._log_pages() * PAGE_BYTES
         size, disk = RESERVE_LOGS * log_bytes, os.statvfs(path.parent)
         if not path.exists() and disk.f_bavail * disk.f_frsize < size + log_bytes:
@@ -300,7 +286,7 @@ class Spool:
             self._give_up_reserve()
 
     def _look_at_reserve(self) -> None:
-        """Take the reserve again as soon as there is room."""
+        """Create the reserve again after it was removed."""
         if self._pages_max is not None:
             self._reserve()
 
@@ -309,7 +295,7 @@ class Spool:
             os.unlink(self._path.with_name(RESERVE_FILE))
 
     def _take_over(self, base: sqlite3.Connection) -> None:
-        """Take over positions of an earlier version, which are of the name that the gateway has."""
+        """Copy the positions of an earlier version to the present name of the gateway."""
         found = base.execute("SELECT COUNT(*) FROM sqlite_master WHERE name = 'position'").fetchone()[0]
         if found and self._gateway:
             base.execute("BEGIN IMMEDIATE")
@@ -335,7 +321,7 @@ class Spool:
     # --- messages ----------------------------------------------------------------------------------------------------
 
     def commit(self, new: Sequence[SpoolRow], acknowledged: Collection[int], now_ns: int, utc_ns: int) -> None:
-        """Store and remove messages, and keep within room and age, all or nothing. Raises SpoolError."""
+        """Store and remove messages, and limit age and size, in one transaction. Raises SpoolError."""
         if self._base is None:
             self.open()
         base = self._connection()
@@ -361,11 +347,11 @@ class Spool:
         self.spooled += len(new)
 
     def remove(self, acknowledged: Collection[int], now_ns: int, utc_ns: int) -> None:
-        """Remove messages from a disk that has no room for more. Raises SpoolError."""
+        """Remove messages from a full disk. Raises SpoolError."""
         self._give_up_reserve()
         try:
             for some in _batched(acknowledged, max(1, self._log_pages() * PAGE_BYTES // LONGEST_BYTES)):
-                # the log begins anew for each, and takes as many bytes as the messages had
+                # the checkpoint empties the log, so that the next group fits into it
                 self._connection().execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
                 self.commit((), some, now_ns, utc_ns)
             base = self._connection()
@@ -377,14 +363,14 @@ class Spool:
             self._reserve()
 
     def after(self, limit: int) -> list[SpoolRow]:
-        """The next messages, oldest first, which count as given from now on. Raises SpoolError."""
+        """Return the next messages for the sender, oldest first. Raises SpoolError."""
         found: list[SpoolRow] = []
         if self._ahead_from:
             found = self._between(self._ahead, _ID_MAX, limit)
             self._ahead = found[-1].id if found else self._ahead
             waited = self._between(self._given, self._ahead_from, limit - len(found))
             self._given = waited[-1].id if waited else self._given
-            if not waited and len(found) < limit:  # all that waited is given
+            if not waited and len(found) < limit:  # the sender received all older messages
                 self._given, self._ahead_from, self._ahead = self._ahead, 0, 0
             return found + waited
         found = self._between(self._given, _ID_MAX, limit)
@@ -392,7 +378,7 @@ class Spool:
         return found
 
     def _between(self, after_id: int, last_id: int, limit: int) -> list[SpoolRow]:
-        """Messages after an id up to another, oldest first. Raises SpoolError."""
+        """Return the messages after one ID up to another ID, oldest first. Raises SpoolError."""
         if limit <= 0:
             return []
         base = self._connection()
@@ -403,12 +389,12 @@ class Spool:
             raise SpoolError(f"{self._path}: {reason_of(error)}") from error
 
     def rewind(self) -> None:
-        """Nothing was given: the connection that it was given to is gone."""
+        """Give all messages again, because the connection was lost."""
         self._given = 0
         self._ahead_from = self._ahead = self._next_id - 1 if self._newest_first else 0
 
     def positions(self) -> list[StreamPosition]:
-        """How far streams have come, those of earlier boots included. Raises SpoolError."""
+        """Return the newest numbers of all streams, including earlier boots. Raises SpoolError."""
         try:
             rows = self._connection().execute(
                 "SELECT boot, device, stream, begin, last FROM progress WHERE gateway = ? OR ? = ''",
@@ -421,11 +407,11 @@ class Spool:
 
     def _connection(self) -> sqlite3.Connection:
         if self._base is None:
-            raise SpoolError(f"{self._path}: is not open")
+            raise SpoolError(f"{self._path} is not open")
         return self._base
 
     def _look_at(self, error: Exception) -> None:
-        """Begin a new file at the next attempt where this one is damaged."""
+        """Rename the file if it is damaged. The next transaction creates a new one."""
         if type(error) in _OF_DAMAGE:
             with suppress(OSError):
                 self._set_aside()
@@ -441,7 +427,7 @@ class Spool:
         self.messages += len(rows)
         ends = {row.key: row for row in rows}
         begins = {row.key: row.first for row in reversed(rows)}
-        # where the clock is not set, 0 here: the newest must not be the first to go
+        # with an unset clock, utc_ns is 0: use a larger number so that imud does not remove the newest first
         (after_ns,) = base.execute(
             "SELECT COALESCE(MAX(stored_utc_ns), 0) FROM progress WHERE stored_utc_ns < ?", (NUMBER_MOST,)
         ).fetchone()
@@ -468,26 +454,29 @@ class Spool:
 
     @property
     def _taken(self) -> tuple[int, int, int]:
-        """What `_FREE` leaves out: all up to the first id, and all after the second up to the third."""
+        """Return the parameters of `_FREE`."""
         return self._given, self._ahead_from, self._ahead
 
     def _sound(self, base: sqlite3.Connection, where: str, values: Sequence[object]) -> list[SpoolRow]:
-        """Rows that are not damaged; one that is becomes a note, or goes where it does not say of which numbers."""
+        """Return undamaged rows.
+
+        Replace a damaged row by a `dropped` message, or delete it if its numbers are unknown.
+        """
         while True:
             rows = base.execute(f"SELECT {_COLUMNS} FROM message WHERE {where}", values).fetchall()
             found = [row for one in rows if (row := sound_row(one) or self._mended(base, one)) is not None]
-            if found or not rows:  # else all of them are gone, and others stand behind them
+            if found or not rows:  # otherwise all rows were deleted, and other rows may follow
                 return found
 
     def _mended(self, base: sqlite3.Connection, values: Sequence[Any]) -> SpoolRow | None:
         number, row, cause = values[0], mended_row(values), DropCause.DAMAGED.value
         self.dropped[cause] = self.dropped.get(cause, 0) + (row.items if row is not None else 1)
         if row is None:
-            log.warning("mqtt: %s: message %d is damaged and does not say which numbers it had", self._path, number)
+            log.warning("mqtt: %s: deleting the damaged message %d, whose numbers are unknown", self._path, number)
             base.execute("DELETE FROM message WHERE id = ?", (number,))
             self.messages -= 1
             return None
-        log.warning("mqtt: %s: %s %d to %d are damaged", self._path, row.topic, row.first, row.last)
+        log.warning("mqtt: %s: the numbers %d to %d of %s are damaged", self._path, row.first, row.last, row.topic)
         base.execute("UPDATE message SET kind = ?, payload = ? WHERE id = ?", (row.kind, row.payload, number))
         return row
 
@@ -525,13 +514,13 @@ class Spool:
         return int(size * (pages - free))
 
     def _thin_some(self, base: sqlite3.Connection) -> bool:
-        """Make statistics of the oldest whole samples; return whether there were any."""
+        """Replace the oldest complete samples by statistics. Return whether there were any."""
         found = self._sound(
             base, f"{_FREE} AND id > ? AND kind IN (?, ?) ORDER BY id LIMIT ?",
             (*self._taken, self._thin_from, *_THICK, STEP),
         )  # fmt: skip
         for row in found:
-            if row.kind in _THICK:  # else it was damaged, and is a note by now
+            if row.kind in _THICK:  # a damaged row became a `dropped` message
                 self._thin(base, row)
             self._thin_from = row.id
         return bool(found)
@@ -553,14 +542,17 @@ class Spool:
         self.thinned += row.items
 
     def _drop_some(self, base: sqlite3.Connection) -> bool:
-        """Drop the oldest messages; return whether there were any."""
+        """Drop the oldest messages. Return whether there were any."""
         found = self._sound(base, f"{_FREE} AND kind != 'dropped' ORDER BY id LIMIT ?", (*self._taken, STEP))
         for row in found:
             self._drop(base, row, DropCause.SPACE)
         return bool(found)
 
     def _drop(self, base: sqlite3.Connection, row: SpoolRow, cause: DropCause) -> None:
-        """Put a note of what was dropped in the place of a message, or into the note before it. No-op for a note."""
+        """Replace a message by a `dropped` message, or add it to the previous one.
+
+        Do nothing for a `dropped` message.
+        """
         if row.kind == MessageKind.DROPPED.value:
             return
         self.dropped[cause.value] = self.dropped.get(cause.value, 0) + row.items
@@ -584,12 +576,12 @@ class Spool:
 
 
 def _batched(numbers: Collection[int], most: int) -> Iterator[tuple[int, ...]]:
-    """Numbers in groups, in their order."""
+    """Yield groups of at most `most` numbers in ascending order."""
     left = iter(sorted(numbers))
     while some := tuple(islice(left, most)):
         yield some
 
 
 def _text_of(stored: bytes) -> str:
-    """A text of the file; one that is damaged comes as well, and is found when its row is looked at."""
+    """Return a stored string. Accept damaged UTF-8, because `sound_row` checks the row later."""
     return stored.decode("utf-8", "replace")

@@ -1,10 +1,10 @@
-"""Statistics of samples over intervals: mean, minimum, maximum and root mean square, by batches.
+"""Statistics of intervals of samples: mean, minimum, maximum and root mean square.
 
-    samples ─▶ per quantity and component: count, sum, sum of squares, least, greatest ─▶ Interval
+    samples ─▶ per quantity and component: count, sum, sum of squares, minimum, maximum ─▶ Interval
 
-Angles are continued across ±π from the first sample of the interval on, and their mean is brought back into -π to π, so
-that a heading about south is no mean of both ends. Quaternions are taken with the sign that is nearer to the first
-one, since q and -q are the same attitude, and their mean is a unit quaternion. Values that are not finite do not count.
+Angles: imud unwraps the angles of an interval at ±π from its first sample, and wraps the mean to -π … π. Otherwise the
+mean of a heading near south would be north. Quaternions: q and -q are the same attitude. imud uses the sign that is
+nearer to the first quaternion, and normalizes the mean. Values that are not finite are ignored.
 """
 
 import math
@@ -24,7 +24,7 @@ _TURN: Final = 2 * math.pi
 
 
 class _Quantity:
-    """One quantity of an interval."""
+    """Sums of one quantity of an interval."""
 
     __slots__ = ("_count", "_high", "_low", "_reference", "_squares", "_sums")
 
@@ -35,8 +35,9 @@ class _Quantity:
         self._reference: Sequence[float] | None = None
 
     def add(self, name: str, values: list[Sequence[float]]) -> None:
-        """Add values of as many components; those that are not finite are left out."""
+        """Add values. Ignore values with a component that is not finite."""
         columns = list(zip(*values, strict=True))
+        # one sum detects NaN and infinity; it is cheaper than a test of each value
         if not math.isfinite(sum(map(sum, columns))):
             values = [value for value in values if all(map(math.isfinite, value))]
             columns = list(zip(*values, strict=True))
@@ -56,7 +57,7 @@ class _Quantity:
             self._high[at] = max(self._high[at], *column)
 
     def measures(self, name: str, wanted: Sequence[str]) -> Measures | None:
-        """What is wanted of it; None where there was no value."""
+        """Return the requested statistics; None if there was no value."""
         count = self._count
         if not count:
             return None
@@ -76,7 +77,7 @@ class _Quantity:
 
 
 class IntervalMaker:
-    """The interval that is being summed up. Synchronization: one thread."""
+    """Present interval. Synchronization: one thread."""
 
     def __init__(self, wanted: Sequence[str] = MEASURES) -> None:
         """`wanted` are names of MEASURES."""
@@ -94,11 +95,11 @@ class IntervalMaker:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing to take."""
+        """Return whether the interval has no sample."""
         return self._first is None
 
     def add(self, samples: Sequence[Sample]) -> None:
-        """Add samples, in their order."""
+        """Add samples in their order."""
         if not samples:
             return
         self._first = self._first or samples[0]
@@ -115,7 +116,7 @@ class IntervalMaker:
             self._add(name, [(value,) for one in samples if (value := getattr(one, name)) is not None])
 
     def take(self) -> Interval | None:
-        """Return the interval and begin anew; None without samples."""
+        """Return the interval and start the next; None without samples."""
         first, last = self._first, self._last
         if first is None or last is None:
             return None
@@ -139,20 +140,20 @@ class IntervalMaker:
 
 
 def by_interval(samples: Sequence[Sample], period_ns: int) -> Iterator[tuple[int, list[Sample]]]:
-    """Split samples by intervals of CLOCK_MONOTONIC: the number of each, and its samples."""
+    """Yield the number and the samples of each interval of CLOCK_MONOTONIC."""
     for number, group in groupby(samples, lambda one: one.t_ns // period_ns):
         yield number, list(group)
 
 
 def summed_up(samples: Sequence[Sample]) -> Interval | None:
-    """All that is kept of samples whose room is needed; None without samples."""
+    """Return the statistics of samples that the spool replaces; None without samples."""
     maker = IntervalMaker()
     maker.add(samples)
     return maker.take()
 
 
 def _continued(column: Sequence[float], near: float) -> tuple[float, ...]:
-    """Angles, each within half a turn of the one before."""
+    """Return angles unwrapped at ±π, starting near `near`."""
     made = []
     for value in column:
         near += math.remainder(value - near, _TURN)
@@ -161,7 +162,7 @@ def _continued(column: Sequence[float], near: float) -> tuple[float, ...]:
 
 
 def _same_side(value: Sequence[float], reference: Sequence[float]) -> Sequence[float]:
-    """A quaternion with the sign that is nearer to the reference."""
+    """Return the quaternion with the sign that is nearer to the reference."""
     if sum(a * b for a, b in zip(value, reference, strict=True)) >= 0:
         return value
     return [-part for part in value]

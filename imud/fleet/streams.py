@@ -1,10 +1,10 @@
-"""What is sent of a device, from batches of samples and events to messages whose numbers have no gaps.
+"""Streams of a device: messages with sequence numbers without gaps, made of batches and events.
 
-    samples ─┬─▶ whole samples of `batch_s`           ─▶ stream `samples`
-             └─▶ intervals of `rate_hz`, `batch_s` of them ─▶ stream `statistics`
-    events  ───▶ each by itself                        ─▶ stream `events`
+    samples ─┬─▶ complete samples of `batch_s`                ─▶ stream `samples`
+             └─▶ intervals of `rate_hz`, `batch_s` of them    ─▶ stream `statistics`
+    events  ───▶ one message per event                        ─▶ stream `events`
 
-Samples that had no room in the queue show as a gap of `seq`: a message says so in their place.
+Samples that had no room in the queue cause a gap in `seq`. A message of the kind `dropped` covers the gap.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,23 +34,22 @@ from imud.model.event import Event
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
 
-INTERVALS_MAX: Final = 100
-"""Intervals in one message: about 100 kB with all quantities and measures."""
+INTERVALS_MAX: Final = 100  # maximum number of intervals in one message, about 100 kB with all quantities and measures
 LATE_NS: Final = NS_PER_S
-"""An interval is over so long after its end, when no later sample has come: samples come up to 50 ms late."""
+"""Time after the end of an interval before imud sends it, ns, if no later sample arrives. Samples arrive up to 50 ms
+late."""
 
 
-ReadClock = Callable[[], GatewayClock | None]
-"""Reads the wall clock of this gateway with its state."""
+ReadClock = Callable[[], GatewayClock | None]  # reads the wall clock of this gateway and its state
 
 
 def no_clock() -> GatewayClock | None:
-    """Say nothing of the clock."""
+    """Return None: the messages contain no clock."""
     return None
 
 
 class Gateway(NamedTuple):
-    """Names of this gateway, and of this start of its daemon."""
+    """Names of this gateway and the identifier of this start of the daemon."""
 
     site: str
     gateway: str
@@ -58,21 +57,20 @@ class Gateway(NamedTuple):
 
 
 class _Numbered:
-    """One stream: makes messages and knows the next number."""
+    """One stream: makes messages and counts their numbers."""
 
     def __init__(self, gateway: Gateway, device: str, stream: Stream, clock: ReadClock) -> None:
         self._gateway, self._device, self._stream, self._clock = gateway, device, stream, clock
         self._topic = topic_of(gateway.site, gateway.gateway, device, stream)
         self._begin = 0
-        self.next = 0
-        """The number that comes next; 0 while there was none."""
+        self.next = 0  # next number; 0 before the first
 
     def message(
         self, kind: MessageKind, first: int, last: int, count: int, utc_ns: int, *, cause: DropCause | None = None,
         samples: list[Sample] | None = None, intervals: list[Interval] | None = None,
         events: list[Event] | None = None,
     ) -> FleetMessage:  # fmt: skip
-        """A message of the next numbers."""
+        """Return a message of the next numbers."""
         self._begin = self._begin or first
         self.next = last + 1
         return FleetMessage(
@@ -82,15 +80,15 @@ class _Numbered:
         )  # fmt: skip
 
     def row(self, message: FleetMessage, stored_utc_ns: int, payload: bytes | None = None) -> SpoolRow:
-        """The message as it is stored."""
+        """Return a message as a row of the spool."""
         return row_of(self._topic, self._stream, message, payload or encode_message(message), stored_utc_ns)
 
     def resume(self, position: StreamPosition) -> None:
-        """Go on where the spool says that the stream came to."""
+        """Continue at a position of the spool."""
         self._begin, self.next = position.begin, position.last + 1
 
     def missing(self, first: int, utc_ns: int, cause: DropCause) -> list[SpoolRow]:
-        """The message about numbers that are missing before `first`, if there are any."""
+        """Return the message about the numbers before `first` that no message covers; empty if there are none."""
         if not self.next or first <= self.next:
             return []
         gap = self.message(MessageKind.DROPPED, self.next, first - 1, first - self.next, utc_ns, cause=cause)
@@ -98,12 +96,12 @@ class _Numbered:
 
 
 class DeviceStreams:
-    """The streams of one device, or of the gateway itself (empty name). Synchronization: one thread."""
+    """Streams of one device, or of the gateway (empty name). Synchronization: one thread."""
 
     def __init__(
         self, gateway: Gateway, device: str, device_id: int, sending: DeviceSending, clock: ReadClock = no_clock
     ) -> None:
-        """`clock` is read for each message."""
+        """`clock` is called for each message."""
         self._device_id, self._sending = device_id, sending
         self._whole = _Numbered(gateway, device, Stream.SAMPLES, clock) if device else None
         self._statistics = _Numbered(gateway, device, Stream.STATISTICS, clock) if device else None
@@ -114,14 +112,13 @@ class DeviceStreams:
         self._samples: list[Sample] = []
         self._intervals: list[Interval] = []
         self._samples_max = SLOTS_MAX if sending.whole is Whole.SLOTS else SAMPLES_MAX
-        self.gaps = 0
-        """Samples that did not come: they had no room in the queue."""
-        self.next_seq = 0
-        """The `seq` that comes next; 0 while there was none."""
+        self.gaps = 0  # number of samples that had no room in the queue
+        self.next_seq = 0  # next expected `seq`; 0 before the first sample
+        # QUEUE, or OFF for the first gap after a restart of the output
         self._gap_cause = DropCause.QUEUE
 
     def resume(self, stream: str, position: StreamPosition) -> None:
-        """Go on where an earlier run of the output in the same boot ended."""
+        """Continue a stream of an earlier run of the output in the same boot."""
         numbered = {Stream.SAMPLES: self._whole, Stream.STATISTICS: self._statistics, Stream.EVENTS: self._events}
         found = numbered.get(Stream(stream))
         if found is None:
@@ -131,7 +128,7 @@ class DeviceStreams:
             self.next_seq, self._gap_cause = max(self.next_seq, found.next), DropCause.OFF
 
     def add(self, samples: Sequence[Sample]) -> list[SpoolRow]:
-        """Take samples in the order of their `seq`; return the messages that are whole."""
+        """Add samples in the order of their `seq`. Return the complete messages."""
         made: list[SpoolRow] = []
         begin = 0
         for at, sample in enumerate(samples):
@@ -144,7 +141,7 @@ class DeviceStreams:
         return made + self._add_run(samples[begin:])
 
     def event(self, event: Event, utc_ns: int) -> list[SpoolRow]:
-        """Take an event; return its message."""
+        """Return the message of an event."""
         if not self._sending.events:
             return []
         number = self._events.next or 1
@@ -152,7 +149,7 @@ class DeviceStreams:
         return [self._events.row(message, utc_ns)]
 
     def missed_events(self, count: int, utc_ns: int) -> list[SpoolRow]:
-        """Take the count of events that had no room in the queue; return the message about them."""
+        """Return the message about `count` events that had no room in the queue."""
         if not self._sending.events:
             return []
         first = self._events.next or 1
@@ -162,7 +159,7 @@ class DeviceStreams:
         return [self._events.row(message, utc_ns)]
 
     def look(self, now_ns: int) -> list[SpoolRow]:
-        """Return messages that are due though no later sample has come."""
+        """Return the messages that are due although no later sample arrived."""
         made: list[SpoolRow] = []
         late_ns = now_ns - LATE_NS
         if self._samples and self._is_over(self._samples[0].t_ns, late_ns):
@@ -174,14 +171,14 @@ class DeviceStreams:
         return made
 
     def flush(self) -> list[SpoolRow]:
-        """Return messages of all that there is, also of an interval that has not ended."""
+        """Return messages of all held samples and intervals, including the present interval."""
         self._end_interval()
         return self._send_samples() + self._send_intervals()
 
     # --- samples -----------------------------------------------------------------------------------------------------
 
     def _add_run(self, samples: Sequence[Sample]) -> list[SpoolRow]:
-        """Take samples without a gap."""
+        """Add samples without a gap."""
         made: list[SpoolRow] = []
         if not samples:
             return made
@@ -201,7 +198,10 @@ class DeviceStreams:
         return made
 
     def _is_over(self, begin_ns: int, now_ns: int) -> bool:
-        """Whether the time of one message, on a grid of CLOCK_MONOTONIC, is over."""
+        """Return whether the present time is in a later batch than `begin_ns`.
+
+        Batches start at multiples of `batch_s` of CLOCK_MONOTONIC.
+        """
         batch_ns = self._sending.batch_ns
         return begin_ns // batch_ns < now_ns // batch_ns
 
@@ -242,7 +242,7 @@ class DeviceStreams:
         return [stream.row(message, newest.end_utc_ns)]
 
     def _note_gap(self, sample: Sample) -> list[SpoolRow]:
-        """Messages about samples that are missing before this one."""
+        """Return the messages about the gap before a sample."""
         if self._gap_cause is DropCause.QUEUE:
             self.gaps += sample.seq - self.next_seq
         made = []
@@ -254,7 +254,7 @@ class DeviceStreams:
 
 
 def notes_of(rows: Sequence[SpoolRow], cause: DropCause, gateway: str) -> list[SpoolRow]:
-    """Messages that say that others were dropped, one for each stream, in place of `rows`, whose numbers follow on."""
+    """Return one `dropped` message per stream in place of `rows`, whose numbers are consecutive."""
     first: dict[tuple[str, str], SpoolRow] = {}
     last: dict[tuple[str, str], SpoolRow] = {}
     count: dict[tuple[str, str], int] = {}

@@ -1,11 +1,12 @@
-"""The thread of the spool: what the event loop put into a queue becomes messages on disk, and these go to the sender.
+"""Thread of the spool: stores samples and events as messages on disk and gives them to the sender.
 
-    loop ──put──▶ queue ──▶ streams ──messages──▶ spool (a transaction a second) ──▶ sender
+    loop ──put──▶ queue ──▶ streams ──messages──▶ spool (one transaction per second) ──▶ sender
                                                     ▲────────acknowledged──────────────┘
 
-The loop never waits: samples that have no room in the queue are counted, and show as a gap that a message explains. A
-disk that is full or fails ends the spooling; for a while messages wait in memory, then only their numbers do. What is
-newer than the last transaction, and samples whose `batch_s` is not over, are lost when the process is killed.
+The event loop never waits. If the queue is full, the loop drops and counts samples, and a message covers the gap in
+their numbers. If the disk is full or fails, messages wait in memory up to PENDING_BYTES; after that, imud keeps only
+their numbers. If the process is killed, the samples since the last transaction and the samples of an unfinished
+`batch_s` are lost.
 """
 
 import logging
@@ -32,52 +33,44 @@ from imud.model.units import NS_PER_S
 log = logging.getLogger(__name__)
 
 QUEUE_SAMPLES: Final = 20_000
-"""Samples that wait for the writer: 20 s of a device at 1 kHz, about 20 MB. A flash card that erases stalls for a
-second, a checkpoint of the log for less."""
+"""Maximum number of samples in the queue: 20 s at 1 kHz, about 20 MB. A flash card can stall for one second while it
+erases."""
 QUEUE_EVENTS: Final = 2_000
-COMMIT_NS: Final = NS_PER_S
-"""Between two transactions: messages that are newer are lost when the process is killed."""
-DISK_RETRY_NS: Final = 10 * NS_PER_S
-"""A disk that was full or failed is tried again after so long."""
+COMMIT_NS: Final = NS_PER_S  # Time between two transactions, ns. If the process is killed, newer messages are lost.
+DISK_RETRY_NS: Final = 10 * NS_PER_S  # time between two attempts on a full or failed disk, ns
 PENDING_BYTES: Final = 8 << 20
-"""Messages that wait in memory while the disk fails; of those that are more only the numbers are kept."""
+"""Maximum size of the messages in memory while the disk fails, bytes. Above it, imud keeps only their numbers."""
 
 
 class SentState(NamedTuple):
-    """State of devices that is to be published, retained, by topic."""
+    """Retained states of devices and gateway, by topic."""
 
     statuses: Mapping[str, DeviceStatus]
-    other: Mapping[str, object]
-    """Further messages by topic; None removes what is there."""
+    other: Mapping[str, object]  # further messages by topic; None removes the message from the broker
 
 
 class MissedEvents:
-    """Events of a device that had no room, in their place."""
+    """Events of a device that had no room in the queue, at their position in the queue."""
 
     def __init__(self, device: str) -> None:
         self.device = device
         self.count = 0
-        self.t_ns = 0
-        """CLOCK_MONOTONIC of the newest."""
+        self.t_ns = 0  # CLOCK_MONOTONIC of the newest event
 
 
 Item = Batch | Event | MissedEvents | SentState
 
 
 class WriterQueue:
-    """Queue from the event loop to the writer. Synchronization: one thread puts, one takes."""
+    """Queue from the event loop to the writer. Synchronization: one thread puts, one thread takes."""
 
     def __init__(self, samples_max: int = QUEUE_SAMPLES, events_max: int = QUEUE_EVENTS) -> None:
-        self.queued = 0
-        """Samples and events that were put since the start."""
-        self.dropped = 0
-        """Samples and events that had no room."""
+        self.queued = 0  # number of samples and events since the start
+        self.dropped = 0  # number of samples and events that had no room
         self._samples_max, self._events_max = samples_max, events_max
         self._items: deque[Batch | Event | MissedEvents] = deque()
-        self._lock = threading.Lock()
-        """Held where states and counts of missed events are changed, which never waits for a disk."""
-        self._missed: dict[str, MissedEvents] = {}
-        """Of devices whose newest event had no room: what the next one that has none is added to."""
+        self._lock = threading.Lock()  # protects states and counts of missed events; never held during disk access
+        self._missed: dict[str, MissedEvents] = {}  # the newest entry of each device whose newest event had no room
         self._statuses: dict[str, DeviceStatus] = {}
         self._other: dict[str, object] = {}
         self._put = self._taken = 0
@@ -85,7 +78,7 @@ class WriterQueue:
 
     @property
     def waiting(self) -> int:
-        """Samples that wait."""
+        """Return the number of samples in the queue."""
         return self._put - self._taken
 
     def put_batch(self, batch: Batch) -> None:
@@ -99,7 +92,7 @@ class WriterQueue:
         self._put += count
 
     def put_event(self, event: Event) -> None:
-        """Add an event; of one without room only that it was there, which is counted."""
+        """Add an event. Count it only if the queue is full."""
         self.queued += 1
         if self._events_put - self._events_taken >= self._events_max:
             self.dropped += 1
@@ -110,7 +103,7 @@ class WriterQueue:
         self._events_put += 1
 
     def put_state(self, state: SentState) -> None:
-        """Add a state; of each topic the newest waits, so that there is always room."""
+        """Add states. The queue keeps only the newest state of each topic, so it always has room."""
         with self._lock:
             for topic, status in state.statuses.items():
                 self._other.pop(topic, None)
@@ -120,7 +113,7 @@ class WriterQueue:
                 self._other[topic] = other
 
     def take(self) -> Item | None:
-        """Return the states that wait, or the oldest of all else; None for nothing."""
+        """Return all states, or else the oldest batch or event; None if the queue is empty."""
         if self._statuses or self._other:
             with self._lock:
                 state = SentState(self._statuses, self._other)
@@ -135,13 +128,13 @@ class WriterQueue:
         elif isinstance(item, Event):
             self._events_taken += 1
         else:
-            with self._lock:  # what comes from now on is counted anew
+            with self._lock:  # count later events in a new entry
                 if self._missed.get(item.device) is item:
                     self._missed.pop(item.device, None)
         return item
 
     def _miss(self, event: Event) -> None:
-        """Count an event in the place that it would have had. There is one place between two events at most."""
+        """Count an event at its position in the queue. There is at most one entry between two events."""
         with self._lock:
             missed = self._missed.get(event.device)
             if missed is None:
@@ -152,30 +145,29 @@ class WriterQueue:
 
 
 class SpoolWriter:
-    """The thread and what it owns. Synchronization: counters are read by any thread, the rest is the thread's own."""
+    """Thread with the spool and its streams.
+
+    Synchronization: any thread may read the counters; the thread owns the rest.
+    """
 
     def __init__(
         self, settings: MqttOptions, gateway: Gateway, queue: WriterQueue, spool: Spool, sender: MqttSender,
         now_ns: Callable[[], int], utc_offset_ns: Callable[[], int], start_worker: StartWorker,
         clock: ReadClock = no_clock,
     ) -> None:  # fmt: skip
-        """`clock` reads the wall clock with its state; what is spooled before it was synchronised has no age."""
-        self.problem = ""
-        """Why nothing is spooled, one sentence; empty while it is."""
-        self.lost_on_disk = 0
-        """Samples and events of which only the numbers are left because the disk failed."""
-        self.failure: BaseException | None = None
-        """The exception that ended the thread, which is an internal error."""
-        self.positions: list[StreamPosition] = []
-        """How far the streams have come, as of the last transaction."""
+        """`clock` reads the wall clock. Messages have no age before the clock is synchronized."""
+        self.problem = ""  # cause of a failed transaction, one sentence; empty if the spool works
+        self.lost_on_disk = 0  # number of samples and events that imud lost because the disk failed
+        self.failure: BaseException | None = None  # internal error that ended the thread
+        self.positions: list[StreamPosition] = []  # positions of the streams at the last transaction
         self.closed: Callable[[], None] = lambda: None
-        """Called when the spool is closed, by the thread that closed it; set by who has its lock."""
+        """Called by the closing thread after the spool is closed. The owner of the lock file sets it."""
         self._is_closing = self._is_closed = False
         self._settings, self._gateway = settings, gateway
         self._queue, self._spool, self._sender = queue, spool, sender
         self._now_ns, self._utc_offset_ns, self._clock = now_ns, utc_offset_ns, clock
+        # True after the first synchronized reading: the clock stays accurate enough without the network
         self._is_set = False
-        """Whether the wall clock was synchronised at any time since the start: it goes on when the network is gone."""
         self._streams: dict[str, DeviceStreams] = {}
         self._resumable: dict[str, list[StreamPosition]] = {}
         self._boots: dict[str, int] = {}
@@ -183,16 +175,16 @@ class SpoolWriter:
         self._acknowledged: set[int] = set()
         self._session = 0
         self._due_ns = 0
+        # number of messages that `messages_per_s` allows now, and the time of this number
         self._allowed, self._allowed_ns = 1.0, now_ns()
-        """Messages that may be given, as of a time, where `messages_per_s` bounds them."""
         self._resume()
         self._worker = start_worker("mqtt spool", self.work, self._failed)
         sender.wanting = self._worker.ring
 
     def close(self) -> None:
-        """Store all that waits and end the thread; may be called twice.
+        """Store all waiting messages and end the thread. A second call does nothing.
 
-        A thread that hangs in the disk is left with the spool: it does the same when the disk goes on.
+        If the disk blocks the thread, it stores the messages later, when the disk works again.
         """
         self._sender.wanting = lambda: None
         self._is_closing = True
@@ -200,12 +192,15 @@ class SpoolWriter:
             self._finish()
         else:
             log.error(
-                "mqtt: the spool's thread has not ended within %g s (a disk that hangs?): %d samples wait, and are "
-                "stored if the disk goes on before imud ends", END_LIMIT_S, self._queue.waiting,
+                "mqtt: the thread of the spool did not end within %g s because the disk does not respond; %d samples "
+                "wait, and imud stores them if the disk responds before imud ends", END_LIMIT_S, self._queue.waiting,
             )  # fmt: skip
 
     def _finish(self) -> None:
-        """Store all that waits and close the spool, once. By the thread, or after its end."""
+        """Store all waiting messages and close the spool, once.
+
+        The thread calls this method, or `close` after the thread ended.
+        """
         if self._is_closed:
             return
         self._is_closed = True
@@ -217,16 +212,16 @@ class SpoolWriter:
         self._store(self._now_ns())
         if self._rows:
             log.error(
-                "mqtt: %d messages are lost with the end, because nothing can be spooled: %s",
+                "mqtt: %d messages are lost at the end because the spool failed: %s",
                 len(self._rows), self.problem,
             )  # fmt: skip
         self._spool.close()
         self.closed()
 
-    # --- the thread's side -------------------------------------------------------------------------------------------
+    # --- thread -------------------------------------------------------------------------------------------------------
 
     def work(self) -> int:
-        """Do what is due, the end included; return the time until the next round, ns."""
+        """Do the due work. Return the time until the next round, ns."""
         rest_ns = self._do_due()
         if self._is_closing:
             self._finish()
@@ -244,7 +239,7 @@ class SpoolWriter:
         return max(1, min(COMMIT_NS, self._due_ns - self._now_ns(), pause_ns))
 
     def _take_answers(self) -> None:
-        """Note what was acknowledged, and begin anew with the oldest after a new connection."""
+        """Take the acknowledgements. After a new connection, give the oldest messages again."""
         session = self._sender.session
         for of_session, number in self._sender.take_acknowledged():
             if of_session == self._session:
@@ -254,7 +249,7 @@ class SpoolWriter:
             self._spool.rewind()
 
     def _take_all(self) -> None:
-        """Make messages of what waits in the queue."""
+        """Make messages of the items in the queue."""
         while (item := self._queue.take()) is not None:
             if isinstance(item, Batch):
                 self._take_batch(item)
@@ -277,7 +272,7 @@ class SpoolWriter:
         streams = self._streams_of(batch.device, batch.device_id)
         if streams is None:
             return
-        if batch.samples[0].seq < streams.next_seq:  # the device was made anew, and counts from 1 again
+        if batch.samples[0].seq < streams.next_seq:  # the device was created again and counts from 1
             self._rows += streams.flush()
             del self._streams[batch.device]
             self._resumable.pop(batch.device, None)
@@ -300,7 +295,7 @@ class SpoolWriter:
         return found
 
     def _resume(self) -> None:
-        """Find out where an earlier run of the output in the same boot ended."""
+        """Continue the streams of an earlier run of the output in the same boot."""
         try:
             self._spool.open()
             self.positions = self._spool.positions()
@@ -309,6 +304,7 @@ class SpoolWriter:
             return
         for position in self.positions:
             boot, _, number = position.boot.partition("-")
+            # the identifier of a boot is `EPOCH`, and `EPOCH-N` after the N-th start of a device
             if boot == self._gateway.boot and position.stream in Stream.__members__.values():
                 known = self._boots.get(position.device, 1)
                 if int(number or "1") > known:
@@ -317,10 +313,10 @@ class SpoolWriter:
                 if int(number or "1") == known:
                     self._resumable.setdefault(position.device, []).append(position)
 
-    # --- the spool ---------------------------------------------------------------------------------------------------
+    # --- spool --------------------------------------------------------------------------------------------------------
 
     def _store(self, now_ns: int) -> None:
-        """Write one transaction of all that is new, if there is anything."""
+        """Write one transaction with all new messages and acknowledgements, if there are any."""
         self._due_ns = now_ns + COMMIT_NS
         if not self._rows and not self._acknowledged and not self.problem:
             return
@@ -341,9 +337,9 @@ class SpoolWriter:
         self._acknowledged -= acknowledged
 
     def _commit(self, acknowledged: frozenset[int], now_ns: int) -> None:
-        """Store what waits, one by one after a problem: a disk that was full may not have room for all of it at once.
+        """Store the waiting messages. Raises SpoolError.
 
-        Raises SpoolError.
+        After a problem, store them one by one, because a full disk may not have room for all.
         """
         utc_ns, most = self._stored_utc_ns(now_ns), 1 if self.problem else max(len(self._rows), 1)
         self._spool.commit(self._rows[:most], acknowledged, now_ns, utc_ns)
@@ -353,13 +349,14 @@ class SpoolWriter:
             del self._rows[:most]
 
     def _stored_utc_ns(self, now_ns: int) -> int:
-        """CLOCK_REALTIME, by which messages age; 0 before it was ever synchronised, when it says nothing of ages."""
+        """Return CLOCK_REALTIME of the transaction; 0 before the clock was synchronized, because messages then have no
+        age."""
         clock = self._clock()
         self._is_set = self._is_set or clock is None or clock.synchronised
         return now_ns + self._utc_offset_ns() if self._is_set else 0
 
     def _make_room(self, acknowledged: frozenset[int], now_ns: int) -> None:
-        """Remove what was acknowledged, for which a disk can have room that has none for more."""
+        """Remove acknowledged messages. A full disk can have room for this although it has no room for new messages."""
         if acknowledged:
             with suppress(SpoolError):
                 self._spool.remove(acknowledged, now_ns, self._stored_utc_ns(now_ns))
@@ -367,10 +364,11 @@ class SpoolWriter:
                 self._due_ns = now_ns + COMMIT_NS
 
     def _give(self, now_ns: int) -> int:
-        """Give the sender what it has room for; return after what time more may be given, ns."""
+        """Give messages to the sender up to its free places. Return the time until more messages are allowed, ns."""
         room, rate_hz = self._sender.room(), self._settings.messages_per_s
         if rate_hz is not None:
             self._allowed += (now_ns - self._allowed_ns) * rate_hz / NS_PER_S
+            # at most one second of messages accumulates
             self._allowed, self._allowed_ns = min(self._allowed, max(rate_hz, 1.0)), now_ns
             room = min(room, int(self._allowed))
         try:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class Authority:
-    """Certificates made by openssl for one test."""
+    """Certificate authority of one test."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -26,7 +26,7 @@ class Authority:
         return str(self.folder / name)
 
     def listener(self, port: int) -> Sequence[str]:
-        """Lines of mosquitto's configuration: a port with TLS that asks its clients for a certificate."""
+        """Return the lines of mosquitto's configuration for a TLS port that requires client certificates."""
         return (
             f"listener {port} 127.0.0.1", f"cafile {self['ca.pem']}", f"certfile {self['broker.pem']}",
             f"keyfile {self['broker.key']}", "require_certificate true", "allow_anonymous true",

@@ -44,7 +44,7 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
 
 @pytest.fixture(autouse=True)
 def _closed_spools(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Close what a test leaves open: from Python 3.13 on there is a warning for each database that is not closed."""
+    """Close databases that a test leaves open. Python 3.13 and newer warn about each of them."""
     opened: list[Spool] = []
     opening = Spool.open
 

@@ -1,8 +1,9 @@
-"""`make fleet-demo`: a broker, three gateways with a simulated sensor each, and `imud fleet top` on them.
+"""`make fleet-demo`: a broker, three gateways with a simulated sensor each, and `imud fleet top`.
 
     simulator ──pty──▶ imud run ──MQTT──▶ mosquitto ──▶ imud fleet top
 
-Arguments go to `imud fleet top`: `make fleet-demo ARGS="--plain --duration 20s"`. All ends with it.
+The arguments are the arguments of `imud fleet top`: `make fleet-demo ARGS="--plain --duration 20s"`. All processes end
+with it.
 """
 
 import json
@@ -23,10 +24,10 @@ LIMIT_S: Final = 60.0
 
 @contextmanager
 def ended_with(words: Sequence[str], log: Path) -> Iterator[None]:
-    """A program that runs as long as the block."""
+    """Run a program during the block."""
     with (
         log.open("w") as out,
-        # the simulator runs until its input ends
+        # the simulator ends when its standard input closes
         subprocess.Popen(words, stdin=subprocess.PIPE, stdout=out, stderr=out) as process,
     ):
         try:
@@ -40,7 +41,7 @@ def ended_with(words: Sequence[str], log: Path) -> Iterator[None]:
 
 
 def configuration(folder: Path, gateway: str, port: int) -> Path:
-    """A daemon of its own: everything below its folder."""
+    """Return the configuration of a daemon with all files in `folder`."""
     tree = {
         "state_dir": str(folder),
         "socket": {"path": str(folder / "imud.sock")},
@@ -59,7 +60,7 @@ def configuration(folder: Path, gateway: str, port: int) -> Path:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run until `imud fleet top` ends; its exit status is that of the demonstration."""
+    """Run until `imud fleet top` ends. Return its exit status."""
     if NO_MOSQUITTO:
         print(f"fleet-demo: {NO_MOSQUITTO}", file=sys.stderr)
         return 2

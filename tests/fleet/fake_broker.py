@@ -1,4 +1,4 @@
-"""A broker in memory for the sender: takes what is sent when the test says so, and fails when it says so."""
+"""Broker in memory for tests of the sender. The test decides when it acknowledges and when it fails."""
 
 import threading
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from tests.support.daemon_process import LIMIT_S
 
 
 class FakeConnection:
-    """A connection to it."""
+    """Connection to a `FakeBroker`."""
 
     def __init__(self, broker: "FakeBroker") -> None:
         self.acknowledged: list[int] = []
@@ -39,7 +39,7 @@ class FakeConnection:
         return len(self.sent)
 
     def wait(self, seconds: float) -> None:
-        """Acknowledge what is not held back; fail if the broker is to."""
+        """Acknowledge messages if the test allows it. Raise BrokerError if the broker has a problem."""
         if self._broker.problem:
             raise BrokerError(self._broker.problem)
         while self._answered < len(self.sent) and self._broker.answers > 0:
@@ -59,28 +59,25 @@ class FakeConnection:
 
 
 class FakeBroker:
-    """The broker. `connect` is a `Connect`; with `blocks` waits are waits, for a sender that runs."""
+    """Broker in memory. `connect` is a `Connect`. With `blocks`, `wait` of a connection really waits."""
 
     def __init__(self, *, blocks: bool = False) -> None:
         self.blocks = blocks
         self.changed = threading.Condition()
         self.connections: list[FakeConnection] = []
         self.asked: list[str] = []
-        self.problem = ""
-        """Why every connection fails now; empty for none."""
-        self.answers = 1_000_000
-        """Acknowledgements that are still given."""
+        self.problem = ""  # problem of every connection; empty if the broker works
+        self.answers = 1_000_000  # number of remaining acknowledgements
         self.window = 4
         self.will: Will | None = None
         self.connecting, self.accepts = threading.Event(), threading.Event()
         self.accepts.set()
-        self.was_wanted = True
-        """What the sender said when the newest connection was accepted."""
+        self.was_wanted = True  # result of `is_wanted` at the newest connection
 
     def connect(
         self, broker: Broker, _settings: MqttOptions, _client_id: str, will: Will, is_wanted: Callable[[], bool]
     ) -> FakeConnection:
-        """Accept, or not; with `accepts` unset once it is set, whether the connection is still wanted or not."""
+        """Accept or reject a connection. Wait for `accepts` first."""
         self.asked.append(broker.host)
         self.will = will
         self.connecting.set()
@@ -92,7 +89,7 @@ class FakeBroker:
         return self.connections[-1]
 
     def wait_for(self, topic: str, holds: Callable[[bytes], bool] = lambda payload: True) -> None:
-        """Wait until a message of the topic was sent whose payload fits."""
+        """Wait until the sender sent a message of the topic for which `holds` returns True."""
         with self.changed:
             assert self.changed.wait_for(
                 lambda: any(sent[0] == topic and holds(sent[1]) for one in self.connections

@@ -1,4 +1,4 @@
-"""A gateway of the tests that sends given messages with QoS 1 and waits until the broker has taken them."""
+"""Gateway that sends given messages with QoS 1 and waits for the acknowledgements."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -30,7 +30,7 @@ UTC_NS = 1_790_000_000_000_000_000
 def samples_message(
     first: int, last: int, *, gateway: str = "gw", boot: str = "1", device: str = "bow", utc_ns: int = UTC_NS
 ) -> FleetMessage:
-    """Whole samples with these numbers, a millisecond apart; `utc_ns` is that of number 0."""
+    """Return complete samples with these numbers at 1 kHz. `utc_ns` is the time of number 0."""
     samples = [
         Sample(
             device, seq, seq * NS_PER_MS, 500, Sync.EDGE, seq * NS_PER_MS + 10, utc_ns + seq * NS_PER_MS,
@@ -45,7 +45,7 @@ def samples_message(
 
 
 def intervals_message(first: int, last: int, *, boot: str = "1", utc_ns: int = UTC_NS) -> FleetMessage:
-    """One interval of these samples."""
+    """Return one interval of such samples."""
     begin, end = first * NS_PER_MS, last * NS_PER_MS
     one = Interval(
         first, last, last - first + 1, begin, end, utc_ns + begin, utc_ns + end, 500, Sync.EDGE,
@@ -56,24 +56,24 @@ def intervals_message(first: int, last: int, *, boot: str = "1", utc_ns: int = U
 
 
 def event_message(number: int, t_ns: int, *, boot: str = "1", utc_ns: int = UTC_NS) -> FleetMessage:
-    """An event at a time of CLOCK_MONOTONIC."""
+    """Return an event at `t_ns`."""
     made = samples_message(number, number, boot=boot)
     events = [Event(t_ns, "bow", EventKind.UP, "it is up")]
     return msgspec.structs.replace(made, kind=MessageKind.EVENTS, samples=[], events=events, utc_ns=utc_ns + t_ns)
 
 
 def not_set(message: FleetMessage, utc_ns: int = 0) -> FleetMessage:
-    """The same message of a gateway whose clock nothing keeps; `utc_ns` is what it had at t_ns = 0."""
+    """Return the message with an unsynchronized clock. `utc_ns` is its time at t_ns = 0."""
     return msgspec.structs.replace(message, clock=GatewayClock(0, utc_ns, synchronised=False))
 
 
 def synchronised(message: FleetMessage, utc_ns: int = UTC_NS, *, t_ns: int = 0, error_ns: int = 1000) -> FleetMessage:
-    """The same message of a gateway whose clock is kept."""
+    """Return the message with a synchronized clock."""
     return msgspec.structs.replace(message, clock=GatewayClock(t_ns, utc_ns, synchronised=True, error_ns=error_ns))
 
 
 def dropped_message(first: int, last: int, *, gateway: str = "gw", boot: str = "1") -> FleetMessage:
-    """What the gateway says of numbers that it dropped."""
+    """Return the message about dropped numbers."""
     return msgspec.structs.replace(
         samples_message(first, last, gateway=gateway, boot=boot), kind=MessageKind.DROPPED, cause=DropCause.SPACE,
         samples=[],
@@ -81,7 +81,7 @@ def dropped_message(first: int, last: int, *, gateway: str = "gw", boot: str = "
 
 
 class SendingGateway:
-    """A client of the broker. Synchronization: one thread."""
+    """MQTT client of the test. Synchronization: one thread."""
 
     def __init__(self, port: int) -> None:
         from paho.mqtt.client import Client, MQTTv5
@@ -93,20 +93,17 @@ class SendingGateway:
         self._client.loop_start()
 
     def send(self, *messages: FleetMessage, stream: Stream = Stream.SAMPLES) -> None:
-        """Send messages of a stream."""
         self.publish((topic_of("mill", one.gateway, one.device, stream), encode_message(one)) for one in messages)
 
     def send_state(self, state: GatewayState, gateway: str = "gw") -> None:
-        """Send a state, retained."""
         self.publish([(topic_of("mill", gateway, "", STATE), msgspec.json.encode(state))], retain=True)
 
     def publish(self, messages: Iterable[tuple[str, bytes]], *, retain: bool = False) -> None:
-        """Send payloads, and wait until the broker has acknowledged them."""
+        """Publish payloads and wait until the broker acknowledges them."""
         for info in [self._client.publish(topic, payload, qos=1, retain=retain) for topic, payload in messages]:
             info.wait_for_publish(LIMIT_S)
             assert info.is_published()
 
     def close(self) -> None:
-        """Disconnect."""
         self._client.disconnect()
         self._client.loop_stop()

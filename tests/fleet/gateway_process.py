@@ -1,7 +1,8 @@
-"""A gateway as a process of its own, to be killed: `python -m tests.fleet.gateway_process PORTS SPOOL EPOCH`.
+"""Gateway as a separate process that a test kills: `python -m tests.fleet.gateway_process PORTS SPOOL EPOCH`.
 
-It makes samples of one device at 1 kHz in the real time of the machine, sends them by the real output, and prints after
-each transaction how far each stream has come into the spool. After SIGTERM it makes no more, and prints what waits.
+It makes samples of one device at 1 kHz in real time and sends them with the real output. After each transaction, it
+prints the newest number of each stream in the spool. After SIGTERM, it makes no more samples and prints the number of
+waiting messages.
 """
 
 import os
@@ -30,9 +31,11 @@ def main(
     ports: str, spool: str, epoch: str, megabytes: str = "256", certificates: str = "", newest_seq: str = "0",
     statements: str = "0", name: str = "gw", version: str = "5",
 ) -> None:  # fmt: skip
-    """Run until killed. `ports`: of the brokers of a cluster, with commas. `certificates`: folder of an `Authority`,
-    for TLS; empty for none. Samples count on from `newest_seq`. With `statements` it kills itself before that statement
-    of all that are inside a transaction. `version`: of MQTT.
+    """Run until killed.
+
+    `ports` are the ports of the brokers of a cluster, separated by commas. `certificates` is the folder of an
+    `Authority`; empty: no TLS. `newest_seq` is the number before the first sample. With `statements`, the process kills
+    itself before this statement inside a transaction. `version` is the version of MQTT.
     """
     if int(statements):
         die_at_statement(int(statements))
@@ -72,7 +75,7 @@ def main(
 
 
 def die_at_statement(number: int) -> None:
-    """Have SQLite's connections count statements inside transactions, and kill this process before one of them."""
+    """Count the statements inside transactions of SQLite, and kill this process before one of them."""
     left = number
     connect = sqlite3.connect
 

@@ -1,4 +1,4 @@
-"""Gateways for tests with a real broker, in this process or in one that is killed, and the check of their ledger."""
+"""Gateways with a real broker, in this process or in a process that a test kills, and the check of their ledger."""
 
 import os
 import select
@@ -29,7 +29,7 @@ from tests.support.publisher_context import publisher_context
 
 
 class LiveGateway:
-    """The real output in this process; samples come when the test says so."""
+    """Real output in this process with samples from the test."""
 
     def __init__(self, folder: Path, port: int, **settings: object) -> None:
         self.host = HostClock()
@@ -46,7 +46,7 @@ class LiveGateway:
         self.base_ns = self.host.now_ns() - 3600 * NS_PER_S
 
     def publish(self, count: int) -> None:
-        """So many samples at once, stamped at 1 kHz."""
+        """Publish `count` samples with time stamps at 1 kHz."""
         samples = []
         for _ in range(count):
             self.seq += 1
@@ -64,7 +64,7 @@ class LiveGateway:
 
 
 def in_spool(folder: Path) -> tuple[list[SpoolRow], list[StreamPosition]]:
-    """What is in the spool of a gateway that has ended, and how far its streams came."""
+    """Return the messages and the positions in the spool of an ended gateway."""
     spool = Spool(folder, 1 << 40, 1 << 62)
     spool.open()
     found = spool.after(1_000_000), spool.positions()
@@ -73,7 +73,7 @@ def in_spool(folder: Path) -> tuple[list[SpoolRow], list[StreamPosition]]:
 
 
 def closes(collector: Collector, folder: Path) -> dict[tuple[str, str], StreamCounts]:
-    """Check: stored = received + still in the spool, by boot and stream; return the counts of the collector."""
+    """Check that stored = received + in the spool, by boot and stream. Return the counts of the collector."""
     rows, positions = in_spool(folder)
     due = {(one.boot, one.stream): one.last for one in positions}
     for row in reversed(rows):
@@ -83,7 +83,7 @@ def closes(collector: Collector, folder: Path) -> dict[tuple[str, str], StreamCo
         newest = {(key.boot, key.stream): one.newest for key, one in collector.ledger.counts.items()}
         return all(newest.get(key, 0) >= last for key, last in due.items())
 
-    collector.wait_for(has_come)  # the broker acknowledges before it passes on
+    collector.wait_for(has_come)  # the broker acknowledges a message before it delivers the message
     collector.close()
     whole = FleetLedger(from_begin=True)
     for topic, payload in collector.messages:
@@ -102,26 +102,22 @@ def closes(collector: Collector, folder: Path) -> dict[tuple[str, str], StreamCo
 
 
 class GatewayState(NamedTuple):
-    """What a gateway in a process of its own says of itself, after each transaction."""
+    """Report of a gateway process after each transaction."""
 
-    waiting: int
-    """Messages in its spool."""
-    seq: int
-    """Of its newest sample."""
+    waiting: int  # number of messages in its spool
+    seq: int  # `seq` of its newest sample
     spool_bytes: int
 
 
 class KilledGateway:
-    """`gateway_process`, which is killed."""
+    """Process of `gateway_process`. The test kills it."""
 
     def __init__(
         self, port: int | Sequence[int], spool: Path, epoch: int, megabytes: float = 256,
         authority: Authority | None = None, newest_seq: int = 0, statements: int = 0, name: str = "gw",
         version: str = "5",
     ) -> None:  # fmt: skip
-        """Several ports are of the brokers of a cluster. With an authority it speaks TLS. Its samples count on from
-        `newest_seq`. With `statements` it kills itself before that statement inside transactions. `version`: of MQTT.
-        """
+        """Start the process. See `gateway_process.main` for the arguments."""
         self._read = b""
         ports = ",".join(map(str, [port] if isinstance(port, int) else port))
         words = [ports, str(spool), str(epoch), str(megabytes), str(authority.folder) if authority else ""]
@@ -133,12 +129,12 @@ class KilledGateway:
         )
 
     def wait_until(self, waiting: int) -> None:
-        """Until so many messages wait in its spool."""
+        """Wait until this number of messages waits in the spool."""
         while (state := self.state(LIMIT_S)) is None or state.waiting < waiting:
             pass
 
     def state(self, limit_s: float) -> GatewayState | None:
-        """What it says next; None if it says nothing within the time. Raises AssertionError after its end."""
+        """Return the next report; None after the time limit. Raises AssertionError if the process ended."""
         assert self.process.stdout is not None
         if b"\n" not in self._read:
             if not select.select([self.process.stdout], [], [], limit_s)[0]:
@@ -153,7 +149,7 @@ class KilledGateway:
         return GatewayState(*map(int, line.split()))
 
     def drain(self, limit_s: float) -> bool:
-        """Have it make no more samples, and wait until it has sent all; return whether it has."""
+        """Stop making samples and wait until all are sent. Return whether the spool is empty."""
         self.process.send_signal(signal.SIGTERM)
         end_s, waiting = monotonic() + limit_s, 1
         while waiting and monotonic() < end_s:
@@ -162,7 +158,6 @@ class KilledGateway:
         return not waiting
 
     def kill(self) -> None:
-        """With SIGKILL."""
         self.process.send_signal(signal.SIGKILL)
         self.process.wait(LIMIT_S)
         assert self.process.stdout is not None

@@ -1,7 +1,7 @@
-"""A real broker on loopback, Debian's mosquitto, and a collector that keeps a session with it.
+"""Real broker on loopback (mosquitto of Debian), and a collector with a session.
 
-The collector is a bare client of paho-mqtt in a thread; its session outlives a restart of the broker, which keeps what
-comes meanwhile. mosquitto says on standard error when it listens, so that nothing sleeps.
+The collector is a client of paho-mqtt in a thread. Its session outlives a restart of the broker, which stores messages
+in the meantime. mosquitto reports on standard error that it listens, so the tests need no sleep.
 """
 
 import os
@@ -21,12 +21,11 @@ from tests.support.surroundings import free_port
 
 PROGRAM: Final = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/sbin")
 NO_MOSQUITTO: Final = "" if PROGRAM else "mosquitto is not installed (make mqtt-deps)"
-RUNNING: Final = " running"
-"""How the line ends that it writes when it listens."""
+RUNNING: Final = " running"  # end of the line that mosquitto writes when it listens
 
 
 class Mosquitto:
-    """The broker. `lines` are further ones of its configuration."""
+    """Broker process. `lines` are added to its configuration."""
 
     def __init__(self, folder: Path, lines: Sequence[str] = ("allow_anonymous true",), port: int | None = None) -> None:
         self.folder, self.lines = folder, tuple(lines)
@@ -36,7 +35,7 @@ class Mosquitto:
         self._reader: threading.Thread | None = None
 
     def start(self) -> None:
-        """Start it and wait until it listens."""
+        """Start the broker and wait until it listens."""
         assert PROGRAM is not None
         own = os.geteuid() == 0
         config = self.folder / "mosquitto.conf"
@@ -57,7 +56,7 @@ class Mosquitto:
 
     @property
     def pid(self) -> int:
-        """Of the process that runs."""
+        """Return the process ID."""
         assert self._process is not None
         return self._process.pid
 
@@ -67,10 +66,10 @@ class Mosquitto:
             self.log.append(line.rstrip())
             if line.rstrip().endswith(RUNNING):
                 running.set()
-        running.set()  # it ended, perhaps before it listened
+        running.set()  # the broker ended, perhaps before it listened
 
     def stop(self, number: int = signal.SIGTERM) -> None:
-        """End it; with SIGTERM it keeps sessions. No-op where it does not run."""
+        """Stop the broker. With SIGTERM it stores sessions. Do nothing if it does not run."""
         process, self._process = self._process, None
         if process is not None:
             process.send_signal(signal.SIGCONT)
@@ -82,24 +81,24 @@ class Mosquitto:
             process.stdout.close()
 
     def reload(self) -> None:
-        """Have it read its files of rights anew."""
+        """Let the broker read its password and ACL files again."""
         assert self._process is not None
         self._process.send_signal(signal.SIGHUP)
 
     def freeze(self) -> None:
-        """Stop it as it is: connections stay, and nothing answers."""
+        """Stop the process with SIGSTOP: the connections stay open without replies."""
         assert self._process is not None
         self._process.send_signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """Let it go on."""
+        """Continue the process."""
         assert self._process is not None
         self._process.send_signal(signal.SIGCONT)
 
 
 @contextmanager
 def running_broker(folder: Path, *lines: str, port: int | None = None) -> Iterator[Mosquitto]:
-    """A broker that runs. Without lines anybody may connect."""
+    """Run a broker during the block. Without `lines` it accepts every client."""
     folder.mkdir(exist_ok=True)
     broker = Mosquitto(folder, lines or ("allow_anonymous true",), port)
     broker.start()
@@ -110,7 +109,7 @@ def running_broker(folder: Path, *lines: str, port: int | None = None) -> Iterat
 
 
 class Collector:
-    """A reader of all gateways, with its ledger. Synchronization: `wait_for` may be called by the test's thread."""
+    """Reader of all gateways with its ledger. Synchronization: the test's thread may call `wait_for`."""
 
     def __init__(self, port: int, topic: str = "imud/#", prepare: Callable[[Any], None] = lambda client: None) -> None:
         from paho.mqtt.client import Client, MQTTv5
@@ -119,10 +118,8 @@ class Collector:
         from paho.mqtt.properties import Properties
 
         self.ledger = FleetLedger(from_begin=True)
-        self.messages: list[tuple[str, bytes]] = []
-        """Everything that came, as it came."""
-        self.fresh: list[FleetMessage] = []
-        """Messages of streams without what was known."""
+        self.messages: list[tuple[str, bytes]] = []  # all received messages in their order
+        self.fresh: list[FleetMessage] = []  # received messages of streams without duplicates
         self._changed = threading.Condition()
         self._topic = topic
         self._client = Client(CallbackAPIVersion.VERSION2, "collector", protocol=MQTTv5)
@@ -152,11 +149,10 @@ class Collector:
             self._changed.notify_all()
 
     def wait_for(self, true: Callable[[], bool], limit_s: float = LIMIT_S) -> None:
-        """Wait until something holds; it is looked at after each message."""
+        """Wait until `true` returns True. Check it after each message."""
         with self._changed:
             assert self._changed.wait_for(true, limit_s), self.ledger.counts
 
     def close(self) -> None:
-        """Disconnect."""
         self._client.disconnect()
         self._client.loop_stop()

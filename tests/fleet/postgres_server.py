@@ -1,6 +1,6 @@
-"""A real PostgreSQL of the tests, Debian's, on a UNIX socket in a folder of its own.
+"""Real PostgreSQL server of Debian, on a UNIX socket in its own folder.
 
-`initdb` refuses to run as root: there it runs as the package's user `postgres`.
+`initdb` refuses to run as root. Then it runs as the user `postgres`.
 """
 
 import os
@@ -24,7 +24,7 @@ NO_POSTGRES: Final = (
 
 
 class PostgresServer:
-    """The server, with its data in a folder of its own. Synchronization: one thread."""
+    """Server process with its own data folder. Synchronization: one thread."""
 
     def __init__(self, folder: Path) -> None:
         self.url = f"postgresql:///postgres?host={folder}&user=imud"
@@ -37,13 +37,13 @@ class PostgresServer:
         self._call("initdb", "-U", "imud", "--auth=trust", "--no-sync", "-E", "UTF8", "--locale=C")
 
     def start(self) -> None:
-        """Start it, and wait until it answers; after `kill` it recovers from its log."""
+        """Start the server and wait for a reply. After `kill`, it recovers from its log."""
         options = f"-k {self._folder} -c listen_addresses='' -c fsync=off"
         self._call("pg_ctl", "-l", str(self._folder / "log"), "-w", "-t", str(LIMIT_S), "-o", options, "start")
         self._runs = True
 
     def kill(self) -> None:
-        """End all its processes at once, in the midst of whatever they do; no-op where it does not run."""
+        """Kill all processes of the server. Do nothing if it does not run."""
         if self._runs:
             self._runs = False
             self._call("pg_ctl", "-m", "immediate", "-w", "stop")
@@ -59,8 +59,7 @@ class PostgresServer:
 
 @contextmanager
 def running_server() -> Iterator[PostgresServer]:
-    """A server that runs."""
-    folder = Path(tempfile.mkdtemp(prefix="imud-pg-", dir="/tmp"))  # tmp_path is closed to other users
+    folder = Path(tempfile.mkdtemp(prefix="imud-pg-", dir="/tmp"))  # other users cannot read tmp_path
     try:
         server = PostgresServer(folder)
         server.start()
@@ -74,6 +73,6 @@ def running_server() -> Iterator[PostgresServer]:
 
 @contextmanager
 def running_postgres() -> Iterator[str]:
-    """A server that runs; its URL."""
+    """Run a server during the block. Yield its URL."""
     with running_server() as server:
         yield server.url

@@ -1,7 +1,6 @@
-"""A TCP proxy in front of a broker: passes everything on, stops passing it on, breaks or resets connections, is slow.
+"""TCP proxy in front of a broker. It forwards, stalls, cuts or resets connections, or limits their speed.
 
-One thread for all connections. What it has read and not yet passed on is bounded, so that a slow end is felt by the
-other one.
+One thread serves all connections. The buffer is limited, so that a slow end slows the other end.
 """
 
 import selectors
@@ -13,19 +12,16 @@ from typing import Final
 
 PIECE_BYTES: Final = 16_384
 ROUND_S: Final = 0.02
-RESET_AT_CLOSE: Final = struct.pack("ii", 1, 0)
-"""SO_LINGER of 0 s: close() sends RST instead of FIN (tcp(7))."""
+RESET_AT_CLOSE: Final = struct.pack("ii", 1, 0)  # SO_LINGER of 0 s: close() sends RST instead of FIN (tcp(7))
 
 
 class Proxy:
-    """The proxy. Synchronization: methods from any thread."""
+    """Proxy. Synchronization: any thread may call the methods."""
 
     def __init__(self, port: int) -> None:
-        """`port` is the broker's, on loopback."""
-        self.bytes_s: float | None = None
-        """What passes from gateway to broker in a second; None: as much as there is."""
-        self.connections = 0
-        """Connections that were accepted."""
+        """`port` is the port of the broker on loopback."""
+        self.bytes_s: float | None = None  # maximum rate from gateway to broker, bytes/s; None: no limit
+        self.connections = 0  # number of accepted connections
         self._to = port
         self._stalled = self._cut = self._ended = False
         self._pairs: dict[socket.socket, socket.socket] = {}
@@ -38,22 +34,25 @@ class Proxy:
         self._thread.start()
 
     def stall(self) -> None:
-        """Pass nothing on, as a cable that is pulled behind a switch: no end learns anything."""
+        """Forward nothing, as with a cable that is unplugged behind a switch."""
         self._stalled = True
 
     def cut(self) -> None:
-        """Break all connections, and refuse new ones."""
+        """Close all connections and refuse new connections."""
         self._cut = True
 
     def reset(self) -> None:
-        """Reset all connections: on loopback the other end has the RST when this returns. New ones are accepted."""
+        """Reset all connections and accept new ones.
+
+        On loopback, the other end has received RST when this method returns.
+        """
         with self._passing:
             for one in self._from_gateway:
                 one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_AT_CLOSE)
             self._drop_all()
 
     def restore(self) -> None:
-        """Pass everything on."""
+        """Forward all data again."""
         self._stalled = self._cut = False
 
     def close(self) -> None:

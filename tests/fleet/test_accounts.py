@@ -1,4 +1,4 @@
-"""The ledger of a reader: closes after every message, whatever comes in which order how often."""
+"""Ledger of a reader: it balances after each message, for any order and any repetition."""
 
 from hypothesis import given
 from hypothesis import strategies as st

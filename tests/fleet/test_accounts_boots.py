@@ -1,11 +1,10 @@
-"""Where records lie on UTC: by the clock of their message, by what is known of their boot, or nowhere yet."""
+"""UTC time of records: from the clock of their message, from the clock of their boot, or unknown."""
 
 import msgspec
 import pytest
 
 from imud.fleet.accounts import (
     BOOTS_MAX,
-    CLOCK_SET_NS,
     BootClocks,
     BootKey,
     BootOffset,
@@ -15,7 +14,7 @@ from imud.fleet.accounts import (
     offset_of,
     placed,
 )
-from imud.fleet.messages import FleetMessage, GatewayClock
+from imud.fleet.messages import CLOCK_SET_NS, FleetMessage, GatewayClock
 from tests.fleet.fleet_gateway import (
     UTC_NS,
     event_message,
@@ -34,13 +33,15 @@ KNOWN = BootOffset(1_000_000, UTC_NS, 40)
     ("utc_ns", "t_ns", "clock", "known", "expected"),
     [
         (UTC_NS + 5, 5, SET, None, PlacedTime(UTC_NS + 5, True, 40)),
-        (UTC_NS + 9_000, 5, SET, None, PlacedTime(UTC_NS + 9_000, True, 40)),  # both were read, microseconds apart
-        (77, 5, SET, None, PlacedTime(UTC_NS + 5, True, 40)),  # made before the clock was stepped, within one message
+        # the time and the offset were read microseconds apart
+        (UTC_NS + 9_000, 5, SET, None, PlacedTime(UTC_NS + 9_000, True, 40)),
+        (77, 5, SET, None, PlacedTime(UTC_NS + 5, True, 40)),  # the clock stepped after the sample, within one message
         (77, 5, NOT_SET, None, PlacedTime(77, False, None)),
-        (CLOCK_SET_NS + 5, 5, NOT_SET, None, PlacedTime(CLOCK_SET_NS + 5, False, None)),  # systemd has lifted it
+        # systemd set the clock to a wrong time after 2020
+        (CLOCK_SET_NS + 5, 5, NOT_SET, None, PlacedTime(CLOCK_SET_NS + 5, False, None)),
         (77, 5_000_000, NOT_SET, KNOWN, PlacedTime(UTC_NS + 5_000_000, True, 40 + 2_000)),  # 4 ms at 500 ppm: 2 us
         (77, None, NOT_SET, KNOWN, PlacedTime(77, False, None)),
-        (CLOCK_SET_NS, 5, None, None, PlacedTime(CLOCK_SET_NS, True, None)),  # an earlier version
+        (CLOCK_SET_NS, 5, None, None, PlacedTime(CLOCK_SET_NS, True, None)),  # a gateway with an earlier version
         (CLOCK_SET_NS - 1, 5, None, None, PlacedTime(CLOCK_SET_NS - 1, False, None)),
         (0, 5, None, BootOffset(0, UTC_NS, None), PlacedTime(UTC_NS + 5, True, None)),
     ],

@@ -1,4 +1,4 @@
-"""Accounts across the network: what gateways say they have spooled against what came, through any order and restart."""
+"""Ledger across the network: spooled numbers of gateways and received numbers, in any order and after restarts."""
 
 import msgspec
 import pytest
@@ -26,7 +26,7 @@ def state(last: int, boot: str = "1") -> GatewayState:
 
 
 def account_of(positions: SpoolPositions, ledger: FleetLedger) -> tuple[int, int, int]:
-    """Return the samples that the gateway sent, the reader received, and the spool holds."""
+    """Return the numbers that the gateway sent, the reader received, and the spool contains."""
     account = positions.accounts(ledger)[KEY]
     assert account.balance == 0
     return account.sent, account.received, account.in_spool

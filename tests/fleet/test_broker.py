@@ -1,4 +1,4 @@
-"""Connections to a real mosquitto: both versions, TLS with certificates, passwords, websockets, refusals."""
+"""Connections to a real mosquitto: both versions, TLS with certificates, passwords, WebSocket, refusals."""
 
 import os
 import shutil
@@ -26,7 +26,7 @@ def connect(url: str, **settings: object) -> PahoConnection:
 
 
 def send(connection: PahoConnection, payload: bytes = b"{}", topic: str = "imud/s/g/state") -> None:
-    """Send a message and wait until the broker has it."""
+    """Send a message and wait for its acknowledgement."""
     number = connection.publish(topic, payload, "application/json", retain=False)
     for _ in range(1000):
         if number in connection.acknowledged:
@@ -36,7 +36,7 @@ def send(connection: PahoConnection, payload: bytes = b"{}", topic: str = "imud/
 
 
 def wait_for_the_end(connection: PahoConnection) -> None:
-    """Wait until the connection is lost. Raises BrokerError then."""
+    """Wait until the connection is lost. Raises BrokerError."""
     for _ in range(60):
         connection.wait(1.0)
 
@@ -48,7 +48,7 @@ def test_a_message_is_acknowledged_and_the_will_is_published(tmp_path: Path, ver
         connection = connect(f"mqtt://127.0.0.1:{broker.port}", version=version)
         send(connection, b'{"a":1}')
         collector.wait_for(lambda: bool(collector.messages))
-        taken = connect(f"mqtt://127.0.0.1:{broker.port}")  # the same name: the broker ends the first connection
+        taken = connect(f"mqtt://127.0.0.1:{broker.port}")  # same client ID: the broker ends the first connection
         collector.wait_for(lambda: len(collector.messages) == 2)
         assert collector.messages == [("imud/s/g/state", b'{"a":1}'), (WILL.topic, WILL.payload)]
         with pytest.raises(BrokerError, match=r"taken over|lost"):
@@ -58,7 +58,7 @@ def test_a_message_is_acknowledged_and_the_will_is_published(tmp_path: Path, ver
 
 
 LEFT_OPEN = "ignore::pytest.PytestUnraisableExceptionWarning"
-"""paho-mqtt 2.2 leaves the socket of a handshake that failed to the garbage collector."""
+"""paho-mqtt 2.2 leaves the socket of a failed TLS handshake to the garbage collector."""
 
 
 @pytest.mark.filterwarnings(LEFT_OPEN)
@@ -84,14 +84,14 @@ def test_the_bell_is_not_closed_while_another_thread_rings_it(tmp_path: Path, mo
 
         def write_late(bell: int, value: int) -> None:
             closing.start()
-            closing.join(0.1)  # it goes on as far as it can
+            closing.join(0.1)  # it runs until it waits for the lock
             write(bell, value)
 
         monkeypatch.setattr(os, "eventfd_write", write_late)
         connection.ring()
         closing.join()
         monkeypatch.undo()
-        connection.ring()  # nothing: the number of the descriptor may be another file's
+        connection.ring()  # nothing happens: the descriptor may belong to another file
 
 
 def test_messages_that_the_broker_refuses_are_named(tmp_path: Path) -> None:
@@ -148,7 +148,9 @@ def test_tls_with_certificates_of_both_sides(tmp_path: Path, authority: Authorit
             connect(f"mqtts://127.0.0.1:{port}", ca_file=authority["ca.pem"])
         with pytest.raises(BrokerError, match=r"(?i)hostname mismatch|not valid for"):
             connect(f"mqtts://localhost:{port}", ca_file=authority["ca.pem"], **own)
-        with pytest.raises(BrokerError, match="without an answer: look at its log, and whether its port expects TLS"):
+        with pytest.raises(
+            BrokerError, match="without a reply; check the log of the broker, and whether the port requires TLS"
+        ):
             connect(f"mqtt://127.0.0.1:{port}")
 
 

@@ -1,4 +1,4 @@
-"""How a client of a broker is made, and how its errors are described."""
+"""Clients of paho-mqtt and the description of their errors."""
 
 import ssl
 import subprocess

@@ -1,4 +1,4 @@
-"""Pauses that grow and are drawn at random, and brokers in turn."""
+"""Random pauses that grow, and the order of the brokers."""
 
 import random
 
@@ -17,7 +17,7 @@ def longest(_low: float = 0.0) -> float:
 def test_pauses_double_to_the_longest() -> None:
     turn = BrokerTurn([A], 60.0, longest)
     assert [turn.failed(0) for _ in range(6)] == [4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
-    for _ in range(1100):  # 2.0 to this power is too large for a float
+    for _ in range(1100):  # 2.0 to the power of this number exceeds a float
         assert turn.failed(0) == 60.0
     draw = random.Random(25).random
     pauses = [BrokerTurn([A], 60.0, draw).failed(0) for _ in range(500)]

@@ -1,4 +1,4 @@
-"""The collector with a real broker: what the store has is acknowledged, and its ledger goes on."""
+"""Collector with a real broker: it acknowledges stored messages and continues with the stored ledger."""
 
 import asyncio
 import gc
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.live
 
 
 class MemoryStore:
-    """A store that keeps what it is given, and fails when it is told to."""
+    """Store in memory. It fails if the test requests it."""
 
     def __init__(self) -> None:
         self.rows: list[int] = []
@@ -61,7 +61,7 @@ class MemoryStore:
 
 
 def collect(broker: Mosquitto | Proxy, store: MemoryStore, most: int) -> Fleet:
-    """Run the collector until the store has so many rows."""
+    """Run the collector until the store has `most` rows."""
     fleet = Fleet(f"mqtt://127.0.0.1:{broker.port}", name="archive", retry_max_s=1.0)
     store.most = most
     store.collector = FleetCollector(fleet, store)
@@ -100,7 +100,7 @@ def test_what_a_store_refused_comes_again_to_the_next_collector(broker: Mosquitt
     store.fails = False
     collect(broker, store, 9)
     assert store.rows == list(range(1, 10))
-    # a restarted collector knows what it had
+    # the new collector restored the ledger
     gateway.send(samples_message(1, 5), samples_message(10, 12))
     fleet = collect(broker, store, 12)
     assert store.rows == list(range(1, 13))
@@ -110,7 +110,7 @@ def test_what_a_store_refused_comes_again_to_the_next_collector(broker: Mosquitt
 
 
 class ResettingStore(MemoryStore):
-    """A store whose collector loses its connection while it writes, so that acknowledgements meet the reset."""
+    """Store whose collector loses its connection during a write, so that acknowledgements fail."""
 
     def __init__(self, proxy: Proxy, resets: int) -> None:
         super().__init__()
@@ -139,7 +139,7 @@ def test_a_reset_while_a_transaction_is_acknowledged_costs_a_connection_and_noth
 
 
 class SlowStore(MemoryStore):
-    """A store whose first transaction lasts until the test allows it to end."""
+    """Store whose first transaction ends when the test allows it."""
 
     def __init__(self, *, is_slow: bool) -> None:
         super().__init__()
@@ -161,7 +161,7 @@ def test_a_slow_store_is_given_more_at_once_and_its_ledger_closes(broker: Mosqui
 
     def send() -> None:
         gateway.send(samples_message(1, 1))
-        while not store.sizes:  # the first message is alone in its transaction
+        while not store.sizes:  # the first transaction contains only the first message
             store.goes_on.wait(0.005)
         gateway.send(*(samples_message(n, n) for n in range(2, number + 1)))
         store.goes_on.set()
@@ -200,7 +200,7 @@ def test_a_state_that_knows_the_clock_gives_the_store_its_offset(broker: Mosquit
 
 
 def test_what_a_collector_holds_is_nothing_to_the_search_for_cycles() -> None:
-    """A collector holds hundreds of thousands of these objects, which a search would go through."""
+    """The collector holds hundreds of thousands of objects. The garbage collector must not visit them."""
     message = decode_message(encode_message(synchronised(intervals_message(1, 5))))
     (interval,) = message.intervals
     for one in (message, message.clock, interval, interval.values["accel_m_s2"]):

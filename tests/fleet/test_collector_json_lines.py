@@ -1,4 +1,4 @@
-"""Lines of the collector: every record once, with where it is from."""
+"""Lines of the collector: each record once, with its source."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""The command channel: what is refused and why, that a request is carried out once, and a real broker with rights."""
+"""Command channel: rejected requests and their causes, requests that run once, and a real broker with access rights."""
 
 import asyncio
 import re
@@ -70,7 +70,7 @@ class ChannelBench:
         self, number: int = 1, action: str = "identity", *, age_s: float = 0.5, device: str = "bow",
         response_topic: str = "", retain: bool = False, **arguments: object,
     ) -> Outcome | None:  # fmt: skip
-        """Have a request taken; return the answer to it, if there is one at once."""
+        """Send a request. Return the immediate reply, if there is one."""
         issued = self.clock.now_ns() + self.offset_ns - round(age_s * NS_PER_S)
         request = {"v": 1, "id": f"r{number}", "action": action, "arguments": arguments, "issued_utc_ns": issued}
         self.take(msgspec.json.encode(request), device=device, response_topic=response_topic, retain=retain)
@@ -128,7 +128,7 @@ def test_what_is_not_in_the_list_is_denied() -> None:
     ("age_s", "taken"), [(29.9, False), (30.1, False), (-29.9, True), (-30.1, False), (0.9, True), (1.1, False)]
 )
 def test_a_request_has_an_age(age_s: float, taken: bool) -> None:
-    bench = ChannelBench()  # the output started 1 s ago, which an older request was not meant for
+    bench = ChannelBench()  # the output started 1 s ago, so an older request was not for it
     assert (bench.ask(age_s=age_s) is None) is taken
     bench = ChannelBench()
     bench.clock.advance(100 * NS_PER_S)
@@ -175,7 +175,7 @@ def test_a_request_that_comes_again_has_the_answer_that_it_had() -> None:
     bench.run()
     assert bench.device.done == [("turn", {"angle": 3})]
     assert (bench.channel.run, bench.channel.refused) == (1, 2)
-    for _ in range(2):  # a request that failed has its failure again
+    for _ in range(2):  # the second request receives the stored failure
         bench.replies.clear()
         bench.ask(2, "turn")
         bench.run()
@@ -243,13 +243,13 @@ def test_errors_are_answers_and_a_defect_is_one_too() -> None:
     assert [(one.outcome, one.error) for one in bench.answers()] == [
         (Outcome.FAILED, "angle: expected a number, got nothing"),
         (Outcome.FAILED, "mast: no such device"),
-        (Outcome.FAILED, "an internal error; the log of imud has a traceback"),
+        (Outcome.FAILED, "internal error; see the traceback in the log of imud"),
     ]
 
 
 @pytest.fixture
 def log_of_daemon(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
-    """Messages without the repeated ones that the daemon's log leaves out; the handler is that of all tests."""
+    """Return the log without the repeated messages that the daemon suppresses."""
     repeats = RepeatFilter()
     caplog.handler.addFilter(repeats)
     yield caplog
@@ -286,7 +286,7 @@ async def test_one_runs_at_a_time_and_the_end_ends_it() -> None:
     assert (len(bench.device.done), bench.replies) == (1, [])
 
 
-# --- with a broker that has the rights of docs/fleet.md ---------------------------------------------------------------
+# --- broker with the access rights of docs/fleet.md -------------------------------------------------------------------
 
 USERS = ("gw-17", "gw-18", "collector", "operator")
 
@@ -303,7 +303,7 @@ def broker(tmp_path: Path) -> Iterator[Mosquitto]:
     program = shutil.which("mosquitto_passwd")
     if program is None:
         pytest.skip("mosquitto_passwd is not installed (make mqtt-deps)")
-    subprocess.run([program, "-U", passwords], check=True, capture_output=True)  # hashes them
+    subprocess.run([program, "-U", passwords], check=True, capture_output=True)  # encrypts the passwords
     lines = ("allow_anonymous false", f"password_file {passwords}", f"acl_file {rights}")
     with running_broker(tmp_path / "broker", *lines) as made:
         yield made
@@ -381,7 +381,8 @@ class Loop:
             MqttOptions,
         )  # fmt: skip
         context = publisher_context(
-            list, 7, host.now_ns, utc_offset_ns=host.utc_offset_ns, control=lambda _name: device  # type: ignore[arg-type,return-value]  # what the channel uses of it
+            # the members that the channel uses
+            list, 7, host.now_ns, utc_offset_ns=host.utc_offset_ns, control=lambda _name: device  # type: ignore[arg-type,return-value]
         )  # fmt: skip
         self.output = MqttPublisher(settings, context)
         self._ended = threading.Event()
@@ -415,8 +416,8 @@ def test_a_broker_with_rights_lets_the_operator_ask_and_nobody_else(
     operator, collector = Operator(broker.port, "operator", v5=version == "5"), Operator(broker.port, "collector")
     others = [Operator(broker.port, user) for user in ("collector", "gw-18")]
     try:
-        for other in others:  # the broker takes it and passes it on to nobody
-            other.ask("bow", f"of-{other is others[0]}", "identity", qos=0)  # mosquitto 2.0.11 may hang up
+        for other in others:  # the broker accepts the messages but does not deliver them
+            other.ask("bow", f"of-{other is others[0]}", "identity", qos=0)  # mosquitto 2.0.11 may close the connection
         operator.ask("bow", "first", "identity", "imud/mill/gw-17/bow/answer/desk")
         message, answer = operator.answer("first")
         assert (answer.outcome, answer.result) == (Outcome.DONE, {"serial": 7})
@@ -432,7 +433,7 @@ def test_a_broker_with_rights_lets_the_operator_ask_and_nobody_else(
         operator.answer("third")
         assert len(device.done) == 2, "the operator's two, none twice, and none of the others"
         assert not any("/answer" in one.topic for one in others[1].got), "gateways do not read each other"
-        collector.answer("third")  # who collects reads everything
+        collector.answer("third")  # the collector may read all topics
         assert sum("Denied PUBLISH" in line for line in broker.log) == 2
         status = loop.output.status()
         assert (status.commands, status.commands_refused) == (2, 1)

@@ -1,4 +1,4 @@
-"""Topics: names that cannot mean anything else to a broker, made and taken apart."""
+"""Topics: valid names, and the parts of a topic."""
 
 import pytest
 

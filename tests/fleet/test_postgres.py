@@ -1,4 +1,4 @@
-"""Rows in a real PostgreSQL: exactly once whatever is killed when, and placed when the clock of a gateway is known."""
+"""Rows in a real PostgreSQL: each record once despite killed processes, and UTC times after the clock is known."""
 
 import json
 import random
@@ -108,8 +108,7 @@ def test_what_comes_again_after_a_restart_is_a_duplicate_and_no_row(database: st
     assert (counts.whole, counts.duplicates, counts.balance) == (7, 7, 0)
 
 
-LIFTED_NS = 1_750_000_000_000_000_000
-"""Where systemd lifts a clock without a battery: after 2020, and wrong."""
+LIFTED_NS = 1_750_000_000_000_000_000  # time to which systemd sets a clock without a battery: after 2020, but wrong
 
 
 def placed(url: str) -> list[Any]:
@@ -156,7 +155,7 @@ def test_a_clock_that_is_known_places_what_comes_later_after_a_restart_too(datab
 
 
 def test_intervals_alone_say_the_clock_of_a_gateway_that_speaks_of_none(database: str) -> None:
-    """What a gateway of an earlier version sends by default, first at 1970, then with a clock."""
+    """Default messages of a gateway with an earlier version, first at 1970, then with a set clock."""
     write(database, intervals_message(1, 5, utc_ns=0))
     write(database, intervals_message(6, 9))
     assert placed(database) == [
@@ -186,7 +185,7 @@ MOST = NUMBER_MOST - 1
 
 @pytest.mark.parametrize(("t_ns", "offset_ns"), [(-MOST, -MOST), (-MOST, MOST), (MOST, MOST)])
 def test_the_largest_numbers_that_are_decoded_are_rows(database: str, t_ns: int, offset_ns: int) -> None:
-    """They come before the clock of their boot is known, which is known at the other end of time."""
+    """The records arrive before the clock of their boot is known. The clock differs by the maximum value."""
     sample = Sample("bow", MOST, t_ns, MOST, Sync.EDGE, t_ns, offset_ns, t_ns, status=MOST, pps_age_ms=MOST)
     text = Event(t_ns, "bow", EventKind.UP, "\x01\ufffd'\"\\", {"number": MOST, "value": 1.7e308})
     head = not_set(samples_message(1, 1), offset_ns)
@@ -232,7 +231,7 @@ def test_a_second_collector_says_that_there_is_another(database: str, monkeypatc
 
     monkeypatch.setattr(postgres, "LOCK_S", 0.1)
     first = postgres.PostgresStore(database)
-    with pytest.raises(ServerError, match="expected that no other collector writes"):
+    with pytest.raises(ServerError, match="another collector still writes"):
         postgres.PostgresStore(database)
     first.close()
 
@@ -248,7 +247,7 @@ def test_a_second_collector_says_that_there_is_another(database: str, monkeypatc
 def test_a_url_that_cannot_be_read_is_not_printed(url: str, problem: str) -> None:
     from imud.fleet.postgres import PostgresStore
 
-    with pytest.raises(ServerError, match=f"^PostgreSQL: the URL cannot be read: {problem}; it may ") as refused:
+    with pytest.raises(ServerError, match=f"^PostgreSQL: cannot parse the URL: {problem}; imud does not ") as refused:
         PostgresStore(url)
     assert refused.value.__suppress_context__, "a traceback does not print it either"
     assert "cret" not in str(refused.value)
@@ -262,7 +261,7 @@ def test_a_server_that_is_not_there_is_named() -> None:
 
 
 class Collecting:
-    """`imud fleet collect` as a process that is killed, or whose server is."""
+    """Process of `imud fleet collect`. The test kills it or its server."""
 
     def __init__(self, broker: Mosquitto, database: str) -> None:
         self.broker, self.database = broker, database
@@ -276,7 +275,7 @@ class Collecting:
         self.process = subprocess.Popen(words, stderr=subprocess.DEVNULL)
 
     def until(self, text: str, least: int) -> None:
-        """Wait until a query gives so much."""
+        """Wait until a query returns at least this number."""
         wait_until(lambda: (query(self.database, text)[0][0] or 0) >= least, f"{text} gives {least}", 2 * LIMIT_S)
 
     def until_rows(self, number: int) -> None:
@@ -309,7 +308,7 @@ def assert_exactly_once(database: str, sent: int) -> None:
 
 
 def send(gateway: SendingGateway, sent: int) -> int:
-    """Send 3,000 more samples; return the number of all."""
+    """Send 3,000 more samples. Return the number of all samples."""
     gateway.send(*(samples_message(sent + 10 * n + 1, sent + 10 * n + 10) for n in range(300)))
     return sent + 3000
 
@@ -337,7 +336,7 @@ def test_rows_are_exactly_once_when_the_server_is_killed_in_a_transaction(
         try:
             for is_held in (True, False):
                 holder = psycopg.connect(server.url)
-                if is_held:  # the transaction has its rows and waits for the ledger
+                if is_held:  # the transaction has written its rows and waits for the ledger
                     holder.execute("LOCK TABLE imud_ledger IN EXCLUSIVE MODE")
                 sent = send(gateway, sent)
                 if is_held:

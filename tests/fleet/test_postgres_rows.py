@@ -1,4 +1,4 @@
-"""Rows of the collector: values in the order of the columns, times at which records lie."""
+"""Rows of the collector: values in the order of the columns, and UTC times."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The output as a whole with a broker in memory: births and states, what is put into the queue, what goes wrong."""
+"""Complete output with a broker in memory: births and states, content of the queue, problems."""
 
 import importlib
 import json
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.live
 
 
 class PublisherBench:
-    """The output with the threads' work done by hand, but for the sender's, which runs."""
+    """Output without the thread of the writer: the test runs its work. The thread of the sender runs."""
 
     def __init__(self, path: Path, **settings: object) -> None:
         self.clock, self.broker = VirtualClock(), FakeBroker(blocks=True)
@@ -57,7 +57,7 @@ class PublisherBench:
         return self.statuses
 
     def _start(self, *args: object) -> HandWorker:
-        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # as StartWorker
+        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # same parameters as StartWorker
         return self.workers[-1]
 
     def tick(self, seconds: float = 1.0) -> None:
@@ -70,7 +70,7 @@ class PublisherBench:
         self.output.start()
 
     def close(self) -> list[tuple[str, bytes, bool]]:
-        """Close it; return all that was sent."""
+        """Close the output. Return all sent messages."""
         self.output.close()
         self.output.close()
         return [one for connection in self.broker.connections for one in connection.sent]
@@ -144,7 +144,7 @@ def test_settings_that_are_not_as_declared_are_published_when_they_change(tmp_pa
     bench.start()
     declare(SettingsState.AGREE, 1)
     bench.broker.wait_for(topic)
-    declare(SettingsState.AGREE, 2)  # read again, and nothing is different
+    declare(SettingsState.AGREE, 2)  # another reading without a difference
     declare(SettingsState.DIFFER, 3, rate_hz=SettingDifference(100, 50))
     bench.broker.wait_for(topic, lambda payload: b'"differ"' in payload)
     sent = [json.loads(payload) for one, payload, retain in bench.close() if one == topic and retain]
@@ -181,8 +181,8 @@ def test_a_spool_that_fails_is_an_event_and_no_end(tmp_path: Path) -> None:
         bench.output.event(Event(0, "imu0", EventKind.LOSS, "x"))
         bench.tick(20)
     messages = [event.message for event in bench.events]
-    assert any("nothing is spooled" in one for one in messages), messages
-    assert any("spooling again" in one for one in messages), messages
+    assert any("the spool failed" in one for one in messages), messages
+    assert any("the spool works again" in one for one in messages), messages
     assert sum("the spool was damaged" in one for one in messages) == 1, messages
     assert all(event.kind is EventKind.MQTT and not event.device for event in bench.events)
     assert database.exists()
@@ -192,8 +192,8 @@ def test_a_spool_that_fails_is_an_event_and_no_end(tmp_path: Path) -> None:
 def test_a_thread_that_ends_by_a_defect_ends_the_daemon(tmp_path: Path) -> None:
     first, second = PublisherBench(tmp_path), PublisherBench(tmp_path)
     first.output.start()
-    with pytest.raises(ServerError, match="another running imud"):
-        second.output.start()  # two outputs do not share a spool
+    with pytest.raises(ServerError, match="another imud process"):
+        second.output.start()  # two outputs cannot use one spool
     first.workers[0].failed(ZeroDivisionError())
     with pytest.raises(ZeroDivisionError):
         first.output.tick(0)
@@ -212,7 +212,7 @@ def test_the_name_of_the_host_is_the_gateway(tmp_path: Path) -> None:
         MqttOptions(spool_directory=str(tmp_path)), bench.context, connect=bench.broker.connect,
         host_name=lambda: "Gerät",
     )  # fmt: skip
-    with pytest.raises(ServerError, match=r"mqtt.gateway: expected a name .* 'Gerät'"):
+    with pytest.raises(ServerError, match=r"mqtt.gateway: expected 1 to 64 .* 'Gerät'"):
         odd.start()
 
 
@@ -292,7 +292,7 @@ def test_birth_and_messages_say_whether_the_wall_clock_is_set(tmp_path: Path) ->
         assert one["t_ns"] > first["t_ns"]
 
 
-# --- a reader that has only what is published -------------------------------------------------------------------------
+# --- reader with the published messages only --------------------------------------------------------------------------
 
 
 def fields_by_schema(slot: bytes, layout: Mapping[str, Any]) -> dict[str, Any]:
@@ -325,7 +325,7 @@ def test_slots_are_read_by_the_schema_that_is_published_beside_them(tmp_path: Pa
     topics = {topic: payload for topic, payload, _ in bench.close()}
     layout = json.loads(topics["imud/default/gw/imu0/schema"])["slot"]
     payload = topics["imud/default/gw/imu0/samples"]
-    begin = 8 + int.from_bytes(payload[6:8], "little")  # "IMUB", version, 0, bytes of the header (docs/fleet.md)
+    begin = 8 + int.from_bytes(payload[6:8], "little")  # "IMUB", version, 0, length of the header (docs/fleet.md)
     slots = zstandard.ZstdDecompressor().decompress(payload[begin:])
     size = layout["bytes"]
     assert len(slots) == 3 * size

@@ -1,8 +1,8 @@
-"""A gateway that is killed, a broker that restarts, freezes or refuses: the collector's ledger closes every time.
+"""Killed gateways, and brokers that restart, freeze or refuse: the ledger of the collector balances.
 
-The truth is the spool's own file: after the end of the gateway, what it stored is what the collector has or what still
-waits. What a gateway that is killed had in memory, samples of `batch_s` and what came since the last transaction, was
-never stored, and no number of theirs was given out.
+The spool file is the reference. After the gateway ended, each stored number is in the collector or in the spool. A
+killed gateway loses the samples in memory: samples of `batch_s` and samples since the last transaction. They have no
+number in a stream.
 """
 
 import os
@@ -112,20 +112,18 @@ def test_kill_9_while_the_spool_is_full_closes_with_what_was_thinned(tmp_path: P
     assert (one.newest, one.missing, one.balance) == (75_000, 0, 0)
 
 
-KILLS = int(os.environ.get("IMUD_KILLS", "4"))
-"""About 3 s each: by hand 20 and more."""
+KILLS = int(os.environ.get("IMUD_KILLS", "4"))  # Number of kills, about 3 s each. Use 20 or more for a long test.
 
 
 class Killings:
-    """Gateways one after another, each killed: at a random time, or before a random statement of a transaction."""
+    """Sequence of gateways that are killed at a random time or before a random statement of a transaction."""
 
     def __init__(self, port: int, spool: Path, seed: int) -> None:
-        self.told: dict[int, list[int]] = {}
-        """Newest sample at each transaction that the gateway reported, by epoch."""
+        self.told: dict[int, list[int]] = {}  # newest sample of each reported transaction, by epoch
         self._port, self._spool, self._random = port, spool, Random(seed)
 
     def kill_one(self, epoch: int, *, in_commit: bool, newest_seq: int = 0) -> None:
-        """Start one; it ends within 1.5 s after it spoke of a transaction for the first time, or in one of some."""
+        """Start a gateway and kill it within 1.5 s after its first report, or inside a transaction."""
         statements = self._random.randint(STATEMENTS, 4 * STATEMENTS) if in_commit else 0
         gateway = KilledGateway(self._port, self._spool, epoch, newest_seq=newest_seq, statements=statements)
         state = gateway.state(LIMIT_S)
@@ -138,10 +136,8 @@ class Killings:
         gateway.kill()
 
 
-STATEMENTS = 12
-"""Inside one transaction, about."""
-BATCH_SAMPLES = 200
-"""Samples of `batch_s` (0.2 s) at 1 kHz, which wait for their message."""
+STATEMENTS = 12  # approximate number of statements in one transaction
+BATCH_SAMPLES = 200  # samples of `batch_s` (0.2 s) at 1 kHz that wait for their message
 
 
 def test_kill_9_at_random_moments_costs_what_was_in_memory(tmp_path: Path) -> None:
@@ -156,10 +152,10 @@ def test_kill_9_at_random_moments_costs_what_was_in_memory(tmp_path: Path) -> No
     stored = {one.boot: one.last for one in positions if one.stream == "samples"}
     for epoch, told in killings.told.items():
         boot = f"{epoch:016x}"
-        # a transaction stores the samples made before its start, which follows the last report but one
+        # a transaction contains the samples before its start, and starts after the last report but one
         assert stored[boot] >= max([1, *(seq - BATCH_SAMPLES for seq in told[:-2])]), f"boot {epoch}"
         one = counts.get((boot, "samples"))
-        if one is not None:  # what came is without a gap; what did not waits
+        if one is not None:  # the received numbers have no gap; the other numbers are in the spool
             assert (one.missing, one.dropped, one.thinned, one.balance) == (0, {}, 0, 0)
     assert len(stored) == KILLS
 
@@ -172,7 +168,8 @@ def test_kill_9_in_one_boot_shows_each_loss_as_a_gap(tmp_path: Path) -> None:
         killings = Killings(port, spool, seed=17)
         for number in range(KILLS):
             killings.kill_one(7, in_commit=bool(number % 2), newest_seq=begun)
-            begun = max([begun, *killings.told.get(7, [])]) + 10_000  # more than it can have stored and not told
+            # more than the gateway can have stored without a report
+            begun = max([begun, *killings.told.get(7, [])]) + 10_000
         rows, positions = in_spool(spool)
         closes(collector, spool)
     whole = FleetLedger(from_begin=True)
@@ -183,7 +180,7 @@ def test_kill_9_in_one_boot_shows_each_loss_as_a_gap(tmp_path: Path) -> None:
     (last,) = [position.last for position in positions if position.stream == "samples"]
     assert (one.newest, one.missing, one.balance) == (last, 0, 0)
     assert set(one.dropped) == {"off"}
-    assert one.dropped["off"] > (KILLS - 2) * 5000  # the last may have stored nothing
+    assert one.dropped["off"] > (KILLS - 2) * 5000  # the last gateway may have stored nothing
 
 
 def test_a_slow_network_holds_up_nothing_and_loses_nothing(tmp_path: Path, broker: Mosquitto) -> None:

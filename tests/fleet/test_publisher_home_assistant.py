@@ -1,7 +1,8 @@
-"""What Home Assistant is told: its own keys, and templates that give the right values for what imud really sends.
+"""Discovery messages for Home Assistant: its keys, and templates that return the right values for real messages of
+imud.
 
-Home Assistant's templates are Jinja2's, which renders them here. Keys are those of its documentation ("MQTT", sections
-"Device discovery payload" and "Availability").
+Home Assistant uses Jinja2 templates, and the test renders them with Jinja2. The keys are from its documentation
+("MQTT", sections "Device discovery payload" and "Availability").
 """
 
 import json
@@ -25,7 +26,7 @@ jinja2 = pytest.importorskip("jinja2", reason="jinja2 is not installed (extra de
 
 GATEWAY = Gateway("mill", "gw-17", "b")
 REQUIRED = {"binary_sensor": {"state_topic"}, "sensor": {"state_topic"}}
-"""Required keys of a part, by platform, beside `platform` and `unique_id`."""
+"""Required keys of an entity by platform, in addition to `platform` and `unique_id`."""
 
 
 def status(**changes: object) -> DeviceStatus:
@@ -99,7 +100,7 @@ def test_availability_follows_birth_and_last_will(tmp_path: Path) -> None:
     bench.output.remove_device("imu0")
     bench.statuses = []
     bench.tick()
-    bench.broker.wait_for(topic, lambda payload: not payload)  # a removed device leaves Home Assistant
+    bench.broker.wait_for(topic, lambda payload: not payload)  # imud removes the device from Home Assistant
     sent = bench.close()
     first = next(json.loads(payload) for one, payload, retain in sent if one == topic and payload and retain)
     (availability,) = first["availability"]

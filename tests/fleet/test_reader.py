@@ -1,4 +1,4 @@
-"""The reader against a real broker: what is not taken comes again, what is taken does not, and connections return."""
+"""Reader with a real broker: repeated and acknowledged messages, and reconnections."""
 
 import asyncio
 import re
@@ -33,7 +33,7 @@ def fleet_at(broker: Mosquitto, name: str = "") -> Fleet:
 async def taken(
     fleet: Fleet, number: int, settled: Callable[[], bool] = lambda: True, **wanted: str
 ) -> list[FleetBatch]:
-    """So many batches; the last of them is not acknowledged. The connection is closed when something holds."""
+    """Return `number` batches. The last one is not acknowledged. Close the connection when `settled` returns True."""
     found = []
     async with asyncio.timeout(LIMIT_S):
         batches = fleet.watch(**wanted)
@@ -90,9 +90,10 @@ async def test_what_a_reader_had_not_taken_comes_again_and_nothing_else(
         return sum("Received PUBACK from imud-reader-archive" in line for line in broker.log)
 
     await session_begun(fleet_at(broker, "archive"))
-    gateway.publish([(topic_of("mill", "gw", "", "state"), b"")], retain=True)  # one acknowledgement, before the others
+    # one acknowledgement before the acknowledgements of the samples
+    gateway.publish([(topic_of("mill", "gw", "", "state"), b"")], retain=True)
     gateway.send(*(samples_message(10 * n + 1, 10 * n + 10) for n in range(5)))
-    # a socket that is closed while something is unread is reset, and the broker may never read what was sent last
+    # closing a socket with unread data resets the connection, and the broker may never read the last messages
     before = acknowledged()
     assert len(await taken(fleet_at(broker, "archive"), 3, lambda: acknowledged() >= before + 3)) == 3
     assert [one.message.first for one in (await taken(fleet_at(broker, "archive"), 3))] == [21, 31, 41]
@@ -109,7 +110,7 @@ async def test_the_broker_sends_no_more_than_the_reader_has_room_for(
     before = sum("Sending PUBLISH to imud-reader-slow" in line for line in broker.log)
     batches = fleet.watch()
     await anext(batches)
-    gateway.send_state(STATE)  # the broker has handled all before it
+    gateway.send_state(STATE)  # the broker has processed all earlier messages
     sent = sum("Sending PUBLISH to imud-reader-slow" in line for line in broker.log) - before
     count = 1
     async for _ in batches:
@@ -194,7 +195,7 @@ async def test_a_wait_that_ends_before_the_next_attempt_gives_nothing() -> None:
 @pytest.mark.parametrize("version", VERSIONS)
 def test_over_websockets(tmp_path: Path, version: str) -> None:
     port, plain = free_port(), free_port()
-    # one setting for all listeners: else mosquitto 2.0.21 keeps nothing for a client of websockets that is away
+    # one configuration for all listeners: otherwise mosquitto 2.0.21 stores nothing for a disconnected WebSocket client
     lines = (f"listener {port} 127.0.0.1", "protocol websockets", f"listener {plain} 127.0.0.1", "allow_anonymous true")
 
     async def play() -> list[FleetBatch]:

@@ -1,4 +1,4 @@
-"""One connection of a reader with a real broker: deliveries, acknowledgements, its end."""
+"""One connection of a reader with a real broker: deliveries, acknowledgements, end."""
 
 import asyncio
 import errno
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from imud.fleet.broker import BrokerError
-from imud.fleet.reader import RECEIVE_MAX, WAITING_BYTES, ReaderAccess, ReaderConnection
+from imud.fleet.broker import BrokerError, ReaderAccess
+from imud.fleet.reader import RECEIVE_MAX, WAITING_BYTES, ReaderConnection
 from imud.fleet.settings import broker_of
 from tests.fleet.authority import Authority
 from tests.fleet.fleet_gateway import SendingGateway
@@ -33,7 +33,7 @@ async def opened(
 
 
 async def lost(connection: ReaderConnection) -> None:
-    """Take what had come before the connection was lost. Raises BrokerError then."""
+    """Receive messages until the connection is lost. Raises BrokerError."""
     while await connection.next(LIMIT_S) is not None:
         pass
 
@@ -76,7 +76,7 @@ async def test_a_message_is_delivered_until_it_is_acknowledged(
 
 
 async def waiting_and_taken(connection: ReaderConnection, count: int) -> tuple[int, list[int]]:
-    """How many messages wait in the reader when all that could come have come; then take all."""
+    """Wait until no more messages arrive. Return their number, then receive all."""
     for _ in range(100):
         await asyncio.sleep(0.001)
     most, found = connection.waiting, []
@@ -94,7 +94,7 @@ async def waiting_and_taken(connection: ReaderConnection, count: int) -> tuple[i
 def test_a_broker_that_sends_without_bound_waits_for_the_reader(
     tmp_path: Path, authority: Authority, scheme: str
 ) -> None:
-    """MQTT 3.1.1 lets a reader set no bound, and this broker has none of its own."""
+    """A reader with MQTT 3.1.1 cannot set a limit, and this broker has no limit."""
     port, plain, count = free_port(), free_port(), 2 * RECEIVE_MAX
     listener = authority.listener(port) if scheme == "mqtts" else [f"listener {port} 127.0.0.1", "allow_anonymous true"]
     lines = [*listener, "max_inflight_messages 0", f"listener {plain} 127.0.0.1", "allow_anonymous true"]
@@ -149,15 +149,15 @@ async def test_a_broker_that_ends_is_noticed(broker: Mosquitto) -> None:
 async def test_a_reset_that_an_acknowledgement_meets_is_a_loss_and_watches_no_other_file(
     broker: Mosquitto, gateway: SendingGateway, proxy: Proxy, is_v5: bool
 ) -> None:
-    """paho-mqtt closes the socket inside `ack`, and the next file that is opened has its number."""
+    """paho-mqtt closes the socket inside `ack`. The next opened file then gets its descriptor."""
     connection = await opened(proxy.port, 60, is_v5=is_v5)
     await asyncio.to_thread(gateway.publish, [(f"imud/{n}", b"") for n in range(4)])
     first, second = await connection.next(LIMIT_S), await connection.next(LIMIT_S)
     assert first is not None
     assert second is not None
-    proxy.reset()  # and the event loop, which would read it, has no turn
+    proxy.reset()  # the event loop has no turn in which it could detect the reset
     connection.acknowledge(first.number)
-    others = [socket.socketpair() for _ in range(8)]  # one of them has the number that the connection had
+    others = [socket.socketpair() for _ in range(8)]  # one of them gets the descriptor of the connection
     try:
         connection.acknowledge(second.number)
         for pair in others:
@@ -177,7 +177,7 @@ async def test_a_reset_that_an_acknowledgement_meets_is_a_loss_and_watches_no_ot
 async def test_a_descriptor_that_the_event_loop_cannot_forget_ends_the_connection_all_the_same(
     broker: Mosquitto, gateway: SendingGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """epoll of a descriptor that is closed already raises where both reading and writing were waited for."""
+    """epoll raises for a closed descriptor if the loop waited for reading and writing."""
     connection = await opened(broker.port)
     waiting = asyncio.ensure_future(connection.next())
     await asyncio.sleep(0)

@@ -1,4 +1,4 @@
-"""The sender: a window of messages, retained ones first, everything again after a loss, in order."""
+"""Sender: window of messages, retained messages first, and all messages again in order after a lost connection."""
 
 import threading
 
@@ -125,7 +125,7 @@ def test_it_ends_with_a_farewell() -> None:
 
 @pytest.mark.live
 def test_what_is_still_connecting_at_the_end_says_nothing() -> None:
-    """The next output has the same name, and may be connected already."""
+    """The next output uses the same client ID and may already be connected."""
     bench = SenderBench()
     bench.broker.accepts.clear()
     bench.sender.retain({"state": b"born"})

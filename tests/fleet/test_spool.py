@@ -1,4 +1,4 @@
-"""The spool: order, room, age, a full disk, a damaged file; every number is covered by exactly one message, always."""
+"""Spool: order, size, age, full disk, damaged file. Exactly one message covers each number in all cases."""
 
 import sqlite3
 import subprocess
@@ -12,6 +12,7 @@ import pytest
 
 from imud.fleet.accounts import FleetLedger, StreamCounts, StreamPosition
 from imud.fleet.messages import (
+    CLOCK_SET_NS,
     VERSION,
     FleetMessage,
     MessageKind,
@@ -21,7 +22,7 @@ from imud.fleet.messages import (
     encode_slots_message,
     topic_of,
 )
-from imud.fleet.spool import CLOCK_SET_NS, FILE, RESERVE_FILE, STEP, Spool, SpoolError, SpoolRow, row_of
+from imud.fleet.spool import FILE, RESERVE_FILE, STEP, Spool, SpoolError, SpoolRow, row_of
 from imud.formats.slot import encode_slots
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
@@ -64,7 +65,7 @@ class SpoolBench:
         return found
 
     def counts(self) -> StreamCounts:
-        """What a reader would get, of the stream `samples`."""
+        """Return the counts of a reader of the stream `samples`."""
         ledger = FleetLedger(from_begin=True)
         for row in self.all():
             ledger.take(decode_message(row.payload), Stream(row.stream))
@@ -228,7 +229,7 @@ def test_a_note_that_was_delivered_is_not_widened(tmp_path: Path) -> None:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 512 kB."""
+    """Return a file system of 512 kB."""
     disk = tmp_path / "disk"
     disk.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=512k", "x", disk], check=False).returncode:
@@ -256,7 +257,7 @@ def test_a_full_disk_leaves_the_spool_as_it_was_until_messages_are_acknowledged(
     assert len(given) == number
     bench.spool.remove([row.id for row in given], bench.now_ns, UTC_NS)
     assert bench.spool.messages == 0
-    for _ in range(300):  # from here on the file does not grow, and what waits becomes thinner
+    for _ in range(300):  # after this loop the file does not grow, and imud thins messages
         bench.commit(batch(100 * number + 1))
         number += 1
     assert bench.spool.thinned > 0
@@ -335,11 +336,11 @@ DAMAGE = {
     "a number that is a text": "last = 'many'",
     "a time that is a text": "stored_utc_ns = 'never'",
 }
-"""What a disk can make of a row, as SQL; SQLite gives all of it back without an error."""
+"""Damage of a row by a disk, as SQL. SQLite returns all these values without an error."""
 
 
 def damage(folder: Path, change: str, where: str = "id = 2", table: str = "message") -> None:
-    """Change rows behind the back of the spool; without more words the second message."""
+    """Change rows of the spool file, by default the second message."""
     base = sqlite3.connect(folder / FILE, isolation_level=None)
     base.execute(f"UPDATE {table} SET {change} WHERE {where}")
     base.close()

@@ -1,4 +1,4 @@
-"""Rows of the spool: what is sound, what is mended, what is left of the rest; all of SQLite's types are looked at."""
+"""Rows of the spool: undamaged, repaired and deleted rows, for all types of SQLite."""
 
 import msgspec
 import pytest
@@ -7,8 +7,7 @@ from imud.fleet.messages import DropCause, MessageKind, Stream, decode_message
 from imud.fleet.spool import SpoolRow, is_position, mended_row, row_of, sound_row
 from tests.fleet.test_spool import batch
 
-FOREIGN = (None, 1.5, "text", b"\xff", -1, 1 << 63)
-"""What SQLite can give back in any column."""
+FOREIGN = (None, 1.5, "text", b"\xff", -1, 1 << 63)  # values that SQLite can return in any column
 
 
 def test_a_row_is_what_it_was() -> None:
@@ -18,7 +17,7 @@ def test_a_row_is_what_it_was() -> None:
 
 @pytest.mark.parametrize("column", SpoolRow._fields[1:])
 def test_a_column_of_another_kind_is_found_or_is_as_good(column: str) -> None:
-    """The time may be any number; `items` is of no message that is sent."""
+    """Any number is a valid time. No sent message contains `items`."""
     for value in FOREIGN:
         row = sound_row(tuple(value if name == column else one for name, one in batch(1)._asdict().items()))
         assert row is None or column in ("stored_utc_ns", "items"), value
@@ -38,7 +37,7 @@ def test_a_row_that_says_its_numbers_becomes_a_note(column: str) -> None:
 
 @pytest.mark.parametrize("change", [{"last": 900}, {"items": 3}, {"topic": "imud/x"}, {"boot": ""}, {"first": 0}])
 def test_a_row_whose_numbers_do_not_agree_does_not(change: dict[str, object]) -> None:
-    """A note of numbers that it never had would take other messages for duplicates."""
+    """A `dropped` message with wrong numbers would make other messages duplicates."""
     assert mended_row([change.get(name, one) for name, one in batch(101)._asdict().items()]) is None
 
 

@@ -1,4 +1,4 @@
-"""Statistics against values computed by hand, and the same whatever batches the samples come in."""
+"""Statistics compared with manually computed values, for any division into batches."""
 
 import math
 from math import pi, radians, sqrt

@@ -1,4 +1,4 @@
-"""From samples and events to messages: numbers without gaps, intervals on their grid, what is missing is said."""
+"""Messages of samples and events: numbers without gaps, intervals on their grid, messages about lost samples."""
 
 import msgspec
 import pytest

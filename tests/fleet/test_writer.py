@@ -1,4 +1,4 @@
-"""The queue and the thread of the spool: bounded, nothing twice, a disk that fails costs only what it must."""
+"""Queue and thread of the spool: limits, no repetition, and few losses on a failed disk."""
 
 import threading
 from itertools import pairwise
@@ -62,11 +62,11 @@ class WriterBench:
         self.seq = 0
 
     def _start(self, *args: object) -> HandWorker:
-        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # as StartWorker
+        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # same parameters as StartWorker
         return self.workers[-1]
 
     def put(self, count: int) -> None:
-        """Samples of `count` milliseconds."""
+        """Put samples of `count` milliseconds."""
         base_ns = self.clock.now_ns()
         made = []
         for n in range(count):
@@ -130,7 +130,7 @@ def test_what_waited_is_sent_in_order_and_no_faster_than_is_allowed(tmp_path: Pa
         bench.work()
         sent.append(len(bench.arrived()))
     assert sent[-1] == 20
-    assert max(b - a for a, b in pairwise([0, *sent])) <= 6  # what a second allows, and what it had saved
+    assert max(b - a for a, b in pairwise([0, *sent])) <= 6  # the allowance of one second and the accumulated allowance
     begun = next(number for number, count in enumerate(sent) if count)
     assert 3 * 5 <= sent[begun + 5] <= 3 * 7
     firsts = [decode_message(payload).first for payload in bench.arrived()]
@@ -167,7 +167,7 @@ def test_after_a_loss_everything_unacknowledged_goes_again_in_order(tmp_path: Pa
     counts = bench.counts()
     assert (counts.whole, counts.duplicates) == (3000, 2000)
     assert bench.spool.messages == 0
-    # an acknowledgement of an earlier connection does not count
+    # the sender ignores an acknowledgement of an earlier connection
     bench.put(1000)
     bench.work(2)
     bench.broker.problem = "gone"
@@ -206,11 +206,11 @@ def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path: Path, caplog: pyt
     bench.put(1000)
     bench.disk.fails = True
     bench.writer.close()
-    assert "2 messages are lost with the end, because nothing can be spooled: No space left" in caplog.text
+    assert "2 messages are lost at the end because the spool failed: No space left" in caplog.text
 
 
 class TightSpool(Spool):
-    """A spool whose disk has no room for two messages at once."""
+    """Spool on a disk that has no room for two messages at a time."""
 
     def commit(self, new: Any, acknowledged: Any, now_ns: int, utc_ns: int) -> None:
         if len(new) > 1:
@@ -329,8 +329,7 @@ def test_events_that_have_no_room_have_numbers_in_their_place(tmp_path: Path) ->
     bench.writer.close()
 
 
-LIFTED_NS = 1_750_000_000 * NS_PER_S
-"""Where systemd lifts a clock without a battery: after 2020, and wrong."""
+LIFTED_NS = 1_750_000_000 * NS_PER_S  # time to which systemd sets a clock without a battery: after 2020, but wrong
 
 
 def test_every_message_has_the_clock_as_it_was_when_it_was_made(tmp_path: Path) -> None:
@@ -384,7 +383,7 @@ def test_positions_of_this_boot_stay_when_there_are_too_many_though_the_clock_is
 
 
 class HangingSpool(Spool):
-    """A spool whose disk hangs in the first transaction until the test lets it go on."""
+    """Spool on a disk that blocks the first transaction until the test continues."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, 100_000_000, HOUR_NS)
@@ -412,7 +411,7 @@ def test_a_thread_that_hangs_in_the_disk_keeps_the_spool_and_loses_nothing(
     bench.put(500)
     bench.writer.close()
     assert not closed.is_set()
-    assert "the spool's thread has not ended" in caplog.text
+    assert "the thread of the spool did not end" in caplog.text
     assert "500 samples wait" in caplog.text
     spool.goes_on.set()
     assert closed.wait(LIMIT_S)
