@@ -1,4 +1,4 @@
-"""Publishers: outputs of samples and events that never make the pipeline wait."""
+"""Registry of the outputs of samples and events."""
 
 from imud.contracts.publisher import PublisherType
 from imud.contracts.registry import Registry

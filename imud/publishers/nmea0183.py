@@ -1,10 +1,10 @@
-"""The output of NMEA 0183: attitude and heading of one device as sentences, each at its own rate.
+"""Output `nmea0183`: attitude and heading of one device as sentences, each with its own rate.
 
     batch ─▶ is a sentence due? ─▶ newest sample, mean angular rate ──as ned-frd──▶ sentences ─▶ TCP, UDP, serial port
 
-The rate of turn is that of the angular rates averaged since the last such sentence, so that vibration above its rate
-does not come back as a slow turn. All other values are those of the newest sample; without samples nothing is sent, so
-that an instrument shows that its source is gone.
+The rate of turn is the mean angular rate since the previous ROT sentence. Without the mean, fast vibration would appear
+as a slow turn. All other values are from the newest sample. If no sample arrives, the output does not send sentences.
+The instrument then shows that its source is missing.
 """
 
 import asyncio
@@ -35,50 +35,46 @@ from imud.publishers.thinning import MeanRate, Pace
 log = logging.getLogger(__name__)
 
 BACKLOG: Final = 8
-CLIENTS_MAX: Final = 32
-"""Plotters and instruments of one vessel; one more is refused, so that those that are there go on."""
-STUCK_NS: Final = 30 * NS_PER_S
-"""A client that takes nothing for so long is disconnected."""
+CLIENTS_MAX: Final = 32  # maximum number of clients: plotters and instruments of one vessel
+STUCK_NS: Final = 30 * NS_PER_S  # time without progress after which imud disconnects a client, ns
 RECV_BYTES: Final = 4096
 RETRY_FIRST_NS: Final = NS_PER_S
 RETRY_MOST_NS: Final = 30 * NS_PER_S
-ACCEPT_PAUSE_S: Final = 1.0
-"""After the process ran out of descriptors."""
+ACCEPT_PAUSE_S: Final = 1.0  # pause of accept after the process ran out of descriptors, s
 
 
 class SentenceOutput(Protocol):
-    """A way out."""
+    """Port for sentences."""
 
     def put(self, sentences: bytes) -> None:
-        """Send whole sentences, or drop them."""
+        """Send complete sentences, or drop them."""
         ...
 
     def tick(self, now_ns: int) -> None:
-        """Look after connections; called ten times a second."""
+        """Check connections. The output calls this method ten times a second."""
         ...
 
     def status(self) -> OutputStatus:
-        """What was sent."""
+        """Return the counters and the problem of the port."""
         ...
 
     def close(self) -> None:
-        """Close; may be called twice."""
+        """Close the port. A second call does nothing."""
         ...
 
 
 class TcpClient:
-    """One client that reads."""
+    """TCP client."""
 
     def __init__(self, sock: socket.socket, peer: str) -> None:
         self.sock = sock
         self.peer = peer
-        self._rest = b""
-        """Of sentences that were taken in part."""
+        self._rest = b""  # rest of the sentences of which the kernel accepted only a part
         self.full_ns: int | None = None
-        """Since when it has no room for what is sent; None while it has, and while nothing is sent."""
+        """Time since which the socket buffer is full; None if it has room or imud sends nothing."""
 
     def put(self, sentences: bytes, now_ns: int) -> bool:
-        """Send, or drop; return whether they were sent. Raises OSError when the connection has ended."""
+        """Send or drop sentences. Return whether imud sent them. Raises OSError if the connection ended."""
         try:
             if self._rest:
                 count = self.sock.send(self._rest)
@@ -96,19 +92,18 @@ class TcpClient:
 
 
 class TcpOutput:
-    """A TCP server: each client gets all sentences from now on. What clients send is read and ignored."""
+    """TCP server. Each client receives all sentences. imud reads and ignores data from clients."""
 
     def __init__(self, address: str, port: int, now_ns: Callable[[], int]) -> None:
         self._address = address
-        self.port = port
-        """The bound port once open, also where 0 was asked for."""
+        self.port = port  # bound port after `open`, also if the configured port is 0
         self._now_ns = now_ns
         self._clients: dict[int, TcpClient] = {}
         self._listener: socket.socket | None = None
         self._sent = self._dropped = 0
 
     def open(self) -> None:
-        """Listen. Raises ServerError when address and port cannot be had."""
+        """Listen. Raises ServerError if address and port cannot be used."""
         family = socket.AF_INET6 if ":" in self._address else socket.AF_INET
         listener = socket.socket(family, socket.SOCK_STREAM)
         try:
@@ -118,7 +113,7 @@ class TcpOutput:
         except OSError as error:
             listener.close()
             raise ServerError(
-                f"NMEA 0183 cannot be served at {self._address} port {self.port}: {reason_of(error)}; "
+                f"cannot open the NMEA 0183 server at {self._address} port {self.port}: {reason_of(error)}; "
                 f"set nmea0183.tcp_port to another port, or to null"
             ) from error
         listener.setblocking(False)
@@ -127,33 +122,31 @@ class TcpOutput:
         asyncio.get_running_loop().add_reader(listener, self._accept)
 
     def put(self, sentences: bytes) -> None:
-        """Send to every client that has room."""
+        """Send sentences to each client with room in its socket buffer."""
         now_ns, count = self._now_ns(), sentences.count(b"\n")
         for number, client in list(self._clients.items()):
             try:
                 if client.put(sentences, now_ns):
                     self._sent += count
                     continue
-            except OSError:  # reset by the peer
+            except OSError:  # the client reset the connection
                 self._drop_client(number)
             self._dropped += count
 
     def tick(self, now_ns: int) -> None:
-        """Disconnect clients that take nothing."""
+        """Disconnect clients without progress."""
         for number, client in list(self._clients.items()):
             if client.full_ns is not None and now_ns - client.full_ns > STUCK_NS:
-                log.info(
-                    "nmea0183: %s is disconnected: it has read nothing for %d s", client.peer, STUCK_NS // NS_PER_S
-                )
+                log.info("nmea0183: disconnecting %s, which did not read for %d s", client.peer, STUCK_NS // NS_PER_S)
                 self._drop_client(number)
 
     def status(self) -> OutputStatus:
-        """What was sent."""
+        """Return the counters of the server."""
         name = f"tcp {self._address}:{self.port}"
         return OutputStatus(name, self._sent, self._dropped, len(self._clients), "")
 
     def close(self) -> None:
-        """Stop listening and disconnect everybody; may be called twice."""
+        """Stop listening and disconnect all clients. A second call does nothing."""
         for number in list(self._clients):
             self._drop_client(number)
         listener, self._listener = self._listener, None
@@ -169,14 +162,14 @@ class TcpOutput:
             sock, address = listener.accept()
         except (BlockingIOError, ConnectionError):
             return
-        except OSError:  # out of descriptors: the listener stays readable, an immediate retry would be a busy loop
+        except OSError:  # out of descriptors: the listener stays readable, so an immediate retry would be a busy loop
             loop = asyncio.get_running_loop()
             loop.remove_reader(listener)
             loop.call_later(ACCEPT_PAUSE_S, self._listen_again)
             return
         peer = f"{address[0]} port {address[1]}"
         if len(self._clients) >= CLIENTS_MAX:
-            log.info("nmea0183: %s is refused: there are %d clients already", peer, CLIENTS_MAX)
+            log.info("nmea0183: rejecting %s: the limit of %d clients is reached", peer, CLIENTS_MAX)
             sock.close()
             return
         sock.setblocking(False)
@@ -199,7 +192,7 @@ class TcpOutput:
         except BlockingIOError:
             return
         except OSError:
-            pass  # reset by the peer
+            pass  # the client reset the connection
         self._drop_client(number)
 
     def _drop_client(self, number: int) -> None:
@@ -209,7 +202,7 @@ class TcpOutput:
 
 
 class UdpOutput:
-    """Datagrams to one address: a host, a network's broadcast address or a multicast group."""
+    """Datagrams to one address: a host, a broadcast address or a multicast group."""
 
     def __init__(self, address: str, port: int) -> None:
         self._address = (address, port)
@@ -222,11 +215,11 @@ class UdpOutput:
         self._problem = ""
 
     def put(self, sentences: bytes) -> None:
-        """Send them as one datagram."""
+        """Send sentences as one datagram."""
         count = sentences.count(b"\n")
         try:
             self._sock.sendto(sentences, self._address)
-        except OSError as error:  # no route, network down, or nobody there: the next one may arrive
+        except OSError as error:  # no route, network down, or no receiver: the next datagram can arrive
             self._dropped += count
             problem = reason_of(error)
             if problem != self._problem:
@@ -237,20 +230,20 @@ class UdpOutput:
             self._problem = ""
 
     def tick(self, _now_ns: int) -> None:
-        """No-op: there is no connection."""
+        """Do nothing: UDP has no connection."""
 
     def status(self) -> OutputStatus:
-        """What was sent."""
+        """Return the counters of the port."""
         address, port = self._address
         return OutputStatus(f"udp {address}:{port}", self._sent, self._dropped, int(not self._problem), self._problem)
 
     def close(self) -> None:
-        """Close; may be called twice."""
+        """Close the socket. A second call does nothing."""
         self._sock.close()
 
 
 def open_serial(port: str, baud: int) -> int:
-    """Open a serial port for writing without waiting, 8N1; return its descriptor. Raises OSError."""
+    """Open a serial port for writing without waiting, 8N1. Return its descriptor. Raises OSError."""
     made = serial.Serial(port, baud, timeout=0, write_timeout=0, exclusive=True)
     try:
         fd = os.dup(made.fileno())
@@ -261,7 +254,7 @@ def open_serial(port: str, baud: int) -> int:
 
 
 class SerialOutput:
-    """A serial port, opened again after it was away."""
+    """Serial port. imud opens it again after a loss."""
 
     def __init__(
         self, port: str, baud: int, now_ns: Callable[[], int], open_port: Callable[[str, int], int] = open_serial
@@ -278,7 +271,7 @@ class SerialOutput:
         self._problem = "not open yet"
 
     def put(self, sentences: bytes) -> None:
-        """Write, or drop while the port is away or its queue is full."""
+        """Write sentences. Drop them if the port is missing or its queue is full."""
         count = sentences.count(b"\n")
         if self._fd is None:
             self._dropped += count
@@ -298,19 +291,19 @@ class SerialOutput:
             self._lose(reason_of(error))
 
     def tick(self, now_ns: int) -> None:
-        """Open the port when that is due."""
+        """Open the port if an attempt is due."""
         if self._fd is None and self._opening is None and now_ns >= self._due_ns:
             loop = asyncio.get_running_loop()
             self._opening = loop.run_in_executor(None, self._open_port, self._port, self._baud)
             self._opening.add_done_callback(self._opened)
 
     def status(self) -> OutputStatus:
-        """What was sent."""
+        """Return the counters of the port."""
         is_open = self._fd is not None
         return OutputStatus(f"serial {self._port}", self._sent, self._dropped, int(is_open), self._problem)
 
     def close(self) -> None:
-        """Close; may be called twice."""
+        """Close the port. A second call does nothing."""
         opening, self._opening = self._opening, None
         if opening is not None:
             opening.remove_done_callback(self._opened)
@@ -322,8 +315,8 @@ class SerialOutput:
         error = opening.exception()
         if error is None:
             self._fd, self._wait_ns, self._problem = opening.result(), RETRY_FIRST_NS, ""
-            log.info("nmea0183: sentences go to %s at %d baud", self._port, self._baud)
-        elif isinstance(error, (OSError, ValueError)):  # ValueError: a rate that the driver does not have
+            log.info("nmea0183: sending to %s at %d baud", self._port, self._baud)
+        elif isinstance(error, (OSError, ValueError)):  # ValueError: the driver does not support the baud rate
             self._lose(reason_of(error))
         else:
             raise error
@@ -331,7 +324,7 @@ class SerialOutput:
     def _lose(self, problem: str) -> None:
         self._close_port()
         if problem != self._problem:
-            log.warning("nmea0183: %s: %s; it is opened again when it can be", self._port, problem)
+            log.warning("nmea0183: %s: %s; trying again", self._port, problem)
         self._problem = problem
         self._due_ns = self._now_ns() + self._wait_ns
         self._wait_ns = min(2 * self._wait_ns, RETRY_MOST_NS)
@@ -343,18 +336,19 @@ class SerialOutput:
 
 
 def _close_late(opening: "asyncio.Future[int]") -> None:
-    """Close a port that was opened while the output was closed."""
+    """Close a port that a thread opened after the output was closed."""
     if not opening.cancelled() and opening.exception() is None:
         os.close(opening.result())
 
 
 PA_PER_BAR: Final = 100_000.0
 LEVEL_COS: Final = 0.1
-"""Below this cosine of pitch (84°) heading and roll turn about nearly the same axis: there is no rate of turn."""
+"""Minimum cosine of pitch for a rate of turn (pitch 84°). Above this pitch, heading and roll are nearly the same
+rotation."""
 
 
 class Formatter(StrEnum):
-    """Sentences by their formatters."""
+    """Sentence formatters."""
 
     HDT = "HDT"
     HDG = "HDG"
@@ -372,24 +366,24 @@ TALKERS: Final[Mapping[Formatter, str]] = {
     Formatter.XDR: "YX",
     Formatter.PASHR: "",
 }
-"""HC: magnetic compass, also where its heading is corrected to a true one, TI: rate of turn, YX: transducer.
+"""Talkers: HC magnetic compass, also for a corrected true heading; TI rate of turn; YX transducer. PASHR has no talker.
 
-gpsd 3.22 knows HC and II as talkers of a heading, and neither HE nor HN, gyroscopic compasses. PASHR has no talker."""
+gpsd 3.22 accepts HC and II as talkers of a heading, but not HE and HN (gyrocompasses)."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeadingReference:
-    """What the yaw of samples counts from."""
+    """Reference of the yaw of samples."""
 
     heading: Heading = Heading.UNKNOWN
     declination_deg: float | None = None
-    """What was added to a magnetic heading to make it a true one; None for nothing."""
+    """Declination of a true heading made from a magnetic one, degrees; None if yaw was not corrected."""
 
 
 def make(kind: Formatter, sample: Sample, reference: HeadingReference, talker: str = "") -> bytes | None:
-    """The sentence of a sample whose axes and angles are those of `ned-frd`; None where the sample has not its values.
+    """Return the sentence of a sample in `ned-frd`; None if the sample does not contain the values.
 
-    `talker` takes the place of the one in TALKERS; empty keeps that.
+    A non-empty `talker` replaces the talker of TALKERS.
     """
     return _MAKERS[kind](talker or TALKERS[kind], sample, reference)
 
@@ -448,10 +442,11 @@ _MAKERS: Final[Mapping[Formatter, Callable[[str, Sample, HeadingReference], byte
 
 
 def turn_rate_rad_s(sample: Sample) -> float | None:
-    """Rate of change of the heading, positive to starboard; None without an angular rate, or with the bow straight up.
+    """Return the rate of change of the heading, positive to starboard; None without angular rate, or with the bow
+    straight up.
 
-    With roll φ and pitch θ it is (q sin φ + r cos φ) / cos θ of the angular rates q about y and r about z, so that
-    rolling and pitching do not show in it. Without an attitude the body is taken for level.
+    The rate is (q sin φ + r cos φ) / cos θ, with roll φ, pitch θ and the angular rates q about y and r about z. Thus
+    rolling and pitching have no effect. Without an attitude, imud assumes a level body.
     """
     gyro = sample.gyro_rad_s
     if gyro is None or not all(map(math.isfinite, gyro)):
@@ -487,15 +482,14 @@ def _roll_pitch_rad(sample: Sample) -> tuple[float, float] | None:
 
 
 REFERENCE_NS: Final = NS_PER_S
-"""What the heading counts from is looked up so often: a device says it when it was asked."""
-WHO: Final = "nmea0183"
-"""Who asks for a latency."""
-BITS_PER_BYTE: Final = 10
-"""8N1 on a serial line."""
+"""Time between two reads of the heading reference from the device status, ns. The device reports the reference only on
+request."""
+WHO: Final = "nmea0183"  # name of this output in latency requests
+BITS_PER_BYTE: Final = 10  # bits per byte of a serial port with 8N1
 USUAL_BYTES: Final = {
     Formatter.HDT: 19, Formatter.HDG: 27, Formatter.HDM: 19, Formatter.ROT: 22, Formatter.XDR: 82, Formatter.PASHR: 57,
 }  # fmt: skip
-"""Size of each sentence with all that it can have, for the load of a serial line."""
+"""Maximum usual length of each sentence, bytes, for the load of a serial port."""
 FormatterName = Literal["HDT", "HDG", "HDM", "ROT", "XDR", "PASHR"]
 Talker = Annotated[str, msgspec.Meta(pattern="^([A-Z]{2})?$", extra={"words": "two capital letters, or nothing"})]
 RateHz = Annotated[float, msgspec.Meta(ge=0.01, le=100)]
@@ -505,47 +499,47 @@ class Nmea0183Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=
     """Options of the NMEA 0183 output."""
 
     enabled: bool = False
-    """Whether sentences are sent."""
+    """Send sentences."""
     device: str | None = None
-    """Name of the device whose attitude is sent; null where there is only one."""
+    """Name of the device; null: the only device of the configuration."""
     sentences: dict[FormatterName, RateHz] = msgspec.field(
         default_factory=lambda: {"HDT": 10.0, "HDG": 10.0, "ROT": 10.0, "XDR": 2.0}
     )
-    """Sentences and how many of each are sent in a second; those that are left out are not sent."""
+    """Sentences and their rates, Hz. imud sends only the listed sentences."""
     talker: Talker = ""
     """Talker of all sentences; empty: HC for headings, TI for ROT, YX for XDR."""
     tcp_address: Annotated[str, msgspec.Meta(min_length=1)] = "127.0.0.1"
-    """IP address on which plotters connect; `0.0.0.0` is every network of this machine. There is no password."""
+    """IP address of the TCP server; `0.0.0.0`: all networks of the host. There is no password."""
     tcp_port: Annotated[int, msgspec.Meta(ge=0, le=65535)] | None = 10110
-    """TCP port; 0 takes any free one, null: there is no server."""
+    """TCP port; 0: any free port, null: no TCP server."""
     udp: list[str] = msgspec.field(default_factory=list)
-    """Where datagrams go, each as ADDRESS:PORT: a host, a multicast group, or a broadcast address such as
+    """Destinations of UDP datagrams, each as ADDRESS:PORT: a host, a multicast group, or a broadcast address such as
     `192.168.1.255:10110`."""
     serial_port: str | None = None
-    """Serial port on which sentences are written; null for none."""
+    """Serial port for the sentences; null: no serial port."""
     serial_baud: Annotated[int, msgspec.Meta(ge=4800, le=921600)] = 38400
-    """Its rate, bit/s; the standard has 4800 and 38400."""
+    """Baud rate of the serial port, bit/s. The standard specifies 4800 and 38400."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what is no address, and for sentences that the serial line cannot carry."""
+        """Raise ValueError if an address is invalid, or if the serial port is too slow for the sentences."""
         if not is_ip_address(self.tcp_address):
             raise ValueError(f"tcp_address: expected an IP address such as 127.0.0.1, got {shown(self.tcp_address)}")
         for text in self.udp:
             if address_of(text) is None:
                 raise ValueError(f"udp: expected IP address and port such as 192.168.1.255:10110, got {shown(text)}")
         if not self.sentences:
-            raise ValueError("sentences: expected one at least, got none")
+            raise ValueError("sentences: expected at least one sentence, got none")
         needed = sum(rate_hz * USUAL_BYTES[Formatter(name)] for name, rate_hz in self.sentences.items())
         room = self.serial_baud / BITS_PER_BYTE
         if self.serial_port is not None and needed > room:
             raise ValueError(
-                f"sentences: expected what {self.serial_baud} bit/s can carry, {room:.0f} bytes a second, got "
-                f"{needed:.0f}; lower their rates, or set serial_baud"
+                f"sentences: expected at most {room:.0f} bytes per second at {self.serial_baud} bit/s, got "
+                f"{needed:.0f}; reduce the rates, or set serial_baud"
             )
 
 
 def address_of(text: str) -> tuple[str, int] | None:
-    """IP address and port of `192.168.1.255:10110` or `[fe80::1]:10110`; None for another text."""
+    """Return IP address and port of `192.168.1.255:10110` or `[fe80::1]:10110`; None if the text is not an address."""
     address, _, port = text.rpartition(":")
     if address.startswith("[") and address.endswith("]"):
         address = address[1:-1]
@@ -557,7 +551,7 @@ def address_of(text: str) -> tuple[str, int] | None:
 
 
 class Nmea0183:
-    """Sends the sentences of one device. Synchronization: the event loop's thread only."""
+    """Output of the sentences of one device. Synchronization: the event loop's thread only."""
 
     def __init__(self, settings: Nmea0183Options, context: PublisherContext) -> None:
         self._settings = settings
@@ -566,6 +560,7 @@ class Nmea0183:
             Formatter(name): Pace(rate) for name, rate in settings.sentences.items()
         }
         self._outputs: list[SentenceOutput] = []
+        # 0: the next `tick` reads the heading reference
         self._names: dict[str, None] = {}
         self._device: str | None = None
         self._reference = HeadingReference()
@@ -574,7 +569,7 @@ class Nmea0183:
         self._warned = ""
 
     def start(self) -> None:
-        """Open the ways out. Raises ServerError when the TCP port cannot be had."""
+        """Open the ports. Raises ServerError if the TCP port cannot be used."""
         settings, now_ns = self._settings, self._context.clock.now_ns
         if settings.tcp_port is not None:
             server = TcpOutput(settings.tcp_address, settings.tcp_port, now_ns)
@@ -587,17 +582,17 @@ class Nmea0183:
         self._context.outputs.sentences.append(self.status)
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Note the device; it is the one whose attitude is sent if it is named, or the only one."""
+        """Add a device. The output uses the configured device, or the only device."""
         self._names[name] = None
         self._choose()
 
     def remove_device(self, name: str) -> None:
-        """Forget a device that left the configuration."""
+        """Remove a device."""
         self._names.pop(name, None)
         self._choose()
 
     def publish(self, batch: Batch) -> None:
-        """Send the sentences that are due."""
+        """Send the due sentences with the values of the newest sample. Ignore the batches of other devices."""
         if batch.device != self._device:
             return
         if Formatter.ROT in self._paces:
@@ -619,10 +614,10 @@ class Nmea0183:
                 output.put(sentences)
 
     def event(self, event: Event) -> None:
-        """No-op: there is no sentence for it."""
+        """Do nothing: no sentence describes an event."""
 
     def tick(self, now_ns: int) -> None:
-        """Look after the ways out, and look up what the heading counts from."""
+        """Check the ports and read the heading reference."""
         for output in self._outputs:
             output.tick(now_ns)
         if self._device is not None and now_ns - self._looked_ns >= REFERENCE_NS:
@@ -630,7 +625,7 @@ class Nmea0183:
             self._look_up(self._device)
 
     def close(self) -> None:
-        """Close the ways out; may be called twice."""
+        """Close all ports and withdraw the latency request. A second call does nothing."""
         for output in self._outputs:
             output.close()
         self._outputs.clear()
@@ -639,11 +634,11 @@ class Nmea0183:
             self._context.outputs.sentences.remove(self.status)
 
     def status(self) -> list[OutputStatus]:
-        """Return the state of every way out."""
+        """Return the state of each port."""
         return [output.status() for output in self._outputs]
 
     def _choose(self) -> None:
-        """Choose the device, and ask for the latency that the fastest sentence needs."""
+        """Choose the device and request the latency for the fastest sentence."""
         wanted = self._settings.device
         if wanted is None and len(self._names) == 1:
             (wanted,) = self._names
@@ -651,7 +646,7 @@ class Nmea0183:
         if device is None and self._names:
             self._warn(
                 f"nmea0183.device: expected the name of one device ({', '.join(self._names)}), got "
-                f"{wanted or 'none'}; nothing is sent"
+                f"{wanted or 'none'}; imud sends no sentences"
             )
         if device == self._device:
             return
@@ -663,7 +658,7 @@ class Nmea0183:
             latencies.ask(WHO, round(NS_PER_S / max(self._settings.sentences.values())), (device,))
 
     def _look_up(self, device: str) -> None:
-        """Look up what the heading of the device counts from."""
+        """Read the heading reference of the device."""
         found = next((status for status in self._context.devices.status() if status.name == device), None)
         if found is None or found.frame is None:
             return

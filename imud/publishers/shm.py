@@ -1,8 +1,8 @@
-"""Shared memory: one ring of slots per device, `/run/imud/shm/imud.<device>`, for readers that want no system call.
+"""Output `shm`: one ring of slots per device, `/run/imud/shm/imud.<device>`. Readers need no system call.
 
-Readers are `imud.client.ring` and `imud/include/imud.h`; the layout is `imud.formats.ring`. A reader may be as slow
-as it likes: the ring never waits for it. A ring that cannot be made, or that is removed or cut, is made anew as soon as
-that is possible; the daemon and its other outputs go on meanwhile.
+The readers are `imud.client.ring` and `imud/include/imud.h`; `imud.formats.ring` describes the layout. The ring never
+waits for a reader. If imud cannot create a ring, or if a ring is removed or truncated, imud creates it again as soon as
+possible. The daemon and its other outputs continue in the meantime.
 """
 
 import fcntl
@@ -56,7 +56,8 @@ from imud.model.units import NS_PER_MS
 log = logging.getLogger(__name__)
 
 LEFTOVERS_MAX: Final = 10_000
-"""Entries of the directory that are looked at for leftovers: in a shared directory others may make millions."""
+"""Maximum number of directory entries that imud checks for temporary files. Other users can create millions of entries
+in a shared directory."""
 
 _DIRECTORY_MODE = 0o755
 _OPEN_DIRECTORY = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -67,41 +68,42 @@ _TEMPORARY = ".new"
 
 
 class RingDirectory:
-    """An open directory of rings. Synchronization: one thread."""
+    """Open directory of rings. Synchronization: one thread."""
 
     def __init__(self, path: str) -> None:
-        """Open `path` and remove what a daemon left there that died while it made a ring.
+        """Open `path`. Remove the temporary files of a daemon that died while it created a ring.
 
-        Raises ServerError when it is missing, when others may replace files in it, or when this user may not make any.
+        Raises ServerError if the directory is missing, if other users can replace its files, or if this user cannot
+        create files.
         """
         self.path = path
         self._fd = _open(path)
         try:
             self._identity = _identity(_checked(self._fd, path))
-        except BaseException:  # whatever ended it, the descriptor does not stay open
+        except BaseException:  # close the descriptor after any error
             os.close(self._fd)
             raise
         self._remove_leftovers()
 
     @property
     def current(self) -> bool:
-        """Whether `path` still names this directory; False after it was removed, renamed or mounted over."""
+        """Return whether `path` still names this directory. False after it was removed, renamed or mounted over."""
         try:
             return _identity(os.stat(self.path, follow_symlinks=False)) == self._identity
         except OSError:
             return False
 
     def names(self, name: str, file: os.stat_result) -> bool:
-        """Whether `name` here is `file`."""
+        """Return whether the directory entry `name` is the file `file`."""
         try:
             return _identity(os.stat(name, dir_fd=self._fd, follow_symlinks=False)) == _identity(file)
         except OSError:
             return False
 
     def refuse_second_writer(self, name: str) -> None:
-        """Raise ServerError when another daemon of this user's or root's writes the ring `name`.
+        """Raise ServerError if another daemon of this user or of root writes the ring `name`.
 
-        Whatever else has that name is left for `make` to replace.
+        `make` replaces any other file with this name.
         """
         try:
             found = os.stat(name, dir_fd=self._fd, follow_symlinks=False)
@@ -116,27 +118,32 @@ class RingDirectory:
         try:
             if _credible(os.fstat(descriptor)) and _is_locked(descriptor):
                 path = os.path.join(self.path, name)
-                raise ServerError(f"{path} is written by another imud, {_process(descriptor)}: stop that one first")
+                raise ServerError(f"{path}: another imud writes this ring, {_process(descriptor)}: stop it first")
         finally:
             os.close(descriptor)
 
     def make(self, name: str, size_bytes: int, head: bytes, mode: int, group_id: int | None) -> int:
-        """Make the file `name`, locked and whole before it appears, `head` and zeros in it; return its descriptor.
+        """Create the file `name` with `head` and zeros. Return its locked descriptor.
 
-        What has that name is replaced, if this user may. The group is given where this user may. Raises ServerError.
+        The file appears complete and locked. It replaces a file with the same name, and gets the group, if this user
+        has the permission. Raises ServerError.
         """
         temporary = f".{name}.{secrets.token_hex(8)}{_TEMPORARY}"
         path = os.path.join(self.path, name)
         try:
             descriptor = os.open(temporary, _CREATE, 0o600, dir_fd=self._fd)
         except OSError as error:
-            raise ServerError(f"{path} cannot be made: {error.strerror}; may imud write to {self.path}?") from error
+            raise ServerError(
+                f"cannot create {path}: {error.strerror}; check the permissions of {self.path}"
+            ) from error
         try:
             _lock(descriptor)
-            os.posix_fallocate(descriptor, 0, size_bytes)  # a write into a page that does not fit would raise SIGBUS
+            # otherwise a write to a page without memory would raise SIGBUS
+            os.posix_fallocate(descriptor, 0, size_bytes)
             os.pwrite(descriptor, head, 0)
             if group_id is not None:
-                with suppress(PermissionError):  # not in the group: the caller sees it by the file's group
+                # the user is not in the group; the caller sees this by the group of the file
+                with suppress(PermissionError):
                     os.fchown(descriptor, -1, group_id)
             os.fchmod(descriptor, mode)
             self._rename(temporary, name)
@@ -145,19 +152,19 @@ class RingDirectory:
             with suppress(OSError):
                 os.unlink(temporary, dir_fd=self._fd)
             raise ServerError(
-                f"{path} cannot be made, {size_bytes} bytes: {error.strerror};"
-                f" look at what has its name (ls -ld {path}), at the free space (df {self.path}), or set fewer `slots`"
+                f"cannot create {path} with {size_bytes} bytes: {error.strerror}; check the file (ls -ld {path}) and "
+                f"the free space (df {self.path}), or reduce shm.slots"
             ) from error
         return descriptor
 
     def remove(self, name: str, file: os.stat_result) -> None:
-        """Remove `name` if it is `file`; without the right to do so it stays."""
+        """Remove `name` if it is `file` and if this user has the permission."""
         if self.names(name, file):
             with suppress(OSError):
                 os.unlink(name, dir_fd=self._fd)
 
     def close(self) -> None:
-        """Release the descriptor; may be called twice."""
+        """Close the descriptor. A second call does nothing."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -174,7 +181,7 @@ class RingDirectory:
             seen = [entry.name for entry in islice(entries, LEFTOVERS_MAX)]
         for name in seen:
             if name.startswith(".imud.") and name.endswith(_TEMPORARY):
-                with suppress(OSError):  # of another user: unlink is refused
+                with suppress(OSError):  # the file of another user cannot be removed
                     self._remove_leftover(name)
 
     def _remove_leftover(self, name: str) -> None:
@@ -189,9 +196,9 @@ class RingDirectory:
 
 
 def open_directory(configured: str, environment: Mapping[str, str]) -> RingDirectory:
-    """Open the configured directory; instead of the default one, where it cannot be used, the user's own.
+    """Open the configured directory. If the default directory cannot be used, open the directory of the user.
 
-    The default ones are made if they are missing. Raises ServerError.
+    This function creates missing default directories. Raises ServerError.
     """
     if configured != DIRECTORY:
         return RingDirectory(configured)
@@ -201,16 +208,16 @@ def open_directory(configured: str, environment: Mapping[str, str]) -> RingDirec
     except ServerError as error:
         for other in others:
             directory = _made(other)
-            log.warning("shm: %s; rings are in %s", error, other)
+            log.warning("shm: %s; using %s", error, other)
             return directory
         raise
 
 
 def _made(path: str) -> RingDirectory:
     for level in (Path(path).parent, Path(path)):
-        with suppress(OSError):  # it is there, or opening it says what is wrong
+        with suppress(OSError):  # it exists, or opening it reports the problem
             level.mkdir(_DIRECTORY_MODE)
-            level.chmod(_DIRECTORY_MODE)  # whatever the umask
+            level.chmod(_DIRECTORY_MODE)  # the umask may have removed permissions
     return RingDirectory(path)
 
 
@@ -218,32 +225,34 @@ def _open(path: str) -> int:
     try:
         return os.open(path, _OPEN_DIRECTORY)
     except PermissionError:
-        raise ServerError(f"{path} may not be opened by user {user_name()}; `ls -ld {path}` shows who may") from None
+        raise ServerError(
+            f"user {user_name()} cannot open {path}: permission denied; check its permissions (ls -ld {path})"
+        ) from None
     except OSError as error:
         reason = "a symbolic link" if os.path.islink(path) else error.strerror
-        hint = "make it, or set shm.directory"
+        hint = "create it, or set shm.directory"
         raise ServerError(f"{path}: expected a directory for shared memory ({reason}); {hint}") from error
 
 
 def _checked(descriptor: int, path: str) -> os.stat_result:
-    """Status of the directory. Raises ServerError."""
+    """Return the status of the directory. Raises ServerError if other users can replace its files."""
     status = os.fstat(descriptor)
     if status.st_uid not in (0, os.geteuid()):
         raise ServerError(
-            f"{path} belongs to user {status.st_uid}, who may replace the rings in it:"
-            f" expected root or {user_name()} as its owner; set shm.directory"
+            f"{path} belongs to user {status.st_uid}, who can replace the rings: expected root or {user_name()} as its "
+            f"owner; set shm.directory"
         )
     if status.st_mode & _OTHERS_WRITE and not status.st_mode & stat.S_ISVTX:
         raise ServerError(
-            f"{path} has mode {stat.S_IMODE(status.st_mode):04o}: others may replace the rings in it; chmod go-w {path}"
+            f"{path} has mode {stat.S_IMODE(status.st_mode):04o}: other users can replace the rings; chmod go-w {path}"
         )
     if not os.access(".", os.W_OK | os.X_OK, dir_fd=descriptor):
-        raise ServerError(f"{path}: user {user_name()} may not make files there; `ls -ld {path}` shows who may")
+        raise ServerError(f"user {user_name()} cannot create files in {path}; check its permissions (ls -ld {path})")
     return status
 
 
 def _credible(status: os.stat_result) -> bool:
-    """Whether a daemon of this user's, or root's, can have made the file."""
+    """Return whether a daemon of this user or of root can have created the file."""
     return stat.S_ISREG(status.st_mode) and status.st_uid in (0, os.geteuid())
 
 
@@ -256,7 +265,7 @@ def _lock(descriptor: int) -> None:
 
 
 def _is_locked(descriptor: int) -> bool:
-    """Whether a process has a write lock on the file, for which it must have opened it for writing."""
+    """Return whether a process has a write lock on the file. The process must have opened it for writing."""
     asked = _FLOCK.pack(fcntl.F_RDLCK, os.SEEK_SET, 0, 0, 0)
     answer = fcntl.fcntl(descriptor, fcntl.F_OFD_GETLK, asked)
     assert isinstance(answer, bytes)
@@ -270,7 +279,7 @@ def _process(descriptor: int) -> str:
         return "of another version"
 
 
-_lseek, _END = os.lseek, os.SEEK_END  # looked up once: called for every batch
+_lseek, _END = os.lseek, os.SEEK_END  # looked up once, because `write` uses them for each batch
 _CLOSED = struct.pack("<I", STATE_CLOSED)
 _INVALID = struct.pack("<Q", SEQ_INVALID)
 _PAYLOAD = slice(8, SLOT_BYTES)
@@ -278,17 +287,16 @@ _LEDGER_PAYLOAD = slice(LEDGER_BLOCK_OFFSET + 8, LEDGER_BLOCK_OFFSET + LEDGER_BL
 
 
 class ShmRing:
-    """Owns the file of one device from creation to `close`. Synchronization: one thread."""
+    """Ring file of one device. Synchronization: one thread."""
 
     def __init__(self, directory: RingDirectory, header: RingHeader, mode: int, group_id: int | None) -> None:
-        """Make the file, whole before it appears in `directory`. Raises ServerError."""
+        """Create the complete file in `directory`. Raises ServerError."""
         self._directory = directory
         self._name = ring_path(directory.path, header.device).name
         self._size_bytes = HEADER_BYTES + header.slot_count * SLOT_BYTES
         self._fd = directory.make(self._name, self._size_bytes, encode_header(header), mode, group_id)
         self._status = os.fstat(self._fd)
-        self.group_given = self._status.st_gid == group_id
-        """Whether the file belongs to the group that was asked for."""
+        self.group_given = self._status.st_gid == group_id  # true if the file has the requested group
         self._memory = self._mapped()
         with memoryview(self._memory) as view:
             self._words, self._halves = view.cast("Q"), view.cast("I")
@@ -296,17 +304,17 @@ class ShmRing:
         self._newest = header.newest_seq
         self._update = 0
         self._known: tuple[str, Mapping[str, int]] | None = None
+        # minimum size of the file for a write; larger than any file after the file was truncated
         self._least_bytes = self._size_bytes
-        """Size of the file from which on it may be written; none is enough any more once it was cut."""
         self._closed = False
 
     @property
     def newest(self) -> int:
-        """Sequence number of the newest sample that was to be written, 0 before the first."""
+        """Return the sequence number of the newest sample; 0 before the first."""
         return self._newest
 
     def write(self, samples: Sequence[Sample], slots: Sequence[bytes]) -> None:
-        """Write `samples`, oldest first, which are encoded in `slots`; no-op if the file was cut."""
+        """Write `samples`, oldest first, as `slots`. Do nothing if the file was truncated."""
         if _lseek(self._fd, 0, _END) < self._least_bytes:
             self._restore_size()
             self._newest = samples[-1].seq
@@ -322,15 +330,15 @@ class ShmRing:
         word = at >> 3
         words[word] = SEQ_INVALID
         self._memory[at + 8 : at + SLOT_BYTES] = slot[_PAYLOAD]
-        words[word] = words[NEWEST_WORD] = seq  # from left to right
-        if seq != self._newest + 1:  # samples in between were never here: readers must not wait for them
+        words[word] = words[NEWEST_WORD] = seq  # Python assigns from left to right
+        if seq != self._newest + 1:  # the ring does not contain the samples between: readers must not wait for them
             words[FIRST_WORD] = seq
         self._newest = seq
 
     def _write_run(self, first: int, last: int, slots: Sequence[bytes]) -> bool:
-        """Write slots back to back: all are invalid before the first payload is stored, and until the last one is.
+        """Write consecutive slots. All slots are invalid from before the first payload until after the last payload.
 
-        Returns False, with nothing written, where a number is missing before or between them, or the ring ends there.
+        Return False without a write if a number is missing, or if the run reaches the end of the ring.
         """
         count, begin = len(slots), first & self._mask
         if first != self._newest + 1 or last != self._newest + count or begin + count > self._mask + 1:
@@ -346,12 +354,12 @@ class ShmRing:
         return True
 
     def beat(self, now_ns: int) -> None:
-        """Show that the daemon lives."""
+        """Write the heartbeat."""
         if self._is_whole():
             self._words[HEARTBEAT_WORD] = now_ns
 
     def set_ledger(self, driver: str, ledger: Mapping[str, int]) -> None:
-        """Show the ledger and the driver in use, if they are not what is shown already."""
+        """Write the ledger and the driver if they changed."""
         if self._known == (driver, ledger) or not self._is_whole():
             return
         self._known = (driver, dict(ledger))
@@ -362,15 +370,15 @@ class ShmRing:
         self._words[LEDGER_UPDATE_WORD] = self._update
 
     def is_intact(self, directory: RingDirectory) -> bool:
-        """Whether the file has its size, and its name in `directory`."""
+        """Return whether the file has its size and its name in `directory`."""
         return self._is_whole() and self.is_named(directory)
 
     def is_named(self, directory: RingDirectory) -> bool:
-        """Whether the file has its name in `directory`."""
+        """Return whether the file has its name in `directory`."""
         return directory.names(self._name, self._status)
 
     def close(self) -> None:
-        """Mark the ring closed for its readers, and remove the file if it is still this one; may be called twice."""
+        """Mark the ring as closed and remove its file. A second call does nothing."""
         if self._closed:
             return
         self._closed = True
@@ -388,7 +396,7 @@ class ShmRing:
         except OSError as error:
             self._directory.remove(self._name, self._status)
             os.close(self._fd)
-            raise ServerError(f"{self._name}: {self._size_bytes} bytes cannot be mapped: {error.strerror}") from error
+            raise ServerError(f"cannot map {self._size_bytes} bytes of {self._name}: {error.strerror}") from error
 
     def _is_whole(self) -> bool:
         whole = _lseek(self._fd, 0, _END) >= self._least_bytes
@@ -397,9 +405,9 @@ class ShmRing:
         return whole
 
     def _restore_size(self) -> None:
-        """Make the file as long as it was, for readers that have it mapped, and mark it closed, without the mapping.
+        """Restore the size of a truncated file and mark it as closed, without the mapping.
 
-        Nothing is written to it any more.
+        Readers can have the file mapped. imud does not write to it after that.
         """
         self._least_bytes = sys.maxsize
         with suppress(OSError):
@@ -407,57 +415,55 @@ class ShmRing:
             os.pwrite(self._fd, _CLOSED, OFFSETS["state"])
 
 
-ASKER: Final = "shared memory"
-"""Who asks for the latency of its settings."""
+ASKER: Final = "shared memory"  # name of this output in latency requests
 RETRY_NS: Final = 1_000_000_000
-"""A ring that cannot be made is tried again once a second: a full memory is not filled any faster."""
+"""Time between two attempts to create a ring, ns. A full memory is not filled faster than that."""
 OTHERS_WRITE: Final = 0o022
-SLOTS_MIN, SLOTS_MAX = 64, 1 << 20
-"""64 slots are one 16 kB ring; 2²⁰ are 256 MB, more than a gateway should give to one device."""
+SLOTS_MIN, SLOTS_MAX = 64, 1 << 20  # limits of `slots`: a ring of 64 slots has 16 kB, a ring of 2²⁰ slots 256 MB
 
 
 class ShmOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Shared memory."""
+    """Options of shared memory."""
 
     enabled: bool = True
-    """Whether there are rings at all."""
+    """Write rings."""
     directory: str = DIRECTORY
-    """Where the files are; $XDG_RUNTIME_DIR/imud/shm instead of the default for a daemon that may not use that. Readers
-    look into both; another directory is named by their environment variable IMUD_SHM."""
+    """Directory of the ring files. If the daemon cannot use the default, it uses $XDG_RUNTIME_DIR/imud/shm. Readers
+    search both; IMUD_SHM in their environment names another directory."""
     slots: Annotated[int, msgspec.Meta(ge=SLOTS_MIN, le=SLOTS_MAX)] = 4096
-    """Samples a ring holds, a power of two, 256 bytes each: 4096 are four seconds at 1 kHz and 1 MB per device."""
+    """Number of samples in a ring, a power of two. A sample needs 256 bytes: 4096 samples are four seconds at 1 kHz and
+    1 MB per device."""
     latency_ms: Annotated[float, msgspec.Meta(ge=0, le=50)] = 5.0
-    """Samples may be written so much later than they could be, several at once, which costs less CPU; 0: each at once.
-    Where a client of the socket asks for less, it is less for all."""
+    """Maximum hold of samples before imud writes them, ms; 0: write each sample immediately. A longer hold costs less
+    CPU time. A client of the socket with a lower latency reduces the hold for all readers."""
     group: str = "imud"
-    """Group that may read, if it exists and imud may give files to it."""
+    """Group with read access, if it exists and imud may use it."""
     mode: Annotated[int, msgspec.Meta(ge=0, le=0o777)] = 0o640
-    """File mode: what the owner, the group and all others may do; only the owner may write."""
+    """File mode: permissions of owner, group and others. Only the owner may have write permission."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError, which the configuration reports with its line, for what no type can say."""
+        """Raise ValueError if a value is invalid."""
         if self.slots & (self.slots - 1):
             below = 1 << self.slots.bit_length() - 1
-            raise ValueError(f"slots: expected a power of two, found {self.slots}; near it are {below} and {2 * below}")
+            raise ValueError(f"slots: expected a power of two, got {self.slots}; try {below} or {2 * below}")
         if not self.directory.startswith("/"):
-            raise ValueError(f"directory: expected an absolute path, found {self.directory!r}")
+            raise ValueError(f"directory: expected an absolute path, got {self.directory!r}")
         if self.mode & OTHERS_WRITE:
-            raise ValueError(f"mode: expected none that lets group or others write the rings, found {self.mode:#o}")
+            raise ValueError(f"mode: expected no write permission for group and others, got {self.mode:#o}; try 0o640")
 
 
 @dataclass(slots=True)
 class _Place:
-    """A device of the configuration, and why it has no ring."""
+    """Device of the configuration, and the cause of a missing ring."""
 
     device_id: int
-    newest: int = 0
-    """Sequence number of its newest sample while it had no ring."""
+    newest: int = 0  # sequence number of the newest sample while there was no ring
     problem: str = ""
     retry_ns: int = 0
 
 
 class ShmPublisher:
-    """Writes every device's samples into its ring. Synchronization: the event loop's thread only."""
+    """Output that writes the samples of each device into a ring. Synchronization: the event loop's thread only."""
 
     def __init__(self, settings: ShmOptions, context: PublisherContext) -> None:
         self._settings = settings
@@ -470,32 +476,32 @@ class ShmPublisher:
         self._directory_problem = ""
 
     def start(self) -> None:
-        """Open the directory and find the group. Raises ServerError when files cannot be made in the directory."""
+        """Open the directory and find the group. Raises ServerError if imud cannot create files in the directory."""
         if sys.byteorder != "little":
-            raise ServerError("shared memory is little-endian and this machine is not: set `shm: {enabled: false}`")
+            raise ServerError("shared memory needs a little-endian host; set `shm: {enabled: false}`")
         self._opened_directory()
         self._group_id = self._find_group()
         self._started = True
         self._context.latencies.ask(ASKER, round(self._settings.latency_ms * NS_PER_MS))
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Make the device's ring; where that fails, log why and go on trying.
+        """Create the ring of a device. If that fails, log the cause and try again later.
 
-        Raises ServerError when another daemon writes it, or when the directory cannot be used.
+        Raises ServerError if another daemon writes the ring, or if the directory cannot be used.
         """
         self.remove_device(name)
         try:
             directory = self._opened_directory()
             directory.refuse_second_writer(ring_path(directory.path, name).name)
         except ServerError:
-            if not self._started:  # it will not be: leave nothing open
+            if not self._started:  # the daemon will not start: close all rings
                 self.close()
             raise
         self._places[name] = _Place(device_id)
         self._make(name, directory, self._context.clock.now_ns())
 
     def remove_device(self, name: str) -> None:
-        """Close the device's ring and remove its file; no-op if absent."""
+        """Close the ring of a device and remove its file. Do nothing if there is no ring."""
         self._places.pop(name, None)
         ring = self._rings.pop(name, None)
         self._context.outputs.rings.pop(name, None)
@@ -504,7 +510,7 @@ class ShmPublisher:
             ring.close()
 
     def publish(self, batch: Batch) -> None:
-        """Write the samples; the oldest of the ring give way."""
+        """Write samples over the oldest samples of the ring."""
         ring = self._rings.get(batch.device)
         if ring is not None:
             ring.write(batch.samples, batch.slots())
@@ -512,10 +518,10 @@ class ShmPublisher:
             self._places[batch.device].newest = batch.samples[-1].seq
 
     def event(self, event: Event) -> None:
-        """Nothing: shared memory carries samples only."""
+        """Do nothing: rings contain only samples."""
 
     def tick(self, now_ns: int) -> None:
-        """Make rings anew that were removed or cut; refresh ledgers and heartbeats."""
+        """Create missing or truncated rings again. Write ledgers and heartbeats."""
         directory = self._current_directory()
         for name, place in self._places.items():
             ring = self._rings.get(name)
@@ -524,7 +530,7 @@ class ShmPublisher:
         self._show(now_ns)
 
     def close(self) -> None:
-        """Show the final ledgers, then close every ring; may be called twice."""
+        """Write the final ledgers and close all rings. A second call does nothing."""
         self._context.latencies.release(ASKER)
         if self._rings:
             self._show(self._context.clock.now_ns())
@@ -548,7 +554,7 @@ class ShmPublisher:
         return self._directory
 
     def _current_directory(self) -> RingDirectory:
-        """The directory that is at its path now; where none is there that can be used, the one that was."""
+        """Return the directory that the path names now. If it cannot be used, return the previous one."""
         directory = self._opened_directory()
         if directory.current:
             return directory
@@ -564,7 +570,7 @@ class ShmPublisher:
         return self._directory
 
     def _make_anew(self, name: str, directory: RingDirectory, now_ns: int) -> None:
-        """Replace a ring that was removed or cut, or make the one that could not be made."""
+        """Replace a missing or truncated ring, or create the ring that could not be created before."""
         old = self._rings.get(name)
         if old is None or not old.is_named(directory):
             try:
@@ -573,12 +579,12 @@ class ShmPublisher:
                 self._put_off(name, error, now_ns)
                 return
         if self._make(name, directory, now_ns):
-            log.warning("shm: the ring of %s was missing or cut; it is made anew", name)
+            log.warning("shm: the ring file of %s was missing or truncated; created it again", name)
             if old is not None:
                 old.close()
 
     def _make(self, name: str, directory: RingDirectory, now_ns: int) -> bool:
-        """Make the device's ring, which goes on from the number where the one before ended."""
+        """Create the ring of a device. It continues with the sequence numbers of the previous ring."""
         context, settings, place, old = self._context, self._settings, self._places[name], self._rings.get(name)
         newest = place.newest if old is None else old.newest
         header = RingHeader(
@@ -593,7 +599,7 @@ class ShmPublisher:
         context.outputs.rings[name] = str(ring_path(directory.path, name))
         context.outputs.without_ring.discard(name)
         if self._group_id is not None and not ring.group_given:
-            self._warn_of_group(f"cannot be given files by user {os.geteuid()}, who is not in it")
+            self._warn_of_group(f"does not contain user {os.geteuid()}, so imud cannot give it files")
         return True
 
     def _put_off(self, name: str, error: ServerError, now_ns: int) -> None:
@@ -611,7 +617,7 @@ class ShmPublisher:
             return None
 
     def _warn_of_group(self, why: str) -> None:
-        """Log once why the group cannot read; the daemon starts all the same."""
+        """Log once why the group cannot read the ring."""
         self._group_id = None
         log.warning("shm: group %s %s; its members cannot read shared memory", self._settings.group, why)
 

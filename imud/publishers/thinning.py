@@ -1,7 +1,7 @@
-"""Thinning of samples to a rate: which of them are sent, and the mean of the angular rates of all between.
+"""Thinning of samples to a rate: selected samples, and the mean of the angular rates between them.
 
-samples ─▶ Pace.is_due ─▶ the one nearest to each due instant, never resampled; RateThinner: for several rates
-    └────▶ MeanRate ────▶ what vibration leaves of the angular rate over the same time
+samples ─▶ Pace.is_due ─▶ the sample nearest to each due time, never resampled; RateThinner: several rates
+   └────▶ MeanRate ────▶ mean angular rate over the same time
 """
 
 import math
@@ -12,20 +12,20 @@ from imud.model.sample import Sample, Vector3
 from imud.model.units import NS_PER_S
 
 PAUSE_PERIODS: Final = 4
-"""After so many periods without a sample how often samples come is learned anew; a lost one or two change nothing."""
+"""Number of periods without a sample after which the sample period is unknown. One or two lost samples have no
+effect."""
 
 
-NOTHING: Final[Mapping[float, tuple[int, ...]]] = {}
-"""What is chosen of most batches."""
+NOTHING: Final[Mapping[float, tuple[int, ...]]] = {}  # result of `choose` for most batches
 
 
 class Pace:
-    """Thins the samples of one device to `rate_hz`: the one nearest to each due instant, never resampled.
+    """Selection of samples at `rate_hz`: the sample nearest to each due time, never resampled.
 
-    Due instants are start + k / rate_hz in the time of the samples, k counted, so that rounding never adds up. Nearest,
-    because a device that sends just at the rate has its samples at due instants, some a little early: all are taken,
-    where the first one at or after each would be up to a quarter less. They are counted from a sample anew where that
-    is late by more than the step between samples: after a pause, and with a device slower than the rate.
+    The due times are start + k / rate_hz in the time of the samples. k is an integer counter, so rounding errors do not
+    accumulate. Taking the nearest sample keeps all samples of a device with exactly this rate, although some are early.
+    Taking the first sample after each due time would lose up to a quarter of them. The due times restart at a sample
+    that is late by more than one sample period: after a pause, or with a device slower than the rate.
     """
 
     __slots__ = ("_count", "_period_ns", "_start_ns", "due_ns")
@@ -34,13 +34,12 @@ class Pace:
         self._period_ns = NS_PER_S / rate_hz
         self._start_ns: int | None = None
         self._count = 0
-        self.due_ns = 0
-        """A sample measured before this instant is not one to send."""
+        self.due_ns = 0  # earliest time stamp of the next selected sample
 
     def is_due(self, t_ns: int, step_ns: int) -> bool:
-        """Whether the sample measured at `t_ns` is one to send; if so, the next due instant is a later one.
+        """Return whether the sample at `t_ns` is selected. If so, advance the due time.
 
-        `step_ns` is the time since the sample before it, sent or not; for the first sample 0.
+        `step_ns` is the time since the previous sample; 0 for the first sample.
         """
         if t_ns < self.due_ns:
             return False
@@ -48,18 +47,18 @@ class Pace:
         late_ns = 0 if start_ns is None else t_ns - start_ns - math.ceil(self._count * period_ns)
         half_ns = min(step_ns, period_ns) / 2
         if start_ns is None or step_ns > PAUSE_PERIODS * period_ns:
-            start_ns, half_ns, self._count = t_ns, 0.0, 0  # how often samples come is not known, or not any more
+            start_ns, half_ns, self._count = t_ns, 0.0, 0  # the sample period is unknown
         elif late_ns > 2 * half_ns:
             start_ns, self._count = t_ns - math.ceil(half_ns), 0
         self._start_ns = start_ns
         self._count += 1
         due_ns = start_ns + math.ceil(self._count * period_ns - half_ns)
-        self.due_ns = due_ns if due_ns > t_ns else t_ns + 1  # a period below one ns, or a sum that rounds down
+        self.due_ns = due_ns if due_ns > t_ns else t_ns + 1  # a period below one ns, or a sum that was rounded down
         return True
 
 
 class RateThinner:
-    """The paces of one device, one for each rate: all who want a rate get the same samples, which are made once."""
+    """Paces of one device, one per rate. All readers with the same rate receive the same samples."""
 
     __slots__ = ("_newest_ns", "_paces", "_users")
 
@@ -69,22 +68,22 @@ class RateThinner:
         self._newest_ns = 0
 
     def __bool__(self) -> bool:
-        """Whether any rate is wanted."""
+        """Return whether there is any rate."""
         return bool(self._paces)
 
     def add(self, rate_hz: float) -> None:
-        """Choose samples for this rate, too; it may be wanted several times."""
+        """Add a reader with this rate."""
         self._users[rate_hz] = self._users.get(rate_hz, 0) + 1
         self._paces.setdefault(rate_hz, Pace(rate_hz))
 
     def discard(self, rate_hz: float) -> None:
-        """Take back one `add`; the rate is forgotten with the last."""
+        """Remove a reader with this rate. The last reader removes the rate."""
         self._users[rate_hz] -= 1
         if not self._users[rate_hz]:
             del self._users[rate_hz], self._paces[rate_hz]
 
     def choose(self, samples: Sequence[Sample]) -> Mapping[float, tuple[int, ...]]:
-        """Return which samples are to be sent, their indices by rate; to be called with each sample, once."""
+        """Return the indices of the selected samples by rate. Call it once with each sample."""
         paces = self._paces
         if not paces:
             return NOTHING
@@ -105,7 +104,7 @@ class RateThinner:
 
 
 class MeanRate:
-    """Mean of the angular rates of the samples since it was taken last, sensor or body axes as published."""
+    """Mean angular rate of the samples since the last `take`, in the published axes."""
 
     __slots__ = ("_count", "_x", "_y", "_z")
 
@@ -114,7 +113,7 @@ class MeanRate:
         self._count = 0
 
     def add(self, samples: Sequence[Sample]) -> None:
-        """Add samples; those without angular rates are left out."""
+        """Add samples. Ignore samples without angular rates."""
         for sample in samples:
             gyro = sample.gyro_rad_s
             if gyro is not None:
@@ -124,7 +123,7 @@ class MeanRate:
                 self._count += 1
 
     def take(self) -> Vector3 | None:
-        """Return the mean and begin anew; None without samples."""
+        """Return the mean and start again; None without samples."""
         count = self._count
         if not count:
             return None

@@ -235,9 +235,9 @@ def test_an_edge_saves_a_snapshot_and_a_full_disk_stops_recording_only(
         saved = told(events, "saved ")
         gpio_chip.drive("PPS", False)
         fill(disk / "filler")
-        full = told(events, "nothing is recorded")
+        full = told(events, "cannot record to")
         gpio_chip.drive("PPS", True)
-        not_saved = told(events, "a snapshot was not saved")
+        not_saved = told(events, "cannot save the snapshot")
         end_ns = monotonic_ns()
         while live[-1].t_ns < end_ns:
             live.append(next(watch))

@@ -237,11 +237,11 @@ async def test_the_only_device_is_sent_and_of_several_the_named_one(caplog: pyte
         ({"udp": ["192.168.1.255:0"]}, "expected IP address and port such as"),
         ({"udp": ["fe80::1:10110"]}, "expected IP address and port such as"),
         ({"tcp_address": "boat"}, "expected an IP address"),
-        ({"sentences": {}}, "expected one at least"),
+        ({"sentences": {}}, "expected at least one sentence"),
         ({"sentences": {"GGA": 1}}, "keys HDG, HDM, HDT, PASHR, ROT, XDR"),
         ({"sentences": {"HDT": 0}}, "a number from 0.01 to 100"),
         ({"talker": "ii"}, "two capital letters"),
-        ({"serial_port": "/dev/ttyS0", "serial_baud": 4800}, "480 bytes a second, got 844"),
+        ({"serial_port": "/dev/ttyS0", "serial_baud": 4800}, "480 bytes per second at 4800 bit/s, got 844"),
     ],
 )
 def test_settings_that_are_refused(given: dict[str, object], words: str) -> None:

@@ -49,12 +49,12 @@ def test_row_and_defaults() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"slots": 1000}, "power of two, found 1000; near it are 512 and 1024"),
+        ({"slots": 1000}, "power of two, got 1000; try 512 or 1024"),
         ({"slots": 32}, ">= 64"),
         ({"slots": 1 << 21}, "<= 1048576"),
         ({"mode": 640}, "<= 511"),
-        ({"mode": 0o660}, "mode: expected none that lets group or others write the rings, found 0o660"),
-        ({"mode": 0o602}, "found 0o602"),
+        ({"mode": 0o660}, "mode: expected no write permission for group and others, got 0o660"),
+        ({"mode": 0o602}, "got 0o602"),
         ({"directory": "shm"}, "absolute path"),
         ({"slotz": 64}, "slotz"),
     ],
@@ -308,7 +308,7 @@ def other_daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
 
 def test_second_daemon_is_refused(tmp_path: Path) -> None:
     with other_daemon(tmp_path) as other:
-        with pytest.raises(ServerError, match=f"another imud, process {other.pid}: stop that one first"):
+        with pytest.raises(ServerError, match=f"another imud writes this ring, process {other.pid}: stop it first"):
             Board(tmp_path, now_ns=START_NS + 60_000_000_000)  # whatever its heartbeat
         other.kill()
         other.wait()
@@ -327,8 +327,8 @@ def test_ring_that_another_daemon_has_taken_over_is_left_to_it(
         assert board.path.stat().st_ino == inode
         board.publish([1])
         assert [r.getMessage() for r in caplog.records if r.levelno == logging.ERROR] == [
-            f"shm: no ring for {DEVICE}: {board.path} is written by another imud, process {other.pid}:"
-            " stop that one first; trying again every second"
+            f"shm: no ring for {DEVICE}: {board.path}: another imud writes this ring, process {other.pid}:"
+            " stop it first; trying again every second"
         ]
         other.kill()
         other.wait()
@@ -394,7 +394,7 @@ def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: py
     assert len(os.listdir("/proc/self/fd")) == descriptors + 1  # of the directory
     assert (board.context.outputs.rings, board.context.outputs.without_ring) == ({}, {DEVICE})
     [record] = (record for record in caplog.records if record.levelno == logging.ERROR)
-    assert re.search(r"imud.imu0 cannot be made, 20480 bytes: No space left .* fewer `slots`", record.getMessage())
+    assert re.search(r"imud.imu0 with 20480 bytes: No space left .* reduce shm.slots", record.getMessage())
     assert not list(tmp_path.iterdir())
     board.tick(1_000_000_000)
     with Ring(board.path, now_ns=lambda: board.now_ns) as reader:
@@ -414,14 +414,14 @@ def test_directory_that_is_not_there_or_not_writable(tmp_path: Path, monkeypatch
     with pytest.raises(ServerError, match="expected a directory for shared memory"):
         make(tmp_path / "none").start()
     monkeypatch.setattr(os, "access", lambda *_, **__: False)
-    with pytest.raises(ServerError, match="may not make files there"):
+    with pytest.raises(ServerError, match="cannot create files in"):
         make(tmp_path).start()
 
 
 def test_file_that_cannot_be_made(caplog: pytest.LogCaptureFixture) -> None:
     publisher = make(Path("/proc"))
     publisher.add_device(DEVICE, 0)
-    assert "may imud write to /proc" in caplog.text
+    assert "check the permissions of /proc" in caplog.text
     publisher.publish(Batch(DEVICE, 0, [make_sample(1)]))
     publisher.close()
 
@@ -437,7 +437,7 @@ def test_group_that_does_not_exist_or_cannot_be_given(
     group, why = "no-such-group", "does not exist;"
     if exists:
         group = next(one.gr_name for one in grp.getgrall() if one.gr_gid != os.getegid())
-        why = f"cannot be given files by user {os.geteuid()}, who is not in it;"
+        why = f"does not contain user {os.geteuid()}, so imud cannot give it files;"
         monkeypatch.setattr(os, "fchown", refuse_group)
     publisher = make(tmp_path, group=group)
     with caplog.at_level(logging.WARNING):

@@ -163,10 +163,10 @@ def test_daemon_starts_reloads_and_stops(tmp_path: Path, shared: Path, kind: str
 @pytest.mark.parametrize(
     ("uid", "mode", "message"),
     [
-        (HOSTILE_UID, 0o755, f"belongs to user {HOSTILE_UID}, who may replace the rings"),
-        (HOSTILE_UID, 0o1777, f"belongs to user {HOSTILE_UID}, who may replace the rings"),
-        (0, 0o777, "has mode 0777: others may replace the rings in it; chmod go-w"),
-        (0, 0o775, "has mode 0775: others may replace"),
+        (HOSTILE_UID, 0o755, f"belongs to user {HOSTILE_UID}, who can replace the rings"),
+        (HOSTILE_UID, 0o1777, f"belongs to user {HOSTILE_UID}, who can replace the rings"),
+        (0, 0o777, "has mode 0777: other users can replace the rings; chmod go-w"),
+        (0, 0o775, "has mode 0775: other users can replace"),
     ],
 )
 def test_directory_that_others_rule(shared: Path, uid: int, mode: int, message: str) -> None:
@@ -205,7 +205,7 @@ def test_directory_of_the_user_where_the_system_has_none(
     assert stat.S_IMODE(Path(found.path).stat().st_mode) == 0o755
     assert caplog.messages == [
         f"shm: {system}: expected a directory for shared memory (No such file or directory); "
-        f"make it, or set shm.directory; rings are in {found.path}"
+        f"create it, or set shm.directory; using {found.path}"
     ]
     found.close()
     with pytest.raises(ServerError, match="expected a directory"):
@@ -249,7 +249,7 @@ def test_removed_ring_is_made_anew(board: Board, caplog: pytest.LogCaptureFixtur
         assert ring.read() == ([make_sample(4)], 0)  # the old one to its end
         assert ring.read() == ([make_sample(5), make_sample(6)], 0)
         assert (ring.epoch, ring.missed) == (77, 0)
-    assert f"the ring of {DEVICE} was missing or cut; it is made anew" in caplog.text
+    assert f"the ring file of {DEVICE} was missing or truncated; created it again" in caplog.text
     assert board.word("first_seq") == 5
 
 

@@ -1,8 +1,10 @@
-"""Table: all metrics of imud except the process's own, in the order they are shown. `docs/metrics.md` lists them.
+"""Table of all metrics of imud except the metrics of the process, in the order of the output.
 
-Base units, `_total` for counters, labels of bounded sets only. Counters of one scrape come from one moment of the
-event loop, so sums over them are exact: the ledger closes in every scrape. Values of clients are summed over all:
-a label per client would make a new time series for every connection.
+`docs/metrics.md` lists them.
+
+Names use base units, and `_total` for counters. Labels have a bounded set of values. All counters of a scrape are from
+the same turn of the event loop, so the ledger balances in each scrape. imud adds the values of all clients, because a
+label per client would create a new time series for each connection.
 """
 
 import platform
@@ -65,11 +67,11 @@ def _info(name: str, help_: str, reader: Reader) -> Family:
     return Family(name, MetricType.INFO, NO_UNIT, help_, reader)
 
 
-# --- how values are read ----------------------------------------------------------------------------------------------
+# --- readers of values ------------------------------------------------------------------------------------------------
 
 
 def _edged(device: DeviceStatus) -> ClockStatus | None:
-    """The clock of a device with lines."""
+    """Return the clock of a device with GPIO lines."""
     return device.clock if device.lines is not None else None
 
 
@@ -78,7 +80,7 @@ def _with_alarm(device: DeviceStatus) -> LinesStatus | None:
 
 
 def _with_sin(device: DeviceStatus) -> LinesStatus | None:
-    """The lines of a device whose SIN imud drives."""
+    """Return the lines of a device with a SIN line."""
     return device.lines if device.lines is not None and device.lines.sin else None
 
 
@@ -87,18 +89,18 @@ def _triggered(device: DeviceStatus) -> ClockStatus | None:
 
 
 def _fed(device: DeviceStatus) -> UtcStatus | None:
-    """UTC of a device that sentences are sent to."""
+    """Return the UTC state of a device that receives sentences."""
     return device.utc if device.utc is not None and device.utc.source else None
 
 
 def _declared(device: DeviceStatus) -> SettingsStatus | None:
-    """Settings of a device for which some are declared."""
+    """Return the settings of a device with declared settings."""
     found = device.declared
     return found if found is not None and found.state is not SettingsState.UNDECLARED else None
 
 
 def _compared(device: DeviceStatus) -> SettingsStatus | None:
-    """The same once the device has reported them."""
+    """Return the settings of a device with declared settings after the device reported its settings."""
     found = _declared(device)
     return found if found is not None and found.state is not SettingsState.UNKNOWN else None
 
@@ -131,12 +133,12 @@ def _ledger(field: str) -> Reader:
 
 
 def _ledger_by(label: str, **fields: str) -> Reader:
-    """Fields of the ledger by the label's value: `crc="lost_crc"`."""
+    """Return a reader of ledger fields, one per label value: `crc="lost_crc"`."""
     return LEDGER.by(label, lambda ledger: {value: ledger[field] for value, field in fields.items()})
 
 
 def _vector(label: str, names: tuple[str, ...], read: Callable[[MotionValues], Vector3 | None]) -> Reader:
-    """Three values of the motion by the label's value; absent where there are none."""
+    """Return a reader of the three components of a vector."""
     return MOTION.by(label, lambda motion: dict(zip(names, read(motion) or (), strict=False)))
 
 
@@ -156,87 +158,90 @@ def _clients_by_encoding(snapshot: Snapshot) -> Lines:
     return (((encoding,), encodings[encoding]) for encoding in CLIENT_ENCODINGS)
 
 
-# --- the daemon and its devices ---------------------------------------------------------------------------------------
+# --- daemon and device identity ---------------------------------------------------------------------------------------
 
 DAEMON_FAMILIES: Final = (
     _info(
-        "imud_build_info", "What runs here; always 1.",
+        "imud_build_info", "Version of imud and Python; always 1.",
         Reader(("version", "python"), lambda _snapshot: (((imud.__version__, platform.python_version()), 1),)),
     ),
     _gauge(
         "imud_heartbeat_age_seconds",
-        "Time since the daemon's ten-times-a-second tick; grows when the event loop is stuck.",
+        "Time since the last tick of the event loop, which ticks ten times per second.",
         daemon(lambda snapshot: snapshot.heartbeat_age_ns), SECONDS,
     ),
     _counter(
-        "imud_log_messages_dropped_total", "Messages missing in the log because it was not read in time.",
+        "imud_log_messages_dropped_total", "Log messages that imud dropped because the log was not read in time.",
         daemon(lambda snapshot: snapshot.log_messages_dropped),
     ),
-    _info("imud_device_info", "What the device is; always 1.", Reader(DEVICE_INFO_LABELS, _device_info)),
+    _info("imud_device_info", "Identity of the device; always 1.", Reader(DEVICE_INFO_LABELS, _device_info)),
 )  # fmt: skip
 
-# --- every device -----------------------------------------------------------------------------------------------------
+# --- each device ------------------------------------------------------------------------------------------------------
 
 DEVICE_FAMILIES: Final = (
-    _gauge("imud_device_up", "1 while samples flow, else 0.", DEVICE.one(lambda d: d.state is DeviceState.RUNNING)),
     _gauge(
-        "imud_device_state", "1 for the state the device is in, 0 for the others.",
+        "imud_device_up", "1 if the device sends samples, otherwise 0.",
+        DEVICE.one(lambda d: d.state is DeviceState.RUNNING),
+    ),
+    _gauge(
+        "imud_device_state", "1 for the present device state, 0 for the others.",
         DEVICE.by("state", lambda d: {state.value: d.state is state for state in DeviceState}),
     ),
-    _counter("imud_device_connects_total", "Times the link was opened.", DEVICE.one(lambda d: d.connects)),
-    _counter("imud_bytes_in_total", "Bytes that the link delivered.", _ledger("bytes_in")),
+    _counter("imud_device_connects_total", "Number of connections to the link.", DEVICE.one(lambda d: d.connects)),
+    _counter("imud_bytes_in_total", "Bytes received from the link.", _ledger("bytes_in")),
     _counter(
-        "imud_bytes_total", "Bytes by what became of them.",
+        "imud_bytes_total", "Received bytes by use.",
         _ledger_by("fate", good_frames="bytes_in_good_frames", bad_frames="bytes_in_bad_frames",
                    skipped="bytes_skipped"), BYTES,
     ),
-    _gauge("imud_bytes_pending", "Bytes that may still become a frame.", _ledger("bytes_pending")),
-    _counter("imud_frames_good_total", "Frames whose check value was right.", _ledger("frames_good")),
+    _gauge("imud_bytes_pending", "Received bytes of an incomplete frame.", _ledger("bytes_pending")),
+    _counter("imud_frames_good_total", "Frames with a correct checksum.", _ledger("frames_good")),
     _counter(
-        "imud_frames_total", "Good frames by what became of them.",
+        "imud_frames_total", "Good frames by use.",
         _ledger_by("fate", samples="frames_in_samples", replies="frames_in_replies", ignored="frames_ignored"),
     ),
-    _gauge("imud_frames_pending", "Good frames that wait for the rest of their sample.", _ledger("frames_pending")),
+    _gauge("imud_frames_pending", "Good frames of an incomplete sample.", _ledger("frames_pending")),
     _counter(
-        "imud_frames_bad_total", "Damaged frames by reason; not_finite ones are used without those values.",
+        "imud_frames_bad_total", "Damaged frames by reason; imud uses a not_finite frame without its invalid values.",
         _ledger_by("reason", crc="frames_bad_crc", length="frames_bad_length", content="frames_bad_content",
                    not_finite="frames_not_finite"),
     ),
     _counter("imud_unknown_tags_total", "Sub-packets of good frames with an unknown tag.", _ledger("unknown_tags")),
     _gauge(
-        "imud_ledger_unaccounted_bytes", "Bytes delivered less bytes accounted for; 0 unless imud has a bug.",
+        "imud_ledger_unaccounted_bytes", "Received bytes minus the bytes in the ledger; 0 unless imud has a bug.",
         LEDGER.one(bytes_open), BYTES,
     ),
     _gauge(
-        "imud_ledger_unaccounted_frames", "Good frames less frames accounted for; 0 unless imud has a bug.",
+        "imud_ledger_unaccounted_frames", "Good frames minus the frames in the ledger; 0 unless imud has a bug.",
         LEDGER.one(frames_open),
     ),
-    _counter("imud_samples_total", "Samples made.", _ledger("samples")),
+    _counter("imud_samples_total", "Samples made of the frames.", _ledger("samples")),
     _counter(
-        "imud_samples_lost_total", "Samples lost by cause.",
+        "imud_samples_lost_total", "Lost samples by cause.",
         _ledger_by("cause", gap_device="lost_gap_device", crc="lost_crc", overrun="lost_overrun", queue="lost_queue"),
     ),
     _counter(
-        "imud_gaps_unknown_total", "Gaps between samples whose size is not known within one sample.",
+        "imud_gaps_unknown_total", "Gaps with an unknown number of lost samples.",
         _ledger("lost_unknown"),
     ),
     _counter(
-        "imud_replies_stray_total", "Lines of text from the device that answered no request in time.",
+        "imud_replies_stray_total", "Text lines from the device that were not a reply to a request in time.",
         _ledger_by("kind", late="replies_late", unsolicited="replies_unsolicited"),
     ),
     _gauge(
         "imud_sample_rate_hertz", "Samples per second over the last seconds.", DEVICE.one(lambda d: d.rate_hz), HERTZ
     ),
     _gauge(
-        "imud_sample_rate_expected_hertz", "Rate by the device's own time stamps; absent while unknown.",
+        "imud_sample_rate_expected_hertz", "Sample rate according to the device time; absent if unknown.",
         DEVICE.one(lambda d: d.expected_rate_hz or None), HERTZ,
     ),
     _gauge(
-        "imud_sample_hold_seconds", "How long data waits at present to be processed together; 0: it does not wait.",
+        "imud_sample_hold_seconds", "Present hold of samples before imud processes them as a batch; 0: no hold.",
         DEVICE.one(lambda device: device.hold_ns), SECONDS,
     ),
     _gauge(
-        "imud_sample_hold_wanted_seconds", "How long the strictest consumer of the samples would let them wait.",
+        "imud_sample_hold_wanted_seconds", "Lowest latency that a reader of the samples requested.",
         DEVICE.one(lambda device: device.hold_wanted_ns), SECONDS,
     ),
     _gauge(
@@ -248,32 +253,33 @@ DEVICE_FAMILIES: Final = (
         CLOCK.one(lambda clock: clock.offset_ns), SECONDS,
     ),
     _gauge(
-        "imud_clock_skew_ratio", "How much faster than the unsteered host the device's clock runs; 4e-05: 40 ppm.",
+        "imud_clock_skew_ratio",
+        "Frequency error of the device clock relative to the unsteered host clock; 4e-05: 40 ppm fast.",
         CLOCK.one(lambda clock: clock.skew_ppm), RATIO,
     ),
     _gauge(
-        "imud_clock_steering_ratio", "How much faster than unsteered CLOCK_MONOTONIC runs; 0.0005: a slew of 500 ppm.",
+        "imud_clock_steering_ratio", "Frequency change of CLOCK_MONOTONIC by steering; 0.0005: a slew of 500 ppm.",
         CLOCK.one(lambda clock: clock.steering_ppm), RATIO,
     ),
     _gauge(
-        "imud_clock_residual_seconds", "One-sigma spread of arrival times around the fitted clock.",
+        "imud_clock_residual_seconds", "One-sigma spread of the arrival times around the fit.",
         CLOCK.one(lambda clock: clock.residual_ns), SECONDS,
     ),
     _gauge(
         "imud_clock_error_seconds", "One-sigma error of the newest time stamp.",
         CLOCK.one(lambda clock: clock.t_err_ns), SECONDS,
     ),
-    _counter("imud_clock_resets_total", "Times the device's clock started anew.", CLOCK.one(lambda c: c.resets)),
+    _counter("imud_clock_resets_total", "Number of restarts of the device counter.", CLOCK.one(lambda c: c.resets)),
     _gauge(
-        "imud_temperature_celsius", "Temperature that the device sends.", DEVICE.one(lambda d: d.temperature_c), CELSIUS
+        "imud_temperature_celsius", "Temperature from the device.", DEVICE.one(lambda d: d.temperature_c), CELSIUS
     ),
     _gauge(
-        "imud_frame_problem", "1 while gravity or heading contradicts the attitude or the configuration, else 0.",
+        "imud_frame_problem", "1 if gravity or heading contradicts the attitude or the configuration, otherwise 0.",
         FRAME.one(lambda frame: bool(frame.problem)),
     ),
     _gauge("imud_status_bits", "Status word of the newest sample.", DEVICE.one(lambda d: d.status_bits)),
     _counter(
-        "imud_kernel_errors_total", "Errors of the port that the kernel counted since the link was opened.",
+        "imud_kernel_errors_total", "Port errors that the kernel counted since imud opened the link.",
         KERNEL.by("kind", lambda kernel: {
             "overrun": kernel.overrun, "framing": kernel.framing, "parity": kernel.parity, "break": kernel.break_,
             "error_passive": kernel.error_passive, "bus_off": kernel.bus_off,
@@ -281,156 +287,157 @@ DEVICE_FAMILIES: Final = (
     ),
 )  # fmt: skip
 
-# --- metrics of some devices ------------------------------------------------------------------------------------------
+# --- some devices -----------------------------------------------------------------------------------------------------
 
 POLLING_FAMILIES: Final = (
-    _counter("imud_polls_total", "Deadlines at which the device was read.", POLLING.one(lambda p: p.polls)),
+    _counter("imud_polls_total", "Deadlines with a read of the device.", POLLING.one(lambda p: p.polls)),
     _counter(
-        "imud_polls_late_total", "Of these, begun more than a quarter of the period after the deadline.",
+        "imud_polls_late_total", "Reads that started more than a quarter of the period after the deadline.",
         POLLING.one(lambda p: p.late),
     ),
-    _counter("imud_polls_missed_total", "Deadlines that passed without a read.", POLLING.one(lambda p: p.missed)),
-    _counter("imud_polls_stale_total", "Reads that gave nothing new.", POLLING.one(lambda p: p.stale)),
+    _counter("imud_polls_missed_total", "Deadlines without a read.", POLLING.one(lambda p: p.missed)),
+    _counter("imud_polls_stale_total", "Reads without a new measurement.", POLLING.one(lambda p: p.stale)),
     _counter(
-        "imud_poll_delay_seconds_total", "Time from deadline to read, summed over all polls.",
+        "imud_poll_delay_seconds_total", "Sum of the times from deadline to read.",
         POLLING.one(lambda p: p.late_sum_ns), SECONDS,
     ),
     _gauge(
-        "imud_poll_delay_worst_seconds", "Longest time from deadline to read since start.",
+        "imud_poll_delay_worst_seconds", "Longest time from deadline to read since the start.",
         POLLING.one(lambda p: p.late_worst_ns), SECONDS,
     ),
-    _counter("imud_transfers_failed_total", "Transfers of polls that failed.", POLLING.one(lambda p: p.failed)),
+    _counter("imud_transfers_failed_total", "Failed transfers of polls.", POLLING.one(lambda p: p.failed)),
     _counter(
-        "imud_device_vanished_total", "Times a polled device had to be identified again.",
+        "imud_device_vanished_total", "Number of times that imud identified a polled device again.",
         POLLING.one(lambda p: p.vanished),
     ),
     _counter(
-        "imud_serial_line_timeouts_total", "Requests on the device's line that got no reply.",
+        "imud_serial_line_timeouts_total", "Requests on the RS-485 bus of the device without a reply.",
         SERIAL_LINE.one(lambda line: line.timeouts),
     ),
     _counter(
-        "imud_serial_line_late_bytes_total", "Bytes on the device's line that came when nothing was asked.",
+        "imud_serial_line_late_bytes_total", "Bytes on the RS-485 bus of the device without a request.",
         SERIAL_LINE.one(lambda line: line.late_bytes), BYTES,
     ),
     _counter(
-        "imud_serial_line_strange_bytes_total", "Bytes on the device's line before a reply, or instead of it.",
+        "imud_serial_line_strange_bytes_total",
+        "Bytes on the RS-485 bus of the device before a reply or in place of a reply.",
         SERIAL_LINE.one(lambda line: line.strange_bytes), BYTES,
     ),
     _counter(
-        "imud_serial_line_echoes_total", "Requests on the device's line that came back as an echo.",
+        "imud_serial_line_echoes_total", "Requests on the RS-485 bus of the device that imud received as an echo.",
         SERIAL_LINE.one(lambda line: line.echoes),
     ),
 )  # fmt: skip
 
 TIME_FAMILIES: Final = (
     _gauge(
-        "imud_clock_hold_seconds", "How long the link's adapter may hold bytes back; 0 for none.",
+        "imud_clock_hold_seconds", "Maximum delay of received bytes by the latency timer of the adapter; 0: no delay.",
         CLOCK.one(lambda clock: clock.hold_ns), SECONDS,
     ),
     _counter(
-        "imud_clock_edges_total", "Pulses on SOUT, or triggers given on SIN, that reached the clock.",
+        "imud_clock_edges_total", "Edges on SOUT or triggers on SIN that the clock used.",
         EDGES.one(lambda clock: clock.edges),
     ),
     _counter(
-        "imud_clock_edges_unpaired_total", "Pulses on SOUT that belong to no sample.",
+        "imud_clock_edges_unpaired_total", "Edges on SOUT without a sample.",
         EDGES.one(lambda clock: clock.edges_unpaired),
     ),
     _counter(
         "imud_clock_samples_unpaired_total",
-        "Samples whose own pulse or trigger was not seen, though others were.",
+        "Samples without an edge or trigger, although other samples have one.",
         EDGES.one(lambda clock: clock.samples_unpaired),
     ),
     _counter(
-        "imud_triggers_unanswered_total", "Triggers on SIN that no sample answered.",
+        "imud_triggers_unanswered_total", "Triggers on SIN without a sample.",
         TRIGGERS.one(lambda clock: clock.triggers_missed),
     ),
     _gauge(
-        "imud_clock_reference_error_seconds", "One-sigma error of what the host knows of UTC; absent while nothing.",
+        "imud_clock_reference_error_seconds", "One-sigma error of UTC on the host; absent if UTC is unknown.",
         CLOCK.one(lambda clock: clock.reference_error_ns or None), SECONDS,
     ),
     _gauge(
-        "imud_utc_problem", "1 while something is wrong with the source of UTC or the feed of chronyd.",
+        "imud_utc_problem", "1 if the source of UTC or the feed of chronyd has a problem, otherwise 0.",
         UTC.one(lambda utc: bool(utc.problem)),
     ),
     _counter(
-        "imud_utc_sentences_total", "RMC sentences that the source gave.", SENTENCES.one(lambda utc: utc.sentences)
+        "imud_utc_sentences_total", "RMC sentences received from the source.", SENTENCES.one(lambda utc: utc.sentences)
     ),
     _counter(
-        "imud_utc_sentences_sent_total", "Of these, sent to the device.", SENTENCES.one(lambda utc: utc.sent)
+        "imud_utc_sentences_sent_total", "RMC sentences sent to the device.", SENTENCES.one(lambda utc: utc.sent)
     ),
     _counter(
-        "imud_utc_sentences_refused_total", "Of these, not sent, by cause.",
+        "imud_utc_sentences_refused_total", "RMC sentences that imud did not send, by cause.",
         SENTENCES.by("cause", lambda utc: utc.refused),
     ),
-    _counter("imud_pps_pulses_total", "Pulses per second that counted.", UTC.one(lambda utc: utc.pulses)),
+    _counter("imud_pps_pulses_total", "PPS pulses that imud used.", UTC.one(lambda utc: utc.pulses)),
     _counter(
-        "imud_pps_pulses_ignored_total", "Pulses that were in step with none.",
+        "imud_pps_pulses_ignored_total", "PPS pulses at an unexpected time, which imud ignored.",
         UTC.one(lambda utc: utc.pulses_ignored),
     ),
     _counter(
-        "imud_chrony_samples_total", "Samples for chronyd: sent to it, or refused by it.",
+        "imud_chrony_samples_total", "Samples for chronyd: sent, or refused by chronyd.",
         UTC.by("fate", lambda utc: {"sent": utc.chrony_sent, "refused": utc.chrony_refused}),
     ),
 )  # fmt: skip
 
 LINE_FAMILIES: Final = (
     _gauge(
-        "imud_line_problem", "1 while a line cannot be used, or its level cannot be right.",
+        "imud_line_problem", "1 if imud cannot use a line or if its level is implausible, otherwise 0.",
         LINES.by("line", _line_problems),
     ),
-    _counter("imud_line_edges_total", "Edges seen on a line.", LINES.by("line", lambda lines: lines.edges)),
+    _counter("imud_line_edges_total", "Edges on a line.", LINES.by("line", lambda lines: lines.edges)),
     _counter(
-        "imud_line_edges_lost_total", "Edges that the kernel dropped because they were not read in time.",
+        "imud_line_edges_lost_total", "Edges that the kernel dropped because imud did not read them in time.",
         LINES.by("line", lambda lines: lines.edges_lost),
     ),
     _gauge(
-        "imud_alarm_active", "1 while the ALARM line is active; absent while its level is not known.",
+        "imud_alarm_active", "1 if the ALARM line is active, otherwise 0; absent if its level is unknown.",
         LINES.one(lambda lines: lines.alarm),
     ),
-    _counter("imud_alarms_total", "Times the ALARM line became active.", ALARM.one(lambda lines: lines.alarms)),
-    _counter("imud_triggers_total", "Triggers made on SIN.", SIN.one(lambda lines: lines.triggers)),
+    _counter("imud_alarms_total", "Activations of the ALARM line.", ALARM.one(lambda lines: lines.alarms)),
+    _counter("imud_triggers_total", "Triggers on SIN.", SIN.one(lambda lines: lines.triggers)),
     _counter(
-        "imud_triggers_missed_total", "Deadlines for which no trigger was made, the host being busy.",
+        "imud_triggers_missed_total", "Deadlines without a trigger because the host was busy.",
         SIN.one(lambda lines: lines.triggers_missed),
     ),
     _counter(
-        "imud_trigger_delay_seconds_total", "Time from deadline to trigger, summed over all.",
+        "imud_trigger_delay_seconds_total", "Sum of the times from deadline to trigger.",
         SIN.one(lambda lines: lines.trigger_late_sum_ns), SECONDS,
     ),
     _gauge(
-        "imud_trigger_delay_worst_seconds", "Longest time from deadline to trigger since start.",
+        "imud_trigger_delay_worst_seconds", "Longest time from deadline to trigger since the start.",
         SIN.one(lambda lines: lines.trigger_late_worst_ns), SECONDS,
     ),
 )  # fmt: skip
 
 SETTINGS_FAMILIES: Final = (
     _gauge(
-        "imud_settings_differ", "Settings of the device that are not as declared; absent while that is not known.",
+        "imud_settings_differ", "Number of device settings that differ from the declared settings; absent if unknown.",
         COMPARED.one(lambda settings: len(settings.differences)),
     ),
     _gauge(
-        "imud_settings_problem", "1 while declared settings cannot be read, set or saved.",
+        "imud_settings_problem", "1 if imud cannot read, apply or save the declared settings, otherwise 0.",
         DECLARED.one(lambda settings: bool(settings.problem)),
     ),
     _counter(
-        "imud_settings_repairs_total", "Times that imud has set the device by itself.",
+        "imud_settings_repairs_total", "Number of times that imud applied the declared settings without a request.",
         DECLARED.one(lambda settings: settings.repairs),
     ),
     _counter(
-        "imud_settings_flash_writes_total", "Writes to the flash of this module by imud, earlier runs included.",
+        "imud_settings_flash_writes_total", "Writes to the flash of the device by imud, including earlier runs.",
         SETTINGS.one(lambda settings: settings.flash_writes),
     ),
     _gauge(
-        "imud_settings_flash_writes_day", "Of these, those of the last 24 hours, which are limited.",
+        "imud_settings_flash_writes_day", "Writes to the flash in the last 24 hours, which imud limits.",
         SETTINGS.one(lambda settings: settings.flash_writes_day),
     ),
 )  # fmt: skip
 
-# --- from shared memory -----------------------------------------------------------------------------------------------
+# --- shared memory ----------------------------------------------------------------------------------------------------
 
 RING_FAMILIES: Final = (
     _gauge(
-        "imud_ring_written", "1 while the device's ring in shared memory is there and written, else 0.",
+        "imud_ring_written", "1 if imud writes the ring of the device in shared memory, otherwise 0.",
         RING.one(lambda ring: ring.written),
     ),
     _gauge(
@@ -438,21 +445,21 @@ RING_FAMILIES: Final = (
         _vector("angle", ANGLES, lambda motion: motion.attitude_rad), RADIANS,
     ),
     _gauge(
-        "imud_acceleration_norm_meters_per_second_squared", "Length of the mean acceleration of the last second.",
+        "imud_acceleration_norm_meters_per_second_squared", "Norm of the mean acceleration of the last second.",
         MOTION.one(lambda motion: motion.accel_norm_m_s2), ACCELERATION,
     ),
     _gauge(
         "imud_vibration_rms_meters_per_second_squared",
-        "RMS of the acceleration's deviation from its mean of each second.",
+        "RMS of the deviation of the acceleration from its mean of each second.",
         _vector("axis", AXES, lambda motion: motion.vibration_rms_m_s2), ACCELERATION,
     ),
     _gauge(
         "imud_vibration_peak_meters_per_second_squared",
-        "Largest deviation of the acceleration from its mean of each second.",
+        "Maximum deviation of the acceleration from its mean of each second.",
         _vector("axis", AXES, lambda motion: motion.vibration_peak_m_s2), ACCELERATION,
     ),
     _gauge(
-        "imud_motion_span_seconds", "Time from the oldest to the newest sample that vibration was computed over.",
+        "imud_motion_span_seconds", "Time from the oldest to the newest sample of the vibration values.",
         MOTION.one(lambda motion: motion.span_ns), SECONDS,
     ),
 )  # fmt: skip
@@ -468,32 +475,32 @@ LATENCY: Final = Histogram(
 
 CLIENT_FAMILIES: Final = (
     _gauge(
-        "imud_clients", "Clients by the encoding they watch in; none for those that do not watch.",
+        "imud_clients", "Clients by the encoding of their subscription; none: no subscription.",
         Reader(("encoding",), _clients_by_encoding),
     ),
     _gauge(
-        "imud_client_queue_samples", "Samples that wait for clients to read them, all clients together.",
+        "imud_client_queue_samples", "Samples in the queues of all clients.",
         daemon(lambda snapshot: sum(client.queue_samples for client in snapshot.clients)),
     ),
     _gauge(
-        "imud_client_queue_samples_max", "Samples that wait for the slowest client.",
+        "imud_client_queue_samples_max", "Samples in the longest queue of a client.",
         daemon(lambda snapshot: max((client.queue_samples for client in snapshot.clients), default=0)),
     ),
     _gauge(
-        "imud_client_queue_bytes", "Bytes that wait for clients to read them, all clients together.",
+        "imud_client_queue_bytes", "Bytes in the queues of all clients.",
         daemon(lambda snapshot: sum(client.queue_bytes for client in snapshot.clients)), BYTES,
     ),
     _counter(
-        "imud_client_samples_sent_total", "Samples given to clients, as seen at scrapes.",
+        "imud_client_samples_sent_total", "Samples sent to clients, updated at each scrape.",
         daemon(lambda snapshot: snapshot.client_samples_sent),
     ),
     _counter(
         "imud_client_samples_dropped_total",
-        "Samples dropped for clients that did not read fast enough, as seen at scrapes.",
+        "Samples dropped for slow clients, updated at each scrape.",
         daemon(lambda snapshot: snapshot.client_samples_dropped),
     ),
     _counter(
-        "imud_events_total", "Events by kind; device is empty for the daemon's own.",
+        "imud_events_total", "Events by kind; device is empty for events of the daemon.",
         Reader(("device", "kind"), lambda snapshot: snapshot.events),
     ),
 )  # fmt: skip
@@ -509,11 +516,10 @@ FAMILIES: Final[tuple[Family | Histogram, ...]] = (
     LATENCY,
     *CLIENT_FAMILIES,
 )
-"""Every metric, in the order they are shown."""
+"""All metrics in the order of the output."""
 
 
 def _mqtt(read: Callable[[MqttStatus], float]) -> Reader:
-    """A value of the output."""
     return each(lambda snapshot: snapshot.mqtts, read)
 
 
@@ -530,33 +536,33 @@ def _gauge_of(name: str, unit: Unit, words: str, read: Callable[[MqttStatus], fl
 
 
 MQTT_FAMILIES: Final = (
-    _gauge_of("connected", NO_UNIT, "1 while a broker is connected, else 0.", lambda status: bool(status.broker)),
+    _gauge_of("connected", NO_UNIT, "1 if a broker is connected, otherwise 0.", lambda status: bool(status.broker)),
     _gauge_of(
-        "spooling", NO_UNIT, "1 while the spool can be written, 0 while the disk does not let it.",
+        "spooling", NO_UNIT, "1 if imud can write the spool, 0 if the disk is full or fails.",
         lambda status: not status.spool_problem,
     ),
     _counter_of("queued", "Samples and events given to the output.", lambda status: status.queued),
     _counter_of("spooled_messages", "Messages written to the spool.", lambda status: status.spooled),
-    _counter_of("sent_messages", "Messages sent, those sent again included.", lambda status: status.sent),
-    _counter_of("acknowledged_messages", "Messages that the broker has taken.", lambda status: status.acknowledged),
+    _counter_of("sent_messages", "Sent messages, including repeated messages.", lambda status: status.sent),
+    _counter_of("acknowledged_messages", "Messages that the broker acknowledged.", lambda status: status.acknowledged),
     _gauge_of("waiting_messages", NO_UNIT, "Messages in the spool.", lambda status: status.waiting),
-    _gauge_of("spool_bytes", BYTES, "Room that the spool uses.", lambda status: status.spool_bytes),
+    _gauge_of("spool_bytes", BYTES, "Size of the spool.", lambda status: status.spool_bytes),
     _counter_of(
-        "thinned", "Samples of which only statistics are left, for want of room in the spool.",
+        "thinned", "Samples that imud replaced by statistics because the spool was full.",
         lambda status: status.thinned,
     ),
     Family(
-        "imud_mqtt_dropped_total", MetricType.COUNTER, NO_UNIT, "Samples and events that were dropped, by cause.",
+        "imud_mqtt_dropped_total", MetricType.COUNTER, NO_UNIT, "Dropped samples and events by cause.",
         Reader(("cause",), _dropped),
     ),
     _counter_of("reconnects", "Connections to a broker after the first.", lambda status: status.reconnects),
-    _counter_of("commands", "Requests for actions that were carried out, or tried.", lambda status: status.commands),
-    _counter_of("commands_refused", "Requests for actions that were refused.", lambda status: status.commands_refused),
+    _counter_of("commands", "Requests for commands that imud ran.", lambda status: status.commands),
+    _counter_of("commands_refused", "Rejected requests for commands.", lambda status: status.commands_refused),
 )  # fmt: skip
 
 
 def _output(read: Callable[[OutputStatus], float]) -> Reader:
-    """A value of each way out."""
+    """Return a reader of a value of each port."""
 
     def lines(snapshot: Snapshot) -> Lines:
         return [((status.name,), read(status)) for status in snapshot.outputs]
@@ -571,29 +577,27 @@ OUTPUT_FAMILIES: Final = (
     ),
     Family(
         "imud_nmea0183_sentences_dropped_total", MetricType.COUNTER, NO_UNIT,
-        "Sentences that were not sent because the way out had no room or was away.",
+        "Sentences that imud dropped because a port was missing or its queue was full.",
         _output(lambda status: status.dropped),
     ),
     Family(
         "imud_nmea0183_readers", MetricType.GAUGE, NO_UNIT,
-        "Clients of the TCP server; of a port or an address 1 while it takes what is sent, 0 while it does not.",
+        "Clients of the TCP server; for a serial port or an address 1 if it accepts data, otherwise 0.",
         _output(lambda status: status.readers),
     ),
 )  # fmt: skip
 
 
 def _recorder(read: Callable[[RecorderStatus], float]) -> Reader:
-    """A value of the recorder."""
     return each(lambda snapshot: snapshot.recorders, read)
 
 
 def _flight(read: Callable[[FlightStatus], float]) -> Reader:
-    """A value of the flight recorder."""
     return each(lambda snapshot: snapshot.flights, read)
 
 
 def _snapshots(snapshot: Snapshot) -> Lines:
-    """Snapshots by what became of them."""
+    """Return the number of snapshots by result."""
     return [
         ((result,), getattr(status, result))
         for status in snapshot.flights
@@ -602,7 +606,10 @@ def _snapshots(snapshot: Snapshot) -> Lines:
 
 
 def _disk(snapshot: Snapshot) -> Lines:
-    """Both recorders write to one directory; the one that always writes knows its present file, too."""
+    """Return the size of all recordings.
+
+    Both recorders share one directory, and only the continuous recorder knows the size of its open file.
+    """
     always = [status.disk_bytes for status in snapshot.recorders]
     return [((), size) for size in always or [status.disk_bytes for status in snapshot.flights]]
 
@@ -610,13 +617,13 @@ def _disk(snapshot: Snapshot) -> Lines:
 RECORDINGS_FAMILIES: Final = (
     Family(
         "imud_recordings_bytes", MetricType.GAUGE, BYTES,
-        "Size of all recordings in the directory of the recorder, snapshots included.", Reader((), _disk),
+        "Size of all recordings in the directory of the recorder, including snapshots.", Reader((), _disk),
     ),
 )  # fmt: skip
 
 RECORDER_FAMILIES: Final = (
     Family(
-        "imud_recorder_active", MetricType.GAUGE, NO_UNIT, "1 while imud records, 0 while the disk does not let it.",
+        "imud_recorder_active", MetricType.GAUGE, NO_UNIT, "1 if imud records, 0 if the disk is full or fails.",
         _recorder(lambda status: not status.problem),
     ),
     Family(
@@ -629,16 +636,16 @@ RECORDER_FAMILIES: Final = (
     ),
     Family(
         "imud_recorder_records_dropped_total", MetricType.COUNTER, NO_UNIT,
-        "Records that are missing in recordings because the disk was too slow.",
+        "Records that imud dropped because the disk was too slow.",
         _recorder(lambda status: status.records_dropped),
     ),
     Family(
-        "imud_recorder_waiting_bytes", MetricType.GAUGE, BYTES, "Records that wait to be written.",
+        "imud_recorder_waiting_bytes", MetricType.GAUGE, BYTES, "Size of the records in the queue of the recorder.",
         _recorder(lambda status: status.waiting_bytes),
     ),
     Family(
         "imud_recorder_files_removed_total", MetricType.COUNTER, NO_UNIT,
-        "Recordings that were removed to keep within the budget.",
+        "Recordings that imud removed to stay below the size limit.",
         _recorder(lambda status: status.files_removed),
     ),
 )  # fmt: skip
@@ -646,29 +653,29 @@ RECORDER_FAMILIES: Final = (
 FLIGHT_FAMILIES: Final = (
     Family(
         "imud_flight_recorder_active", MetricType.GAUGE, NO_UNIT,
-        "1 while the flight recorder keeps what devices deliver, 0 while there is no room for it.",
+        "1 if the flight recorder records, 0 if there is no room for it.",
         _flight(lambda status: not status.problem),
     ),
     Family(
-        "imud_flight_recorder_kept_seconds", MetricType.GAUGE, SECONDS, "Length of what the flight recorder has.",
+        "imud_flight_recorder_kept_seconds", MetricType.GAUGE, SECONDS, "Time that the flight recorder covers.",
         _flight(lambda status: status.kept_ns),
     ),
     Family(
-        "imud_flight_recorder_kept_bytes", MetricType.GAUGE, BYTES, "Size of what the flight recorder has.",
+        "imud_flight_recorder_kept_bytes", MetricType.GAUGE, BYTES, "Size of the data of the flight recorder.",
         _flight(lambda status: status.kept_bytes),
     ),
     Family(
         "imud_flight_recorder_records_dropped_total", MetricType.COUNTER, NO_UNIT,
-        "Records that the flight recorder does not have because this machine was too slow.",
+        "Records that the flight recorder dropped because the host was too slow.",
         _flight(lambda status: status.records_dropped),
     ),
     Family(
         "imud_flight_recorder_snapshots_total", MetricType.COUNTER, NO_UNIT,
-        "Alerts whose snapshot was saved, could not be saved, or was one too many within an hour.",
+        "Alerts by result: snapshot saved, failed, or left out because of the limit per hour.",
         Reader(("result",), _snapshots),
     ),
     Family(
-        "imud_flight_recorder_snapshots_sent_total", MetricType.COUNTER, NO_UNIT, "Snapshots that clients asked for.",
+        "imud_flight_recorder_snapshots_sent_total", MetricType.COUNTER, NO_UNIT, "Snapshots sent to clients.",
         _flight(lambda status: status.sent),
     ),
 )  # fmt: skip

@@ -1,7 +1,7 @@
-"""Descriptions of metrics: name, type, unit, help, labels, and how the values are read from the snapshot of a scrape.
+"""Descriptions of metrics: name, type, unit, help text, labels, and a reader of the values.
 
-A `Reader` has the names of the labels and gives the values. Those of devices come from a `DevicePart`: it finds the
-record that the values are in, and leaves out devices that have none, because absent is not zero.
+A `Reader` contains the label names and returns the values of a snapshot. A `DevicePart` finds the record of a value in
+the status of each device. It omits devices without this record, because absent is not zero.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,45 +23,36 @@ from imud.publishers.metrics.rings import RingView
 
 T = TypeVar("T")
 
-Lines = Iterable[tuple[tuple[str, ...], float]]
-"""Values of the labels, and the value."""
+Lines = Iterable[tuple[tuple[str, ...], float]]  # label values and value of each time series
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """Contents of one scrape, all of one moment of the event loop."""
+    """Content of one scrape, from one turn of the event loop."""
 
     devices: Sequence[DeviceStatus] = ()
     clients: Sequence[ClientStatus] = ()
-    events: Sequence[tuple[tuple[str, str], int]] = ()
-    """Events so far, by device and kind."""
+    events: Sequence[tuple[tuple[str, str], int]] = ()  # number of events by device and kind
     heartbeat_age_ns: int = 0
     log_messages_dropped: int = 0
     client_samples_sent: int = 0
-    """Samples sent to clients, those that disconnected included, as seen at scrapes."""
+    """Number of samples sent to all clients until the scrape, including disconnected clients."""
     client_samples_dropped: int = 0
     rings: Mapping[str, str] = field(default_factory=dict)
-    """Path of the ring by device; empty where there is none though there should be."""
-    views: Mapping[str, RingView] = field(default_factory=dict)
-    """What was found in these rings."""
-    recorders: Sequence[RecorderStatus] = ()
-    """One while there is a recorder."""
-    flights: Sequence[FlightStatus] = ()
-    """One while there is a flight recorder."""
-    outputs: Sequence[OutputStatus] = ()
-    """Ways out of outputs that send sentences."""
-    mqtts: Sequence[MqttStatus] = ()
-    """One while there is the output `mqtt`."""
+    """Path of the ring of each device; empty if imud could not create it."""
+    views: Mapping[str, RingView] = field(default_factory=dict)  # content of the rings
+    recorders: Sequence[RecorderStatus] = ()  # state of the recorder, if it runs
+    flights: Sequence[FlightStatus] = ()  # state of the flight recorder, if it runs
+    outputs: Sequence[OutputStatus] = ()  # states of the ports of outputs that send sentences
+    mqtts: Sequence[MqttStatus] = ()  # state of the output `mqtt`, if it runs
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """The unit of a metric."""
+    """Unit of a metric."""
 
-    name: str
-    """The end of the metric's name, in front of `_total`; empty for numbers without a unit."""
-    divisor: float = 1
-    """Turns the values that are read into this unit."""
+    name: str  # suffix of the metric name before `_total`; empty for numbers without a unit
+    divisor: float = 1  # divisor that converts a value into this unit
 
 
 NO_UNIT: Final = Unit("")
@@ -75,12 +66,11 @@ SECONDS: Final = Unit("seconds", NS_PER_S)
 
 
 class MetricType(StrEnum):
-    """Types of metrics with one value per set of labels, by their names in OpenMetrics."""
+    """Metric types with one value per set of labels, by their OpenMetrics names."""
 
     GAUGE = "gauge"
     COUNTER = "counter"
-    INFO = "info"
-    """Always 1; the information is in the labels."""
+    INFO = "info"  # value is always 1; the labels contain the information
 
 
 _MAKE: Final[Mapping[MetricType, Callable[..., Any]]] = {
@@ -100,20 +90,19 @@ class Reader:
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """The description of one metric."""
+    """Description of one metric."""
 
-    name: str
-    """Name in the text format, `_total` and `_info` included."""
+    name: str  # name in the text format, including `_total` and `_info`
     type: MetricType
     unit: Unit
     help: str
     reader: Reader
 
     def metric(self, snapshot: Snapshot) -> Metric:
-        """The metric with its values."""
+        """Return the metric with its values."""
         info, divisor = self.type is MetricType.INFO, self.unit.divisor
         metric: Metric = _MAKE[self.type](self.name.removesuffix("_info"), self.help, labels=self.reader.labels)
-        add = metric.add_metric  # type: ignore[attr-defined]  # all three have it
+        add = metric.add_metric  # type: ignore[attr-defined]  # all three classes have this method
         for labels, value in self.reader.lines(snapshot):
             add(labels, {} if info else value / divisor)
         return metric
@@ -121,17 +110,16 @@ class Family:
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
-    """The description of one histogram over times in ns, shown in seconds, with the label `device`."""
+    """Description of a histogram of times, ns, with the label `device`. The output is in seconds."""
 
     name: str
     help: str
-    bounds_ns: Sequence[int]
-    """Upper bounds of the buckets; one without bound follows."""
+    bounds_ns: Sequence[int]  # Upper bounds of the buckets. The last bucket has no bound.
     read: Callable[[DeviceStatus], tuple[Sequence[int], int]]
-    """Values per bucket, the unbounded last included, and the sum of all in ns."""
+    """Returns the number of values per bucket and the sum of all values, ns."""
 
     def metric(self, snapshot: Snapshot) -> Metric:
-        """The metric with its values; its counts are cumulative, as Prometheus has them."""
+        """Return the metric with cumulative counts, as Prometheus requires."""
         bounds = (*(str(bound / SECONDS.divisor) for bound in self.bounds_ns), "+Inf")
         metric = HistogramMetricFamily(self.name, self.help, labels=("device",))
         for device in snapshot.devices:
@@ -145,17 +133,17 @@ class Histogram:
 
 
 Parts = Iterable[tuple[str, T | None]]
-"""The name of each device and a record of it; None for a device without it: its metrics are absent."""
+"""Name and record of each device. None if the device has no such record: its metrics are then absent."""
 
 
 @dataclass(frozen=True, slots=True)
 class DevicePart(Generic[T]):
-    """A record of each device; the label `device` of its values is the device's name."""
+    """Record of each device. The value of the label `device` is the device name."""
 
     find: Callable[[Snapshot], Parts[T]]
 
     def one(self, read: Callable[[T], float | None]) -> Reader:
-        """Reads one value without further labels; absent where it is None."""
+        """Return a reader of one value without further labels; absent if the value is None."""
 
         def lines(snapshot: Snapshot) -> Iterator[tuple[tuple[str], float]]:
             for name, part in self.find(snapshot):
@@ -166,7 +154,7 @@ class DevicePart(Generic[T]):
         return Reader(("device",), lines)
 
     def by(self, label: str, read: Callable[[T], Mapping[str, float]]) -> Reader:
-        """Reads values by one further label."""
+        """Return a reader of values with one further label."""
 
         def lines(snapshot: Snapshot) -> Iterator[tuple[tuple[str, str], float]]:
             for name, part in self.find(snapshot):
@@ -178,15 +166,15 @@ class DevicePart(Generic[T]):
 
 
 def status_part(find: Callable[[DeviceStatus], T | None]) -> DevicePart[T]:
-    """A record that `find` finds in the status of a device."""
+    """Return the part of the record that `find` returns for the status of a device."""
     return DevicePart(lambda snapshot: ((device.name, find(device)) for device in snapshot.devices))
 
 
 def daemon(read: Callable[[Snapshot], float]) -> Reader:
-    """Reads one value of the daemon, without labels."""
+    """Return a reader of one value of the daemon, without labels."""
     return Reader((), lambda snapshot: (((), read(snapshot)),))
 
 
 def each(find: Callable[[Snapshot], Sequence[T]], read: Callable[[T], float]) -> Reader:
-    """Reads one value, without labels, of an output of which there is one or none."""
+    """Return a reader of one value without labels, of an output that exists once or not at all."""
     return Reader((), lambda snapshot: [((), read(status)) for status in find(snapshot)])

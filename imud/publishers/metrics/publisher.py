@@ -1,12 +1,13 @@
-"""The Prometheus endpoint: `http://ADDRESS:PORT/metrics`. Names and meanings: docs/metrics.md.
+"""Output `metrics`: the Prometheus endpoint `http://ADDRESS:PORT/metrics`. docs/metrics.md describes the metrics.
 
-`/scrapes` says how often `/metrics` was asked and how long ago, which `imud doctor` asks without being counted.
+`/scrapes` reports the number of scrapes and the time since the last one. `imud doctor` requests it, and this request
+does not count.
 
     HTTP thread ──call_soon_threadsafe──▶ event loop: status, clients ──▶ HTTP thread: rings, render, send
 
-The event loop gives a snapshot of plain records and goes on. Rendering holds Python's global lock, so the HTTP
-thread pauses for PAUSE_S before every metric and every SAMPLES_PER_TURN lines of it: measured with 16 devices
-(`python -m tests.bench.metrics`), a whole scrape without pauses keeps the loop waiting for 7 ms, one turn 0.3 ms.
+The event loop only creates a snapshot of plain records. Rendering holds Python's global lock. The HTTP thread therefore
+pauses for PAUSE_S before each metric and after SAMPLES_PER_TURN lines. With 16 devices, a scrape without pauses delays
+the event loop by 7 ms, one turn by 0.3 ms (`python -m tests.bench.metrics`).
 """
 
 import asyncio
@@ -47,15 +48,13 @@ from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, Scr
 log = logging.getLogger(__name__)
 
 SNAPSHOT_S: Final = 2.0
-"""Time-out for the event loop's answer; the scrape then reports that it is stuck."""
+"""Time limit for the reply of the event loop, s. After it, the scrape reports a blocked event loop."""
 PAUSE_S: Final = 100e-6
-"""Long enough for the kernel to wake the loop's thread, which takes some ten microseconds."""
+"""Pause of the HTTP thread, s. The kernel needs some ten microseconds to wake the thread of the event loop."""
 
-SAMPLES_PER_TURN: Final = 64
-"""Lines rendered without a pause; one costs some 4 µs."""
+SAMPLES_PER_TURN: Final = 64  # Number of lines rendered without a pause. One line costs about 4 us.
 
-DEVICES_PER_TURN: Final = 8
-"""Devices whose status is taken in one turn of the event loop, about 0.3 ms."""
+DEVICES_PER_TURN: Final = 8  # number of devices whose status the event loop reads in one turn, about 0.3 ms
 JSON: Final = "application/json"
 ABOUT: Final = b"imud: metrics for Prometheus are at /metrics\n"
 
@@ -64,35 +63,37 @@ class MetricsOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Options of the Prometheus endpoint."""
 
     enabled: bool = True
-    """Whether metrics are served at all."""
+    """Serve metrics."""
     address: Annotated[str, msgspec.Meta(min_length=1)] = "127.0.0.1"
-    """IP address to listen on; `0.0.0.0` is every network of this machine. There is no password."""
+    """IP address of the server; `0.0.0.0`: all networks of the host. There is no password."""
     port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 9321
-    """TCP port; 0 takes any free one."""
+    """TCP port; 0: any free port."""
     motion: bool = True
-    """Whether attitude, acceleration and vibration are among the metrics, computed from the rings in shared memory."""
+    """Include attitude, acceleration and vibration. imud computes them from the rings in shared memory."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what is no address to listen on."""
+        """Raise ValueError if the address is invalid."""
         if not is_ip_address(self.address) and self.address != "localhost":
             raise ValueError(f"address: expected an IP address such as 127.0.0.1 or ::1, got {shown(self.address)}")
 
 
 def pause() -> None:
-    """Let another thread run that waits for Python's global lock."""
+    """Release Python's global lock for other threads."""
     time.sleep(PAUSE_S)
 
 
 class Scrapes(msgspec.Struct, frozen=True):
-    """Requests of `/metrics` since the start."""
+    """Number of scrapes since the start."""
 
     scrapes: int
-    age_s: float
-    """Time since the last one, or before the first since the endpoint was made, s."""
+    age_s: float  # time since the last scrape, or since the start of the endpoint, s
 
 
 class ClientTotals:
-    """Sums of samples sent to and dropped for clients; a sum over the present ones would fall when one leaves."""
+    """Sums of the samples sent and dropped for all clients.
+
+    A sum over the connected clients would decrease when a client disconnects.
+    """
 
     def __init__(self) -> None:
         self.sent = 0
@@ -100,7 +101,7 @@ class ClientTotals:
         self._seen: dict[int, tuple[int, int]] = {}
 
     def update(self, clients: Sequence[ClientStatus]) -> None:
-        """Add what happened since the last call."""
+        """Add the samples since the previous call."""
         for client in clients:
             sent, dropped = self._seen.get(client.number, (0, 0))
             self.sent += client.sent - sent
@@ -117,7 +118,7 @@ class DaemonCollector(Collector):
         self._pause = pause
 
     def show(self, snapshot: Snapshot) -> None:
-        """Collect from `snapshot` from now on."""
+        """Set the snapshot for `collect`."""
         totals = self._totals
         totals.update(snapshot.clients)
         self._snapshot = replace(
@@ -125,11 +126,11 @@ class DaemonCollector(Collector):
         )  # fmt: skip
 
     def describe(self) -> list[Metric]:
-        """Describe nothing in advance: the registry would render everything once for it."""
+        """Return an empty list. Otherwise the registry would render all metrics for the description."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Yield all metrics of the snapshot, with pauses while they are rendered."""
+        """Yield all metrics of the snapshot."""
         recorder = RECORDER_FAMILIES if self._snapshot.recorders else ()
         flight = FLIGHT_FAMILIES if self._snapshot.flights else ()
         outputs = OUTPUT_FAMILIES if self._snapshot.outputs else ()
@@ -142,7 +143,7 @@ class DaemonCollector(Collector):
 
 
 class _PausingList(list[Line]):
-    """The lines of a metric; iteration pauses before the first and after every SAMPLES_PER_TURN."""
+    """Lines of a metric. The iterator pauses before the first line and after each SAMPLES_PER_TURN lines."""
 
     def __init__(self, samples: Sequence[Line], pause: Callable[[], None]) -> None:
         super().__init__(samples)
@@ -155,7 +156,7 @@ class _PausingList(list[Line]):
 
 
 class Renderer:
-    """The registry of all metrics and the text made from it. Synchronization: the HTTP thread."""
+    """Registry of all metrics. Synchronization: the HTTP thread."""
 
     def __init__(self, pause: Callable[[], None] = pause) -> None:
         self._registry = CollectorRegistry()
@@ -164,16 +165,16 @@ class Renderer:
         ProcessCollector(registry=self._registry)
 
     def render(self, snapshot: Snapshot, accept: str) -> HttpResponse:
-        """The metrics in the format that the Accept header asks for."""
+        """Return the metrics in the format that the Accept header requests."""
         self._collector.show(snapshot)
         encode, content_type = encoder_for(accept)
         return HttpResponse("200 OK", encode(self._registry), content_type)
 
 
 def encoder_for(accept: str) -> tuple[Callable[[CollectorRegistry], bytes], str]:
-    """The encoder for an Accept header, and its content type; the default where prometheus_client cannot read it.
+    """Return the encoder and the content type for an Accept header; the defaults if the header is invalid.
 
-    `choose_encoder` raises for a `version` that is no number (seen with 0.26).
+    `choose_encoder` of prometheus_client raises if `version` is not a number (seen with 0.26).
     """
     try:
         return choose_encoder(accept)
@@ -182,10 +183,9 @@ def encoder_for(accept: str) -> tuple[Callable[[CollectorRegistry], bytes], str]
 
 
 class MetricsPublisher:
-    """Publisher of metrics. Synchronization: the event loop's thread; `_answer` runs in the HTTP thread."""
+    """Output of metrics. Synchronization: the event loop's thread; the HTTP thread runs `_answer`."""
 
-    publish: Final = None
-    """Samples are counted by the pipeline."""
+    publish: Final = None  # this output does not need samples
 
     def __init__(self, settings: MetricsOptions, context: PublisherContext, *, snapshot_s: float = SNAPSHOT_S) -> None:
         self._settings = settings
@@ -199,18 +199,17 @@ class MetricsPublisher:
         self._server: ScrapeServer | None = None
         self._scrapes = 0
         self._scraped_ns = context.clock.now_ns()
+        # held in the HTTP thread: 32 snapshots at once would need one long turn of the daemon's event loop
         self._turn = asyncio.Lock()
-        """Of the HTTP thread: 32 snapshots at once would be 32 in one turn of the daemon's event loop."""
-        self._pages: dict[str, asyncio.Task[HttpResponse]] = {}
-        """Pages of which the event loop has given nothing yet, by content type, of which there are a handful."""
+        self._pages: dict[str, asyncio.Task[HttpResponse]] = {}  # tasks that wait for a snapshot, by content type
 
     @property
     def port(self) -> int:
-        """The bound port; 0 while nothing is served."""
+        """Return the bound port; 0 if the server is closed."""
         return self._server.port if self._server else 0
 
     def start(self) -> None:
-        """Listen, if enabled. Raises ServerError when address and port cannot be had."""
+        """Start the server if the output is enabled. Raises ServerError if address and port cannot be used."""
         if not self._settings.enabled:
             return
         self._loop = asyncio.get_running_loop()
@@ -220,23 +219,23 @@ class MetricsPublisher:
         log.info("metrics at http://%s:%d/metrics", self._settings.address, self.port)
 
     def add_device(self, name: str, device_id: int) -> None:
-        """No-op: devices are found in the status at every scrape."""
+        """Do nothing: each scrape reads the devices from the status."""
 
     def remove_device(self, name: str) -> None:
-        """Forget the device's events."""
+        """Remove the event counters of a device."""
         for key in [key for key in self._events if key[0] == name]:
             del self._events[key]
 
     def event(self, event: Event) -> None:
-        """Count it."""
+        """Count an event."""
         self._events[event.device, event.kind.value] += 1
 
     def tick(self, now_ns: int) -> None:
-        """Note that the event loop runs."""
+        """Store the time: the heartbeat of the event loop."""
         self._tick_ns = now_ns
 
     def close(self) -> None:
-        """End the HTTP thread; may be called twice."""
+        """Stop the HTTP thread. A second call does nothing."""
         if self._server:
             self._server.close()
         self._server = None
@@ -256,9 +255,9 @@ class MetricsPublisher:
         return await self._page(request.accept)
 
     async def _page(self, accept: str) -> HttpResponse:
-        """The page that others wait for as well, if there is one.
+        """Return a page, together with other requests that wait for a snapshot.
 
-        Scrapers that gave up would be answered before the one that waits, and each costs the loop a snapshot.
+        Otherwise imud would first serve clients that no longer wait, and each would need a snapshot.
         """
         content_type = encoder_for(accept)[1]
         page = self._pages.get(content_type)
@@ -267,7 +266,7 @@ class MetricsPublisher:
         return await asyncio.shield(page)
 
     async def _scrape(self, accept: str, content_type: str) -> HttpResponse:
-        """Make one page; who asks from the snapshot on gets another one."""
+        """Return a new page. Requests after the snapshot get the next page."""
         async with self._turn:
             try:
                 snapshot = await self._ask_loop()
@@ -281,7 +280,7 @@ class MetricsPublisher:
             return self._renderer.render(replace(snapshot, views=views), accept)
 
     async def _ask_loop(self) -> Snapshot:
-        """Get a snapshot from the daemon's event loop. Raises TimeoutError when the loop is stuck or has ended."""
+        """Return a snapshot from the event loop. Raises TimeoutError if the loop is blocked or has ended."""
         answer: Future[Snapshot] = Future()
         if self._loop is None or self._loop.is_closed():
             raise TimeoutError
@@ -290,13 +289,13 @@ class MetricsPublisher:
             return await asyncio.wrap_future(answer)
 
     def _begin_snapshot(self, answer: "Future[Snapshot]") -> None:
-        """Begin with how late the loop is: in its next turn it has ticked, and is late no more."""
+        """Start a snapshot. Measure the delay of the loop first, because the loop ticks before its next turn."""
         self._gather(answer, self._context.clock.now_ns() - self._tick_ns, self._context.devices.each_status(), [])
 
     def _gather(
         self, answer: "Future[Snapshot]", late_ns: int, rest: Iterator[DeviceStatus], found: list[DeviceStatus]
     ) -> None:
-        """Take the status of some devices, of the next ones in the next turn of the loop, and answer at the end."""
+        """Add the status of some devices. Continue in the next turn of the loop, and return the snapshot at the end."""
         some = list(islice(rest, DEVICES_PER_TURN))
         found += some
         if len(some) == DEVICES_PER_TURN and not answer.cancelled():

@@ -1,17 +1,18 @@
-"""Attitude, acceleration and vibration of each device, from its ring in shared memory when metrics are asked for.
+"""Attitude, acceleration and vibration of each device, computed from its ring in shared memory during a scrape.
 
-Nothing is added to the way of a sample: the HTTP thread copies the newest slots out of the file of the ring (pread,
-which has no SIGBUS) and computes over columns of them. The work is bounded: once a second however often metrics are
-asked for, SAMPLES_MAX slots of a device, with a pause for every VALUES_PER_TURN values.
+This adds no work per sample. The HTTP thread copies the newest slots from the ring file (pread cannot cause SIGBUS) and
+computes over columns. The work is limited: at most one reading per second, SAMPLES_MAX slots per device, and a pause
+after VALUES_PER_TURN values.
 
-    slots ──▶ time stamps ──▶ the span: since the look before, at least SPAN_MIN_NS, at most what was copied
-                              blocks of BLOCK_NS ──▶ mean and deviations of each axis ──▶ RMS and peak over all blocks
+    slots ──▶ time stamps ──▶ span: since the previous reading, at least SPAN_MIN_NS, at most the copied slots
+    blocks of BLOCK_NS ──▶ mean and deviations of each axis ──▶ RMS and peak over all blocks
 
-Vibration is the deviation from the mean of the block: what is slower than about 1 Hz, gravity included, is not in it,
-and its RMS does not depend on the length of the span.
+Vibration is the deviation from the mean of a block. It does not contain gravity and motion slower than about 1 Hz. Its
+RMS does not depend on the length of the span.
 
-A slot needs no CRC here. The snapshot of the scrape comes from the thread that writes, so slots up to its newest sample
-are whole; and `newest_seq`, read again after the copy, says which of the oldest were overwritten meanwhile.
+A CRC check is not necessary. The thread that writes the ring also makes the snapshot, so all slots up to its newest
+sample are complete. imud reads `newest_seq` again after the copy to find the slots that were overwritten during the
+copy.
 """
 
 import math
@@ -30,18 +31,18 @@ from imud.model.sample import Vector3
 from imud.model.units import NS_PER_S
 
 LOOK_NS: Final = NS_PER_S
-"""Rings are read at most once in this time; scrapes in between get the same values."""
+"""Minimum time between two readings of the rings, ns. Scrapes in between return the same values."""
 SAMPLES_MAX: Final = 4096
-"""Slots of a device that are read: all of a ring of the usual size, 4 s at 1 kHz; 1 MB and some 2 ms of CPU."""
-SPAN_MIN_NS: Final = 10 * NS_PER_S
-"""A second scraper must not shorten what the first one sees."""
+"""Maximum number of slots per device: a complete ring of the default size, 4 s at 1 kHz, 1 MB and about 2 ms of CPU
+time."""
+SPAN_MIN_NS: Final = 10 * NS_PER_S  # Minimum span, ns. A second scraper must not shorten the span of the first.
 VALUES_PER_TURN: Final = 4096
-"""Values that are read or summed up without a pause: 0.3 ms. A pause is long where many programs want the CPU."""
+"""Number of values between two pauses, 0.3 ms. A pause takes long if many programs need CPU time."""
 BLOCK_NS: Final = NS_PER_S
-BLOCK_SAMPLES_MIN: Final = 8
-"""Fewer samples in a second say nothing of vibration."""
+BLOCK_SAMPLES_MIN: Final = 8  # minimum number of samples in a block for vibration
 OVERTAKEN_SLOTS: Final = 8
-"""Beside the slot that is written now: a reader may see stores of the writer in another order."""
+"""Number of slots that imud ignores next to the slot that is being written, because a reader can see the stores of the
+writer in another order."""
 
 _OFFSETS: Final = {field.name: field.offset for field in SLOT_FIELDS}
 _WORDS: Final = SLOT_BYTES // 8
@@ -51,27 +52,20 @@ _EULER: Final = struct.Struct(f"<{_OFFSETS['euler_rad']}x3d")
 
 
 class MotionValues(NamedTuple):
-    """Values of one device over the newest samples; None for what it does not send."""
+    """Motion of one device over the newest samples. A value is None if the device does not send it."""
 
-    span_ns: int
-    """From the oldest sample to the newest one that were used."""
-    attitude_rad: Vector3 | None
-    """Roll, pitch, yaw of the newest sample, in the convention that is published."""
-    accel_norm_m_s2: float | None
-    """Length of the mean acceleration over the newest block."""
-    vibration_rms_m_s2: Vector3 | None
-    """X, Y, Z; None also where no block has BLOCK_SAMPLES_MIN samples."""
-    vibration_peak_m_s2: Vector3 | None
-    """Largest deviation from the mean of its block."""
+    span_ns: int  # time from the oldest to the newest sample of the span
+    attitude_rad: Vector3 | None  # roll, pitch and yaw of the newest sample, in the published convention
+    accel_norm_m_s2: float | None  # norm of the mean acceleration over the newest block
+    vibration_rms_m_s2: Vector3 | None  # x, Y, Z; None if no block has BLOCK_SAMPLES_MIN samples
+    vibration_peak_m_s2: Vector3 | None  # maximum deviation from the mean of a block
 
 
 class RingView(NamedTuple):
     """State of the ring of one device."""
 
-    written: bool
-    """Whether the file is there and the daemon writes it."""
-    motion: MotionValues | None = None
-    """None without samples in the span, or where it is not wanted."""
+    written: bool  # true if the file exists and the daemon writes it
+    motion: MotionValues | None = None  # none without samples in the span, or if the option `motion` is off
 
 
 class RingReader:
@@ -80,16 +74,15 @@ class RingReader:
     def __init__(self, pause: Callable[[], None], *, motion: bool) -> None:
         self._pause = pause
         self._motion = motion
-        self._values = 0
-        """Since the last pause."""
+        self._values = 0  # number of values since the last pause
         self._looked_ns: int | None = None
         self._views: dict[str, RingView] = {}
 
     def look(self, rings: Mapping[str, str], newest: Mapping[str, int], now_ns: int) -> Mapping[str, RingView]:
-        """The views by device; those of the last look if it was less than LOOK_NS ago.
+        """Return the views by device. Return the previous views if they are not older than LOOK_NS.
 
-        `rings` has the path of the ring by device, empty where there is none though there should be; `newest` the
-        number of the newest sample. Both are of one moment of the event loop; `now_ns` is about that time.
+        `rings` contains the path of each ring, empty if imud could not create it. `newest` contains the newest sequence
+        numbers. Both are from one turn of the event loop, at about `now_ns`.
         """
         before_ns = self._looked_ns
         if before_ns is None or now_ns - before_ns >= LOOK_NS:
@@ -103,7 +96,7 @@ class RingReader:
     def _view(self, path: str, newest: int, since_ns: int, now_ns: int) -> RingView:
         try:
             fd = os.open(path, OPEN_FLAGS)
-        except OSError:  # an empty path is one of them
+        except OSError:  # also for an empty path
             return RingView(False)
         try:
             header = _header(fd, path)
@@ -127,7 +120,7 @@ def _header(fd: int, path: str) -> RingHeader:
 
 
 def _newest_slots(fd: int, path: str, header: RingHeader, newest: int) -> bytes:
-    """Up to SAMPLES_MAX slots up to the number `newest`, oldest first, without gaps in their numbers."""
+    """Return at most SAMPLES_MAX slots up to the number `newest`, oldest first, with consecutive numbers."""
     count = header.slot_count
     newest = min(newest, header.newest_seq)
     oldest = max(header.first_seq, newest + 1 - min(count, SAMPLES_MAX))
@@ -145,9 +138,9 @@ def _pread_slots(fd: int, first: int, end: int) -> bytes:
 
 
 def motion_of(slots: bytes, since_ns: int, used: Callable[[int], None] = lambda _: None) -> MotionValues | None:
-    """Motion over the slots whose time stamps are not before `since_ns`, oldest first; None for none.
+    """Return the motion over the slots with time stamps from `since_ns`, oldest first; None if there is no slot.
 
-    `used` is called with the number of values after every piece of work.
+    This function calls `used` with the number of values after each part of the work.
     """
     view = memoryview(slots)
     times = view.cast("q")[_T_NS::_WORDS].tolist()
@@ -159,7 +152,7 @@ def motion_of(slots: bytes, since_ns: int, used: Callable[[int], None] = lambda 
     attitude = _EULER.unpack_from(view, len(view) - SLOT_BYTES) if bits[-1] & HAS_EULER else None
     numbers = view.cast("d")
     axes: list[list[float]] = [
-        numbers[_ACCEL + axis :: _WORDS].tolist()  # type: ignore[misc]  # typeshed says integers, whatever the format
+        numbers[_ACCEL + axis :: _WORDS].tolist()  # type: ignore[misc]  # typeshed declares integers for all formats
         for axis in range(3)
     ]
     used(len(times))
@@ -177,7 +170,7 @@ def motion_of(slots: bytes, since_ns: int, used: Callable[[int], None] = lambda 
 
 
 def _blocks(times: list[int]) -> list[tuple[int, int]]:
-    """First index and end of each block of BLOCK_NS, newest first: the newest is a whole one."""
+    """Return first index and end of each block of BLOCK_NS, newest first. The newest block is complete."""
     blocks, end = [], len(times)
     while end:
         first = bisect_left(times, times[end - 1] - BLOCK_NS + 1)
@@ -193,7 +186,7 @@ def _mean(values: Sequence[float]) -> float:
 def _deviation(
     axis: list[float], blocks: list[tuple[int, int]], used: Callable[[int], None]
 ) -> tuple[float, float] | None:
-    """RMS and peak of the deviation from the mean of the block; None where all blocks are too small."""
+    """Return RMS and peak of the deviation from the mean of each block; None if all blocks are too small."""
     squares, size, peak = 0.0, 0, 0.0
     for first, end in blocks:
         if end - first >= BLOCK_SAMPLES_MIN:

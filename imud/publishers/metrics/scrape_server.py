@@ -1,12 +1,12 @@
-"""A small HTTP/1.1 server for scrapes, in a thread with an event loop of its own.
+"""Small HTTP/1.1 server for scrapes, in a thread with its own event loop.
 
-A connection is one request and one answer. A client that connects and says nothing, says it slowly, or does not read
-its answer holds one of CONNECTIONS_MAX places for CONNECTION_S at most, and nothing else; when all are taken, the
-oldest connection is ended for the new one, so that silent clients cannot lock out the one that asks.
-Synchronization: `start` and `close` in one thread; `answer` runs in the server's own.
+A connection has one request and one reply. A silent or slow client occupies one of CONNECTIONS_MAX places for at most
+CONNECTION_S. If all places are taken, the server closes the oldest connection, so that silent clients cannot block
+other clients. Synchronization: one thread calls `start` and `close`; the thread of the server calls `answer`.
 
-Why no library: measured with 300 silent clients, prometheus_client's `start_http_server` holds 300 threads and 300
-descriptors without end, aiohttp 300 descriptors (and costs 180 ms of imports and 11 MB); this one 31, and 0 after 5 s.
+Libraries need more resources. With 300 silent clients, `start_http_server` of prometheus_client keeps 300 threads and
+300 descriptors, aiohttp 300 descriptors (and 180 ms of imports and 11 MB). This server needs 31 descriptors, and 0
+after 5 s.
 """
 
 import asyncio
@@ -20,42 +20,35 @@ from typing import Final
 from imud.host.threads import share_interpreter
 from imud.model.errors import ServerError
 
-CONNECTION_S: Final = 5.0
-"""From connection to the end of the answer. Prometheus itself waits 10 s."""
-CONNECTIONS_MAX: Final = 32
-"""Limit of connections: the server is for a handful of scrapers and people."""
-REQUEST_BYTES_MAX: Final = 8192
-"""Prometheus sends about 400 bytes of request and headers."""
+CONNECTION_S: Final = 5.0  # Maximum time from the connection to the end of the reply, s. Prometheus waits 10 s.
+CONNECTIONS_MAX: Final = 32  # Maximum number of connections. The server is for a few scrapers.
+REQUEST_BYTES_MAX: Final = 8192  # Maximum length of a request, bytes. Prometheus sends about 400 bytes.
 
-ACCEPT_PAUSE_S: Final = 1.0
-"""After the process ran out of descriptors."""
+ACCEPT_PAUSE_S: Final = 1.0  # pause of accept after the process ran out of descriptors, s
 
 TEXT: Final = "text/plain; charset=utf-8"
 
 
 @dataclass(frozen=True, slots=True)
 class HttpRequest:
-    """The parts of an HTTP request that are used."""
+    """Used parts of an HTTP request."""
 
     method: str
-    path: str
-    """Without the query."""
-    accept: str
-    """The Accept header, empty if there is none."""
+    path: str  # path without the query
+    accept: str  # accept header; empty if there is none
 
 
 @dataclass(frozen=True, slots=True)
 class HttpResponse:
-    """Answer to an HTTP request."""
+    """Reply to an HTTP request."""
 
-    status: str
-    """Code and reason, for example `200 OK`."""
+    status: str  # code and reason, for example `200 OK`
     body: bytes
     content_type: str = TEXT
 
 
 class ScrapeServer:
-    """HTTP server of `answer`."""
+    """HTTP server that calls `answer` for each request."""
 
     def __init__(
         self,
@@ -67,8 +60,7 @@ class ScrapeServer:
         connections_max: int = CONNECTIONS_MAX,
     ) -> None:
         self.address = address
-        self.port = port
-        """The bound port once started, also where 0 was asked for."""
+        self.port = port  # bound port after the start, also if the configured port is 0
         self._answer = answer
         self._connection_s = connection_s
         self._connections_max = connections_max
@@ -80,11 +72,11 @@ class ScrapeServer:
 
     @property
     def connections(self) -> int:
-        """Connections that are open now."""
+        """Return the number of open connections."""
         return len(self._connections)
 
     def start(self) -> None:
-        """Listen. Raises ServerError when address and port cannot be had."""
+        """Start the server. Raises ServerError if address and port cannot be used."""
         share_interpreter()
         self._listener = _listen(self.address, self.port)
         self.port = self._listener.getsockname()[1]
@@ -98,7 +90,7 @@ class ScrapeServer:
             raise ServerError(f"metrics cannot be served at {self.address} port {self.port}: the thread did not start")
 
     def close(self) -> None:
-        """End every connection and the thread; may be called twice."""
+        """Close all connections and end the thread. A second call does nothing."""
         if self._thread and self._loop and self._stop:
             self._loop.call_soon_threadsafe(self._stop.set)
             self._thread.join()
@@ -125,12 +117,12 @@ class ScrapeServer:
         await asyncio.gather(*connections, return_exceptions=True)
 
     def _accept(self, loop: asyncio.AbstractEventLoop, listener: socket.socket) -> None:
-        """Accept one client: `asyncio.start_server` may neither report nor close a client accepted at the end."""
+        """Accept one client. `asyncio.start_server` may neither report nor close a client accepted at the end."""
         try:
             client, _ = listener.accept()
         except (BlockingIOError, ConnectionError):
             return
-        except OSError:  # out of descriptors: the listener stays readable, an immediate retry would be a busy loop
+        except OSError:  # out of descriptors: the listener stays readable, so an immediate retry would be a busy loop
             loop.remove_reader(listener)
             loop.call_later(ACCEPT_PAUSE_S, loop.add_reader, listener, self._accept, loop, listener)
             return
@@ -144,7 +136,7 @@ class ScrapeServer:
         connection.add_done_callback(lambda done: self._ended(done, client))
 
     def _ended(self, connection: asyncio.Task[None], client: socket.socket) -> None:
-        """Close the socket. Not done by the task: one that is cancelled before its first step runs none of its code."""
+        """Close the socket. The task cannot do this: a task that is cancelled before its first step runs no code."""
         self._connections.pop(connection, None)
         client.close()
 
@@ -162,11 +154,12 @@ class ScrapeServer:
                     with_body = request is None or request.method != "HEAD"
                     await loop.sock_sendall(client, _response(answer, with_body=with_body))
         except (TimeoutError, ConnectionError):
-            pass  # silent, slow, or gone: no answer
+            pass  # silent, slow or disconnected client: no reply
 
 
 async def _read_head(loop: asyncio.AbstractEventLoop, client: socket.socket) -> bytes | None:
-    """Everything up to the empty line; None when the client ends first or exceeds REQUEST_BYTES_MAX."""
+    """Return the data up to the empty line; None if the client disconnects first or sends more than
+    REQUEST_BYTES_MAX."""
     data = b""
     while b"\r\n\r\n" not in data:
         part = await loop.sock_recv(client, REQUEST_BYTES_MAX)
@@ -177,7 +170,7 @@ async def _read_head(loop: asyncio.AbstractEventLoop, client: socket.socket) -> 
 
 
 def parse_request(head: bytes) -> HttpRequest | None:
-    """Parse request line and headers (RFC 9112, sections 3 and 5); None if they are not HTTP/1."""
+    """Return path and headers of a request (RFC 9112, sections 3 and 5); None if it is not HTTP/1."""
     line, *headers = head.decode("latin-1").split("\r\n")
     words = line.split(" ")
     if len(words) != 3 or not words[2].startswith("HTTP/1."):

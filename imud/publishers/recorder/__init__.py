@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""Output `recorder`."""

@@ -1,11 +1,10 @@
-"""A recording for one client: blocks go to it through a socket, and it does with them what it likes.
+"""Recording for one client: imud sends the blocks of the recording through a socket.
 
     feed ──put──▶ queue ──once a second, or RING_BYTES──▶ thread: block, compress ──▶ socket ──▶ the client, its file
 
-The daemon opens no file for a client, and never waits for one: the socket is written with MSG_DONTWAIT, and while it
-is full records wait in the queue, which is bounded; what has no room there is dropped, and stands in the recording as
-lost.
-A pipe would not do (`imud.publishers.socket.client` has the reason).
+The daemon opens no file for a client and never waits for a client. It writes the socket with MSG_DONTWAIT. If the
+socket is full, records wait in the queue. If the queue is full, imud drops records and marks the loss in the recording.
+A pipe cannot replace the socket: `imud.publishers.socket.client` contains the reason.
 """
 
 import select
@@ -22,18 +21,17 @@ from imud.publishers.recorder.writer import WRITE_NS, RecordFeed, RecordQueue
 
 FLAGS: Final = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
 BUFFER_BYTES: Final = 1 << 20
-"""Asked of the kernel for a socket, which gives what it may: usually 208 KiB (net.core.wmem_max), two blocks."""
+"""Requested size of the socket buffer, bytes. The kernel limits it, usually to 208 KiB (net.core.wmem_max), two
+blocks."""
 CLOSE_TRIES: Final = 10
 CLOSE_WAIT_MS: Final = 50
-"""When imud stops, a client has half a second to take what waits for it."""
-FULL_NS: Final = 20 * NS_PER_MS
-"""A socket that is full is looked at again after so long: at 208 KiB, 10 MB/s."""
-LINGER_NS: Final = 10 * NS_PER_S
-"""After the end of a recording a client that takes nothing for so long has lost the rest."""
+"""Interval of the checks during half a second in which a client can receive waiting records when imud ends, ms."""
+FULL_NS: Final = 20 * NS_PER_MS  # time between two attempts on a full socket, ns: 10 MB/s with 208 KiB
+LINGER_NS: Final = 10 * NS_PER_S  # time without progress after which a client loses the rest of an ended recording, ns
 
 
 def stream_pair() -> tuple[socket.socket, socket.socket]:
-    """Make the daemon's end, which takes nothing in, and the client's. Raises OSError."""
+    """Return the end of the daemon, which receives nothing, and the end of the client. Raises OSError."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
     ours.shutdown(socket.SHUT_RD)
@@ -41,29 +39,26 @@ def stream_pair() -> tuple[socket.socket, socket.socket]:
 
 
 class LastRecords(NamedTuple):
-    """The mark at the end of a recording."""
+    """Mark at the end of a recording."""
 
-    records: bytes
-    """Whole records, for which there is always room."""
+    records: bytes  # complete records, for which there is always room
 
 
 class BlockSender:
-    """The daemon's end of a client's socket. It closes the socket. Synchronization: one thread at a time."""
+    """Daemon's end of a client's socket. This class closes the socket. Synchronization: one thread at a time."""
 
     def __init__(self, sock: socket.socket, now_ns: Callable[[], int]) -> None:
         self.sent_bytes = 0
-        self.ended = False
-        """Whether the socket is closed: all was sent, or the client has closed its end or reads no more."""
+        self.ended = False  # true if the socket is closed: all blocks were sent, or the client disconnected
         self._sock = sock
         self._now_ns = now_ns
         self._rest = memoryview(b"")
-        self._moved_ns = now_ns()
-        """When the socket took something last."""
+        self._moved_ns = now_ns()  # time of the last progress
 
     def send(self, block: bytes = b"") -> bool:
-        """Send what is left of the block before and then this one; return whether all is sent.
+        """Send the rest of the previous block and then `block`. Return whether all is sent.
 
-        Give the next block only when it is; a client that has closed its end takes everything.
+        Do not give the next block before. Data for a disconnected client is discarded.
         """
         if block:
             self._rest = memoryview(block)
@@ -75,49 +70,46 @@ class BlockSender:
                 self._moved_ns = self._now_ns()
         except BlockingIOError:
             return False
-        except OSError:  # closed by the client
+        except OSError:  # the client closed its end
             self.close()
         return True
 
     @property
     def is_stuck(self) -> bool:
-        """Whether the client has taken nothing for LINGER_NS."""
+        """Return whether the client made no progress for LINGER_NS."""
         return bool(self._rest) and self._now_ns() - self._moved_ns >= LINGER_NS
 
     def close(self) -> None:
-        """Close the socket: the client reads what is in it, then end of file; may be called twice."""
+        """Close the socket. The client reads the buffered data, then end of file. A second call does nothing."""
         self.ended = True
         self._rest = memoryview(b"")
         self._sock.close()
 
 
 class StreamWriter:
-    """The thread of a recording for a client. Synchronization: `ended` and `failure` are read by any thread."""
+    """Thread of a recording for a client. Synchronization: any thread may read `ended` and `failure`."""
 
     def __init__(
         self, queue: RecordQueue[LastRecords], sock: socket.socket, now_ns: Callable[[], int], start_worker: StartWorker
     ) -> None:
-        self.failure: BaseException | None = None
-        """The exception that ended the thread, which is an internal error."""
+        self.failure: BaseException | None = None  # internal error that ended the thread
         self._queue = queue
         self._sock = sock
         self._sender = BlockSender(sock, now_ns)
         self._gatherer = BlockGatherer()
-        self.is_ending = False
-        """Whether the last records wait in the queue, or are gathered: set by the loop."""
-        self._is_last = False
-        """Whether all records are gathered."""
+        self.is_ending = False  # True if the last records are in the queue; set by the event loop
+        self._is_last = False  # True if the last records are in the present block
         self._hurry = False
         self._worker = start_worker("record", self._round, self._failed)
         queue.ring = self._worker.ring
 
     @property
     def ended(self) -> bool:
-        """Whether nothing is sent any more: all was, or the client has gone."""
+        """Return whether the recording has ended: all records were sent, or the client disconnected."""
         return self._sender.ended
 
     def close(self, *, flush: bool) -> None:
-        """End the thread; with `flush` the client has a moment to take what waits. May be called twice."""
+        """End the thread. With `flush`, wait shortly for the client. A second call does nothing."""
         self._queue.ring = lambda: None
         self._hurry = True
         self._worker.end()
@@ -132,7 +124,7 @@ class StreamWriter:
         self._sender.close()
 
     def _round(self) -> int:
-        """Send what waits, as far as the socket takes it; return the time until the next round, ns."""
+        """Send waiting records until the socket is full. Return the time until the next round, ns."""
         sender = self._sender
         while not (self._hurry or sender.ended):
             if not sender.send():
@@ -159,7 +151,7 @@ class StreamWriter:
 
 
 class ClientRecording:
-    """A recording that a client asked for. Synchronization: the event loop's thread only."""
+    """Recording for a client. Synchronization: the event loop's thread only."""
 
     def __init__(
         self,
@@ -168,7 +160,7 @@ class ClientRecording:
         sock: socket.socket,
         start_worker: StartWorker = BusThread,
     ) -> None:
-        """`devices` are names, None for all; `sock` is the daemon's end of the client's socket."""
+        """`devices` are device names, None for all. `sock` is the daemon's end of the client's socket."""
         self._queue = RecordQueue[LastRecords]()
         self._feed = RecordFeed(context, self._queue, devices)
         self._writer = StreamWriter(self._queue, sock, context.clock.now_ns, start_worker)
@@ -179,20 +171,20 @@ class ClientRecording:
 
     @property
     def records_dropped(self) -> int:
-        """Records that had no room, because the client does not read."""
+        """Return the number of records that imud dropped because the client was too slow."""
         return self._queue.dropped
 
     @property
     def ended(self) -> bool:
-        """Whether it is over, and `close` may be called: all is sent, or the client has gone."""
+        """Return whether `close` may be called: all records were sent, or the client disconnected."""
         return self._writer.ended
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Note a device, which is recorded if it was asked for."""
+        """Add a device. Record it if the client selected it."""
         self._feed.add_device(name, device_id)
 
     def remove_device(self, name: str) -> None:
-        """Forget a device that left the configuration."""
+        """Remove a device."""
         self._feed.remove_device(name)
 
     def event(self, event: Event) -> None:
@@ -201,7 +193,7 @@ class ClientRecording:
             self._feed.event(event)
 
     def tick(self, now_ns: int) -> None:
-        """Record devices that are new, checks, and losses. Raises what ended the thread."""
+        """Record new devices, checks and losses. Raises the exception that ended the thread."""
         if self._writer.failure is not None:
             raise self._writer.failure
         if not self._stopped:
@@ -210,7 +202,7 @@ class ClientRecording:
             self._feed.check_if_due(now_ns)
 
     def stop(self, reason: str) -> None:
-        """End the recording regularly; what waits is still sent. No-op if stopped."""
+        """End the recording with its end record. imud still sends waiting records. A second call does nothing."""
         if self._stopped:
             return
         self._stopped = True
@@ -218,7 +210,7 @@ class ClientRecording:
         self._writer.is_ending = True
 
     def close(self, *, flush: bool = False) -> None:
-        """End it; with `flush` a client has a moment to take what waits. May be called twice."""
+        """Close the recording. With `flush`, wait shortly for the client. A second call does nothing."""
         self._stopped = True
         self._feed.stop()
         self._writer.close(flush=flush)

@@ -1,4 +1,4 @@
-"""The directory of recordings: names of files, and the oldest removed so that all of them keep within a budget."""
+"""Directory of recordings: file names, and removal of the oldest files above the limit of disk space."""
 
 import os
 import re
@@ -16,55 +16,50 @@ from imud.model.options import Options
 from imud.model.units import NS_PER_S
 
 SUFFIX: Final = ".imudrec"
-SNAPSHOT: Final = "-snapshot"
-"""Ends the name of a snapshot, before the suffix."""
+SNAPSHOT: Final = "-snapshot"  # suffix of the name of a snapshot
 NAME: Final = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{6}(-snapshot)?\.imudrec")
-"""Files that the recorder makes, and only such are ever removed."""
-FILES_MAX: Final = 100_000
-"""Files looked at in one directory."""
-RETRY_NS: Final = 60 * NS_PER_S
-"""A directory that was full or failed is tried again after so long."""
+"""File names of the recorder. imud removes only these files."""
+FILES_MAX: Final = 100_000  # maximum number of files that imud reads from the directory
+RETRY_NS: Final = 60 * NS_PER_S  # time between two attempts on a full or failed disk, ns
 
 
 class RecordingFile(NamedTuple):
-    """A file of the directory."""
+    """Recording in the directory."""
 
     name: str
     size: int
 
 
 class RecordingDirectory:
-    """The directory. Synchronization: any thread."""
+    """Directory of recordings. Synchronization: any thread."""
 
     def __init__(self, path: Path, keep_bytes: int) -> None:
         self.path = path
-        self.removed = 0
-        """Files removed for the budget since the start."""
-        self.in_use: set[str] = set()
-        """Names of files that are written at present, which are not removed."""
+        self.removed = 0  # number of files removed since the start
+        self.in_use: set[str] = set()  # names of open files, which imud does not remove
         self.kept_bytes = 0
-        """Size of the files that are not in use, as of the last look, and of those that were added since."""
+        """Size of the files that are not open, from the last measurement and the files added after it."""
         self._keep_bytes = keep_bytes
         self._lock = Lock()
 
     def make(self) -> None:
-        """Make the directory where it is missing. Raises OSError."""
+        """Create the directory if it does not exist. Raises OSError."""
         self.path.mkdir(mode=0o750, parents=True, exist_ok=True)
 
     def measure(self) -> None:
-        """Look how much the files take. Raises OSError."""
+        """Measure the size of the files. Raises OSError."""
         with self._lock:
             self._note(self.files())
 
     def add(self, size: int) -> None:
-        """Count a file that was written."""
+        """Add the size of a closed file."""
         with self._lock:
             self.kept_bytes += size
 
     def new_file(self, utc_ns: int, epoch: int, number: int, kind: str = "") -> Path:
-        """Return the path of the next file: names sort by time, those of one run of the daemon go together.
+        """Return the path of the next file. Names sort by time; the files of one run of the daemon share the epoch.
 
-        `kind` is SNAPSHOT for one, which are counted by themselves.
+        `kind` is SNAPSHOT for a snapshot. Snapshots have their own numbers.
         """
         begun = datetime.fromtimestamp(utc_ns // NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
         return self.path / f"{begun}-{epoch & 0xFFFF_FFFF:08x}-{number:06d}{kind}{SUFFIX}"
@@ -82,9 +77,11 @@ class RecordingDirectory:
         return sorted(found)
 
     def make_room(self, reserve_bytes: int) -> Sequence[str]:
-        """Remove the oldest files that are not in use, until the rest and `reserve_bytes` more are within the budget.
+        """Remove the oldest closed files until the size of the rest plus `reserve_bytes` is below the limit.
 
-        Returns their names. Raises OSError.
+        Return their names.
+
+        Raises OSError.
         """
         with self._lock:
             files = self.files()
@@ -112,47 +109,47 @@ class FlightOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Options of the flight recorder."""
 
     enabled: bool = False
-    """Whether imud keeps the last minutes, to be saved by an alert or by `imud record --snapshot`."""
+    """Keep the data of the last minutes. An alert or `imud record --snapshot` saves it."""
     minutes: Annotated[float, msgspec.Meta(ge=0.1, le=1440)] = 5.0
-    """Time before an alert that is kept, min."""
+    """Time before an alert, min."""
     after_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 30.0
-    """Time after an alert that is saved with it, s."""
+    """Time after an alert, s."""
     memory_mb: Annotated[float, msgspec.Meta(ge=1, le=100_000)] = 64.0
-    """Room for what is kept, MB (10⁶ bytes): where `minutes` need more, less of them is kept."""
+    """Maximum size of the kept data, MB (10⁶ bytes). imud keeps fewer minutes if they need more."""
     directory: str = ""
-    """Where it is kept: empty for the main memory, or a directory that imud makes, for example on a tmpfs; what a
-    killed imud left there is saved at the next start."""
+    """Directory of the kept data, for example on a tmpfs; empty: main memory. imud creates the directory. After a kill,
+    imud saves the data in this directory at the next start."""
     acceleration_m_s2: Annotated[float, msgspec.Meta(gt=0, le=1_000_000)] | None = None
-    """An acceleration above which a sample is an alert, m/s², gravity included; null for none."""
+    """Acceleration that causes an alert, m/s², including gravity; null: no alert."""
     device_lost: bool = True
-    """Whether it is an alert that a device that was running is gone or silent."""
+    """Cause an alert if a running device becomes missing or silent."""
     line: InputOptions | None = None
-    """A GPIO line whose becoming active is an alert, with the keys `line`, `chip`, `active_low` and `bias` as those of
-    a device; null for none."""
+    """GPIO line that causes an alert when it becomes active, with the keys `line`, `chip`, `active_low` and `bias` as
+    for a device; null: no line."""
     per_hour: Annotated[int, msgspec.Meta(ge=1, le=3600)] = 6
-    """At most so many snapshots are saved by alerts within an hour."""
+    """Maximum number of snapshots by alerts per hour."""
 
 
 class RecorderOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of the recorder."""
 
     enabled: bool = False
-    """Whether imud records always, to files that follow one another."""
+    """Record continuously."""
     directory: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud/recordings"
-    """Where the files are; imud makes it where it is missing."""
+    """Directory of the recordings. imud creates it."""
     devices: list[str] | None = None
-    """Names of the devices that are recorded; null for all."""
+    """Names of the recorded devices; null: all devices."""
     keep_gb: Annotated[float, msgspec.Meta(gt=0, le=1_000_000)] = 10.0
-    """Room for all files together, snapshots included, GB (10⁹ bytes): the oldest are removed before it is exceeded."""
+    """Maximum size of all files, including snapshots, GB (10⁹ bytes). imud removes the oldest files."""
     file_mb: Annotated[float, msgspec.Meta(ge=1, le=100_000)] = 100.0
-    """A new file begins at this size, MB (10⁶ bytes), …"""
+    """Size of a file after which imud starts a new file, MB (10⁶ bytes)."""
     file_minutes: Annotated[float, msgspec.Meta(ge=1, le=10_080)] = 60.0
-    """… or after this time, whichever comes first."""
+    """Time after which imud starts a new file, min."""
     flight: FlightOptions = FlightOptions()
-    """The flight recorder: the last minutes, saved when something happens."""
+    """Options of the flight recorder."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a budget with room for less than two files, or for a snapshot."""
+        """Raise ValueError if the limit has no room for two files or for a snapshot."""
         if self.keep_gb * 1000 < 2 * self.file_mb:
             raise ValueError(
                 f"keep_gb: expected room for two files of file_mb ({self.file_mb:g}), {self.file_mb / 500:g} or more, "
@@ -167,5 +164,4 @@ class RecorderOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=
 
     @property
     def keep_bytes(self) -> int:
-        """`keep_gb` in bytes."""
         return round(self.keep_gb * 1000 * MEGABYTE)

@@ -1,8 +1,9 @@
-"""The flight recorder: the last minutes are kept, and saved when something happens.
+"""Flight recorder: keeps the data of the last minutes and saves it after an alert.
 
-What devices deliver goes into segments (`segments.py`), of which the oldest go. An alert, which is an acceleration over
-a bound, a device that is lost, or a GPIO line, has them saved to the directory of recordings after a while; a client of
-the socket gets them at once. A snapshot is a recording like any other.
+The flight recorder writes the input of the devices into segments and drops the oldest segments. Alerts are an
+acceleration above a limit, a missing device, or a GPIO line. Some time after an alert, imud saves the segments as a
+snapshot to the directory of recordings. A client of the socket can request a snapshot at any time. A snapshot is a
+normal recording.
 """
 
 import errno
@@ -40,37 +41,32 @@ HOUR_NS: Final = 3600 * NS_PER_S
 
 
 class Alert(NamedTuple):
-    """Something that is to be saved."""
+    """Event that causes a snapshot."""
 
-    t_ns: int
-    """CLOCK_MONOTONIC."""
-    device: str
-    """Empty for one of no device."""
-    reason: str
-    """What happened, one sentence."""
+    t_ns: int  # CLOCK_MONOTONIC
+    device: str  # device name; empty if the alert belongs to no device
+    reason: str  # cause of the alert, one sentence
 
 
 class AlertGate:
-    """Decides on alerts: one at a time, for what follows it is in the same snapshot, and so many an hour.
+    """Limit of alerts: one pending alert at a time, and a maximum number per hour.
+
+    A snapshot also contains the alerts after its alert.
 
     Synchronization: one thread.
     """
 
     def __init__(self, after_ns: int, per_hour: int) -> None:
-        """`after_ns`: a snapshot is saved so long after its alert."""
-        self.pending: Alert | None = None
-        """The alert whose snapshot is to be saved."""
-        self.left_out = 0
-        """Alerts that were not saved since the last that was, because there were too many."""
-        self.left_out_total = 0
-        """The same since the start."""
+        """`after_ns` is the time from an alert to its snapshot."""
+        self.pending: Alert | None = None  # alert that waits for its snapshot
+        self.left_out = 0  # number of ignored alerts since the last accepted alert
+        self.left_out_total = 0  # number of ignored alerts since the start
         self._after_ns = after_ns
         self._per_hour = per_hour
-        self._accepted: deque[int] = deque()
-        """Times of those within an hour."""
+        self._accepted: deque[int] = deque()  # times of the alerts accepted in the last hour
 
     def add(self, alert: Alert) -> bool:
-        """Take an alert; return False for the first one that is left out."""
+        """Add an alert. Return False for the first alert above the limit."""
         if self.pending is not None:
             return True
         accepted = self._accepted
@@ -86,7 +82,7 @@ class AlertGate:
         return True
 
     def take_due(self, now_ns: int, *, at_once: bool = False) -> Alert | None:
-        """Return the alert whose snapshot is to be saved now, once; with `at_once` also one that is not due yet."""
+        """Return the due alert once. With `at_once`, return the pending alert before it is due."""
         alert = self.pending
         if alert is None or (now_ns - alert.t_ns < self._after_ns and not at_once):
             return None
@@ -95,25 +91,21 @@ class AlertGate:
 
 
 SEGMENTS_MAX: Final = 64
-"""Each has a descriptor; the flight recorder makes half as many of the time that it keeps."""
+"""Maximum number of segments. Each segment needs a descriptor. The flight recorder uses half of them."""
 
 
 class SegmentBegin(NamedTuple):
-    """The mark at which a segment begins."""
+    """Mark in the queue at which a segment starts."""
 
-    t_ns: int
-    """CLOCK_MONOTONIC."""
-    session: bytes
-    """Record that a recording begins with."""
-    path: Path | None
-    """Its file; None for one in memory."""
-    drop_before_ns: int
-    """Segments that ended before this time are not kept any more, CLOCK_MONOTONIC."""
+    t_ns: int  # CLOCK_MONOTONIC
+    session: bytes  # first record of a recording
+    path: Path | None  # path of the segment file; None in memory
+    drop_before_ns: int  # CLOCK_MONOTONIC limit: imud drops segments that ended before
 
 
 @dataclass(slots=True)
 class Segment:
-    """A segment of the ring."""
+    """Segment of the ring."""
 
     t_ns: int
     descriptor: int
@@ -121,7 +113,7 @@ class Segment:
     bytes: int = 0
 
     def close(self) -> None:
-        """Give its room back; no-op if done."""
+        """Close the segment and remove its file. A second call does nothing."""
         descriptor, self.descriptor = self.descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
@@ -131,20 +123,17 @@ class Segment:
 
 
 class SegmentRing:
-    """The ring. Synchronization: the thread of the flight recorder; the counters are read by any."""
+    """Ring of segments. Synchronization: the thread of the flight recorder; any thread may read the counters."""
 
     def __init__(self, bytes_max: int) -> None:
-        self.bytes = 0
-        """Size of all segments."""
-        self.oldest_ns = 0
-        """CLOCK_MONOTONIC at the begin of the oldest; 0 without any."""
-        self.newest_bytes = 0
-        """Size of the newest."""
+        self.bytes = 0  # size of all segments
+        self.oldest_ns = 0  # CLOCK_MONOTONIC at the start of the oldest segment; 0 without segments
+        self.newest_bytes = 0  # size of the newest segment
         self._bytes_max = bytes_max
         self._segments: deque[Segment] = deque()
 
     def begin(self, mark: SegmentBegin) -> None:
-        """Begin a segment, and drop those that are too old. Raises OSError."""
+        """Start a segment and drop old segments. Raises OSError."""
         segments = self._segments
         while len(segments) > 1 and segments[1].t_ns <= mark.drop_before_ns:
             self._drop_oldest()
@@ -158,7 +147,10 @@ class SegmentRing:
         self.oldest_ns, self.newest_bytes = segments[0].t_ns, 0
 
     def append(self, block: bytes) -> None:
-        """Append a block to the newest segment; the oldest go where there is no room. Raises OSError without any."""
+        """Append a block to the newest segment.
+
+        Drop the oldest segments if there is no room. Raises OSError if all are dropped.
+        """
         segments = self._segments
         while len(segments) > 1 and self.bytes + len(block) > self._bytes_max:
             self._drop_oldest()
@@ -168,7 +160,7 @@ class SegmentRing:
             self._drop_oldest()
 
     def _write(self, segment: Segment, block: bytes) -> bool:
-        """Append a whole block, or nothing; False where there is no room."""
+        """Append the complete block or nothing. Return False if there is no room."""
         try:
             written = os.write(segment.descriptor, block)
         except OSError as error:
@@ -197,7 +189,7 @@ class SegmentRing:
         self.newest_bytes = 0
 
     def reader(self, ending: bytes) -> "SegmentReader":
-        """Return a reader of what there is now, which goes on when segments are dropped. Raises OSError."""
+        """Return a reader of the present data. It stays valid after imud drops segments. Raises OSError."""
         opened: list[tuple[int, int]] = []
         try:
             for segment in self._segments:
@@ -213,19 +205,20 @@ class SegmentReader:
     """Reader of the blocks of a snapshot. It closes its descriptors at the end. Synchronization: one thread."""
 
     def __init__(self, opened: Sequence[tuple[int, int]], ending: bytes) -> None:
-        """`opened` are descriptors of segments with the bytes that are read of each; `ending` is the last record, or
-        nothing for a recording without its regular end."""
-        self.bytes = sum(size for _, size in opened)
-        """What a snapshot takes, about."""
+        """`opened` are descriptors of segments with the number of bytes to read.
+
+        `ending` is the last record; empty for a recording without an end record.
+        """
+        self.bytes = sum(size for _, size in opened)  # approximate size of the snapshot
         self._opened = list(opened)
         self._blocks = self._read(ending)
 
     def next_block(self) -> bytes:
-        """Return the next block; nothing at the end. Raises OSError."""
+        """Return the next block; empty at the end. Raises OSError."""
         return next(self._blocks, b"")
 
     def close(self) -> None:
-        """Release the descriptors; may be called twice."""
+        """Close the descriptors. A second call does nothing."""
         while self._opened:
             os.close(self._opened.pop()[0])
 
@@ -235,7 +228,7 @@ class SegmentReader:
             descriptor, size = self._opened[0]
             is_first = number == 0
             for index, block in enumerate(_blocks_of(descriptor, size)):
-                if index or is_first:  # the first block of a segment is its session
+                if index or is_first:  # the first block of a segment is its session record
                     yield renumbered(block, number)
                     number += 1
             os.close(self._opened.pop(0)[0])
@@ -244,7 +237,7 @@ class SegmentReader:
 
 
 def left_behind(files: Sequence[Path]) -> SegmentReader:
-    """Return a reader of the segments that a process left in files, in their order. Raises OSError."""
+    """Return a reader of the segment files of another process, in their order. Raises OSError."""
     opened: list[tuple[int, int]] = []
     try:
         for path in files:
@@ -258,7 +251,7 @@ def left_behind(files: Sequence[Path]) -> SegmentReader:
 
 
 def _blocks_of(descriptor: int, size: int) -> Iterator[bytes]:
-    """The whole blocks in so many bytes of a file; it may end in a part of one, if its writer was killed."""
+    """Yield the complete blocks of a segment. The last block is incomplete if the writer was killed."""
     at = 0
     while at + HEAD.size <= size:
         head = os.pread(descriptor, HEAD.size, at)
@@ -271,42 +264,39 @@ def _blocks_of(descriptor: int, size: int) -> Iterator[bytes]:
 
 
 class Save(NamedTuple):
-    """The mark at which a snapshot is to be saved."""
+    """Mark in the queue at which imud saves a snapshot."""
 
     path: Path
-    ending: bytes
-    """Record that it ends with."""
+    ending: bytes  # last record of the snapshot
 
 
 class Rescue(NamedTuple):
-    """The mark at which what another process left is to be saved, and then removed."""
+    """Mark in the queue at which imud saves and removes the segments of another process."""
 
     path: Path
-    files: Sequence[Path]
-    """Its segments in their order."""
+    files: Sequence[Path]  # segment files in their order
 
 
 class Send(NamedTuple):
-    """The mark at which a snapshot is to be sent to a client."""
+    """Mark in the queue at which imud sends a snapshot to a client."""
 
     sock: socket.socket
     ending: bytes
 
 
 class Saved(NamedTuple):
-    """What became of a snapshot."""
+    """Result of a snapshot."""
 
     path: Path
     bytes: int
-    problem: str
-    """Why it was not saved, one sentence; empty if it was."""
+    problem: str  # cause of the failure, one sentence; empty after a success
 
 
 Mark = SegmentBegin | Save | Rescue | Send
 
 
 class FlightWriter:
-    """The thread. Synchronization: attributes are written by the thread and read by any."""
+    """Thread of the flight recorder. Synchronization: the thread writes the attributes, any thread reads them."""
 
     def __init__(
         self,
@@ -316,26 +306,22 @@ class FlightWriter:
         now_ns: Callable[[], int],
         start_worker: StartWorker,
     ) -> None:
-        self.problem = ""
-        """Why nothing is kept any more, until a new segment begins; empty while all is well."""
-        self.saved: deque[Saved] = deque()
-        """What became of snapshots; the loop takes it."""
-        self.failure: BaseException | None = None
-        """The exception that ended the thread, which is an internal error."""
+        self.problem = ""  # cause of a failed segment, until the next segment starts; empty if there is no problem
+        self.saved: deque[Saved] = deque()  # Results of snapshots. The event loop removes them.
+        self.failure: BaseException | None = None  # internal error that ended the thread
         self._queue = queue
         self._ring = ring
         self._directory = directory
         self._now_ns = now_ns
         self._gatherer = BlockGatherer()
         self._is_open = False
-        self.sends_ended = 0
-        """Clients that have their snapshot, or have gone."""
+        self.sends_ended = 0  # number of finished snapshots for clients
         self._sends: list[tuple[BlockSender, SegmentReader]] = []
         self._worker = start_worker("flight", self._round, self._failed)
         queue.ring = self._worker.ring
 
     def close(self) -> None:
-        """Do what is asked for still, and end the thread; may be called twice."""
+        """Do the queued work and end the thread. A second call does nothing."""
         self._queue.ring = lambda: None
         self._worker.end()
         self._round()
@@ -345,10 +331,10 @@ class FlightWriter:
         self._sends.clear()
         self._ring.clear()
 
-    # --- the thread's side -------------------------------------------------------------------------------------------
+    # --- thread -------------------------------------------------------------------------------------------------------
 
     def _round(self) -> int:
-        """Do all that waits; return the time until the next round, ns."""
+        """Process the queue. Return the time until the next round, ns."""
         while (item := self._queue.take()) is not None:
             try:
                 if isinstance(item, bytes):
@@ -384,7 +370,7 @@ class FlightWriter:
             self._rescue(mark)
 
     def _rescue(self, mark: Rescue) -> None:
-        """Save what was left, and remove it; where that is not possible, it is there at the next start."""
+        """Save and remove the segments of another process. After an error, the next start tries again."""
         saved = self._save(mark.path, lambda: left_behind(mark.files))
         self.saved.append(saved)
         for file in mark.files if not saved.problem else ():
@@ -395,7 +381,7 @@ class FlightWriter:
         sender = BlockSender(mark.sock, self._now_ns)
         try:
             self._sends.append((sender, self._ring.reader(mark.ending)))
-        except OSError:  # no descriptors are left: the client sees an end without a recording
+        except OSError:  # out of descriptors: the client reads an empty file
             sender.close()
             self.sends_ended += 1
 
@@ -408,7 +394,7 @@ class FlightWriter:
             self._ring.append(block)
 
     def _save(self, path: Path, make_reader: Callable[[], SegmentReader]) -> Saved:
-        """Write the file, and leave nothing where that is not possible."""
+        """Save a snapshot. Remove the file after an error."""
         self._directory.in_use.add(path.name)
         try:
             reader = make_reader()
@@ -436,7 +422,7 @@ class FlightWriter:
 
 
 def _write(reader: SegmentReader, path: Path) -> int:
-    """Write a snapshot; return its size. Leaves no file for an empty one, or where it raises OSError."""
+    """Write a snapshot. Return its size. Remove the file if it is empty or after OSError."""
     size, descriptor = 0, os.open(path, FLAGS, 0o640)
     try:
         while block := reader.next_block():
@@ -457,12 +443,12 @@ def _write(reader: SegmentReader, path: Path) -> int:
 
 
 def _is_sent(sender: BlockSender, reader: SegmentReader) -> bool:
-    """Send to a client as far as it takes something; return whether that is over, with everything closed then."""
+    """Send blocks until the socket is full. Return whether the snapshot has ended; everything is then closed."""
     block = b""
     while not sender.ended and sender.send(block):
         try:
             block = reader.next_block()
-        except OSError:  # what was sent before is whole
+        except OSError:  # the blocks sent before are complete
             block = b""
         if not block:
             sender.close()
@@ -476,15 +462,16 @@ def _is_sent(sender: BlockSender, reader: SegmentReader) -> bool:
 log = logging.getLogger(__name__)
 
 SEGMENT_NS_MIN: Final = 5 * NS_PER_S
-"""A segment begins with the state of every device, which is 17 kB of one at 1 kHz: a twentieth of 5 s of its data."""
+"""Minimum length of a segment, ns. A segment starts with the state of each device, 17 kB at 1 kHz: a twentieth of the
+data of 5 s."""
 SEGMENTS_OF_BYTES: Final = 16
-"""A new segment begins at such a part of the room, so that little more than that is dropped at once."""
+"""Number of segments in the maximum size. imud drops not much more than a sixteenth at a time."""
 SENDS_MAX: Final = 4
-"""Clients that get a snapshot at the same time; each keeps the room of segments that were dropped meanwhile."""
+"""Maximum number of clients that receive a snapshot at a time. Each keeps the memory of dropped segments."""
 
 
 class FlightRecorder:
-    """The flight recorder. Synchronization: the event loop's thread only."""
+    """Flight recorder. Synchronization: the event loop's thread only."""
 
     def __init__(
         self,
@@ -502,29 +489,26 @@ class FlightRecorder:
         after_ns = round(flight.after_s * NS_PER_S)
         self._segment_ns = max(SEGMENT_NS_MIN, (self._keep_ns + after_ns) // (SEGMENTS_MAX // 2))
         self._bytes_max = round(flight.memory_mb * MEGABYTE)
+        # directory of the segments; None in memory
         self._own = RecordingDirectory(Path(flight.directory), self._bytes_max) if flight.directory else None
-        """Where segments are; None in memory."""
         self._ring = SegmentRing(self._bytes_max)
         self._queue = RecordQueue[Mark]()
         self._feed = RecordFeed(context, self._queue, settings.devices)
         self._gate = AlertGate(after_ns, flight.per_hour)
-        self._saving: dict[Path, Alert] = {}
-        """Alerts whose snapshots are written at present."""
+        self._saving: dict[Path, Alert] = {}  # alerts of the snapshots that are being saved
         bound = flight.acceleration_m_s2
         self._bound_2 = float("inf") if bound is None else bound * bound
         self._line: WatchedInput | None = None
         self._writer: FlightWriter | None = None
         self._begun_ns = 0
-        self._segments = self._snapshots = self._sends = 0
-        """Counts since the start."""
-        self._saved = self._failed = 0
-        """Snapshots, by what became of them."""
+        self._segments = self._snapshots = self._sends = 0  # numbers since the start
+        self._saved = self._failed = 0  # snapshots by result
         self._problem = ""
 
-    # --- the publisher -----------------------------------------------------------------------------------------------
+    # --- publisher ----------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Begin to keep what devices deliver. Raises ServerError."""
+        """Start recording. Raises ServerError."""
         try:
             self._directory.make()
             self._directory.measure()
@@ -544,18 +528,18 @@ class FlightRecorder:
         context.outputs.snapshots.append(self.snapshot)
         context.outputs.flights.append(self.status)
         where = f"in {self._settings.directory}" if self._own is not None else "in memory"
-        log.info("flight recorder: the last %g minutes are kept %s", self._settings.minutes, where)
+        log.info("flight recorder: keeping the last %g minutes %s", self._settings.minutes, where)
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Note the device: it is kept from the next tick on, when it is there."""
+        """Add a device. The recording starts in the next tick, after the device exists."""
         self._feed.add_device(name, device_id)
 
     def remove_device(self, name: str) -> None:
-        """Forget a device that left the configuration."""
+        """Remove a device."""
         self._feed.remove_device(name)
 
     def publish(self, batch: Batch) -> None:
-        """Look for an acceleration over the bound."""
+        """Search for an acceleration above the limit."""
         bound_2 = self._bound_2
         if bound_2 == float("inf") or self._gate.pending is not None or not self._feed.wants(batch.device):
             return
@@ -566,7 +550,7 @@ class FlightRecorder:
                 return
 
     def event(self, event: Event) -> None:
-        """Keep an event; a device that is lost is an alert."""
+        """Record an event. A missing device is an alert."""
         if self._writer is None:
             return
         self._feed.event(event)
@@ -574,7 +558,7 @@ class FlightRecorder:
             self._alert(event.device, f"{event.device} is lost: {event.message}")
 
     def tick(self, now_ns: int) -> None:
-        """Keep devices that are new, checks, losses; begin a segment, save a snapshot that is due."""
+        """Record new devices, checks and losses. Start a due segment, and save a due snapshot."""
         writer = self._writer
         if writer is None:
             return
@@ -584,7 +568,7 @@ class FlightRecorder:
             self._line.tick(now_ns)
         self._feed.follow()
         if lost := self._feed.note_losses(now_ns):
-            self._raise(now_ns, f"flight recorder: this machine is too slow: {lost} records were not kept")
+            self._raise(now_ns, f"flight recorder: the host is too slow: {lost} records were dropped")
         is_full = self._ring.newest_bytes >= self._bytes_max // SEGMENTS_OF_BYTES
         pause_ns = RETRY_NS if writer.problem else self._segment_ns
         if (self._feed.check_if_due(now_ns) and is_full) or now_ns - self._begun_ns >= pause_ns:
@@ -595,7 +579,7 @@ class FlightRecorder:
         self._look_after(writer.problem, now_ns)
 
     def close(self) -> None:
-        """Save a snapshot that is to be, and drop the rest; may be called twice."""
+        """Save a pending snapshot and drop all segments. A second call does nothing."""
         writer, self._writer = self._writer, None
         if writer is None:
             return
@@ -611,12 +595,12 @@ class FlightRecorder:
             self._tell(writer.saved.popleft(), now_ns)
 
     def snapshot(self, sock: socket.socket) -> float:
-        """Send what there is to a client's socket, which is closed then; return its length, s. Raises ServerError."""
+        """Send a snapshot to the socket of a client and close the socket. Return the length, s. Raises ServerError."""
         writer, oldest_ns = self._writer, self._ring.oldest_ns
         if writer is None or not oldest_ns:
-            raise ServerError(f"nothing is kept: {self._problem or 'the flight recorder has just begun'}")
+            raise ServerError(f"the flight recorder has no data: {self._problem or 'it has just started'}")
         if self._sends - writer.sends_ended >= SENDS_MAX:
-            raise ServerError(f"{SENDS_MAX} clients get a snapshot at present; try again")
+            raise ServerError(f"the limit of {SENDS_MAX} clients with a snapshot at a time is reached; try again later")
         self._sends += 1
         self._feed.check()
         self._queue.mark(Send(sock, self._feed.ending("a snapshot for a client")))
@@ -631,7 +615,7 @@ class FlightRecorder:
             self._gate.left_out_total, self._sends, self._directory.kept_bytes,
         )  # fmt: skip
 
-    # --- segments and snapshots --------------------------------------------------------------------------------------
+    # --- segments and snapshots ---------------------------------------------------------------------------------------
 
     def _begin_segment(self, now_ns: int) -> None:
         context, pending = self._context, self._gate.pending
@@ -646,7 +630,7 @@ class FlightRecorder:
         self._feed.follow()
 
     def _left_behind(self) -> list[Rescue]:
-        """What a daemon that was killed left: a snapshot of each run. Raises OSError."""
+        """Return the segments of killed daemons, one snapshot for each run. Raises OSError."""
         runs: dict[str, list[Path]] = {}
         for file in self._own.files() if self._own is not None else ():
             assert self._own is not None
@@ -659,7 +643,11 @@ class FlightRecorder:
     def _alert(self, device: str, reason: str) -> None:
         now_ns = self._context.clock.now_ns()
         if not self._gate.add(Alert(now_ns, device, reason)):
-            self._raise(now_ns, f"not saved: {reason}; {self._settings.per_hour} snapshots were within an hour", device)
+            self._raise(
+                now_ns,
+                f"no snapshot of an alert: {reason}; the limit of {self._settings.per_hour} per hour is reached",
+                device,
+            )
 
     def _save_due(self, now_ns: int, *, at_once: bool = False) -> None:
         alert = self._gate.take_due(now_ns, at_once=at_once)
@@ -675,11 +663,13 @@ class FlightRecorder:
 
     def _tell(self, saved: Saved, now_ns: int) -> None:
         alert = self._saving.pop(saved.path, None)
-        device, reason = ("", "an imud that was killed left it") if alert is None else (alert.device, alert.reason)
+        device, reason = (
+            ("", "data of an imud process that was killed") if alert is None else (alert.device, alert.reason)
+        )
         self._failed += bool(saved.problem)
         self._saved += not saved.problem
         if saved.problem:
-            self._raise(now_ns, f"a snapshot was not saved: {saved.path}: {saved.problem}: {reason}", device)
+            self._raise(now_ns, f"cannot save the snapshot {saved.path}: {saved.problem}; alert: {reason}", device)
         else:
             self._raise(now_ns, f"saved {saved.path}: {reason}", device, file=str(saved.path), bytes=saved.bytes)
 
@@ -687,17 +677,17 @@ class FlightRecorder:
         if problem == self._problem:
             return
         before, self._problem = self._problem, problem
-        words = f"nothing is kept: {problem}" if problem else f"keeping again; it was not possible before: {before}"
+        words = f"cannot record: {problem}" if problem else f"recording again after: {before}"
         self._raise(now_ns, f"flight recorder: {words}")
 
-    # --- the line ----------------------------------------------------------------------------------------------------
+    # --- GPIO line ----------------------------------------------------------------------------------------------------
 
     def _on_edges(self, edges: Sequence[Edge]) -> None:
         if any(edge.rising for edge in edges):
             self._alert("", "the line of the flight recorder became active")
 
     def _on_line(self, problem: str) -> None:
-        self._raise(self._context.clock.now_ns(), f"flight recorder: its line: {problem}")
+        self._raise(self._context.clock.now_ns(), f"flight recorder: GPIO line: {problem}")
 
     def _raise(self, now_ns: int, message: str, device: str = "", **detail: str | int) -> None:
         log.warning("%s", message)

@@ -1,4 +1,4 @@
-"""The output `recorder`: files that are always written, the flight recorder, or both, within one budget of the disk."""
+"""Output `recorder`: continuous files, the flight recorder, or both, within one limit of disk space."""
 
 import logging
 import os
@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 
 class Recorder:
-    """The recorder. Synchronization: the event loop's thread only."""
+    """Continuous recorder. Synchronization: the event loop's thread only."""
 
     def __init__(
         self,
@@ -42,10 +42,10 @@ class Recorder:
         self._problem = ""
         self._due_ns = 0
 
-    # --- the publisher -----------------------------------------------------------------------------------------------
+    # --- publisher ----------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Make the directory and begin a file. Raises ServerError."""
+        """Create the directory and start a file. Raises ServerError."""
         try:
             self._directory.make()
             self._directory.make_room(self._file_bytes)
@@ -57,15 +57,15 @@ class Recorder:
         log.info("recording to %s", self._settings.directory)
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Note the device: it is recorded from the next tick on, when it is there."""
+        """Add a device. The recording starts in the next tick, after the device exists."""
         self._feed.add_device(name, device_id)
 
     def remove_device(self, name: str) -> None:
-        """Forget a device that left the configuration."""
+        """Remove a device."""
         self._feed.remove_device(name)
 
     def publish(self, batch: Batch) -> None:
-        """No-op: what samples are made of is recorded."""
+        """Do nothing: the recording contains the input of the devices, not samples."""
 
     def event(self, event: Event) -> None:
         """Record an event."""
@@ -73,7 +73,7 @@ class Recorder:
             self._feed.event(event)
 
     def tick(self, now_ns: int) -> None:
-        """Record devices that are new, checks, losses; begin a file that is due; look after the disk."""
+        """Record new devices, checks and losses. Start a new file if it is due. Check the disk."""
         writer = self._writer
         if writer is None:
             return
@@ -88,13 +88,13 @@ class Recorder:
             return
         self._feed.follow()
         if lost := self._feed.note_losses(now_ns):
-            self._raise(now_ns, f"the disk is too slow: {lost} records were not recorded")
+            self._raise(now_ns, f"the disk is too slow: {lost} records were dropped")
         is_full = writer.file_bytes >= self._file_bytes or now_ns - self._begun_ns >= self._file_ns
         if self._feed.check_if_due(now_ns) and is_full:
             self._next_file(now_ns)
 
     def close(self) -> None:
-        """End the file regularly; may be called twice."""
+        """End the file with its end record. A second call does nothing."""
         writer, self._writer = self._writer, None
         if writer is None:
             return
@@ -121,12 +121,14 @@ class Recorder:
             disk_bytes=self._directory.kept_bytes + (writer.file_bytes if writer is not None else 0),
         )
 
-    # --- files -------------------------------------------------------------------------------------------------------
+    # --- files --------------------------------------------------------------------------------------------------------
 
     def _begin_file(self, end_of_last: str = "") -> None:
-        """Begin a file with what all records after it need; before it, end the last one, where a reason is given.
+        """Start a file with the state that a replay needs.
 
-        Each look at the clocks may record a reading of them: all come before the end of the last file.
+        First end the previous file if `end_of_last` contains a reason.
+
+        Reading a clock can make a record. All clocks are therefore read before the end of the previous file.
         """
         context, now_ns = self._context, self._context.clock.now_ns()
         utc_ns = now_ns + context.clock.utc_offset_ns()
@@ -150,19 +152,19 @@ class Recorder:
             self._stop_recording(reason_of(error), now_ns)
             return
         if removed:
-            log.info("recordings removed to keep within %g GB: %s", self._settings.keep_gb, ", ".join(removed))
+            log.info("removed recordings to stay below %g GB: %s", self._settings.keep_gb, ", ".join(removed))
 
     def _end_file(self, reason: str) -> None:
         self._feed.put(self._feed.ending(reason))
 
-    # --- what goes wrong ---------------------------------------------------------------------------------------------
+    # --- problems -----------------------------------------------------------------------------------------------------
 
     def _stop_recording(self, problem: str, now_ns: int) -> None:
         self._feed.stop()
         self._due_ns = now_ns + RETRY_NS
         if problem != self._problem:
             self._problem = problem
-            self._raise(now_ns, f"nothing is recorded: {self._settings.directory}: {problem}; samples go on")
+            self._raise(now_ns, f"cannot record to {self._settings.directory}: {problem}; the other outputs continue")
 
     def _try_again(self, now_ns: int) -> None:
         problem = self._problem
@@ -177,7 +179,7 @@ class Recorder:
             return
         self._problem = ""
         self._begin_file()
-        self._raise(now_ns, f"recording again; it was not possible before: {problem}")
+        self._raise(now_ns, f"recording again after: {problem}")
 
     def _raise(self, now_ns: int, message: str) -> None:
         log.warning("%s", message)
@@ -185,7 +187,7 @@ class Recorder:
 
 
 class RecorderOutput:
-    """What the settings ask for. Synchronization: the event loop's thread only."""
+    """Recorders that the configuration enables. Synchronization: the event loop's thread only."""
 
     def __init__(
         self, settings: RecorderOptions, context: PublisherContext, start_worker: StartWorker = BusThread
@@ -197,7 +199,7 @@ class RecorderOutput:
             self._parts.append(Recorder(settings, context, directory, start_worker))
 
     def start(self) -> None:
-        """Start them. Raises ServerError, and leaves nothing running then."""
+        """Start all recorders. Raises ServerError; then no recorder is running."""
         try:
             for part in self._parts:
                 part.start()
@@ -206,32 +208,29 @@ class RecorderOutput:
             raise
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Note a device."""
         for part in self._parts:
             part.add_device(name, device_id)
 
     def remove_device(self, name: str) -> None:
-        """Forget a device."""
         for part in self._parts:
             part.remove_device(name)
 
     def publish(self, batch: Batch) -> None:
-        """Look for alerts: what samples are made of is recorded elsewhere."""
+        """Search for alerts. The recorders do not need the samples themselves."""
         if self._flight is not None:
             self._flight.publish(batch)
 
     def event(self, event: Event) -> None:
-        """Record an event."""
         for part in self._parts:
             part.event(event)
 
     def tick(self, now_ns: int) -> None:
-        """Do what is due."""
+        """Call `tick` of all recorders."""
         for part in self._parts:
             part.tick(now_ns)
 
     def close(self) -> None:
-        """End all; may be called twice."""
+        """Close all recorders. A second call does nothing."""
         for part in self._parts:
             part.close()
 

@@ -1,9 +1,9 @@
-"""Writer of recordings in a thread of its own: records wait in a bounded queue, and are written a block at a time.
+"""Writer of recordings: records wait in a limited queue, and a thread writes them in blocks.
 
-    loop ──put──▶ queue ──once a second, or RING_BYTES──▶ thread: block, compress, write, now and then sync
+    loop ──put──▶ queue ──once a second, or RING_BYTES──▶ thread: block, compress, write, sometimes sync
 
-The loop never waits: a record that has no room in the queue is dropped and counted. An error of the disk ends the
-writing; the thread says why, and goes on emptying the queue until it is given a new file.
+The event loop never waits. If the queue is full, imud drops and counts records. After an error of the disk, the thread
+stores the problem and empties the queue until the next file.
 """
 
 import errno
@@ -26,41 +26,37 @@ from imud.model.event import Event
 from imud.model.units import NS_PER_S
 
 QUEUE_BYTES: Final = 16 << 20
-"""Records that wait: 2 minutes of a device at 1 kHz, 5 s of 24 of them. An SD card that erases stalls for a second."""
-RING_BYTES: Final = 256 << 10
-"""The thread is woken for so many: a block of them is full."""
-WRITE_NS: Final = NS_PER_S
-"""Records are in the file so long after they came: so much is missing when the process is killed."""
+"""Maximum size of the queue, bytes: 2 minutes of a device at 1 kHz, 5 s of 24 devices. An SD card can stall for a
+second while it erases."""
+RING_BYTES: Final = 256 << 10  # size that wakes the thread, bytes: one full block
+WRITE_NS: Final = NS_PER_S  # Time between two writes, ns. If the process is killed, newer records are lost.
 SYNC_NS: Final = 5 * NS_PER_S
-"""And on the disk so long after: so much is missing when the power fails."""
+"""Time between two synchronizations with the disk, ns. A power failure loses newer records."""
 FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_APPEND
 
-M = TypeVar("M")
-"""What stands between records, for example the path of a file that begins; never bytes."""
+M = TypeVar("M")  # type of the marks between records, for example the path of a new file; never bytes
 
 
 class RecordQueue(Generic[M]):
-    """Queue of records, and of marks between them. Synchronization: one thread puts, one takes."""
+    """Queue of records and marks. Synchronization: one thread puts, one thread takes."""
 
     def __init__(self, bytes_max: int = QUEUE_BYTES) -> None:
-        self.dropped = 0
-        """Records that had no room since the start."""
+        self.dropped = 0  # number of records that had no room since the start
         self.dropped_bytes = 0
         self._items: deque[bytes | M] = deque()
         self._bytes_max = bytes_max
         self._put = self._taken = 0
         self._rung = 0
-        self.ring: Callable[[], None] = lambda: None
-        """Wakes the thread; set by it."""
+        self.ring: Callable[[], None] = lambda: None  # wakes the thread, which sets it
 
     @property
     def waiting_bytes(self) -> int:
-        """Records that wait."""
+        """Return the size of the waiting records, bytes."""
         return self._put - self._taken
 
     @property
     def is_easy(self) -> bool:
-        """Whether at least half of the room is free."""
+        """Return whether at least half of the queue is free."""
         return 2 * self.waiting_bytes < self._bytes_max
 
     def put(self, record: bytes) -> None:
@@ -77,12 +73,12 @@ class RecordQueue(Generic[M]):
             self.ring()
 
     def mark(self, mark: M) -> None:
-        """Add a mark after the records so far, for which there is always room, and wake the thread."""
+        """Add a mark after the present records, and wake the thread. There is always room for a mark."""
         self._items.append(mark)
         self.ring()
 
     def take(self) -> bytes | M | None:
-        """Return the oldest item; None for none."""
+        """Return the oldest item; None if the queue is empty."""
         try:
             item = self._items.popleft()
         except IndexError:
@@ -93,17 +89,13 @@ class RecordQueue(Generic[M]):
 
 
 class RecordingWriter:
-    """The thread and its file. Synchronization: the counters are written by the thread and read by any."""
+    """Thread and file of a recording. Synchronization: the thread writes the counters, any thread reads them."""
 
     def __init__(self, queue: RecordQueue[Path], now_ns: Callable[[], int], start_worker: StartWorker) -> None:
-        self.file_bytes = 0
-        """Size of the present file."""
-        self.written_bytes = 0
-        """What was written to all files."""
-        self.records = 0
-        """Records that were written."""
-        self.problem = ""
-        """Why nothing is written any more, until a new file begins; empty while all is well."""
+        self.file_bytes = 0  # size of the present file
+        self.written_bytes = 0  # size of all files since the start
+        self.records = 0  # number of written records
+        self.problem = ""  # cause of a failed write, until the next file starts; empty if there is no problem
         self._queue = queue
         self._now_ns = now_ns
         self._gatherer = BlockGatherer()
@@ -114,7 +106,7 @@ class RecordingWriter:
         queue.ring = self._worker.ring
 
     def close(self) -> None:
-        """Write what waits and end the thread; may be called twice."""
+        """Write the waiting records and end the thread. A second call does nothing."""
         self._queue.ring = lambda: None
         self._worker.end()
         self._round()
@@ -122,13 +114,13 @@ class RecordingWriter:
 
     @property
     def failure(self) -> BaseException | None:
-        """The exception that ended the thread, which is an internal error."""
+        """Internal error that ended the thread."""
         return self._failure
 
-    # --- the thread's side -------------------------------------------------------------------------------------------
+    # --- thread -------------------------------------------------------------------------------------------------------
 
     def _round(self) -> int:
-        """Write all that waits; return the time until the next round, ns."""
+        """Write the waiting records. Return the time until the next round, ns."""
         queue = self._queue
         while (item := queue.take()) is not None:
             try:
@@ -171,7 +163,7 @@ class RecordingWriter:
             os.fdatasync(self._descriptor)
 
     def _fail(self, error: OSError) -> None:
-        """Leave the file with its whole blocks, and write nothing more to it."""
+        """Close the file after its last complete block, and drop all records until the next file."""
         with suppress(OSError):
             if self._descriptor >= 0:
                 os.ftruncate(self._descriptor, self.file_bytes)
@@ -190,19 +182,19 @@ class RecordingWriter:
 
 
 CHECK_NS: Final = NS_PER_S
-"""The newest sample and the ledger of each device are recorded so often: a replay is compared with them."""
+"""Interval of the check records, ns. They contain the newest sample and the ledger, with which a replay is compared."""
 BEGIN_NS: Final = 2_000_000
-"""Describing devices takes so long in one tick, but for the last of them; the state of one takes 0.6 ms. The others
-follow in the next ticks: samples do not wait for a recording that begins."""
+"""Maximum time for the description of devices in one tick, ns, except the last device. One state takes 0.6 ms. The next
+ticks describe the other devices, so that a new recording does not delay samples."""
 
 
 class RecordFeed:
-    """Feed of one recording. Synchronization: the event loop's thread only."""
+    """Source of the records of one recording. Synchronization: the event loop's thread only."""
 
     def __init__(
         self, context: PublisherContext, queue: RecordQueue[Any], devices: Collection[str] | None = None
     ) -> None:
-        """`devices` are the names of those that are recorded, None for all."""
+        """`devices` are the names of the recorded devices, None for all."""
         self._context = context
         self._source = context.devices.recording
         self._queue = queue
@@ -210,27 +202,25 @@ class RecordFeed:
         self._devices = devices
         self._ids: dict[str, int] = {}
         self._recorded: set[str] = set()
-        self._due: set[str] = set()
-        """Those of them that are still to be described again."""
+        self._due: set[str] = set()  # devices with a pending description
         self._checked_ns = 0
-        self._dropped = (0, 0)
-        """Records and bytes that were dropped and stand in the recording as such."""
+        self._dropped = (0, 0)  # number and size of the dropped records that the recording already contains
         self._lost_ns = 0
 
-    # --- devices -----------------------------------------------------------------------------------------------------
+    # --- devices ------------------------------------------------------------------------------------------------------
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Note the device: it is recorded from the next `follow` on, when it is there."""
+        """Add a device. The recording starts with the next `follow`, after the device exists."""
         self._ids[name] = device_id
 
     def remove_device(self, name: str) -> None:
-        """Forget a device that left the configuration, or is made anew."""
+        """Remove a device that left the configuration or that imud creates again."""
         self._ids.pop(name, None)
         self._recorded.discard(name)
         self._due.discard(name)
 
     def follow(self) -> None:
-        """Begin to record devices that are new, and describe those again that are due."""
+        """Start recording new devices, and describe devices with a pending description."""
         now_ns = self._context.clock.now_ns
         end_ns = now_ns() + BEGIN_NS
         for name in self._source.names():
@@ -242,10 +232,10 @@ class RecordFeed:
                     return
 
     def describe(self, *, at_once: bool) -> None:
-        """Record the host's clocks and the state of each device as they are now.
+        """Record the clocks of the host and the state of each device.
 
-        Without `at_once` devices are described by the next calls of `follow`: for a place where a replay can go on from
-        what it has of them before.
+        Without `at_once`, the next calls of `follow` describe the devices. Use this at a place where a replay still has
+        their earlier state.
         """
         self._source.begin_host(self._put)
         if not at_once:
@@ -255,10 +245,10 @@ class RecordFeed:
         for name in sorted(self._recorded):
             self._source.begin(name, self._put)
 
-    # --- records -----------------------------------------------------------------------------------------------------
+    # --- records ------------------------------------------------------------------------------------------------------
 
     def session(self, number: int, now_ns: int) -> bytes:
-        """Return the record that a file begins with."""
+        """Return the first record of a file."""
         context = self._context
         host = f"{platform.node()}, {platform.system()} {platform.release()} {platform.machine()}"
         utc_ns = now_ns + context.clock.utc_offset_ns()
@@ -269,17 +259,17 @@ class RecordFeed:
         return records.encode_object(Kind.SESSION, NO_DEVICE, session)
 
     def ending(self, reason: str) -> bytes:
-        """Return the record that a file ends with."""
+        """Return the last record of a file."""
         now_ns = self._context.clock.now_ns()
         end = EndRecord(now_ns, now_ns + self._context.clock.utc_offset_ns(), reason)
         return records.encode_object(Kind.END, NO_DEVICE, end)
 
     def put(self, record: bytes) -> None:
-        """Record something else."""
+        """Add another record."""
         self._put(record)
 
     def event(self, event: Event) -> None:
-        """Record an event of a device that is recorded, or of the daemon itself."""
+        """Record an event of a recorded device or of the daemon."""
         if not event.device or self.wants(event.device):
             device = self._ids.get(event.device, NO_DEVICE)
             self._put(records.encode_object(Kind.EVENT, device, event))
@@ -290,7 +280,7 @@ class RecordFeed:
             self._source.check(name, self._put)
 
     def check_if_due(self, now_ns: int) -> bool:
-        """Record them once in CHECK_NS; return whether that was now."""
+        """Call `check` every CHECK_NS. Return whether it was called."""
         if now_ns - self._checked_ns < CHECK_NS:
             return False
         self._checked_ns = now_ns
@@ -298,7 +288,7 @@ class RecordFeed:
         return True
 
     def note_losses(self, now_ns: int) -> int:
-        """Record what was dropped as soon as there is room again, and the states after it; return how many records."""
+        """Record the losses when the queue has room again, then the states. Return the number of dropped records."""
         if self._queue.dropped == self._dropped[0]:
             return 0
         self._lost_ns = self._lost_ns or now_ns
@@ -310,7 +300,7 @@ class RecordFeed:
         return lost.records
 
     def finish(self, reason: str) -> bytes:
-        """Record the last checks, and nothing any more; return the records that end the recording, losses included."""
+        """Record the last checks and stop. Return the last records of the recording, including losses."""
         if self._queue.dropped == self._dropped[0]:
             self.check()
         self.stop()
@@ -318,18 +308,18 @@ class RecordFeed:
         return (records.encode_lost(lost) if lost.records else b"") + self.ending(reason)
 
     def _new_losses(self, now_ns: int) -> LostRecord:
-        """Return what was dropped and does not stand in the recording, and take it for noted."""
+        """Return the new losses and mark them as recorded."""
         queue, (noted, noted_bytes) = self._queue, self._dropped
         lost = LostRecord(queue.dropped - noted, queue.dropped_bytes - noted_bytes, self._lost_ns or now_ns)
         self._dropped, self._lost_ns = (queue.dropped, queue.dropped_bytes), 0
         return lost
 
     def stop(self) -> None:
-        """Record nothing any more; a `follow` begins again."""
+        """Stop recording. `follow` starts again."""
         self._source.end(self._put)
         self._recorded.clear()
         self._due.clear()
 
     def wants(self, name: str) -> bool:
-        """Whether a device is to be recorded."""
+        """Return whether a device is selected."""
         return self._devices is None or name in self._devices

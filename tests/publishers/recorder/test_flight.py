@@ -147,7 +147,7 @@ def test_a_line_that_becomes_active_is_an_alert(tmp_path: Path) -> None:
     (file,) = bench.files
     bench.reports[0]("no line GPIO5")
     assert bench.messages == [
-        f"saved {file}: the line of the flight recorder became active", "flight recorder: its line: no line GPIO5"
+        f"saved {file}: the line of the flight recorder became active", "flight recorder: GPIO line: no line GPIO5"
     ]  # fmt: skip
     bench.flight.close()
 
@@ -158,7 +158,10 @@ def test_a_storm_of_alerts_does_not_fill_the_disk(tmp_path: Path) -> None:
         bench.publish("bow", 9.8, 9.8)
         bench.tick(1)
     assert len(bench.files) == 3
-    assert sum("not saved: |a| of bow was 9.8 m/s²; 3 snapshots were within an hour" in m for m in bench.messages) == 1
+    assert (
+        sum("no snapshot of an alert: |a| of bow was 9.8 m/s²; the limit of 3 per hour" in m for m in bench.messages)
+        == 1
+    )
     assert len(bench.messages) == 4
     status = bench.flight.status()
     assert (status.saved, status.failed, status.sent) == (3, 0, 0)
@@ -192,7 +195,7 @@ def test_what_a_killed_imud_left_is_saved_at_the_next_start(tmp_path: Path) -> N
     assert not reader.is_damaged
     assert not reader.ended
     assert sum(one.kind == Kind.DATA for one in found) >= 10
-    assert bench.messages == [f"saved {file}: an imud that was killed left it"]
+    assert bench.messages == [f"saved {file}: data of an imud process that was killed"]
     bench.flight.close()
     killed.flight.close()
 
@@ -212,7 +215,7 @@ def test_a_client_gets_what_there_is(tmp_path: Path) -> None:
     pairs = [stream_pair() for _ in range(SENDS_MAX + 1)]
     for ours, _ in pairs[:-1]:
         bench.flight.snapshot(ours)
-    with pytest.raises(ServerError, match="4 clients get a snapshot at present"):
+    with pytest.raises(ServerError, match="the limit of 4 clients with a snapshot"):
         bench.flight.snapshot(pairs[-1][0])
     bench.flight.close()
     for pair in pairs:
@@ -225,15 +228,13 @@ def test_where_nothing_is_kept_that_is_told_once_and_tried_again(tmp_path: Path)
     bench = FlightBench(tmp_path, directory=str(folder))
     folder.rename(tmp_path / "elsewhere")
     bench.tick(12)
-    assert bench.messages == ["flight recorder: nothing is kept: No such file or directory"]
+    assert bench.messages == ["flight recorder: cannot record: No such file or directory"]
     ours, theirs = stream_pair()
-    with ours, theirs, pytest.raises(ServerError, match="nothing is kept: No such file"):
+    with ours, theirs, pytest.raises(ServerError, match="the flight recorder has no data: No such file"):
         bench.flight.snapshot(ours)
     folder.mkdir()
     bench.tick(RETRY_NS / NS_PER_S)
-    assert bench.messages[1:] == [
-        "flight recorder: keeping again; it was not possible before: No such file or directory"
-    ]
+    assert bench.messages[1:] == ["flight recorder: recording again after: No such file or directory"]
     bench.tick(5)
     assert len(list(folder.iterdir())) >= 1
     bench.flight.close()

@@ -127,7 +127,7 @@ def test_what_is_dropped_stands_in_the_file_and_the_states_after_it(
     assert [one.kind for one in found[at + 1 : at + 4]] == [Kind.CALL, Kind.DEVICE, Kind.DEVICE]
     (event,) = bench.events
     assert event.kind is EventKind.RECORDER
-    assert f"{lost.records} records were not recorded" in event.message
+    assert f"{lost.records} records were dropped" in event.message
 
 
 def test_a_full_disk_is_one_event_and_recording_goes_on_when_there_is_room(
@@ -142,7 +142,7 @@ def test_a_full_disk_is_one_event_and_recording_goes_on_when_there_is_room(
     bench.tick()
     bench.tick()
     (event,) = bench.events
-    assert "No space left on device; samples go on" in event.message
+    assert "No space left on device; the other outputs continue" in event.message
     assert bench.source.listening == []
     assert bench.recorder.status().problem
     monkeypatch.undo()
