@@ -1,4 +1,4 @@
-"""The output as a whole: which device, when, by which axes; and a real gpsd that reads it."""
+"""Complete output: choice of the device, times of sentences, axes, and a real gpsd as reader."""
 
 import asyncio
 import json
@@ -43,7 +43,7 @@ LIMIT_S = 60.0
 NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (make bench-deps)"
 GPSD_VERSION = "" if NO_GPSD else subprocess.check_output(["gpsd", "-V"], text=True).split()[1]
 LEFT_45: Vector3 = (radians(10), radians(5), radians(-45))
-"""As a HiPNUC module sends it: right side down by 10°, bow up by 5°, heading 45°."""
+"""Attitude in the axes of HiPNUC: right side down by 10°, bow up by 5°, heading 45°."""
 
 
 class Asked:
@@ -86,7 +86,7 @@ class OutputBench:
         self, count: int = 1, device: str = "bow", euler: Vector3 | None = LEFT_45, frame: PublishedAxes = AS_SENT,
         gyro_z: float = 0.0,
     ) -> None:  # fmt: skip
-        """Samples at 1 kHz."""
+        """Publish samples at 1 kHz."""
         samples = []
         for _ in range(count):
             self.seq += 1
@@ -106,7 +106,7 @@ class OutputBench:
                 await asyncio.sleep(0)
 
     def received(self) -> list[str]:
-        """Sentences that the client has got, without checksums, which are checked."""
+        """Return the sentences that the client received, without their checksums. The checksums are checked."""
         sentences = self.reader.recv(65536).decode().splitlines()
         for one in sentences:
             pynmea2.parse(one, check=True)
@@ -123,7 +123,7 @@ async def sending(**settings: Any) -> AsyncIterator[OutputBench]:
 
 
 def in_output(**settings: Any) -> Callable[[Callable[..., Awaitable[None]]], Callable[..., None]]:
-    """Run a test in a loop of its own. Its argument `bench` is an output with these settings and one client."""
+    """Run a test in its own event loop. Its argument `bench` is an output with these options and one client."""
     return in_context("bench", lambda _folder: sending(**settings))
 
 
@@ -167,7 +167,7 @@ async def test_values_are_those_of_ships_whatever_the_axes_are(
     got = bench.received()
     assert got[:2] == ["PASHR,000001.001,45.00,T,+10.00,+5.00,,,,,0,0", "HCHDG,42.0,,,3.0,E"]
     rate_deg_min = float(got[3].split(",")[1])
-    assert 115 < rate_deg_min < 122  # 2° a second to starboard about the body's z axis
+    assert 115 < rate_deg_min < 122  # 2° per second to starboard about the body's z axis
 
 
 @in_output(sentences={"PASHR": 1.0})
@@ -184,7 +184,7 @@ async def test_pynmea2_reads_the_attitude_of_pashr(bench: OutputBench) -> None:
 @in_output(sentences={"ROT": 10.0})
 async def test_the_rate_of_turn_is_the_mean_since_the_last(bench: OutputBench) -> None:
     bench.publish(1, euler=(0.0, 0.0, 0.0))
-    for number in range(100):  # vibration of 500 Hz about a turn of 1° a second to starboard
+    for number in range(100):  # vibration of 500 Hz and a turn of 1° per second to starboard
         bench.publish(1, euler=(0.0, 0.0, 0.0), gyro_z=radians(-1.0 + (20.0 if number % 2 else -20.0)))
     assert bench.received() == ["TIROT,0.0,A", "TIROT,60.0,A"]
 
@@ -264,7 +264,7 @@ def test_the_usual_size_of_a_sentence_is_no_less_than_a_full_one(kind: Formatter
     assert len(made) <= USUAL_BYTES[kind]
 
 
-# --- a reader that no one here wrote --------------------------------------------------------------------------------
+# --- independent reader -----------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -278,7 +278,7 @@ def gpsd(port: int, source: str) -> Iterator[None]:
 
 
 async def reports(port: int, bench: OutputBench, enough: int) -> tuple[list[dict[str, object]], set[str]]:
-    """Attitude reports of gpsd while samples come, and which sentences its parser took, checksum included."""
+    """Return the attitude reports of gpsd, and the sentences that its parser accepted, including the checksum."""
     async with asyncio.timeout(LIMIT_S):
         while True:
             try:
@@ -310,9 +310,9 @@ async def reports(port: int, bench: OutputBench, enough: int) -> tuple[list[dict
 @pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)
 @in_loop
 async def test_gpsd_takes_all_sentences_and_reports_what_it_knows_of_them() -> None:
-    """Bow to starboard at 2° a second, right side down by 10°, bow up by 5°.
+    """The bow turns to starboard at 2° per second, right side down by 10°, bow up by 5°.
 
-    gpsd 3.22 reports the heading alone; of one that knows more, signs and units are checked.
+    gpsd 3.22 reports only the heading. The test checks signs and units of all other values that a newer gpsd reports.
     """
     bench = OutputBench(sentences={"HDT": 10.0, "HDG": 10.0, "ROT": 10.0, "XDR": 2.0, "PASHR": 10.0})
     port = free_port()

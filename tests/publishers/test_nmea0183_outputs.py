@@ -1,4 +1,4 @@
-"""Ways out: what they take arrives whole, what they do not take is dropped and counted, and none of them waits."""
+"""Ports: accepted sentences arrive complete, other sentences are dropped and counted, and no port waits."""
 
 import asyncio
 import os
@@ -77,7 +77,7 @@ async def test_what_a_client_sends_is_ignored_and_it_stays_while_there_is_nothin
         await asyncio.sleep(0)
     made.put(ONE)
     assert client.recv(100) == ONE
-    made.clock.advance(100 * STUCK_NS)  # a device that is away, or a sentence of 0.01 Hz
+    made.clock.advance(100 * STUCK_NS)  # a missing device, or a sentence with 0.01 Hz
     made.tick(made.clock.now_ns())
     assert made.status().readers == 1
     made.put(ONE)
@@ -94,7 +94,7 @@ async def test_a_client_that_does_not_read_loses_whole_sentences_and_is_disconne
     assert status.sent + status.dropped == 200
     got = bytearray()
     client.settimeout(0)
-    while len(got) < status.sent * len(BUSY):  # the rest of the one cut off comes with the next
+    while len(got) < status.sent * len(BUSY):  # the rest of a partly sent sentence precedes the next sentence
         made.put(b"")
         try:
             got += client.recv(1 << 20)
@@ -150,7 +150,7 @@ def test_datagrams() -> None:
 
 def test_datagrams_without_a_way_are_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     made = UdpOutput("127.0.0.1", 9)
-    made.put(ONE + b"x" * 70_000)  # longer than a datagram can be
+    made.put(ONE + b"x" * 70_000)  # longer than the maximum of a datagram
     made.put(ONE + b"x" * 70_000)
     assert (made.status().dropped, made.status().readers) == (2, 0)
     assert "too long" in made.status().problem
@@ -185,7 +185,7 @@ async def test_a_serial_port_that_goes_away_is_opened_again() -> None:
     made.tick(clock.now_ns())
     await until(lambda: made.status().problem == "No such file or directory")
     made.tick(clock.now_ns())
-    assert len(tried) == 1  # not yet
+    assert len(tried) == 1  # the attempt is not due
     clock.advance(RETRY_FIRST_NS)
     made.tick(clock.now_ns())
     await until(lambda: made.status().readers == 1)

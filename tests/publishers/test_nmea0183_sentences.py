@@ -1,4 +1,4 @@
-"""Values of sentences by hand, and headings only with their reference."""
+"""Sentences with manually computed values, and headings only with a known reference."""
 
 import math
 from math import nan, radians
@@ -27,7 +27,7 @@ def sample(
 
 
 def body(kind: Formatter, one: Sample, reference: HeadingReference, talker: str = "") -> str | None:
-    """What stands between `$` and `*`."""
+    """Return the text between `$` and `*`."""
     made = make(kind, one, reference, talker)
     return None if made is None else made.decode().removeprefix("$").partition("*")[0]
 
@@ -37,8 +37,8 @@ def body(kind: Formatter, one: Sample, reference: HeadingReference, talker: str 
     [
         (MAGNETIC, (None, "HCHDG,45.0,,,,", "HCHDM,45.0,M")),
         (CORRECTED, ("HCHDT,45.0,T", "HCHDG,42.0,,,3.0,E", "HCHDM,42.0,M")),
-        (TRUE, ("HCHDT,45.0,T", None, None)),  # the device's own true heading has no magnetic one
-        (HeadingReference(Heading.RELATIVE), (None, None, None)),  # from the direction at power-on
+        (TRUE, ("HCHDT,45.0,T", None, None)),  # a true heading from the device has no magnetic heading
+        (HeadingReference(Heading.RELATIVE), (None, None, None)),  # relative to the direction at power-on
         (HeadingReference(Heading.UNKNOWN), (None, None, None)),
     ],
 )
@@ -64,9 +64,9 @@ def test_a_talker_for_all() -> None:
 def test_the_rate_of_turn_is_that_of_the_heading() -> None:
     level = sample((0, 0, 0), (5, 5, 2))
     assert turn_rate_rad_s(level) == pytest.approx(radians(2))
-    # on its right side, right side down: turning about y is what changes the heading
+    # right side down by 90°: a rotation about y changes the heading
     assert turn_rate_rad_s(sample((90, 0, 0), (0, 3, 0))) == pytest.approx(radians(3))
-    # bow up by 60°: the heading turns twice as fast as the body about its own z axis
+    # bow up by 60°: the heading turns twice as fast as the body about its z axis
     assert turn_rate_rad_s(sample((0, 60, 0), (0, 0, 1))) == pytest.approx(radians(2))
     assert turn_rate_rad_s(sample(None, (0, 0, 1))) == pytest.approx(radians(1))
 

@@ -69,7 +69,7 @@ def test_file_of_a_new_ring(board: Board) -> None:
     assert header == layout.RingHeader(77, os.getpid(), layout.STATE_LIVE, DEVICE, 3, SLOTS, 0, 1, START_NS)
     status = board.path.stat()
     assert status.st_size == layout.HEADER_BYTES + SLOTS * SLOT_BYTES
-    assert status.st_blocks * 512 >= status.st_size  # st_blocks counts 512-byte units; every block is there
+    assert status.st_blocks * 512 >= status.st_size  # st_blocks counts units of 512 bytes: all blocks are allocated
 
 
 def test_ring_is_whole_before_it_appears(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,7 +100,7 @@ def test_slots_lie_where_their_number_says_and_the_ring_wraps(board: Board) -> N
     for seq in range(3, SLOTS + 3):
         assert raw[slot_at(seq) :][:SLOT_BYTES] == encode_slot(make_sample(seq), 3)
     assert len(raw) == layout.HEADER_BYTES + SLOTS * SLOT_BYTES
-    board.publish([507, 508])  # a gap in the numbers moves the first one
+    board.publish([507, 508])  # the gap moves the first number
     assert (board.word("first_seq"), board.word("newest_seq")) == (507, 508)
 
 
@@ -129,7 +129,7 @@ Notes = list[tuple[int, int, object]]
 
 
 class Spy:
-    """Stands before a memoryview and notes what is written where, in bytes."""
+    """Buffer in front of a memoryview that stores position and length of each write, bytes."""
 
     def __init__(self, target: memoryview, notes: Notes) -> None:
         self.target, self.notes = target, notes
@@ -265,7 +265,7 @@ def test_what_is_not_for_the_ring_is_ignored(board: Board) -> None:
         board.publisher.add_device("../imu", 4)
     board.publisher.remove_device(DEVICE)
     assert not board.path.exists()
-    board.publish([1])  # a batch that was on its way
+    board.publish([1])  # a batch that arrives late
     board.tick()
     board.publisher.remove_device(DEVICE)
 
@@ -295,7 +295,7 @@ time.sleep(60)
 
 @contextmanager
 def other_daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """Another process that has a ring in `folder`; killed at the end."""
+    """Start another process with a ring in `folder`. Kill it at the end."""
     command = [sys.executable, "-c", OTHER_DAEMON, str(folder)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -309,10 +309,10 @@ def other_daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
 def test_second_daemon_is_refused(tmp_path: Path) -> None:
     with other_daemon(tmp_path) as other:
         with pytest.raises(ServerError, match=f"another imud writes this ring, process {other.pid}: stop it first"):
-            Board(tmp_path, now_ns=START_NS + 60_000_000_000)  # whatever its heartbeat
+            Board(tmp_path, now_ns=START_NS + 60_000_000_000)  # the age of its heartbeat has no effect
         other.kill()
         other.wait()
-        Board(tmp_path).publisher.close()  # at once
+        Board(tmp_path).publisher.close()  # the ring can be created immediately
 
 
 def test_ring_that_another_daemon_has_taken_over_is_left_to_it(
@@ -355,8 +355,8 @@ def dead_pid() -> int:
 @pytest.mark.parametrize(
     "leave",
     [
-        lambda path: other_writer(path, dead_pid()),  # killed and restarted at once
-        lambda path: other_writer(path, os.getppid()),  # number in use again: no proof
+        lambda path: other_writer(path, dead_pid()),  # a killed daemon that systemd restarted
+        lambda path: other_writer(path, os.getppid()),  # another process has the same number
         lambda path: other_writer(path, 1, heartbeat_ns=1 << 62),
         lambda path: other_writer(path, os.getppid(), state=layout.STATE_CLOSED),
         lambda path: path.write_bytes(b"of another version"),
@@ -376,7 +376,7 @@ def test_file_of_an_earlier_daemon_is_replaced(tmp_path: Path, leave: Callable[[
 
 
 def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    """The daemon runs without the ring, says so once, and makes the ring as soon as there is room."""
+    """The daemon runs without the ring, logs it once, and creates the ring when there is room."""
     tries: list[int] = []
 
     def refuse(*_: object) -> None:
@@ -391,7 +391,7 @@ def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: py
             board.tick()
         board.publish([1, 2, 3])
     assert [(at - START_NS) // 1_000_000 for at in tries] == [0, 1000, 2000, 3000]
-    assert len(os.listdir("/proc/self/fd")) == descriptors + 1  # of the directory
+    assert len(os.listdir("/proc/self/fd")) == descriptors + 1  # the descriptor of the directory
     assert (board.context.outputs.rings, board.context.outputs.without_ring) == ({}, {DEVICE})
     [record] = (record for record in caplog.records if record.levelno == logging.ERROR)
     assert re.search(r"imud.imu0 with 20480 bytes: No space left .* reduce shm.slots", record.getMessage())

@@ -1,4 +1,4 @@
-"""What other users may put into a directory of rings, or do to it: nothing stops or misleads the daemon."""
+"""Hostile users of a directory of rings: they can neither stop nor mislead the daemon."""
 
 import errno
 import logging
@@ -33,7 +33,7 @@ FORGED: Final = encode_header(
 
 @pytest.fixture(name="shared")
 def _shared() -> Iterator[Path]:
-    """A directory as /dev/shm is: every user may make names, only owners may remove them."""
+    """Return a directory with the rights of /dev/shm: every user can create files, only owners can remove them."""
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-test-") as name:
         os.chmod(name, 0o1777)
         yield Path(name)
@@ -71,7 +71,7 @@ def plant(path: Path, kind: str) -> None:
 @needs_root
 @pytest.mark.parametrize("kind", [kind for kind in HOSTILE if kind != "directory with content"])
 def test_what_has_the_name_gives_way(shared: Path, kind: str) -> None:
-    """For root, who may replace other users' files."""
+    """As root, the daemon can replace files of other users."""
     plant(shared / f"imud.{DEVICE}", kind)
     board = Board(shared)
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
@@ -84,7 +84,10 @@ def test_what_has_the_name_gives_way(shared: Path, kind: str) -> None:
 @needs_root
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_names_of_unfinished_rings(shared: Path, kind: str) -> None:
-    """Those of a daemon that died while it made them are removed, other users' neither opened nor in the way."""
+    """The daemon removes temporary files of a dead daemon.
+
+    It neither opens nor needs the names of other users' files.
+    """
     plant(shared / f".imud.{DEVICE}.new", kind)
     (shared / ".imud.mine.new").touch()
     board = Board(shared)
@@ -119,7 +122,7 @@ def ask(process: subprocess.Popen[str], command: str) -> None:
 @needs_root
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_what_cannot_be_replaced_costs_one_ring_only(shared: Path, kind: str) -> None:
-    """For a user who may not: the ring comes as soon as the name is free."""
+    """Without this permission, the daemon creates the ring when the name is free."""
     path = shared / f"imud.{DEVICE}"
     plant(path, kind)
     with python_as(DAEMON_UID, DAEMON, str(shared)) as daemon:
@@ -143,7 +146,7 @@ def test_what_cannot_be_replaced_costs_one_ring_only(shared: Path, kind: str) ->
 @pytest.mark.live
 @pytest.mark.parametrize("kind", ["FIFO", "directory with content"])
 def test_daemon_starts_reloads_and_stops(tmp_path: Path, shared: Path, kind: str) -> None:
-    """The process: at its start, at reload, and at SIGTERM, which `running_daemon` waits for."""
+    """Start, reload and SIGTERM of a daemon process. `running_daemon` waits for its end."""
     nothing = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
     another = {**nothing, "uart": {"port": str(tmp_path / "nothing"), "baud": 115200}}
     for name in ("bow", "stern"):
@@ -226,7 +229,7 @@ def test_reader_looks_where_the_daemon_may_be(tmp_path: Path, monkeypatch: pytes
     with pytest.raises(ServerError, match=f"{tmp_path}/system/imud.imu0: no such ring"):
         Ring(DEVICE)
     boards = []
-    for folder in (own, tmp_path / "system"):  # the system's comes first where there are both
+    for folder in (own, tmp_path / "system"):  # the directory of the system is first if both exist
         boards.append(Board(folder))
         with Ring(DEVICE) as ring:
             assert ring.path.parent == folder
@@ -234,7 +237,8 @@ def test_reader_looks_where_the_daemon_may_be(tmp_path: Path, monkeypatch: pytes
         board.publisher.close()
 
 
-# ---- what happens to a ring while it is in use --------------------------------------------------------------------
+# ---- changes of a ring in use
+# -----------------------------------------------------------------------------------------
 
 
 def test_removed_ring_is_made_anew(board: Board, caplog: pytest.LogCaptureFixture) -> None:
@@ -242,11 +246,11 @@ def test_removed_ring_is_made_anew(board: Board, caplog: pytest.LogCaptureFixtur
         board.publish([1, 2])
         board.path.unlink()
         board.publish([3])
-        assert ring.read() == ([make_sample(seq) for seq in (1, 2, 3)], 0)  # still mapped by both
+        assert ring.read() == ([make_sample(seq) for seq in (1, 2, 3)], 0)  # writer and reader still map the file
         board.publish([4])
         board.tick()
         board.publish([5, 6])
-        assert ring.read() == ([make_sample(4)], 0)  # the old one to its end
+        assert ring.read() == ([make_sample(4)], 0)  # the reader reads the old ring to its end
         assert ring.read() == ([make_sample(5), make_sample(6)], 0)
         assert (ring.epoch, ring.missed) == (77, 0)
     assert f"the ring file of {DEVICE} was missing or truncated; created it again" in caplog.text
@@ -312,7 +316,8 @@ def test_ring_cut_by_a_byte(board: Board) -> None:
 
 
 def test_reader_of_a_cut_ring_has_its_pages_back(board: Board) -> None:
-    """Those of a reader that looks at nothing: the file is as long again, closed, and not used any more."""
+    """A reader that does not check the file still has its pages: imud restores the size and marks the file as
+    closed."""
     board.publish([1])
     with board.path.open("rb") as file:
         os.truncate(board.path, 0)
@@ -345,7 +350,7 @@ def test_directory_removed_and_made_again(tmp_path: Path, caplog: pytest.LogCapt
             board.publish([seq])
             board.tick()
         assert ring.read() == ([make_sample(seq) for seq in range(1, 16)], 0)
-        assert len([record for record in caplog.records if record.levelno == logging.ERROR]) == 2  # each once
+        assert len([record for record in caplog.records if record.levelno == logging.ERROR]) == 2  # one per problem
         folder.mkdir()
         board.tick(1_000_000_000)
         board.publish([16])
@@ -354,7 +359,7 @@ def test_directory_removed_and_made_again(tmp_path: Path, caplog: pytest.LogCapt
     assert not list(folder.iterdir())
 
 
-def test_descriptors_are_given_back(tmp_path: Path) -> None:  # checked by a fixture of tests/conftest.py
+def test_descriptors_are_given_back(tmp_path: Path) -> None:  # a fixture of tests/conftest.py checks the descriptors
     board = Board(tmp_path)
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         for _ in range(20):

@@ -1,4 +1,4 @@
-"""Thinning: the sample nearest to each due instant, without drift; the mean of what is between."""
+"""Thinning: the sample nearest to each due time, without drift, and the mean between samples."""
 
 import random
 from itertools import pairwise
@@ -35,8 +35,9 @@ def test_it_takes_the_sample_nearest_to_each_due_instant(rate_hz: float) -> None
 def test_a_device_that_sends_just_at_the_rate_has_its_samples_taken(device_hz: float) -> None:
     rng = random.Random(7)
     times_ns = [START_NS + int(k * 1e9 / device_hz) + rng.randrange(-300_000, 300_000) for k in range(30_000)]
-    times_ns[100:103] = times_ns[1_000:1_001] = []  # lost ones take no others with them
-    assert len(taken(Pace(100.0), times_ns)) >= len(times_ns) - 5  # the second at most, and those above 100 Hz
+    times_ns[100:103] = times_ns[1_000:1_001] = []  # a lost sample does not affect other samples
+    # at most the two samples at the gap, and the samples above 100 Hz
+    assert len(taken(Pace(100.0), times_ns)) >= len(times_ns) - 5
 
 
 def test_it_does_not_drift_in_a_day() -> None:
@@ -45,7 +46,7 @@ def test_it_does_not_drift_in_a_day() -> None:
     assert sum(pace.is_due(t_ns, 333_333_333) for t_ns in times_ns) == instants
     assert (
         pace.due_ns == START_NS + 86_400 * 1_000_000_000 - 166_666_667 + 1
-    )  # half a step before due instant number 259,200
+    )  # half a sample period before due time number 259,200
 
 
 def test_a_rate_above_the_device_s_takes_everything() -> None:
@@ -70,11 +71,11 @@ def test_a_thinner_chooses_for_each_rate_across_batches() -> None:
     for rate_hz in (100.0, 250.0, 100.0):
         thinner.add(rate_hz)
     assert thinner.choose(samples(*(k * ms for k in range(1, 11)))) == {100.0: (0,), 250.0: (0, 4, 8)}
-    assert not thinner.choose(samples(11 * ms - 600_000))  # 0.6 ms before the due instant of the slower
+    assert not thinner.choose(samples(11 * ms - 600_000))  # 0.6 ms before the due time of the lower rate
     assert thinner.choose(samples(11 * ms, 12 * ms)) == {100.0: (0,)}
     thinner.discard(100.0)
     thinner.discard(250.0)
-    assert not thinner.choose(samples(21 * ms - 300_001))  # the step before the last one taken was 0.6 ms
+    assert not thinner.choose(samples(21 * ms - 300_001))  # the step before the selected sample was 0.6 ms
     assert thinner.choose(samples(21 * ms - 300_000)) == {100.0: (0,)}
     thinner.discard(100.0)
     assert not thinner.choose(samples(31 * ms))

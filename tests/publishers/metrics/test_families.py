@@ -1,4 +1,4 @@
-"""Metrics: every number is that of the status, in base units; documentation and alerts name what exists."""
+"""Metrics: each value is a value of the status in base units. Documentation and alerts use existing names."""
 
 import re
 from collections.abc import Sequence
@@ -201,7 +201,7 @@ PARTS: dict[tuple[str, tuple[tuple[str, str], ...]], float] = {
     ("imud_trigger_delay_seconds_total", ()): 0.012000456,
     ("imud_trigger_delay_worst_seconds", ()): 0.0009,
 }
-"""Every line of the parts that only some devices have."""
+"""All lines of the parts that only some devices have."""
 
 
 def parts_of(name: str, shown: dict[Key, float]) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
@@ -250,8 +250,8 @@ def test_a_problem_of_a_line_without_edges_is_shown() -> None:
 
 
 def test_every_number_of_the_parts_has_a_metric() -> None:
-    """A field that is added to a part and shown nowhere is noticed here: its change must change a scrape."""
-    means = {"late_mean_ns", "trigger_late_mean_ns"}  # sum over count
+    """A new field of a part must have a metric: a change of the field must change a scrape."""
+    means = {"late_mean_ns", "trigger_late_mean_ns"}  # sum divided by count
     before = parts_of("bow", rendered(Snapshot((equipped("bow"),))))
     for part in ("polling", "serial_line", "lines", "utc"):
         status = equipped("bow")
@@ -342,7 +342,7 @@ def test_identity_with_quotes_and_newlines_stays_one_label() -> None:
 def test_clients_are_summed_and_totals_never_fall() -> None:
     totals = ClientTotals()
     totals.update([client(1, sent=10, dropped=2), client(2, sent=5)])
-    totals.update([client(2, sent=6, dropped=1), client(3, sent=4)])  # 1 left
+    totals.update([client(2, sent=6, dropped=1), client(3, sent=4)])  # client 1 disconnected
     totals.update([])
     assert (totals.sent, totals.dropped) == (10 + 6 + 4, 2 + 1)
     clients: Sequence[states.ClientStatus] = [
@@ -370,7 +370,8 @@ def test_both_formats_say_the_same() -> None:
     ours = re.compile("imud_")
     from_plain, from_rich = (
         {k: v for k, v in values(list(found)).items() if ours.match(k[0])}
-        for found in (parse_text(plain.body.decode()), parse_openmetrics(rich.body.decode()))  # type: ignore[no-untyped-call]  # the library's parser has no types
+        # the parser of the library has no types
+        for found in (parse_text(plain.body.decode()), parse_openmetrics(rich.body.decode()))  # type: ignore[no-untyped-call]
     )
     assert from_plain == from_rich
 
@@ -388,14 +389,14 @@ def test_rendering_pauses_often() -> None:
     lines = sum(line.startswith(b"imud_") for line in body.splitlines())
     assert lines > 900
     assert pauses >= lines / SAMPLES_PER_TURN
-    assert pauses >= sum(line.startswith(b"# HELP imud_") for line in body.splitlines()) - 1  # events: none yet
+    assert pauses >= sum(line.startswith(b"# HELP imud_") for line in body.splitlines()) - 1  # there is no event
 
 
 # --- documentation and alerts ---------------------------------------------------------------------------------------
 
 
 def shown_names() -> set[str]:
-    """Names of all families as they stand after `# HELP`."""
+    """Return the names of all families after `# HELP`."""
     recorder = states.RecorderStatus("a", "", 1, 2, 3, 4, 5, 6)
     flight = states.FlightStatus("", 1, 2, 3, 4, 5, 6, 7, 8)
     output = states.OutputStatus("tcp 127.0.0.1:10110", 1, 2, 3, "")

@@ -1,4 +1,4 @@
-"""Metrics of the output `mqtt`: each value, and none without the output."""
+"""Metrics of the output `mqtt`: each value, and no metric without the output."""
 
 from imud.contracts.status import MqttStatus
 from imud.publishers.metrics.metric import Snapshot

@@ -1,4 +1,4 @@
-"""Metrics of outputs that send sentences: each value of each way out, and none without one."""
+"""Metrics of outputs that send sentences: each value of each port, and no metric without a port."""
 
 from imud.contracts.status import OutputStatus
 from imud.publishers.metrics.metric import Snapshot

@@ -1,4 +1,4 @@
-"""Metrics of the recorder and the flight recorder: each value of their status, and none without them."""
+"""Metrics of the recorders: each value of their status, and no metric without a recorder."""
 
 from imud.contracts.status import FlightStatus, RecorderStatus
 from imud.publishers.metrics.metric import Snapshot
@@ -29,6 +29,6 @@ def test_of_the_flight_recorder_too() -> None:
     }  # fmt: skip
     assert shown("imud_recordings_", flights) == {"bytes": 8}
     both = Snapshot(recorders=(RECORDER,), flights=(FlightStatus("", 1, 2, 3, 4, 5, 6, 7, 5),))
-    assert shown("imud_recordings_", both) == {"bytes": 6}  # with the present file
+    assert shown("imud_recordings_", both) == {"bytes": 6}  # including the open file
     full = Snapshot(flights=(FlightStatus(FULL, 0, 0, 0, 0, 0, 0, 0, 0),))
     assert shown("imud_flight_recorder_", full)["active"] == 0

@@ -1,4 +1,4 @@
-"""The Prometheus endpoint: a scrape asks the event loop, and starts, fails and ends cleanly."""
+"""Prometheus endpoint: a scrape requests a snapshot of the event loop. Start, failure and end."""
 
 import asyncio
 import socket
@@ -38,7 +38,8 @@ def context(status: Callable[[], Sequence[DeviceStatus]] = lambda: DEVICES) -> P
 async def publisher(
     context: PublisherContext, snapshot_s: float = LIMIT_S, **settings: object
 ) -> AsyncIterator[MetricsPublisher]:
-    made = MetricsPublisher(MetricsOptions(**{"port": 0, **settings}), context, snapshot_s=snapshot_s)  # type: ignore[arg-type]  # any key
+    # options by name
+    made = MetricsPublisher(MetricsOptions(**{"port": 0, **settings}), context, snapshot_s=snapshot_s)  # type: ignore[arg-type]
     made.start()
     try:
         yield made
@@ -88,12 +89,12 @@ async def test_scrapes_are_counted_and_asking_for_the_count_is_none() -> None:
         line, head, body = await ask(served.port, "/scrapes")
         assert line == "HTTP/1.1 200 OK"
         assert "Content-Type: application/json" in head
-        assert body == '{"scrapes":1,"age_s":4.0}'  # the clock of the test goes on 2 s a look: status, and here
+        assert body == '{"scrapes":1,"age_s":4.0}'  # the clock of the test advances by 2 s at each reading
 
 
 @in_loop
 async def test_scrapes_that_wait_together_get_one_page_in_each_format() -> None:
-    """Each snapshot takes the loop's time, and who gave up would be served before the one that still waits."""
+    """Each snapshot costs time of the event loop. Scrapers that no longer wait would be served first."""
     seen: list[int] = []
 
     def status() -> Sequence[DeviceStatus]:
@@ -117,7 +118,7 @@ async def test_scrapes_that_wait_together_get_one_page_in_each_format() -> None:
         with ThreadPoolExecutor(10) as threads:
             formats = ["text/plain"] * 9 + ["application/openmetrics-text; version=1.0.0"]
             answers = [threads.submit(scrape, served.port, accept) for accept in formats]
-            assert all_came(served.port, len(formats))  # the loop stands still until then
+            assert all_came(served.port, len(formats))  # the event loop is blocked until then
             types = [await asyncio.wrap_future(answer) for answer in answers]
     assert [each.partition(";")[0] for each in types] == [each.partition(";")[0] for each in formats]
     assert len(seen) == 2
@@ -202,7 +203,7 @@ async def test_a_loop_that_does_not_answer_gives_503() -> None:
     async with publisher(context(), snapshot_s=0.05) as served:
         with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
             connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
-            assert b"503 Service Unavailable" in read_all(connection)  # the loop is blocked by this very read
+            assert b"503 Service Unavailable" in read_all(connection)  # this read blocks the event loop
 
 
 @in_loop

@@ -1,4 +1,4 @@
-"""MotionValues from the ring: values by hand, bounded work, and no slot that the writer overtook."""
+"""MotionValues of a ring: manually computed values, limited work, and no overwritten slot."""
 
 import math
 import os
@@ -34,7 +34,7 @@ def motion(data: bytes, since_ns: int = 0) -> MotionValues:
 
 
 def test_vibration_by_hand() -> None:
-    """X rests, Y is ±0.5 about 0.1, Z is 9.81 with 9 samples of 0 and one of 1 in ten: variance 0.09."""
+    """X rests. Y is ±0.5 around 0.1. Z is 9.81 plus 1 in one of ten samples: variance 0.09."""
     found = motion(slots([(0.0, 0.1 + (0.5 if n % 2 else -0.5), G + (n % 10 == 3)) for n in range(100)]))
     assert found.vibration_rms_m_s2 == pytest.approx((0.0, 0.5, 0.3), abs=1e-6)
     assert found.vibration_peak_m_s2 == pytest.approx((0.0, 0.5, 0.9), abs=1e-9)
@@ -43,7 +43,7 @@ def test_vibration_by_hand() -> None:
 
 
 def test_slow_motion_is_no_vibration_and_the_span_changes_no_rms() -> None:
-    """A turn of the sensor in 20 s moves gravity from Z to X; the vibration is a sine of 25 Hz, amplitude 0.2."""
+    """The sensor turns in 20 s, so gravity moves from Z to X. The vibration is a sine of 25 Hz with amplitude 0.2."""
 
     def at(n: int) -> Vector3:
         turn = math.pi / 2 * n / 2000
@@ -56,7 +56,7 @@ def test_slow_motion_is_no_vibration_and_the_span_changes_no_rms() -> None:
         assert found.vibration_rms_m_s2 is not None
         x, y, z = found.vibration_rms_m_s2
         assert y == pytest.approx(0.2 / math.sqrt(2), rel=1e-9)
-        assert x < 0.23  # in one second gravity moves by 0.77 m/s² at most, whose standard deviation is 0.22
+        assert x < 0.23  # gravity moves by at most 0.77 m/s² per second, a standard deviation of 0.22
         assert z < 0.23
     assert long.vibration_peak_m_s2 is not None
     assert max(long.vibration_peak_m_s2) < 0.4
@@ -65,7 +65,8 @@ def test_slow_motion_is_no_vibration_and_the_span_changes_no_rms() -> None:
 def test_the_norm_is_that_of_the_last_second() -> None:
     found = motion(slots([(0.0, 0.0, 2 * G)] * 150 + [(0.0, 3.0, 4.0)] * 100))
     assert found.accel_norm_m_s2 == pytest.approx(5.0)
-    assert found.vibration_peak_m_s2 == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)  # the step is between two seconds
+    # the step is at the boundary of two blocks
+    assert found.vibration_peak_m_s2 == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
 def test_blocks_do_not_reach_over_a_gap() -> None:
@@ -100,7 +101,7 @@ def test_every_piece_of_work_is_told() -> None:
     assert pieces == [1000, *[100] * 30]
 
 
-# --- the file ---------------------------------------------------------------------------------------------------------
+# --- file -----------------------------------------------------------------------------------------------------------
 
 
 def look(board: Board, newest: int, *, motion: bool = True) -> RingView:
@@ -115,7 +116,7 @@ def test_a_ring_that_has_wrapped_is_read_in_order(board: Board) -> None:
     found = look(board, 150)
     assert found.written
     assert found.motion is not None
-    assert found.motion.span_ns == 54 * NS_PER_MS  # 96 to 150: 9 slots could be overwritten while they are copied
+    assert found.motion.span_ns == 54 * NS_PER_MS  # 96 to 150: the writer can overwrite 9 slots during the copy
     assert found.motion.accel_norm_m_s2 == pytest.approx(math.hypot(123.0, 123.25, 123.5))
 
 
@@ -132,7 +133,7 @@ def test_only_samples_of_the_snapshot_are_used(board: Board) -> None:
 def test_slots_that_are_overwritten_during_the_copy_are_left_out(
     board: Board, more: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The writer goes on by `more` samples after the copy was made; what may be torn is not used."""
+    """The writer writes `more` samples during the copy. imud ignores slots that can be incomplete."""
     board.publish(range(1, 65))
     board.now_ns = 0
     real = os.pread
@@ -181,7 +182,7 @@ def test_a_ring_is_written_while_its_file_is_there_and_beats(board: Board) -> No
 
 
 def test_a_pause_for_every_so_many_values(tmp_path: Path) -> None:
-    """Few devices with few samples make none; 4096 samples are read, then summed up in four blocks on three axes."""
+    """Few samples cause no pause. 4096 samples are read, then added up in four blocks on three axes."""
     for count, expected in ((100, 0), (4096, 3)):
         pauses: list[int] = []
         folder = tmp_path / str(count)
@@ -230,14 +231,14 @@ def test_the_span_is_the_time_since_the_look_before_but_ten_seconds_at_least(tmp
         assert view.motion is not None
         return view.motion.span_ns / NS_PER_S
 
-    for seq in range(1, 4001, 100):  # samples at 100 Hz up to 40 s
+    for seq in range(1, 4001, 100):  # samples at 100 Hz until 40 s
         data = [
             Sample(DEVICE, n, n * 10 * NS_PER_MS, 1, Sync.ARRIVAL, 0, 0, accel_m_s2=(0.0, 0.0, G))
             for n in range(seq, seq + 100)
         ]
         board.publish_samples(data)
     assert span_s(40.0) == 10.0
-    assert span_s(41.5) == 8.5  # the last sample is of 40 s, the span begins at 31.5
+    assert span_s(41.5) == 8.5  # the last sample is at 40 s, the span starts at 31.5 s
     reader = RingReader(lambda: None, motion=True)
     span_s(15.0)
     assert span_s(40.0) == 25.0

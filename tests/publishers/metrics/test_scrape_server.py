@@ -1,4 +1,4 @@
-"""The server of scrapes: it answers, and silent, slow, deaf or wrong clients hold nothing up."""
+"""Server of scrapes: it replies although clients are silent, slow, do not read, or send invalid requests."""
 
 import asyncio
 import errno
@@ -49,7 +49,7 @@ async def test_silent_clients_cannot_lock_out_a_scraper() -> None:
         for _ in range(3):
             assert (await ask(served.port))[2] == "hello"
         ended = 0
-        for connection in silent[:8]:  # the oldest were ended for the newer ones
+        for connection in silent[:8]:  # the server closed the oldest connections
             ended += read_all(connection) == b""
         assert ended == 8
         for connection in silent:
@@ -70,7 +70,7 @@ async def test_a_client_that_does_not_read_its_answer_is_ended() -> None:
             async with asyncio.timeout(LIMIT_S):
                 while not asked or served.connections:
                     await asyncio.sleep(0.001)
-            assert len(read_all(deaf)) < 50_000_000  # what the kernel had taken already
+            assert len(read_all(deaf)) < 50_000_000  # the kernel buffered this part
 
 
 @pytest.mark.parametrize("head", [b"\x00\xff\r\n\r\n", b"GET /\r\n\r\n", b"GET / SPDY/3\r\n\r\n", b"\r\n\r\n"])

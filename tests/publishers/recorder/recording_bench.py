@@ -1,4 +1,4 @@
-"""What a recorder records, made by hand, and the context of a recorder whose time is the test's."""
+"""Context of a recorder with records, time and workers of the test."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -20,13 +20,13 @@ EPOCH = 0x5F3A9C01
 
 
 class HandSource:
-    """Devices whose records are made by hand."""
+    """Devices with records of the test."""
 
     def __init__(self) -> None:
         self.present = ["bow", "mast"]
         self.listening: list[PutRecord] = []
         self.on_begin: Callable[[], None] = lambda: None
-        """Called where a device is described: it takes its time."""
+        """Called when the recorder describes a device, which takes time."""
 
     def names(self) -> Sequence[str]:
         return self.present
@@ -51,14 +51,14 @@ class HandSource:
 
 
 class RecordingBench:
-    """Time, devices, events and workers of a part that records."""
+    """Time, devices, events and workers of a recorder."""
 
     def __init__(self) -> None:
         self.clock, self.source = VirtualClock(), HandSource()
         self.events: list[Event] = []
         self.workers: list[HandWorker] = []
         self.on_clocks_read: Callable[[], None] = lambda: None
-        """Called where the recorder looks at the host's clocks, which may record a reading."""
+        """Called when the recorder reads the clocks, which can make a record."""
         self.context = publisher_context(
             list, EPOCH, self.clock.now_ns, recording=self.source, utc_offset_ns=self._utc_offset_ns,
             raise_event=self.events.append,
@@ -73,13 +73,13 @@ class RecordingBench:
         return UTC_OFFSET_NS
 
     def advance(self, seconds: float) -> int:
-        """Let time pass; return CLOCK_MONOTONIC."""
+        """Advance the time. Return CLOCK_MONOTONIC."""
         self.clock.advance(round(seconds * NS_PER_S))
         return self.clock.now_ns()
 
 
 def records_in(path: Path) -> list[Record]:
-    """The records of a recording, which must be whole and have its regular end."""
+    """Return the records of a complete recording with an end record."""
     with path.open("rb") as file:
         reader = RecordingReader(file, path.name)
         found = list(reader)

@@ -1,4 +1,4 @@
-"""A recording for a client: whole for one that reads, with its losses for one that does not, and nobody ever waits."""
+"""Recording for a client: complete for a client that reads, with marked losses for a slow client, without waiting."""
 
 import socket
 from io import BytesIO
@@ -18,7 +18,7 @@ LINGER_NS = 10_000_000_000
 
 
 class StreamBench(RecordingBench):
-    """A recording whose thread is the test's, and the client's end of its socket."""
+    """Recording with a thread that the test runs, and the client's end of the socket."""
 
     def __init__(self, *devices: str) -> None:
         super().__init__()
@@ -32,7 +32,7 @@ class StreamBench(RecordingBench):
         self.workers[0].work()
 
     def read(self) -> bool:
-        """Read what is there; return whether the end was reached."""
+        """Read the present data. Return whether the recording ended."""
         while True:
             try:
                 data = self.client.recv(1 << 20)
@@ -92,7 +92,7 @@ def test_a_client_that_does_not_read_loses_records_and_the_recording_says_how_ma
     bench.tick()
     while bench.workers[0].work() == module.FULL_NS:
         bench.read()
-    bench.tick()  # there is room again
+    bench.tick()  # the queue has room again
     bench.source.deliver(77)
     bench.recording.stop("")
     while not bench.read():
@@ -101,7 +101,7 @@ def test_a_client_that_does_not_read_loses_records_and_the_recording_says_how_ma
     lost = sum(records.decode_lost(one.body).records for one in found if one.kind == Kind.LOST)
     kept = sum(one.kind == Kind.DATA for one in found)
     assert lost == bench.recording.records_dropped
-    assert kept + lost >= delivered + 1  # checks may be among the lost
+    assert kept + lost >= delivered + 1  # some of the lost records can be checks
     after = [one.kind for one in found][[one.kind for one in found].index(Kind.LOST) + 1 :]
     assert after[:3] == [Kind.CALL, Kind.DEVICE, Kind.DEVICE]
     bench.close()

@@ -1,4 +1,4 @@
-"""The directory of recordings: names, order, and a budget that removes nothing else."""
+"""Directory of recordings: names, order, and a limit that removes only recordings."""
 
 from pathlib import Path
 
@@ -52,6 +52,6 @@ def test_what_files_take_is_known_without_those_that_are_written(tmp_path: Path)
     assert directory.kept_bytes == 90
     directory.in_use.add(directory.files()[-1].name)
     directory.make_room(20)
-    assert directory.kept_bytes == 30  # the oldest was removed, the newest is written
+    assert directory.kept_bytes == 30  # imud removed the oldest file, and the newest is open
     directory.add(7)
     assert directory.kept_bytes == 37

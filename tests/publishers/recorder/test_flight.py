@@ -1,4 +1,4 @@
-"""The flight recorder: what it keeps, which alerts are saved, and what it says of it."""
+"""Flight recorder: kept data, saved alerts, and reports."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,7 +25,7 @@ SENDS_MAX, RETRY_NS = 4, 60 * NS_PER_S
 
 
 class FlightBench(RecordingBench):
-    """A flight recorder whose thread, time and line are the test's."""
+    """Flight recorder with thread, time and GPIO line of the test."""
 
     def __init__(self, folder: Path, devices: list[str] | None = None, **flight: Any) -> None:
         super().__init__()
@@ -49,7 +49,7 @@ class FlightBench(RecordingBench):
         return NoLine()
 
     def tick(self, seconds: float = 0.1) -> None:
-        """Time passes in steps of at most a second, each with a tick, a round of the thread, and a record."""
+        """Advance the time in steps of at most one second, each with a tick, a round of the thread, and a record."""
         while seconds > 0:
             self.source.deliver()
             self.flight.tick(self.advance(min(seconds, 1.0)))
@@ -97,7 +97,7 @@ def test_an_acceleration_over_the_bound_is_saved_with_what_came_before_and_after
     bench.tick(3)
     (file,) = bench.files
     assert file.name.endswith("-000000-snapshot.imudrec")
-    assert 69 <= span_s(file) <= 79  # 60 s before, 10 s after, and up to a segment of 5 s
+    assert 69 <= span_s(file) <= 79  # 60 s before, 10 s after, and up to one segment of 5 s
     found = records_in(file)
     assert decode_object(found[-1], EndRecord).reason == "|a| of bow was 51.5 m/s²"
     kinds = [one.kind for one in found]
@@ -121,7 +121,7 @@ def test_a_device_that_is_lost_is_an_alert_unless_it_is_not_recorded(tmp_path: P
     bench = FlightBench(tmp_path, devices=["bow"], after_s=0)
     for device, kind in (("mast", EventKind.DOWN), ("bow", EventKind.UP), ("bow", EventKind.LOSS)):
         bench.flight.event(Event(1, device, kind, ""))
-    bench.publish("bow", 1e6)  # without a bound
+    bench.publish("bow", 1e6)  # without a limit of acceleration
     bench.tick(2)
     assert bench.files == []
     bench.flight.event(Event(1, "bow", EventKind.DOWN, "the adapter was pulled out"))

@@ -1,4 +1,4 @@
-"""Which alerts of the flight recorder are saved: one at a time, so many an hour."""
+"""Limit of alerts: one at a time, and a maximum number per hour."""
 
 from imud.model.units import NS_PER_S
 from imud.publishers.recorder.flight import Alert, AlertGate

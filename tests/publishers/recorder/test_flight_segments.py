@@ -1,4 +1,4 @@
-"""The ring of segments: the oldest go by time and by room, and what is read is one whole recording."""
+"""Ring of segments: limits of time and size, and complete recordings."""
 
 import errno
 import os
@@ -22,7 +22,7 @@ def session(number: int) -> bytes:
 
 
 class RingBench:
-    """A ring whose segments have one block of data each, besides their session."""
+    """Ring with one data block per segment, in addition to the session record."""
 
     def __init__(self, bytes_max: int = 1 << 20, folder: Path | None = None) -> None:
         self.ring = SegmentRing(bytes_max)
@@ -72,7 +72,7 @@ def test_segments_that_ended_before_the_time_that_is_kept_go() -> None:
     bench = RingBench()
     for _ in range(5):
         bench.add()
-    bench.add(drop_before_ns=3)  # segment 2 ends at 3, where the third begins
+    bench.add(drop_before_ns=3)  # segment 2 ends at 3, when segment 3 starts
     assert devices(read(bench.ring.reader(END))) == [3, 4, 5]
     assert bench.ring.oldest_ns == 3
     bench.close()
@@ -174,7 +174,7 @@ def test_a_full_file_system_makes_the_oldest_go_and_is_an_error_for_the_last(
 
     def write_where_there_is_room(descriptor: int, data: bytes) -> int:
         if len(list(tmp_path.iterdir())) >= room[0]:
-            return write(descriptor, data[:5])  # a part of it, as a full disk does
+            return write(descriptor, data[:5])  # a partial write, as on a full disk
         return write(descriptor, data)
 
     monkeypatch.setattr(os, "write", write_where_there_is_room)

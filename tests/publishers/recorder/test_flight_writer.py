@@ -1,4 +1,4 @@
-"""The thread of the flight recorder: snapshots to files and to clients, whatever disk and clients do."""
+"""Thread of the flight recorder: snapshots to files and clients, with failing disks and clients."""
 
 import os
 from collections.abc import Iterator
@@ -60,7 +60,7 @@ def test_a_snapshot_has_all_that_came_before_it_and_nothing_after(
     bench.work()
     (saved,) = bench.writer.saved
     assert (saved.path, saved.bytes, saved.problem) == (path, path.stat().st_size, "")
-    assert len(synced) == 1  # it is on the disk when it is reported
+    assert len(synced) == 1  # the file is on the disk before the report
     assert [(one.kind, one.device) for one in records_in(path)] == [
         (Kind.SESSION, NO_DEVICE), (Kind.DATA, 0), (Kind.DATA, 1), (Kind.END, NO_DEVICE)
     ]  # fmt: skip

@@ -1,5 +1,7 @@
-"""Daemons that record and are killed at random moments, as processes: what they had written is whole, and replays as it
-ran. `python -m tests.bench.recorder_kills` kills many more."""
+"""Recording daemons that are killed at random moments: the written data is complete and can be replayed.
+
+`python -m tests.bench.recorder_kills` kills more daemons.
+"""
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,12 +12,9 @@ import pytest
 from tests.bench.recorder_kills import capture, look_at, run_and_kill
 
 AT_ONCE = 3
-EARLY, LATE = 2, 3
-"""So many are killed from the first block on, which has no samples, and so many when samples were written."""
-WITH_SAMPLES_BYTES = 40_000
-"""More than what a file begins with."""
-LATEST_S = 1.2
-"""The next block comes within a second."""
+EARLY, LATE = 2, 3  # number of daemons killed after the first block, which has no samples, and after written samples
+WITH_SAMPLES_BYTES = 40_000  # size that exceeds the start of a file, bytes
+LATEST_S = 1.2  # maximum time until the next block, s
 
 
 @pytest.mark.live

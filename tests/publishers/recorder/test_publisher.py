@@ -1,4 +1,4 @@
-"""The output `recorder`: what its settings ask for runs, and nothing else."""
+"""Output `recorder`: only the enabled recorders run."""
 
 from pathlib import Path
 

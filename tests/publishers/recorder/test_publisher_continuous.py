@@ -1,4 +1,4 @@
-"""The recorder: files that follow one another, losses and full disks that are told, and devices that come and go."""
+"""Continuous recorder: consecutive files, reported losses and full disks, new and removed devices."""
 
 import os
 from pathlib import Path
@@ -24,7 +24,7 @@ class RecorderBench(RecordingBench):
     def __init__(self, folder: Path, **settings: object) -> None:
         super().__init__()
         self.folder = folder / "recordings"
-        made = RecorderOptions(directory=str(self.folder), **settings)  # type: ignore[arg-type]  # by its keys
+        made = RecorderOptions(directory=str(self.folder), **settings)  # type: ignore[arg-type]  # options by name
         directory = RecordingDirectory(self.folder, made.keep_bytes)
         self.recorder = Recorder(made, self.context, directory, self.start_worker)
         self.recorder.start()
@@ -61,7 +61,7 @@ def test_only_the_named_devices_are_recorded_and_new_ones_as_they_come(tmp_path:
     bench.tick()
     bench.source.present.append("keel")
     bench.tick()
-    bench.recorder.remove_device("mast")  # it was restarted
+    bench.recorder.remove_device("mast")  # the device restarted
     bench.tick()
     bench.recorder.close()
     assert [one.device for one in bench.read() if one.kind == Kind.DEVICE] == [1, 2, 1]
@@ -163,7 +163,8 @@ def test_old_files_are_removed_for_new_ones(tmp_path: Path) -> None:
         bench.tick(1.1)
         bench.tick(1.1)
     there = sum(path.stat().st_size for path in bench.folder.iterdir())
-    assert abs(bench.recorder.status().disk_bytes - there) <= 1000  # a file's end is written after the next began
+    # imud writes the end of a file after it starts the next
+    assert abs(bench.recorder.status().disk_bytes - there) <= 1000
     bench.recorder.close()
     assert sum(path.stat().st_size for path in bench.folder.iterdir()) <= 2_100_000
     assert bench.recorder.status().files_removed >= 3

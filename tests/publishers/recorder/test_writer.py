@@ -1,4 +1,4 @@
-"""The queue and the thread of the recorder: bounded, in order, whole blocks whatever the disk does."""
+"""Queue and thread of the recorder: limited size, order, and complete blocks despite failing disks."""
 
 import errno
 import os
@@ -23,7 +23,7 @@ class WriterBench:
         self.writer = RecordingWriter(self.queue, self.clock.now_ns, self._start)
 
     def _start(self, *args: object) -> HandWorker:
-        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # as StartWorker
+        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # same parameters as StartWorker
         return self.workers[-1]
 
     def work(self) -> None:

@@ -1,4 +1,4 @@
-"""The feed of a recording: only what was asked for, never much at once, and losses that stand where they happened."""
+"""Feed of a recording: only the selected devices, limited work per tick, and losses at their position."""
 
 from imud.formats import records
 from imud.formats.records import NO_DEVICE, Kind, Record
@@ -76,7 +76,7 @@ def test_what_was_dropped_stands_where_there_is_room_again_with_the_states_after
         bench.source.deliver(100)
     dropped = bench.queue.dropped
     assert dropped
-    assert bench.feed.note_losses(bench.advance(1)) == 0  # there is no room to say so
+    assert bench.feed.note_losses(bench.advance(1)) == 0  # the queue has no room for the record of the loss
     begun_ns = bench.clock.now_ns()
     bench.taken()
     assert bench.feed.note_losses(bench.advance(1)) == dropped
