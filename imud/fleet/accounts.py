@@ -25,8 +25,8 @@ from imud.fleet.messages import (
 from imud.model.units import NS_PER_MS
 
 RANGES_MAX: Final = 1000  # Maximum number of stored gaps per stream. Numbers of older gaps stay missing.
+# Maximum number of streams of all gateways and boots. A reader with more streams raises an error.
 STREAMS_MAX: Final = 100_000
-"""Maximum number of streams of all gateways and boots. A reader with more streams raises an error."""
 
 
 class StreamKey(NamedTuple):
@@ -50,8 +50,8 @@ class StreamCounts(msgspec.Struct):
     newest: int  # highest number that a message covered
     whole: int = 0  # numbers of complete samples; in the stream `statistics`, numbers of declared intervals
     thinned: int = 0  # numbers that arrived as statistics because the spool was full
+    # Numbers that the gateway dropped, by cause
     dropped: dict[str, int] = {}  # msgspec copies a mutable default
-    """Numbers that the gateway dropped, by cause."""
     missing: int = 0  # numbers that no message covers
     duplicates: int = 0  # numbers that arrived again
 
@@ -169,8 +169,8 @@ class FleetLedger:
         return msgspec.structs.replace(message, samples=samples)
 
 
+# Maximum number of streams in the states of all gateways. A reader with more streams raises an error.
 POSITIONS_MAX: Final = 100_000
-"""Maximum number of streams in the states of all gateways. A reader with more streams raises an error."""
 
 
 class StreamPosition(msgspec.Struct, frozen=True):
@@ -271,14 +271,14 @@ def decode_state(payload: bytes) -> GatewayState:
     return state
 
 
+# Maximum deviation of `utc_ns` from the clock in its message, ns. A larger deviation means a step of the clock after
+# the sample. The gateway reads the clock within microseconds.
 STEP_NS: Final = NS_PER_MS
-"""Maximum deviation of `utc_ns` from the clock in its message, ns. A larger deviation means a step of the clock after
-the sample. The gateway reads the clock within microseconds."""
+# Divisor for the drift, 500 ppm: maximum frequency error that the kernel assumes for an unsynchronized clock
+# (adjtimex(2))
 DRIFT: Final = 2000
-"""Divisor for the drift, 500 ppm: maximum frequency error that the kernel assumes for an unsynchronized clock
-(adjtimex(2))."""
+# Maximum number of boots with a stored offset, equal to STREAMS_MAX. imud removes the oldest.
 BOOTS_MAX: Final = 100_000
-"""Maximum number of boots with a stored offset, equal to STREAMS_MAX. imud removes the oldest."""
 
 
 class BootKey(NamedTuple):

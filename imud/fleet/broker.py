@@ -32,8 +32,8 @@ UNANSWERED: Final = (
     "or a client certificate"
 )
 REFUSED: Final = 0x80  # lowest reason code of a refusal (MQTT 5.0, section 2.4)
+# Maximum length of a file of certificates, bytes. The file with all authorities of Debian has 0.2 MB.
 PEM_BYTES: Final = 4 << 20
-"""Maximum length of a file of certificates, bytes. The file with all authorities of Debian has 0.2 MB."""
 MQTT_5: Final = 5  # value of `MQTTv5` in paho-mqtt: protocol version in CONNECT (MQTT 5.0, section 3.1.2.2)
 PASSWORD_BYTES: Final = 65_535  # maximum length of a password, bytes (MQTT 5.0, section 3.1.3.6)
 
@@ -54,8 +54,8 @@ class ReaderAccess(msgspec.Struct, frozen=True):
 
 BrokerAccess = MqttOptions | ReaderAccess
 
+# Callbacks of paho-mqtt. The owner of a client implements the callbacks that it needs as `_on_connect`, ….
 CALLBACKS: Final = ("on_connect", "on_disconnect", "on_message", "on_publish", "on_subscribe")
-"""Callbacks of paho-mqtt. The owner of a client implements the callbacks that it needs as `_on_connect`, …."""
 
 
 def paho_client(
@@ -191,15 +191,15 @@ def _read(name: str, path: str, most: int) -> bytes:
 log = logging.getLogger(__name__)
 
 IN_FLIGHT_MAX: Final = 20  # Maximum number of messages without an acknowledgement. A broker can set a lower limit.
+# Time between two checks for the end of the output, s, while imud waits for CONNACK. It is shorter than CLOSE_S of the
+# sender.
 LOOK_S: Final = 0.1
-"""Time between two checks for the end of the output, s, while imud waits for CONNACK. It is shorter than CLOSE_S of the
-sender."""
 PACKET_BYTES: Final = 16_384  # maximum length of a packet from the broker, bytes: four times the longest request
+# Maximum length of an MQTT packet, bytes (MQTT 5.0, section 2.1.4), if the broker does not set a lower limit
 PACKET_BYTES_MOST: Final = 268_435_460
-"""Maximum length of an MQTT packet, bytes (MQTT 5.0, section 2.1.4), if the broker does not set a lower limit."""
+# Bytes of a packet without topic and payload: type, lengths, packet identifier, content type, and correlation data of
+# 128 bytes
 OVERHEAD_BYTES: Final = 200
-"""Bytes of a packet without topic and payload: type, lengths, packet identifier, content type, and correlation data of
-128 bytes."""
 EXTRA_MISSING: Final = "the output mqtt needs the extra mqtt: pip install 'imud[mqtt]'"
 
 
@@ -215,7 +215,7 @@ class Received(NamedTuple):
 
     topic: str
     payload: bytes
-    retain: bool  # true if the broker stored the message (retained)
+    retain: bool  # True if the broker stored the message (retained)
     response_topic: str  # topic for the reply; empty if the message does not contain it, and with MQTT 3.1.1
     correlation: bytes | None  # correlation data for the reply (MQTT 5 only)
 
@@ -256,8 +256,8 @@ class BrokerConnection(Protocol):
         ...
 
 
+# Function that returns an accepted connection, with the arguments of `PahoConnection`. Raises BrokerError.
 Connect = Callable[[Broker, MqttOptions, str, Will, Callable[[], bool]], BrokerConnection]
-"""Function that returns an accepted connection, with the arguments of `PahoConnection`. Raises BrokerError."""
 
 
 def check_extra() -> None:
@@ -453,8 +453,8 @@ class PahoConnection:
 
 
 FIRST_S: Final = 4.0  # Maximum length of the first pause, s. 500 gateways then reconnect at 125 per second.
+# Minimum duration of a stable connection, ns. After it, pauses start with FIRST_S again.
 STABLE_NS: Final = 30 * NS_PER_S
-"""Minimum duration of a stable connection, ns. After it, pauses start with FIRST_S again."""
 
 
 class BrokerTurn:

@@ -19,13 +19,13 @@ from imud.fleet.reader import RECEIVE_MAX, Fleet, FleetBatch, FleetDelivery, Fle
 from imud.model.units import NS_PER_S
 
 COMMIT_S: Final = 0.5
+# Maximum number of messages in one transaction. The broker can send the same number during the transaction.
 BATCHES_MAX: Final = RECEIVE_MAX // 2
-"""Maximum number of messages in one transaction. The broker can send the same number during the transaction."""
+# Maximum size of the messages in one transaction, bytes. Two transactions are in memory at a time.
 TURN_BYTES: Final = 8 << 20
-"""Maximum size of the messages in one transaction, bytes. Two transactions are in memory at a time."""
+# Number of allocations between two runs of the garbage collector. A transaction of large messages allocates this
+# number.
 GC_ALLOCATIONS: Final = 100_000
-"""Number of allocations between two runs of the garbage collector. A transaction of large messages allocates this
-number."""
 
 
 Offsets = Mapping[BootKey, BootOffset]  # clock offsets of boots whose clock is known now

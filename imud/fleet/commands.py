@@ -56,7 +56,7 @@ class CommandReply(NamedTuple):
     correlation: bytes | None
 
 
-class _Asked(NamedTuple):
+class _Request(NamedTuple):
     """Request that passed its checks."""
 
     device: str
@@ -64,7 +64,7 @@ class _Asked(NamedTuple):
     topic: str
     correlation: bytes | None
 
-    def is_same(self, other: "_Asked") -> bool:
+    def is_same(self, other: "_Request") -> bool:
         """Return whether both requests are equal."""
         mine, theirs = self.request, other.request
         return (self.device, mine.action, mine.arguments) == (other.device, theirs.action, theirs.arguments)
@@ -83,16 +83,16 @@ class CommandChannel:
     ) -> None:  # fmt: skip
         self.run = 0  # number of requests that imud ran
         self.refused = 0  # number of rejected requests
+        # Sends replies, called from both threads. The output sets it.
         self.answer: Callable[[CommandReply], None] = lambda _reply: None
-        """Sends replies, called from both threads. The output sets it."""
         self._settings, self._gateway, self._control = settings, gateway, control
         self._now_ns, self._utc_offset_ns = now_ns, utc_offset_ns
         self._start_ns = now_ns()
-        self._asked: deque[_Asked] = deque()
+        self._asked: deque[_Request] = deque()
         self._times_ns: deque[int] = deque()
         self._known: dict[str, int] = {}  # arrival of each ID, CLOCK_MONOTONIC; `per_minute` limits their number
         self._lock = threading.Lock()
-        self._answers: dict[str, tuple[_Asked, bytes]] = {}  # finished requests and their replies by ID, newest last
+        self._answers: dict[str, tuple[_Request, bytes]] = {}  # finished requests and their replies by ID, newest last
         self._task: asyncio.Task[None] | None = None
 
     @property
@@ -120,8 +120,8 @@ class CommandChannel:
         if topic is None:
             self._ignore(f"expected a response topic below {answer_topic(*parts[:3])}")
             return
-        asked = _Asked(parts.device, request, topic, received.correlation)
-        outcome, problem = self._judged(asked)
+        asked = _Request(parts.device, request, topic, received.correlation)
+        outcome, problem = self._check(asked)
         if outcome is Outcome.DUPLICATE and self._repeat(asked):
             return
         if outcome is not None:
@@ -130,7 +130,7 @@ class CommandChannel:
         self._known[request.id] = self._now_ns()
         self._asked.append(asked)
 
-    def _judged(self, asked: _Asked) -> tuple[Outcome | None, str]:
+    def _check(self, asked: _Request) -> tuple[Outcome | None, str]:
         """Return the outcome and the cause if imud rejects a request, otherwise None."""
         now_ns, request = self._now_ns(), asked.request
         while self._times_ns and now_ns - self._times_ns[0] >= MINUTE_NS:
@@ -171,7 +171,7 @@ class CommandChannel:
             return "the request is older than the start of imud, and may already have run"
         return ""
 
-    def _repeat(self, asked: _Asked) -> bool:
+    def _repeat(self, asked: _Request) -> bool:
         """Send the stored reply of an equal request. Return whether there is one."""
         with self._lock:
             kept = self._answers.get(asked.request.id)
@@ -186,15 +186,15 @@ class CommandChannel:
             self.refused += 1
         log.warning("mqtt: ignoring a request: %s", problem)
 
-    def _refuse(self, asked: _Asked, outcome: Outcome, problem: str) -> None:
+    def _refuse(self, asked: _Request, outcome: Outcome, problem: str) -> None:
         with self._lock:
             self.refused += 1
         log.warning(
             "mqtt: %s: rejecting request %s for %s (%s): %s",
             asked.device, asked.request.id, shown(asked.request.action), outcome, problem,
-            extra=None if outcome is Outcome.BUSY else _by_itself(asked),
+            extra=None if outcome is Outcome.BUSY else _own_log_line(asked),
         )  # fmt: skip
-        self._give_answer(asked, outcome, error=problem)
+        self._send_reply(asked, outcome, error=problem)
 
     # --- event loop
     # -----------------------------------------------------------------------------------------------------
@@ -214,18 +214,18 @@ class CommandChannel:
             return
         self._task = asyncio.get_running_loop().create_task(self._run(asked))
 
-    async def _run(self, asked: _Asked) -> None:
+    async def _run(self, asked: _Request) -> None:
         """Run a request and send its reply."""
         request = asked.request
         self.run += 1
         log.warning(
             "mqtt: %s: request %s: %s %s", asked.device, request.id, shown(request.action), shown(request.arguments),
-            extra=_by_itself(asked),
+            extra=_own_log_line(asked),
         )  # fmt: skip
         try:
             result = await self._control(asked.device).act(request.action, request.arguments)
         except ImudError as error:
-            log.warning("mqtt: %s: request %s failed: %s", asked.device, request.id, error, extra=_by_itself(asked))
+            log.warning("mqtt: %s: request %s failed: %s", asked.device, request.id, error, extra=_own_log_line(asked))
             self._end(asked, Outcome.FAILED, error=str(error))
         except Exception:
             log.exception("mqtt: %s: request %s failed because of an internal error", asked.device, request.id)
@@ -240,9 +240,9 @@ class CommandChannel:
         if self._task is not None:
             self._task.cancel()
 
-    def _end(self, asked: _Asked, outcome: Outcome, *, result: object = None, error: str = "") -> None:
+    def _end(self, asked: _Request, outcome: Outcome, *, result: object = None, error: str = "") -> None:
         """Send the reply of a finished request and store it."""
-        payload = self._give_answer(asked, outcome, result=result, error=error)
+        payload = self._send_reply(asked, outcome, result=result, error=error)
         if len(payload) > ANSWER_BYTES:
             return
         with self._lock:
@@ -250,7 +250,7 @@ class CommandChannel:
             while len(self._answers) > ANSWERS_KEPT:
                 del self._answers[next(iter(self._answers))]
 
-    def _give_answer(self, asked: _Asked, outcome: Outcome, *, result: object = None, error: str = "") -> bytes:
+    def _send_reply(self, asked: _Request, outcome: Outcome, *, result: object = None, error: str = "") -> bytes:
         """Send a reply. Return its payload."""
         answer = CommandAnswer(
             v=VERSION, id=asked.request.id, gateway=self._gateway.gateway, device=asked.device,
@@ -261,6 +261,6 @@ class CommandChannel:
         return payload
 
 
-def _by_itself(asked: _Asked) -> dict[str, str]:
+def _own_log_line(asked: _Request) -> dict[str, str]:
     """Return the `extra` of log messages that the log must not merge with messages of other requests."""
     return {SAME_AS: asked.request.id}

@@ -30,9 +30,8 @@ from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
 
 ROOT: Final = "imud"
+# Pattern of a name, at most 64 characters. MQTT limits a topic to 65,535 bytes, and a client ID contains three names.
 NAME_PATTERN: Final = "[A-Za-z0-9_-]{1,64}"
-"""Pattern of a name, at most 64 characters. MQTT limits a topic to 65,535 bytes, and a client ID contains three
-names."""
 _NAME: Final = re.compile(NAME_PATTERN)
 
 
@@ -95,19 +94,19 @@ def parse_topic(topic: str) -> TopicParts | None:
 
 VERSION: Final = 1
 MAGIC: Final = b"IMUB"
+# Maximum number of slots in one message: 128 kB before compression, the smallest limit of the large cloud brokers
 SLOTS_MAX: Final = 500
-"""Maximum number of slots in one message: 128 kB before compression, the smallest limit of the large cloud brokers."""
 SAMPLES_MAX: Final = 200  # maximum number of samples in one JSON message, about 100 kB
 HEADER_MAX: Final = 4096
 LEVEL: Final = 3  # compression level of Zstandard, its default
+# Limit of the absolute value of integers. The sum of two such numbers fits into 64 bits. ns since 1970 reach it in
+# 2116.
 NUMBER_MOST: Final = 1 << 62
-"""Limit of the absolute value of integers. The sum of two such numbers fits into 64 bits. ns since 1970 reach it in
-2116."""
+# Start of 2020 as CLOCK_REALTIME, ns. A clock with an earlier time is not set.
 CLOCK_SET_NS: Final = 1_577_836_800 * NS_PER_S
-"""Start of 2020 as CLOCK_REALTIME, ns. A clock with an earlier time is not set."""
 _NUL: Final = b"\\u0000"  # escaped NUL in a JSON string, or an escaped backslash followed by `u0000`
+# Pattern of an escaped NUL only. This search takes ten times as long as the decoding.
 _NUL_ALONE: Final = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
-"""Pattern of an escaped NUL only. This search takes ten times as long as the decoding."""
 _PREFIX: Final = struct.Struct("<4sBBH")
 JSON_TYPE: Final = "application/json"
 SLOTS_TYPE: Final = "application/vnd.imud.slots+zstd"
@@ -165,8 +164,8 @@ class GatewayClock(msgspec.Struct, frozen=True, gc=False):
 
     t_ns: int  # CLOCK_MONOTONIC of the reading
     utc_offset_ns: int  # CLOCK_REALTIME minus CLOCK_MONOTONIC at the reading
+    # True if the kernel reports a synchronized clock (STA_UNSYNC not set). Otherwise the clock can have any error.
     synchronised: bool
-    """True if the kernel reports a synchronized clock (STA_UNSYNC not set). Otherwise the clock can have any error."""
     error_ns: int | None = None  # One-sigma error of the offset; None if the clock is not synchronized
 
 
@@ -175,8 +174,8 @@ class FleetMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True, kw
 
     v: int  # version of the format, VERSION
     gateway: str
+    # Identifier of the start of the daemon, 16 hexadecimal digits: `epoch` on the socket and in shared memory
     boot: str
-    """Identifier of the start of the daemon, 16 hexadecimal digits: `epoch` on the socket and in shared memory."""
     device: str  # device name; empty for the gateway
     kind: MessageKind
     begin: int  # first number of the stream in this boot
@@ -184,8 +183,8 @@ class FleetMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True, kw
     last: int
     count: int  # number of samples or events that the numbers stand for
     utc_ns: int  # CLOCK_REALTIME of the newest sample or event
+    # Wall clock when the message was made; None if the version of the gateway does not send it
     clock: GatewayClock | None = None
-    """Wall clock when the message was made; None if the version of the gateway does not send it."""
     cause: DropCause | None = None  # cause of the loss, for the kind `dropped`
     samples: list[Sample] = []  # msgspec copies a mutable default
     intervals: list[Interval] = []
@@ -352,8 +351,8 @@ def finite(sample: Sample) -> Sample:
     return msgspec.structs.replace(sample, **bad) if bad else sample
 
 
+# Maximum length of a request, bytes. The longest arguments of a command have some hundred bytes.
 REQUEST_BYTES: Final = 4096
-"""Maximum length of a request, bytes. The longest arguments of a command have some hundred bytes."""
 Id = Annotated[str, msgspec.Meta(pattern=f"^{NAME_PATTERN}$")]
 
 
@@ -361,12 +360,11 @@ class Outcome(StrEnum):
     """Outcomes of a request."""
 
     DONE = "done"  # the command ran; `result` contains its return value
+    # The device or a check rejected the command, or the command did not end; `error` contains the cause
     FAILED = "failed"
-    """The device or a check rejected the command, or the command did not end; `error` contains the cause."""
     DENIED = "denied"  # the configuration of the gateway does not allow the command
+    # The request is too old, from the future, or from before the start of the gateway, or the gateway clock is not set
     STALE = "stale"
-    """The request is too old, from the future, or from before the start of the gateway, or the gateway clock is not
-    set."""
     DUPLICATE = "duplicate"  # The gateway already received a request with this ID. It has sent or will send the reply.
     BUSY = "busy"  # too many requests are waiting, or too many requests arrived within a minute
 

@@ -84,6 +84,7 @@ RECORDS: Final = FleetTable(
 )  # fmt: skip
 LEDGER: Final = "imud_ledger"
 BOOTS: Final = "imud_boots"
+# Statements that create the tables, by table name
 SCHEMA: Final = {
     SAMPLES.name: SAMPLES.statement(),
     RECORDS.name: RECORDS.statement(),
@@ -93,7 +94,6 @@ SCHEMA: Final = {
     BOOTS: f"CREATE TABLE IF NOT EXISTS {BOOTS} (gateway text, boot text, t_ns bigint NOT NULL, "
     "utc_offset_ns bigint NOT NULL, utc_err_ns bigint, PRIMARY KEY (gateway, boot));",
 }
-"""Statements that create the tables, by table name."""
 
 
 def sample_rows(batch: FleetBatch) -> Iterable[Row]:
@@ -155,6 +155,7 @@ LOCK: Final = 0x696D7564  # Number of the advisory lock, "imud". One collector a
 LOCK_S: Final = 20  # Maximum wait for the lock, s. The lock of a killed collector ends with its last statement.
 EXTRA_MISSING: Final = "--to postgresql needs the extra fleet: pip install 'imud[fleet]'"
 _UTC_NS: Final = "t_ns + %(utc_offset_ns)s"
+# SQL expressions of the columns that change when the clock of a boot is known, equal to `accounts.placed`
 _PLACED: Final = {
     "time": f"timestamptz 'epoch' + ({_UTC_NS}) / 1000 * interval '1 microsecond'",
     "utc_ns": _UTC_NS,
@@ -164,7 +165,6 @@ _PLACED: Final = {
     "'begin_utc_ns', (content->>'begin_t_ns')::bigint + %(utc_offset_ns)s, "
     "'end_utc_ns', (content->>'end_t_ns')::bigint + %(utc_offset_ns)s) ELSE content END",
 }
-"""SQL expressions of the columns that change when the clock of a boot is known, equal to `accounts.placed`."""
 
 
 class PostgresStore:

@@ -2,7 +2,7 @@
 
     loop: publish, event, tick ──▶ WriterQueue ──▶ writer (thread: messages, spool) ──▶ sender (thread: broker)
 
-docs/fleet.md describes the messages. A lock file prevents that two daemons use the same spool.
+docs/fleet.md describes the messages. A lock file keeps other daemons from using the same spool.
 """
 
 import fcntl
@@ -53,7 +53,7 @@ ANGLES: Final = ("roll", "pitch", "yaw")  # components of `euler_rad`
 def discovery_topic(gateway: Gateway, device: str) -> str:
     """Return the discovery topic of a device.
 
-    Its checksum distinguishes device `b` of gateway `a_b` from `b_b` of `a`.
+    Its checksum distinguishes device `c` of gateway `a_b` from device `b_c` of gateway `a`.
     """
     return f"{PREFIX}/device/{_unique_id(gateway, device)}/config"
 
@@ -131,12 +131,12 @@ def _attitude_parts(topic: str) -> dict[str, dict[str, object]]:
 log = logging.getLogger(__name__)
 
 LOCK: Final = "lock"
+# Minimum time between two state messages, ns. The state of one device costs the event loop 0.6 ms.
 STATE_NS: Final = NS_PER_S
-"""Minimum time between two state messages, ns. The state of one device costs the event loop 0.6 ms."""
+# Events that change the state of a device
 STATE_KINDS: Final = frozenset(
     (EventKind.UP, EventKind.DOWN, EventKind.SYNC, EventKind.CONFIGURATION, EventKind.ALARM, EventKind.ATTITUDE)
 )
-"""Events that change the state of a device."""
 
 
 class MqttPublisher:
@@ -248,7 +248,7 @@ class MqttPublisher:
         failure = writer.failure or sender.failure
         if failure is not None:
             raise failure
-        self._look_at_problems(now_ns, writer, sender)
+        self._report_problems(now_ns, writer, sender)
         if self._commands is not None:
             self._commands.run_next()
         if now_ns - self._state_ns >= STATE_NS:
@@ -352,7 +352,7 @@ class MqttPublisher:
 
     # --- problems -----------------------------------------------------------------------------------------------------
 
-    def _look_at_problems(self, now_ns: int, writer: SpoolWriter, sender: MqttSender) -> None:
+    def _report_problems(self, now_ns: int, writer: SpoolWriter, sender: MqttSender) -> None:
         """Report changes of the spool as events, and changes of the connection in the log."""
         if writer.problem != self._spool_problem:
             before, self._spool_problem = self._spool_problem, writer.problem

@@ -52,18 +52,16 @@ from imud.fleet.settings import Broker, broker_of
 from imud.model.errors import BadArgument, ServerError
 from imud.model.units import NS_PER_S
 
+# Maximum number of messages without an acknowledgement. 1,000 gateways with two devices send this number per second.
 RECEIVE_MAX: Final = 2000
-"""Maximum number of messages without an acknowledgement. 1,000 gateways with two devices send this number per
-second."""
+# Maximum size of the waiting messages, bytes. A message with statistics usually has 4 kB, at most 130 kB.
 WAITING_BYTES: Final = 16 << 20
-"""Maximum size of the waiting messages, bytes. A message with statistics usually has 4 kB, at most 130 kB."""
+# Maximum length of a message, bytes. A message of a gateway has at most 130 kB; the state of a hundred devices is
+# shorter.
 PACKET_BYTES: Final = 1_000_000
-"""Maximum length of a message, bytes. A message of a gateway has at most 130 kB; the state of a hundred devices is
-shorter."""
 KEEP_ALIVE_S: Final = 30
+# Pause after received messages, s. Reading several messages together costs less than half of the CPU time per message.
 GATHER_S: Final = 0.01
-"""Pause after received messages, s. Reading several messages together costs less than half of the CPU time per
-message."""
 MISC_S: Final = 1.0  # interval of the keep-alive checks, s
 
 
@@ -72,7 +70,7 @@ class FleetDelivery(NamedTuple):
 
     topic: str
     payload: bytes
-    retain: bool  # true if the broker stored the message (retained)
+    retain: bool  # True if the broker stored the message (retained)
     number: int  # packet identifier for the acknowledgement, valid in `connection`
     connection: "ReaderConnection"
 
@@ -81,12 +79,12 @@ class ReaderConnection:
     """Connection to one broker. `open` creates it. Synchronization: the event loop's thread."""
 
     def __init__(self, broker: Broker) -> None:
+        # Number of rejected messages with QoS 0. A broker can send any number of them without an acknowledgement.
         self.refused = 0
-        """Number of rejected messages with QoS 0. A broker can send any number of them without an acknowledgement."""
         self._broker = broker
         self._queue: deque[FleetDelivery] = deque()
         self._bytes = 0  # bytes of the messages in the queue
-        self._came = asyncio.Event()
+        self._changed = asyncio.Event()
         self._problem = ""
         self._answered = False
         self._awaited = 0  # number of topics without a SUBACK
@@ -94,8 +92,10 @@ class ReaderConnection:
         self._socket: Any = None
         # True while the socket is not read: after received messages, or because the queue is full
         self._is_paused = False
-        self._gathering: asyncio.TimerHandle | None = None
-        self._number = -1  # descriptor of the socket: paho-mqtt can close the socket before the event loop removes it
+        self._pause_timer: asyncio.TimerHandle | None = None
+        self._descriptor = (
+            -1
+        )  # descriptor of the socket: paho-mqtt can close the socket before the event loop removes it
         self._timer: asyncio.TimerHandle | None = None
 
     @classmethod
@@ -119,8 +119,8 @@ class ReaderConnection:
             await self._connect(access, client_id, session_s, is_v5=is_v5)
             await self._until(lambda: self._answered, "no answer")
             self._awaited = len(topics)
-            self._guarded(lambda: self._client.subscribe([(topic, 1) for topic in topics]))
-            self._look_at_writing()
+            self._call_client(lambda: self._client.subscribe([(topic, 1) for topic in topics]))
+            self._watch_writable()
             # a session can contain more messages than the reader accepts at once, and SUBACK follows them
             await self._until(lambda: not self._awaited or not self._has_room(), "no answer to the subscription")
         except (OSError, ValueError) as error:
@@ -140,9 +140,9 @@ class ReaderConnection:
         if self._socket is None:
             raise BrokerError(f"{self._broker.name}: {LOST}")
         client.on_socket_close = self._on_socket_close
-        self._number = self._socket.fileno()
-        asyncio.get_running_loop().add_reader(self._number, self._read)
-        self._look_after()
+        self._descriptor = self._socket.fileno()
+        asyncio.get_running_loop().add_reader(self._descriptor, self._read)
+        self._check_keep_alive()
 
     @property
     def waiting(self) -> int:
@@ -156,25 +156,25 @@ class ReaderConnection:
                 await self._until(lambda: bool(self._queue), "", timeout_s)
         found = self._queue.popleft() if self._queue else None
         self._bytes -= len(found.payload) if found is not None else 0
-        self._look_at_reading()
+        self._continue_reading()
         return found
 
     def acknowledge(self, number: int) -> None:
         """Acknowledge a message. Do nothing if the connection is lost."""
         client = self._client
         if client is not None and not self._problem:
-            self._guarded(lambda: client.ack(number, 1))
-            self._look_at_writing()
+            self._call_client(lambda: client.ack(number, 1))
+            self._watch_writable()
 
     def close(self) -> None:
         """Send DISCONNECT and close the connection. The broker keeps the session. A second call does nothing."""
         client, self._client = self._client, None
         self._problem = self._problem or "the connection is closed"
-        self._came.set()
-        for timer in (self._timer, self._gathering):
+        self._changed.set()
+        for timer in (self._timer, self._pause_timer):
             if timer is not None:
                 timer.cancel()
-        self._forget_socket()
+        self._remove_socket()
         if client is not None:
             close_client(client)
 
@@ -187,8 +187,8 @@ class ReaderConnection:
                 while not true():
                     if self._problem:
                         raise BrokerError(f"{self._broker.name}: {self._problem}")
-                    self._came.clear()
-                    await self._came.wait()
+                    self._changed.clear()
+                    await self._changed.wait()
         except TimeoutError:
             if not problem:
                 raise
@@ -199,27 +199,27 @@ class ReaderConnection:
         client, before = self._client, len(self._queue)
         while client is not None:
             known = len(self._queue)
-            self._guarded(client.loop_read)
+            self._call_client(client.loop_read)
             has_more = len(self._queue) > known or self._pending()
             if self._problem or not has_more or len(self._queue) > RECEIVE_MAX or self._bytes > WAITING_BYTES:
                 break
         if self._socket is not None and len(self._queue) > before:
             loop = asyncio.get_running_loop()
             self._is_paused = True
-            loop.remove_reader(self._number)
-            self._gathering = loop.call_later(GATHER_S, self._gathered)
-        self._look_at_writing()
+            loop.remove_reader(self._descriptor)
+            self._pause_timer = loop.call_later(GATHER_S, self._end_pause)
+        self._watch_writable()
 
-    def _gathered(self) -> None:
-        self._gathering = None
-        self._look_at_reading()
+    def _end_pause(self) -> None:
+        self._pause_timer = None
+        self._continue_reading()
 
-    def _look_at_reading(self) -> None:
+    def _continue_reading(self) -> None:
         """Continue to read after a pause if the queue has room."""
-        if self._is_paused and self._gathering is None and self._has_room() and self._socket is not None:
+        if self._is_paused and self._pause_timer is None and self._has_room() and self._socket is not None:
             loop = asyncio.get_running_loop()
             self._is_paused = False
-            loop.add_reader(self._number, self._read)
+            loop.add_reader(self._descriptor, self._read)
             if self._pending():  # the event loop cannot see bytes that the TLS library already read
                 loop.call_soon(self._read)
 
@@ -232,28 +232,28 @@ class ReaderConnection:
 
     def _write(self) -> None:
         if self._client is not None:
-            self._guarded(self._client.loop_write)
-            self._look_at_writing()
+            self._call_client(self._client.loop_write)
+            self._watch_writable()
 
-    def _look_at_writing(self) -> None:
+    def _watch_writable(self) -> None:
         """Wait until the socket is writable if paho-mqtt has data to write."""
         if self._problem or self._socket is None:
             return
         loop = asyncio.get_running_loop()
         if self._client.want_write():
-            loop.add_writer(self._number, self._write)
+            loop.add_writer(self._descriptor, self._write)
         else:
-            loop.remove_writer(self._number)
+            loop.remove_writer(self._descriptor)
 
-    def _look_after(self) -> None:
+    def _check_keep_alive(self) -> None:
         """Send and check keep-alives."""
-        self._timer = asyncio.get_running_loop().call_later(MISC_S, self._look_after)
+        self._timer = asyncio.get_running_loop().call_later(MISC_S, self._check_keep_alive)
         # otherwise PINGRESP can be in the data that was not read, and paho-mqtt would report a timeout
         if self._has_room():
-            self._guarded(self._client.loop_misc)
-        self._look_at_writing()
+            self._call_client(self._client.loop_misc)
+        self._watch_writable()
 
-    def _guarded(self, work: Any) -> None:
+    def _call_client(self, work: Any) -> None:
         """Call paho-mqtt. Store the problem if the call or the closed socket shows a lost connection."""
         try:
             work()
@@ -262,16 +262,16 @@ class ReaderConnection:
         if self._client is not None and self._client.socket() is None:
             self._problem = self._problem or (LOST if self._answered else UNANSWERED)
         if self._problem:
-            self._forget_socket()
-            self._came.set()
+            self._remove_socket()
+            self._changed.set()
 
-    def _forget_socket(self) -> None:
+    def _remove_socket(self) -> None:
         """Remove the socket from the event loop. Its descriptor may be closed and belong to another file."""
         sock, self._socket = self._socket, None
         if sock is not None:
             for forget in ("remove_reader", "remove_writer"):
                 with suppress(OSError, RuntimeError):  # RuntimeError: the event loop has ended
-                    getattr(asyncio.get_running_loop(), forget)(self._number)
+                    getattr(asyncio.get_running_loop(), forget)(self._descriptor)
 
     # --- callbacks of paho-mqtt ---------------------------------------------------------------------------------------
 
@@ -279,14 +279,14 @@ class ReaderConnection:
         if reason.is_failure:
             self._problem = f"the broker refuses the connection: {reason}"
         self._answered = True
-        self._came.set()
+        self._changed.set()
 
     def _on_subscribe(self, _client: Any, _data: Any, _mid: int, reasons: Any, _properties: Any) -> None:
         for reason in reasons:
             if reason.value >= REFUSED:
                 self._problem = self._problem or f"the broker refuses a subscription: {reason}"
         self._awaited = 0
-        self._came.set()
+        self._changed.set()
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
         if not message.qos:
@@ -294,12 +294,12 @@ class ReaderConnection:
             return
         self._bytes += len(message.payload)
         self._queue.append(FleetDelivery(message.topic, message.payload, bool(message.retain), message.mid, self))
-        self._came.set()
+        self._changed.set()
 
     def _on_socket_close(self, _client: Any, _data: Any, _sock: Any) -> None:
         """Remove the socket from the event loop before paho-mqtt closes its descriptor."""
-        self._forget_socket()
-        self._came.set()
+        self._remove_socket()
+        self._changed.set()
 
     def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: Any, _properties: Any) -> None:
         if flags.is_disconnect_packet_from_server:
@@ -308,8 +308,8 @@ class ReaderConnection:
 
 log = logging.getLogger(__name__)
 
+# Time for which the broker keeps a named session without a connection, s. A broker can have a lower limit.
 SESSION_S: Final = 7 * 24 * 3600
-"""Time for which the broker keeps a named session without a connection, s. A broker can have a lower limit."""
 RETRY_MAX_S: Final = 60.0
 VERSIONS: Final = ("5", "3.1.1")  # Supported versions of MQTT. The first is the default.
 
@@ -320,8 +320,8 @@ class FleetBatch(NamedTuple):
     site: str
     stream: Stream
     message: FleetMessage  # message with samples of the same type as in `imud.client`
+    # Newest clock offset of the boot; None before the first. It gives older records of the boot a UTC time.
     offset: BootOffset | None = None
-    """Newest clock offset of the boot; None before the first. It gives older records of the boot a UTC time."""
 
     def time_of(self, utc_ns: int, t_ns: int) -> PlacedTime:
         """Return the UTC time of a record with these two times."""

@@ -24,8 +24,8 @@ from imud.model.units import NS_PER_S
 REPLIES_MAX: Final = 32  # Maximum number of replies that wait for a connection. The sender drops the oldest.
 OUTBOX_MAX: Final = 60  # maximum number of messages in memory, 6 MB at most: three times IN_FLIGHT_MAX
 WAIT_S: Final = 1.0  # Maximum wait, s. The thread then checks keep-alives and the end.
+# Maximum wait of `close` for the thread, s. Samples wait for it during a reload of the configuration.
 CLOSE_S: Final = 0.5
-"""Maximum wait of `close` for the thread, s. Samples wait for it during a reload of the configuration."""
 FAREWELL_S: Final = 0.3  # part of CLOSE_S for the acknowledgement of the farewell, s
 
 
@@ -42,14 +42,14 @@ class MqttSender:
         self.session = 0  # Number of the connection. It changes at each connection and each loss.
         self.connected = False
         self.broker = ""  # name of the connected broker; empty if there is none
+        # Cause of a missing connection, one sentence; empty if the connection works, and before the first attempt
         self.problem = ""
-        """Cause of a missing connection, one sentence; empty if the connection works, and before the first attempt."""
         self.sent = 0  # number of sent messages of the spool, including repeated messages
         self.acknowledged = 0  # number of acknowledged messages of the spool
         self.reconnects = 0  # number of connections after the first
         self.failure: BaseException | None = None  # internal error that ended the thread
+        # Called by the thread if messages are wanted or acknowledgements wait. The writer sets it.
         self.wanting: Callable[[], None] = lambda: None
-        """Called by the thread if messages are wanted or acknowledgements wait. The writer sets it."""
         self._settings, self._client_id, self._will = settings, client_id, will
         self._turn, self._connect, self._now_ns = turn, connect, now_ns
         self._commands = commands
@@ -64,7 +64,7 @@ class MqttSender:
         self._connection: BrokerConnection | None = None
         self._wake = WakeEvent()
         self._ended = False
-        self._last_words = b""
+        self._farewell = b""
         self._thread: threading.Thread | None = None
         self._was_connected = False
 
@@ -80,7 +80,7 @@ class MqttSender:
         A thread that is still connecting does not complete its connection, because the next output may use the same
         client ID.
         """
-        self._last_words = last_words
+        self._farewell = last_words
         self._ended = True
         self._ring()
         self.join(CLOSE_S)
@@ -162,10 +162,10 @@ class MqttSender:
             else:
                 self._send(connection)
                 connection.wait(WAIT_S)
-                self._pass_on(connection)
+                self._take_acknowledgements(connection)
                 self._take_requests(connection)
         except BrokerError as error:
-            self._lose(str(error))
+            self._disconnect(str(error))
             return self._turn.failed(self._now_ns())
         return 0.0
 
@@ -223,7 +223,7 @@ class MqttSender:
             self._in_flight[number] = 0
         return True
 
-    def _pass_on(self, connection: BrokerConnection) -> None:
+    def _take_acknowledgements(self, connection: BrokerConnection) -> None:
         """Pass the acknowledgements to the writer."""
         if not connection.acknowledged:
             return
@@ -246,10 +246,10 @@ class MqttSender:
             if self._commands is not None:
                 self._commands.take(one)
 
-    def _lose(self, problem: str) -> None:
+    def _disconnect(self, problem: str) -> None:
         connection = self._connection
         if connection is not None:
-            self._pass_on(connection)
+            self._take_acknowledgements(connection)
             connection.close()
         with self._lock:
             self._connection = None
@@ -266,12 +266,12 @@ class MqttSender:
         if connection is None:
             return
         try:
-            number = connection.publish(self._will.topic, self._last_words, JSON_TYPE, retain=True)
+            number = connection.publish(self._will.topic, self._farewell, JSON_TYPE, retain=True)
             end_ns = self._now_ns() + round(FAREWELL_S * NS_PER_S)
             while number not in connection.acknowledged and (rest_ns := end_ns - self._now_ns()) > 0:
                 connection.wait(rest_ns / NS_PER_S)
         except BrokerError:
             pass  # the broker publishes the last will
-        self._pass_on(connection)
+        self._take_acknowledgements(connection)
         connection.close()
         self._connection = None

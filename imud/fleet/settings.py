@@ -11,10 +11,8 @@ from imud.model.options import Options, is_host, shown
 from imud.model.units import NS_PER_S
 
 MEGABYTE: Final = 1_000_000
-BROKERS_MAX: Final = 16
-"""Maximum number of brokers. imud tries one after the other; more brokers would take minutes."""
-EVERY: Final = "*"
-"""Key for all devices without an entry of their own."""
+BROKERS_MAX: Final = 16  # Maximum number of brokers. imud tries one after the other; more brokers would take minutes.
+EVERY: Final = "*"  # key for all devices without an entry of their own
 Measure = Literal["mean", "min", "max", "rms"]
 Name = Annotated[str, msgspec.Meta(pattern=f"^({NAME_PATTERN})?$", extra={"words": "letters, digits, _ and -"})]
 
@@ -90,8 +88,7 @@ class Broker(NamedTuple):
     port: int
     tls: bool
     websockets: bool
-    path: str
-    """Path of the WebSocket."""
+    path: str  # path of the WebSocket
 
     @property
     def name(self) -> str:
@@ -101,8 +98,7 @@ class Broker(NamedTuple):
         return f"{scheme}://{host}:{self.port}{self.path if self.websockets else ''}"
 
 
-PORTS: Final = {"mqtt": 1883, "mqtts": 8883, "ws": 80, "wss": 443}
-"""Supported URL schemes and their default ports."""
+PORTS: Final = {"mqtt": 1883, "mqtts": 8883, "ws": 80, "wss": 443}  # supported URL schemes and their default ports
 
 
 def broker_of(url: str) -> Broker | None:

@@ -86,7 +86,7 @@ def row_of(topic: str, stream: Stream, message: FleetMessage, payload: bytes, st
     )  # fmt: skip
 
 
-def sound_row(values: Sequence[object]) -> SpoolRow | None:
+def undamaged_row(values: Sequence[object]) -> SpoolRow | None:
     """Return a row; None if the values are damaged."""
     row = _numbered(values)
     if row is None or row.kind not in _KINDS:
@@ -99,7 +99,7 @@ def sound_row(values: Sequence[object]) -> SpoolRow | None:
     return row if (head.gateway, head.boot, head.device, head.first, head.last) == own else None
 
 
-def mended_row(values: Sequence[object]) -> SpoolRow | None:
+def repaired_row(values: Sequence[object]) -> SpoolRow | None:
     """Return a `dropped` message in place of a damaged row; None if its numbers are unknown."""
     row = _numbered([*values[:4], "", *values[5:-1], b""])
     if row is None or row.items != row.last - row.first + 1:
@@ -146,24 +146,23 @@ def _numbered(values: Sequence[object]) -> SpoolRow | None:
 log = logging.getLogger(__name__)
 
 FILE: Final = "spool.db"
+# Interval of the synchronization of the log with the disk, ns. A power failure loses the messages of this time.
 SYNC_NS: Final = 5 * NS_PER_S
-"""Interval of the synchronization of the log with the disk, ns. A power failure loses the messages of this time."""
+# Size of a page, bytes. The pages of a message that becomes statistics are only free if pages are small: with 4096
+# bytes, the default of SQLite, most messages have only a few pages.
 PAGE_BYTES: Final = 1024
-"""Size of a page, bytes. The pages of a message that becomes statistics are only free if pages are small: with 4096
-bytes, the default of SQLite, most messages have only a few pages."""
 LOG_PAGES: Final = 4000  # maximum number of pages in the log, 4 MB, the same size as the default of SQLite
 LOG_PART: Final = 16  # maximum share of the disk for the log, 1/16: 0.5 MB on a disk of 8 MB
 LOG_PAGES_LEAST: Final = 64
 RESERVE_FILE: Final = "spool.reserve"
+# Size of the reserve in logs: a checkpoint can grow the file by the size of one log, and one transaction needs another
 RESERVE_LOGS: Final = 2
-"""Size of the reserve in logs: a checkpoint can grow the file by the size of one log, and one transaction needs
-another."""
 LONGEST_BYTES: Final = 1 << 18  # twice the maximum length of a message, bytes
 STEP: Final = 32  # number of messages that imud thins or drops between two checks of the size
 STEPS_MAX: Final = 64  # maximum number of steps in one transaction: 2,048 messages, more than arrive in one second
+# Maximum number of streams with a stored position: three streams of each of 256 devices, and streams of earlier boots.
+# A state message with all positions has 120 kB, not more than the longest message.
 POSITIONS_MAX: Final = 1024
-"""Maximum number of streams with a stored position: three streams of each of 256 devices, and streams of earlier boots.
-A state message with all positions has 120 kB, not more than the longest message."""
 BUSY_S: Final = 1.0  # time to wait for a program that has locked the file, s
 
 _SCHEMA: Final = """
@@ -177,14 +176,14 @@ CREATE TABLE IF NOT EXISTS progress (
     last INTEGER NOT NULL, stored_utc_ns INTEGER NOT NULL, PRIMARY KEY (gateway, boot, device, stream)
 ) WITHOUT ROWID;
 """
-_TAKE_OVER: Final = """
+# Earlier versions stored positions without the name of the gateway, in the table `position`
+_COPY_POSITIONS: Final = """
 INSERT OR IGNORE INTO progress (gateway, boot, device, stream, begin, last, stored_utc_ns)
     SELECT ?, boot, device, stream, begin, last, stored_utc_ns FROM position
 """
-"""Earlier versions stored positions without the name of the gateway, in the table `position`."""
 _COLUMNS: Final = "id, boot, device, stream, kind, topic, first, last, items, stored_utc_ns, payload"
+# Condition for messages that the sender did not receive. imud may thin or drop only these.
 _FREE: Final = "id > ? AND NOT (id > ? AND id <= ?)"
-"""Condition for messages that the sender did not receive. imud may thin or drop only these."""
 _ID_MAX: Final = (1 << 63) - 1
 _THICK: Final = (MessageKind.SAMPLES.value, MessageKind.SLOTS.value)
 _OF_DAMAGE: Final = (sqlite3.DatabaseError, sqlite3.IntegrityError)  # errors that only a damaged file causes
@@ -256,10 +255,10 @@ class Spool:
         ):  # fmt: skip
             base.execute(f"PRAGMA {pragma}")
         base.executescript(_SCHEMA)
-        self._take_over(base)
+        self._copy_positions(base)
         newest, self.messages = base.execute("SELECT COALESCE(MAX(id), 0), COUNT(*) FROM message").fetchone()
         if newest >= NUMBER_MOST:
-            raise sqlite3.DatabaseError("the messages cannot be numbered on")
+            raise sqlite3.DatabaseError("the row IDs are at their maximum")
         self._next_id = max(self._next_id, newest + 1)
         self.used_bytes = self._used()
         self._thin_from, self._markers = 0, {}
@@ -283,23 +282,23 @@ class Spool:
                 os.close(number)
             self._pages_max = None
         except OSError:
-            self._give_up_reserve()
+            self._remove_reserve()
 
-    def _look_at_reserve(self) -> None:
+    def _restore_reserve(self) -> None:
         """Create the reserve again after it was removed."""
         if self._pages_max is not None:
             self._reserve()
 
-    def _give_up_reserve(self) -> None:
+    def _remove_reserve(self) -> None:
         with suppress(OSError):
             os.unlink(self._path.with_name(RESERVE_FILE))
 
-    def _take_over(self, base: sqlite3.Connection) -> None:
+    def _copy_positions(self, base: sqlite3.Connection) -> None:
         """Copy the positions of an earlier version to the present name of the gateway."""
         found = base.execute("SELECT COUNT(*) FROM sqlite_master WHERE name = 'position'").fetchone()[0]
         if found and self._gateway:
             base.execute("BEGIN IMMEDIATE")
-            base.execute(_TAKE_OVER, (self._gateway,))
+            base.execute(_COPY_POSITIONS, (self._gateway,))
             base.execute("DROP TABLE position")
             base.execute("COMMIT")
 
@@ -337,18 +336,18 @@ class Spool:
             base.execute("COMMIT")
             if is_due:
                 self._synced_ns = now_ns
-                self._look_at_reserve()
+                self._restore_reserve()
         except sqlite3.Error as error:
             with suppress(sqlite3.Error):
                 base.execute("ROLLBACK")
             self.messages, self.thinned, self.dropped, self._next_id, self._thin_from, self._markers = before
-            self._look_at(error)
+            self._rename_if_damaged(error)
             raise SpoolError(f"{self._path}: {reason_of(error)}") from error
         self.spooled += len(new)
 
     def remove(self, acknowledged: Collection[int], now_ns: int, utc_ns: int) -> None:
         """Remove messages from a full disk. Raises SpoolError."""
-        self._give_up_reserve()
+        self._remove_reserve()
         try:
             for some in _batched(acknowledged, max(1, self._log_pages() * PAGE_BYTES // LONGEST_BYTES)):
                 # the checkpoint empties the log, so that the next group fits into it
@@ -383,9 +382,9 @@ class Spool:
             return []
         base = self._connection()
         try:
-            return self._sound(base, "id > ? AND id <= ? ORDER BY id LIMIT ?", (after_id, last_id, limit))
+            return self._undamaged(base, "id > ? AND id <= ? ORDER BY id LIMIT ?", (after_id, last_id, limit))
         except sqlite3.Error as error:
-            self._look_at(error)
+            self._rename_if_damaged(error)
             raise SpoolError(f"{self._path}: {reason_of(error)}") from error
 
     def rewind(self) -> None:
@@ -402,7 +401,7 @@ class Spool:
             )
             return [StreamPosition(*row) for row in rows if is_position(row)]
         except sqlite3.Error as error:
-            self._look_at(error)
+            self._rename_if_damaged(error)
             raise SpoolError(f"{self._path}: {reason_of(error)}") from error
 
     def _connection(self) -> sqlite3.Connection:
@@ -410,7 +409,7 @@ class Spool:
             raise SpoolError(f"{self._path} is not open")
         return self._base
 
-    def _look_at(self, error: Exception) -> None:
+    def _rename_if_damaged(self, error: Exception) -> None:
         """Rename the file if it is damaged. The next transaction creates a new one."""
         if type(error) in _OF_DAMAGE:
             with suppress(OSError):
@@ -453,23 +452,23 @@ class Spool:
             self.messages -= done.rowcount
 
     @property
-    def _taken(self) -> tuple[int, int, int]:
+    def _free_values(self) -> tuple[int, int, int]:
         """Return the parameters of `_FREE`."""
         return self._given, self._ahead_from, self._ahead
 
-    def _sound(self, base: sqlite3.Connection, where: str, values: Sequence[object]) -> list[SpoolRow]:
+    def _undamaged(self, base: sqlite3.Connection, where: str, values: Sequence[object]) -> list[SpoolRow]:
         """Return undamaged rows.
 
         Replace a damaged row by a `dropped` message, or delete it if its numbers are unknown.
         """
         while True:
             rows = base.execute(f"SELECT {_COLUMNS} FROM message WHERE {where}", values).fetchall()
-            found = [row for one in rows if (row := sound_row(one) or self._mended(base, one)) is not None]
+            found = [row for one in rows if (row := undamaged_row(one) or self._repaired(base, one)) is not None]
             if found or not rows:  # otherwise all rows were deleted, and other rows may follow
                 return found
 
-    def _mended(self, base: sqlite3.Connection, values: Sequence[Any]) -> SpoolRow | None:
-        number, row, cause = values[0], mended_row(values), DropCause.DAMAGED.value
+    def _repaired(self, base: sqlite3.Connection, values: Sequence[Any]) -> SpoolRow | None:
+        number, row, cause = values[0], repaired_row(values), DropCause.DAMAGED.value
         self.dropped[cause] = self.dropped.get(cause, 0) + (row.items if row is not None else 1)
         if row is None:
             log.warning("mqtt: %s: deleting the damaged message %d, whose numbers are unknown", self._path, number)
@@ -487,12 +486,12 @@ class Spool:
         oldest = base.execute(
             f"SELECT id, stored_utc_ns FROM message WHERE {_FREE} AND kind != 'dropped' "
             "AND stored_utc_ns BETWEEN ? AND ? ORDER BY id LIMIT ?",
-            (*self._taken, CLOCK_SET_NS, NUMBER_MOST, STEP),
+            (*self._free_values, CLOCK_SET_NS, NUMBER_MOST, STEP),
         ).fetchall()
         for number, stored_utc_ns in oldest:
             if stored_utc_ns >= old_ns:
                 break
-            for row in self._sound(base, "id = ?", (number,)):
+            for row in self._undamaged(base, "id = ?", (number,)):
                 self._drop(base, row, DropCause.AGE)
 
     def _keep_room(self, base: sqlite3.Connection) -> None:
@@ -515,9 +514,9 @@ class Spool:
 
     def _thin_some(self, base: sqlite3.Connection) -> bool:
         """Replace the oldest complete samples by statistics. Return whether there were any."""
-        found = self._sound(
+        found = self._undamaged(
             base, f"{_FREE} AND id > ? AND kind IN (?, ?) ORDER BY id LIMIT ?",
-            (*self._taken, self._thin_from, *_THICK, STEP),
+            (*self._free_values, self._thin_from, *_THICK, STEP),
         )  # fmt: skip
         for row in found:
             if row.kind in _THICK:  # a damaged row became a `dropped` message
@@ -543,7 +542,7 @@ class Spool:
 
     def _drop_some(self, base: sqlite3.Connection) -> bool:
         """Drop the oldest messages. Return whether there were any."""
-        found = self._sound(base, f"{_FREE} AND kind != 'dropped' ORDER BY id LIMIT ?", (*self._taken, STEP))
+        found = self._undamaged(base, f"{_FREE} AND kind != 'dropped' ORDER BY id LIMIT ?", (*self._free_values, STEP))
         for row in found:
             self._drop(base, row, DropCause.SPACE)
         return bool(found)
@@ -559,7 +558,7 @@ class Spool:
         before: list[SpoolRow] = []
         marker_id = self._markers.get(row.key, 0)
         if marker_id > self._given and not self._ahead_from < marker_id <= self._ahead:
-            before = self._sound(base, "id = ?", (marker_id,))
+            before = self._undamaged(base, "id = ?", (marker_id,))
         for old in before:
             noted = decode_message(old.payload)
             if old.last + 1 == row.first and noted.cause is cause:
@@ -583,5 +582,5 @@ def _batched(numbers: Collection[int], most: int) -> Iterator[tuple[int, ...]]:
 
 
 def _text_of(stored: bytes) -> str:
-    """Return a stored string. Accept damaged UTF-8, because `sound_row` checks the row later."""
+    """Return a stored string. Accept damaged UTF-8, because `undamaged_row` checks the row later."""
     return stored.decode("utf-8", "replace")

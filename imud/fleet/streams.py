@@ -35,9 +35,9 @@ from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
 
 INTERVALS_MAX: Final = 100  # maximum number of intervals in one message, about 100 kB with all quantities and measures
+# Time after the end of an interval before imud sends it, ns, if no later sample arrives. Samples arrive up to 50 ms
+# late.
 LATE_NS: Final = NS_PER_S
-"""Time after the end of an interval before imud sends it, ns, if no later sample arrives. Samples arrive up to 50 ms
-late."""
 
 
 ReadClock = Callable[[], GatewayClock | None]  # reads the wall clock of this gateway and its state
@@ -158,7 +158,7 @@ class DeviceStreams:
         )
         return [self._events.row(message, utc_ns)]
 
-    def look(self, now_ns: int) -> list[SpoolRow]:
+    def take_due(self, now_ns: int) -> list[SpoolRow]:
         """Return the messages that are due although no later sample arrived."""
         made: list[SpoolRow] = []
         late_ns = now_ns - LATE_NS

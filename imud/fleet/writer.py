@@ -32,14 +32,14 @@ from imud.model.units import NS_PER_S
 
 log = logging.getLogger(__name__)
 
+# Maximum number of samples in the queue: 20 s at 1 kHz, about 20 MB. A flash card can stall for one second while it
+# erases.
 QUEUE_SAMPLES: Final = 20_000
-"""Maximum number of samples in the queue: 20 s at 1 kHz, about 20 MB. A flash card can stall for one second while it
-erases."""
 QUEUE_EVENTS: Final = 2_000
 COMMIT_NS: Final = NS_PER_S  # Time between two transactions, ns. If the process is killed, newer messages are lost.
 DISK_RETRY_NS: Final = 10 * NS_PER_S  # time between two attempts on a full or failed disk, ns
+# Maximum size of the messages in memory while the disk fails, bytes. Above it, imud keeps only their numbers.
 PENDING_BYTES: Final = 8 << 20
-"""Maximum size of the messages in memory while the disk fails, bytes. Above it, imud keeps only their numbers."""
 
 
 class SentState(NamedTuple):
@@ -160,8 +160,8 @@ class SpoolWriter:
         self.lost_on_disk = 0  # number of samples and events that imud lost because the disk failed
         self.failure: BaseException | None = None  # internal error that ended the thread
         self.positions: list[StreamPosition] = []  # positions of the streams at the last transaction
+        # Called by the closing thread after the spool is closed. The owner of the lock file sets it.
         self.closed: Callable[[], None] = lambda: None
-        """Called by the closing thread after the spool is closed. The owner of the lock file sets it."""
         self._is_closing = self._is_closed = False
         self._settings, self._gateway = settings, gateway
         self._queue, self._spool, self._sender = queue, spool, sender
@@ -233,7 +233,7 @@ class SpoolWriter:
         now_ns = self._now_ns()
         if now_ns >= self._due_ns:
             for streams in self._streams.values():
-                self._rows += streams.look(now_ns)
+                self._rows += streams.take_due(now_ns)
             self._store(now_ns)
         pause_ns = self._give(now_ns)
         return max(1, min(COMMIT_NS, self._due_ns - self._now_ns(), pause_ns))

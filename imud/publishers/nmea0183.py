@@ -70,8 +70,8 @@ class TcpClient:
         self.sock = sock
         self.peer = peer
         self._rest = b""  # rest of the sentences of which the kernel accepted only a part
+        # Time since which the socket buffer is full; None if it has room or imud sends nothing
         self.full_ns: int | None = None
-        """Time since which the socket buffer is full; None if it has room or imud sends nothing."""
 
     def put(self, sentences: bytes, now_ns: int) -> bool:
         """Send or drop sentences. Return whether imud sent them. Raises OSError if the connection ended."""
@@ -342,9 +342,9 @@ def _close_late(opening: "asyncio.Future[int]") -> None:
 
 
 PA_PER_BAR: Final = 100_000.0
+# Minimum cosine of pitch for a rate of turn (pitch 84°). Above this pitch, heading and roll are nearly the same
+# rotation.
 LEVEL_COS: Final = 0.1
-"""Minimum cosine of pitch for a rate of turn (pitch 84°). Above this pitch, heading and roll are nearly the same
-rotation."""
 
 
 class Formatter(StrEnum):
@@ -358,6 +358,8 @@ class Formatter(StrEnum):
     PASHR = "PASHR"
 
 
+# Talkers: HC magnetic compass, also for a corrected true heading; TI rate of turn; YX transducer. PASHR has no talker.
+# gpsd 3.22 accepts HC and II as talkers of a heading, but not HE and HN (gyrocompasses).
 TALKERS: Final[Mapping[Formatter, str]] = {
     Formatter.HDT: "HC",
     Formatter.HDG: "HC",
@@ -366,9 +368,6 @@ TALKERS: Final[Mapping[Formatter, str]] = {
     Formatter.XDR: "YX",
     Formatter.PASHR: "",
 }
-"""Talkers: HC magnetic compass, also for a corrected true heading; TI rate of turn; YX transducer. PASHR has no talker.
-
-gpsd 3.22 accepts HC and II as talkers of a heading, but not HE and HN (gyrocompasses)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -376,8 +375,8 @@ class HeadingReference:
     """Reference of the yaw of samples."""
 
     heading: Heading = Heading.UNKNOWN
+    # Declination of a true heading made from a magnetic one, degrees; None if yaw was not corrected
     declination_deg: float | None = None
-    """Declination of a true heading made from a magnetic one, degrees; None if yaw was not corrected."""
 
 
 def make(kind: Formatter, sample: Sample, reference: HeadingReference, talker: str = "") -> bytes | None:
@@ -481,15 +480,15 @@ def _roll_pitch_rad(sample: Sample) -> tuple[float, float] | None:
     return euler_rad[0], euler_rad[1]
 
 
+# Time between two reads of the heading reference from the device status, ns. The device reports the reference only on
+# request.
 REFERENCE_NS: Final = NS_PER_S
-"""Time between two reads of the heading reference from the device status, ns. The device reports the reference only on
-request."""
 WHO: Final = "nmea0183"  # name of this output in latency requests
 BITS_PER_BYTE: Final = 10  # bits per byte of a serial port with 8N1
+# Maximum usual length of each sentence, bytes, for the load of a serial port
 USUAL_BYTES: Final = {
     Formatter.HDT: 19, Formatter.HDG: 27, Formatter.HDM: 19, Formatter.ROT: 22, Formatter.XDR: 82, Formatter.PASHR: 57,
 }  # fmt: skip
-"""Maximum usual length of each sentence, bytes, for the load of a serial port."""
 FormatterName = Literal["HDT", "HDG", "HDM", "ROT", "XDR", "PASHR"]
 Talker = Annotated[str, msgspec.Meta(pattern="^([A-Z]{2})?$", extra={"words": "two capital letters, or nothing"})]
 RateHz = Annotated[float, msgspec.Meta(ge=0.01, le=100)]
@@ -564,7 +563,7 @@ class Nmea0183:
         self._names: dict[str, None] = {}
         self._device: str | None = None
         self._reference = HeadingReference()
-        self._looked_ns = self._newest_ns = 0
+        self._reference_ns = self._newest_ns = 0
         self._rate = MeanRate()
         self._warned = ""
 
@@ -620,9 +619,9 @@ class Nmea0183:
         """Check the ports and read the heading reference."""
         for output in self._outputs:
             output.tick(now_ns)
-        if self._device is not None and now_ns - self._looked_ns >= REFERENCE_NS:
-            self._looked_ns = now_ns
-            self._look_up(self._device)
+        if self._device is not None and now_ns - self._reference_ns >= REFERENCE_NS:
+            self._reference_ns = now_ns
+            self._read_reference(self._device)
 
     def close(self) -> None:
         """Close all ports and withdraw the latency request. A second call does nothing."""
@@ -650,14 +649,14 @@ class Nmea0183:
             )
         if device == self._device:
             return
-        self._device, self._looked_ns, self._reference = device, 0, HeadingReference()
+        self._device, self._reference_ns, self._reference = device, 0, HeadingReference()
         latencies = self._context.latencies
         if device is None:
             latencies.release(WHO)
         else:
             latencies.ask(WHO, round(NS_PER_S / max(self._settings.sentences.values())), (device,))
 
-    def _look_up(self, device: str) -> None:
+    def _read_reference(self, device: str) -> None:
         """Read the heading reference of the device."""
         found = next((status for status in self._context.devices.status() if status.name == device), None)
         if found is None or found.frame is None:

@@ -55,9 +55,9 @@ from imud.model.units import NS_PER_MS
 
 log = logging.getLogger(__name__)
 
+# Maximum number of directory entries that imud checks for temporary files. Other users can create millions of entries
+# in a shared directory.
 LEFTOVERS_MAX: Final = 10_000
-"""Maximum number of directory entries that imud checks for temporary files. Other users can create millions of entries
-in a shared directory."""
 
 _DIRECTORY_MODE = 0o755
 _OPEN_DIRECTORY = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -142,7 +142,7 @@ class RingDirectory:
             os.posix_fallocate(descriptor, 0, size_bytes)
             os.pwrite(descriptor, head, 0)
             if group_id is not None:
-                # the user is not in the group; the caller sees this by the group of the file
+                # fails if the user is not in the group; the caller checks the group of the file
                 with suppress(PermissionError):
                     os.fchown(descriptor, -1, group_id)
             os.fchmod(descriptor, mode)
@@ -296,7 +296,7 @@ class ShmRing:
         self._size_bytes = HEADER_BYTES + header.slot_count * SLOT_BYTES
         self._fd = directory.make(self._name, self._size_bytes, encode_header(header), mode, group_id)
         self._status = os.fstat(self._fd)
-        self.group_given = self._status.st_gid == group_id  # true if the file has the requested group
+        self.group_given = self._status.st_gid == group_id  # True if the file has the requested group
         self._memory = self._mapped()
         with memoryview(self._memory) as view:
             self._words, self._halves = view.cast("Q"), view.cast("I")
@@ -416,8 +416,8 @@ class ShmRing:
 
 
 ASKER: Final = "shared memory"  # name of this output in latency requests
+# Time between two attempts to create a ring, ns. A full memory is not filled faster than that.
 RETRY_NS: Final = 1_000_000_000
-"""Time between two attempts to create a ring, ns. A full memory is not filled faster than that."""
 OTHERS_WRITE: Final = 0o022
 SLOTS_MIN, SLOTS_MAX = 64, 1 << 20  # limits of `slots`: a ring of 64 slots has 16 kB, a ring of 2²⁰ slots 256 MB
 
@@ -526,7 +526,7 @@ class ShmPublisher:
         for name, place in self._places.items():
             ring = self._rings.get(name)
             if (ring is None or not ring.is_intact(directory)) and now_ns >= place.retry_ns:
-                self._make_anew(name, directory, now_ns)
+                self._replace(name, directory, now_ns)
         self._show(now_ns)
 
     def close(self) -> None:
@@ -569,7 +569,7 @@ class ShmPublisher:
         directory.close()
         return self._directory
 
-    def _make_anew(self, name: str, directory: RingDirectory, now_ns: int) -> None:
+    def _replace(self, name: str, directory: RingDirectory, now_ns: int) -> None:
         """Replace a missing or truncated ring, or create the ring that could not be created before."""
         old = self._rings.get(name)
         if old is None or not old.is_named(directory):

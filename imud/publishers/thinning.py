@@ -11,9 +11,8 @@ from typing import Final
 from imud.model.sample import Sample, Vector3
 from imud.model.units import NS_PER_S
 
+# Number of periods without a sample after which the sample period is unknown. One or two lost samples have no effect.
 PAUSE_PERIODS: Final = 4
-"""Number of periods without a sample after which the sample period is unknown. One or two lost samples have no
-effect."""
 
 
 NOTHING: Final[Mapping[float, tuple[int, ...]]] = {}  # result of `choose` for most batches

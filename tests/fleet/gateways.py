@@ -95,7 +95,7 @@ def closes(collector: Collector, folder: Path) -> dict[tuple[str, str], StreamCo
     counts = {(key.boot, key.stream): one for key, one in whole.counts.items()}
     numbered = {(one.boot, one.stream): one.last for one in positions}
     newest = {key: one.newest for key, one in counts.items()}
-    assert numbered == newest, f"numbered {numbered}, came {newest}"
+    assert numbered == newest, f"numbered {numbered}, received {newest}"
     for key, one in counts.items():
         assert (one.missing, one.balance) == (0, 0), f"{key}: {one}"
     return {(key.boot, key.stream): one for key, one in collector.ledger.counts.items()}

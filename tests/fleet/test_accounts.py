@@ -27,7 +27,7 @@ def counts_of(*messages: FleetMessage, stream: Stream = Stream.SAMPLES, from_beg
     return counts
 
 
-def test_each_number_counts_once_and_is_not_given_twice() -> None:
+def test_each_number_counts_once_and_is_delivered_once() -> None:
     dropped, intervals = MessageKind.DROPPED, MessageKind.INTERVALS
     counts = counts_of(message(1, 10), message(11, 20, intervals), message(21, 25, dropped), message(28, 30))
     assert counts == StreamCounts(1, 30, whole=13, thinned=10, dropped={"space": 5}, missing=2)
@@ -59,7 +59,7 @@ RANGES = st.tuples(st.integers(1, 40), st.integers(0, 12)).map(lambda pair: (pai
         min_size=1,
     )
 )
-def test_it_closes_whatever_comes(taken: list[tuple[tuple[int, int], MessageKind]]) -> None:
+def test_the_ledger_balances_for_any_sequence_of_messages(taken: list[tuple[tuple[int, int], MessageKind]]) -> None:
     ledger = FleetLedger(from_begin=True)
     seen: set[int] = set()
     for (first, last), kind in taken:

@@ -46,7 +46,7 @@ KNOWN = BootOffset(1_000_000, UTC_NS, 40)
         (0, 5, None, BootOffset(0, UTC_NS, None), PlacedTime(UTC_NS + 5, True, None)),
     ],
 )
-def test_where_a_record_lies(
+def test_utc_time_of_a_record(
     utc_ns: int, t_ns: int | None, clock: GatewayClock | None, known: BootOffset | None, expected: PlacedTime
 ) -> None:
     assert placed(utc_ns, t_ns, clock, known) == expected
@@ -67,11 +67,11 @@ def test_where_a_record_lies(
         ),
     ],
 )
-def test_what_a_message_says_of_the_clock(message: FleetMessage, expected: BootOffset | None) -> None:
+def test_clock_offset_of_a_message(message: FleetMessage, expected: BootOffset | None) -> None:
     assert offset_of(message) == expected
 
 
-def test_a_boot_is_fresh_once_and_its_newest_offset_counts() -> None:
+def test_a_boot_is_fresh_once_and_the_newest_offset_is_used() -> None:
     clocks = BootClocks()
     assert clocks.take(not_set(samples_message(1, 2))) is None
     assert clocks.take_fresh() == {}
@@ -83,10 +83,12 @@ def test_a_boot_is_fresh_once_and_its_newest_offset_counts() -> None:
     assert clocks.take(not_set(samples_message(7, 8))) == later
     assert clocks.take_fresh() == {}
     assert clocks.take(samples_message(1, 2, boot="2", utc_ns=0)) is None
-    assert boot_of(samples_message(1, 1, boot="00ff-3")) == BootKey("gw", "00ff"), "a restarted device has its boot"
+    assert boot_of(samples_message(1, 1, boot="00ff-3")) == BootKey("gw", "00ff"), (
+        "a device with a restarted count belongs to the boot"
+    )
 
 
-def test_a_state_says_it_too() -> None:
+def test_a_state_contains_the_clock_offset() -> None:
     clocks, state = BootClocks(), GatewayState(v=1, online=True, boot="1", clock=SET)
     clocks.take_state("gw", msgspec.structs.replace(state, clock=NOT_SET))
     clocks.take_state("gw", msgspec.structs.replace(state, clock=None))
@@ -99,4 +101,4 @@ def test_a_state_says_it_too() -> None:
     assert len(clocks.offsets) == BOOTS_MAX
     assert BootKey("gw-0", "1") not in clocks.offsets
     assert BootKey(f"gw-{BOOTS_MAX}", "1") in clocks.offsets
-    assert len(clocks.take_fresh()) == BOOTS_MAX, "a reader that does not place anything never asks for them"
+    assert len(clocks.take_fresh()) == BOOTS_MAX, "a reader may never take the offsets"

@@ -32,7 +32,7 @@ def account_of(positions: SpoolPositions, ledger: FleetLedger) -> tuple[int, int
     return account.sent, account.received, account.in_spool
 
 
-def test_what_was_spooled_before_the_first_state_counts_only_from_the_begin() -> None:
+def test_numbers_spooled_before_the_first_state_count_only_with_from_begin() -> None:
     positions, ledger = SpoolPositions(), FleetLedger()
     positions.take("gw", state(40))
     assert account_of(positions, ledger) == (0, 0, 0)
@@ -45,7 +45,7 @@ def test_what_was_spooled_before_the_first_state_counts_only_from_the_begin() ->
     assert account_of(positions, FleetLedger()) == (40, 0, 40)
 
 
-def test_a_state_that_is_older_than_what_came_takes_nothing_back() -> None:
+def test_an_old_state_does_not_reduce_the_positions() -> None:
     positions, ledger = SpoolPositions(), FleetLedger()
     ledger.take(message(1, 30), Stream.SAMPLES)
     positions.take("gw", state(50))
@@ -60,7 +60,7 @@ DEEP = b'{"v":1,"online":true,"boot":"1","mqtt":{"deep":' + b"[" * 100_000
 
 
 @pytest.mark.parametrize("payload", [b"", b"[]", b'{"v":1}', b'{"v":1,"online":1,"boot":"1"}', b"\xff", DEEP])
-def test_other_payloads_are_refused(payload: bytes) -> None:
+def test_invalid_payloads_are_rejected(payload: bytes) -> None:
     with pytest.raises(ValueError, match="expected the state of a gateway"):
         decode_state(payload)
     assert decode_state(b'{"v":1,"online":false,"boot":"ab","reason":"lost"}').reason == "lost", "a will is a state"
@@ -81,7 +81,7 @@ TOO_MUCH = 1 << 62
         state(TOO_MUCH),
     ],
 )
-def test_what_no_database_has_is_refused(bad: GatewayState) -> None:
+def test_values_that_no_database_can_store_are_rejected(bad: GatewayState) -> None:
     with pytest.raises(ValueError, match="expected"):
         decode_state(msgspec.json.encode(bad))
     assert decode_state(msgspec.json.encode(state(TOO_MUCH - 1)))
@@ -94,7 +94,7 @@ STATES = st.tuples(st.sampled_from(["1", "2"]), st.integers(1, 60))
 
 
 @given(st.lists(st.one_of(MESSAGES, STATES, st.just("restart"), st.just("killed"))))
-def test_it_closes_whatever_comes_and_however_often_the_collector_starts_anew(steps: list[object]) -> None:
+def test_the_ledger_balances_for_any_sequence_and_any_number_of_restarts(steps: list[object]) -> None:
     ledger, positions = FleetLedger(from_begin=True), SpoolPositions(from_begin=True)
     seen: dict[str, set[int]] = {"1": set(), "2": set()}
     given_out: dict[str, list[int]] = {"1": [], "2": []}
@@ -135,7 +135,7 @@ def test_it_closes_whatever_comes_and_however_often_the_collector_starts_anew(st
         assert len(seqs) == len(set(seqs))
 
 
-def test_positions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_positions_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.fleet.accounts.POSITIONS_MAX", 2)
     positions = SpoolPositions(from_begin=True)
     for boot in ("1", "2", "1"):
@@ -145,7 +145,7 @@ def test_positions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [key.boot for key in positions.accounts(FleetLedger())] == ["1", "2"]
 
 
-def test_what_was_stored_does_not_change_afterwards() -> None:
+def test_a_stored_ledger_does_not_change() -> None:
     ledger = FleetLedger()
     ledger.take(message(1, 4, MessageKind.DROPPED), Stream.SAMPLES)
     stored = ledger.stored(KEY)

@@ -57,12 +57,12 @@ def test_a_message_is_acknowledged_and_the_will_is_published(tmp_path: Path, ver
             one.close()
 
 
+# paho-mqtt 2.2 leaves the socket of a failed TLS handshake to the garbage collector
 LEFT_OPEN = "ignore::pytest.PytestUnraisableExceptionWarning"
-"""paho-mqtt 2.2 leaves the socket of a failed TLS handshake to the garbage collector."""
 
 
 @pytest.mark.filterwarnings(LEFT_OPEN)
-def test_a_broker_that_ends_is_noticed_and_one_that_is_not_there_named(tmp_path: Path) -> None:
+def test_a_stopped_broker_is_detected_and_a_missing_broker_is_named(tmp_path: Path) -> None:
     with running_broker(tmp_path / "broker") as broker:
         url = f"mqtt://127.0.0.1:{broker.port}"
         with pytest.raises(BrokerError, match=r"mqtts://127.0.0.1"):
@@ -76,7 +76,7 @@ def test_a_broker_that_ends_is_noticed_and_one_that_is_not_there_named(tmp_path:
             connect(url)
 
 
-def test_the_bell_is_not_closed_while_another_thread_rings_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_wake_up_descriptor_is_not_closed_during_ring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with running_broker(tmp_path / "broker") as broker:
         connection = connect(f"mqtt://127.0.0.1:{broker.port}")
         closing = threading.Thread(target=connection.close)
@@ -94,7 +94,7 @@ def test_the_bell_is_not_closed_while_another_thread_rings_it(tmp_path: Path, mo
         connection.ring()  # nothing happens: the descriptor may belong to another file
 
 
-def test_messages_that_the_broker_refuses_are_named(tmp_path: Path) -> None:
+def test_refused_messages_are_named(tmp_path: Path) -> None:
     rights = tmp_path / "rights"
     rights.write_text("topic write imud/s/g/state\n")
     lines = ("allow_anonymous true", "max_packet_size 2000", f"acl_file {rights}")

@@ -47,7 +47,7 @@ def test_a_file_that_cannot_be_read_is_named_with_its_key(tmp_path: Path, author
 
 
 @pytest.mark.parametrize("name", ["ca_file", "cert_file", "key_file"])
-def test_a_file_that_is_no_certificate_and_no_key_is_named(tmp_path: Path, authority: Authority, name: str) -> None:
+def test_an_invalid_certificate_or_key_file_is_named(tmp_path: Path, authority: Authority, name: str) -> None:
     path = tmp_path / "garbage"
     path.write_text("no certificate\n")
     settings = msgspec.structs.replace(of_tls(authority), **{name: str(path)})
@@ -55,7 +55,7 @@ def test_a_file_that_is_no_certificate_and_no_key_is_named(tmp_path: Path, autho
         paho_client(TLS_BROKER, settings, "one", is_v5=True)
 
 
-def test_a_key_with_a_passphrase_is_refused_and_not_asked_for(tmp_path: Path, authority: Authority) -> None:
+def test_a_key_with_a_passphrase_is_rejected_without_a_prompt(tmp_path: Path, authority: Authority) -> None:
     locked = tmp_path / "locked.key"
     words = ["openssl", "rsa", "-aes256", "-passout", "pass:x", "-in", authority["gateway.key"], "-out", str(locked)]
     subprocess.run(words, check=True, capture_output=True)

@@ -14,7 +14,7 @@ def longest(_low: float = 0.0) -> float:
     return 1.0
 
 
-def test_pauses_double_to_the_longest() -> None:
+def test_pauses_double_up_to_the_maximum() -> None:
     turn = BrokerTurn([A], 60.0, longest)
     assert [turn.failed(0) for _ in range(6)] == [4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
     for _ in range(1100):  # 2.0 to the power of this number exceeds a float
@@ -45,7 +45,7 @@ def test_brokers_take_turns() -> None:
 
 
 @pytest.mark.parametrize(("held_ns", "pause_s"), [(STABLE_NS, FIRST_S), (STABLE_NS - 1, 32.0)])
-def test_only_a_connection_that_held_begins_anew(held_ns: int, pause_s: float) -> None:
+def test_only_a_stable_connection_resets_the_pause(held_ns: int, pause_s: float) -> None:
     turn = BrokerTurn([A], 60.0, longest)
     for _ in range(3):
         turn.failed(0)

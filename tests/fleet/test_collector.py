@@ -90,7 +90,9 @@ def begin_session(broker: Mosquitto) -> None:
     assert not fleet.problem
 
 
-def test_what_a_store_refused_comes_again_to_the_next_collector(broker: Mosquitto, gateway: SendingGateway) -> None:
+def test_messages_that_a_store_refused_are_delivered_to_the_next_collector(
+    broker: Mosquitto, gateway: SendingGateway
+) -> None:
     begin_session(broker)
     gateway.send(samples_message(1, 5), samples_message(6, 9))
     store = MemoryStore()
@@ -123,7 +125,7 @@ class ResettingStore(MemoryStore):
             self.proxy.reset()
 
 
-def test_a_reset_while_a_transaction_is_acknowledged_costs_a_connection_and_nothing_else(
+def test_a_reset_during_the_acknowledgements_loses_only_the_connection(
     broker: Mosquitto, gateway: SendingGateway, proxy: Proxy
 ) -> None:
     begin_session(broker)
@@ -154,7 +156,9 @@ class SlowStore(MemoryStore):
         super().write(batches, accounts, offsets)
 
 
-def test_a_slow_store_is_given_more_at_once_and_its_ledger_closes(broker: Mosquitto, gateway: SendingGateway) -> None:
+def test_a_slow_store_receives_larger_transactions_and_its_ledger_balances(
+    broker: Mosquitto, gateway: SendingGateway
+) -> None:
     begin_session(broker)
     number = RECEIVE_MAX + BATCHES_MAX
     store = SlowStore(is_slow=True)
@@ -174,13 +178,13 @@ def test_a_slow_store_is_given_more_at_once_and_its_ledger_closes(broker: Mosqui
     fleet = collect(broker, store, number)
     sending.join()
     assert store.rows == list(range(1, number + 1))
-    assert max(store.sizes) == BATCHES_MAX, "the messages of the meantime fill a transaction"
+    assert max(store.sizes) == BATCHES_MAX, "messages received during a transaction fill the next one"
     (account,) = fleet.accounts.values()
     assert (account.sent, account.received, account.in_spool, account.balance) == (number, number, 0, 0)
     assert (account.counts.missing, account.counts.duplicates) == (0, 0)
 
 
-def test_what_waits_in_memory_is_bounded_in_bytes(broker: Mosquitto, gateway: SendingGateway) -> None:
+def test_the_size_of_waiting_messages_is_limited(broker: Mosquitto, gateway: SendingGateway) -> None:
     begin_session(broker)
     text = [Event(0, "bow", EventKind.UP, "1" * 100_000)]
     large = [msgspec.structs.replace(samples_message(n, n), events=text) for n in range(1, 151)]
@@ -191,7 +195,7 @@ def test_what_waits_in_memory_is_bounded_in_bytes(broker: Mosquitto, gateway: Se
     assert max(store.sizes) <= TURN_BYTES // 100_000 + 1
 
 
-def test_a_state_that_knows_the_clock_gives_the_store_its_offset(broker: Mosquitto, gateway: SendingGateway) -> None:
+def test_a_state_with_a_clock_gives_the_store_its_offset(broker: Mosquitto, gateway: SendingGateway) -> None:
     clock = GatewayClock(9, UTC_NS, synchronised=True, error_ns=700)
     gateway.send_state(GatewayState(v=1, online=True, boot="1", clock=clock))
     store = MemoryStore()
@@ -199,7 +203,7 @@ def test_a_state_that_knows_the_clock_gives_the_store_its_offset(broker: Mosquit
     assert store.offsets == {BootKey("gw", "1"): BootOffset(9, UTC_NS, 700)}
 
 
-def test_what_a_collector_holds_is_nothing_to_the_search_for_cycles() -> None:
+def test_the_garbage_collector_does_not_track_stored_objects() -> None:
     """The collector holds hundreds of thousands of objects. The garbage collector must not visit them."""
     message = decode_message(encode_message(synchronised(intervals_message(1, 5))))
     (interval,) = message.intervals

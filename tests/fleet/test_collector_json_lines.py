@@ -23,7 +23,7 @@ from tests.fleet.fleet_gateway import (
 HEAD = {"site": "mill", "gateway": "gw", "boot": "1", "device": "bow", "stream": "samples"}
 
 
-def test_a_sample_has_its_values() -> None:
+def test_the_line_of_a_sample_contains_its_values() -> None:
     (line,) = lines_of(FleetBatch("mill", Stream.SAMPLES, samples_message(3, 3)))
     assert json.loads(line) == HEAD | {
         "kind": "sample", "seq": 3, "t_ns": 3_000_000, "t_err_ns": 500, "sync": "edge", "t_rx_ns": 3_000_010,
@@ -35,7 +35,7 @@ def test_a_sample_has_its_values() -> None:
     assert json.loads(line)["accel_m_s2"] == [None, 0.0, None]
 
 
-def test_dropped_intervals_and_events_have_their_kinds() -> None:
+def test_lines_of_dropped_records_intervals_and_events_have_kinds() -> None:
     out = io.StringIO()
     batches = [
         FleetBatch("mill", Stream.SAMPLES, dropped_message(1, 4)),
@@ -51,7 +51,7 @@ def test_dropped_intervals_and_events_have_their_kinds() -> None:
     assert (up["stream"], up["kind"], up["event"], up["message"]) == ("events", "event", "up", "it is up")
 
 
-def test_lines_before_the_clock_is_set_say_so_and_the_line_of_the_clock_places_them() -> None:
+def test_lines_report_an_unset_clock_and_a_later_line_contains_its_offset() -> None:
     messages = [
         samples_message(1, 1, utc_ns=0), intervals_message(2, 3, utc_ns=0), event_message(4, 4_000_000, utc_ns=0),
         dropped_message(5, 6),

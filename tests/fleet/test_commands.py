@@ -95,10 +95,10 @@ class ChannelBench:
         asyncio.run(loop())
 
 
-def test_a_request_is_carried_out_and_answered_with_its_correlation() -> None:
+def test_the_reply_of_a_request_contains_its_correlation() -> None:
     bench = ChannelBench()
     assert bench.ask(1, "turn", angle=3, response_topic="imud/mill/gw/bow/answer/me") is None
-    assert bench.device.done == [], "nothing happens in the sender's thread"
+    assert bench.device.done == [], "the sender's thread runs no command"
     bench.run()
     assert bench.device.done == [("turn", {"angle": 3})]
     (reply,) = bench.replies
@@ -108,10 +108,10 @@ def test_a_request_is_carried_out_and_answered_with_its_correlation() -> None:
     assert (bench.channel.run, bench.channel.refused) == (1, 0)
     bench.ask(2)
     bench.run()
-    assert bench.replies[1].topic == "imud/mill/gw/bow/answer", "without a response topic, of the device"
+    assert bench.replies[1].topic == "imud/mill/gw/bow/answer", "the default is the reply topic of the device"
 
 
-def test_what_is_not_in_the_list_is_denied() -> None:
+def test_commands_that_are_not_allowed_are_denied() -> None:
     bench = ChannelBench()
     assert bench.ask(1, "factory_reset") is Outcome.DENIED
     assert bench.ask(2, "turn", device="mast", angle=3) is Outcome.DENIED
@@ -127,7 +127,7 @@ def test_what_is_not_in_the_list_is_denied() -> None:
 @pytest.mark.parametrize(
     ("age_s", "taken"), [(29.9, False), (30.1, False), (-29.9, True), (-30.1, False), (0.9, True), (1.1, False)]
 )
-def test_a_request_has_an_age(age_s: float, taken: bool) -> None:
+def test_old_and_future_requests_are_rejected(age_s: float, taken: bool) -> None:
     bench = ChannelBench()  # the output started 1 s ago, so an older request was not for it
     assert (bench.ask(age_s=age_s) is None) is taken
     bench = ChannelBench()
@@ -135,7 +135,7 @@ def test_a_request_has_an_age(age_s: float, taken: bool) -> None:
     assert (bench.ask(age_s=age_s) is None) is (abs(age_s) < 30)
 
 
-def test_a_request_that_becomes_old_while_it_waits_is_not_carried_out() -> None:
+def test_a_request_that_becomes_too_old_in_the_queue_does_not_run() -> None:
     bench = ChannelBench()
     bench.ask(1)
     bench.clock.advance(31 * NS_PER_S)
@@ -143,10 +143,10 @@ def test_a_request_that_becomes_old_while_it_waits_is_not_carried_out() -> None:
     assert [one.outcome for one in bench.answers()] == [Outcome.STALE]
     assert bench.device.done == []
     bench.offset_ns = 0
-    assert bench.ask(2) is Outcome.STALE, "without a clock nothing is carried out"
+    assert bench.ask(2) is Outcome.STALE, "imud runs no request without a set clock"
 
 
-def test_a_request_is_carried_out_once_for_as_long_as_its_age_would_allow() -> None:
+def test_a_request_runs_once_within_its_maximum_age() -> None:
     bench = ChannelBench(per_minute=600)
     bench.ask(1, age_s=-29.0)
     bench.run()
@@ -160,10 +160,10 @@ def test_a_request_is_carried_out_once_for_as_long_as_its_age_would_allow() -> N
     assert len(bench.device.done) == 1
 
 
-def test_a_request_that_comes_again_has_the_answer_that_it_had() -> None:
+def test_a_repeated_request_receives_the_stored_reply() -> None:
     bench = ChannelBench()
     bench.ask(1, "turn", angle=3)
-    assert bench.ask(1, "turn", angle=3) is Outcome.DUPLICATE, "it waits, and will have its answer"
+    assert bench.ask(1, "turn", angle=3) is Outcome.DUPLICATE, "the first request waits for its reply"
     bench.run()
     bench.replies.clear()
     bench.ask(1, "turn", angle=3, response_topic="imud/mill/gw/bow/answer/other")
@@ -171,7 +171,7 @@ def test_a_request_that_comes_again_has_the_answer_that_it_had() -> None:
     assert (reply.topic, reply.correlation) == ("imud/mill/gw/bow/answer/other", b"c")
     assert (bench.answers()[0].outcome, bench.answers()[0].result) == (Outcome.DONE, {"serial": 7})
     bench.ask(1, "turn", angle=4)
-    assert bench.answers()[-1].outcome is Outcome.DUPLICATE, "another request with the id of this one"
+    assert bench.answers()[-1].outcome is Outcome.DUPLICATE, "a different request with the same id"
     bench.run()
     assert bench.device.done == [("turn", {"angle": 3})]
     assert (bench.channel.run, bench.channel.refused) == (1, 2)
@@ -182,7 +182,7 @@ def test_a_request_that_comes_again_has_the_answer_that_it_had() -> None:
         assert [(one.outcome, one.error.split(":")[0]) for one in bench.answers()] == [(Outcome.FAILED, "angle")]
 
 
-def test_as_many_answers_are_kept_as_are_allowed() -> None:
+def test_the_number_of_stored_replies_is_limited() -> None:
     bench = ChannelBench(per_minute=600)
     for number in range(ANSWERS_KEPT + 1):
         bench.ask(number)
@@ -192,7 +192,7 @@ def test_as_many_answers_are_kept_as_are_allowed() -> None:
     assert len(bench.device.done) == ANSWERS_KEPT + 1
 
 
-def test_more_than_the_rate_or_the_queue_has_room_for_is_busy() -> None:
+def test_requests_above_the_rate_or_the_queue_are_rejected_as_busy() -> None:
     bench = ChannelBench(per_minute=5)
     assert [bench.ask(number) for number in range(5)] == [None] * 5
     assert bench.ask(5) is Outcome.BUSY
@@ -217,13 +217,13 @@ def test_more_than_the_rate_or_the_queue_has_room_for_is_busy() -> None:
         b'{"v": 1, "id": "a", "action": "", "issued_utc_ns": 1}',
     ],
 )  # fmt: skip
-def test_what_is_no_request_is_counted_and_not_answered(payload: bytes) -> None:
+def test_invalid_requests_are_counted_without_a_reply(payload: bytes) -> None:
     bench = ChannelBench()
     bench.take(payload)
     assert (bench.channel.refused, bench.replies) == (1, [])
 
 
-def test_kept_requests_and_answers_elsewhere_are_ignored() -> None:
+def test_retained_requests_and_foreign_reply_topics_are_ignored() -> None:
     bench = ChannelBench()
     bench.ask(1, retain=True)
     for topic in ("imud/mill/gw/bow/samples", "imud/mill/gw/state", "imud/mill/gw/mast/answer", "a/b",
@@ -234,7 +234,7 @@ def test_kept_requests_and_answers_elsewhere_are_ignored() -> None:
     assert (bench.channel.refused, bench.replies, bench.device.done) == (8, [], [])
 
 
-def test_errors_are_answers_and_a_defect_is_one_too() -> None:
+def test_errors_and_internal_errors_have_a_reply() -> None:
     bench = ChannelBench(actions=["identity", "turn", "break"])
     bench.ask(1, "turn")
     bench.ask(2, "identity", device="mast")
@@ -268,7 +268,7 @@ def test_every_request_is_in_the_log(log_of_daemon: pytest.LogCaptureFixture) ->
 
 
 @in_loop
-async def test_one_runs_at_a_time_and_the_end_ends_it() -> None:
+async def test_one_request_runs_at_a_time_and_close_stops_it() -> None:
     bench = ChannelBench()
     bench.device.go_on = asyncio.Event()
     bench.ask(1)
@@ -408,7 +408,7 @@ class Loop:
 
 @pytest.mark.live
 @pytest.mark.parametrize("version", ["5", "3.1.1"])
-def test_a_broker_with_rights_lets_the_operator_ask_and_nobody_else(
+def test_a_broker_with_access_rights_accepts_requests_of_the_operator_only(
     tmp_path: Path, broker: Mosquitto, version: str
 ) -> None:
     device = FakeDevice()
@@ -431,14 +431,14 @@ def test_a_broker_with_rights_lets_the_operator_ask_and_nobody_else(
         operator.ask("bow", "first", "identity")
         operator.ask("bow", "third", "identity")
         operator.answer("third")
-        assert len(device.done) == 2, "the operator's two, none twice, and none of the others"
+        assert len(device.done) == 2, "two requests of the operator, each once, and no request of others"
         assert not any("/answer" in one.topic for one in others[1].got), "gateways do not read each other"
         collector.answer("third")  # the collector may read all topics
         assert sum("Denied PUBLISH" in line for line in broker.log) == 2
         status = loop.output.status()
         assert (status.commands, status.commands_refused) == (2, 1)
         again = [one for one in operator.got if b'"first"' in one.payload and "/answer" in one.topic]
-        assert len(again) == 2, "what came again has its answer again"
+        assert len(again) == 2, "a repeated request receives its reply again"
     finally:
         loop.close()
         for one in (operator, collector, *others):

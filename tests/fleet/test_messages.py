@@ -48,7 +48,7 @@ def message(kind: MessageKind, first: int = 5, last: int = 7, **more: object) ->
     )  # fmt: skip
 
 
-def test_the_header_is_what_the_document_says() -> None:
+def test_the_header_is_as_documented() -> None:
     payload = encode_message(message(MessageKind.EVENTS, 1, 1, events=[Event(3, "bow", EventKind.UP, "up")]))
     assert json.loads(payload) == {
         "v": 1, "gateway": "gw", "boot": "00000000000000ff", "device": "bow", "kind": "events", "begin": 1,
@@ -58,7 +58,7 @@ def test_the_header_is_what_the_document_says() -> None:
 
 
 @pytest.mark.parametrize("as_slots", [False, True])
-def test_samples_come_back_as_they_went(as_slots: bool) -> None:
+def test_samples_survive_encoding_and_decoding(as_slots: bool) -> None:
     samples = [made(seq) for seq in (5, 6, 7)]
     if as_slots:
         payload = encode_slots_message(message(MessageKind.SLOTS), encode_slots(samples, 0))
@@ -70,7 +70,7 @@ def test_samples_come_back_as_they_went(as_slots: bool) -> None:
     assert decode_message(payload).samples == samples
 
 
-def test_values_that_json_does_not_have_are_left_out() -> None:
+def test_values_that_json_cannot_represent_are_omitted() -> None:
     bad = msgspec.structs.replace(made(5), gyro_rad_s=(0.0, math.nan, 0.0), temperature_c=math.inf)
     payload = encode_message(message(MessageKind.SAMPLES, samples=[bad]))
     assert b"null" not in payload
@@ -94,7 +94,7 @@ def bomb() -> bytes:
         encode_slots_message(message(MessageKind.SLOTS), [bytes(100)]),
     ],
 )  # fmt: skip
-def test_anything_else_is_an_error_with_a_reason(payload: bytes) -> None:
+def test_invalid_payloads_raise_an_error_with_the_cause(payload: bytes) -> None:
     with pytest.raises(ValueError, match="expected"):
         decode_message(payload)
     for boot in ("", "a b", "x" * 65, "1\n"):
@@ -132,7 +132,7 @@ def put(value: Any, path: tuple[Any, ...], number: int) -> bytes:
 
 
 @pytest.mark.parametrize("whole", FULL, ids=lambda whole: str(whole["kind"]))
-def test_numbers_that_no_database_has_are_refused_wherever_they_are(whole: dict[str, Any]) -> None:
+def test_numbers_that_no_database_can_store_are_rejected_in_each_field(whole: dict[str, Any]) -> None:
     for path in places(whole):
         for number in (NUMBER_MOST, -NUMBER_MOST, 1 << 63, 10**30):
             with pytest.raises(ValueError, match="expected"):
@@ -144,7 +144,7 @@ def test_numbers_that_no_database_has_are_refused_wherever_they_are(whole: dict[
         decode_message(encode_slots_message(message(MessageKind.SLOTS), slots))
 
 
-def test_events_have_text_without_nul_and_a_number_each() -> None:
+def test_events_have_text_without_nul_and_their_own_number() -> None:
     for text in ("\0", "a\0", "\\\\\0"):
         with pytest.raises(ValueError, match="without NUL"):
             decode_message(encode_message(message(MessageKind.EVENTS, events=[Event(3, "bow", EventKind.UP, text)])))
@@ -157,7 +157,7 @@ def test_events_have_text_without_nul_and_a_number_each() -> None:
 
 
 @given(st.binary(max_size=200), st.integers(0, 400))
-def test_damaged_bytes_raise_nothing_else(noise: bytes, at: int) -> None:
+def test_damaged_payloads_raise_only_value_errors(noise: bytes, at: int) -> None:
     payload = encode_slots_message(message(MessageKind.SLOTS), encode_slots([made(5)], 0))
     for one in (noise, MAGIC + noise, payload[:at] + noise + payload[at + len(noise) :]):
         with suppress(ValueError):

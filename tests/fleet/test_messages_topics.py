@@ -5,7 +5,7 @@ import pytest
 from imud.fleet.messages import SCHEMA, STATE, STATUS, Stream, TopicParts, parse_topic, topic_of
 
 
-def test_topics_stand_as_documented() -> None:
+def test_topics_are_as_documented() -> None:
     assert topic_of("mill", "gw-1", "", STATE) == "imud/mill/gw-1/state"
     assert topic_of("mill", "gw-1", "", Stream.EVENTS) == "imud/mill/gw-1/events"
     assert topic_of("mill", "gw-1", "bow", Stream.SAMPLES) == "imud/mill/gw-1/bow/samples"
@@ -14,7 +14,7 @@ def test_topics_stand_as_documented() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "+", "#", "$SYS", "a b", "ä", "x" * 65, "a\0", "a\n"])
-def test_a_name_that_is_none_makes_no_topic(name: str) -> None:
+def test_an_invalid_name_raises_an_error(name: str) -> None:
     with pytest.raises(ValueError, match="letters, digits"):
         topic_of(name, "gw", "bow", STATUS)
     with pytest.raises(ValueError, match="letters, digits"):
@@ -41,5 +41,5 @@ def test_a_name_that_is_none_makes_no_topic(name: str) -> None:
         "imud/a//state",
     ],
 )
-def test_what_is_no_topic_of_a_gateway_is_none(topic: str) -> None:
+def test_other_topics_are_not_parsed(topic: str) -> None:
     assert parse_topic(topic) is None

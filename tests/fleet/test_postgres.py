@@ -100,7 +100,7 @@ def test_rows_have_time_numbers_and_values(database: str) -> None:
     ]
 
 
-def test_what_comes_again_after_a_restart_is_a_duplicate_and_no_row(database: str) -> None:
+def test_repeated_messages_after_a_restart_are_duplicates_without_rows(database: str) -> None:
     write(database, samples_message(1, 5))
     ledger = write(database, samples_message(1, 5), samples_message(4, 7))
     assert query(database, "SELECT seq FROM imud_samples ORDER BY seq") == [(n,) for n in range(1, 8)]
@@ -120,7 +120,7 @@ def placed(url: str) -> list[Any]:
 
 
 @pytest.mark.parametrize("wrong_ns", [0, LIFTED_NS])
-def test_what_comes_before_the_clock_is_set_is_placed_when_it_is(database: str, wrong_ns: int) -> None:
+def test_rows_get_their_utc_time_when_the_clock_is_set(database: str, wrong_ns: int) -> None:
     before = [
         samples_message(1, 2, utc_ns=wrong_ns), samples_message(3, 3, boot="1-2", utc_ns=wrong_ns),
         intervals_message(4, 5, utc_ns=wrong_ns), event_message(6, 6_000_000, utc_ns=wrong_ns),
@@ -142,7 +142,7 @@ def test_what_comes_before_the_clock_is_set_is_placed_when_it_is(database: str, 
     assert (content["begin_utc_ns"], content["end_utc_ns"]) == (UTC_NS + 4_000_000, UTC_NS + 5_000_000)
 
 
-def test_a_clock_that_is_known_places_what_comes_later_after_a_restart_too(database: str) -> None:
+def test_a_stored_clock_offset_is_used_after_a_restart(database: str) -> None:
     write(database, synchronised(intervals_message(1, 5), t_ns=5_000_000))
     late = [samples_message(1, 1, utc_ns=0), intervals_message(6, 8, utc_ns=0), event_message(9, 9_000_000, utc_ns=0)]
     write(database, *(not_set(one) for one in late))
@@ -154,7 +154,7 @@ def test_a_clock_that_is_known_places_what_comes_later_after_a_restart_too(datab
     assert found == [(str(UTC_NS + 5_000_000),), (str(UTC_NS + 8_000_000),)]
 
 
-def test_intervals_alone_say_the_clock_of_a_gateway_that_speaks_of_none(database: str) -> None:
+def test_intervals_contain_the_clock_of_a_gateway_without_a_clock_field(database: str) -> None:
     """Default messages of a gateway with an earlier version, first at 1970, then with a set clock."""
     write(database, intervals_message(1, 5, utc_ns=0))
     write(database, intervals_message(6, 9))
@@ -163,13 +163,13 @@ def test_intervals_alone_say_the_clock_of_a_gateway_that_speaks_of_none(database
     ]
 
 
-def test_the_state_of_a_gateway_places_what_came_before_it(database: str) -> None:
+def test_the_state_of_a_gateway_gives_earlier_rows_their_utc_time(database: str) -> None:
     write(database, not_set(intervals_message(1, 5, utc_ns=0)))
     write(database, offsets={BootKey("gw", "1"): BootOffset(0, UTC_NS, 7)})
     assert placed(database) == [(1, UTC_NS + 1_000_000, (UTC_NS + 1_000_000) // 1000, True, 507)]
 
 
-def test_rows_that_the_ledger_does_not_know_stay_single(database: str) -> None:
+def test_rows_missing_in_the_ledger_are_not_duplicated(database: str) -> None:
     first = write(database, samples_message(1, 5), intervals_message(1, 5), event_message(1, 1))
     assert len(first.counts) == 3
     query(database, "DELETE FROM imud_ledger")
@@ -213,7 +213,7 @@ def test_a_transaction_that_fails_leaves_nothing(database: str) -> None:
     assert query(database, "SELECT count(*) FROM imud_samples") == [(0,)]
 
 
-def test_a_user_who_may_only_write_rows_does(database: str) -> None:
+def test_a_user_without_the_right_to_create_tables_can_write_rows(database: str) -> None:
     write(database)
     query(
         database,
@@ -226,7 +226,7 @@ def test_a_user_who_may_only_write_rows_does(database: str) -> None:
     query(database, "DROP OWNED BY writer; DROP ROLE writer")
 
 
-def test_a_second_collector_says_that_there_is_another(database: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_collector_reports_the_first(database: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from imud.fleet import postgres
 
     monkeypatch.setattr(postgres, "LOCK_S", 0.1)
@@ -244,7 +244,7 @@ def test_a_second_collector_says_that_there_is_another(database: str, monkeypatc
         ("postgresql://u:secret@h/x?port=1&colour=2", "invalid URI query parameter"),
     ],
 )
-def test_a_url_that_cannot_be_read_is_not_printed(url: str, problem: str) -> None:
+def test_an_invalid_url_is_not_printed(url: str, problem: str) -> None:
     from imud.fleet.postgres import PostgresStore
 
     with pytest.raises(ServerError, match=f"^PostgreSQL: cannot parse the URL: {problem}; imud does not ") as refused:
@@ -253,7 +253,7 @@ def test_a_url_that_cannot_be_read_is_not_printed(url: str, problem: str) -> Non
     assert "cret" not in str(refused.value)
 
 
-def test_a_server_that_is_not_there_is_named() -> None:
+def test_a_missing_server_is_named() -> None:
     from imud.fleet.postgres import PostgresStore
 
     with pytest.raises(ServerError, match=r"PostgreSQL: .*nowhere"):

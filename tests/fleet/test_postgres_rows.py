@@ -30,7 +30,7 @@ def record(message: FleetMessage, offset: BootOffset | None = None) -> dict[str,
     return named(RECORDS, row)
 
 
-def test_a_sample_has_its_values_by_the_names_of_the_columns() -> None:
+def test_a_sample_row_contains_its_values_by_column_name() -> None:
     (row,) = sample_rows(FleetBatch("mill", Stream.SAMPLES, synchronised(samples_message(3, 3), error_ns=40)))
     found = {name: value for name, value in named(SAMPLES, row).items() if value is not None}
     # 1,790,000,000 s after 1970: `date -u -d @1790000000`
@@ -41,7 +41,7 @@ def test_a_sample_has_its_values_by_the_names_of_the_columns() -> None:
     }  # fmt: skip
 
 
-def test_what_has_no_clock_has_the_time_of_its_boot_where_that_is_known() -> None:
+def test_a_record_without_a_clock_uses_the_offset_of_its_boot() -> None:
     for message, t_ns in (
         (intervals_message(2, 4, utc_ns=0), 2_000_000), (event_message(5, 5_000_000, utc_ns=0), 5_000_000),
         (msgspec.structs.replace(dropped_message(6, 7), utc_ns=7_000_000), 7_000_000),
@@ -54,7 +54,7 @@ def test_what_has_no_clock_has_the_time_of_its_boot_where_that_is_known() -> Non
     assert (content["begin_utc_ns"], content["end_utc_ns"]) == (UTC_NS + 2_000_000, UTC_NS + 4_000_000)
 
 
-def test_a_time_before_1970_and_what_was_dropped_by_an_earlier_version() -> None:
+def test_a_time_before_1970_and_dropped_records_of_an_earlier_version() -> None:
     found = record(msgspec.structs.replace(dropped_message(6, 7), cause=DropCause.AGE, utc_ns=-1))
     assert (found["time"], found["utc_ns"], found["t_ns"], found["utc_set"]) == (
         "1969-12-31T23:59:59.999999+00:00", -1, None, False,

@@ -95,7 +95,7 @@ def test_birth_states_and_farewell(tmp_path: Path) -> None:
     assert json.loads(bench.broker.will.payload)["reason"] == "connection lost"
 
 
-def test_states_are_looked_at_after_events_and_now_and_then(tmp_path: Path) -> None:
+def test_states_are_published_after_events_and_periodically(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path, status_s=60)
     bench.start()
     bench.tick()
@@ -116,7 +116,7 @@ def test_states_are_looked_at_after_events_and_now_and_then(tmp_path: Path) -> N
     bench.close()
 
 
-def test_a_device_that_is_removed_leaves_no_state(tmp_path: Path) -> None:
+def test_a_removed_device_leaves_no_retained_state(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path)
     bench.start()
     bench.tick()
@@ -129,7 +129,7 @@ def test_a_device_that_is_removed_leaves_no_state(tmp_path: Path) -> None:
     assert bench.output.status().broker == ""
 
 
-def test_settings_that_are_not_as_declared_are_published_when_they_change(tmp_path: Path) -> None:
+def test_settings_are_published_when_they_change(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path)
     topic = "imud/default/gw/imu0/settings"
 
@@ -153,7 +153,7 @@ def test_settings_that_are_not_as_declared_are_published_when_they_change(tmp_pa
     assert sent[1]["actual"] == {"rate_hz": "50"}
 
 
-def test_only_declared_devices_are_queued(tmp_path: Path) -> None:
+def test_only_configured_devices_are_queued(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path, devices={"imu0": {}})
     for name in ("imu0", "imu1"):
         bench.output.add_device(name, 0)
@@ -169,7 +169,7 @@ def test_only_declared_devices_are_queued(tmp_path: Path) -> None:
     assert bench.context.outputs.mqtts == []
 
 
-def test_a_spool_that_fails_is_an_event_and_no_end(tmp_path: Path) -> None:
+def test_a_failed_spool_causes_an_event_and_the_output_continues(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path / "spool")
     bench.start()
     database = tmp_path / "spool" / "spool.db"
@@ -189,7 +189,7 @@ def test_a_spool_that_fails_is_an_event_and_no_end(tmp_path: Path) -> None:
     bench.close()
 
 
-def test_a_thread_that_ends_by_a_defect_ends_the_daemon(tmp_path: Path) -> None:
+def test_an_internal_error_in_a_thread_ends_the_daemon(tmp_path: Path) -> None:
     first, second = PublisherBench(tmp_path), PublisherBench(tmp_path)
     first.output.start()
     with pytest.raises(ServerError, match="another imud process"):
@@ -202,7 +202,7 @@ def test_a_thread_that_ends_by_a_defect_ends_the_daemon(tmp_path: Path) -> None:
     second.close()
 
 
-def test_the_name_of_the_host_is_the_gateway(tmp_path: Path) -> None:
+def test_the_host_name_is_the_default_gateway_name(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path, gateway="")
     bench.output.start()
     bench.close()
@@ -265,7 +265,7 @@ def test_bad_settings_are_named(given: Mapping[str, Any], words: str) -> None:
         ("wss://[::1]", Broker("::1", 443, True, True, "/mqtt")),
     ],
 )
-def test_names_of_brokers_and_devices(url: str, broker: Broker) -> None:
+def test_urls_of_brokers_and_names_of_devices(url: str, broker: Broker) -> None:
     assert broker_of(url) == broker
     assert broker_of(broker.name) == broker
     settings = msgspec.convert({"devices": {"bow": {"rate_hz": 5}, "*": {"rate_hz": 2}}}, MqttOptions)
@@ -274,7 +274,7 @@ def test_names_of_brokers_and_devices(url: str, broker: Broker) -> None:
     assert alone.sending("mast") is None
 
 
-def test_birth_and_messages_say_whether_the_wall_clock_is_set(tmp_path: Path) -> None:
+def test_birth_and_messages_contain_the_state_of_the_wall_clock(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path)
     bench.start()
     bench.reference = UtcReference(100, 40)
@@ -308,7 +308,7 @@ def fields_by_schema(slot: bytes, layout: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def test_slots_are_read_by_the_schema_that_is_published_beside_them(tmp_path: Path) -> None:
+def test_slots_can_be_decoded_with_the_published_schema(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path, devices={"*": {"whole": "slots", "rate_hz": None}})
     bench.start(3)
     sent = [

@@ -62,7 +62,7 @@ def test_a_restart_of_the_broker_loses_nothing(tmp_path: Path, broker: Mosquitto
     finish(gateway, collector)
 
 
-def test_a_broker_that_freezes_is_left_and_loses_nothing(tmp_path: Path, broker: Mosquitto) -> None:
+def test_a_frozen_broker_is_replaced_without_loss(tmp_path: Path, broker: Mosquitto) -> None:
     collector = Collector(broker.port)
     gateway = LiveGateway(tmp_path / "spool", broker.port)
     gateway.publish(2000)
@@ -76,7 +76,7 @@ def test_a_broker_that_freezes_is_left_and_loses_nothing(tmp_path: Path, broker:
     assert counts.newest >= 6900
 
 
-def test_a_broker_that_refuses_messages_loses_nothing(tmp_path: Path) -> None:
+def test_refused_messages_are_not_lost(tmp_path: Path) -> None:
     rights = tmp_path / "rights"
     rights.write_text("topic read #\ntopic write imud/default/gw/state\n")
     port = free_port()
@@ -90,7 +90,7 @@ def test_a_broker_that_refuses_messages_loses_nothing(tmp_path: Path) -> None:
         finish(gateway, collector)
 
 
-def test_kill_9_while_the_spool_is_full_closes_with_what_was_thinned(tmp_path: Path) -> None:
+def test_the_ledger_balances_after_a_kill_with_a_full_spool(tmp_path: Path) -> None:
     port, spool = free_port(), tmp_path / "spool"
     live = LiveGateway(spool, port, spool_mb=1)
     for number in range(1, 6):
@@ -140,7 +140,7 @@ STATEMENTS = 12  # approximate number of statements in one transaction
 BATCH_SAMPLES = 200  # samples of `batch_s` (0.2 s) at 1 kHz that wait for their message
 
 
-def test_kill_9_at_random_moments_costs_what_was_in_memory(tmp_path: Path) -> None:
+def test_a_kill_loses_only_the_samples_in_memory(tmp_path: Path) -> None:
     port, spool = free_port(), tmp_path / "spool"
     with running_broker(tmp_path / "broker", port=port):
         collector = Collector(port)
@@ -160,7 +160,7 @@ def test_kill_9_at_random_moments_costs_what_was_in_memory(tmp_path: Path) -> No
     assert len(stored) == KILLS
 
 
-def test_kill_9_in_one_boot_shows_each_loss_as_a_gap(tmp_path: Path) -> None:
+def test_a_kill_within_one_boot_shows_the_loss_as_a_gap(tmp_path: Path) -> None:
     port, spool = free_port(), tmp_path / "spool"
     begun = 0
     with running_broker(tmp_path / "broker", port=port):
@@ -183,7 +183,7 @@ def test_kill_9_in_one_boot_shows_each_loss_as_a_gap(tmp_path: Path) -> None:
     assert one.dropped["off"] > (KILLS - 2) * 5000  # the last gateway may have stored nothing
 
 
-def test_a_slow_network_holds_up_nothing_and_loses_nothing(tmp_path: Path, broker: Mosquitto) -> None:
+def test_a_slow_network_neither_blocks_nor_loses_samples(tmp_path: Path, broker: Mosquitto) -> None:
     with closing(Proxy(broker.port)) as proxy:
         collector = Collector(broker.port)
         gateway = LiveGateway(tmp_path / "spool", proxy.port)

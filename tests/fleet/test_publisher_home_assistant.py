@@ -25,8 +25,8 @@ from tests.support.socket_rig import device_status, sample
 jinja2 = pytest.importorskip("jinja2", reason="jinja2 is not installed (extra dev)")
 
 GATEWAY = Gateway("mill", "gw-17", "b")
+# Required keys of an entity by platform, in addition to `platform` and `unique_id`
 REQUIRED = {"binary_sensor": {"state_topic"}, "sensor": {"state_topic"}}
-"""Required keys of an entity by platform, in addition to `platform` and `unique_id`."""
 
 
 def status(**changes: object) -> DeviceStatus:

@@ -64,9 +64,7 @@ STATE = GatewayState(v=1, online=True, boot="1", positions=[StreamPosition("1", 
 
 
 @in_loop
-async def test_batches_come_as_samples_of_the_client_and_the_account_closes(
-    broker: Mosquitto, gateway: SendingGateway
-) -> None:
+async def test_batches_contain_samples_and_the_ledger_balances(broker: Mosquitto, gateway: SendingGateway) -> None:
     gateway.send_state(STATE)
     fleet = fleet_at(broker, "archive")
     await session_begun(fleet)
@@ -81,7 +79,7 @@ async def test_batches_come_as_samples_of_the_client_and_the_account_closes(
 
 
 @in_loop
-async def test_what_a_reader_had_not_taken_comes_again_and_nothing_else(
+async def test_only_messages_without_acknowledgement_are_delivered_again(
     broker: Mosquitto, gateway: SendingGateway
 ) -> None:
     gateway.send_state(STATE)
@@ -144,7 +142,7 @@ async def test_a_broker_that_restarts_loses_nothing(broker: Mosquitto, gateway: 
 
 
 @in_loop
-async def test_only_what_is_wanted_comes_even_where_the_session_had_more(
+async def test_only_selected_topics_are_delivered_although_the_session_has_more(
     broker: Mosquitto, gateway: SendingGateway
 ) -> None:
     gateway.send_state(STATE)
@@ -157,7 +155,9 @@ async def test_only_what_is_wanted_comes_even_where_the_session_had_more(
 
 
 @in_loop
-async def test_what_no_gateway_sends_is_counted_and_acknowledged(broker: Mosquitto, gateway: SendingGateway) -> None:
+async def test_messages_of_unknown_senders_are_counted_and_acknowledged(
+    broker: Mosquitto, gateway: SendingGateway
+) -> None:
     gateway.send_state(STATE)
     fleet = fleet_at(broker, "archive")
     await session_begun(fleet)
@@ -183,7 +183,7 @@ async def test_the_next_broker_of_the_cluster_is_tried(broker: Mosquitto, gatewa
 
 
 @in_loop
-async def test_a_wait_that_ends_before_the_next_attempt_gives_nothing() -> None:
+async def test_a_timeout_before_the_next_attempt_returns_none() -> None:
     fleet = Fleet(f"mqtt://127.0.0.1:{free_port()}", retry_max_s=60.0)
     async with FleetSession(fleet, site=None, gateway=None, device=None) as session:
         for _ in range(3):
@@ -228,7 +228,7 @@ def test_the_example_of_the_document(broker: Mosquitto, gateway: SendingGateway)
 
 
 @pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
-def test_a_refusal_is_said_and_tried_again(tmp_path: Path) -> None:
+def test_a_refusal_is_reported_and_tried_again(tmp_path: Path) -> None:
     with running_broker(tmp_path / "closed", "allow_anonymous false") as closed:
         fleet = fleet_at(closed)
 

@@ -91,9 +91,7 @@ async def waiting_and_taken(connection: ReaderConnection, count: int) -> tuple[i
 
 @pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
 @pytest.mark.parametrize("scheme", ["mqtt", "mqtts"])
-def test_a_broker_that_sends_without_bound_waits_for_the_reader(
-    tmp_path: Path, authority: Authority, scheme: str
-) -> None:
+def test_a_broker_without_a_limit_waits_for_the_reader(tmp_path: Path, authority: Authority, scheme: str) -> None:
     """A reader with MQTT 3.1.1 cannot set a limit, and this broker has no limit."""
     port, plain, count = free_port(), free_port(), 2 * RECEIVE_MAX
     listener = authority.listener(port) if scheme == "mqtts" else [f"listener {port} 127.0.0.1", "allow_anonymous true"]
@@ -120,7 +118,7 @@ def test_a_broker_that_sends_without_bound_waits_for_the_reader(
 
 
 @in_loop
-async def test_large_messages_that_nobody_takes_wait_at_the_broker(broker: Mosquitto, gateway: SendingGateway) -> None:
+async def test_large_messages_wait_at_the_broker(broker: Mosquitto, gateway: SendingGateway) -> None:
     size, count = 200_000, 150
     connection = await opened(broker.port)
     sending = asyncio.to_thread(gateway.publish, [(f"imud/{number}", bytes(size)) for number in range(count)])
@@ -134,7 +132,7 @@ async def test_large_messages_that_nobody_takes_wait_at_the_broker(broker: Mosqu
 
 
 @in_loop
-async def test_a_broker_that_ends_is_noticed(broker: Mosquitto) -> None:
+async def test_a_stopped_broker_is_detected(broker: Mosquitto) -> None:
     connection = await opened(broker.port)
     await asyncio.to_thread(broker.stop)
     with pytest.raises(BrokerError, match=f"mqtt://127.0.0.1:{broker.port}: "):
@@ -146,7 +144,7 @@ async def test_a_broker_that_ends_is_noticed(broker: Mosquitto) -> None:
 
 @BOTH
 @in_loop
-async def test_a_reset_that_an_acknowledgement_meets_is_a_loss_and_watches_no_other_file(
+async def test_a_reset_during_an_acknowledgement_is_a_loss_and_removes_the_descriptor(
     broker: Mosquitto, gateway: SendingGateway, proxy: Proxy, is_v5: bool
 ) -> None:
     """paho-mqtt closes the socket inside `ack`. The next opened file then gets its descriptor."""
@@ -174,7 +172,7 @@ async def test_a_reset_that_an_acknowledgement_meets_is_a_loss_and_watches_no_ot
 
 
 @in_loop
-async def test_a_descriptor_that_the_event_loop_cannot_forget_ends_the_connection_all_the_same(
+async def test_an_error_of_the_event_loop_does_not_prevent_the_end_of_the_connection(
     broker: Mosquitto, gateway: SendingGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """epoll raises for a closed descriptor if the loop waited for reading and writing."""

@@ -35,7 +35,7 @@ class SenderBench:
         return [payload for _, payload, _ in self.broker.connections[-1].sent]
 
 
-def test_messages_go_in_their_order_within_the_window() -> None:
+def test_messages_are_sent_in_order_within_the_window() -> None:
     bench = SenderBench()
     bench.broker.answers = 0
     assert bench.sender.room() == 0
@@ -63,7 +63,7 @@ def test_messages_go_in_their_order_within_the_window() -> None:
     assert bench.broker.connections[0].types[6:] == [SLOTS_TYPE]
 
 
-def test_after_a_loss_nothing_is_held_and_the_session_is_another() -> None:
+def test_a_lost_connection_clears_the_outbox_and_starts_a_new_session() -> None:
     bench = SenderBench("a", "b")
     bench.broker.answers = 1
     bench.sender.work()
@@ -84,7 +84,7 @@ def test_after_a_loss_nothing_is_held_and_the_session_is_another() -> None:
     assert bench.broker.asked == ["a", "a", "b"]
 
 
-def test_retained_messages_go_first_and_again_at_each_connection() -> None:
+def test_retained_messages_are_sent_first_at_each_connection() -> None:
     bench = SenderBench()
     bench.sender.retain({"state": b"born", "status": b"1"})
     bench.sender.work()
@@ -110,7 +110,7 @@ def test_retained_messages_go_first_and_again_at_each_connection() -> None:
 
 
 @pytest.mark.live
-def test_it_ends_with_a_farewell() -> None:
+def test_the_sender_ends_with_a_farewell() -> None:
     bench = SenderBench()
     connected = threading.Event()
     bench.sender.wanting = connected.set
@@ -124,7 +124,7 @@ def test_it_ends_with_a_farewell() -> None:
 
 
 @pytest.mark.live
-def test_what_is_still_connecting_at_the_end_says_nothing() -> None:
+def test_a_connection_that_completes_after_the_end_sends_nothing() -> None:
     """The next output uses the same client ID and may already be connected."""
     bench = SenderBench()
     bench.broker.accepts.clear()
@@ -140,7 +140,7 @@ def test_what_is_still_connecting_at_the_end_says_nothing() -> None:
     assert bench.broker.asked == ["a"], "it does not try again"
 
 
-def test_an_answer_that_is_lost_with_its_connection_goes_again() -> None:
+def test_a_reply_without_acknowledgement_is_sent_again() -> None:
     bench = SenderBench()
     bench.broker.answers = 1
     bench.sender.work()
@@ -158,7 +158,7 @@ def test_an_answer_that_is_lost_with_its_connection_goes_again() -> None:
     assert bench.broker.connections[-1].correlations == [b"c", b"c", None]
 
 
-def test_answers_that_wait_are_bounded_and_the_oldest_go() -> None:
+def test_the_number_of_waiting_replies_is_limited() -> None:
     bench = SenderBench()
     bench.broker.window, bench.broker.answers = 1000, 0
     bench.sender.work()

@@ -74,7 +74,7 @@ class SpoolBench:
         return found
 
 
-def test_messages_come_in_their_order_until_they_are_acknowledged(tmp_path: Path) -> None:
+def test_messages_are_given_in_order_until_they_are_acknowledged(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path)
     bench.commit(batch(1), batch(101), batch(201))
     first = bench.spool.after(2)
@@ -87,7 +87,7 @@ def test_messages_come_in_their_order_until_they_are_acknowledged(tmp_path: Path
 
 
 @pytest.mark.live
-def test_what_was_committed_is_there_after_the_end_without_a_farewell(tmp_path: Path) -> None:
+def test_committed_messages_survive_the_end_of_the_process(tmp_path: Path) -> None:
     code = (
         "import os, sys; from pathlib import Path; from tests.fleet.test_spool import SpoolBench, batch\n"
         "bench = SpoolBench(Path(sys.argv[1]))\n"
@@ -118,7 +118,7 @@ def test_the_oldest_samples_become_statistics_before_anything_is_dropped(tmp_pat
     assert kinds == sorted(kinds), "intervals are the oldest, slots the newest"
 
 
-def test_when_nothing_can_be_thinned_the_oldest_are_dropped_and_it_is_said(tmp_path: Path) -> None:
+def test_the_oldest_messages_are_dropped_and_counted_if_all_are_thinned(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path, kilobytes=100)
     for number in range(200):
         bench.commit(batch(100 * number + 1), batch(number + 1, 1, whole=False))
@@ -133,7 +133,7 @@ def test_when_nothing_can_be_thinned_the_oldest_are_dropped_and_it_is_said(tmp_p
     assert sum(row.kind == "dropped" for row in rows) == 2, "neighbours share one note for each stream"
 
 
-def test_what_is_new_goes_before_what_waited_where_asked(tmp_path: Path) -> None:
+def test_new_messages_are_given_first_with_newest_first(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path, newest_first=True)
     bench.commit(batch(1), batch(101), batch(201), batch(301))
     bench.spool.rewind()
@@ -151,7 +151,7 @@ def test_what_is_new_goes_before_what_waited_where_asked(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("newest_first", [False, True])
-def test_messages_that_the_sender_has_are_not_changed(tmp_path: Path, newest_first: bool) -> None:
+def test_messages_in_the_sender_are_not_changed(tmp_path: Path, newest_first: bool) -> None:
     bench = SpoolBench(tmp_path, kilobytes=150, newest_first=newest_first)
     bench.commit(batch(1), batch(101))
     bench.spool.rewind()
@@ -214,7 +214,7 @@ def test_ages_count_only_while_the_clock_is_set(tmp_path: Path) -> None:
     assert bench.counts() == StreamCounts(1, 200, whole=200)
 
 
-def test_a_note_that_was_delivered_is_not_widened(tmp_path: Path) -> None:
+def test_a_delivered_dropped_message_is_not_extended(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path, hours=1)
     bench.commit(batch(1))
     bench.commit(batch(101), utc_ns=UTC_NS + HOUR_NS)
@@ -240,7 +240,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", "-l", disk], check=True)
 
 
-def test_a_full_disk_leaves_the_spool_as_it_was_until_messages_are_acknowledged(small_disk: Path) -> None:
+def test_a_full_disk_does_not_change_the_spool_until_messages_are_acknowledged(small_disk: Path) -> None:
     bench = SpoolBench(small_disk)
     number = 0
     with pytest.raises(SpoolError, match="full"):  # noqa: PT012
@@ -263,7 +263,7 @@ def test_a_full_disk_leaves_the_spool_as_it_was_until_messages_are_acknowledged(
     assert bench.spool.thinned > 0
 
 
-def test_the_reserve_is_taken_again_when_the_disk_has_room(small_disk: Path) -> None:
+def test_the_reserve_is_created_again_when_the_disk_has_room(small_disk: Path) -> None:
     reserve, other = small_disk / RESERVE_FILE, small_disk / "other"
     bench = SpoolBench(small_disk)
     assert reserve.stat().st_size > 100_000
@@ -283,7 +283,7 @@ def test_the_reserve_is_taken_again_when_the_disk_has_room(small_disk: Path) -> 
     assert reserve.stat().st_size > 100_000
 
 
-def test_a_damaged_file_is_set_aside(tmp_path: Path) -> None:
+def test_a_damaged_file_is_renamed(tmp_path: Path) -> None:
     (tmp_path / FILE).write_bytes(b"This is no database at all, and it is long enough to be seen as none." * 100)
     bench = SpoolBench(tmp_path)
     assert bench.spool.set_aside == str(tmp_path / "spool.db.damaged")
@@ -294,7 +294,7 @@ def test_a_damaged_file_is_set_aside(tmp_path: Path) -> None:
         Spool(tmp_path / "file" / "spool", 1_000_000, HOUR_NS).open()
 
 
-def test_a_file_that_is_damaged_later_is_set_aside_at_the_next_attempt(tmp_path: Path) -> None:
+def test_a_file_that_is_damaged_later_is_renamed_at_the_next_attempt(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path)
     for number in range(STEP):
         bench.commit(batch(100 * number + 1))
@@ -313,7 +313,7 @@ def test_a_file_that_is_damaged_later_is_set_aside_at_the_next_attempt(tmp_path:
     assert bench.counts().whole == 100
 
 
-def test_a_payload_that_cannot_be_read_is_dropped_as_damaged(tmp_path: Path) -> None:
+def test_an_invalid_payload_is_dropped_as_damaged(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path, kilobytes=60)
     bench.commit(batch(1)._replace(payload=b"IMUB" + bytes(30_000)))
     for number in range(1, 20):
@@ -322,6 +322,7 @@ def test_a_payload_that_cannot_be_read_is_dropped_as_damaged(tmp_path: Path) -> 
     assert bench.counts().dropped["damaged"] == 100
 
 
+# Damage of a row by a disk, as SQL. SQLite returns all these values without an error.
 DAMAGE = {
     "a topic that is no text": "topic = CAST(x'696d75642f73ff' AS TEXT)",
     "a topic with a wildcard": "topic = 'imud/site/#/bow/samples'",
@@ -336,7 +337,6 @@ DAMAGE = {
     "a number that is a text": "last = 'many'",
     "a time that is a text": "stored_utc_ns = 'never'",
 }
-"""Damage of a row by a disk, as SQL. SQLite returns all these values without an error."""
 
 
 def damage(folder: Path, change: str, where: str = "id = 2", table: str = "message") -> None:
@@ -348,7 +348,7 @@ def damage(folder: Path, change: str, where: str = "id = 2", table: str = "messa
 
 @pytest.mark.parametrize("change", DAMAGE.values(), ids=DAMAGE)
 @pytest.mark.parametrize("kilobytes", [100_000, 20], ids=["read", "thinned"])
-def test_a_damaged_row_costs_only_itself(tmp_path: Path, change: str, kilobytes: int) -> None:
+def test_a_damaged_row_does_not_affect_other_rows(tmp_path: Path, change: str, kilobytes: int) -> None:
     bench = SpoolBench(tmp_path)
     bench.commit(*(batch(100 * number + 1) for number in range(10)))
     bench.spool.close()
@@ -363,7 +363,7 @@ def test_a_damaged_row_costs_only_itself(tmp_path: Path, change: str, kilobytes:
     assert again.spool.dropped["damaged"]
 
 
-def test_a_damaged_row_that_says_its_numbers_is_a_note(tmp_path: Path) -> None:
+def test_a_damaged_row_with_known_numbers_becomes_a_dropped_message(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path)
     bench.commit(*(batch(100 * number + 1) for number in range(3)))
     damage(tmp_path, "payload = 17")
@@ -374,7 +374,7 @@ def test_a_damaged_row_that_says_its_numbers_is_a_note(tmp_path: Path) -> None:
     assert bench.spool.messages == 3
 
 
-def test_messages_behind_damaged_ones_that_are_gone_are_given(tmp_path: Path) -> None:
+def test_messages_after_deleted_damaged_rows_are_given(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path)
     bench.commit(*(batch(100 * number + 1) for number in range(4)))
     damage(tmp_path, "topic = ''", "id <= 2")
@@ -382,7 +382,7 @@ def test_messages_behind_damaged_ones_that_are_gone_are_given(tmp_path: Path) ->
     assert bench.spool.messages == 2
 
 
-def test_a_damaged_position_is_left_out(tmp_path: Path) -> None:
+def test_a_damaged_position_is_ignored(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path)
     bench.commit(batch(1), batch(1, device="stern"))
     damage(tmp_path, "stored_utc_ns = 'never', boot = CAST(x'ff' AS TEXT)", "device = 'stern'", "progress")
@@ -390,7 +390,7 @@ def test_a_damaged_position_is_left_out(tmp_path: Path) -> None:
     assert [(one.device, one.last) for one in bench.spool.positions()] == [("bow", 200)]
 
 
-def test_a_file_whose_numbers_are_at_their_end_is_set_aside(tmp_path: Path) -> None:
+def test_a_file_with_the_maximum_row_id_is_renamed(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path)
     bench.commit(batch(1))
     bench.spool.close()
@@ -401,7 +401,7 @@ def test_a_file_whose_numbers_are_at_their_end_is_set_aside(tmp_path: Path) -> N
     assert [row.first for row in again.all()] == [101]
 
 
-def test_positions_are_those_of_one_name_of_the_gateway(tmp_path: Path) -> None:
+def test_positions_belong_to_one_name_of_the_gateway(tmp_path: Path) -> None:
     old = Spool(tmp_path, 1 << 30, HOUR_NS, gateway="gw")
     old.open()
     old.commit([batch(1)], (), 1, UTC_NS)
@@ -415,7 +415,7 @@ def test_positions_are_those_of_one_name_of_the_gateway(tmp_path: Path) -> None:
     new.close()
 
 
-def test_what_was_dropped_of_two_names_is_in_two_notes(tmp_path: Path) -> None:
+def test_dropped_messages_of_two_gateway_names_are_not_joined(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path, hours=1)
     first, second = batch(1), batch(101)
     bench.commit(first, second._replace(topic=second.topic.replace("gw", "other")))
@@ -426,7 +426,7 @@ def test_what_was_dropped_of_two_names_is_in_two_notes(tmp_path: Path) -> None:
     ]
 
 
-def test_positions_of_an_earlier_version_are_taken_over(tmp_path: Path) -> None:
+def test_positions_of_an_earlier_version_are_copied(tmp_path: Path) -> None:
     base = sqlite3.connect(tmp_path / FILE, isolation_level=None)
     base.execute("CREATE TABLE position (boot, device, stream, begin, last, stored_utc_ns)")
     base.execute("INSERT INTO position VALUES ('1', 'bow', 'samples', 3, 17, 1)")
@@ -438,7 +438,7 @@ def test_positions_of_an_earlier_version_are_taken_over(tmp_path: Path) -> None:
         spool.close()
 
 
-def test_the_streams_of_as_many_devices_as_there_may_be_keep_their_begin(tmp_path: Path) -> None:
+def test_the_streams_of_the_maximum_number_of_devices_keep_their_begin(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path)
     for first in (1, 2):
         for whole in (True, False):

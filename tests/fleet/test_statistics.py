@@ -14,7 +14,7 @@ def made(seq: int, **values: object) -> Sample:
     return Sample("bow", seq, seq * 1000, 10 * seq, Sync.EDGE, seq * 1000, seq * 1000 + 7, **values)  # type: ignore[arg-type]
 
 
-def test_values_by_hand() -> None:
+def test_statistics_have_the_computed_values() -> None:
     interval = summed_up(
         [
             made(3, temperature_c=1.0, gyro_rad_s=(0.0, 3.0, -1.0)),
@@ -42,7 +42,7 @@ def test_values_by_hand() -> None:
 
 
 @pytest.mark.parametrize("cut", range(1, 6))
-def test_batches_do_not_matter(cut: int) -> None:
+def test_the_division_into_batches_has_no_effect(cut: int) -> None:
     headings = [178, -179, -177, 179, 170, -175]
     samples = [
         made(n, euler_rad=(0.1 * n, 0.0, radians(one)), accel_m_s2=(1.0 * n, -n, n * n), status=1 << n)
@@ -60,7 +60,7 @@ def test_batches_do_not_matter(cut: int) -> None:
     assert found.status == whole.status == 0b1111110
 
 
-def test_headings_about_south_have_a_mean_about_south() -> None:
+def test_the_mean_of_headings_near_south_is_near_south() -> None:
     interval = summed_up(
         [made(n, euler_rad=(0.0, 0.0, radians(one))) for n, one in enumerate((179.0, -179.0, -178.0), 1)]
     )

@@ -34,7 +34,7 @@ def ranges(rows: list[SpoolRow], stream: Stream) -> list[tuple[str, int, int]]:
     return [(row.kind, row.first, row.last) for row in rows if row.stream == stream]
 
 
-def test_whole_samples_go_in_batches_of_their_time() -> None:
+def test_complete_samples_are_sent_in_batches_of_batch_s() -> None:
     one = streams(rate_hz=None, whole="json", batch_s=0.1)
     made = one.add(samples(1, 250))
     assert ranges(made, Stream.SAMPLES) == [("samples", 1, 99), ("samples", 100, 199)]
@@ -50,13 +50,13 @@ def test_whole_samples_go_in_batches_of_their_time() -> None:
 
 
 @pytest.mark.parametrize(("whole", "most"), [(Whole.JSON, SAMPLES_MAX), (Whole.SLOTS, SLOTS_MAX)])
-def test_a_message_holds_so_many_samples_at_most(whole: Whole, most: int) -> None:
+def test_the_number_of_samples_in_a_message_is_limited(whole: Whole, most: int) -> None:
     one = streams(rate_hz=None, whole=whole.value, batch_s=60)
     made = one.add(samples(1, 3 * most)) + one.flush()
     assert [row.items for row in made] == [most] * 3
 
 
-def test_intervals_are_those_of_the_grid() -> None:
+def test_intervals_start_on_the_grid() -> None:
     one = streams(rate_hz=10, values=["mean"], batch_s=0.2)
     made = one.add(samples(1, 1000))
     assert ranges(made, Stream.STATISTICS) == [
@@ -68,18 +68,18 @@ def test_intervals_are_those_of_the_grid() -> None:
     assert (second.first, second.last, second.values["temperature_c"].mean) == (100, 199, (149.5,))
 
 
-def test_what_is_due_goes_though_nothing_comes() -> None:
+def test_due_messages_are_sent_without_new_samples() -> None:
     one = streams(rate_hz=1, whole="slots", batch_s=1)
     assert one.add(samples(1000, 1010)) == []
-    assert one.look(NS_PER_S * 2) == []
-    assert one.look(NS_PER_S * 2 + LATE_NS - 1) == []
-    made = one.look(NS_PER_S * 2 + LATE_NS)
+    assert one.take_due(NS_PER_S * 2) == []
+    assert one.take_due(NS_PER_S * 2 + LATE_NS - 1) == []
+    made = one.take_due(NS_PER_S * 2 + LATE_NS)
     assert [(row.stream, row.first, row.last) for row in made] == [
         ("samples", 1000, 1010), ("statistics", 1000, 1010),
     ]  # fmt: skip
 
 
-def test_samples_that_had_no_room_are_noted_in_both_streams() -> None:
+def test_both_streams_contain_a_message_about_dropped_samples() -> None:
     one = streams(rate_hz=1, whole="slots")
     made = one.add(samples(1, 50)) + one.add([*samples(61, 70), *samples(72, 80)]) + one.flush()
     for stream in (Stream.SAMPLES, Stream.STATISTICS):
@@ -92,7 +92,7 @@ def test_samples_that_had_no_room_are_noted_in_both_streams() -> None:
     assert one.gaps == 11
 
 
-def test_a_later_run_in_the_same_boot_goes_on() -> None:
+def test_a_later_run_in_the_same_boot_continues_the_numbers() -> None:
     one = streams(rate_hz=None, whole="json")
     one.resume("samples", StreamPosition(GATEWAY.boot, "bow", "samples", 1, 100))
     one.resume("events", StreamPosition(GATEWAY.boot, "bow", "events", 1, 7))
@@ -104,7 +104,7 @@ def test_a_later_run_in_the_same_boot_goes_on() -> None:
     assert one.event(Event(0, "bow", EventKind.UP, "up"), 77)[0].first == 8
 
 
-def test_notes_keep_the_numbers() -> None:
+def test_dropped_messages_keep_the_numbers() -> None:
     one = streams(rate_hz=10, whole="json")
     made = one.add(samples(1, 1500)) + one.event(Event(0, "bow", EventKind.UP, "up"), 77)
     notes = notes_of(made, DropCause.DISK, "gw")

@@ -118,7 +118,7 @@ def test_everything_is_spooled_sent_and_removed(tmp_path: Path) -> None:
     assert bench.writer.problem == "No space left on device"
 
 
-def test_what_waited_is_sent_in_order_and_no_faster_than_is_allowed(tmp_path: Path) -> None:
+def test_waiting_messages_are_sent_in_order_with_the_allowed_rate(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path, messages_per_s=3)
     bench.broker.problem = "no route"
     for _ in range(10):
@@ -138,7 +138,7 @@ def test_what_waited_is_sent_in_order_and_no_faster_than_is_allowed(tmp_path: Pa
     assert bench.counts().missing == 0
 
 
-def test_a_rate_below_one_message_a_second_sends_one_now_and_then(tmp_path: Path) -> None:
+def test_a_rate_below_one_message_per_second_works(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path, messages_per_s=0.25)
     bench.put(5000)
     bench.work(21)
@@ -152,7 +152,7 @@ def test_a_rate_below_one_message_a_second_sends_one_now_and_then(tmp_path: Path
     assert len(commits) in (9, 10), "there is one transaction a second"
 
 
-def test_after_a_loss_everything_unacknowledged_goes_again_in_order(tmp_path: Path) -> None:
+def test_messages_without_acknowledgement_are_sent_again_in_order(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path)
     bench.broker.answers = 1
     bench.put(3000)
@@ -179,7 +179,7 @@ def test_after_a_loss_everything_unacknowledged_goes_again_in_order(tmp_path: Pa
     assert bench.counts().whole == 4000
 
 
-def test_samples_that_have_no_room_are_counted_and_noted(tmp_path: Path) -> None:
+def test_samples_without_room_are_counted_and_reported(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path)
     for _ in range(25):
         bench.put(1000)
@@ -191,7 +191,7 @@ def test_samples_that_have_no_room_are_counted_and_noted(tmp_path: Path) -> None
     assert bench.counts() == StreamCounts(1, 26_000, whole=21_000, dropped={"queue": 5000})
 
 
-def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_short_failure_of_the_disk_loses_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     bench = WriterBench(tmp_path)
     bench.put(1000)
     bench.work()
@@ -218,7 +218,7 @@ class TightSpool(Spool):
         super().commit(new, acknowledged, now_ns, utc_ns)
 
 
-def test_a_disk_without_room_for_all_that_waits_takes_it_one_by_one(tmp_path: Path) -> None:
+def test_waiting_messages_are_stored_one_by_one_on_a_full_disk(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path, spool=TightSpool(tmp_path, 100_000_000, HOUR_NS))
     bench.put(5000)
     bench.workers[0].work()
@@ -229,7 +229,7 @@ def test_a_disk_without_room_for_all_that_waits_takes_it_one_by_one(tmp_path: Pa
     assert bench.counts().whole == 5000
 
 
-def test_a_disk_that_fails_for_long_leaves_the_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_failure_of_the_disk_keeps_only_the_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.fleet.writer.PENDING_BYTES", 1 << 17)
     bench = WriterBench(tmp_path)
     bench.disk.fails = True
@@ -245,7 +245,7 @@ def test_a_disk_that_fails_for_long_leaves_the_numbers(tmp_path: Path, monkeypat
     assert counts.whole + counts.dropped["disk"] == bench.seq
 
 
-def test_a_device_that_counts_from_one_again_is_a_boot_of_its_own(tmp_path: Path) -> None:
+def test_a_device_with_a_restarted_count_gets_its_own_boot(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path)
     bench.put(1000)
     bench.seq = 0
@@ -266,7 +266,7 @@ def test_a_device_that_counts_from_one_again_is_a_boot_of_its_own(tmp_path: Path
     ]  # fmt: skip
 
 
-def test_what_waits_at_the_end_is_stored_for_the_next_run(tmp_path: Path) -> None:
+def test_waiting_messages_are_stored_at_the_end(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path, boot="1")
     bench.broker.problem = "no network"
     bench.put(2000)
@@ -291,7 +291,7 @@ def test_events_of_the_gateway_and_of_devices(tmp_path: Path) -> None:
     assert topics == ["imud/site/gw/events", "imud/site/gw/bow/events"]
 
 
-def test_the_queues_of_events_and_states_are_bounded() -> None:
+def test_the_queues_of_events_and_states_are_limited() -> None:
     queue = WriterQueue(samples_max=10, events_max=2)
     for number in range(1000):
         queue.put_event(Event(number, "", EventKind.LINK, "x"))
@@ -311,7 +311,7 @@ def test_the_queues_of_events_and_states_are_bounded() -> None:
     assert (queue.take(), queue.dropped) == (None, 0)
 
 
-def test_events_that_have_no_room_have_numbers_in_their_place(tmp_path: Path) -> None:
+def test_events_without_room_keep_their_numbers(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path, queue=WriterQueue(events_max=2))
     for _ in range(2):
         for device in ("bow", "", "bow", "bow", "", "bow"):
@@ -332,7 +332,7 @@ def test_events_that_have_no_room_have_numbers_in_their_place(tmp_path: Path) ->
 LIFTED_NS = 1_750_000_000 * NS_PER_S  # time to which systemd sets a clock without a battery: after 2020, but wrong
 
 
-def test_every_message_has_the_clock_as_it_was_when_it_was_made(tmp_path: Path) -> None:
+def test_each_message_contains_the_clock_of_its_creation(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path)
     bench.wall_clock = GatewayClock(5, LIFTED_NS, synchronised=False)
     bench.put(1000)
@@ -344,7 +344,7 @@ def test_every_message_has_the_clock_as_it_was_when_it_was_made(tmp_path: Path) 
     assert clocks == [GatewayClock(5, LIFTED_NS, synchronised=False)] * 2 + [bench.wall_clock] * 2
 
 
-def test_what_was_spooled_before_the_clock_was_set_is_not_old_when_it_is(tmp_path: Path) -> None:
+def test_messages_spooled_before_the_clock_was_set_do_not_expire(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path)
     bench.broker.problem = "no route"
     bench.utc_offset_ns, bench.wall_clock = LIFTED_NS, GatewayClock(0, LIFTED_NS, synchronised=False)
@@ -362,9 +362,7 @@ def test_what_was_spooled_before_the_clock_was_set_is_not_old_when_it_is(tmp_pat
     assert bench.counts().dropped == {"age": 1000}, "of what was spooled while the clock was set"
 
 
-def test_positions_of_this_boot_stay_when_there_are_too_many_though_the_clock_is_not_set(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_positions_of_this_boot_are_kept_with_an_unset_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.fleet.spool.POSITIONS_MAX", 20)
     old = WriterBench(tmp_path, "old")
     old.utc_offset_ns = LIFTED_NS
@@ -397,7 +395,7 @@ class HangingSpool(Spool):
 
 
 @pytest.mark.live
-def test_a_thread_that_hangs_in_the_disk_keeps_the_spool_and_loses_nothing(
+def test_a_thread_blocked_by_the_disk_keeps_the_spool_and_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("imud.host.threads.END_LIMIT_S", 0.1)

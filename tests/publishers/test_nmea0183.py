@@ -42,8 +42,8 @@ REFERENCE_NS = NS_PER_S
 LIMIT_S = 60.0
 NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (make bench-deps)"
 GPSD_VERSION = "" if NO_GPSD else subprocess.check_output(["gpsd", "-V"], text=True).split()[1]
+# Attitude in the axes of HiPNUC: right side down by 10°, bow up by 5°, heading 45°
 LEFT_45: Vector3 = (radians(10), radians(5), radians(-45))
-"""Attitude in the axes of HiPNUC: right side down by 10°, bow up by 5°, heading 45°."""
 
 
 class Asked:
@@ -152,7 +152,7 @@ async def test_each_udp_address_gets_the_sentences() -> None:
 
 @pytest.mark.parametrize("convention", [None, *Convention])
 @in_output(sentences={"PASHR": 1.0, "HDG": 1.0, "XDR": 1.0, "ROT": 1.0})
-async def test_values_are_those_of_ships_whatever_the_axes_are(
+async def test_values_use_the_axes_of_ships_for_all_device_axes(
     bench: OutputBench, convention: Convention | None
 ) -> None:
     frame = published_frame(None, convention, None, AS_SENT.device)
@@ -182,7 +182,7 @@ async def test_pynmea2_reads_the_attitude_of_pashr(bench: OutputBench) -> None:
 
 
 @in_output(sentences={"ROT": 10.0})
-async def test_the_rate_of_turn_is_the_mean_since_the_last(bench: OutputBench) -> None:
+async def test_the_rate_of_turn_is_the_mean_since_the_previous_sentence(bench: OutputBench) -> None:
     bench.publish(1, euler=(0.0, 0.0, 0.0))
     for number in range(100):  # vibration of 500 Hz and a turn of 1° per second to starboard
         bench.publish(1, euler=(0.0, 0.0, 0.0), gyro_z=radians(-1.0 + (20.0 if number % 2 else -20.0)))
@@ -190,7 +190,7 @@ async def test_the_rate_of_turn_is_the_mean_since_the_last(bench: OutputBench) -
 
 
 @in_output(heading=Heading.RELATIVE, declination_deg=None, sentences={"HDT": 100.0})
-async def test_the_reference_is_looked_up_again(bench: OutputBench) -> None:
+async def test_the_heading_reference_is_read_again(bench: OutputBench) -> None:
     bench.publish()
     statuses = bench.context.devices.status()
     known = FrameStatus("", "device", "", "", Heading.TRUE, None, {})
@@ -202,7 +202,7 @@ async def test_the_reference_is_looked_up_again(bench: OutputBench) -> None:
 
 
 @in_loop
-async def test_the_only_device_is_sent_and_of_several_the_named_one(caplog: pytest.LogCaptureFixture) -> None:
+async def test_the_only_device_or_the_configured_device_is_used(caplog: pytest.LogCaptureFixture) -> None:
     bench = OutputBench(sentences={"HDT": 100.0})
     assert bench.asked.of == {WHO: (10 * NS_PER_MS, ("bow",))}
     bench.output.add_device("mast", 1)
@@ -244,7 +244,7 @@ async def test_the_only_device_is_sent_and_of_several_the_named_one(caplog: pyte
         ({"serial_port": "/dev/ttyS0", "serial_baud": 4800}, "480 bytes per second at 4800 bit/s, got 844"),
     ],
 )
-def test_settings_that_are_refused(given: dict[str, object], words: str) -> None:
+def test_invalid_options_are_rejected(given: dict[str, object], words: str) -> None:
     assert words in "; ".join(map(str, wrong_values(Nmea0183Options, given)))
 
 
@@ -254,7 +254,7 @@ def test_addresses() -> None:
 
 
 @pytest.mark.parametrize("kind", Formatter)
-def test_the_usual_size_of_a_sentence_is_no_less_than_a_full_one(kind: Formatter) -> None:
+def test_usual_bytes_covers_complete_sentences(kind: Formatter) -> None:
     full = Sample(
         "bow", 1, 0, 0, Sync.ARRIVAL, 0, NS_PER_S, euler_rad=(radians(-80), radians(-80), radians(211.5)),
         gyro_rad_s=(0.0, 0.0, radians(-0.3)), temperature_c=23.4, pressure_pa=101_325.0,
@@ -309,7 +309,7 @@ async def reports(port: int, bench: OutputBench, enough: int) -> tuple[list[dict
 @pytest.mark.live
 @pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)
 @in_loop
-async def test_gpsd_takes_all_sentences_and_reports_what_it_knows_of_them() -> None:
+async def test_gpsd_accepts_all_sentences_and_reports_their_values() -> None:
     """The bow turns to starboard at 2° per second, right side down by 10°, bow up by 5°.
 
     gpsd 3.22 reports only the heading. The test checks signs and units of all other values that a newer gpsd reports.

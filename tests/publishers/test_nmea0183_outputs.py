@@ -70,7 +70,7 @@ async def test_every_client_gets_every_sentence(made: Server) -> None:
 
 
 @in_context("made", serving)
-async def test_what_a_client_sends_is_ignored_and_it_stays_while_there_is_nothing_to_send(made: Server) -> None:
+async def test_data_from_a_client_is_ignored_and_an_idle_client_stays_connected(made: Server) -> None:
     client = await made.connected()
     client.sendall(b"?WATCH={}\r\n" * 1000)
     for _ in range(20):
@@ -85,7 +85,7 @@ async def test_what_a_client_sends_is_ignored_and_it_stays_while_there_is_nothin
 
 
 @in_context("made", serving)
-async def test_a_client_that_does_not_read_loses_whole_sentences_and_is_disconnected(made: Server) -> None:
+async def test_a_client_that_does_not_read_loses_complete_sentences_and_is_disconnected(made: Server) -> None:
     client = await made.connected()
     for _ in range(200):
         made.put(BUSY)
@@ -112,7 +112,7 @@ async def test_a_client_that_does_not_read_loses_whole_sentences_and_is_disconne
 
 
 @in_context("made", serving)
-async def test_one_client_too_many_is_refused(made: Server) -> None:
+async def test_clients_above_the_limit_are_rejected(made: Server) -> None:
     for _ in range(CLIENTS_MAX):
         await made.connected()
     one_more = made.connect()
@@ -132,7 +132,7 @@ async def test_one_client_too_many_is_refused(made: Server) -> None:
 
 
 @in_context("made", serving)
-async def test_a_port_that_is_taken(made: Server) -> None:
+async def test_a_port_in_use_is_reported(made: Server) -> None:
     with pytest.raises(ServerError, match=r"nmea0183\.tcp_port"):
         TcpOutput("127.0.0.1", made.port, VirtualClock().now_ns).open()
 
@@ -148,7 +148,7 @@ def test_datagrams() -> None:
         made.close()
 
 
-def test_datagrams_without_a_way_are_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_datagrams_without_a_route_are_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     made = UdpOutput("127.0.0.1", 9)
     made.put(ONE + b"x" * 70_000)  # longer than the maximum of a datagram
     made.put(ONE + b"x" * 70_000)
@@ -170,7 +170,7 @@ class Port:
 
 
 @in_loop
-async def test_a_serial_port_that_goes_away_is_opened_again() -> None:
+async def test_a_lost_serial_port_is_opened_again() -> None:
     clock, ports = VirtualClock(), [Port(), Port()]
     tried: list[int] = []
 
@@ -208,7 +208,7 @@ async def test_a_serial_port_that_goes_away_is_opened_again() -> None:
 
 
 @in_loop
-async def test_a_full_serial_line_drops_whole_sentences() -> None:
+async def test_a_full_serial_port_drops_complete_sentences() -> None:
     clock, port = VirtualClock(), Port()
     made = SerialOutput(port.path, 4800, clock.now_ns)
     made.tick(clock.now_ns())
@@ -228,7 +228,7 @@ async def test_a_full_serial_line_drops_whole_sentences() -> None:
 
 
 @in_loop
-async def test_a_port_that_opens_while_the_output_is_closed_is_closed() -> None:
+async def test_a_port_opened_after_the_end_is_closed() -> None:
     clock, port = VirtualClock(), Port()
     fds: list[int] = []
 

@@ -56,12 +56,12 @@ def test_roll_pitch_temperature_pressure() -> None:
     assert body(Formatter.XDR, sample(euler_deg=None), MAGNETIC) is None
 
 
-def test_a_talker_for_all() -> None:
+def test_the_configured_talker_is_used_for_all_sentences() -> None:
     assert body(Formatter.HDT, sample(), TRUE, "II") == "IIHDT,45.0,T"
     assert str(body(Formatter.PASHR, sample(), TRUE, "II")).startswith("PASHR,")
 
 
-def test_the_rate_of_turn_is_that_of_the_heading() -> None:
+def test_the_rate_of_turn_is_the_rate_of_the_heading() -> None:
     level = sample((0, 0, 0), (5, 5, 2))
     assert turn_rate_rad_s(level) == pytest.approx(radians(2))
     # right side down by 90°: a rotation about y changes the heading

@@ -59,7 +59,7 @@ def test_row_and_defaults() -> None:
         ({"slotz": 64}, "slotz"),
     ],
 )
-def test_settings_that_cannot_be(values: dict[str, object], message: str) -> None:
+def test_invalid_options_are_reported(values: dict[str, object], message: str) -> None:
     with pytest.raises(msgspec.ValidationError, match=message):
         msgspec.convert(values, ShmOptions)
 
@@ -72,7 +72,7 @@ def test_file_of_a_new_ring(board: Board) -> None:
     assert status.st_blocks * 512 >= status.st_size  # st_blocks counts units of 512 bytes: all blocks are allocated
 
 
-def test_ring_is_whole_before_it_appears(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ring_is_complete_before_it_appears(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[bool, layout.RingHeader, int]] = []
     rename = os.rename
 
@@ -91,7 +91,7 @@ def test_ring_is_whole_before_it_appears(tmp_path: Path, monkeypatch: pytest.Mon
     assert (existed, header.device, header.state, mode) == (False, DEVICE, layout.STATE_LIVE, 0o640)
 
 
-def test_slots_lie_where_their_number_says_and_the_ring_wraps(board: Board) -> None:
+def test_slots_are_at_the_position_of_their_number_and_the_ring_wraps(board: Board) -> None:
     board.publish([1, 2])
     board.publish([3])
     assert (board.word("newest_seq"), board.word("first_seq")) == (3, 1)
@@ -105,7 +105,7 @@ def test_slots_lie_where_their_number_says_and_the_ring_wraps(board: Board) -> N
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_batches_leave_the_same_bytes_as_their_samples_one_by_one(tmp_path: Path, seed: int) -> None:
+def test_batches_and_single_samples_write_the_same_bytes(tmp_path: Path, seed: int) -> None:
     random = Random(seed)
     for name in ("one", "many"):
         (tmp_path / name).mkdir()
@@ -220,7 +220,7 @@ def test_tick_shows_ledger_driver_and_heartbeat_and_writes_what_changed(board: B
     assert board.word("heartbeat_ns") == board.now_ns
 
 
-def test_a_tick_asks_for_ledgers_and_not_for_the_state_where_they_have_a_source(tmp_path: Path) -> None:
+def test_a_tick_reads_ledgers_without_the_complete_state(tmp_path: Path) -> None:
     def whole_state() -> list[DeviceStatus]:
         raise AssertionError("the state of every device was made for its ledger")
 
@@ -234,7 +234,7 @@ def test_a_tick_asks_for_ledgers_and_not_for_the_state_where_they_have_a_source(
     publisher.close()
 
 
-def test_close_tells_readers_and_removes_the_file(board: Board) -> None:
+def test_close_marks_the_ring_and_removes_the_file(board: Board) -> None:
     with board.path.open("rb") as file:
         board.ledger.bytes_in, board.now_ns = 9, START_NS + 7
         board.publisher.close()
@@ -256,7 +256,7 @@ def test_close_leaves_the_ring_of_a_successor(board: Board) -> None:
     assert board.path.read_bytes() == b"new"
 
 
-def test_what_is_not_for_the_ring_is_ignored(board: Board) -> None:
+def test_events_and_unknown_devices_are_ignored(board: Board) -> None:
     before = board.path.read_bytes()
     board.publisher.event(Event(1, DEVICE, EventKind.UP, "found"))
     board.publisher.publish(Batch("another", 4, [make_sample(1, "another")]))
@@ -270,7 +270,7 @@ def test_what_is_not_for_the_ring_is_ignored(board: Board) -> None:
     board.publisher.remove_device(DEVICE)
 
 
-def test_leftovers_of_a_daemon_that_died_while_starting(tmp_path: Path) -> None:
+def test_temporary_files_of_a_dead_daemon_are_removed(tmp_path: Path) -> None:
     (tmp_path / f".imud.{DEVICE}.new").write_bytes(b"half")
     board = Board(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == [f"imud.{DEVICE}"]
@@ -315,9 +315,7 @@ def test_second_daemon_is_refused(tmp_path: Path) -> None:
         Board(tmp_path).publisher.close()  # the ring can be created immediately
 
 
-def test_ring_that_another_daemon_has_taken_over_is_left_to_it(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_ring_of_another_daemon_is_not_replaced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     board = Board(tmp_path)
     board.path.unlink()
     with other_daemon(tmp_path) as other:
@@ -337,7 +335,7 @@ def test_ring_that_another_daemon_has_taken_over_is_left_to_it(
     board.publisher.close()
 
 
-def test_reader_cannot_pose_as_a_daemon(tmp_path: Path) -> None:
+def test_lock_of_a_reader_is_not_the_lock_of_a_daemon(tmp_path: Path) -> None:
     first = Board(tmp_path)
     first.die()
     with first.path.open("rb") as file:
@@ -375,7 +373,9 @@ def test_file_of_an_earlier_daemon_is_replaced(tmp_path: Path, leave: Callable[[
         board.publisher.close()
 
 
-def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_full_memory_delays_the_ring(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """The daemon runs without the ring, logs it once, and creates the ring when there is room."""
     tries: list[int] = []
 
@@ -410,7 +410,7 @@ def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: py
     assert not board.context.outputs.without_ring
 
 
-def test_directory_that_is_not_there_or_not_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_or_read_only_directory_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ServerError, match="expected a directory for shared memory"):
         make(tmp_path / "none").start()
     monkeypatch.setattr(os, "access", lambda *_, **__: False)
@@ -418,7 +418,7 @@ def test_directory_that_is_not_there_or_not_writable(tmp_path: Path, monkeypatch
         make(tmp_path).start()
 
 
-def test_file_that_cannot_be_made(caplog: pytest.LogCaptureFixture) -> None:
+def test_file_that_cannot_be_created_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     publisher = make(Path("/proc"))
     publisher.add_device(DEVICE, 0)
     assert "check the permissions of /proc" in caplog.text

@@ -70,7 +70,7 @@ def plant(path: Path, kind: str) -> None:
 
 @needs_root
 @pytest.mark.parametrize("kind", [kind for kind in HOSTILE if kind != "directory with content"])
-def test_what_has_the_name_gives_way(shared: Path, kind: str) -> None:
+def test_other_files_with_the_name_are_replaced(shared: Path, kind: str) -> None:
     """As root, the daemon can replace files of other users."""
     plant(shared / f"imud.{DEVICE}", kind)
     board = Board(shared)
@@ -121,7 +121,7 @@ def ask(process: subprocess.Popen[str], command: str) -> None:
 
 @needs_root
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_what_cannot_be_replaced_costs_one_ring_only(shared: Path, kind: str) -> None:
+def test_a_file_that_cannot_be_replaced_affects_one_ring_only(shared: Path, kind: str) -> None:
     """Without this permission, the daemon creates the ring when the name is free."""
     path = shared / f"imud.{DEVICE}"
     plant(path, kind)
@@ -172,7 +172,7 @@ def test_daemon_starts_reloads_and_stops(tmp_path: Path, shared: Path, kind: str
         (0, 0o775, "has mode 0775: other users can replace"),
     ],
 )
-def test_directory_that_others_rule(shared: Path, uid: int, mode: int, message: str) -> None:
+def test_directory_that_other_users_can_change_is_rejected(shared: Path, uid: int, mode: int, message: str) -> None:
     shared.chmod(mode)
     os.chown(shared, uid, uid)
     with pytest.raises(ServerError, match=message):
@@ -185,14 +185,14 @@ def test_directory_that_others_rule(shared: Path, uid: int, mode: int, message: 
         (lambda path: path.symlink_to("real"), "a symbolic link"), (os.mkfifo, "Not a directory"),
     ],
 )  # fmt: skip
-def test_what_is_no_directory(tmp_path: Path, make: Callable[[Path], object], why: str) -> None:
+def test_paths_that_are_not_a_directory_are_rejected(tmp_path: Path, make: Callable[[Path], object], why: str) -> None:
     (tmp_path / "real").mkdir()
     make(tmp_path / "shm")
     with pytest.raises(ServerError, match=rf"expected a directory for shared memory \({why}\)"):
         RingDirectory(str(tmp_path / "shm"))
 
 
-def test_directory_of_the_user_where_the_system_has_none(
+def test_directory_of_the_user_replaces_a_missing_default(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     system, own = tmp_path / "none" / "imud" / "shm", tmp_path / "run"
@@ -219,7 +219,7 @@ def test_directory_of_the_user_where_the_system_has_none(
     found.close()
 
 
-def test_reader_looks_where_the_daemon_may_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reader_searches_all_directories_of_the_daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own = tmp_path / "imud" / "shm"
     own.mkdir(parents=True)
     (tmp_path / "system").mkdir()
@@ -241,7 +241,7 @@ def test_reader_looks_where_the_daemon_may_be(tmp_path: Path, monkeypatch: pytes
 # -----------------------------------------------------------------------------------------
 
 
-def test_removed_ring_is_made_anew(board: Board, caplog: pytest.LogCaptureFixture) -> None:
+def test_removed_ring_is_created_again(board: Board, caplog: pytest.LogCaptureFixture) -> None:
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         board.publish([1, 2])
         board.path.unlink()
@@ -271,7 +271,7 @@ def test_slow_reader_of_a_removed_ring(board: Board) -> None:
 
 @pytest.mark.parametrize("size_bytes", [0, 1, HEADER_BYTES, HEADER_BYTES + SLOT_BYTES])
 @pytest.mark.parametrize("first", ["publish", "tick", "read", "close"])
-def test_cut_ring_is_made_anew(tmp_path: Path, size_bytes: int, first: str) -> None:
+def test_truncated_ring_is_created_again(tmp_path: Path, size_bytes: int, first: str) -> None:
     board = Board(tmp_path)
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         board.publish([1, 2])
@@ -304,7 +304,7 @@ def test_new_ring_before_its_first_sample(board: Board) -> None:
         assert ring.read() == ([make_sample(3)], 0)
 
 
-def test_ring_cut_by_a_byte(board: Board) -> None:
+def test_ring_truncated_by_a_byte(board: Board) -> None:
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         board.publish([1, 2])
         os.truncate(board.path, RING_BYTES - 1)
@@ -315,7 +315,7 @@ def test_ring_cut_by_a_byte(board: Board) -> None:
         assert ring.read() == ([make_sample(4)], 1)
 
 
-def test_reader_of_a_cut_ring_has_its_pages_back(board: Board) -> None:
+def test_reader_of_a_truncated_ring_keeps_its_pages(board: Board) -> None:
     """A reader that does not check the file still has its pages: imud restores the size and marks the file as
     closed."""
     board.publish([1])
@@ -338,7 +338,7 @@ def test_ring_replaced_by_another_file(board: Board) -> None:
         assert ring.read() == ([make_sample(2)], 0)
 
 
-def test_directory_removed_and_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_directory_removed_and_created_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     folder = tmp_path / "shm"
     folder.mkdir()
     board = Board(folder)
@@ -359,7 +359,7 @@ def test_directory_removed_and_made_again(tmp_path: Path, caplog: pytest.LogCapt
     assert not list(folder.iterdir())
 
 
-def test_descriptors_are_given_back(tmp_path: Path) -> None:  # a fixture of tests/conftest.py checks the descriptors
+def test_descriptors_are_closed(tmp_path: Path) -> None:  # a fixture of tests/conftest.py checks the descriptors
     board = Board(tmp_path)
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         for _ in range(20):
@@ -441,7 +441,7 @@ def test_names_of_rings_in_a_message(tmp_path: Path) -> None:
     assert len(message) < 500
 
 
-def test_leftovers_are_not_looked_for_without_end(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_search_for_temporary_files_is_limited(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(directory, "LEFTOVERS_MAX", 3)
     for number in range(10):
         (shared / f".imud.{number}.new").touch()

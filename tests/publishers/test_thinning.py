@@ -18,7 +18,7 @@ def taken(pace: Pace, times_ns: list[int]) -> list[int]:
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 3.0, 7.3, 99.9, 100.0, 300.0])
-def test_it_takes_the_sample_nearest_to_each_due_instant(rate_hz: float) -> None:
+def test_the_sample_nearest_to_each_due_time_is_selected(rate_hz: float) -> None:
     rng = random.Random(5)
     times_ns = [START_NS]
     while times_ns[-1] < START_NS + 10_000_000_000:
@@ -32,7 +32,7 @@ def test_it_takes_the_sample_nearest_to_each_due_instant(rate_hz: float) -> None
 
 
 @pytest.mark.parametrize("device_hz", [99.99, 100.0, 100.01])
-def test_a_device_that_sends_just_at_the_rate_has_its_samples_taken(device_hz: float) -> None:
+def test_all_samples_of_a_device_with_the_same_rate_are_selected(device_hz: float) -> None:
     rng = random.Random(7)
     times_ns = [START_NS + int(k * 1e9 / device_hz) + rng.randrange(-300_000, 300_000) for k in range(30_000)]
     times_ns[100:103] = times_ns[1_000:1_001] = []  # a lost sample does not affect other samples
@@ -40,7 +40,7 @@ def test_a_device_that_sends_just_at_the_rate_has_its_samples_taken(device_hz: f
     assert len(taken(Pace(100.0), times_ns)) >= len(times_ns) - 5
 
 
-def test_it_does_not_drift_in_a_day() -> None:
+def test_the_selection_does_not_drift_in_a_day() -> None:
     pace, instants = Pace(3.0), 259_200
     times_ns = [START_NS + ceil(k * 1e9 / 3.0) for k in range(instants)]
     assert sum(pace.is_due(t_ns, 333_333_333) for t_ns in times_ns) == instants
@@ -49,7 +49,7 @@ def test_it_does_not_drift_in_a_day() -> None:
     )  # half a sample period before due time number 259,200
 
 
-def test_a_rate_above_the_device_s_takes_everything() -> None:
+def test_a_rate_above_the_sample_rate_selects_all_samples() -> None:
     for step_ns, rates_hz in ((1_000_000, (1000.0, 1001.0, 1e6)), (1, (1e9, 5e9, 1e300))):
         times_ns = [START_NS + k * step_ns for k in range(100)]
         for rate_hz in rates_hz:
@@ -81,7 +81,7 @@ def test_a_thinner_chooses_for_each_rate_across_batches() -> None:
     assert not thinner.choose(samples(31 * ms))
 
 
-def test_a_mean_leaves_out_what_has_no_rate() -> None:
+def test_the_mean_ignores_samples_without_angular_rate() -> None:
     mean = MeanRate()
     assert mean.take() is None
     bare = Sample("bow", 1, 0, 0, Sync.ARRIVAL, 0, 0)

@@ -505,6 +505,7 @@ CLIENT_FAMILIES: Final = (
     ),
 )  # fmt: skip
 
+# All metrics in the order of the output
 FAMILIES: Final[tuple[Family | Histogram, ...]] = (
     *DAEMON_FAMILIES,
     *DEVICE_FAMILIES,
@@ -516,7 +517,6 @@ FAMILIES: Final[tuple[Family | Histogram, ...]] = (
     LATENCY,
     *CLIENT_FAMILIES,
 )
-"""All metrics in the order of the output."""
 
 
 def _mqtt(read: Callable[[MqttStatus], float]) -> Reader:

@@ -35,11 +35,11 @@ class Snapshot:
     events: Sequence[tuple[tuple[str, str], int]] = ()  # number of events by device and kind
     heartbeat_age_ns: int = 0
     log_messages_dropped: int = 0
+    # Number of samples sent to all clients until the scrape, including disconnected clients
     client_samples_sent: int = 0
-    """Number of samples sent to all clients until the scrape, including disconnected clients."""
     client_samples_dropped: int = 0
+    # Path of the ring of each device; empty if imud could not create it
     rings: Mapping[str, str] = field(default_factory=dict)
-    """Path of the ring of each device; empty if imud could not create it."""
     views: Mapping[str, RingView] = field(default_factory=dict)  # content of the rings
     recorders: Sequence[RecorderStatus] = ()  # state of the recorder, if it runs
     flights: Sequence[FlightStatus] = ()  # state of the flight recorder, if it runs
@@ -115,8 +115,8 @@ class Histogram:
     name: str
     help: str
     bounds_ns: Sequence[int]  # Upper bounds of the buckets. The last bucket has no bound.
+    # Returns the number of values per bucket and the sum of all values, ns
     read: Callable[[DeviceStatus], tuple[Sequence[int], int]]
-    """Returns the number of values per bucket and the sum of all values, ns."""
 
     def metric(self, snapshot: Snapshot) -> Metric:
         """Return the metric with cumulative counts, as Prometheus requires."""
@@ -132,8 +132,8 @@ class Histogram:
         return metric
 
 
+# Name and record of each device. None if the device has no such record: its metrics are then absent.
 Parts = Iterable[tuple[str, T | None]]
-"""Name and record of each device. None if the device has no such record: its metrics are then absent."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,10 +47,10 @@ from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, Scr
 
 log = logging.getLogger(__name__)
 
+# Time limit for the reply of the event loop, s. After it, the scrape reports a blocked event loop.
 SNAPSHOT_S: Final = 2.0
-"""Time limit for the reply of the event loop, s. After it, the scrape reports a blocked event loop."""
+# Pause of the HTTP thread, s. The kernel needs some ten microseconds to wake the thread of the event loop.
 PAUSE_S: Final = 100e-6
-"""Pause of the HTTP thread, s. The kernel needs some ten microseconds to wake the thread of the event loop."""
 
 SAMPLES_PER_TURN: Final = 64  # Number of lines rendered without a pause. One line costs about 4 us.
 
@@ -276,7 +276,7 @@ class MetricsPublisher:
             finally:
                 del self._pages[content_type]
             newest = {device.name: device.newest_seq for device in snapshot.devices}
-            views = self._rings.look(snapshot.rings, newest, self._scraped_ns)
+            views = self._rings.read(snapshot.rings, newest, self._scraped_ns)
             return self._renderer.render(replace(snapshot, views=views), accept)
 
     async def _ask_loop(self) -> Snapshot:

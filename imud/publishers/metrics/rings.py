@@ -30,19 +30,18 @@ from imud.model.errors import ServerError
 from imud.model.sample import Vector3
 from imud.model.units import NS_PER_S
 
+# Minimum time between two readings of the rings, ns. Scrapes in between return the same values.
 LOOK_NS: Final = NS_PER_S
-"""Minimum time between two readings of the rings, ns. Scrapes in between return the same values."""
+# Maximum number of slots per device: a complete ring of the default size, 4 s at 1 kHz, 1 MB and about 2 ms of CPU time
 SAMPLES_MAX: Final = 4096
-"""Maximum number of slots per device: a complete ring of the default size, 4 s at 1 kHz, 1 MB and about 2 ms of CPU
-time."""
 SPAN_MIN_NS: Final = 10 * NS_PER_S  # Minimum span, ns. A second scraper must not shorten the span of the first.
+# Number of values between two pauses, 0.3 ms. A pause takes long if many programs need CPU time.
 VALUES_PER_TURN: Final = 4096
-"""Number of values between two pauses, 0.3 ms. A pause takes long if many programs need CPU time."""
 BLOCK_NS: Final = NS_PER_S
 BLOCK_SAMPLES_MIN: Final = 8  # minimum number of samples in a block for vibration
+# Number of slots that imud ignores next to the slot that is being written, because a reader can see the stores of the
+# writer in another order
 OVERTAKEN_SLOTS: Final = 8
-"""Number of slots that imud ignores next to the slot that is being written, because a reader can see the stores of the
-writer in another order."""
 
 _OFFSETS: Final = {field.name: field.offset for field in SLOT_FIELDS}
 _WORDS: Final = SLOT_BYTES // 8
@@ -57,15 +56,15 @@ class MotionValues(NamedTuple):
     span_ns: int  # time from the oldest to the newest sample of the span
     attitude_rad: Vector3 | None  # roll, pitch and yaw of the newest sample, in the published convention
     accel_norm_m_s2: float | None  # norm of the mean acceleration over the newest block
-    vibration_rms_m_s2: Vector3 | None  # x, Y, Z; None if no block has BLOCK_SAMPLES_MIN samples
+    vibration_rms_m_s2: Vector3 | None  # X, Y, Z; None if no block has BLOCK_SAMPLES_MIN samples
     vibration_peak_m_s2: Vector3 | None  # maximum deviation from the mean of a block
 
 
 class RingView(NamedTuple):
     """State of the ring of one device."""
 
-    written: bool  # true if the file exists and the daemon writes it
-    motion: MotionValues | None = None  # none without samples in the span, or if the option `motion` is off
+    written: bool  # True if the file exists and the daemon writes it
+    motion: MotionValues | None = None  # None without samples in the span, or if the option `motion` is off
 
 
 class RingReader:
@@ -78,7 +77,7 @@ class RingReader:
         self._looked_ns: int | None = None
         self._views: dict[str, RingView] = {}
 
-    def look(self, rings: Mapping[str, str], newest: Mapping[str, int], now_ns: int) -> Mapping[str, RingView]:
+    def read(self, rings: Mapping[str, str], newest: Mapping[str, int], now_ns: int) -> Mapping[str, RingView]:
         """Return the views by device. Return the previous views if they are not older than LOOK_NS.
 
         `rings` contains the path of each ring, empty if imud could not create it. `newest` contains the newest sequence

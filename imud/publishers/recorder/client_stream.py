@@ -20,12 +20,11 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.publishers.recorder.writer import WRITE_NS, RecordFeed, RecordQueue
 
 FLAGS: Final = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
+# Requested size of the socket buffer, bytes. The kernel limits it, usually to 208 KiB (net.core.wmem_max), two blocks.
 BUFFER_BYTES: Final = 1 << 20
-"""Requested size of the socket buffer, bytes. The kernel limits it, usually to 208 KiB (net.core.wmem_max), two
-blocks."""
 CLOSE_TRIES: Final = 10
+# Interval of the checks during half a second in which a client can receive waiting records when imud ends, ms
 CLOSE_WAIT_MS: Final = 50
-"""Interval of the checks during half a second in which a client can receive waiting records when imud ends, ms."""
 FULL_NS: Final = 20 * NS_PER_MS  # time between two attempts on a full socket, ns: 10 MB/s with 208 KiB
 LINGER_NS: Final = 10 * NS_PER_S  # time without progress after which a client loses the rest of an ended recording, ns
 
@@ -49,7 +48,7 @@ class BlockSender:
 
     def __init__(self, sock: socket.socket, now_ns: Callable[[], int]) -> None:
         self.sent_bytes = 0
-        self.ended = False  # true if the socket is closed: all blocks were sent, or the client disconnected
+        self.ended = False  # True if the socket is closed: all blocks were sent, or the client disconnected
         self._sock = sock
         self._now_ns = now_ns
         self._rest = memoryview(b"")

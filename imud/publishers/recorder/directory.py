@@ -17,8 +17,8 @@ from imud.model.units import NS_PER_S
 
 SUFFIX: Final = ".imudrec"
 SNAPSHOT: Final = "-snapshot"  # suffix of the name of a snapshot
+# File names of the recorder. imud removes only these files.
 NAME: Final = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{6}(-snapshot)?\.imudrec")
-"""File names of the recorder. imud removes only these files."""
 FILES_MAX: Final = 100_000  # maximum number of files that imud reads from the directory
 RETRY_NS: Final = 60 * NS_PER_S  # time between two attempts on a full or failed disk, ns
 
@@ -37,8 +37,8 @@ class RecordingDirectory:
         self.path = path
         self.removed = 0  # number of files removed since the start
         self.in_use: set[str] = set()  # names of open files, which imud does not remove
+        # Size of the files that are not open, from the last measurement and the files added after it
         self.kept_bytes = 0
-        """Size of the files that are not open, from the last measurement and the files added after it."""
         self._keep_bytes = keep_bytes
         self._lock = Lock()
 

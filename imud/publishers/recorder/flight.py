@@ -90,8 +90,8 @@ class AlertGate:
         return alert
 
 
+# Maximum number of segments. Each segment needs a descriptor. The flight recorder uses half of them.
 SEGMENTS_MAX: Final = 64
-"""Maximum number of segments. Each segment needs a descriptor. The flight recorder uses half of them."""
 
 
 class SegmentBegin(NamedTuple):
@@ -461,13 +461,13 @@ def _is_sent(sender: BlockSender, reader: SegmentReader) -> bool:
 
 log = logging.getLogger(__name__)
 
+# Minimum length of a segment, ns. A segment starts with the state of each device, 17 kB at 1 kHz: a twentieth of the
+# data of 5 s.
 SEGMENT_NS_MIN: Final = 5 * NS_PER_S
-"""Minimum length of a segment, ns. A segment starts with the state of each device, 17 kB at 1 kHz: a twentieth of the
-data of 5 s."""
+# Number of segments in the maximum size. imud drops not much more than a sixteenth at a time.
 SEGMENTS_OF_BYTES: Final = 16
-"""Number of segments in the maximum size. imud drops not much more than a sixteenth at a time."""
+# Maximum number of clients that receive a snapshot at a time. Each keeps the memory of dropped segments.
 SENDS_MAX: Final = 4
-"""Maximum number of clients that receive a snapshot at a time. Each keeps the memory of dropped segments."""
 
 
 class FlightRecorder:
@@ -575,8 +575,8 @@ class FlightRecorder:
             self._begin_segment(now_ns)
         self._save_due(now_ns)
         while writer.saved:
-            self._tell(writer.saved.popleft(), now_ns)
-        self._look_after(writer.problem, now_ns)
+            self._report(writer.saved.popleft(), now_ns)
+        self._report_problem(writer.problem, now_ns)
 
     def close(self) -> None:
         """Save a pending snapshot and drop all segments. A second call does nothing."""
@@ -592,7 +592,7 @@ class FlightRecorder:
         self._feed.stop()
         writer.close()
         while writer.saved:
-            self._tell(writer.saved.popleft(), now_ns)
+            self._report(writer.saved.popleft(), now_ns)
 
     def snapshot(self, sock: socket.socket) -> float:
         """Send a snapshot to the socket of a client and close the socket. Return the length, s. Raises ServerError."""
@@ -661,7 +661,7 @@ class FlightRecorder:
         self._feed.check()
         self._queue.mark(Save(path, self._feed.ending(alert.reason)))
 
-    def _tell(self, saved: Saved, now_ns: int) -> None:
+    def _report(self, saved: Saved, now_ns: int) -> None:
         alert = self._saving.pop(saved.path, None)
         device, reason = (
             ("", "data of an imud process that was killed") if alert is None else (alert.device, alert.reason)
@@ -673,7 +673,7 @@ class FlightRecorder:
         else:
             self._raise(now_ns, f"saved {saved.path}: {reason}", device, file=str(saved.path), bytes=saved.bytes)
 
-    def _look_after(self, problem: str, now_ns: int) -> None:
+    def _report_problem(self, problem: str, now_ns: int) -> None:
         if problem == self._problem:
             return
         before, self._problem = self._problem, problem

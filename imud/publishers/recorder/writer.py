@@ -25,13 +25,13 @@ from imud.model.errors import reason_of
 from imud.model.event import Event
 from imud.model.units import NS_PER_S
 
+# Maximum size of the queue, bytes: 2 minutes of a device at 1 kHz, 5 s of 24 devices. An SD card can stall for a second
+# while it erases.
 QUEUE_BYTES: Final = 16 << 20
-"""Maximum size of the queue, bytes: 2 minutes of a device at 1 kHz, 5 s of 24 devices. An SD card can stall for a
-second while it erases."""
 RING_BYTES: Final = 256 << 10  # size that wakes the thread, bytes: one full block
 WRITE_NS: Final = NS_PER_S  # Time between two writes, ns. If the process is killed, newer records are lost.
+# Time between two synchronizations with the disk, ns. A power failure loses newer records.
 SYNC_NS: Final = 5 * NS_PER_S
-"""Time between two synchronizations with the disk, ns. A power failure loses newer records."""
 FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_APPEND
 
 M = TypeVar("M")  # type of the marks between records, for example the path of a new file; never bytes
@@ -96,12 +96,12 @@ class RecordingWriter:
         self.written_bytes = 0  # size of all files since the start
         self.records = 0  # number of written records
         self.problem = ""  # cause of a failed write, until the next file starts; empty if there is no problem
+        self.failure: BaseException | None = None  # internal error that ended the thread
         self._queue = queue
         self._now_ns = now_ns
         self._gatherer = BlockGatherer()
         self._descriptor = -1
         self._synced_ns = now_ns()
-        self._failure: BaseException | None = None
         self._worker = start_worker("recorder", self._round, self._failed)
         queue.ring = self._worker.ring
 
@@ -111,11 +111,6 @@ class RecordingWriter:
         self._worker.end()
         self._round()
         self._close_file()
-
-    @property
-    def failure(self) -> BaseException | None:
-        """Internal error that ended the thread."""
-        return self._failure
 
     # --- thread -------------------------------------------------------------------------------------------------------
 
@@ -178,14 +173,14 @@ class RecordingWriter:
             os.close(descriptor)
 
     def _failed(self, error: BaseException) -> None:
-        self._failure = error
+        self.failure = error
 
 
+# Interval of the check records, ns. They contain the newest sample and the ledger, with which a replay is compared.
 CHECK_NS: Final = NS_PER_S
-"""Interval of the check records, ns. They contain the newest sample and the ledger, with which a replay is compared."""
+# Maximum time for the description of devices in one tick, ns, except the last device. One state takes 0.6 ms. The next
+# ticks describe the other devices, so that a new recording does not delay samples.
 BEGIN_NS: Final = 2_000_000
-"""Maximum time for the description of devices in one tick, ns, except the last device. One state takes 0.6 ms. The next
-ticks describe the other devices, so that a new recording does not delay samples."""
 
 
 class RecordFeed:

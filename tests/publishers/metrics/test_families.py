@@ -102,7 +102,7 @@ LEDGER_LINES = {
 }
 
 
-def test_every_ledger_number_is_shown_as_it_is() -> None:
+def test_each_ledger_counter_has_a_metric() -> None:
     shown = rendered(Snapshot(DEVICES))
     assert set(LEDGER_LINES) == set(LEDGER_FIELDS)
     for status in DEVICES:
@@ -110,7 +110,7 @@ def test_every_ledger_number_is_shown_as_it_is() -> None:
             assert shown[key(name, device=status.name, **labels)] == status.ledger[field], field
 
 
-def test_ledger_closes_in_the_scrape_and_a_hole_shows() -> None:
+def test_the_ledger_balances_in_a_scrape_and_a_difference_is_shown() -> None:
     ledger = dict(DEVICES[0].ledger)
     ledger["bytes_in"] += 3
     ledger["frames_in_replies"] += 2
@@ -156,6 +156,7 @@ def test_absent_is_not_zero() -> None:
         assert key(name, device="rear") not in shown
 
 
+# All lines of the parts that only some devices have
 PARTS: dict[tuple[str, tuple[tuple[str, str], ...]], float] = {
     ("imud_polls_total", ()): 1000,
     ("imud_polls_late_total", ()): 20,
@@ -201,7 +202,6 @@ PARTS: dict[tuple[str, tuple[tuple[str, str], ...]], float] = {
     ("imud_trigger_delay_seconds_total", ()): 0.012000456,
     ("imud_trigger_delay_worst_seconds", ()): 0.0009,
 }
-"""All lines of the parts that only some devices have."""
 
 
 def parts_of(name: str, shown: dict[Key, float]) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
@@ -220,7 +220,7 @@ def test_every_part_is_shown_in_base_units() -> None:
         assert shown[line] == pytest.approx(value, rel=1e-12), line
 
 
-def test_parts_that_a_device_has_not_are_absent() -> None:
+def test_missing_parts_of_a_device_are_absent() -> None:
     plain = device("plain", 2)
     unsure = equipped(
         "unsure", 3, polling=None, serial_line=None,
@@ -360,7 +360,7 @@ def test_clients_are_summed_and_totals_never_fall() -> None:
     assert shown[key("imud_client_queue_bytes")] == 9 * 256
 
 
-def test_both_formats_say_the_same() -> None:
+def test_both_formats_contain_the_same_values() -> None:
     renderer = Renderer(pause=lambda: None)
     plain = renderer.render(Snapshot(DEVICES), "text/html, */*;q=0.1")
     rich = renderer.render(Snapshot(DEVICES), "application/openmetrics-text; version=1.0.0, text/plain;q=0.5")
@@ -427,7 +427,7 @@ def test_label_values_are_documented() -> None:
         assert {value.value for value in values_of} in [set(row.strip().split(", ")) for row in rows], kind
 
 
-def test_names_say_type_and_unit() -> None:
+def test_names_contain_type_and_unit() -> None:
     more = (*MQTT_FAMILIES, *OUTPUT_FAMILIES, *RECORDER_FAMILIES, *FLIGHT_FAMILIES, *RECORDINGS_FAMILIES)
     for family in (*FAMILIES, *more):
         assert family.name.startswith("imud_")

@@ -5,7 +5,7 @@ from imud.publishers.metrics.metric import Snapshot
 from tests.support.metrics import shown
 
 
-def test_each_value_is_that_of_the_output() -> None:
+def test_each_metric_is_a_value_of_the_output() -> None:
     status = MqttStatus("mqtt://a:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8, "space": 9}, 10, 11, 12)
     assert shown("imud_mqtt_", Snapshot(mqtts=(status,))) == {
         "connected": 1, "spooling": 1, "queued_total": 1, "spooled_messages_total": 2, "sent_messages_total": 3,
@@ -16,7 +16,7 @@ def test_each_value_is_that_of_the_output() -> None:
     assert shown("imud_mqtt_", Snapshot()) == {}
 
 
-def test_what_does_not_work_is_zero() -> None:
+def test_a_failure_is_zero() -> None:
     status = MqttStatus("", "refused", "full", 0, 0, 0, 0, 0, 0, 0, {}, 0)
     values = shown("imud_mqtt_", Snapshot(mqtts=(status,)))
     assert (values["connected"], values["spooling"]) == (0, 0)

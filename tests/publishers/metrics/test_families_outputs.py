@@ -5,7 +5,7 @@ from imud.publishers.metrics.metric import Snapshot
 from tests.support.metrics import shown
 
 
-def test_each_value_is_that_of_the_way_out() -> None:
+def test_each_metric_is_a_value_of_a_port() -> None:
     tcp, serial = "tcp 127.0.0.1:10110", "serial /dev/ttyUSB0"
     outputs = (OutputStatus(tcp, 1, 2, 3, ""), OutputStatus(serial, 4, 5, 0, "No such file or directory"))
     assert shown("imud_nmea0183_", Snapshot(outputs=outputs)) == {

@@ -8,7 +8,7 @@ RECORDER = RecorderStatus("a", "", 1, 2, 3, 4, 5, 6)
 FULL = "No space left on device"
 
 
-def test_each_value_is_that_of_the_status() -> None:
+def test_each_metric_is_a_value_of_the_status() -> None:
     recorders = Snapshot(recorders=(RECORDER,))
     assert shown("imud_recorder_", recorders) == {
         "active": 1, "written_bytes_total": 1, "records_total": 2, "records_dropped_total": 3, "waiting_bytes": 4,
@@ -21,7 +21,7 @@ def test_each_value_is_that_of_the_status() -> None:
         assert shown(prefix, Snapshot()) == {}
 
 
-def test_of_the_flight_recorder_too() -> None:
+def test_each_metric_is_a_value_of_the_flight_recorder() -> None:
     flights = Snapshot(flights=(FlightStatus("", 90_500_000_000, 2, 3, 4, 5, 6, 7, 8),))
     assert shown("imud_flight_recorder_", flights) == {
         "active": 1, "kept_seconds": 90.5, "kept_bytes": 2, "records_dropped_total": 3, "snapshots_total saved": 4,

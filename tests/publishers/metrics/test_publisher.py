@@ -80,7 +80,7 @@ async def test_scrape_over_http_reads_the_status_in_the_loops_thread() -> None:
 
 
 @in_loop
-async def test_scrapes_are_counted_and_asking_for_the_count_is_none() -> None:
+async def test_scrapes_are_counted_without_requests_of_the_count() -> None:
     async with publisher(
         publisher_context(lambda: DEVICES, 1, iter(range(10**11, 10**12, 2 * 10**9)).__next__)
     ) as served:
@@ -93,7 +93,7 @@ async def test_scrapes_are_counted_and_asking_for_the_count_is_none() -> None:
 
 
 @in_loop
-async def test_scrapes_that_wait_together_get_one_page_in_each_format() -> None:
+async def test_waiting_scrapes_share_one_page_per_format() -> None:
     """Each snapshot costs time of the event loop. Scrapers that no longer wait would be served first."""
     seen: list[int] = []
 
@@ -125,7 +125,7 @@ async def test_scrapes_that_wait_together_get_one_page_in_each_format() -> None:
 
 
 @in_loop
-async def test_a_scrape_of_many_devices_takes_some_of_them_in_each_turn_of_the_loop() -> None:
+async def test_a_scrape_reads_a_limited_number_of_devices_per_turn() -> None:
     turn, seen = 0, []
 
     def each_status() -> Iterator[DeviceStatus]:
@@ -150,7 +150,7 @@ async def test_a_scrape_of_many_devices_takes_some_of_them_in_each_turn_of_the_l
 
 @pytest.mark.parametrize("devices", [1, 3 * DEVICES_PER_TURN])
 @in_loop
-async def test_a_loop_that_stood_still_is_late_though_it_ticks_while_devices_are_looked_at(devices: int) -> None:
+async def test_the_delay_of_a_blocked_loop_is_shown_although_it_ticks_during_the_snapshot(devices: int) -> None:
     now_ns = 5_000_000_000
     published: list[MetricsPublisher] = []
 
@@ -199,7 +199,7 @@ async def test_paths_and_methods() -> None:
 
 
 @in_loop
-async def test_a_loop_that_does_not_answer_gives_503() -> None:
+async def test_a_blocked_loop_causes_status_503() -> None:
     async with publisher(context(), snapshot_s=0.05) as served:
         with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
             connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
@@ -223,7 +223,7 @@ async def test_disabled_opens_nothing_and_closes_twice() -> None:
 
 
 @in_loop
-async def test_port_in_use_is_told() -> None:
+async def test_port_in_use_is_reported() -> None:
     async with publisher(context()) as first:
         second = MetricsPublisher(MetricsOptions(port=first.port), context())
         with pytest.raises(ServerError, match=rf"127\.0\.0\.1 port {first.port}: Address already in use; .*ss -ltnp"):

@@ -33,7 +33,7 @@ def motion(data: bytes, since_ns: int = 0) -> MotionValues:
     return found
 
 
-def test_vibration_by_hand() -> None:
+def test_vibration_has_the_computed_values() -> None:
     """X rests. Y is ±0.5 around 0.1. Z is 9.81 plus 1 in one of ten samples: variance 0.09."""
     found = motion(slots([(0.0, 0.1 + (0.5 if n % 2 else -0.5), G + (n % 10 == 3)) for n in range(100)]))
     assert found.vibration_rms_m_s2 == pytest.approx((0.0, 0.5, 0.3), abs=1e-6)
@@ -42,7 +42,7 @@ def test_vibration_by_hand() -> None:
     assert found.span_ns == 990 * NS_PER_MS
 
 
-def test_slow_motion_is_no_vibration_and_the_span_changes_no_rms() -> None:
+def test_slow_motion_is_not_vibration_and_the_span_does_not_change_the_rms() -> None:
     """The sensor turns in 20 s, so gravity moves from Z to X. The vibration is a sine of 25 Hz with amplitude 0.2."""
 
     def at(n: int) -> Vector3:
@@ -62,14 +62,14 @@ def test_slow_motion_is_no_vibration_and_the_span_changes_no_rms() -> None:
     assert max(long.vibration_peak_m_s2) < 0.4
 
 
-def test_the_norm_is_that_of_the_last_second() -> None:
+def test_the_norm_belongs_to_the_last_second() -> None:
     found = motion(slots([(0.0, 0.0, 2 * G)] * 150 + [(0.0, 3.0, 4.0)] * 100))
     assert found.accel_norm_m_s2 == pytest.approx(5.0)
     # the step is at the boundary of two blocks
     assert found.vibration_peak_m_s2 == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
-def test_blocks_do_not_reach_over_a_gap() -> None:
+def test_a_block_ends_at_a_gap() -> None:
     before = slots([(0.0, 0.0, G)] * 50)
     after = slots([(0.0, G, 0.0)] * 50, start_ns=3600 * NS_PER_S)
     found = motion(before + after)
@@ -77,7 +77,7 @@ def test_blocks_do_not_reach_over_a_gap() -> None:
     assert found.span_ns == 3600 * NS_PER_S + 490 * NS_PER_MS
 
 
-def test_what_is_not_sent_is_absent() -> None:
+def test_missing_values_are_absent() -> None:
     assert motion_of(b"", 0) is None
     assert motion_of(slots([(0.0, 0.0, G)]), 1) is None  # older than the span
     angles = motion(slot(1, 5, None, (0.1, 0.2, 0.3)))
@@ -88,14 +88,14 @@ def test_what_is_not_sent_is_absent() -> None:
     assert motion(slots([(0.0, 0.0, G)] * 8, rate_hz=10)).vibration_rms_m_s2 is not None
 
 
-def test_samples_without_acceleration_among_others_are_left_out() -> None:
+def test_samples_without_acceleration_are_ignored() -> None:
     data: list[Vector3 | None] = [(0.5 if n % 4 == 0 else -0.5, 0.0, G) if n % 2 == 0 else None for n in range(100)]
     found = motion(slots(data))
     assert found.vibration_rms_m_s2 == pytest.approx((0.5, 0.0, 0.0), abs=1e-6)
     assert found.accel_norm_m_s2 == pytest.approx(G)
 
 
-def test_every_piece_of_work_is_told() -> None:
+def test_each_part_of_the_work_is_reported() -> None:
     pieces: list[int] = []
     assert motion_of(slots([(0.0, 0.0, G)] * 1000), 0, pieces.append) is not None
     assert pieces == [1000, *[100] * 30]
@@ -104,16 +104,16 @@ def test_every_piece_of_work_is_told() -> None:
 # --- file -----------------------------------------------------------------------------------------------------------
 
 
-def look(board: Board, newest: int, *, motion: bool = True) -> RingView:
+def read(board: Board, newest: int, *, motion: bool = True) -> RingView:
     reader = RingReader(lambda: None, motion=motion)
-    return reader.look({DEVICE: str(board.path)}, {DEVICE: newest}, board.now_ns)[DEVICE]
+    return reader.read({DEVICE: str(board.path)}, {DEVICE: newest}, board.now_ns)[DEVICE]
 
 
 def test_a_ring_that_has_wrapped_is_read_in_order(board: Board) -> None:
     board.publish(range(1, 151))
     board.now_ns = 160 * NS_PER_MS
     board.tick(0)
-    found = look(board, 150)
+    found = read(board, 150)
     assert found.written
     assert found.motion is not None
     assert found.motion.span_ns == 54 * NS_PER_MS  # 96 to 150: the writer can overwrite 9 slots during the copy
@@ -123,14 +123,14 @@ def test_a_ring_that_has_wrapped_is_read_in_order(board: Board) -> None:
 def test_only_samples_of_the_snapshot_are_used(board: Board) -> None:
     board.publish(range(1, 41))
     board.now_ns = 0
-    found = look(board, 30)
+    found = read(board, 30)
     assert found.motion is not None
     assert found.motion.span_ns == 29 * NS_PER_MS
-    assert look(board, 0).motion is None
+    assert read(board, 0).motion is None
 
 
 @pytest.mark.parametrize("more", [1, 10, 54, 63, 64, 65, 500])
-def test_slots_that_are_overwritten_during_the_copy_are_left_out(
+def test_slots_overwritten_during_the_copy_are_ignored(
     board: Board, more: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The writer writes `more` samples during the copy. imud ignores slots that can be incomplete."""
@@ -147,7 +147,7 @@ def test_slots_that_are_overwritten_during_the_copy_are_left_out(
         return data
 
     monkeypatch.setattr(os, "pread", pread)
-    found = look(board, 64)
+    found = read(board, 64)
     assert copied
     left = SLOTS - 1 - OVERTAKEN_SLOTS - more
     if left > 0:
@@ -157,31 +157,31 @@ def test_slots_that_are_overwritten_during_the_copy_are_left_out(
         assert found.motion is None
 
 
-def test_slots_whose_numbers_do_not_follow_are_not_used(board: Board) -> None:
+def test_slots_without_consecutive_numbers_are_ignored(board: Board) -> None:
     board.publish(range(1, 31))
     board.now_ns = 0
-    assert look(board, 30).motion is not None
+    assert read(board, 30).motion is not None
     board.poke(4096 + 20 * SLOT_BYTES, (7).to_bytes(8, "little"))
-    assert look(board, 30).motion is None
+    assert read(board, 30).motion is None
 
 
-def test_a_ring_is_written_while_its_file_is_there_and_beats(board: Board) -> None:
+def test_a_ring_is_written_if_its_file_exists_and_has_a_heartbeat(board: Board) -> None:
     board.publish(range(1, 31))
     board.tick()
-    assert look(board, 30).written
+    assert read(board, 30).written
     board.now_ns += NS_PER_S
-    assert not look(board, 30).written
+    assert not read(board, 30).written
     board.tick()
-    assert look(board, 30).written
+    assert read(board, 30).written
     board.poke(0, b"another!")
-    assert look(board, 30) == RingView(False)
+    assert read(board, 30) == RingView(False)
     board.path.unlink()
-    assert look(board, 30) == RingView(False)
+    assert read(board, 30) == RingView(False)
     reader = RingReader(lambda: None, motion=True)
-    assert reader.look({"bow": ""}, {}, START_NS) == {"bow": RingView(False)}
+    assert reader.read({"bow": ""}, {}, START_NS) == {"bow": RingView(False)}
 
 
-def test_a_pause_for_every_so_many_values(tmp_path: Path) -> None:
+def test_a_pause_follows_each_number_of_values(tmp_path: Path) -> None:
     """Few samples cause no pause. 4096 samples are read, then added up in four blocks on three axes."""
     for count, expected in ((100, 0), (4096, 3)):
         pauses: list[int] = []
@@ -190,18 +190,18 @@ def test_a_pause_for_every_so_many_values(tmp_path: Path) -> None:
         board = Board(folder, slots=SAMPLES_MAX, now_ns=0)
         board.publish(range(1, count + 1))
         reader = RingReader(lambda pauses=pauses: pauses.append(1), motion=True)  # type: ignore[misc]
-        reader.look({DEVICE: str(board.path)}, {DEVICE: count}, 0)
+        reader.read({DEVICE: str(board.path)}, {DEVICE: count}, 0)
         assert len(pauses) == expected
         board.publisher.close()
 
 
-def test_motion_is_off_by_a_switch(board: Board) -> None:
+def test_the_option_motion_disables_motion(board: Board) -> None:
     board.publish(range(1, 31))
     board.tick()
-    assert look(board, 30, motion=False) == RingView(True)
+    assert read(board, 30, motion=False) == RingView(True)
 
 
-def test_many_scrapes_of_one_second_are_one_look(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scrapes_within_one_second_share_one_reading(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     board.publish(range(1, 31))
     board.tick()
     opened: list[str] = []
@@ -214,20 +214,20 @@ def test_many_scrapes_of_one_second_are_one_look(board: Board, monkeypatch: pyte
     monkeypatch.setattr(os, "open", counted)
     reader = RingReader(lambda: None, motion=True)
     rings, newest = {DEVICE: str(board.path)}, {DEVICE: 30}
-    first = reader.look(rings, newest, board.now_ns)
+    first = reader.read(rings, newest, board.now_ns)
     for later_ns in range(0, NS_PER_S, NS_PER_S // 100):
-        assert reader.look(rings, newest, board.now_ns + later_ns) is first
+        assert reader.read(rings, newest, board.now_ns + later_ns) is first
     assert len(opened) == 1
-    reader.look(rings, newest, board.now_ns + NS_PER_S)
+    reader.read(rings, newest, board.now_ns + NS_PER_S)
     assert len(opened) == 2
 
 
-def test_the_span_is_the_time_since_the_look_before_but_ten_seconds_at_least(tmp_path: Path) -> None:
+def test_the_span_is_the_time_since_the_previous_reading_at_least_ten_seconds(tmp_path: Path) -> None:
     board = Board(tmp_path, slots=SAMPLES_MAX, now_ns=0)
     reader = RingReader(lambda: None, motion=True)
 
     def span_s(now_s: float) -> float:
-        view = reader.look({DEVICE: str(board.path)}, {DEVICE: 4000}, round(now_s * NS_PER_S))[DEVICE]
+        view = reader.read({DEVICE: str(board.path)}, {DEVICE: 4000}, round(now_s * NS_PER_S))[DEVICE]
         assert view.motion is not None
         return view.motion.span_ns / NS_PER_S
 

@@ -35,7 +35,7 @@ async def hello(_request: HttpRequest) -> HttpResponse:
 
 @pytest.mark.parametrize("said", [b"", b"GET", b"GET /metrics HTTP/1.1\r\nHost: x\r\n"])
 @in_loop
-async def test_silent_or_half_requests_end_in_time(said: bytes) -> None:
+async def test_silent_clients_and_incomplete_requests_end_in_time(said: bytes) -> None:
     async with server(hello, connection_s=0.05) as served:
         with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as silent:
             silent.sendall(said)
@@ -57,7 +57,7 @@ async def test_silent_clients_cannot_lock_out_a_scraper() -> None:
 
 
 @in_loop
-async def test_a_client_that_does_not_read_its_answer_is_ended() -> None:
+async def test_a_client_that_does_not_read_is_disconnected() -> None:
     asked: list[HttpRequest] = []
 
     async def much(request: HttpRequest) -> HttpResponse:
@@ -75,7 +75,7 @@ async def test_a_client_that_does_not_read_its_answer_is_ended() -> None:
 
 @pytest.mark.parametrize("head", [b"\x00\xff\r\n\r\n", b"GET /\r\n\r\n", b"GET / SPDY/3\r\n\r\n", b"\r\n\r\n"])
 @in_loop
-async def test_what_is_no_http_gets_400(head: bytes) -> None:
+async def test_invalid_requests_get_status_400(head: bytes) -> None:
     async with server(hello) as served:
         with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
             connection.sendall(head)
@@ -87,7 +87,7 @@ async def test_what_is_no_http_gets_400(head: bytes) -> None:
 
 @pytest.mark.parametrize(("size", "is_answered"), [(8192, True), (8193, False), (32768, False)])
 @in_loop
-async def test_too_long_a_request_is_ended(size: int, is_answered: bool) -> None:
+async def test_a_request_above_the_limit_is_disconnected(size: int, is_answered: bool) -> None:
     async with server(hello) as served:
         with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
             head = b"GET / HTTP/1.1\r\nX: "
@@ -96,7 +96,7 @@ async def test_too_long_a_request_is_ended(size: int, is_answered: bool) -> None
 
 
 @in_loop
-async def test_without_descriptors_the_server_pauses_instead_of_turning_in_circles(
+async def test_the_server_pauses_without_descriptors(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     accept, calls_s = socket.socket.accept, list[float]()
@@ -122,6 +122,6 @@ def test_parse_request() -> None:
 
 
 @pytest.mark.parametrize("address", ["192.0.2.1", "not an address"])
-def test_address_that_is_not_here_is_told(address: str) -> None:
+def test_an_unusable_address_is_reported(address: str) -> None:
     with pytest.raises(ServerError, match=f"{address} port 0: .*; set metrics.address"):
         ScrapeServer(address, 0, hello).start()

@@ -25,8 +25,8 @@ class HandSource:
     def __init__(self) -> None:
         self.present = ["bow", "mast"]
         self.listening: list[PutRecord] = []
+        # Called when the recorder describes a device, which takes time
         self.on_begin: Callable[[], None] = lambda: None
-        """Called when the recorder describes a device, which takes time."""
 
     def names(self) -> Sequence[str]:
         return self.present
@@ -57,8 +57,8 @@ class RecordingBench:
         self.clock, self.source = VirtualClock(), HandSource()
         self.events: list[Event] = []
         self.workers: list[HandWorker] = []
+        # Called when the recorder reads the clocks, which can make a record
         self.on_clocks_read: Callable[[], None] = lambda: None
-        """Called when the recorder reads the clocks, which can make a record."""
         self.context = publisher_context(
             list, EPOCH, self.clock.now_ns, recording=self.source, utc_offset_ns=self._utc_offset_ns,
             raise_event=self.events.append,

@@ -53,7 +53,7 @@ class StreamBench(RecordingBench):
         self.client.close()
 
 
-def test_it_begins_with_the_state_of_all_and_ends_regularly() -> None:
+def test_a_recording_starts_with_all_states_and_ends_with_an_end_record() -> None:
     bench = StreamBench()
     bench.tick()
     bench.source.deliver()
@@ -73,7 +73,7 @@ def test_it_begins_with_the_state_of_all_and_ends_regularly() -> None:
     bench.close()
 
 
-def test_a_client_that_does_not_read_loses_records_and_the_recording_says_how_many(
+def test_the_recording_contains_the_number_of_records_lost_by_a_slow_client(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(module, "RecordQueue", {module.LastRecords: lambda: RecordQueue[module.LastRecords](1 << 20)})
@@ -107,7 +107,7 @@ def test_a_client_that_does_not_read_loses_records_and_the_recording_says_how_ma
     bench.close()
 
 
-def test_only_the_chosen_devices_are_in_it_and_a_client_that_closes_ends_it() -> None:
+def test_only_selected_devices_are_recorded_until_the_client_disconnects() -> None:
     bench = StreamBench("mast")
     bench.tick()
     bench.recording.stop("")
@@ -124,7 +124,7 @@ def test_only_the_chosen_devices_are_in_it_and_a_client_that_closes_ends_it() ->
     assert bench.workers[0].ended
 
 
-def test_after_the_end_a_client_that_takes_nothing_is_given_up() -> None:
+def test_a_client_without_progress_is_disconnected_after_the_end() -> None:
     bench = StreamBench()
     for _ in range(100):
         bench.source.deliver(100_000)
@@ -139,7 +139,7 @@ def test_after_the_end_a_client_that_takes_nothing_is_given_up() -> None:
     bench.close()
 
 
-def test_imud_that_stops_sends_what_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waiting_records_are_sent_when_imud_stops(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = StreamBench()
     bench.source.deliver()
     bench.recording.stop("imud stopped")
@@ -157,7 +157,7 @@ def test_imud_that_stops_sends_what_waits(monkeypatch: pytest.MonkeyPatch) -> No
     stuck.close()
 
 
-def test_a_mistake_in_the_thread_ends_the_daemon() -> None:
+def test_an_internal_error_in_the_thread_ends_the_daemon() -> None:
     bench = StreamBench()
     bench.workers[0].failed(ZeroDivisionError("a mistake"))
     with pytest.raises(ZeroDivisionError):
@@ -165,7 +165,7 @@ def test_a_mistake_in_the_thread_ends_the_daemon() -> None:
     bench.close()
 
 
-def test_the_daemon_takes_nothing_in() -> None:
+def test_the_daemon_ignores_data_from_the_client() -> None:
     ours, theirs = stream_pair()
     with ours, theirs:
         assert ours.recv(1) == b""

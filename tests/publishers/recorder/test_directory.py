@@ -14,7 +14,7 @@ def filled(folder: Path, keep_bytes: int, *sizes: int) -> RecordingDirectory:
     return directory
 
 
-def test_names_sort_by_time_and_are_known_again(tmp_path: Path) -> None:
+def test_names_sort_by_time_and_are_recognized(tmp_path: Path) -> None:
     directory = filled(tmp_path, 1000, 10, 20)
     assert directory.new_file(1_763_717_507 * NS_PER_S, 0x1_0000_00AB, 12).name == (
         "20251121T093147Z-000000ab-000012.imudrec"
@@ -32,7 +32,7 @@ def test_the_oldest_are_removed_until_there_is_room(tmp_path: Path) -> None:
     assert directory.removed == 1
 
 
-def test_the_present_file_and_files_of_others_stay(tmp_path: Path) -> None:
+def test_the_open_file_and_other_files_are_not_removed(tmp_path: Path) -> None:
     directory = filled(tmp_path, 10, 50, 50)
     foreign = [directory.path / name for name in ("mine.imudrec", "20251121T093147Z-000000ab-000012.imudrec.gz")]
     for path in foreign:
@@ -45,7 +45,7 @@ def test_the_present_file_and_files_of_others_stay(tmp_path: Path) -> None:
     assert all(path.exists() for path in foreign)
 
 
-def test_what_files_take_is_known_without_those_that_are_written(tmp_path: Path) -> None:
+def test_the_measured_size_excludes_open_files(tmp_path: Path) -> None:
     directory = filled(tmp_path, 100, 40, 30, 20)
     assert directory.kept_bytes == 0
     directory.measure()

@@ -85,7 +85,7 @@ def span_s(path: Path) -> float:
     return float(end.t_ns - begun.t_ns) / NS_PER_S
 
 
-def test_an_acceleration_over_the_bound_is_saved_with_what_came_before_and_after(tmp_path: Path) -> None:
+def test_an_acceleration_above_the_limit_is_saved_with_the_data_before_and_after(tmp_path: Path) -> None:
     bench = FlightBench(tmp_path, acceleration_m_s2=50)
     bench.tick(150)
     bench.publish("bow", 49.9, 9.8, float("nan"))
@@ -117,7 +117,7 @@ def test_an_acceleration_over_the_bound_is_saved_with_what_came_before_and_after
     assert not bench.context.outputs.flights
 
 
-def test_a_device_that_is_lost_is_an_alert_unless_it_is_not_recorded(tmp_path: Path) -> None:
+def test_a_missing_device_is_an_alert_if_it_is_recorded(tmp_path: Path) -> None:
     bench = FlightBench(tmp_path, devices=["bow"], after_s=0)
     for device, kind in (("mast", EventKind.DOWN), ("bow", EventKind.UP), ("bow", EventKind.LOSS)):
         bench.flight.event(Event(1, device, kind, ""))
@@ -137,7 +137,7 @@ def test_a_device_that_is_lost_is_an_alert_unless_it_is_not_recorded(tmp_path: P
     ignoring.flight.close()
 
 
-def test_a_line_that_becomes_active_is_an_alert(tmp_path: Path) -> None:
+def test_an_active_line_is_an_alert(tmp_path: Path) -> None:
     bench = FlightBench(tmp_path, line=InputOptions(line="GPIO5"), after_s=0)
     bench.edges[0]([Edge(1, False, 1)])
     bench.tick(2)
@@ -170,7 +170,7 @@ def test_a_storm_of_alerts_does_not_fill_the_disk(tmp_path: Path) -> None:
     bench.flight.close()
 
 
-def test_an_alert_that_waits_is_saved_when_imud_stops_and_the_memory_is_given_back(tmp_path: Path) -> None:
+def test_a_pending_alert_is_saved_when_imud_stops_and_the_memory_is_freed(tmp_path: Path) -> None:
     bench = FlightBench(tmp_path, acceleration_m_s2=50, directory=str(tmp_path / "flight"))
     bench.tick(12)
     assert len(list((tmp_path / "flight").iterdir())) >= 2
@@ -183,7 +183,7 @@ def test_an_alert_that_waits_is_saved_when_imud_stops_and_the_memory_is_given_ba
     bench.flight.close()
 
 
-def test_what_a_killed_imud_left_is_saved_at_the_next_start(tmp_path: Path) -> None:
+def test_data_of_a_killed_imud_is_saved_at_the_next_start(tmp_path: Path) -> None:
     killed = FlightBench(tmp_path, directory=str(tmp_path / "flight"))
     killed.tick(12)
     bench = FlightBench(tmp_path, directory=str(tmp_path / "flight"))
@@ -200,7 +200,7 @@ def test_what_a_killed_imud_left_is_saved_at_the_next_start(tmp_path: Path) -> N
     killed.flight.close()
 
 
-def test_a_client_gets_what_there_is(tmp_path: Path) -> None:
+def test_a_client_receives_the_present_data(tmp_path: Path) -> None:
     bench = FlightBench(tmp_path)
     bench.tick(30)
     ours, theirs = stream_pair()
@@ -223,7 +223,7 @@ def test_a_client_gets_what_there_is(tmp_path: Path) -> None:
             sock.close()
 
 
-def test_where_nothing_is_kept_that_is_told_once_and_tried_again(tmp_path: Path) -> None:
+def test_a_failed_segment_is_reported_once_and_tried_again(tmp_path: Path) -> None:
     folder = tmp_path / "flight"
     bench = FlightBench(tmp_path, directory=str(folder))
     folder.rename(tmp_path / "elsewhere")
@@ -240,7 +240,7 @@ def test_where_nothing_is_kept_that_is_told_once_and_tried_again(tmp_path: Path)
     bench.flight.close()
 
 
-def test_a_directory_that_cannot_be_made_and_a_budget_without_room_for_a_snapshot_are_refused(tmp_path: Path) -> None:
+def test_an_invalid_directory_and_a_limit_without_room_for_a_snapshot_are_rejected(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"")
     with pytest.raises(ServerError, match="flight recorder"):
         FlightBench(tmp_path, directory=str(tmp_path / "a" / "b"))
@@ -250,7 +250,7 @@ def test_a_directory_that_cannot_be_made_and_a_budget_without_room_for_a_snapsho
     assert records.VERSION == 1
 
 
-def test_a_mistake_in_the_thread_ends_the_daemon(tmp_path: Path) -> None:
+def test_an_internal_error_in_the_thread_ends_the_daemon(tmp_path: Path) -> None:
     bench = FlightBench(tmp_path)
     bench.workers[0].failed(ZeroDivisionError("a mistake"))
     with pytest.raises(ZeroDivisionError):

@@ -12,7 +12,7 @@ def alert(t_ns: int, reason: str = "a blow") -> Alert:
     return Alert(t_ns, "bow", reason)
 
 
-def test_an_alert_is_due_once_with_those_in_the_meantime() -> None:
+def test_an_alert_is_due_once_with_all_later_alerts() -> None:
     gate = AlertGate(AFTER_NS, 6)
     assert gate.take_due(0) is None
     assert gate.add(alert(5))
@@ -25,7 +25,7 @@ def test_an_alert_is_due_once_with_those_in_the_meantime() -> None:
     assert gate.take_due(8, at_once=True) == alert(7)  # at the end of imud
 
 
-def test_there_are_only_so_many_an_hour_and_the_first_that_is_left_out_is_told() -> None:
+def test_alerts_per_hour_are_limited_and_the_first_ignored_alert_is_reported() -> None:
     gate = AlertGate(0, 2)
     for t_ns in (0, 10):
         assert gate.add(alert(t_ns))

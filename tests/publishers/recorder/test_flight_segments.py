@@ -56,7 +56,7 @@ def devices(kept: list[records.Record]) -> list[int]:
     return [one.device for one in kept if one.kind == Kind.DATA]
 
 
-def test_a_snapshot_is_one_recording_with_one_session_and_a_regular_end() -> None:
+def test_a_snapshot_has_one_session_record_and_an_end_record() -> None:
     bench = RingBench()
     for _ in range(3):
         bench.add()
@@ -68,7 +68,7 @@ def test_a_snapshot_is_one_recording_with_one_session_and_a_regular_end() -> Non
     assert (bench.ring.bytes, bench.ring.oldest_ns) == (0, 0)
 
 
-def test_segments_that_ended_before_the_time_that_is_kept_go() -> None:
+def test_segments_before_the_kept_time_are_dropped() -> None:
     bench = RingBench()
     for _ in range(5):
         bench.add()
@@ -78,7 +78,7 @@ def test_segments_that_ended_before_the_time_that_is_kept_go() -> None:
     bench.close()
 
 
-def test_the_oldest_go_where_the_room_is_used_up_but_never_the_newest() -> None:
+def test_the_oldest_segments_are_dropped_but_never_the_newest() -> None:
     bench = RingBench(bytes_max=10_000)
     for _ in range(10):
         bench.add(2_000)
@@ -100,7 +100,7 @@ def test_the_oldest_go_where_the_room_is_used_up_but_never_the_newest() -> None:
     ring.clear()
 
 
-def test_a_reader_that_cannot_be_made_leaves_no_descriptor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_reader_closes_its_descriptors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = RingBench(folder=tmp_path)
     for _ in range(2):
         bench.add()
@@ -120,7 +120,7 @@ def test_a_reader_that_cannot_be_made_leaves_no_descriptor(tmp_path: Path, monke
     bench.close()
 
 
-def test_a_reader_goes_on_with_what_there_was_when_segments_go() -> None:
+def test_a_reader_stays_valid_after_segments_are_dropped() -> None:
     bench = RingBench()
     for _ in range(3):
         bench.add()
@@ -135,7 +135,7 @@ def test_a_reader_goes_on_with_what_there_was_when_segments_go() -> None:
     bench.close()
 
 
-def test_files_of_a_directory_go_with_their_segments_and_are_whole_recordings(tmp_path: Path) -> None:
+def test_segment_files_are_complete_recordings_and_are_removed(tmp_path: Path) -> None:
     bench = RingBench(folder=tmp_path)
     for _ in range(3):
         bench.add()
@@ -150,7 +150,7 @@ def test_files_of_a_directory_go_with_their_segments_and_are_whole_recordings(tm
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_process_left_is_read_but_for_a_block_that_was_cut(tmp_path: Path) -> None:
+def test_complete_blocks_of_a_killed_process_are_read(tmp_path: Path) -> None:
     bench = RingBench(folder=tmp_path)
     for _ in range(3):
         bench.add()
@@ -164,7 +164,7 @@ def test_what_a_killed_process_left_is_read_but_for_a_block_that_was_cut(tmp_pat
     bench.close()
 
 
-def test_a_full_file_system_makes_the_oldest_go_and_is_an_error_for_the_last(
+def test_a_full_file_system_drops_the_oldest_segments_and_then_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench = RingBench(folder=tmp_path)

@@ -46,7 +46,7 @@ def bench(tmp_path: Path) -> Iterator[FlightWriterBench]:
     made.writer.close()
 
 
-def test_a_snapshot_has_all_that_came_before_it_and_nothing_after(
+def test_a_snapshot_contains_all_earlier_records_and_no_later_record(
     bench: FlightWriterBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, synced = bench.folder / "a", list[int]()
@@ -69,7 +69,7 @@ def test_a_snapshot_has_all_that_came_before_it_and_nothing_after(
     assert [one.device for one in records_in(bench.folder / "b") if one.kind == Kind.DATA] == [0, 1, 2]
 
 
-def test_a_client_gets_it_piece_by_piece_and_the_others_do_not_wait(bench: FlightWriterBench, tmp_path: Path) -> None:
+def test_a_slow_client_does_not_delay_other_clients(bench: FlightWriterBench, tmp_path: Path) -> None:
     ours, theirs = stream_pair()
     bench.begin()
     for number in range(40):
@@ -94,7 +94,7 @@ def test_a_client_gets_it_piece_by_piece_and_the_others_do_not_wait(bench: Fligh
     theirs.close()
 
 
-def test_clients_that_close_or_take_nothing_are_given_up(bench: FlightWriterBench) -> None:
+def test_clients_without_progress_are_disconnected(bench: FlightWriterBench) -> None:
     bench.begin()
     for number in range(40):
         bench.put(number, 200_000)
@@ -110,7 +110,7 @@ def test_clients_that_close_or_take_nothing_are_given_up(bench: FlightWriterBenc
     silent[1].close()
 
 
-def test_a_client_sees_the_end_without_descriptors_and_when_imud_stops(
+def test_a_client_reads_end_of_file_without_descriptors_and_when_imud_stops(
     bench: FlightWriterBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.begin()
@@ -133,7 +133,7 @@ def test_a_client_sees_the_end_without_descriptors_and_when_imud_stops(
     refused[1].close()
 
 
-def test_a_full_disk_leaves_no_part_of_a_snapshot(bench: FlightWriterBench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_no_incomplete_snapshot(bench: FlightWriterBench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.begin()
     bench.put(0)
     bench.work()
@@ -156,7 +156,7 @@ def test_a_full_disk_leaves_no_part_of_a_snapshot(bench: FlightWriterBench, monk
     assert bench.writer.saved[1].problem == ""
 
 
-def test_where_nothing_can_be_kept_nothing_is_saved_until_a_segment_begins(
+def test_after_a_failed_segment_nothing_is_saved_until_the_next_segment(
     bench: FlightWriterBench, tmp_path: Path
 ) -> None:
     bench.begin(tmp_path / "no" / "folder")
@@ -174,7 +174,7 @@ def test_where_nothing_can_be_kept_nothing_is_saved_until_a_segment_begins(
     assert kinds_in(bench.folder / "b") == [Kind.SESSION, Kind.DATA, Kind.END]
 
 
-def test_snapshots_keep_within_the_budget(tmp_path: Path) -> None:
+def test_snapshots_stay_below_the_limit(tmp_path: Path) -> None:
     bench = FlightWriterBench(tmp_path, keep_bytes=100_000)
     for number in range(5):
         bench.begin()
@@ -188,7 +188,7 @@ def test_snapshots_keep_within_the_budget(tmp_path: Path) -> None:
     bench.writer.close()
 
 
-def test_what_was_left_is_saved_and_removed_or_stays(
+def test_data_of_a_killed_process_is_saved_and_removed_or_kept(
     bench: FlightWriterBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files = [tmp_path / "000", tmp_path / "001"]

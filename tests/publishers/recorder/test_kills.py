@@ -18,7 +18,7 @@ LATEST_S = 1.2  # maximum time until the next block, s
 
 
 @pytest.mark.live
-def test_of_daemons_that_are_killed_every_block_is_whole_and_replays_as_it_ran(tmp_path: Path) -> None:
+def test_all_blocks_of_killed_daemons_are_complete_and_replay(tmp_path: Path) -> None:
     random = Random(4)
     kills = [(random.uniform(0, LATEST_S), 1 if n < EARLY else WITH_SAMPLES_BYTES) for n in range(EARLY + LATE)]
     capture(tmp_path / "capture")

@@ -43,13 +43,13 @@ def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_
     assert ends == [["000000-snapshot.imudrec", "000000.imudrec"], ["000000-snapshot.imudrec"]]
 
 
-def test_it_is_wanted_for_either() -> None:
+def test_the_output_is_enabled_for_either_recorder() -> None:
     assert not PUBLISHER.wanted(RecorderOptions())
     assert PUBLISHER.wanted(RecorderOptions(enabled=True))
     assert PUBLISHER.wanted(RecorderOptions(flight=FlightOptions(enabled=True)))
 
 
-def test_where_one_cannot_start_nothing_runs(tmp_path: Path) -> None:
+def test_a_failed_start_leaves_no_recorder_running(tmp_path: Path) -> None:
     bench = RecordingBench()
     (tmp_path / "file").write_bytes(b"")
     flight = FlightOptions(enabled=True, directory=str(tmp_path / "file" / "no"))

@@ -43,7 +43,7 @@ class RecorderBench(RecordingBench):
             return list(RecordingReader(file, path.name))
 
 
-def test_a_file_begins_with_session_host_and_devices_and_ends_regularly(tmp_path: Path) -> None:
+def test_a_file_starts_with_session_host_and_devices_and_has_an_end_record(tmp_path: Path) -> None:
     bench = RecorderBench(tmp_path)
     bench.tick()
     bench.source.deliver()
@@ -56,7 +56,7 @@ def test_a_file_begins_with_session_host_and_devices_and_ends_regularly(tmp_path
     assert bench.context.outputs.recorders == []
 
 
-def test_only_the_named_devices_are_recorded_and_new_ones_as_they_come(tmp_path: Path) -> None:
+def test_only_the_selected_devices_are_recorded_including_new_devices(tmp_path: Path) -> None:
     bench = RecorderBench(tmp_path, devices=["mast", "keel"])
     bench.tick()
     bench.source.present.append("keel")
@@ -67,7 +67,7 @@ def test_only_the_named_devices_are_recorded_and_new_ones_as_they_come(tmp_path:
     assert [one.device for one in bench.read() if one.kind == Kind.DEVICE] == [1, 2, 1]
 
 
-def test_a_new_file_begins_by_size_and_by_time_with_the_states_again(tmp_path: Path) -> None:
+def test_a_new_file_starts_by_size_or_time_with_all_states(tmp_path: Path) -> None:
     bench = RecorderBench(tmp_path, file_mb=1, file_minutes=2)
     bench.tick()
     bench.source.deliver(1_100_000)
@@ -84,7 +84,7 @@ def test_a_new_file_begins_by_size_and_by_time_with_the_states_again(tmp_path: P
     assert [one.number for one in sessions] == [0, 1, 2]
 
 
-def test_a_reading_of_the_clocks_stands_neither_after_the_end_of_a_file_nor_before_the_begin_of_one(
+def test_clock_readings_are_within_a_file(
     tmp_path: Path,
 ) -> None:
     bench = RecorderBench(tmp_path, file_minutes=1)
@@ -104,9 +104,7 @@ def test_a_reading_of_the_clocks_stands_neither_after_the_end_of_a_file_nor_befo
         assert [found[0], found[-1]] == [Kind.SESSION, Kind.END]
 
 
-def test_what_is_dropped_stands_in_the_file_and_the_states_after_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_contains_the_losses_and_then_the_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "RecordQueue", {Path: lambda: RecordQueue[Path](2000)})
     bench = RecorderBench(tmp_path)
     bench.tick()
@@ -130,7 +128,7 @@ def test_what_is_dropped_stands_in_the_file_and_the_states_after_it(
     assert f"{lost.records} records were dropped" in event.message
 
 
-def test_a_full_disk_is_one_event_and_recording_goes_on_when_there_is_room(
+def test_a_full_disk_causes_one_event_and_recording_continues_with_free_space(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench = RecorderBench(tmp_path)
@@ -155,7 +153,7 @@ def test_a_full_disk_is_one_event_and_recording_goes_on_when_there_is_room(
     assert Kind.DATA in bench.kinds(1)
 
 
-def test_old_files_are_removed_for_new_ones(tmp_path: Path) -> None:
+def test_old_files_are_removed_for_new_files(tmp_path: Path) -> None:
     bench = RecorderBench(tmp_path, file_mb=1, keep_gb=0.002)
     bench.tick()
     for _ in range(5):
@@ -170,7 +168,7 @@ def test_old_files_are_removed_for_new_ones(tmp_path: Path) -> None:
     assert bench.recorder.status().files_removed >= 3
 
 
-def test_a_directory_that_cannot_be_made_and_a_budget_for_less_than_two_files_are_refused(tmp_path: Path) -> None:
+def test_an_invalid_directory_and_a_limit_below_two_files_are_rejected(tmp_path: Path) -> None:
     (tmp_path / "recordings").write_bytes(b"")
     with pytest.raises(ServerError, match="recordings"):
         RecorderBench(tmp_path)
@@ -178,7 +176,7 @@ def test_a_directory_that_cannot_be_made_and_a_budget_for_less_than_two_files_ar
         RecorderOptions(keep_gb=0.1)
 
 
-def test_a_mistake_in_the_thread_ends_the_daemon(tmp_path: Path) -> None:
+def test_an_internal_error_in_the_thread_ends_the_daemon(tmp_path: Path) -> None:
     bench = RecorderBench(tmp_path)
     bench.workers[0].failed(ZeroDivisionError("a mistake"))
     with pytest.raises(ZeroDivisionError):

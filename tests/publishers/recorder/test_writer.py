@@ -41,7 +41,7 @@ def read(path: Path) -> list[bytes]:
         ]
 
 
-def test_records_are_in_the_file_after_a_round_each_in_its_own(tmp_path: Path) -> None:
+def test_records_are_in_their_file_after_a_round(tmp_path: Path) -> None:
     bench = WriterBench()
     first, second = tmp_path / "1", tmp_path / "2"
     bench.queue.mark(first)
@@ -60,7 +60,7 @@ def test_records_are_in_the_file_after_a_round_each_in_its_own(tmp_path: Path) -
     bench.writer.close()
 
 
-def test_the_thread_is_woken_for_a_full_block() -> None:
+def test_a_full_block_wakes_the_thread() -> None:
     bench = WriterBench()
     size = len(record(0, 1000))
     for number in range(RING_BYTES // size + 1):
@@ -68,7 +68,7 @@ def test_the_thread_is_woken_for_a_full_block() -> None:
     assert bench.workers[0].rung == 1
 
 
-def test_what_has_no_room_is_dropped_and_counted(tmp_path: Path) -> None:
+def test_records_without_room_are_dropped_and_counted(tmp_path: Path) -> None:
     bench = WriterBench(bytes_max=4 * len(record(0)))
     bench.queue.mark(tmp_path / "1")
     for number in range(10):
@@ -81,7 +81,9 @@ def test_what_has_no_room_is_dropped_and_counted(tmp_path: Path) -> None:
     bench.writer.close()
 
 
-def test_a_full_disk_leaves_whole_blocks_and_ends_the_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_complete_blocks_and_stops_the_writer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench, write = WriterBench(), os.write
     bench.queue.mark(tmp_path / "1")
     bench.queue.put(record(0))
@@ -105,7 +107,7 @@ def test_a_full_disk_leaves_whole_blocks_and_ends_the_writing(tmp_path: Path, mo
     bench.writer.close()
 
 
-def test_a_file_that_is_there_already_is_not_overwritten(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     bench = WriterBench()
     (tmp_path / "1").write_bytes(b"mine")
     bench.queue.mark(tmp_path / "1")
@@ -115,7 +117,7 @@ def test_a_file_that_is_there_already_is_not_overwritten(tmp_path: Path) -> None
     assert (tmp_path / "1").read_bytes() == b"mine"
 
 
-def test_the_file_is_synced_now_and_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_file_is_synchronized_periodically(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench, synced = WriterBench(), list[int]()
     monkeypatch.setattr(os, "fdatasync", synced.append)
     bench.queue.mark(tmp_path / "1")

@@ -25,7 +25,7 @@ class FeedBench(RecordingBench):
         return [record.kind for record in self.taken()]
 
 
-def test_devices_are_described_for_a_limited_time_in_a_tick_and_the_others_in_the_next() -> None:
+def test_the_description_of_devices_is_limited_per_tick() -> None:
     bench = FeedBench()
     bench.source.present = [f"imu{number}" for number in range(5)]
     bench.source.on_begin = lambda: bench.clock.advance(BEGIN_NS // 2)
@@ -36,7 +36,7 @@ def test_devices_are_described_for_a_limited_time_in_a_tick_and_the_others_in_th
     assert found == [2, 2, 1, 0]
 
 
-def test_events_and_checks_are_of_the_devices_that_were_asked_for() -> None:
+def test_events_and_checks_belong_to_the_selected_devices() -> None:
     bench = FeedBench("mast")
     bench.feed.add_device("bow", 0)
     bench.feed.add_device("mast", 1)
@@ -48,7 +48,7 @@ def test_events_and_checks_are_of_the_devices_that_were_asked_for() -> None:
     assert found == [(Kind.EVENT, 1), (Kind.EVENT, NO_DEVICE), (Kind.DEVICE, 1), (Kind.CHECK, 1)]
 
 
-def test_devices_that_are_still_to_be_described_again_are_not_checked() -> None:
+def test_devices_with_a_pending_description_have_no_check() -> None:
     bench = FeedBench()
     bench.feed.follow()
     bench.feed.describe(at_once=False)
@@ -68,7 +68,7 @@ def test_checks_are_due_once_a_second() -> None:
     assert bench.feed.check_if_due(bench.clock.now_ns() + CHECK_NS)
 
 
-def test_what_was_dropped_stands_where_there_is_room_again_with_the_states_after_it() -> None:
+def test_losses_are_recorded_with_the_states_when_there_is_room() -> None:
     bench = FeedBench(bytes_max=500)
     bench.feed.follow()
     bench.taken()
@@ -86,7 +86,7 @@ def test_what_was_dropped_stands_where_there_is_room_again_with_the_states_after
     assert bench.feed.note_losses(bench.advance(1)) == 0
 
 
-def test_the_end_says_what_was_dropped_also_where_there_is_no_room() -> None:
+def test_the_end_contains_the_losses_of_a_full_queue() -> None:
     bench = FeedBench(bytes_max=500)
     bench.feed.follow()
     for _ in range(20):
