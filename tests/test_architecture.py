@@ -176,7 +176,6 @@ LARGE_CONSTRUCTORS = {
     "imud.device.stream_search.StreamRound",
     "imud.device.transport.SearchLoop",
     "imud.device.utc.UtcFeed",
-    "imud.fleet.sender.MqttSender",
     "imud.fleet.writer.SpoolWriter",
     "imud.lines.sync.SyncSignals",
     "imud.sampling.clock.SampleClock",

@@ -186,22 +186,18 @@ class MqttPublisher:
         self._spool = Spool(
             directory, settings.spool_bytes, settings.spool_age_ns, newest_first=settings.newest_first, gateway=gateway
         )  # fmt: skip
+        client_id = f"imud-{settings.site}-{gateway}"
+        now_ns, utc_offset_ns = context.clock.now_ns, context.clock.utc_offset_ns
+        self._sender = MqttSender(settings, client_id, will, turn, self._connect, now_ns)
         if settings.commands.enabled:
             self._commands = CommandChannel(
-                settings.commands,
-                self._gateway,
-                context.devices.control,
-                context.clock.now_ns,
-                context.clock.utc_offset_ns,
+                settings.commands, self._gateway, context.devices.control, now_ns, utc_offset_ns
             )
-        self._sender = MqttSender(
-            settings, f"imud-{settings.site}-{gateway}", will, turn, self._connect, context.clock.now_ns, self._commands
-        )  # fmt: skip
-        if self._commands is not None:
             self._commands.answer = self._sender.reply
+            self._sender.commands = self._commands
         self._writer = SpoolWriter(
-            settings, self._gateway, self._queue, self._spool, self._sender, context.clock.now_ns,
-            context.clock.utc_offset_ns, self._start_worker, self._clock,
+            settings, self._gateway, self._queue, self._spool, self._sender, now_ns, utc_offset_ns, self._start_worker,
+            self._clock,
         )  # fmt: skip
         lock, self._lock = self._lock, -1
         self._writer.closed = lambda: os.close(lock)  # if the disk blocks the writer, its thread keeps the lock

@@ -37,7 +37,7 @@ class MqttSender:
 
     def __init__(
         self, settings: MqttOptions, client_id: str, will: Will, turn: BrokerTurn, connect: Connect,
-        now_ns: Callable[[], int], commands: CommandChannel | None = None,
+        now_ns: Callable[[], int],
     ) -> None:  # fmt: skip
         self.session = 0  # Number of the connection. It changes at each connection and each loss.
         self.connected = False
@@ -50,9 +50,9 @@ class MqttSender:
         self.failure: BaseException | None = None  # internal error that ended the thread
         # Called by the thread if messages are wanted or acknowledgements wait. The writer sets it.
         self.wanting: Callable[[], None] = lambda: None
+        self.commands: CommandChannel | None = None  # receiver of requests; set before `start`
         self._settings, self._client_id, self._will = settings, client_id, will
         self._turn, self._connect, self._now_ns = turn, connect, now_ns
-        self._commands = commands
         self._replies: deque[CommandReply] = deque(maxlen=REPLIES_MAX)
         self._sent_replies: dict[int, CommandReply] = {}  # replies without an acknowledgement, by packet identifier
         self._lock = threading.Lock()
@@ -72,7 +72,7 @@ class MqttSender:
         self._thread = threading.Thread(target=self._main, name="mqtt sender", daemon=True)
         self._thread.start()
 
-    def close(self, last_words: bytes) -> None:
+    def close(self, farewell: bytes) -> None:
         """Publish the retained farewell and end the thread.
 
         Messages without an acknowledgement stay in the spool. A second call does nothing.
@@ -80,7 +80,7 @@ class MqttSender:
         A thread that is still connecting does not complete its connection, because the next output may use the same
         client ID.
         """
-        self._farewell = last_words
+        self._farewell = farewell
         self._ended = True
         self._ring()
         self.join(CLOSE_S)
@@ -175,8 +175,8 @@ class MqttSender:
         if self._ended:
             connection.close()
             return
-        if self._commands is not None:
-            connection.subscribe(self._commands.subscription)
+        if self.commands is not None:
+            connection.subscribe(self.commands.subscription)
         self._turn.connected(self._now_ns())
         self.reconnects += self._was_connected
         self._was_connected = True
@@ -243,8 +243,8 @@ class MqttSender:
         """Check received requests. The event loop runs them."""
         received, connection.received = connection.received, []
         for one in received:
-            if self._commands is not None:
-                self._commands.take(one)
+            if self.commands is not None:
+                self.commands.take(one)
 
     def _disconnect(self, problem: str) -> None:
         connection = self._connection
