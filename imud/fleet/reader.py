@@ -121,7 +121,7 @@ class ReaderConnection:
             self._awaited = len(topics)
             self._call_client(lambda: self._client.subscribe([(topic, 1) for topic in topics]))
             self._watch_writable()
-            # a session can contain more messages than the reader accepts at once, and SUBACK follows them
+            # SUBACK follows the messages of the session, and these can fill the queue
             await self._until(lambda: not self._awaited or not self._has_room(), "no answer to the subscription")
         except (OSError, ValueError) as error:
             self.close()
@@ -350,7 +350,7 @@ def brokers_of(urls: Sequence[str]) -> list[Broker]:
 
 
 class Fleet:
-    """Gateways of a broker or of a cluster of brokers. Synchronization: one event loop."""
+    """Gateways of one broker or one cluster. Synchronization: one event loop."""
 
     def __init__(
         self, *urls: str, access: ReaderAccess | None = None, name: str = "", version: str = VERSIONS[0],
@@ -445,7 +445,7 @@ class FleetSession:
     """Session with the broker over several connections. Synchronization: one event loop."""
 
     def __init__(self, fleet: Fleet, *, site: str | None, gateway: str | None, device: str | None) -> None:
-        """None selects all. Raises BadArgument if a name is invalid."""
+        """Select all gateways or devices with None. Raises BadArgument if a name is invalid."""
         for what, given in (("site", site), ("gateway", gateway), ("device", device)):
             if given is not None and not is_name(given):
                 raise BadArgument(f"{what}: expected 1 to 64 letters, digits, '_' or '-', got {given!r}")

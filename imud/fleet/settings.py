@@ -11,7 +11,7 @@ from imud.model.options import Options, is_host, shown
 from imud.model.units import NS_PER_S
 
 MEGABYTE: Final = 1_000_000
-BROKERS_MAX: Final = 16  # Maximum number of brokers. imud tries one after the other; more brokers would take minutes.
+BROKERS_MAX: Final = 16  # Maximum number of brokers. imud tries them in order, and more brokers would take minutes.
 EVERY: Final = "*"  # key for all devices without an entry of their own
 Measure = Literal["mean", "min", "max", "rms"]
 Name = Annotated[str, msgspec.Meta(pattern=f"^({NAME_PATTERN})?$", extra={"words": "letters, digits, _ and -"})]

@@ -69,7 +69,7 @@ class TcpClient:
     def __init__(self, sock: socket.socket, peer: str) -> None:
         self.sock = sock
         self.peer = peer
-        self._rest = b""  # rest of the sentences of which the kernel accepted only a part
+        self._rest = b""  # rest of a sentence that the kernel accepted in part
         # Time since which the socket buffer is full; None if it has room or imud sends nothing
         self.full_ns: int | None = None
 

@@ -13,8 +13,6 @@ from imud.model.units import NS_PER_S
 
 # Number of periods without a sample after which the sample period is unknown. One or two lost samples have no effect.
 PAUSE_PERIODS: Final = 4
-
-
 NOTHING: Final[Mapping[float, tuple[int, ...]]] = {}  # result of `choose` for most batches
 
 

@@ -249,7 +249,7 @@ class MetricsPublisher:
             age_ns = self._context.clock.now_ns() - self._scraped_ns
             return HttpResponse("200 OK", msgspec.json.encode(Scrapes(self._scrapes, age_ns / NS_PER_S)), JSON)
         if request.path != "/metrics":
-            return HttpResponse("404 Not Found", b"there is only /metrics\n")
+            return HttpResponse("404 Not Found", b"expected /metrics or /scrapes\n")
         self._scrapes += 1
         self._scraped_ns = self._context.clock.now_ns()
         return await self._page(request.accept)
@@ -271,7 +271,7 @@ class MetricsPublisher:
             try:
                 snapshot = await self._ask_loop()
             except TimeoutError:
-                text = f"the daemon gave no status within {self._snapshot_s:g} s\n"
+                text = f"the daemon did not reply within {self._snapshot_s:g} s\n"
                 return HttpResponse("503 Service Unavailable", text.encode())
             finally:
                 del self._pages[content_type]

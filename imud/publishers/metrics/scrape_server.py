@@ -87,7 +87,7 @@ class ScrapeServer:
         if self._stop is None:
             self._thread.join()
             self._listener.close()
-            raise ServerError(f"metrics cannot be served at {self.address} port {self.port}: the thread did not start")
+            raise ServerError(f"cannot serve metrics at {self.address} port {self.port}: the thread did not start")
 
     def close(self) -> None:
         """Close all connections and end the thread. A second call does nothing."""
@@ -206,9 +206,9 @@ def _listen(address: str, port: int) -> socket.socket:
 
 
 def _bind_message(address: str, port: int, error: OSError) -> str:
-    hint = "set metrics.address to an address of this machine, for example 127.0.0.1 or 0.0.0.0"
+    hint = "set metrics.address to an address of the host, for example 127.0.0.1 or 0.0.0.0"
     if error.errno == errno.EADDRINUSE:
-        hint = f"another program listens there, `ss -ltnp 'sport = {port}'` names it; or set metrics.port"
+        hint = f"another program uses this port (`ss -ltnp 'sport = {port}'`); stop it, or set metrics.port"
     elif error.errno == errno.EACCES:
-        hint = "ports below 1024 need CAP_NET_BIND_SERVICE; set metrics.port to a higher one"
-    return f"metrics cannot be served at {address} port {port}: {error.strerror}; {hint}"
+        hint = "ports below 1024 need CAP_NET_BIND_SERVICE; set metrics.port to a higher port"
+    return f"cannot serve metrics at {address} port {port}: {error.strerror}; {hint}"

@@ -158,7 +158,7 @@ class RecorderOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=
         room_mb = (2 * self.file_mb if self.enabled else 0) + self.flight.memory_mb
         if self.flight.enabled and self.keep_gb * 1000 < room_mb:
             raise ValueError(
-                f"keep_gb: expected room for a snapshot of flight.memory_mb ({self.flight.memory_mb:g}) beside the "
+                f"keep_gb: expected room for a snapshot of flight.memory_mb ({self.flight.memory_mb:g}) and the "
                 f"files, {room_mb / 1000:g} or more, got {self.keep_gb:g}"
             )
 
