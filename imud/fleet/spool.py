@@ -177,10 +177,6 @@ CREATE TABLE IF NOT EXISTS progress (
 ) WITHOUT ROWID;
 """
 # Earlier versions stored positions without the name of the gateway, in the table `position`
-_COPY_POSITIONS: Final = """
-INSERT OR IGNORE INTO progress (gateway, boot, device, stream, begin, last, stored_utc_ns)
-    SELECT ?, boot, device, stream, begin, last, stored_utc_ns FROM position
-"""
 _COLUMNS: Final = "id, boot, device, stream, kind, topic, first, last, items, stored_utc_ns, payload"
 # Condition for messages that the sender did not receive. imud may thin or drop only these.
 _FREE: Final = "id > ? AND NOT (id > ? AND id <= ?)"
@@ -255,7 +251,6 @@ class Spool:
         ):  # fmt: skip
             base.execute(f"PRAGMA {pragma}")
         base.executescript(_SCHEMA)
-        self._copy_positions(base)
         newest, self.messages = base.execute("SELECT COALESCE(MAX(id), 0), COUNT(*) FROM message").fetchone()
         if newest >= NUMBER_MOST:
             raise sqlite3.DatabaseError("the row IDs are at their maximum")
@@ -292,15 +287,6 @@ class Spool:
     def _remove_reserve(self) -> None:
         with suppress(OSError):
             os.unlink(self._path.with_name(RESERVE_FILE))
-
-    def _copy_positions(self, base: sqlite3.Connection) -> None:
-        """Copy the positions of an earlier version to the present name of the gateway."""
-        found = base.execute("SELECT COUNT(*) FROM sqlite_master WHERE name = 'position'").fetchone()[0]
-        if found and self._gateway:
-            base.execute("BEGIN IMMEDIATE")
-            base.execute(_COPY_POSITIONS, (self._gateway,))
-            base.execute("DROP TABLE position")
-            base.execute("COMMIT")
 
     def _set_aside(self) -> None:
         self._drop_connection()

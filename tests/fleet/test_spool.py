@@ -10,7 +10,7 @@ from random import Random
 
 import pytest
 
-from imud.fleet.accounts import FleetLedger, StreamCounts, StreamPosition
+from imud.fleet.accounts import FleetLedger, StreamCounts
 from imud.fleet.messages import (
     CLOCK_SET_NS,
     VERSION,
@@ -424,18 +424,6 @@ def test_dropped_messages_of_two_gateway_names_are_not_joined(tmp_path: Path) ->
         ("gw", 1, 100, "dropped"),
         ("other", 101, 200, "dropped"),
     ]
-
-
-def test_positions_of_an_earlier_version_are_copied(tmp_path: Path) -> None:
-    base = sqlite3.connect(tmp_path / FILE, isolation_level=None)
-    base.execute("CREATE TABLE position (boot, device, stream, begin, last, stored_utc_ns)")
-    base.execute("INSERT INTO position VALUES ('1', 'bow', 'samples', 3, 17, 1)")
-    base.close()
-    for _ in range(2):
-        spool = Spool(tmp_path, 1 << 30, HOUR_NS, gateway="gw")
-        spool.open()
-        assert spool.positions() == [StreamPosition("1", "bow", "samples", 3, 17)]
-        spool.close()
 
 
 def test_the_streams_of_the_maximum_number_of_devices_keep_their_begin(tmp_path: Path) -> None:
