@@ -22,7 +22,6 @@ from imud.model.errors import LinkError
 from imud.model.event import EventKind
 from imud.model.options import Options, shown
 from imud.model.units import NS_PER_S
-from imud.recording.observer import PathParts
 from imud.sampling.path import CanPath, SamplePath
 
 
@@ -199,7 +198,7 @@ class CanTransport:
         self._options = options
         self._codec = driver.make_codec(context.ledger, options)
         self.path = CanPath(self._codec, clock, context.path_context(driver, self.link, self._exchange.on_message))
-        context.tap.path_made(PathParts(self.path, driver.name, options))
+        context.tap.path_made(self.path, driver.name, options)
 
     def _begin(self) -> None:
         """Give frames that come from now on to the device's codec."""
@@ -213,7 +212,7 @@ class CanTransport:
         first = driver.example_frames(Random(0))[0]
         bits = frame_bits(first.extended, len(first.data))
         path.set_frame_time(bits * NS_PER_S // link.bitrate if link.bitrate else 0)
-        path.loss.link_opened()
+        path.link_opened()
         path.begin(self._now_ns())
         self._context.attachments.start(path.clock)
 

@@ -33,7 +33,6 @@ from imud.model.event import EventKind
 from imud.model.options import Options
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.recording.observer import PathParts
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import PolledPath, PollTiming, ReadyEdges, SamplePath
 
@@ -327,7 +326,7 @@ class PolledTransport:
         )
         self.driver = driver
         self.path = PolledPath(codec, timing, clock, context.path_context(driver, self.link, _ignore_message))
-        context.tap.path_made(PathParts(self.path, driver.name, device.options, timing.period_ns, timing.edges))
+        context.tap.path_made(self.path, driver.name, device.options)
         return self.path
 
     def _candidates(self) -> list[PolledDriver]:

@@ -23,7 +23,6 @@ from imud.model.event import EventKind
 from imud.model.ledger import Ledger
 from imud.model.sample import Sync
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
-from imud.recording.observer import PathParts
 from imud.sampling.path import SamplePath, StreamPath
 
 GRID_NS: Final = NS_PER_MS
@@ -215,7 +214,7 @@ class StreamTransport:
         else:
             path.clock.restart()
         path.clock.link_changed(byte_ns=uart_byte_ns(link.baud), hold_ns=link.hold_ns)
-        path.loss.link_opened()
+        path.link_opened()
         path.begin(self._now_ns())
         self._remember()
         self._context.attachments.start(path.clock)
@@ -232,7 +231,7 @@ class StreamTransport:
         path_context = context.path_context(driver, self.link, self._exchange.on_message)
         self.driver = driver
         self.path = StreamPath(codec, clock, path_context, context.attachments.drain_edges, self._exchange)
-        context.tap.path_made(PathParts(self.path, driver.name, options))
+        context.tap.path_made(self.path, driver.name, options)
         return self.path
 
     def _remember(self) -> None:

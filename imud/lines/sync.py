@@ -162,23 +162,23 @@ class SyncSignals:
     def _on_sout(self, edges: Sequence[Edge]) -> None:
         if self._clock is not None:
             self._follow()
-            self._clock.aiding.on_sout_edges(edges)
+            self._clock.add_edges("sout", edges)
 
     def _on_divided(self, edges: Sequence[Edge]) -> None:
         if self._clock is not None:
-            self._clock.aiding.on_divided_edges(edges)
+            self._clock.add_edges("sout_div", edges)
 
     def _on_pps(self, edges: Sequence[Edge]) -> None:
         self._follow()
         if self._clock is not None:
-            self._clock.aiding.on_pps_edges(edges)
+            self._clock.add_edges("pps", edges)
         if self._on_pulses is not None:
             self._on_pulses(edges)
 
     def _on_stamps(self, stamps: Sequence[TriggerStamp]) -> None:
         if self._clock is not None:
             self._follow()
-            self._clock.aiding.on_trigger_stamps(stamps)
+            self._clock.add_triggers(stamps)
 
     def _on_alarm(self, edges: Sequence[Edge]) -> None:
         self._alarm.line.on_edges(edges)

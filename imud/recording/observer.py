@@ -1,15 +1,12 @@
-"""Taps: where a recording hears what goes into the path and the clock of a device, and the host's clocks.
+"""Observers of the input of paths and of the host's clocks: they encode the input as records.
 
-A tap without listeners costs nothing: the methods of path and clock are as their classes have them. While anything
-listens, those of the device's own objects are replaced by ones that call them and then make a record: after, so that
-clocks that were read and edges that were fetched on the way stand before it.
-Synchronization: the event loop's thread only.
+A path calls its observer after each input, so that the clock readings and edges that the input needed are recorded
+before it. Synchronization: the event loop's thread only.
 """
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Protocol, cast
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Protocol
 
 import msgspec
 
@@ -25,40 +22,15 @@ from imud.model.errors import Trouble
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.recording.state import StateError, StateWriter
-from imud.sampling.path import DeviceClock, ReadyEdges, SamplePath
-from imud.sampling.steering import AidingSources
+from imud.sampling.path import PolledPath, SamplePath
 
 log = logging.getLogger(__name__)
 
-PATH_OWN: Final = frozenset({
-    "_device", "_device_id", "_drain_edges", "_ledger", "_listener", "_now_ns", "_on_bad_frame", "_on_message",
-    "_overruns", "_publish", "_rotation", "_status_mask", "_status_seen", "_utc_offset_ns", "frame", "latency",
-})  # fmt: skip
-"""Attributes of a path that are no part of its state: what it was made with, and what is only shown."""
 TROUBLES: Final = tuple(Trouble)
-PATH_CALLS: Final = ("begin", "flush", "reset", "publish_gathered", "set_frame_time")
-CLOCK_CALLS: Final = ("restart", "link_changed", "set_utc_reference", "set_own_status")
-LINE_CALLS: Final = {"sout": "on_sout_edges", "sout_div": "on_divided_edges", "pps": "on_pps_edges"}
-"""Method of the clock's aiding sources that takes the edges of a line."""
-
-Note = Callable[..., None]
-
-
-@dataclass(frozen=True, slots=True)
-class PathParts:
-    """A path as its transport made it."""
-
-    path: SamplePath
-    driver: str
-    options: Options | None
-    period_ns: int = 0
-    """Polled devices: time between two reads."""
-    edges: ReadyEdges | None = None
-    """Of a data-ready line."""
 
 
 class PathObserver:
-    """Tap of one device; its transport says when there is another path."""
+    """Recorder of the input of one device's path. The transport calls `path_made` for each new path."""
 
     def __init__(self, config: DeviceConfig, device_id: int, ledger: Ledger, host: HostClock) -> None:
         self._config = config
@@ -66,27 +38,26 @@ class PathObserver:
         self._ledger = ledger
         self._host = host
         self._listeners: list[PutRecord] = []
-        self._parts: PathParts | None = None
-        self._observed: list[tuple[object, str]] = []
+        self._path: SamplePath | None = None
+        self._driver = ""
+        self._options: Options | None = None
         self._overruns = 0
-        self._inside = False
-        """Whether a method of the path runs."""
-        self._heard: _HeardAiding | None = None
 
     # --- the transport's side ----------------------------------------------------------------------------------------
 
-    def path_made(self, parts: PathParts) -> None:
-        """Listen to this path from now on."""
-        self._release()
-        self._parts = parts
+    def path_made(self, path: SamplePath, driver: str, options: Options | None) -> None:
+        """Replace the path of the device: record the new path, and observe it instead of the old path."""
+        if self._path is not None:
+            self._path.observe(None)
+        self._path, self._driver, self._options = path, driver, options
         if self._listeners:
-            self._put(self._path_record())
-            self._observe(parts)
+            self._put(self._path_record(path))
+            path.observe(self)
 
     def codec_changed(self) -> None:
         """Note that the codec was set by what the device said of itself."""
-        if self._listeners and self._parts is not None:
-            self._put(self._path_record())
+        if self._listeners and self._path is not None:
+            self._put(self._path_record(self._path))
 
     def described(self, where: str, identity: Mapping[str, str], settings: Mapping[str, str]) -> None:
         """Note what the device said of itself."""
@@ -98,23 +69,22 @@ class PathObserver:
     def begin(self, put: PutRecord, where: str, identity: Mapping[str, str], settings: Mapping[str, str]) -> None:
         """Describe the device with its path as it is now, and pass on all that follows."""
         put(self._device_record(where, identity, settings))
-        if self._parts is not None:
-            put(self._path_record())
         if put not in self._listeners:
             self._listeners.append(put)
-        if self._parts is not None and not self._observed:
-            self._observe(self._parts)
+        if self._path is not None:
+            put(self._path_record(self._path))
+            self._path.observe(self)
 
     def end(self, put: PutRecord) -> None:
         """Pass on nothing any more; no-op for one that does not listen."""
         if put in self._listeners:
             self._listeners.remove(put)
-        if not self._listeners:
-            self._release()
+        if not self._listeners and self._path is not None:
+            self._path.observe(None)
 
     def check(self, put: PutRecord) -> None:
         """Record the newest sample and the ledger."""
-        newest = self._parts.path.newest if self._parts is not None else None
+        newest = self._path.newest if self._path is not None else None
         checked = CheckRecord(
             self._host.now_ns(),
             newest.seq if newest is not None else 0,
@@ -137,147 +107,48 @@ class PathObserver:
         )
         return records.encode_object(Kind.DEVICE, self._id, described)
 
-    def _path_record(self) -> bytes:
-        parts = self._parts
-        assert parts is not None
-        options = msgspec.to_builtins(parts.options) if parts.options is not None else {}
-        made = PathRecord(parts.driver, options, parts.period_ns, self._ledger.snapshot(), self._state(parts))
+    def _path_record(self, path: SamplePath) -> bytes:
+        options = msgspec.to_builtins(self._options) if self._options is not None else {}
+        period_ns = path.period_ns if isinstance(path, PolledPath) else 0
+        made = PathRecord(self._driver, options, period_ns, self._ledger.snapshot(), self._state(path))
         return records.encode_object(Kind.PATH, self._id, made)
 
-    def _state(self, parts: PathParts) -> bytes:
-        writer = StateWriter({"ledger": self._ledger, "steady": self._host.steady}, PATH_OWN)
-        roots: dict[str, object] = {"path": parts.path}
-        if parts.edges is not None:
-            roots = {"edges": parts.edges, **roots}
+    def _state(self, path: SamplePath) -> bytes:
+        external = {"ledger": self._ledger, "steady": self._host.steady, "observer": self}
         try:
-            return writer.write(roots)
+            return StateWriter(external, path.NOT_STATE).write({"path": path})
         except StateError as error:
             log.warning("%s: recorded without its state: %s", self._config.name, error)
             return b""
 
-    def _observe(self, parts: PathParts) -> None:
-        path, clock = parts.path, parts.path.clock
-        for name, note in self._notes().items():
-            if hasattr(path, name):
-                self._replace(path, name, note)
-        for name in PATH_CALLS:
-            if hasattr(path, name):
-                self._replace(path, name, self._begun if name == "begin" else self._call("path", name))
-        self._replace(path.loss, "link_opened", self._call("loss", "link_opened"))
-        self._replace(path.loss, "missed", self._missed)
-        for name in CLOCK_CALLS:
-            self._replace(clock, name, self._call("clock", name))
-        if isinstance(clock, DeviceClock):
-            clock.heard_aiding = self._hear
-            self._observed.append((clock, "heard_aiding"))
-        if parts.edges is not None:
-            self._replace(parts.edges, "on_edges", self._edges("data_ready"))
-            self._replace(parts.edges, "restart", self._call("edges", "restart"))
+    # --- the input, reported by the path (`InputObserver`) -----------------------------------------------------------
 
-    def _replace(self, target: object, name: str, note: Note) -> None:
-        method = getattr(target, name)
+    def data(self, data: bytes, t_rx_ns: int, waited_ns: int) -> None:
+        """Record bytes."""
+        self._put(records.encode_data(self._id, data, t_rx_ns, waited_ns))
 
-        def observed(*args: Any, **kwargs: Any) -> Any:
-            try:
-                return method(*args, **kwargs)
-            finally:  # what made the daemon fail is what one wants to see
-                note(*args, **kwargs)
+    def frames(self, frames: Sequence[CanFrame]) -> None:
+        """Record CAN frames."""
+        self._put(records.encode_frames(self._id, frames))
 
-        def outermost(*args: Any, **kwargs: Any) -> Any:
-            if self._inside:  # a replay makes this call by the outer one
-                return method(*args, **kwargs)
-            self._inside = True
-            try:
-                return method(*args, **kwargs)
-            finally:
-                self._inside = False
-                note(*args, **kwargs)
+    def readings(self, readings: Sequence[Reading]) -> None:
+        """Record the readings of a polled device."""
+        self._put(records.encode_readings(self._id, [_reading(one) for one in readings]))
 
-        setattr(target, name, outermost if isinstance(target, SamplePath) else observed)
-        self._observed.append((target, name))
+    def edges(self, line: str, edges: Sequence[Edge]) -> None:
+        """Record edges of a line."""
+        self._put(records.encode_edges(self._id, line, edges))
 
-    def _hear(self, aiding: AidingSources) -> AidingSources:
-        """Return what stands for the aiding sources."""
-        if self._heard is None or self._heard.of is not aiding:
-            notes = {name: self._edges(line) for line, name in LINE_CALLS.items()}
-            self._heard = _HeardAiding(
-                aiding, {**notes, "on_trigger_stamps": self._call("aiding", "on_trigger_stamps")}
-            )
-        return cast(AidingSources, self._heard)
+    def overruns(self, count: int) -> None:
+        """Record the kernel's count of overruns if it changed. The data of the loss is recorded after it."""
+        if count != self._overruns:
+            self._overruns = count
+            self.call("path", "overruns", count)
 
-    def _release(self) -> None:
-        for target, name in self._observed:
-            delattr(target, name)
-        self._observed = []
-
-    def _notes(self) -> dict[str, Note]:
-        """What makes records of the methods of a path that are given data."""
-        device, put = self._id, self._put
-        encode_data = records.encode_data
-
-        def on_data(data: bytes, t_rx_ns: int) -> None:
-            put(encode_data(device, data, t_rx_ns, -1))
-
-        def gather(data: bytes, t_rx_ns: int, waited_ns: int = 0) -> None:
-            put(encode_data(device, data, t_rx_ns, waited_ns))
-
-        def on_frames(frames: Sequence[CanFrame]) -> None:
-            put(records.encode_frames(device, frames))
-
-        def on_readings(readings: Sequence[Reading]) -> None:
-            put(records.encode_readings(device, [_reading(one) for one in readings]))
-
-        def skip(reading: Reading) -> None:
-            put(records.encode_object(Kind.CALL, device, CallRecord("path", "skip", [len(reading.data)])))
-
-        return {
-            "on_data": on_data, "gather": gather, "on_frames": on_frames, "on_readings": on_readings, "skip": skip
-        }  # fmt: skip
-
-    def _call(self, target: str, method: str) -> Note:
-        def note(*args: Any, **kwargs: Any) -> None:
-            call = CallRecord(target, method, [msgspec.to_builtins(one) for one in args], kwargs)
-            self._put(records.encode_object(Kind.CALL, self._id, call))
-
-        return note
-
-    def _begun(self, now_ns: int) -> None:
-        """Record the begin of the path, with what a search has counted before."""
-        self._call("ledger", "set")(self._ledger.snapshot())
-        self._call("path", "begin")(now_ns)
-
-    def _missed(self, _count: int, overruns: int) -> None:
-        """Record the kernel's overruns, before the data with which they were looked at."""
-        if overruns != self._overruns:
-            self._overruns = overruns
-            self._call("path", "overruns")(overruns)
-
-    def _edges(self, line: str) -> Note:
-        def note(edges: Sequence[Edge]) -> None:
-            self._put(records.encode_edges(self._id, line, edges))
-
-        return note
-
-
-class _HeardAiding:
-    """Aiding sources with notes of some of their methods."""
-
-    def __init__(self, of: AidingSources, notes: Mapping[str, Note]) -> None:
-        self.of = of
-        self._notes = notes
-
-    def __getattr__(self, name: str) -> Any:
-        method, note = getattr(self.of, name), self._notes.get(name)
-        if note is None:
-            return method
-
-        def observed(*args: Any) -> None:
-            try:
-                method(*args)
-            finally:
-                note(*args)
-
-        return observed
+    def call(self, target: str, method: str, *arguments: object, **keywords: object) -> None:
+        """Record the call of a method of path or clock."""
+        call = CallRecord(target, method, [msgspec.to_builtins(one) for one in arguments], keywords)
+        self._put(records.encode_object(Kind.CALL, self._id, call))
 
 
 class ClockObserver:

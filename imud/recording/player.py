@@ -28,7 +28,7 @@ from imud.model.errors import ImudError, TransferError, reason_of
 from imud.model.event import Event, kind_of
 from imud.model.ledger import LEDGER_FIELDS, Ledger
 from imud.model.options import NoOptions
-from imud.recording.observer import LINE_CALLS, TROUBLES
+from imud.recording.observer import TROUBLES
 from imud.recording.state import StateError, StateReader
 from imud.sampling.path import (
     CanPath,
@@ -56,7 +56,6 @@ class PlayedDevice:
     ledger: Ledger = field(default_factory=Ledger)
     path: SamplePath | None = None
     driver: Driver | None = None
-    edges: ReadyEdges | None = None
     overruns: int = 0
     checks: int = 0
     """Places where the recording says what the live run had."""
@@ -218,11 +217,9 @@ class Player:
     def _restore(self, device: PlayedDevice, state: bytes) -> None:
         if self._no_state or not state:
             raise StateError(self._no_state or "the recording does not have the state of its clock")
-        reader = StateReader(state, {"ledger": device.ledger, "steady": self._host.steady})
-        if device.edges is not None:
-            reader.restore("edges", device.edges)
         assert device.path is not None
-        reader.restore("path", device.path)
+        external = {"ledger": device.ledger, "steady": self._host.steady, "observer": None}
+        StateReader(state, external).restore("path", device.path)
 
     def _path(
         self, device: PlayedDevice, driver: Driver, config: DeviceConfig, made: PathRecord, before: SamplePath | None
@@ -243,9 +240,9 @@ class Player:
         if isinstance(driver, CanDriver):
             return CanPath(driver.make_codec(ledger, options), clock, context)
         assert isinstance(driver, PolledDriver)
-        if config.lines is not None and config.lines.data_ready is not None:
-            device.edges = ReadyEdges(config.lines.data_ready, made.period_ns)
-        timing = PollTiming(made.period_ns, driver.update_ns(options), device.edges)
+        ready = config.lines.data_ready if config.lines is not None else None
+        edges = ReadyEdges(ready, made.period_ns) if ready is not None else None
+        timing = PollTiming(made.period_ns, driver.update_ns(options), edges)
         return PolledPath(driver.make_codec(ledger, options), timing, clock, context)
 
     # --- calls -------------------------------------------------------------------------------------------------------
@@ -253,13 +250,8 @@ class Player:
     def _call(self, device: PlayedDevice | None, call: CallRecord) -> None:
         if call.target == "host" and call.method == "restore":
             self._restore_host(*call.arguments)
-            return
-        if device is None or device.path is None:
-            return
-        made = _CALLS.get((call.target, call.method))
-        if made is None:
-            raise ImudError(f"the recording has a call {call.target}.{call.method}, which this imud does not know")
-        made(device, *call.arguments, **call.keywords)
+        elif device is not None and device.path is not None:
+            _repeat(device, device.path, call)
 
 
 def _config_of(described: DeviceRecord, driver: Driver, made: PathRecord) -> DeviceConfig:
@@ -278,11 +270,12 @@ def _config_of(described: DeviceRecord, driver: Driver, made: PathRecord) -> Dev
 
 
 def _give_edges(device: PlayedDevice, line: str, found: list[records.EdgeRecord]) -> None:
-    edges = [Edge(*one) for one in found]
-    if line == "data_ready" and device.edges is not None:
-        device.edges.on_edges(edges)
-    elif line in LINE_CALLS and device.path is not None:
-        getattr(device.path.clock.aiding, LINE_CALLS[line])(edges)
+    edges, path = [Edge(*one) for one in found], device.path
+    if line != "data_ready":
+        if path is not None:
+            path.clock.add_edges(line, edges)
+    elif isinstance(path, PolledPath) and path.edges is not None:
+        path.edges.on_edges(edges)
 
 
 def _reading(one: records.ReadingRecord) -> Reading:
@@ -318,47 +311,36 @@ def _check(device: PlayedDevice, live: CheckRecord) -> None:
         device.differences.append(f"at {live.t_ns} ns: {words}")
 
 
-def _set_ledger(device: PlayedDevice, values: dict[str, int]) -> None:
+def _set_ledger(ledger: Ledger, values: dict[str, int]) -> None:
     for name in LEDGER_FIELDS:
-        setattr(device.ledger, name, values[name])
+        setattr(ledger, name, values[name])
 
 
-def _skip(device: PlayedDevice, size: int) -> None:
-    device.ledger.bytes_in += size
-    device.ledger.bytes_skipped += size
-
-
-def _set_overruns(device: PlayedDevice, overruns: int) -> None:
-    device.overruns = overruns
-
-
-def _of(part: str, method: str, convert: Callable[[Any], Any] = lambda one: one) -> Callable[..., None]:
-    """Return what calls a method of a part of a device's path."""
-
-    def call(device: PlayedDevice, *arguments: Any, **keywords: Any) -> None:
-        path: Any = device.path
-        targets = {"path": path, "edges": device.edges, "clock": path.clock, "loss": path.loss}
-        target = path.clock.aiding if part == "aiding" else targets[part]
-        getattr(target, method)(*map(convert, arguments), **keywords)
-
-    return call
-
-
-_CALLS: Final[dict[tuple[str, str], Callable[..., None]]] = {
-    **{("path", name): _of("path", name) for name in ("begin", "flush", "reset", "publish_gathered", "set_frame_time")},
-    ("path", "skip"): _skip,
-    ("path", "overruns"): _set_overruns,
-    ("ledger", "set"): _set_ledger,
-    ("loss", "link_opened"): _of("loss", "link_opened"),
-    **{("clock", name): _of("clock", name) for name in ("restart", "link_changed", "set_own_status")},
-    ("aiding", "on_trigger_stamps"): _of(
-        "aiding", "on_trigger_stamps", lambda stamps: [TriggerStamp(*one) for one in stamps]
-    ),
-    ("clock", "set_utc_reference"): _of(
-        "clock", "set_utc_reference", lambda one: None if one is None else UtcReference(*one)
-    ),
-    ("edges", "restart"): _of("edges", "restart"),
-}
+def _repeat(device: PlayedDevice, path: Any, call: CallRecord) -> None:
+    """Make a recorded call of the path, or of a part of it."""
+    arguments = call.arguments
+    match call.target, call.method:
+        case "path", "begin" | "flush" | "reset" | "publish_gathered" | "set_frame_time":
+            getattr(path, call.method)(*arguments)
+        case "path", "skip":
+            device.ledger.bytes_in += arguments[0]
+            device.ledger.bytes_skipped += arguments[0]
+        case "path", "overruns":
+            device.overruns = arguments[0]
+        case "ledger", "set":
+            _set_ledger(device.ledger, arguments[0])
+        case "loss", "link_opened":
+            path.link_opened()
+        case "edges", "restart":
+            path.edges.restart()
+        case "clock", "restart" | "link_changed" | "set_own_status":
+            getattr(path.clock, call.method)(*arguments, **call.keywords)
+        case "clock", "set_utc_reference":
+            path.clock.set_utc_reference(None if arguments[0] is None else UtcReference(*arguments[0]))
+        case "aiding", "on_trigger_stamps":
+            path.clock.add_triggers([TriggerStamp(*one) for one in arguments[0]])
+        case _:
+            raise ImudError(f"the recording has a call {call.target}.{call.method}, which this imud does not know")
 
 
 def _ignore_message(_message: Message, _t_rx_ns: int) -> None:

@@ -36,19 +36,14 @@ class StateError(ImudError):
 
 
 def attributes(value: object) -> Attributes:
-    """Return the attributes of an object, in slots or not, but for methods and None of its class that were
-    replaced on the object itself."""
+    """Return the attributes of an object, in slots or not."""
     found: Attributes = {}
     for class_ in type(value).__mro__:
         slots = class_.__dict__.get("__slots__", ())
         for name in (slots,) if isinstance(slots, str) else slots:
             if name not in ("__dict__", "__weakref__") and hasattr(value, name):
                 found[name] = getattr(value, name)
-    for name, one in getattr(value, "__dict__", {}).items():
-        of_class = getattr(type(value), name, found)
-        if of_class is not None and not callable(of_class):
-            found[name] = one
-    return found
+    return found | getattr(value, "__dict__", {})
 
 
 class StateWriter:

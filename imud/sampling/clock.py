@@ -23,7 +23,17 @@ from functools import partial
 from math import hypot
 from typing import Final, NamedTuple
 
-from imud.contracts.lines import NO_TIME_BITS, Mark, SoutTiming, TimeBits, TriggerTiming, UtcReference
+from imud.contracts.lines import (
+    NO_TIME_BITS,
+    Edge,
+    Mark,
+    SoutTiming,
+    TimeBits,
+    TriggerStamp,
+    TriggerTiming,
+    UtcReference,
+)
+from imud.contracts.observer import InputObserver
 from imud.contracts.status import ClockStatus
 from imud.host.clock import UNSTEERED, SteadyTime
 from imud.model.sample import T_ERR_MOST, Measurement, Sample, Sync
@@ -143,7 +153,7 @@ class SampleClock:
         "_aiding", "_arrivals", "_delay", "_device", "_error_ns", "_fit", "_fit_begin_ns", "_fit_bias_ns",
         "_fit_error_ns", "_fit_sync", "_holdover", "_host", "_jump", "_known", "_line", "_make_aiding",
         "_on_unknown_gap", "_own_status", "_resets", "_seq", "_slew", "_stamps", "_sync", "_t_err_ns", "_t_ns",
-        "_t_rx_ns", "_time", "missed", "waited_ns",
+        "_t_rx_ns", "_time", "missed", "observer", "waited_ns",
     )  # fmt: skip
 
     def __init__(
@@ -175,6 +185,8 @@ class SampleClock:
         self._own_status: int | None = None
         self.missed = 0
         """Samples missing right before the newest one; one of unknown size is no part of it."""
+        self.observer: InputObserver | None = None
+        """Observer of the input; None if no recording runs. `SamplePath.observe` sets it."""
         self.waited_ns = 0  # set by the owner: how long the messages given next may have waited unread
 
     def sample(self, m: Measurement, t_rx_ns: int, utc_offset_ns: int, t_begin_ns: int | None = None) -> Sample:
@@ -273,17 +285,35 @@ class SampleClock:
 
     # --- aiding sources ------------------------------------------------------------------------------------------
 
-    @property
-    def aiding(self) -> AidingSources:
-        """Where edges and triggers are added, right before the messages that follow them; made on first use."""
+    def _sources(self) -> AidingSources:
+        """Return the aiding sources, made on first use: without them the clock is faster."""
         if self._aiding is None:
             self._aiding = self._make_aiding()
         return self._aiding
 
+    def add_edges(self, line: str, edges: Sequence[Edge]) -> None:
+        """Add edges of the line `sout`, `sout_div` or `pps`, right before the messages that follow them."""
+        if line == "sout":
+            self._sources().on_sout_edges(edges)
+        elif line == "sout_div":
+            self._sources().on_divided_edges(edges)
+        elif line == "pps":
+            self._sources().on_pps_edges(edges)
+        if self.observer is not None:
+            self.observer.edges(line, edges)
+
+    def add_triggers(self, stamps: Sequence[TriggerStamp]) -> None:
+        """Add triggers that the host gave on SIN, right before the messages that answer them."""
+        self._sources().on_trigger_stamps(stamps)
+        if self.observer is not None:
+            self.observer.call("aiding", "on_trigger_stamps", stamps)
+
     def set_utc_reference(self, reference: UtcReference | None) -> None:
         """Set the host's estimate of UTC, or None. A device on UTC is recognised by it."""
         if reference is not None or self._aiding is not None:
-            self.aiding.set_utc_reference(reference)
+            self._sources().set_utc_reference(reference)
+        if self.observer is not None:
+            self.observer.call("clock", "set_utc_reference", reference)
 
     @property
     def utc_reference(self) -> UtcReference | None:
@@ -293,6 +323,8 @@ class SampleClock:
     def set_own_status(self, bits: int | None) -> None:
         """Set the host's own bits, which `sample` adds to the status from now on; None for none."""
         self._own_status = bits
+        if self.observer is not None:
+            self.observer.call("clock", "set_own_status", bits)
 
     def take_marks(self) -> list[Mark]:
         """Return the pulses on SOUT_DIV whose samples are known by now, in order, each once."""
@@ -329,6 +361,8 @@ class SampleClock:
         self._delay = LinkDelay(byte_ns, hold_ns)
         self._arrivals.change_link(self._delay)
         self._drop_fit()
+        if self.observer is not None:
+            self.observer.call("clock", "link_changed", byte_ns=byte_ns, hold_ns=hold_ns)
 
     def restart(self) -> None:
         """Begin anew after the device or the link was away: the next stamp is no reset. What is missing until then is
@@ -340,6 +374,8 @@ class SampleClock:
             self._stamps.restart()
         self.missed = 0
         self._drop_fit()
+        if self.observer is not None:
+            self.observer.call("clock", "restart")
 
     def continue_from(self, other: "SampleClock") -> None:
         """Go on where another clock of the same device ends: `seq` and `t_ns` keep rising."""

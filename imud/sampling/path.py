@@ -10,12 +10,13 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import hypot, sqrt
-from typing import Final, NamedTuple, Protocol
+from typing import ClassVar, Final, NamedTuple, Protocol
 
 from imud.attitude.published import PublishedAxes
 from imud.contracts.codec import BadFrame, BadReason, CanCodec, CodecEvent, PolledCodec, Reading, StreamCodec, Vanished
 from imud.contracts.driver import Driver
 from imud.contracts.lines import DeviceLines, Edge, ReadyOptions
+from imud.contracts.observer import InputObserver
 from imud.contracts.publisher import AS_SENT, Batch
 from imud.contracts.script import Message, ReplyFrame, TextLine
 from imud.contracts.status import LATENCY_BOUNDS_NS
@@ -26,7 +27,7 @@ from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Sample
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sampling.clock import SampleClock
-from imud.sampling.steering import STAMP_FLOOR_NS, AidingSources
+from imud.sampling.steering import STAMP_FLOOR_NS
 
 RATE_WINDOW_NS = 2 * NS_PER_S
 """The rate shown is that of the last two seconds: long enough for 1 Hz devices, short enough to see a stall."""
@@ -132,10 +133,18 @@ class PathContext:
 class SamplePath(ABC):
     """Path from the data of one device to published samples; subclasses receive the data."""
 
+    NOT_STATE: ClassVar = frozenset({
+        "_device", "_device_id", "_drain_edges", "_ledger", "_listener", "_now_ns", "_on_bad_frame", "_on_message",
+        "_overruns", "_publish", "_rotation", "_status_mask", "_status_seen", "_utc_offset_ns", "frame", "latency",
+    })  # fmt: skip
+    """Attributes that a recorded state leaves out: parts of the daemon, and statistics."""
+
     def __init__(self, clock: SampleClock, context: PathContext) -> None:
         self.clock = clock
         self.latency = LatencyMeter()
         self.loss = LossMeter(context.ledger)
+        self.observer: InputObserver | None = None
+        """Observer of the input; None if no recording runs. `observe` sets it."""
         self.newest: Sample | None = None
         """As the device sent it, in the sensor's own axes."""
         self.frame = context.frame
@@ -155,6 +164,10 @@ class SamplePath(ABC):
         self._overruns = context.overruns
         self._now_ns = context.host.now_ns
         self._utc_offset_ns = context.host.utc_offset_ns
+
+    def observe(self, observer: InputObserver | None) -> None:
+        """Report each input of the path and of its clock to `observer`; None ends the reports."""
+        self.observer = self.clock.observer = observer
 
     def watch_status(self, mask: int) -> None:
         """Gather these bits of the status of all samples from now on."""
@@ -180,14 +193,39 @@ class SamplePath(ABC):
         """Start on a link whose device is found."""
         self.begun_ns = self.last_data_ns = now_ns
         self._begun_samples = self._ledger.samples
+        self._on_begin()
+        if self.observer is not None:  # with the counters of a search before
+            self.observer.call("ledger", "set", self._ledger.snapshot())
+            self.observer.call("path", "begin", now_ns)
 
-    @abstractmethod
+    def link_opened(self) -> None:
+        """Note that the kernel's counters of the link restarted."""
+        self.loss.link_opened()
+        if self.observer is not None:
+            self.observer.call("loss", "link_opened")
+
     def flush(self, now_ns: int) -> None:
         """Process what waits for a rest that did not come: the link is idle."""
+        try:
+            self._flush(now_ns)
+        finally:
+            if self.observer is not None:
+                self.observer.call("path", "flush", now_ns)
 
-    @abstractmethod
     def reset(self) -> None:
         """Discard what is incomplete: the link ended."""
+        self._reset()
+        if self.observer is not None:
+            self.observer.call("path", "reset")
+
+    def _on_begin(self) -> None:  # noqa: B027 - most paths have nothing to prepare
+        """Prepare for the first data of a link."""
+
+    @abstractmethod
+    def _flush(self, now_ns: int) -> None: ...
+
+    @abstractmethod
+    def _reset(self) -> None: ...
 
     def publish_events(self, events: Sequence[CodecEvent], t_rx_ns: int) -> None:
         """Publish the samples in what a codec made of something that came at `t_rx_ns`, as one batch."""
@@ -218,7 +256,7 @@ class SamplePath(ABC):
             if type(event) is Measurement:
                 samples.append(clock.sample(event, t_rx_ns, utc_offset_ns, t_begin_ns))
                 if clock.missed:
-                    loss.missed(clock.missed, self._overruns())
+                    self._add_loss(clock.missed)
                 loss.bad_frames = 0
             elif type(event) is TextLine:
                 self._on_message(event.text, t_rx_ns)
@@ -228,6 +266,12 @@ class SamplePath(ABC):
                 if event.reason is not BadReason.NOT_FINITE:  # that one comes with its sample
                     loss.bad_frames += 1
                 self._on_bad_frame(event)
+
+    def _add_loss(self, count: int) -> None:
+        overruns = self._overruns()
+        self.loss.missed(count, overruns)
+        if self.observer is not None:
+            self.observer.overruns(overruns)
 
     def _finish(self, samples: list[Sample], t_rx_ns: int) -> None:
         self._ledger.samples += len(samples)
@@ -276,13 +320,17 @@ class StreamPath(SamplePath):
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
         """Process bytes as read, with CLOCK_MONOTONIC right after the read."""
         self.last_data_ns = t_rx_ns
-        if self._drain_edges is not None:
-            self._drain_edges()
-        events = self.codec.feed(data)
-        if events:
-            self.publish_events(events, t_rx_ns)
-            if self._listener is not None and self._listener.wants_samples:
-                self._pass_on(events, self._listener)
+        try:
+            if self._drain_edges is not None:
+                self._drain_edges()
+            events = self.codec.feed(data)
+            if events:
+                self.publish_events(events, t_rx_ns)
+                if self._listener is not None and self._listener.wants_samples:
+                    self._pass_on(events, self._listener)
+        finally:  # a recording must contain the data that caused an error
+            if self.observer is not None:
+                self.observer.data(data, t_rx_ns, -1)
 
     def gather(self, data: bytes, t_rx_ns: int, waited_ns: int = 0) -> bool:
         """Process bytes, and keep their samples for `publish_gathered`; returns whether there are any.
@@ -290,34 +338,42 @@ class StreamPath(SamplePath):
         The bytes waited in the kernel for up to `waited_ns`; 0: they were read as they came.
         """
         self.last_data_ns = t_rx_ns
-        events = self.codec.feed(data)
-        if not events:
-            return False
-        before = len(self.gathered)
-        self.clock.waited_ns = waited_ns
-        self._sort(events, t_rx_ns, self._utc_offset_ns(), self.gathered)
-        self.clock.waited_ns = 0
-        return len(self.gathered) > before
+        try:
+            events = self.codec.feed(data)
+            if not events:
+                return False
+            before = len(self.gathered)
+            self.clock.waited_ns = waited_ns
+            self._sort(events, t_rx_ns, self._utc_offset_ns(), self.gathered)
+            self.clock.waited_ns = 0
+            return len(self.gathered) > before
+        finally:
+            if self.observer is not None:
+                self.observer.data(data, t_rx_ns, waited_ns)
 
     def publish_gathered(self) -> None:
         """Publish the samples that were kept, as one batch."""
         samples, self.gathered = self.gathered, []
-        if samples:
-            self._finish(samples, samples[-1].t_rx_ns)
+        try:
+            if samples:
+                self._finish(samples, samples[-1].t_rx_ns)
+        finally:
+            if self.observer is not None:
+                self.observer.call("path", "publish_gathered")
 
     def _pass_on(self, events: Sequence[CodecEvent], listener: SampleListener) -> None:
         for event in events:
             if type(event) is Measurement:
                 listener.on_sample(event)
 
-    def flush(self, now_ns: int) -> None:
+    def _flush(self, now_ns: int) -> None:
         """Process whole frames that wait inside a longer one that never came."""
         if self._ledger.bytes_pending:
             events = self.codec.flush()
             if events:
                 self.publish_events(events, now_ns)
 
-    def reset(self) -> None:
+    def _reset(self) -> None:
         """Count bytes that wait for the rest of their frame as skipped."""
         self.codec.reset()
 
@@ -334,6 +390,8 @@ class CanPath(SamplePath):
     def set_frame_time(self, frame_ns: int) -> None:
         """Set the shortest time of a frame on the wire, ns; 0 where the bit rate is not known."""
         self._frame_ns = frame_ns
+        if self.observer is not None:
+            self.observer.call("path", "set_frame_time", frame_ns)
 
     def on_frames(self, frames: Sequence[CanFrame]) -> None:
         """Process frames as read in one go, each with its own time of arrival.
@@ -341,46 +399,37 @@ class CanPath(SamplePath):
         What a device measured at one instant begins to arrive with the first frame that waits for others; frames of
         other devices come between them.
         """
-        feed, ledger, samples = self.codec.feed_frame, self._ledger, list[Sample]()
-        utc_offset_ns = self._utc_offset_ns()
-        t_rx_ns = self.last_data_ns
-        for can_id, extended, data, t_rx_ns, after_loss in frames:
-            if after_loss:
-                self.codec.reset()
-            pending = ledger.frames_pending
-            if not pending:
-                self._first_ns = t_rx_ns
-            events = feed(can_id, extended, data, t_rx_ns)
-            if events:
-                self._sort(events, t_rx_ns, utc_offset_ns, samples, self._first_ns - self._frame_ns)
-            if pending and ledger.frames_pending == 1:  # what waited is over, and this frame waits for others now
-                self._first_ns = t_rx_ns
-        self.last_data_ns = t_rx_ns
-        if samples:
-            self._finish(samples, t_rx_ns)
+        try:
+            feed, ledger, samples = self.codec.feed_frame, self._ledger, list[Sample]()
+            utc_offset_ns = self._utc_offset_ns()
+            t_rx_ns = self.last_data_ns
+            for can_id, extended, data, t_rx_ns, after_loss in frames:
+                if after_loss:
+                    self.codec.reset()
+                pending = ledger.frames_pending
+                if not pending:
+                    self._first_ns = t_rx_ns
+                events = feed(can_id, extended, data, t_rx_ns)
+                if events:
+                    self._sort(events, t_rx_ns, utc_offset_ns, samples, self._first_ns - self._frame_ns)
+                if pending and ledger.frames_pending == 1:  # what waited is over, and this frame waits for others now
+                    self._first_ns = t_rx_ns
+            self.last_data_ns = t_rx_ns
+            if samples:
+                self._finish(samples, t_rx_ns)
+        finally:
+            if self.observer is not None:
+                self.observer.frames(frames)
 
-    def flush(self, now_ns: int) -> None:
+    def _flush(self, now_ns: int) -> None:
         """Process what need not wait for frames that did not come."""
         events = self.codec.flush()
         if events:
             self.publish_events(events, now_ns)
 
-    def reset(self) -> None:
+    def _reset(self) -> None:
         """Drop frames that wait for the rest of their sample."""
         self.codec.reset()
-
-
-class DeviceClock(SampleClock):
-    """A clock whose methods can be replaced on the object itself: a recording hears its calls (`recording.tap`)."""
-
-    heard_aiding: Callable[[AidingSources], AidingSources] | None = None
-    """Returns what stands for the aiding sources while a recording hears their calls; None while none does."""
-
-    @property
-    def aiding(self) -> AidingSources:
-        """Where edges and triggers are added."""
-        made = super().aiding
-        return made if self.heard_aiding is None else self.heard_aiding(made)
 
 
 def make_clock(
@@ -398,7 +447,7 @@ def make_clock(
 
     If `before` is a clock, the new clock continues its sequence numbers and time stamps.
     """
-    clock = DeviceClock(
+    clock = SampleClock(
         name,
         tick_ns=driver.tick_ns,
         tick_modulus=driver.tick_modulus,
@@ -446,6 +495,8 @@ class ReadyEdges:
         """Edges without a read: the next edge came first, or the kernel dropped the edge."""
         self.interval_ns = period_ns
         """Interval of the two newest edges."""
+        self.observer: InputObserver | None = None
+        """Observer of the edges; None if no recording runs."""
         self._offset_ns = round(settings.offset_us * NS_PER_US)
         self._error_ns = settings.bias_us * NS_PER_US / sqrt(3) + STAMP_FLOOR_NS
         self._edges: deque[Edge] = deque(maxlen=KEPT)
@@ -459,10 +510,14 @@ class ReadyEdges:
             if before is not None:
                 self.interval_ns = max(1, (edge.t_ns - before.t_ns) // max(1, edge.number - before.number))
             self._edges.append(edge)
+        if self.observer is not None:
+            self.observer.edges("data_ready", edges)
 
     def restart(self) -> None:
         """Begin to read, possibly another device: earlier edges do not count as missed."""
         self._read = None
+        if self.observer is not None:
+            self.observer.call("edges", "restart")
 
     def match(self, start_ns: int, end_ns: int) -> Stamp | None:
         """Return the stamp of a read from `start_ns` to `end_ns`, failed or not; None without edge. In order only."""
@@ -514,9 +569,10 @@ class PolledPath(SamplePath):
         self.codec = codec
         self.failed = 0
         """Transfers that failed."""
+        self.edges = timing.edges
+        """Edges of the data-ready line; None without one."""
         self._period_ns = timing.period_ns
         self._update_ns = timing.update_ns
-        self._edges = timing.edges
         self._before_ns = 0
         self._faults = 0
         self._read_ns = 0
@@ -531,16 +587,20 @@ class PolledPath(SamplePath):
         """Time between two reads, ns."""
         return self._period_ns
 
-    def begin(self, now_ns: int) -> None:
-        """Start: the device was identified and set up."""
-        super().begin(now_ns)
-        self.reset()
+    def observe(self, observer: InputObserver | None) -> None:
+        """Report each input of the path, of its clock and of its data-ready line to `observer`."""
+        super().observe(observer)
+        if self.edges is not None:
+            self.edges.observer = observer
+
+    def _on_begin(self) -> None:
+        self._reset()
         self._is_back = True
 
-    def flush(self, now_ns: int) -> None:
+    def _flush(self, now_ns: int) -> None:
         """No-op: what is read comes whole or not at all."""
 
-    def reset(self) -> None:
+    def _reset(self) -> None:
         """Forget earlier data: the next frame is not compared with it."""
         self.codec.reset()
         self._before_ns = 0
@@ -548,28 +608,37 @@ class PolledPath(SamplePath):
 
     def on_readings(self, readings: Sequence[Reading]) -> str:
         """Process readings, oldest first; return why the device must be identified again, or an empty string."""
-        utc_offset_ns = self._utc_offset_ns()
-        samples: list[Sample] = []
-        gone = ""
-        edges = self._edges
-        for reading in readings:
-            if gone:
-                self.skip(reading)
-                continue
-            stamp = None
-            if reading.poll == 0:
-                stamp = edges.match(reading.start_ns, reading.end_ns) if edges is not None else None
-                self._measure_gap(reading.start_ns)
-            if reading.error is not None:
-                gone = self._failed(reading)
-            else:
-                gone = self._decode(reading, stamp, utc_offset_ns, samples)
-        if samples:
-            self._finish(samples, samples[-1].t_rx_ns)
-        return gone
+        try:
+            utc_offset_ns = self._utc_offset_ns()
+            samples: list[Sample] = []
+            gone = ""
+            edges = self.edges
+            for reading in readings:
+                if gone:
+                    self._skip(reading)
+                    continue
+                stamp = None
+                if reading.poll == 0:
+                    stamp = edges.match(reading.start_ns, reading.end_ns) if edges is not None else None
+                    self._measure_gap(reading.start_ns)
+                if reading.error is not None:
+                    gone = self._failed(reading)
+                else:
+                    gone = self._decode(reading, stamp, utc_offset_ns, samples)
+            if samples:
+                self._finish(samples, samples[-1].t_rx_ns)
+            return gone
+        finally:
+            if self.observer is not None:
+                self.observer.readings(readings)
 
     def skip(self, reading: Reading) -> None:
         """Count bytes of a device that is not identified as skipped."""
+        self._skip(reading)
+        if self.observer is not None:
+            self.observer.call("path", "skip", len(reading.data))
+
+    def _skip(self, reading: Reading) -> None:
         self._ledger.bytes_in += len(reading.data)
         self._ledger.bytes_skipped += len(reading.data)
 

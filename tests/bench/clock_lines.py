@@ -148,7 +148,7 @@ def speed_ns(*, edges: bool, count: int = 20_000) -> float:
             spent = 0
         begin = perf_counter_ns()
         if edges:
-            clock.aiding.on_sout_edges(read.edges)
+            clock.add_edges("sout", read.edges)
         for message, t_rx_ns in messages:
             clock.sample(message, t_rx_ns, 0)
         spent += perf_counter_ns() - begin

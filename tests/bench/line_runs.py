@@ -56,7 +56,7 @@ def with_sout(clock: SampleClock, reads: Sequence[LineRead], *, silent: range = 
     dated = []
     for i, read in enumerate(reads):
         if i not in silent:
-            clock.aiding.on_sout_edges(read.edges)
+            clock.add_edges("sout", read.edges)
         for a, number in zip(read.arrivals, read.numbers, strict=True):
             dated.append(DatedSample(clock.sample(measurement(a), a.t_rx_ns, 0), measured_ns(a), number))
     return dated
@@ -79,7 +79,7 @@ def run_pps(model: ArrivalModel, seconds: int, *, silent_s: range = range(0)) ->
     for a in arrivals:
         due: list[Edge] = [p for p in pulses[given : given + 3] if p.t_ns <= a.t_rx_ns]
         given += len(due)
-        clock.aiding.on_pps_edges(due)
+        clock.add_edges("pps", due)
         # without a pulse the age goes on
         newest = max((p.t_ns // NS_PER_S for p in pulses[:given] if p.t_ns <= a.t_ns), default=a.t_ns // NS_PER_S)
         age = pps_age_ms(a, model.crystal.skew_ppm) + 1000 * (a.t_ns // NS_PER_S - newest)
@@ -108,7 +108,7 @@ def run_triggers(model: ArrivalModel, seconds: int, answered: float) -> tuple[li
     """A device that answers most triggers; also how many it did not answer."""
     clock, dated, missed = clock_for(model), [], 0
     for stamp, a in triggered(model, int(model.rate_hz) * seconds, answered):
-        clock.aiding.on_trigger_stamps([stamp])
+        clock.add_triggers([stamp])
         if a is None:
             missed += 1
         else:

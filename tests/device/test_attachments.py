@@ -241,8 +241,8 @@ def test_where_the_measurement_is_reaches_the_clock() -> None:
     by_sout, by_sin = (make_clock("imu", lines, DRIVER, None) for _ in range(2))
     for i in range(200):
         at_ns = NS_PER_S + i * 10 * NS_PER_MS
-        by_sout.aiding.on_sout_edges([Edge(at_ns + 90_000, False, 2 * i + 2)])  # the rising edge is counted back
-        by_sin.aiding.on_trigger_stamps([TriggerStamp(at_ns, 0, i + 1)])
+        by_sout.add_edges("sout", [Edge(at_ns + 90_000, False, 2 * i + 2)])  # the rising edge is counted back
+        by_sin.add_triggers([TriggerStamp(at_ns, 0, i + 1)])
         m, t_rx_ns = Measurement(82, 0, 10_000 * i), at_ns + NS_PER_MS
         sample, answer = by_sout.sample(m, t_rx_ns, 0), by_sin.sample(m, t_rx_ns, 0)
     assert (sample.sync, sample.t_ns - at_ns) == (Sync.EDGE, -7_000)

@@ -159,7 +159,7 @@ def test_no_run_where_messages_are_not_dated_by_the_fit_of_arrivals() -> None:
             dated.take(*device.read(), runs=True)
         if settle:
             assert dated.in_runs
-            assert dated.clock.aiding.edge_seq is None  # from now on it has aiding sources
+            assert dated.clock._sources().edge_seq is None  # from now on it has aiding sources
         before, (events, t_rx_ns, _) = len(dated.samples), device.read()
         assert dated.clock.add_run(dated.samples, events, 0, t_rx_ns, 0) == 0
         assert len(dated.samples) == before

@@ -138,8 +138,8 @@ def test_edges_of_sout_are_paired_and_stamp_as_well_as_ever(steering: Steering) 
         for a in read.arrivals:
             host.at(a.t_rx_ns)
             edges = steered_edges(read.edges, steering)
-            clock.aiding.on_sout_edges(edges)
-            clock.aiding.on_divided_edges([edge for edge in edges if edge.rising and edge.number % 10 == 1])
+            clock.add_edges("sout", edges)
+            clock.add_edges("sout_div", [edge for edge in edges if edge.rising and edge.number % 10 == 1])
             read.edges.clear()
             d = date(clock, host, a)
             dated.append(d._replace(truth_ns=steering.monotonic_ns(measured_ns(a))))
@@ -163,7 +163,7 @@ def test_triggers_are_paired_with_their_answers(steering: Steering) -> None:
     for stamp, a in triggered(model(BARE_UART), 100 * SECONDS, 1.0):
         assert a is not None
         host.at(stamp.t_ns)
-        clock.aiding.on_trigger_stamps([TriggerStamp(steering.monotonic_ns(stamp.t_ns), stamp.err_ns, stamp.number)])
+        clock.add_triggers([TriggerStamp(steering.monotonic_ns(stamp.t_ns), stamp.err_ns, stamp.number)])
         dated.append(date(clock, host, a))
     assert_honest(dated)
     assert sum(d.sample.edge_seq is not None for d in dated[500:]) > 0.99 * (len(dated) - 500)
@@ -178,7 +178,7 @@ def test_pulses_per_second_date_samples_by_their_age(steering: Steering) -> None
     for a in arrivals:
         while pulses and pulses[0].t_ns <= a.t_rx_ns:
             host.at(pulses[0].t_ns)
-            clock.aiding.on_pps_edges(steered_edges([pulses.pop(0)], steering))
+            clock.add_edges("pps", steered_edges([pulses.pop(0)], steering))
         host.at(a.t_rx_ns)
         m = Measurement(a.size_bytes, a.trailing_bytes, a.dev_ns // TICK_NS, pps_age_ms=pps_age_ms(a, 50.0))
         sample = clock.sample(m, steering.monotonic_ns(a.t_rx_ns), UTC_AHEAD_NS)

@@ -233,7 +233,7 @@ def run(
     first_ns = 0
     for read in simulate_reads(model.run(rate_hz * SECONDS), SEED, faults or LineFaults()):
         if edges:
-            clock.aiding.on_sout_edges(read.edges)
+            clock.add_edges("sout", read.edges)
         for a, number in zip(read.arrivals, read.numbers, strict=True):
             truth_ns = measured_ns(a)
             first_ns = first_ns or truth_ns

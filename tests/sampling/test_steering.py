@@ -135,7 +135,7 @@ def test_device_time_that_creeps_does_not_throw_the_line_off() -> None:
     clock, dated = sout_clock(m), []
     clock.set_utc_reference(REFERENCE)
     for read in simulate_reads(m.run(12_000), 3078, LineFaults(frame_loss=0.1, pulse_loss=0.1, loaded=True)):
-        clock.aiding.on_sout_edges(read.edges)
+        clock.add_edges("sout", read.edges)
         for a in read.arrivals:
             truth_ns = measured_ns(a)
             ticks = (truth_ns + UTC_OFFSET_NS) // NS_PER_MS % UNIX
@@ -206,7 +206,7 @@ def test_the_status_bit_says_which_frames_have_a_pulse_unless_it_is_never_set(ev
     for i in range(2000):
         at, pulse = BEGIN_NS + 10 * i * NS_PER_MS, i % every == 0
         if pulse:
-            clock.aiding.on_sout_edges([Edge(at, True, 2 * i + 1), Edge(at + 80_000, False, 2 * i + 2)])
+            clock.add_edges("sout", [Edge(at, True, 2 * i + 1), Edge(at + 80_000, False, 2 * i + 2)])
         m = Measurement(82, 0, 10 * i, status=bit if pulse else 0)
         numbers.append(clock.sample(m, at + 2 * NS_PER_MS, 0).edge_seq)
     assert numbers[1000::every] == list(range(2001, 4001, 2 * every))
@@ -251,13 +251,13 @@ def give(clock: SampleClock, what: str, t_ns: int, number: int) -> None:
     """One thing that is no message."""
     edges = [Edge(t_ns, True, 2 * number + 1), Edge(t_ns + 80_000, False, 2 * number + 2)]
     if what == "edges":
-        clock.aiding.on_sout_edges(edges)
+        clock.add_edges("sout", edges)
     elif what == "pulses":
-        clock.aiding.on_pps_edges(edges)
+        clock.add_edges("pps", edges)
     elif what == "divided":
-        clock.aiding.on_divided_edges(edges)
+        clock.add_edges("sout_div", edges)
     elif what == "triggers":
-        clock.aiding.on_trigger_stamps([TriggerStamp(t_ns, 1000, number)])
+        clock.add_triggers([TriggerStamp(t_ns, 1000, number)])
     elif what == "reference":
         clock.set_utc_reference(UtcReference(-t_ns % (1000 * NS_PER_MS), 1000))
     elif what == "nothing known":
@@ -270,7 +270,7 @@ def test_divided_pulses_find_their_samples() -> None:
     for i in range(1000):
         at = BEGIN_NS + 10 * i * NS_PER_MS
         if i % 4 == 0:
-            clock.aiding.on_divided_edges([Edge(at + 3000, True, i + 1), Edge(at + 83_000, False, i + 2)])
+            clock.add_edges("sout_div", [Edge(at + 3000, True, i + 1), Edge(at + 83_000, False, i + 2)])
         if i % 100 == 48:
             expected.append((i + 1, None))  # its sample is lost
             continue
