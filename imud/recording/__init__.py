@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""Recordings: the input of a device, recorded and replayed."""

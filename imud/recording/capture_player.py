@@ -1,7 +1,7 @@
-"""Player of captures, raw, stamped, or of a CAN bus: through the codecs and clocks of the daemon, without a daemon.
+"""Player of captures: raw, with time stamps, or of a CAN bus. It uses the codecs and clocks of the daemon.
 
-A capture has less than a recording: what it cannot know is said by `KnownTimes`, and stamps that would be made up are
-made so that nobody takes them for more than they are.
+A capture contains less than a recording. `KnownTimes` describes the meaning of its times. If the capture does not
+contain host times, the samples have the device time and the maximum error.
 """
 
 from collections.abc import Callable
@@ -11,51 +11,44 @@ from typing import Final
 import msgspec
 
 from imud.attitude.published import published_frame
-from imud.config.model import DeviceConfig
-from imud.contracts.codec import BadFrame
 from imud.contracts.driver import CanDriver, Driver, StreamDriver
 from imud.contracts.publisher import Batch
-from imud.contracts.script import Message
 from imud.formats.can import CandumpReader
 from imud.formats.capture import CaptureReader
 from imud.formats.records import DeviceRecord
 from imud.model.errors import BadArgument
-from imud.model.options import NoOptions, Options
+from imud.model.options import Options
 from imud.model.sample import T_ERR_MOST, Sample, Sync
 from imud.model.units import uart_byte_ns
-from imud.recording.player import PlayedClock, PlayedDevice
+from imud.recording.player import PlayedClock, PlayedDevice, ignore_frame, ignore_message
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import CanPath, PathContext, SamplePath, StreamPath, make_clock
 
 NAME: Final = "replay"
-"""Of the device, as in `imud replay` of a capture."""
+"""Name of the device, as in `imud replay`."""
 DEVICE_ID: Final = 0
 GATHERED: Final = 256
-"""Frames of a CAN bus that are processed together, as of one read."""
+"""Number of CAN frames in one call of the path."""
 START_UTC: Final = "start_utc_ns"
-"""Detail of a stamped capture: CLOCK_REALTIME at its first record."""
+"""Detail of a capture with time stamps: CLOCK_REALTIME at its first record."""
 
 
 class KnownTimes(Enum):
-    """What the times of exported samples are; the value says it for people."""
+    """Meaning of the times of exported samples. The value is the text for the user."""
 
-    HOST = "times of the host, by its CLOCK_MONOTONIC and CLOCK_REALTIME then"
+    HOST = "times of the host: CLOCK_MONOTONIC and CLOCK_REALTIME of the capture"
     MONOTONIC = (
-        "the capture has CLOCK_MONOTONIC of its reads and does not say what time of day that was: "
-        "utc_ns counts from the first read"
+        "the capture contains CLOCK_MONOTONIC of its reads and no time of day: utc_ns counts from the first read"
     )
-    WALL_CLOCK = (
-        "the log has the wall clock only, as candump wrote it: t_ns and utc_ns are both made of it, and a step of that "
-        "clock is in them"
-    )
+    WALL_CLOCK = "the log of candump contains only the wall clock: t_ns and utc_ns are this clock, including its steps"
     NONE = (
-        "the capture has bytes and no time of any read: host times, their error and their source are not known. Times "
-        "are those of the device's own clock, where it sends them, else of the bytes on the wire"
+        "the capture contains bytes without the times of the reads: host times, their error and their source are "
+        "unknown. The times are the device time, or the time on the wire if the device does not send its time"
     )
 
     @property
     def has_host_times(self) -> bool:
-        """Whether stamps are of a clock of the host."""
+        """Return whether a clock of the host made the time stamps."""
         return self is not KnownTimes.NONE
 
 
@@ -63,28 +56,30 @@ class CapturePlayer:
     """Player of one capture of one device. Synchronization: one thread."""
 
     def __init__(self, publish: Callable[[Batch], None], driver: Driver, options: Options, where: str) -> None:
-        """`where` names the file for people. Raises BadArgument for a driver whose devices cannot be captured."""
+        """`where` names the file for the user. Raises BadArgument if no capture of this driver's devices exists."""
         if not isinstance(driver, StreamDriver | CanDriver):
-            raise BadArgument(f"--driver {driver.name}: expected a driver of bytes or of CAN frames; it is polled")
+            raise BadArgument(
+                f"--driver {driver.name}: expected a driver of bytes or CAN frames, got a driver that polls its devices"
+            )
         described = DeviceRecord(NAME, driver.name, "replay", where, {}, {}, {})
         self.device: Final = PlayedDevice(DEVICE_ID, described)
         self.device.driver = driver
         self.times = KnownTimes.NONE
-        """What the times are; known from the first sample on."""
+        """Meaning of the times; valid after the first sample."""
         self._publish = publish
         self._driver = driver
         self._options = options
         self._host = PlayedClock()
 
     def play_bytes(self, reader: CaptureReader, baud: int) -> None:
-        """Play a capture of bytes; `baud` is the rate of the wire in bit/s where the capture does not name it."""
+        """Play a capture of bytes. `baud` is the bit rate if the capture does not contain it."""
         driver = self._driver
         assert isinstance(driver, StreamDriver)
         rate = reader.baud or baud
         byte_ns, sent, t_ns, path = uart_byte_ns(rate), 0, 0, None
         for chunk in reader:
             sent += len(chunk.data)
-            t_ns = sent * byte_ns if chunk.t_ns is None else chunk.t_ns
+            t_ns = sent * byte_ns if chunk.t_ns is None else chunk.t_ns  # no time stamps: time on the wire
             if path is None:
                 self._set_times(reader, t_ns)
                 path = self._stream_path(driver, byte_ns, reader.hold_ns, t_ns)
@@ -92,7 +87,7 @@ class CapturePlayer:
         self._end(path, t_ns)
 
     def play_frames(self, reader: CandumpReader) -> None:
-        """Play a log of a CAN bus."""
+        """Play a log of a CAN bus. Ignore the frames of other devices."""
         driver = self._driver
         assert isinstance(driver, CanDriver)
         self.times = KnownTimes.WALL_CLOCK
@@ -132,20 +127,19 @@ class CapturePlayer:
         return path
 
     def _clock(self, byte_ns: int, hold_ns: int) -> SampleClock:
-        config = DeviceConfig(NAME, self._driver.name, self._options, False, "replay", NoOptions())
         return make_clock(
-            config.name, config.lines, self._driver, None, host=self._host.steady, byte_ns=byte_ns, hold_ns=hold_ns,
+            NAME, None, self._driver, None, host=self._host.steady, byte_ns=byte_ns, hold_ns=hold_ns,
             on_unknown_gap=self.device.ledger.add_unknown_gap,
         )  # fmt: skip
 
     def _context(self, publish: Callable[[Batch], None]) -> PathContext:
         frame = published_frame(None, None, None, self._driver.axes)
         return PathContext(
-            NAME, DEVICE_ID, self.device.ledger, publish, _ignore_message, _ignore_frame, lambda: 0, self._host, frame
+            NAME, DEVICE_ID, self.device.ledger, publish, ignore_message, ignore_frame, lambda: 0, self._host, frame
         )
 
     def _publish_without_times(self, batch: Batch) -> None:
-        """Publish samples with the time of the device in place of times that nobody measured."""
+        """Publish samples with the device time in place of the unknown host time."""
         samples = [_by_device(sample) for sample in batch.samples]
         self._publish(Batch(batch.device, batch.device_id, samples, batch.frame))
 
@@ -158,11 +152,3 @@ class CapturePlayer:
 def _by_device(sample: Sample) -> Sample:
     t_ns = sample.t_ns if sample.t_dev_ns is None else sample.t_dev_ns
     return msgspec.structs.replace(sample, t_ns=t_ns, t_err_ns=T_ERR_MOST, sync=Sync.ARRIVAL, t_rx_ns=t_ns, utc_ns=t_ns)
-
-
-def _ignore_message(_message: Message, _t_rx_ns: int) -> None:
-    """Ignore what the device answered."""
-
-
-def _ignore_frame(_frame: BadFrame) -> None:
-    """Ignore the frame: the ledger has it."""

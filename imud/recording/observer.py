@@ -1,7 +1,7 @@
-"""Observers of the input of paths and of the host's clocks: they encode the input as records.
+"""Observers of a device's path and of the host's clocks: they encode each input as a record.
 
-A path calls its observer after each input, so that the clock readings and edges that the input needed are recorded
-before it. Synchronization: the event loop's thread only.
+The path calls its observer after each input, so that the clock readings and edges of this input are recorded before it.
+Synchronization: the event loop's thread only.
 """
 
 import logging
@@ -30,7 +30,7 @@ TROUBLES: Final = tuple(Trouble)
 
 
 class PathObserver:
-    """Recorder of the input of one device's path. The transport calls `path_made` for each new path."""
+    """Recorder of the input of one device. The transport calls `path_made` for each new path."""
 
     def __init__(self, config: DeviceConfig, device_id: int, ledger: Ledger, host: HostClock) -> None:
         self._config = config
@@ -41,12 +41,13 @@ class PathObserver:
         self._path: SamplePath | None = None
         self._driver = ""
         self._options: Options | None = None
+        # newest recorded count; the kernel counts from the opening of the link
         self._overruns = 0
 
     # --- the transport's side ----------------------------------------------------------------------------------------
 
     def path_made(self, path: SamplePath, driver: str, options: Options | None) -> None:
-        """Replace the path of the device: record the new path, and observe it instead of the old path."""
+        """Observe `path` instead of the previous path. Record the driver, its options and the state of the new path."""
         if self._path is not None:
             self._path.observe(None)
         self._path, self._driver, self._options = path, driver, options
@@ -55,19 +56,22 @@ class PathObserver:
             path.observe(self)
 
     def codec_changed(self) -> None:
-        """Note that the codec was set by what the device said of itself."""
+        """Record the path again: the codec changed its options because the device reported its identity."""
         if self._listeners and self._path is not None:
             self._put(self._path_record(self._path))
 
     def described(self, where: str, identity: Mapping[str, str], settings: Mapping[str, str]) -> None:
-        """Note what the device said of itself."""
+        """Record the identity and the settings that the device reported."""
         if self._listeners:
             self._put(self._device_record(where, identity, settings))
 
     # --- the recorder's side -----------------------------------------------------------------------------------------
 
     def begin(self, put: PutRecord, where: str, identity: Mapping[str, str], settings: Mapping[str, str]) -> None:
-        """Describe the device with its path as it is now, and pass on all that follows."""
+        """Send the description and the state of the device to `put`, then each input.
+
+        A second call sends the description and the state again.
+        """
         put(self._device_record(where, identity, settings))
         if put not in self._listeners:
             self._listeners.append(put)
@@ -76,14 +80,14 @@ class PathObserver:
             self._path.observe(self)
 
     def end(self, put: PutRecord) -> None:
-        """Pass on nothing any more; no-op for one that does not listen."""
+        """Send no more records to `put`. Do nothing if `put` receives no records."""
         if put in self._listeners:
             self._listeners.remove(put)
         if not self._listeners and self._path is not None:
             self._path.observe(None)
 
     def check(self, put: PutRecord) -> None:
-        """Record the newest sample and the ledger."""
+        """Send the newest sample and the ledger to `put`. A replay compares its own values with them."""
         newest = self._path.newest if self._path is not None else None
         checked = CheckRecord(
             self._host.now_ns(),
@@ -94,7 +98,7 @@ class PathObserver:
         )
         put(records.encode_object(Kind.CHECK, self._id, checked))
 
-    # --- what is recorded --------------------------------------------------------------------------------------------
+    # --- records -----------------------------------------------------------------------------------------------------
 
     def _put(self, record: bytes) -> None:
         for put in self._listeners:
@@ -119,49 +123,50 @@ class PathObserver:
             return StateWriter(external, path.NOT_STATE).write({"path": path})
         except StateError as error:
             log.warning("%s: recorded without its state: %s", self._config.name, error)
-            return b""
+            return b""  # a replay then starts with a new clock
 
-    # --- the input, reported by the path (`InputObserver`) -----------------------------------------------------------
+    # --- input, called by the path (contract `InputObserver`)
+    # ----------------------------------------------------------
 
     def data(self, data: bytes, t_rx_ns: int, waited_ns: int) -> None:
-        """Record bytes."""
         self._put(records.encode_data(self._id, data, t_rx_ns, waited_ns))
 
     def frames(self, frames: Sequence[CanFrame]) -> None:
-        """Record CAN frames."""
         self._put(records.encode_frames(self._id, frames))
 
     def readings(self, readings: Sequence[Reading]) -> None:
-        """Record the readings of a polled device."""
         self._put(records.encode_readings(self._id, [_reading(one) for one in readings]))
 
     def edges(self, line: str, edges: Sequence[Edge]) -> None:
-        """Record edges of a line."""
         self._put(records.encode_edges(self._id, line, edges))
 
     def overruns(self, count: int) -> None:
-        """Record the kernel's count of overruns if it changed. The data of the loss is recorded after it."""
+        """Record the number of overruns if it changed.
+
+        The path calls this method before it reports the data of the loss.
+        """
         if count != self._overruns:
             self._overruns = count
             self.call("path", "overruns", count)
 
     def call(self, target: str, method: str, *arguments: object, **keywords: object) -> None:
         """Record the call of a method of path or clock."""
+        # named tuples become lists
         call = CallRecord(target, method, [msgspec.to_builtins(one) for one in arguments], keywords)
         self._put(records.encode_object(Kind.CALL, self._id, call))
 
 
 class ClockObserver:
-    """Tap of the host's clocks."""
+    """Recorder of the host's clocks."""
 
     def __init__(self, host: HostClock) -> None:
         self._host = host
         self._listeners: list[PutRecord] = []
 
     def begin(self, put: PutRecord) -> None:
-        """Describe how the clocks were steered so far, and pass on each reading that follows."""
+        """Send the present state of the clocks to `put`, then each reading."""
         host = self._host
-        host.utc_offset_ns()
+        host.utc_offset_ns()  # reads the clocks, so that the state is up to date
         steady = StateWriter({}).write({"steady": host.steady})
         call = CallRecord("host", "restore", [steady, *host.kept()])
         put(records.encode_object(Kind.CALL, records.NO_DEVICE, call))
@@ -170,7 +175,7 @@ class ClockObserver:
         host.on_measured = self._measured
 
     def end(self, put: PutRecord) -> None:
-        """Pass on nothing any more; no-op for one that does not listen."""
+        """Send no more readings to `put`. Do nothing if `put` receives no readings."""
         if put in self._listeners:
             self._listeners.remove(put)
         if not self._listeners:
@@ -186,48 +191,54 @@ class ClockObserver:
 
 
 class RecordedDevice(Protocol):
-    """A device with its tap."""
+    """A device with an observer. `imud.device` implements it, and this part may not import `imud.device`."""
 
     @property
     def tap(self) -> PathObserver:
-        """Where it is heard."""
+        """Observer of the device's path."""
         ...
 
     def record(self, put: PutRecord) -> None:
-        """Describe the device as it is now, and pass on all that it delivers."""
+        """Send the description of the device to `put`, then each input."""
         ...
 
 
 class RecordableDevices:
-    """What can be recorded of a daemon. Synchronization: the event loop's thread only."""
+    """Devices and host clocks of a daemon that a recorder can record.
+
+    Synchronization: the event loop's thread only.
+    """
 
     def __init__(self, devices: Mapping[str, RecordedDevice], host: HostClock) -> None:
-        """`devices` are those that there are at the time of each call."""
+        """`devices` contains the present devices at each call."""
         self._devices = devices
         self._host = ClockObserver(host)
 
     def names(self) -> Sequence[str]:
-        """Names of the devices there are."""
+        """Return the names of the present devices."""
         return list(self._devices)
 
     def begin_host(self, put: PutRecord) -> None:
-        """Describe the host's clocks, and pass on their readings from now on; again for one that listens already."""
+        """Send the state of the host's clocks to `put`, then each reading. A second call sends the state again."""
         self._host.begin(put)
 
     def begin(self, device: str, put: PutRecord) -> None:
-        """Describe a device, and pass on all that it delivers; again for one that listens already. No-op if absent."""
+        """Send the description of a device to `put`, then each input. Do nothing if the device does not exist.
+
+        A second call sends the description again.
+        """
         found = self._devices.get(device)
         if found is not None:
             found.record(put)
 
     def check(self, device: str, put: PutRecord) -> None:
-        """Pass on the newest sample and the ledger of a device as a record. No-op if absent."""
+        """Send the newest sample and the ledger of a device to `put`. Do nothing if the device does not exist."""
         found = self._devices.get(device)
         if found is not None:
             found.tap.check(put)
 
     def end(self, put: PutRecord) -> None:
-        """Pass on nothing of any device any more, nor of the host."""
+        """Send no more records of the devices and of the host to `put`."""
         for device in self._devices.values():
             device.tap.end(put)
         self._host.end(put)
@@ -241,7 +252,7 @@ def _reading(reading: Reading) -> records.ReadingRecord:
 
 
 def _configuration(config: DeviceConfig) -> dict[str, Any]:
-    """What a replay needs of the configuration, and the link for people, as it stands below the device's name."""
+    """Return the keys of the device's configuration that a replay needs, and the options of its link, for display."""
     made = {
         "driver": config.driver,
         config.link: config.link_settings,

@@ -1,7 +1,7 @@
-"""Player of recordings: the records of a file go into the same codecs and clocks as in the daemon, in the same order.
+"""Player of recordings: it passes the records to the codecs and clocks of the daemon, in the recorded order.
 
-The samples, stamps, errors and ledgers that come out are those of the live run, which the recording proves: at each
-check record it says what they were there, and the player counts where they are not.
+The replay makes the samples, time stamps, errors and ledger counters of the live run again. Check records contain these
+values of the live run. The player compares them with its own values and counts the differences.
 """
 
 from collections.abc import Callable, Iterable
@@ -42,31 +42,32 @@ from imud.sampling.path import (
 )
 
 FROM_OUTSIDE: Final = ("lost_queue", "replies_late", "replies_unsolicited")
-"""Counters that neither codec nor clock decides: a check sets them."""
+"""Ledger counters that do not depend on codec and clock. The player copies them from each check record."""
 _DATA: Final = int(Kind.DATA)
-"""Of an enumeration each look at a member takes 0.1 µs on Python 3.11."""
+"""Integer of `Kind.DATA`: reading a member of an enumeration takes 0.1 µs on Python 3.11."""
 
 
 @dataclass(slots=True)
 class PlayedDevice:
-    """A device of a recording, and what came of it."""
+    """State of one device during the replay."""
 
     device_id: int
     described: DeviceRecord
     ledger: Ledger = field(default_factory=Ledger)
     path: SamplePath | None = None
     driver: Driver | None = None
+    # overruns that the kernel counted in the live run
     overruns: int = 0
     checks: int = 0
-    """Places where the recording says what the live run had."""
+    """Number of check records."""
     differences: list[str] = field(default_factory=list)
-    """Where the replay had something else, one sentence each."""
+    """Differences between replay and live run, one sentence for each check record that differs."""
     fresh_starts: list[str] = field(default_factory=list)
-    """Why the clock had to begin anew, which the live one did not."""
+    """Reasons for each new clock that replaced the clock of the live run."""
 
 
 class RecordedEvent(msgspec.Struct, frozen=True):
-    """An event as it was recorded, perhaps of a kind that this imud does not know."""
+    """An event of a recording. `kind` may be unknown to this version of imud."""
 
     t_ns: int
     device: str
@@ -76,7 +77,7 @@ class RecordedEvent(msgspec.Struct, frozen=True):
 
 
 class PlayedClock(HostClock):
-    """The host's clocks as they were recorded."""
+    """Host clocks with the recorded readings."""
 
     __slots__ = ("offset_ns",)
 
@@ -85,12 +86,12 @@ class PlayedClock(HostClock):
         self.offset_ns = 0
 
     def utc_offset_ns(self) -> int:
-        """Return CLOCK_REALTIME minus CLOCK_MONOTONIC as of the newest record."""
+        """Return CLOCK_REALTIME minus CLOCK_MONOTONIC of the newest record, ns."""
         return self.offset_ns
 
 
 class Player:
-    """Player of the records of one recording, in their order. Synchronization: one thread."""
+    """Player of the records of one recording. Synchronization: one thread."""
 
     def __init__(
         self,
@@ -99,34 +100,37 @@ class Player:
         fresh: bool = False,
         on_event: Callable[[Event, int], None] = lambda _event, _utc_ns: None,
     ) -> None:
-        """With `fresh` clocks and codecs begin anew with the file; they do so with one of another version of imud.
+        """Publish the batches of all devices to `publish`. Pass each event with its CLOCK_REALTIME to `on_event`.
 
-        `on_event` gets events as they were noticed then, each with its CLOCK_REALTIME.
+        With `fresh`, or if another version of imud wrote the recording, codecs and clocks start without their recorded
+        state.
         """
         self.devices: dict[int, PlayedDevice] = {}
-        """By the daemon's number."""
+        """Devices by their number in the recorded daemon."""
         self.lost = 0
-        """Records that the recorder dropped."""
+        """Number of records that the recorder dropped."""
         self._publish = publish
         self._on_event = on_event
         self._host = PlayedClock()
-        self._no_state = "it was asked for a fresh clock" if fresh else ""
-        """Why states are not used."""
+        self._no_state = "a new clock was requested" if fresh else ""
+        """Reason to ignore recorded states; empty if the player uses them."""
 
     def play(self, found: Iterable[Record]) -> None:
-        """Process records. Raises ImudError for one that cannot be what a recorder wrote, and OSErrors of `publish`."""
+        """Process records. Raises ImudError for an invalid record, and OSError if `publish` raises it."""
         for record in found:
             try:
                 self._play(record)
-            except (ImudError, OSError):  # codecs and clocks do no I/O: the samples could not be written
+            except (ImudError, OSError):  # codecs and clocks do no I/O: `publish` raised the OSError
                 raise
-            except Exception as error:  # a codec or clock whose recorded state was forged may raise anything
+            except Exception as error:  # a forged state can cause any exception in a codec or clock
                 words = f"{type(error).__name__}: {printable(str(error))}"
-                raise ImudError(f"a record of kind {record.kind} cannot be replayed: {words}") from error
+                raise ImudError(
+                    f"cannot replay a record of kind {record.kind}: {words}; is the file damaged?"
+                ) from error
 
     def _play(self, record: Record) -> None:
         kind, device = record.kind, self.devices.get(record.device)
-        if kind == _DATA and device is not None:  # nearly all
+        if kind == _DATA and device is not None:  # most records
             self._play_device(device, record)
         elif kind == Kind.CLOCKS:
             self._read_clocks(records.decode_clocks(record.body))
@@ -164,7 +168,7 @@ class Player:
 
     def _begin(self, session: SessionRecord) -> None:
         if session.imud != __version__:
-            self._no_state = self._no_state or f"imud {session.imud} wrote the recording, this is {__version__}"
+            self._no_state = self._no_state or f"imud {session.imud} wrote the recording, this is imud {__version__}"
 
     def _event(self, recorded: RecordedEvent) -> None:
         event = Event(recorded.t_ns, recorded.device, kind_of(recorded.kind), recorded.message, recorded.detail)
@@ -179,6 +183,7 @@ class Player:
         if clocks.suspends > host.suspends:
             host.suspends = clocks.suspends
             for device in self.devices.values():
+                # CLOCK_MONOTONIC stops during a suspend, so the number of lost samples is unknown
                 if device.path is not None and device.path.fresh:
                     device.ledger.add_unknown_gap()
 
@@ -203,20 +208,21 @@ class Player:
         config = _config_of(device.described, driver, made)
         before = device.path
         device.path = self._path(device, driver, config, made, before=None)
-        for name in LEDGER_FIELDS:
-            setattr(device.ledger, name, made.ledger.get(name, 0))
+        _set_ledger(device.ledger, made.ledger)
         try:
             self._restore(device, made.state)
         except StateError as error:
             device.fresh_starts.append(str(error))
+            # the new clock continues the sequence numbers of the previous path
             device.path = self._path(device, driver, config, made, before=before)
             ledger = device.ledger
+            # the new codec does not contain the pending bytes and frames
             ledger.bytes_skipped, ledger.bytes_pending = ledger.bytes_skipped + ledger.bytes_pending, 0
             ledger.frames_ignored, ledger.frames_pending = ledger.frames_ignored + ledger.frames_pending, 0
 
     def _restore(self, device: PlayedDevice, state: bytes) -> None:
         if self._no_state or not state:
-            raise StateError(self._no_state or "the recording does not have the state of its clock")
+            raise StateError(self._no_state or "the recording does not contain the state of the clock")
         assert device.path is not None
         external = {"ledger": device.ledger, "steady": self._host.steady, "observer": None}
         StateReader(state, external).restore("path", device.path)
@@ -231,7 +237,7 @@ class Player:
             on_unknown_gap=ledger.add_unknown_gap,
         )  # fmt: skip
         context = PathContext(
-            config.name, device.device_id, ledger, self._publish, _ignore_message, _ignore_frame,
+            config.name, device.device_id, ledger, self._publish, ignore_message, ignore_frame,
             lambda: device.overruns, self._host,
             published_frame(config.frame, config.convention, config.declination_deg, driver.axes),
         )  # fmt: skip
@@ -255,7 +261,7 @@ class Player:
 
 
 def _config_of(described: DeviceRecord, driver: Driver, made: PathRecord) -> DeviceConfig:
-    """What is needed of the configuration. Raises ImudError where it cannot be one."""
+    """Return the recorded configuration of a device. Raises ImudError if it is invalid."""
     tree = described.configuration
     try:
         return DeviceConfig(
@@ -266,7 +272,7 @@ def _config_of(described: DeviceRecord, driver: Driver, made: PathRecord) -> Dev
             declination_deg=msgspec.convert(tree.get("declination_deg"), float | None),
         )  # fmt: skip
     except msgspec.ValidationError as error:
-        raise ImudError(f"{described.name}: its configuration cannot be read: {reason_of(error)}") from None
+        raise ImudError(f"{described.name}: cannot read the recorded configuration: {reason_of(error)}") from None
 
 
 def _give_edges(device: PlayedDevice, line: str, found: list[records.EdgeRecord]) -> None:
@@ -281,16 +287,17 @@ def _give_edges(device: PlayedDevice, line: str, found: list[records.EdgeRecord]
 def _reading(one: records.ReadingRecord) -> Reading:
     if not one.trouble:
         return Reading(one.poll, one.data, None, one.start_ns, one.end_ns)
-    trouble = TROUBLES[min(one.trouble, len(TROUBLES)) - 1]
+    trouble = TROUBLES[min(one.trouble, len(TROUBLES)) - 1]  # a trouble of a newer imud
     error = TransferError(trouble, one.data.decode(errors="replace"))
     return Reading(one.poll, b"", error, one.start_ns, one.end_ns)
 
 
 def _check(device: PlayedDevice, live: CheckRecord) -> None:
-    """Compare with the live run; what neither codec nor clock decides is taken from it."""
+    """Compare newest sample and ledger with the live run. Copy the counters that codec and clock do not decide."""
     ledger, newest = device.ledger, device.path.newest if device.path is not None else None
     for name in FROM_OUTSIDE:
         setattr(ledger, name, live.ledger[name])
+    # a search skipped bytes that the recording does not contain
     searched = live.ledger["bytes_in"] - ledger.bytes_in
     if searched and searched == live.ledger["bytes_skipped"] - ledger.bytes_skipped:
         ledger.bytes_in += searched
@@ -307,17 +314,17 @@ def _check(device: PlayedDevice, live: CheckRecord) -> None:
         name: (live.ledger[name], here) for name, here in ledger.snapshot().items() if live.ledger.get(name) != here
     }
     if found:
-        words = ", ".join(f"{name} was {a}, is {b}" for name, (a, b) in found.items())
+        words = ", ".join(f"{name} recorded {a}, replayed {b}" for name, (a, b) in found.items())
         device.differences.append(f"at {live.t_ns} ns: {words}")
 
 
 def _set_ledger(ledger: Ledger, values: dict[str, int]) -> None:
     for name in LEDGER_FIELDS:
-        setattr(ledger, name, values[name])
+        setattr(ledger, name, values.get(name, 0))  # 0: an older imud did not have the counter
 
 
 def _repeat(device: PlayedDevice, path: Any, call: CallRecord) -> None:
-    """Make a recorded call of the path, or of a part of it."""
+    """Repeat a recorded call of the path, its clock or its edges."""
     arguments = call.arguments
     match call.target, call.method:
         case "path", "begin" | "flush" | "reset" | "publish_gathered" | "set_frame_time":
@@ -340,12 +347,13 @@ def _repeat(device: PlayedDevice, path: Any, call: CallRecord) -> None:
         case "aiding", "on_trigger_stamps":
             path.clock.add_triggers([TriggerStamp(*one) for one in arguments[0]])
         case _:
-            raise ImudError(f"the recording has a call {call.target}.{call.method}, which this imud does not know")
+            name = f"{call.target}.{call.method}"
+            raise ImudError(f"cannot replay the call {name}: imud {__version__} does not know it; try a newer imud")
 
 
-def _ignore_message(_message: Message, _t_rx_ns: int) -> None:
-    """Ignore what the device answered: nobody asked here."""
+def ignore_message(_message: Message, _t_rx_ns: int) -> None:
+    """Ignore a text line or reply: a replay sends no requests."""
 
 
-def _ignore_frame(_frame: BadFrame) -> None:
-    """Ignore the frame: the ledger has it."""
+def ignore_frame(_frame: BadFrame) -> None:
+    """Ignore a bad frame: the codec counts it in the ledger."""

@@ -1,12 +1,12 @@
-"""The state of a device's codec, clock and path as bytes, so that a recording can begin in the middle of a run.
+"""Saved state of a device's codec, clock and path, so that a recording can start in the middle of a run.
 
-The objects below a root are written as what they are: class, attributes, containers, references to what was written
-before. Nothing is imported or called from the bytes but classes and functions of imud's own codecs and clocks, and no
-constructor runs: a recording is a foreign file. What belongs to the daemon (ledger, host's time) is external: it has a
-name, and whoever restores the state gives his own.
+A state contains the objects below a root: class, attributes, containers, and references to objects written before. A
+recording is a foreign file. The reader therefore imports only classes and functions of codecs and clocks, and it calls
+no constructor except for msgspec structs. Objects of the daemon (ledger, steady time, observer) are external: the
+state contains only their names.
 
-The state is that of one version of imud: where a class has other attributes than those that were written, restoring
-raises, and a replay begins with an empty clock instead.
+A state is valid for one version of imud. If a class has other attributes, the reader raises StateError, and the replay
+starts with a new clock.
 """
 
 from collections import deque
@@ -24,19 +24,19 @@ from imud.model.errors import ImudError, reason_of
 MODULES: Final = (
     "imud.sampling.", "imud.contracts.", "imud.drivers.", "imud.formats.", "imud.model.sample:", "imud.host.clock:",
 )  # fmt: skip
-"""Modules whose classes and functions a state may have."""
+"""Modules of the classes and functions that a state may contain."""
 DEPTH_MAX: Final = 200
-"""Objects inside objects; codecs and clocks have ten."""
+"""Maximum depth of objects inside objects. Codecs and clocks have a depth of ten."""
 
 Attributes = dict[str, Any]
 
 
 class StateError(ImudError):
-    """A state cannot be written or restored. Example: a recording of another version of imud."""
+    """Failure to write or restore a state. Example: a recording of another version of imud."""
 
 
 def attributes(value: object) -> Attributes:
-    """Return the attributes of an object, in slots or not."""
+    """Return the attributes of an object, from `__slots__` and `__dict__`."""
     found: Attributes = {}
     for class_ in type(value).__mro__:
         slots = class_.__dict__.get("__slots__", ())
@@ -47,33 +47,34 @@ def attributes(value: object) -> Attributes:
 
 
 class StateWriter:
-    """Writer of one state. `external` names what belongs to the daemon, `leave` attributes of the roots."""
+    """Writer of one state."""
 
-    def __init__(self, external: Mapping[str, object], leave: frozenset[str] = frozenset()) -> None:
+    def __init__(self, external: Mapping[str, object], excluded: frozenset[str] = frozenset()) -> None:
+        """`external` are the objects of the daemon by name, `excluded` the attributes of the roots that it omits."""
         self._external = {id(one): name for name, one in external.items()}
-        self._leave = leave
+        self._excluded = excluded
         self._numbers: dict[int, int] = {}
         self._kept: list[object] = []
 
     def write(self, roots: Mapping[str, object]) -> bytes:
-        """Return the state of these objects. Raises StateError for what cannot be written."""
+        """Return the state of the roots. Raises StateError for an object that cannot be written."""
         tree = {}
         for root in roots.values():
             self._numbers[id(root)] = len(self._numbers)
         for name, root in roots.items():
-            parts = {key: one for key, one in attributes(root).items() if key not in self._leave}
+            parts = {key: one for key, one in attributes(root).items() if key not in self._excluded}
             written = {key: self._value(one, f"{name}.{key}", 0) for key, one in parts.items()}
             tree[name] = (self._numbers[id(root)], written)
         try:
             return msgspec.msgpack.encode(tree)
         except (OverflowError, TypeError, ValueError) as error:
-            raise StateError(f"the state cannot be written: {reason_of(error)}") from None
+            raise StateError(f"cannot write the state: {reason_of(error)}") from None
 
     def _value(self, value: Any, path: str, depth: int) -> Any:  # noqa: PLR0911 - one for each kind of value
         if value is None or type(value) in (bool, int, float, str, bytes):
             return value
         if depth > DEPTH_MAX:
-            raise StateError(f"the state is deeper than {DEPTH_MAX} at {path}")
+            raise StateError(f"cannot write the state: {path} is deeper than {DEPTH_MAX} objects")
         if id(value) in self._external:
             return ["x", self._external[id(value)]]
         if id(value) in self._numbers:
@@ -85,7 +86,7 @@ class StateWriter:
         if isinstance(value, MethodType):
             return ["b", self._value(value.__self__, path, depth + 1), value.__name__]
         self._numbers[id(value)] = len(self._numbers)
-        self._kept.append(value)  # or another object could get its id
+        self._kept.append(value)  # another object must not get this id
         return [self._numbers[id(value)], *self._object(value, path, depth + 1)]
 
     def _object(self, value: Any, path: str, depth: int) -> list[Any]:
@@ -115,26 +116,29 @@ _BY_NAME: Final = {kind.__name__: kind for kind in _CONTAINERS}
 
 
 def _name_of(value: Any) -> str:
-    """Name of a class or function. Raises StateError for one that a state may not have."""
+    """Return the name of a class or function. Raises StateError if a state may not contain it."""
     name = f"{value.__module__}:{value.__qualname__}"
+    # "<": a lambda or a local class, which no import finds
     if not name.startswith(MODULES) or "<" in name:
-        raise StateError(f"the state has a {name}, which cannot be written")
+        raise StateError(f"cannot write the state: {name} is not part of a codec or clock")
     return name
 
 
 def _named(name: Any) -> Any:
-    """The class or function of a name. Raises StateError for one that a state may not have."""
+    """Return the class or function of a name. Raises StateError if a state may not contain it."""
+    # "__": __class__, __globals__ and the like lead out of the allowed modules
     if not isinstance(name, str) or not name.startswith(MODULES) or "__" in name:
-        raise StateError(f"the state has a {str(name)[:80]!r}, which is no part of a codec or a clock")
+        raise StateError(f"cannot restore the state: expected a class of a codec or clock, got {str(name)[:80]!r}")
     module, _, path = name.partition(":")
     try:
         found: Any = import_module(module)
         for part in path.split("."):
             found = getattr(found, part)
     except (ImportError, AttributeError):
-        raise StateError(f"the state has a {name[:80]}, which this imud does not have") from None
+        raise StateError(f"cannot restore the state: this imud has no {name[:80]}") from None
+    # a module also contains the names that it imports
     if getattr(found, "__module__", "") != module or not isinstance(found, type | FunctionType):
-        raise StateError(f"the state has a {name[:80]}, which is neither a class nor a function")
+        raise StateError(f"cannot restore the state: {name[:80]} is not a class or function")
     return found
 
 
@@ -142,38 +146,38 @@ class StateReader:
     """Reader of one state."""
 
     def __init__(self, state: bytes, external: Mapping[str, object]) -> None:
-        """Raises StateError for bytes that are none."""
+        """`external` are the objects of the daemon by name. Raises StateError for an invalid state."""
         self._external = external
         self._made: dict[int, Any] = {}
         try:
             self._tree = msgspec.msgpack.decode(state, type=dict[str, tuple[int, dict[str, Any]]])
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise StateError(f"the state cannot be read: {reason_of(error)}") from None
+            raise StateError(f"cannot read the state: {reason_of(error)}") from None
 
     def restore(self, name: str, root: object) -> None:
-        """Give a root the attributes that were written; roots in the order in which they were written.
+        """Set the attributes of a root. Restore the roots in the order of the state.
 
-        Raises StateError; the root is of no use then.
+        Raises StateError. The root is then invalid.
         """
         known = attributes(root)
         if name not in self._tree:
-            raise StateError(f"the state has no {name}")
+            raise StateError(f"cannot restore the state: it does not contain {name}")
         number, parts = self._tree[name]
         self._made[number] = root
         for key, written in parts.items():
             if key not in known:
-                raise StateError(f"the state has {name}.{key}, which this imud does not have")
+                raise StateError(f"cannot restore the state: this imud has no attribute {name}.{key}")
             _set(root, key, self._value(written, 0))
 
     def _value(self, written: Any, depth: int) -> Any:
         if not isinstance(written, list):
             return written
         if depth > DEPTH_MAX:
-            raise StateError(f"the state is deeper than {DEPTH_MAX}")
+            raise StateError(f"cannot restore the state: it is deeper than {DEPTH_MAX} objects")
         try:
             return self._object(written, depth + 1)
         except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
-            raise StateError(f"the state cannot be restored: {reason_of(error)}") from None
+            raise StateError(f"cannot restore the state: {reason_of(error)}") from None
 
     def _object(self, written: list[Any], depth: int) -> Any:  # noqa: PLR0911 - one for each kind of value
         match written:
@@ -192,14 +196,14 @@ class StateReader:
             case [int(number), *rest]:
                 made = self._made[number] = self._container(number, rest, depth)
                 return made
-        raise StateError(f"the state cannot be restored: {str(written)[:80]}")
+        raise StateError(f"cannot restore the state: unexpected value {str(written)[:80]}")
 
     def _container(self, number: int, written: list[Any], depth: int) -> Any:  # noqa: PLR0911 - one for each kind of value
         match written:
             case ["deque", most, list(items)]:
                 return deque((self._value(one, depth) for one in items), maxlen=most)
             case ["list", list(items)]:
-                made = self._made[number] = list[Any]()
+                made = self._made[number] = list[Any]()  # before its items, which may refer to it
                 made.extend(self._value(one, depth) for one in items)
                 return made
             case ["dict", list(pairs)]:
@@ -213,12 +217,12 @@ class StateReader:
             case [str(name), list(items)] if name in _BY_NAME:
                 return _CONTAINERS[_BY_NAME[name]]([self._value(one, depth) for one in items])
             case [str(name), list(items)]:
-                return _named(name)._make([self._value(one, depth) for one in items])
-        raise StateError(f"the state cannot be restored: {str(written)[:80]}")
+                return _named(name)._make([self._value(one, depth) for one in items])  # named tuples
+        raise StateError(f"cannot restore the state: unexpected value {str(written)[:80]}")
 
     def _instance(self, number: int, kind: Any, parts: dict[str, Any], depth: int) -> Any:
         if not isinstance(kind, type) or issubclass(kind, BaseException):
-            raise StateError(f"the state has an object of {kind}")
+            raise StateError(f"cannot restore the state: an object must not be of {kind}")
         if issubclass(kind, msgspec.Struct):
             made: Any = kind(**{key: self._value(one, depth) for key, one in parts.items()})
             self._made[number] = made
@@ -231,5 +235,5 @@ class StateReader:
 
 def _set(target: object, name: str, value: object) -> None:
     if name.startswith("__"):
-        raise StateError(f"the state has an attribute {name}")
+        raise StateError(f"cannot restore the state: an attribute must not be named {name}")
     object.__setattr__(target, name, value)

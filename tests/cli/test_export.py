@@ -270,7 +270,7 @@ def test_a_raw_capture_has_the_times_of_the_device_and_says_so(tmp_path: Path, c
         assert {row[name] for row in found} == {""}
     assert [int(row["t_dev_ns"]) for row in found] == [10_000_000 * i for i in range(300)]
     words = " ".join(printed.err.split())
-    assert "the capture has bytes and no time of any read" in words
+    assert "the capture contains bytes without the times of the reads" in words
     assert "Hz" not in words
     assert "live run" not in words
     (tmp_path / "c.raw").write_bytes(b"".join(hi91(10 * i) for i in range(30)))
@@ -281,7 +281,7 @@ def test_a_raw_capture_has_the_times_of_the_device_and_says_so(tmp_path: Path, c
     assert {one["t_err_ns"] for _, one in stamps} == {0xFFFF_FFFF}
     with out.open("rb") as stream:
         (metadata,) = [one.metadata for one in make_reader(stream).iter_metadata()]
-    assert "no time of any read" in metadata["times"]
+    assert "without the times of the reads" in metadata["times"]
 
 
 def test_a_stamped_capture_and_a_log_of_candump_have_their_own_times(tmp_path: Path, cli: Cli) -> None:
@@ -291,13 +291,13 @@ def test_a_stamped_capture_and_a_log_of_candump_have_their_own_times(tmp_path: P
     assert len(found) == FRAMES
     assert abs(int(found[-1]["t_ns"]) - (1000 * 10**9 + 299 * 10**7)) < 10**7
     assert int(found[0]["utc_ns"]) < 10**7
-    assert "does not say what time of day that was" in " ".join(printed.err.split())
+    assert "and no time of day" in " ".join(printed.err.split())
     (tmp_path / "can.log").write_text(imu61x_log(range(200)))
     printed = cli("export", "--to", "csv", "--driver", "imu61x-can", tmp_path / "can.log")
     found = rows(printed.out)
     assert len(found) == 200
     assert abs(int(found[100]["utc_ns"]) - (1_763_717_507 * 10**9 + 100 * 10**7)) < 10**6
-    assert "the log has the wall clock only" in " ".join(printed.err.split())
+    assert "contains only the wall clock" in " ".join(printed.err.split())
 
 
 # --- what goes wrong --------------------------------------------------------------------------------------------------
@@ -322,7 +322,7 @@ def test_files_that_are_no_recordings(tmp_path: Path, cli: Cli) -> None:
     cli.refuses("expected a recording or a capture", "export", "--to", "csv", str(tmp_path / "none"))
     (tmp_path / "c.raw").write_bytes(hi91(0))
     cli.refuses(
-        "expected a driver of bytes or of CAN frames",
+        "expected a driver of bytes or CAN frames",
         "export",
         "--to",
         "csv",

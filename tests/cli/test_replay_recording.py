@@ -53,7 +53,7 @@ def test_options_of_captures_are_refused(recorded: Recorded, cli: Cli) -> None:
 def test_a_fresh_clock_gives_other_numbers_and_says_why(recorded: Recorded, cli: Cli) -> None:
     printed = cli("replay", "--json", "--fresh", recorded[0])
     assert len(printed.out.splitlines()) == len(recorded[1])
-    assert printed.err.count("it was asked for a fresh clock") == 2
+    assert printed.err.count("a new clock was requested") == 2
     assert cli("replay", recorded[0]).out == "", "samples need --json"
 
 

@@ -96,5 +96,5 @@ def test_a_log_of_a_can_bus_has_the_wall_clock_and_frames_of_others_are_left_out
 
 
 def test_a_polled_device_cannot_be_captured(tmp_path: Path) -> None:
-    with pytest.raises(BadArgument, match="it is polled"):
+    with pytest.raises(BadArgument, match="polls its devices"):
         Played("hipnuc-modbus")

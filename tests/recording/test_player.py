@@ -143,7 +143,7 @@ def test_without_the_state_the_clock_begins_anew_and_says_so(recorded: pytest.Mo
     player = Player(lambda batch: samples.extend(batch.samples))
     player.play(without_state(record) for one in rig.recorded for record in records_of(one))
     (played,) = player.devices.values()
-    assert played.fresh_starts == ["the recording does not have the state of its clock"]
+    assert played.fresh_starts == ["the recording does not contain the state of the clock"]
     assert len(samples) == len(rig.samples)
     assert played.ledger.closes()
     assert played.differences
