@@ -56,8 +56,8 @@ class AlarmCheck:
         self._candidate = AlarmVerdict.UNKNOWN
         self._since_ns = 0
         self._levels: set[bool] = set()
+        # whether the line has agreed for long where it would contradict with the axes exchanged
         self._axes_proven = False
-        """Whether the line has agreed for long where it would contradict with the axes exchanged."""
 
     def add_sample(self, t_ns: int, euler_rad: Vector3 | None, level: bool) -> AlarmVerdict | None:
         """Compare a sample with the level of the line at its time; return the new verdict if it changed."""
@@ -101,6 +101,7 @@ INTERVAL_NS: Final = NS_PER_S
 FRESH_NS: Final = 150 * NS_PER_MS
 """The level is compared with a sample no older than this; `tick` comes every 100 ms."""
 
+# the fault by verdict, and what to check
 _PROBLEMS: Final = {
     AlarmVerdict.STUCK_LOW: (
         "it is low while an angle is out of the range that the device is set to ({ranges}): is the wire connected, "
@@ -114,7 +115,6 @@ _PROBLEMS: Final = {
         "it does what the other axis should do ({ranges}): is the device mounted as its settings say ({mounting})?"
     ),
 }
-"""The fault by verdict, and what to check."""
 
 
 class AlarmLine:
@@ -126,8 +126,7 @@ class AlarmLine:
         self.raised = 0
         """Number of times that it became active, including an active level found at opening."""
         self._raise_event = raise_event
-        self._changes = 0
-        """Changes since the last event."""
+        self._changes = 0  # changes since the last event
         self._due_ns = 0
 
     def on_level(self, now_ns: int, active: bool | None) -> None:

@@ -43,8 +43,7 @@ from imud.sampling.path import (
 
 FROM_OUTSIDE: Final = ("lost_queue", "replies_late", "replies_unsolicited")
 """Ledger counters that do not depend on codec and clock. The player copies them from each check record."""
-_DATA: Final = int(Kind.DATA)
-"""Integer of `Kind.DATA`: reading a member of an enumeration takes 0.1 µs on Python 3.11."""
+_DATA: Final = int(Kind.DATA)  # integer of `Kind.DATA`: reading a member of an enumeration takes 0.1 µs on Python 3.11
 
 
 @dataclass(slots=True)
@@ -112,8 +111,8 @@ class Player:
         self._publish = publish
         self._on_event = on_event
         self._host = PlayedClock()
+        # reason to ignore recorded states; empty if the player uses them
         self._no_state = "a new clock was requested" if fresh else ""
-        """Reason to ignore recorded states; empty if the player uses them."""
 
     def play(self, found: Iterable[Record]) -> None:
         """Process records. Raises ImudError for an invalid record, and OSError if `publish` raises it."""

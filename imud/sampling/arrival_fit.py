@@ -156,8 +156,8 @@ class ArrivalFit:
         """Device time from which on an arrival begins a new bin, with which the fit changes."""
         self._open = _Bin(device_ns, arrival_ns, 0.0, 0.0)
         self._bins = [self._open]
+        # lower hull over the first `_hull_bins` bins, which change no more; from the point of the oldest
         self._hull: list[Point] = []
-        """Lower hull over the first `_hull_bins` bins, which change no more; from the point of the oldest."""
         self._hull_bins = 0
 
     @property

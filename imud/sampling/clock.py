@@ -170,8 +170,8 @@ class SampleClock:
         self._stamps = StampTime(stamp_modulus) if stamp_modulus else None
         self._delay = LinkDelay(byte_ns, hold_ns)
         self._arrivals = ArrivalTime(self._delay, 0 if tick_ns else tick_modulus, on_unknown_gap)
+        # where the device's counter is by the fit when it was lowest; None until a fit is used
         self._line: CounterLine | None = None
-        """Where the device's counter is by the fit when it was lowest; None until a fit is used."""
         self._jump, self._slew = JumpDetector(), Slew()
         self._holdover: Holdover | None = None
         self._fit: ArrivalFit | None = None

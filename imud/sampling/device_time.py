@@ -65,14 +65,11 @@ class PeriodLearner:
         self._candidate = 0
         self._run = 0
         self._run_sum = 0
-        self._uneven = self._uneven_sum = 0
-        """Steps in a row that are not the period exactly, and their sum."""
-        self._unjudged: list[int] = []
-        """Steps from before there was a period that were not noted as gaps."""
-        self._odd_at = 0.0
-        """Number of the last step that was no period."""
+        self._uneven = self._uneven_sum = 0  # steps in a row that are not the period exactly, and their sum
+        self._unjudged: list[int] = []  # steps from before there was a period that were not noted as gaps
+        self._odd_at = 0.0  # number of the last step that was no period
+        # whether there were many periods in a row before it; a period learned of steps with losses is no rate
         self._steady = False
-        """Whether there were many periods in a row before it; a period learned of steps with losses is no rate."""
         self.is_new = False
         """Whether the period is another since this was set to False: the device's rate was changed."""
         self.changes = 0
@@ -271,21 +268,18 @@ class DeviceTime:
         self.ticks = 0
         """The newest stamp."""
         self._phase_ns = 0.0
-        self._shift_ns = 0.0
-        """Part of the corrections of the counter that is still in `even_ns`."""
+        self._shift_ns = 0.0  # part of the corrections of the counter that is still in `even_ns`
+        # part of `_shift_ns` that no arrival has confirmed: the first step of another rate looks like a correction
         self._unsure_ns = 0.0
-        """Part of `_shift_ns` that no arrival has confirmed: the first step of another rate looks like a correction."""
         self._even_for = 0
-        self._step_ns = 0
-        """The newest step of the counter; negative where that is shorter than half a turn forward."""
-        self._gap = 0
-        """Samples missing in the last gap, while it is watched."""
+        self._step_ns = 0  # the newest step of the counter; negative where that is shorter than half a turn forward
+        self._gap = 0  # samples missing in the last gap, while it is watched
         self.uneven = False
         """Whether the newest step, after many even ones, is no whole number of periods by more than a tick."""
         self.doubt_ns = 0.0
         """By how much even samples were preferred to stamps, until an arrival confirms it."""
+        # number of further samples within which the phase of a new rate within its ticks may become known
         self._unsettled = 0
-        """Number of further samples within which the phase of a new rate within its ticks may become known."""
         self.rephased = False
         """Whether the device's rate was changed: where in their ticks the samples are now is anew."""
         self.watched = 0
@@ -481,8 +475,7 @@ class JumpDetector:
 
     def __init__(self) -> None:
         self._since_ns = 0
-        self._begin_ns = 0
-        """Device time between the first late message and the one before."""
+        self._begin_ns = 0  # device time between the first late message and the one before
         self.late_reads = 0
         """Number of late reads in a row."""
 
@@ -556,22 +549,16 @@ class StampTime:
 
     def __init__(self, modulus: int) -> None:
         self._modulus = modulus
-        self._stamp = -1
-        """The newest stamp; -1 before the first."""
+        self._stamp = -1  # the newest stamp; -1 before the first
         self.before = 0
         """Ticks of the message before the newest one."""
-        self._ticks = 0
-        """Ticks of the newest message, not wrapped."""
+        self._ticks = 0  # ticks of the newest message, not wrapped
         self._arrival_ns = 0
-        self._origin_ns = 0
-        """Arrival that lateness is relative to."""
-        self._lowest_ns = 0.0
-        """Least arrival minus ticks so far, from the origin; it rises by DRIFT."""
-        self._live_ticks = self._live_arrival_ns = 0
-        """The message since which arrivals have kept pace with the ticks."""
+        self._origin_ns = 0  # arrival that lateness is relative to
+        self._lowest_ns = 0.0  # least arrival minus ticks so far, from the origin; it rises by DRIFT
+        self._live_ticks = self._live_arrival_ns = 0  # the message since which arrivals have kept pace with the ticks
         self._stuck = 0
-        self._pulsed = False
-        """Whether a pulse per second sets the stamp to zero."""
+        self._pulsed = False  # whether a pulse per second sets the stamp to zero
         self._foreign_ticks: int | None = None
         self._foreign_since_ns = 0
         self.in_use = False

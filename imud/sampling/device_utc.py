@@ -63,8 +63,8 @@ class IntervalFit:
         self._ref_device_ns = self._ref_ns = 0
         self._middle = 0.0
         self._slope = 1.0
+        # of the set at `_ref_device_ns`, and how much it opens per device ns from there on
         self._width_ns = self._fan = 0.0
-        """Of the set at `_ref_device_ns`, and how much it opens per device ns from there on."""
         self.newest_ns = 0
         """Device time of the newest interval."""
         self.known = False

@@ -52,8 +52,8 @@ MARK_REACH: Final = 0.5
 MARKS_KEPT: Final = 1024
 """Most marks that are kept for the reader, and most pulses that wait for their sample."""
 _LEVEL_GAIN: Final = (1.0, 1.0, *(2 * (2 * n - 1) / (n * (n + 1)) for n in range(2, TRACKED + 1)))
+# gains of the n-th of equally weighted points on a line
 _SLOPE_GAIN: Final = (0.0, 0.0, *(6 / (n * (n + 1)) for n in range(2, TRACKED + 1)))
-"""Gains of the n-th of equally weighted points on a line."""
 
 EdgeStamp = tuple[int, int]
 """(CLOCK_MONOTONIC of a rising edge, its number)."""
@@ -98,8 +98,8 @@ class EdgeTracker:
     def __init__(self, device_ns: int, edge_ns: int, slope: float) -> None:
         self._device_ns = device_ns
         self._edge_ns = edge_ns
+        # the line at `_device_ns`, above `_edge_ns`: floats of ns since boot lose digits after some months
         self._offset = 0.0
-        """The line at `_device_ns`, above `_edge_ns`: floats of ns since boot lose digits after some months."""
         self._count = 1
         self.slope = slope
         """Host ns per device ns."""

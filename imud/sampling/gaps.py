@@ -121,12 +121,11 @@ class ArrivalPace:
         self._turn = turn
         self.period_ns = 0.0
         """Time between samples; 0.0 while unknown."""
-        self._error = 1.0
-        """Relative error of the period."""
+        self._error = 1.0  # relative error of the period
+        # windows in a row that were late or early: each lost samples or had a wrong phase, or the rate is another
         self._off_windows = 0
-        """Windows in a row that were late or early: each lost samples or had a wrong phase, or the rate is another."""
+        # by how much the last of them in which no sample was missing was late; 0.0 where it was early
         self._off_ns = 0.0
-        """By how much the last of them in which no sample was missing was late; 0.0 where it was early."""
         self.begin(0)
 
     @property
@@ -137,10 +136,8 @@ class ArrivalPace:
     def begin(self, arrival_ns: int) -> None:
         """Set the first message, or the first after a gap of unknown size; what is known of the period stays."""
         self._due_ns = float(arrival_ns)
-        self._has_phase = False
-        """Whether a window has shown how long the first message waited."""
-        self._unjudged = 0
-        """Samples since the window that was judged last."""
+        self._has_phase = False  # whether a window has shown how long the first message waited
+        self._unjudged = 0  # samples since the window that was judged last
         self._begin_window(arrival_ns)
 
     def _begin_window(self, arrival_ns: int) -> None:

@@ -1,7 +1,7 @@
-"""The hot path of one device: bytes or frames → codec → clock → batch → publishers. Everything else happens around it.
+"""Path of the samples of one device: bytes or frames → codec → clock → batch → publishers.
 
-Per read: one `feed`, one clock call and one record per sample, one batch; counters are plain integers.
-Synchronization: the event loop's thread only.
+This is the code with the strictest limit on CPU time. For each read: one `feed` and one batch. For each sample: one
+call of the clock and one record. Counters are plain integers. Synchronization: the event loop's thread only.
 """
 
 from abc import ABC, abstractmethod
@@ -30,24 +30,24 @@ from imud.sampling.clock import SampleClock
 from imud.sampling.steering import STAMP_FLOOR_NS
 
 RATE_WINDOW_NS = 2 * NS_PER_S
-"""The rate shown is that of the last two seconds: long enough for 1 Hz devices, short enough to see a stall."""
+"""Window of the sample rate, ns: long enough for devices with 1 Hz, short enough to show a stall."""
 
 
 class RateMeter:
-    """Samples per second over the last `RATE_WINDOW_NS`, from counts taken at every tick."""
+    """Sample rate over the last `RATE_WINDOW_NS`. The device adds the sample count at each tick."""
 
     def __init__(self) -> None:
         self._marks: deque[tuple[int, int]] = deque()
 
     def mark(self, now_ns: int, count: int) -> None:
-        """Note that `count` samples were made until `now_ns`."""
+        """Add the sample count at `now_ns`."""
         marks = self._marks
         marks.append((now_ns, count))
-        while len(marks) > 2 and marks[1][0] <= now_ns - RATE_WINDOW_NS:
+        while len(marks) > 2 and marks[1][0] <= now_ns - RATE_WINDOW_NS:  # keep one mark before the window
             marks.popleft()
 
     def rate_hz(self) -> float:
-        """Samples per second between the oldest and the newest mark; 0.0 before there are two."""
+        """Return the samples per second between the oldest and the newest count; 0.0 without two counts."""
         if len(self._marks) < 2:
             return 0.0
         (t0_ns, n0), (t1_ns, n1) = self._marks[0], self._marks[-1]
@@ -64,15 +64,16 @@ class LatencyMeter:
         self.sum_ns = 0
 
     def add(self, now_ns: int, samples: Sequence[Sample]) -> None:
-        """Count samples that are published at `now_ns`, oldest first."""
+        """Count samples that imud publishes at `now_ns`. The samples are sorted, oldest first."""
         if len(samples) == 1:
             latency_ns = now_ns - samples[0].t_ns
             self.buckets[bisect_left(LATENCY_BOUNDS_NS, latency_ns)] += 1
             self.sum_ns += latency_ns
             return
-        latencies = [now_ns - sample.t_ns for sample in reversed(samples)]  # rising, as times of samples do
+        latencies = [now_ns - sample.t_ns for sample in reversed(samples)]  # reversed: ascending latencies
         self.sum_ns += sum(latencies)
         buckets, begin = self.buckets, 0
+        # one step for each bucket, not for each sample
         for bucket in range(bisect_left(LATENCY_BOUNDS_NS, latencies[0]), len(LATENCY_BOUNDS_NS)):
             end = bisect_right(latencies, LATENCY_BOUNDS_NS[bucket], begin)
             buckets[bucket] += end - begin
@@ -83,20 +84,21 @@ class LatencyMeter:
 
 
 class LossMeter:
-    """Attribution of missing samples to causes: damaged frames, then kernel overruns, the rest to the device.
+    """Attribution of lost samples to causes: first damaged frames, then kernel overruns, then the device.
 
-    A device-time gap says how many samples are missing; damaged frames heard since the last sample explain as many of
-    them, then overruns the kernel counted explain the rest, and what is left the device itself did not send.
+    The device counter shows the number of lost samples. Each damaged frame since the last sample explains one of them.
+    An overrun explains the rest. Without an overrun, the device did not send the rest.
     """
 
     def __init__(self, ledger: Ledger) -> None:
         self.bad_frames = 0
-        """Damaged frames heard since the last sample; the owner counts them and sets 0 after each sample."""
+        """Number of damaged frames since the last sample. The path counts them and resets the number after each sample.
+        """
         self._ledger = ledger
         self._overruns_seen = 0
 
     def missed(self, count: int, overruns: int) -> None:
-        """Attribute `count` missing samples; the kernel counted `overruns` since the link was opened."""
+        """Attribute `count` lost samples. `overruns` is the kernel's count since the link was opened."""
         ledger = self._ledger
         by_crc = min(count, self.bad_frames)
         left = count - by_crc
@@ -107,49 +109,49 @@ class LossMeter:
         self._overruns_seen = overruns
 
     def link_opened(self) -> None:
-        """Note that the kernel's counters start anew."""
+        """Reset the overruns: the kernel counts from the opening of the link."""
         self._overruns_seen = 0
 
 
 @dataclass(frozen=True, slots=True)
 class PathContext:
-    """Parts that every sample path of one device needs in addition to its codec and clock."""
+    """Parts of a device that its path needs in addition to codec and clock."""
 
     device: str
-    """Name in the configuration."""
+    """Name of the device in the configuration."""
     device_id: int
     ledger: Ledger
     publish: Callable[[Batch], None]
     on_message: Callable[[Message, int], None]
-    """Called with a text line or reply frame, and CLOCK_MONOTONIC of its arrival."""
+    """Called with a text line or reply frame, and with CLOCK_MONOTONIC of its arrival, ns."""
     on_bad_frame: Callable[[BadFrame], None]
     overruns: Callable[[], int]
-    """Overruns that the kernel counted since the link was opened."""
+    """Returns the number of overruns that the kernel counted since the link was opened."""
     host: HostClock
     frame: PublishedAxes = AS_SENT
-    """Axes and angles of what is published."""
+    """Axes and angles of the published samples."""
 
 
 class SamplePath(ABC):
-    """Path from the data of one device to published samples; subclasses receive the data."""
+    """Path from the data of one device to published samples. The subclasses receive the data."""
 
     NOT_STATE: ClassVar = frozenset({
         "_device", "_device_id", "_drain_edges", "_ledger", "_listener", "_now_ns", "_on_bad_frame", "_on_message",
         "_overruns", "_publish", "_rotation", "_status_mask", "_status_seen", "_utc_offset_ns", "frame", "latency",
     })  # fmt: skip
-    """Attributes that a recorded state leaves out: parts of the daemon, and statistics."""
+    """Attributes that a recorded state does not contain: parts of the daemon, and statistics."""
 
     def __init__(self, clock: SampleClock, context: PathContext) -> None:
         self.clock = clock
         self.latency = LatencyMeter()
         self.loss = LossMeter(context.ledger)
         self.observer: InputObserver | None = None
-        """Observer of the input; None if no recording runs. `observe` sets it."""
+        """Observer of the input; None if no recording runs. Set by `observe`."""
         self.newest: Sample | None = None
-        """As the device sent it, in the sensor's own axes."""
+        """Newest sample, in the axes of the sensor."""
         self.frame = context.frame
         self.begun_ns = 0
-        """CLOCK_MONOTONIC when the link was last given to this path."""
+        """CLOCK_MONOTONIC at the last `begin`, ns."""
         self.last_data_ns = 0
         self.last_sample_ns = 0
         self._begun_samples = context.ledger.samples
@@ -166,46 +168,46 @@ class SamplePath(ABC):
         self._utc_offset_ns = context.host.utc_offset_ns
 
     def observe(self, observer: InputObserver | None) -> None:
-        """Report each input of the path and of its clock to `observer`; None ends the reports."""
+        """Report each input of the path and of its clock to `observer`. None stops the reports."""
         self.observer = self.clock.observer = observer
 
     def watch_status(self, mask: int) -> None:
-        """Gather these bits of the status of all samples from now on."""
+        """Collect these bits of the status of each sample. `take_status` returns them."""
         self._status_mask, self._status_seen = mask, 0
 
     def take_status(self) -> int:
-        """Return the gathered bits that any sample had since the last call."""
+        """Return the collected status bits of all samples since the previous call."""
         seen, self._status_seen = self._status_seen, 0
         return seen
 
     @property
     def fresh(self) -> bool:
-        """Whether a sample came since the link was last given to this path."""
+        """Return whether a sample arrived since the last `begin`."""
         return self._ledger.samples > self._begun_samples
 
     @property
     def period_ns(self) -> int:
-        """Expected time between two samples, ns; 0 while it is not known."""
+        """Return the expected time between two samples, ns; 0 if unknown."""
         expected_hz = self.clock.expected_rate_hz
         return int(NS_PER_S / expected_hz) if expected_hz else 0
 
     def begin(self, now_ns: int) -> None:
-        """Start on a link whose device is found."""
+        """Start on an open link after detection of the device."""
         self.begun_ns = self.last_data_ns = now_ns
         self._begun_samples = self._ledger.samples
         self._on_begin()
-        if self.observer is not None:  # with the counters of a search before
+        if self.observer is not None:  # the counters include a search, which no recording contains
             self.observer.call("ledger", "set", self._ledger.snapshot())
             self.observer.call("path", "begin", now_ns)
 
     def link_opened(self) -> None:
-        """Note that the kernel's counters of the link restarted."""
+        """Reset the kernel's counters: the link was opened."""
         self.loss.link_opened()
         if self.observer is not None:
             self.observer.call("loss", "link_opened")
 
     def flush(self, now_ns: int) -> None:
-        """Process what waits for a rest that did not come: the link is idle."""
+        """Process an incomplete frame or sample: the link is idle."""
         try:
             self._flush(now_ns)
         finally:
@@ -213,13 +215,13 @@ class SamplePath(ABC):
                 self.observer.call("path", "flush", now_ns)
 
     def reset(self) -> None:
-        """Discard what is incomplete: the link ended."""
+        """Discard an incomplete frame or sample: the link was closed."""
         self._reset()
         if self.observer is not None:
             self.observer.call("path", "reset")
 
     def _on_begin(self) -> None:  # noqa: B027 - most paths have nothing to prepare
-        """Prepare for the first data of a link."""
+        """Prepare for the data of a link after `begin`."""
 
     @abstractmethod
     def _flush(self, now_ns: int) -> None: ...
@@ -228,7 +230,7 @@ class SamplePath(ABC):
     def _reset(self) -> None: ...
 
     def publish_events(self, events: Sequence[CodecEvent], t_rx_ns: int) -> None:
-        """Publish the samples in what a codec made of something that came at `t_rx_ns`, as one batch."""
+        """Publish the samples of `events` as one batch. The data of the events arrived at `t_rx_ns`."""
         samples: list[Sample] = []
         self._sort(events, t_rx_ns, self._utc_offset_ns(), samples)
         if samples:
@@ -242,7 +244,10 @@ class SamplePath(ABC):
         samples: list[Sample],
         t_begin_ns: int | None = None,
     ) -> None:
-        """Pass each event to where it belongs; append samples. `t_begin_ns` is that of `SampleClock.sample`."""
+        """Append the samples of `events` to `samples`. Pass messages and bad frames to the device.
+
+        `t_begin_ns`: see `SampleClock.sample`.
+        """
         clock, loss = self.clock, self.loss
         at, count = 0, len(events)
         while at < count:
@@ -263,7 +268,7 @@ class SamplePath(ABC):
             elif type(event) is ReplyFrame:
                 self._on_message(event, t_rx_ns)
             elif type(event) is BadFrame:
-                if event.reason is not BadReason.NOT_FINITE:  # that one comes with its sample
+                if event.reason is not BadReason.NOT_FINITE:  # the sample of this frame follows
                     loss.bad_frames += 1
                 self._on_bad_frame(event)
 
@@ -279,6 +284,7 @@ class SamplePath(ABC):
         self.last_sample_ns = t_rx_ns
         if self._rotation is not None:
             samples = self._rotation.samples(samples)
+        # readers of the batch get the published axes, `newest` keeps the axes of the sensor
         self._publish(Batch(self._device, self._device_id, samples, self.frame))
         if mask := self._status_mask:
             for sample in samples:
@@ -288,10 +294,10 @@ class SamplePath(ABC):
 
 
 class SampleListener(Protocol):
-    """Listener to measurements as a codec makes them, before they are samples: a command waits for one."""
+    """Listener to the measurements of a codec, for a command that waits for one."""
 
     wants_samples: bool
-    """Whether it listens now."""
+    """Whether the listener is active."""
 
     def on_sample(self, sample: Measurement) -> None:
         """Process one measurement."""
@@ -299,7 +305,7 @@ class SampleListener(Protocol):
 
 
 class StreamPath(SamplePath):
-    """The path of a device that sends bytes."""
+    """Path of a device that sends bytes."""
 
     def __init__(
         self,
@@ -309,16 +315,16 @@ class StreamPath(SamplePath):
         drain_edges: Callable[[], None] | None = None,
         listener: SampleListener | None = None,
     ) -> None:
-        """`drain_edges` gives the clock the edges of lines that precede the bytes; called before they are decoded."""
+        """`drain_edges` passes the buffered edges of the lines to the clock. The path calls it before decoding."""
         super().__init__(clock, context)
         self.codec = codec
         self._listener = listener
         self._drain_edges = drain_edges
         self.gathered: list[Sample] = []
-        """Samples that are not published yet, oldest first."""
+        """Samples that `publish_gathered` will publish, oldest first."""
 
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
-        """Process bytes as read, with CLOCK_MONOTONIC right after the read."""
+        """Process the bytes of one read. `t_rx_ns` is CLOCK_MONOTONIC right after the read."""
         self.last_data_ns = t_rx_ns
         try:
             if self._drain_edges is not None:
@@ -326,16 +332,19 @@ class StreamPath(SamplePath):
             events = self.codec.feed(data)
             if events:
                 self.publish_events(events, t_rx_ns)
-                if self._listener is not None and self._listener.wants_samples:
-                    self._pass_on(events, self._listener)
-        finally:  # a recording must contain the data that caused an error
+                listener = self._listener
+                if listener is not None and listener.wants_samples:
+                    for event in events:
+                        if type(event) is Measurement:
+                            listener.on_sample(event)
+        finally:  # a recording must contain the data that caused an exception
             if self.observer is not None:
                 self.observer.data(data, t_rx_ns, -1)
 
     def gather(self, data: bytes, t_rx_ns: int, waited_ns: int = 0) -> bool:
-        """Process bytes, and keep their samples for `publish_gathered`; returns whether there are any.
+        """Process bytes, and hold their samples until `publish_gathered`. Return whether the bytes contained samples.
 
-        The bytes waited in the kernel for up to `waited_ns`; 0: they were read as they came.
+        `waited_ns` is the maximum time of the bytes in the kernel's buffer; 0 if imud read them on arrival.
         """
         self.last_data_ns = t_rx_ns
         try:
@@ -352,7 +361,7 @@ class StreamPath(SamplePath):
                 self.observer.data(data, t_rx_ns, waited_ns)
 
     def publish_gathered(self) -> None:
-        """Publish the samples that were kept, as one batch."""
+        """Publish the held samples as one batch."""
         samples, self.gathered = self.gathered, []
         try:
             if samples:
@@ -361,43 +370,37 @@ class StreamPath(SamplePath):
             if self.observer is not None:
                 self.observer.call("path", "publish_gathered")
 
-    def _pass_on(self, events: Sequence[CodecEvent], listener: SampleListener) -> None:
-        for event in events:
-            if type(event) is Measurement:
-                listener.on_sample(event)
-
     def _flush(self, now_ns: int) -> None:
-        """Process whole frames that wait inside a longer one that never came."""
+        """Process complete frames inside an incomplete longer frame."""
         if self._ledger.bytes_pending:
             events = self.codec.flush()
             if events:
                 self.publish_events(events, now_ns)
 
     def _reset(self) -> None:
-        """Count bytes that wait for the rest of their frame as skipped."""
         self.codec.reset()
 
 
 class CanPath(SamplePath):
-    """The path of a device on a CAN bus."""
+    """Path of a device on a CAN bus."""
 
     def __init__(self, codec: CanCodec, clock: SampleClock, context: PathContext) -> None:
         super().__init__(clock, context)
         self.codec = codec
-        self._frame_ns = 0
-        self._first_ns = 0
+        self._frame_ns = 0  # shortest time of a frame on the wire
+        self._first_ns = 0  # arrival of the first frame of the present sample
 
     def set_frame_time(self, frame_ns: int) -> None:
-        """Set the shortest time of a frame on the wire, ns; 0 where the bit rate is not known."""
+        """Set the shortest time of a frame on the wire, ns; 0 if the bit rate is unknown."""
         self._frame_ns = frame_ns
         if self.observer is not None:
             self.observer.call("path", "set_frame_time", frame_ns)
 
     def on_frames(self, frames: Sequence[CanFrame]) -> None:
-        """Process frames as read in one go, each with its own time of arrival.
+        """Process the CAN frames of one read. Each frame has its own arrival time.
 
-        What a device measured at one instant begins to arrive with the first frame that waits for others; frames of
-        other devices come between them.
+        A sample can consist of several frames. The measurement was made before the arrival of its first frame. Frames
+        of other devices can arrive between the frames of a sample.
         """
         try:
             feed, ledger, samples = self.codec.feed_frame, self._ledger, list[Sample]()
@@ -412,7 +415,7 @@ class CanPath(SamplePath):
                 events = feed(can_id, extended, data, t_rx_ns)
                 if events:
                     self._sort(events, t_rx_ns, utc_offset_ns, samples, self._first_ns - self._frame_ns)
-                if pending and ledger.frames_pending == 1:  # what waited is over, and this frame waits for others now
+                if pending and ledger.frames_pending == 1:  # this frame is the first frame of the next sample
                     self._first_ns = t_rx_ns
             self.last_data_ns = t_rx_ns
             if samples:
@@ -422,13 +425,12 @@ class CanPath(SamplePath):
                 self.observer.frames(frames)
 
     def _flush(self, now_ns: int) -> None:
-        """Process what need not wait for frames that did not come."""
+        """Process a sample whose missing frames are not required."""
         events = self.codec.flush()
         if events:
             self.publish_events(events, now_ns)
 
     def _reset(self) -> None:
-        """Drop frames that wait for the rest of their sample."""
         self.codec.reset()
 
 
@@ -443,10 +445,7 @@ def make_clock(
     hold_ns: int = 0,
     on_unknown_gap: Callable[[], None] = lambda: None,
 ) -> SampleClock:
-    """Return the clock of the device `name` for samples of `driver`.
-
-    If `before` is a clock, the new clock continues its sequence numbers and time stamps.
-    """
+    """Return the clock for samples of `driver`. With `before`, continue its sequence numbers and time stamps."""
     clock = SampleClock(
         name,
         tick_ns=driver.tick_ns,
@@ -466,45 +465,46 @@ def make_clock(
 
 
 QUIET_NS: Final = 500 * NS_PER_MS
-"""Edges count as stopped after this time, which is shorter than what makes a device silent."""
+"""Time without edges after which the line counts as stopped, ns. It is shorter than the time until a device is silent.
+"""
 KEPT: Final = 1024
-"""Capacity of the buffer of edges without a read: that of the kernel's event buffer."""
+"""Number of buffered edges without a read: the capacity of the kernel's event buffer."""
 AGE_LIMIT: Final = 1.5
-"""A further read of an edge that begins later than this, in intervals, may belong to an unseen edge: the wire broke."""
+"""Maximum time from an edge to a second read of its values, in intervals. After that, an edge may have been lost."""
 EITHER: Final = 1 / sqrt(2)
-"""Root mean square of an error that is 0 or its bound with equal probability."""
+"""Root mean square of an error that is 0 or 1 with equal probability."""
 
 
 class Stamp(NamedTuple):
-    """Instant of measurement of the values that were read."""
+    """Time stamp of the values of one read."""
 
     t_ns: int
-    """CLOCK_MONOTONIC; not after the begin of the read."""
+    """CLOCK_MONOTONIC, ns; at most the start of the read."""
     err_ns: int
-    """One-sigma error of `t_ns`."""
+    """One-sigma error of `t_ns`, ns."""
     number: int
-    """`Edge.number`."""
+    """Number of the edge (`Edge.number`)."""
 
 
 class ReadyEdges:
-    """Edges of one data-ready line. Synchronization: the loop's thread only."""
+    """Edges of one data-ready line. Synchronization: the event loop's thread only."""
 
     def __init__(self, settings: ReadyOptions, period_ns: int) -> None:
-        """`period_ns` is the expected interval of edges, used until two have come."""
+        """`period_ns` is the expected interval of the edges, ns, until two edges have arrived."""
         self.missed = 0
-        """Edges without a read: the next edge came first, or the kernel dropped the edge."""
+        """Number of edges without a read: the next edge arrived first, or the kernel dropped the edge."""
         self.interval_ns = period_ns
-        """Interval of the two newest edges."""
+        """Interval of the two newest edges, ns."""
         self.observer: InputObserver | None = None
-        """Observer of the edges; None if no recording runs."""
+        """Observer of the edges; None if no recording runs. Set by `PolledPath.observe`."""
         self._offset_ns = round(settings.offset_us * NS_PER_US)
         self._error_ns = settings.bias_us * NS_PER_US / sqrt(3) + STAMP_FLOOR_NS
         self._edges: deque[Edge] = deque(maxlen=KEPT)
         self._newest: Edge | None = None
-        self._read: int | None = None
+        self._read: int | None = None  # number of the edge of the newest read
 
     def on_edges(self, edges: Sequence[Edge]) -> None:
-        """Add edges after which new values can be read, oldest first."""
+        """Add edges, oldest first. New values are ready after each edge."""
         for edge in edges:
             before, self._newest = self._newest, edge
             if before is not None:
@@ -514,13 +514,16 @@ class ReadyEdges:
             self.observer.edges("data_ready", edges)
 
     def restart(self) -> None:
-        """Begin to read, possibly another device: earlier edges do not count as missed."""
+        """Start the reads, possibly of another device. Do not count earlier edges as missed."""
         self._read = None
         if self.observer is not None:
             self.observer.call("edges", "restart")
 
     def match(self, start_ns: int, end_ns: int) -> Stamp | None:
-        """Return the stamp of a read from `start_ns` to `end_ns`, failed or not; None without edge. In order only."""
+        """Return the time stamp of a read from `start_ns` to `end_ns`; None without an edge.
+
+        Failed reads count too. Call this method in the order of the reads.
+        """
         edges = self._edges
         while len(edges) > 1 and edges[1].t_ns <= start_ns:
             edges.popleft()
@@ -530,61 +533,61 @@ class ReadyEdges:
         limit_ns = AGE_LIMIT * self.interval_ns
         if self._read is not None and number != self._read:
             self.missed += max(0, number - self._read - 1)
-            limit_ns = max(limit_ns, QUIET_NS)  # the first read of an edge: the host was late
+            limit_ns = max(limit_ns, QUIET_NS)  # first read of this edge: the host may be late
         self._read = number
         if start_ns - t_ns > limit_ns:
             return None
         error_ns = self._error_ns
-        if len(edges) > 1 and edges[1].t_ns <= end_ns:  # new values during the read: either
+        if (
+            len(edges) > 1 and edges[1].t_ns <= end_ns
+        ):  # the registers changed during the read: the values are old or new
             newest_ns = max(edge.t_ns for edge in edges if edge.t_ns <= end_ns)
             error_ns = hypot(error_ns, EITHER * (newest_ns - t_ns))
         return Stamp(min(t_ns + self._offset_ns, start_ns), int(error_ns) + 1, number)
 
 
 FAULTS_MAX: Final = 3
-"""Number of damaged or failed reads in a row after which the device is identified again."""
+"""Number of consecutive damaged or failed reads after which imud identifies the device again."""
 GAP_PERIODS: Final = 1.5
-"""With less time since the read before, none is missing."""
+"""Minimum time since the previous read, in periods, that counts as a gap."""
 SIGMA_OF_AGE: Final = 1 / sqrt(3)
-"""Root mean square of an age that is anything from 0 to its bound."""
+"""Root mean square of an age that is uniformly distributed from 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class PollTiming:
-    """Timing of reads, as far as known."""
+    """Timing of the reads."""
 
     period_ns: int
-    """Time between two reads."""
+    """Time between two reads, ns."""
     update_ns: int
-    """Longest time between two updates of the device's registers; 0 where it is not known."""
+    """Maximum time between two updates of the device's registers, ns; 0 if unknown."""
     edges: ReadyEdges | None
-    """Edges of the data-ready line; None without one."""
+    """Edges of the data-ready line; None without a line."""
 
 
 class PolledPath(SamplePath):
-    """The path of a device that is polled."""
+    """Path of a device that imud polls."""
 
     def __init__(self, codec: PolledCodec, timing: PollTiming, clock: SampleClock, context: PathContext) -> None:
         super().__init__(clock, context)
         self.codec = codec
         self.failed = 0
-        """Transfers that failed."""
+        """Number of failed transfers."""
         self.edges = timing.edges
-        """Edges of the data-ready line; None without one."""
+        """Edges of the data-ready line; None without a line."""
         self._period_ns = timing.period_ns
         self._update_ns = timing.update_ns
-        self._before_ns = 0
-        self._faults = 0
-        self._read_ns = 0
-        """Begin of the newest read that gave a sample, a stale one or a lost one; 0 before the first."""
-        self._is_back = False
-        """Whether the device was identified and not read since."""
+        self._before_ns = 0  # start of the previous successful read
+        self._faults = 0  # consecutive damaged or disturbed reads
+        self._read_ns = 0  # start of the newest read with a new, stale or lost sample, ns; 0 before the first read
+        self._is_back = False  # whether imud has identified the device and not read it yet
+        # whether imud stopped its reads for a time after the newest sample
         self._gap_unknown = context.ledger.samples > 0
-        """Whether the device was not read for a while since its newest sample."""
 
     @property
     def period_ns(self) -> int:
-        """Time between two reads, ns."""
+        """Return the time between two reads, ns."""
         return self._period_ns
 
     def observe(self, observer: InputObserver | None) -> None:
@@ -598,16 +601,16 @@ class PolledPath(SamplePath):
         self._is_back = True
 
     def _flush(self, now_ns: int) -> None:
-        """No-op: what is read comes whole or not at all."""
+        """Do nothing. A reading is complete or failed."""
 
     def _reset(self) -> None:
-        """Forget earlier data: the next frame is not compared with it."""
+        """Discard the previous reading: the codec does not compare the next reading with it."""
         self.codec.reset()
         self._before_ns = 0
         self._faults = 0
 
     def on_readings(self, readings: Sequence[Reading]) -> str:
-        """Process readings, oldest first; return why the device must be identified again, or an empty string."""
+        """Process readings, oldest first. Return the reason to identify the device again; empty without a reason."""
         try:
             utc_offset_ns = self._utc_offset_ns()
             samples: list[Sample] = []
@@ -616,7 +619,7 @@ class PolledPath(SamplePath):
             for reading in readings:
                 if gone:
                     self._skip(reading)
-                    continue
+                    continue  # imud counts the bytes as skipped until it has identified the device again
                 stamp = None
                 if reading.poll == 0:
                     stamp = edges.match(reading.start_ns, reading.end_ns) if edges is not None else None
@@ -633,7 +636,7 @@ class PolledPath(SamplePath):
                 self.observer.readings(readings)
 
     def skip(self, reading: Reading) -> None:
-        """Count bytes of a device that is not identified as skipped."""
+        """Count the bytes of an unidentified device as skipped."""
         self._skip(reading)
         if self.observer is not None:
             self.observer.call("path", "skip", len(reading.data))
@@ -657,7 +660,7 @@ class PolledPath(SamplePath):
                 gone, vanished = event.why, True
             elif type(event) is BadFrame:
                 self._on_bad_frame(event)
-                if event.reason is not BadReason.NOT_FINITE:  # that one comes with its sample
+                if event.reason is not BadReason.NOT_FINITE:  # the sample of this frame follows
                     self._ledger.lost_crc += 1
                     gone = gone or self._fault(f"{FAULTS_MAX} damaged frames in a row, the last by {event.reason}")
         if reading.poll == 0:
@@ -667,7 +670,7 @@ class PolledPath(SamplePath):
         return gone
 
     def _measure_gap(self, start_ns: int) -> None:
-        """Look at a read of a sample: where the device was looked for right before, it ends a gap of unknown size."""
+        """Check the first read after an identification: a long time since the last read is a gap of unknown size."""
         if self._is_back:
             self._is_back = False
             if self._read_ns and start_ns - self._read_ns >= GAP_PERIODS * self._period_ns:
@@ -693,7 +696,8 @@ class PolledPath(SamplePath):
         return why if self._faults >= FAULTS_MAX else ""
 
     def _error_ns(self, reading: Reading) -> int:
-        """One-sigma error of `start_ns` as the time of measurement."""
+        """Return the one-sigma error of `reading.start_ns` as the time of the measurement, ns."""
+        # the registers are up to one update old, or up to one read
         age_ns = reading.start_ns - self._before_ns if self._before_ns else self._period_ns
         if self._update_ns and self._update_ns < age_ns:
             age_ns = self._update_ns

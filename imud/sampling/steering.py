@@ -168,11 +168,10 @@ class AidingSources:
         self._sout_timing = sout_timing
         self._sin_timing = sin_timing
         self._pulses = PulseDecoder(int(sout_timing.width_us * NS_PER_US))
+        # in the order of their first edges: the first one counts where several have an event
         self._sources: list[EdgeSource] = []
-        """In the order of their first edges: the first one counts where several have an event."""
         self._source: EdgeSource | None = None
-        self._fix_ns = 0.0
-        """Correction that is added to the fit of arrivals, ns."""
+        self._fix_ns = 0.0  # correction that is added to the fit of arrivals, ns
         self._device_ns: int | None = None
         self._pps: PpsAge | None = None
         self.sout: EdgeSource | None = None

@@ -52,13 +52,10 @@ class PpsReference:
         """Sentences that were damaged, not valid, or matched no pulse."""
         self._on_second = on_second
         self._stamps: deque[int] = deque(maxlen=PULSES_KEPT)
-        self._seconds: deque[int] = deque(maxlen=PULSES_KEPT)
-        """Seconds of the stamps, from an arbitrary origin."""
+        self._seconds: deque[int] = deque(maxlen=PULSES_KEPT)  # seconds of the stamps, from an arbitrary origin
         self._candidates: list[int] = []
-        self._base_s: int | None = None
-        """Unix second at which `_seconds` is 0."""
-        self._claim_s: int | None = None
-        """`_base_s` by the last sentence."""
+        self._base_s: int | None = None  # unix second at which `_seconds` is 0
+        self._claim_s: int | None = None  # `_base_s` by the last sentence
         self._fit: tuple[float, float, float] | None = None
 
     def on_pulse(self, t_ns: int) -> bool:
