@@ -1,21 +1,22 @@
-"""The fit of arrivals: offset and skew of a device's clock from the lower envelope of arrival times over device time.
+"""Fit of arrivals: offset and skew of a device's clock, from the lower envelope of arrival times over device time.
 
-An arrival is `arrival_ns = truth + delay` (less the time on the wire) with a delay that is never negative, so the truth
-lies on or under every point (device_ns, arrival_ns), and the points that were hardly delayed lie on it. An average
-follows the mean delay and every burst; the lower convex hull does not (Zhang, Liu, Xia: Clock synchronization
-algorithms for network measurements, INFOCOM 2002).
+An arrival is `arrival_ns = truth + delay` (less the time on the wire). The delay is never negative. Therefore the truth
+is on or below each point (device_ns, arrival_ns), and the points with a very small delay are on it. A mean follows the
+mean delay and each burst of delays. The lower convex hull does not (Zhang, Liu, Xia: Clock synchronization algorithms
+for network measurements, INFOCOM 2002).
 
-Plan: each bin of device time keeps its lowest point above the present fit; bins begin as single samples and double
-in width until 64 of them cover about a minute; then the oldest goes. Whenever a bin opens, the lower hull over the
-bins gives the fit: its edge over a point at three quarters of the window. (The edge over the mean minimises the summed
-distance, but is later to follow a crystal that drifts: its error at the newest end is 51 µs at 0.1 ppm/s and 64 s,
-at three quarters 13 µs.) A sample costs one evaluation of the fit and one comparison; the hull is paid once per bin.
+Bins: each bin of device time keeps its lowest point above the present fit. A bin starts with one sample. The width of
+the bins doubles until 64 bins cover about one minute, then the oldest bin is dropped. Each new bin changes the fit: the
+new fit is the edge of the lower hull above a point at three quarters of the window. (The edge above the mean has the
+smallest total distance, but it follows a drift of the crystal later: its error at the newest end is 51 µs at 0.1 ppm/s
+and 64 s, and 13 µs at three quarters.) The cost is one evaluation of the fit and one comparison per sample, and one
+hull per bin.
 
-Latency timers (USB adapters): a message waits in the adapter between nothing and the timer's period, so the truth lies
-under every arrival and above every arrival less that period. Where the timer beats with the samples (100 Hz on 16 ms,
-or two crystals 30 ppm apart) the shortest wait creeps from nothing to the step between phases and falls back, once in
-a minute or an hour, and an envelope alone follows it. `feasible_lines` bounds the truth from both sides; the middle of
-the lines between the bounds is the better estimate, and their spread is the error.
+Latency timer of a USB adapter: a frame waits in the adapter for 0 to one period of the timer. The truth is below each
+arrival, and above each arrival less this period. If the timer and the samples have a beat (100 Hz and 16 ms, or two
+crystals with a difference of 30 ppm), the shortest wait increases slowly and falls back, once in a minute or an hour.
+An envelope follows this movement. `feasible_lines` bounds the truth from both sides. The middle of the lines between
+the bounds is the better estimate, and the spread of the lines is its error.
 """
 
 from dataclasses import dataclass
@@ -24,46 +25,53 @@ from typing import Final
 
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
+# 64 s of window: long compared to the beat of two crystals with an adapter's timer, short compared to their warm-up
 BINS: Final = 64
 BIN_LONGEST_NS: Final = NS_PER_S
-"""64 s of window: long against the beat of two crystals with an adapter's timer, short against their warming up."""
 SLOPE_LOWEST: Final = 1 / 1.07
 SLOPE_HIGHEST: Final = 1 / 0.93
-"""Host ns per device ns. Parts 4.08 % off nominal have been sold; past 7 % it is another tick, not a crystal."""
+"""Limits of the slope, host ns per device ns. Devices with an error of 4.08 % exist. Above 7 %, the tick is different.
+"""
 SUPPORT_AT: Final = 0.75
-"""Position of the chosen hull edge, as a share of the window."""
+"""Position of the hull edge in the window, as a share of the window."""
+# a fit is known after this number of points, and after this time or number of periods of a latency timer
 ENOUGH_POINTS: Final = 8
 ENOUGH_SPAN_NS: Final = 100 * NS_PER_MS
 ENOUGH_HOLDS: Final = 20
-"""A fit is known from this number of points on, and this time or number of periods of a latency timer."""
 SPREAD_BINS: Final = 12
-"""A fit under n bins is off by their mean distance times this over n, one sigma (by simulation, loaded host)."""
+"""Error of a fit over n bins: mean distance of the bins, times this factor, divided by n (one sigma, from a
+simulation)."""
+# newest bins, at least RECENT_NS long: a common delay of all of them is not a delay of single frames
 RECENT_BINS: Final = 8
 RECENT_NS: Final = 2 * NS_PER_S
-"""Number of the newest bins, over at least this time, whose common delay is no delay of single messages."""
 KNOWN_SIGMAS: Final = 4
-"""A slope that was known is within so many of its errors."""
+"""Maximum deviation of the slope from its known value, in standard errors."""
 DRIFT_MOST: Final = 1e-6
-"""Change of a crystal's rate in a second, at most."""
+"""Maximum change of a crystal's rate per second."""
 LATENCIES_NS: Final = (200 * NS_PER_US, 600 * NS_PER_US, 2000 * NS_PER_US, 6000 * NS_PER_US)
-"""Allowances for polling and wake-up on top of the longest wait, tried in turn until some line fits."""
+"""Delays of polling and wake-up in addition to the longest wait, ns. The fit uses the first delay with a feasible line.
+"""
 LATE_FACTOR: Final = 4.0
-"""Longest waits are twice the mean less the least, and a busy host is in the mean: with delays that fall off
-exponentially twice their mean is at most so many times the share of waits that the timer alone cannot explain, in
-periods of the timer."""
+"""Factor for late frames. It multiplies the share of waits that the timer alone cannot explain, in periods of the
+timer.
+
+The longest wait is twice the mean less the shortest wait, and a busy host increases the mean. With exponentially
+distributed delays, twice their mean is at most this factor times the share.
+"""
 HOLD_MESSAGES: Final = 32
-"""Number of messages that show whether the timer is what it was said to be."""
+"""Number of frames that show whether the reported timer period is correct."""
 HOLD_MOST_NS: Final = 16 * NS_PER_MS
-"""Longest timer that is believed without having been reported: the default of the common adapters."""
+"""Longest timer that the fit assumes without a report, ns: the default of common adapters."""
 LOWER_HALF: Final = 1 / (1 - log(2))
-"""Mean of exponentially distributed values over the mean of their lower half, which stalls are not in."""
+"""Mean of exponentially distributed values, divided by the mean of their lower half. The lower half contains no stalls.
+"""
 
 Point = tuple[float, float]
-"""(device ns, ns)."""
+"""Device time and time, ns."""
 
 
 class _Bin:
-    """The lowest point in an interval of device time, with the least and the mean wait of its messages."""
+    """Lowest point in an interval of device time, with the shortest and the mean wait of its frames."""
 
     __slots__ = (
         "arrival_ns", "begin_ns", "count", "device_ns", "late", "late_ns", "lowest", "wait", "wait_least", "wait_most",
@@ -74,27 +82,27 @@ class _Bin:
         self.device_ns = device_ns
         self.arrival_ns = arrival_ns
         self.lowest = lowest
-        """Distance of (device_ns, arrival_ns) above the fit."""
+        """Distance of (device_ns, arrival_ns) above the fit, ns."""
         self.wait = wait
-        """Sum over `count` messages of how long they waited, above the fit."""
+        """Sum of the waits of `count` frames above the fit, ns."""
         self.wait_least = wait
         self.wait_most = wait
         self.count = 1
         self.late = 0
-        """Number of messages that waited for longer than the timer can hold them."""
+        """Number of frames that waited for longer than the timer can hold them."""
         self.late_ns = 0.0
-        """By how much, in all; `wait` is without that."""
+        """Sum of the waits in excess of the timer, ns. `wait` does not contain it."""
 
     def longest_wait(self) -> float:
-        """Longest time that the timer held a message, without the stalls of the host.
+        """Return the longest wait in the timer without stalls of the host, ns.
 
-        Waits that sweep the timer's period, or repeat in even steps, lie as far above their mean as the least lies
-        below it; a stall adds little to a mean.
+        Waits that cover the period of the timer evenly are symmetric: the longest wait is as far above the mean as the
+        shortest is below. A stall changes the mean only slightly.
         """
         return min(2 * self.wait / self.count - self.wait_least, self.wait_most)
 
     def merged(self, after: "_Bin") -> "_Bin":
-        """Merge this bin with its neighbour."""
+        """Return the union of this bin and the next bin."""
         low = self if self.lowest <= after.lowest else after
         merged = _Bin(low.device_ns, low.arrival_ns, low.lowest, self.wait + after.wait)
         merged.begin_ns = self.begin_ns
@@ -107,10 +115,10 @@ class _Bin:
 
 
 class ArrivalFit:
-    """A line from device time to host time under all arrivals. Times are int ns, `slope` is host ns per device ns.
+    """Line from device time to host time below all arrivals. Times are ns (int), `slope` is host ns per device ns.
 
-    Its value at `device_ns` is `ref_arrival_ns + slope * (device_ns - ref_device_ns)`; the sample path computes that
-    itself, without a call.
+    The value at `device_ns` is `ref_arrival_ns + slope * (device_ns - ref_device_ns)`. The clock computes it without a
+    call.
     """
 
     __slots__ = (
@@ -123,70 +131,71 @@ class ArrivalFit:
     def __init__(
         self, device_ns: int, arrival_ns: int, hold_ns: int = 0, slope: float = 1.0, slope_error: float = 0.07
     ) -> None:
-        """Begin at a first arrival; `slope` may be known, with its one-sigma error, from an earlier fit."""
+        """Start at the first arrival. An earlier fit can supply `slope` and its one-sigma error."""
         self.ref_device_ns = device_ns
         self.ref_arrival_ns = arrival_ns
         self.slope = slope
         self._slope_known, self._slope_known_error = slope, KNOWN_SIGMAS * slope_error
         self._begin_ns = device_ns
         self.fitted_ns = device_ns
-        """Device time of the newest change of the fit."""
+        """Device time of the newest change of the fit, ns."""
         self.count = 1
         """Number of arrivals."""
         self.error_ns = 0.0
-        """One-sigma error of the fit at its newest end, as far as the spread of the points shows it."""
+        """One-sigma error of the fit at its newest end, from the spread of the points, ns."""
         self.slope_error = slope_error
         self.residual_ns = 0.0
-        """Root mean square distance of the bins' lowest points above the fit."""
+        """Root mean square distance of the lowest points above the fit, ns."""
         self.recent_ns = 0.0
-        """Distance of the lowest point of the newest bins: more than spread, if the device's clock stood still."""
+        """Distance of the lowest point of the newest bins above the fit, ns. It is large if the device's clock stopped.
+        """
         self.hold_ns = hold_ns
-        """Period of the adapter's latency timer; 0 for none."""
+        """Period of the adapter's latency timer, ns; 0 without a timer."""
         self.hidden_ns = float(hold_ns)
-        """Width of what a latency timer leaves open at the newest end (`feasible_lines`)."""
+        """Width of the feasible lines at the newest end, ns: the part that a latency timer hides."""
         self.shift_ns = hold_ns / 2
         """Distance from the fit down to the middle of the feasible lines, ns."""
         self.measured_hold_ns = 0
-        """How long the adapter holds messages, where most wait for longer than it was said to hold them; else 0."""
+        """Measured period of the timer, ns, if most frames wait for longer than `hold_ns`; else 0."""
         self._wait_most = float(hold_ns + LATENCIES_NS[0])
         self._pause_ns = float(hold_ns)
         self._pause_count = 1
         self._width_ns = 0
         self.until_ns = device_ns + 1
-        """Device time from which on an arrival begins a new bin, with which the fit changes."""
+        """Device time of the next bin, ns. The arrival at or after this time changes the fit."""
         self._open = _Bin(device_ns, arrival_ns, 0.0, 0.0)
         self._bins = [self._open]
-        # lower hull over the first `_hull_bins` bins, which change no more; from the point of the oldest
+        # lower hull over the first `_hull_bins` bins, which no longer change, relative to the point of the oldest bin
         self._hull: list[Point] = []
         self._hull_bins = 0
 
     @property
     def span_ns(self) -> int:
-        """Device time between the oldest and the newest bin."""
+        """Return the device time between the oldest and the newest bin, ns."""
         return self._open.device_ns - self._bins[0].device_ns
 
     def is_known(self, least_ns: int) -> bool:
-        """Whether there are enough points, over `least_ns` or more."""
+        """Return whether the fit has enough points, over at least `least_ns`."""
         return self.count >= ENOUGH_POINTS and self.span_ns >= max(least_ns, ENOUGH_HOLDS * self.hold_ns)
 
     def set_pause(self, pause_ns: float, count: int) -> None:
-        """Set the longest pause between messages that a read can end in, at most the timer's period.
+        """Set the longest pause between frames at which a read can end: at most the period of the timer.
 
-        `count` messages cannot all be followed by whole others in their reads.
+        Of `count` consecutive frames, at least one is the last frame of its read.
         """
         self._pause_ns, self._pause_count = pause_ns, count
 
     def add_arrival(self, device_ns: int, arrival_ns: int, trailing_ns: int, above_ns: float) -> bool:
-        """Add an arrival `above_ns` above the fit; `device_ns` never falls. Return whether the fit changed.
+        """Add an arrival `above_ns` above the fit. Return whether the fit changed.
 
-        Bytes of `trailing_ns` on the wire followed the message in the same read.
+        `device_ns` must not fall. `trailing_ns` is the time on the wire of the bytes after the frame in the same read.
         """
         self.count += 1
         wait = above_ns + trailing_ns
         late_ns = 0.0
         if wait > self._wait_most:
             late_ns = wait - self._wait_most
-            wait = self._wait_most  # the truth is under the fit: a timer alone cannot have held it for longer
+            wait = self._wait_most  # the truth is below the fit: the timer alone cannot cause this wait
         if device_ns >= self.until_ns:
             bin_ = _Bin(device_ns, arrival_ns, above_ns, wait)
             self._bins.append(bin_)
@@ -215,7 +224,7 @@ class ArrivalFit:
         return False
 
     def _make_room(self) -> None:
-        """Drop the oldest bin, or merge pairs of them while they are short."""
+        """Drop the oldest bin. If the bins are short, merge pairs of bins instead."""
         bins = self._bins
         self._hull.clear()
         self._hull_bins = 0
@@ -246,11 +255,11 @@ class ArrivalFit:
             self._look_through_timer(device_ns)
 
     def _slope_error_known(self, device_ns: int) -> float:
-        """How far the slope can be from that of the fit before: less sure the longer ago that was."""
+        """Return the maximum deviation from the slope of the previous fit. It grows with the age of that fit."""
         return self._slope_known_error + DRIFT_MOST * (device_ns - self._begin_ns) / NS_PER_S
 
     def _look_through_timer(self, device_ns: int) -> None:
-        """Replace the fit by the middle of the lines that the timer leaves open."""
+        """Replace the fit by the middle of the feasible lines."""
         x0 = self._bins[0].device_ns
         upper = lower_hull([(float(b.device_ns - x0), b.lowest) for b in self._bins])
         lower = [(float(b.device_ns - x0), -f) for b, f in zip(self._bins, self._floors(), strict=True)]
@@ -264,7 +273,7 @@ class ArrivalFit:
             )
             if found is not None:
                 break
-        else:
+        else:  # no line fits: a stall of the host, keep the fit
             self.hidden_ns = float(min(self.hold_ns, LATENCIES_NS[-1]))
             self.shift_ns = self.hidden_ns / 2
             return
@@ -279,11 +288,11 @@ class ArrivalFit:
         self._move(touch_ns, self.ref_arrival_ns + int(above_ref + yu), self.slope + slope)
 
     def _floors(self) -> list[float]:
-        """Lower bounds of the truth, bin by bin: the longest wait less the timer, and the least less the pause.
+        """Return the lower bound of the truth in each bin.
 
-        The longest wait shows nothing where the host stood still, the least nothing where hardly a message came in
-        time, and a bound far above the fit is of a bin that was late as a whole. A bin that stands out above its two
-        neighbours on either side was stalled, and is brought down to them.
+        The bound is the longest wait less the timer, or the shortest wait less the pause. The longest wait is useless
+        if the host stalled. The shortest wait is useless if almost no frame was in time. A bound far above the fit
+        belongs to a bin that was delayed as a whole.
         """
         hold, pause, enough = self.hold_ns, self._pause_ns, self._pause_count
         held = hold + LATE_FACTOR * hold * self._count_late()
@@ -294,18 +303,17 @@ class ArrivalFit:
             least = b.lowest - pause if b.count - b.late >= enough else none
             floor = max(longest, least)
             floors.append(floor if floor <= self._wait_most else none)
+        # a bin above its two neighbors on both sides was stalled: use the bound of the neighbors
         padded = [-inf, -inf, *floors, -inf, -inf]
         return [min(f, max(padded[i : i + 2] + padded[i + 3 : i + 5])) for i, f in enumerate(floors)]
 
     def _count_late(self) -> float:
-        """Return the share of messages that waited for more than the timer; measure that where most did.
-
-        Waits that sweep a timer's period are half of it on the average. The periods of timers are powers of two, in ms.
-        """
+        """Return the share of frames that waited for longer than the timer. If most did, measure the timer."""
         bins, count = self._bins, sum([b.count for b in self._bins])
         late, late_ns = sum([b.late for b in bins]), sum([b.late_ns for b in bins])
-        if 2 * late > count >= HOLD_MESSAGES and late_ns < late * HOLD_MOST_NS:  # or the host stood still
+        if 2 * late > count >= HOLD_MESSAGES and late_ns < late * HOLD_MOST_NS:  # otherwise the host stalled
             mean_ns = (sum([b.wait for b in bins]) + late_ns) / count
+            # evenly distributed waits have a mean of half a period; periods are powers of two, in ms
             hold_ns = NS_PER_MS
             while hold_ns < 2 * mean_ns and hold_ns < HOLD_MOST_NS:
                 hold_ns *= 2
@@ -313,12 +321,12 @@ class ArrivalFit:
         return late / count
 
     def _move(self, ref_device_ns: int, ref_arrival_ns: int, slope: float) -> None:
-        """Change the line, and with it all distances above it."""
+        """Change the line and all distances above it."""
         x_old, y_old, slope_old = self.ref_device_ns, self.ref_arrival_ns, self.slope
         self.ref_device_ns, self.ref_arrival_ns, self.slope = ref_device_ns, ref_arrival_ns, slope
         for b in self._bins:
             b.lowest = lowest = b.arrival_ns - ref_arrival_ns - slope * (b.device_ns - ref_device_ns)
-            if not self.hold_ns:  # waits show something of a timer only
+            if not self.hold_ns:  # waits matter only with a timer
                 continue
             was = b.arrival_ns - y_old - slope_old * (b.device_ns - x_old)
             change = lowest - was
@@ -327,7 +335,7 @@ class ArrivalFit:
             b.wait_most += change
             if b.late:
                 b.late_ns += change * b.late
-                if b.late_ns < 0.0:  # the fit was too low when they came
+                if b.late_ns < 0.0:  # the old fit was too low
                     b.late, b.late_ns = 0, 0.0
 
     def _judge(self, device_ns: int) -> None:
@@ -351,14 +359,14 @@ class ArrivalFit:
 
 
 def lower_hull(points: list[Point]) -> list[Point]:
-    """Lower convex hull of points in order of x (Andrew's monotone chain)."""
+    """Return the lower convex hull of points that are sorted by x (Andrew's monotone chain)."""
     hull: list[Point] = []
     extend_lower_hull(hull, points)
     return hull
 
 
 def extend_lower_hull(hull: list[Point], points: list[Point]) -> None:
-    """Add points to a lower hull, in order of x and right of it."""
+    """Add points to a lower hull. The points are sorted by x and to the right of the hull."""
     for x, y in points:
         while len(hull) >= 2:
             (xa, ya), (xb, yb) = hull[-2], hull[-1]
@@ -369,7 +377,7 @@ def extend_lower_hull(hull: list[Point], points: list[Point]) -> None:
 
 
 def _edge_over(hull: list[Point], x: float, lowest: float, highest: float) -> tuple[float, float, float]:
-    """Slope of the hull's edge over `x`, held between two bounds, and a point (x, y) of the line under the hull."""
+    """Return (slope, x, y): slope of the hull's edge above `x`, limited to two bounds, and a point of this line."""
     if len(hull) < 2:
         return (lowest + highest) / 2, *hull[0]
     i = 1
@@ -386,10 +394,10 @@ def _edge_over(hull: list[Point], x: float, lowest: float, highest: float) -> tu
 
 @dataclass(frozen=True, slots=True)
 class FeasibleLines:
-    """All lines between an upper and a lower bound, evaluated at the newest point."""
+    """All lines between an upper and a lower bound."""
 
     lowest_ns: float
-    """Lowest value of any such line there."""
+    """Lowest value of these lines at the newest point, ns."""
     highest_ns: float
     slope_lowest: float
     slope_highest: float
@@ -398,12 +406,10 @@ class FeasibleLines:
 def feasible_lines(
     upper: list[Point], lower: list[Point], x: float, flattest: float = -1.0, steepest: float = 1.0
 ) -> FeasibleLines | None:
-    """Return the lines under all points of `upper` and above all of `lower` up to `x`; None where there are none.
+    """Return the lines below all points of `upper` and above all points of `lower`; None if no line exists.
 
-    Their slopes are between `flattest` and `steepest`.
-
-    The points are the corners of two convex chains; every pair of them bounds the slope, so with some ten corners each
-    this is exact and cheap.
+    The lines are evaluated at `x`. Their slopes are between `flattest` and `steepest`. Each pair of corners of the two
+    convex chains bounds the slope. With about ten corners in each chain, this is exact and fast.
     """
     for xu, yu in upper:
         for xl, yl in lower:

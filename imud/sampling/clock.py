@@ -1,21 +1,20 @@
-"""The clock of one device: the only maker of `Sample`. It dates each measurement in the host's time.
+"""Clock of one device. It makes all samples and time-stamps each measurement in host time.
 
-Per message (`SampleClock.sample`, then `_by_device`):
+Steps for each frame (`SampleClock.sample`, then `_by_device`):
 
-    ticks ─▶ device time (`device_time`) ─┐
-    arrival less wire time ───────────────┴▶ above or below the fit of arrivals (`arrival_fit`)?
-        ├─ the counter was corrected: device time is made even again
-        ├─ the clock jumped: a new fit begins, or time goes on by UTC (`Holdover`)
-        └─ the point is added to the fit
-    time of measurement = fit − half of the bias that the link can hide (`link_delay`) + what is still slewed (`Slew`)
-        └─ edges, a pulse per second and UTC improve on that (`steering`), where there are any
+    ticks ──────────────────▶ device time (`device_time`) ─┐
+    arrival less wire time ────────────────────────────────┴▶ distance above or below the fit (`arrival_fit`)
+        ├─ the device corrected its counter: remove the correction from the device time
+        ├─ the counter jumped: start a new fit, or continue by UTC (`Holdover`)
+        └─ otherwise: add the point to the fit
+    time stamp = fit − half of the bias that the link can hide (`arrival_time.LinkDelay`) + remaining `Slew`
+        └─ edges, a pulse per second and UTC correct the time stamp (`steering`)
 
-Until the fit is known well enough, and for devices without time, a message is dated by its arrival. All this is done in
-steady time, which nothing steers (`imud.host.clock`); what comes and goes is in CLOCK_MONOTONIC.
+Before the fit is accurate, and for devices without device time, the arrival time makes the time stamp. The clock
+computes in steady time, which nothing steers (`imud.host.clock`). Its input and output are in CLOCK_MONOTONIC.
 
-Three rules hold for any input: `t_ns` rises strictly, is never after arrival, and a device clock that jumps starts a
-new fit instead of carrying the stamps along.
-Synchronization: none; one thread.
+Three rules hold for any input: `t_ns` rises strictly, `t_ns` is never after the arrival, and a jump of the device
+counter starts a new fit and does not move the time stamps. Synchronization: none; one thread.
 """
 
 from collections.abc import Callable, Sequence
@@ -49,21 +48,21 @@ _T_ERR_MOST: Final = float(T_ERR_MOST)
 
 
 class RunStart(NamedTuple):
-    """What holds for all messages of a run; names are those of `SampleClock`."""
+    """State at the start of a run, with the names of `SampleClock`."""
 
     device: str
     seq: int
-    """Of the newest sample."""
+    """Sequence number of the newest sample."""
     t_ns: int
-    """Of the newest sample."""
+    """Time stamp of the newest sample, ns."""
     t_rx_ns: int
-    """When the messages were read."""
+    """CLOCK_MONOTONIC of the read, ns."""
     utc_offset_ns: int
     byte_ns: int
     waited_ns: int
     bias_ns: float
     error_ns: float
-    """Of the fit."""
+    """One-sigma error of the fit, ns."""
     sync: Sync
     own_status: int | None
 
@@ -77,9 +76,9 @@ def add_even_run(
     fit: ArrivalFit,
     host: SteadyTime,
 ) -> float:
-    """Append samples of the events from `at` on, while each is the usual case; return the error of the newest time.
+    """Append samples of `events` from index `at` on. Stop at the first event that needs `SampleClock.sample`.
 
-    `time` and `fit` are as after the newest of them.
+    Return the time stamp error of the newest sample, ns. Update `time` and `fit` to the newest sample.
     """
     device, seq, newest_ns, t_rx_ns, utc_offset_ns, byte_ns, waited_ns, bias_ns, fit_error_ns, sync, own = start
     offset_ns, even_from_ns = host.offset_ns, host.even_from_ns
@@ -88,6 +87,7 @@ def add_even_run(
     doubt_ns, ticks, device_ns, raw_ns = time.doubt_ns, time.ticks, time.even_ns, time.raw_ns
     period_ticks, modulus, tick_ns = time.period.period_ticks, time.modulus, time.tick_ns
     keep, add_arrival, before, newest_error_ns = samples.append, fit.add_arrival, len(samples), 0.0
+    # local names are faster than attributes in the loop
     for index in range(at, len(events)):
         m = events[index]
         if type(m) is not Measurement or m.dev_ticks is None:
@@ -95,17 +95,19 @@ def add_even_run(
         step = (m.dev_ticks - ticks) % modulus
         trailing_ns = m.trailing_bytes * byte_ns
         arrival_ns = t_rx_ns - (m.size_bytes * byte_ns + trailing_ns + offset_ns)
+        # a gap, a repeated counter value, or a change of the host's rate
         if step != period_ticks or not step or arrival_ns < even_from_ns:
             break
         next_ns = device_ns + (step_ns := step * tick_ns)
         fit_ns = ref_arrival_ns + slope * (next_ns - ref_device_ns)
         above_ns = arrival_ns - fit_ns
-        is_new = not waited_ns or above_ns <= 0.0
+        is_new = not waited_ns or above_ns <= 0.0  # a held frame above the fit contains no new information
         if not is_new:
             above_ns = max(above_ns - waited_ns, 0.0)
         steady_ns = int(fit_ns - bias_ns)
         t_ns = steady_ns + offset_ns
         if (
+            # an early or late frame, a fit that is due, or a time stamp that needs a correction
             not _EARLY_NS <= above_ns < JUMP_LATE_NS
             or (is_new and next_ns >= until_ns)
             or not even_from_ns <= steady_ns <= arrival_ns
@@ -132,21 +134,21 @@ def add_even_run(
 
 YOUNG_NS: Final = 32 * NS_PER_S
 YOUNG_FACTOR: Final = 1.2
-"""A fit this short has not seen the timer's beat, and a stalled read in it weighs more."""
+"""Factor for the error of a fit that is shorter than YOUNG_NS. The beat of the latency timer is not visible yet."""
 _ARRIVAL: Final = Sync.ARRIVAL
 
 
 class SampleClock:
-    """Clock that makes samples of one device's measurements.
+    """Clock of one device, which makes samples of measurements.
 
-    `tick_ns` and `tick_modulus` describe the device's counter, `byte_ns` is the time of a byte on the wire (0: none
-    known), `hold_ns` how long an adapter may hold bytes back (USB latency timer). A counter with `tick_ns` 0 numbers
-    the samples: it shows how many are missing, and the arrivals show when they were. Messages without that counter are
-    dated by `pps_age_ms`, in ms modulo `stamp_modulus` (0: by arrival). `bits` are the status bits of the device that
-    concern time, `sout` and `sin` where on their edges the measurement is. `host` is kept up to date by the caller.
+    `tick_ns` and `tick_modulus` describe the device counter. With `tick_ns` 0, the counter numbers the samples: the
+    clock counts lost samples with it, and uses the arrival times. `stamp_modulus` is the modulus of `pps_age_ms`, ms,
+    for frames without device counter; 0 if `pps_age_ms` is not usable. `byte_ns` is the time of one byte on the wire, 0
+    if unknown. `hold_ns` is the maximum delay in an adapter (USB latency timer). `bits` are status bits about time.
+    `sout` and `sin` describe the instant of the measurement relative to an edge. The caller updates `host`.
 
-    `missed` counts within one sample; for a gap where that cannot be known `on_unknown_gap` is called.
-    Edges, triggers and UTC are given before the messages that follow them; without device time they are ignored.
+    `on_unknown_gap` is called for each gap of unknown size. Add edges, triggers and UTC before the frames that follow
+    them.
     """
 
     __slots__ = (
@@ -170,32 +172,34 @@ class SampleClock:
         self._stamps = StampTime(stamp_modulus) if stamp_modulus else None
         self._delay = LinkDelay(byte_ns, hold_ns)
         self._arrivals = ArrivalTime(self._delay, 0 if tick_ns else tick_modulus, on_unknown_gap)
-        # where the device's counter is by the fit when it was lowest; None until a fit is used
+        # lowest position of the device counter relative to the fit; None before the first fit is in use
         self._line: CounterLine | None = None
         self._jump, self._slew = JumpDetector(), Slew()
         self._holdover: Holdover | None = None
         self._fit: ArrivalFit | None = None
         self._fit_begin_ns = 0  # device time
-        self._fit_bias_ns = self._fit_error_ns = 0.0  # distance from the fit down to the time of measurement; its error
-        self._fit_sync = Sync.ARRIVAL  # REGRESSION once the fit is used
-        self._sync = Sync.ARRIVAL  # origin of the newest time stamp, where there are aiding sources
-        self._known, self._resets = False, 0  # whether device time has begun
+        self._fit_bias_ns = self._fit_error_ns = (
+            0.0  # distance from the fit down to the time of measurement, and its error
+        )
+        self._fit_sync = Sync.ARRIVAL  # REGRESSION if the fit is in use
+        self._sync = Sync.ARRIVAL  # source of the newest time stamp if there are aiding sources
+        self._known, self._resets = False, 0  # known: the device time has started
         self._seq = self._t_ns = self._t_rx_ns = self._t_err_ns = 0
-        self._error_ns = 0.0  # one-sigma error of the newest time, before it is lifted or held back
+        self._error_ns = 0.0  # one-sigma error of the newest time stamp before its correction
         self._own_status: int | None = None
         self.missed = 0
-        """Samples missing right before the newest one; one of unknown size is no part of it."""
+        """Number of lost samples directly before the newest sample, without gaps of unknown size."""
         self.observer: InputObserver | None = None
-        """Observer of the input; None if no recording runs. `SamplePath.observe` sets it."""
-        self.waited_ns = 0  # set by the owner: how long the messages given next may have waited unread
+        """Observer of the input; None if no recording runs. Set by `SamplePath.observe`."""
+        self.waited_ns = 0  # set by the path: maximum time of the next frames in the kernel's buffer
 
     def sample(self, m: Measurement, t_rx_ns: int, utc_offset_ns: int, t_begin_ns: int | None = None) -> Sample:
-        """Return the measurement with its place in time, as the next sample of the device.
+        """Return the next sample of the device.
 
-        `t_rx_ns` is CLOCK_MONOTONIC right after the read that completed the message; it must not fall. Where it stands
-        still for more messages than there is room for before it, `t_rx_ns` of the sample is lifted by nanoseconds.
-        `utc_offset_ns` is CLOCK_REALTIME minus CLOCK_MONOTONIC at the same moment. `t_begin_ns` is CLOCK_MONOTONIC when
-        the message began on the wire, where that is known (its first frame came earlier); None: by its size.
+        `t_rx_ns` is CLOCK_MONOTONIC right after the read of the last byte. It must not fall. If it is constant for more
+        frames than time stamps fit before it, the clock increases `t_rx_ns` of the sample by some ns. `utc_offset_ns`
+        is CLOCK_REALTIME minus CLOCK_MONOTONIC. `t_begin_ns` is CLOCK_MONOTONIC at the start of the frame on the wire;
+        None: computed from its size.
         """
         if t_rx_ns < self._t_rx_ns:  # noqa: PLR1730 - a call of max() costs 60 ns on the sample path
             t_rx_ns = self._t_rx_ns
@@ -204,7 +208,7 @@ class SampleClock:
         offset_ns, even_from_ns = host.offset_ns, host.even_from_ns
         on_wire_ns = size_bytes * byte_ns + trailing_ns
         arrival_ns = t_rx_ns - (on_wire_ns + offset_ns) if t_begin_ns is None else host.steady_ns(t_begin_ns)
-        if t_begin_ns is None and arrival_ns < even_from_ns:
+        if t_begin_ns is None and arrival_ns < even_from_ns:  # the host's rate changed after this time
             arrival_ns = host.steady_ns(t_rx_ns) - on_wire_ns
         if ticks is None and self._stamps is not None and m.pps_age_ms is not None:
             ticks = self._stamped(self._stamps, m.pps_age_ms, arrival_ns)
@@ -224,11 +228,12 @@ class SampleClock:
         t_ns = steady_ns + offset_ns
         if steady_ns < even_from_ns:
             t_ns, error_ns = min(host.monotonic_ns(steady_ns), t_rx_ns), error_ns + host.error_ns(steady_ns)
+        # time stamps rise strictly
         if t_ns <= self._t_ns:
             steady_ns += self._t_ns + 1 - t_ns
             t_ns = self._t_ns + 1
         if steady_ns != wanted_ns:
-            slew.add(steady_ns - wanted_ns)
+            slew.add(steady_ns - wanted_ns)  # the next samples remove the correction slowly
             error_ns += abs(steady_ns - wanted_ns)
         if t_ns > t_rx_ns:  # noqa: PLR1730 - as above
             t_rx_ns = t_ns
@@ -246,7 +251,7 @@ class SampleClock:
     def add_run(
         self, samples: list[Sample], events: Sequence[object], at: int, t_rx_ns: int, utc_offset_ns: int
     ) -> int:
-        """Append what `sample` makes of messages of one read from `at` on; return where one is not the usual case."""
+        """Append samples of `events` from index `at` on. Return the index of the first event that needs `sample`."""
         time, fit, sync = self._time, self._fit, self._fit_sync
         unusual = time.watched or time.rephased or self._jump.late_reads or self._slew.left_ns
         if sync is _ARRIVAL or fit is None or unusual or self._aiding is not None:
@@ -266,10 +271,11 @@ class SampleClock:
     def sample_polled(
         self, m: Measurement, t_ns: int, t_err_ns: int, t_rx_ns: int, utc_offset_ns: int, edge_seq: int | None = None
     ) -> Sample:
-        """Return a measurement that the host polled, as the next sample of the device.
+        """Return the next sample of a device that imud polls.
 
-        `t_ns` is CLOCK_MONOTONIC right before the poll, or by the data-ready edge of number `edge_seq`; `t_err_ns` is
-        its one-sigma error, `t_rx_ns` right after the answer. A `t_ns` that does not rise is lifted, and the error too.
+        `t_ns` is CLOCK_MONOTONIC right before the poll, or of the data-ready edge with the number `edge_seq`.
+        `t_err_ns` is its one-sigma error. `t_rx_ns` is CLOCK_MONOTONIC right after the reply. If `t_ns` does not rise,
+        the clock increases `t_ns` and the error.
         """
         self.missed, self._fit_sync = 0, _ARRIVAL if edge_seq is None else Sync.EDGE
         self._arrivals.spread.add_arrival(t_ns)
@@ -286,13 +292,13 @@ class SampleClock:
     # --- aiding sources ------------------------------------------------------------------------------------------
 
     def _sources(self) -> AidingSources:
-        """Return the aiding sources, made on first use: without them the clock is faster."""
+        """Return the aiding sources. Create them at the first use, because the clock is faster without them."""
         if self._aiding is None:
             self._aiding = self._make_aiding()
         return self._aiding
 
     def add_edges(self, line: str, edges: Sequence[Edge]) -> None:
-        """Add edges of the line `sout`, `sout_div` or `pps`, right before the messages that follow them."""
+        """Add edges of the line `sout`, `sout_div` or `pps` before the frames that follow them."""
         if line == "sout":
             self._sources().on_sout_edges(edges)
         elif line == "sout_div":
@@ -303,13 +309,13 @@ class SampleClock:
             self.observer.edges(line, edges)
 
     def add_triggers(self, stamps: Sequence[TriggerStamp]) -> None:
-        """Add triggers that the host gave on SIN, right before the messages that answer them."""
+        """Add triggers of imud on SIN before the frames that answer them."""
         self._sources().on_trigger_stamps(stamps)
         if self.observer is not None:
             self.observer.call("aiding", "on_trigger_stamps", stamps)
 
     def set_utc_reference(self, reference: UtcReference | None) -> None:
-        """Set the host's estimate of UTC, or None. A device on UTC is recognised by it."""
+        """Set the host's estimate of UTC, or None. The clock uses it to detect a device with UTC."""
         if reference is not None or self._aiding is not None:
             self._sources().set_utc_reference(reference)
         if self.observer is not None:
@@ -317,17 +323,17 @@ class SampleClock:
 
     @property
     def utc_reference(self) -> UtcReference | None:
-        """The host's estimate of UTC; None while it has none."""
+        """Return the host's estimate of UTC; None if unknown."""
         return self._aiding.utc_reference if self._aiding else None
 
     def set_own_status(self, bits: int | None) -> None:
-        """Set the host's own bits, which `sample` adds to the status from now on; None for none."""
+        """Set status bits of imud, which `sample` adds to the status of the next samples. None removes them."""
         self._own_status = bits
         if self.observer is not None:
             self.observer.call("clock", "set_own_status", bits)
 
     def take_marks(self) -> list[Mark]:
-        """Return the pulses on SOUT_DIV whose samples are known by now, in order, each once."""
+        """Return the new SOUT_DIV pulses with their sample, in order. Each pulse is returned once."""
         marks = self._aiding.marks if self._aiding is not None else None
         return marks.take_marks() if marks is not None else []
 
@@ -335,14 +341,14 @@ class SampleClock:
 
     @property
     def expected_rate_hz(self) -> float:
-        """Samples per second of the host by the device's own stamps; 0 while unknown."""
+        """Return the sample rate according to the device counter, Hz in host time; 0 if unknown."""
         period_ns = self._period_ns()
         if self._line is not None and self._fit is not None:
-            period_ns *= self._line.slope / self._fit.slope  # the fit's swings while messages wait
+            period_ns *= self._line.slope / self._fit.slope  # the slope of the fit is inaccurate if frames wait
         return NS_PER_S / period_ns if period_ns else 0.0
 
     def status(self) -> ClockStatus:
-        """Return the state of the estimate at the newest sample."""
+        """Return the state of the clock at the newest sample."""
         fit = self._fit if self._fit_sync is not Sync.ARRIVAL else None
         status = ClockStatus(
             sync=self._sync if self._aiding else self._fit_sync,
@@ -357,7 +363,7 @@ class SampleClock:
         return self._aiding.add_status(status) if self._aiding else status
 
     def link_changed(self, *, byte_ns: int, hold_ns: int) -> None:
-        """Begin a new fit for another baud rate or port. `t_ns` goes on rising."""
+        """Start a new fit, for another baud rate or port."""
         self._delay = LinkDelay(byte_ns, hold_ns)
         self._arrivals.change_link(self._delay)
         self._drop_fit()
@@ -365,8 +371,10 @@ class SampleClock:
             self.observer.call("clock", "link_changed", byte_ns=byte_ns, hold_ns=hold_ns)
 
     def restart(self) -> None:
-        """Begin anew after the device or the link was away: the next stamp is no reset. What is missing until then is
-        counted if the device's counter ran on; else the gap is one of unknown size."""
+        """Start again after the device or the link was missing. This does not count as a reset.
+
+        If the device counter continued, the clock counts the lost samples. Otherwise the gap has an unknown size.
+        """
         self._known = False
         self._time.period.restart()
         self._arrivals.restart()
@@ -378,14 +386,14 @@ class SampleClock:
             self.observer.call("clock", "restart")
 
     def continue_from(self, other: "SampleClock") -> None:
-        """Go on where another clock of the same device ends: `seq` and `t_ns` keep rising."""
+        """Continue the sequence numbers and time stamps of another clock of the same device."""
         self._seq, self._t_ns, self._t_rx_ns = other._seq, other._t_ns, other._t_rx_ns
         self.set_utc_reference(other.utc_reference)
 
     # --- by arrival ----------------------------------------------------------------------------------------------
 
     def _stamped(self, stamps: StampTime, stamp: int, arrival_ns: int) -> int | None:
-        """Return the ticks of a message that has a short stamp only; None where those do not date it."""
+        """Return the ticks of a frame with `pps_age_ms` only; None if `pps_age_ms` is not usable for the time stamp."""
         was_in_use = stamps.in_use
         ticks = stamps.ticks(stamp, arrival_ns, self._time.ticks if self._known else None)
         if was_in_use is not stamps.in_use:
@@ -395,7 +403,7 @@ class SampleClock:
         return ticks
 
     def _by_arrival(self, m: Measurement, ticks: int | None, arrival_ns: int) -> int:
-        """Return the time of a message without device time, which may have a number; leave its error in `_error_ns`."""
+        """Return the time of a frame without device time, which may have a number. Set `_error_ns`."""
         arrivals = self._arrivals
         t_ns = arrivals.date(
             ticks, arrival_ns, m.size_bytes, alone=not self._known, triggered=m.pps_age_ms is not None,
@@ -405,7 +413,7 @@ class SampleClock:
         return t_ns
 
     def _less_bias(self, arrival_ns: int, size_bytes: int) -> int:
-        """Return the time of a message before the fit is used; leave its error in `_error_ns`."""
+        """Return the time of a frame before the fit is in use. Set `_error_ns`."""
         t_ns, self._error_ns = self._delay.before(arrival_ns, size_bytes, self._period_ns(), float(FIRST_SPREAD_NS))
         self._error_ns += self.waited_ns
         return t_ns
@@ -413,7 +421,7 @@ class SampleClock:
     # --- by device time ------------------------------------------------------------------------------------------
 
     def _by_device(self, ticks: int, arrival_ns: int, trailing_ns: int, t_rx_ns: int, size_bytes: int) -> int:
-        """Return the time of a message with device time; leave its error in `_error_ns`."""
+        """Return the time of a frame with device time. Set `_error_ns`."""
         time, fit = self._time, self._fit
         if fit is None:
             self._begin(ticks, arrival_ns, t_rx_ns)
@@ -423,7 +431,7 @@ class SampleClock:
         device_ns = time.even_ns
         fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
         above_ns = arrival_ns - fit_ns
-        if waited := self.waited_ns and above_ns > 0.0:  # it may have come when the fit says, or that much later
+        if waited := self.waited_ns and above_ns > 0.0:  # arrival is between the fit and the read
             arrival_ns -= int(min(above_ns, self.waited_ns))
             above_ns = max(above_ns - self.waited_ns, 0.0)
         if time.rephased:
@@ -437,6 +445,7 @@ class SampleClock:
             device_ns = time.even_ns
             fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
             above_ns = arrival_ns - fit_ns
+        # late reads: frames after a long pause of the host
         odd = above_ns < _EARLY_NS or above_ns > JUMP_LATE_NS or self._jump.late_reads
         if odd and self._jump.is_jump(
             fit, above_ns, device_ns - before_ns, None if self._fit_sync is _ARRIVAL else self._fit_error_ns, t_rx_ns,
@@ -446,13 +455,14 @@ class SampleClock:
         self.missed = time.missed
         if not waited and fit.add_arrival(device_ns, arrival_ns, trailing_ns, above_ns):
             if self._jump.stood_still(fit, self._fit_error_ns):
-                self._resets += 1  # messages stay late: the device's clock stood still for a while
+                self._resets += 1  # all frames stay late: the device counter stopped for a time
                 self._start_fit(arrival_ns)
             elif other := self._delay.corrected(fit, self._period_ns(), size_bytes):
-                self._delay = other
+                self._delay = other  # the link has another delay than expected
                 self._start_fit(arrival_ns)
             else:
                 fit_ns = self._refit(fit, device_ns, device_ns - before_ns, fit_ns, size_bytes)
+        # the fit is not in use yet
         if self._fit_sync is _ARRIVAL:
             if self._holdover is not None:
                 self._error_ns = self._holdover.error_ns(device_ns)
@@ -468,7 +478,7 @@ class SampleClock:
         return int(fit_ns)
 
     def _begin(self, ticks: int, arrival_ns: int, t_rx_ns: int) -> None:
-        """Set the first stamp of a fit: of a new device, or of one whose clock runs on over a changed link."""
+        """Start a fit: for a new device, or for a device that continued its counter while the link changed."""
         time, line = self._time, self._line
         elapsed_ns = time.elapsed_ns(ticks)
         if self._known and (
@@ -485,7 +495,7 @@ class SampleClock:
         self._start_fit(arrival_ns)
 
     def _begin_counter(self, ticks: int, arrival_ns: int, missed: int | None) -> None:
-        """Set the first stamp of a counter that began anew, or was not read for a while, `missed` where it is known."""
+        """Start with a new counter value. `missed` is the number of lost samples; None if unknown."""
         if missed is None and self._seq and not self._time.period.is_gap:
             period_ns = self._period_ns()
             if not period_ns or arrival_ns - self._host.steady_ns(self._t_ns) >= GAP_PERIODS * period_ns:
@@ -495,9 +505,10 @@ class SampleClock:
         self._time.begin(ticks)
 
     def _after_jump(self, above_ns: float, ticks: int, arrival_ns: int, size_bytes: int) -> int:
-        """Return the time of the first message after a jump: by UTC if the counter jumped to it, else by arrival.
+        """Return the time of the first frame after a jump of the counter: by UTC if known, else by arrival.
 
-        A counter that only looks as if it had jumped goes on: the fit rests on messages that waited, or they wait now.
+        If the counter only seems to jump, it continues: frames in the fit were delayed, or the present frames are
+        delayed.
         """
         aiding, time = self._aiding, self._time
         ran_on = above_ns > 0.0 or self._ran_on(time.even_ns, arrival_ns)
@@ -518,18 +529,18 @@ class SampleClock:
         return self._less_bias(arrival_ns, size_bytes)
 
     def _ran_on(self, device_ns: int, arrival_ns: int) -> bool:
-        """Whether a message below the fit is no earlier than the device's counter allows: the fit is late."""
+        """Return whether the device counter allows a frame below the fit: then the fit is late."""
         return self._line is not None and self._line.carries(device_ns, arrival_ns)
 
     def _hold_over(self, aiding: AidingSources, ticks: int, arrival_ns: int, utc_ns: int, missed: int | None) -> int:
-        """Return the time of a message whose counter jumped to `utc_ns`, or within UTC; holdover begins there."""
+        """Return the time of a frame after a jump of its counter to UTC or within UTC. Start holdover."""
         period_ns, tick_ns, error_ns = self._period_ns() or 1.0, self._time.tick_ns, float(self._t_err_ns)
         newest_ns = self._host.steady_ns(self._t_ns)
         steps = max(round((utc_ns - newest_ns) / period_ns), 1)
         t_ns = newest_ns + int(steps * period_ns)
         unknown = self._fit_sync is _ARRIVAL and self._holdover is None
         if unknown or abs(t_ns - utc_ns) > tick_ns + 2 * error_ns:
-            t_ns, error_ns = max(utc_ns, newest_ns + 1), aiding.utc.tick_error_ns  # or the device samples anew
+            t_ns, error_ns = max(utc_ns, newest_ns + 1), aiding.utc.tick_error_ns  # the device restarted its sampling
         elif missed is None and error_ns + tick_ns < period_ns:
             missed = steps - 1
         self._begin_counter(ticks, arrival_ns, missed)
@@ -537,13 +548,14 @@ class SampleClock:
         aiding.utc.confirm()
         self._holdover = holdover = Holdover(self._fit_begin_ns, t_ns, error_ns, tick_ns)
         self._error_ns = holdover.error_ns(self._fit_begin_ns)
-        self._fit_begin_ns -= SETTLED_AFTER_NS  # time went on: corrections stay slow
+        self._fit_begin_ns -= SETTLED_AFTER_NS  # corrections stay slow, because the time stamps continue
         return t_ns
 
     def _begin_phase(self, fit: ArrivalFit, device_ns: int, arrival_ns: int, size_bytes: int) -> int:
-        """Return the time of a sample after the device's rate was changed: where in its tick it is now is not known.
+        """Return the time of a sample after a change of the device's rate. Its position in the tick is unknown.
 
-        The crystal is the same. Its rate is kept, and the former line until new arrivals show where the samples are.
+        The rate of the crystal did not change. The clock keeps this rate, and uses the previous fit until a new fit is
+        accurate.
         """
         self._time.rephased, self.missed = False, self._time.missed
         holdover, slope, slope_error = self._holdover, fit.slope, fit.slope_error
@@ -557,7 +569,7 @@ class SampleClock:
         return holdover.at(device_ns) if holdover is not None else self._less_bias(arrival_ns, size_bytes)
 
     def _start_fit(self, arrival_ns: int, slope: float = 1.0, slope_error: float = SLOPE_HIGHEST - 1) -> None:
-        """Begin a new fit at the present device time."""
+        """Start a new fit at the present device time."""
         self._drop_fit()
         self._fit_begin_ns = self._time.even_ns
         self._fit = ArrivalFit(self._fit_begin_ns, arrival_ns, self._delay.hold_ns, slope, slope_error)
@@ -571,7 +583,7 @@ class SampleClock:
             self._aiding.restart()
 
     def _refit(self, fit: ArrivalFit, device_ns: int, elapsed_ns: int, fit_ns_before: float, size_bytes: int) -> float:
-        """Use a fit that changed, without a step; return its value at `device_ns`."""
+        """Use a changed fit without a step of the time stamps. Return the value of the fit at `device_ns`."""
         delay = self._delay
         period_ns = self._period_ns()
         fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
@@ -597,7 +609,7 @@ class SampleClock:
         return fit_ns
 
     def _steered(self, aiding: AidingSources, m: Measurement, fit_ns: int, arrival_ns: int) -> int:
-        """Return what aiding sources make of a time by the fit; leave its error in `_error_ns`."""
+        """Return the time of a frame, corrected by the aiding sources. Set `_error_ns`."""
         device_ns, fit = self._time.even_ns, self._holdover or self._fit
         assert fit is not None
         t_ns = aiding.steer(
@@ -608,7 +620,7 @@ class SampleClock:
         return t_ns
 
     def _period_ns(self) -> float:
-        """Host time between samples; 0 while unknown."""
+        """Return the host time between samples, ns; 0 if unknown."""
         time, fit = self._time, self._fit
         if not time.tick_ns:
             return self._arrivals.spread.period_ns
