@@ -1,10 +1,8 @@
-"""The time of messages that carry none: by their arrival, by their even pace, by their number; and what is missing.
+"""Time stamps of frames without device time: from the arrival times, the constant rate and the number of a frame.
 
-    arrival, number ─▶ EvenArrivals: a line under the arrivals ─▶ time, error
-                  │         while there is none: the arrival less half of the link's bias, and its spread as error
-                  └──▶ ArrivalLosses: samples missing before the message
-
-Nothing here reads a clock.
+arrival, number ─▶ EvenArrivals: a fit below the arrivals ─▶ time, error
+              │         before the fit: the arrival less half of the link's bias; the error is the spread
+              └──▶ ArrivalLosses: lost samples before the frame
 """
 
 from collections.abc import Callable
@@ -16,27 +14,30 @@ from imud.sampling.arrival_fit import ENOUGH_SPAN_NS, ArrivalFit
 from imud.sampling.gaps import ArrivalLosses
 
 WAKE_NS: Final = 100 * NS_PER_US
-"""Shortest way from the interrupt to the reader, at most (30–100 µs on small boards)."""
+"""Maximum of the shortest time from the interrupt to the reader, ns (30 to 100 µs on small boards)."""
 FIFO_BYTES: Final = 4
-"""A 16550 or PL011 receive FIFO reports a tail below its trigger level after up to four byte times."""
+"""Number of byte times after which a 16550 or PL011 FIFO reports bytes below its trigger level."""
 USB_POLL_NS: Final = 125 * NS_PER_US
-"""One micro-frame: the wait of a full adapter for the host's poll."""
+"""Wait of a full adapter for the host's poll, ns: one micro-frame."""
 FIRST_SPREAD_NS: Final = 2 * NS_PER_MS
-"""Spread assumed of arrivals before any is known."""
+"""Assumed spread of the first arrivals, ns."""
 SIGMA_OF_RANGE: Final = 1 / sqrt(12)
-"""One-sigma error of a value that can be anywhere in a range, per width of the range."""
+"""One-sigma error of a value that is uniformly distributed in a range, per width of the range."""
 SIGMA_OF_HIDDEN: Final = sqrt((2 / 12 + 1 / 4) / 3)
-"""The same of what an adapter hides: anywhere in two cases of three; in the third at an end, where packets go at once,
-or a timer begins with each."""
+"""One-sigma error of the delay in an adapter, per width of its range.
+
+In two of three cases the delay is anywhere in the range. In the third case it is at an end: the adapter sends packets
+immediately, or each packet starts its timer.
+"""
 SMOOTHING: Final = 1 / 32
 WIRE_SLACK: Final = 1.05
-"""Messages that follow each other this much faster than the wire can carry them did not come over such a wire."""
+"""Factor by which frames can be faster than the wire before imud assumes that no such wire exists."""
 
 
 class LinkDelay:
-    """Bounds of the constant part of the delay, which arrivals cannot show: from 0 to the largest bias of the link.
+    """Bounds of the constant delay, which arrivals cannot show: from 0 to the largest bias of the link.
 
-    `byte_ns` is the time of a byte on the wire (0: unknown), `hold_ns` the period of an adapter's latency timer.
+    `byte_ns` is the time of a byte on the wire, 0 if unknown. `hold_ns` is the period of an adapter's latency timer.
     """
 
     __slots__ = ("byte_ns", "hold_ns")
@@ -47,43 +48,46 @@ class LinkDelay:
 
     @property
     def floor_ns(self) -> int:
-        """Upper bound of the delay of the message that was delayed least."""
+        """Return the upper bound of the delay of the least delayed frame, ns."""
         if self.hold_ns:
             return WAKE_NS + USB_POLL_NS
         return WAKE_NS + FIFO_BYTES * self.byte_ns
 
     def carries(self, period_ns: float, size_bytes: int) -> bool:
-        """Whether the wire time fits the rate; a pty or a USB device accepts any baud rate."""
+        """Return whether the wire can carry frames at this rate. A pty or a USB device accepts any baud rate."""
         return not period_ns or period_ns * WIRE_SLACK >= size_bytes * self.byte_ns
 
     def corrected(self, fit: ArrivalFit, period_ns: float, size_bytes: int) -> "LinkDelay | None":
-        """Return the delay that arrivals show, where it is another: no such wire, or a longer timer than reported."""
+        """Return the delay according to the arrivals if it differs: no such wire, or a longer timer than reported."""
         if fit.span_ns >= NS_PER_S and not self.carries(period_ns, size_bytes):
             return LinkDelay(0, self.hold_ns)
         return LinkDelay(self.byte_ns, fit.measured_hold_ns) if fit.measured_hold_ns else None
 
     def held_ns(self, period_ns: float, size_bytes: int) -> float:
-        """Longest time that an adapter's timer can hide behind bytes that follow.
+        """Return the maximum time that an adapter's timer can hide, ns.
 
-        A read ends either in the pause after a message or inside the next one, and then counting back the bytes that
-        trail leaves the pause: with messages every `period_ns`, no more than that pause, and never more than the timer.
+        A read ends in the pause after a frame or inside the next frame. The bytes after a frame show the delay except
+        for the pause. The hidden time is therefore at most the pause between two frames, and at most the timer.
         """
         if not period_ns:
             return self.hold_ns
         return min(self.hold_ns, max(period_ns - size_bytes * self.byte_ns, 0.0))
 
     def bias_error_ns(self, hidden_ns: float) -> float:
-        """One-sigma error of the middle of what arrivals cannot show, of which an adapter hides `hidden_ns`."""
+        """Return the one-sigma error of the middle of the hidden delay, ns. An adapter hides `hidden_ns` of it."""
         return SIGMA_OF_RANGE * self.floor_ns + SIGMA_OF_HIDDEN * hidden_ns
 
     def before(self, arrival_ns: int, size_bytes: int, period_ns: float, sigma_ns: float) -> tuple[int, float]:
-        """Return (when a message was sent that arrived at `arrival_ns`, its error); arrivals spread by `sigma_ns`."""
+        """Return (time of transmission, its error), ns, of a frame that arrived at `arrival_ns`.
+
+        `sigma_ns` is the spread of the arrivals.
+        """
         bias_ns = self.floor_ns + self.held_ns(period_ns, size_bytes)
         return arrival_ns - int(bias_ns / 2), SIGMA_OF_RANGE * bias_ns + sigma_ns
 
 
 class ArrivalSpread:
-    """Mean and spread of the steps between arrivals, for devices that send no time."""
+    """Mean and spread of the steps between arrivals, for devices without device time."""
 
     __slots__ = ("_last_ns", "_spread", "period_ns")
 
@@ -91,10 +95,10 @@ class ArrivalSpread:
         self._last_ns = 0
         self._spread = 0.0
         self.period_ns = 0.0
-        """Mean step between messages; 0 while unknown."""
+        """Mean step between frames, ns; 0 if unknown."""
 
     def add_arrival(self, arrival_ns: int, steps: int = 1) -> None:
-        """Add the arrival of a message, less its wire time; `steps` messages after the one before."""
+        """Add the arrival of a frame less its time on the wire, `steps` frames after the previous frame."""
         last_ns, self._last_ns = self._last_ns, arrival_ns
         if not last_ns:
             return
@@ -109,35 +113,42 @@ class ArrivalSpread:
 
     @property
     def sigma_ns(self) -> float:
-        """One-sigma spread of a single arrival.
+        """Return the one-sigma spread of one arrival, ns.
 
-        Mean absolute deviation of a step; for delays that fall off exponentially it equals their scale, which is
-        their spread, and their mean above the floor is as large again.
+        It is the mean absolute deviation of a step. For exponentially distributed delays, this deviation equals the
+        spread of the delays. The mean delay above the shortest delay is as large.
         """
         return 1.5 * self._spread if self.period_ns else FIRST_SPREAD_NS
 
 
 LEARNING_MESSAGES: Final = 32
-"""Number of messages whose mean step is the first estimate of the period."""
+"""Number of frames for the first estimate of the period."""
 HALF: Final = 0.5
-"""A message that is further from the line, in periods, is another sample's or was delayed by whole samples."""
+"""Maximum distance of a frame from the fit, in periods. Beyond that, the frame is another sample, or was delayed."""
 AGREEING: Final = 4
-"""So many messages that come at pace, all late by the same number of periods, show that so many samples are missing."""
+"""Number of frames at normal pace that must be late by the same number of periods before imud counts lost samples."""
 UNDECIDED_MOST: Final = 32
-"""After so many messages that come at pace and do not agree the rate is another."""
+"""Maximum number of late frames at normal pace without agreement. After that, imud measures the rate again."""
 EVEN_SHARE: Final = 0.25
-"""Mean distance above the line, in periods, of arrivals that follow a pace; where it is more their times are better."""
+"""Maximum mean distance above the fit, in periods. Beyond that, the arrival time is better than the fit."""
 MEAN_SMOOTHING: Final = 1 / 128
 LOST_MOST: Final = 3
 NEAR_SHARE: Final = 0.02
-"""A message that is late by so few periods within this share of one is more likely another sample's, on a host where
-others are late by no more on the average."""
+"""Maximum distance of a late frame from whole periods, as a share of a period, that counts as another sample.
+
+The mean distance of the other frames must be as small.
+"""
 HOLD_SHARE: Final = 0.25
-"""An adapter that may hold messages for longer, in periods, hides how many of them are missing."""
+"""Maximum delay in an adapter, in periods. A longer delay hides the number of lost samples."""
 
 
 class EvenArrivals:
-    """A line under the arrivals of messages without device time."""
+    """Fit below the arrivals of frames without device time, over the sample count.
+
+    A busy host delays single frames by an unknown time. The fit is therefore more accurate than one arrival time. A
+    frame that is late by whole periods was delayed, or samples before it are lost. The next frames decide between both
+    cases. Until then, half of the distance from the fit to the arrival is part of the time stamp error.
+    """
 
     __slots__ = (
         "_above_mean", "_agreeing", "_arrival_ns", "_begin_ns", "_device_ns", "_fit", "_late_periods", "_learned",
@@ -146,13 +157,13 @@ class EvenArrivals:
 
     def __init__(self) -> None:
         self.t_ns = 0
-        """Time of the newest message by the line; `add_arrival` returns whether it is to be used."""
+        """Time of the newest frame according to the fit, ns. `add_arrival` returns whether it is valid."""
         self.error_ns = 0.0
-        """One-sigma error of that."""
+        """One-sigma error of `t_ns`, ns."""
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew: the device or its link was away, or its rate is another."""
+        """Discard the fit and the period: the device or its link was missing, or the rate changed."""
         self._fit: ArrivalFit | None = None
         self._period_ns = 0.0
         self._learned = 0
@@ -161,10 +172,10 @@ class EvenArrivals:
         self._above_mean = 0.0
 
     def add_arrival(self, delay: LinkDelay, arrival_ns: int, number: int, *, triggered: bool) -> bool:
-        """Add a message `number` samples after the one before; return whether the line dates it better.
+        """Add a frame. Return whether the fit is better than the arrival time.
 
-        0 for a message without a number, which may have samples missing before it. Samples that are `triggered` need
-        not be even. `delay` is that of the link.
+        The frame is `number` samples after the previous frame; 0 for a frame without a number, before which samples may
+        be lost. `triggered` samples need not have a constant rate. `delay` is the delay of the link.
         """
         steps = number or 1
         before_ns, self._arrival_ns = self._arrival_ns, arrival_ns
@@ -176,18 +187,19 @@ class EvenArrivals:
         fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
         above_ns = arrival_ns - fit_ns
         at_pace = arrival_ns - before_ns > HALF * period_ns
-        if above_ns < -HALF * period_ns:
+        if above_ns < -HALF * period_ns:  # half a period early: the rate changed
             self.restart()
             return False
         if above_ns > HALF * period_ns and not number:
-            late = round(above_ns / period_ns)
+            late = round(above_ns / period_ns)  # delay in whole periods
             if not self._are_missing(late, at_pace=at_pace):
-                self._device_ns = device_ns
+                self._device_ns = device_ns  # undecided: count no loss yet
                 if self._undecided > UNDECIDED_MOST:
                     self.restart()
                     return False
                 near_ns = NEAR_SHARE * period_ns
                 is_near = abs(above_ns - late * period_ns) < near_ns and self._above_mean < near_ns
+                # use the time of the other sample, but count no loss yet
                 if at_pace and late <= LOST_MOST and is_near:
                     fit_ns += late * period_ns
                 return self._use(delay, fit, device_ns, fit_ns, above_ns)
@@ -203,7 +215,7 @@ class EvenArrivals:
         return self._use(delay, fit, device_ns, fit_ns, max(above_ns, 0.0) if triggered else 0.0)
 
     def _learn(self, delay: LinkDelay, arrival_ns: int, steps: int) -> None:
-        """Measure the period by the first messages, unless an adapter hides what is missing."""
+        """Measure the period with the first frames, unless an adapter hides lost samples."""
         if not self._begin_ns:
             self._begin_ns = arrival_ns
             return
@@ -218,7 +230,7 @@ class EvenArrivals:
         self._fit = ArrivalFit(0, arrival_ns, delay.hold_ns)
 
     def _are_missing(self, late: int, *, at_pace: bool) -> bool:
-        """Whether the last messages agree that so many samples are missing."""
+        """Return whether the last AGREEING frames are all late by `late` periods: then `late` samples are lost."""
         if not at_pace:
             self._agreeing = 0
             return False
@@ -228,7 +240,10 @@ class EvenArrivals:
         return self._agreeing >= AGREEING
 
     def _use(self, delay: LinkDelay, fit: ArrivalFit, device_ns: int, line_ns: float, doubt_ns: float) -> bool:
-        """Set the newest time by the line, or up to `doubt_ns` later; return whether that is to be used."""
+        """Set `t_ns` and `error_ns`. Return whether the fit is better than the arrival time.
+
+        The truth is up to `doubt_ns` after `line_ns`.
+        """
         self.t_ns = int(line_ns - delay.floor_ns / 2 - fit.shift_ns)
         self.error_ns = hypot(fit.error_ns, delay.bias_error_ns(fit.hidden_ns)) + HALF * doubt_ns
         self.error_ns += fit.slope_error * (device_ns - fit.fitted_ns)
@@ -236,36 +251,36 @@ class EvenArrivals:
 
 
 class ArrivalTime:
-    """Time of a device's messages without device time. `modulus` is that of their number, 0 without one."""
+    """Time of a device's frames without device time. `modulus` is the modulus of their number, 0 without a number."""
 
     __slots__ = ("_even", "_losses", "_numbered", "delay", "error_ns", "missed", "spread")
 
     def __init__(self, delay: LinkDelay, modulus: int, on_unknown_gap: Callable[[], None]) -> None:
-        """`on_unknown_gap` is called for a gap in which the number of missing samples is not known."""
+        """`on_unknown_gap` is called for each gap with an unknown number of lost samples."""
         self.delay = delay
-        """Of the link now."""
+        """Delay of the present link."""
         self.spread = ArrivalSpread()
         self._even = EvenArrivals()
         self._losses = ArrivalLosses(modulus, on_unknown_gap)
         self._numbered = modulus > 0
         self.error_ns = 0.0
-        """One-sigma error of the newest time."""
+        """One-sigma error of the newest time, ns."""
         self.missed = 0
-        """Samples missing right before the newest message."""
+        """Number of lost samples directly before the newest frame."""
 
     @property
     def resets(self) -> int:
-        """How often the number began anew."""
+        """Return the number of restarts of the frame number."""
         return self._losses.resets
 
     def restart(self) -> None:
-        """Begin anew after the device or the link was away."""
+        """Start again after the device or the link was missing."""
         self._losses.restart()
         self.missed = 0
         self.change_link(self.delay)
 
     def change_link(self, delay: LinkDelay) -> None:
-        """Go on over a link with other delays."""
+        """Continue on a link with another delay."""
         self.delay = delay
         self.spread = ArrivalSpread()
         self._even.restart()
@@ -273,10 +288,10 @@ class ArrivalTime:
     def date(
         self, number: int | None, arrival_ns: int, size_bytes: int, *, alone: bool, triggered: bool, is_first: bool
     ) -> int:
-        """Return the time of a message of `size_bytes` that began to arrive at `arrival_ns`.
+        """Return the time of a frame that started to arrive at `arrival_ns`. Set `error_ns` and `missed`.
 
-        `alone`: no other messages of the device carry time; `triggered`: each follows a pulse of its own; `is_first`:
-        the device has sent none before. Sets `error_ns` and `missed`.
+        `alone`: no other frames of the device contain the time. `triggered`: each frame follows its own pulse.
+        `is_first`: the first frame of the device.
         """
         missed = steps = 0
         if self._numbered and number is not None:

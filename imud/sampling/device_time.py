@@ -1,11 +1,11 @@
-"""Device time from a counter: unwrapped, finer than its tick, without its corrections; missing samples; jumps.
+"""Device time from the device counter: unwrapped, finer than a tick, without corrections; lost samples and jumps.
 
-    ticks ─▶ DeviceTime.advance ─▶ raw_ns, even_ns, missed        period_learner: the step between samples
+    ticks ─▶ DeviceTime.advance ─▶ raw_ns, even_ns, missed        PeriodLearner: the step between samples
                     │
-                    ├─ absorb_correction: the counter was set by a little while the samples went on
-                    └─ JumpDetector: the counter began anew, or is another time
+                    ├─ absorb_correction: the device corrected its counter, the samples continued
+                    └─ JumpDetector: the counter restarted, or has another time
 
-Counters that number the samples and give no time are in `gaps`. Nothing here reads a clock.
+`gaps` handles counters that only number the samples.
 """
 
 from collections.abc import Callable
@@ -16,35 +16,41 @@ from imud.sampling.arrival_fit import SLOPE_HIGHEST, ArrivalFit
 from imud.sampling.gaps import CounterLine
 
 CONSISTENT: Final = 4
-"""Number of equal steps in a row that make a rate."""
+"""Number of consecutive equal steps that make a period."""
 CONSISTENT_LONGER: Final = 12
-"""The same for a longer step than before: where one of ten messages is lost, every second minute at 1 kHz leaves the
-same hole four times in a row, and a period of two ticks for one would shift device time by a tick."""
+"""Number of consecutive equal steps that make a longer period than the present one.
+
+If one of ten frames is lost at 1 kHz, four consecutive steps of two ticks occur every second minute. A period of two
+ticks would shift the device time by one tick.
+"""
 OFF_MOST: Final = 2.0
-"""Ticks by which steps of an uneven rate can differ from as many periods: one, and the error of the period."""
+"""Maximum difference between the steps of an uneven rate and the same number of periods, ticks."""
 STEADY_STEPS: Final = 64
-"""Number of equal steps in a row that were a rate: another one afterwards is a change of it."""
+"""Number of consecutive equal steps after which another step is a change of the rate."""
 GAP_FACTOR: Final = 1.5
-"""While the period is not known, a step that is so much longer than the one before or after has a gap in it."""
+"""Factor between adjacent steps above which the longer step contains a gap, if the period is unknown."""
 LEARNED_STEPS: Final = 4
-"""A gap of more periods is not learned from: how many it has rests on the period itself."""
+"""Maximum number of periods in a gap that improves the period. The number in a longer gap depends on the period itself.
+"""
 WHOLE_AFTER: Final = 64
-"""Number of equal steps after which the period is a whole number of ticks: a different step before was a loss."""
+"""Number of equal steps after which the period is a whole number of ticks. An earlier different step was a loss."""
 WHOLE_OFF: Final = 0.5
-"""A whole number of ticks that is further from the mean is another rate."""
+"""Maximum distance of a whole number of ticks from the mean. Beyond that, the rate is another."""
 UNJUDGED_MOST: Final = 64
-"""Steps from before there is a period that are kept until there is one; a device of an even rate has a few."""
+"""Maximum number of steps that are stored until the period is known. A device with an even rate needs a few."""
 EVERY_TICK: Final = 1.5
-"""With a shorter period two samples can be in one tick; with a longer one it is the same sample."""
+"""Period in ticks below which two samples can be in one tick. With a longer period, the tick contains the same sample.
+"""
 MEMORY: Final = 4096
-"""Steps in the mean of a period that is no whole number of ticks; then both sums are halved."""
+"""Number of steps in the mean of an uneven period. After that, both sums are halved."""
 
 
 class PeriodLearner:
-    """Estimate of the step between samples in device ticks; counts the samples missing in a longer one.
+    """Estimate of the step between samples in device ticks. It counts the lost samples in a longer step.
 
-    The period is measured, not taken from the nominal rate. `on_unknown_gap` is called for a step whose missing samples
-    are not known within one: before there is a period, or where its error over many periods is too large.
+    The period is measured, because the nominal rate is not accurate. `on_unknown_gap` is called for a step with an
+    unknown number of lost samples: before the period is known, or after a gap so long that the error of the period
+    matters.
     """
 
     __slots__ = (
@@ -55,9 +61,9 @@ class PeriodLearner:
     def __init__(self, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
         self._on_unknown_gap = on_unknown_gap
         self.is_gap = False
-        """Whether the newest step that was no period was noted as a gap of unknown size."""
+        """Whether the newest step of another length was reported as a gap of unknown size."""
         self.period_ticks = 0.0
-        """Mean step; 0 while unknown."""
+        """Mean step, ticks; 0 if unknown."""
         self._sum = 0.0
         self._count = 0.0
         self._even = 0
@@ -65,27 +71,28 @@ class PeriodLearner:
         self._candidate = 0
         self._run = 0
         self._run_sum = 0
-        self._uneven = self._uneven_sum = 0  # steps in a row that are not the period exactly, and their sum
-        self._unjudged: list[int] = []  # steps from before there was a period that were not noted as gaps
-        self._odd_at = 0.0  # number of the last step that was no period
-        # whether there were many periods in a row before it; a period learned of steps with losses is no rate
+        self._uneven = self._uneven_sum = 0  # consecutive steps that are not exactly the period, and their sum
+        self._unjudged: list[int] = []  # steps before the first period that were not reported as gaps
+        self._odd_at = 0.0  # number of the last step of another length
+        # whether many equal steps preceded it; a period from steps with losses is not a rate
         self._steady = False
         self.is_new = False
-        """Whether the period is another since this was set to False: the device's rate was changed."""
+        """Whether the device's rate changed. The owner resets it."""
         self.changes = 0
-        """Times that a period of no whole number of ticks showed where in a tick it is; 0 where it is a whole one."""
+        """Number of changes of the step, if the period is not a whole number of ticks; else 0. They show the phase in
+        the tick."""
 
     def add_step(self, ticks: int) -> int:
-        """Add the step to the newest sample; return how many samples are missing in it."""
+        """Add the step to the newest sample. Return the number of lost samples in the step."""
         period = self.period_ticks
-        if ticks <= 0:
+        if ticks <= 0:  # two samples in one tick, or the same sample again
             if 0 < period < EVERY_TICK:
                 self._refine(0)
             return 0
         if ticks == period:
             self.add_even_steps()
             return 0
-        if period and abs(ticks - period) <= 1 and int(ticks / period + 0.5) == 1:
+        if period and abs(ticks - period) <= 1 and int(ticks / period + 0.5) == 1:  # an uneven rate
             self._refine(ticks)
             return 0
         if self._learn(ticks):
@@ -95,33 +102,33 @@ class PeriodLearner:
         return self.steps_in(ticks) - 1
 
     def restart(self, *, was_added: bool = False) -> None:
-        """Forget the newest step: the counter began anew, or was not read for a while.
+        """Forget the newest step: the counter restarted, or imud did not receive frames for a time.
 
-        `was_added`: what was added last was no step of one counter; whoever calls notes the gap.
+        `was_added`: the last added step was not a step of one counter, and the caller reports the gap.
         """
         if was_added and self._unjudged and not self.is_gap:
             self._unjudged.pop()
         self._run, self.is_gap = 0, False
 
     def add_even_steps(self, count: int = 1) -> None:
-        """Add so many steps that are exactly the period, at least one."""
+        """Add `count` steps that equal the period exactly, at least one."""
         self._run = 0
         self._even += count
 
     def steps_in(self, ticks: int) -> int:
-        """Return how many periods are in a longer step; the period must be known."""
+        """Return the number of periods in a longer step. The period must be known."""
         period = self.period_ticks
         steps = max(int(ticks / period + 0.5), 1)
         if not self.changes:
             return steps
         if steps <= LEARNED_STEPS and abs(ticks - steps * period) <= 1:
-            self._average(ticks, steps)  # the mean of what is left, where one of ten is lost, is off by a thousandth
-        elif steps > (self._count + self._even) * period:  # the mean is off by a tick over all it was made of
+            self._average(ticks, steps)  # the mean without the lost steps is wrong by a thousandth
+        elif steps > (self._count + self._even) * period:  # the error of the mean exceeds one tick
             self._on_unknown_gap()
         return steps
 
     def _average(self, ticks: int, steps: int) -> None:
-        """Add `steps` periods of `ticks` in all to the mean."""
+        """Add a step of `ticks` that contains `steps` periods to the mean."""
         self._sum += ticks + int(self._even * self.period_ticks)
         self._count += steps + self._even
         self._even = 0
@@ -133,7 +140,7 @@ class PeriodLearner:
             self._uneven = self._uneven_sum = 0
         self._uneven += 1
         self._uneven_sum += ticks
-        if self._uneven == CONSISTENT_LONGER:
+        if self._uneven == CONSISTENT_LONGER:  # enough uneven steps for another rate
             count, total = self._uneven, self._uneven_sum
             self._uneven = self._uneven_sum = 0
             if abs(total - count * self.period_ticks) > OFF_MOST:
@@ -143,7 +150,7 @@ class PeriodLearner:
         self._average(ticks, 1)
         same, self._before = ticks == self._before, ticks
         self.changes += not same
-        if same and self.changes <= 1 and self._count >= WHOLE_AFTER:
+        if same and self.changes <= 1 and self._count >= WHOLE_AFTER:  # a whole number of ticks
             self.is_new = abs(ticks - self.period_ticks) > WHOLE_OFF
             self._odd_at = 0.0
             self.period_ticks, self._sum, self._count, self.changes = float(ticks), float(ticks), 1.0, 0
@@ -152,7 +159,7 @@ class PeriodLearner:
             self._count /= 2
 
     def _learn(self, ticks: int) -> bool:
-        """Adopt another period when the last steps agree on it; return whether they do."""
+        """Use another period if the last steps agree on it. Return whether they agree."""
         self._uneven, self._uneven_sum, self.is_gap = 0, 0, False
         is_first = not self.period_ticks
         if is_first and len(self._unjudged) < UNJUDGED_MOST:
@@ -162,6 +169,7 @@ class PeriodLearner:
             self._run_sum += ticks
         else:
             if self._run and is_first:
+                # without a period, the longer of two adjacent steps contains the gap
                 shorter, longer = sorted((ticks, self._candidate))
                 if longer > GAP_FACTOR * shorter + 1:
                     self.is_gap = True
@@ -179,21 +187,21 @@ class PeriodLearner:
         return True
 
     def _judge(self) -> None:
-        """Note the gaps among the steps from before the first period: two beside each other can be of a like length."""
+        """Report the gaps among the steps before the first period. Two adjacent gaps can have the same length."""
         for ticks in self._unjudged:
             if int(ticks / self.period_ticks + 0.5) > 1 and ticks - self.period_ticks >= 1:
                 self._on_unknown_gap()
         self._unjudged.clear()
 
     def _note_odd(self) -> None:
-        """Note a step that is no period, and whether there were many before."""
+        """Count a step of another length, and store whether many equal steps preceded it."""
         even = self._count + self._even - self._odd_at
         if even:
             self._steady = not 0 < even < STEADY_STEPS
             self._odd_at += even
 
     def _adopt(self, ticks: int, steps: int, *, is_new: bool) -> None:
-        """Take `ticks` over so many steps for the period from now on."""
+        """Use `ticks` over `steps` steps as the new period."""
         self.is_new = is_new
         self._odd_at, self._steady = 0.0, False
         self._sum, self._count = float(ticks), float(steps)
@@ -204,56 +212,58 @@ class PeriodLearner:
 
 # --- device time finer than a tick ----------------------------------------------------------------------------------
 QUANTISED: Final = 0.29
-"""One-sigma error of a truncated stamp, in ticks: 1 / √12."""
+"""One-sigma error of a truncated counter value, ticks: 1 / √12."""
 SETTLED_CHANGES: Final = 64
-"""After so many steps that differ from the one before, the phase of an uneven rate within its ticks is known to a small
-part of one. At 400 Hz in ms that is 64 samples; a rate 50 ppm off 100 Hz takes ten minutes."""
+"""Number of changed steps after which the phase of an uneven rate within a tick is accurate to a small part of a tick.
+
+At 400 Hz and ticks of 1 ms, this takes 64 samples. A rate 50 ppm off 100 Hz takes ten minutes.
+"""
 UNSETTLED_MOST: Final = 512
-"""Number of samples of a new rate within which its phase may settle; one that takes longer drifts slowly."""
+"""Maximum number of samples until the phase of a new rate is accurate. A phase that takes longer drifts slowly."""
 EVEN_FOR: Final = 64
-"""Number of even samples after which one uneven step is the counter's, not the device's: its samples stay even."""
+"""Number of even samples after which an uneven step is a correction of the counter, not an uneven sample."""
 FOLLOWED_NS: Final = 15 * NS_PER_US
-"""A sample that is outside its tick by no more shows the error of the learned period, which is followed."""
+"""Maximum distance of a sample from its tick, ns, that is an error of the learned period."""
 UNEVEN_NS: Final = 200 * NS_PER_US
-"""A step that is off by less than this or a tick is no correction of the counter."""
+"""Maximum difference of a step, ns, or one tick, that is not a correction of the counter."""
 UNEVEN_SHARE: Final = 0.25
 WATCHED: Final = 256
-"""Number of samples after an uneven step or a gap whose device time is compared with the arrivals."""
+"""Number of samples after an uneven step or a gap whose device time the clock compares with the arrivals."""
 
 # --- corrections ----------------------------------------------------------------------------------------------------
 CORRECTION_MOST_NS: Final = 250 * NS_PER_MS
-"""A counter that moves by more jumped to another time. An hour and more without pulses at 50 ppm."""
+"""Maximum correction of the counter, ns: more than an hour without pulses at 50 ppm. A larger step is a jump."""
 CORRECTION_SPAN_NS: Final = 5 * NS_PER_S
-"""A fit over less time swings by more than a correction."""
+"""Minimum span of a fit, ns. A shorter fit is less accurate than a correction."""
 CORRECTION_SIGMAS: Final = 4
 CORRECTION_TICKS: Final = 0.5
-"""Distance below the fit at which a message came before its sample, if that was taken at its stamp."""
+"""Distance below the fit, ticks, at which a frame arrived before its sample."""
 REPHASED_TICKS: Final = 1.05
-"""The same for a step that may be the first of another rate: its samples may be anywhere in their ticks."""
+"""Distance below the fit, ticks, if the step may start another rate: the samples can be anywhere in their ticks."""
 
 # --- jumps ----------------------------------------------------------------------------------------------------------
 JUMP_EARLY_NS: Final = 5.0 * NS_PER_MS
 JUMP_EARLY_SIGMAS: Final = 10
-"""A message so far below the fit shows that the device's clock jumped ahead."""
+"""Distance below the fit, ns and standard errors, that shows a forward jump of the device counter."""
 FIRST_EARLY_NS: Final = NS_PER_S
-"""The same before the fit is used: the first message may have waited that long in a buffer."""
+"""The same before the fit is in use: the first frame may have waited for this time in a buffer."""
 JUMP_LATE_NS: Final = NS_PER_S / 2
 JUMP_LATE_READS: Final = 3
-"""Number of late reads over a second that show a jump of the device's clock: fewer may be a busy host's queue."""
+"""Number of late reads in one second that show a jump. Fewer can be the queue of a busy host."""
 
 
 class DeviceTime:
-    """Unwrapped device time in ns, of the newest sample.
+    """Unwrapped device time of the newest sample, ns.
 
-    A stamp is truncated to a tick, so at 400 Hz a millisecond counter steps 2, 3, 2, 3. The samples are even all the
-    same: `even_ns` steps by the learned period and is held inside the tick that the stamp names. Where a device that
-    was even so far leaves its tick, the counter was corrected, or had been before: then the ticks are shifted instead.
+    A counter value is truncated to a tick. At 400 Hz, a counter of milliseconds steps 2, 3, 2, 3, but the samples are
+    even. `even_ns` therefore steps by the learned period and stays inside the tick of the counter value. If an even
+    device leaves its tick, it corrected its counter, and the ticks are shifted instead.
 
-    A module on UTC takes back at the first pulse after a break what its crystal gathered: 0.9 ms after 30 s at 30 ppm,
-    30 ms after ten minutes at 50 ppm. Its sampling does not move with the counter. A step that is no whole number of
-    periods, or one over samples that were not lost, is therefore compared with the arrivals (`absorb_correction`):
-    where they fit the next sample better than the stamp, the step is taken out of device time, and the fit and the
-    pairing of edges go on undisturbed. Corrections within a tick need no arrivals: samples stay even over them.
+    A device on UTC corrects the error of its crystal at the first pulse after a break: 0.9 ms after 30 s at 30 ppm, 30
+    ms after ten minutes at 50 ppm. The samples do not move with the counter. `absorb_correction` therefore compares a
+    step with the arrivals if it is not a whole number of periods, or if no samples were lost in it. If the arrivals do
+    not confirm the step, the device time does not contain it, and the fit and the pairing of edges continue. A
+    correction within a tick needs no arrivals, because the samples stay even.
     """
 
     __slots__ = (
@@ -262,38 +272,39 @@ class DeviceTime:
     )  # fmt: skip
 
     def __init__(self, tick_ns: int, tick_modulus: int, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
-        """`on_unknown_gap` is called for a gap in which the number of missing samples is not known."""
+        """`on_unknown_gap` is called for each gap with an unknown number of lost samples."""
         self.tick_ns = tick_ns
         self.modulus = tick_modulus
         self.ticks = 0
-        """The newest stamp."""
+        """Newest counter value."""
         self._phase_ns = 0.0
-        self._shift_ns = 0.0  # part of the corrections of the counter that is still in `even_ns`
-        # part of `_shift_ns` that no arrival has confirmed: the first step of another rate looks like a correction
+        self._shift_ns = 0.0  # corrections of the counter in `even_ns`
+        # part of `_shift_ns` without confirmation by an arrival: the first step of another rate looks like a correction
         self._unsure_ns = 0.0
         self._even_for = 0
-        self._step_ns = 0  # the newest step of the counter; negative where that is shorter than half a turn forward
-        self._gap = 0  # samples missing in the last gap, while it is watched
+        self._step_ns = 0  # newest step of the counter; negative if the backward step is shorter
+        self._gap = 0  # lost samples in the last gap while arrivals are compared
         self.uneven = False
-        """Whether the newest step, after many even ones, is no whole number of periods by more than a tick."""
+        """Whether the newest step after many even steps differs from whole periods by more than a tick."""
         self.doubt_ns = 0.0
-        """By how much even samples were preferred to stamps, until an arrival confirms it."""
-        # number of further samples within which the phase of a new rate within its ticks may become known
+        """Difference between even samples and counter values, ns, that no arrival has confirmed."""
+        # number of samples in which the phase of a new rate can become accurate
         self._unsettled = 0
         self.rephased = False
-        """Whether the device's rate was changed: where in their ticks the samples are now is anew."""
+        """Whether the device's rate changed. The position of the samples in their ticks is then unknown."""
         self.watched = 0
-        """Number of further samples whose device time is compared with their arrivals."""
+        """Number of further samples whose device time is compared with the arrivals."""
         self.period = PeriodLearner(on_unknown_gap)
         self.raw_ns = 0
-        """Unwrapped device time as stamped."""
+        """Unwrapped device time according to the counter, ns."""
         self.even_ns = 0
-        """`raw_ns` plus the part of a tick that an even rate reveals; never falls while the clock runs on."""
+        """`raw_ns` plus the part of a tick that the even rate shows, ns. It does not fall while the counter continues.
+        """
         self.missed = 0
-        """Samples missing between the last two."""
+        """Number of lost samples between the two newest samples."""
 
     def begin(self, ticks: int) -> None:
-        """Set the first stamp of a device, or the first after its clock started anew."""
+        """Set the first counter value of a device, or the first value after a restart of its counter."""
         self.period.restart(was_added=ticks == self.ticks)
         self.ticks = ticks
         self._phase_ns = self._shift_ns = self._unsure_ns = self.doubt_ns = 0.0
@@ -302,13 +313,13 @@ class DeviceTime:
         self.raw_ns = self.even_ns = ticks % self.modulus * self.tick_ns
 
     def elapsed_ns(self, ticks: int) -> int:
-        """Device time from the newest stamp to `ticks`, if the counter only went forward and wrapped once at most."""
+        """Return the device time from the newest counter value to `ticks`, ns, with at most one wrap."""
         return (ticks - self.ticks) % self.modulus * self.tick_ns
 
     def missed_since(self, line: CounterLine, ticks: int, arrival_ns: int) -> int | None:
-        """Return how many samples are missing since the newest one; None where the counter did not run on to `ticks`.
+        """Return the number of lost samples since the newest sample; None if the counter did not continue to `ticks`.
 
-        The message is at `arrival_ns` and not read at once after the newest one: the counter may have turned meanwhile.
+        `arrival_ns` is the arrival of the frame. The counter may have wrapped several times.
         """
         step_ns, turn_ns, period = self.elapsed_ns(ticks), self.modulus * self.tick_ns, self.period
         turns = line.turns(self.even_ns + step_ns, arrival_ns, turn_ns)
@@ -317,12 +328,12 @@ class DeviceTime:
         return period.steps_in(step_ns // self.tick_ns + turns * self.modulus) - 1
 
     def advance(self, ticks: int) -> None:
-        """Set the next stamp."""
+        """Set the next counter value."""
         step = (ticks - self.ticks) % self.modulus
         self.ticks = ticks
         tick_ns, period = self.tick_ns, self.period
         self.raw_ns += step * tick_ns
-        if step == period.period_ticks and step and not self.watched:  # the usual case, in a third of the time
+        if step == period.period_ticks and step and not self.watched:  # fast path, in a third of the time
             period.add_even_steps()
             self.missed = 0
             self._even_for += 1
@@ -348,13 +359,13 @@ class DeviceTime:
         if step != period.period_ticks and (step or period.period_ticks < EVERY_TICK):
             off_ns = ((missed + 1) * period.period_ticks - step) * tick_ns
             phase_ns = self._phase_ns + off_ns
-            self._phase_ns = held_ns = min(max(phase_ns, 0.0), float(tick_ns))
+            self._phase_ns = held_ns = min(max(phase_ns, 0.0), float(tick_ns))  # hold the sample inside its tick
             if phase_ns != held_ns:
                 self._leave_tick(step, off_ns, phase_ns - held_ns)
         self.even_ns = self.raw_ns + int(self._phase_ns + self._shift_ns)
 
     def advance_evenly(self, ticks: int, steps: int) -> None:
-        """Set the newest of so many next stamps, each of which is exactly one period on; nothing may be watched."""
+        """Set the newest of `steps` counter values, each one period after the other, while `watched` is 0."""
         self.ticks = ticks
         self.period.add_even_steps(steps)
         self.missed = 0
@@ -364,14 +375,14 @@ class DeviceTime:
         self.even_ns += elapsed_ns
 
     def _rephase(self) -> None:
-        """Note that device time before the newest sample does not show when the samples after it are."""
+        """Mark the phase as unknown: the device time of earlier samples does not show the time of the next samples."""
         self.rephased, self.uneven = True, False
         self.watched = self._gap = 0
         self._shift_ns -= self._unsure_ns
         self._unsure_ns = self.doubt_ns = 0.0
 
     def _leave_tick(self, step: int, off_ns: float, over_ns: float) -> None:
-        """Handle a sample that is even with those before only if it is `over_ns` outside of its tick."""
+        """Process a sample that is `over_ns` outside of its tick if it is even with the previous samples."""
         off, over, tick_ns = abs(off_ns), abs(over_ns), self.tick_ns
         settled = self._even_for >= EVEN_FOR and self.period.period_ticks > 0
         if off > max(tick_ns * 1.01, UNEVEN_NS):
@@ -385,30 +396,30 @@ class DeviceTime:
             self._even_for = 0
 
     def _note_uneven(self, step: int) -> None:
-        """Note a step that lost samples do not explain; backward, if that is shorter than half a turn forward."""
+        """Store a step that lost samples do not explain. It is backward if that is shorter than half a turn."""
         self._step_ns = (step - self.modulus if step > self.modulus // 2 else step) * self.tick_ns
         self.uneven = self.uneven or self._even_for >= EVEN_FOR
         self.watched = WATCHED
         self._even_for = 0
 
     def absorb_correction(self, fit: ArrivalFit, before_ns: int, arrival_ns: int) -> bool:
-        """Take a correction of the counter at the newest sample, or shortly before, out of device time.
+        """Remove a correction of the counter from the device time, at the newest sample or shortly before.
 
-        The sample before was at device time `before_ns`; the message began at `arrival_ns` at the latest. Returns
-        whether there was one; `even_ns` and `missed` are then set anew.
+        `before_ns` is the device time of the previous sample. `arrival_ns` is the latest start of the frame. Return
+        whether there was a correction. In this case, set `even_ns` and `missed` again.
         """
         period_ns = self.period.period_ticks * self.tick_ns
         if not period_ns or fit.span_ns < CORRECTION_SPAN_NS:
             return False
         slope, device_ns = fit.slope, self.even_ns
-        due_ns = fit.ref_arrival_ns + slope * (before_ns - fit.ref_device_ns)
+        due_ns = fit.ref_arrival_ns + slope * (before_ns - fit.ref_device_ns)  # due arrival of the previous sample
         early_ns = CORRECTION_SIGMAS * fit.error_ns
         early_ns += (REPHASED_TICKS if self.uneven else CORRECTION_TICKS) * self.tick_ns
         early_ns += fit.slope_error * max(min(device_ns - fit.fitted_ns, CORRECTION_MOST_NS), 0)
         above_ns = arrival_ns - due_ns - slope * (device_ns - before_ns)
         if self.uneven:
             return self._absorb_step(before_ns, (arrival_ns - due_ns) / slope, above_ns, early_ns, fit.hold_ns)
-        if self._gap and above_ns < -early_ns:
+        if self._gap and above_ns < -early_ns:  # the counter was set forward: fewer samples are lost than the gap shows
             periods = min(round(-above_ns / (slope * period_ns)), self._gap)
             if (
                 periods
@@ -422,23 +433,23 @@ class DeviceTime:
         return False
 
     def _absorb_step(self, before_ns: int, elapsed_ns: float, above_ns: float, early_ns: float, hold_ns: int) -> bool:
-        """Make an uneven step even, if the message, `elapsed_ns` after the sample before, fits that better."""
+        """Make an uneven step even if the arrival confirms this, `elapsed_ns` after the previous sample."""
         period_ns = self.period.period_ticks * self.tick_ns
         waited_ns = elapsed_ns - period_ns
-        if waited_ns < -early_ns:
+        if waited_ns < -early_ns:  # earlier than one period
             return False
         periods = 1 + int(max(waited_ns - hold_ns, 0.0) / period_ns)
         moved_ns = self._step_ns - periods * period_ns
         if abs(moved_ns) > CORRECTION_MOST_NS:
             return False
         late_ns = elapsed_ns - periods * period_ns
-        if -early_ns <= above_ns <= late_ns:
+        if -early_ns <= above_ns <= late_ns:  # the counter value fits better
             return False
         self._make_even(before_ns, periods)
         return True
 
     def _make_even(self, before_ns: int, periods: int) -> None:
-        """Place the newest sample `periods` after the one before, which was at `before_ns`."""
+        """Place the newest sample `periods` after the previous sample, which was at `before_ns`."""
         period_ns = self.period.period_ticks * self.tick_ns
         if self._step_ns < 0:
             self.raw_ns -= self.modulus * self.tick_ns
@@ -451,7 +462,7 @@ class DeviceTime:
         self.uneven = False
 
     def _shorten_gap(self, periods: int) -> None:
-        """Count `periods` of the samples in the last gap as never missing: the counter was set forward."""
+        """Reduce the last gap by `periods` samples: the counter was set forward, and the samples are not lost."""
         back_ns = round(periods * self.period.period_ticks * self.tick_ns)
         self._shift_ns -= back_ns
         self.even_ns -= back_ns
@@ -461,7 +472,10 @@ class DeviceTime:
 
     @property
     def error_ns(self) -> float:
-        """One-sigma error of `even_ns` by the length of a tick; 0 where every stamp is off by the same."""
+        """Return the one-sigma error of `even_ns` from the length of a tick, ns.
+
+        It is 0 if all counter values have the same error.
+        """
         changes = self.period.changes
         if not changes:
             return 0.0
@@ -469,47 +483,47 @@ class DeviceTime:
 
 
 class JumpDetector:
-    """Detector of jumps of the device's clock: early messages show them at once, late ones when they stay late."""
+    """Detector of jumps of the device counter: by one early frame, or by frames that stay late."""
 
     __slots__ = ("_begin_ns", "_since_ns", "late_reads")
 
     def __init__(self) -> None:
         self._since_ns = 0
-        self._begin_ns = 0  # device time between the first late message and the one before
+        self._begin_ns = 0  # device time between the first late frame and the previous frame
         self.late_reads = 0
-        """Number of late reads in a row."""
+        """Number of consecutive late reads."""
 
     def is_late_since_gap(self, period_ns: float) -> bool:
-        """Whether samples were missing before the first late message: the counter may have begun anew there."""
+        """Return whether samples were lost before the first late frame: the counter may have restarted there."""
         return self.late_reads > 0 and self._begin_ns > GAP_FACTOR * period_ns
 
     def reset(self) -> None:
-        """Forget late reads: a new fit begins."""
+        """Forget late reads: a new fit starts."""
         self.late_reads = 0
 
     def stood_still(self, fit: ArrivalFit, error_ns: float) -> bool:
-        """Whether all of the newest messages are late: the device's clock stood still for a while."""
+        """Return whether all of the newest frames are late: the device counter stopped for a time."""
         return fit.recent_ns > JUMP_EARLY_NS + JUMP_EARLY_SIGMAS * error_ns
 
     def is_jump(
         self, fit: ArrivalFit, above_ns: float, elapsed_ns: int, error_ns: float | None, t_rx_ns: int, t_before_ns: int
     ) -> bool:
-        """Whether a message so far above or below the fit shows that the device's clock jumped.
+        """Return whether a frame above or below the fit shows a jump of the device counter.
 
-        `t_before_ns` is when the message before was read. No `error_ns`: a young fit.
+        `t_before_ns` is the read of the previous frame. `error_ns` is None before the fit is in use.
         """
         if above_ns < -JUMP_EARLY_NS:
             return self.is_early(fit, above_ns, elapsed_ns, error_ns)
         return self.is_late(fit, above_ns, elapsed_ns, t_rx_ns, new_read=t_rx_ns > t_before_ns)
 
     def is_early(self, fit: ArrivalFit, above_ns: float, elapsed_ns: int, error_ns: float | None) -> bool:
-        """Whether a message `above_ns` (negative) above the fit came before it could; no `error_ns`: a young fit."""
+        """Return whether a frame `above_ns` (negative) above the fit arrived too early."""
         if error_ns is None:
             return above_ns < -FIRST_EARLY_NS - (SLOPE_HIGHEST - 1) * (elapsed_ns + fit.span_ns)
         return above_ns < -JUMP_EARLY_SIGMAS * error_ns - JUMP_EARLY_NS - 4 * fit.slope_error * elapsed_ns
 
     def is_late(self, fit: ArrivalFit, above_ns: float, elapsed_ns: int, t_rx_ns: int, *, new_read: bool) -> bool:
-        """Whether messages have been so late for so long that the device's clock must have stood still."""
+        """Return whether frames have been late for so long that the device counter must have stopped."""
         if above_ns < JUMP_LATE_NS + fit.slope_error * elapsed_ns:
             self.late_reads = 0
             return False
@@ -520,27 +534,27 @@ class JumpDetector:
 
 
 PULSE_TICKS: Final = 1000
-"""From pulse to pulse, in ms."""
+"""Time between pulses, ms."""
 EARLY_NS: Final = 100 * NS_PER_MS
-"""A message so far before the earliest possible one was not measured then: a pulse came."""
+"""Minimum time before the earliest possible arrival, ns, that shows a pulse."""
 DRIFT: Final = 200e-6
-"""Rate error of a device's crystal against the host's, at most."""
+"""Maximum rate error of a device's crystal compared to the host."""
 LATE_NS: Final = 400 * NS_PER_MS
-"""How far from whole turns the lateness of live messages may be."""
+"""Maximum distance of the lateness of live frames from whole turns, ns."""
+# live frames: over this number of ticks, their pace equals the pace of their values within this share. A step that
+# differs from the time between arrivals by more than a latency timer restarts the count.
 LIVE_TICKS: Final = 640
 LIVE_SHARE: Final = 0.04
 LIVE_BREAK_NS: Final = 40 * NS_PER_MS
-"""Messages over so many ticks that come at the pace of their stamps, within this share, are read as they come; a step
-that differs from the time between arrivals by more than an adapter's latency timer begins that count anew."""
 STUCK_MESSAGES: Final = 8
-"""With so many equal stamps the stamp is no time: each message follows a pulse of its own (triggers on SIN)."""
+"""Number of equal values that show that the value is not a time: each frame follows its own pulse (triggers on SIN)."""
 FOREIGN_NS: Final = 1000 * NS_PER_MS
-"""After so long without a message that carries time, those with a stamp alone are dated by it."""
+"""Time without a frame with device time after which `pps_age_ms` makes the time stamps, ns."""
 WRAP: Final = 1 << 32
 
 
 class StampTime:
-    """Ticks of 1 ms from stamps of 1 ms that begin anew after `modulus`, modulo 2³²."""
+    """Ticks of 1 ms, modulo 2³², from values of 1 ms that restart after `modulus` (`pps_age_ms`)."""
 
     __slots__ = (
         "_arrival_ns", "_foreign_since_ns", "_foreign_ticks", "_live_arrival_ns", "_live_ticks", "_lowest_ns",
@@ -549,26 +563,26 @@ class StampTime:
 
     def __init__(self, modulus: int) -> None:
         self._modulus = modulus
-        self._stamp = -1  # the newest stamp; -1 before the first
+        self._stamp = -1  # newest value; -1 before the first
         self.before = 0
-        """Ticks of the message before the newest one."""
-        self._ticks = 0  # ticks of the newest message, not wrapped
+        """Ticks of the previous frame."""
+        self._ticks = 0  # unwrapped ticks of the newest frame
         self._arrival_ns = 0
-        self._origin_ns = 0  # arrival that lateness is relative to
-        self._lowest_ns = 0.0  # least arrival minus ticks so far, from the origin; it rises by DRIFT
-        self._live_ticks = self._live_arrival_ns = 0  # the message since which arrivals have kept pace with the ticks
+        self._origin_ns = 0  # arrival relative to which lateness is measured
+        self._lowest_ns = 0.0  # least lateness, with DRIFT added
+        self._live_ticks = self._live_arrival_ns = 0  # frame since which the arrivals keep pace
         self._stuck = 0
-        self._pulsed = False  # whether a pulse per second sets the stamp to zero
+        self._pulsed = False  # whether a pulse per second resets the value
         self._foreign_ticks: int | None = None
         self._foreign_since_ns = 0
         self.in_use = False
-        """Whether ticks come from stamps now."""
+        """Whether the ticks come from `pps_age_ms`."""
 
     def ticks(self, stamp: int, arrival_ns: int, known_ticks: int | None) -> int | None:
-        """Return the ticks of a message; None where the stamp does not show its time.
+        """Return the ticks of a frame; None if `stamp` does not show its time.
 
-        `known_ticks` are those that the clock knows last, None for none: if they are not from here, other messages
-        carry time, and those are preferred.
+        `known_ticks` are the last ticks of the clock, None without ticks. If other frames of the device contain the
+        time, the clock prefers these frames.
         """
         if self._is_foreign(known_ticks, arrival_ns):
             return None
@@ -577,7 +591,7 @@ class StampTime:
             return None
         elapsed_ns, before = arrival_ns - self._arrival_ns, self._stamp
         self._stamp, self._arrival_ns = stamp, arrival_ns
-        self._stuck = self._stuck + 1 if stamp == before and elapsed_ns > NS_PER_MS else 0
+        self._stuck = self._stuck + 1 if stamp == before and elapsed_ns > NS_PER_MS else 0  # 0: two frames of one read
         if self._stuck >= STUCK_MESSAGES or (self._stuck and not self.in_use):
             self.in_use = False
             return None
@@ -590,13 +604,13 @@ class StampTime:
         return self._ticks % WRAP
 
     def restart(self) -> None:
-        """Begin anew: the device or its link was away."""
+        """Start again: the device or its link was missing."""
         self._stamp = -1
         self.in_use = self._pulsed = False
         self._foreign_ticks = None
 
     def _is_foreign(self, known_ticks: int | None, arrival_ns: int) -> bool:
-        """Whether messages that carry time come as well."""
+        """Return whether other frames of the device contain the time."""
         if known_ticks is None or (self.in_use and known_ticks == self._ticks % WRAP):
             self._foreign_ticks = None
             return False
@@ -606,7 +620,7 @@ class StampTime:
         return arrival_ns - self._foreign_since_ns < FOREIGN_NS
 
     def _begin(self, stamp: int, arrival_ns: int, known_ticks: int | None) -> None:
-        """Set the first stamp; ticks go on from those that other messages carried."""
+        """Set the first value. The ticks continue from the frames with device time."""
         since_ms = round((arrival_ns - self._foreign_since_ns) / NS_PER_MS)
         self._ticks = stamp if known_ticks is None else known_ticks + since_ms
         self._stamp, self._arrival_ns, self._origin_ns = stamp, arrival_ns, arrival_ns - self._ticks * NS_PER_MS
@@ -614,13 +628,13 @@ class StampTime:
         self._live_ticks, self._live_arrival_ns = self._ticks, arrival_ns
 
     def _late_ns(self, ticks: int, arrival_ns: int) -> float:
-        """Lateness of a message at `ticks` against the one that was least late."""
+        """Return the lateness of a frame at `ticks` compared to the least late frame, ns."""
         return arrival_ns - self._origin_ns - ticks * NS_PER_MS - self._lowest_ns
 
     def _step(self, stamp: int, before: int, arrival_ns: int, elapsed_ns: int) -> int:
-        """Ticks since the message before; the stamp may have turned or been set to zero between.
+        """Return the ticks since the previous frame. The value may have wrapped, or a pulse may have reset it.
 
-        The first pulse comes at any stamp: the arrivals show how long ago the message before was.
+        The first pulse can come at any value. The arrivals then show the time since the previous frame.
         """
         turned = (stamp - before) % self._modulus
         if stamp >= before:
@@ -630,21 +644,21 @@ class StampTime:
         if self._pulsed:
             nearer = abs(late_ns) < abs(self._late_ns(self._ticks + pulsed, arrival_ns))
             self._pulsed = not (nearer and before > PULSE_TICKS)
-        elif late_ns < -EARLY_NS:
+        elif late_ns < -EARLY_NS:  # too early for a wrap: a pulse reset the value
             self._pulsed = True
             if abs(elapsed_ns - pulsed * NS_PER_MS) > LIVE_BREAK_NS:
                 return max(round(elapsed_ns / NS_PER_MS), 1)
         return pulsed if self._pulsed else turned
 
     def _follow(self, arrival_ns: int, elapsed_ns: int) -> None:
-        """Note how late the message is; add the turns that live messages show to be missing."""
+        """Update the lateness. Add the turns that are lost according to live frames."""
         self._lowest_ns += DRIFT * elapsed_ns
         if self._ticks - self._live_ticks >= LIVE_TICKS:
             self._add_turns(arrival_ns)
         self._lowest_ns += min(self._late_ns(self._ticks, arrival_ns), 0.0)
 
     def _add_turns(self, arrival_ns: int) -> None:
-        """Add whole turns by which messages are late that come at the pace of their stamps."""
+        """Add whole turns if frames are late by whole turns and keep pace with their values."""
         pace = (arrival_ns - self._live_arrival_ns) / ((self._ticks - self._live_ticks) * NS_PER_MS)
         late_ns = self._late_ns(self._ticks, arrival_ns)
         turn = PULSE_TICKS if self._pulsed else self._modulus
