@@ -24,13 +24,10 @@ from imud.recording.player import PlayedClock, PlayedDevice, ignore_frame, ignor
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import CanPath, PathContext, SamplePath, StreamPath, make_clock
 
-NAME: Final = "replay"
-"""Name of the device, as in `imud replay`."""
+NAME: Final = "replay"  # name of the device, as in `imud replay`
 DEVICE_ID: Final = 0
-GATHERED: Final = 256
-"""Number of CAN frames in one call of the path."""
-START_UTC: Final = "start_utc_ns"
-"""Detail of a capture with time stamps: CLOCK_REALTIME at its first record."""
+GATHERED: Final = 256  # number of CAN frames in one call of the path
+START_UTC: Final = "start_utc_ns"  # detail of a capture with time stamps: CLOCK_REALTIME at its first record
 
 
 class KnownTimes(Enum):
@@ -64,8 +61,7 @@ class CapturePlayer:
         described = DeviceRecord(NAME, driver.name, "replay", where, {}, {}, {})
         self.device: Final = PlayedDevice(DEVICE_ID, described)
         self.device.driver = driver
-        self.times = KnownTimes.NONE
-        """Meaning of the times; valid after the first sample."""
+        self.times = KnownTimes.NONE  # meaning of the times; valid after the first sample
         self._publish = publish
         self._driver = driver
         self._options = options

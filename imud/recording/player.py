@@ -57,8 +57,7 @@ class PlayedDevice:
     driver: Driver | None = None
     # overruns that the kernel counted in the live run
     overruns: int = 0
-    checks: int = 0
-    """Number of check records."""
+    checks: int = 0  # number of check records
     differences: list[str] = field(default_factory=list)
     """Differences between replay and live run, one sentence for each check record that differs."""
     fresh_starts: list[str] = field(default_factory=list)
@@ -104,10 +103,8 @@ class Player:
         With `fresh`, or if another version of imud wrote the recording, codecs and clocks start without their recorded
         state.
         """
-        self.devices: dict[int, PlayedDevice] = {}
-        """Devices by their number in the recorded daemon."""
-        self.lost = 0
-        """Number of records that the recorder dropped."""
+        self.devices: dict[int, PlayedDevice] = {}  # devices by their number in the recorded daemon
+        self.lost = 0  # number of records that the recorder dropped
         self._publish = publish
         self._on_event = on_event
         self._host = PlayedClock()

@@ -29,45 +29,33 @@ from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 BINS: Final = 64
 BIN_LONGEST_NS: Final = NS_PER_S
 SLOPE_LOWEST: Final = 1 / 1.07
+# limits of the slope, host ns per device ns. Devices with an error of 4.08 % exist. Above 7 %, the tick is different.
 SLOPE_HIGHEST: Final = 1 / 0.93
-"""Limits of the slope, host ns per device ns. Devices with an error of 4.08 % exist. Above 7 %, the tick is different.
-"""
-SUPPORT_AT: Final = 0.75
-"""Position of the hull edge in the window, as a share of the window."""
+SUPPORT_AT: Final = 0.75  # position of the hull edge in the window, as a share of the window
 # a fit is known after this number of points, and after this time or number of periods of a latency timer
 ENOUGH_POINTS: Final = 8
 ENOUGH_SPAN_NS: Final = 100 * NS_PER_MS
 ENOUGH_HOLDS: Final = 20
+# error of a fit over n bins: mean distance of the bins, times this factor, divided by n (one sigma, from a simulation).
 SPREAD_BINS: Final = 12
-"""Error of a fit over n bins: mean distance of the bins, times this factor, divided by n (one sigma, from a
-simulation)."""
 # newest bins, at least RECENT_NS long: a common delay of all of them is not a delay of single frames
 RECENT_BINS: Final = 8
 RECENT_NS: Final = 2 * NS_PER_S
-KNOWN_SIGMAS: Final = 4
-"""Maximum deviation of the slope from its known value, in standard errors."""
-DRIFT_MOST: Final = 1e-6
-"""Maximum change of a crystal's rate per second."""
+KNOWN_SIGMAS: Final = 4  # maximum deviation of the slope from its known value, in standard errors
+DRIFT_MOST: Final = 1e-6  # maximum change of a crystal's rate per second
+# delays of polling and wake-up in addition to the longest wait, ns. The fit uses the first delay with a feasible line.
 LATENCIES_NS: Final = (200 * NS_PER_US, 600 * NS_PER_US, 2000 * NS_PER_US, 6000 * NS_PER_US)
-"""Delays of polling and wake-up in addition to the longest wait, ns. The fit uses the first delay with a feasible line.
-"""
+# factor for late frames. It multiplies the share of waits that the timer alone cannot explain, in periods of the timer.
+# The longest wait is twice the mean less the shortest wait, and a busy host increases the mean. With exponentially
+# distributed delays, twice their mean is at most this factor times the share.
 LATE_FACTOR: Final = 4.0
-"""Factor for late frames. It multiplies the share of waits that the timer alone cannot explain, in periods of the
-timer.
-
-The longest wait is twice the mean less the shortest wait, and a busy host increases the mean. With exponentially
-distributed delays, twice their mean is at most this factor times the share.
-"""
-HOLD_MESSAGES: Final = 32
-"""Number of frames that show whether the reported timer period is correct."""
+HOLD_MESSAGES: Final = 32  # number of frames that show whether the reported timer period is correct
 HOLD_MOST_NS: Final = 16 * NS_PER_MS
 """Longest timer that the fit assumes without a report, ns: the default of common adapters."""
+# mean of exponentially distributed values, divided by the mean of their lower half. The lower half contains no stalls.
 LOWER_HALF: Final = 1 / (1 - log(2))
-"""Mean of exponentially distributed values, divided by the mean of their lower half. The lower half contains no stalls.
-"""
 
-Point = tuple[float, float]
-"""Device time and time, ns."""
+Point = tuple[float, float]  # device time and time, ns
 
 
 class _Bin:
@@ -81,17 +69,13 @@ class _Bin:
         self.begin_ns = device_ns
         self.device_ns = device_ns
         self.arrival_ns = arrival_ns
-        self.lowest = lowest
-        """Distance of (device_ns, arrival_ns) above the fit, ns."""
-        self.wait = wait
-        """Sum of the waits of `count` frames above the fit, ns."""
+        self.lowest = lowest  # distance of (device_ns, arrival_ns) above the fit, ns
+        self.wait = wait  # sum of the waits of `count` frames above the fit, ns
         self.wait_least = wait
         self.wait_most = wait
         self.count = 1
-        self.late = 0
-        """Number of frames that waited for longer than the timer can hold them."""
-        self.late_ns = 0.0
-        """Sum of the waits in excess of the timer, ns. `wait` does not contain it."""
+        self.late = 0  # number of frames that waited for longer than the timer can hold them
+        self.late_ns = 0.0  # sum of the waits in excess of the timer, ns. `wait` does not contain it.
 
     def longest_wait(self) -> float:
         """Return the longest wait in the timer without stalls of the host, ns.
@@ -137,24 +121,17 @@ class ArrivalFit:
         self.slope = slope
         self._slope_known, self._slope_known_error = slope, KNOWN_SIGMAS * slope_error
         self._begin_ns = device_ns
-        self.fitted_ns = device_ns
-        """Device time of the newest change of the fit, ns."""
-        self.count = 1
-        """Number of arrivals."""
-        self.error_ns = 0.0
-        """One-sigma error of the fit at its newest end, from the spread of the points, ns."""
+        self.fitted_ns = device_ns  # device time of the newest change of the fit, ns
+        self.count = 1  # number of arrivals
+        self.error_ns = 0.0  # one-sigma error of the fit at its newest end, from the spread of the points, ns
         self.slope_error = slope_error
-        self.residual_ns = 0.0
-        """Root mean square distance of the lowest points above the fit, ns."""
+        self.residual_ns = 0.0  # root mean square distance of the lowest points above the fit, ns
+        # distance of the lowest point of the newest bins above the fit, ns. It is large if the device's clock stopped.
         self.recent_ns = 0.0
-        """Distance of the lowest point of the newest bins above the fit, ns. It is large if the device's clock stopped.
-        """
-        self.hold_ns = hold_ns
-        """Period of the adapter's latency timer, ns; 0 without a timer."""
+        self.hold_ns = hold_ns  # period of the adapter's latency timer, ns; 0 without a timer
         self.hidden_ns = float(hold_ns)
         """Width of the feasible lines at the newest end, ns: the part that a latency timer hides."""
-        self.shift_ns = hold_ns / 2
-        """Distance from the fit down to the middle of the feasible lines, ns."""
+        self.shift_ns = hold_ns / 2  # distance from the fit down to the middle of the feasible lines, ns
         self.measured_hold_ns = 0
         """Measured period of the timer, ns, if most frames wait for longer than `hold_ns`; else 0."""
         self._wait_most = float(hold_ns + LATENCIES_NS[0])
@@ -288,12 +265,10 @@ class ArrivalFit:
         self._move(touch_ns, self.ref_arrival_ns + int(above_ref + yu), self.slope + slope)
 
     def _floors(self) -> list[float]:
-        """Return the lower bound of the truth in each bin.
-
-        The bound is the longest wait less the timer, or the shortest wait less the pause. The longest wait is useless
-        if the host stalled. The shortest wait is useless if almost no frame was in time. A bound far above the fit
-        belongs to a bin that was delayed as a whole.
-        """
+        """Return the lower bound of the truth in each bin."""
+        # The bound is the longest wait less the timer, or the shortest wait less the pause. The longest wait is useless
+        # if the host stalled. The shortest wait is useless if almost no frame was in time. A bound far above the fit
+        # belongs to a bin that was delayed as a whole.
         hold, pause, enough = self.hold_ns, self._pause_ns, self._pause_count
         held = hold + LATE_FACTOR * hold * self._count_late()
         none = -hold - pause
@@ -396,8 +371,7 @@ def _edge_over(hull: list[Point], x: float, lowest: float, highest: float) -> tu
 class FeasibleLines:
     """All lines between an upper and a lower bound."""
 
-    lowest_ns: float
-    """Lowest value of these lines at the newest point, ns."""
+    lowest_ns: float  # lowest value of these lines at the newest point, ns
     highest_ns: float
     slope_lowest: float
     slope_highest: float

@@ -15,20 +15,14 @@ from imud.sampling.gaps import ArrivalLosses
 
 WAKE_NS: Final = 100 * NS_PER_US
 """Maximum of the shortest time from the interrupt to the reader, ns (30 to 100 µs on small boards)."""
-FIFO_BYTES: Final = 4
-"""Number of byte times after which a 16550 or PL011 FIFO reports bytes below its trigger level."""
-USB_POLL_NS: Final = 125 * NS_PER_US
-"""Wait of a full adapter for the host's poll, ns: one micro-frame."""
-FIRST_SPREAD_NS: Final = 2 * NS_PER_MS
-"""Assumed spread of the first arrivals, ns."""
+FIFO_BYTES: Final = 4  # number of byte times after which a 16550 or PL011 FIFO reports bytes below its trigger level
+USB_POLL_NS: Final = 125 * NS_PER_US  # wait of a full adapter for the host's poll, ns: one micro-frame
+FIRST_SPREAD_NS: Final = 2 * NS_PER_MS  # assumed spread of the first arrivals, ns
 SIGMA_OF_RANGE: Final = 1 / sqrt(12)
 """One-sigma error of a value that is uniformly distributed in a range, per width of the range."""
+# one-sigma error of the delay in an adapter, per width of its range. In two of three cases the delay is anywhere in the
+# range. In the third case it is at an end: the adapter sends packets immediately, or each packet starts its timer.
 SIGMA_OF_HIDDEN: Final = sqrt((2 / 12 + 1 / 4) / 3)
-"""One-sigma error of the delay in an adapter, per width of its range.
-
-In two of three cases the delay is anywhere in the range. In the third case it is at an end: the adapter sends packets
-immediately, or each packet starts its timer.
-"""
 SMOOTHING: Final = 1 / 32
 WIRE_SLACK: Final = 1.05
 """Factor by which frames can be faster than the wire before imud assumes that no such wire exists."""
@@ -94,8 +88,7 @@ class ArrivalSpread:
     def __init__(self) -> None:
         self._last_ns = 0
         self._spread = 0.0
-        self.period_ns = 0.0
-        """Mean step between frames, ns; 0 if unknown."""
+        self.period_ns = 0.0  # mean step between frames, ns; 0 if unknown
 
     def add_arrival(self, arrival_ns: int, steps: int = 1) -> None:
         """Add the arrival of a frame less its time on the wire, `steps` frames after the previous frame."""
@@ -121,8 +114,7 @@ class ArrivalSpread:
         return 1.5 * self._spread if self.period_ns else FIRST_SPREAD_NS
 
 
-LEARNING_MESSAGES: Final = 32
-"""Number of frames for the first estimate of the period."""
+LEARNING_MESSAGES: Final = 32  # number of frames for the first estimate of the period
 HALF: Final = 0.5
 """Maximum distance of a frame from the fit, in periods. Beyond that, the frame is another sample, or was delayed."""
 AGREEING: Final = 4
@@ -133,13 +125,10 @@ EVEN_SHARE: Final = 0.25
 """Maximum mean distance above the fit, in periods. Beyond that, the arrival time is better than the fit."""
 MEAN_SMOOTHING: Final = 1 / 128
 LOST_MOST: Final = 3
+# maximum distance of a late frame from whole periods, as a share of a period, that counts as another sample. The mean
+# distance of the other frames must be as small.
 NEAR_SHARE: Final = 0.02
-"""Maximum distance of a late frame from whole periods, as a share of a period, that counts as another sample.
-
-The mean distance of the other frames must be as small.
-"""
-HOLD_SHARE: Final = 0.25
-"""Maximum delay in an adapter, in periods. A longer delay hides the number of lost samples."""
+HOLD_SHARE: Final = 0.25  # maximum delay in an adapter, in periods. A longer delay hides the number of lost samples.
 
 
 class EvenArrivals:
@@ -156,10 +145,8 @@ class EvenArrivals:
     )  # fmt: skip
 
     def __init__(self) -> None:
-        self.t_ns = 0
-        """Time of the newest frame according to the fit, ns. `add_arrival` returns whether it is valid."""
-        self.error_ns = 0.0
-        """One-sigma error of `t_ns`, ns."""
+        self.t_ns = 0  # time of the newest frame according to the fit, ns. `add_arrival` returns whether it is valid.
+        self.error_ns = 0.0  # one-sigma error of `t_ns`, ns
         self.restart()
 
     def restart(self) -> None:
@@ -240,10 +227,8 @@ class EvenArrivals:
         return self._agreeing >= AGREEING
 
     def _use(self, delay: LinkDelay, fit: ArrivalFit, device_ns: int, line_ns: float, doubt_ns: float) -> bool:
-        """Set `t_ns` and `error_ns`. Return whether the fit is better than the arrival time.
-
-        The truth is up to `doubt_ns` after `line_ns`.
-        """
+        """Set `t_ns` and `error_ns`. Return whether the fit is better than the arrival time."""
+        # The truth is up to `doubt_ns` after `line_ns`.
         self.t_ns = int(line_ns - delay.floor_ns / 2 - fit.shift_ns)
         self.error_ns = hypot(fit.error_ns, delay.bias_error_ns(fit.hidden_ns)) + HALF * doubt_ns
         self.error_ns += fit.slope_error * (device_ns - fit.fitted_ns)
@@ -257,16 +242,13 @@ class ArrivalTime:
 
     def __init__(self, delay: LinkDelay, modulus: int, on_unknown_gap: Callable[[], None]) -> None:
         """`on_unknown_gap` is called for each gap with an unknown number of lost samples."""
-        self.delay = delay
-        """Delay of the present link."""
+        self.delay = delay  # delay of the present link
         self.spread = ArrivalSpread()
         self._even = EvenArrivals()
         self._losses = ArrivalLosses(modulus, on_unknown_gap)
         self._numbered = modulus > 0
-        self.error_ns = 0.0
-        """One-sigma error of the newest time, ns."""
-        self.missed = 0
-        """Number of lost samples directly before the newest frame."""
+        self.error_ns = 0.0  # one-sigma error of the newest time, ns
+        self.missed = 0  # number of lost samples directly before the newest frame
 
     @property
     def resets(self) -> int:

@@ -51,18 +51,14 @@ class RunStart(NamedTuple):
     """State at the start of a run, with the names of `SampleClock`."""
 
     device: str
-    seq: int
-    """Sequence number of the newest sample."""
-    t_ns: int
-    """Time stamp of the newest sample, ns."""
-    t_rx_ns: int
-    """CLOCK_MONOTONIC of the read, ns."""
+    seq: int  # sequence number of the newest sample
+    t_ns: int  # time stamp of the newest sample, ns
+    t_rx_ns: int  # CLOCK_MONOTONIC of the read, ns
     utc_offset_ns: int
     byte_ns: int
     waited_ns: int
     bias_ns: float
-    error_ns: float
-    """One-sigma error of the fit, ns."""
+    error_ns: float  # one-sigma error of the fit, ns
     sync: Sync
     own_status: int | None
 
@@ -187,8 +183,7 @@ class SampleClock:
         self._seq = self._t_ns = self._t_rx_ns = self._t_err_ns = 0
         self._error_ns = 0.0  # one-sigma error of the newest time stamp before its correction
         self._own_status: int | None = None
-        self.missed = 0
-        """Number of lost samples directly before the newest sample, without gaps of unknown size."""
+        self.missed = 0  # number of lost samples directly before the newest sample, without gaps of unknown size
         self.observer: InputObserver | None = None
         """Observer of the input; None if no recording runs. Set by `SamplePath.observe`."""
         self.waited_ns = 0  # set by the path: maximum time of the next frames in the kernel's buffer
@@ -505,11 +500,9 @@ class SampleClock:
         self._time.begin(ticks)
 
     def _after_jump(self, above_ns: float, ticks: int, arrival_ns: int, size_bytes: int) -> int:
-        """Return the time of the first frame after a jump of the counter: by UTC if known, else by arrival.
-
-        If the counter only seems to jump, it continues: frames in the fit were delayed, or the present frames are
-        delayed.
-        """
+        """Return the time of the first frame after a jump of the counter: by UTC if known, else by arrival."""
+        # If the counter only seems to jump, it continues: frames in the fit were delayed, or the present frames are
+        # delayed.
         aiding, time = self._aiding, self._time
         ran_on = above_ns > 0.0 or self._ran_on(time.even_ns, arrival_ns)
         if aiding is not None:
@@ -552,11 +545,9 @@ class SampleClock:
         return t_ns
 
     def _begin_phase(self, fit: ArrivalFit, device_ns: int, arrival_ns: int, size_bytes: int) -> int:
-        """Return the time of a sample after a change of the device's rate. Its position in the tick is unknown.
-
-        The rate of the crystal did not change. The clock keeps this rate, and uses the previous fit until a new fit is
-        accurate.
-        """
+        """Return the time of a sample after a change of the device's rate. Its position in the tick is unknown."""
+        # The rate of the crystal did not change. The clock keeps this rate, and uses the previous fit until a new fit
+        # is accurate.
         self._time.rephased, self.missed = False, self._time.missed
         holdover, slope, slope_error = self._holdover, fit.slope, fit.slope_error
         if self._fit_sync is not _ARRIVAL:

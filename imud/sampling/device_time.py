@@ -15,34 +15,25 @@ from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sampling.arrival_fit import SLOPE_HIGHEST, ArrivalFit
 from imud.sampling.gaps import CounterLine
 
-CONSISTENT: Final = 4
-"""Number of consecutive equal steps that make a period."""
+CONSISTENT: Final = 4  # number of consecutive equal steps that make a period
+# number of consecutive equal steps that make a longer period than the present one. If one of ten frames is lost at 1
+# kHz, four consecutive steps of two ticks occur every second minute. A period of two ticks would shift the device time
+# by one tick.
 CONSISTENT_LONGER: Final = 12
-"""Number of consecutive equal steps that make a longer period than the present one.
-
-If one of ten frames is lost at 1 kHz, four consecutive steps of two ticks occur every second minute. A period of two
-ticks would shift the device time by one tick.
-"""
-OFF_MOST: Final = 2.0
-"""Maximum difference between the steps of an uneven rate and the same number of periods, ticks."""
-STEADY_STEPS: Final = 64
-"""Number of consecutive equal steps after which another step is a change of the rate."""
+OFF_MOST: Final = 2.0  # maximum difference between the steps of an uneven rate and the same number of periods, ticks
+STEADY_STEPS: Final = 64  # number of consecutive equal steps after which another step is a change of the rate
 GAP_FACTOR: Final = 1.5
 """Factor between adjacent steps above which the longer step contains a gap, if the period is unknown."""
+# maximum number of periods in a gap that improves the period. The number in a longer gap depends on the period itself.
 LEARNED_STEPS: Final = 4
-"""Maximum number of periods in a gap that improves the period. The number in a longer gap depends on the period itself.
-"""
 WHOLE_AFTER: Final = 64
 """Number of equal steps after which the period is a whole number of ticks. An earlier different step was a loss."""
-WHOLE_OFF: Final = 0.5
-"""Maximum distance of a whole number of ticks from the mean. Beyond that, the rate is another."""
+WHOLE_OFF: Final = 0.5  # maximum distance of a whole number of ticks from the mean. Beyond that, the rate is another.
 UNJUDGED_MOST: Final = 64
 """Maximum number of steps that are stored until the period is known. A device with an even rate needs a few."""
+# period in ticks below which two samples can be in one tick. With a longer period, the tick contains the same sample.
 EVERY_TICK: Final = 1.5
-"""Period in ticks below which two samples can be in one tick. With a longer period, the tick contains the same sample.
-"""
-MEMORY: Final = 4096
-"""Number of steps in the mean of an uneven period. After that, both sums are halved."""
+MEMORY: Final = 4096  # number of steps in the mean of an uneven period. After that, both sums are halved.
 
 
 class PeriodLearner:
@@ -60,10 +51,8 @@ class PeriodLearner:
 
     def __init__(self, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
         self._on_unknown_gap = on_unknown_gap
-        self.is_gap = False
-        """Whether the newest step of another length was reported as a gap of unknown size."""
-        self.period_ticks = 0.0
-        """Mean step, ticks; 0 if unknown."""
+        self.is_gap = False  # whether the newest step of another length was reported as a gap of unknown size
+        self.period_ticks = 0.0  # mean step, ticks; 0 if unknown
         self._sum = 0.0
         self._count = 0.0
         self._even = 0
@@ -76,11 +65,10 @@ class PeriodLearner:
         self._odd_at = 0.0  # number of the last step of another length
         # whether many equal steps preceded it; a period from steps with losses is not a rate
         self._steady = False
-        self.is_new = False
-        """Whether the device's rate changed. The owner resets it."""
+        self.is_new = False  # whether the device's rate changed. The owner resets it.
+        # number of changes of the step, if the period is not a whole number of ticks; else 0. They show the phase in
+        # the tick.
         self.changes = 0
-        """Number of changes of the step, if the period is not a whole number of ticks; else 0. They show the phase in
-        the tick."""
 
     def add_step(self, ticks: int) -> int:
         """Add the step to the newest sample. Return the number of lost samples in the step."""
@@ -211,13 +199,10 @@ class PeriodLearner:
 
 
 # --- device time finer than a tick ----------------------------------------------------------------------------------
-QUANTISED: Final = 0.29
-"""One-sigma error of a truncated counter value, ticks: 1 / √12."""
+QUANTISED: Final = 0.29  # one-sigma error of a truncated counter value, ticks: 1 / √12
+# number of changed steps after which the phase of an uneven rate within a tick is accurate to a small part of a tick.
+# At 400 Hz and ticks of 1 ms, this takes 64 samples. A rate 50 ppm off 100 Hz takes ten minutes.
 SETTLED_CHANGES: Final = 64
-"""Number of changed steps after which the phase of an uneven rate within a tick is accurate to a small part of a tick.
-
-At 400 Hz and ticks of 1 ms, this takes 64 samples. A rate 50 ppm off 100 Hz takes ten minutes.
-"""
 UNSETTLED_MOST: Final = 512
 """Maximum number of samples until the phase of a new rate is accurate. A phase that takes longer drifts slowly."""
 EVEN_FOR: Final = 64
@@ -233,11 +218,9 @@ WATCHED: Final = 256
 # --- corrections ----------------------------------------------------------------------------------------------------
 CORRECTION_MOST_NS: Final = 250 * NS_PER_MS
 """Maximum correction of the counter, ns: more than an hour without pulses at 50 ppm. A larger step is a jump."""
-CORRECTION_SPAN_NS: Final = 5 * NS_PER_S
-"""Minimum span of a fit, ns. A shorter fit is less accurate than a correction."""
+CORRECTION_SPAN_NS: Final = 5 * NS_PER_S  # minimum span of a fit, ns. A shorter fit is less accurate than a correction.
 CORRECTION_SIGMAS: Final = 4
-CORRECTION_TICKS: Final = 0.5
-"""Distance below the fit, ticks, at which a frame arrived before its sample."""
+CORRECTION_TICKS: Final = 0.5  # distance below the fit, ticks, at which a frame arrived before its sample
 REPHASED_TICKS: Final = 1.05
 """Distance below the fit, ticks, if the step may start another rate: the samples can be anywhere in their ticks."""
 
@@ -275,8 +258,7 @@ class DeviceTime:
         """`on_unknown_gap` is called for each gap with an unknown number of lost samples."""
         self.tick_ns = tick_ns
         self.modulus = tick_modulus
-        self.ticks = 0
-        """Newest counter value."""
+        self.ticks = 0  # newest counter value
         self._phase_ns = 0.0
         self._shift_ns = 0.0  # corrections of the counter in `even_ns`
         # part of `_shift_ns` without confirmation by an arrival: the first step of another rate looks like a correction
@@ -286,22 +268,17 @@ class DeviceTime:
         self._gap = 0  # lost samples in the last gap while arrivals are compared
         self.uneven = False
         """Whether the newest step after many even steps differs from whole periods by more than a tick."""
-        self.doubt_ns = 0.0
-        """Difference between even samples and counter values, ns, that no arrival has confirmed."""
+        self.doubt_ns = 0.0  # difference between even samples and counter values, ns, that no arrival has confirmed
         # number of samples in which the phase of a new rate can become accurate
         self._unsettled = 0
         self.rephased = False
         """Whether the device's rate changed. The position of the samples in their ticks is then unknown."""
-        self.watched = 0
-        """Number of further samples whose device time is compared with the arrivals."""
+        self.watched = 0  # number of further samples whose device time is compared with the arrivals
         self.period = PeriodLearner(on_unknown_gap)
-        self.raw_ns = 0
-        """Unwrapped device time according to the counter, ns."""
+        self.raw_ns = 0  # unwrapped device time according to the counter, ns
+        # `raw_ns` plus the part of a tick that the even rate shows, ns. It does not fall while the counter continues.
         self.even_ns = 0
-        """`raw_ns` plus the part of a tick that the even rate shows, ns. It does not fall while the counter continues.
-        """
-        self.missed = 0
-        """Number of lost samples between the two newest samples."""
+        self.missed = 0  # number of lost samples between the two newest samples
 
     def begin(self, ticks: int) -> None:
         """Set the first counter value of a device, or the first value after a restart of its counter."""
@@ -490,8 +467,7 @@ class JumpDetector:
     def __init__(self) -> None:
         self._since_ns = 0
         self._begin_ns = 0  # device time between the first late frame and the previous frame
-        self.late_reads = 0
-        """Number of consecutive late reads."""
+        self.late_reads = 0  # number of consecutive late reads
 
     def is_late_since_gap(self, period_ns: float) -> bool:
         """Return whether samples were lost before the first late frame: the counter may have restarted there."""
@@ -533,14 +509,10 @@ class JumpDetector:
         return self.late_reads >= JUMP_LATE_READS and t_rx_ns - self._since_ns > NS_PER_S
 
 
-PULSE_TICKS: Final = 1000
-"""Time between pulses, ms."""
-EARLY_NS: Final = 100 * NS_PER_MS
-"""Minimum time before the earliest possible arrival, ns, that shows a pulse."""
-DRIFT: Final = 200e-6
-"""Maximum rate error of a device's crystal compared to the host."""
-LATE_NS: Final = 400 * NS_PER_MS
-"""Maximum distance of the lateness of live frames from whole turns, ns."""
+PULSE_TICKS: Final = 1000  # time between pulses, ms
+EARLY_NS: Final = 100 * NS_PER_MS  # minimum time before the earliest possible arrival, ns, that shows a pulse
+DRIFT: Final = 200e-6  # maximum rate error of a device's crystal compared to the host
+LATE_NS: Final = 400 * NS_PER_MS  # maximum distance of the lateness of live frames from whole turns, ns
 # live frames: over this number of ticks, their pace equals the pace of their values within this share. A step that
 # differs from the time between arrivals by more than a latency timer restarts the count.
 LIVE_TICKS: Final = 640
@@ -564,8 +536,7 @@ class StampTime:
     def __init__(self, modulus: int) -> None:
         self._modulus = modulus
         self._stamp = -1  # newest value; -1 before the first
-        self.before = 0
-        """Ticks of the previous frame."""
+        self.before = 0  # ticks of the previous frame
         self._ticks = 0  # unwrapped ticks of the newest frame
         self._arrival_ns = 0
         self._origin_ns = 0  # arrival relative to which lateness is measured
@@ -575,8 +546,7 @@ class StampTime:
         self._pulsed = False  # whether a pulse per second resets the value
         self._foreign_ticks: int | None = None
         self._foreign_since_ns = 0
-        self.in_use = False
-        """Whether the ticks come from `pps_age_ms`."""
+        self.in_use = False  # whether the ticks come from `pps_age_ms`
 
     def ticks(self, stamp: int, arrival_ns: int, known_ticks: int | None) -> int | None:
         """Return the ticks of a frame; None if `stamp` does not show its time.
@@ -632,10 +602,8 @@ class StampTime:
         return arrival_ns - self._origin_ns - ticks * NS_PER_MS - self._lowest_ns
 
     def _step(self, stamp: int, before: int, arrival_ns: int, elapsed_ns: int) -> int:
-        """Return the ticks since the previous frame. The value may have wrapped, or a pulse may have reset it.
-
-        The first pulse can come at any value. The arrivals then show the time since the previous frame.
-        """
+        """Return the ticks since the previous frame. The value may have wrapped, or a pulse may have reset it."""
+        # The first pulse can come at any value. The arrivals then show the time since the previous frame.
         turned = (stamp - before) % self._modulus
         if stamp >= before:
             return turned

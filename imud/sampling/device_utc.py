@@ -1,13 +1,14 @@
-"""Devices on UTC or with a pulse per second: each sample lies within a millisecond of known time.
+"""Devices with UTC or with a pulse per second: the time of each sample is known within one millisecond.
 
-`DeviceUtc`: with PPS and RMC the ms counter of a HiPNUC module turns into "UTC in ms" (manual 1.2.1); of 32 bits, so
-either Unix time modulo 2³² or the time of day, no source says which. A counter that agrees with the host's UTC within
-milliseconds eight times in a second or more, or right after it jumped, is UTC. GPS time, 18 s ahead, never agrees.
+`DeviceUtc`: with PPS and RMC, the ms counter of a HiPNUC device becomes "UTC in ms" (manual 1.2.1). The counter has 32
+bits. It is therefore Unix time modulo 2³² or the time of day; no source defines which. A counter is UTC if it agrees
+with the host's UTC within some milliseconds eight times in at least one second, or directly after a jump. GPS time is
+18 s ahead and never agrees.
 
-`PpsAge`: the host and the device both see a pulse per second, and `pps_age_ms` is how long before a sample it was. It
-is in whole ms, taken as cut off (the HiPNUC manual 3.3.1 says "the time elapsed"; that it is cut and not rounded is
-assumed, as in its other stamps), so each sample lies between pulse + age and a millisecond later. Behind a plain UART
-the fit of arrivals is better than that; behind a slow adapter the pulse is.
+`PpsAge`: host and device receive the same pulse per second. `pps_age_ms` is the time from the pulse to the sample in
+whole ms, assumed as truncated (the HiPNUC manual 3.3.1 says only "the time elapsed"; other counters are truncated).
+Each sample is therefore between pulse + age and one millisecond later. Behind a UART without an adapter, the fit of
+arrivals is more accurate. Behind a slow adapter, the pulse is more accurate.
 """
 
 from collections import deque
@@ -20,16 +21,16 @@ from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sampling.arrival_fit import Point, feasible_lines, lower_hull
 from imud.sampling.arrival_time import SIGMA_OF_RANGE
 
+# 32 s of intervals: a crystal that drifts by 0.1 ppm/s is then at most 13 µs off a straight line
 BIN_NS: Final = NS_PER_S
 BINS: Final = 32
-"""Half a minute: a crystal that drifts by 0.1 ppm/s leaves a straight line by 13 µs."""
 NARROWEST_NS: Final = 60 * NS_PER_US
+# maximum distance between fit and intervals without a contradiction, in standard errors: a constant delay can be √3.
 APART_SIGMAS: Final = 1.75
-"""A constant delay that hides in the fit is anything up to √3 of its sigmas: within that nothing contradicts."""
 
 
 class _Bin:
-    """The narrowest bounds in an interval of device time, each with its device time."""
+    """Narrowest bounds of the time in an interval of device time."""
 
     __slots__ = ("begin_ns", "high", "high_device_ns", "low", "low_device_ns")
 
@@ -39,7 +40,7 @@ class _Bin:
         self.high = high
 
     def narrow(self, device_ns: int, low: int, high: int, slope: float) -> None:
-        """Add another interval, `slope` host ns per device ns."""
+        """Add bounds at `device_ns`. `slope` is host ns per device ns."""
         if low - self.low > slope * (device_ns - self.low_device_ns):
             self.low, self.low_device_ns = low, device_ns
         if high - self.high < slope * (device_ns - self.high_device_ns):
@@ -47,9 +48,9 @@ class _Bin:
 
 
 class IntervalFit:
-    """Lowest and highest possible time of a sample, by the intervals of the last half minute.
+    """Lowest and highest possible time of a sample, from the intervals of the last 32 s.
 
-    The set is never taken for narrower than `narrowest_ns`.
+    The width of the result is at least `narrowest_ns`.
     """
 
     __slots__ = (
@@ -63,12 +64,10 @@ class IntervalFit:
         self._ref_device_ns = self._ref_ns = 0
         self._middle = 0.0
         self._slope = 1.0
-        # of the set at `_ref_device_ns`, and how much it opens per device ns from there on
+        # width at `_ref_device_ns`, and its increase per device ns
         self._width_ns = self._fan = 0.0
-        self.newest_ns = 0
-        """Device time of the newest interval."""
-        self.known = False
-        """Whether there is an estimate."""
+        self.newest_ns = 0  # device time of the newest interval, ns
+        self.known = False  # whether the fit has a result
 
     def clear(self) -> None:
         """Forget all intervals."""
@@ -76,9 +75,9 @@ class IntervalFit:
         self.known = False
 
     def add_interval(self, device_ns: int, low: int, high: int, arrival_ns: int, slope: float) -> None:
-        """Add that the sample at `device_ns` is between `low` and `high`, and not after the arrival of its message.
+        """Add that the sample at `device_ns` is between `low` and `high`, and not after the arrival of its frame.
 
-        A device ns is about `slope` host ns.
+        `slope` is the approximate host ns per device ns.
         """
         if low < arrival_ns < high:
             high = arrival_ns
@@ -92,17 +91,17 @@ class IntervalFit:
         bins.append(_Bin(device_ns, low, high))
 
     def width_ns(self, device_ns: int) -> float:
-        """Width of the set at `device_ns`, not before its newest end."""
+        """Return the distance between lowest and highest time at `device_ns`, ns."""
         return self._width_ns + self._fan * (device_ns - self._ref_device_ns)
 
     def combined(self, device_ns: int, fit_ns: int, error_ns: float, common_ns: float) -> tuple[float, float]:
-        """Return (what to add to the fit of arrivals for the sample at `device_ns`, one-sigma error after it).
+        """Return (correction of the fit of arrivals at `device_ns`, one-sigma error after the correction), ns.
 
-        `error_ns` is the error of the fit, `common_ns` the error that all intervals share. Each weighs by its error,
-        and the result lies within the set. Both can be wrong by the same uneven ticks, so the error is that of the
-        better, and a fit that has to be moved into the set is worse by that. Where the two contradict each other beyond
-        their errors, one of them is wrong, and nothing shows which: a device that gets no pulse any more reports for a
-        while that it is on UTC.
+        `error_ns` is the error of the fit, `common_ns` the error that all intervals share. The result is the weighted
+        mean of both, and is within the bounds. The same uneven ticks can affect both, so the error is the smaller of
+        both errors. A fit that is outside of the bounds has a larger error. If both contradict each other, the error is
+        half of the difference, because it is unknown which of them is wrong: a device without pulses reports for a time
+        that it is on UTC.
         """
         width_ns = max(self.width_ns(device_ns), self._narrowest_ns)
         middle = self._ref_ns - fit_ns + self._middle + self._slope * (device_ns - self._ref_device_ns)
@@ -116,7 +115,7 @@ class IntervalFit:
         return held, error
 
     def _fit(self, device_ns: int, slope: float) -> None:
-        """Fit all bins again; the oldest go where no line passes through all."""
+        """Fit all bins again. If no line passes through all bins, drop the older half."""
         bins = self._bins
         while bins:
             x0, y0 = bins[0].begin_ns, bins[0].low
@@ -139,7 +138,7 @@ class IntervalFit:
 
 
 def _point(x: int, y: int, slope: float) -> Point:
-    """A point relative to a line through the origin."""
+    """Return a point relative to a line through the origin."""
     return float(x), y - slope * x
 
 
@@ -149,23 +148,20 @@ SLACK_NS: Final = 2 * NS_PER_MS
 TOLERANCE_MOST_NS: Final = NS_PER_S // 4
 AGREEMENTS: Final = 8
 DISAGREEMENTS: Final = 8
+# additional one-sigma error, ticks: half a tick combined with the 1 / √12 of the intervals. Both errors can stay at
+# their bounds for one minute (20 ppm at 100 Hz). Twice this error covers their sum, one tick.
 TICK_ERROR: Final = 1 / sqrt(6)
-"""Half a tick with the intervals' own 1 / √12. Both errors can stand still at their bounds for a minute (20 ppm at 100
-Hz), a tick together, and twice the stated error covers that."""
-CHECK_EVERY_NS: Final = NS_PER_S // 8
-"""A device that is not on UTC is checked so often."""
-REFERENCE_STEP: Final = 4
-"""Change of a reference, in its errors, above which it was set anew: earlier intervals no longer hold."""
+CHECK_EVERY_NS: Final = NS_PER_S // 8  # time between checks of a device that is not on UTC, ns
+REFERENCE_STEP: Final = 4  # change of the reference, in its errors, after which earlier intervals are invalid
 AGE_MOST_MS: Final = 2000
-"""Oldest valid age: one pulse may be missing; an older age belongs to an input without pulses."""
-STAMP_NS: Final = 50 * NS_PER_US
-"""The host's stamp of a pulse may be late by so much."""
+"""Maximum valid age, ms: one pulse may be lost. A larger age means that the input receives no pulses."""
+STAMP_NS: Final = 50 * NS_PER_US  # maximum delay of the host's time stamp of a pulse, ns
 STALE_NS: Final = 3 * NS_PER_S
 PULSES_KEPT: Final = 8
 
 
 class DeviceUtc:
-    """Detection that a device's counter is UTC, and the time of its samples by UTC."""
+    """Detection of a device counter that is UTC, and the time of its samples by UTC."""
 
     __slots__ = ("_agreed", "_checked_ns", "_differed", "_tick_ns", "_turn_ns", "active", "intervals", "reference")
 
@@ -175,19 +171,17 @@ class DeviceUtc:
         self._agreed = 0
         self._differed = 0
         self._checked_ns = 0
-        self.reference: UtcReference | None = None
-        """The host's estimate of UTC; None while it has none."""
-        self.active = False
-        """Whether the device is on UTC."""
-        self.intervals = IntervalFit(tick_ns)  # device time itself is no finer than that
+        self.reference: UtcReference | None = None  # the host's estimate of UTC; None if unknown
+        self.active = False  # whether the device is on UTC
+        self.intervals = IntervalFit(tick_ns)  # device time is not finer than a tick
 
     @property
     def tick_error_ns(self) -> float:
-        """Additional error: device time is as coarse as UTC now, and samples need not keep step with it."""
+        """Return the one-sigma error of the device time, ns. Samples can be anywhere in a tick."""
         return TICK_ERROR * self._tick_ns
 
     def set_reference(self, reference: UtcReference | None) -> None:
-        """Set the host's present estimate of UTC."""
+        """Set the host's present estimate of UTC. Discard the intervals if it changed by a step."""
         before = self.reference
         if before and reference:
             step_ns = abs(reference.offset_ns - before.offset_ns)
@@ -198,21 +192,24 @@ class DeviceUtc:
             self.reset()
 
     def reset(self) -> None:
-        """Forget that the device was on UTC."""
+        """Mark the device as not on UTC."""
         self.active = False
         self._agreed = self._differed = 0
         self._checked_ns = 0
         self.intervals.clear()
 
     def above(self, ticks: int, t_ns: int, error_ns: float) -> int | None:
-        """How much later than `t_ns`, one sigma `error_ns`, the tick began by UTC; None when it does not agree."""
+        """Return the time from `t_ns` to the start of the tick by UTC, ns; None if the counter does not agree with UTC.
+
+        `error_ns` is the one-sigma error of `t_ns`.
+        """
         reference = self.reference
         if reference is None:
             return None
         tolerance = min(SIGMAS * (error_ns + reference.error_ns) + SLACK_NS, TOLERANCE_MOST_NS)
         device_ns = ticks * self._tick_ns
         off_ns = device_ns - t_ns - reference.offset_ns
-        for turn_ns in (self._turn_ns, DAY_NS):
+        for turn_ns in (self._turn_ns, DAY_NS):  # Unix time modulo 2³², or the time of day
             half = turn_ns // 2
             above = (off_ns + half) % turn_ns - half
             if -tolerance - self._tick_ns <= above <= tolerance and device_ns < turn_ns:
@@ -223,9 +220,9 @@ class DeviceUtc:
         self, ticks: int, device_ns: int, arrival_ns: int, fit_ns: int, fit_error_ns: float, slope: float, *,
         refused: bool,
     ) -> None:  # fmt: skip
-        """Compare the sample at `device_ns`, by the fit at `fit_ns`, with UTC.
+        """Compare the sample at `device_ns`, at `fit_ns` according to the fit, with UTC.
 
-        Its message began at `arrival_ns` at the latest; `refused` when the device's status says it is not on UTC.
+        `arrival_ns` is the latest start of its frame. `refused`: the device reports that it is not on UTC.
         """
         if refused or self.reference is None:
             if self.active or self._agreed:
@@ -250,14 +247,14 @@ class DeviceUtc:
             self.intervals.add_interval(device_ns, fit_ns + above, fit_ns + above + self._tick_ns, arrival_ns, slope)
 
     def confirm(self) -> None:
-        """Accept at once that the device is on UTC: its counter jumped to what agrees, which is no chance."""
+        """Mark the device as on UTC immediately: its counter jumped to a value that agrees."""
         self.intervals.clear()
         self.active = True
         self._agreed, self._differed = AGREEMENTS, 0
 
 
 class PpsAge:
-    """Intervals for the time of samples, from pulses per second and from the samples' age since the newest pulse."""
+    """Intervals for the time of samples, from the pulses per second and the age of each sample."""
 
     __slots__ = ("_pulses_ns", "_trusted", "intervals")
 
@@ -267,16 +264,17 @@ class PpsAge:
         self.intervals = IntervalFit()
 
     def add_pulses(self, pulses_ns: Iterable[int]) -> None:
-        """Add rising edges in their order, before the messages that follow them."""
+        """Add rising edges in order, before the frames that follow them."""
         self._pulses_ns.extend(pulses_ns)
 
     def add_age(
         self, age_ms: int, device_ns: int, arrival_ns: int, fit_ns: int, fit_error_ns: float, slope: float,
         slope_error: float,
     ) -> None:  # fmt: skip
-        """Add that a pulse was `age_ms` before the sample at `device_ns`, which is at `fit_ns` by the fit.
+        """Add that a pulse was `age_ms` before the sample at `device_ns`, at `fit_ns` according to the fit.
 
-        Its message began at `arrival_ns` at the latest. A device ns is `slope` host ns, one sigma `slope_error`.
+        `arrival_ns` is the latest start of its frame. `slope` is host ns per device ns, `slope_error` its one-sigma
+        error.
         """
         if age_ms > AGE_MOST_MS:
             return
@@ -293,7 +291,7 @@ class PpsAge:
                 return
 
     def is_better(self, device_ns: int, fit_error_ns: float) -> bool:
-        """Whether fresh intervals are better than the fit; once they are, until they are half as good."""
+        """Return whether the intervals are more accurate than the fit, or up to half as accurate if they are in use."""
         intervals = self.intervals
         if device_ns - intervals.newest_ns > STALE_NS:
             intervals.clear()

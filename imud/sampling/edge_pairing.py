@@ -1,14 +1,16 @@
-"""Pairing of edges with samples, robust against the loss of either.
+"""Pairing of edges with samples. It tolerates the loss of edges and of samples.
 
-An event is a pulse on SOUT or a trigger on SIN; its stamp is the kernel's, its number that of its rising edge or of the
-trigger. Counting alone goes wrong with the first loss. Device time says how many periods lie between two samples, so
-the line through the events paired so far (`EdgeTracker`) predicts when the event of each sample is due; the nearest
-event within a narrow window is its own, those passed over belong to no sample, and a sample without one in its window
-lost it. To begin with, the fit of arrivals predicts: as soon as its error is below half a period, eight samples are
-compared with their nearest events, and a line through most of them is the beginning. A line that is off by whole
-periods, because the fit was, is found when the fit is known better, and by events that come after their message.
+An event is a pulse on SOUT or a trigger on SIN, with the time stamp of the kernel and the number of its rising edge or
+trigger. A count of events would be wrong after the first loss. The device time shows the number of periods between two
+samples. The line through the paired events (`EdgeTracker`) therefore predicts the event of each sample. The nearest
+event in a narrow window is the event of the sample. Earlier events belong to no sample. A sample without an event in
+its window lost its event.
 
-Pulses on SOUT_DIV are only assigned to samples (`MarkPairing`): cameras are triggered by them.
+At the start, the fit of arrivals predicts the events. If its error is below half a period, the module compares eight
+samples with their nearest events, and starts a line through most of them. A line that is wrong by whole periods is
+found later, if the fit is more accurate or if events arrive after their frames.
+
+`MarkPairing` assigns pulses on SOUT_DIV to samples. Users trigger cameras with these pulses.
 """
 
 from collections import deque
@@ -20,47 +22,36 @@ from typing import Final
 from imud.contracts.lines import Edge, Mark
 from imud.model.units import NS_PER_US
 
-REACH: Final = 0.45
-"""Share of a period; an event further off than this belongs to another sample."""
-SURE: Final = 1.4
-"""The fit may choose the events of the first samples when this multiple of its error is within reach."""
+REACH: Final = 0.45  # maximum distance of an event from its predicted time, as a share of a period
+SURE: Final = 1.4  # factor for the error of the fit that must be within REACH before the fit selects the first events
+# window around the predicted time: WINDOW_NS plus WINDOW_SPREADS times the spread of the events
 WINDOW_NS: Final = 30 * NS_PER_US
 WINDOW_SPREADS: Final = 8
 FIRST: Final = 8
-AGREE: Final = 6
-"""AGREE of the FIRST samples must agree."""
+AGREE: Final = 6  # number of the FIRST samples that must agree
 AGREE_NS: Final = 150 * NS_PER_US
-AGREE_SHARE: Final = 0.1
-"""Tolerance of agreement in ns, or as a share of a period."""
-MISSES_MOST: Final = 8
-"""Number of samples in a row without an event after which the line is dropped."""
+AGREE_SHARE: Final = 0.1  # maximum distance of agreeing events from their median, in ns or as a share of a period
+MISSES_MOST: Final = 8  # number of consecutive samples without an event after which the line is dropped
 WRONG: Final = 0.75
-WRONG_MOST: Final = 64
-"""The line is wrong when the fit is off by this share of a period for that many samples in a row."""
+WRONG_MOST: Final = 64  # number of consecutive samples with a fit off by WRONG periods after which the line is wrong
+# maximum difference of the slopes of line and fit. A larger difference means that the events belong to other samples.
 SLOPE_OFF_MOST: Final = 0.12
-"""A line whose slope differs from the fit's by more went through the events of other samples: past two crystals."""
-LEARNED: Final = 16
-"""Number of pairs from which the delay of the fit behind the events is known."""
-QUEUE_MOST: Final = 4096
-"""Events that wait for their message: 4 s at 1 kHz."""
-TRACKED: Final = 32
-"""Length of the tracker's memory, in events."""
+LEARNED: Final = 16  # number of pairs after which the delay of the fit behind the events is known
+QUEUE_MOST: Final = 4096  # maximum number of events that wait for their frame: 4 s at 1 kHz
+TRACKED: Final = 32  # number of events in the memory of the tracker
 SMOOTHING: Final = 1 / 32
 FIRST_SPREAD_NS: Final = 10 * NS_PER_US
-MARK_REACH: Final = 0.5
-"""Share of a period; a sample further off than this is not the mark's."""
-MARKS_KEPT: Final = 1024
-"""Most marks that are kept for the reader, and most pulses that wait for their sample."""
+MARK_REACH: Final = 0.5  # maximum distance of a sample from its pulse, as a share of a period
+MARKS_KEPT: Final = 1024  # maximum number of marks for the reader, and of pulses that wait for their sample
 _LEVEL_GAIN: Final = (1.0, 1.0, *(2 * (2 * n - 1) / (n * (n + 1)) for n in range(2, TRACKED + 1)))
 # gains of the n-th of equally weighted points on a line
 _SLOPE_GAIN: Final = (0.0, 0.0, *(6 / (n * (n + 1)) for n in range(2, TRACKED + 1)))
 
-EdgeStamp = tuple[int, int]
-"""(CLOCK_MONOTONIC of a rising edge, its number)."""
+EdgeStamp = tuple[int, int]  # time of a rising edge, ns, and its number
 
 
 class PulseDecoder:
-    """Decoder of edges into pulses of known width: a falling edge stands in for a lost rising one."""
+    """Decoder of edges into pulses of known width. A falling edge replaces a lost rising edge."""
 
     __slots__ = ("_risen", "_width_ns")
 
@@ -69,7 +60,7 @@ class PulseDecoder:
         self._risen = 0
 
     def decode(self, edges: Sequence[Edge]) -> list[EdgeStamp]:
-        """Return the pulses in `edges`; one whose rising edge is missing is counted back from its falling edge."""
+        """Return the pulses in `edges`. Compute a lost rising edge from the falling edge."""
         pulses: list[EdgeStamp] = []
         for t_ns, rising, number in edges:
             if rising:
@@ -86,11 +77,11 @@ def rising_edges(edges: Sequence[Edge]) -> list[EdgeStamp]:
 
 
 class EdgeTracker:
-    """A line from device time to host time through the stamps of periodic events; it predicts the next event.
+    """Line from device time to host time through periodic events. It predicts the next event.
 
-    Unlike arrivals, stamps of edges are late by microseconds, so their mean is followed and not their lower envelope:
-    at first a fit of equal weights, later one that forgets (alpha-beta filter), 32 events long. A crystal that drifts
-    by 0.1 ppm/s is then followed within 0.1 µs at 10 Hz and above.
+    The time stamps of edges are late by microseconds, not by milliseconds as arrivals. The line therefore follows their
+    mean and not their lower envelope: first a fit with equal weights, then an alpha-beta filter over 32 events. It
+    follows a crystal that drifts by 0.1 ppm/s within 0.1 µs at 10 Hz and above.
     """
 
     __slots__ = ("_count", "_device_ns", "_edge_ns", "_offset", "slope", "spread_ns")
@@ -98,24 +89,22 @@ class EdgeTracker:
     def __init__(self, device_ns: int, edge_ns: int, slope: float) -> None:
         self._device_ns = device_ns
         self._edge_ns = edge_ns
-        # the line at `_device_ns`, above `_edge_ns`: floats of ns since boot lose digits after some months
+        # line at `_device_ns`, relative to `_edge_ns`: a float of ns since boot loses digits after some months
         self._offset = 0.0
         self._count = 1
-        self.slope = slope
-        """Host ns per device ns."""
-        self.spread_ns = float(FIRST_SPREAD_NS)
-        """Mean distance of stamps from where they were due."""
+        self.slope = slope  # host ns per device ns
+        self.spread_ns = float(FIRST_SPREAD_NS)  # mean distance of events from their predicted time, ns
 
     def above(self, device_ns: int, edge_ns: int) -> float:
-        """Delay of the event at `edge_ns` behind the line at `device_ns`, ns."""
+        """Return the delay of the event at `edge_ns` behind the line at `device_ns`, ns."""
         return edge_ns - self._edge_ns - self._offset - self.slope * (device_ns - self._device_ns)
 
     def due_ns(self, device_ns: int) -> int:
-        """Predict the time of the event at `device_ns`."""
+        """Return the predicted time of the event at `device_ns`, ns."""
         return self._edge_ns + int(self._offset + self.slope * (device_ns - self._device_ns))
 
     def add_edge(self, device_ns: int, edge_ns: int, above: float) -> None:
-        """Follow an event `above` its due time; `device_ns` rises."""
+        """Follow an event `above` ns after its predicted time. `device_ns` must rise."""
         self._count = n = self._count + 1 if self._count < TRACKED else TRACKED
         self.slope += _SLOPE_GAIN[n] * above / (device_ns - self._device_ns)
         self._offset = (_LEVEL_GAIN[n] - 1.0) * above
@@ -123,18 +112,17 @@ class EdgeTracker:
         self.spread_ns += ((above if above > 0 else -above) - self.spread_ns) * SMOOTHING
 
     def widen(self, above: float) -> None:
-        """Count an event at this distance into the spread without following it."""
+        """Add an event to the spread without following it."""
         self.spread_ns += (abs(above) - self.spread_ns) * SMOOTHING
 
     def set_spread(self, spread_ns: float) -> None:
-        """Set the spread that the first events show."""
         self.spread_ns = spread_ns
 
 
 class EdgePairing:
     """Pairing of the events of one source with samples.
 
-    `lead_ns` is the time from the event to the first byte of the message.
+    `lead_ns` is the time from the event to the first byte of the frame.
     """
 
     __slots__ = (
@@ -149,32 +137,25 @@ class EdgePairing:
         self._first: list[tuple[int, int]] = []
         self._pairs = 0
         self._wrong = 0
-        self.delay_ns = float(lead_ns)
-        """Delay of the fit of arrivals behind the events, ns."""
-        self.delay_error_ns = 0.0
-        """One-sigma error of the fit when it was compared last."""
-        self.learned = False
-        """Whether `delay_ns` comes from pairs."""
-        self.due_ns = 0
-        """Predicted time of the newest sample's event; only while `running`."""
-        self.spread_ns = float(FIRST_SPREAD_NS)
-        """Mean distance of events from where they were due."""
+        self.delay_ns = float(lead_ns)  # delay of the fit of arrivals behind the events, ns
+        self.delay_error_ns = 0.0  # one-sigma error of the fit at the newest pair, ns
+        self.learned = False  # whether `delay_ns` comes from pairs
+        self.due_ns = 0  # predicted time of the newest sample's event, ns; valid only while `running`
+        self.spread_ns = float(FIRST_SPREAD_NS)  # mean distance of events from their predicted time, ns
         self.stamp_ns = 0
-        self.number = 0
-        """The event of the newest sample that was paired."""
-        self.misses = 0
-        """Samples in a row without event."""
+        self.number = 0  # number of the newest paired event. `stamp_ns` is its time.
+        self.misses = 0  # number of consecutive samples without an event
         self.events = 0
         self.events_unpaired = 0
         self.samples_unpaired = 0
 
     @property
     def running(self) -> bool:
-        """Whether there is a line through events."""
+        """Return whether a line through events exists."""
         return self._tracker is not None
 
     def add_events(self, events: Sequence[EdgeStamp]) -> None:
-        """Add events in their order, before the messages that follow them."""
+        """Add events in order, before the frames that follow them."""
         queue = self._queue
         queue.extend(events)
         self.events += len(events)
@@ -183,12 +164,12 @@ class EdgePairing:
             self.events_unpaired += 1
 
     def restart(self) -> None:
-        """Forget all that is relative to device time or to the fit: either began anew. Events that wait stay."""
+        """Restart with a new device time or fit. Keep the waiting events."""
         self.learned = False
         self._drop_line()
 
     def _drop_line(self) -> None:
-        """Drop the line; a learned delay of the fit behind the events still holds."""
+        """Drop the line. Keep a learned delay of the fit behind the events."""
         self._tracker = None
         self._first.clear()
         self.misses = self._wrong = 0
@@ -199,10 +180,10 @@ class EdgePairing:
     def pair(
         self, device_ns: int, arrival_ns: int, fit_ns: int, fit_error_ns: float, period_ns: float, slope: float
     ) -> bool:
-        """Find the event of the sample at `device_ns`, whose message began at `arrival_ns` at the latest.
+        """Find the event of the sample at `device_ns`. Return whether `stamp_ns` and `number` are this event.
 
-        `fit_ns` is its time by the fit of arrivals, one sigma `fit_error_ns`; `period_ns` between samples (0: unknown).
-        Returns whether `stamp_ns` and `number` are its event's.
+        `arrival_ns` is the latest start of the sample's frame. `fit_ns` is its time according to the fit,
+        `fit_error_ns` the one-sigma error. `period_ns` is the time between samples, 0 if unknown.
         """
         tracker = self._tracker
         reach = REACH * period_ns
@@ -226,13 +207,13 @@ class EdgePairing:
         return self._learn(fit_ns - self.due_ns, late=self.stamp_ns > arrival_ns, most=WRONG * period_ns)
 
     def _learn(self, delay_ns: int, *, late: bool, most: float) -> bool:
-        """Compare a pair with the fit of arrivals; drop the line and return False when they contradict."""
+        """Compare a pair with the fit of arrivals. If they contradict each other, drop the line and return False."""
         if self._pairs:
             self.delay_ns += (delay_ns - self.delay_ns) * SMOOTHING
         else:
             self.delay_ns = float(delay_ns)
         self._pairs += 1
-        if late or abs(self.delay_ns - self._lead_ns) > most:
+        if late or abs(self.delay_ns - self._lead_ns) > most:  # an event after its frame, or a wrong period
             self._wrong += 1
             if self._wrong >= WRONG_MOST:
                 self.restart()
@@ -243,12 +224,13 @@ class EdgePairing:
         return True
 
     def skip(self, device_ns: int) -> None:
-        """Pass over the sample at `device_ns`, which has no event."""
+        """Pass the sample at `device_ns`, which has no event."""
         if self._tracker is not None:
             self.due_ns = self._tracker.due_ns(device_ns)
 
     def _nearest(self, tracker: EdgeTracker, device_ns: int, reach: float) -> bool:
-        """Find the event nearest to the predicted time, drop those before it; follow it if it is in the window."""
+        """Find and follow the event nearest to the predicted time. Return whether it is in the window."""
+        # Drop the earlier events.
         queue = self._queue
         best, best_off = (0, 0), inf
         while queue:
@@ -266,7 +248,7 @@ class EdgePairing:
         window = WINDOW_NS + WINDOW_SPREADS * tracker.spread_ns
         if abs(best_off) > window:
             self.events_unpaired += 1
-            tracker.widen(min(abs(best_off), 2 * window))  # one stray event must not open the window
+            tracker.widen(min(abs(best_off), 2 * window))  # one wrong event must not widen the window
             self.spread_ns = tracker.spread_ns
             return False
         self.stamp_ns, self.number = best
@@ -275,7 +257,7 @@ class EdgePairing:
         return True
 
     def _acquire(self, device_ns: int, due_ns: int, period_ns: float, slope: float) -> None:
-        """Note the nearest event; begin a line when enough agree."""
+        """Store the nearest event. Start a line if enough events agree."""
         reach, queue, first = REACH * period_ns, self._queue, self._first
         while queue and queue[0][0] < due_ns - reach:
             queue.popleft()
@@ -297,7 +279,7 @@ class EdgePairing:
             self._begin(agreed, slope, spread_ns)
 
     def _begin(self, points: list[tuple[int, int]], slope: float, spread_ns: float) -> None:
-        """Begin a line through the first pairs of (device ns, event ns)."""
+        """Start a line through the first pairs of (device ns, event ns)."""
         self._tracker = tracker = EdgeTracker(*points[0], slope)
         for device_ns, t_ns in points[1:]:
             tracker.add_edge(device_ns, t_ns, tracker.above(device_ns, t_ns))
@@ -317,11 +299,11 @@ class MarkPairing:
         self._found: deque[Mark] = deque(maxlen=MARKS_KEPT)
 
     def add_pulses(self, pulses: Sequence[EdgeStamp]) -> None:
-        """Add rising edges in their order, before the messages that follow them."""
+        """Add rising edges in order, before the frames that follow them."""
         self._waiting.extend(pulses)
 
     def add_sample(self, t_ns: int, seq: int, period_ns: float) -> None:
-        """Add sample `seq`, whose pulse was or would have been at `t_ns`; samples in their order."""
+        """Add sample `seq`, with its real or possible pulse at `t_ns`. Add the samples in order."""
         waiting, reach = self._waiting, MARK_REACH * period_ns
         if not period_ns:
             return
@@ -330,7 +312,7 @@ class MarkPairing:
             self._found.append(Mark(at_ns, number, seq if at_ns >= t_ns - reach else None))
 
     def take_marks(self) -> list[Mark]:
-        """Return the pulses whose samples are known by now, in order, each once."""
+        """Return the new pulses with their sample, in order. Each pulse is returned once."""
         marks = list(self._found)
         self._found.clear()
         return marks

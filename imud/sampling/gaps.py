@@ -1,8 +1,8 @@
-"""Gaps between samples where the device's counter alone does not give their size.
+"""Gaps between samples, if the device counter alone does not show their size.
 
-`CounterLine` keeps where a counter of time was before its fit began anew: messages that waited while the host was busy
-make a fit that is late, and a message on time then looks as if the counter had jumped. `ArrivalPace` is for devices
-without time: the pace of their arrivals, learned from the messages that waited least, shows what is missing.
+`CounterLine` keeps the position of a device counter from before the present fit. Frames that waited for a busy host
+make a fit that is late. A frame in time then looks like a jump of the counter. `ArrivalPace` is for devices without
+device time: the pace of the frames with the shortest wait shows the lost samples.
 """
 
 from collections.abc import Callable
@@ -15,51 +15,43 @@ from imud.sampling.arrival_fit import ArrivalFit
 # --- counters of time -----------------------------------------------------------------------------------------------
 EARLY_NS: Final = 5 * NS_PER_MS
 EARLY_SIGMAS: Final = 10
-"""A message so far below the line came before its sample: the counter was set anew."""
+"""Distance below the line, ns and standard errors, at which a frame arrived before its sample: the counter was set."""
+# maximum lateness of a counter that continued while the link was missing, ns. Beyond that, it can be another counter.
 LATE_NS: Final = NS_PER_S // 2
-"""A counter that ran on while the link was away is this late at most; with more it may be another's."""
 STEADY: Final = 2e-5
-"""A slope known so well does not swing; while the host is starved it is known a hundred times worse."""
+"""Maximum error of a slope that is stable. On an overloaded host, the error is a hundred times larger."""
 KEPT_NS: Final = 600 * NS_PER_S
-"""Messages that are late for so long are no starvation: the counter stood still."""
+"""Time after which late frames mean that the counter stopped, ns. Until then, the host may be overloaded."""
 
-GAP_PERIODS: Final = 1.5
-"""With less host time since the sample before, none is missing."""
+GAP_PERIODS: Final = 1.5  # minimum host time since the previous sample, in periods, that counts as a gap
 
 # --- arrivals -------------------------------------------------------------------------------------------------------
-STEPS_ALWAYS: Final = 4
-"""So many steps are accepted at any arrival: messages that waited arrive together."""
-STEPS_FACTOR: Final = 1.5
-"""Error of the rate over a longer gap, at most; a larger jump is a counter that began anew."""
+STEPS_ALWAYS: Final = 4  # number of counter steps accepted at any arrival time, because delayed frames arrive together
+STEPS_FACTOR: Final = 1.5  # maximum error of the rate over a longer gap. A larger jump is a restart of the counter.
 QUEUED_NS: Final = NS_PER_S // 2
-"""How long messages may wait and then arrive together; no device starts anew within that time."""
-STEPS_UNKNOWN: Final = 1000
-"""So many steps are accepted while the rate is not known."""
+"""Maximum wait of frames that then arrive together, ns. No device restarts within this time."""
+STEPS_UNKNOWN: Final = 1000  # number of counter steps accepted while the rate is unknown
+# a window contains a frame with a very short wait if it has this number of frames, has this length, and its lateness
+# varies by at most SETTLED_SPREAD_NS (a latency timer and a short delay of the host)
 WINDOW_MESSAGES: Final = 16
 WINDOW_NS: Final = NS_PER_S
-"""So many messages over so much time contain one that hardly waited, if their lateness varies by no more than this: an
-adapter's latency timer and a little of the host's own."""
 SETTLED_SPREAD_NS: Final = 50 * NS_PER_MS
-PACE_GAIN: Final = 0.5
-"""Share of a window's drift that goes into the period."""
-PACE_KNOWN: Final = 0.002
-"""Relative error from which on samples are counted by the period."""
+PACE_GAIN: Final = 0.5  # share of a window's drift that corrects the period
+PACE_KNOWN: Final = 0.002  # relative error of the period below which it counts samples
+# maximum relative error of a first estimate of the period that is corrected. A larger error restarts the measurement.
 PACE_NEAR: Final = 0.05
-"""A first estimate of the period that is off by no more is corrected; one that is off by more is made anew."""
-PACE_FLOOR: Final = 1e-5
-"""Relative error of the period at the least: crystals drift, and messages wait."""
+PACE_FLOOR: Final = 1e-5  # minimum relative error of the period, because crystals drift and frames wait
 OFF_WINDOWS: Final = 4
-"""So many windows in a row that are late or early by more than the period explains are another rate."""
-UNCERTAIN: Final = 0.75
-"""A gap is certain within one sample while the error of the period over it is no more of one."""
-RESUME_STEPS: Final = 8
-"""How far from its due a number may be after the link was away."""
+"""Number of consecutive windows that are later or earlier than the period allows, after which the rate is another."""
+UNCERTAIN: Final = 0.75  # maximum error of the period over a gap, in samples, for a gap of known size
+RESUME_STEPS: Final = 8  # maximum distance of a number from its due value after the link was missing
 
 
 class CounterLine:
-    """The host time of a counter, by the fit as it was when it was lowest: arrivals are above as long as that runs on.
+    """Host time of a device counter, from the fit with the smallest delay.
 
-    While the host is starved every message is late, and the fit follows them upwards; this line does not.
+    Arrivals are above the line if the counter continues. On an overloaded host, all frames are late and the fit follows
+    them. This line does not follow them.
     """
 
     __slots__ = ("_device_ns", "_error_ns", "_fitted_ns", "_host_ns", "_slope_error", "slope")
@@ -69,12 +61,11 @@ class CounterLine:
 
     def _set(self, fit: ArrivalFit, error_ns: float) -> None:
         self._device_ns, self._host_ns = fit.ref_device_ns, fit.ref_arrival_ns
-        self.slope = fit.slope
-        """Host ns per device ns."""
+        self.slope = fit.slope  # host ns per device ns
         self._fitted_ns, self._slope_error, self._error_ns = fit.fitted_ns, fit.slope_error, error_ns
 
     def follow(self, fit: ArrivalFit, error_ns: float) -> None:
-        """Follow a fit that changed, unless it swings, or rests on messages that are later than those before."""
+        """Follow a changed fit, unless the fit is inaccurate or its frames are later than the previous frames."""
         device_ns = fit.fitted_ns
         fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
         is_steady = fit.slope_error <= max(self._slope_error, STEADY)
@@ -84,32 +75,32 @@ class CounterLine:
             self._set(fit, error_ns)
 
     def above(self, device_ns: int, arrival_ns: float) -> float:
-        """Return how far an arrival is above the line, ns."""
+        """Return the distance of an arrival above the line, ns."""
         return arrival_ns - self._host_ns - self.slope * (device_ns - self._device_ns)
 
     def early_ns(self, device_ns: int) -> float:
-        """Return how far below the line an arrival can be at most."""
+        """Return the maximum distance of an arrival below the line, ns."""
         return EARLY_NS + EARLY_SIGMAS * self._error_ns + 4 * self._slope_error * abs(device_ns - self._fitted_ns)
 
     def carries(self, device_ns: int, arrival_ns: float) -> bool:
-        """Whether the counter can have run on to `device_ns`; the message may have waited."""
+        """Return whether the counter can have continued to `device_ns`. The frame may have waited."""
         return self.above(device_ns, arrival_ns) >= -self.early_ns(device_ns)
 
     def is_on_time(self, device_ns: int, arrival_ns: float) -> bool:
-        """Whether the counter ran on to `device_ns`, and the message hardly waited."""
+        """Return whether the counter continued to `device_ns` and the frame waited only for a short time."""
         return self.carries(device_ns, arrival_ns) and self.above(device_ns, arrival_ns) <= LATE_NS
 
     def turns(self, device_ns: int, arrival_ns: float, turn_ns: int) -> int:
-        """Return how often the counter turned unseen before `device_ns`, each turn of `turn_ns`."""
+        """Return the number of lost turns of the counter before `device_ns`. A turn is `turn_ns` long."""
         return max(round(self.above(device_ns, arrival_ns) / (self.slope * turn_ns)), 0)
 
 
 class ArrivalPace:
-    """When messages of an even pace are due, from those that waited least; what stays late is missing.
+    """Expected arrival of frames with a constant rate, from the frames with the shortest wait.
 
-    Messages that waited for a busy host arrive together and late. Where some of them were dropped, those after are late
-    by the count of messages ever after: the lateness that a whole window shares is what is missing. `turn` is after how
-    many samples a device's number begins anew: the arrivals need show only the whole turns then; 1 without a number.
+    Frames that waited for a busy host arrive together and late. If some of them are lost, the next frames stay late by
+    the number of lost frames. The lateness that all frames of a window share therefore counts as lost samples. `turn`
+    is the modulus of the frame number, 1 without a number: with a number, the arrivals only show whole turns.
     """
 
     __slots__ = (
@@ -119,25 +110,24 @@ class ArrivalPace:
 
     def __init__(self, turn: int = 1) -> None:
         self._turn = turn
-        self.period_ns = 0.0
-        """Time between samples; 0.0 while unknown."""
+        self.period_ns = 0.0  # time between samples, ns; 0.0 if unknown
         self._error = 1.0  # relative error of the period
-        # windows in a row that were late or early: each lost samples or had a wrong phase, or the rate is another
+        # consecutive windows that were late or early: samples were lost, the phase was wrong, or the rate is another
         self._off_windows = 0
-        # by how much the last of them in which no sample was missing was late; 0.0 where it was early
+        # lateness of the newest of these windows without lost samples, 0.0 if it was early
         self._off_ns = 0.0
         self.begin(0)
 
     @property
     def is_known(self) -> bool:
-        """Whether the period is known well enough to count by."""
+        """Return whether the period is accurate enough to count samples."""
         return self._error < PACE_KNOWN
 
     def begin(self, arrival_ns: int) -> None:
-        """Set the first message, or the first after a gap of unknown size; what is known of the period stays."""
+        """Start with the first frame, or with the first frame after a gap of unknown size. Keep the period."""
         self._due_ns = float(arrival_ns)
-        self._has_phase = False  # whether a window has shown how long the first message waited
-        self._unjudged = 0  # samples since the window that was judged last
+        self._has_phase = False  # whether a window has shown the wait of the first frame
+        self._unjudged = 0  # samples since the newest judged window
         self._begin_window(arrival_ns)
 
     def _begin_window(self, arrival_ns: int) -> None:
@@ -146,17 +136,17 @@ class ArrivalPace:
         self._begin_ns, self._until_ns = arrival_ns, arrival_ns + WINDOW_NS
 
     def steps_most(self, arrival_ns: int) -> float:
-        """Return how many samples after the newest one a message can be at most; the period must be known."""
+        """Return the maximum number of samples from the newest sample to a frame. The period must be known."""
         return STEPS_FACTOR * (arrival_ns - self._due_ns + QUEUED_NS) / self.period_ns
 
     def has_no_room(self, arrival_ns: int) -> bool:
-        """Whether no sample can be missing between the newest one and a message."""
+        """Return whether no sample can be lost between the newest sample and a frame."""
         return self.is_known and arrival_ns - self._due_ns < STEPS_FACTOR * self.period_ns
 
     def resume(self, steps: int, arrival_ns: int) -> int:
-        """Return how many samples after the newest one a number is that is `steps` ahead, whole turns left out.
+        """Return the number of samples to a number that is `steps` ahead, plus whole turns.
 
-        0 where it does not fit the time that passed: the device need not be the same, or began anew.
+        Return 0 if the number does not fit the elapsed time: the device restarted, or is another device.
         """
         if not self.is_known:
             return 0
@@ -166,10 +156,10 @@ class ArrivalPace:
         return steps if doubt < self._turn / RESUME_STEPS and abs(steps - passed) <= doubt else 0
 
     def add_arrival(self, arrival_ns: int, steps: int = 1) -> tuple[int, bool]:
-        """Add a message `steps` samples after the newest one.
+        """Add a frame `steps` samples after the newest sample. Return (number of lost samples, is certain).
 
-        Returns how many more samples are known by now to be missing before it, and whether that is certain within one
-        sample (or, with a number, one turn).
+        The lost samples are those that this frame shows in addition. The number is certain within one sample, or within
+        one turn.
         """
         self._due_ns += steps * self.period_ns
         late_ns = arrival_ns - self._due_ns
@@ -184,10 +174,8 @@ class ArrivalPace:
         return self._close(arrival_ns)
 
     def _close(self, arrival_ns: int) -> tuple[int, bool]:
-        """Judge a window, unless messages waited in it: then the next one shows what is missing.
-
-        Where all were early none waited long: the phase or the rate is another.
-        """
+        """Judge a window, unless frames waited in it: then the next window shows the lost samples."""
+        # If all frames were early, none waited for long: the phase or the rate is another.
         if not self.period_ns:
             return self._learn(arrival_ns)
         self._unjudged += self._steps
@@ -207,7 +195,7 @@ class ArrivalPace:
         return 0, certain
 
     def _judge(self, arrival_ns: int) -> tuple[int, bool]:
-        """Tell samples that are missing from a period that is a little off, by the lateness that a window shares."""
+        """Distinguish lost samples from an inaccurate period, by the lateness that a window shares."""
         late_ns, turn_ns = self._least_ns, self._turn * self.period_ns
         off = late_ns / (self._unjudged * self.period_ns)
         has_phase, self._has_phase = self._has_phase, True
@@ -219,10 +207,10 @@ class ArrivalPace:
                 self._off_ns = max(late_ns, 0.0)
             if before_ns and abs(rest_ns - before_ns) <= PACE_KNOWN * self._unjudged * self.period_ns:
                 self._off_windows, self._off_ns = 0, 0.0
-                self._due_ns += late_ns  # the same again: it is not the rate that changed, but the phase
+                self._due_ns += late_ns  # the same lateness twice: the phase changed, not the rate
                 return turns * self._turn, not turns or sure or self._turn > 1
             if self._off_windows < OFF_WINDOWS:
-                self._due_ns += turns * turn_ns if turns else min(late_ns, 0)  # late ones waited
+                self._due_ns += turns * turn_ns if turns else min(late_ns, 0)  # the late frames waited
                 if turns:
                     return turns * self._turn, sure or self._turn > 1
                 return 0, not has_phase or late_ns * -2 < turn_ns
@@ -230,16 +218,16 @@ class ArrivalPace:
         if abs(off) > PACE_KNOWN and (self.is_known or abs(off) > PACE_NEAR or 2 * late_ns >= turn_ns):
             return self._learn(arrival_ns)
         self._due_ns += late_ns
-        if has_phase:  # else late by as much as the one message waited that set the phase
+        if has_phase:  # otherwise the lateness is the wait of the first frame
             self.period_ns *= 1 + off * (PACE_GAIN if self.is_known else 1.0)
             self._error = max(abs(off), self._error * PACE_GAIN if self.is_known else abs(off), PACE_FLOOR)
         return 0, late_ns * -2 < turn_ns
 
 
 class SampleNumber:
-    """A wrapping counter that numbers a device's samples and gives no time.
+    """Wrapping counter that numbers the samples of a device without device time.
 
-    The pace of arrivals shows whether a number can be right, and how often it turned while nothing was read.
+    The pace of arrivals shows whether a number is plausible, and the number of turns while imud received no frames.
     """
 
     __slots__ = ("_arrival_ns", "_modulus", "_number", "_pace", "_was_known", "known")
@@ -250,18 +238,17 @@ class SampleNumber:
         self._arrival_ns = 0
         self._pace = ArrivalPace(modulus)
         self._was_known = False
-        self.known = False
-        """Whether there is a sample before."""
+        self.known = False  # whether a previous sample exists
 
     def restart(self) -> None:
-        """Count on from the newest sample only if the next number fits the time that passed."""
+        """Continue the count from the newest sample only if the next number fits the elapsed time."""
         self._was_known = self._was_known or self.known
         self.known = False
 
     def steps(self, number: int, arrival_ns: int, period_ns: float) -> int:
-        """Number of samples from the newest one to this; 0 for the first one and after a counter began anew.
+        """Return the number of samples from the newest sample to this number.
 
-        `period_ns` is used while the pace is not known.
+        Return 0 for the first number and after a restart. `period_ns` replaces the period while the pace is unknown.
         """
         steps = (number - self._number) % self._modulus
         if not self.known:
@@ -276,13 +263,16 @@ class SampleNumber:
         return steps if steps <= most else 0
 
     def is_sure(self, arrival_ns: int) -> bool:
-        """Whether a number that counts no step leaves no gap: it is the first one, or there was no time for one."""
+        """Return whether a number without steps leaves no gap.
+
+        It leaves no gap if it is the first number, or if the time is too short.
+        """
         if not self.known:
             return not self._was_known
         return self._pace.has_no_room(arrival_ns)
 
     def advance(self, number: int, arrival_ns: int, steps: int) -> int:
-        """Set the newest sample, `steps` after the one before; return how many more are missing: turns not seen."""
+        """Set the newest sample, `steps` after the previous sample. Return the number of lost samples in lost turns."""
         was_known = self.known or self._was_known
         self._number, self._arrival_ns, self.known, self._was_known = number, arrival_ns, True, False
         if steps and was_known:
@@ -292,9 +282,9 @@ class SampleNumber:
 
 
 class ArrivalLosses:
-    """Counts what is missing between messages of a device without time: by their number, else by their pace.
+    """Counter of lost samples for a device without device time: by the frame number, else by the pace.
 
-    `modulus` is that of the number, 0 without one. `on_unknown_gap` is called for a gap whose size is not known.
+    `modulus` is the modulus of the number, 0 without a number. `on_unknown_gap` is called for each gap of unknown size.
     """
 
     __slots__ = ("_number", "_on_unknown_gap", "_pace", "missed", "resets")
@@ -303,19 +293,17 @@ class ArrivalLosses:
         self._on_unknown_gap = on_unknown_gap
         self._number = SampleNumber(modulus) if modulus else None
         self._pace: ArrivalPace | None = None
-        self.missed = 0
-        """Samples missing right before the newest number, or known by it to be missing before."""
-        self.resets = 0
-        """How often the number began anew."""
+        self.missed = 0  # number of lost samples directly before the newest number, and of earlier ones that it shows
+        self.resets = 0  # number of restarts of the frame number
 
     def restart(self) -> None:
-        """Begin anew after the device or the link was away."""
+        """Start again after the device or the link was missing."""
         self._pace = None
         if self._number is not None:
             self._number.restart()
 
     def add_number(self, number: int, arrival_ns: int, period_ns: float) -> int:
-        """Add a numbered message; return how many samples after the newest one it is, 0 where it begins anew."""
+        """Add a frame with a number. Return its distance from the newest sample in samples; 0 after a restart."""
         counter = self._number
         assert counter is not None
         steps, goes_on = counter.steps(number, arrival_ns, period_ns), counter.known
@@ -327,9 +315,9 @@ class ArrivalLosses:
         return steps if goes_on else 0
 
     def add_arrival(self, arrival_ns: int, *, is_first: bool) -> int:
-        """Add a message without a number; return how many samples are known by it to be missing before.
+        """Add a frame without a number. Return the number of lost samples that it shows.
 
-        `is_first` where the device has sent none before.
+        `is_first`: the first frame of the device.
         """
         pace = self._pace
         if pace is None:

@@ -91,9 +91,8 @@ class LossMeter:
     """
 
     def __init__(self, ledger: Ledger) -> None:
+        # number of damaged frames since the last sample. The path counts them and resets the number after each sample.
         self.bad_frames = 0
-        """Number of damaged frames since the last sample. The path counts them and resets the number after each sample.
-        """
         self._ledger = ledger
         self._overruns_seen = 0
 
@@ -117,19 +116,16 @@ class LossMeter:
 class PathContext:
     """Parts of a device that its path needs in addition to codec and clock."""
 
-    device: str
-    """Name of the device in the configuration."""
+    device: str  # name of the device in the configuration
     device_id: int
     ledger: Ledger
     publish: Callable[[Batch], None]
     on_message: Callable[[Message, int], None]
     """Called with a text line or reply frame, and with CLOCK_MONOTONIC of its arrival, ns."""
     on_bad_frame: Callable[[BadFrame], None]
-    overruns: Callable[[], int]
-    """Returns the number of overruns that the kernel counted since the link was opened."""
+    overruns: Callable[[], int]  # returns the number of overruns that the kernel counted since the link was opened
     host: HostClock
-    frame: PublishedAxes = AS_SENT
-    """Axes and angles of the published samples."""
+    frame: PublishedAxes = AS_SENT  # axes and angles of the published samples
 
 
 class SamplePath(ABC):
@@ -147,11 +143,9 @@ class SamplePath(ABC):
         self.loss = LossMeter(context.ledger)
         self.observer: InputObserver | None = None
         """Observer of the input; None if no recording runs. Set by `observe`."""
-        self.newest: Sample | None = None
-        """Newest sample, in the axes of the sensor."""
+        self.newest: Sample | None = None  # newest sample, in the axes of the sensor
         self.frame = context.frame
-        self.begun_ns = 0
-        """CLOCK_MONOTONIC at the last `begin`, ns."""
+        self.begun_ns = 0  # CLOCK_MONOTONIC at the last `begin`, ns
         self.last_data_ns = 0
         self.last_sample_ns = 0
         self._begun_samples = context.ledger.samples
@@ -244,10 +238,8 @@ class SamplePath(ABC):
         samples: list[Sample],
         t_begin_ns: int | None = None,
     ) -> None:
-        """Append the samples of `events` to `samples`. Pass messages and bad frames to the device.
-
-        `t_begin_ns`: see `SampleClock.sample`.
-        """
+        """Append the samples of `events` to `samples`. Pass messages and bad frames to the device."""
+        # `t_begin_ns`: see `SampleClock.sample`.
         clock, loss = self.clock, self.loss
         at, count = 0, len(events)
         while at < count:
@@ -296,8 +288,7 @@ class SamplePath(ABC):
 class SampleListener(Protocol):
     """Listener to the measurements of a codec, for a command that waits for one."""
 
-    wants_samples: bool
-    """Whether the listener is active."""
+    wants_samples: bool  # whether the listener is active
 
     def on_sample(self, sample: Measurement) -> None:
         """Process one measurement."""
@@ -320,8 +311,7 @@ class StreamPath(SamplePath):
         self.codec = codec
         self._listener = listener
         self._drain_edges = drain_edges
-        self.gathered: list[Sample] = []
-        """Samples that `publish_gathered` will publish, oldest first."""
+        self.gathered: list[Sample] = []  # samples that `publish_gathered` will publish, oldest first
 
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
         """Process the bytes of one read. `t_rx_ns` is CLOCK_MONOTONIC right after the read."""
@@ -464,26 +454,20 @@ def make_clock(
     return clock
 
 
+# time without edges after which the line counts as stopped, ns. It is shorter than the time until a device is silent.
 QUIET_NS: Final = 500 * NS_PER_MS
-"""Time without edges after which the line counts as stopped, ns. It is shorter than the time until a device is silent.
-"""
-KEPT: Final = 1024
-"""Number of buffered edges without a read: the capacity of the kernel's event buffer."""
+KEPT: Final = 1024  # number of buffered edges without a read: the capacity of the kernel's event buffer
 AGE_LIMIT: Final = 1.5
 """Maximum time from an edge to a second read of its values, in intervals. After that, an edge may have been lost."""
-EITHER: Final = 1 / sqrt(2)
-"""Root mean square of an error that is 0 or 1 with equal probability."""
+EITHER: Final = 1 / sqrt(2)  # root mean square of an error that is 0 or 1 with equal probability
 
 
 class Stamp(NamedTuple):
     """Time stamp of the values of one read."""
 
-    t_ns: int
-    """CLOCK_MONOTONIC, ns; at most the start of the read."""
-    err_ns: int
-    """One-sigma error of `t_ns`, ns."""
-    number: int
-    """Number of the edge (`Edge.number`)."""
+    t_ns: int  # CLOCK_MONOTONIC, ns; at most the start of the read
+    err_ns: int  # one-sigma error of `t_ns`, ns
+    number: int  # number of the edge (`Edge.number`)
 
 
 class ReadyEdges:
@@ -491,10 +475,8 @@ class ReadyEdges:
 
     def __init__(self, settings: ReadyOptions, period_ns: int) -> None:
         """`period_ns` is the expected interval of the edges, ns, until two edges have arrived."""
-        self.missed = 0
-        """Number of edges without a read: the next edge arrived first, or the kernel dropped the edge."""
-        self.interval_ns = period_ns
-        """Interval of the two newest edges, ns."""
+        self.missed = 0  # number of edges without a read: the next edge arrived first, or the kernel dropped the edge
+        self.interval_ns = period_ns  # interval of the two newest edges, ns
         self.observer: InputObserver | None = None
         """Observer of the edges; None if no recording runs. Set by `PolledPath.observe`."""
         self._offset_ns = round(settings.offset_us * NS_PER_US)
@@ -546,24 +528,18 @@ class ReadyEdges:
         return Stamp(min(t_ns + self._offset_ns, start_ns), int(error_ns) + 1, number)
 
 
-FAULTS_MAX: Final = 3
-"""Number of consecutive damaged or failed reads after which imud identifies the device again."""
-GAP_PERIODS: Final = 1.5
-"""Minimum time since the previous read, in periods, that counts as a gap."""
-SIGMA_OF_AGE: Final = 1 / sqrt(3)
-"""Root mean square of an age that is uniformly distributed from 0 to 1."""
+FAULTS_MAX: Final = 3  # number of consecutive damaged or failed reads after which imud identifies the device again
+GAP_PERIODS: Final = 1.5  # minimum time since the previous read, in periods, that counts as a gap
+SIGMA_OF_AGE: Final = 1 / sqrt(3)  # root mean square of an age that is uniformly distributed from 0 to 1
 
 
 @dataclass(frozen=True, slots=True)
 class PollTiming:
     """Timing of the reads."""
 
-    period_ns: int
-    """Time between two reads, ns."""
-    update_ns: int
-    """Maximum time between two updates of the device's registers, ns; 0 if unknown."""
-    edges: ReadyEdges | None
-    """Edges of the data-ready line; None without a line."""
+    period_ns: int  # time between two reads, ns
+    update_ns: int  # maximum time between two updates of the device's registers, ns; 0 if unknown
+    edges: ReadyEdges | None  # edges of the data-ready line; None without a line
 
 
 class PolledPath(SamplePath):
@@ -572,10 +548,8 @@ class PolledPath(SamplePath):
     def __init__(self, codec: PolledCodec, timing: PollTiming, clock: SampleClock, context: PathContext) -> None:
         super().__init__(clock, context)
         self.codec = codec
-        self.failed = 0
-        """Number of failed transfers."""
-        self.edges = timing.edges
-        """Edges of the data-ready line; None without a line."""
+        self.failed = 0  # number of failed transfers
+        self.edges = timing.edges  # edges of the data-ready line; None without a line
         self._period_ns = timing.period_ns
         self._update_ns = timing.update_ns
         self._before_ns = 0  # start of the previous successful read

@@ -1,15 +1,15 @@
-"""Steering: corrections of the fit of arrivals by aiding sources (edges, a pulse per second, UTC), without a step.
+"""Corrections of the fit of arrivals by aiding sources (edges, a pulse per second, UTC) without a step.
 
-Ranked by what the stamp rests on; `sync` names the best of them:
+`sync` names the best source of a time stamp:
 
-- `utc`: the device's counter agrees with the host's UTC. Its milliseconds bound the stamp; where an edge gives it, that
-  is far inside of them and stays.
-- `edge`: the sample's SOUT pulse or SIN trigger, as stamped by the kernel; for a sample whose own was lost the line
-  through the others, for two samples at most. Or the pulse per second, where it is better than the arrivals.
-- `regression`: the fit of arrivals, less its delay behind the edges where those showed it.
+- `utc`: the device counter agrees with the host's UTC. Its milliseconds bound the time stamp. An edge is more
+  accurate and stays in use.
+- `edge`: the kernel's time stamp of the sample's SOUT pulse or SIN trigger. If the event of a sample is lost, the line
+  through the other events, for at most two samples. Or the pulse per second, if it is more accurate than the arrivals.
+- `regression`: the fit of arrivals, less its delay behind the edges if edges have shown this delay.
 
-Whatever changes below (a source, an interval, the delay), the difference is kept and slewed away (`Slew`), and is part
-of the error. `Holdover` carries time over a jump of the counter to UTC until a new fit is known well enough.
+If a source, an interval or the delay changes, `Slew` removes the difference slowly. Until then, the difference is part
+of the error. `Holdover` continues the time after a jump of the counter to UTC, until a new fit is accurate.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,47 +27,39 @@ from imud.model.units import NS_PER_S, NS_PER_US
 from imud.sampling.device_utc import DeviceUtc, PpsAge
 from imud.sampling.edge_pairing import EdgePairing, EdgeStamp, MarkPairing, PulseDecoder, rising_edges
 
-SLEW: Final = 500e-6
-"""Share of the elapsed time that a settled clock is corrected by: half a millisecond per second."""
-SLEW_SETTLING: Final = 0.2
-"""The same while the fit is young."""
+SLEW: Final = 500e-6  # maximum correction of a settled clock, as a share of the elapsed time: 0.5 ms per second
+SLEW_SETTLING: Final = 0.2  # maximum correction while the fit is young
 SETTLED_AFTER_NS: Final = 10 * NS_PER_S
 HOLDOVER_NS: Final = 16 * NS_PER_S
-"""A fit this long ends holdover: a young one swings, and holdover is 0.8 ms off by then at worst."""
-HOLDOVER_RATE: Final = 50e-6
-"""Largest rate error of steady time against UTC: a crystal's tolerance."""
-TICK_SHARE: Final = 0.5
-"""Error of a tick's start: the instant of measurement within it is not known."""
+"""Span of a fit that ends holdover, ns. A younger fit is inaccurate, and holdover is at most 0.8 ms off by then."""
+HOLDOVER_RATE: Final = 50e-6  # maximum rate error of steady time compared to UTC: the tolerance of a crystal
+TICK_SHARE: Final = 0.5  # error of the start of a tick, ticks: the position of the measurement in the tick is unknown
 UNPAIRED_MOST: Final = 2
-"""Number of samples in a row that may lack their edge before the fit of arrivals takes over."""
+"""Maximum number of consecutive samples without an edge before the fit of arrivals replaces the edges."""
 STAMP_SPREADS: Final = 2.0
-"""Standard deviation of a stamp, in mean distances of stamps from their line: delays are exponentially distributed."""
+"""Standard deviation of a time stamp, in mean distances from the line. Delays are exponentially distributed."""
 STAMP_FLOOR_NS: Final = 3 * NS_PER_US
-"""From the edge to the kernel's stamp at best; the mean of all stamps does not show it."""
+"""Minimum delay from the edge to the kernel's time stamp, ns. The mean of the time stamps does not show it."""
 
 
 class Slew:
-    """The difference between published and estimated time, brought to zero at a bounded rate.
-
-    A reader's time step therefore never jumps.
-    """
+    """Difference between published and estimated time, reduced to zero at a limited rate, without a step."""
 
     __slots__ = ("left_ns",)
 
     def __init__(self) -> None:
-        self.left_ns = 0.0
-        """Published time minus estimated time."""
+        self.left_ns = 0.0  # published time minus estimated time, ns
 
     def set(self, left_ns: float) -> None:
-        """Set the difference."""
+        """Set the difference, ns."""
         self.left_ns = left_ns
 
     def add(self, change_ns: float) -> None:
-        """Add a change of the published time, or the reverse of one of the estimate."""
+        """Add a change of the published time, or the negative change of the estimate."""
         self.left_ns += change_ns
 
     def advance(self, elapsed_ns: int, age_ns: int) -> float:
-        """Reduce the difference by what `elapsed_ns` allows with a fit of `age_ns`, and return it."""
+        """Reduce the difference for the elapsed time and the age of the fit. Return the rest, ns."""
         left = self.left_ns
         if left:
             most = elapsed_ns * (SLEW if age_ns > SETTLED_AFTER_NS else SLEW_SETTLING)
@@ -82,10 +74,9 @@ class Slew:
 
 
 class Holdover:
-    """A line from where the old fit ended, until the new fit is used. Errors grow with time.
+    """Line from the end of the old fit, in use until the new fit is accurate. Its error grows with time.
 
-    By default at the rate of UTC: what the old fit knew of the device's crystal no longer holds where the counter is
-    UTC now.
+    By default, its rate is the rate of UTC: after a jump to UTC, the old fit of the crystal is no longer valid.
     """
 
     __slots__ = ("_device_ns", "_error_ns", "_t_ns", "least_ns", "slope", "slope_error")
@@ -97,48 +88,42 @@ class Holdover:
         self._device_ns = device_ns
         self._t_ns = t_ns
         self._error_ns = hypot(error_ns, TICK_SHARE * tick_ns)
-        self.least_ns = least_ns
-        """Span of the new fit from which on it is used."""
-        self.slope = slope
-        """Host ns per device ns."""
+        self.least_ns = least_ns  # span of the new fit that ends holdover, ns
+        self.slope = slope  # host ns per device ns
         self.slope_error = slope_error
 
     def at(self, device_ns: int) -> int:
-        """Host time at `device_ns`."""
+        """Return the host time at `device_ns`."""
         return self._t_ns + int(self.slope * (device_ns - self._device_ns))
 
     def error_ns(self, device_ns: int) -> float:
-        """One-sigma error of `at`."""
+        """Return the one-sigma error of `at`, ns."""
         return self._error_ns + self.slope_error * (device_ns - self._device_ns)
 
 
 @dataclass(slots=True, eq=False)
 class EdgeSource:
-    """An aiding source with an edge per sample: SOUT or SIN."""
+    """Aiding source with an edge for each sample: SOUT or SIN."""
 
     pairing: EdgePairing
-    offset_ns: int
-    """Instant of measurement minus event."""
-    sigma_ns: float
-    """One-sigma error of that."""
-    mask: int = 0
-    """Status bit of samples that have an event; 0 where no bit shows it."""
-    stamp_error_ns: int = 0
-    """One-sigma error of the newest event's stamp, where it is known."""
+    offset_ns: int  # instant of measurement minus event, ns
+    sigma_ns: float  # one-sigma error of `offset_ns`, ns
+    mask: int = 0  # status bit of samples with an event; 0 without such a bit
+    stamp_error_ns: int = 0  # one-sigma error of the newest event's time stamp, ns; 0 if unknown
     bit_seen: bool = False
 
     @property
     def error_ns(self) -> float:
-        """One-sigma error of a stamp of this source."""
+        """Return the one-sigma error of a time stamp of this source, ns."""
         return hypot(STAMP_SPREADS * self.pairing.spread_ns, self.sigma_ns, self.stamp_error_ns) + STAMP_FLOOR_NS
 
     def add_event(self, event: EdgeStamp, error_ns: int) -> None:
-        """Add an event whose stamp has this one-sigma error."""
+        """Add an event. `error_ns` is the one-sigma error of its time stamp."""
         self.stamp_error_ns = error_ns
         self.pairing.add_events((event,))
 
     def silent(self, status: int | None) -> bool:
-        """Whether the device's status bits deny that this sample has an event."""
+        """Return whether the status of the device shows that this sample has no event."""
         if status is None:
             return False
         if status & self.mask:
@@ -148,9 +133,9 @@ class EdgeSource:
 
 
 class AidingSources:
-    """All aiding sources of a device's time; each is used from its first edge on.
+    """All aiding sources of a device's time. Each source is in use after its first edge.
 
-    Edges are added before the messages that follow them, in the order of time. Synchronization: none; one thread.
+    Add edges in the order of time, before the frames that follow them. Synchronization: none; one thread.
     """
 
     __slots__ = (
@@ -168,30 +153,26 @@ class AidingSources:
         self._sout_timing = sout_timing
         self._sin_timing = sin_timing
         self._pulses = PulseDecoder(int(sout_timing.width_us * NS_PER_US))
-        # in the order of their first edges: the first one counts where several have an event
+        # order of their first edges: the first source has priority
         self._sources: list[EdgeSource] = []
         self._source: EdgeSource | None = None
-        self._fix_ns = 0.0  # correction that is added to the fit of arrivals, ns
+        self._fix_ns = 0.0  # correction of the fit of arrivals, ns
         self._device_ns: int | None = None
         self._pps: PpsAge | None = None
         self.sout: EdgeSource | None = None
         self.sin: EdgeSource | None = None
-        self.sout_offset_ns = 0
-        """From a pulse on SOUT to its measurement."""
+        self.sout_offset_ns = 0  # time from a pulse on SOUT to its measurement, ns
         self.marks: MarkPairing | None = None
         self.utc = DeviceUtc(tick_ns, tick_modulus)
         self.utc_reference: UtcReference | None = None
-        """The host's estimate of UTC, against CLOCK_MONOTONIC; None while it has none."""
+        """The host's estimate of UTC relative to CLOCK_MONOTONIC; None if unknown."""
         self.slew = Slew()
-        self.error_ns = 0.0
-        """One-sigma error of the newest time."""
-        self.sync = Sync.ARRIVAL
-        """Origin of the newest time stamp."""
-        self.edge_seq: int | None = None
-        """Number of the event of the newest sample; None where it has none."""
+        self.error_ns = 0.0  # one-sigma error of the newest time stamp, ns
+        self.sync = Sync.ARRIVAL  # source of the newest time stamp
+        self.edge_seq: int | None = None  # number of the event of the newest sample; None without an event
 
     def add_status(self, status: ClockStatus) -> ClockStatus:
-        """Return the state of a clock with that of its aiding sources."""
+        """Return the status of a clock with the status of its aiding sources."""
         sout, sin, reference = self.sout, self.sin, self.utc_reference
         first = sout or sin
         return msgspec.structs.replace(
@@ -216,13 +197,13 @@ class AidingSources:
         self.sout.pairing.add_events([(steady_ns(t_ns), number) for t_ns, number in self._pulses.decode(edges)])
 
     def on_divided_edges(self, edges: Sequence[Edge]) -> None:
-        """Add edges of SOUT_DIV; `SampleClock.take_marks` returns which samples they belong to."""
+        """Add edges of SOUT_DIV. `SampleClock.take_marks` returns their samples."""
         if self.marks is None:
             self.marks = MarkPairing()
         self.marks.add_pulses(rising_edges(edges))
 
     def on_trigger_stamps(self, stamps: Iterable[TriggerStamp]) -> None:
-        """Add triggers that the host gave on SIN, each answered by one message."""
+        """Add triggers of imud on SIN. The device answers each trigger with one frame."""
         if self.sin is None:
             timing = self._sin_timing
             pairing = EdgePairing(int(SIN_DELAY_US * NS_PER_US))
@@ -232,7 +213,7 @@ class AidingSources:
             self.sin.add_event((self._host.steady_ns(t_ns), number), err_ns)
 
     def on_pps_edges(self, edges: Sequence[Edge]) -> None:
-        """Add edges of the pulse per second that the device's SIN gets."""
+        """Add edges of the pulse per second on the device's SIN."""
         if self._pps is None:
             self._pps = PpsAge()
         self._pps.add_pulses(self._host.steady_ns(t_ns) for t_ns, _ in rising_edges(edges))
@@ -245,7 +226,7 @@ class AidingSources:
         self.utc.set_reference(reference)
 
     def restart(self) -> None:
-        """Forget all that is relative to device time or to the fit: either began anew."""
+        """Restart with a new device time or fit."""
         self._source = self._device_ns = None
         self._fix_ns = 0.0
         self.slew.set(0.0)
@@ -259,15 +240,15 @@ class AidingSources:
         self, m: Measurement, device_ns: int, arrival_ns: int, fit_ns: int, fit_error_ns: float, fit_sync: Sync,
         period_ns: float, slope: float, slope_error: float, age_ns: int,
     ) -> int:  # fmt: skip
-        """Return when the sample at `device_ns` was taken, which is `fit_ns` by the fit of arrivals.
+        """Return the time of the sample at `device_ns`, at `fit_ns` in the fit. Set `error_ns`, `sync` and `edge_seq`.
 
-        Sets `error_ns`, `sync` and `edge_seq`. The message began at `arrival_ns` at the latest; samples are `period_ns`
-        apart, a device ns is `slope` host ns, one sigma `slope_error`, and the fit has been running for `age_ns`.
+        `arrival_ns` is the latest start of the frame. `period_ns` is the time between samples. `slope` is host ns per
+        device ns, and `slope_error` its one-sigma error. `age_ns` is the age of the fit.
         """
         elapsed_ns = device_ns - self._device_ns if self._device_ns is not None else 0
         self._device_ns = device_ns
         before, fix_before = self._source, self._fix_ns
-        advanced = 2 * elapsed_ns > period_ns  # a slope over less than that is none
+        advanced = 2 * elapsed_ns > period_ns  # a shorter time is too short for a slope
         source, paired = None, False
         for candidate in self._sources:
             pairing = candidate.pairing
@@ -279,7 +260,7 @@ class AidingSources:
             if source is None and pairing.running and pairing.misses <= UNPAIRED_MOST:
                 source, paired = candidate, own
         if source is not None and source is before and self._pps is None and self.utc.reference is None:
-            fix_ns, error_ns, by_pps = fix_before, fit_error_ns, False  # no other source has to be asked
+            fix_ns, error_ns, by_pps = fix_before, fit_error_ns, False  # no other source can change the result
         else:
             fix_ns, error_ns, by_pps = self._fix(m, device_ns, arrival_ns, fit_ns, fit_error_ns, slope, slope_error)
         self._source, self._fix_ns = source, fix_ns
@@ -292,6 +273,7 @@ class AidingSources:
             wanted_ns = (pairing.stamp_ns if paired else pairing.due_ns) + source.offset_ns
             self.edge_seq = pairing.number if paired else None
         slew = self.slew
+        # remove the step slowly
         if source is not before or (source is None and fix_ns != fix_before):
             was_ns = before.pairing.due_ns + before.offset_ns if before else fit_ns + fix_before
             slew.add(was_ns - (source.pairing.due_ns + source.offset_ns if source else fit_ns + fix_ns))
@@ -304,8 +286,9 @@ class AidingSources:
         self, m: Measurement, device_ns: int, arrival_ns: int, fit_ns: int, fit_error_ns: float, slope: float,
         slope_error: float,
     ) -> tuple[float, float, bool]:  # fmt: skip
-        """Return (what to add to the fit, its error then, whether a pulse per second decides that)."""
+        """Return (correction of the fit, ns; error after it, ns; whether the pulse per second decides)."""
         fix_ns = 0.0
+        # the delay of the fit behind the edges
         for source in self._sources:
             if source.pairing.learned:
                 fix_ns = source.offset_ns - source.pairing.delay_ns
