@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""GPIO lines: SOUT, SOUT_DIV, SIN, PPS, ALARM, reset and data ready."""

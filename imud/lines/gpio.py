@@ -1,9 +1,9 @@
-"""Line requests: inputs and outputs of GPIO chips.
+"""Requests of GPIO lines: inputs and outputs of GPIO chips.
 
-gpiod requests a line. Edge events are then read from the request's file descriptor as the kernel's own structs, for
-less than half of what gpiod's objects cost. Nothing is debounced: a debounced edge has the time of its acceptance, not
-its own. With detection of both edges the kernel reads the level only when its interrupt thread runs, and a short pulse
-may become one edge; where only rising edges carry information, only those are requested.
+gpiod requests a line. imud then reads the edge events from the descriptor of the request as structs of the kernel,
+which needs less than half of the CPU time of gpiod's objects. imud does not debounce, because a debounced edge has the
+time of its acceptance. With detection of both edges, the kernel reads the level only when its interrupt thread runs,
+and a short pulse can become one edge. If only rising edges carry information, imud requests only rising edges.
 """
 
 import asyncio
@@ -23,21 +23,16 @@ from imud.host.files import group_of, user_name
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 
 DEVICES: Final = Path("/dev")
-GROUP: Final = "gpio"
-"""Group of GPIO chips on Raspberry Pi OS; named in messages where the chip belongs to root alone."""
-GONE: Final = frozenset({errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.EBADF})
-"""Errors of a chip that was removed."""
+GROUP: Final = "gpio"  # group of GPIO chips on Raspberry Pi OS, for messages about a chip that belongs to root
+GONE: Final = frozenset({errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.EBADF})  # errors of a removed chip
 
 
 class LineLocation(NamedTuple):
     """Chip and offset of a line."""
 
-    path: str
-    """Device node of the chip."""
-    offset: int
-    """Offset of the line on the chip."""
-    name: str
-    """Name of the line, empty if it has none."""
+    path: str  # device node of the chip
+    offset: int  # offset of the line on the chip
+    name: str  # name of the line; empty without a name
 
     def __str__(self) -> str:
         named = f" ({self.name})" if self.name else ""
@@ -45,21 +40,21 @@ class LineLocation(NamedTuple):
 
 
 def load_gpiod() -> Any:
-    """Import gpiod. Raises LinkError if it is missing, or is the module of libgpiod 1."""
+    """Import gpiod. Raises LinkError if it is not installed, or if it is the module of libgpiod 1."""
     try:
         import gpiod
     except ImportError as error:
         raise LinkError("GPIO lines need the Python package gpiod, got none: `pip install 'gpiod>=2.3'`") from error
     if not hasattr(gpiod, "request_lines"):
         raise LinkError(
-            f"GPIO lines need gpiod 2.3 or later, got that of libgpiod 1 ({gpiod.__file__}), which is Debian 12's "
-            "python3-libgpiod: `pip install 'gpiod>=2.3'` into the environment that imud runs in"
+            f"GPIO lines need gpiod 2.3 or later, got that of libgpiod 1 ({gpiod.__file__}), the python3-libgpiod of "
+            "Debian 12: `pip install 'gpiod>=2.3'` into the environment of imud"
         )
     return gpiod
 
 
 def find_line(gpiod: Any, settings: LineOptions, devices: Path = DEVICES) -> LineLocation:
-    """Find the configured line. Raises LinkMissing, LinkDenied, and LinkError if two lines match."""
+    """Find the configured line. Raises LinkMissing, LinkDenied, or LinkError if two lines match."""
     chips, denied = _chips(gpiod, settings.chip, devices)
     found = [
         LineLocation(chip.path, offset, name)
@@ -76,13 +71,13 @@ def find_line(gpiod: Any, settings: LineOptions, devices: Path = DEVICES) -> Lin
 
 
 def chip_error(error: OSError, path: str) -> LinkError:
-    """Return the LinkError for a chip that cannot be used."""
+    """Return the LinkError for a chip that imud cannot use."""
     if error.errno in GONE:
-        return LinkMissing(f"{path} is gone, or is no GPIO chip: {os.strerror(error.errno or 0)}")
-    if error.errno == errno.EPERM:  # of a group it would be EACCES
+        return LinkMissing(f"{path} is missing, or is not a GPIO chip: {os.strerror(error.errno or 0)}")
+    if error.errno == errno.EPERM:  # EPERM: the control group; the group of the node would cause EACCES
         return LinkDenied(
-            f"{path} may not be opened: the control group of this process does not allow the device (EPERM, "
-            f"not its group); add a line `DeviceAllow={path} rw` to the unit (`systemctl edit imud`), and restart imud"
+            f"{path} may not be opened: the control group of this process does not allow the device (EPERM, not its "
+            f"group); add a line `DeviceAllow={path} rw` to the unit (`systemctl edit imud`), and restart imud"
         )
     if error.errno == errno.EACCES:
         group, user = group_of(path, GROUP), user_name()
@@ -94,31 +89,30 @@ def chip_error(error: OSError, path: str) -> LinkError:
 
 
 def request_error(gpiod: Any, error: OSError, location: LineLocation) -> LinkError:
-    """Return the LinkError for a line whose request the kernel refused."""
+    """Return the LinkError for a line request that the kernel refused."""
     if error.errno == errno.EBUSY:
         holder = ""
-        with suppress(OSError), gpiod.Chip(location.path) as chip:  # it may have been removed meanwhile
+        with suppress(OSError), gpiod.Chip(location.path) as chip:  # the chip may be removed by now
             holder = chip.get_line_info(location.offset).consumer or ""
-        return LinkBusy(f"{location} is in use by {holder or 'a nameless program'}: stop that, or choose another line")
+        return LinkBusy(f"{location} is in use by {holder or 'an unknown program'}: stop it, or choose another line")
     if error.errno in (errno.ENODEV, errno.ENOENT, errno.EACCES, errno.EPERM):
         return chip_error(error, location.path)
     reason = os.strerror(error.errno or 0)
-    return LinkError(f"{location} cannot be requested: {reason}; an input needs a chip that makes interrupts")
+    return LinkError(f"{location} cannot be requested: {reason}; an input needs a chip with interrupts")
 
 
 class _Chip(NamedTuple):
     path: str
     label: str
-    names: tuple[str, ...]
-    """Names of the lines by offset; empty for a line without a name."""
+    names: tuple[str, ...]  # names of the lines by offset; empty for a line without a name
 
     def __str__(self) -> str:
         return f"{os.path.basename(self.path)} ({self.label})"
 
 
 def _chips(gpiod: Any, wanted: str, devices: Path) -> tuple[Sequence[_Chip], LinkDenied | None]:
-    """Return the chips to search, and the error of a chip that may not be opened."""
-    node = devices / wanted  # an absolute path stays as it is
+    """Return the chips to search, and the error of a chip that imud may not open."""
+    node = devices / wanted  # an absolute path stays unchanged
     if wanted and node.exists():
         return [_read(gpiod, str(node))], None
     chips: list[_Chip] = []
@@ -129,7 +123,7 @@ def _chips(gpiod: Any, wanted: str, devices: Path) -> tuple[Sequence[_Chip], Lin
         except LinkDenied as error:
             denied = error
         except LinkMissing:
-            continue  # removed since the folder was listed
+            continue  # removed after `_nodes`
     if not wanted:
         return chips, denied
     found = [chip for chip in chips if chip.label == wanted]
@@ -137,12 +131,12 @@ def _chips(gpiod: Any, wanted: str, devices: Path) -> tuple[Sequence[_Chip], Lin
         raise LinkError(f"expected the label {wanted} on one GPIO chip, got it on {' and '.join(map(str, found))}")
     if not found:
         there = ", ".join(map(str, chips)) or "none"
-        raise denied or LinkMissing(f"GPIO chip {wanted} is not there; there are: {there}")
+        raise denied or LinkMissing(f"GPIO chip {wanted} does not exist; existing chips: {there}")
     return found, None
 
 
 def _nodes(devices: Path) -> list[str]:
-    """Return the nodes of all chips by number, without symbolic links (/dev/gpiochip4 of a Raspberry Pi 5 is one)."""
+    """Return the nodes of all chips by number, without symbolic links (/dev/gpiochip4 of a Raspberry Pi 5)."""
     nodes = [node for node in devices.glob("gpiochip*") if not node.is_symlink()]
     return [str(node) for node in sorted(nodes, key=lambda node: int(re.sub(r"\D", "", node.name) or 0))]
 
@@ -162,41 +156,38 @@ def _no_line(line: int | str, chips: Sequence[_Chip]) -> LinkMissing:
     names = [name for chip in chips for name in chip.names if name]
     near = get_close_matches(line, names, n=1, cutoff=0.5)
     hint = f"; did you mean {near[0]}?" if near else ""
-    where = ", ".join(map(str, chips)) or "any chip, as there is none"
+    where = ", ".join(map(str, chips)) or "any chip: no chip exists"
     return LinkMissing(f"no line has the name {line} on {where}{hint} (`gpioinfo` lists names)")
 
 
-EVENT: Final = Struct("=QIIII24x")
-"""struct gpio_v2_line_event."""
-RISING: Final = 1
-"""`id` of an edge from inactive to active (GPIO_V2_LINE_EVENT_RISING_EDGE); 2 is the falling edge."""
+EVENT: Final = Struct("=QIIII24x")  # struct gpio_v2_line_event
+RISING: Final = 1  # `id` of an edge from inactive to active (GPIO_V2_LINE_EVENT_RISING_EDGE). 2 is the falling edge.
 SET_VALUES: Final = 0xC010B40F
-"""GPIO_V2_LINE_SET_VALUES_IOCTL. Its argument is two u64: the levels, and the mask of the request's lines to set."""
+"""GPIO_V2_LINE_SET_VALUES_IOCTL. The argument is two u64: the levels, and the mask of the request's lines to set."""
 _SEQNO_MODULUS: Final = 2**32
 
-_ioctl = ctypes.PyDLL(None, use_errno=True).ioctl  # PyDLL: the GIL is kept
+_ioctl = ctypes.PyDLL(None, use_errno=True).ioctl  # PyDLL keeps the GIL
 _ioctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)
 _LEVELS = {active: (ctypes.c_uint64 * 2)(active, 1) for active in (False, True)}
 
 
 class LineEventDecoder:
-    """Decoder of the edge events of one line; numbers them over all requests of the line, and counts lost ones.
+    """Decoder of the edge events of one line. It numbers them over all requests of the line, and counts lost edges.
 
     Synchronization: one thread.
     """
 
     def __init__(self) -> None:
-        self.lost = 0
-        """Edges that the kernel dropped."""
+        self.lost = 0  # number of edges that the kernel dropped
         self._number = 0
         self._seqno = 0
 
     def restart(self) -> None:
-        """Begin a new request: the kernel counts from 1 again, the edge numbers continue."""
+        """Start a new request: the kernel restarts its count at 1, the edge numbers continue."""
         self._seqno = 0
 
     def decode(self, data: bytes) -> list[Edge]:
-        """Return the edges in `data`, which holds a whole number of events."""
+        """Return the edges in `data`, which contains complete events."""
         found = []
         for t_ns, kind, _offset, _seqno, seqno in EVENT.iter_unpack(data):
             step = (seqno - self._seqno) % _SEQNO_MODULUS
@@ -216,17 +207,15 @@ def set_line(fd: int, active: bool) -> None:
 
 KERNEL_EVENTS: Final = 1024
 """Capacity of the kernel's event buffer of a line, its maximum: one second of SOUT at 1 kHz."""
-READ_EVENTS: Final = 64
-"""Events per read."""
-CONSUMER_CHARACTERS: Final = 31
-"""Longest consumer name that the kernel keeps (GPIO_MAX_NAME_SIZE - 1)."""
+READ_EVENTS: Final = 64  # number of events in one read
+CONSUMER_CHARACTERS: Final = 31  # maximum length of a consumer name in the kernel (GPIO_MAX_NAME_SIZE - 1)
 
 
 class _Line:
     """Request and release of a line."""
 
     def __init__(self, settings: LineOptions, purpose: str, devices: Path) -> None:
-        """`purpose` follows `imud` in the consumer name that other programs see."""
+        """`purpose` follows `imud` in the consumer name, which other programs display."""
         self._settings = settings
         self._purpose = purpose
         self._devices = devices
@@ -255,14 +244,14 @@ class _Line:
             request.release()
 
     def _error(self, error: OSError) -> LinkError:
-        """Return the LinkError for a system call that failed on the open request."""
+        """Return the LinkError for a failed system call on the open request."""
         if error.errno in GONE:
-            return LinkMissing(f"{self.title} is gone ({os.strerror(error.errno or 0)}): was an adapter pulled out?")
+            return LinkMissing(f"{self.title} is missing ({os.strerror(error.errno or 0)}): was its adapter unplugged?")
         return LinkError(f"{self.title} cannot be used: {os.strerror(error.errno or 0)}")
 
 
 class GpioInput(_Line):
-    """Input line of a GPIO chip, an `InputLine`. Synchronization: the loop's thread only."""
+    """Input line of a GPIO chip (contract `InputLine`). Synchronization: the event loop's thread only."""
 
     def __init__(
         self, settings: InputOptions, purpose: str = "", rising_only: bool = False, *, devices: Path = DEVICES
@@ -277,17 +266,17 @@ class GpioInput(_Line):
 
     @property
     def edges_lost(self) -> int:
-        """Edges that the kernel dropped because they were not read in time, over all requests."""
+        """Return the number of edges that the kernel dropped, because imud did not read them in time."""
         return self._decoder.lost
 
     def open(self) -> None:
-        """Request the line; the kernel buffers its edges. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+        """Request the line. The kernel then buffers its edges. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
         self._open(self._config, KERNEL_EVENTS)
         os.set_blocking(self._fd, False)
         self._decoder.restart()
 
     def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
-        """Deliver the edges since `open`, and new ones as they come; without `watch` only when `drain` is called."""
+        """Deliver the edges since `open` and each new edge. Without `watch`, deliver edges only in `drain`."""
         self._on_edges, self._on_end = on_edges, on_end
         self._loop = asyncio.get_running_loop()
         if watch:
@@ -298,10 +287,10 @@ class GpioInput(_Line):
         return self._fd
 
     def drain(self) -> None:
-        """Read and deliver the buffered edges; one system call if there are none. Does not block."""
+        """Read and deliver the buffered edges. Do not block. Without edges, this is one system call."""
         if self._on_edges is None:
             return
-        for _ in range(KERNEL_EVENTS // READ_EVENTS):  # bounded: a floating wire must not block the loop
+        for _ in range(KERNEL_EVENTS // READ_EVENTS):  # limited: a floating wire must not block the loop
             try:
                 data = os.read(self._fd, READ_EVENTS * EVENT.size)
             except BlockingIOError:
@@ -314,7 +303,7 @@ class GpioInput(_Line):
                 return
 
     def level(self) -> bool:
-        """Return whether the line is active now. Raises LinkMissing, LinkError."""
+        """Return whether the line is active. Raises LinkMissing, LinkError."""
         if self._request is None:
             raise LinkError(f"{self.title} is not open")
         try:
@@ -323,7 +312,7 @@ class GpioInput(_Line):
             raise self._error(error) from error
 
     def close(self) -> None:
-        """Release the line; may be called twice."""
+        """Release the line. A second call does nothing."""
         if self._loop is not None:
             self._loop.remove_reader(self._fd)
         self._loop = self._on_edges = self._on_end = None
@@ -347,7 +336,7 @@ class GpioInput(_Line):
 
 
 class GpioOutput(_Line):
-    """Output line of a GPIO chip, an `OutputLine`. Synchronization: one thread at a time."""
+    """Output line of a GPIO chip (contract `OutputLine`). Synchronization: one thread at a time."""
 
     def __init__(
         self,
@@ -357,13 +346,13 @@ class GpioOutput(_Line):
         devices: Path = DEVICES,
         drive: Callable[[int, bool], None] | None = None,
     ) -> None:
-        """`drive` sets the level of the line, from the descriptor of its request; `set_line` if None."""
+        """`drive` sets the level of the line with the descriptor of its request; None for `set_line`."""
         super().__init__(settings, purpose, devices)
         self._open_drain = settings.open_drain
         self._drive = drive or set_line
 
     def open(self) -> None:
-        """Request the line as an output that is inactive from the start. Raises as `GpioInput.open`."""
+        """Request the line as an output with inactive level. Raises as `GpioInput.open`."""
         self._open(self._config, None)
 
     def set(self, active: bool) -> None:
@@ -376,8 +365,8 @@ class GpioOutput(_Line):
             raise self._error(error) from error
 
     def close(self) -> None:
-        """Set the line inactive and release it; may be called twice."""
-        with suppress(OSError):  # the chip is gone, and the line with it
+        """Set the line inactive and release it. A second call does nothing."""
+        with suppress(OSError):  # the chip was removed
             if self._request is not None:
                 self._drive(self._fd, False)
         self._release()

@@ -1,8 +1,8 @@
-"""The reset line of a device: pulsed on request, and after a long unsuccessful search for the device.
+"""Reset line of a device: imud pulses it on request, and after a long search without success.
 
-With `at_start` it is also pulsed once, before the first search. Otherwise a pulse is the last resort: a device that
-restarts by itself is absent for `wait_s` as well, and one that was unplugged is not helped. It needs ROUNDS failed
-rounds of search and more than `wait_s`, and comes once a minute at most.
+With `at_start`, imud also pulses it once before the first search. An automatic pulse is the last resort: a device that
+restarts by itself is also missing for `wait_s`, and a pulse does not help an unplugged device. It needs ROUNDS failed
+search rounds and a search longer than `wait_s`. The minimum time between two automatic pulses is one minute.
 """
 
 import asyncio
@@ -19,21 +19,17 @@ from imud.model.units import NS_PER_S
 from imud.sampling.clock import SampleClock
 
 MS_PER_S: Final = 1000
-ROUNDS: Final = 3
-"""Failed rounds of search before the line is pulsed."""
-MARGIN_NS: Final = 1 * NS_PER_S
-"""The line is pulsed after a search of `wait_s` and this."""
-AGAIN_NS: Final = 60 * NS_PER_S
-"""Least interval between two automatic pulses."""
+ROUNDS: Final = 3  # number of failed search rounds before an automatic pulse
+MARGIN_NS: Final = 1 * NS_PER_S  # additional search time after `wait_s` before an automatic pulse, ns
+AGAIN_NS: Final = 60 * NS_PER_S  # minimum time between two automatic pulses, ns
 
-Sleep = Callable[[float], Awaitable[None]]
-"""`asyncio.sleep`, or a replacement of it."""
+Sleep = Callable[[float], Awaitable[None]]  # `asyncio.sleep`, or its replacement in a test
 
 
 async def reset(line: OutputLine, settings: ResetOptions, sleep: Sleep = asyncio.sleep) -> None:
-    """Pulse the open line, and wait for the device's start-up. Raises LinkError.
+    """Pulse the open line, and wait for the start of the device. Raises LinkError.
 
-    The line is left inactive, also when the coroutine is cancelled.
+    The line becomes inactive, also if the coroutine is cancelled.
     """
     line.set(True)
     try:
@@ -44,7 +40,7 @@ async def reset(line: OutputLine, settings: ResetOptions, sleep: Sleep = asyncio
 
 
 class ResetLine:
-    """Reset line, kept open and inactive. Synchronization: the loop's thread only."""
+    """Reset line, kept open and inactive. Synchronization: the event loop's thread only."""
 
     def __init__(
         self,
@@ -54,9 +50,8 @@ class ResetLine:
         now_ns: Callable[[], int],
         on_pulse: Callable[[], None],
     ) -> None:
-        """`now_ns` is CLOCK_MONOTONIC. `on_pulse` is called right before each pulse."""
-        self.problem = ""
-        """Why the line cannot be driven, one sentence; empty if it can."""
+        """`now_ns` returns CLOCK_MONOTONIC. `on_pulse` is called right before each pulse."""
+        self.problem = ""  # reason why imud cannot drive the line, one sentence; empty if it can
         self._line = line
         self._settings = settings
         self._raise_event, self._now_ns = raise_event, now_ns
@@ -64,17 +59,17 @@ class ResetLine:
         self._is_open = False
         self._closed = False
         self._open_ns = 0
-        self._rounds = 0
-        self._since_ns = 0
-        self._again_ns = 0
+        self._rounds = 0  # failed search rounds since the last sample or pulse
+        self._since_ns = 0  # start of the search
+        self._again_ns = 0  # earliest time of the next automatic pulse
         self._pulsing = asyncio.Lock()
         self._due_at_start = settings.at_start
 
     def start(self, clock: SampleClock) -> None:
-        """Do nothing: a device counts as found when its first sample comes (`found`)."""
+        """Do nothing. The device is found at its first sample (`found`)."""
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
-        """Open the line if that is due. Call it at 10 Hz."""
+        """Open the line if due. Call this method at 10 Hz."""
         if self._is_open or self._closed or now_ns < self._open_ns:
             return
         try:
@@ -85,15 +80,15 @@ class ResetLine:
             self._is_open, self.problem = True, ""
 
     def stop(self) -> None:
-        """Do nothing: the line stays open while the device's link is down."""
+        """Do nothing. The line stays open while the device's link is closed."""
 
     def close(self) -> None:
-        """Release the line, inactive; may be called twice. `tick` does not open it again."""
+        """Set the line inactive and release it. `tick` does not open it again. A second call does nothing."""
         self._is_open, self._closed = False, True
         self._line.close()
 
     async def pulse(self) -> None:
-        """Reset the device and wait for its start-up. Raises CommandError."""
+        """Reset the device and wait for its start. Raises CommandError."""
         async with self._pulsing:
             if not self._is_open:
                 raise CommandError(f"reset: {self.problem or 'the line is not open'}")
@@ -106,7 +101,10 @@ class ResetLine:
                 raise CommandError(f"reset: {error}") from error
 
     async def settled(self) -> None:
-        """Wait until no pulse and no start-up is in progress; at the start pulse first, if that is wanted."""
+        """Wait until no pulse and no start of the device is in progress.
+
+        With `at_start`, pulse the line at the first call.
+        """
         if self._due_at_start and self._is_open:
             self._due_at_start = False
             self._raise_event(self._now_ns(), EventKind.LINK, "reset by its line at the start", line="reset")
@@ -120,7 +118,7 @@ class ResetLine:
         self._rounds = 0
 
     async def not_found(self, now_ns: int) -> None:
-        """Count a failed round of search, and pulse the line if that is due."""
+        """Count a failed search round, and pulse the line if due."""
         if self._rounds == 0:
             self._since_ns = now_ns
         self._rounds += 1
@@ -153,7 +151,7 @@ def make_reset(
     now_ns: Callable[[], int],
     on_pulse: Callable[[], None],
 ) -> ResetLine | None:
-    """Make the reset line of a device; None if it has none."""
+    """Return the reset line of a device; None if it has no reset line."""
     if lines is None or lines.reset is None:
         return None
     output = factory.make_output(lines.reset, f"{device} reset")

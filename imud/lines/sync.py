@@ -1,7 +1,7 @@
-"""The synchronisation lines of one device: SOUT, SOUT_DIV, PPS and SIN for its clock, ALARM for its status.
+"""Synchronization lines of one device: SOUT, SOUT_DIV, PPS and SIN for its clock, ALARM for its status.
 
-Edges have to reach the clock before the frame that follows them: `drain` is called before the data of a read is
-decoded. A line that fails affects only what it provides, and is opened again when that is possible.
+The clock must receive an edge before the frame that follows it. The path therefore calls `drain` before it decodes the
+data of a read. A failed line affects only its own function. imud opens it again when possible.
 """
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -20,14 +20,14 @@ from imud.model.sample import Sample
 from imud.sampling.clock import SampleClock
 
 ALARM_STATUS: Final = 1 << 31
-"""Bit of `Sample.status` that imud sets: the ALARM line was active. The devices' own bits are below 2¹⁶."""
+"""Bit of `Sample.status` that imud sets while the ALARM line is active. The bits of devices are below 2¹⁶."""
 WITH_FRAMES: Final = ("sout", "sout_div")
-"""Lines whose edges are needed only together with frames: the loop is not woken for them, which costs as much as a
-frame."""
+"""Lines whose edges imud needs only together with frames. The event loop does not wake up for these edges, because a
+wake-up needs as much CPU time as a frame."""
 
 
 class SyncSignals:
-    """Lines of one device, except reset and data ready. Synchronization: the loop's thread only."""
+    """Lines of one device, except reset and data ready. Synchronization: the event loop's thread only."""
 
     def __init__(
         self,
@@ -40,9 +40,9 @@ class SyncSignals:
         on_pulses: OnEdges | None = None,
         follow: Callable[[], object] = int,
     ) -> None:
-        """`now_ns` is CLOCK_MONOTONIC. `on_pulses` receives the edges of PPS after the clock.
+        """`now_ns` returns CLOCK_MONOTONIC. `on_pulses` receives the edges of PPS after the clock.
 
-        `follow` is called before edges are delivered: it notes how CLOCK_MONOTONIC is steered, for their conversion.
+        `follow` updates the steady time. It is called before edges are delivered, because the clock converts them.
         """
         self._raise_event, self._now_ns, self._follow = raise_event, now_ns, follow
         self._on_pulses = on_pulses
@@ -74,13 +74,13 @@ class SyncSignals:
             )
 
     def start(self, clock: SampleClock) -> None:
-        """Deliver edges to the clock of the device that was found, and drive SIN."""
+        """Deliver edges to the clock of the detected device, and drive SIN."""
         self._clock = clock
         self._show_alarm()
         self.tick(self._now_ns(), None)
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
-        """Open lines that are due, raise pending events, check ALARM against the newest sample. Call it at 10 Hz."""
+        """Open due lines, raise pending events, and compare ALARM with the newest sample. Call this method at 10 Hz."""
         if self._closed:
             return
         for watched in self._watched.values():
@@ -95,33 +95,33 @@ class SyncSignals:
             self._raise_mark(mark)
 
     def stop(self) -> None:
-        """Stop at the end of the device's link: release SIN, drop further edges; may be called twice."""
+        """Release SIN and drop further edges: the device's link was closed. A second call does nothing."""
         self._clock = None
         if self._sin is not None:
             self._sin.stop()
 
     def close(self) -> None:
-        """Release all lines; may be called twice. `tick` does not open them again."""
+        """Release all lines. `tick` does not open them again. A second call does nothing."""
         self._closed = True
         self.stop()
         for watched in self._watched.values():
             watched.close()
 
     def drain(self) -> None:
-        """Deliver all buffered edges and trigger stamps to the clock. Does not block; one system call per line."""
+        """Deliver all buffered edges and trigger stamps to the clock. Do not block: one system call per line."""
         for watched in self._drained:
             watched.drain()
         if self._sin is not None:
             self._sin.drain()
 
     def set_alarm_ranges(self, ranges: AlarmRanges | None) -> None:
-        """Set what ALARM should indicate by the device's settings; None: not known, and not checked."""
+        """Set the ranges that ALARM indicates according to the device settings. None disables the check."""
         self._alarm.set_ranges(ranges)
 
     def trigger_once(self) -> None:
-        """Make one edge on SIN in addition to those of its rate. Raises CommandError."""
+        """Make one additional edge on SIN. Raises CommandError."""
         if self._sin is None:
-            raise CommandError("trigger: expected the key sin below lines of the device, got none")
+            raise CommandError("trigger: expected the key lines.sin of the device, got none")
         try:
             self._sin.once()
         except LinkError as error:
@@ -129,11 +129,11 @@ class SyncSignals:
 
     @property
     def can_trigger(self) -> bool:
-        """Whether SIN is configured."""
+        """Return whether SIN is configured."""
         return self._sin is not None
 
     def status(self, reset: ResetLine | None = None) -> LinesStatus:
-        """Return state and counters of the lines, with the problem of the reset line."""
+        """Return the state and the counters of the lines. `reset` adds the problem of the reset line."""
         watched, sin = self._watched, self._sin
         problems = {key: line.problem for key, line in watched.items() if line.problem}
         if sin is not None and sin.problem:
@@ -189,12 +189,12 @@ class SyncSignals:
         self._show_alarm()
 
     def _show_alarm(self) -> None:
-        """Set the alarm bit of the samples from now on."""
+        """Set the alarm bit of the next samples."""
         if self._clock is not None:
             self._clock.set_own_status(ALARM_STATUS if self._alarm.line.active else None)
 
     def _raise_mark(self, mark: Mark) -> None:
-        words = f"sample {mark.seq}" if mark.seq is not None else "a sample that was lost"
+        words = f"sample {mark.seq}" if mark.seq is not None else "a lost sample"
         self._raise_event(
             mark.t_ns, EventKind.MARK, f"pulse {mark.number} on SOUT_DIV belongs to {words}",
             t_ns=mark.t_ns, edge_seq=mark.number, seq=mark.seq,
@@ -214,15 +214,14 @@ def _no_script(_target: object) -> None:
 
 
 RESET: Final = Action("pulse the reset line, and wait until the device works again", _no_script)
-TRIGGER: Final = Action("make one edge on SIN, in addition to those of its rate", _no_script)
+TRIGGER: Final = Action("make one additional edge on SIN", _no_script)
 
 
 class LineActions:
-    """Actions by the GPIO lines of one device. Synchronization: the loop's thread only."""
+    """Actions that use the GPIO lines of one device. Synchronization: the event loop's thread only."""
 
     def __init__(self, reset: ResetLine | None, signals: SyncSignals | None) -> None:
-        self.rows: dict[str, Action] = {}
-        """Actions by name."""
+        self.rows: dict[str, Action] = {}  # actions by name
         self._coroutines: dict[str, Callable[[], Awaitable[None]]] = {}
         if reset is not None:
             self.rows["reset"], self._coroutines["reset"] = RESET, reset.pulse
@@ -234,7 +233,7 @@ class LineActions:
             self.rows["trigger"], self._coroutines["trigger"] = TRIGGER, trigger
 
     async def run(self, name: str, arguments: Mapping[str, Any]) -> object:
-        """Run an action; none of them has a result. Raises BadArgument, CommandError."""
+        """Run an action. It returns None. Raises BadArgument, CommandError."""
         self.rows[name].arguments(arguments)
         await self._coroutines[name]()
         return None

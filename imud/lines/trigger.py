@@ -1,9 +1,9 @@
-"""SIN as a trigger: imud makes rising edges on a line at absolute deadlines, and time-stamps each of them.
+"""SIN as a trigger: imud makes rising edges on a line at absolute deadlines, and time-stamps each edge.
 
-    deadline ─▶ clock, line high, clock ─▶ stamp ─┐ buffered; the loop is woken for them every HAND_OVER_NS,
-    pulse length ─▶ line low                      ┘ or fetches them with `drain` before it decodes what it read
+    deadline ─▶ clock, line high, clock ─▶ time stamp ─┐ buffered; wakes the event loop every HAND_OVER_NS,
+    pulse length ─▶ line low                           ┘ or `drain` fetches them before the path decodes a read
 
-A device in ONMARK mode answers each rising edge with a frame, 125 µs later on average (HiPNUC manual, 1.2.1).
+A device in ONMARK mode answers each rising edge with a frame, after 125 µs on average (HiPNUC manual, 1.2.1).
 """
 
 import asyncio
@@ -19,39 +19,32 @@ from imud.model.errors import LinkError
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 PULSE_NS: Final = NS_PER_MS
-"""Length of a pulse, at most half a period. The manual gives none for triggers; 1 ms passes any level shifter."""
+"""Length of a pulse, ns, at most half a period. The manual gives no length. 1 ms passes each level shifter."""
 LATE_SHARE: Final = 4
-"""An edge that would be more than a quarter of a period late is skipped: the next would follow it too soon."""
-HAND_OVER_NS: Final = 50 * NS_PER_MS
-"""Least interval between two wake-ups of the loop for stamps."""
-STAMPS_MAX: Final = 10_000
-"""Capacity of the buffer of stamps while the loop is stalled; the oldest are dropped."""
-IDLE_NS: Final = 60 * NS_PER_S
-"""Sleep of the thread while nothing is due."""
+"""Share of a period, 1/4, after which imud skips a late edge. The next edge would follow too soon."""
+HAND_OVER_NS: Final = 50 * NS_PER_MS  # minimum time between two wake-ups of the event loop for time stamps, ns
+STAMPS_MAX: Final = 10_000  # capacity of the buffer of time stamps. If the event loop stalls, the oldest are dropped.
+IDLE_NS: Final = 60 * NS_PER_S  # sleep of the thread without a due edge, ns
 
 OnStamps = Callable[[Sequence[TriggerStamp]], None]
-"""Called in the loop's thread with stamps in their order."""
+"""Called with time stamps in order, in the thread of the event loop."""
 
 
 class TriggerCounts:
-    """Counters of a trigger. Written by its thread, read by any."""
+    """Counters of a trigger. The trigger's thread writes them, any thread can read them."""
 
     __slots__ = ("edges", "missed", "singles", "sum_late_ns", "worst_late_ns")
 
     def __init__(self) -> None:
-        self.edges = 0
-        """Rising edges made."""
-        self.singles = 0
-        """Of these, those requested one by one."""
-        self.missed = 0
-        """Deadlines missed: no edge was made for them."""
-        self.sum_late_ns = 0
-        """Sum of the times from deadline to edge, over the edges that have a deadline."""
+        self.edges = 0  # number of rising edges
+        self.singles = 0  # number of edges that `once` requested
+        self.missed = 0  # number of deadlines without an edge
+        self.sum_late_ns = 0  # sum of the times from deadline to edge, ns, without the edges of `once`
         self.worst_late_ns = 0
 
     @property
     def mean_late_ns(self) -> float:
-        """Mean time from deadline to edge; 0 without edges."""
+        """Return the mean time from deadline to edge, ns; 0 without edges."""
         return self.sum_late_ns / max(self.edges - self.singles, 1)
 
 
@@ -61,7 +54,7 @@ class SquareWave:
     def __init__(
         self, line: OutputLine, rate_hz: float, counts: TriggerCounts, now_ns: Callable[[], int], pulse_ns: int
     ) -> None:
-        """The first deadline is now; there are no deadlines if `rate_hz` is 0."""
+        """The first deadline is now. Without `rate_hz` (0), there are no deadlines."""
         self._line, self._counts, self._now_ns = line, counts, now_ns
         self._period_ns = round(NS_PER_S / rate_hz) if rate_hz else 0
         self._pulse_ns = min(pulse_ns, self._period_ns // 2) if rate_hz else pulse_ns
@@ -69,21 +62,21 @@ class SquareWave:
         self._low_ns = min(self._pulse_ns, self._late_ns) if rate_hz else pulse_ns
         self._due_ns = self._rest_until_ns = now_ns()
         self._fall_ns: int | None = None
-        self._wanted: deque[None] = deque()
+        self._wanted: deque[None] = deque()  # one entry for each requested edge; deque operations are thread-safe
         self.stamps: deque[TriggerStamp] = deque(maxlen=STAMPS_MAX)
-        """Stamps of the edges, oldest first; the consumer removes them."""
+        """Time stamps of the edges, oldest first. The consumer removes them."""
 
     @property
     def high(self) -> bool:
-        """Whether the line is active."""
+        """Return whether the line is active."""
         return self._fall_ns is not None
 
     def once(self) -> None:
-        """Request one edge in addition to those of the rate, as soon as the line is low."""
+        """Request one edge in addition to the deadlines, as soon as the line is low."""
         self._wanted.append(None)
 
     def work(self) -> int:
-        """Make the edges that are due; return the time until the next call, ns. Raises LinkError."""
+        """Make the due edges. Return the time until the next call, ns. Raises LinkError."""
         now_ns = self._now_ns()
         if self._fall_ns is not None:
             if now_ns < self._fall_ns:
@@ -102,7 +95,7 @@ class SquareWave:
         return self._next_ns() - now_ns
 
     def _next_ns(self) -> int:
-        """Return the time of the next rising edge."""
+        """Return the time of the next rising edge, ns."""
         if self._wanted:
             return self._rest_until_ns
         if self._period_ns:
@@ -110,7 +103,7 @@ class SquareWave:
         return self._now_ns() + IDLE_NS
 
     def _pass_over(self, now_ns: int) -> None:
-        """Count the deadlines that are missed, and advance to the next."""
+        """Count the missed deadlines, and advance to the next deadline."""
         over_ns = now_ns - self._late_ns - self._due_ns
         if over_ns > 0:
             passed = -(-over_ns // self._period_ns)
@@ -132,7 +125,7 @@ class SquareWave:
         after_ns = now_ns()
         self._counts.edges += 1
         self._fall_ns = after_ns + self._pulse_ns
-        error_ns = (after_ns - before_ns + 1) // 2
+        error_ns = (after_ns - before_ns + 1) // 2  # the edge is between both clock readings
         self.stamps.append(TriggerStamp((before_ns + after_ns) // 2, error_ns, self._counts.edges))
         return self._pulse_ns
 
@@ -143,7 +136,7 @@ class SquareWave:
 
 
 class Trigger:
-    """Driver of an open line with its own thread. Synchronization: the loop's thread only."""
+    """Driver of an open line with its own thread. Synchronization: the event loop's thread only."""
 
     def __init__(
         self,
@@ -154,7 +147,7 @@ class Trigger:
         start_worker: StartWorker = BusThread,
         pulse_ns: int = PULSE_NS,
     ) -> None:
-        """With `rate_hz` 0 only `once` makes edges. The caller opens and closes the line."""
+        """With `rate_hz` 0, only `once` makes edges. The caller opens and closes the line."""
         self._line, self._rate_hz, self._pulse_ns = line, rate_hz, pulse_ns
         self._now_ns, self._start_worker = now_ns, start_worker
         self.counts = TriggerCounts()
@@ -167,7 +160,7 @@ class Trigger:
         self._problem: LinkError | None = None
 
     def start(self, on_stamps: OnStamps, on_end: OnLineEnd) -> None:
-        """Start the thread. Needs a running loop and an open line."""
+        """Start the thread. A running event loop and an open line are required."""
         self._loop = asyncio.get_running_loop()
         self._on_stamps, self._on_end = on_stamps, on_end
         self._problem = None
@@ -175,14 +168,14 @@ class Trigger:
         self._worker = self._start_worker(f"trigger {self._line.title}", self._round, self._failed)
 
     def once(self) -> None:
-        """Request one edge as soon as the line is low; its stamp is delivered like the others. Raises LinkError."""
+        """Request one edge as soon as the line is low. Its time stamp is delivered as usual. Raises LinkError."""
         if self._wave is None or self._worker is None or self._problem is not None:
             raise self._problem or LinkError(f"{self._line.title} is not driven: no edge can be made")
         self._wave.once()
         self._worker.ring()
 
     def drain(self) -> None:
-        """Deliver the stamps of all edges made so far. Does not block."""
+        """Deliver the time stamps of all edges so far. Do not block."""
         wave, on_stamps = self._wave, self._on_stamps
         if wave is None or on_stamps is None or not wave.stamps:
             return
@@ -193,17 +186,21 @@ class Trigger:
         on_stamps(found)
 
     def stop(self) -> None:
-        """End the thread, deliver the remaining stamps, and leave the line inactive and open; may be called twice."""
+        """Stop the thread, deliver the remaining time stamps, and leave the line inactive and open.
+
+        A second call does nothing.
+        """
         if self._worker is None:
             return
         self._worker.end()
         self._worker = None
-        with suppress(LinkError):  # the line is gone
+        with suppress(LinkError):  # the line is missing
             self._line.set(False)
         self.drain()
         self._wave = self._on_stamps = self._on_end = None
 
-    # --- the thread's side -------------------------------------------------------------------------------------------
+    # --- the trigger's thread
+    # --------------------------------------------------------------------------------------------
 
     def _round(self) -> int:
         wave = self._wave
@@ -247,9 +244,9 @@ class Trigger:
 
 
 class SinTrigger:
-    """SIN as a driven line: opens the line, runs its `Trigger`, and starts both again after a failure.
+    """SIN as a driven line: it opens the line, runs its `Trigger`, and restarts both after a failure.
 
-    Synchronization: the loop's thread only.
+    Synchronization: the event loop's thread only.
     """
 
     def __init__(
@@ -261,24 +258,23 @@ class SinTrigger:
         now_ns: Callable[[], int],
         start_worker: StartWorker,
     ) -> None:
-        """`report` receives a message when the line fails for a new reason."""
-        self.problem = ""
-        """Why SIN cannot be driven, one sentence; empty if it can."""
+        """`report` receives a message if the line fails for a new reason."""
+        self.problem = ""  # reason why imud cannot drive SIN, one sentence; empty if it can
         self._line, self._on_stamps, self._report, self._now_ns = line, on_stamps, report, now_ns
         pulse_ns = round(settings.pulse_ms * NS_PER_MS)
         self._trigger = Trigger(line, settings.rate_hz, now_ns, start_worker=start_worker, pulse_ns=pulse_ns)
         self.drain: Callable[[], None] = self._trigger.drain
-        """Delivers the stamps of all edges made so far. Does not block."""
+        """Delivers the time stamps of all edges so far. Does not block."""
         self._running = False
         self._due_ns = 0
 
     @property
     def counts(self) -> TriggerCounts:
-        """Counters since the start."""
+        """Return the counters since the start."""
         return self._trigger.counts
 
     def tick(self, now_ns: int) -> None:
-        """Start to drive the line if that is due. Call it at 10 Hz."""
+        """Start to drive the line if due. Call this method at 10 Hz."""
         if self._running or now_ns < self._due_ns:
             return
         try:
@@ -291,11 +287,11 @@ class SinTrigger:
         self._trigger.start(self._on_stamps, self._end)
 
     def once(self) -> None:
-        """Make one edge in addition to those of the rate. Raises LinkError."""
+        """Make one edge in addition to the deadlines. Raises LinkError."""
         self._trigger.once()
 
     def stop(self) -> None:
-        """Leave the line inactive and release it; may be called twice. The next `tick` opens it again."""
+        """Leave the line inactive and release it. The next `tick` opens it again. A second call does nothing."""
         self._trigger.stop()
         self._line.close()
         self._running = False

@@ -1,4 +1,4 @@
-"""An input line that is kept open: a failure is reported once, and the line is opened again when that is possible."""
+"""Input line that imud keeps open. It reports a failure once, and opens the line again when possible."""
 
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -8,11 +8,11 @@ from imud.model.errors import LinkError
 from imud.model.units import NS_PER_S
 
 RETRY_NS: Final = 5 * NS_PER_S
-"""Pause before a line is opened again: its chip may return, or another program may release it."""
+"""Pause before imud opens a line again, ns: its chip may return, or another program may release it."""
 
 
 class WatchedLine:
-    """An input line that is kept open. Synchronization: the loop's thread only."""
+    """Input line that imud keeps open. Synchronization: the event loop's thread only."""
 
     def __init__(
         self,
@@ -26,15 +26,12 @@ class WatchedLine:
     ) -> None:
         """`on_level` receives the level after each opening and after lost edges, and None when the line is closed.
 
-        `report` receives a message when the line fails for a new reason, and when it is open again. Without `watch` the
-        loop does not wake up for edges; `drain` and `tick` deliver them.
+        `report` receives a message if the line fails for a new reason, and when it is open again. Without `watch`, the
+        event loop does not wake up for edges. `drain` and `tick` then deliver them.
         """
         self.line = line
-        """The input itself."""
-        self.problem = ""
-        """Why the line is not open, one sentence; empty if it is."""
-        self.edges = 0
-        """Edges delivered since the start."""
+        self.problem = ""  # reason why the line is closed, one sentence; empty if it is open
+        self.edges = 0  # number of edges since the start
         self._on_edges = on_edges
         self._on_level = on_level
         self._report = report
@@ -46,11 +43,11 @@ class WatchedLine:
 
     @property
     def edges_lost(self) -> int:
-        """Edges that the kernel dropped since the start."""
+        """Return the number of edges that the kernel dropped since the start."""
         return self.line.edges_lost
 
     def tick(self, now_ns: int) -> None:
-        """Open the line if that is due; read the level again if edges were lost. Call it at 10 Hz."""
+        """Open the line if due. Read the level again after lost edges. Call this method at 10 Hz."""
         if not self._is_open:
             if now_ns >= self._due_ns:
                 self._open(now_ns)
@@ -62,12 +59,12 @@ class WatchedLine:
             self._read_level()
 
     def drain(self) -> None:
-        """Deliver the edges that the kernel has buffered. Does not block."""
+        """Deliver the edges in the kernel's buffer. Do not block."""
         if self._is_open:
             self.line.drain()
 
     def close(self) -> None:
-        """Release the line; may be called twice. The next `tick` opens it again."""
+        """Release the line. The next `tick` opens it again. A second call does nothing."""
         self._is_open = False
         self._due_ns = 0
         self.line.close()
@@ -98,7 +95,7 @@ class WatchedLine:
             self._end(error)
 
     def _end(self, error: LinkError) -> None:
-        """Close the line, which is gone."""
+        """Close the line after it failed."""
         self.close()
         self._fail(error, self._now_ns())
 
@@ -110,7 +107,7 @@ class WatchedLine:
 
 
 def watching(lines: LineFactory, now_ns: Callable[[], int]) -> WatchLine:
-    """Return what keeps lines open that belong to no device."""
+    """Return a function that keeps lines open that belong to no device."""
 
     def watch(settings: InputOptions, purpose: str, on_edges: OnEdges, report: Callable[[str], None]) -> WatchedInput:
         return WatchedLine(lines.make_input(settings, purpose, True), on_edges, lambda _level: None, report, now_ns)

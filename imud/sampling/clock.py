@@ -72,10 +72,7 @@ def add_even_run(
     fit: ArrivalFit,
     host: SteadyTime,
 ) -> float:
-    """Append samples of `events` from index `at` on. Stop at the first event that needs `SampleClock.sample`.
-
-    Return the time stamp error of the newest sample, ns. Update `time` and `fit` to the newest sample.
-    """
+    """Append samples until an event needs `SampleClock.sample`. Return the error of the newest time stamp, ns."""
     device, seq, newest_ns, t_rx_ns, utc_offset_ns, byte_ns, waited_ns, bias_ns, fit_error_ns, sync, own = start
     offset_ns, even_from_ns = host.offset_ns, host.even_from_ns
     ref_arrival_ns, ref_device_ns, slope = fit.ref_arrival_ns, fit.ref_device_ns, fit.slope
@@ -83,7 +80,6 @@ def add_even_run(
     doubt_ns, ticks, device_ns, raw_ns = time.doubt_ns, time.ticks, time.even_ns, time.raw_ns
     period_ticks, modulus, tick_ns = time.period.period_ticks, time.modulus, time.tick_ns
     keep, add_arrival, before, newest_error_ns = samples.append, fit.add_arrival, len(samples), 0.0
-    # local names are faster than attributes in the loop
     for index in range(at, len(events)):
         m = events[index]
         if type(m) is not Measurement or m.dev_ticks is None:

@@ -166,9 +166,9 @@ def test_a_user_without_the_right(gpio_chip: GpioChip) -> None:
 def test_what_is_not_there(gpio_chip: GpioChip) -> None:
     with pytest.raises(LinkMissing, match=r"has no line 6: its lines are 0 to 5"):
         GpioInput(InputOptions(line=6, chip=gpio_chip.path.name)).open()
-    with pytest.raises(LinkMissing, match=rf"gpiochip99 is not there; there are: {gpio_chip.path.name} \("):
+    with pytest.raises(LinkMissing, match=rf"gpiochip99 does not exist; existing chips: {gpio_chip.path.name} \("):
         GpioInput(InputOptions(line=0, chip="gpiochip99")).open()
-    with pytest.raises(LinkMissing, match="null is gone, or is no GPIO chip"):
+    with pytest.raises(LinkMissing, match="null is missing, or is not a GPIO chip"):
         GpioInput(InputOptions(line=0, chip="/dev/null")).open()
 
 
@@ -183,7 +183,7 @@ async def test_a_chip_that_is_pulled_out_and_comes_back(gpio_chip: GpioChip) -> 
     await watcher.wait_for(2)
     (end,) = watcher.ends
     assert isinstance(end, LinkMissing)
-    assert "line 2 (PPS) is gone" in str(end)
+    assert "line 2 (PPS) is missing" in str(end)
     with pytest.raises(LinkMissing, match="SIN"):
         output.set(True)
     output.close()

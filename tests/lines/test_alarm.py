@@ -46,7 +46,7 @@ def test_edges_are_events_at_their_own_time(signals: SignalBench) -> None:
     line.on_edges([Edge(10 * NS_PER_S, True, 1)])
     line.on_edges([Edge(20 * NS_PER_S, False, 2)])
     assert [(event.t_ns, event.message) for event in signals.events] == [
-        (10 * NS_PER_S, "alarm"), (20 * NS_PER_S, "no alarm any more")
+        (10 * NS_PER_S, "alarm"), (20 * NS_PER_S, "alarm ended")
     ]  # fmt: skip
     assert (line.active, line.raised) == (False, 1)
 
@@ -67,7 +67,7 @@ def test_a_chattering_line_makes_one_event_a_second_and_the_last_state_is_report
     assert len(signals.events) == 1
     line.tick(NS_PER_S)
     line.tick(3 * NS_PER_S)
-    assert signals.messages() == ["alarm", "no alarm any more"]
+    assert signals.messages() == ["alarm", "alarm ended"]
 
 
 def test_a_line_that_went_away_and_came_back(signals: SignalBench) -> None:
@@ -132,8 +132,8 @@ def test_a_wire_that_is_not_connected(it: Monitored) -> None:
     ((message, verdict),) = it.verdicts
     assert verdict == "stuck_low"
     assert message == (
-        "line alarm: it is low while an angle is out of the range that the device is set to (X off, Y -5 to 5°): is "
-        "the wire connected, and to the pin that has the alarm (PIN7)?"
+        "line alarm: it is low while an angle is out of the range in the device settings (X off, Y -5 to 5°): is the "
+        "wire connected to the alarm pin (PIN7)?"
     )
     assert message == f"line alarm: {it.monitor.problem}"
     it.edge(True)
@@ -155,7 +155,7 @@ def test_the_other_axis(it: Monitored) -> None:
     it.run(1, 0, pitch_deg=20)
     assert it.monitor.problem == ""
     it.run(3, 0, pitch_deg=20)
-    assert "mounted" in it.monitor.problem
+    assert "mounting" in it.monitor.problem
     assert it.monitor.problem.endswith("(MOUNT)?")
 
 

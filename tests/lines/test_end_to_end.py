@@ -149,7 +149,7 @@ async def test_an_alarm_is_an_event_and_shown_in_the_samples(wired: WiredDevice)
     samples = await wired.wait(10)
     messages = [event.message for event in wired.of_kind(EventKind.ALARM)]
     assert any(message.startswith("alarm") for message in messages)
-    assert any(message.startswith("no alarm any more") for message in messages)
+    assert any(message.startswith("alarm ended") for message in messages)
     assert not any("line alarm" in message for message in messages)
     status = wired.device.status()
     assert status.settings["alarm.y"] == "-5° … 5°, on"

@@ -136,7 +136,7 @@ async def test_a_chip_that_vanishes_ends_the_line(
         patch.setattr(os, "read", gone)
         line.drain()
     assert isinstance(sink.end, LinkMissing)
-    assert "gpiochip0 line 0 (SOUT) is gone (No such device)" in str(sink.end)
+    assert "gpiochip0 line 0 (SOUT) is missing (No such device)" in str(sink.end)
     assert gpiod.requests[0].released
     line.drain()
     line.close()

@@ -37,7 +37,7 @@ def test_by_path_or_by_name_alone_whatever_other_names_a_chip_has(gpiod: FakeGpi
         ("SOUP", "", LinkMissing, "no line has the name SOUP on gpiochip0 (pinctrl-bcm2711), gpiochip10 (expander); did you mean SOUT?"),
         ("SOUT", "expander", LinkMissing, "no line has the name SOUT on gpiochip10 (expander)"),
         (3, "gpiochip0", LinkMissing, "gpiochip0 (pinctrl-bcm2711) has no line 3: its lines are 0 to 2"),
-        (0, "gpiochip7", LinkMissing, "GPIO chip gpiochip7 is not there; there are: gpiochip0 (pinctrl-bcm2711), gpiochip10 (expander)"),
+        (0, "gpiochip7", LinkMissing, "GPIO chip gpiochip7 does not exist; existing chips: gpiochip0 (pinctrl-bcm2711), gpiochip10 (expander)"),
     ],
 )  # fmt: skip
 def test_what_is_not_there(
@@ -52,9 +52,9 @@ def test_what_is_not_there(
 def test_no_chip_at_all_or_two_of_a_label(tmp_path: Path, gpiod: FakeGpiod) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(LinkMissing, match="on any chip, as there is none"):
+    with pytest.raises(LinkMissing, match="on any chip: no chip exists"):
         find_line(gpiod, LineOptions(line="SOUT"), empty)
-    with pytest.raises(LinkMissing, match="there are: none"):
+    with pytest.raises(LinkMissing, match="existing chips: none"):
         find_line(gpiod, LineOptions(line=0, chip="gpiochip0"), empty)
     gpiod.chips["gpiochip10"] = gpiod.chips["gpiochip0"]
     with pytest.raises(LinkError, match=r"on one GPIO chip, got it on gpiochip0 \(.*\) and gpiochip10 \("):
@@ -76,7 +76,7 @@ def test_a_chip_that_goes_away_or_is_none_matters_only_if_the_line_is_not_elsewh
 ) -> None:
     gpiod.errors["gpiochip0"] = errno.ENODEV
     assert find_line(gpiod, LineOptions(line="RESET"), tmp_path).offset == 0
-    with pytest.raises(LinkMissing, match="gpiochip0 is gone, or is no GPIO chip: No such device"):
+    with pytest.raises(LinkMissing, match="gpiochip0 is missing, or is not a GPIO chip: No such device"):
         find_line(gpiod, LineOptions(line=0, chip="gpiochip0"), tmp_path)
     (tmp_path / "ttyS0").touch()
     with pytest.raises(LinkError, match="ttyS0 cannot be used as a GPIO chip"):
@@ -86,10 +86,10 @@ def test_a_chip_that_goes_away_or_is_none_matters_only_if_the_line_is_not_elsewh
 @pytest.mark.parametrize(
     ("number", "kind", "message"),
     [
-        (errno.EBUSY, LinkBusy, "gpiochip0 line 0 (SOUT) is in use by gpiomon: stop that"),
+        (errno.EBUSY, LinkBusy, "gpiochip0 line 0 (SOUT) is in use by gpiomon: stop it"),
         (errno.EACCES, LinkDenied, "may not be opened by user"),
         (errno.EPERM, LinkDenied, "add a line `DeviceAllow="),
-        (errno.ENODEV, LinkMissing, "is gone"),
+        (errno.ENODEV, LinkMissing, "is missing"),
         (errno.ENXIO, LinkError, "gpiochip0 line 0 (SOUT) cannot be requested: No such device or address; an input"),
     ],
 )
@@ -104,7 +104,7 @@ def test_a_line_that_is_not_given(
 
 def test_a_holder_without_a_name(gpiod: FakeGpiod, tmp_path: Path) -> None:
     place = LineLocation(str(tmp_path / "gpiochip0"), 0, "SOUT")
-    assert "in use by a nameless program" in str(request_error(gpiod, OSError(errno.EBUSY, ""), place))
+    assert "in use by an unknown program" in str(request_error(gpiod, OSError(errno.EBUSY, ""), place))
     gpiod.errors["gpiochip0"] = errno.ENODEV
     assert isinstance(request_error(gpiod, OSError(errno.EBUSY, ""), place), LinkBusy)
 

@@ -134,7 +134,7 @@ async def test_one_edge_by_command_where_there_is_sin() -> None:
     assert not bench.output("sin").is_open
     bench = SyncBench(DeviceLines(sout=SoutOptions(line="A")))
     assert not bench.signals.can_trigger
-    with pytest.raises(CommandError, match="expected the key sin"):
+    with pytest.raises(CommandError, match=r"expected the key lines\.sin"):
         bench.signals.trigger_once()
     assert bench.signals.status().sin is False
 

@@ -10,7 +10,7 @@ from tests.support.event_loops import VirtualClock, in_loop
 
 RETRY_NS = 5 * 10**9
 
-BUSY = LinkBusy("gpiochip0 line 3 is in use by gpiomon: stop that")
+BUSY = LinkBusy("gpiochip0 line 3 is in use by gpiomon: stop it")
 
 
 class Watched:
