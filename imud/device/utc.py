@@ -117,7 +117,7 @@ class UtcFeed:
             problem=(source.problem if source is not None else "") or (chrony.problem if chrony is not None else ""),
             sentences=source.sentences if source is not None else 0,
             sent=feed.sent if feed is not None else 0,
-            refused=feed.status().refused if feed is not None else {},
+            refused=dict(feed.refused) if feed is not None else {},
             pulses=self._pps.pulses,
             pulses_ignored=self._pps.pulses_ignored,
             chrony_sent=chrony.sent if chrony is not None else 0,

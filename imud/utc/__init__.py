@@ -1,4 +1,4 @@
-"""UTC: sources of RMC sentences, references from PPS pulses and the system clock, the feeds of device and chronyd."""
+"""UTC: sources of RMC sentences, references from pulses and from the system clock, feeds of device and chronyd."""
 
 from imud.contracts.registry import Registry
 from imud.utc.receivers import MakeSource

@@ -1,13 +1,13 @@
-"""UTC from a pulse per second and the RMC sentences that name its seconds.
+"""UTC from a pulse per second and from RMC sentences, which contain the second of a pulse.
 
-The kernel stamps each pulse with CLOCK_MONOTONIC; a pulse is the begin of a second of UTC. `UTC - MONOTONIC` at the
-last 16 pulses is kept and fitted by a line: its slope is the median of the slopes between all pairs (Theil-Sen), so
-that a quarter of the stamps may be outliers; its height is the upper quartile, as stamps are late and never early.
-Doubtful pulses are rejected:
+A pulse is the start of a second of UTC. The kernel time-stamps it with CLOCK_MONOTONIC. A line is fitted to UTC minus
+CLOCK_MONOTONIC at the last 16 pulses. Its slope is the median of the slopes between all pairs (Theil-Sen), so that a
+quarter of the time stamps can be outliers. Its height is the upper quartile, because time stamps are late and never
+early. imud rejects these pulses:
 
-- a pulse counts if it is a whole number of seconds after the last that did, 10 at most, each within 0.5 ms;
-- three rejected pulses in step with each other start again: the receiver was exchanged, or the host was suspended;
-- the second is known when two consecutive sentences give a pulse the same second, and is corrected the same way.
+- A pulse is accepted if it follows the previous accepted pulse by 1 to 10 whole seconds, within 0.5 ms per second.
+- Three rejected pulses with whole seconds between them restart the fit: another receiver, or a suspend of the host.
+- The second of a pulse is known after two consecutive sentences with the same second. It is corrected in the same way.
 """
 
 import socket
@@ -25,41 +25,36 @@ from imud.formats.nmea0183 import Rmc, parse
 from imud.model.units import NS_PER_S, NS_PER_US
 
 STEP_TOLERANCE_NS: Final = 500 * NS_PER_US
-"""Oscillators are within 100 ppm, interrupts late by some hundred µs at worst."""
+"""Maximum error of a second between pulses, ns: 100 ppm of the oscillators, and some hundred µs of interrupt delay."""
 GAP_S_MAX: Final = 10
 PULSES_NEEDED: Final = 3
 PULSES_KEPT: Final = 16
 SENTENCES_NEEDED: Final = 2
-HOLD_NS: Final = 600 * NS_PER_S
-"""Hold-over: UTC counts as unknown this long after the last pulse."""
+HOLD_NS: Final = 600 * NS_PER_S  # time after the last pulse until UTC is unknown, ns
 STAMP_NS: Final = 5 * NS_PER_US
-"""One-sigma uncertainty of the constant delay of stamps: interrupt entry on a gateway takes some µs."""
-WANDER: Final = 1e-6
-"""Wander of the oscillator's rate in hold-over: 1 µs each second."""
-MAD_TO_SIGMA: Final = 1.4826
-"""Sigma of a normal distribution over its median absolute deviation."""
+"""One-sigma error of the constant delay of time stamps, ns. The entry of an interrupt needs some µs."""
+WANDER: Final = 1e-6  # change of the oscillator's rate without pulses: 1 µs per second
+MAD_TO_SIGMA: Final = 1.4826  # ratio of sigma to the median absolute deviation of a normal distribution
 
 
 class PpsReference:
-    """Estimator of UTC from pulses and sentences. Pure. Synchronization: one thread."""
+    """Estimator of UTC from pulses and sentences. Synchronization: one thread."""
 
     def __init__(self, on_second: Callable[[int, int], None] | None = None) -> None:
-        """`on_second(t_ns, unix_s)` is called for each pulse whose second is known."""
-        self.pulses = 0
-        """Pulses that counted."""
+        """`on_second(t_ns, unix_s)` is called for each pulse with a known second."""
+        self.pulses = 0  # number of accepted pulses
         self.pulses_ignored = 0
-        self.sentences_ignored = 0
-        """Sentences that were damaged, not valid, or matched no pulse."""
+        self.sentences_ignored = 0  # number of sentences that were damaged, invalid, or matched no pulse
         self._on_second = on_second
         self._stamps: deque[int] = deque(maxlen=PULSES_KEPT)
-        self._seconds: deque[int] = deque(maxlen=PULSES_KEPT)  # seconds of the stamps, from an arbitrary origin
+        self._seconds: deque[int] = deque(maxlen=PULSES_KEPT)  # seconds of the time stamps, from an arbitrary start
         self._candidates: list[int] = []
-        self._base_s: int | None = None  # unix second at which `_seconds` is 0
-        self._claim_s: int | None = None  # `_base_s` by the last sentence
+        self._base_s: int | None = None  # unix second of `_seconds` 0
+        self._claim_s: int | None = None  # `_base_s` according to the last sentence
         self._fit: tuple[float, float, float] | None = None
 
     def on_pulse(self, t_ns: int) -> bool:
-        """Add a rising edge of PPS at CLOCK_MONOTONIC `t_ns`; return whether it counts."""
+        """Add a rising edge of PPS at CLOCK_MONOTONIC `t_ns`. Return whether the pulse is accepted."""
         seconds = self._seconds_since(self._stamps[-1], t_ns) if self._stamps else 0
         if not seconds:
             return self._add_candidate(t_ns)
@@ -74,7 +69,7 @@ class PpsReference:
         return True
 
     def on_sentence(self, sentence: bytes, t_rx_ns: int) -> None:
-        """Add an RMC sentence of the receiver that makes the pulses, received at CLOCK_MONOTONIC `t_rx_ns`."""
+        """Add an RMC sentence of the receiver of the pulses. `t_rx_ns` is CLOCK_MONOTONIC at its arrival."""
         rmc = parse(sentence)
         if not isinstance(rmc, Rmc) or not rmc.valid or not self._stamps:
             self.sentences_ignored += 1
@@ -89,7 +84,7 @@ class PpsReference:
         self._claim_s = base_s
 
     def reference(self, now_ns: int) -> UtcReference | None:
-        """Return the estimate at `now_ns`; None before enough pulses and sentences and HOLD_NS after the last pulse."""
+        """Return the estimate at `now_ns`; None before enough pulses and sentences, or HOLD_NS after the last pulse."""
         if self._base_s is None or len(self._stamps) < PULSES_NEEDED or now_ns - self._stamps[-1] > HOLD_NS:
             return None
         if self._fit is None:
@@ -103,7 +98,7 @@ class PpsReference:
         return UtcReference(offset_ns, round(error_ns))
 
     def _fit_line(self) -> tuple[float, float, float]:
-        """Return height of the line above the offset of the last pulse (ns), slope, one-sigma spread (ns)."""
+        """Return (height of the line above the offset of the last pulse, ns; slope; one-sigma spread, ns)."""
         last_ns, last_s = self._stamps[-1], self._seconds[-1]
         points = [
             (t_ns - last_ns, (second - last_s) * NS_PER_S - (t_ns - last_ns))
@@ -114,10 +109,10 @@ class PpsReference:
         middle_ns = median(heights)
         sigma_ns = MAD_TO_SIGMA * median(abs(height - middle_ns) for height in heights)
         height_ns = quantiles(heights, n=4, method="inclusive")[2]
-        return height_ns, slope, hypot(sigma_ns, height_ns - middle_ns)  # the remaining lateness is of this order
+        return height_ns, slope, hypot(sigma_ns, height_ns - middle_ns)  # the remaining delay is about as large
 
     def _add_candidate(self, t_ns: int) -> bool:
-        """Add a pulse that is out of step with those that counted; return whether its kind takes over."""
+        """Add a rejected pulse. Return whether the rejected pulses replace the accepted pulses."""
         candidates = self._candidates
         if candidates and not self._seconds_since(candidates[-1], t_ns):
             self.pulses_ignored += len(candidates)
@@ -136,7 +131,7 @@ class PpsReference:
 
     @staticmethod
     def _seconds_since(before_ns: int, t_ns: int) -> int:
-        """Return the whole seconds between two pulses, 0 if they are out of step."""
+        """Return the whole seconds between two pulses; 0 if the time is not a whole number of seconds."""
         seconds = round((t_ns - before_ns) / NS_PER_S)
         off_ns = abs(t_ns - before_ns - seconds * NS_PER_S)
         return seconds if 1 <= seconds <= GAP_S_MAX and off_ns <= seconds * STEP_TOLERANCE_NS else 0
@@ -148,31 +143,33 @@ HALF_NS: Final = NS_PER_S // 2
 
 
 def encode(system_ns: int, offset_ns: int, *, pulse: bool, leap: int = 0) -> bytes:
-    """Encode a sample: at `system_ns` (CLOCK_REALTIME) true time was `offset_ns` more; `pulse`: modulo one second."""
+    """Encode a sample for chronyd: at CLOCK_REALTIME `system_ns`, the true time was `offset_ns` later.
+
+    With `pulse`, the offset is modulo one second.
+    """
     seconds, rest_ns = divmod(system_ns, NS_PER_S)
     return SAMPLE.pack(seconds, rest_ns // NS_PER_US, offset_ns / NS_PER_S, pulse, leap, 0, MAGIC)
 
 
 class ChronyFeed:
-    """Sender of samples to chronyd. Never blocks. Synchronization: one thread."""
+    """Sender of samples to chronyd. It never blocks. Synchronization: one thread."""
 
     def __init__(self, path: str, utc_offset_ns: Callable[[], int]) -> None:
-        """`path` is chronyd's socket, which may not exist yet; `utc_offset_ns` as `SourceContext.utc_offset_ns`."""
+        """`path` is chronyd's socket, which may not exist yet. `utc_offset_ns`: see `SourceContext.utc_offset_ns`."""
         self.title = f"chronyd at {path}"
         self.problem = ""
-        """Why the last sample was not accepted, one sentence; empty if it was."""
+        """Reason why chronyd did not accept the last sample, one sentence; empty if it accepted the sample."""
         self.sent = 0
-        self.refused = 0
-        """Samples not accepted: chronyd does not run, or does not keep up."""
+        self.refused = 0  # number of samples that chronyd did not accept: it is not running, or it is too slow
         self._path = path
         self._utc_offset_ns = utc_offset_ns
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
 
     def send_pulse(self, t_ns: int, unix_s: int | None = None) -> bool:
-        """Send a pulse at CLOCK_MONOTONIC `t_ns`, the begin of `unix_s` if known; return whether it was accepted.
+        """Send a pulse at CLOCK_MONOTONIC `t_ns`, the start of `unix_s` if known. Return whether chronyd accepted it.
 
-        Call it soon after the pulse. Without the second chronyd needs another source for it (`lock`).
+        Call this method soon after the pulse. Without the second, chronyd needs another source for it (`lock`).
         """
         system_ns = t_ns + self._utc_offset_ns()
         second_s = (system_ns + HALF_NS) // NS_PER_S if unix_s is None else unix_s
@@ -180,7 +177,7 @@ class ChronyFeed:
         return self._send(encode(system_ns, offset_ns, pulse=unix_s is None))
 
     def close(self) -> None:
-        """Close the socket; may be called twice."""
+        """Close the socket. A second call does nothing."""
         with suppress(OSError):
             self._socket.close()
 
@@ -189,7 +186,7 @@ class ChronyFeed:
             self._socket.sendto(sample, self._path)
         except OSError as error:
             self.refused += 1
-            self.problem = f"{self.title} refuses samples: {error.strerror or error}; is it running, with this socket?"
+            self.problem = f"{self.title} rejects samples: {error.strerror or error}; is it running with this socket?"
             return False
         self.sent += 1
         self.problem = ""

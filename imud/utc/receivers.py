@@ -1,8 +1,8 @@
-"""RMC sentences of GNSS receivers: through gpsd, or from a receiver on a serial port of its own.
+"""RMC sentences of GNSS receivers: from gpsd, or from a receiver on a serial port.
 
-gpsd passes on a receiver's own sentences, or makes them for receivers with another protocol. Its JSON protocol
-(gpsd_json(5)) is: a greeting, `?WATCH={"enable":true,"nmea":true}` once, then sentences. A silent receiver is no broken
-connection; TCP keep-alive detects a gpsd that is gone.
+gpsd forwards the sentences of a receiver, or makes sentences for receivers with another protocol. Its JSON protocol
+(gpsd_json(5)) is a greeting, `?WATCH={"enable":true,"nmea":true}` once, then sentences. A silent receiver is not a
+broken connection. TCP keep-alive detects a missing gpsd.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ from imud.model.errors import LinkError, reason_of
 from imud.model.options import Options, is_host, shown
 
 OnSentence = Callable[[bytes, int], None]
-"""Called with one RMC sentence, including its line end, and CLOCK_MONOTONIC (ns) right after its arrival."""
+"""Called with one RMC sentence including its line end, and with CLOCK_MONOTONIC right after its arrival, ns."""
 MakePort = Callable[[str, int], StreamLink]
 """Makes a closed serial link from a path and a rate in bit/s."""
 
@@ -30,71 +30,71 @@ class RmcOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Options of the source of a device's RMC sentences."""
 
     source: Literal["gpsd", "nmea", "system"]
-    """`gpsd`: a GNSS receiver that gpsd owns. `nmea`: one on a serial port of its own. `system`: the system clock,
-    while the kernel says that it is synchronised."""
+    """`gpsd`: a GNSS receiver that gpsd owns. `nmea`: a receiver on a serial port. `system`: the system clock while it
+    is synchronized."""
     rate_hz: Annotated[int, Meta(ge=1, le=10)] = 1
-    """Sentences per second at most, for the device."""
+    """Maximum number of sentences per second for the device."""
     host: Annotated[str, Meta(min_length=1, max_length=253)] = "127.0.0.1"
-    """Host on which gpsd runs."""
+    """Host of gpsd."""
     tcp_port: Annotated[int, Meta(ge=1, le=65535)] = 2947
     """TCP port of gpsd."""
     gps: Annotated[str, Meta(max_length=256)] = ""
-    """Path of the receiver in gpsd, where gpsd has several; empty for all."""
+    """Path of the receiver in gpsd, if gpsd has several receivers. Empty for all receivers."""
     port: str = ""
     """Path of the receiver's serial port, for `nmea`."""
     baud: Annotated[int, Meta(ge=4800, le=921_600)] = 9600
-    """Rate of that port in bit/s."""
+    """Bit rate of this port."""
     error_ms: Annotated[float, Meta(gt=0, le=60)] = 50.0
-    """The system clock is used while its one-sigma error is below this. Sentences only name the second, and are sent
-    200 ms after its begin, so that such an error does no harm."""
+    """Maximum one-sigma error of the system clock. A sentence only contains the second and is sent 200 ms after its
+    start. Such an error therefore has no effect."""
 
     def __post_init__(self) -> None:
         if not is_host(self.host):
             raise ValueError(f"host: expected an IP address or a host name, got {shown(self.host)}")
         if self.source == "nmea" and not self.port:
-            raise ValueError("expected the key port beside source nmea, the path of the receiver's port, got none")
+            raise ValueError("expected the key port for source nmea, the path of the receiver's port, got none")
 
 
 class RmcSource(Protocol):
-    """Source of sentences, valid or not; recovers from failures. Synchronization: the loop's thread only."""
+    """Source of sentences, valid or not. It recovers from failures. Synchronization: the event loop's thread only."""
 
     title: str
-    """The source for people, for example `gpsd at 127.0.0.1:2947`."""
+    """Name of the source for the user. Example: `gpsd at 127.0.0.1:2947`."""
     problem: str
-    """Why it delivers nothing, one sentence; empty if it does."""
+    """Reason why the source delivers no sentences, one sentence; empty if it delivers sentences."""
     sentences: int
-    """Sentences delivered since the start."""
+    """Number of sentences since the start."""
 
     def start(self, on_sentence: OnSentence) -> None:
-        """Deliver sentences from now on. Needs a running loop."""
+        """Start to deliver sentences. Needs a running event loop."""
         ...
 
     def close(self) -> None:
-        """Deliver nothing more, and release port or connection; may be called twice."""
+        """Stop the delivery, and release the port or connection. A second call does nothing."""
         ...
 
 
 class SourceContext(NamedTuple):
-    """Services of the host that sources need."""
+    """Services of the host for sources."""
 
     make_port: MakePort
     now_ns: Callable[[], int]
-    """CLOCK_MONOTONIC."""
+    """CLOCK_MONOTONIC, ns."""
     utc_offset_ns: Callable[[], int]
-    """CLOCK_REALTIME minus CLOCK_MONOTONIC, now."""
+    """CLOCK_REALTIME minus CLOCK_MONOTONIC, ns."""
 
 
 MakeSource = Callable[[RmcOptions, SourceContext], RmcSource]
-"""Makes a source; `imud.utc.RMC_SOURCES` has one for each value of `RmcSettings.source`."""
+"""Makes a source. `imud.utc.RMC_SOURCES` contains one for each value of `RmcOptions.source`."""
 
 LINE_BYTES_MAX: Final = 16384
-"""Longer lines (gpsd writes JSON of some kilobytes) are skipped without being buffered."""
+"""Maximum length of a line, bytes. gpsd writes JSON of some kilobytes. Longer lines are skipped and not buffered."""
 FIRST_PAUSE_S: Final = 0.5
 LONGEST_PAUSE_S: Final = 30.0
 
 
 class SentenceSplitter:
-    """Finder of RMC sentences among other sentences, JSON and noise. Buffers LINE_BYTES_MAX at most.
+    """Finder of RMC sentences between other sentences, JSON and noise. It buffers at most LINE_BYTES_MAX.
 
     Synchronization: one thread.
     """
@@ -104,7 +104,7 @@ class SentenceSplitter:
         self._skipping = False
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Add bytes, split anywhere; return the complete sentences, with CR LF, checksums not verified."""
+        """Add bytes. Return the complete sentences with CR LF. Their checksums are not verified."""
         *lines, tail = (self._tail + data).split(b"\n")
         if lines and self._skipping:
             lines, self._skipping = lines[1:], False
@@ -114,12 +114,12 @@ class SentenceSplitter:
         return [sentence for line in lines if len(line) <= LINE_BYTES_MAX and (sentence := _rmc_in(line))]
 
     def clear(self) -> None:
-        """Drop the buffered bytes: the stream begins again."""
+        """Drop the buffered bytes: the stream restarts."""
         self._tail, self._skipping = b"", False
 
 
 class Retry:
-    """Pauses between attempts: each twice as long as the last, short again after a success.
+    """Pauses between attempts. Each pause is twice as long as the previous one, until a success.
 
     Synchronization: one task.
     """
@@ -129,17 +129,17 @@ class Retry:
         self._pause_s = FIRST_PAUSE_S
 
     async def pause(self) -> None:
-        """Sleep for the next pause, LONGEST_PAUSE_S at most."""
+        """Sleep for the next pause, at most LONGEST_PAUSE_S."""
         pause_s, self._pause_s = self._pause_s, min(self._pause_s * 2, LONGEST_PAUSE_S)
         await self._sleep(pause_s)
 
     def reset(self) -> None:
-        """Note a success."""
+        """Make the next pause short after a success."""
         self._pause_s = FIRST_PAUSE_S
 
 
 class ReconnectingSource(ABC):
-    """An `RmcSource` that connects again after each end of its stream. Synchronization: the loop's thread only."""
+    """Source that connects again after each end of its stream. Synchronization: the event loop's thread only."""
 
     def __init__(self, title: str, retry: Retry | None) -> None:
         self.title = title
@@ -151,12 +151,12 @@ class ReconnectingSource(ABC):
         self._task: asyncio.Task[None] | None = None
 
     def start(self, on_sentence: OnSentence) -> None:
-        """Deliver sentences from now on. Needs a running loop."""
+        """Start to deliver sentences. Needs a running event loop."""
         self._on_sentence = on_sentence
         self._task = asyncio.get_running_loop().create_task(self._run(), name=self.title)
 
     def close(self) -> None:
-        """Close the connection, and deliver nothing more; may be called twice."""
+        """Close the connection and stop the delivery. A second call does nothing."""
         self._on_sentence = _ignore
         self._disconnect()
         if self._task is not None:
@@ -165,11 +165,11 @@ class ReconnectingSource(ABC):
 
     @abstractmethod
     async def _connect_and_read(self) -> None:
-        """Serve one connection from begin to end, and leave the reason of its end in `problem`."""
+        """Serve one connection until its end, and store the reason of the end in `problem`."""
 
     @abstractmethod
     def _disconnect(self) -> None:
-        """Close the connection, if any; may be called twice."""
+        """Close the connection, if any. A second call does nothing."""
 
     async def _run(self) -> None:
         while True:
@@ -178,7 +178,7 @@ class ReconnectingSource(ABC):
             await self._retry.pause()
 
     def _on_data(self, data: bytes, t_rx_ns: int) -> None:
-        """Add bytes of the stream; `t_rx_ns` is CLOCK_MONOTONIC right after the read."""
+        """Add bytes of the stream. `t_rx_ns` is CLOCK_MONOTONIC right after the read."""
         for sentence in self._splitter.feed(data):
             self.problem = ""
             self.sentences += 1
@@ -187,7 +187,7 @@ class ReconnectingSource(ABC):
 
 
 def _rmc_in(line: bytes) -> bytes | None:
-    """Return the RMC sentence at the end of a line: lost bytes may have joined it to an earlier one."""
+    """Return the RMC sentence at the end of a line. Lost bytes may have joined it to an earlier sentence."""
     begin = line.rfind(b"$")
     sentence = line[begin:].rstrip(b"\r")
     if begin < 0 or sentence[3:7] != b"RMC," or len(sentence) > RMC_BYTES_MAX - 2:
@@ -196,20 +196,21 @@ def _rmc_in(line: bytes) -> bytes | None:
 
 
 def _ignore(_sentence: bytes, _t_rx_ns: int) -> None:
-    """Ignore the sentence: the receiver before `start` and after `close`."""
+    """Ignore the sentence, before `start` and after `close`."""
 
 
 CONNECT_LIMIT_S: Final = 5.0
 READ_BYTES: Final = 65536
 KEEP_ALIVE: Final = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
-"""Seconds of silence before the first probe, between probes, and their number: a loss is noticed within 25 s."""
+"""Seconds of silence before the first probe, seconds between probes, number of probes: imud detects a loss within 25 s.
+"""
 
 
 class GpsdSource(ReconnectingSource):
-    """A client of gpsd."""
+    """Client of gpsd."""
 
     def __init__(self, settings: RmcOptions, now_ns: Callable[[], int], retry: Retry | None = None) -> None:
-        """`now_ns` is CLOCK_MONOTONIC."""
+        """`now_ns` returns CLOCK_MONOTONIC."""
         super().__init__(f"gpsd at {settings.host}:{settings.tcp_port}", retry)
         self._now_ns = now_ns
         self._address = settings.host, settings.tcp_port
@@ -222,13 +223,13 @@ class GpsdSource(ReconnectingSource):
                 reader, writer = await asyncio.open_connection(*self._address)
         except (OSError, TimeoutError) as error:
             reason = "no answer" if isinstance(error, TimeoutError) else reason_of(error)
-            self.problem = f"{self.title} cannot be reached: {reason}; is gpsd running?"
+            self.problem = f"cannot connect to {self.title}: {reason}; is gpsd running?"
             return
         self._writer = writer
         try:
             _keep_alive(writer.get_extra_info("socket"))
             writer.write(self._watch)
-            self.problem = f"{self.title} has no sentences yet: has its receiver a view of the sky?"
+            self.problem = f"{self.title} has no sentences yet: does its receiver have a view of the sky?"
             while data := await reader.read(READ_BYTES):
                 self._on_data(data, self._now_ns())
             self.problem = f"{self.title} closed the connection"
@@ -246,7 +247,7 @@ class GpsdSource(ReconnectingSource):
 
 
 class NmeaPortSource(ReconnectingSource):
-    """A receiver on a serial port, with NMEA 0183."""
+    """NMEA 0183 receiver on a serial port."""
 
     def __init__(self, link: StreamLink, retry: Retry | None = None) -> None:
         super().__init__(f"NMEA receiver on {link.title}", retry)
@@ -256,11 +257,11 @@ class NmeaPortSource(ReconnectingSource):
     async def _connect_and_read(self) -> None:
         link = self._link
         self._ended.clear()
-        self.problem = f"{self.title}: the port is not there"
+        self.problem = f"{self.title}: the port does not exist"
         await link.wait_present()
         try:
             link.open()
-            self.problem = f"{self.title} sent no sentence yet: is its rate {link.baud} bit/s?"
+            self.problem = f"{self.title} has sent no sentence yet: is its rate {link.baud} bit/s?"
             link.start(self._on_data, self._on_end)
             await self._ended.wait()
         except LinkError as error:
@@ -290,10 +291,10 @@ def _keep_alive(sock: socket.socket) -> None:
 
 
 def make_gpsd(settings: RmcOptions, context: SourceContext) -> GpsdSource:
-    """Make the source `gpsd`."""
+    """Return the source `gpsd`."""
     return GpsdSource(settings, context.now_ns)
 
 
 def make_nmea(settings: RmcOptions, context: SourceContext) -> NmeaPortSource:
-    """Make the source `nmea`."""
+    """Return the source `nmea`."""
     return NmeaPortSource(context.make_port(settings.port, settings.baud))

@@ -1,8 +1,8 @@
-"""The system clock: whether the kernel reports it as synchronised, and RMC sentences made from it while it is.
+"""System clock: its state in the kernel, and RMC sentences with its time while it is synchronized.
 
-A daemon that keeps the clock (chronyd, ntpd, systemd-timesyncd) clears STA_UNSYNC and sets its estimate of the error
-and a bound of it; the kernel increases the bound by 500 µs each second and sets STA_UNSYNC at 16 s. adjtimex(2) reads
-this without changing anything.
+A daemon that controls the clock (chronyd, ntpd, systemd-timesyncd) clears STA_UNSYNC and sets its estimate and a bound
+of the error. The kernel increases the bound by 500 µs per second, and sets STA_UNSYNC at 16 s. adjtimex(2) reads these
+values.
 """
 
 import asyncio
@@ -20,16 +20,16 @@ from imud.utc.receivers import OnSentence, RmcOptions, SourceContext
 STA_UNSYNC: Final = 0x40
 TIME_ERROR: Final = 5
 AFTER_NS: Final = 200 * NS_PER_MS
-"""Delay of a sentence after the instant it names: more than the allowed error of the clock (60 ms, three sigma), so
-that it never precedes the pulse of its second."""
+"""Delay of a sentence after its time, ns. It is longer than the allowed error of the clock (60 ms, three sigma), so
+that a sentence never precedes the pulse of its second."""
 LATEST_NS: Final = 800 * NS_PER_MS
-"""Latest time in a second to send a sentence; a later one could be assigned to the next."""
+"""Latest time in a second to send a sentence, ns. The device could assign a later sentence to the next second."""
 LATE_NS: Final = 50 * NS_PER_MS
-"""A sentence that is due longer than this is skipped: the next one is near."""
+"""Maximum delay of a due sentence, ns. After that, imud skips it, because the next sentence follows soon."""
 
 
 class Timex(ctypes.Structure):
-    """struct timex of <linux/timex.h>, with the machine's `long`."""
+    """struct timex of <linux/timex.h>, with the host's `long`."""
 
     _fields_ = (
         ("modes", ctypes.c_uint), ("offset", ctypes.c_long), ("freq", ctypes.c_long), ("maxerror", ctypes.c_long),
@@ -42,23 +42,21 @@ class Timex(ctypes.Structure):
 
 
 class KernelClock(NamedTuple):
-    """State of the system clock, as the kernel reports it."""
+    """State of the system clock in the kernel."""
 
-    synchronised: bool
-    """Whether a daemon synchronises it."""
+    synchronised: bool  # whether a daemon synchronizes the clock
     estimated_error_us: int
-    """One-sigma error as the daemon estimates it; 0 if it does not (systemd-timesyncd)."""
-    most_error_us: int
-    """Bound of the error."""
+    """One-sigma error according to the daemon, µs; 0 if the daemon sets none (systemd-timesyncd)."""
+    most_error_us: int  # bound of the error, µs
 
     @property
     def error_ns(self) -> int:
-        """One-sigma error: the estimate, or that of a uniform distribution within the bound, whichever is greater."""
+        """Return the one-sigma error, ns: the estimate, or the error from the bound (uniform) if larger."""
         return round(max(self.estimated_error_us, self.most_error_us / sqrt(3)) * NS_PER_US)
 
 
 def ask_kernel(timex: Timex) -> int:
-    """Call adjtimex(2): fill `timex`, return the state of the clock. Raises OSError."""
+    """Call adjtimex(2): fill `timex` and return the state of the clock. Raises OSError."""
     state: int = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
     if state < 0:
         number = ctypes.get_errno()
@@ -67,7 +65,7 @@ def ask_kernel(timex: Timex) -> int:
 
 
 def kernel_clock(ask: Callable[[Timex], int] = ask_kernel) -> KernelClock:
-    """Read the state of the clock; not synchronised if the call is refused (a container's filter)."""
+    """Read the state of the clock. If the call is refused (filter of a container), the clock is not synchronized."""
     timex = Timex()
     try:
         state = ask(timex)
@@ -78,12 +76,12 @@ def kernel_clock(ask: Callable[[Timex], int] = ask_kernel) -> KernelClock:
 
 
 def system_reference(clock: KernelClock, offset_ns: int) -> UtcReference | None:
-    """Return the system clock as a reference of UTC; None if it is not synchronised."""
+    """Return the system clock as a reference of UTC; None if it is not synchronized."""
     return UtcReference(offset_ns, clock.error_ns) if clock.synchronised else None
 
 
 class SystemClockSource:
-    """Sentences after each second of the system clock, an `RmcSource`. Synchronization: the loop's thread only."""
+    """Source of one or more sentences per second of the system clock. Synchronization: the event loop's thread only."""
 
     def __init__(
         self,
@@ -92,7 +90,7 @@ class SystemClockSource:
         utc_offset_ns: Callable[[], int],
         ask: Callable[[], KernelClock] = kernel_clock,
     ) -> None:
-        """`now_ns` and `utc_offset_ns` as in `SourceContext`; `ask` reads the state of the clock."""
+        """`now_ns` and `utc_offset_ns`: see `SourceContext`. `ask` reads the state of the clock."""
         self.title = "the system clock"
         self.problem = ""
         self.sentences = 0
@@ -103,18 +101,18 @@ class SystemClockSource:
         self._timer: asyncio.TimerHandle | None = None
 
     def start(self, on_sentence: OnSentence) -> None:
-        """Deliver a sentence after each second, or part of one. Needs a running loop."""
+        """Deliver a sentence for each second, or each part of it. Needs a running event loop."""
         self._on_sentence = on_sentence
         self._schedule()
 
     def close(self) -> None:
-        """Deliver nothing more; may be called twice."""
+        """Stop the delivery. A second call does nothing."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
     def tick(self) -> None:
-        """Deliver the sentence that is due, if any, and if the clock is good enough."""
+        """Deliver the due sentence if the clock is accurate enough."""
         now_ns = self._now_ns()
         utc_ns = now_ns + self._utc_offset_ns()
         named_ns = self._named_ns(utc_ns)
@@ -128,7 +126,7 @@ class SystemClockSource:
             self._on_sentence(build(named_ns), now_ns)
 
     def wait_ns(self) -> int:
-        """Return the time until the next sentence is due, ns."""
+        """Return the time until the next due sentence, ns."""
         now_ns = self._now_ns()
         utc_ns = now_ns + self._utc_offset_ns()
         named_ns = self._named_ns(utc_ns)
@@ -136,7 +134,7 @@ class SystemClockSource:
         return min(named_ns + self._step_ns, next_second_ns) + AFTER_NS - utc_ns
 
     def _named_ns(self, utc_ns: int) -> int:
-        """Return the last instant that a sentence is to name."""
+        """Return the last instant that a sentence describes, ns."""
         second, rest_ns = divmod(utc_ns - AFTER_NS, NS_PER_S)
         return second * NS_PER_S + rest_ns // self._step_ns * self._step_ns
 
@@ -150,13 +148,13 @@ class SystemClockSource:
     def _complaint(self) -> str:
         clock = self._ask()
         if not clock.synchronised:
-            return "the system clock is not synchronised: is chronyd or another NTP client running?"
+            return "the system clock is not synchronized: is chronyd or another NTP client running?"
         if clock.error_ns > self._most_ns:
             error_ms, most_ms = clock.error_ns / NS_PER_MS, self._most_ns / NS_PER_MS
-            return f"the system clock may be wrong by {error_ms:.1f} ms, allowed are {most_ms:g} ms"
+            return f"the system clock may be wrong by {error_ms:.1f} ms, the maximum is {most_ms:g} ms (error_ms)"
         return ""
 
 
 def make(settings: RmcOptions, context: SourceContext) -> SystemClockSource:
-    """Make the source `system`."""
+    """Return the source `system`."""
     return SystemClockSource(settings, context.now_ns, context.utc_offset_ns)

@@ -192,7 +192,7 @@ def test_each_rmc_source(keys: str, rmc: RmcOptions | None) -> None:
     [
         (HIPNUC + ", rmc: {}", "expected the key source"),
         (HIPNUC + ", rmc: {source: ntp}", 'expected one of "gpsd", "nmea", "system"'),
-        (HIPNUC + ", rmc: {source: nmea}", "expected the key port beside source nmea"),
+        (HIPNUC + ", rmc: {source: nmea}", "expected the key port for source nmea"),
         (HIPNUC + ", rmc: {source: gpsd, rate_hz: 11}", "rate_hz"),
         (HIPNUC + ", rmc: {source: gpsd, rate_hz: 0}", "rate_hz"),
         (HIPNUC + ", rmc: {source: gpsd, tcp_port: 0}", "tcp_port"),

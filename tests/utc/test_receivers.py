@@ -112,7 +112,7 @@ async def test_an_unreachable_server_is_a_problem_and_not_the_end() -> None:
     source.start(Sentences())
     async with asyncio.timeout(LIMIT_S):
         await paused.wait()
-    assert "cannot be reached" in source.problem
+    assert "cannot connect to gpsd" in source.problem
     assert "is gpsd running?" in source.problem
     source.close()
 

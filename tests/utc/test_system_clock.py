@@ -127,8 +127,8 @@ async def test_woken_early_it_waits_and_woken_late_it_leaves_out() -> None:
 @pytest.mark.parametrize(
     ("clock", "problem"),
     [
-        (KernelClock(False, 0, 0), "not synchronised"),
-        (KernelClock(True, 51_000, 60_000), "may be wrong by 51.0 ms, allowed are 50 ms"),
+        (KernelClock(False, 0, 0), "not synchronized"),
+        (KernelClock(True, 51_000, 60_000), "may be wrong by 51.0 ms, the maximum is 50 ms"),
         (KernelClock(True, 0, 100_000), "may be wrong by 57.7 ms"),
     ],
 )
