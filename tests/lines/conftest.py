@@ -1,4 +1,4 @@
-"""Fixtures: two simulated GPIO chips, and the check for descriptors that stay open."""
+"""Fixtures: two simulated GPIO chips, and a check for descriptors that stay open."""
 
 import sys
 from pathlib import Path

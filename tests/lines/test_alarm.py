@@ -1,4 +1,4 @@
-"""The ALARM line: its events and their rate, and a wiring fault next to the angles, with what to check."""
+"""ALARM line: its events, their rate, and the report of a wiring fault."""
 
 from math import radians
 
@@ -35,7 +35,7 @@ def test_at_the_beginning_only_an_alarm_is_news_and_once(signals: SignalBench) -
     (event,) = signals.events
     assert (event.t_ns, event.kind, event.message) == (5, EventKind.ALARM, "alarm")
     assert event.detail == {"active": True, "raised": 1, "changes": 1}
-    # The edge that came between opening the line and reading its level
+    # The edge that arrived between opening the line and reading its level
     line.on_edges([Edge(10 * NS_PER_S, True, 1)])
     assert (len(signals.events), line.raised) == (1, 1)
 
@@ -106,7 +106,7 @@ class Monitored:
         self.monitor.line.on_edges([Edge(self.now_ns, active, self.number)])
 
     def run(self, seconds: float, roll_deg: float | None, pitch_deg: float = 0.0, age_ns: int = 0) -> None:
-        """Samples that old at every tick."""
+        """Samples with this age at each tick."""
         for _ in range(round(seconds * NS_PER_S / TICK_NS)):
             self.signals.clock.advance(TICK_NS)
             angles = None if roll_deg is None else (radians(roll_deg), radians(pitch_deg), 0.0)

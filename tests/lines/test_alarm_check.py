@@ -1,4 +1,4 @@
-"""The level of the ALARM line against the angles: verdicts on one sample, and over time."""
+"""Level of the ALARM line compared with the angles: verdicts on one sample, and over time."""
 
 from math import radians
 
@@ -59,7 +59,7 @@ def test_only_what_lasts_is_reported_and_once() -> None:
     step_ns = 10 * NS_PER_MS
     for number in range(1000):
         out = 100 <= number < 200 or number >= 300
-        level = 103 <= number < 203  # it lags, and from 300 on the wire is broken
+        level = 103 <= number < 203  # it lags; the wire is broken from 300 on
         change = check.add_sample(number * step_ns, angles(0, 9.0 if out else 0.0), level)
         if change:
             changes.append((number, change))
@@ -71,7 +71,7 @@ def test_only_what_lasts_is_reported_and_once() -> None:
 
 
 def run(levels_of_y: bool, *, stuck: bool = False) -> AlarmVerdict:
-    """A device that tilts about X, then about Y; its line follows the tilt about Y, or that about X, or nothing."""
+    """A device that tilts about X, then about Y. Its line follows the tilt about Y, the tilt about X, or no tilt."""
     check = AlarmCheck(ONLY_Y)
     for number in range(4000):
         x_deg, y_deg = (9.0, 0.0) if number % 2000 < 500 else (0.0, 9.0) if number % 2000 < 1000 else (0.0, 0.0)

@@ -1,4 +1,4 @@
-"""The pins of a simulated module through the whole device: what belongs to what, and time that never jumps."""
+"""Pins of a simulated module through the whole device: edges, samples, and time stamps without steps."""
 
 from itertools import pairwise
 
@@ -19,10 +19,10 @@ from tests.support.wired_device import BEGIN_NS, EDGE_LATE_NS, WiredDevice
 
 SOUT = DeviceLines(sout=SoutOptions(line="A"))
 HI92 = ModuleSettings(hi91=Output(), hi92=Output(10))
-"""Messages without device time, dated by their stamp of 13 bits."""
+"""Frames without device time. Their 13-bit `pps_age_ms` makes the time stamps."""
 FEW_US = 4_000
 STEP_NS = 20_000
-"""By how much the error of time may change from one sample to the next: 500 ppm of slewing in 10 ms, and noise."""
+"""Maximum change of the time stamp error between two samples, ns: 500 ppm of slewing in 10 ms, and noise."""
 
 
 def off_ns(wired: WiredDevice, sample: Sample) -> int:
@@ -30,7 +30,7 @@ def off_ns(wired: WiredDevice, sample: Sample) -> int:
 
 
 def check_pairs(wired: WiredDevice, samples: list[Sample]) -> int:
-    """Every sample that names an edge names its own; returns how many do."""
+    """Check that each sample with an edge has its own edge. Return the number of these samples."""
     pulses = wired.pulses(Pin.SOUT)
     named = [sample for sample in samples if sample.edge_seq is not None]
     for sample in named:
@@ -59,7 +59,7 @@ async def test_every_sample_has_its_edge(wired: WiredDevice, settings: ModuleSet
     assert event.detail["before"] in ("arrival", "regression")
     status = wired.device.status()
     assert status.lines is not None
-    assert 0 <= max(wired.pulses(Pin.SOUT)) - status.lines.edges["sout"] <= 1  # one may wait for the loop
+    assert 0 <= max(wired.pulses(Pin.SOUT)) - status.lines.edges["sout"] <= 1  # one edge may wait for the event loop
     assert (status.lines.problems, status.clock.samples_unpaired) == ({}, 0)
 
 
@@ -69,7 +69,7 @@ async def test_edges_that_stop_and_come_back(wired: WiredDevice) -> None:
     wired.cut.add(Pin.SOUT)
     without = await wired.wait(10)
     before = sum(sample.edge_seq is not None for sample in without)
-    assert before <= 1  # of a pulse that was there already
+    assert before <= 1  # of a pulse before the start
     assert {sample.sync for sample in without[before + 2 :]} == {Sync.REGRESSION}
     assert {sample.edge_seq for sample in without[before:]} == {None}
     (event,) = [event for event in wired.of_kind(EventKind.SYNC) if event.detail["before"] == "edge"]
@@ -161,7 +161,7 @@ async def test_an_alarm_is_an_event_and_shown_in_the_samples(wired: WiredDevice)
     for sample, alarm in zip(samples, shown, strict=True):
         assert sample.euler_rad is not None
         beyond_rad = abs(sample.euler_rad[0]) - 0.0873
-        assert alarm == (beyond_rad > 0) or abs(beyond_rad) < 0.03  # it looks at its angles every 10 ms
+        assert alarm == (beyond_rad > 0) or abs(beyond_rad) < 0.03  # the device checks its angles every 10 ms
 
 
 @played(lambda: WiredDevice(ALARM, RANGE, HipnucHardware(motion=Still(roll_rad=0.3)), identify=True))
@@ -177,7 +177,7 @@ async def test_an_alarm_wire_that_is_cut_is_reported(wired: WiredDevice) -> None
     await wired.device.act("alarm", {"axis": "Y", "min_deg": -60, "max_deg": 60})
     status = wired.device.status()
     assert status.lines is not None
-    assert status.lines.problems == {}  # what it is set to is not known any more
+    assert status.lines.problems == {}  # the settings are unknown again
 
 
 @pytest.mark.manual("B 1.2.1 trigger")
@@ -208,7 +208,7 @@ PPS = DeviceLines(pps=PpsOptions(line="E"))
 UTC_S = 1_795_000_000
 FIRST_PULSE_NS = BEGIN_NS + 2 * NS_PER_S
 WITHOUT_S = 30
-"""So long no pulse comes. What the device's crystal gathers meanwhile, the device itself takes back at once."""
+"""Time without pulses, s. The device corrects the error of its crystal immediately after it."""
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Inputs and outputs on a chip of the test's making: what is asked of the kernel, and what comes of its answers."""
+"""Inputs and outputs on a fake chip: the requests to the kernel, and the results of its replies."""
 
 import asyncio
 import errno
@@ -67,7 +67,7 @@ async def test_edges_come_by_the_loop_and_by_drain_and_lost_ones_are_counted(gpi
     line.open()
     (request,) = gpiod.requests
     request.feed((100, 1, 1))
-    line.drain()  # before `start` nothing is delivered
+    line.drain()  # no delivery before `start`
     line.start(sink.on_edges, sink.on_end)
     await sink.wait()
     assert sink.edges == [Edge(100, True, 1)]
@@ -199,7 +199,7 @@ def test_an_output_whose_chip_vanishes_or_that_is_no_line(gpiod: FakeGpiod, tmp_
     line.close()
     assert gpiod.requests[0].released
     assert gpiod.requests[0].settings.drive is Drive.PUSH_PULL
-    # The kernel's own answer to the ioctl on a pipe
+    # The kernel's own reply to the ioctl on a pipe
     assert isinstance(GPIO_LINES.make_output(OutputOptions(line="RESET"), "x"), GpioOutput)
     line = GpioOutput(OutputOptions(line="RESET"), devices=tmp_path)
     line.open()

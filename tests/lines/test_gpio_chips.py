@@ -1,4 +1,4 @@
-"""Where a line is, and one clear error for each way in which it is not."""
+"""Search for a line, and one clear error for each reason why it is not found."""
 
 # ruff: noqa: E501 - a row of the table is a case and the whole message for it
 

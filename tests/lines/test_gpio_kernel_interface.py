@@ -1,11 +1,11 @@
-"""Events of a line as the kernel writes them, by hand."""
+"""Events of a line in the format of the kernel, packed by hand."""
 
 from imud.contracts.lines import Edge
 from imud.lines.gpio import LineEventDecoder
 
 
 def event(t_ns: int, kind: int, seqno: int) -> bytes:
-    """`struct gpio_v2_line_event`, of line 5 in a request that counts otherwise."""
+    """Return a `struct gpio_v2_line_event` of line 5, in a request with another count."""
     words = (kind, 5, 77, seqno)
     return t_ns.to_bytes(8, "little") + b"".join(word.to_bytes(4, "little") for word in words) + bytes(24)
 

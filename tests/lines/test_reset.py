@@ -1,4 +1,4 @@
-"""Reset: how long, how often, and what a cancellation leaves behind; and when a device is reset automatically."""
+"""Reset line: duration and interval of the pulses, the level after a cancellation, and automatic resets."""
 
 import asyncio
 from collections.abc import Callable, Coroutine
@@ -82,7 +82,7 @@ class Scene:
 
     @property
     def pulses_s(self) -> list[float]:
-        """When the line became active, s after the beginning."""
+        """Times of the active level, s after the start."""
         return [t_ns / NS_PER_S - 1000 for t_ns, active in self.line.history if active]
 
     async def search(self, seconds: float, every_s: float = 0.5) -> None:
@@ -99,7 +99,7 @@ class Scene:
 
 @pytest.mark.parametrize(("every_s", "first_s"), [(0.5, 4.5), (6.0, 18.0)])
 def test_after_three_rounds_and_the_time_a_device_needs_and_then_once_a_minute(every_s: float, first_s: float) -> None:
-    """A round every 0.5 s: the first ends at 0.5 s, and 4 s later the device should have been back."""
+    """A round every 0.5 s: the first ends at 0.5 s. After 4 s, the device should have returned."""
     it = Scene()
     run_virtually(it.clock, it.search(150, every_s))
     assert it.pulses_s[0] == pytest.approx(first_s, abs=0.01)
@@ -136,7 +136,7 @@ async def test_a_pulse_on_request_is_at_once_and_a_search_waits_for_its_end(it: 
     await it.reset.settled()
     assert it.clock.now_ns() - begin_ns == pytest.approx(3.02e9, abs=1000)
     await task
-    await it.search(3)  # not found since: it is not reset again at once
+    await it.search(3)  # no sample since: no immediate second reset
     assert it.pulses_s == [0.0]
 
 

@@ -1,4 +1,4 @@
-"""The lines of one device one by one: what reaches the clock and when, what fails, and that all lines are released."""
+"""Lines of one device: the edges and their order, failures, and the release of all lines."""
 
 import asyncio
 
@@ -73,9 +73,9 @@ async def test_lines_are_watched_before_there_is_a_clock_and_delivered_to_it_aft
     for key in ("sout", "sout_div", "pps"):
         bench.input(key).pulse(bench.clock.now_ns(), 80_000)
     assert bench.sample_clock.status().edges == 0
-    bench.signals.drain()  # now, not when the loop comes round
+    bench.signals.drain()  # now, before the next turn of the event loop
     assert bench.sample_clock.status().edges == 1
-    assert [edge.rising for edge in bench.pulses] == [True]  # the falling edges are not even asked for
+    assert [edge.rising for edge in bench.pulses] == [True]  # imud does not request falling edges
     status = bench.signals.status()
     assert status.edges == {"sout": 2, "sout_div": 1, "pps": 1, "alarm": 0}
     assert status.edges_lost == {"sout": 0, "sout_div": 0, "pps": 0, "alarm": 0}
@@ -186,7 +186,7 @@ async def test_at_the_end_of_the_link_sin_is_released_and_closed_lines_stay_clos
     bench.start()
     assert bench.output("sin").is_open
     bench.signals.close()
-    # A replay that came to its end is ticked ten times a second as before
+    # After the end of a replay, `tick` still runs ten times per second
     bench = SyncBench()
     bench.start()
     bench.signals.close()

@@ -1,4 +1,4 @@
-"""SIN: deadlines without drift, honest stamps, and what is left out when there is no time."""
+"""SIN: deadlines without drift, accurate time stamps, and skipped edges if the time is too short."""
 
 import asyncio
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ STAMPS_MAX = 10_000
 
 LIMIT_S = 60
 CALL_NS = 2_000
-"""What one look at the clock takes here."""
+"""Time of one clock reading in these tests, ns."""
 
 
 class Time:
-    """A clock that goes on by CALL_NS with each look at it, and by what the test says."""
+    """A clock that advances by CALL_NS with each reading, and by the steps of the test."""
 
     def __init__(self) -> None:
         self.t_ns = 1_000_000 * NS_PER_MS
@@ -44,7 +44,7 @@ class SquareWaveBench:
         self.begin_ns = self.time.t_ns
 
     def run(self, duration_ns: int, late_ns: int = 0) -> None:
-        """Work as a thread would that wakes up `late_ns` late."""
+        """Work like a thread that wakes up `late_ns` late."""
         end_ns = self.time.t_ns + duration_ns
         while self.time.t_ns < end_ns:
             rest_ns = self.wave.work()
@@ -103,7 +103,7 @@ def test_stamps_are_numbered_and_each_is_the_middle_of_the_call() -> None:
 
 @pytest.mark.parametrize("stall_ms", [7.0, 12.0, 25.0, 33.0, 1000.0])
 def test_deadlines_that_cannot_be_kept_are_counted_and_the_grid_stays(stall_ms: float) -> None:
-    """At 100 Hz an edge is made up to 2.5 ms late."""
+    """At 100 Hz, an edge may be up to 2.5 ms late."""
     bench = SquareWaveBench(100.0)
     bench.run(15 * NS_PER_MS)
     bench.time.t_ns += int(stall_ms * NS_PER_MS)
@@ -120,7 +120,7 @@ def test_deadlines_that_cannot_be_kept_are_counted_and_the_grid_stays(stall_ms: 
 def test_a_long_pulse_gets_its_pause_and_old_stamps_are_dropped() -> None:
     bench = SquareWaveBench(1000.0)
     bench.wave.work()
-    bench.time.t_ns += 1_150_000  # asleep over the next deadline
+    bench.time.t_ns += 1_150_000  # sleeps longer than the next deadline
     bench.run(5 * NS_PER_MS)
     history = bench.line.history
     lows_ns = [up - down for (down, _), (up, _) in zip(history[1::2], history[2::2], strict=False)]

@@ -1,4 +1,4 @@
-"""A line that is kept open: opened when due, failures reported once, its level read when it may have changed."""
+"""Input line that imud keeps open: due openings, failures reported once, and reads of the level."""
 
 import asyncio
 
@@ -29,7 +29,7 @@ class Watched:
 @in_loop
 async def test_it_is_opened_at_once_and_its_level_read_again_after_lost_edges() -> None:
     it = Watched()
-    it.watched.drain()  # before it is open there is nothing
+    it.watched.drain()  # no edges before it is open
     it.watched.tick(0)
     assert it.line.is_open
     assert it.levels == [False]
@@ -40,7 +40,7 @@ async def test_it_is_opened_at_once_and_its_level_read_again_after_lost_edges() 
     assert it.edges == [Edge(10, True, 1), Edge(20, False, 2)]
     assert (it.watched.edges, it.reports, it.watched.problem) == (2, [], "")
     it.watched.tick(1)
-    assert it.levels == [False]  # edges say the rest
+    assert it.levels == [False]  # edges show all later changes
     it = Watched()
     it.watched.tick(0)
     it.line.edge(5, True)
@@ -87,7 +87,7 @@ async def test_a_line_that_goes_has_no_level_and_comes_back() -> None:
     assert it.levels == [False, None, True]
     it.line.edge(30, False)
     it.watched.drain()
-    assert it.edges == [Edge(30, False, 2)]  # numbers go on; the one that was not delivered shows
+    assert it.edges == [Edge(30, False, 2)]  # the numbers continue: a lost edge is visible
 
 
 @in_loop
@@ -102,7 +102,7 @@ async def test_edges_of_a_line_that_is_not_watched_are_delivered_by_the_tick() -
 
 
 class Unstartable(MemoryInput):
-    """A line that opens and cannot start."""
+    """A line that opens and then fails to start."""
 
     def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
         raise LinkError("it does not start")
@@ -153,6 +153,6 @@ async def test_a_line_of_no_device_is_kept_open_by_its_settings() -> None:
     watched.tick(RETRY_NS)
     line.pulse(10, 5)
     await asyncio.sleep(0)
-    assert edges == [Edge(10, True, 1)]  # only rising ones are asked for
+    assert edges == [Edge(10, True, 1)]  # imud requests only rising edges
     watched.close()
     assert not line.is_open

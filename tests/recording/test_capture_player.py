@@ -1,4 +1,4 @@
-"""Captures through codecs and clocks: the samples of `imud replay`, with the times that the capture has."""
+"""Captures through codecs and clocks: the samples and times of `imud replay`."""
 
 from io import BytesIO
 from pathlib import Path
@@ -77,7 +77,7 @@ def test_a_raw_capture_of_a_device_without_time_has_the_time_of_the_bytes_on_the
     samples: list[Sample] = []
     player = CapturePlayer(lambda batch: samples.extend(batch.samples), FAKE_DRIVER, FAKE_DRIVER.settings(), "file")
     frame = fake_frame(bytes(94))
-    player.play_bytes(CaptureReader(BytesIO(frame * 200)), 100_000)  # 10 ms each
+    player.play_bytes(CaptureReader(BytesIO(frame * 200)), 100_000)  # 10 ms per frame
     assert len(samples) == 200
     assert samples[-1].t_ns == pytest.approx(2 * NS_PER_S, abs=20 * NS_PER_MS)
     assert samples[100].t_ns == pytest.approx(samples[0].t_ns + NS_PER_S, rel=0.05)

@@ -1,4 +1,4 @@
-"""Taps: nothing is different on path and clock while nobody listens, and everything is heard while somebody does."""
+"""Observers: the path has an observer only while a recording runs, and the records contain every input in order."""
 
 from types import SimpleNamespace
 from typing import cast
@@ -81,7 +81,7 @@ def test_two_recorders_hear_the_same_and_another_path_is_described() -> None:
     assert one.kinds() == [Kind.DEVICE, Kind.PATH, Kind.PATH]
     two.path.on_data(hi91(0), 6)
     assert one.kinds()[-1] == Kind.DATA
-    for path in (two.path, TappedPath().path):  # the clock of the present path gets the edges, and the recording too
+    for path in (two.path, TappedPath().path):  # the edges reach the clock of the present path, and the recording
         one.tap.path_made(path, DRIVER.name, None)
         path.clock.add_edges("sout", [Edge(7, True, 1)])
         assert (path.clock.status().edges, one.kinds()[-1]) == (1, Kind.EDGES)

@@ -1,6 +1,6 @@
-"""Recording and replay: stories of devices again, recorded, and their replay field by field the same (`check_replay`).
+"""Recording and replay: recorded tests of devices, whose replay must equal the live run (`check_replay`).
 
-`IMUD_RECORD_RIGS=1 pytest tests/device tests/lines` does it with all of them.
+`IMUD_RECORD_RIGS=1 pytest tests/device tests/lines` records all of these tests.
 """
 
 import asyncio
@@ -69,7 +69,6 @@ def bench(tmp_path: Path, recorded: pytest.MonkeyPatch) -> PolledBusBench:
     ],
 )
 def test_a_run_on_a_line_or_can_bus_is_replayed(run: Callable[[], None]) -> None:
-    """`check_replay` compares the samples and the ledger at the end of each run."""
     run()
 
 
@@ -92,7 +91,7 @@ def test_a_run_of_a_polled_device_is_replayed(bench: PolledBusBench, run: Callab
 
 
 def run_of(driver: str, middle: int) -> DeviceRig:
-    """A stream of frames with jitter; what was recorded up to `middle` of them is forgotten, and begins anew there.
+    """A stream of frames with jitter. The recording starts again at frame `middle`, without the earlier records.
 
     The host's time is slewed by 100 ppm. The host is suspended before the first frame and shortly before the last.
     """

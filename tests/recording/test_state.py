@@ -1,4 +1,4 @@
-"""States: what codecs and clocks are made of comes back, and nothing else is let in."""
+"""Saved states: all attributes of codecs and clocks are restored, and a forged state is rejected."""
 
 from collections import deque
 from functools import partial

@@ -1,4 +1,4 @@
-"""The fit under the arrivals, and the lines that a latency timer leaves open, against a brute-force search."""
+"""Fit below the arrivals, and the feasible lines of a latency timer, compared with a brute-force search."""
 
 from collections.abc import Iterable
 from itertools import pairwise
@@ -15,12 +15,12 @@ def at(fit: ArrivalFit, device_ns: int) -> float:
 
 
 def add(fit: ArrivalFit, device_ns: int, arrival_ns: int) -> bool:
-    """Add an arrival without bytes behind it; whether the fit changed."""
+    """Add an arrival without bytes after it. Return whether the fit changed."""
     return fit.add_arrival(device_ns, arrival_ns, 0, arrival_ns - at(fit, device_ns))
 
 
 def fitted(slope: float, delay_mean_ns: float, seconds: int, seed: int = 1) -> tuple[ArrivalFit, int]:
-    """A fit under 100 points a second of a line through the origin, and its error at the newest point."""
+    """Return a fit below 100 points per second of a line through the origin, and its error at the newest point."""
     random = Random(seed)
     fit, device_ns = ArrivalFit(0, 0), 0
     for i in range(1, 100 * seconds):
@@ -45,7 +45,7 @@ def test_it_is_young_but_not_wild() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_no_point_is_under_the_hull_however_it_was_made(seed: int) -> None:
-    """Corners are points, the slopes between them rise, and a hull that was extended is that of all points at once."""
+    """Corners are points, the slopes between them rise, and an extended hull equals the hull of all points."""
     random = Random(seed)
     points = [(float(x), random.gauss(0, 100)) for x in sorted(random.sample(range(10_000), 80))]
     hull = lower_hull(points)
@@ -62,7 +62,7 @@ def test_no_point_is_under_the_hull_however_it_was_made(seed: int) -> None:
 
 
 def test_the_fit_is_over_the_bins_that_are_left() -> None:
-    """What went with the oldest bins, or was merged away, has no corner in the hull any more."""
+    """The hull has no corner of a dropped or merged bin."""
     random = Random(3)
     fit, points = ArrivalFit(0, 0), [(0, 0)]
     for i in range(1, 4000):
@@ -71,11 +71,11 @@ def test_the_fit_is_over_the_bins_that_are_left() -> None:
         points.append((device_ns, arrival_ns))
         if add(fit, device_ns, arrival_ns):
             kept = [(x, y) for x, y in points if x >= device_ns - fit.span_ns]
-            assert min(y - at(fit, x) for x, y in kept) > -10_000  # a bin keeps what was lowest above an earlier fit
+            assert min(y - at(fit, x) for x, y in kept) > -10_000  # lowest point above an earlier fit
 
 
 def test_the_window_is_bounded() -> None:
-    """A bin opens with each change: no more in a window's time than the window may have."""
+    """Each change opens a bin: the number of bins in a window is limited."""
     fit, _ = fitted(1.0, 1_000_000, 200)
     assert 30 * NS_PER_S < fit.span_ns < (BINS + 2) * NS_PER_S
     later = range(200 * NS_PER_S, 200 * NS_PER_S + fit.span_ns, 10 * NS_PER_MS)
@@ -83,7 +83,7 @@ def test_the_window_is_bounded() -> None:
 
 
 def test_an_old_minimum_goes() -> None:
-    """One impossible early arrival bends the line for no more than a window."""
+    """One arrival that is too early affects the fit for at most one window."""
     fit, device_ns = ArrivalFit(0, -5_000_000), 0
     for i in range(1, 100 * 100):
         device_ns = i * 10 * NS_PER_MS
@@ -95,7 +95,7 @@ def test_an_old_minimum_goes() -> None:
 
 
 def behind_timer(seconds: int, stalls_ns: Iterable[tuple[int, int]], hold_ns: int, pause_ns: int) -> ArrivalFit:
-    """A fit of messages every 10 ms that a timer of `hold_ns` hands over; none are in a stall from ns to ns."""
+    """A fit of frames every 10 ms behind a timer of `hold_ns`. The stalls contain no frames."""
     random, fit, stalls = Random(3), ArrivalFit(0, 0, hold_ns), tuple(stalls_ns)
     fit.set_pause(pause_ns, hold_ns // (10 * NS_PER_MS) + 2)
     for i in range(1, 100 * seconds):
@@ -103,13 +103,13 @@ def behind_timer(seconds: int, stalls_ns: Iterable[tuple[int, int]], hold_ns: in
         handed_ns = sent_ns + hold_ns - (sent_ns + 7_000_000 + i * 40) % hold_ns
         handed_ns = next((until for since, until in stalls if since <= handed_ns < until), handed_ns)
         device_ns, arrival_ns = sent_ns, handed_ns + int(random.expovariate(1 / 30_000))
-        trailing_ns = max(arrival_ns - sent_ns - pause_ns, 0)  # the wire is busy, but for the pause
+        trailing_ns = max(arrival_ns - sent_ns - pause_ns, 0)  # time on the wire except for the pause
         fit.add_arrival(device_ns, arrival_ns - trailing_ns, trailing_ns, arrival_ns - trailing_ns - at(fit, device_ns))
     return fit
 
 
 def test_messages_between_stalls_bound_what_a_timer_hides() -> None:
-    """A third of all messages is handed over late; the others show what they show on a quiet host."""
+    """A third of all frames is late. The others show the same bounds as on an idle host."""
     hold_ns, pause_ns = 16 * NS_PER_MS, 3 * NS_PER_MS
     stalls = [(at_ms * NS_PER_MS, (at_ms + 120) * NS_PER_MS) for at_ms in range(0, 70_000, 350)]
     fit = behind_timer(70, stalls, hold_ns, pause_ns)

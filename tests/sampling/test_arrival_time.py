@@ -1,4 +1,4 @@
-"""Messages without device time: by their arrival, by their pace, by their number."""
+"""Frames without device time: by arrival time, by pace, by number."""
 
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.arrival_time import FIRST_SPREAD_NS, ArrivalTime, LinkDelay
@@ -9,7 +9,7 @@ PERIOD_NS = 10 * NS_PER_MS
 
 
 def fed(times: ArrivalTime, count: int, *, numbered: bool = False, alone: bool = True) -> int:
-    """The time of the last of so many even arrivals, relative to it."""
+    """Return the time stamp of the last of `count` even arrivals, relative to its arrival."""
     t_ns = 0
     for i in range(count):
         at_ns = BEGIN_NS + i * PERIOD_NS
@@ -26,7 +26,7 @@ def test_the_first_message_is_dated_by_its_arrival() -> None:
 
 
 def off_ns(times: ArrivalTime, late_ns: int, number: int | None = None, *, alone: bool = True) -> int:
-    """Return the time from the time stamp of a message to its arrival at `late_ns`, ns."""
+    """Return the time from the time stamp of a frame to its arrival at `late_ns`, ns."""
     return late_ns - times.date(number, late_ns, 82, alone=alone, triggered=False, is_first=False)
 
 
@@ -36,7 +36,7 @@ def test_a_late_message_is_dated_by_the_pace_of_those_before_unless_others_carry
         fed(times, 100, alone=alone)
         late_ns = BEGIN_NS + 100 * PERIOD_NS + 4 * NS_PER_MS
         assert (off_ns(times, late_ns, alone=alone) > 3 * NS_PER_MS) is alone
-        times.restart()  # the link was away: the pace is learned again
+        times.restart()  # after a missing link, the pace is measured again
         assert off_ns(times, late_ns + 400 * PERIOD_NS, alone=alone) == DELAY.floor_ns // 2
 
 

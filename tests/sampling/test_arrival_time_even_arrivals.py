@@ -1,4 +1,4 @@
-"""Messages without device time by their even pace: delayed ones, missing ones, another rate, triggers."""
+"""Frames without device time at a constant rate: delayed frames, lost samples, another rate, triggers."""
 
 from random import Random
 
@@ -13,7 +13,7 @@ DELAY = LinkDelay(0, 0)
 
 
 def settled(even: EvenArrivals, count: int = 300) -> int:
-    """Arrivals at an even pace, each up to 100 µs late; return when the next one is due."""
+    """Arrivals at a constant rate, each up to 100 µs late. Return the due time of the next arrival."""
     random = Random(1)
     for i in range(count):
         even.add_arrival(DELAY, BEGIN_NS + i * PERIOD_NS + int(random.random() * 100 * NS_PER_US), 0, triggered=False)
@@ -28,7 +28,7 @@ def test_it_is_not_used_before_its_pace_is_known() -> None:
 
 
 def test_messages_that_waited_are_dated_as_if_they_had_not() -> None:
-    """Two seconds of them arrive together."""
+    """Frames of two seconds arrive together."""
     even = EvenArrivals()
     due_ns = settled(even)
     read_ns = due_ns + 200 * PERIOD_NS

@@ -1,4 +1,4 @@
-"""Bounds of a delay by the link alone."""
+"""Bounds of the delay of a link."""
 
 from imud.model.units import NS_PER_MS
 from imud.sampling.arrival_time import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay

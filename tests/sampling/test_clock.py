@@ -1,4 +1,4 @@
-"""The clock as a whole: three rules for any input, what devices and hosts do to it, polled samples."""
+"""The complete clock: three rules for any input, disturbances by devices and hosts, polled samples."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -17,11 +17,12 @@ from tests.support.clock_feed import BEGIN_NS, Point, feed, make_clock, message,
 
 FRAME = Measurement(28, 0, None, (0.0, 0.0, 9.8))
 NEAR_NS = 2 * NS_PER_MS
-"""Messages are read 1 ms after they were measured and take 0.9 ms on the wire."""
+"""Maximum distance of a time stamp from the truth, ns. A frame needs 0.9 ms on the wire, and is read 1 ms after its
+sample."""
 
 
 def far(samples: Sequence[Sample], points: Sequence[Point]) -> int:
-    """Largest distance of a stamp from the truth, ns."""
+    """Return the largest distance of a time stamp from the truth, ns."""
     return max(abs(s.t_ns - BEGIN_NS - ms * NS_PER_MS) for s, (_, ms) in zip(samples, points, strict=True))
 
 
@@ -97,7 +98,7 @@ def test_a_counter_that_is_late_for_good_began_anew(before: list[Point], after: 
 
 @pytest.mark.parametrize("reads", [((200, 22_001),), ((150, 22_001), (150, 23_500))])
 def test_a_busy_host_is_no_reset(reads: tuple[tuple[int, int], ...]) -> None:
-    """The messages that its reader finds later are old; many messages of one read are one witness."""
+    """The reader of a busy host gets old frames. Several frames in one read count as one late read."""
     clock = make_clock()
     feed(clock, steady(0, 0, 2000))
     samples: list[Sample] = []
@@ -152,14 +153,14 @@ def test_without_device_time() -> None:
     assert far(samples, points) < NEAR_NS
     assert clock.missed == 0
     assert clock.expected_rate_hz == 0.0
-    clock = make_clock(byte_ns=1000)  # messages of one burst keep their distance
+    clock = make_clock(byte_ns=1000)  # frames of one burst keep their distance
     samples = [clock.sample(message(None, 82 * (3 - i)), BEGIN_NS, 0) for i in range(4)]
     assert [b.t_ns - a.t_ns for a, b in pairwise(samples)] == [82_000] * 3
     assert samples[0].t_ns <= BEGIN_NS - 4 * 82_000
 
 
 def test_corrections_are_slewed() -> None:
-    """Arrivals suddenly 3 ms earlier: the step between samples stays within 0.05 %."""
+    """Arrivals are suddenly 3 ms earlier. The step between samples changes by at most 0.05 %."""
     clock = make_clock(hold_ns=0)
     late = [clock.sample(message(10 * i), BEGIN_NS + (10 * i + 4) * NS_PER_MS, 0) for i in range(3000)]
     steps = [b.t_ns - a.t_ns for a, b in pairwise(late[2000:])]
@@ -184,11 +185,11 @@ def test_a_changed_link_starts_arrival_anew_but_not_time() -> None:
     assert samples[300].sync is Sync.ARRIVAL
     assert samples[-1].sync is Sync.REGRESSION
     assert clock.status().resets == 0
-    clock.restart()  # counts neither a reset nor a gap
+    clock.restart()  # neither a reset nor a gap
     samples += feed(clock, [(7, 9000)])
     assert clock.missed == 0
     assert clock.status().resets == 0
-    clock.link_changed(byte_ns=10_850, hold_ns=0)  # behind it the device restarts: a reset
+    clock.link_changed(byte_ns=10_850, hold_ns=0)  # the device restarts: a reset
     samples += feed(clock, steady(27, 9020, 300)) + feed(clock, steady(7, 15_000, 300))
     assert clock.status().resets == 1
     assert clock.missed == 0
@@ -206,7 +207,7 @@ def test_one_clock_follows_another() -> None:
 
 
 def test_a_wire_too_slow_for_the_rate_is_not_believed() -> None:
-    """A pty says 9600 baud and delivers 1 kHz: counting 85 ms of wire back would be nonsense."""
+    """A pty reports 9600 baud and delivers 1 kHz. The clock must not subtract 85 ms of time on the wire."""
     clock = make_clock(byte_ns=1_041_666)
     points = steady(0, 0, 5000, step_ms=1)
     samples = feed(clock, points)
@@ -275,7 +276,7 @@ def test_by_an_edge() -> None:
 
 @pytest.mark.parametrize(("hold_ns", "slower"), [(0, 0.0), (NS_PER_MS, 0.0), (0, 50e-6)])
 def test_messages_that_waited_are_dated_by_the_fit_and_do_not_hold_it_back(hold_ns: int, slower: float) -> None:
-    """Nine of ten are read up to 9 ms late. If the crystal slows by 50 ppm, one of ten shows it."""
+    """Nine of ten frames are read up to 9 ms late. If the crystal slows by 50 ppm, one of ten frames shows it."""
     clock = make_clock(hold_ns=hold_ns)
     feed(clock, steady(0, 0, 20_000, 1))
     before, offs = clock.status(), []

@@ -1,4 +1,4 @@
-"""Against the truth: at least 95 of 100 samples within twice the error they state, over every profile of arrival.
+"""Time stamp errors compared with the truth: at least 95 of 100 samples are within twice their error, in each profile.
 
 `python -m tests.bench.clock` prints the whole table.
 """
@@ -34,14 +34,14 @@ def test_the_error_is_honest(profile: ArrivalProfile, crystal: str) -> None:
 
 
 def test_uneven_ticks_are_no_error() -> None:
-    """400 Hz in milliseconds: the truncation of up to 0.5 ms is not in the stamps."""
+    """400 Hz in milliseconds: the time stamps do not contain the truncation of up to 0.5 ms."""
     model = ArrivalModel(PROFILES[1], 400, 1, Crystal(0.0), 921_600)
     assert accuracy(run(model, 8000), settle_ns=5_000_000_000).rms_ns < 60_000
 
 
 @pytest.mark.parametrize("rate_hz", [200, pytest.param(1000, marks=pytest.mark.thorough)])
 def test_bursts_behind_a_slow_timer(rate_hz: int) -> None:
-    """16 ms of messages in each read: each is dated by the bytes behind it and by what the timer can hide."""
+    """Each read contains frames of 16 ms. The time stamp depends on the bytes after the frame and on the timer."""
     model = ArrivalModel(USB_16MS, rate_hz, 3, CRYSTALS["50 ppm slow"], BAUD_OF_RATE[rate_hz])
     got = accuracy(run(model, 20 * rate_hz), settle_ns=10_000_000_000)
     assert got.share >= 0.95

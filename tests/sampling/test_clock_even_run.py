@@ -1,4 +1,4 @@
-"""Messages that are dated in one loop: the same samples, losses and state of the clock as one by one."""
+"""Frames in one loop (`add_run`): the same samples, losses and state of the clock as frame by frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,29 +17,29 @@ from imud.sampling.clock import SampleClock
 BYTES: Final = 82
 BYTE_NS: Final = 10_850
 MODULUS: Final = 1 << 12
-"""Ticks in which the counter turns, several times in a trial."""
+"""Modulus of the counter, ticks. It wraps several times in a trial."""
 ROUNDS: Final = 600
 BEGIN_NS: Final = 1000 * NS_PER_S
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What the device and its link are like."""
+    """Properties of the device and its link."""
 
     name: str
     period_ms: float = 1.0
     hold_ns: int = 0
     most: int = 24
-    """Messages of a read, at most."""
+    """Maximum number of frames in a read."""
     waits: bool = False
-    """Whether messages wait to be read together."""
+    """Whether frames wait and are read together."""
     lost: float = 0.0
     odd: float = 0.0
-    """Share of messages without time, and of jumps of the counter."""
+    """Share of frames without device time, and of jumps of the counter."""
     slewed: float = 0.0
-    """Rate of CLOCK_MONOTONIC against steady time."""
+    """Rate of CLOCK_MONOTONIC relative to steady time."""
     early_ns: int = 0
-    """How much earlier than it can be a read is now and then."""
+    """Time by which some reads are too early, ns."""
 
 
 TRIALS: Final = (
@@ -56,7 +56,7 @@ TRIALS: Final = (
 
 
 class Device:
-    """Reads of a device, each with when it was read and how long its messages may have waited."""
+    """Reads of a device, each with its time and the maximum wait of its frames."""
 
     def __init__(self, trial: Trial, random: Random) -> None:
         self._trial = trial
@@ -65,7 +65,7 @@ class Device:
         self._t_rx_ns = BEGIN_NS
 
     def read(self) -> tuple[list[CodecEvent], int, int]:
-        """The next read."""
+        """Return the next read."""
         trial, random = self._trial, self._random
         count = random.choice((1, 1, trial.most // 2, trial.most))
         events = [event for place in range(count) for event in self._message(count - 1 - place)]
@@ -92,7 +92,7 @@ class Device:
 
 
 class Dated:
-    """A clock, and what it made of the reads."""
+    """A clock with its samples of the reads."""
 
     def __init__(self, trial: Trial) -> None:
         self.host = SteadyTime()
@@ -110,7 +110,7 @@ class Dated:
         self.unknown += 1
 
     def take(self, events: Sequence[CodecEvent], t_rx_ns: int, waited_ns: int, *, runs: bool) -> None:
-        """Date the messages of a read: in runs, or one by one."""
+        """Time-stamp the frames of a read, in runs or one by one."""
         self.clock.waited_ns = waited_ns
         at = 0
         while at < len(events):
@@ -147,7 +147,7 @@ def test_a_run_is_dated_as_its_messages_one_by_one(trial: Trial, seed: int) -> N
     assert many.missed == one.missed
     assert many.states == one.states
     assert many.unknown == one.unknown
-    if trial.period_ms == int(trial.period_ms):  # else no step is exactly the period
+    if trial.period_ms == int(trial.period_ms):  # otherwise no step equals the period
         assert many.in_runs > 0.05 * len(many.samples)
 
 
@@ -159,7 +159,7 @@ def test_no_run_where_messages_are_not_dated_by_the_fit_of_arrivals() -> None:
             dated.take(*device.read(), runs=True)
         if settle:
             assert dated.in_runs
-            assert dated.clock._sources().edge_seq is None  # from now on it has aiding sources
+            assert dated.clock._sources().edge_seq is None  # the clock has aiding sources now
         before, (events, t_rx_ns, _) = len(dated.samples), device.read()
         assert dated.clock.add_run(dated.samples, events, 0, t_rx_ns, 0) == 0
         assert len(dated.samples) == before

@@ -1,4 +1,4 @@
-"""Stamps on a host whose clocks are slewed, stepped, suspended or stopped: as right as on one that is left alone."""
+"""Time stamps on a host with slewed, stepped, suspended or stopped clocks are as accurate as on an undisturbed host."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -72,14 +72,14 @@ def test_stamps_are_those_of_a_host_that_is_left_alone(steering: Steering, profi
     alone = run(model(profile), ALONE, 100 * SECONDS)
     assert_honest(dated)
     apart = [abs(a.point.off_ns - b.point.off_ns) for a, b in zip(dated, alone, strict=True)]
-    more = [ns - 0.09 * abs(b.point.off_ns) for ns, b in zip(apart, alone, strict=True)]  # an error is slewed as well
+    more = [ns - 0.09 * abs(b.point.off_ns) for ns, b in zip(apart, alone, strict=True)]  # and their slew
     assert sorted(more)[int(0.95 * len(more))] < 10 * NS_PER_US
     worst = max(apart[i] - 2 * dated[i].sample.t_err_ns for i in range(len(apart)))
     assert worst < 0
 
 
 def test_where_steering_is_not_seen_they_are_not() -> None:
-    """The cells above are no proof unless the slew would show."""
+    """The tests above prove nothing unless the slew would be visible."""
     dated = run(model(BARE_UART), NTP, 100 * SECONDS, unseen=True)
     assert max(abs(d.point.off_ns) for d in dated) > NS_PER_MS
 
@@ -94,7 +94,7 @@ def test_the_rate_of_the_device_is_against_the_unsteered_clock() -> None:
 
 @pytest.mark.parametrize("steering", STEERED[1:], ids=lambda steering: steering.name)
 def test_what_waited_for_a_stalled_host_is_dated_by_the_rate_of_its_own_time(steering: Steering) -> None:
-    """300 ms in one read, every two seconds: the clocks are not read meanwhile, and the rate need not be today's."""
+    """Frames of 300 ms in one read, every two seconds. The rate between two clock readings is unknown."""
     host, clock = on(steering)
     dated = []
     for a in model(BARE_UART).run(100 * SECONDS):
@@ -107,7 +107,7 @@ def test_what_waited_for_a_stalled_host_is_dated_by_the_rate_of_its_own_time(ste
 
 
 def test_a_read_that_waits_for_its_decoding_is_dated_by_the_rate_of_its_own_time() -> None:
-    """The clocks are read 50 ms after it: 83,333 ppm make 4 ms of that."""
+    """The clocks are read 50 ms after the data: 83,333 ppm are 4 ms."""
     host, clock = on(CHRONY)
     to, dated = CHRONY.monotonic_ns, []
     for a in model(BARE_UART).run(100 * SECONDS):
@@ -120,7 +120,7 @@ def test_a_read_that_waits_for_its_decoding_is_dated_by_the_rate_of_its_own_time
 
 
 def steered_edges(edges: Sequence[Edge], steering: Steering) -> list[Edge]:
-    """Edges as the kernel stamps them: by CLOCK_MONOTONIC."""
+    """Return edges with the kernel's time stamps in CLOCK_MONOTONIC."""
     return [edge._replace(t_ns=steering.monotonic_ns(edge.t_ns)) for edge in edges]
 
 
@@ -189,14 +189,14 @@ def test_pulses_per_second_date_samples_by_their_age(steering: Steering) -> None
 
 @pytest.mark.parametrize("steering", STEERED, ids=lambda steering: steering.name)
 def test_a_device_on_utc_stays_on_it(steering: Steering) -> None:
-    """The reference is given once a second, as the host's pulse line makes it: right, whatever CLOCK_MONOTONIC does."""
+    """The reference is set once per second and is correct for each rate of CLOCK_MONOTONIC."""
     host, clock = on(steering)
     dated, given_s = [], -1
     for a in model(BARE_UART).run(100 * SECONDS):
         offset_ns = host.at(a.t_rx_ns)
         if (a.t_rx_ns - BEGIN_NS) // NS_PER_S != given_s:
             given_s = (a.t_rx_ns - BEGIN_NS) // NS_PER_S
-            ahead_ns = UTC_AHEAD_NS + a.t_rx_ns - steering.monotonic_ns(a.t_rx_ns)  # of UTC over CLOCK_MONOTONIC
+            ahead_ns = UTC_AHEAD_NS + a.t_rx_ns - steering.monotonic_ns(a.t_rx_ns)  # UTC minus CLOCK_MONOTONIC
             clock.set_utc_reference(UtcReference(ahead_ns, 20_000))
             assert clock.utc_reference == UtcReference(ahead_ns, 20_000)
         m = Measurement(a.size_bytes, a.trailing_bytes, (a.t_ns + UTC_AHEAD_NS) // TICK_NS % TICK_MODULUS)
@@ -226,7 +226,7 @@ def test_a_step_of_the_wall_clock_moves_utc_at_once_and_nothing_else(step_ns: in
 
 
 def counted(arrivals: Iterator[Arrival], host: SteeredHost) -> tuple[list[DatedArrival], int, int]:
-    """Samples; how many are missing; gaps of unknown size."""
+    """Return (samples, number of lost samples, gaps of unknown size)."""
     unknown: list[int] = []
     clock = SampleClock(
         "imu", tick_ns=TICK_NS, tick_modulus=TICK_MODULUS, byte_ns=model(BARE_UART).byte_ns, hold_ns=0,
@@ -241,7 +241,7 @@ def counted(arrivals: Iterator[Arrival], host: SteeredHost) -> tuple[list[DatedA
 
 @pytest.mark.parametrize("away_s", [2, pytest.param(3600, marks=pytest.mark.thorough)])
 def test_after_a_suspend_time_goes_on_right(away_s: int) -> None:
-    """CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW stop; the device's clock runs on. The gap is counted by its `Device`."""
+    """CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW stop, the device counter continues. `Device` counts the gap."""
 
     def device() -> Iterator[Arrival]:
         for i, a in enumerate(model(BARE_UART).run(3000)):
@@ -256,7 +256,7 @@ def test_after_a_suspend_time_goes_on_right(away_s: int) -> None:
 
 @pytest.mark.parametrize("steering", [ALONE, NTP], ids=lambda steering: steering.name)
 def test_a_stopped_machine_whose_clocks_go_on_loses_exactly_what_was_not_read(steering: Steering) -> None:
-    """5 s: the first three messages of them wait in the UART, the others are lost."""
+    """The host stops for 5 s: the first three frames wait in the UART, the others are lost."""
     away = range(1000, 1500)
     arrivals = list(model(BARE_UART).run(2400))
 
@@ -273,7 +273,7 @@ def test_a_stopped_machine_whose_clocks_go_on_loses_exactly_what_was_not_read(st
 
 
 def test_frames_with_a_begin_of_their_own_are_converted_as_well() -> None:
-    """CAN: the first frame of a sample came some ms before the one that completed it; the kernel stamped both."""
+    """CAN: the first frame of a sample arrived some ms before the last frame. The kernel time-stamped both."""
     m = replace(model(BARE_UART), size_bytes=0, baud=0)
     host = SteeredHost(CHRONY)
     host.at(BEGIN_NS)

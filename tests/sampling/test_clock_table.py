@@ -1,4 +1,4 @@
-"""The stated error in short cells of `tests.bench.clock_table`, and defects that its cells showed."""
+"""Time stamp error in short cells of `tests.bench.clock_table`, and regressions that its cells showed."""
 
 from dataclasses import replace
 
@@ -55,7 +55,7 @@ def test_the_stated_error_is_honest(cell: Cell, most_us: float, seed: int) -> No
     ids=lambda c: c.name,
 )  # fmt: skip
 def test_the_stated_error_is_neither_too_small_nor_too_large(cell: Cell) -> None:
-    """Over six machines: what no arrival shows is another delay on each."""
+    """Six hosts with different hidden delays."""
     assert RATIO_LEAST <= figures_of(cell, range(6), 45).ratio <= RATIO_MOST
 
 
@@ -70,7 +70,7 @@ def test_the_stated_error_is_honest_whatever_happens_to_the_clocks_of_the_host(h
 
 @pytest.mark.parametrize("seed", [1, 13, 21])
 def test_the_first_step_of_another_rate_is_no_correction_of_the_counter(seed: int) -> None:
-    """Taken for one, it stayed in all stamps after: 7.9 ms off with 0.5 ms stated."""
+    """Without this rule, the clock removed the step from all later time stamps: 7.9 ms off with an error of 0.5 ms."""
     cell = Cell("100 Hz to 400", FAST, Device(rates_hz=((0.0, 100.0), (12.0, 400.0))))
     later = list(dated(cell, seed, 20))[600:]
     far = [one for one in later if abs(one.off_ns) > NS_PER_MS]
@@ -95,20 +95,20 @@ def test_a_timer_that_is_as_the_driver_says_is_left_alone_on_a_busy_host() -> No
 
 
 def test_a_first_read_that_waited_bounds_nothing() -> None:
-    """What was sent in the first 200 ms arrives at once: no message in it shows how long the timer holds others."""
+    """The frames of the first 200 ms arrive together: none of them shows how long the timer holds other frames."""
     cell = Cell("hub stalls 200 ms every 5 s", FRAMES, stalls=Stalls(5 * NS_PER_S, 200 * NS_PER_MS))
     later = list(dated(cell, 3, 9))[200:]
     assert max(abs(d.off_ns) for d in later) < NS_PER_MS
 
 
 def test_messages_that_a_young_fit_took_for_late_are_so_no_longer_when_it_has_moved() -> None:
-    """Else two such messages at 10 Hz widen what the timer leaves open for a minute."""
+    """Otherwise, two such frames at 10 Hz widen the feasible lines of the timer for one minute."""
     assert figures_of(Cell("10 Hz", USB_16, SLOW_RATE), (0, 4), 60).sigma_us < 1300
 
 
 @pytest.mark.parametrize("seed", [2, 61010, 61016])
 def test_messages_come_by_the_machine_of_their_seed(seed: int) -> None:
-    """Seeds that are alike modulo six are different machines: the shortest way from sample to read is their own."""
+    """Seeds with the same remainder modulo six are different hosts: each has its own shortest delay."""
     cell = Cell("plain", UART)
     profile = machine_of(seed).profile(UART, "")
     least_ns = min(m.t_rx_ns - m.truth_ns for m in messages(cell, seed, 30))

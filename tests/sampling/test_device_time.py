@@ -1,4 +1,4 @@
-"""Device time: unwrapped, finer than its tick, even over corrections of the counter; missing samples; numbers."""
+"""Device time: unwrapped, finer than a tick, even over corrections of the counter; lost samples; numbers."""
 
 from collections.abc import Callable
 from itertools import pairwise, product
@@ -42,14 +42,14 @@ def test_it_wraps_any_number_of_times() -> None:
 
 
 def test_a_backward_step_is_a_long_way_forward() -> None:
-    """The caller compares it with the host's time; nothing here is signed."""
+    """The caller compares it with the host time. Device time has no sign."""
     time = DeviceTime(NS_PER_MS, 1 << 32)
     time.begin(5000)
     assert time.elapsed_ns(4990) == ((1 << 32) - 10) * NS_PER_MS
 
 
 def test_an_uneven_rate_becomes_even() -> None:
-    """400 Hz in milliseconds: the stamps step 2, 3, 2, 3; the samples 2.5."""
+    """400 Hz in milliseconds: the counter steps 2, 3, 2, 3, the samples 2.5."""
     time = DeviceTime(NS_PER_MS, 1 << 32)
     time.begin(0)
     even = []
@@ -63,7 +63,7 @@ def test_an_uneven_rate_becomes_even() -> None:
 
 
 def test_two_samples_in_one_tick_are_distinguished() -> None:
-    """1 kHz in milliseconds, 100 ppm fast: after 5 s a stamp comes twice."""
+    """1 kHz in milliseconds, 100 ppm fast: after 5 s, a counter value occurs twice."""
     time = DeviceTime(NS_PER_MS, 1 << 32)
     time.begin(0)
     even = []
@@ -90,21 +90,21 @@ def test_a_loss_is_counted_with_the_step() -> None:
 @pytest.mark.parametrize(
     ("steps", "missed", "period"),
     [
-        ([10, 30, 10, 50, 10], [0] * 5, 0),  # nothing is missing before a period is known
+        ([10, 30, 10, 50, 10], [0] * 5, 0),  # no lost samples before the period is known
         ([10] * 10 + [20, 10, 10], [1, 0, 0], 10),
         ([10] * 10 + [30, 10, 10], [2, 0, 0], 10),
         ([1] * 10 + [2, 1, 1], [1, 0, 0], 1),
         ([1] * 10 + [5, 1, 1], [4, 0, 0], 1),
         ([1000] * 10 + [3000, 1000], [2, 0], 1000),
-        ([1] * 10 + [2, 1, 3, 1] * 500, [1, 0, 2, 0] * 500, 1),  # losses among good steps do not change the period
-        ([10, 0] * 50, [0] * 100, 10),  # repeats are ignored
-        ([10] * 20 + [1] * 20 + [10], [0] * 20 + [9], 1),  # a faster rate costs nothing
-        ([10] * 20 + [20] * 12 + [40], [0, 1], 20),  # a slower one is adopted after twelve
-        ([1, 2, 1, 1] + [1] * 100, [0] * 100, 1),  # losses in the beginning leave no fraction
+        ([1] * 10 + [2, 1, 3, 1] * 500, [1, 0, 2, 0] * 500, 1),  # losses between normal steps do not change the period
+        ([10, 0] * 50, [0] * 100, 10),  # ignores repeated counter values
+        ([10] * 20 + [1] * 20 + [10], [0] * 20 + [9], 1),  # a faster rate causes no loss
+        ([10] * 20 + [20] * 12 + [40], [0, 1], 20),  # uses a slower rate after twelve steps
+        ([1, 2, 1, 1] + [1] * 100, [0] * 100, 1),  # losses at the start leave no fraction
     ],
 )
 def test_missing_samples_of_steps(steps: list[int], missed: list[int], period: int) -> None:
-    """`missed` is of the last steps."""
+    """`missed` contains the results of the last steps."""
     learner = PeriodLearner()
     assert [learner.add_step(step) for step in steps][-len(missed) :] == missed
     assert learner.period_ticks == period
@@ -114,12 +114,12 @@ def test_missing_samples_of_steps(steps: list[int], missed: list[int], period: i
 @pytest.mark.parametrize(
     ("steps", "gaps"),
     [
-        ([400, 300, 100, 100, 100, 100], 2),  # of a like length: neither stands out beside the other
+        ([400, 300, 100, 100, 100, 100], 2),  # of about the same length: neither is longer than the other
         ([300, 300, 100, 100, 100, 100], 2),
-        ([400, 100, 300, 100, 100, 100, 100], 3),  # 300 stands out beside the period before and the one after
+        ([400, 100, 300, 100, 100, 100, 100], 3),  # 300 is longer than the period before and after it
         ([100, 101, 99, 100], 0),
         ([2, 3, 2, 3, 2, 3], 0),
-        ([1, 1, 2, 1], 0),  # 750 Hz in milliseconds, or a loss: within one
+        ([1, 1, 2, 1], 0),  # 750 Hz in milliseconds, or a loss: accurate within one sample
     ],
 )
 def test_gaps_from_before_a_period_is_known_are_noted_when_it_is(steps: list[int], gaps: int) -> None:
@@ -162,7 +162,7 @@ def test_uneven_ticks_are_no_loss() -> None:
 
 
 def test_losses_do_not_blur_an_uneven_rate() -> None:
-    """A mean of only what is left is off by a thousandth, and that drags device time through its tick."""
+    """The mean without the lost steps is wrong by a thousandth. The device time would move through its tick."""
     random = Random(3)
     learner = PeriodLearner()
     ticks, i, found = 0, 0, []
@@ -177,7 +177,7 @@ def test_losses_do_not_blur_an_uneven_rate() -> None:
 
 
 def test_at_a_tick_per_sample_two_may_share_one() -> None:
-    """1 kHz in milliseconds, 100 ppm fast: a stamp comes twice after 10 s."""
+    """1 kHz in milliseconds, 100 ppm fast: a counter value occurs twice after 10 s."""
     learner = PeriodLearner()
     for i in range(10_100):
         learner.add_step(int(i * 0.9999) - int((i - 1) * 0.9999))
@@ -214,7 +214,7 @@ SET_AT_S = 12
 SETTLED_S = 10.5
 SLEW = 550e-6
 JITTER_STEP_NS = 60_000
-"""Stamps of edges are late by an exponential law of 4 µs."""
+"""Largest step from the jitter, ns. The time stamps of edges are late by an exponential law of 4 µs."""
 
 
 def run(
@@ -226,7 +226,7 @@ def run(
     reference: UtcReference | None = None,
     faults: LineFaults | None = None,
 ) -> tuple[list[DatedSample], Callable[[], int]]:
-    """A device on UTC whose counter is set by so much; also how often that was taken for a restart."""
+    """Return the samples of a device on UTC with a corrected counter, and the number of resets."""
     model = ArrivalModel(profile, rate_hz, SEED, Crystal(0.0), BAUD_OF_RATE[rate_hz])
     clock, dated = sout_clock(model), []
     clock.set_utc_reference(reference)
@@ -286,11 +286,11 @@ def test_a_correction_behind_a_slow_adapter_with_losses_is_covered(set_ms: float
     assert all(abs(t.off_ns) <= 3 * t.sample.t_err_ns for t in settled)
     assert rises(t.sample for t in dated)
     wrong = sum(t.sample.edge_seq not in (None, t.number) for t in settled)
-    assert wrong <= 16 * rate_hz // 1000  # no more than the adapter holds in one read, until the next shows it
+    assert wrong <= 16 * rate_hz // 1000  # at most the frames that the adapter holds in one read
 
 
 def stamps(*steps: int) -> tuple[DeviceTime, list[int]]:
-    """Device time over steps in ms after 100 of 10 ms, relative to the last of those."""
+    """Return the device time over `steps`, in ms, after 100 steps of 10 ms, relative to the last of them."""
     time = DeviceTime(NS_PER_MS, UNIX)
     time.begin(0)
     ticks, found = 0, []
@@ -303,21 +303,21 @@ def stamps(*steps: int) -> tuple[DeviceTime, list[int]]:
 
 
 def test_two_ticks_less_within_a_minute_are_no_step() -> None:
-    """The correction takes what room the tick leaves, and the next natural one finds none."""
+    """The correction uses the rest of the tick. The next normal step finds no rest."""
     time, found = stamps(9, *[10] * 70, 9, 10)
     assert max(abs(b - a - 10 * NS_PER_MS) for a, b in pairwise([0, *found])) < 0.05 * NS_PER_MS
     assert time.doubt_ns > NS_PER_MS // 3
 
 
 def test_samples_that_are_uneven_are_followed() -> None:
-    """Stamps that change all the time are the device's: its samples are where they say, within a tick."""
+    """A device whose counter values change all the time: its samples are at these values, within a tick."""
     time, found = stamps(*[11, 11, 11, 9, 9, 9] * 10)
     assert abs(found[-1] - 600 * NS_PER_MS) <= 2 * NS_PER_MS
     assert not time.uneven
 
 
 def test_messages_that_pause_are_no_correction() -> None:
-    """The device rested for 13 ms once, and its message came when it should."""
+    """The device paused once for 13 ms, and its frame arrived in time."""
     clock = make_clock()
     points = steady(0, 0, 1000) + steady(9_993 + 10, 10_003, 500)
     samples = feed(clock, points)
@@ -341,7 +341,7 @@ def test_a_counter_that_moves_far_began_anew(set_ms: int) -> None:
 
 
 def test_until_an_arrival_confirms_it_the_correction_is_doubted() -> None:
-    """A period more may have passed; device time as stamped goes back with the counter."""
+    """One more period may have passed. The counter is set backward."""
     clock = make_clock()
     (last,) = feed(clock, steady(100_000, 0, 1000))[-1:]
     first, second = feed(clock, [(109_970, 10_000), (109_980, 10_010)])
@@ -374,7 +374,7 @@ def numbering_clock() -> SampleClock:
 
 
 def numbered(clock: SampleClock, index: int, t_ns: int, wait_ns: int = 2 * NS_PER_MS) -> Sample:
-    """Sample `index`, begun on the wire at `t_ns`, complete `wait_ns` later."""
+    """Sample `index`, on the wire from `t_ns`, complete after `wait_ns`."""
     return clock.sample(Measurement(40, 0, index % 65536), t_ns + wait_ns, 0, t_ns)
 
 
@@ -382,7 +382,7 @@ def numbered(clock: SampleClock, index: int, t_ns: int, wait_ns: int = 2 * NS_PE
     ("indices", "missed"),
     [
         ((65530, 65531, 65532, 65535, 65536, 65540, 65541), [0, 0, 0, 2, 0, 3, 0]),  # through the wrap
-        ((1, 2, 3, 4, 1004), [0, 0, 0, 0, 999]),  # a long gap is believed when time agrees
+        ((1, 2, 3, 4, 1004), [0, 0, 0, 0, 999]),  # a long gap that agrees with the host time
     ],
 )
 def test_missing_samples_are_counted(indices: tuple[int, ...], missed: list[int]) -> None:
@@ -396,7 +396,7 @@ def test_missing_samples_are_counted(indices: tuple[int, ...], missed: list[int]
 
 @pytest.mark.parametrize(("later", "resets"), [(0, 1), (500, 0)], ids=["began anew", "link restarted"])
 def test_a_counter_that_jumps_is_no_loss(later: int, resets: int) -> None:
-    """400 ms after sample 40019 it starts again from 0, or it runs on while the link is away."""
+    """The counter restarts at 0 400 ms after sample 40019, or it continues while the link is missing."""
     made = numbering_clock()
     for index in range(40000, 40020):
         numbered(made, index, index * PERIOD_NS)
@@ -409,12 +409,12 @@ def test_a_counter_that_jumps_is_no_loss(later: int, resets: int) -> None:
 
 
 def test_time_is_that_of_the_first_frame_and_says_its_error() -> None:
-    """The error shown covers what arrivals are off, and gaps do not spoil the rate."""
+    """The error contains the distance of the arrivals, and gaps do not change the rate."""
     made, random, offs = numbering_clock(), Random(1), []
     for index in range(2000):
         if index % 50 in (7, 8):
             continue
-        delay_ns = int((0.05 + random.expovariate(20)) * NS_PER_MS)  # the least in the middle of what links allow for
+        delay_ns = int((0.05 + random.expovariate(20)) * NS_PER_MS)  # the middle of the allowed range
         made_of = numbered(made, index, index * PERIOD_NS + delay_ns, random.randrange(1 * NS_PER_MS, 6 * NS_PER_MS))
         assert made_of.sync is Sync.ARRIVAL
         assert made_of.t_dev_ns is None
@@ -435,7 +435,7 @@ def test_time_is_that_of_the_first_frame_and_says_its_error() -> None:
         ([10] * 100 + [35] + [2, 3] * 6, True), ([2, 3] * 100 + [20] * 12, True), ([2] * 100 + [1] * 12, True),
         ([5] * 100 + [4] * 12, True), ([10] * 100 + [35] + [2, 3] * 5, False), ([2, 3] * 300, False),
         ([1] * 999 + [2] + [1] * 40, False),
-        # of a stream that loses every second message, twelve in a row may look like half the rate
+        # if every second frame is lost, twelve consecutive frames can look like half the rate
         ([1, 2, 1, 1, 2] * 20 + [2] * 12 + [1] * 12, False),
     ],
 )  # fmt: skip

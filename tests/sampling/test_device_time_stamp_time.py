@@ -1,4 +1,4 @@
-"""Time from stamps of 13 bits: they turn, pulses set them to zero, messages wait, and other messages carry time."""
+"""Ticks from 13-bit values (`pps_age_ms`): wraps, resets by pulses, delayed frames, and frames with device time."""
 
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ BEGIN_NS = 1_000 * NS_PER_S
 
 
 def ticks_of(stamps: list[int], step_ms: int = 10) -> list[int | None]:
-    """Ticks of stamps that come every `step_ms`."""
+    """Return the ticks of values with a step of `step_ms`."""
     time, known = StampTime(MODULUS), None
     found = []
     for i, stamp in enumerate(stamps):
@@ -27,10 +27,10 @@ def ticks_of(stamps: list[int], step_ms: int = 10) -> list[int | None]:
 @pytest.mark.parametrize(
     ("stamps", "ticks"),
     [
-        ([8170, 8180, 8190, 8, 18], [8180, 8190, 8200, 8210]),  # the turn of a real module at 100 Hz, as recorded
-        # a pulse per second does not look like seven lost seconds
+        ([8170, 8180, 8190, 8, 18], [8180, 8190, 8200, 8210]),  # the wrap of a real device at 100 Hz, recorded
+        # a pulse per second does not look like a loss of seven seconds
         ([950, 960, 970, 980, 990, 2, 12, 22, 32], [960, 970, 980, 990, 1002, 1012, 1022, 1032]),
-        ([0] * 50, [None] * 49),  # messages that follow a trigger each have no time
+        ([0] * 50, [None] * 49),  # frames that answer triggers contain no time
         ([4711] * 50, [None] * 49),
     ],
 )
@@ -39,14 +39,14 @@ def test_ticks_of_stamps(stamps: list[int], ticks: list[int | None]) -> None:
 
 
 def test_pulses_that_stay_away_and_come_again() -> None:
-    """After pulses the stamp runs on to its turn, and a pulse sets it to zero again."""
+    """After the last pulse, the value increases until its wrap. Then a pulse resets it again."""
     truth = list(range(500, 30_000, 10))
     stamps = [t % 1000 if t < 3000 or t >= 20_000 else (t - 2000) % MODULUS for t in truth]
     assert ticks_of(stamps)[1:] == truth[1:]
 
 
 def test_a_loss_within_a_turn_is_what_the_stamp_says() -> None:
-    """4 s of messages are missing, those around it arrive together: only the stamp shows it."""
+    """Frames of 4 s are lost, and the frames around the gap arrive together: only the value shows the loss."""
     time = StampTime(MODULUS)
     known = None
     for i in range(100):
@@ -57,7 +57,7 @@ def test_a_loss_within_a_turn_is_what_the_stamp_says() -> None:
 
 
 def test_turns_that_were_missed_are_added_when_messages_come_on_time() -> None:
-    """20 s are missing, the stamp shows 20000 - 2 · 8192 = 3616 ms of them."""
+    """20 s are lost. The value shows 20000 - 2 · 8192 = 3616 ms of them."""
     time = StampTime(MODULUS)
     known: int | None = None
     truth = [*range(0, 3000, 10), *range(23_000, 25_000, 10)]
@@ -89,12 +89,12 @@ def test_messages_that_carry_time_are_preferred() -> None:
 
 
 def hi92(stamp: int) -> Measurement:
-    """An HI92 frame with nothing in it but its stamp."""
+    """Return an HI92 frame with only `pps_age_ms`."""
     return Measurement(54, 0, None, pps_age_ms=stamp)
 
 
 def make_clock(unknown: list[int]) -> SampleClock:
-    """A clock of a module that sends HI91 or HI92 at 115200 baud."""
+    """Return the clock of a device that sends HI91 or HI92 at 115200 baud."""
     return SampleClock(
         "bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=86_806, hold_ns=0, stamp_modulus=MODULUS,
         on_unknown_gap=lambda: unknown.append(1),
@@ -102,7 +102,7 @@ def make_clock(unknown: list[int]) -> SampleClock:
 
 
 def test_samples_are_dated_by_the_fit_of_their_stamps() -> None:
-    """Every third arrival is 4 ms late, which the fit does not follow."""
+    """Every third arrival is 4 ms late. The fit does not follow them."""
     unknown: list[int] = []
     clock, truth_ns, errors = make_clock(unknown), BEGIN_NS, []
     for i in range(3000):

@@ -1,4 +1,4 @@
-"""Devices on UTC and beside a pulse per second: recognised, bounded, honest, and never a step."""
+"""Devices with UTC or with a pulse per second: detection, bounds, accurate errors, no step."""
 
 import pytest
 
@@ -25,7 +25,7 @@ from tests.support.clock_feed import BEGIN_NS, rises
 UNIX = 1 << 32
 DAY = DAY_NS // NS_PER_MS
 SLEW = 550e-6
-"""500 ppm, and some for crystals and lines that are not exact."""
+"""500 ppm, and a margin for inexact crystals and lines."""
 
 
 def model(profile: ArrivalProfile, rate_hz: int = 100, ppm: float = 0.0, seed: int = 1) -> ArrivalModel:
@@ -44,7 +44,7 @@ def test_a_device_that_turns_to_utc_is_recognised(profile: ArrivalProfile, turn_
     assert clock.status().reference_error_ns == REFERENCE.error_ns
     assert syncs(dated[1500:]) == {Sync.UTC}
     assert share_honest(dated) >= 0.95
-    assert steepest(dated[1100:]) < 2 * SLEW  # the slews of the fit and of what corrects it
+    assert steepest(dated[1100:]) < 2 * SLEW  # the slew of the fit and of its correction
     assert rises(t.sample for t in dated)
     assert max(abs(t.off_ns) for t in after(dated, 30)) < 600_000
     assert max(t.sample.t_err_ns for t in after(dated, 30)) < NS_PER_MS
@@ -52,7 +52,7 @@ def test_a_device_that_turns_to_utc_is_recognised(profile: ArrivalProfile, turn_
 
 @pytest.mark.parametrize("ppm", [-50_000.0, 50.0])
 def test_what_the_crystal_did_before_the_turn_is_forgotten(ppm: float) -> None:
-    """At the crystal's old rate time ran 0.8 s away until the new fit counted, 16 s after the turn."""
+    """With the crystal's old rate, the time moved by 0.8 s until the new fit was in use, 16 s after the jump."""
     dated, clock = run_utc(model(USB_16MS, 100, ppm), 32, turn_ms=UNIX)
     assert clock.status().resets == 0
     assert share_honest(dated) >= 0.95
@@ -69,14 +69,14 @@ def test_a_turn_before_anything_is_known_gives_the_time_itself() -> None:
 
 
 def test_samples_that_hardly_drift_through_the_milliseconds_of_utc() -> None:
-    """Device time and UTC are each within a tick, and both stay at their ends for seconds."""
+    """Device time and UTC are each accurate within a tick, and both can stay at their limits for seconds."""
     dated, _ = run_utc(model(USB_16MS_PACKET, 200, -50.0, 2002), 15, turn_ms=UNIX, turn_at=0.06)
     assert share_honest(dated) >= 0.95
 
 
 @pytest.mark.parametrize("error_ns", [REFERENCE.error_ns, 10 * NS_PER_S])
 def test_gps_time_is_refused(error_ns: int) -> None:
-    """A host refuses a time that is 18 s off, even if the error of its own time is 10 s."""
+    """The clock rejects a time that is 18 s off, even if the error of the host's time is 10 s."""
     unsure = UtcReference(UTC_OFFSET_NS, error_ns)
     dated, clock = run_utc(model(BARE_UART), 25, turn_ms=UNIX, ahead_ns=18 * NS_PER_S, reference=unsure)
     assert Sync.UTC not in syncs(dated)
@@ -95,7 +95,7 @@ def test_a_device_that_was_on_utc_before_is_recognised() -> None:
 
 
 def on_utc(clock: SampleClock, count: int, status: int | None, off_ms: float, first: int = 0) -> list[Sync]:
-    """100 Hz on UTC, off by a growing distance."""
+    """100 Hz on UTC, with an increasing distance."""
     found = []
     for i in range(first, first + count):
         at = BEGIN_NS + 10 * i * NS_PER_MS
@@ -141,12 +141,12 @@ def test_a_pulse_per_second_is_better_than_a_slow_adapter(rate_hz: int, ppm: flo
     assert share_honest(dated) >= 0.95
     assert rises(t.sample for t in dated)
     settled = after(dated, 0.6 * seconds)
-    assert sum(abs(t.off_ns) for t in settled) < 600_000 * len(settled)  # 1.5 ms at 100 Hz without, 6 ms at 1 Hz
+    assert sum(abs(t.off_ns) for t in settled) < 600_000 * len(settled)  # without it 1.5 ms at 100 Hz, 6 ms at 1 Hz
     assert Sync.EDGE in syncs(settled)
 
 
 def test_a_young_fit_does_not_mislead_the_pulse() -> None:
-    """A slope that is off by 0.1 % is a millisecond at an age of a second: the intervals have to allow for it."""
+    """A slope error of 0.1 % is one millisecond at an age of one second. The intervals must contain it."""
     dated = run_pps(model(LOADED, 1000, 50.0, 1007), 4)
     assert share_honest(dated) >= 0.95
     assert all(abs(t.off_ns) < 3 * t.sample.t_err_ns for t in dated)

@@ -1,4 +1,4 @@
-"""Intervals of whole milliseconds, together."""
+"""Intervals of whole milliseconds and their common fit."""
 
 import pytest
 
@@ -10,7 +10,7 @@ FAR = 1 << 60
 
 
 def filled(ppm: float, seconds: int = 40) -> tuple[IntervalFit, int]:
-    """Stamps of a clock that runs `ppm` fast, cut off to ms, of instants that are their own device time."""
+    """Add time stamps, truncated to ms, of a clock that is `ppm` fast. The device time is the instant itself."""
     intervals, x = IntervalFit(), 0
     for i in range(seconds * 10):
         x = i * NS_PER_S // 10 + 400_000
@@ -34,7 +34,7 @@ def test_the_estimate_runs_at_the_slope_of_the_intervals() -> None:
     intervals = IntervalFit()
     for x in range(0, 20 * NS_PER_S + 1, NS_PER_S // 10):
         low = int(x * (1 + 50e-6))
-        intervals.add_interval(x, low, low + MS, FAR, 1.0)  # 50 ppm beside the slope that is passed
+        intervals.add_interval(x, low, low + MS, FAR, 1.0)  # 50 ppm in addition to the given slope
     at, fits = 60 * NS_PER_S, int(60 * NS_PER_S * (1 + 50e-6)) + MS // 2
     assert abs(intervals.combined(at, fits, 1e12, 0.0)[0]) < 300_000
 
@@ -48,7 +48,7 @@ def test_a_better_fit_stays_within() -> None:
 
 
 def test_a_fit_beside_the_intervals_is_moved_and_doubted_by_that() -> None:
-    """One second of intervals says nothing of the slope, and the set of lines is as wide as that."""
+    """Intervals of one second show no slope, and the feasible lines are as wide as the intervals."""
     intervals = IntervalFit()
     for x in (0, NS_PER_S // 2, NS_PER_S):
         intervals.add_interval(x, x, x + MS, FAR, 1.0)
@@ -87,7 +87,7 @@ def test_contradictions_drop_what_is_old() -> None:
 
 
 def test_a_fit_that_contradicts_narrow_intervals_is_covered() -> None:
-    """A device without pulses drifts away and still reports UTC: its milliseconds agree with each other only."""
+    """A device without pulses drifts away and reports UTC: its milliseconds only agree with each other."""
     intervals, x = IntervalFit(), 0
     for _ in range(1000):
         x += 10_037_000

@@ -1,4 +1,4 @@
-"""Edges paired with samples by device time, whichever side loses; pulses decoded from edges."""
+"""Pairing of edges with samples by device time, with losses on both sides; decoding of pulses from edges."""
 
 import pytest
 
@@ -12,10 +12,10 @@ from imud.sampling.edge_pairing import MISSES_MOST, QUEUE_MOST, WRONG_MOST, Edge
 @pytest.mark.parametrize(
     ("reads", "pulses"),
     [
-        ([[Edge(1000, True, 1), Edge(81_000, False, 2)]], [(1000, 1)]),  # a pulse is its rising edge
-        # the halves of a pulse may come apart
+        ([[Edge(1000, True, 1), Edge(81_000, False, 2)]], [(1000, 1)]),  # the rising edge is the time of a pulse
+        # the edges of a pulse may arrive in two reads
         ([[Edge(1000, True, 1)], [Edge(81_000, False, 2), Edge(500_000, True, 3)]], [(1000, 1), (500_000, 3)]),
-        # a falling edge alone is counted back
+        # computes a lost rising edge from the falling edge
         ([[Edge(1000, True, 1), Edge(581_000, False, 4)]], [(1000, 1), (501_000, 3)]),
     ],
 )
@@ -37,7 +37,7 @@ ERROR_NS = 100_000.0
 
 
 def pair(pairing: EdgePairing, i: int, fit_off_ns: int = LEAD_NS) -> bool:
-    """Sample `i`, whose event was at i periods; the fit is where its message began."""
+    """Pair sample `i`, whose event was at i periods. The fit is at the start of its frame."""
     at = i * PERIOD_NS
     return pairing.pair(at, at + NS_PER_MS, at + fit_off_ns, ERROR_NS, float(PERIOD_NS), 1.0)
 

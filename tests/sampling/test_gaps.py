@@ -1,7 +1,7 @@
-"""Losses while the process does not run: the device samples on, the kernel keeps what fits, and the rest is missing.
+"""Losses while the process is stopped: the device continues, and the kernel drops data if its buffer is full.
 
-The truth is what the device made less what was delivered. Losses are right within one sample per stall, or the gap is
-reported as one of unknown size.
+The truth is the number of samples of the device less the delivered samples. The count of lost samples is accurate
+within one sample per stall, or the gap is reported as a gap of unknown size.
 """
 
 from dataclasses import dataclass, field, replace
@@ -27,18 +27,18 @@ SEEDS: Final = (1, pytest.param(2, marks=pytest.mark.thorough), pytest.param(3, 
 
 @dataclass(frozen=True)
 class Device:
-    """A simulated device: its rate, its counter, and how far its crystal is off."""
+    """A simulated device: its rate, its counter, and the error of its crystal."""
 
     rate_hz: int
     tick_ns: int
-    """0: the counter numbers the samples; -1: there is none."""
+    """0: the counter numbers the samples. -1: no counter."""
     modulus: int
     ppm: float = 30.0
     first: int = 12345
     stamp_modulus: int = 0
-    """Of a stamp in ms in messages without a counter; 0 where there is none."""
+    """Modulus of `pps_age_ms` in frames without a counter; 0 without this value."""
     pulses: bool = False
-    """Whether a pulse per second sets the stamp to zero."""
+    """Whether a pulse per second resets `pps_age_ms`."""
 
     def stamp_ms(self, index: int) -> int | None:
         if not self.stamp_modulus:
@@ -54,12 +54,12 @@ class Device:
         return int(self.first + index * step) % self.modulus
 
     def time_ns(self, index: int) -> int:
-        """CLOCK_MONOTONIC when a sample was measured."""
+        """Return CLOCK_MONOTONIC at the measurement of a sample, ns."""
         return BEGIN_NS + int(index * NS_PER_S / self.rate_hz * (1 - self.ppm * 1e-6))
 
 
 def make_clock(device: Device, unknown: list[int]) -> SampleClock:
-    """A clock that appends to `unknown`."""
+    """Return a clock that appends a gap of unknown size to `unknown`."""
     return SampleClock(
         "imu",
         tick_ns=device.tick_ns if device.tick_ns >= 0 else NS_PER_MS,
@@ -73,7 +73,7 @@ def make_clock(device: Device, unknown: list[int]) -> SampleClock:
 
 @dataclass
 class Reader:
-    """A process that reads what the kernel kept of a device's bytes, and stalls now and then."""
+    """A process that reads the bytes of a device from the kernel's buffer, and stalls sometimes."""
 
     device: Device
     clock: SampleClock
@@ -93,27 +93,27 @@ class Reader:
         self._wait(end)
 
     def stall(self, duration_ns: int) -> None:
-        """Do not read for so long; then read at once what the kernel kept."""
+        """Do not read for this time. Then read the kernel's buffer."""
         self._wait(self.now_ns + duration_ns)
         while self.waiting:
             self._read()
             self._wait(self.now_ns + 40 * NS_PER_US)
 
     def starve(self, duration_ns: int, every_ns: int) -> None:
-        """Get one read now and then, as beside a process that takes all the time."""
+        """Get a read only sometimes, like a process next to a busy process."""
         end = self.now_ns + duration_ns
         while self.now_ns < end:
             self._wait(self.now_ns + every_ns)
             self._read()
 
     def finish(self) -> int:
-        """Read on until all is settled; return what is missing in truth."""
+        """Read until the clock is settled. Return the true number of lost samples."""
         self.stall(0)
         self.run(6 * NS_PER_S)
         return self.made - self.delivered
 
     def _wait(self, until_ns: int) -> None:
-        """Let the device send, and the kernel drop what does not fit."""
+        """Let the device send, and let the kernel drop the bytes that do not fit."""
         while self.device.time_ns(self.made) < until_ns - 100 * NS_PER_US:
             if (len(self.waiting) + 1) * FRAME_BYTES <= self.kept_bytes:
                 self.waiting.append(self.made)
@@ -135,7 +135,7 @@ class Reader:
 
 
 def reader(device: Device, kept_bytes: int, seed: int) -> tuple[Reader, list[int]]:
-    """A reader at 8 s, and what its clock reports as unknown."""
+    """Return a reader at 8 s, and the list of gaps of unknown size."""
     unknown: list[int] = []
     one = Reader(device, make_clock(device, unknown), kept_bytes, Random(seed))
     one.run(8 * NS_PER_S)
@@ -161,7 +161,7 @@ STAMPED = [HI92, HI92_400, HI92_FAST]
     [*product(COUNTED + STAMPED, [N_TTY]), *product([HI91_400, NUMBERED, HI92_400], [FLIP_BUFFER])],
 )
 def test_losses_over_stalls_are_those_of_the_device(device: Device, kept_bytes: int, seed: int) -> None:
-    """Stalls are shorter than a turn of the counter or stamp."""
+    """Stalls are shorter than a wrap of the counter or value."""
     one, unknown = reader(device, kept_bytes, seed)
     longest_s = 7 if device.stamp_modulus else 10
     for _ in range(STALLS):
@@ -184,7 +184,7 @@ def test_losses_over_longer_stalls_are_right_within_one_where_messages_are_on_ti
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("device", "kept_bytes"), [*product(COUNTED, [N_TTY]), (NUMBERED, FLIP_BUFFER)])
 def test_losses_under_starvation_are_those_of_the_device(device: Device, kept_bytes: int, seed: int) -> None:
-    """Every message is late for up to 20 s, and the fit with them; then the host catches up."""
+    """All frames are late for up to 20 s, and the fit follows them. Then the host catches up."""
     one, unknown = reader(device, kept_bytes, seed)
     for _ in range(4):
         one.starve(int(one.random.uniform(1, 20) * NS_PER_S), int(one.random.uniform(0.05, 0.7) * NS_PER_S))
@@ -247,13 +247,13 @@ def test_a_restart_before_the_rate_is_known_is_one_gap(samples: int, away_ms: in
 
 
 def paced(pace: ArrivalPace, begin_ns: int, messages: int, late_ns: int = 0) -> tuple[int, int]:
-    """Add messages at 100 Hz; return how many samples they show to be missing, and how many windows were not sure."""
+    """Add frames at 100 Hz. Return the number of lost samples and the number of uncertain windows."""
     found = [pace.add_arrival(begin_ns + index * 10 * NS_PER_MS + late_ns) for index in range(messages)]
     return sum(missed for missed, _ in found), sum(not certain for _, certain in found)
 
 
 def known_pace() -> ArrivalPace:
-    """The pace of 100 Hz after a minute."""
+    """Return the pace of 100 Hz after one minute."""
     pace = ArrivalPace()
     pace.begin(BEGIN_NS)
     assert paced(pace, BEGIN_NS + 10 * NS_PER_MS, 6000) == (0, 0)
@@ -305,7 +305,7 @@ def test_a_window_that_waited_as_a_whole_costs_nothing_that_is_known_of_the_pace
 @pytest.mark.parametrize("late_ms", [4, 45])
 @pytest.mark.parametrize("missing_from", [(240,), (170, 201), (180, 215)])
 def test_messages_that_stay_late_by_the_same_are_of_the_same_rate(late_ms: int, missing_from: tuple[int, ...]) -> None:
-    """As of a sender that was started anew, or whose own timer slept for too long; seven or more are missing then."""
+    """The sender restarted, or its timer slept too long. Seven or more late frames are lost samples."""
     pace, period_ns = ArrivalPace(), 100 * NS_PER_MS
     pace.begin(BEGIN_NS)
     found = []

@@ -1,4 +1,4 @@
-"""Rates, latencies and the causes of loss, by hand."""
+"""Rate, latency, and causes of loss, computed by hand."""
 
 from imud.contracts.status import LATENCY_BOUNDS_NS
 from imud.model.ledger import Ledger
@@ -44,7 +44,7 @@ def test_latencies_go_into_the_buckets_whose_bounds_they_do_not_exceed() -> None
 
 
 def published_after(*latencies_ns: int) -> list[Sample]:
-    """Samples, oldest first, that are published at 2000 s."""
+    """Samples that are published at 2000 s, oldest first."""
     return [
         Sample("bow", seq, 2 * 10**12 - latency_ns, 1, Sync.ARRIVAL, 0, 0)
         for seq, latency_ns in enumerate(latencies_ns, start=1)
@@ -60,7 +60,7 @@ def test_loss_is_explained_by_damage_first_then_overruns_then_the_device() -> No
     loss.bad_frames = 0
     loss.missed(4, overruns=7)
     assert (ledger.lost_crc, ledger.lost_overrun, ledger.lost_gap_device) == (2, 4, 1)
-    loss.missed(1, overruns=7)  # no new overrun since
+    loss.missed(1, overruns=7)  # no new overrun
     assert (ledger.lost_crc, ledger.lost_overrun, ledger.lost_gap_device) == (2, 4, 2)
     loss.link_opened()
     loss.missed(1, overruns=1)

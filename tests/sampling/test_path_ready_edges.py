@@ -1,4 +1,4 @@
-"""Which edge a read belongs to, by time stamps alone."""
+"""Edge of a read, by time stamps only."""
 
 from math import sqrt
 
@@ -14,7 +14,7 @@ EXACT = ReadyOptions(line="Y", bias_us=0)
 
 
 def edge(number: int, t_ns: int | None = None) -> Edge:
-    """At number · 1 ms unless said otherwise."""
+    """Return an edge at number · 1 ms by default."""
     return Edge(number * MS if t_ns is None else t_ns, True, number)
 
 
@@ -25,7 +25,7 @@ def edges(*numbers: int, settings: ReadyOptions = EXACT) -> ReadyEdges:
 
 
 def read(made: ReadyEdges, start_ms: float, end_ms: float) -> tuple[int, int] | None:
-    """(Number, time in ns) of the edge."""
+    """Return the number of the edge and its time, ns."""
     stamp = made.match(round(start_ms * MS), round(end_ms * MS))
     return (stamp.number, stamp.t_ns) if stamp is not None else None
 

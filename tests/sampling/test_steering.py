@@ -1,4 +1,4 @@
-"""Edges through the whole clock: every pair right, no step when edges come and go, errors honest; slewing."""
+"""Edges through the complete clock: correct pairs, no step at the start and end of edges, accurate errors; slewing."""
 
 from itertools import pairwise
 from math import sqrt
@@ -74,7 +74,7 @@ def model(profile: ArrivalProfile, rate_hz: int = 100, seed: int = 1, crystal: C
 def test_every_pair_is_right_under_loss_on_either_side(
     profile: ArrivalProfile, rate_hz: int, seconds: int, rising_only: bool
 ) -> None:
-    """The kernel reports and numbers all edges, or the rising edges only."""
+    """The kernel reports and numbers all edges, or only rising edges."""
     m = model(profile, rate_hz, 3)
     reads = simulate_reads(m.run(rate_hz * seconds), 3, HALF_LOST)
     if rising_only:
@@ -95,7 +95,7 @@ def test_every_pair_is_right_under_loss_on_either_side(
 
 @pytest.mark.parametrize("crystal", [Crystal(-50_000.0), Crystal(20.0, 0.1)], ids=["-5 %", "drifting"])
 def test_with_edges_only_their_own_jitter_is_left(crystal: Crystal) -> None:
-    """Simulated stamps are late by 3 µs and an exponential law of 4 µs."""
+    """The simulated time stamps are late by 3 µs and an exponential law of 4 µs."""
     dated = after(run_sout(model(USB_16MS, 100, 1, crystal), 30, LineFaults(pulse_loss=0.01, extra=0.01)), 5)
     mean = sum(t.off_ns for t in dated) / len(dated)
     assert sqrt(sum((t.off_ns - mean) ** 2 for t in dated) / len(dated)) < 5_000
@@ -119,18 +119,18 @@ def test_edges_that_stop_and_come_back_make_no_step(profile: ArrivalProfile) -> 
     begin = sum(len(read.arrivals) for read in reads[: silent.start])
     end = sum(len(read.arrivals) for read in reads[: silent.stop])
     assert {t.sample.sync for t in dated[begin - 300 : begin]} == {Sync.EDGE}
-    last = max(i for i, t in enumerate(dated[:end]) if t.sample.edge_seq is not None)  # of a pulse seen before
+    last = max(i for i, t in enumerate(dated[:end]) if t.sample.edge_seq is not None)  # for a pulse before
     assert last <= begin + 2
     assert syncs(dated[last + 3 : end]) == {Sync.REGRESSION}
     assert syncs(dated[end + 50 :]) == {Sync.EDGE}
-    # the jitter of the stamps themselves, beyond which only slewing is allowed
+    # jitter of the time stamps; only slewing may exceed it
     assert max(abs(b.off_ns - a.off_ns) for a, b in pairwise(dated[1010:])) < JITTER_STEP_NS
     assert steepest(dated[begin + 3 : end]) < 2 * STEEPEST
     assert share_honest(dated) >= 0.95
 
 
 def test_device_time_that_creeps_does_not_throw_the_line_off() -> None:
-    """A device on UTC whose own crystal is 5 % slow: its milliseconds say little of which pulse is a sample's."""
+    """A device on UTC whose crystal is 5 % slow: its milliseconds do not identify the pulse of a sample."""
     m = model(LOADED, 1000, 3078, Crystal(-50_000.0))
     clock, dated = sout_clock(m), []
     clock.set_utc_reference(REFERENCE)
@@ -145,7 +145,7 @@ def test_device_time_that_creeps_does_not_throw_the_line_off() -> None:
 
 
 def test_the_fit_keeps_the_delay_learned_from_edges() -> None:
-    """Behind this adapter the fit alone is 1.5 ms off."""
+    """Behind this adapter, the fit without edges is 1.5 ms off."""
     m = model(USB_16MS_PACKET, 100)
     reads = simulate_reads(m.run(3000), 1, LineFaults())
     dated = with_sout(sout_clock(m), reads, silent=range(len(reads) // 2, len(reads)))
@@ -154,7 +154,7 @@ def test_the_fit_keeps_the_delay_learned_from_edges() -> None:
 
 
 def test_a_delay_learned_by_a_young_fit_adds_to_the_error() -> None:
-    """Pulses for 6 s only: the fit moves by a millisecond afterwards, and the learned delay does not follow."""
+    """Pulses for 6 s only: then the fit moves by one millisecond, and the learned delay does not follow."""
     m = model(USB_16MS, 100, 1048, Crystal(-50.0))
     reads = simulate_reads(m.run(4500), 1048, LineFaults())
     begin = next(i for i, read in enumerate(reads) if read.arrivals[0].t_ns > m.begin_ns + 6 * NS_PER_S)
@@ -193,13 +193,13 @@ def test_what_was_lost_is_counted() -> None:
     assert status.edges == seen
     paired = sum(t.sample.edge_seq is not None for t in dated)
     assert 0.03 * seen < status.edges_unpaired < 0.07 * seen
-    assert seen - paired - status.edges_unpaired < 100  # those of the beginning
+    assert seen - paired - status.edges_unpaired < 100  # events of the first seconds
     assert 0 <= len(dated) - paired - status.samples_unpaired < 100
 
 
 @pytest.mark.parametrize(("every", "bit"), [(5, 0x1000), (1, 0)], ids=["bit", "never set"])
 def test_the_status_bit_says_which_frames_have_a_pulse_unless_it_is_never_set(every: int, bit: int) -> None:
-    """100 Hz, a pulse and bit 12 for each n-th frame only."""
+    """100 Hz, with a pulse and bit 12 only for each n-th frame."""
     bits = TimeBits(sync_out=0x1000)
     clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=10_850, hold_ns=0, bits=bits)
     numbers = []
@@ -248,7 +248,7 @@ def test_any_input_gives_rising_stamps_before_arrival(
 
 
 def give(clock: SampleClock, what: str, t_ns: int, number: int) -> None:
-    """One thing that is no message."""
+    """Give one input that is not a frame."""
     edges = [Edge(t_ns, True, 2 * number + 1), Edge(t_ns + 80_000, False, 2 * number + 2)]
     if what == "edges":
         clock.add_edges("sout", edges)
@@ -272,7 +272,7 @@ def test_divided_pulses_find_their_samples() -> None:
         if i % 4 == 0:
             clock.add_edges("sout_div", [Edge(at + 3000, True, i + 1), Edge(at + 83_000, False, i + 2)])
         if i % 100 == 48:
-            expected.append((i + 1, None))  # its sample is lost
+            expected.append((i + 1, None))  # the sample is lost
             continue
         s = clock.sample(message(10 * i), at + 2 * NS_PER_MS, 0)
         if i % 4 == 0:

@@ -1,4 +1,4 @@
-"""Table: Measurements in and samples out of a `SampleClock`, as rows of device ticks and host time."""
+"""Measurements for a `SampleClock` and its samples, as rows of device ticks and host time."""
 
 from collections.abc import Iterable
 from itertools import pairwise
@@ -8,14 +8,14 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
 
 Point = tuple[int | None, int]
-"""(device ticks, ms of the host since the beginning)."""
+"""Device ticks, and host time since the start, ms."""
 
 MODULUS = 1 << 32
 BEGIN_NS = 1_000 * NS_PER_S
 
 
 def make_clock(*, tick_modulus: int = MODULUS, byte_ns: int = 10_850, hold_ns: int = 0) -> SampleClock:
-    """A clock of millisecond ticks behind a UART at 921600 baud."""
+    """Return a clock with ticks of one millisecond, behind a UART at 921600 baud."""
     return SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=tick_modulus, byte_ns=byte_ns, hold_ns=hold_ns)
 
 
@@ -24,7 +24,7 @@ def message(ticks: int | None, trailing_bytes: int = 0) -> Measurement:
 
 
 def feed(clock: SampleClock, points: Iterable[Point]) -> list[Sample]:
-    """Samples for (ticks, host ms since the beginning); each message is read 1 ms after it was measured."""
+    """Return the samples of (ticks, host ms since the start). Each frame is read 1 ms after its measurement."""
     return [clock.sample(message(ticks), BEGIN_NS + int((ms + 1) * NS_PER_MS), 0) for ticks, ms in points]
 
 
@@ -33,6 +33,6 @@ def steady(first_tick: int, first_ms: int, count: int, step_ms: int = 10) -> lis
 
 
 def rises(samples: Iterable[Sample]) -> bool:
-    """Whether time rises strictly and no sample is dated after its arrival."""
+    """Return whether the time stamps rise strictly, and none is after the arrival."""
     taken = list(samples)
     return all(a.t_ns < b.t_ns for a, b in pairwise(taken)) and all(s.t_ns <= s.t_rx_ns for s in taken)

@@ -1,4 +1,4 @@
-"""A real daemon that feeds a device what a real gpsd hears from a receiver on a pseudo-terminal."""
+"""A real daemon that feeds a device with the sentences that a real gpsd receives on a pseudo-terminal."""
 
 import os
 import select
@@ -23,11 +23,11 @@ NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (Debian package
 
 
 class Receiver(PtyPort):
-    """A GNSS receiver with a fix, on a pty: one cycle of sentences after the other."""
+    """A GNSS receiver with a fix, on a pty. It sends one cycle of sentences after the other."""
 
     def __init__(self) -> None:
         super().__init__()
-        os.chmod(self.path, 0o666)  # gpsd gives its rights away
+        os.chmod(self.path, 0o666)  # gpsd drops its privileges
         self.second = UTC_S
 
     def cycle(self) -> None:
@@ -36,7 +36,7 @@ class Receiver(PtyPort):
         gga = f"GPGGA,{time},0000.000,N,00000.000,E,1,08,0.9,12.0,M,0.0,M,,"
         gsa = "GPGSA,A,3,01,02,03,04,05,06,07,08,,,,,1.6,0.9,1.3"
         rest = "".join(f"${body}*{checksum(body.encode()):02X}\r\n" for body in (gga, gsa))
-        self.received()  # what gpsd asks of the receiver is not answered
+        self.received()  # no reply to the requests of gpsd
         self.send(rmc + rest.encode())
         self.second += 1
 
@@ -62,7 +62,7 @@ def receiver() -> Iterator[Receiver]:
 
 
 class Port(PtyPort):
-    """The far end of a serial port: a device that only listens."""
+    """The far end of a serial port, with a device that only receives."""
 
     text = b""
 
@@ -99,7 +99,7 @@ def test_a_device_is_fed_what_gpsd_hears(receiver: Receiver, port: Port, tmp_pat
         while len(fed) < WANTED:
             assert time.monotonic() < end, daemon.statuses()["bow"].utc
             now_s = time.time()
-            if int(now_s) > receiver.second and now_s % 1 < 0.5:  # a receiver names each second early in it
+            if int(now_s) > receiver.second and now_s % 1 < 0.5:  # a receiver sends each sentence early in its second
                 receiver.second = int(now_s)
                 receiver.cycle()
                 receiver.second -= 1

@@ -1,4 +1,4 @@
-"""UTC from pulses and sentences, with known truth."""
+"""UTC from pulses and sentences, compared with the truth."""
 
 from random import Random
 
@@ -14,7 +14,7 @@ BEGIN_NS = 77 * NS_PER_S + 123_456_789
 
 
 class Receiver:
-    """Pulses as a host whose oscillator is `ppm` fast stamps them, and sentences."""
+    """Sentences, and pulses with the time stamps of a host whose oscillator is `ppm` fast."""
 
     def __init__(self, ppm: float = 30.0, late_ns: float = 0.0) -> None:
         self.seconds: list[tuple[int, int]] = []
@@ -41,7 +41,7 @@ class Receiver:
         return reference
 
     def error_ns(self, after_s: float = 0.0) -> float:
-        """The estimate minus the truth."""
+        """Return the estimate minus the truth, ns."""
         truth_ns = UTC_S * NS_PER_S + (self.number + after_s) * NS_PER_S
         return self.known(after_s).offset_ns - (int(truth_ns) - self.t_ns(after_s))
 

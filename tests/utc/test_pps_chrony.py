@@ -1,4 +1,4 @@
-"""The samples that chronyd is sent: against a socket of the test's, and against a real chronyd."""
+"""Samples for chronyd: to a socket of the test, and to a real chronyd."""
 
 import os
 import shutil
@@ -28,7 +28,7 @@ def receiver(tmp_path: Path) -> Iterator[socket.socket]:
 
 
 def feed(receiver: socket.socket, ahead_ns: int = 0) -> ChronyFeed:
-    """A feed on a host whose clock is `ahead_ns` ahead of UTC, and whose CLOCK_MONOTONIC is UTC less UTC_S."""
+    """A feed on a host whose clock is `ahead_ns` ahead of UTC, and whose CLOCK_MONOTONIC is UTC - UTC_S."""
     return ChronyFeed(receiver.getsockname(), lambda: UTC_S * NS_PER_S + ahead_ns)
 
 
@@ -102,7 +102,7 @@ def chronyd(tmp_path: Path) -> Iterator[Path]:
         f"refclock SOCK {tmp_path}/imud.sock refid IMUD poll 0 filter 1\n"
         f"bindcmdaddress {tmp_path}/command.sock\ncmdport 0\nport 0\npidfile {tmp_path}/pid\nuser root\n"
     )
-    tmp_path.chmod(0o750)  # chronyd wants a folder that others cannot write for its command socket
+    tmp_path.chmod(0o750)  # chronyd requires a folder without write permission for others
     process = subprocess.Popen(["chronyd", "-x", "-d", "-f", str(config)], stderr=subprocess.PIPE, text=True)
     try:
         yield tmp_path
@@ -113,7 +113,7 @@ def chronyd(tmp_path: Path) -> Iterator[Path]:
 
 
 def sources(folder: Path) -> dict[str, list[str]]:
-    """The reference clocks that chronyd has, by name: fields of `chronyc -c sources`."""
+    """Return the reference clocks of chronyd by name: the fields of `chronyc -c sources`."""
     with suppress(subprocess.TimeoutExpired):
         run = subprocess.run(
             ["chronyc", "-h", str(folder / "command.sock"), "-c", "sources"],
@@ -126,7 +126,7 @@ def sources(folder: Path) -> dict[str, list[str]]:
 @pytest.mark.live
 @pytest.mark.skipif(bool(NO_CHRONY), reason=NO_CHRONY)
 def test_chronyd_takes_the_samples_and_sees_the_offset(chronyd: Path) -> None:
-    offset_ns = 123 * NS_PER_MS  # UTC by the pulses is so much ahead of the system clock
+    offset_ns = 123 * NS_PER_MS  # UTC according to the pulses minus the system clock
     utc_offset_ns = HostClock().utc_offset_ns
     chrony = ChronyFeed(str(chronyd / "imud.sock"), utc_offset_ns)
     limit_s = time.monotonic() + LIMIT_S
@@ -140,6 +140,6 @@ def test_chronyd_takes_the_samples_and_sees_the_offset(chronyd: Path) -> None:
         assert time.monotonic() < limit_s, (source, chrony.problem)
         time.sleep(0.2)
     assert source[0] == "#"  # a reference clock
-    # fields 7 and 8: offset of the last sample as adjusted and as measured; positive means the system clock is ahead
+    # fields 7 and 8: adjusted and measured offset of the last sample; positive: the system clock is ahead
     assert abs(float(source[8])) == pytest.approx(0.123, abs=0.02)
     chrony.close()

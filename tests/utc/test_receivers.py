@@ -1,4 +1,4 @@
-"""Sources that read a receiver: gpsd against a server that the test plays, a serial port with a link in memory."""
+"""Sources with a receiver: gpsd on a server of the test, and a serial port with a fake link."""
 
 import asyncio
 import json
@@ -93,7 +93,7 @@ def test_a_server_that_closes_is_connected_to_again() -> None:
         pauses.append(seconds)
 
     assert play(serve, scene, retry=Retry(sleep)).data[:3] == SENTENCES[1:4]
-    assert set(pauses) == {FIRST_PAUSE_S}  # after each success the next pause is short again
+    assert set(pauses) == {FIRST_PAUSE_S}  # after a success, the next pause is short again
 
 
 @in_loop

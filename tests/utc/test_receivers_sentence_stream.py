@@ -1,4 +1,4 @@
-"""RMC sentences in a byte stream: found in any split, buffered within a bound; pauses between connections."""
+"""RMC sentences in a byte stream: any split, limited buffer; and the pauses between connections."""
 
 import tracemalloc
 from random import Random
@@ -45,7 +45,7 @@ def test_a_line_without_end_is_skipped_and_not_buffered() -> None:
             assert tracemalloc.get_traced_memory()[0] <= LINE_BYTES_MAX + 4000
     finally:
         tracemalloc.stop()
-    assert splitter.feed(SENTENCES[0] + SENTENCES[1]) == [SENTENCES[1]]  # the first ends the skipped line
+    assert splitter.feed(SENTENCES[0] + SENTENCES[1]) == [SENTENCES[1]]  # the first sentence ends the skipped line
 
 
 @in_loop

@@ -1,4 +1,4 @@
-"""What the feed sends, when, and what it refuses and why; and that a module fed by it shows UTC."""
+"""Feed of sentences: transmission time, rejected sentences with their reasons, and a device that becomes UTC."""
 
 from itertools import pairwise
 
@@ -40,7 +40,7 @@ class FeedBench:
         self.sent.append(data)
 
     def give(self, named_s: float, at_s: float, sentence: bytes | None = None, *, waited_s: float = 0.0) -> str:
-        """A sentence that names `named_s` after UTC_S comes at `at_s`; returns why it was refused, or nothing."""
+        """Give the sentence of second `named_s` at `at_s`, both after UTC_S. Return the reason to reject it, or ""."""
         before = dict(self.feed.refused)
         t_rx_ns = BEGIN_NS + round(at_s * NS_PER_S)
         self.now_ns = t_rx_ns + round(waited_s * NS_PER_S)
@@ -96,7 +96,7 @@ def test_it_has_to_be_through_before_the_next_second(
     bench = FeedBench(reference=reference)
     if reference is None:
         bench.feed.on_pulse(BEGIN_NS)
-        refusal = Refusal.STALE if refusal is Refusal.AHEAD else refusal  # by pulses alone, of the second before
+        refusal = Refusal.STALE if refusal is Refusal.AHEAD else refusal  # without reference: of the second before
     assert bench.give(named_s, at_s) == refusal
 
 

@@ -1,4 +1,4 @@
-"""The system clock: the kernel's own answer, what it means, and sentences at the right moment or not at all."""
+"""System clock: the state in the kernel, its meaning, and sentences at the right time or not at all."""
 
 import asyncio
 import time
@@ -31,7 +31,7 @@ def test_the_kernel_answers_sensibly() -> None:
     assert 0 <= clock.estimated_error_us <= 16_000_000
     assert clock.synchronised or clock.most_error_us > 0
     offset_ns = HostClock().utc_offset_ns()
-    assert abs(time.monotonic_ns() + offset_ns - time.time_ns()) < 5 * NS_PER_S  # the machine may stall in between
+    assert abs(time.monotonic_ns() + offset_ns - time.time_ns()) < 5 * NS_PER_S  # the host may stall in between
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_the_kernel_answers_sensibly() -> None:
 )
 def test_what_counts_as_synchronised(state: int, status: int, synchronised: bool) -> None:
     def ask(timex: Timex) -> int:
-        assert timex.modes == 0  # nothing is to be changed
+        assert timex.modes == 0  # adjtimex must not change the clock
         timex.status, timex.esterror, timex.maxerror = status, 7, 99
         return state
 
@@ -75,7 +75,7 @@ def test_the_error_is_the_greater_of_both(clock: KernelClock, error_ns: int) -> 
 
 
 class SystemClockBench:
-    """A source with a clock of the test's. Its timer does not run, as the tests do not wait."""
+    """A source with a clock of the test. Its timer does not run, because the tests do not wait."""
 
     def __init__(self, rate_hz: int = 1, clock: KernelClock = GOOD) -> None:
         self.now_ns = 5 * NS_PER_S
