@@ -15,7 +15,7 @@ from tests.support.event_loops import VirtualClock
 from tests.support.files import hi91
 
 
-class TappedPath:
+class ObservedPath:
     def __init__(self) -> None:
         self.clock = VirtualClock()
         self.host = self.clock.host
@@ -31,31 +31,31 @@ class TappedPath:
             make_clock(config.name, config.lines, DRIVER, None, host=self.host.steady, on_unknown_gap=gap),
             context,
         )
-        self.tap = PathObserver(config, 3, self.ledger, self.host)
-        self.tap.path_made(self.path, DRIVER.name, options)
-        self.heard: list[bytes] = []
+        self.observer = PathObserver(config, 3, self.ledger, self.host)
+        self.observer.path_made(self.path, DRIVER.name, options)
+        self.records: list[bytes] = []
 
     def begin(self) -> None:
-        self.tap.begin(self.heard.append, "/dev/ttyUSB0", {}, {})
+        self.observer.begin(self.records.append, "/dev/ttyUSB0", {}, {})
 
     def kinds(self) -> list[int]:
-        return [record.kind for one in self.heard for record in records_of(one)]
+        return [record.kind for one in self.records for record in records_of(one)]
 
     @property
     def observers(self) -> set[object]:
         return {self.path.observer, self.path.clock.observer}
 
 
-def test_all_is_heard_in_its_order_while_somebody_listens() -> None:
-    one = TappedPath()
+def test_a_recording_contains_the_inputs_in_order() -> None:
+    one = ObservedPath()
     assert one.observers == {None}
     one.begin()
-    assert one.observers == {one.tap}
-    one.tap.end(one.heard.append)
+    assert one.observers == {one.observer}
+    one.observer.end(one.records.append)
     assert one.observers == {None}
     one.path.on_data(hi91(0), 1)
     assert one.kinds() == [Kind.DEVICE, Kind.PATH]
-    one = TappedPath()
+    one = ObservedPath()
     one.begin()
     one.path.clock.link_changed(byte_ns=86_806, hold_ns=0)
     one.path.on_data(hi91(0), 5)
@@ -63,59 +63,59 @@ def test_all_is_heard_in_its_order_while_somebody_listens() -> None:
     assert one.kinds() == [Kind.DEVICE, Kind.PATH, Kind.CALL, Kind.DATA, Kind.CALL]
 
 
-def test_two_recorders_hear_the_same_and_another_path_is_described() -> None:
-    one, other = TappedPath(), list[bytes]()
+def test_two_recorders_get_the_same_records_and_the_state_of_a_new_path() -> None:
+    one, other = ObservedPath(), list[bytes]()
     one.begin()
-    one.tap.begin(other.append, "", {}, {})
+    one.observer.begin(other.append, "", {}, {})
     one.path.on_data(hi91(0), 5)
-    one.tap.end(one.heard.append)
+    one.observer.end(one.records.append)
     one.path.on_data(hi91(10), 6)
-    assert one.heard[-1] == other[-2]
+    assert one.records[-1] == other[-2]
     assert len(other) == 4
-    one = TappedPath()
+    one = ObservedPath()
     one.begin()
     before = one.path
-    two = TappedPath()
-    one.tap.path_made(two.path, DRIVER.name, None)
+    two = ObservedPath()
+    one.observer.path_made(two.path, DRIVER.name, None)
     before.on_data(hi91(0), 5)
     assert one.kinds() == [Kind.DEVICE, Kind.PATH, Kind.PATH]
     two.path.on_data(hi91(0), 6)
     assert one.kinds()[-1] == Kind.DATA
-    for path in (two.path, TappedPath().path):  # the edges reach the clock of the present path, and the recording
-        one.tap.path_made(path, DRIVER.name, None)
+    for path in (two.path, ObservedPath().path):  # the edges reach the clock of the present path, and the recording
+        one.observer.path_made(path, DRIVER.name, None)
         path.clock.add_edges("sout", [Edge(7, True, 1)])
         assert (path.clock.status().edges, one.kinds()[-1]) == (1, Kind.EDGES)
 
 
-def test_readings_of_the_clocks_are_heard() -> None:
+def test_readings_of_the_clocks_are_recorded() -> None:
     clock = VirtualClock()
-    host, heard = clock.host, list[bytes]()
-    tap = ClockObserver(host)
-    tap.begin(heard.append)
-    assert [record.kind for one in heard for record in records_of(one)] == [Kind.CALL]
+    host, records = clock.host, list[bytes]()
+    observer = ClockObserver(host)
+    observer.begin(records.append)
+    assert [record.kind for one in records for record in records_of(one)] == [Kind.CALL]
     clock.advance(2_000_000_000)
     host.utc_offset_ns()
-    assert [record.kind for record in records_of(heard[-1])] == [Kind.CLOCKS]
-    tap.end(heard.append)
+    assert [record.kind for record in records_of(records[-1])] == [Kind.CLOCKS]
+    observer.end(records.append)
     clock.advance(2_000_000_000)
     host.utc_offset_ns()
-    assert len(heard) == 2
+    assert len(records) == 2
 
 
-def test_the_taps_of_the_devices_pass_on_what_there_is() -> None:
-    one, put = TappedPath(), list[bytes]()
-    taps = RecordableDevices({"bow": cast("RecordedDevice", SimpleNamespace(tap=one.tap))}, one.host)
-    assert taps.names() == ["bow"]
+def test_recordable_devices_ignore_an_unknown_device() -> None:
+    one, put = ObservedPath(), list[bytes]()
+    devices = RecordableDevices({"bow": cast("RecordedDevice", SimpleNamespace(tap=one.observer))}, one.host)
+    assert devices.names() == ["bow"]
     for name in ("stern", "bow"):
-        taps.check(name, put.append)
+        devices.check(name, put.append)
     assert [record.kind for data in put for record in records_of(data)] == [Kind.CHECK]
 
 
-def test_a_check_has_the_newest_sample_if_there_is_one() -> None:
-    one, put = TappedPath(), list[bytes]()
-    one.tap.check(put.append)
+def test_a_check_contains_the_newest_sample() -> None:
+    one, put = ObservedPath(), list[bytes]()
+    one.observer.check(put.append)
     one.path.on_data(hi91(0), 5)
-    one.tap.check(put.append)
+    one.observer.check(put.append)
     newest = one.path.newest
     assert newest is not None
     found = [decode_object(record, CheckRecord) for data in put for record in records_of(data)]
