@@ -163,7 +163,7 @@ def test_a_user_without_the_right(gpio_chip: GpioChip) -> None:
         os.seteuid(0)
 
 
-def test_what_is_not_there(gpio_chip: GpioChip) -> None:
+def test_errors_of_missing_lines(gpio_chip: GpioChip) -> None:
     with pytest.raises(LinkMissing, match=r"has no line 6: its lines are 0 to 5"):
         GpioInput(InputOptions(line=6, chip=gpio_chip.path.name)).open()
     with pytest.raises(LinkMissing, match=rf"gpiochip99 does not exist; existing chips: {gpio_chip.path.name} \("):

@@ -25,7 +25,7 @@ def signals() -> SignalBench:
     return SignalBench()
 
 
-def test_at_the_beginning_only_an_alarm_is_news_and_once(signals: SignalBench) -> None:
+def test_at_the_start_only_an_active_alarm_is_an_event(signals: SignalBench) -> None:
     line = AlarmLine(signals.raise_event)
     line.on_level(5, False)
     assert (line.active, line.raised, len(signals.events)) == (False, 0, 0)
@@ -119,7 +119,7 @@ def it(signals: SignalBench) -> Monitored:
     return Monitored(signals)
 
 
-def test_a_line_that_does_as_it_is_set_is_no_news(it: Monitored) -> None:
+def test_a_correct_line_causes_no_event(it: Monitored) -> None:
     it.run(3, 0)
     it.edge(True)
     it.run(3, 20)
@@ -159,7 +159,7 @@ def test_the_other_axis(it: Monitored) -> None:
     assert it.monitor.problem.endswith("(MOUNT)?")
 
 
-def test_nothing_is_said_without_settings_angles_level_or_fresh_samples(it: Monitored) -> None:
+def test_no_verdict_without_settings_angles_level_or_fresh_samples(it: Monitored) -> None:
     it.run(5, None)
     it.run(5, 20, age_ns=FRESH_NS + 1)
     it.monitor.line.on_level(it.now_ns, None)

@@ -54,7 +54,7 @@ def test_at_the_limit_either_level_is_right() -> None:
     assert judge(ONLY_Y, angles(0, -5 + 1.1 * MARGIN_DEG), False) is AlarmVerdict.RIGHT
 
 
-def test_only_what_lasts_is_reported_and_once() -> None:
+def test_a_lasting_contradiction_is_reported_once() -> None:
     check, changes = AlarmCheck(ONLY_Y), []
     step_ns = 10 * NS_PER_MS
     for number in range(1000):

@@ -40,7 +40,7 @@ def test_by_path_or_by_name_alone_whatever_other_names_a_chip_has(gpiod: FakeGpi
         (0, "gpiochip7", LinkMissing, "GPIO chip gpiochip7 does not exist; existing chips: gpiochip0 (pinctrl-bcm2711), gpiochip10 (expander)"),
     ],
 )  # fmt: skip
-def test_what_is_not_there(
+def test_errors_of_missing_lines(
     gpiod: FakeGpiod, tmp_path: Path, line: int | str, chip: str, kind: type[LinkError], message: str
 ) -> None:
     with pytest.raises(LinkError) as caught:
@@ -61,9 +61,7 @@ def test_no_chip_at_all_or_two_of_a_label(tmp_path: Path, gpiod: FakeGpiod) -> N
         find_line(gpiod, LineOptions(line=0, chip="pinctrl-bcm2711"), tmp_path)
 
 
-def test_a_chip_that_may_not_be_opened_matters_only_if_the_line_is_not_elsewhere(
-    gpiod: FakeGpiod, tmp_path: Path
-) -> None:
+def test_a_denied_chip_matters_only_if_no_other_chip_has_the_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
     gpiod.errors["gpiochip0"] = errno.EACCES
     assert find_line(gpiod, LineOptions(line="RESET"), tmp_path).offset == 0
     for settings in (LineOptions(line="SOUT"), LineOptions(line=0, chip="gpiochip0"), LineOptions(line=0, chip="x")):
@@ -71,9 +69,7 @@ def test_a_chip_that_may_not_be_opened_matters_only_if_the_line_is_not_elsewhere
             find_line(gpiod, settings, tmp_path)
 
 
-def test_a_chip_that_goes_away_or_is_none_matters_only_if_the_line_is_not_elsewhere(
-    gpiod: FakeGpiod, tmp_path: Path
-) -> None:
+def test_a_missing_chip_matters_only_if_no_other_chip_has_the_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
     gpiod.errors["gpiochip0"] = errno.ENODEV
     assert find_line(gpiod, LineOptions(line="RESET"), tmp_path).offset == 0
     with pytest.raises(LinkMissing, match="gpiochip0 is missing, or is not a GPIO chip: No such device"):
@@ -93,7 +89,7 @@ def test_a_chip_that_goes_away_or_is_none_matters_only_if_the_line_is_not_elsewh
         (errno.ENXIO, LinkError, "gpiochip0 line 0 (SOUT) cannot be requested: No such device or address; an input"),
     ],
 )
-def test_a_line_that_is_not_given(
+def test_a_line_request_that_the_kernel_refuses(
     gpiod: FakeGpiod, tmp_path: Path, number: int, kind: type[LinkError], message: str
 ) -> None:
     gpiod.holder = "gpiomon"

@@ -24,7 +24,7 @@ SETTINGS = ResetOptions(line="RESET", hold_ms=20)
 
 @in_loop
 @pytest.mark.manual("A 2.2 reset")
-async def test_the_line_is_held_then_the_device_has_its_time_unless_the_line_is_gone() -> None:
+async def test_a_pulse_waits_for_the_start_of_the_device() -> None:
     story: list[object] = []
     line = MemoryOutput(on_change=lambda _t_ns, active: story.append(active))
     line.open()
@@ -112,7 +112,7 @@ def test_after_three_rounds_and_the_time_a_device_needs_and_then_once_a_minute(e
 
 
 @played(Scene)
-async def test_a_device_that_was_found_meanwhile_is_not_reset(it: Scene) -> None:
+async def test_a_device_found_in_the_meantime_is_not_reset(it: Scene) -> None:
     for _ in range(10):
         await it.search(4)
         it.reset.found()
@@ -152,7 +152,7 @@ def test_the_line_is_kept_inactive_and_left_so() -> None:
 
 
 @in_loop
-async def test_a_line_that_another_program_has_is_reported_once_and_tried_again() -> None:
+async def test_a_busy_line_is_reported_once_and_opened_again() -> None:
     it = Scene()
     it.line.open_error = LinkBusy("in use by gpioset")
     for _ in range(6):

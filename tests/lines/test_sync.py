@@ -85,7 +85,7 @@ async def test_lines_are_watched_before_there_is_a_clock_and_delivered_to_it_aft
 
 
 @in_loop
-async def test_the_alarm_is_in_the_samples_of_whatever_clock() -> None:
+async def test_the_alarm_is_in_the_samples_of_each_clock() -> None:
     bench = SyncBench(DeviceLines(alarm=InputOptions(line="D")))
     bench.start()
     assert bench.status_of_sample(None) is None
@@ -140,7 +140,7 @@ async def test_one_edge_by_command_where_there_is_sin() -> None:
 
 
 @in_loop
-async def test_sin_that_cannot_be_had_or_breaks_is_reported_once_and_tried_again() -> None:
+async def test_sin_that_fails_is_reported_once_and_opened_again() -> None:
     bench = SyncBench()
     bench.output("sin").open_error = LinkBusy("line 5 is in use")
     bench.start()

@@ -260,7 +260,7 @@ async def test_a_line_that_vanishes_ends_this_start_of_the_trigger_once() -> Non
 
 
 @in_loop
-async def test_a_mistake_of_ours_comes_up_in_the_loop() -> None:
+async def test_an_unexpected_exception_reaches_the_event_loop() -> None:
     rig, found = TriggerBench(100.0), list[object]()
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: found.append(context["exception"]))
     rig.start()

@@ -51,7 +51,7 @@ async def test_it_is_opened_at_once_and_its_level_read_again_after_lost_edges() 
 
 
 @in_loop
-async def test_a_line_that_cannot_be_had_is_reported_once_and_tried_again() -> None:
+async def test_a_line_that_fails_to_open_is_reported_once_and_opened_again() -> None:
     it = Watched()
     it.line.open_error = BUSY
     it.watched.tick(0)
@@ -123,7 +123,7 @@ class Blind(MemoryInput):
 
 
 @in_loop
-async def test_a_level_that_cannot_be_read_ends_it_and_closing_is_no_failure() -> None:
+async def test_a_failed_read_of_the_level_closes_the_line() -> None:
     it = Watched(Blind())
     it.watched.tick(it.clock.now_ns())
     assert not it.line.is_open

@@ -136,7 +136,7 @@ def test_a_recording_that_begins_in_the_middle_has_the_stamps_and_numbers_of_the
     assert rig.samples[0].seq > 1 or middle == 1
 
 
-def test_without_the_state_the_clock_begins_anew_and_says_so(recorded: pytest.MonkeyPatch) -> None:
+def test_without_the_state_a_new_clock_starts_and_is_reported(recorded: pytest.MonkeyPatch) -> None:
     rig = run_of("hipnuc-uart", 30)
     samples: list[Sample] = []
     player = Player(lambda batch: samples.extend(batch.samples))
@@ -191,7 +191,7 @@ def test_a_read_that_is_missing_is_found_by_the_checks(recorded: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_records_that_make_no_sense_are_an_error_and_no_crash(recorded: pytest.MonkeyPatch, seed: int) -> None:
+def test_damaged_records_raise_imud_error(recorded: pytest.MonkeyPatch, seed: int) -> None:
     random, found = Random(seed), recorded_run()
     for _ in range(20):
         at = random.randrange(len(found))

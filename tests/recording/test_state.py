@@ -39,7 +39,7 @@ def there_and_back(value: object, external: dict[str, object] | None = None) -> 
         {1, 2}, frozenset({3}), deque([1, 2], maxlen=5), Edge(1, True, 2), bytearray(b"ab"), SampleClock,
     ],
 )  # fmt: skip
-def test_values_come_back(value: object) -> None:
+def test_values_are_restored(value: object) -> None:
     assert there_and_back(value) == value
     assert type(there_and_back(value)) is type(value)
 
@@ -50,7 +50,7 @@ class Slotted:
     unset: int
 
 
-def test_objects_come_back_with_what_belongs_to_the_daemon() -> None:
+def test_objects_are_restored_with_objects_of_the_daemon() -> None:
     slotted = Slotted()
     slotted.set = 1
     assert attributes(slotted) == {"set": 1}
@@ -69,7 +69,7 @@ def test_objects_come_back_with_what_belongs_to_the_daemon() -> None:
 
 
 @pytest.mark.parametrize("value", [print, lambda: 0, Holder(), open, msgspec.json.Decoder()])
-def test_what_is_no_part_of_a_codec_cannot_be_written(value: object) -> None:
+def test_an_object_that_is_not_part_of_a_codec_cannot_be_written(value: object) -> None:
     with pytest.raises(StateError):
         StateWriter({}).write({"root": Holder(value=value)})
 
@@ -102,7 +102,7 @@ def test_an_attribute_that_this_version_does_not_have_is_an_error() -> None:
 
 @example(b"\x81\xa5\x00\x00\x00\x00\x80")
 @given(st.binary(max_size=60))
-def test_no_bytes_raise_anything_else(data: bytes) -> None:
+def test_any_bytes_raise_state_error(data: bytes) -> None:
     try:
         StateReader(data, {}).restore("root", Holder(value=None))
     except StateError:
@@ -110,7 +110,7 @@ def test_no_bytes_raise_anything_else(data: bytes) -> None:
     raise AssertionError(data)
 
 
-def test_steady_time_comes_back() -> None:
+def test_steady_time_is_restored() -> None:
     steady, new = SteadyTime(), SteadyTime()
     for second in range(50):
         steady.add_pair(second * 1_000_000_500, second * 1_000_000_000)

@@ -30,14 +30,14 @@ def fitted(slope: float, delay_mean_ns: float, seconds: int, seed: int = 1) -> t
 
 
 @pytest.mark.parametrize("slope", [1.0, 1 / 0.95, 1 / 1.05, 1.00005])
-def test_it_lies_where_nothing_was_delayed(slope: float) -> None:
+def test_the_fit_follows_the_frames_without_delay(slope: float) -> None:
     fit, off_ns = fitted(slope, 1_000_000, 100)
     assert abs(off_ns) < 20_000  # the mean delay is 1 ms
     assert fit.slope == pytest.approx(slope, abs=1e-6)
     assert fit.error_ns < 20_000
 
 
-def test_it_is_young_but_not_wild() -> None:
+def test_a_young_fit_stays_within_its_bounds() -> None:
     fit, off_ns = fitted(1.0, 1_000_000, 1)
     assert abs(off_ns) < 1_000_000
     assert fit.slope_error > 1e-5
@@ -82,7 +82,7 @@ def test_the_window_is_bounded() -> None:
     assert sum(add(fit, device_ns, device_ns + 1_000_000) for device_ns in later) <= BINS
 
 
-def test_an_old_minimum_goes() -> None:
+def test_an_old_minimum_leaves_the_window() -> None:
     """One arrival that is too early affects the fit for at most one window."""
     fit, device_ns = ArrivalFit(0, -5_000_000), 0
     for i in range(1, 100 * 100):

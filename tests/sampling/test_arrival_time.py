@@ -19,7 +19,7 @@ def fed(times: ArrivalTime, count: int, *, numbered: bool = False, alone: bool =
     return t_ns
 
 
-def test_the_first_message_is_dated_by_its_arrival() -> None:
+def test_the_first_frame_has_the_arrival_time() -> None:
     times = ArrivalTime(DELAY, 0, lambda: None)
     assert fed(times, 1) == -DELAY.floor_ns // 2
     assert times.error_ns > FIRST_SPREAD_NS
@@ -30,7 +30,7 @@ def off_ns(times: ArrivalTime, late_ns: int, number: int | None = None, *, alone
     return late_ns - times.date(number, late_ns, 82, alone=alone, triggered=False, is_first=False)
 
 
-def test_a_late_message_is_dated_by_the_pace_of_those_before_unless_others_carry_time() -> None:
+def test_a_late_frame_is_time_stamped_by_the_pace() -> None:
     for alone in (True, False):
         times = ArrivalTime(DELAY, 0, lambda: None)
         fed(times, 100, alone=alone)

@@ -27,7 +27,7 @@ def test_it_is_not_used_before_its_pace_is_known() -> None:
     assert used[-1]
 
 
-def test_messages_that_waited_are_dated_as_if_they_had_not() -> None:
+def test_delayed_frames_are_time_stamped_by_the_fit() -> None:
     """Frames of two seconds arrive together."""
     even = EvenArrivals()
     due_ns = settled(even)
@@ -40,7 +40,7 @@ def test_messages_that_waited_are_dated_as_if_they_had_not() -> None:
 
 
 @pytest.mark.parametrize("missing", [1, 2, 40])
-def test_messages_that_are_missing_are_counted_after_four(missing: int) -> None:
+def test_lost_samples_are_counted_after_four_frames(missing: int) -> None:
     even = EvenArrivals()
     due_ns = settled(even) + missing * PERIOD_NS
     for i in range(8):
@@ -52,7 +52,7 @@ def test_messages_that_are_missing_are_counted_after_four(missing: int) -> None:
             assert even.error_ns < 200 * NS_PER_US
 
 
-def test_a_number_leaves_no_doubt() -> None:
+def test_a_number_shows_the_loss_at_once() -> None:
     even = EvenArrivals()
     for i in range(300):
         even.add_arrival(DELAY, BEGIN_NS + i * PERIOD_NS, 1, triggered=False)
@@ -70,7 +70,7 @@ def test_a_triggered_sample_may_be_as_late_as_it_arrives() -> None:
 
 
 @pytest.mark.parametrize("period_ns", [5 * NS_PER_MS, 20 * NS_PER_MS])
-def test_another_rate_begins_anew(period_ns: int) -> None:
+def test_another_rate_restarts_the_fit(period_ns: int) -> None:
     even = EvenArrivals()
     due_ns = settled(even)
     used = [even.add_arrival(DELAY, due_ns + i * period_ns, 0, triggered=False) for i in range(400)]
@@ -79,7 +79,7 @@ def test_another_rate_begins_anew(period_ns: int) -> None:
     assert abs(even.t_ns - (due_ns + 399 * period_ns)) < 200 * NS_PER_US
 
 
-def test_arrivals_without_a_pace_are_not_dated_by_one() -> None:
+def test_arrivals_without_a_pace_keep_the_arrival_time() -> None:
     random, even, t_ns, used = Random(2), EvenArrivals(), BEGIN_NS, 0
     for _ in range(3000):
         t_ns += int(random.expovariate(1 / PERIOD_NS))
@@ -87,7 +87,7 @@ def test_arrivals_without_a_pace_are_not_dated_by_one() -> None:
     assert used < 300
 
 
-def test_an_adapter_that_holds_messages_hides_what_is_missing() -> None:
+def test_an_adapter_that_holds_frames_hides_losses() -> None:
     even = EvenArrivals()
     delay = LinkDelay(0, 16 * NS_PER_MS)
     assert not any(even.add_arrival(delay, BEGIN_NS + i * PERIOD_NS, 0, triggered=False) for i in range(200))

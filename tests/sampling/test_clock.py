@@ -64,7 +64,7 @@ def test_it_comes_from_arrival_to_regression() -> None:
     ],
     ids=["restarted", "suspended", "set forward", "silent"],
 )
-def test_what_a_jump_of_the_counter_means(before: list[Point], after: list[Point], resets: int) -> None:
+def test_jumps_of_the_counter(before: list[Point], after: list[Point], resets: int) -> None:
     clock = make_clock()
     samples = feed(clock, [*before, after[0]])
     assert clock.missed == (30_000 if after[0][1] == 305_000 else 0)
@@ -85,7 +85,7 @@ def test_what_a_jump_of_the_counter_means(before: list[Point], after: list[Point
         (steady(0, 0, 2000), steady(20_000, 20_040, 3000), 2500),  # the clock of the device stopped for 20 s
     ],
 )
-def test_a_counter_that_is_late_for_good_began_anew(before: list[Point], after: list[Point], settled: int) -> None:
+def test_a_counter_that_stays_late_has_restarted(before: list[Point], after: list[Point], settled: int) -> None:
     clock = make_clock()
     feed(clock, before)
     samples = feed(clock, after)
@@ -97,7 +97,7 @@ def test_a_counter_that_is_late_for_good_began_anew(before: list[Point], after: 
 
 
 @pytest.mark.parametrize("reads", [((200, 22_001),), ((150, 22_001), (150, 23_500))])
-def test_a_busy_host_is_no_reset(reads: tuple[tuple[int, int], ...]) -> None:
+def test_a_busy_host_causes_no_reset(reads: tuple[tuple[int, int], ...]) -> None:
     """The reader of a busy host gets old frames. Several frames in one read count as one late read."""
     clock = make_clock()
     feed(clock, steady(0, 0, 2000))
@@ -177,7 +177,7 @@ def test_wall_clock_steps_move_only_utc() -> None:
         assert a.utc_ns - a.t_ns == (1_700_000_000 * NS_PER_S if i < 150 else 5)
 
 
-def test_a_changed_link_starts_arrival_anew_but_not_time() -> None:
+def test_a_changed_link_restarts_the_arrivals_and_not_the_time() -> None:
     clock = make_clock()
     samples = feed(clock, steady(0, 0, 300))
     clock.link_changed(byte_ns=1_085, hold_ns=NS_PER_MS)
@@ -206,7 +206,7 @@ def test_one_clock_follows_another() -> None:
     assert [s.seq for s in samples] == list(range(1, 201))
 
 
-def test_a_wire_too_slow_for_the_rate_is_not_believed() -> None:
+def test_a_wire_too_slow_for_the_rate_is_ignored() -> None:
     """A pty reports 9600 baud and delivers 1 kHz. The clock must not subtract 85 ms of time on the wire."""
     clock = make_clock(byte_ns=1_041_666)
     points = steady(0, 0, 5000, step_ms=1)
@@ -254,7 +254,7 @@ def test_time_is_that_of_the_poll() -> None:
     assert (sample.seq, sample.t_ns) == (2, 1_000_001)
 
 
-def test_time_rises_strictly_is_never_after_the_answer_and_the_lift_is_in_the_error() -> None:
+def test_polled_time_rises_strictly_and_the_error_contains_the_change() -> None:
     one = polled_clock()
     samples = [one.sample_polled(FRAME, t_ns, 1, t_ns + 5, 0) for t_ns in (100, 100, 50, 103, 200)]
     assert [sample.t_ns for sample in samples] == [100, 101, 102, 103, 200]
@@ -275,7 +275,7 @@ def test_by_an_edge() -> None:
 
 
 @pytest.mark.parametrize(("hold_ns", "slower"), [(0, 0.0), (NS_PER_MS, 0.0), (0, 50e-6)])
-def test_messages_that_waited_are_dated_by_the_fit_and_do_not_hold_it_back(hold_ns: int, slower: float) -> None:
+def test_held_frames_are_time_stamped_by_the_fit_and_do_not_change_it(hold_ns: int, slower: float) -> None:
     """Nine of ten frames are read up to 9 ms late. If the crystal slows by 50 ppm, one of ten frames shows it."""
     clock = make_clock(hold_ns=hold_ns)
     feed(clock, steady(0, 0, 20_000, 1))

@@ -25,7 +25,7 @@ CELLS = [
 
 
 @pytest.mark.parametrize(("profile", "crystal"), CELLS, ids=lambda v: getattr(v, "name", v))
-def test_the_error_is_honest(profile: ArrivalProfile, crystal: str) -> None:
+def test_the_error_covers_the_truth(profile: ArrivalProfile, crystal: str) -> None:
     for rate_hz, seconds in ((100, 30), (1, 100)):
         model = ArrivalModel(profile, rate_hz, 7, CRYSTALS[crystal], BAUD_OF_RATE[rate_hz])
         got = accuracy(run(model, rate_hz * seconds), settle_ns=20_000_000_000)
@@ -33,7 +33,7 @@ def test_the_error_is_honest(profile: ArrivalProfile, crystal: str) -> None:
         assert got.share_settling >= 0.95
 
 
-def test_uneven_ticks_are_no_error() -> None:
+def test_uneven_ticks_cause_no_error() -> None:
     """400 Hz in milliseconds: the time stamps do not contain the truncation of up to 0.5 ms."""
     model = ArrivalModel(PROFILES[1], 400, 1, Crystal(0.0), 921_600)
     assert accuracy(run(model, 8000), settle_ns=5_000_000_000).rms_ns < 60_000

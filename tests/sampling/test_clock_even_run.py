@@ -131,7 +131,7 @@ class Dated:
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (1, 2))])
 @pytest.mark.parametrize("trial", TRIALS, ids=lambda trial: trial.name)
-def test_a_run_is_dated_as_its_messages_one_by_one(trial: Trial, seed: int) -> None:
+def test_a_run_gives_the_same_samples_as_single_frames(trial: Trial, seed: int) -> None:
     random = Random(f"{trial.name} {seed}")
     device, one, many = Device(trial, random), Dated(trial), Dated(trial)
     for number in range(ROUNDS):
@@ -151,7 +151,7 @@ def test_a_run_is_dated_as_its_messages_one_by_one(trial: Trial, seed: int) -> N
         assert many.in_runs > 0.05 * len(many.samples)
 
 
-def test_no_run_where_messages_are_not_dated_by_the_fit_of_arrivals() -> None:
+def test_no_run_without_a_fit_in_use() -> None:
     for settle in (False, True):
         trial = Trial("even")
         device, dated = Device(trial, Random(1)), Dated(trial)

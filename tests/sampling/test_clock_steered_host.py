@@ -67,7 +67,7 @@ def assert_honest(dated: Sequence[DatedArrival], settle_s: float = 10) -> None:
     ],
     ids=lambda value: value.name,
 )  # fmt: skip
-def test_stamps_are_those_of_a_host_that_is_left_alone(steering: Steering, profile: ArrivalProfile) -> None:
+def test_time_stamps_equal_those_of_an_undisturbed_host(steering: Steering, profile: ArrivalProfile) -> None:
     dated = run(model(profile), steering, 100 * SECONDS)
     alone = run(model(profile), ALONE, 100 * SECONDS)
     assert_honest(dated)
@@ -78,7 +78,7 @@ def test_stamps_are_those_of_a_host_that_is_left_alone(steering: Steering, profi
     assert worst < 0
 
 
-def test_where_steering_is_not_seen_they_are_not() -> None:
+def test_without_the_unsteered_clock_the_slew_is_visible() -> None:
     """The tests above prove nothing unless the slew would be visible."""
     dated = run(model(BARE_UART), NTP, 100 * SECONDS, unseen=True)
     assert max(abs(d.point.off_ns) for d in dated) > NS_PER_MS
@@ -93,7 +93,7 @@ def test_the_rate_of_the_device_is_against_the_unsteered_clock() -> None:
 
 
 @pytest.mark.parametrize("steering", STEERED[1:], ids=lambda steering: steering.name)
-def test_what_waited_for_a_stalled_host_is_dated_by_the_rate_of_its_own_time(steering: Steering) -> None:
+def test_frames_of_a_stalled_host_use_the_rate_of_their_time(steering: Steering) -> None:
     """Frames of 300 ms in one read, every two seconds. The rate between two clock readings is unknown."""
     host, clock = on(steering)
     dated = []
@@ -106,7 +106,7 @@ def test_what_waited_for_a_stalled_host_is_dated_by_the_rate_of_its_own_time(ste
     assert sorted(settled)[int(0.95 * len(settled))] < 500 * NS_PER_US
 
 
-def test_a_read_that_waits_for_its_decoding_is_dated_by_the_rate_of_its_own_time() -> None:
+def test_a_read_that_waits_for_its_decoding_uses_the_rate_of_its_time() -> None:
     """The clocks are read 50 ms after the data: 83,333 ppm are 4 ms."""
     host, clock = on(CHRONY)
     to, dated = CHRONY.monotonic_ns, []
@@ -170,7 +170,7 @@ def test_triggers_are_paired_with_their_answers(steering: Steering) -> None:
 
 
 @pytest.mark.parametrize("steering", STEERED, ids=lambda steering: steering.name)
-def test_pulses_per_second_date_samples_by_their_age(steering: Steering) -> None:
+def test_pulses_per_second_time_stamp_samples_by_age(steering: Steering) -> None:
     host, clock = on(steering, USB_16MS)
     arrivals = list(model(USB_16MS).run(100 * SECONDS))
     pulses = pulses_per_second(arrivals, 1)
@@ -212,7 +212,7 @@ def usual_run() -> list[DatedArrival]:
 
 
 @pytest.mark.parametrize("step_ns", [-NS_PER_S, 3600 * NS_PER_S, -50 * NS_PER_US], ids=["leap second", "hour", "50 µs"])
-def test_a_step_of_the_wall_clock_moves_utc_at_once_and_nothing_else(step_ns: int) -> None:
+def test_a_step_of_the_wall_clock_moves_only_utc(step_ns: int) -> None:
     host, clock = on(USUAL)
     dated = []
     for i, a in enumerate(model(BARE_UART).run(1000)):
@@ -240,7 +240,7 @@ def counted(arrivals: Iterator[Arrival], host: SteeredHost) -> tuple[list[DatedA
 
 
 @pytest.mark.parametrize("away_s", [2, pytest.param(3600, marks=pytest.mark.thorough)])
-def test_after_a_suspend_time_goes_on_right(away_s: int) -> None:
+def test_the_time_continues_after_a_suspend(away_s: int) -> None:
     """CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW stop, the device counter continues. `Device` counts the gap."""
 
     def device() -> Iterator[Arrival]:
@@ -255,7 +255,7 @@ def test_after_a_suspend_time_goes_on_right(away_s: int) -> None:
 
 
 @pytest.mark.parametrize("steering", [ALONE, NTP], ids=lambda steering: steering.name)
-def test_a_stopped_machine_whose_clocks_go_on_loses_exactly_what_was_not_read(steering: Steering) -> None:
+def test_a_stopped_host_loses_exactly_the_unread_samples(steering: Steering) -> None:
     """The host stops for 5 s: the first three frames wait in the UART, the others are lost."""
     away = range(1000, 1500)
     arrivals = list(model(BARE_UART).run(2400))

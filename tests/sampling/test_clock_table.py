@@ -42,7 +42,7 @@ CELLS = [
 
 @pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize(("cell", "most_us"), CELLS, ids=lambda v: getattr(v, "name", ""))
-def test_the_stated_error_is_honest(cell: Cell, most_us: float, seed: int) -> None:
+def test_the_time_stamp_error_covers_the_truth(cell: Cell, most_us: float, seed: int) -> None:
     got = figures_of(cell, [seed], 45)
     assert got.settling >= 0.95
     assert got.settled >= 0.97
@@ -61,7 +61,7 @@ def test_the_stated_error_is_neither_too_small_nor_too_large(cell: Cell) -> None
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("host", HOST_CLOCKS, ids=lambda host: host.name)
-def test_the_stated_error_is_honest_whatever_happens_to_the_clocks_of_the_host(host: HostClocks) -> None:
+def test_the_time_stamp_error_covers_the_truth_on_any_host(host: HostClocks) -> None:
     got = figures_of(Cell(host.name, UART, host=host), (1, 4))
     assert got.settling >= 0.95
     assert got.settled >= 0.97
@@ -69,7 +69,7 @@ def test_the_stated_error_is_honest_whatever_happens_to_the_clocks_of_the_host(h
 
 
 @pytest.mark.parametrize("seed", [1, 13, 21])
-def test_the_first_step_of_another_rate_is_no_correction_of_the_counter(seed: int) -> None:
+def test_the_first_step_of_another_rate_is_not_a_correction(seed: int) -> None:
     """Without this rule, the clock removed the step from all later time stamps: 7.9 ms off with an error of 0.5 ms."""
     cell = Cell("100 Hz to 400", FAST, Device(rates_hz=((0.0, 100.0), (12.0, 400.0))))
     later = list(dated(cell, seed, 20))[600:]
@@ -94,20 +94,20 @@ def test_a_timer_that_is_as_the_driver_says_is_left_alone_on_a_busy_host() -> No
         assert clock.status().hold_ns == NS_PER_MS
 
 
-def test_a_first_read_that_waited_bounds_nothing() -> None:
+def test_a_delayed_first_read_gives_no_bound() -> None:
     """The frames of the first 200 ms arrive together: none of them shows how long the timer holds other frames."""
     cell = Cell("hub stalls 200 ms every 5 s", FRAMES, stalls=Stalls(5 * NS_PER_S, 200 * NS_PER_MS))
     later = list(dated(cell, 3, 9))[200:]
     assert max(abs(d.off_ns) for d in later) < NS_PER_MS
 
 
-def test_messages_that_a_young_fit_took_for_late_are_so_no_longer_when_it_has_moved() -> None:
+def test_late_frames_are_judged_again_after_the_fit_moved() -> None:
     """Otherwise, two such frames at 10 Hz widen the feasible lines of the timer for one minute."""
     assert figures_of(Cell("10 Hz", USB_16, SLOW_RATE), (0, 4), 60).sigma_us < 1300
 
 
 @pytest.mark.parametrize("seed", [2, 61010, 61016])
-def test_messages_come_by_the_machine_of_their_seed(seed: int) -> None:
+def test_each_seed_has_its_own_host(seed: int) -> None:
     """Seeds with the same remainder modulo six are different hosts: each has its own shortest delay."""
     cell = Cell("plain", UART)
     profile = machine_of(seed).profile(UART, "")

@@ -41,7 +41,7 @@ def test_it_wraps_any_number_of_times() -> None:
     assert time.error_ns == 0
 
 
-def test_a_backward_step_is_a_long_way_forward() -> None:
+def test_a_backward_step_counts_as_a_long_forward_step() -> None:
     """The caller compares it with the host time. Device time has no sign."""
     time = DeviceTime(NS_PER_MS, 1 << 32)
     time.begin(5000)
@@ -133,7 +133,7 @@ def test_gaps_from_before_a_period_is_known_are_noted_when_it_is(steps: list[int
     assert len(noted) == gaps
 
 
-def test_a_step_to_another_counter_is_noted_by_whoever_restarts() -> None:
+def test_a_step_to_another_counter_is_reported_by_the_caller_of_restart() -> None:
     noted: list[int] = []
     learner = PeriodLearner(lambda: noted.append(1))
     learner.add_step(1 << 31)
@@ -153,7 +153,7 @@ def test_steps_that_never_agree_are_kept_in_bounds() -> None:
     assert len(learner._unjudged) <= UNJUDGED_MOST
 
 
-def test_uneven_ticks_are_no_loss() -> None:
+def test_uneven_ticks_cause_no_loss() -> None:
     """400 Hz in milliseconds."""
     learner = PeriodLearner()
     assert [learner.add_step(2 + i % 2) for i in range(1000)] == [0] * 1000
@@ -184,7 +184,7 @@ def test_at_a_tick_per_sample_two_may_share_one() -> None:
     assert learner.period_ticks == pytest.approx(0.9999, abs=3e-5)
 
 
-def test_one_of_ten_lost_at_random_is_no_slower_rate() -> None:
+def test_random_losses_are_not_a_slower_rate() -> None:
     random = Random(1)
     learner = PeriodLearner()
     for _ in range(20_000):
@@ -260,7 +260,7 @@ CORRECTIONS = [
 
 
 @pytest.mark.parametrize(("set_ms", "rate_hz", "edges", "reference"), CORRECTIONS)
-def test_a_correction_is_no_step(set_ms: float, rate_hz: int, edges: bool, reference: UtcReference | None) -> None:
+def test_a_correction_causes_no_step(set_ms: float, rate_hz: int, edges: bool, reference: UtcReference | None) -> None:
     dated, resets = run(BARE_UART, rate_hz, set_ms, edges=edges, reference=reference)
     settled = after(dated, SETTLED_S)
     assert resets() == 0
@@ -302,7 +302,7 @@ def stamps(*steps: int) -> tuple[DeviceTime, list[int]]:
     return time, [x - found[0] for x in found[1:]]
 
 
-def test_two_ticks_less_within_a_minute_are_no_step() -> None:
+def test_two_small_corrections_cause_no_step() -> None:
     """The correction uses the rest of the tick. The next normal step finds no rest."""
     time, found = stamps(9, *[10] * 70, 9, 10)
     assert max(abs(b - a - 10 * NS_PER_MS) for a, b in pairwise([0, *found])) < 0.05 * NS_PER_MS
@@ -316,7 +316,7 @@ def test_samples_that_are_uneven_are_followed() -> None:
     assert not time.uneven
 
 
-def test_messages_that_pause_are_no_correction() -> None:
+def test_a_pause_is_not_a_correction() -> None:
     """The device paused once for 13 ms, and its frame arrived in time."""
     clock = make_clock()
     points = steady(0, 0, 1000) + steady(9_993 + 10, 10_003, 500)
@@ -331,7 +331,7 @@ def test_messages_that_pause_are_no_correction() -> None:
 
 
 @pytest.mark.parametrize("set_ms", [-2_000, 2_000])
-def test_a_counter_that_moves_far_began_anew(set_ms: int) -> None:
+def test_a_counter_that_moves_far_has_restarted(set_ms: int) -> None:
     clock = make_clock()
     feed(clock, steady(100_000, 0, 1000))
     feed(clock, [(110_030, 10_000)])
@@ -340,7 +340,7 @@ def test_a_counter_that_moves_far_began_anew(set_ms: int) -> None:
     assert clock.status().resets == 1
 
 
-def test_until_an_arrival_confirms_it_the_correction_is_doubted() -> None:
+def test_a_correction_needs_an_arrival_that_confirms_it() -> None:
     """One more period may have passed. The counter is set backward."""
     clock = make_clock()
     (last,) = feed(clock, steady(100_000, 0, 1000))[-1:]
@@ -353,7 +353,7 @@ def test_until_an_arrival_confirms_it_the_correction_is_doubted() -> None:
 
 
 @pytest.mark.parametrize(("seconds", "seen"), [(4, False), (6, True)])
-def test_a_young_line_takes_nothing_for_a_correction(seconds: int, seen: bool) -> None:
+def test_a_young_fit_detects_no_correction(seconds: int, seen: bool) -> None:
     time, _ = stamps(7)
     before_ns = time.even_ns - 7 * NS_PER_MS
     begin = before_ns - seconds * NS_PER_S
@@ -395,7 +395,7 @@ def test_missing_samples_are_counted(indices: tuple[int, ...], missed: list[int]
 
 
 @pytest.mark.parametrize(("later", "resets"), [(0, 1), (500, 0)], ids=["began anew", "link restarted"])
-def test_a_counter_that_jumps_is_no_loss(later: int, resets: int) -> None:
+def test_a_counter_that_jumps_causes_no_loss(later: int, resets: int) -> None:
     """The counter restarts at 0 400 ms after sample 40019, or it continues while the link is missing."""
     made = numbering_clock()
     for index in range(40000, 40020):

@@ -101,7 +101,7 @@ def make_clock(unknown: list[int]) -> SampleClock:
     )  # fmt: skip
 
 
-def test_samples_are_dated_by_the_fit_of_their_stamps() -> None:
+def test_samples_are_time_stamped_by_the_fit_of_their_values() -> None:
     """Every third arrival is 4 ms late. The fit does not follow them."""
     unknown: list[int] = []
     clock, truth_ns, errors = make_clock(unknown), BEGIN_NS, []

@@ -75,7 +75,7 @@ def test_arrivals_bound_from_above() -> None:
     assert intervals.width_ns(4 * NS_PER_S) < 200_000
 
 
-def test_contradictions_drop_what_is_old() -> None:
+def test_contradictions_drop_old_intervals() -> None:
     intervals, x = filled(0.0)
     for i in range(1, 200):
         intervals.add_interval(

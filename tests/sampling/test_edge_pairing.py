@@ -73,7 +73,7 @@ def test_the_nearest_is_taken_and_a_distant_one_is_not() -> None:
     assert not pair(pairing, 101)
 
 
-def test_what_is_near_but_not_near_enough_is_counted_on_both_sides() -> None:
+def test_a_distant_event_counts_as_unpaired_on_both_sides() -> None:
     pairing = running()
     pairing.add_events([(100 * PERIOD_NS + NS_PER_MS, 100)])
     assert not pair(pairing, 100)

@@ -200,7 +200,7 @@ def test_losses_under_starvation_are_those_of_the_device(device: Device, kept_by
 @pytest.mark.parametrize(
     ("device", "stall_s"), [(UNCOUNTED, 0.2), (UNCOUNTED, 2.0), (UNCOUNTED, 10.0), (UNCOUNTED_FAST, 2.0)]
 )
-def test_losses_of_a_device_without_counter_are_seen_by_its_pace(device: Device, stall_s: float) -> None:
+def test_the_pace_shows_losses_without_a_counter(device: Device, stall_s: float) -> None:
     one, unknown = reader(device, N_TTY, 2)
     one.run(20 * NS_PER_S)
     for _ in range(3):
@@ -211,7 +211,7 @@ def test_losses_of_a_device_without_counter_are_seen_by_its_pace(device: Device,
 
 
 @pytest.mark.parametrize("device", [UNCOUNTED, UNCOUNTED_FAST])
-def test_what_the_pace_cannot_show_is_unknown(device: Device) -> None:
+def test_a_gap_that_the_pace_cannot_show_is_unknown(device: Device) -> None:
     one, unknown = reader(device, N_TTY, 1)
     for _ in range(STALLS):
         one.stall(int(one.random.choice([0.7, 1, 2, 5, 10]) * NS_PER_S))
@@ -261,7 +261,7 @@ def known_pace() -> ArrivalPace:
 
 
 @pytest.mark.parametrize("waited_ms", [0, 18, 300])
-def test_a_first_message_that_waited_costs_nothing_that_is_known_of_the_pace(waited_ms: int) -> None:
+def test_a_delayed_first_frame_keeps_the_pace(waited_ms: int) -> None:
     pace = known_pace()
     period_ns = pace.period_ns
     begin_ns = BEGIN_NS + 100 * NS_PER_S
@@ -282,7 +282,7 @@ def test_the_pace_is_known_within_80_messages_whatever_they_wait_up_to_a_twentie
     assert pace.period_ns == pytest.approx(period_ns, rel=5e-3)
 
 
-def test_messages_that_are_early_once_show_a_wrong_phase_and_no_other_rate() -> None:
+def test_early_frames_show_a_wrong_phase_and_not_another_rate() -> None:
     pace = known_pace()
     period_ns = pace.period_ns
     begin_ns = BEGIN_NS + 60_010 * NS_PER_MS
@@ -292,7 +292,7 @@ def test_messages_that_are_early_once_show_a_wrong_phase_and_no_other_rate() -> 
 
 
 @pytest.mark.parametrize("late_ms", [4, 40])
-def test_a_window_that_waited_as_a_whole_costs_nothing_that_is_known_of_the_pace(late_ms: int) -> None:
+def test_a_delayed_window_keeps_the_pace(late_ms: int) -> None:
     pace, step_ns = ArrivalPace(256), 100 * NS_PER_MS
     pace.begin(BEGIN_NS)
     for index in range(1, 400):
@@ -304,7 +304,7 @@ def test_a_window_that_waited_as_a_whole_costs_nothing_that_is_known_of_the_pace
 
 @pytest.mark.parametrize("late_ms", [4, 45])
 @pytest.mark.parametrize("missing_from", [(240,), (170, 201), (180, 215)])
-def test_messages_that_stay_late_by_the_same_are_of_the_same_rate(late_ms: int, missing_from: tuple[int, ...]) -> None:
+def test_a_constant_lateness_is_not_another_rate(late_ms: int, missing_from: tuple[int, ...]) -> None:
     """The sender restarted, or its timer slept too long. Seven or more late frames are lost samples."""
     pace, period_ns = ArrivalPace(), 100 * NS_PER_MS
     pace.begin(BEGIN_NS)
@@ -329,7 +329,7 @@ def test_messages_that_are_off_in_every_window_are_of_another_rate(period_ms: fl
 @pytest.mark.parametrize(
     ("device", "restarts"), [*product(COUNTED[1:], [False]), *product([*COUNTED[:-1], UNCOUNTED], [True])]
 )
-def test_what_a_counter_shows_after_the_link_was_away(device: Device, restarts: bool) -> None:
+def test_losses_after_a_missing_link(device: Device, restarts: bool) -> None:
     """A counter that continued counts the lost samples. A counter that restarted leaves a gap of unknown size."""
     one, unknown = reader(device, N_TTY, 3)
     one.run(0 if restarts else 10 * NS_PER_S)

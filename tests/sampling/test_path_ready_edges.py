@@ -56,7 +56,7 @@ def test_edges_read_twice_or_before_a_restart_are_not_missed() -> None:
     assert made.missed == 0
 
 
-def test_reads_without_an_edge_or_too_late_for_it_are_of_none() -> None:
+def test_a_read_without_an_edge_has_no_time_stamp() -> None:
     made = edges(2, 3)
     assert read(made, 1.9, 1.95) is None
     assert read(made, 4.5, 4.6) == (3, 3 * MS)

@@ -44,7 +44,7 @@ from tests.support.clock_feed import BEGIN_NS, make_clock, message, rises
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(("age_ns", "rate"), [(0, SLEW_SETTLING), (SETTLED_AFTER_NS + 1, SLEW)])
-def test_the_rate_of_a_slew_is_bounded_and_it_ends_at_nothing(sign: int, age_ns: int, rate: float) -> None:
+def test_the_rate_of_a_slew_is_limited_and_it_ends_at_zero(sign: int, age_ns: int, rate: float) -> None:
     slew = Slew()
     slew.set(sign * 10.0 * NS_PER_S)
     before = slew.left_ns
@@ -102,7 +102,7 @@ def test_with_edges_only_their_own_jitter_is_left(crystal: Crystal) -> None:
     assert syncs(dated) == {Sync.EDGE}
 
 
-def test_the_error_is_honest_without_a_bias() -> None:
+def test_the_error_covers_the_truth_without_a_bias() -> None:
     dated = run_sout(model(BARE_UART), 30, HALF_LOST, SoutTiming(bias_us=0.0))
     assert share_honest(dated) >= 0.95
     assert sum(t.sample.t_err_ns for t in after(dated, 10)) / len(after(dated, 10)) < 20_000
@@ -184,7 +184,7 @@ def test_a_lost_rising_edge_is_counted_back_and_the_offset_of_the_edge_is_config
     assert here[-1].sample.t_ns - there[-1].sample.t_ns == 200_000
 
 
-def test_what_was_lost_is_counted() -> None:
+def test_lost_samples_are_counted() -> None:
     m = model(BARE_UART)
     reads = simulate_reads(m.run(2000), 1, LineFaults(pulse_loss=0.1, frame_loss=0.05))
     dated = with_sout(clock := sout_clock(m), reads)

@@ -81,7 +81,7 @@ def port() -> Iterator[Port]:
 
 @pytest.mark.live
 @pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)
-def test_a_device_is_fed_what_gpsd_hears(receiver: Receiver, port: Port, tmp_path: Path) -> None:
+def test_a_device_gets_the_sentences_of_gpsd(receiver: Receiver, port: Port, tmp_path: Path) -> None:
     tcp_port = free_port()
     device = {
         "driver": "hipnuc-uart",

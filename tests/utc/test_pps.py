@@ -61,7 +61,7 @@ def test_three_pulses_and_two_sentences_give_utc() -> None:
 
 
 @pytest.mark.parametrize(("ppm", "late_ns"), [(-100.0, 0.0), (0.0, 5_000.0), (100.0, 5_000.0), (-100.0, 50_000.0)])
-def test_the_stated_error_is_honest(ppm: float, late_ns: float) -> None:
+def test_the_time_stamp_error_covers_the_truth(ppm: float, late_ns: float) -> None:
     receiver, inside = Receiver(ppm, late_ns), 0
     receiver.go(20)
     for _ in range(100):
@@ -116,7 +116,7 @@ def test_another_receiver_takes_over() -> None:
     assert reference.offset_ns + receiver.t_ns(4.6) == pytest.approx((UTC_S + 40.35) * NS_PER_S, abs=1000)
 
 
-def test_one_wrong_sentence_is_nothing_and_two_are_believed() -> None:
+def test_two_sentences_are_needed_for_another_second() -> None:
     receiver = Receiver()
     receiver.go(10)
     receiver.go(1, says=3)

@@ -97,7 +97,7 @@ def test_a_server_that_closes_is_connected_to_again() -> None:
 
 
 @in_loop
-async def test_an_unreachable_server_is_a_problem_and_not_the_end() -> None:
+async def test_an_unreachable_server_is_reported_and_retried() -> None:
     server = await asyncio.start_server(lambda _r, w: w.close(), "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
     server.close()
@@ -225,7 +225,7 @@ async def test_a_port_that_goes_away_or_is_held_is_opened_again() -> None:
 
 
 @in_loop
-async def test_the_row_makes_it_of_the_port_that_is_named() -> None:
+async def test_make_nmea_uses_the_configured_port() -> None:
     asked: list[tuple[str, int]] = []
 
     def make_port(path: str, baud: int) -> Port:

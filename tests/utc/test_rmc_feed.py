@@ -126,7 +126,7 @@ def test_the_first_nanosecond_of_the_guard_is_too_late(reference: UtcReference |
         assert bench.give(0, limit_s) == refusal
 
 
-def test_a_device_has_no_more_sentences_than_it_may_have() -> None:
+def test_sentences_above_the_rate_are_rejected() -> None:
     bench = FeedBench(rate_hz=2)
     refusals = [bench.give(tenth / 10, tenth / 10 + 0.05) for tenth in range(30)]
     assert [n for n, refusal in enumerate(refusals) if not refusal] == [0, 5, 10, 15, 20, 25]

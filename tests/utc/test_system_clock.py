@@ -38,7 +38,7 @@ def test_the_kernel_answers_sensibly() -> None:
     ("state", "status", "synchronised"),
     [(0, 0x0001, True), (1, 0x2011, True), (5, 0x0040, False), (5, 0x0001, False), (0, 0x0040, False)],
 )
-def test_what_counts_as_synchronised(state: int, status: int, synchronised: bool) -> None:
+def test_states_that_count_as_synchronized(state: int, status: int, synchronised: bool) -> None:
     def ask(timex: Timex) -> int:
         assert timex.modes == 0  # adjtimex must not change the clock
         timex.status, timex.esterror, timex.maxerror = status, 7, 99
@@ -47,7 +47,7 @@ def test_what_counts_as_synchronised(state: int, status: int, synchronised: bool
     assert kernel_clock(ask) == KernelClock(synchronised, 7, 99)
 
 
-def test_a_kernel_that_may_not_be_asked_vouches_for_nothing() -> None:
+def test_a_refused_call_means_not_synchronized() -> None:
     def ask(_timex: Timex) -> int:
         raise PermissionError(1, "Operation not permitted")
 
@@ -114,7 +114,7 @@ async def test_each_names_its_instant_after_it_was_and_within_its_second(rate_hz
 
 
 @in_loop
-async def test_woken_early_it_waits_and_woken_late_it_leaves_out() -> None:
+async def test_an_early_wakeup_waits_and_a_late_wakeup_skips_edges() -> None:
     bench = SystemClockBench()
     bench.go(1, late_ns=-1000)
     assert bench.got == []
@@ -133,7 +133,7 @@ async def test_woken_early_it_waits_and_woken_late_it_leaves_out() -> None:
     ],
 )
 @in_loop
-async def test_a_clock_that_is_not_good_enough_gives_none_and_says_why(clock: KernelClock, problem: str) -> None:
+async def test_an_inaccurate_clock_gives_no_sentence_and_reports_the_reason(clock: KernelClock, problem: str) -> None:
     bench = SystemClockBench(clock=clock)
     bench.go(3)
     assert bench.got == []
@@ -144,7 +144,7 @@ async def test_a_clock_that_is_not_good_enough_gives_none_and_says_why(clock: Ke
     assert bench.source.problem == ""
 
 
-def test_it_runs_in_the_loop_and_stops() -> None:
+def test_the_timer_runs_in_the_event_loop_and_stops() -> None:
     clock, sentences = VirtualClock(), Sentences()
     settings = RmcOptions(source="system", rate_hz=10)
     source = SystemClockSource(settings, clock.now_ns, clock.host.utc_offset_ns, lambda: GOOD)
