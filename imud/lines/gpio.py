@@ -212,8 +212,6 @@ CONSUMER_CHARACTERS: Final = 31  # maximum length of a consumer name in the kern
 
 
 class _Line:
-    """Request and release of a line."""
-
     def __init__(self, settings: LineOptions, purpose: str, devices: Path) -> None:
         """`purpose` follows `imud` in the consumer name, which other programs display."""
         self._settings = settings
@@ -244,7 +242,6 @@ class _Line:
             request.release()
 
     def _error(self, error: OSError) -> LinkError:
-        """Return the LinkError for a failed system call on the open request."""
         if error.errno in GONE:
             return LinkMissing(f"{self.title} is missing ({os.strerror(error.errno or 0)}): was its adapter unplugged?")
         return LinkError(f"{self.title} cannot be used: {os.strerror(error.errno or 0)}")

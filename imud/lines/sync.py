@@ -129,7 +129,6 @@ class SyncSignals:
 
     @property
     def can_trigger(self) -> bool:
-        """Return whether SIN is configured."""
         return self._sin is not None
 
     def status(self, reset: ResetLine | None = None) -> LinesStatus:
@@ -189,7 +188,6 @@ class SyncSignals:
         self._show_alarm()
 
     def _show_alarm(self) -> None:
-        """Set the alarm bit of the next samples."""
         if self._clock is not None:
             self._clock.set_own_status(ALARM_STATUS if self._alarm.line.active else None)
 
@@ -201,7 +199,6 @@ class SyncSignals:
         )  # fmt: skip
 
     def _reporter(self, key: str) -> Callable[[str], None]:
-        """Return a function that raises an event about the line."""
         return lambda message: self._raise_event(self._now_ns(), EventKind.LINK, f"line {key}: {message}", line=key)
 
 

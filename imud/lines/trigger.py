@@ -68,7 +68,6 @@ class SquareWave:
 
     @property
     def high(self) -> bool:
-        """Return whether the line is active."""
         return self._fall_ns is not None
 
     def once(self) -> None:
@@ -95,7 +94,6 @@ class SquareWave:
         return self._next_ns() - now_ns
 
     def _next_ns(self) -> int:
-        """Return the time of the next rising edge, ns."""
         if self._wanted:
             return self._rest_until_ns
         if self._period_ns:
@@ -270,7 +268,6 @@ class SinTrigger:
 
     @property
     def counts(self) -> TriggerCounts:
-        """Return the counters since the start."""
         return self._trigger.counts
 
     def tick(self, now_ns: int) -> None:

@@ -95,7 +95,6 @@ class WatchedLine:
             self._end(error)
 
     def _end(self, error: LinkError) -> None:
-        """Close the line after it failed."""
         self.close()
         self._fail(error, self._now_ns())
 

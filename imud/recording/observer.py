@@ -141,10 +141,8 @@ class PathObserver:
         self._put(records.encode_edges(self._id, line, edges))
 
     def overruns(self, count: int) -> None:
-        """Record the number of overruns if it changed.
-
-        The path calls this method before it reports the data of the loss.
-        """
+        """Record the number of overruns if it changed."""
+        # The path calls this method before it reports the data of the loss.
         if count != self._overruns:
             self._overruns = count
             self.call("path", "overruns", count)

@@ -78,15 +78,12 @@ class _Bin:
         self.late_ns = 0.0  # sum of the waits in excess of the timer, ns. `wait` does not contain it.
 
     def longest_wait(self) -> float:
-        """Return the longest wait in the timer without stalls of the host, ns.
-
-        Waits that cover the period of the timer evenly are symmetric: the longest wait is as far above the mean as the
-        shortest is below. A stall changes the mean only slightly.
-        """
+        """Return the longest wait in the timer without stalls of the host, ns."""
+        # Waits that cover the period of the timer evenly are symmetric: the longest wait is as far above the mean as
+        # the shortest is below. A stall changes the mean only slightly.
         return min(2 * self.wait / self.count - self.wait_least, self.wait_most)
 
     def merged(self, after: "_Bin") -> "_Bin":
-        """Return the union of this bin and the next bin."""
         low = self if self.lowest <= after.lowest else after
         merged = _Bin(low.device_ns, low.arrival_ns, low.lowest, self.wait + after.wait)
         merged.begin_ns = self.begin_ns
@@ -148,7 +145,6 @@ class ArrivalFit:
 
     @property
     def span_ns(self) -> int:
-        """Return the device time between the oldest and the newest bin, ns."""
         return self._open.device_ns - self._bins[0].device_ns
 
     def is_known(self, least_ns: int) -> bool:
@@ -156,10 +152,8 @@ class ArrivalFit:
         return self.count >= ENOUGH_POINTS and self.span_ns >= max(least_ns, ENOUGH_HOLDS * self.hold_ns)
 
     def set_pause(self, pause_ns: float, count: int) -> None:
-        """Set the longest pause between frames at which a read can end: at most the period of the timer.
-
-        Of `count` consecutive frames, at least one is the last frame of its read.
-        """
+        """Set the longest pause between frames at which a read can end: at most the period of the timer."""
+        # Of `count` consecutive frames, at least one is the last frame of its read.
         self._pause_ns, self._pause_count = pause_ns, count
 
     def add_arrival(self, device_ns: int, arrival_ns: int, trailing_ns: int, above_ns: float) -> bool:
@@ -214,7 +208,6 @@ class ArrivalFit:
         self._width_ns = min((newest.begin_ns - bins[0].begin_ns) // (BINS // 2), BIN_LONGEST_NS)
 
     def _fit(self, device_ns: int) -> None:
-        """Fit the line to the bins again."""
         bins = self._bins
         origin = bins[0]
         x0, y0 = origin.device_ns, origin.arrival_ns
@@ -296,7 +289,6 @@ class ArrivalFit:
         return late / count
 
     def _move(self, ref_device_ns: int, ref_arrival_ns: int, slope: float) -> None:
-        """Change the line and all distances above it."""
         x_old, y_old, slope_old = self.ref_device_ns, self.ref_arrival_ns, self.slope
         self.ref_device_ns, self.ref_arrival_ns, self.slope = ref_device_ns, ref_arrival_ns, slope
         for b in self._bins:

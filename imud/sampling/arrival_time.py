@@ -42,7 +42,6 @@ class LinkDelay:
 
     @property
     def floor_ns(self) -> int:
-        """Return the upper bound of the delay of the least delayed frame, ns."""
         if self.hold_ns:
             return WAKE_NS + USB_POLL_NS
         return WAKE_NS + FIFO_BYTES * self.byte_ns
@@ -58,11 +57,9 @@ class LinkDelay:
         return LinkDelay(self.byte_ns, fit.measured_hold_ns) if fit.measured_hold_ns else None
 
     def held_ns(self, period_ns: float, size_bytes: int) -> float:
-        """Return the maximum time that an adapter's timer can hide, ns.
-
-        A read ends in the pause after a frame or inside the next frame. The bytes after a frame show the delay except
-        for the pause. The hidden time is therefore at most the pause between two frames, and at most the timer.
-        """
+        """Return the maximum time that an adapter's timer can hide, ns."""
+        # A read ends in the pause after a frame or inside the next frame. The bytes after a frame show the delay except
+        # for the pause. The hidden time is therefore at most the pause between two frames, and at most the timer.
         if not period_ns:
             return self.hold_ns
         return min(self.hold_ns, max(period_ns - size_bytes * self.byte_ns, 0.0))
@@ -106,11 +103,9 @@ class ArrivalSpread:
 
     @property
     def sigma_ns(self) -> float:
-        """Return the one-sigma spread of one arrival, ns.
-
-        It is the mean absolute deviation of a step. For exponentially distributed delays, this deviation equals the
-        spread of the delays. The mean delay above the shortest delay is as large.
-        """
+        """Return the one-sigma spread of one arrival, ns."""
+        # It is the mean absolute deviation of a step. For exponentially distributed delays, this deviation equals the
+        # spread of the delays. The mean delay above the shortest delay is as large.
         return 1.5 * self._spread if self.period_ns else FIRST_SPREAD_NS
 
 
@@ -252,7 +247,6 @@ class ArrivalTime:
 
     @property
     def resets(self) -> int:
-        """Return the number of restarts of the frame number."""
         return self._losses.resets
 
     def restart(self) -> None:

@@ -339,7 +339,6 @@ class SampleClock:
         return NS_PER_S / period_ns if period_ns else 0.0
 
     def status(self) -> ClockStatus:
-        """Return the state of the clock at the newest sample."""
         fit = self._fit if self._fit_sync is not Sync.ARRIVAL else None
         status = ClockStatus(
             sync=self._sync if self._aiding else self._fit_sync,
@@ -556,7 +555,6 @@ class SampleClock:
         return holdover.at(device_ns) if holdover is not None else self._less_bias(arrival_ns, size_bytes)
 
     def _start_fit(self, arrival_ns: int, slope: float = 1.0, slope_error: float = SLOPE_HIGHEST - 1) -> None:
-        """Start a new fit at the present device time."""
         self._drop_fit()
         self._fit_begin_ns = self._time.even_ns
         self._fit = ArrivalFit(self._fit_begin_ns, arrival_ns, self._delay.hold_ns, slope, slope_error)
@@ -607,7 +605,6 @@ class SampleClock:
         return t_ns
 
     def _period_ns(self) -> float:
-        """Return the host time between samples, ns; 0 if unknown."""
         time, fit = self._time, self._fit
         if not time.tick_ns:
             return self._arrivals.spread.period_ns

@@ -116,7 +116,6 @@ class PeriodLearner:
         return steps
 
     def _average(self, ticks: int, steps: int) -> None:
-        """Add a step of `ticks` that contains `steps` periods to the mean."""
         self._sum += ticks + int(self._even * self.period_ticks)
         self._count += steps + self._even
         self._even = 0
@@ -189,7 +188,6 @@ class PeriodLearner:
             self._odd_at += even
 
     def _adopt(self, ticks: int, steps: int, *, is_new: bool) -> None:
-        """Use `ticks` over `steps` steps as the new period."""
         self.is_new = is_new
         self._odd_at, self._steady = 0.0, False
         self._sum, self._count = float(ticks), float(steps)
@@ -449,10 +447,8 @@ class DeviceTime:
 
     @property
     def error_ns(self) -> float:
-        """Return the one-sigma error of `even_ns` from the length of a tick, ns.
-
-        It is 0 if all counter values have the same error.
-        """
+        """Return the one-sigma error of `even_ns` from the length of a tick, ns."""
+        # It is 0 if all counter values have the same error.
         changes = self.period.changes
         if not changes:
             return 0.0

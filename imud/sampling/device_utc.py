@@ -70,7 +70,6 @@ class IntervalFit:
         self.known = False  # whether the fit has a result
 
     def clear(self) -> None:
-        """Forget all intervals."""
         self._bins.clear()
         self.known = False
 
@@ -91,18 +90,15 @@ class IntervalFit:
         bins.append(_Bin(device_ns, low, high))
 
     def width_ns(self, device_ns: int) -> float:
-        """Return the distance between lowest and highest time at `device_ns`, ns."""
         return self._width_ns + self._fan * (device_ns - self._ref_device_ns)
 
     def combined(self, device_ns: int, fit_ns: int, error_ns: float, common_ns: float) -> tuple[float, float]:
-        """Return (correction of the fit of arrivals at `device_ns`, one-sigma error after the correction), ns.
-
-        `error_ns` is the error of the fit, `common_ns` the error that all intervals share. The result is the weighted
-        mean of both, and is within the bounds. The same uneven ticks can affect both, so the error is the smaller of
-        both errors. A fit that is outside of the bounds has a larger error. If both contradict each other, the error is
-        half of the difference, because it is unknown which of them is wrong: a device without pulses reports for a time
-        that it is on UTC.
-        """
+        """Return (correction of the fit of arrivals at `device_ns`, one-sigma error after the correction), ns."""
+        # `error_ns` is the error of the fit, `common_ns` the error that all intervals share. The result is the weighted
+        # mean of both, and is within the bounds. The same uneven ticks can affect both, so the error is the smaller of
+        # both errors. A fit that is outside of the bounds has a larger error. If both contradict each other, the error
+        # is half of the difference, because it is unknown which of them is wrong: a device without pulses reports for a
+        # time that it is on UTC.
         width_ns = max(self.width_ns(device_ns), self._narrowest_ns)
         middle = self._ref_ns - fit_ns + self._middle + self._slope * (device_ns - self._ref_device_ns)
         own_ns = hypot(SIGMA_OF_RANGE * width_ns, common_ns)
@@ -138,7 +134,6 @@ class IntervalFit:
 
 
 def _point(x: int, y: int, slope: float) -> Point:
-    """Return a point relative to a line through the origin."""
     return float(x), y - slope * x
 
 

@@ -151,7 +151,6 @@ class EdgePairing:
 
     @property
     def running(self) -> bool:
-        """Return whether a line through events exists."""
         return self._tracker is not None
 
     def add_events(self, events: Sequence[EdgeStamp]) -> None:
@@ -224,7 +223,6 @@ class EdgePairing:
         return True
 
     def skip(self, device_ns: int) -> None:
-        """Pass the sample at `device_ns`, which has no event."""
         if self._tracker is not None:
             self.due_ns = self._tracker.due_ns(device_ns)
 
@@ -279,7 +277,6 @@ class EdgePairing:
             self._begin(agreed, slope, spread_ns)
 
     def _begin(self, points: list[tuple[int, int]], slope: float, spread_ns: float) -> None:
-        """Start a line through the first pairs of (device ns, event ns)."""
         self._tracker = tracker = EdgeTracker(*points[0], slope)
         for device_ns, t_ns in points[1:]:
             tracker.add_edge(device_ns, t_ns, tracker.above(device_ns, t_ns))

@@ -75,7 +75,6 @@ class CounterLine:
             self._set(fit, error_ns)
 
     def above(self, device_ns: int, arrival_ns: float) -> float:
-        """Return the distance of an arrival above the line, ns."""
         return arrival_ns - self._host_ns - self.slope * (device_ns - self._device_ns)
 
     def early_ns(self, device_ns: int) -> float:
@@ -187,7 +186,6 @@ class ArrivalPace:
         return found
 
     def _learn(self, arrival_ns: int) -> tuple[int, bool]:
-        """Set the first estimate of the period."""
         certain = not self.period_ns
         self.period_ns = (arrival_ns - self._begin_ns) / self._steps
         self._error = 1.0
@@ -263,10 +261,8 @@ class SampleNumber:
         return steps if steps <= most else 0
 
     def is_sure(self, arrival_ns: int) -> bool:
-        """Return whether a number without steps leaves no gap.
-
-        It leaves no gap if it is the first number, or if the time is too short.
-        """
+        """Return whether a number without steps leaves no gap."""
+        # It leaves no gap if it is the first number, or if the time is too short.
         if not self.known:
             return not self._was_known
         return self._pace.has_no_room(arrival_ns)

@@ -387,11 +387,9 @@ class CanPath(SamplePath):
             self.observer.call("path", "set_frame_time", frame_ns)
 
     def on_frames(self, frames: Sequence[CanFrame]) -> None:
-        """Process the CAN frames of one read. Each frame has its own arrival time.
-
-        A sample can consist of several frames. The measurement was made before the arrival of its first frame. Frames
-        of other devices can arrive between the frames of a sample.
-        """
+        """Process the CAN frames of one read. Each frame has its own arrival time."""
+        # A sample can consist of several frames. The measurement was made before the arrival of its first frame. Frames
+        # of other devices can arrive between the frames of a sample.
         try:
             feed, ledger, samples = self.codec.feed_frame, self._ledger, list[Sample]()
             utc_offset_ns = self._utc_offset_ns()
@@ -535,8 +533,6 @@ SIGMA_OF_AGE: Final = 1 / sqrt(3)  # root mean square of an age that is uniforml
 
 @dataclass(frozen=True, slots=True)
 class PollTiming:
-    """Timing of the reads."""
-
     period_ns: int  # time between two reads, ns
     update_ns: int  # maximum time between two updates of the device's registers, ns; 0 if unknown
     edges: ReadyEdges | None  # edges of the data-ready line; None without a line
@@ -561,7 +557,6 @@ class PolledPath(SamplePath):
 
     @property
     def period_ns(self) -> int:
-        """Return the time between two reads, ns."""
         return self._period_ns
 
     def observe(self, observer: InputObserver | None) -> None:

@@ -51,7 +51,6 @@ class Slew:
         self.left_ns = 0.0  # published time minus estimated time, ns
 
     def set(self, left_ns: float) -> None:
-        """Set the difference, ns."""
         self.left_ns = left_ns
 
     def add(self, change_ns: float) -> None:
@@ -93,11 +92,9 @@ class Holdover:
         self.slope_error = slope_error
 
     def at(self, device_ns: int) -> int:
-        """Return the host time at `device_ns`."""
         return self._t_ns + int(self.slope * (device_ns - self._device_ns))
 
     def error_ns(self, device_ns: int) -> float:
-        """Return the one-sigma error of `at`, ns."""
         return self._error_ns + self.slope_error * (device_ns - self._device_ns)
 
 
@@ -114,7 +111,6 @@ class EdgeSource:
 
     @property
     def error_ns(self) -> float:
-        """Return the one-sigma error of a time stamp of this source, ns."""
         return hypot(STAMP_SPREADS * self.pairing.spread_ns, self.sigma_ns, self.stamp_error_ns) + STAMP_FLOOR_NS
 
     def add_event(self, event: EdgeStamp, error_ns: int) -> None:

@@ -177,7 +177,6 @@ class ChronyFeed:
         return self._send(encode(system_ns, offset_ns, pulse=unix_s is None))
 
     def close(self) -> None:
-        """Close the socket. A second call does nothing."""
         with suppress(OSError):
             self._socket.close()
 

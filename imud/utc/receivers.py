@@ -75,8 +75,6 @@ class RmcSource(Protocol):
 
 
 class SourceContext(NamedTuple):
-    """Services of the host for sources."""
-
     make_port: MakePort
     now_ns: Callable[[], int]
     """CLOCK_MONOTONIC, ns."""
@@ -114,7 +112,6 @@ class SentenceSplitter:
         return [sentence for line in lines if len(line) <= LINE_BYTES_MAX and (sentence := _rmc_in(line))]
 
     def clear(self) -> None:
-        """Drop the buffered bytes: the stream restarts."""
         self._tail, self._skipping = b"", False
 
 
@@ -151,12 +148,10 @@ class ReconnectingSource(ABC):
         self._task: asyncio.Task[None] | None = None
 
     def start(self, on_sentence: OnSentence) -> None:
-        """Start to deliver sentences. Needs a running event loop."""
         self._on_sentence = on_sentence
         self._task = asyncio.get_running_loop().create_task(self._run(), name=self.title)
 
     def close(self) -> None:
-        """Close the connection and stop the delivery. A second call does nothing."""
         self._on_sentence = _ignore
         self._disconnect()
         if self._task is not None:
@@ -210,7 +205,6 @@ class GpsdSource(ReconnectingSource):
     """Client of gpsd."""
 
     def __init__(self, settings: RmcOptions, now_ns: Callable[[], int], retry: Retry | None = None) -> None:
-        """`now_ns` returns CLOCK_MONOTONIC."""
         super().__init__(f"gpsd at {settings.host}:{settings.tcp_port}", retry)
         self._now_ns = now_ns
         self._address = settings.host, settings.tcp_port
@@ -291,10 +285,8 @@ def _keep_alive(sock: socket.socket) -> None:
 
 
 def make_gpsd(settings: RmcOptions, context: SourceContext) -> GpsdSource:
-    """Return the source `gpsd`."""
     return GpsdSource(settings, context.now_ns)
 
 
 def make_nmea(settings: RmcOptions, context: SourceContext) -> NmeaPortSource:
-    """Return the source `nmea`."""
     return NmeaPortSource(context.make_port(settings.port, settings.baud))

@@ -101,12 +101,10 @@ class SystemClockSource:
         self._timer: asyncio.TimerHandle | None = None
 
     def start(self, on_sentence: OnSentence) -> None:
-        """Deliver a sentence for each second, or each part of it. Needs a running event loop."""
         self._on_sentence = on_sentence
         self._schedule()
 
     def close(self) -> None:
-        """Stop the delivery. A second call does nothing."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -156,5 +154,4 @@ class SystemClockSource:
 
 
 def make(settings: RmcOptions, context: SourceContext) -> SystemClockSource:
-    """Return the source `system`."""
     return SystemClockSource(settings, context.now_ns, context.utc_offset_ns)
