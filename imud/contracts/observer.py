@@ -9,13 +9,17 @@ from imud.formats.can import CanFrame
 
 
 class InputObserver(Protocol):
-    """Observer of the input of one path and its clock. Only `imud.recording` has one, and `sampling` may not import it.
+    """Observer of the input of one path and its clock.
 
-    The path calls it after each input, so that the clock readings and edges that the input needed are reported before.
+    `imud.recording` implements it, and `imud.sampling` may not import that part. The path calls it after each input. It
+    has therefore reported the clock readings and edges of this input before.
     """
 
     def data(self, data: bytes, t_rx_ns: int, waited_ns: int) -> None:
-        """Report bytes, and the maximum time in the kernel's buffer before the read, ns; -1: `StreamPath.on_data`."""
+        """Report the bytes of one read.
+
+        `waited_ns` is their maximum time in the kernel's buffer for `StreamPath.gather`, and -1 for `on_data`.
+        """
         ...
 
     def frames(self, frames: Sequence[CanFrame]) -> None:
@@ -27,11 +31,11 @@ class InputObserver(Protocol):
         ...
 
     def edges(self, line: str, edges: Sequence[Edge]) -> None:
-        """Report edges of a GPIO line, named as its key in the configuration."""
+        """Report edges of a GPIO line. `line` is its key in the configuration."""
         ...
 
     def overruns(self, count: int) -> None:
-        """Report the overruns that the kernel counted, at each loss of samples."""
+        """Report the number of overruns that the kernel counted. The path calls this method at each loss of samples."""
         ...
 
     def call(self, target: str, method: str, *arguments: object, **keywords: object) -> None:

@@ -28,8 +28,8 @@ from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 # 64 s of window: long compared to the beat of two crystals with an adapter's timer, short compared to their warm-up
 BINS: Final = 64
 BIN_LONGEST_NS: Final = NS_PER_S
-SLOPE_LOWEST: Final = 1 / 1.07
 # limits of the slope, host ns per device ns. Devices with an error of 4.08 % exist. Above 7 %, the tick is different.
+SLOPE_LOWEST: Final = 1 / 1.07
 SLOPE_HIGHEST: Final = 1 / 0.93
 SUPPORT_AT: Final = 0.75  # position of the hull edge in the window, as a share of the window
 # a fit is known after this number of points, and after this time or number of periods of a latency timer

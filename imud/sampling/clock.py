@@ -170,9 +170,8 @@ class SampleClock:
         self._holdover: Holdover | None = None
         self._fit: ArrivalFit | None = None
         self._fit_begin_ns = 0  # device time
-        self._fit_bias_ns = self._fit_error_ns = (
-            0.0  # distance from the fit down to the time of measurement, and its error
-        )
+        # distance from the fit down to the time of measurement, and its error
+        self._fit_bias_ns = self._fit_error_ns = 0.0
         self._fit_sync = Sync.ARRIVAL  # REGRESSION if the fit is in use
         self._sync = Sync.ARRIVAL  # source of the newest time stamp if there are aiding sources
         self._known, self._resets = False, 0  # known: the device time has started

@@ -227,7 +227,7 @@ JUMP_EARLY_NS: Final = 5.0 * NS_PER_MS
 JUMP_EARLY_SIGMAS: Final = 10
 """Distance below the fit, ns and standard errors, that shows a forward jump of the device counter."""
 FIRST_EARLY_NS: Final = NS_PER_S
-"""The same before the fit is in use: the first frame may have waited for this time in a buffer."""
+"""Distance below the fit before it is in use, ns: the first frame may have waited in a buffer."""
 JUMP_LATE_NS: Final = NS_PER_S / 2
 JUMP_LATE_READS: Final = 3
 """Number of late reads in one second that show a jump. Fewer can be the queue of a busy host."""

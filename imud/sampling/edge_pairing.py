@@ -43,8 +43,8 @@ SMOOTHING: Final = 1 / 32
 FIRST_SPREAD_NS: Final = 10 * NS_PER_US
 MARK_REACH: Final = 0.5  # maximum distance of a sample from its pulse, as a share of a period
 MARKS_KEPT: Final = 1024  # maximum number of marks for the reader, and of pulses that wait for their sample
-_LEVEL_GAIN: Final = (1.0, 1.0, *(2 * (2 * n - 1) / (n * (n + 1)) for n in range(2, TRACKED + 1)))
 # gains of the n-th of equally weighted points on a line
+_LEVEL_GAIN: Final = (1.0, 1.0, *(2 * (2 * n - 1) / (n * (n + 1)) for n in range(2, TRACKED + 1)))
 _SLOPE_GAIN: Final = (0.0, 0.0, *(6 / (n * (n + 1)) for n in range(2, TRACKED + 1)))
 
 EdgeStamp = tuple[int, int]  # time of a rising edge, ns, and its number

@@ -143,7 +143,7 @@ class ArrivalPace:
         return self.is_known and arrival_ns - self._due_ns < STEPS_FACTOR * self.period_ns
 
     def resume(self, steps: int, arrival_ns: int) -> int:
-        """Return the number of samples to a number that is `steps` ahead, plus whole turns.
+        """Return the number of samples to a frame whose number is `steps` ahead, with lost whole turns.
 
         Return 0 if the number does not fit the elapsed time: the device restarted, or is another device.
         """
@@ -157,8 +157,7 @@ class ArrivalPace:
     def add_arrival(self, arrival_ns: int, steps: int = 1) -> tuple[int, bool]:
         """Add a frame `steps` samples after the newest sample. Return (number of lost samples, is certain).
 
-        The lost samples are those that this frame shows in addition. The number is certain within one sample, or within
-        one turn.
+        Losses that earlier frames have shown are not counted again. The number is certain within one sample or turn.
         """
         self._due_ns += steps * self.period_ns
         late_ns = arrival_ns - self._due_ns

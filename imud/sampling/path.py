@@ -27,6 +27,7 @@ from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Sample
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sampling.clock import SampleClock
+from imud.sampling.gaps import GAP_PERIODS
 from imud.sampling.steering import STAMP_FLOOR_NS
 
 RATE_WINDOW_NS = 2 * NS_PER_S
@@ -527,7 +528,6 @@ class ReadyEdges:
 
 
 FAULTS_MAX: Final = 3  # number of consecutive damaged or failed reads after which imud identifies the device again
-GAP_PERIODS: Final = 1.5  # minimum time since the previous read, in periods, that counts as a gap
 SIGMA_OF_AGE: Final = 1 / sqrt(3)  # root mean square of an age that is uniformly distributed from 0 to 1
 
 
