@@ -10,8 +10,8 @@ from imud.model.event import EventKind, RaiseEvent
 from imud.model.sample import Sample, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S
 
+# distance from a limit in which both levels are correct, degrees: noise, rounding and hysteresis of the device
 MARGIN_DEG: Final = 0.5
-"""Distance from a limit in which both levels are correct, degrees: noise, rounding and hysteresis of the device."""
 SETTLE_NS: Final = 200 * NS_PER_MS  # maximum delay of the line behind the angle, ns (assumed)
 FAULT_NS: Final = 2 * NS_PER_S  # duration of a contradiction before imud reports it, ns
 
@@ -92,9 +92,9 @@ def _expected(ranges: Mapping[str, AlarmRange], euler_rad: Vector3) -> bool | No
     return None if unsure else False
 
 
+# Minimum time between two events, ns. An angle at its limit makes the line change rapidly.
 INTERVAL_NS: Final = NS_PER_S
-"""Minimum time between two events, ns. An angle at its limit makes the line change rapidly."""
-FRESH_NS: Final = 150 * NS_PER_MS  # maximum age of a sample for the comparison, ns. `tick` runs every 100 ms.
+FRESH_NS: Final = 150 * NS_PER_MS  # Maximum age of a sample for the comparison, ns. `tick` runs every 100 ms.
 
 # problem for each verdict, and the next step
 _PROBLEMS: Final = {

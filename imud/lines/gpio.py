@@ -162,8 +162,8 @@ def _no_line(line: int | str, chips: Sequence[_Chip]) -> LinkMissing:
 
 EVENT: Final = Struct("=QIIII24x")  # struct gpio_v2_line_event
 RISING: Final = 1  # `id` of an edge from inactive to active (GPIO_V2_LINE_EVENT_RISING_EDGE). 2 is the falling edge.
+# GPIO_V2_LINE_SET_VALUES_IOCTL. The argument is two u64: the levels, and the mask of the request's lines to set.
 SET_VALUES: Final = 0xC010B40F
-"""GPIO_V2_LINE_SET_VALUES_IOCTL. The argument is two u64: the levels, and the mask of the request's lines to set."""
 _SEQNO_MODULUS: Final = 2**32
 
 _ioctl = ctypes.PyDLL(None, use_errno=True).ioctl  # PyDLL keeps the GIL
@@ -205,8 +205,8 @@ def set_line(fd: int, active: bool) -> None:
         raise OSError(number, os.strerror(number))
 
 
+# capacity of the kernel's event buffer of a line, its maximum: one second of SOUT at 1 kHz
 KERNEL_EVENTS: Final = 1024
-"""Capacity of the kernel's event buffer of a line, its maximum: one second of SOUT at 1 kHz."""
 READ_EVENTS: Final = 64  # number of events in one read
 CONSUMER_CHARACTERS: Final = 31  # maximum length of a consumer name in the kernel (GPIO_MAX_NAME_SIZE - 1)
 

@@ -19,11 +19,11 @@ from imud.model.event import EventKind, RaiseEvent
 from imud.model.sample import Sample
 from imud.sampling.clock import SampleClock
 
+# Bit of `Sample.status` that imud sets while the ALARM line is active. The bits of devices are below 2¹⁶.
 ALARM_STATUS: Final = 1 << 31
-"""Bit of `Sample.status` that imud sets while the ALARM line is active. The bits of devices are below 2¹⁶."""
+# Lines whose edges imud needs only together with frames. The event loop does not wake up for these edges, because a
+# wake-up needs as much CPU time as a frame.
 WITH_FRAMES: Final = ("sout", "sout_div")
-"""Lines whose edges imud needs only together with frames. The event loop does not wake up for these edges, because a
-wake-up needs as much CPU time as a frame."""
 
 
 class SyncSignals:

@@ -18,16 +18,16 @@ from imud.lines.watched_line import RETRY_NS
 from imud.model.errors import LinkError
 from imud.model.units import NS_PER_MS, NS_PER_S
 
+# Length of a pulse, ns, at most half a period. The manual gives no length. 1 ms passes each level shifter.
 PULSE_NS: Final = NS_PER_MS
-"""Length of a pulse, ns, at most half a period. The manual gives no length. 1 ms passes each level shifter."""
+# Share of a period, 1/4, after which imud skips a late edge. The next edge would follow too soon.
 LATE_SHARE: Final = 4
-"""Share of a period, 1/4, after which imud skips a late edge. The next edge would follow too soon."""
 HAND_OVER_NS: Final = 50 * NS_PER_MS  # minimum time between two wake-ups of the event loop for time stamps, ns
-STAMPS_MAX: Final = 10_000  # capacity of the buffer of time stamps. If the event loop stalls, the oldest are dropped.
+STAMPS_MAX: Final = 10_000  # Capacity of the buffer of time stamps. If the event loop stalls, the oldest are dropped.
 IDLE_NS: Final = 60 * NS_PER_S  # sleep of the thread without a due edge, ns
 
+# called with time stamps in order, in the thread of the event loop
 OnStamps = Callable[[Sequence[TriggerStamp]], None]
-"""Called with time stamps in order, in the thread of the event loop."""
 
 
 class TriggerCounts:
@@ -63,8 +63,8 @@ class SquareWave:
         self._due_ns = self._rest_until_ns = now_ns()
         self._fall_ns: int | None = None
         self._wanted: deque[None] = deque()  # one entry for each requested edge; deque operations are thread-safe
+        # Time stamps of the edges, oldest first. The consumer removes them.
         self.stamps: deque[TriggerStamp] = deque(maxlen=STAMPS_MAX)
-        """Time stamps of the edges, oldest first. The consumer removes them."""
 
     @property
     def high(self) -> bool:
@@ -261,8 +261,8 @@ class SinTrigger:
         self._line, self._on_stamps, self._report, self._now_ns = line, on_stamps, report, now_ns
         pulse_ns = round(settings.pulse_ms * NS_PER_MS)
         self._trigger = Trigger(line, settings.rate_hz, now_ns, start_worker=start_worker, pulse_ns=pulse_ns)
+        # Delivers the time stamps of all edges so far. Does not block.
         self.drain: Callable[[], None] = self._trigger.drain
-        """Delivers the time stamps of all edges so far. Does not block."""
         self._running = False
         self._due_ns = 0
 

@@ -7,8 +7,8 @@ from imud.contracts.lines import Edge, InputLine, InputOptions, LineFactory, OnE
 from imud.model.errors import LinkError
 from imud.model.units import NS_PER_S
 
+# pause before imud opens a line again, ns: its chip may return, or another program may release it
 RETRY_NS: Final = 5 * NS_PER_S
-"""Pause before imud opens a line again, ns: its chip may return, or another program may release it."""
 
 
 class WatchedLine:

@@ -41,8 +41,8 @@ from imud.sampling.path import (
     make_clock,
 )
 
+# Ledger counters that do not depend on codec and clock. The player copies them from each check record.
 FROM_OUTSIDE: Final = ("lost_queue", "replies_late", "replies_unsolicited")
-"""Ledger counters that do not depend on codec and clock. The player copies them from each check record."""
 _DATA: Final = int(Kind.DATA)  # integer of `Kind.DATA`: reading a member of an enumeration takes 0.1 µs on Python 3.11
 
 

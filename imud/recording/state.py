@@ -21,11 +21,11 @@ import msgspec
 
 from imud.model.errors import ImudError, reason_of
 
+# modules of the classes and functions that a state may contain
 MODULES: Final = (
     "imud.sampling.", "imud.contracts.", "imud.drivers.", "imud.formats.", "imud.model.sample:", "imud.host.clock:",
 )  # fmt: skip
-"""Modules of the classes and functions that a state may contain."""
-DEPTH_MAX: Final = 200  # maximum depth of objects inside objects. Codecs and clocks have a depth of ten.
+DEPTH_MAX: Final = 200  # Maximum depth of objects inside objects. Codecs and clocks have a depth of ten.
 
 Attributes = dict[str, Any]
 

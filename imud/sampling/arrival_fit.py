@@ -28,7 +28,7 @@ from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 # 64 s of window: long compared to the beat of two crystals with an adapter's timer, short compared to their warm-up
 BINS: Final = 64
 BIN_LONGEST_NS: Final = NS_PER_S
-# limits of the slope, host ns per device ns. Devices with an error of 4.08 % exist. Above 7 %, the tick is different.
+# Limits of the slope, host ns per device ns. Devices with an error of 4.08 % exist. Above 7 %, the tick is different.
 SLOPE_LOWEST: Final = 1 / 1.07
 SLOPE_HIGHEST: Final = 1 / 0.93
 SUPPORT_AT: Final = 0.75  # position of the hull edge in the window, as a share of the window
@@ -43,16 +43,16 @@ RECENT_BINS: Final = 8
 RECENT_NS: Final = 2 * NS_PER_S
 KNOWN_SIGMAS: Final = 4  # maximum deviation of the slope from its known value, in standard errors
 DRIFT_MOST: Final = 1e-6  # maximum change of a crystal's rate per second
-# delays of polling and wake-up in addition to the longest wait, ns. The fit uses the first delay with a feasible line.
+# Delays of polling and wake-up in addition to the longest wait, ns. The fit uses the first delay with a feasible line.
 LATENCIES_NS: Final = (200 * NS_PER_US, 600 * NS_PER_US, 2000 * NS_PER_US, 6000 * NS_PER_US)
-# factor for late frames. It multiplies the share of waits that the timer alone cannot explain, in periods of the timer.
+# Factor for late frames. It multiplies the share of waits that the timer alone cannot explain, in periods of the timer.
 # The longest wait is twice the mean less the shortest wait, and a busy host increases the mean. With exponentially
 # distributed delays, twice their mean is at most this factor times the share.
 LATE_FACTOR: Final = 4.0
 HOLD_MESSAGES: Final = 32  # number of frames that show whether the reported timer period is correct
+# longest timer that the fit assumes without a report, ns: the default of common adapters
 HOLD_MOST_NS: Final = 16 * NS_PER_MS
-"""Longest timer that the fit assumes without a report, ns: the default of common adapters."""
-# mean of exponentially distributed values, divided by the mean of their lower half. The lower half contains no stalls.
+# Mean of exponentially distributed values, divided by the mean of their lower half. The lower half contains no stalls.
 LOWER_HALF: Final = 1 / (1 - log(2))
 
 Point = tuple[float, float]  # device time and time, ns
@@ -75,7 +75,7 @@ class _Bin:
         self.wait_most = wait
         self.count = 1
         self.late = 0  # number of frames that waited for longer than the timer can hold them
-        self.late_ns = 0.0  # sum of the waits in excess of the timer, ns. `wait` does not contain it.
+        self.late_ns = 0.0  # Sum of the waits in excess of the timer, ns. `wait` does not contain it.
 
     def longest_wait(self) -> float:
         """Return the longest wait in the timer without stalls of the host, ns."""
@@ -123,20 +123,20 @@ class ArrivalFit:
         self.error_ns = 0.0  # one-sigma error of the fit at its newest end, from the spread of the points, ns
         self.slope_error = slope_error
         self.residual_ns = 0.0  # root mean square distance of the lowest points above the fit, ns
-        # distance of the lowest point of the newest bins above the fit, ns. It is large if the device's clock stopped.
+        # Distance of the lowest point of the newest bins above the fit, ns. It is large if the device's clock stopped.
         self.recent_ns = 0.0
         self.hold_ns = hold_ns  # period of the adapter's latency timer, ns; 0 without a timer
+        # width of the feasible lines at the newest end, ns: the part that a latency timer hides
         self.hidden_ns = float(hold_ns)
-        """Width of the feasible lines at the newest end, ns: the part that a latency timer hides."""
         self.shift_ns = hold_ns / 2  # distance from the fit down to the middle of the feasible lines, ns
+        # measured period of the timer, ns, if most frames wait for longer than `hold_ns`; else 0
         self.measured_hold_ns = 0
-        """Measured period of the timer, ns, if most frames wait for longer than `hold_ns`; else 0."""
         self._wait_most = float(hold_ns + LATENCIES_NS[0])
         self._pause_ns = float(hold_ns)
         self._pause_count = 1
         self._width_ns = 0
+        # Device time of the next bin, ns. The arrival at or after this time changes the fit.
         self.until_ns = device_ns + 1
-        """Device time of the next bin, ns. The arrival at or after this time changes the fit."""
         self._open = _Bin(device_ns, arrival_ns, 0.0, 0.0)
         self._bins = [self._open]
         # lower hull over the first `_hull_bins` bins, which no longer change, relative to the point of the oldest bin

@@ -13,19 +13,19 @@ from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sampling.arrival_fit import ENOUGH_SPAN_NS, ArrivalFit
 from imud.sampling.gaps import ArrivalLosses
 
+# maximum of the shortest time from the interrupt to the reader, ns (30 to 100 µs on small boards)
 WAKE_NS: Final = 100 * NS_PER_US
-"""Maximum of the shortest time from the interrupt to the reader, ns (30 to 100 µs on small boards)."""
 FIFO_BYTES: Final = 4  # number of byte times after which a 16550 or PL011 FIFO reports bytes below its trigger level
 USB_POLL_NS: Final = 125 * NS_PER_US  # wait of a full adapter for the host's poll, ns: one micro-frame
 FIRST_SPREAD_NS: Final = 2 * NS_PER_MS  # assumed spread of the first arrivals, ns
+# one-sigma error of a value that is uniformly distributed in a range, per width of the range
 SIGMA_OF_RANGE: Final = 1 / sqrt(12)
-"""One-sigma error of a value that is uniformly distributed in a range, per width of the range."""
-# one-sigma error of the delay in an adapter, per width of its range. In two of three cases the delay is anywhere in the
+# One-sigma error of the delay in an adapter, per width of its range. In two of three cases the delay is anywhere in the
 # range. In the third case it is at an end: the adapter sends packets immediately, or each packet starts its timer.
 SIGMA_OF_HIDDEN: Final = sqrt((2 / 12 + 1 / 4) / 3)
 SMOOTHING: Final = 1 / 32
+# factor by which frames can be faster than the wire before imud assumes that no such wire exists
 WIRE_SLACK: Final = 1.05
-"""Factor by which frames can be faster than the wire before imud assumes that no such wire exists."""
 
 
 class LinkDelay:
@@ -110,20 +110,20 @@ class ArrivalSpread:
 
 
 LEARNING_MESSAGES: Final = 32  # number of frames for the first estimate of the period
+# Maximum distance of a frame from the fit, in periods. Beyond that, the frame is another sample, or was delayed.
 HALF: Final = 0.5
-"""Maximum distance of a frame from the fit, in periods. Beyond that, the frame is another sample, or was delayed."""
+# number of frames at normal pace that must be late by the same number of periods before imud counts lost samples
 AGREEING: Final = 4
-"""Number of frames at normal pace that must be late by the same number of periods before imud counts lost samples."""
+# Maximum number of late frames at normal pace without agreement. After that, imud measures the rate again.
 UNDECIDED_MOST: Final = 32
-"""Maximum number of late frames at normal pace without agreement. After that, imud measures the rate again."""
+# Maximum mean distance above the fit, in periods. Beyond that, the arrival time is better than the fit.
 EVEN_SHARE: Final = 0.25
-"""Maximum mean distance above the fit, in periods. Beyond that, the arrival time is better than the fit."""
 MEAN_SMOOTHING: Final = 1 / 128
 LOST_MOST: Final = 3
-# maximum distance of a late frame from whole periods, as a share of a period, that counts as another sample. The mean
+# Maximum distance of a late frame from whole periods, as a share of a period, that counts as another sample. The mean
 # distance of the other frames must be as small.
 NEAR_SHARE: Final = 0.02
-HOLD_SHARE: Final = 0.25  # maximum delay in an adapter, in periods. A longer delay hides the number of lost samples.
+HOLD_SHARE: Final = 0.25  # Maximum delay in an adapter, in periods. A longer delay hides the number of lost samples.
 
 
 class EvenArrivals:
@@ -140,7 +140,7 @@ class EvenArrivals:
     )  # fmt: skip
 
     def __init__(self) -> None:
-        self.t_ns = 0  # time of the newest frame according to the fit, ns. `add_arrival` returns whether it is valid.
+        self.t_ns = 0  # Time of the newest frame according to the fit, ns. `add_arrival` returns whether it is valid.
         self.error_ns = 0.0  # one-sigma error of `t_ns`, ns
         self.restart()
 

@@ -125,8 +125,8 @@ def add_even_run(
 
 
 YOUNG_NS: Final = 32 * NS_PER_S
+# Factor for the error of a fit that is shorter than YOUNG_NS. The beat of the latency timer is not visible yet.
 YOUNG_FACTOR: Final = 1.2
-"""Factor for the error of a fit that is shorter than YOUNG_NS. The beat of the latency timer is not visible yet."""
 _ARRIVAL: Final = Sync.ARRIVAL
 
 
@@ -179,8 +179,8 @@ class SampleClock:
         self._error_ns = 0.0  # one-sigma error of the newest time stamp before its correction
         self._own_status: int | None = None
         self.missed = 0  # number of lost samples directly before the newest sample, without gaps of unknown size
+        # Observer of the input; None if no recording runs. Set by `SamplePath.observe`.
         self.observer: InputObserver | None = None
-        """Observer of the input; None if no recording runs. Set by `SamplePath.observe`."""
         self.waited_ns = 0  # set by the path: maximum time of the next frames in the kernel's buffer
 
     def sample(self, m: Measurement, t_rx_ns: int, utc_offset_ns: int, t_begin_ns: int | None = None) -> Sample:

@@ -16,24 +16,24 @@ from imud.sampling.arrival_fit import SLOPE_HIGHEST, ArrivalFit
 from imud.sampling.gaps import CounterLine
 
 CONSISTENT: Final = 4  # number of consecutive equal steps that make a period
-# number of consecutive equal steps that make a longer period than the present one. If one of ten frames is lost at 1
+# Number of consecutive equal steps that make a longer period than the present one. If one of ten frames is lost at 1
 # kHz, four consecutive steps of two ticks occur every second minute. A period of two ticks would shift the device time
 # by one tick.
 CONSISTENT_LONGER: Final = 12
 OFF_MOST: Final = 2.0  # maximum difference between the steps of an uneven rate and the same number of periods, ticks
 STEADY_STEPS: Final = 64  # number of consecutive equal steps after which another step is a change of the rate
+# factor between adjacent steps above which the longer step contains a gap, if the period is unknown
 GAP_FACTOR: Final = 1.5
-"""Factor between adjacent steps above which the longer step contains a gap, if the period is unknown."""
-# maximum number of periods in a gap that improves the period. The number in a longer gap depends on the period itself.
+# Maximum number of periods in a gap that improves the period. The number in a longer gap depends on the period itself.
 LEARNED_STEPS: Final = 4
+# Number of equal steps after which the period is a whole number of ticks. An earlier different step was a loss.
 WHOLE_AFTER: Final = 64
-"""Number of equal steps after which the period is a whole number of ticks. An earlier different step was a loss."""
-WHOLE_OFF: Final = 0.5  # maximum distance of a whole number of ticks from the mean. Beyond that, the rate is another.
+WHOLE_OFF: Final = 0.5  # Maximum distance of a whole number of ticks from the mean. Beyond that, the rate is another.
+# Maximum number of steps that are stored until the period is known. A device with an even rate needs a few.
 UNJUDGED_MOST: Final = 64
-"""Maximum number of steps that are stored until the period is known. A device with an even rate needs a few."""
-# period in ticks below which two samples can be in one tick. With a longer period, the tick contains the same sample.
+# Period in ticks below which two samples can be in one tick. With a longer period, the tick contains the same sample.
 EVERY_TICK: Final = 1.5
-MEMORY: Final = 4096  # number of steps in the mean of an uneven period. After that, both sums are halved.
+MEMORY: Final = 4096  # Number of steps in the mean of an uneven period. After that, both sums are halved.
 
 
 class PeriodLearner:
@@ -65,8 +65,8 @@ class PeriodLearner:
         self._odd_at = 0.0  # number of the last step of another length
         # whether many equal steps preceded it; a period from steps with losses is not a rate
         self._steady = False
-        self.is_new = False  # whether the device's rate changed. The owner resets it.
-        # number of changes of the step, if the period is not a whole number of ticks; else 0. They show the phase in
+        self.is_new = False  # Whether the device's rate changed. The owner resets it.
+        # Number of changes of the step, if the period is not a whole number of ticks; else 0. They show the phase in
         # the tick.
         self.changes = 0
 
@@ -198,39 +198,39 @@ class PeriodLearner:
 
 # --- device time finer than a tick ----------------------------------------------------------------------------------
 QUANTISED: Final = 0.29  # one-sigma error of a truncated counter value, ticks: 1 / √12
-# number of changed steps after which the phase of an uneven rate within a tick is accurate to a small part of a tick.
+# Number of changed steps after which the phase of an uneven rate within a tick is accurate to a small part of a tick.
 # At 400 Hz and ticks of 1 ms, this takes 64 samples. A rate 50 ppm off 100 Hz takes ten minutes.
 SETTLED_CHANGES: Final = 64
+# Maximum number of samples until the phase of a new rate is accurate. A phase that takes longer drifts slowly.
 UNSETTLED_MOST: Final = 512
-"""Maximum number of samples until the phase of a new rate is accurate. A phase that takes longer drifts slowly."""
+# number of even samples after which an uneven step is a correction of the counter, not an uneven sample
 EVEN_FOR: Final = 64
-"""Number of even samples after which an uneven step is a correction of the counter, not an uneven sample."""
+# maximum distance of a sample from its tick, ns, that is an error of the learned period
 FOLLOWED_NS: Final = 15 * NS_PER_US
-"""Maximum distance of a sample from its tick, ns, that is an error of the learned period."""
+# maximum difference of a step, ns, or one tick, that is not a correction of the counter
 UNEVEN_NS: Final = 200 * NS_PER_US
-"""Maximum difference of a step, ns, or one tick, that is not a correction of the counter."""
 UNEVEN_SHARE: Final = 0.25
+# number of samples after an uneven step or a gap whose device time the clock compares with the arrivals
 WATCHED: Final = 256
-"""Number of samples after an uneven step or a gap whose device time the clock compares with the arrivals."""
 
 # --- corrections ----------------------------------------------------------------------------------------------------
+# Maximum correction of the counter, ns: more than an hour without pulses at 50 ppm. A larger step is a jump.
 CORRECTION_MOST_NS: Final = 250 * NS_PER_MS
-"""Maximum correction of the counter, ns: more than an hour without pulses at 50 ppm. A larger step is a jump."""
-CORRECTION_SPAN_NS: Final = 5 * NS_PER_S  # minimum span of a fit, ns. A shorter fit is less accurate than a correction.
+CORRECTION_SPAN_NS: Final = 5 * NS_PER_S  # Minimum span of a fit, ns. A shorter fit is less accurate than a correction.
 CORRECTION_SIGMAS: Final = 4
 CORRECTION_TICKS: Final = 0.5  # distance below the fit, ticks, at which a frame arrived before its sample
+# distance below the fit, ticks, if the step may start another rate: the samples can be anywhere in their ticks
 REPHASED_TICKS: Final = 1.05
-"""Distance below the fit, ticks, if the step may start another rate: the samples can be anywhere in their ticks."""
 
 # --- jumps ----------------------------------------------------------------------------------------------------------
 JUMP_EARLY_NS: Final = 5.0 * NS_PER_MS
+# distance below the fit, ns and standard errors, that shows a forward jump of the device counter
 JUMP_EARLY_SIGMAS: Final = 10
-"""Distance below the fit, ns and standard errors, that shows a forward jump of the device counter."""
+# distance below the fit before it is in use, ns: the first frame may have waited in a buffer
 FIRST_EARLY_NS: Final = NS_PER_S
-"""Distance below the fit before it is in use, ns: the first frame may have waited in a buffer."""
 JUMP_LATE_NS: Final = NS_PER_S / 2
+# Number of late reads in one second that show a jump. Fewer can be the queue of a busy host.
 JUMP_LATE_READS: Final = 3
-"""Number of late reads in one second that show a jump. Fewer can be the queue of a busy host."""
 
 
 class DeviceTime:
@@ -264,13 +264,13 @@ class DeviceTime:
         self._even_for = 0
         self._step_ns = 0  # newest step of the counter; negative if the backward step is shorter
         self._gap = 0  # lost samples in the last gap while arrivals are compared
+        # whether the newest step after many even steps differs from whole periods by more than a tick
         self.uneven = False
-        """Whether the newest step after many even steps differs from whole periods by more than a tick."""
         self.doubt_ns = 0.0  # difference between even samples and counter values, ns, that no arrival has confirmed
         # number of samples in which the phase of a new rate can become accurate
         self._unsettled = 0
+        # Whether the device's rate changed. The position of the samples in their ticks is then unknown.
         self.rephased = False
-        """Whether the device's rate changed. The position of the samples in their ticks is then unknown."""
         self.watched = 0  # number of further samples whose device time is compared with the arrivals
         self.period = PeriodLearner(on_unknown_gap)
         self.raw_ns = 0  # unwrapped device time according to the counter, ns
@@ -509,15 +509,15 @@ PULSE_TICKS: Final = 1000  # time between pulses, ms
 EARLY_NS: Final = 100 * NS_PER_MS  # minimum time before the earliest possible arrival, ns, that shows a pulse
 DRIFT: Final = 200e-6  # maximum rate error of a device's crystal compared to the host
 LATE_NS: Final = 400 * NS_PER_MS  # maximum distance of the lateness of live frames from whole turns, ns
-# live frames: over this number of ticks, their pace equals the pace of their values within this share. A step that
+# Live frames: over this number of ticks, their pace equals the pace of their values within this share. A step that
 # differs from the time between arrivals by more than a latency timer restarts the count.
 LIVE_TICKS: Final = 640
 LIVE_SHARE: Final = 0.04
 LIVE_BREAK_NS: Final = 40 * NS_PER_MS
+# number of equal values that show that the value is not a time: each frame follows its own pulse (triggers on SIN)
 STUCK_MESSAGES: Final = 8
-"""Number of equal values that show that the value is not a time: each frame follows its own pulse (triggers on SIN)."""
+# time without a frame with device time after which `pps_age_ms` makes the time stamps, ns
 FOREIGN_NS: Final = 1000 * NS_PER_MS
-"""Time without a frame with device time after which `pps_age_ms` makes the time stamps, ns."""
 WRAP: Final = 1 << 32
 
 

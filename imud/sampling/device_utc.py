@@ -143,13 +143,13 @@ SLACK_NS: Final = 2 * NS_PER_MS
 TOLERANCE_MOST_NS: Final = NS_PER_S // 4
 AGREEMENTS: Final = 8
 DISAGREEMENTS: Final = 8
-# additional one-sigma error, ticks: half a tick combined with the 1 / √12 of the intervals. Both errors can stay at
+# Additional one-sigma error, ticks: half a tick combined with the 1 / √12 of the intervals. Both errors can stay at
 # their bounds for one minute (20 ppm at 100 Hz). Twice this error covers their sum, one tick.
 TICK_ERROR: Final = 1 / sqrt(6)
 CHECK_EVERY_NS: Final = NS_PER_S // 8  # time between checks of a device that is not on UTC, ns
 REFERENCE_STEP: Final = 4  # change of the reference, in its errors, after which earlier intervals are invalid
+# Maximum valid age, ms: one pulse may be lost. A larger age means that the input receives no pulses.
 AGE_MOST_MS: Final = 2000
-"""Maximum valid age, ms: one pulse may be lost. A larger age means that the input receives no pulses."""
 STAMP_NS: Final = 50 * NS_PER_US  # maximum delay of the host's time stamp of a pulse, ns
 STALE_NS: Final = 3 * NS_PER_S
 PULSES_KEPT: Final = 8

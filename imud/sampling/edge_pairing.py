@@ -34,7 +34,7 @@ AGREE_SHARE: Final = 0.1  # maximum distance of agreeing events from their media
 MISSES_MOST: Final = 8  # number of consecutive samples without an event after which the line is dropped
 WRONG: Final = 0.75
 WRONG_MOST: Final = 64  # number of consecutive samples with a fit off by WRONG periods after which the line is wrong
-# maximum difference of the slopes of line and fit. A larger difference means that the events belong to other samples.
+# Maximum difference of the slopes of line and fit. A larger difference means that the events belong to other samples.
 SLOPE_OFF_MOST: Final = 0.12
 LEARNED: Final = 16  # number of pairs after which the delay of the fit behind the events is known
 QUEUE_MOST: Final = 4096  # maximum number of events that wait for their frame: 4 s at 1 kHz
@@ -143,7 +143,7 @@ class EdgePairing:
         self.due_ns = 0  # predicted time of the newest sample's event, ns; valid only while `running`
         self.spread_ns = float(FIRST_SPREAD_NS)  # mean distance of events from their predicted time, ns
         self.stamp_ns = 0
-        self.number = 0  # number of the newest paired event. `stamp_ns` is its time.
+        self.number = 0  # Number of the newest paired event. `stamp_ns` is its time.
         self.misses = 0  # number of consecutive samples without an event
         self.events = 0
         self.events_unpaired = 0

@@ -14,22 +14,22 @@ from imud.sampling.arrival_fit import ArrivalFit
 
 # --- counters of time -----------------------------------------------------------------------------------------------
 EARLY_NS: Final = 5 * NS_PER_MS
+# distance below the line, ns and standard errors, at which a frame arrived before its sample: the counter was set
 EARLY_SIGMAS: Final = 10
-"""Distance below the line, ns and standard errors, at which a frame arrived before its sample: the counter was set."""
-# maximum lateness of a counter that continued while the link was missing, ns. Beyond that, it can be another counter.
+# Maximum lateness of a counter that continued while the link was missing, ns. Beyond that, it can be another counter.
 LATE_NS: Final = NS_PER_S // 2
+# Maximum error of a slope that is stable. On an overloaded host, the error is a hundred times larger.
 STEADY: Final = 2e-5
-"""Maximum error of a slope that is stable. On an overloaded host, the error is a hundred times larger."""
+# Time after which late frames mean that the counter stopped, ns. Until then, the host may be overloaded.
 KEPT_NS: Final = 600 * NS_PER_S
-"""Time after which late frames mean that the counter stopped, ns. Until then, the host may be overloaded."""
 
 GAP_PERIODS: Final = 1.5  # minimum host time since the previous sample, in periods, that counts as a gap
 
 # --- arrivals -------------------------------------------------------------------------------------------------------
 STEPS_ALWAYS: Final = 4  # number of counter steps accepted at any arrival time, because delayed frames arrive together
-STEPS_FACTOR: Final = 1.5  # maximum error of the rate over a longer gap. A larger jump is a restart of the counter.
+STEPS_FACTOR: Final = 1.5  # Maximum error of the rate over a longer gap. A larger jump is a restart of the counter.
+# Maximum wait of frames that then arrive together, ns. No device restarts within this time.
 QUEUED_NS: Final = NS_PER_S // 2
-"""Maximum wait of frames that then arrive together, ns. No device restarts within this time."""
 STEPS_UNKNOWN: Final = 1000  # number of counter steps accepted while the rate is unknown
 # a window contains a frame with a very short wait if it has this number of frames, has this length, and its lateness
 # varies by at most SETTLED_SPREAD_NS (a latency timer and a short delay of the host)
@@ -38,11 +38,11 @@ WINDOW_NS: Final = NS_PER_S
 SETTLED_SPREAD_NS: Final = 50 * NS_PER_MS
 PACE_GAIN: Final = 0.5  # share of a window's drift that corrects the period
 PACE_KNOWN: Final = 0.002  # relative error of the period below which it counts samples
-# maximum relative error of a first estimate of the period that is corrected. A larger error restarts the measurement.
+# Maximum relative error of a first estimate of the period that is corrected. A larger error restarts the measurement.
 PACE_NEAR: Final = 0.05
 PACE_FLOOR: Final = 1e-5  # minimum relative error of the period, because crystals drift and frames wait
+# number of consecutive windows that are later or earlier than the period allows, after which the rate is another
 OFF_WINDOWS: Final = 4
-"""Number of consecutive windows that are later or earlier than the period allows, after which the rate is another."""
 UNCERTAIN: Final = 0.75  # maximum error of the period over a gap, in samples, for a gap of known size
 RESUME_STEPS: Final = 8  # maximum distance of a number from its due value after the link was missing
 

@@ -30,8 +30,8 @@ from imud.sampling.clock import SampleClock
 from imud.sampling.gaps import GAP_PERIODS
 from imud.sampling.steering import STAMP_FLOOR_NS
 
+# window of the sample rate, ns: long enough for devices with 1 Hz, short enough to show a stall
 RATE_WINDOW_NS = 2 * NS_PER_S
-"""Window of the sample rate, ns: long enough for devices with 1 Hz, short enough to show a stall."""
 
 
 class RateMeter:
@@ -92,7 +92,7 @@ class LossMeter:
     """
 
     def __init__(self, ledger: Ledger) -> None:
-        # number of damaged frames since the last sample. The path counts them and resets the number after each sample.
+        # Number of damaged frames since the last sample. The path counts them and resets the number after each sample.
         self.bad_frames = 0
         self._ledger = ledger
         self._overruns_seen = 0
@@ -142,8 +142,8 @@ class SamplePath(ABC):
         self.clock = clock
         self.latency = LatencyMeter()
         self.loss = LossMeter(context.ledger)
+        # Observer of the input; None if no recording runs. Set by `observe`.
         self.observer: InputObserver | None = None
-        """Observer of the input; None if no recording runs. Set by `observe`."""
         self.newest: Sample | None = None  # newest sample, in the axes of the sensor
         self.frame = context.frame
         self.begun_ns = 0  # CLOCK_MONOTONIC at the last `begin`, ns
@@ -453,11 +453,11 @@ def make_clock(
     return clock
 
 
-# time without edges after which the line counts as stopped, ns. It is shorter than the time until a device is silent.
+# Time without edges after which the line counts as stopped, ns. It is shorter than the time until a device is silent.
 QUIET_NS: Final = 500 * NS_PER_MS
 KEPT: Final = 1024  # number of buffered edges without a read: the capacity of the kernel's event buffer
+# Maximum time from an edge to a second read of its values, in intervals. After that, an edge may have been lost.
 AGE_LIMIT: Final = 1.5
-"""Maximum time from an edge to a second read of its values, in intervals. After that, an edge may have been lost."""
 EITHER: Final = 1 / sqrt(2)  # root mean square of an error that is 0 or 1 with equal probability
 
 
@@ -476,8 +476,8 @@ class ReadyEdges:
         """`period_ns` is the expected interval of the edges, ns, until two edges have arrived."""
         self.missed = 0  # number of edges without a read: the next edge arrived first, or the kernel dropped the edge
         self.interval_ns = period_ns  # interval of the two newest edges, ns
+        # Observer of the edges; None if no recording runs. Set by `PolledPath.observe`.
         self.observer: InputObserver | None = None
-        """Observer of the edges; None if no recording runs. Set by `PolledPath.observe`."""
         self._offset_ns = round(settings.offset_us * NS_PER_US)
         self._error_ns = settings.bias_us * NS_PER_US / sqrt(3) + STAMP_FLOOR_NS
         self._edges: deque[Edge] = deque(maxlen=KEPT)

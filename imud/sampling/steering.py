@@ -30,16 +30,16 @@ from imud.sampling.edge_pairing import EdgePairing, EdgeStamp, MarkPairing, Puls
 SLEW: Final = 500e-6  # maximum correction of a settled clock, as a share of the elapsed time: 0.5 ms per second
 SLEW_SETTLING: Final = 0.2  # maximum correction while the fit is young
 SETTLED_AFTER_NS: Final = 10 * NS_PER_S
+# Span of a fit that ends holdover, ns. A younger fit is inaccurate, and holdover is at most 0.8 ms off by then.
 HOLDOVER_NS: Final = 16 * NS_PER_S
-"""Span of a fit that ends holdover, ns. A younger fit is inaccurate, and holdover is at most 0.8 ms off by then."""
 HOLDOVER_RATE: Final = 50e-6  # maximum rate error of steady time compared to UTC: the tolerance of a crystal
 TICK_SHARE: Final = 0.5  # error of the start of a tick, ticks: the position of the measurement in the tick is unknown
+# maximum number of consecutive samples without an edge before the fit of arrivals replaces the edges
 UNPAIRED_MOST: Final = 2
-"""Maximum number of consecutive samples without an edge before the fit of arrivals replaces the edges."""
+# Standard deviation of a time stamp, in mean distances from the line. Delays are exponentially distributed.
 STAMP_SPREADS: Final = 2.0
-"""Standard deviation of a time stamp, in mean distances from the line. Delays are exponentially distributed."""
+# Minimum delay from the edge to the kernel's time stamp, ns. The mean of the time stamps does not show it.
 STAMP_FLOOR_NS: Final = 3 * NS_PER_US
-"""Minimum delay from the edge to the kernel's time stamp, ns. The mean of the time stamps does not show it."""
 
 
 class Slew:
@@ -160,8 +160,8 @@ class AidingSources:
         self.sout_offset_ns = 0  # time from a pulse on SOUT to its measurement, ns
         self.marks: MarkPairing | None = None
         self.utc = DeviceUtc(tick_ns, tick_modulus)
+        # the host's estimate of UTC relative to CLOCK_MONOTONIC; None if unknown
         self.utc_reference: UtcReference | None = None
-        """The host's estimate of UTC relative to CLOCK_MONOTONIC; None if unknown."""
         self.slew = Slew()
         self.error_ns = 0.0  # one-sigma error of the newest time stamp, ns
         self.sync = Sync.ARRIVAL  # source of the newest time stamp

@@ -24,15 +24,15 @@ from imud.contracts.lines import UtcReference
 from imud.formats.nmea0183 import Rmc, parse
 from imud.model.units import NS_PER_S, NS_PER_US
 
+# maximum error of a second between pulses, ns: 100 ppm of the oscillators, and some hundred µs of interrupt delay
 STEP_TOLERANCE_NS: Final = 500 * NS_PER_US
-"""Maximum error of a second between pulses, ns: 100 ppm of the oscillators, and some hundred µs of interrupt delay."""
 GAP_S_MAX: Final = 10
 PULSES_NEEDED: Final = 3
 PULSES_KEPT: Final = 16
 SENTENCES_NEEDED: Final = 2
 HOLD_NS: Final = 600 * NS_PER_S  # time after the last pulse until UTC is unknown, ns
+# One-sigma error of the constant delay of time stamps, ns. The entry of an interrupt needs some µs.
 STAMP_NS: Final = 5 * NS_PER_US
-"""One-sigma error of the constant delay of time stamps, ns. The entry of an interrupt needs some µs."""
 WANDER: Final = 1e-6  # change of the oscillator's rate without pulses: 1 µs per second
 MAD_TO_SIGMA: Final = 1.4826  # ratio of sigma to the median absolute deviation of a normal distribution
 
@@ -157,8 +157,8 @@ class ChronyFeed:
     def __init__(self, path: str, utc_offset_ns: Callable[[], int]) -> None:
         """`path` is chronyd's socket, which may not exist yet. `utc_offset_ns`: see `SourceContext.utc_offset_ns`."""
         self.title = f"chronyd at {path}"
+        # reason why chronyd did not accept the last sample, one sentence; empty if it accepted the sample
         self.problem = ""
-        """Reason why chronyd did not accept the last sample, one sentence; empty if it accepted the sample."""
         self.sent = 0
         self.refused = 0  # number of samples that chronyd did not accept: it is not running, or it is too slow
         self._path = path

@@ -20,10 +20,10 @@ from imud.formats.nmea0183 import RMC_BYTES_MAX
 from imud.model.errors import LinkError, reason_of
 from imud.model.options import Options, is_host, shown
 
+# called with one RMC sentence including its line end, and with CLOCK_MONOTONIC right after its arrival, ns
 OnSentence = Callable[[bytes, int], None]
-"""Called with one RMC sentence including its line end, and with CLOCK_MONOTONIC right after its arrival, ns."""
+# makes a closed serial link from a path and a rate in bit/s
 MakePort = Callable[[str, int], StreamLink]
-"""Makes a closed serial link from a path and a rate in bit/s."""
 
 
 class RmcOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -82,11 +82,11 @@ class SourceContext(NamedTuple):
     """CLOCK_REALTIME minus CLOCK_MONOTONIC, ns."""
 
 
+# Makes a source. `imud.utc.RMC_SOURCES` contains one for each value of `RmcOptions.source`.
 MakeSource = Callable[[RmcOptions, SourceContext], RmcSource]
-"""Makes a source. `imud.utc.RMC_SOURCES` contains one for each value of `RmcOptions.source`."""
 
+# Maximum length of a line, bytes. gpsd writes JSON of some kilobytes. Longer lines are skipped and not buffered.
 LINE_BYTES_MAX: Final = 16384
-"""Maximum length of a line, bytes. gpsd writes JSON of some kilobytes. Longer lines are skipped and not buffered."""
 FIRST_PAUSE_S: Final = 0.5
 LONGEST_PAUSE_S: Final = 30.0
 
@@ -196,9 +196,8 @@ def _ignore(_sentence: bytes, _t_rx_ns: int) -> None:
 
 CONNECT_LIMIT_S: Final = 5.0
 READ_BYTES: Final = 65536
+# seconds of silence before the first probe, seconds between probes, number of probes: imud detects a loss within 25 s
 KEEP_ALIVE: Final = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
-"""Seconds of silence before the first probe, seconds between probes, number of probes: imud detects a loss within 25 s.
-"""
 
 
 class GpsdSource(ReconnectingSource):

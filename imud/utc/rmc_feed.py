@@ -16,8 +16,8 @@ from imud.formats.nmea0183 import Rmc, RmcFault, as_gprmc, parse
 from imud.model.errors import LinkError
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
+# minimum time from the end of the transmission to the next second, ns: the device also has to process the sentence
 GUARD_NS: Final = 20 * NS_PER_MS
-"""Minimum time from the end of the transmission to the next second, ns: the device also has to process the sentence."""
 PULSE_FRESH_NS: Final = NS_PER_S + 100 * NS_PER_MS  # maximum age of a pulse that predicts the next pulse, ns
 AHEAD_NS: Final = 5 * NS_PER_MS  # maximum time that a sentence may be ahead of the reference, ns
 SIGMAS: Final = 3

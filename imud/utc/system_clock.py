@@ -19,13 +19,13 @@ from imud.utc.receivers import OnSentence, RmcOptions, SourceContext
 
 STA_UNSYNC: Final = 0x40
 TIME_ERROR: Final = 5
+# Delay of a sentence after its time, ns. It is longer than the allowed error of the clock (60 ms, three sigma), so that
+# a sentence never precedes the pulse of its second.
 AFTER_NS: Final = 200 * NS_PER_MS
-"""Delay of a sentence after its time, ns. It is longer than the allowed error of the clock (60 ms, three sigma), so
-that a sentence never precedes the pulse of its second."""
+# Latest time in a second to send a sentence, ns. The device could assign a later sentence to the next second.
 LATEST_NS: Final = 800 * NS_PER_MS
-"""Latest time in a second to send a sentence, ns. The device could assign a later sentence to the next second."""
+# Maximum delay of a due sentence, ns. After that, imud skips it, because the next sentence follows soon.
 LATE_NS: Final = 50 * NS_PER_MS
-"""Maximum delay of a due sentence, ns. After that, imud skips it, because the next sentence follows soon."""
 
 
 class Timex(ctypes.Structure):
