@@ -145,7 +145,7 @@ class Trigger:
         start_worker: StartWorker = BusThread,
         pulse_ns: int = PULSE_NS,
     ) -> None:
-        """With `rate_hz` 0, only `once` makes edges. The caller opens and closes the line."""
+        """Only `once` makes edges if `rate_hz` is 0. The caller opens and closes the line."""
         self._line, self._rate_hz, self._pulse_ns = line, rate_hz, pulse_ns
         self._now_ns, self._start_worker = now_ns, start_worker
         self.counts = TriggerCounts()

@@ -104,8 +104,8 @@ class ArrivalSpread:
     @property
     def sigma_ns(self) -> float:
         """Return the one-sigma spread of one arrival, ns."""
-        # It is the mean absolute deviation of a step. For exponentially distributed delays, this deviation equals the
-        # spread of the delays. The mean delay above the shortest delay is as large.
+        # The mean absolute deviation of a step equals the spread of exponentially distributed delays. Their mean above
+        # the shortest delay is as large.
         return 1.5 * self._spread if self.period_ns else FIRST_SPREAD_NS
 
 
@@ -261,7 +261,7 @@ class ArrivalTime:
         self.spread = ArrivalSpread()
         self._even.restart()
 
-    def date(
+    def time_stamp(
         self, number: int | None, arrival_ns: int, size_bytes: int, *, alone: bool, triggered: bool, is_first: bool
     ) -> int:
         """Return the time of a frame that started to arrive at `arrival_ns`. Set `error_ns` and `missed`.

@@ -394,7 +394,7 @@ class SampleClock:
     def _by_arrival(self, m: Measurement, ticks: int | None, arrival_ns: int) -> int:
         """Return the time of a frame without device time, which may have a number. Set `_error_ns`."""
         arrivals = self._arrivals
-        t_ns = arrivals.date(
+        t_ns = arrivals.time_stamp(
             ticks, arrival_ns, m.size_bytes, alone=not self._known, triggered=m.pps_age_ms is not None,
             is_first=not self._seq,
         )  # fmt: skip

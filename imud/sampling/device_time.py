@@ -448,7 +448,7 @@ class DeviceTime:
     @property
     def error_ns(self) -> float:
         """Return the one-sigma error of `even_ns` from the length of a tick, ns."""
-        # It is 0 if all counter values have the same error.
+        # Without a change of the step, all counter values have the same error.
         changes = self.period.changes
         if not changes:
             return 0.0

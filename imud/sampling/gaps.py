@@ -261,7 +261,7 @@ class SampleNumber:
 
     def is_sure(self, arrival_ns: int) -> bool:
         """Return whether a number without steps leaves no gap."""
-        # It leaves no gap if it is the first number, or if the time is too short.
+        # The first number leaves no gap. A number after a very short time leaves no gap either.
         if not self.known:
             return not self._was_known
         return self._pace.has_no_room(arrival_ns)

@@ -13,7 +13,7 @@ def fed(times: ArrivalTime, count: int, *, numbered: bool = False, alone: bool =
     t_ns = 0
     for i in range(count):
         at_ns = BEGIN_NS + i * PERIOD_NS
-        t_ns = times.date(
+        t_ns = times.time_stamp(
             i % 256 if numbered else None, at_ns, 82, alone=alone, triggered=False, is_first=i == 0
         ) - at_ns  # fmt: skip
     return t_ns
@@ -27,7 +27,7 @@ def test_the_first_frame_has_the_arrival_time() -> None:
 
 def off_ns(times: ArrivalTime, late_ns: int, number: int | None = None, *, alone: bool = True) -> int:
     """Return the time from the time stamp of a frame to its arrival at `late_ns`, ns."""
-    return late_ns - times.date(number, late_ns, 82, alone=alone, triggered=False, is_first=False)
+    return late_ns - times.time_stamp(number, late_ns, 82, alone=alone, triggered=False, is_first=False)
 
 
 def test_a_late_frame_is_time_stamped_by_the_pace() -> None:
