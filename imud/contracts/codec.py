@@ -1,4 +1,4 @@
-"""Contract of a codec: bytes in, events out, no I/O. Invalid bytes become `BadFrame`, never an exception."""
+"""Contract of a codec: bytes to events, without I/O. Invalid bytes become `BadFrame`, never an exception."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,100 +17,108 @@ class BadReason(StrEnum):
     """Reasons to reject a frame; each has its own counter in the ledger."""
 
     CRC = "crc"
-    """The check value does not match: damaged on the wire, or a sync word inside other data."""
+    """The check value does not match: bytes damaged on the wire, or a sync word inside other data."""
     LENGTH = "length"
-    """The length field is outside what the protocol allows."""
+    """The length field is outside the range of the protocol."""
     CONTENT = "content"
-    """The check value is right but the content is impossible, for example a sub-packet cut off by the frame's end."""
+    """The check value is correct and the content is impossible, for example a sub-packet longer than the rest of the
+    frame."""
     NOT_FINITE = "not-finite"
-    """The frame is good and its measurement follows, but without values that came as NaN or infinity."""
+    """The frame is valid. Its measurement follows, without the values that were NaN or infinity."""
 
 
 class BadFrame(msgspec.Struct, frozen=True, gc=False):
-    """Bytes that began like a frame and are not one, or (reason NOT_FINITE) a good frame that lacks some values."""
+    """Bytes that begin like a frame and are not a frame, or (reason NOT_FINITE) a valid frame without some values."""
 
     reason: BadReason
     raw: bytes
-    """The bytes as they came, from the sync word to where the frame claimed to end (as far as they are there)."""
+    """Received bytes from the sync word to the end of the frame by its length field; fewer bytes if the rest is
+    missing."""
 
 
 CodecEvent = Measurement | TextLine | ReplyFrame | BadFrame
 
 
 def message_of(event: CodecEvent) -> Message | None:
-    """Return the event if it can answer a command, else None."""
+    """Return the event as a message that can be a reply; None for all other events."""
     if isinstance(event, TextLine):
         return event.text
     return event if isinstance(event, ReplyFrame) else None
 
 
 class StreamCodec(Protocol):
-    """Decoder of a byte stream. Any split of the bytes gives the same events.
+    """Decoder of a byte stream. The events do not depend on how the bytes are split into reads.
 
-    Synchronization: one thread. Memory is bounded by the longest frame plus the longest text line.
+    Synchronization: one thread. Maximum memory: the longest frame plus the longest text line.
     """
 
     ledger: Ledger
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
-        """Decode the next bytes of the stream; return the events they completed. Never raises for any bytes."""
+        """Decode the next bytes of the stream. Return the events that these bytes complete. Never raises an
+        exception.
+        """
         ...
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Return whole frames that wait inside a longer frame that never came: the line is idle. Loses nothing."""
+        """Return the complete frames inside an incomplete longer frame. imud calls this method when the link is
+        idle.
+        """
         ...
 
     def reset(self) -> None:
-        """Count what is pending as skipped: the stream broke (unplugged, other baud rate)."""
+        """Count the pending bytes as skipped. imud calls this method after a replug or a change of the baud rate."""
         ...
 
 
 class CanCodec(Protocol):
-    """Decoder of the frames of one device. Frames of other devices may be among them and change nothing.
+    """Decoder of the frames of one CAN device. Frames of other devices do not affect the decoder.
 
-    The ledger counts data bytes: those of frames of other devices as skipped. Synchronization: one thread.
+    The ledger counts data bytes. Data bytes of other devices count as skipped. Synchronization: one thread.
     """
 
     ledger: Ledger
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """Decode one frame that arrived at `t_rx_ns` (CLOCK_MONOTONIC); return what it completed. Never raises."""
+        """Decode one frame that arrived at `t_rx_ns` (CLOCK_MONOTONIC). Return the completed events. Never raises an
+        exception.
+        """
         ...
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Return what waits for frames that will not come: the bus is idle."""
+        """Return the events that were waiting for further frames. imud calls this method when the bus is idle."""
         ...
 
     def reset(self) -> None:
-        """Discard frames that wait for the rest of their sample: some are missing here (overrun, bus down)."""
+        """Discard the frames of an incomplete sample. imud calls this method after lost frames (overrun, bus off)."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Poll:
-    """A transfer that is repeated."""
+    """A transfer that imud repeats."""
 
     transfer: Transfer
     every_ns: int = 0
-    """0 for at every deadline of the device, otherwise at the first deadline after so much time."""
+    """0: at every deadline of the device. Otherwise the minimum time between two transfers, ns."""
 
 
 class Reading(msgspec.Struct, frozen=True, gc=False):
     """The result of one poll."""
 
     poll: int
-    """Index of the poll in the codec's `polls`."""
+    """Index of the poll in `polls` of the codec."""
     data: bytes
-    """All bytes read, in their order; empty if the transfer failed."""
+    """All received bytes in their order; empty if the transfer failed."""
     error: TransferError | None
     start_ns: int
-    """CLOCK_MONOTONIC right before the transfer."""
+    """CLOCK_MONOTONIC immediately before the transfer."""
     end_ns: int
-    """CLOCK_MONOTONIC right after it."""
+    """CLOCK_MONOTONIC immediately after the transfer."""
 
 
 class Vanished(msgspec.Struct, frozen=True):
-    """Evidence that the device is absent or has lost its settings: it must be identified again."""
+    """Event: the device is absent or has lost its settings. imud must identify the device again."""
 
     why: str
 
@@ -123,21 +131,21 @@ class PolledCodec(Protocol):
 
     ledger: Ledger
     polls: Sequence[Poll]
-    """Cyclic reads; the first makes the samples."""
+    """Cyclic reads. The first poll returns the samples."""
 
     @property
     def stale(self) -> int:
-        """Frames that were the same as the one before: the device had nothing new."""
+        """Number of frames with the same bytes as the previous frame: the device had no new values."""
         ...
 
     def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
-        """Decode the bytes of one transfer. Never raises for any bytes, of any length."""
+        """Decode the bytes of one transfer. Never raises an exception, also for bytes of any length."""
         ...
 
     def on_silence(self, poll: int) -> Sequence[PolledEvent]:
-        """Process a poll whose transfer failed; return what follows from it. Most codecs have nothing to do."""
+        """Process a failed transfer of a poll. Return the resulting events; most codecs return no event."""
         ...
 
     def reset(self) -> None:
-        """Forget the last frame, with which the next one is compared: the device was identified anew."""
+        """Forget the previous frame. imud calls this method after it identified the device again."""
         ...

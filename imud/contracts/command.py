@@ -18,63 +18,67 @@ from imud.model.units import RAD_PER_DEG
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The device that an action is carried out on."""
+    """The device that executes an action."""
 
     settings: Any
     """Options of the device's driver."""
     baud: int
-    """Present bit rate of the line, bit/s; 0 on a link without one."""
+    """Present bit rate of the link, bit/s; 0 if the link has no bit rate."""
     fixed_baud: int = 0
-    """Bit rate that the configuration fixes, bit/s; 0 where it fixes none."""
+    """Bit rate in the configuration, bit/s; 0 if the configuration does not set a bit rate."""
     places: tuple[int, ...] = ()
-    """Addresses at which the device can be on a bus that is polled: the present one, the former one, the configured
-    one; empty on other links."""
+    """Possible addresses of the device on a polled bus: present, former and configured address. Empty on other
+    links."""
     other_bits_per_s: float = 0.0
-    """What other devices of the configuration send on the same CAN bus, bit/s without stuff bits."""
+    """Load of the same CAN bus by all other configured devices, bit/s without stuff bits."""
 
 
 class Risk(StrEnum):
-    """What an action can do that cannot be taken back by another one. Programs for people ask before such an action."""
+    """Effect of an action that no other action can undo. Interactive programs ask for confirmation before such an
+    action.
+    """
 
     NONE = ""
     CONNECTION = "the device may not be reached afterwards"
     RESET = "all settings of the device are lost"
-    """Its settings are written to a backup before, as far as they can be read."""
+    """imud first writes a backup of all readable settings."""
 
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """An action of a device: help, arguments and request script.
+    """An action of a device: help text, arguments and request script.
 
-    The arguments are the keyword-only parameters of `begin`. Their annotations give type and bounds (`msgspec.Meta`),
-    their names the unit; a parameter with a default is optional.
+    The arguments are the keyword-only parameters of `begin`. The annotation of a parameter gives its type and its
+    bounds (`msgspec.Meta`). The name of a parameter contains its unit. A parameter with a default is optional.
     """
 
     help: str
-    """The effect, one sentence."""
+    """Effect of the action, one sentence."""
     begin: Callable[..., Any]
-    """`begin(target, *, name: type = default, …)` makes the request script, or a polled driver's transfer script.
+    """`begin(target, *, name: type = default, …)` returns the request script (polled drivers: the transfer script).
 
-    The script returns the result of the action, a value that JSON can carry. Both raise BadArgument.
-    """
+    The script returns the result of the action, a value that JSON can represent. `begin` and the script raise
+    BadArgument."""
     risk: Risk = Risk.NONE
     saves: bool = False
-    """Whether it writes the device's flash, which is counted, and limited per day."""
+    """Whether the action writes the flash of the device. imud counts these writes and limits them per day."""
 
     @property
     def parameters(self) -> type[Options]:
-        """The parameters of `begin` as a struct type."""
+        """Struct type with the parameters of `begin` as fields."""
         return _parameters(self.begin)
 
     def arguments(self, given: Mapping[str, Any]) -> Options:
-        """Check and convert the arguments of a call. Raises BadArgument naming what was expected and what came."""
+        """Return the checked and converted arguments of a call. Raises BadArgument with the expected and the received
+        value.
+        """
         if wrong := wrong_values(self.parameters, given, "argument"):
             known = ", ".join(str(parameter) for parameter in parameters_of(self)) or "none"
             raise BadArgument(f"{'; '.join(map(str, wrong))}; arguments: {known}")
         return msgspec.convert(dict(given), self.parameters)
 
     def script(self, target: Target, arguments: Options) -> Any:
-        """Make the script of the action, from the result of `arguments`."""
+        """Return the script of the action for `arguments`, a result of the method `arguments`."""
         return self.begin(target, **msgspec.structs.asdict(arguments))
 
 
@@ -97,14 +101,14 @@ class ActionParameter(msgspec.Struct, frozen=True):
 
     name: str
     values: str
-    """The accepted values, for example `a whole number from 1 to 127`."""
+    """Accepted values, for example `a whole number from 1 to 127`."""
     default: str | None
-    """The default as JSON; None for a required argument."""
+    """Default value as JSON; None for a required argument."""
     required: bool = False
-    """Whether a call without it is refused."""
+    """Whether a call must contain this argument."""
 
     def __str__(self) -> str:
-        """Format the description, for example `rate_hz (a number; default 100)`."""
+        """Return the description, for example `rate_hz (a number; default 100)`."""
         return f"{self.name} ({self.values}{'' if self.default is None else f'; default {self.default}'})"
 
 
@@ -115,11 +119,11 @@ class ActionInfo(msgspec.Struct, frozen=True):
     help: str
     parameters: tuple[ActionParameter, ...]
     risk: Risk = Risk.NONE
-    """Why people are asked before, one clause; empty where they are not."""
+    """Reason for a confirmation, one clause; empty if no confirmation is necessary."""
 
 
 def parameters_of(action: Action) -> tuple[ActionParameter, ...]:
-    """Describe the arguments of an action."""
+    """Return the descriptions of the arguments of an action."""
     return tuple(
         ActionParameter(one.name, expected(one.type), None if one.required else shown(one.default), one.required)
         for one in msgspec.structs.fields(action.parameters)
@@ -127,21 +131,21 @@ def parameters_of(action: Action) -> tuple[ActionParameter, ...]:
 
 
 def described(actions: Actions) -> list[ActionInfo]:
-    """Describe actions, in their order."""
+    """Return the descriptions of actions in the same order."""
     return [ActionInfo(name, action.help, parameters_of(action), action.risk) for name, action in actions.items()]
 
 
 class Handling(StrEnum):
-    """How the device is held during a calibration."""
+    """Motion of the device during a calibration."""
 
     REST = "rest"
-    """It must not move."""
+    """The device must not move."""
     TURN = "turn"
-    """It must be turned into as many directions as possible, slowly and in one place."""
+    """The user turns the device slowly, in one place, into as many directions as possible."""
 
 
 class Kept(StrEnum):
-    """What becomes of the result."""
+    """Lifetime of the result of a calibration."""
 
     BY_SAVE = "until power-off, unless it is saved"
     BY_DEVICE = "saved by the device itself"
@@ -150,18 +154,18 @@ class Kept(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the device says of its calibration."""
+    """Progress of a calibration, as the device reports it."""
 
     done: bool
     words: str
-    """The device's own values, for people; another text than before the calibration means a new result."""
+    """Values of the device as readable text. A new text after the calibration means a new result."""
     progress: float | None = None
-    """0 … 1 where the device tells it."""
+    """0 … 1; None if the device does not report its progress."""
 
 
 @dataclass(frozen=True, slots=True)
 class RestMeans:
-    """Means of the samples of a device at rest, in its own frame; None for what its samples lack."""
+    """Means of the samples of a device at rest, in sensor axes; None for a quantity that the samples lack."""
 
     accel_m_s2: Vector3 | None
     gyro_rad_s: Vector3 | None
@@ -173,20 +177,20 @@ class RestMeans:
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """What the samples at rest must be after a calibration: `value(means)` is at most `limit`."""
+    """Expected mean of the samples at rest after a calibration: `value(means)` is at most `limit`."""
 
     name: str
     unit: str
-    """SI."""
+    """SI unit of `value` and `limit`."""
     limit: float
     value: Callable[[RestMeans], float | None]
-    """Its absolute value; None where the samples do not tell."""
+    """Returns the absolute value; None if the samples lack the quantity."""
 
 
+# Limit 0.1 °/s: far above the bias of a calibrated sensor, far below the bias of an uncalibrated sensor.
 GYRO_ZERO: Final = Expectation(
     "mean angular rate", "rad/s", 0.1 * RAD_PER_DEG, lambda m: None if m.gyro_rad_s is None else hypot(*m.gyro_rad_s)
 )
-"""0.1 °/s: far above the bias that a calibrated sensor of these families has, far below that of one that is not."""
 ROLL_ZERO: Final = Expectation(
     "roll", "rad", 0.5 * RAD_PER_DEG, lambda m: None if m.euler_rad is None else abs(m.euler_rad[0])
 )
@@ -199,10 +203,10 @@ YAW_ZERO: Final = Expectation(
 INCLINATION_ZERO: Final = Expectation(
     "inclination", "rad", 0.5 * RAD_PER_DEG, lambda m: None if m.incli_rad is None else max(map(abs, m.incli_rad))
 )
+# 0.1 m/s² is a tilt of 0.6°.
 ACCEL_LEVEL: Final = Expectation(
     "horizontal acceleration", "m/s²", 0.1, lambda m: None if m.accel_m_s2 is None else hypot(*m.accel_m_s2[:2])
 )
-"""0.1 m/s² is a tilt of 0.6°."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -210,23 +214,24 @@ class Calibration:
     """One calibration of a device."""
 
     help: str
-    """The effect, one sentence."""
+    """Effect of the calibration, one sentence."""
     section: str
-    """Of the vendor's manual."""
+    """Section of the vendor's manual."""
     handling: Handling
     instructions: tuple[str, ...]
-    """What a person does before and during it, a sentence each, in their order."""
+    """Steps of the user before and during the calibration, one sentence per step."""
     begin: Callable[[Target], Any]
-    """Makes the script that starts it and, where the device tells, waits for its end."""
+    """Returns the script that starts the calibration. If the device reports the end, the script waits for the end."""
     verdict: Callable[[Target], Any] | None = None
-    """Makes the script that asks the device how far it is and returns a Verdict; None where `begin` waits."""
+    """Returns the script that requests the progress and returns a Verdict; None if `begin` waits for the end."""
     unready: Callable[[Target], Any] | None = None
-    """Makes the script that returns what must be done first, one sentence, or an empty string; None for nothing."""
+    """Returns the script that returns a missing precondition, one sentence or empty; None if there is no
+    precondition."""
     expected: tuple[Expectation, ...] = ()
-    """What the samples at rest must be afterwards."""
+    """Expected means of the samples at rest after the calibration."""
     kept: Kept
     save: Callable[[Target], Any] | None = None
-    """Makes the script that saves the result; only with Kept.BY_SAVE."""
+    """Returns the script that saves the result; only with Kept.BY_SAVE."""
 
 
 Calibrations = Mapping[str, Calibration]
@@ -248,29 +253,29 @@ class Check(msgspec.Struct, frozen=True):
 
     name: str
     value: float | None
-    """None where the samples do not tell; such a check is not passed."""
+    """Mean of the samples; None if the samples lack the quantity. Then `passed` is False."""
     limit: float
     unit: str
     passed: bool
 
 
 class CalibrationResult(msgspec.Struct, frozen=True):
-    """The end of a calibration."""
+    """Result of a calibration."""
 
     kind: str
     verified: bool
-    """Whether the device says that it is done and every check is passed."""
+    """Whether the device reports success and all checks passed."""
     problem: str
-    """What is wrong and what to do, one sentence; empty when verified."""
+    """Fault and next step, one sentence; empty if `verified`."""
     device: str
-    """The device's own values, for people."""
+    """Values of the device as readable text."""
     checks: tuple[Check, ...]
     saved: bool
     kept: Kept
 
 
 def infos(calibrations: Calibrations) -> list[CalibrationInfo]:
-    """Describe calibrations, in their order."""
+    """Return the descriptions of calibrations in the same order."""
     return [
         CalibrationInfo(kind, one.help, one.section, one.handling, one.instructions, one.kept)
         for kind, one in calibrations.items()

@@ -1,4 +1,4 @@
-"""Contract of a driver, the description of one wire protocol for the rest of imud."""
+"""Contract of a driver: the description of one wire protocol for the rest of imud."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,31 +20,31 @@ from imud.model.options import Options
 
 SensorName = Literal["gyro", "accel"]
 Figure = Annotated[float, Meta(gt=0)] | None
-"""A positive figure, None where none is stated."""
+"""Positive number; None if the vendor does not state it."""
 
 
 class SensorFigures(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Figures of one sensor, SI; (rad/s) stands for the unit of the rate, m/s² for an accelerometer."""
+    """Noise figures of one sensor, SI. For an accelerometer, read m/s² in place of rad/s."""
 
     random_walk: Figure = None
-    """Angle or velocity random walk N, (rad/s)/√Hz."""
+    """Angle random walk or velocity random walk N, (rad/s)/√Hz."""
     noise_density: Figure = None
-    """Root of the one-sided spectral density, (rad/s)/√Hz: √2 N of white noise."""
+    """Root of the one-sided spectral density, (rad/s)/√Hz; √2 N for white noise."""
     bias_instability: Figure = None
-    """The least Allan deviation over 0.664, rad/s."""
+    """Minimum Allan deviation divided by 0.664, rad/s."""
     rate_random_walk: Figure = None
-    """K, (rad/s)/√s."""
+    """Rate random walk K, (rad/s)/√s."""
     temperature_slope: Figure = None
-    """Change of the bias with temperature, either sign, (rad/s)/K."""
+    """Change of the bias with temperature, positive or negative, (rad/s)/K."""
 
 
 class ModelFigures(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Figures of one model."""
+    """Noise figures of one model."""
 
     gyro: SensorFigures = SensorFigures()
     accel: SensorFigures = SensorFigures()
     source: str = ""
-    """Document and section."""
+    """Document and section of the figures."""
 
 
 def _no_filter(_settings: Mapping[str, str], _sensor: SensorName) -> str:
@@ -53,67 +53,67 @@ def _no_filter(_settings: Mapping[str, str], _sensor: SensorName) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DataSheet:
-    """What is known of the sensors of a driver's devices from the vendor's documents."""
+    """Facts about the sensors from the vendor's documents."""
 
     document: str = ""
-    """Title and version of the manual, and what it says of noise, in one sentence; empty for a driver without one."""
+    """Title and version of the manual and its statement about noise, one sentence; empty if there is no manual."""
     models: Mapping[str, ModelFigures] = field(default_factory=dict)
-    """Figures by the begin of the product's name; empty where the manual has none for any model."""
+    """Noise figures by the first characters of the product name; empty if the manual has no figures."""
     gyro_step_rad_s: float | None = None
-    """Value of one count of the angular rate on the wire; None for floats, or where the message decides."""
+    """Angular rate of one count on the wire, rad/s; None for floats, or if the scale depends on the frame."""
     accel_step_m_s2: float | None = None
-    """The same of the acceleration."""
+    """Acceleration of one count on the wire, m/s²; None for floats, or if the scale depends on the frame."""
     filter_words: Callable[[Mapping[str, str], SensorName], str] = _no_filter
-    """Describes the device's own low-pass filter of a sensor, from its settings as read back; empty: not known."""
+    """Describes the low-pass filter of a sensor from the device settings; empty if the filter is not known."""
 
     def figures_of(self, product: str) -> ModelFigures | None:
-        """Return the figures of a model by its product name, the longest begin that fits; None for none."""
+        """Return the figures with the longest matching start of the product name; None if no start matches."""
         fitting = [begin for begin in self.models if product.startswith(begin)]
         return self.models[max(fitting, key=len)] if fitting else None
 
 
 SAMPLE_COUNTER = 0
-"""`tick_ns` of a device whose counter numbers its samples: a tick is one sample, its length is not known."""
+"""Value of `tick_ns` if the device counter counts samples. A tick is one sample; its duration is not known."""
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Identity as the device reports it. Strings are empty where it reports none."""
+    """Identity as the device reports it. Strings are empty if the device does not report the value."""
 
     product: str = ""
     serial_number: str = ""
     firmware: str = ""
     details: Mapping[str, str] | None = None
-    """Further properties, by the device's own names."""
+    """Other properties, by the names of the device."""
 
 
 class KeyProblem(NamedTuple):
-    """A value in the configuration with which a driver cannot work."""
+    """A value in the configuration that the driver does not support."""
 
     part: str
     """`link` or `options`."""
     key: str
-    """The key in that part."""
+    """Key in this part."""
     message: str
-    """What is expected, what came, and figures where they decide."""
+    """Expected value, received value, and numbers if they matter."""
 
 
 class StatusBit(NamedTuple):
     """Meaning of one bit of `Measurement.status`."""
 
     name: str
-    """What the device says while it is set, for people."""
+    """Device condition while the bit is set, as readable text."""
     notable: bool = False
-    """Whether its change is an event: values are wrong, or not yet right, while it is set."""
+    """Whether a change of the bit is an event: while the bit is set, values are wrong or not valid yet."""
 
 
 def status_words(bits: Mapping[int, StatusBit], status: int | None) -> tuple[str, ...]:
-    """Return the names of the bits that are set, as far as they are known."""
+    """Return the names of the known bits that are set."""
     return tuple(bit.name for number, bit in bits.items() if status is not None and status >> number & 1)
 
 
 def no_problems(_options: Any, _link: Any) -> Sequence[KeyProblem]:
-    """Find no problem: the version for drivers without rules of their own."""
+    """Return no problem. Default of drivers without additional rules."""
     return ()
 
 
@@ -123,95 +123,97 @@ def _unknown_heading(_settings: object, _read_back: Mapping[str, str]) -> Headin
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Driver:
-    """Fields that drivers of all wire protocols have; the links that a driver can use follow from its kind."""
+    """Description of one wire protocol. The subclass decides which links a driver can use."""
 
     name: str
     """Family and link, for example `hipnuc-uart`."""
     title: str
-    """Vendor and products, for people."""
+    """Vendor and products, as readable text."""
     settings: type[Options]
-    """Type of the driver's settings (`options` of a device)."""
+    """Type of the driver options (`options` of a device)."""
     tick_ns: int
-    """Length of one device tick in ns, or SAMPLE_COUNTER."""
+    """Duration of one device tick, ns, or SAMPLE_COUNTER."""
     tick_modulus: int
-    """Device time counts 0 … tick_modulus - 1."""
+    """Modulus of the device counter: it counts 0 … tick_modulus - 1."""
     stamp_modulus: int = 0
-    """After how many ms `Measurement.pps_age_ms` begins anew without a pulse, where it dates messages without device
-    time; 0 where there are no such messages."""
+    """Modulus of `Measurement.pps_age_ms` without a pulse, ms. imud uses the age to time-stamp frames without device
+    time. 0 if the protocol has no such frames."""
     euler_convention: str
-    """Order, axes and signs of `euler_rad`, in words."""
+    """Order, axes and signs of `euler_rad`, as readable text."""
     navigation_frame: str
-    """The frame that `quat_wxyz` turns into, for example `ENU`."""
+    """Destination frame of the rotation `quat_wxyz`, for example `ENU`."""
     axes: DeviceAxes = RFU_ENU
-    """The same of its axes, angles and navigation frame, for conversions."""
+    """Axes, angles and navigation frame for conversions."""
     heading: Callable[[Any, Mapping[str, str]], Heading] = _unknown_heading
-    """Reference of yaw, from an instance of `settings` and the device's own settings as read back (empty: none yet)."""
+    """Returns the reference of yaw from the driver options and the device settings (empty: not read yet)."""
     actions: Actions = field(default_factory=dict)
-    """Commands that the device executes, by name."""
+    """Actions of the device, by name."""
     calibrations: Calibrations = field(default_factory=dict)
     """Guided calibrations, by kind."""
     device_settings: SettingsTable | None = None
-    """Settings that the device keeps itself; None for a driver that does not know them."""
+    """Table of the device settings; None if the driver does not know them."""
     lines: frozenset[str] = frozenset()
-    """GPIO lines that such a device can have: names of `imud.contracts.lines.DeviceLines`."""
+    """GPIO lines that the device can have: names of fields of `imud.contracts.lines.DeviceLines`."""
     alarm_ranges: Callable[[Mapping[str, str]], AlarmRanges] | None = None
-    """Reads the meaning of the ALARM line from the device's settings; None if they have none."""
+    """Returns the meaning of the ALARM line from the device settings; None if no setting describes it."""
     time_bits: TimeBits = NO_TIME_BITS
     """Bits of `Measurement.status` about time."""
     status_bits: Mapping[int, StatusBit] = field(default_factory=dict)
-    """Meaning of the bits of `Measurement.status`, by number; those that are not known are left out."""
+    """Meaning of the known bits of `Measurement.status`, by bit number."""
     data_sheet: DataSheet = field(default_factory=DataSheet)
-    """What the vendor's manual states of noise, resolution and filters."""
+    """Noise, resolution and filters from the vendor's manual."""
     shown_settings: Callable[[Mapping[str, str]], Mapping[str, str]] = lambda settings: settings
-    """Returns settings as they were read back by name and with units, for people."""
+    """Returns device settings with readable names and units."""
     line_differences: Callable[[Mapping[str, str], DeviceLines], Mapping[str, str]] = lambda _settings, _lines: {}
-    """Finds lines of the configuration that the device's settings contradict: why, one sentence, by the line's key."""
+    """Finds GPIO lines in the configuration that contradict the device settings. Returns a reason, one sentence, by
+    key."""
     declared_line_differences: Callable[[Mapping[str, Any], DeviceLines], Mapping[str, str]] = lambda _declared, _: {}
-    """The same for settings that are declared, by their values, before the device is asked."""
+    """Finds GPIO lines that contradict the values of the declared settings, before imud has read the device
+    settings."""
     limits: Callable[[Mapping[str, Any], DeviceLines, bool], Sequence[str]] = lambda _declared, _lines, _fed: ()
-    """What works, but not with all that the configuration has: from the declared settings by their values, the GPIO
-    lines, and whether sentences with UTC are sent. A sentence each, which `imud check` prints."""
+    """Returns restrictions that `imud check` prints, one sentence each. The arguments are the values of the declared
+    settings, the GPIO lines, and whether imud sends UTC sentences to the device."""
     check: Callable[[Any, Any], Sequence[KeyProblem]] = no_problems
-    """Finds what does not work in an instance of `settings` and in the settings of a link, each good by itself."""
+    """Finds problems of driver options together with link options. Both are valid on their own."""
 
     def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
-        """Return what `imud check` reports of `options`, an instance of `settings`, together with a link's settings.
+        """Return the problems of `options` together with the link options, for `imud check`.
 
-        Links are known by the names of their keys: what a link does not have is not checked.
+        The check looks for keys of the link options by name and skips keys that the link does not have.
         """
         return self.check(options, link)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamDriver(Driver):
-    """A device that sends a byte stream by itself (UART, RS-232, USB serial)."""
+    """Driver of a device that sends a byte stream without requests (UART, RS-232, USB serial)."""
 
     baud_rates: tuple[int, ...]
-    """Rates of the device in bit/s, most likely first: detection tries them in this order."""
+    """Baud rates of the device, bit/s, most likely first. Detection tries them in this order."""
     make_codec: Callable[[Ledger, Any], StreamCodec]
-    """Makes a codec that counts into the ledger, from an instance of `settings`."""
+    """Returns a codec that counts into the ledger, from the driver options."""
     identify: Callable[[], RequestScript[Identity]]
-    """Asks the device what it is, and leaves it as it was."""
+    """Returns the script that reads the identity and does not change the device."""
     read_settings: Callable[[], RequestScript[Mapping[str, str]]]
-    """Reads back the device's own settings, by the device's own names, and leaves it as it was."""
+    """Returns the script that reads the device settings, by the names of the device, and does not change the device."""
     apply_identity: Callable[[StreamCodec, Identity], None] = lambda _codec, _identity: None
-    """Passes the identity to the codec, where the meaning of a field depends on the firmware."""
+    """Passes the identity to the codec. The meaning of a field can depend on the firmware."""
     wake: Callable[[], RequestScript[bool | None]] | None = None
-    """Makes a device send samples that answers and sends none, and says whether it acknowledged; nothing is saved.
-    Returns None and changes nothing where the device is meant to be silent by its own settings. Raises NoReply where
-    nothing answers. None for devices that cannot be silent."""
+    """Returns the script that makes a silent device send samples; None if the device always sends. The script saves
+    nothing. Its result: whether the device acknowledged, or None if the device settings disable the output (then the
+    script changes nothing). Raises NoReply if the device does not reply."""
     why_silent: Callable[[Mapping[str, str]], str] = lambda _settings: "its output is off"
-    """Says in one clause why a device that answers sends no samples, from its settings as `read_settings` returns."""
+    """Returns why a device with these settings replies and sends no samples, one clause."""
     example_frame: Callable[[Random], bytes]
-    """Make one valid frame with random values, for the shared property tests and for fault injection."""
+    """Returns one valid frame with random values, for property tests and fault injection."""
 
     def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
-        """Return the driver's own problems, and a bit rate that such a device does not have."""
+        """Return the problems of the driver options, and an unsupported baud rate."""
         baud = getattr(link, "baud", 0)
         found = list(self.check(options, link))
         if isinstance(baud, int) and baud and baud not in self.baud_rates:
-            rates = ", ".join(map(str, sorted(self.baud_rates)))
-            found.append(KeyProblem("link", "baud", f"expected a rate of {self.name} ({rates}) or auto, got {baud}"))
+            expected = f"a baud rate of {self.name} ({', '.join(map(str, sorted(self.baud_rates)))}) or auto"
+            found.append(KeyProblem("link", "baud", f"expected {expected}, got {baud}"))
         return found
 
 
@@ -219,44 +221,43 @@ D = TypeVar("D", bound=Driver)
 
 
 def of_kind(drivers: Iterable[Driver], kind: type[D]) -> list[D]:
-    """Return the drivers of one kind, in their order."""
+    """Return the drivers of one kind in the same order."""
     return [driver for driver in drivers if isinstance(driver, kind)]
 
 
 def nothing_cyclic(_settings: Any) -> Sequence[CyclicFrame]:
-    """Return no cyclic frames: the version for devices that need none."""
+    """Return no cyclic frames. Default of devices without cyclic frames."""
     return ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CanDriver(Driver):
-    """A device on a CAN bus, which it may share with others."""
+    """Driver of a device on a CAN bus, which other devices may use too."""
 
     make_codec: Callable[[Ledger, Any], CanCodec]
-    """Makes a codec that counts into the ledger, from an instance of `settings`."""
+    """Returns a codec that counts into the ledger, from the driver options."""
     filters: Callable[[Any], Sequence[CanFilter]]
-    """The frames that a device with these settings sends, replies included."""
+    """Returns the filters for all frames of the device, replies included, from the driver options."""
     node_of: Callable[[int, bool, bytes], int | None]
-    """Which device of this protocol would send such a frame (identifier, 29 bits or not, data): its number, or None.
+    """Returns the node number of the device that sends this frame (identifier, whether it has 29 bits, data), or None.
 
-    Only for frames that carry samples; the codec must confirm it."""
+    Only frames with samples have a node number here. The codec must confirm the frame."""
     node_settings: Callable[[int], Any]
-    """Options for the device of that number, the rest at its default."""
+    """Returns driver options for the device with this node number, all other options at their defaults."""
     node_title: Callable[[int], str]
-    """The device of that number for people, for example `node 8`."""
+    """Returns a readable name of this device, for example `node 8`."""
     identify: Callable[[Any], RequestScript[Identity]]
-    """Asks the device with these settings what it is, and leaves it as it was."""
+    """Returns the script that reads the identity and does not change the device."""
     read_settings: Callable[[Any], RequestScript[Mapping[str, str]]]
-    """Reads back the own settings of the device with these settings, by its own names, and leaves it as it was."""
+    """Returns the script that reads the device settings, by the names of the device, and does not change the device."""
     apply_identity: Callable[[CanCodec, Identity], None] = lambda _codec, _identity: None
-    """Passes the identity to the codec, where the frames depend on it."""
+    """Passes the identity to the codec. The frames can depend on the identity."""
     sample_frames: int
-    """Frames that make one sample."""
+    """Number of frames per sample."""
     example_frames: Callable[[Random], Sequence[CanFrame]]
-    """Valid frames that make one sample, in the order they are sent, with random values and the default settings."""
+    """Returns the valid frames of one sample in sending order, with random values, for the default options."""
     cyclic: Callable[[Any], Sequence[CyclicFrame]] = nothing_cyclic
-    """Frames that imud must send for a device with these settings, as long as the link is open; of a link that may not
-    send, none are."""
+    """Returns the frames that imud sends cyclically while the link is open. Read-only links do not send them."""
 
 
 T = TypeVar("T")
@@ -264,24 +265,28 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolledDriver(Driver):
-    """A device that sends only on request, without time or messages: its samples are dated by the host's deadlines."""
+    """Driver of a device that sends only on request and has no device time. The host's deadlines time-stamp its
+    samples.
+    """
 
     tick_ns: int = SAMPLE_COUNTER
     tick_modulus: int = 2
     link: str
-    """Name of the link it hangs on, a row of LINKS."""
+    """Name of its link, a row of LINKS."""
     targets: tuple[int, ...]
-    """Values to try when the link says `auto`, most likely first: I2C addresses, SPI modes."""
+    """Values that detection tries if the link has the value `auto`, most likely first: I2C addresses or SPI modes."""
     probe: Callable[[Any], TransferScript[Identity]]
-    """Reads the identity of a device with these settings. Raises DeviceRefused for another device. Changes nothing."""
+    """Returns the script that reads the identity and changes nothing. Raises DeviceRefused if another device
+    replies."""
     set_up: Callable[[Any], TransferScript[Mapping[str, str]]]
-    """Writes the settings to the device, reads them back, returns them by the device's names. Raises DeviceRefused."""
+    """Returns the script that writes the options to the device, reads them back and returns them by the names of the
+    device. Raises DeviceRefused."""
     make_codec: Callable[[Ledger, Any], PolledCodec]
-    """Makes a codec that counts into the ledger, from an instance of `settings`."""
+    """Returns a codec that counts into the ledger, from the driver options."""
     update_ns: Callable[[Any], int]
-    """Longest time between two updates of the device's registers, from the settings; 0 for not known."""
+    """Returns the maximum time between two updates of the device registers, ns; 0 if it is not known."""
     example_reading: Callable[[Random], bytes]
-    """Bytes of the first poll with random values, for the shared property tests and for fault injection."""
+    """Returns the bytes of the first poll with random values, for property tests and fault injection."""
     read_ns: Callable[[Any, Any], int] = lambda _options, _link: 0
-    """Shortest time that one read of the samples takes on the bus, ns, from instances of `settings` and of the link's
-    settings; 0 for not known. The sum over the devices of a bus decides whether it carries their rates."""
+    """Returns the minimum bus time of one read of the samples, ns, from the driver options and the link options; 0 if
+    it is not known. The sum over all devices of a bus shows whether the bus can carry their rates."""

@@ -1,4 +1,6 @@
-"""Contract of a link, the owner of one port: it delivers received data with arrival times, and reports its end."""
+"""Contract of a link: an open connection to a port. It delivers received data with arrival times and reports its
+end.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,59 +19,59 @@ MIXED: Final = -1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
-    """Use of a port or bus, or of one address on it, by one device."""
+    """Use of a port or bus, or of one address on a bus, by one device."""
 
     place: str
-    """The port or bus: a path, or the name of an interface."""
+    """Port or bus: a path, or the name of an interface."""
     key: str
-    """Key of the settings that names it."""
+    """Key of the option with the port or bus."""
     shared: bool = False
-    """Whether several devices can use the place, each with a part of its own."""
+    """Whether several devices can use the place, each with a different part."""
     part: int | None = None
-    """The part of a shared place, for example a Modbus address; None while it is not known (`auto`)."""
+    """Part of a shared place, for example a Modbus address; None before detection (`auto`)."""
     part_key: str = ""
-    """Key of the settings that names the part."""
+    """Key of the option with the part."""
     terms: Mapping[str, object] = field(default_factory=dict)
-    """Options on which all devices of a shared place must agree, by key."""
+    """Options that must be equal for all devices of a shared place, by key."""
 
 
 class Conflict(NamedTuple):
-    """Why two devices cannot have what they claim."""
+    """Reason why two devices cannot have the same claim."""
 
     key: str
-    """Key of the settings that has to change."""
+    """Key of the option that the user must change."""
     message: str
-    """What was expected, what came, and who has it."""
+    """Expected value, received value, and the owner of the claim."""
 
 
 def conflict_of(mine: Claim, other: Claim, owner: str) -> Conflict | None:
-    """Return why a device cannot have what `owner` has already, None if it can. Both claim the same place."""
+    """Return the conflict of a claim with the claim of `owner` for the same place; None if both are possible."""
     if not (mine.shared and other.shared):
-        return Conflict(mine.key, f"expected a {mine.key} of its own, got {mine.place}, which {owner} has")
+        return Conflict(mine.key, f"expected an unused {mine.key}, got {mine.place}; {owner} uses it")
     for key in differing_terms(mine.terms, other.terms):
         value, have = shown(mine.terms[key]), shown(other.terms[key])
         message = f"expected the same {key} for all devices of {mine.place}, got {value}; {owner} has {have}"
         return Conflict(key, message)
     if mine.part is not None and mine.part == other.part:
-        part = f"{mine.part_key} of its own on {mine.place}, got {mine.part}, which {owner} has"
-        return Conflict(mine.part_key, f"expected {'an' if part[0] in 'aeiou' else 'a'} {part}")
+        part = f"expected an unused {mine.part_key} on {mine.place}, got {mine.part}; {owner} uses it"
+        return Conflict(mine.part_key, part)
     return None
 
 
 def differing_terms(mine: Mapping[str, object], other: Mapping[str, object]) -> list[str]:
-    """List the keys in which two devices of a shared place differ."""
+    """Return the keys with different values of two devices at a shared place."""
     return [key for key in mine if key in other and mine[key] != other[key]]
 
 
 @dataclass(frozen=True)
 class CanUse:
-    """Frames of a CAN bus that one device needs."""
+    """CAN frames of one device on a bus."""
 
     bus: str
     filters: Sequence[CanFilter]
-    """The frames that the device sends."""
+    """Filters for the frames that the device sends."""
     cyclic: Sequence[CyclicFrame]
-    """The frames that imud must send for it."""
+    """Frames that imud must send for the device."""
 
     @cached_property
     def _exact(self) -> frozenset[tuple[int, bool]]:
@@ -77,133 +79,136 @@ class CanUse:
 
     @cached_property
     def _mask(self) -> int:
-        """Mask of all filters, MIXED for several: filters of the same mask overlap only where they are equal."""
         masks = {one.mask for one in self.filters}
+        # filters with one common mask overlap only if they are equal
         return masks.pop() if len(masks) == 1 else MIXED
 
     def receives(self, can_id: int, extended: bool) -> bool:
-        """Whether the device sends frames of this identifier (of 29 bits or not)."""
+        """Return whether the device sends frames with this identifier."""
         return any(wanted.matches(can_id, extended) for wanted in self.filters)
 
     def both_receive(self, other: "CanUse") -> str:
-        """Return an identifier whose frames both take for their device's own; empty if there is none."""
+        """Return an identifier that matches the filters of both devices; empty if there is none."""
         if self.bus != other.bus or (self._mask == other._mask != MIXED and self._exact.isdisjoint(other._exact)):
             return ""
         pairs = ((mine, theirs) for mine in self.filters for theirs in other.filters if mine.overlaps(theirs))
         return next((id_text(mine.can_id | theirs.can_id, mine.extended) for mine, theirs in pairs), "")
 
     def both_send(self, other: "CanUse") -> str:
-        """Return an identifier that imud would send for both; empty if there is none."""
+        """Return an identifier that imud would send for both devices; empty if there is none."""
         theirs = {(frame.can_id, frame.extended) for frame in other.cyclic} if self.bus == other.bus else set()
         return next((id_text(*key) for frame in self.cyclic if (key := (frame.can_id, frame.extended)) in theirs), "")
 
 
 def id_text(can_id: int, extended: bool) -> str:
-    """Format an identifier: eight hexadecimal digits where it has 29 bits, three where it has 11."""
+    """Return an identifier as text: eight hexadecimal digits for 29 bits, three for 11 bits."""
     return f"0x{can_id:08X}" if extended else f"0x{can_id:03X}"
 
 
 S = TypeVar("S", bound=Options)
 
 OnData = Callable[[bytes, int], None]
-"""Called with bytes as read and CLOCK_MONOTONIC (ns) right after the read."""
+"""Receives bytes and CLOCK_MONOTONIC immediately after the read, ns."""
 OnEnd = Callable[[LinkError | None], None]
-"""Called once when the link ends by itself: with the error, or None for the regular end of a replay."""
+"""Receives the error that ended the link, or None at the regular end of a replay. Called once."""
 OnFrames = Callable[[Sequence[CanFrame]], None]
-"""Called with frames of a CAN bus, oldest first."""
+"""Receives CAN frames, oldest first."""
 OnBusNews = Callable[[str, str], None]
-"""Called when the state of a bus changes: the change, one sentence, and the present problem (empty: none)."""
+"""Receives each change of the bus state, one sentence, and the present problem (empty if there is no problem)."""
 
 
 class Link(Protocol):
-    """Methods of every link. Synchronization: the loop's thread only.
+    """Methods of every link. Synchronization: the thread of the loop only.
 
-    Order of calls: `wait_present`, `open`, `start` (of its kind), then the others in any order, `close`. The same
-    object may then be used again from the beginning.
+    Order of calls: `wait_present`, `open`, `start` (depends on the kind), other methods in any order, `close`. The
+    caller may then use the same object again.
     """
 
     title: str
-    """The link in messages, for example `/dev/ttyUSB0`."""
+    """Name of the link in messages, for example `/dev/ttyUSB0`."""
     writable: bool
-    """Whether a device listens at the far end (a replay has none)."""
+    """Whether a device can receive data from imud; False for a replay."""
 
     def absence(self) -> str:
-        """Return why `wait_present` would wait now, one sentence; empty when it would not. Raises LinkError."""
+        """Return why `wait_present` would wait, one sentence; empty if the port is present. Raises LinkError."""
         ...
 
     async def wait_present(self) -> None:
-        """Return when the port is there; at once if it is. Waits on the kernel's events, never polls busily."""
+        """Return when the port is present. Waits for events of the kernel and uses no CPU time."""
         ...
 
     def open(self) -> None:
-        """Open and set up the port. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+        """Open the port and set its parameters. Raises LinkMissing, LinkDenied, LinkBusy or LinkError."""
         ...
 
     def write(self, data: bytes) -> None:
-        """Send bytes, on CAN whole `struct can_frame`; queued (bounded) when the port is full. Raises LinkError."""
+        """Send bytes; on CAN, complete `struct can_frame`. A bounded queue holds them if the port is full. Raises
+        LinkError.
+        """
         ...
 
     def kernel_counters(self) -> KernelCounters:
-        """Errors the kernel counted since `open`."""
+        """Return the errors that the kernel counted since `open`."""
         ...
 
     def close(self) -> None:
-        """Release the port; may be called twice. `on_end` is not called."""
+        """Release the port. A second call does nothing. The link does not call `on_end`."""
         ...
 
 
 class StreamLink(Link, Protocol):
-    """A source of bytes, opened exclusively, driven by the asyncio loop."""
+    """Source of bytes. It opens the port exclusively and runs in the asyncio loop."""
 
     baud: int
-    """Present rate in bit/s; 0 for links without one."""
+    """Present baud rate, bit/s; 0 for links without a baud rate."""
     auto_baud: bool
-    """Whether detection is to find the rate."""
+    """Whether detection must find the baud rate."""
     hold_ns: int
-    """Longest time that the adapter holds bytes back (USB latency timer), ns; 0 for none."""
+    """Latency timer of a USB adapter, ns: maximum delay of received bytes. 0 without a USB adapter."""
     waiting_bytes: int
-    """So many bytes may wait unread while the link is paused, without any being lost; 0: it cannot be paused."""
+    """Number of bytes that the kernel can buffer without loss while the link is paused; 0: the link cannot pause."""
 
     def pause(self) -> None:
-        """Deliver nothing until `resume`: bytes wait in the kernel. For links with `waiting_bytes` only."""
+        """Deliver no bytes until `resume`; the kernel buffers them. Only for links with `waiting_bytes`."""
         ...
 
     def take(self) -> bytes:
-        """Return all bytes that wait, of a paused link; its end is reported by `on_end`."""
+        """Return all buffered bytes of a paused link. `on_end` reports the end of the link."""
         ...
 
     def resume(self) -> None:
-        """Deliver again as bytes come; no-op for a link that ended or is closed."""
+        """Deliver received bytes again. Do nothing if the link ended or is closed."""
         ...
 
     def start(self, on_data: OnData, on_end: OnEnd) -> None:
-        """Deliver bytes from now on. Needs a running loop and an open port."""
+        """Start the delivery of bytes. Requires a running loop and an open port."""
         ...
 
     def set_baud(self, baud: int) -> None:
-        """Change the rate and discard bytes received at the old one. Raises LinkError."""
+        """Change the baud rate and discard bytes received at the old baud rate. Raises LinkError."""
         ...
 
 
 class CanLink(Link, Protocol):
-    """A CAN bus for one device; several devices share a bus, each by a link of its own."""
+    """CAN bus of one device. Several devices share a bus; each has its own link."""
 
     bus: str
-    """Name of the bus: links of the same bus receive the same frames."""
+    """Name of the bus. Links with the same name receive the same frames."""
     filters: Sequence[CanFilter]
-    """Frames to deliver, effective when set. Other frames may be delivered as well."""
+    """Filters of the frames to deliver, effective when set. The link may deliver other frames too."""
     bitrate: int
-    """Rate of the bus in bit/s, known once open; 0 where there is none (virtual buses) or it is unknown."""
+    """Bit rate of the bus, bit/s, known after `open`; 0 for virtual buses or if it is not known."""
     gather_ns: int
-    """Time for which frames may gather before they are delivered together, ns, effective when set; 0: at once.
-    Their times of arrival stay those of each frame. A link that cannot have frames gather ignores it."""
+    """Maximum hold of received frames before the link delivers them together, ns, effective when set; 0: no hold. Each
+    frame keeps its own arrival time. A link that cannot hold frames ignores the value."""
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
-        """Deliver frames from now on. Needs a running loop and an open bus."""
+        """Start the delivery of frames. Requires a running loop and an open bus."""
         ...
 
     def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
-        """Send these frames, in place of earlier ones, at their periods until `close`. Needs what `start` needs.
+        """Send these frames at their periods until `close`, in place of all earlier frames. Requires the same as
+        `start`.
 
         Raises LinkError.
         """
@@ -211,37 +216,41 @@ class CanLink(Link, Protocol):
 
 
 class PolledLink(Link, Protocol):
-    """A polled bus for one device; the bus's thread makes the transfers of all its devices.
+    """Polled bus of one device. One thread of the bus makes the transfers of all its devices.
 
-    The bus's thread calls `select`, `transfer` and `close` once the device has joined the bus, the loop's thread the
-    rest. `write` raises LinkError: all bytes are sent in transfers.
+    After the device joined the bus, the thread of the bus calls `select`, `transfer` and `close`. The thread of the
+    loop calls all other methods. `write` raises LinkError, because transfers send all bytes.
     """
 
     bus: str
-    """Name of the bus: links of the same bus are served by one thread."""
+    """Name of the bus. One thread serves all links with the same name."""
     target: int | None
-    """Address or mode as configured; None for `auto`."""
+    """Configured address or mode; None for `auto`."""
     shared: bool
-    """Whether targets distinguish the devices of one bus (I2C), so that each may be used once only."""
+    """Whether the target selects one of several devices on the bus (I2C). Then each target can have one device only."""
     rate_hz: float
     """Polls per second."""
     bit_rate: int
-    """Rate of the line in bit/s; 0 for buses whose clock the host makes."""
+    """Baud rate of the bus, bit/s; 0 if the host generates the clock."""
 
     def select(self, target: int) -> None:
-        """Use this address, or this mode, in all transfers from now on. Raises LinkError."""
+        """Use this address or mode in all following transfers. Raises LinkError."""
         ...
 
     def place(self, target: int) -> str:
-        """A target in messages, for example `address 0x18`."""
+        """Return the name of a target for messages, for example `address 0x18`."""
         ...
 
     def transfer(self, transfer: Transfer) -> bytes:
-        """Make a transfer and return all bytes read. Raises TransferError; LinkMissing and LinkError for the bus."""
+        """Make a transfer and return all received bytes. Raises TransferError; LinkMissing or LinkError if the bus
+        fails.
+        """
         ...
 
     def serial_line(self) -> SerialLineCounters | None:
-        """Bytes other than replies since `open`; None for buses with a clock, where the host alone sends."""
+        """Return the counters of unexpected bytes since `open`; None for buses with a clock, on which only the host
+        sends.
+        """
         ...
 
 
@@ -250,15 +259,15 @@ def _no_bus(_settings: Options) -> str:
 
 
 def _no_bytes(_settings: Options) -> StreamLink:
-    raise LinkError("expected a link of bytes, got one without")
+    raise LinkError("expected a link with a byte stream, got another link")
 
 
 def _no_frames(_settings: Options) -> CanLink:
-    raise LinkError("expected a link to a CAN bus, got one that is none")
+    raise LinkError("expected a link to a CAN bus, got another link")
 
 
 def _no_transfers(_settings: Options) -> PolledLink:
-    raise LinkError("expected a link to a bus that is polled, got one that is none")
+    raise LinkError("expected a link to a polled bus, got another link")
 
 
 def _claims_nothing(_settings: Options) -> Sequence[Claim]:
@@ -271,43 +280,43 @@ def _knows_no_problem(_settings: Options, _frames: bool) -> str:
 
 @dataclass(frozen=True, slots=True)
 class LinkType(Generic[S]):
-    """Row of a link. Its factories decide which kinds of drivers can use it."""
+    """Row of a link. Its factories decide which kinds of drivers can use the link."""
 
     name: str
-    """The key under a device in the configuration."""
+    """Key under a device in the configuration."""
     settings: type[S]
     make: Callable[[S], StreamLink] = _no_bytes
-    """Makes a closed link of bytes from its settings."""
+    """Returns a closed byte link from its options."""
     make_can: Callable[[S], CanLink] = _no_frames
-    """Makes a closed link to a CAN bus from its settings."""
+    """Returns a closed link to a CAN bus from its options."""
     make_polled: Callable[[S], PolledLink] = _no_transfers
-    """Makes a closed link to a polled bus from its settings."""
+    """Returns a closed link to a polled bus from its options."""
     bus_of: Callable[[S], str] = _no_bus
-    """Returns the name of the bus that its settings name, which devices share; empty for links without one."""
+    """Returns the name of the shared bus in the options; empty for links without a bus."""
     claims: Callable[[S], Sequence[Claim]] = _claims_nothing
-    """What a link with these settings uses, which no other device may use as well."""
+    """Returns the ports, buses and addresses that a link with these options uses."""
     problem: Callable[[S, bool], str] = _knows_no_problem
-    """Why `open` would refuse these settings, as far as that shows without opening a port; empty for nothing known.
+    """Returns why `open` would reject these options; empty if no reason is known. It does not open the port.
 
-    The second argument says whether the link is to deliver frames of a CAN bus."""
+    The second argument is True if the link must deliver CAN frames."""
 
     @property
     def polled(self) -> bool:
-        """Whether it serves polled drivers: devices on it reply and never send unasked."""
+        """Whether the link serves polled drivers. Devices on it send only replies."""
         return self.make_polled is not _no_transfers
 
     @property
     def searchable(self) -> bool:
-        """Whether detection (`driver: auto`) works on it."""
+        """Whether detection (`driver: auto`) supports the link."""
         return self.make is not _no_bytes or self.polled or self.frames_only
 
     @property
     def frames_only(self) -> bool:
-        """Whether it serves drivers of CAN frames only."""
+        """Whether the link serves only drivers for CAN frames."""
         return self.make_can is not _no_frames and self.make is _no_bytes
 
     def fits(self, driver: Driver) -> bool:
-        """Whether a driver can use such a link."""
+        """Return whether a driver can use the link."""
         if isinstance(driver, StreamDriver):
             return self.make is not _no_bytes
         if isinstance(driver, PolledDriver):

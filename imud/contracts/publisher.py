@@ -1,4 +1,4 @@
-"""Contract of a publisher: it outputs samples and events, and never makes the pipeline wait."""
+"""Contract of a publisher: it outputs samples and events and never delays the device."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,52 +18,54 @@ from imud.model.options import Options
 from imud.model.sample import Sample
 
 PutRecord = Callable[[bytes], None]
-"""Takes a whole record (`imud.formats.records`); returns at once. Called in the event loop's thread."""
+"""Receives a complete record (`imud.formats.records`) and does not block. Called in the thread of the event loop."""
 
 TakeSnapshot = Callable[[socket], float]
-"""Sends what a flight recorder has to a client's socket, a recording, and closes it; returns at once how many seconds
-that is. Raises ServerError. Called in the event loop's thread."""
+"""Starts to send the data of a flight recorder as a recording to a client's socket, which it then closes. Returns the
+length of the recording, s, without blocking. Raises ServerError. Called in the thread of the event loop."""
 
 
 class RecordingSource(Protocol):
-    """The devices and the host's clocks of a daemon, as recorders see them. Synchronization: the loop's thread only."""
+    """Data of devices and host clocks for recorders. Synchronization: the thread of the loop only."""
 
     def names(self) -> Sequence[str]:
-        """Names of the devices there are."""
+        """Return the names of the present devices."""
         ...
 
     def begin_host(self, put: PutRecord) -> None:
-        """Describe the host's clocks, and pass on their readings from now on; again for one that listens already."""
+        """Describe the host clocks, then report each of their readings. Call again to repeat the description."""
         ...
 
     def begin(self, device: str, put: PutRecord) -> None:
-        """Describe a device, and pass on all that it delivers; again for one that listens already. No-op if absent."""
+        """Describe a device, then pass on all its data. Call again to repeat the description. Do nothing if it is
+        absent.
+        """
         ...
 
     def check(self, device: str, put: PutRecord) -> None:
-        """Pass on the newest sample and the ledger of a device as a record. No-op if absent."""
+        """Write the newest sample and the ledger of a device as a record. Do nothing if the device is absent."""
         ...
 
     def end(self, put: PutRecord) -> None:
-        """Pass on nothing of any device any more, nor of the host."""
+        """Stop the recording of all devices and of the host."""
         ...
 
 
 AS_SENT: Final = as_sent()
-"""Axes and angles of HiPNUC modules: what a batch has of which nothing else is said."""
+"""Axes and angles of HiPNUC devices: default of a batch."""
 DeviceLedger = tuple[str, str, Mapping[str, int]]
-"""Name of a device, its driver as in `DeviceStatus.driver`, its ledger now."""
+"""Name of a device, its driver as in `DeviceStatus.driver`, and its present ledger."""
 
 
 class Batch:
-    """Samples completed by one read of one device, oldest first, at least one; shared by all publishers, immutable."""
+    """Samples from one read of one device, oldest first, at least one. All publishers share the object. Immutable."""
 
     __slots__ = ("_converted", "_slots", "device", "device_id", "frame", "samples")
 
     def __init__(self, device: str, device_id: int, samples: Sequence[Sample], frame: PublishedAxes = AS_SENT) -> None:
         self.device = device
         self.device_id = device_id
-        """The daemon's number of the device, as in slots."""
+        """Number of the device in slots."""
         self.samples = samples
         self.frame = frame
         """Axes and angles of the samples."""
@@ -71,14 +73,14 @@ class Batch:
         self._converted: dict[Convention, Batch] | None = None
 
     def slots(self) -> list[bytes]:
-        """The samples as slots (`imud.formats.slot`), encoded on first use."""
+        """Return the samples as slots (`imud.formats.slot`). The first call encodes them."""
         slots = self._slots
         if slots is None:
             slots = self._slots = encode_slots(self.samples, self.device_id)
         return slots
 
     def converted(self, convention: Convention | None) -> "Batch":
-        """Return the samples in a convention, turned on first use; None is as they are published."""
+        """Return the samples in a convention; None: as published. The first call rotates them."""
         rotation = None if convention is None else self.frame.rotation_to(convention)
         if convention is None or rotation is None:
             return self
@@ -92,56 +94,56 @@ class Batch:
 
 
 class Publisher(Protocol):
-    """An output of samples. Every method returns at once and is called in the event loop's thread only."""
+    """Output of samples. Every method returns without blocking. Called in the thread of the event loop only."""
 
     @property
     def publish(self) -> Callable[[Batch], None] | None:
-        """Gives samples to readers; drops and counts them for slow readers. None for an output without samples.
+        """Method that sends samples to readers, and drops and counts samples for slow readers. None: no samples.
 
-        It stays the same from `start` on: the daemon looks it up once.
+        The daemon reads the property once, after `start`.
         """
         ...
 
     def start(self) -> None:
-        """Open what it needs (files, sockets, threads). Raises ServerError. Needs a running asyncio loop."""
+        """Open files, sockets and threads. Raises ServerError. Requires a running asyncio loop."""
         ...
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Prepare for a device that the configuration added."""
+        """Prepare for a device that was added to the configuration."""
         ...
 
     def remove_device(self, name: str) -> None:
-        """Remove a device that left the configuration."""
+        """Remove a device that was removed from the configuration."""
         ...
 
     def event(self, event: Event) -> None:
-        """Give an event to readers."""
+        """Send an event to readers."""
         ...
 
     def tick(self, now_ns: int) -> None:
-        """Send heartbeats and ledgers, check time-outs; called ten times a second."""
+        """Send heartbeats and ledgers and check timeouts. Called ten times per second."""
         ...
 
     def close(self) -> None:
-        """Release everything; may be called twice."""
+        """Release everything. A second call does nothing."""
         ...
 
 
 class DeviceControl(Protocol):
-    """What clients with the permission may do to one device. Answers are values that JSON can carry."""
+    """Operations on one device for clients with permission. Results are values that JSON can represent."""
 
     @property
     def actions(self) -> Actions:
-        """Its actions now, by name."""
+        """Present actions of the device, by name."""
         ...
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
-        """Run an action and return its answer. Raises ImudError."""
+        """Run an action and return its result. Raises ImudError."""
         ...
 
     @property
     def calibrations(self) -> Calibrations:
-        """Its guided calibrations now, by kind."""
+        """Present guided calibrations of the device, by kind."""
         ...
 
     async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:
@@ -149,31 +151,31 @@ class DeviceControl(Protocol):
         ...
 
     def stop_calibration(self) -> bool:
-        """End the calibration that runs; return whether there was one."""
+        """Stop the running calibration. Return whether a calibration was running."""
         ...
 
     async def settings_report(self, *, fresh: bool) -> SettingsReport:
-        """Return its own settings: asked for now if `fresh`, otherwise as reported last. Raises ImudError."""
+        """Return the device settings; with `fresh`, read them first. Raises ImudError."""
         ...
 
     async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
-        """Return what would make it as `given` (None: as declared). Raises ImudError."""
+        """Return the steps that change the device settings to `given` (None: declared settings). Raises ImudError."""
         ...
 
     async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
-        """Make it as `given` (None: as declared). Raises ImudError, with nothing written."""
+        """Change the device settings to `given` (None: declared settings). Raises ImudError before the first write."""
         ...
 
 
 class Latencies(Protocol):
-    """Where consumers of samples ask for the latency they need: samples of a device may wait for the strictest."""
+    """Latency requests of publishers. The strictest request limits the hold of a device."""
 
     def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
-        """Ask for samples of `devices` (None: of all) at most so late, in place of what `who` asked for before."""
+        """Request a latency for samples of `devices` (None: of all), in place of the previous request of `who`."""
         ...
 
     def release(self, who: str) -> None:
-        """Ask for nothing any more; no-op for one that does not ask."""
+        """Withdraw the request of `who`. Do nothing if there is no request."""
         ...
 
 
@@ -263,10 +265,11 @@ class PublisherType:
     """Row of a publisher."""
 
     name: str
-    """The top-level key in the configuration."""
+    """Top-level key in the configuration."""
     settings: type[Options]
     make: Callable[[Any, PublisherContext], Publisher]
     wanted: Callable[[Any], bool] = attrgetter("enabled")
-    """Whether there is anything to do with these settings."""
+    """Whether these options enable the publisher."""
     required: bool = True
-    """Whether the daemon ends when it cannot start at the beginning; otherwise it is tried again and again."""
+    """Whether the daemon exits if the first start of the publisher fails. Otherwise the daemon tries again
+    periodically."""

@@ -1,8 +1,10 @@
-"""Contract of the settings that a device keeps itself: their names, types and units, how they are read, written, saved.
+"""Contract of device settings: names, types and units, how imud reads, writes and saves them, and the reports about
+them.
 
-A driver has one table of them. From it come the keys of `settings:` in the configuration, `imud settings`, help, the
-checks and docs/settings.md. A script here is what the driver's transport runs: a request script on a UART or CAN, a
-transfer script on a polled bus. The second half is what imud says of them: declared, actual, planned and done.
+Each driver has one table of settings. The table defines the keys of `settings:` in the configuration, `imud settings`,
+help texts, checks and docs/settings.md. The transport of the driver runs the scripts: request scripts on UART and CAN,
+transfer scripts on a polled bus. The second half of this module describes declared, actual, planned and applied
+settings.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,35 +21,35 @@ from imud.model.options import Options
 
 
 class OnDifference(StrEnum):
-    """What imud does where the device's settings are not those that the configuration declares."""
+    """Reaction of imud if the device settings differ from the declared settings."""
 
     REPORT = "report"
-    """Say so: an event, the status, a metric."""
+    """Report the difference: event, status and metric."""
     APPLY = "apply"
-    """Set what comes into force at once; it holds until the device restarts, and is set again then."""
+    """Write the settings that take effect immediately. imud writes them again after each restart of the device."""
     APPLY_AND_SAVE = "apply_and_save"
-    """Set everything, save it to the device's flash, and restart the device where that is needed."""
+    """Write all settings and save them to the flash of the device. Restart the device if necessary."""
 
 
 class Effect(StrEnum):
-    """Moments at which a written setting comes into force."""
+    """Time at which a written setting takes effect."""
 
     AT_ONCE = "at once"
     AFTER_RESTART = "after save and restart"
 
 
 class Written(StrEnum):
-    """Results of a script that writes a setting: how far it is known that the device has the value."""
+    """Result of a script that writes a setting: how certain the new value is."""
 
     VERIFIED = "written and read back"
     UNVERIFIED = "written, not verified"
-    """The device confirmed, and does not tell its value."""
+    """The device confirmed the write and cannot report the value."""
     PENDING = "written and read back, in force after save and restart"
     UNVERIFIED_PENDING = "written, not verified; in force after save and restart"
 
 
 def nothing_wrong(_target: Target, _values: Mapping[str, Any]) -> None:
-    """Accept every combination of values: the version for devices without such rules."""
+    """Accept every combination of values. Default of devices without such rules."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,58 +57,58 @@ class Setting:
     """One setting of a device."""
 
     type: Any
-    """Type of a value, one that JSON can carry: `Annotated[…, Meta(description=…, extra={"unit": …, "section": …})]`.
+    """Type of a value that JSON can represent: `Annotated[…, Meta(description=…, extra={"unit": …, "section": …})]`.
 
-    Bounds and choices are in it; `section` is that of the vendor's manual."""
+    The type contains bounds and choices. `section` is the section of the vendor's manual."""
     write: Callable[[Target, Any], Any] | None = None
-    """`write(target, value)` makes the script that sets it. None for what can only be read and not be declared.
+    """`write(target, value)` returns the script that writes the setting. None: read-only, cannot be declared.
 
-    The script raises CommandError, TransferError or DeviceRefused where the device does not take the value."""
+    The script raises CommandError, TransferError or DeviceRefused if the device rejects the value."""
     effect: Effect = Effect.AT_ONCE
     connection: bool = False
-    """Whether the device is reached in another way afterwards (bit rate, address, node number): such a setting is
-    written last. Its script follows the device, and goes back where the device is not heard afterwards: by
-    `Request.baud` on a UART, `Request.settings` on a CAN bus, `Transfer.then_at` on RS-485 and I2C."""
+    """Whether the change affects how imud reaches the device (baud rate, address, node number). imud writes such a
+    setting last. Its script follows the device and returns to the former connection if the device does not reply: by
+    `Request.baud` on UART, `Request.settings` on CAN, `Transfer.then_at` on RS-485 and I2C."""
     saves: bool = False
-    """Whether its script saves all settings to flash, and restarts the device, itself in order to follow it. It is
-    written only where saving is wanted, counts as a write to flash, and needs no `save` after it."""
+    """Whether the script itself saves all settings to flash and restarts the device. imud runs it only if saving is
+    requested, counts one write to flash, and runs no `save` after it."""
     readable: bool = True
-    """Whether the device tells the value; what it does not tell is `written, not verified`."""
+    """Whether the device reports the value. Otherwise the result is `written, not verified`."""
     agrees: Callable[[Any, Any], bool] = eq
-    """`agrees(declared, actual)`: equality, or what takes its place where one has tolerances or leaves parts open."""
+    """`agrees(declared, actual)` compares two values: equality, or a comparison with tolerances or optional parts."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SettingsTable:
-    """All settings of the devices of one driver. Steps of a plan have the order of the table."""
+    """All settings of the devices of one driver. The steps of a plan have the order of the table."""
 
     table: Mapping[str, Setting]
     read: Callable[[Target], Any]
-    """Makes the script that reads the present values, by name and in the types of the table.
+    """Returns the script that reads the present values, by name and in the types of the table.
 
-    A setting that this device does not have or did not tell is left out. The device is left as it was."""
+    The result does not contain settings that the device lacks or does not report. The script changes nothing."""
     save: Callable[[Target], Any] | None = None
-    """Makes the script that writes all settings to flash; None where there is nothing to save."""
+    """Returns the script that writes all settings to flash; None if the device has no flash for settings."""
     restart: Callable[[Target], Any] | None = None
-    """Makes the script that restarts the device and waits for it; None where that cannot be done."""
+    """Returns the script that restarts the device and waits for it; None if imud cannot restart the device."""
     check: Callable[[Target, Mapping[str, Any]], None] = nothing_wrong
-    """Raises BadArgument for values that do not go together, for example more output than the bit rate carries.
+    """Raises BadArgument for values that exclude each other, for example more output than the baud rate can carry.
 
-    `values` are the declared ones on top of the present ones as far as these are known: of a configuration that is
-    checked the declared ones alone. `target.baud` is 0 where it is not known."""
+    `values` contains the declared values and, for all other settings, the known present values. `imud check` passes
+    only the declared values. `target.baud` is 0 if the baud rate is not known."""
 
     @property
     def declarable(self) -> type[Options]:
-        """The struct of a declaration: each setting that can be written, None for one that is not declared."""
+        """Struct type of a declaration: one field per writable setting, None if it is not declared."""
         return _declarable(self)
 
     def __hash__(self) -> int:
-        """Hash by identity: a table is made once per driver."""
+        # by identity: each driver has one table
         return id(self)
 
 
 def declared_values(declared: Options | None) -> dict[str, Any]:
-    """Return the values of an instance of `declarable` by name, without those that are not declared."""
+    """Return the declared values by name from an instance of `declarable`."""
     if declared is None:
         return {}
     return {name: value for name, value in msgspec.structs.asdict(declared).items() if value is not None}
@@ -121,68 +123,68 @@ def _declarable(settings: SettingsTable) -> type[Options]:
     return cast(type[Options], made)
 
 
-# --- what imud says of them -------------------------------------------------------------------------------------------
+# --- reports about settings --------------------------------------------------------------------------------------
 
 
 class SettingsState(StrEnum):
     """Result of the newest comparison of declared and actual settings."""
 
     UNDECLARED = "undeclared"
-    """Nothing is declared for the device."""
+    """The configuration declares no settings for the device."""
     UNKNOWN = "unknown"
-    """The device has not reported its settings since its link was opened."""
+    """imud has not read the device settings since the link was opened."""
     AGREE = "agree"
-    """All that can be read is as declared."""
+    """All readable settings have the declared values."""
     DIFFER = "differ"
 
 
 class SettingDifference(msgspec.Struct, frozen=True):
-    """One setting that is not as declared."""
+    """One setting with another value than declared."""
 
     declared: Any
     actual: Any = None
-    """Null where the device does not tell it."""
+    """Null if the device does not report the setting."""
 
 
 class SettingsStatus(msgspec.Struct, frozen=True):
-    """How declared and actual settings of one device compare."""
+    """Comparison of declared and actual settings of one device."""
 
     state: SettingsState
     on_difference: OnDifference
     problem: str = ""
-    """Why the settings could not be read or set, one sentence; empty for none."""
+    """Reason why imud could not read or write the settings, one sentence; empty if there is no problem."""
     differences: dict[str, SettingDifference] = {}  # msgspec copies a mutable default
     unverified: tuple[str, ...] = ()
-    """Declared settings that the device takes and does not tell."""
+    """Declared settings that the device accepts and does not report."""
     read_ns: int | None = None
-    """CLOCK_MONOTONIC when they were read last; null before."""
+    """CLOCK_MONOTONIC of the newest read; null before the first read."""
     repairs: int = 0
-    """Times that imud has set them by itself since start, successful or not."""
+    """Number of automatic attempts of imud to write the declared settings since start."""
     flash_writes: int = 0
-    """Writes to the flash of this module by imud, also in earlier runs; by commands and by itself."""
+    """Number of writes to the flash of this device by imud in all runs, automatic or by command."""
     flash_writes_day: int = 0
-    """Of these, those of the last 24 hours."""
+    """Number of these writes in the last 24 hours."""
 
 
 class SettingInfo(msgspec.Struct, frozen=True):
-    """One setting of a device: its description, and its values as far as they are known."""
+    """Description and known values of one setting."""
 
     name: str
     values: str
-    """The accepted values, for example `a whole number from 1 to 127`."""
+    """Accepted values, for example `a whole number from 1 to 127`."""
     description: str
     unit: str
     section: str
     """Section of the vendor's manual."""
     effect: Effect
     connection: bool
-    """Whether the device is reached in another way after a change."""
+    """Whether the change affects how imud reaches the device."""
     readable: bool
     declarable: bool
-    """Whether it can be set; others can only be read."""
+    """Whether the setting is writable."""
     declared: Any = None
     actual: Any = None
-    """Null where the device did not tell it."""
+    """Null if the device did not report the setting."""
     differs: bool = False
 
 
@@ -197,68 +199,69 @@ class SettingsReport(msgspec.Struct, frozen=True):
 
 
 class PlannedStep(msgspec.Struct, frozen=True):
-    """One setting that is to be written."""
+    """One setting that imud will write."""
 
     name: str
     value: Any
     before: Any = None
-    """Null where it is not known."""
+    """Null if the present value is not known."""
     effect: Effect = Effect.AT_ONCE
     connection: bool = False
     saves: bool = False
-    """Whether this step writes the flash itself and restarts the device."""
+    """Whether this step writes the flash and restarts the device."""
 
 
 class SettingsPlan(msgspec.Struct, frozen=True):
-    """What would be done to make a device as wanted, in this order: steps, save, restart, comparison."""
+    """Steps that change the settings of a device, in this order: steps, save, restart, comparison."""
 
     steps: tuple[PlannedStep, ...] = ()
     save: bool = False
     restart: bool = False
     left_out: dict[str, str] = {}  # msgspec copies a mutable default
-    """Options that differ and are not written, each with why not."""
+    """Reason for each setting that differs and that imud will not write, by name."""
     risk: Risk = Risk.NONE
 
     @property
     def empty(self) -> bool:
-        """Whether there is nothing to do."""
+        """Whether no step is necessary."""
         return not self.steps and not self.save
 
 
 class StepOutcome(StrEnum):
-    """What became of one step."""
+    """Result of one step."""
 
     DONE = "done"
-    """Written, and read back as wanted."""
+    """The setting was written and read back with the wanted value."""
     WRITTEN = "written, in force after a restart"
     NOT_VERIFIED = "written, not verified"
-    """The device does not tell this setting."""
+    """The device does not report this setting."""
     FAILED = "failed"
     NOT_DONE = "not done"
-    """A step before it failed."""
+    """A previous step failed."""
 
 
 class AppliedStep(msgspec.Struct, frozen=True):
-    """One step and what became of it."""
+    """One step and its result."""
 
     name: str
     value: Any
     before: Any
     outcome: StepOutcome
     message: str = ""
-    """Why it failed; empty otherwise."""
+    """Reason of a failure; empty otherwise."""
 
 
 class AppliedSettings(msgspec.Struct, frozen=True):
-    """What was done, and how the device is now."""
+    """Applied steps, and remaining differences."""
 
     steps: tuple[AppliedStep, ...] = ()
     saved: bool = False
     restarted: bool = False
     problem: str = ""
-    """What went wrong, one sentence; empty when all that was planned is done."""
+    """Reason of a failure, one sentence; empty if imud did all planned steps."""
     left_out: dict[str, str] = {}  # msgspec copies a mutable default
     differences: dict[str, SettingDifference] = {}  # msgspec copies a mutable default
-    """What is not as wanted now."""
+    """Remaining differences from the wanted values."""
     advice: str = ""
-    """What to change in the configuration, so that imud finds the device at its next start; empty for nothing."""
+    """Necessary change of the configuration, so that imud finds the device at its next start; empty if no change is
+    necessary."""

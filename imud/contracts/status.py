@@ -1,4 +1,4 @@
-"""Status of a device at one moment: the record behind the command `status`, shared memory and the metrics."""
+"""Status of a device at one moment: the record behind the method `status`, shared memory and the metrics."""
 
 from enum import StrEnum
 from typing import Annotated
@@ -16,23 +16,23 @@ Sigma = Annotated[float, Meta(gt=0)] | None
 
 
 class Deviations(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One-sigma noise of one sample, the same for every axis, in SI units; None where it is not known."""
+    """One-sigma noise of one sample, equal for all axes, SI units; None if it is not known."""
 
     accel_m_s2: Sigma = None
-    """Standard deviation of one sample of the specific force, m/s²; null where it is not known."""
+    """Standard deviation of the specific force of one sample, m/s²; null if it is not known."""
     gyro_rad_s: Sigma = None
-    """The same of the angular rate, rad/s."""
+    """Standard deviation of the angular rate, rad/s."""
     mag_t: Sigma = None
-    """The same of the magnetic field, T."""
+    """Standard deviation of the magnetic field, T."""
     attitude_rad: Sigma = None
-    """The same of the attitude, about each axis of the body, rad."""
+    """Standard deviation of the attitude about each axis of the body, rad."""
     temperature_c: Sigma = None
-    """The same of the temperature, K."""
+    """Standard deviation of the temperature, K."""
     pressure_pa: Sigma = None
-    """The same of the pressure, Pa."""
+    """Standard deviation of the pressure, Pa."""
 
     def updated(self, other: "Deviations") -> "Deviations":
-        """Return these, with those of `other` that are known in their place."""
+        """Return these deviations, replaced by the known deviations of `other`."""
         known = {name: sigma for name in self.__struct_fields__ if (sigma := getattr(other, name)) is not None}
         return msgspec.structs.replace(self, **known)
 
@@ -41,146 +41,146 @@ class DeviceState(StrEnum):
     """States of a device."""
 
     MISSING = "missing"
-    """Its link is absent; imud waits for it."""
+    """The link is absent; imud waits for it."""
     SEARCHING = "searching"
-    """The link is open; no valid frame was heard yet."""
+    """The link is open; imud has not received a valid frame."""
     RUNNING = "running"
-    """Samples flow."""
+    """imud receives samples."""
     SILENT = "silent"
-    """It sends nothing now, though its link is present; it was running before."""
+    """The link is open and the device has stopped sending samples."""
     FINISHED = "finished"
-    """A replay came to its end."""
+    """A replay is at its end."""
     FAILED = "failed"
-    """It needs an operator's action, see `problem`; imud tries again all the same."""
+    """A fault that the user must repair, see `problem`. imud tries again periodically."""
 
 
 class ClockStatus(msgspec.Struct, frozen=True):
-    """State of one device's clock estimate."""
+    """State of the clock of one device."""
 
     sync: Sync = Sync.ARRIVAL
     offset_ns: int = 0
     """Host CLOCK_MONOTONIC minus unwrapped device time, at the newest sample."""
     skew_ppm: float = 0.0
-    """Rate error of the device's clock against the host's, unsteered (CLOCK_MONOTONIC_RAW), 1e-6; +40: it gains 40 µs
-    per second."""
+    """Rate error of the device clock against the host clock without steering (CLOCK_MONOTONIC_RAW), 1e-6; +40: the
+    device clock gains 40 µs per second."""
     residual_ns: int = 0
     """One-sigma spread of the lower envelope of arrival times around the fit."""
     t_err_ns: int = 0
-    """`sync` of the newest sample."""
+    """Time stamp error of the newest sample, one sigma."""
     resets: int = 0
-    """Times the device's clock started anew (restart of the device, jump of its counter)."""
+    """Number of restarts of the device clock (restart of the device, jump of its counter)."""
     hold_ns: int = 0
-    """Longest time that the link's adapter holds bytes back (USB latency timer); 0 for none."""
+    """Latency timer of the link's USB adapter: maximum delay of received bytes; 0 without a USB adapter."""
     edges: int = 0
-    """Pulses on the SOUT line, or triggers given on SIN."""
+    """Number of pulses on the SOUT line, or of triggers on SIN."""
     edges_unpaired: int = 0
-    """Of the pulses, those that belong to no sample: its frame was lost, or they were no pulses of the device."""
+    """Number of pulses without a sample: the frame was lost, or the device did not send the pulse."""
     samples_unpaired: int = 0
-    """Samples that came while pulses did and whose own was not seen."""
+    """Number of samples without a pulse of their own while pulses arrived."""
     triggers_missed: int = 0
-    """Triggers on SIN that no frame answered."""
+    """Number of triggers on SIN without a frame."""
     reference_error_ns: int = 0
-    """One-sigma error of the host's estimate of UTC; 0 without one."""
+    """One-sigma error of the host's estimate of UTC; 0 if there is no estimate."""
     steering_ppm: float = 0.0
-    """How much faster than CLOCK_MONOTONIC_RAW CLOCK_MONOTONIC runs now, 1e-6: what an NTP client makes of it."""
+    """Rate of CLOCK_MONOTONIC relative to CLOCK_MONOTONIC_RAW minus 1, 1e-6: the correction by an NTP client."""
 
 
 class KernelCounters(msgspec.Struct, frozen=True):
-    """Errors the kernel's driver counted since the link was opened."""
+    """Errors that the kernel counted since the link was opened."""
 
     overrun: int = 0
-    """UART FIFO or tty buffer overruns (TIOCGICOUNT), CAN receive queue overflows."""
+    """Overruns of the UART FIFO or tty buffer (TIOCGICOUNT), and overflows of the CAN receive queue."""
     framing: int = 0
     parity: int = 0
     break_: int = msgspec.field(default=0, name="break")
     error_passive: int = 0
-    """Times a CAN controller became error-passive."""
+    """Number of times that a CAN controller became error-passive."""
     bus_off: int = 0
-    """Times a CAN controller left its bus."""
+    """Number of times that a CAN controller went to bus-off."""
 
 
 class PollingStatus(msgspec.Struct, frozen=True):
-    """Reads of a polled device, since start."""
+    """Reads of a polled device since start."""
 
     polls: int = 0
-    """Deadlines at which it was read."""
+    """Number of deadlines with a read."""
     late: int = 0
-    """Of these, begun later than a quarter of the period after the deadline."""
+    """Number of reads that started later than a quarter of the period after the deadline."""
     missed: int = 0
-    """Deadlines that passed without a read: the host or the bus was busy. Also in the ledger's `lost_queue`."""
+    """Number of deadlines without a read, because the host or the bus was busy. Also in `lost_queue` of the ledger."""
     stale: int = 0
-    """Reads that gave the same bytes as the one before: the device had nothing new."""
+    """Number of reads with the same bytes as the previous read: the device had no new values."""
     failed: int = 0
-    """Transfers that failed."""
+    """Number of failed transfers."""
     vanished: int = 0
-    """Times the device had to be identified again."""
+    """Number of times that imud had to identify the device again."""
     late_mean_ns: int = 0
-    """From deadline to read, mean over `polls`."""
+    """Time from the deadline to the read, mean over `polls`."""
     late_worst_ns: int = 0
-    """The longest."""
+    """Maximum time from the deadline to the read."""
     late_sum_ns: int = 0
-    """Sum of all lateness."""
+    """Sum of the times from the deadline to the read."""
 
 
 class SerialLineCounters(msgspec.Struct, frozen=True):
-    """Bytes on a shared serial line other than replies, since it was opened."""
+    """Unexpected bytes on an RS-485 bus since it was opened."""
 
     timeouts: int = 0
-    """Requests without a reply."""
+    """Number of requests without a reply."""
     late_bytes: int = 0
-    """Bytes that came when nothing was asked."""
+    """Number of bytes received without a pending request."""
     strange_bytes: int = 0
-    """Bytes that came before a reply, or instead of it."""
+    """Number of bytes received before a reply, or in place of a reply."""
     echoes: int = 0
-    """Requests that came back as an echo; no fault."""
+    """Number of requests that the adapter echoed; not a fault."""
 
 
 class LinesStatus(msgspec.Struct, frozen=True):
-    """The GPIO lines of one device, since start."""
+    """GPIO lines of one device, since start."""
 
     problems: dict[str, str]
-    """Why a line is not watched or driven now, by its key in the configuration; empty when all are."""
+    """Reason for each line that imud cannot watch or drive, by key of the configuration."""
     edges: dict[str, int]
-    """Edges seen, by line."""
+    """Number of received edges, by line."""
     edges_lost: dict[str, int]
-    """Edges that the kernel dropped because they were not read in time, by line."""
+    """Number of edges that the kernel dropped from a full buffer, by line."""
     alarm: bool | None = None
-    """Whether the ALARM line is active; None without one, or while its level is not known."""
+    """Whether the ALARM line is active; None if there is no line or its level is not known."""
     alarms: int = 0
-    """Times it became active."""
+    """Number of times that the ALARM line became active."""
     sin: bool = False
-    """Whether imud drives SIN, or is to; what follows is of it."""
+    """Whether the configuration has a SIN line for this device. The following fields describe it."""
     triggers: int = 0
-    """Rising edges made on SIN."""
+    """Number of rising edges on SIN."""
     triggers_missed: int = 0
-    """Deadlines for which none was made: the host was busy."""
+    """Number of deadlines without an edge, because the host was busy."""
     trigger_late_mean_ns: int = 0
-    """From deadline to edge, mean over `triggers`."""
+    """Time from the deadline to the edge, mean over `triggers`."""
     trigger_late_worst_ns: int = 0
-    """The longest."""
+    """Maximum time from the deadline to the edge."""
     trigger_late_sum_ns: int = 0
-    """All of them together."""
+    """Sum of the times from the deadline to the edge."""
 
 
 class UtcStatus(msgspec.Struct, frozen=True):
     """Sources of UTC for a device and for the host, since start."""
 
     source: str
-    """Source of RMC sentences, for people; empty without a source."""
+    """Readable name of the source of RMC sentences; empty if there is no source."""
     problem: str
-    """Present fault of the source or of the feed of chronyd, one sentence; empty for none."""
+    """Present fault of the source or of the connection to chronyd, one sentence; empty if there is no fault."""
     sentences: int = 0
-    """Sentences that the source gave."""
+    """Number of sentences from the source."""
     sent: int = 0
-    """Of these, sent to the device."""
+    """Number of sentences that imud sent to the device."""
     refused: dict[str, int] = {}  # msgspec copies a mutable default
-    """Sentences that were not sent, by cause."""
+    """Number of sentences that imud did not send, by cause."""
     pulses: int = 0
-    """Pulses per second that counted."""
+    """Number of accepted pulses per second."""
     pulses_ignored: int = 0
-    """Pulses that were in step with no other."""
+    """Number of pulses outside the rhythm of the other pulses."""
     chrony_sent: int = 0
-    """Samples given to chronyd."""
+    """Number of samples that imud sent to chronyd."""
     chrony_refused: int = 0
 
 
@@ -188,21 +188,22 @@ class FrameStatus(msgspec.Struct, frozen=True):
     """Axes, angles and heading of the samples of one device."""
 
     frame: str
-    """Axes of vectors: those of the sensor, or of the body that it is mounted in."""
+    """Axes of vectors: sensor axes, or axes of the body with the sensor."""
     convention: str
     """`enu-flu` or `ned-frd`; `device`: as the device sends them."""
     euler_convention: str
     """Order, axes and signs of `euler_rad`."""
     navigation_frame: str
-    """The frame that `quat_wxyz` turns into."""
+    """Destination frame of the rotation `quat_wxyz`."""
     heading: Heading
     """Reference of yaw."""
     declination_deg: float | None
-    """Added to the heading; None without one."""
+    """Declination that imud adds to the heading; None without a declination."""
     conventions: dict[str, FrameWords]
-    """What a client gets that asks for a convention, by its name."""
+    """Axes and angles that a client receives if it requests a convention, by name of the convention."""
     problem: str = ""
-    """Contradiction of gravity to attitude or mounting, or of the heading to the configuration; empty for none."""
+    """Contradiction between gravity and attitude or mounting, or between the heading and the configuration; empty if
+    there is no contradiction."""
 
 
 LATENCY_BOUNDS_NS = (
@@ -217,192 +218,194 @@ LATENCY_BOUNDS_NS = (
     20_000_000,
     50_000_000,
 )
-"""Upper bounds of the buckets of the latency histogram, ns; a last bucket without bound follows."""
+"""Upper bounds of the latency histogram, ns. One more bucket without a bound follows."""
 
 
 class DeviceStatus(msgspec.Struct, frozen=True):
-    """The full state of one device. Made for one answer and never changed."""
+    """Complete status of one device, made for one reply. Immutable."""
 
     name: str
     device_id: int
     driver: str
     link: str
-    """The link for people, for example `/dev/ttyUSB0 at 115200 baud`."""
+    """Readable name of the link, for example `/dev/ttyUSB0 at 115200 baud`."""
     state: DeviceState
     problem: str
-    """Why it is not running, one sentence; empty when it runs."""
+    """Reason why the device is not running, one sentence; empty while it is running."""
     identity: dict[str, str]
-    """`product`, `serial_number`, `firmware` and what else the device sent."""
+    """`product`, `serial_number`, `firmware` and other properties that the device reported."""
     settings: dict[str, str]
-    """The device's own settings as read back, by name and with units as far as they are known."""
+    """Device settings as read from the device, with readable names and units if they are known."""
     rate_hz: float
-    """Samples per second over the last seconds."""
+    """Samples per second in the last seconds."""
     expected_rate_hz: float
-    """Rate by the device's own time stamps; 0 while unknown."""
+    """Sample rate from the device time; 0 if it is not known."""
     newest_seq: int
     clock: ClockStatus
     ledger: dict[str, int]
     kernel: KernelCounters
     latency_buckets: tuple[int, ...]
-    """Samples per bucket of LATENCY_BOUNDS_NS, the unbounded last included: time from measurement to publication."""
+    """Number of samples per bucket of LATENCY_BOUNDS_NS: time from measurement to publication. The last bucket has no
+    upper bound."""
     latency_sum_ns: int
     temperature_c: float | None
     status_bits: int | None
     connects: int
-    """Times the link was opened since start."""
+    """Number of times that imud opened the link since start."""
     status_words: tuple[str, ...] = ()
-    """Names of the bits in `status_bits` that are set, as far as they are known."""
+    """Names of the known bits of `status_bits` that are set."""
     status_bit_names: dict[str, str] = {}  # msgspec copies a mutable default
-    """Names of the bits of `status` by number, from the driver; empty while it is not known or has none."""
+    """Names of the bits of `status`, by number; empty if the driver is not known or has no names."""
     euler_convention: str = ""
-    """Order, axes and signs of `euler_rad` as published; empty while the driver is not known."""
+    """Order, axes and signs of the published `euler_rad`; empty while the driver is not known."""
     navigation_frame: str = ""
-    """The frame that `quat_wxyz` turns into; empty while the driver is not known."""
+    """Destination frame of the rotation `quat_wxyz`; empty while the driver is not known."""
     frame: FrameStatus | None = None
-    """Axes and angles of what is published; None while the driver is not known."""
+    """Axes and angles of published samples; None while the driver is not known."""
     polling: PollingStatus | None = None
-    """None for a device that sends by itself."""
+    """Counters of the polls; None for a device that sends without requests."""
     serial_line: SerialLineCounters | None = None
-    """None for a device that shares no serial line; the same for all devices of one line."""
+    """Counters of the RS-485 bus, equal for all devices of the bus; None for a device on another link."""
     lines: LinesStatus | None = None
-    """None for a device without lines."""
+    """Status of the GPIO lines; None for a device without GPIO lines."""
     utc: UtcStatus | None = None
-    """None for a device that is neither fed sentences nor has its pulse per second at the host."""
+    """Sources of UTC; None for a device that receives no sentences and has no pulse per second on the host."""
     hold_ns: int = 0
-    """How long its data waits at present to be processed together, ns; 0: each sample is processed as it comes."""
+    """Present hold of received data, ns; 0: imud processes each sample immediately."""
     hold_wanted_ns: int = 0
-    """How long the consumers of its samples would let it wait, ns: the latency that the strictest of them asks for."""
+    """Maximum hold that all clients of its samples accept, ns: the strictest latency request."""
     hold_by: str = ""
-    """Who that is; empty while nobody asks."""
+    """Name of the client with this request; empty if there is no request."""
     declared: SettingsStatus | None = None
-    """How its own settings compare with those that the configuration declares; None for a driver that does not know
-    them, or is not known."""
+    """Comparison of device settings and declared settings; None if the driver is not known or has no table of
+    settings."""
     noise: Deviations | None = None
-    """Noise of its samples as the configuration has it; None where it has none."""
+    """Noise of the samples from the configuration; None if the configuration does not give it."""
 
 
 class RecorderStatus(msgspec.Struct, frozen=True):
-    """State of the recorder."""
+    """Status of the recorder."""
 
     file: str
-    """Name of the present file; empty while nothing is recorded."""
+    """Name of the present file; empty if the recorder is not recording."""
     problem: str
-    """Why nothing is recorded, one sentence; empty while it is."""
+    """Reason why the recorder is not recording, one sentence; empty while it is recording."""
     written_bytes: int
-    """Bytes written to files since the start."""
+    """Number of bytes written to files since start."""
     records: int
-    """Records in them."""
+    """Number of records in these files."""
     records_dropped: int
-    """Records that had no room because the disk was too slow."""
+    """Number of dropped records: the queue was full, because the disk was too slow."""
     waiting_bytes: int
-    """Records that wait to be written."""
+    """Size of the queued records."""
     files_removed: int
-    """Files removed to keep within the budget."""
+    """Number of files that the recorder removed to stay within its disk budget."""
     disk_bytes: int
-    """Size of all recordings in the directory, snapshots and the present file included."""
+    """Size of all recordings in the directory, with snapshots and the present file."""
 
 
 class FlightStatus(msgspec.Struct, frozen=True):
-    """State of the flight recorder."""
+    """Status of the flight recorder."""
 
     problem: str
-    """Why nothing is kept, one sentence; empty while it is."""
+    """Reason why the flight recorder keeps no data, one sentence; empty while it keeps data."""
     kept_ns: int
-    """Length of what is kept now."""
+    """Time span of the data in memory."""
     kept_bytes: int
     records_dropped: int
-    """Records that had no room because this machine was too slow."""
+    """Number of dropped records: the queue was full, because this host was too slow."""
     saved: int
-    """Snapshots saved to files since the start."""
+    """Number of snapshots saved to files since start."""
     failed: int
-    """Snapshots that could not be saved."""
+    """Number of snapshots that could not be saved."""
     left_out: int
-    """Alerts that were not saved because there were too many within an hour."""
+    """Number of alerts without a snapshot, because the limit per hour was reached."""
     sent: int
-    """Snapshots that clients asked for."""
+    """Number of snapshots sent to clients."""
     disk_bytes: int
-    """Size of all recordings in the directory except the one that is written at present."""
+    """Size of all recordings in the directory without the present file."""
 
 
 class OutputStatus(msgspec.Struct, frozen=True):
-    """One way out of an output that sends sentences."""
+    """One destination of an output that sends sentences."""
 
     name: str
     """Kind and address, for example `tcp 127.0.0.1:10110`."""
     sent: int
-    """Sentences sent since the start; to each client, where there are several."""
+    """Number of sentences sent since start, the sum over all clients."""
     dropped: int
-    """Sentences that were not sent because the way out had no room or was away."""
+    """Number of sentences that imud did not send, because the destination was full or absent."""
     readers: int
-    """Clients that are connected; 1 for a port or an address while it takes what is sent, 0 while it does not."""
+    """Number of connected clients. For a port or an address: 1 while it accepts data, otherwise 0."""
     problem: str
-    """Why nothing is sent, one sentence; empty while it is."""
+    """Reason why imud sends nothing, one sentence; empty while imud sends."""
 
 
 class MqttStatus(msgspec.Struct, frozen=True):
-    """State of the output `mqtt`."""
+    """Status of the output `mqtt`."""
 
     broker: str
-    """The broker that is connected; empty while there is none."""
+    """Connected broker; empty if no broker is connected."""
     problem: str
-    """Why nothing is sent, one sentence; empty while it is."""
+    """Reason why imud sends nothing, one sentence; empty while imud sends."""
     spool_problem: str
-    """Why nothing is spooled, one sentence; empty while it is."""
+    """Reason why imud does not use the spool, one sentence; empty while imud uses it."""
     queued: int
-    """Samples and events that were given to the output since the start."""
+    """Number of samples and events that the output received since start."""
     spooled: int
-    """Messages written to the spool."""
+    """Number of messages written to the spool."""
     sent: int
-    """Messages sent, those sent again included."""
+    """Number of messages sent, repetitions included."""
     acknowledged: int
-    """Messages that the broker has taken."""
+    """Number of messages that the broker acknowledged."""
     waiting: int
-    """Messages in the spool now, those that earlier runs left included."""
+    """Number of messages in the spool, with messages of earlier runs."""
     spool_bytes: int
-    """Room that the spool uses."""
+    """Disk space of the spool, bytes."""
     thinned: int
-    """Samples of which only statistics are left, for want of room."""
+    """Number of samples that imud reduced to statistics to save disk space."""
     dropped: dict[str, int]
-    """Samples and events that were dropped, by cause."""
+    """Number of dropped samples and events, by cause."""
     reconnects: int
-    """Connections after the first."""
+    """Number of connections after the first connection."""
     commands: int = 0
-    """Requests for actions that were carried out, or tried."""
+    """Number of requested actions that imud ran or tried to run."""
     commands_refused: int = 0
-    """Requests that were refused."""
+    """Number of rejected requests."""
 
 
 class ClientStatus(msgspec.Struct, frozen=True):
     """One client of the UNIX socket."""
 
     number: int
-    """Counts connections since start."""
+    """Number of the connection since start."""
     pid: int
     uid: int
     control: bool
-    """Whether it may change things."""
+    """Whether the client has the permission to control devices."""
     encoding: str
-    """`json` or `binary` while it watches, otherwise empty."""
+    """`json` or `binary` while the client has a subscription, otherwise empty."""
     sent: int
-    """Samples given to its socket."""
+    """Number of samples written to the client's socket."""
     dropped: int
-    """Samples dropped because it did not read fast enough."""
+    """Number of dropped samples, because the client did not read fast enough."""
     queue_samples: int
-    """Samples that wait for it now."""
+    """Number of samples in the client's queue."""
     queue_bytes: int
-    """Bytes that wait for it now, replies included."""
+    """Number of bytes in the client's queue, replies included."""
 
 
 class SocketStatus(msgspec.Struct, frozen=True):
-    """The UNIX socket and its clients."""
+    """UNIX socket and its clients."""
 
     path: str
     clients: tuple[ClientStatus, ...]
     accepted: int
-    """Connections since start."""
+    """Number of connections since start."""
     refused: int
-    """Connections refused since start: too many, or no right to read."""
+    """Number of rejected connections since start: too many connections, or no permission to read."""
     evicted: int
-    """Clients disconnected since start because they asked without reading, asked too much, or sent a line too long."""
+    """Number of clients that imud disconnected since start: no reads, too many requests, or a line that was too
+    long."""
     failed: int = 0
-    """Clients disconnected since start because of an error in the daemon."""
+    """Number of clients disconnected since start because of an error in the daemon."""

@@ -34,15 +34,15 @@ CANOPEN = "{{driver: hipnuc-canopen, options: {{{}}}, socketcan: {{interface: {}
     [
         (
             ["a {uart: {port: /dev/x}}", "b {uart: {port: /dev/x}}"],
-            "3: devices.b.uart.port: expected a port of its own, got /dev/x, which a (line 2) has",
+            "3: devices.b.uart.port: expected an unused port, got /dev/x; a (line 2) uses it",
         ),
         (
             ["a {uart: {port: /dev/x}}", "b " + MODBUS.format("/dev/x", 80, 9600)],
-            "3: devices.b.rs485.line: expected a line of its own, got /dev/x, which a (line 2) has",
+            "3: devices.b.rs485.line: expected an unused line, got /dev/x; a (line 2) uses it",
         ),
         (
             ["a " + MODBUS.format("/dev/x", 80, 9600), "b " + MODBUS.format("/dev/x", 80, 9600)],
-            "3: devices.b.rs485.address: expected an address of its own on /dev/x, got 80, which a (line 2) has",
+            "3: devices.b.rs485.address: expected an unused address on /dev/x, got 80; a (line 2) uses it",
         ),
         (
             ["a " + MODBUS.format("/dev/x", 80, 9600), "b " + MODBUS.format("/dev/x", 81, 115200)],
@@ -50,11 +50,11 @@ CANOPEN = "{{driver: hipnuc-canopen, options: {{{}}}, socketcan: {{interface: {}
         ),
         (
             ["a {driver: imu61x-i2c, i2c: {address: 0x18}}", "b {driver: imu61x-i2c, i2c: {address: 24}}"],
-            "3: devices.b.i2c.address: expected an address of its own on /dev/i2c-1, got 24, which a (line 2) has",
+            "3: devices.b.i2c.address: expected an unused address on /dev/i2c-1, got 24; a (line 2) uses it",
         ),
         (
             ["a {spi: {port: /dev/spidev0.0}}", "b {spi: {port: /dev/../dev/spidev0.0}}"],
-            "3: devices.b.spi.port: expected a port of its own, got /dev/../dev/spidev0.0, which a (line 2) has",
+            "3: devices.b.spi.port: expected an unused port, got /dev/../dev/spidev0.0; a (line 2) uses it",
         ),
         (
             ["a " + CANOPEN.format("node: 8", "can0"), "b " + CANOPEN.format("", "can0")],
@@ -84,11 +84,11 @@ CANOPEN = "{{driver: hipnuc-canopen, options: {{{}}}, socketcan: {{interface: {}
         ),
         (
             ["a {driver: imu61x-can, socketcan: {interface: /dev/ttyACM0, backend: slcan}}", "b {uart: {port: /dev/ttyACM0}}"],
-            "3: devices.b.uart.port: expected a port of its own, got /dev/ttyACM0, which a (line 2) has",
+            "3: devices.b.uart.port: expected an unused port, got /dev/ttyACM0; a (line 2) uses it",
         ),
         (
             ["a {driver: hipnuc-uart, uart: {port: /dev/x}, rmc: {source: nmea, port: /dev/x}}"],
-            "2: devices.a.rmc.port: expected a port of its own, got /dev/x, which a (line 2) has",
+            "2: devices.a.rmc.port: expected an unused port, got /dev/x; a (line 2) uses it",
         ),
     ],
 )  # fmt: skip
@@ -158,4 +158,4 @@ def test_two_names_of_one_port_are_one_port(tmp_path: Path) -> None:
     late.symlink_to("port")  # as udev makes it when the adapter is plugged in
     assert owner_of(second, [first, second], LINKS) == "a"
     (found,) = problems(f"a {{uart: {{port: {port}}}}}", f"b {{uart: {{port: {late}}}}}")
-    assert f"expected a port of its own, got {late}, which a (line 2) has" in found
+    assert f"expected an unused port, got {late}; a (line 2) uses it" in found

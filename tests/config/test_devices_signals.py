@@ -82,7 +82,7 @@ def test_defaults() -> None:
         ("driver: imu61x-can, socketcan: {interface: c}, lines: {reset: {line: A}}", "they have: none"),
         ("uart: {port: x}, lines: {sout: {line: A}}", "2:24: devices.a.lines: expected lines only beside a named driver, got them with driver auto; drivers that have lines: hipnuc-uart"),
         ("driver: nobody, uart: {port: x}, lines: {sout: {line: A}}", 'expected a driver that imud knows, got "nobody"'),
-        (hipnuc("sout: {line: 17}"), "2:59: devices.a.lines.sout: expected the key chip beside the number of a line, got none"),
+        (hipnuc("sout: {line: 17}"), "2:59: devices.a.lines.sout: expected the key chip next to the number of a line, got no chip"),
         (hipnuc("sout: {chip: gpiochip0}"), "2:53: devices.a.lines.sout: expected the key line (a whole number from 0 to 1023, or text that is not empty), got none"),
         (hipnuc("sout: {line: -1, chip: c}"), "expected a whole number from 0 to 1023, or text that is not empty, got -1"),
         (hipnuc("sout: {line: A, rate_hz: 5}"), 'devices.a.lines.sout.rate_hz: expected a key that imud knows, got "rate_hz"; known: active_low, bias, bias_us, chip, line, offset_us, width_us'),
