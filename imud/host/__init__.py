@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""Services of the host: clocks, files, log, threads, event loop, service manager."""

@@ -1,17 +1,17 @@
-"""The host's clocks as one object: CLOCK_MONOTONIC, how far CLOCK_REALTIME is ahead of it, and how it is steered.
+"""Host clocks as one object: CLOCK_MONOTONIC, the offset of CLOCK_REALTIME, and the steering by an NTP client.
 
-An NTP client slews CLOCK_MONOTONIC and CLOCK_REALTIME together, by up to 500 ppm, chronyd by up to 83,333 ppm; it steps
-CLOCK_REALTIME alone. CLOCK_MONOTONIC_RAW is neither slewed nor stepped. A reading of several clocks takes several
-calls; a thread that is preempted between them would see their difference too large by the time it was away. So what was
-measured tightly is kept, and each read of a device only checks it, at the cost of two calls:
+An NTP client slews CLOCK_MONOTONIC and CLOCK_REALTIME together, by up to 500 ppm (chronyd: 83,333 ppm). It steps only
+CLOCK_REALTIME. Nothing slews or steps CLOCK_MONOTONIC_RAW. A reading of several clocks needs several calls. If the
+thread is preempted between two calls, the difference of the clocks is too large. imud therefore keeps the result of a
+fast reading. Each read of a device only checks the result with two calls:
 
-    realtime less raw, read one right after the other
-        as when it was measured, within TOLERANCE_NS ──▶ what is kept
-        otherwise, or kept for KEPT_NS ──▶ monotonic, realtime, raw, monotonic: the tightest of READINGS
+    realtime minus raw, one read immediately after the other
+        within TOLERANCE_NS of the kept result ──▶ kept result
+        otherwise, or older than KEPT_NS ──▶ monotonic, realtime, raw, monotonic: the fastest of READINGS
 
-A suspend stops CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW, and steps CLOCK_REALTIME against both; CLOCK_BOOTTIME tells it
-from a step. A step and the begin of a slew are therefore seen by the next read of a device. Where the kernel has no
-CLOCK_MONOTONIC_RAW (one that is not Linux), CLOCK_MONOTONIC stands in: steering is not seen then.
+A suspend stops CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW and steps CLOCK_REALTIME; CLOCK_BOOTTIME distinguishes a suspend
+from a step. The next read of a device detects a step or the start of a slew. On a kernel without CLOCK_MONOTONIC_RAW
+(not Linux), imud uses CLOCK_MONOTONIC and does not detect steering.
 """
 
 import time
@@ -25,16 +25,17 @@ from typing import Final
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 EVEN_NS: Final = 1 * NS_PER_US
-"""Change of the offset that may be left out, beside the errors of the pairs."""
+"""Change of the offset that imud ignores, in addition to the errors of the pairs, ns."""
 PAIRS_MOST: Final = 4096
-"""4 s of a device at 1 kHz while CLOCK_MONOTONIC is slewed, hours otherwise. Half of them go at a time."""
+"""Maximum number of pairs: 4 s of a device at 1 kHz while CLOCK_MONOTONIC is slewed, otherwise hours."""
 RATE_NS: Final = 2 * NS_PER_S
-"""The rate is that of so much time, or of as much as is known."""
+"""Time span of the rate, ns; shorter if fewer pairs exist."""
+# standard deviation of a uniform distribution with range 1
 SIGMA_OF_RANGE: Final = 1 / sqrt(12)
 
 
 class SteadyTime:
-    """Conversion between CLOCK_MONOTONIC and steady time. Without pairs they are the same. Synchronization: none."""
+    """Conversion between CLOCK_MONOTONIC and steady time; equal without pairs. Synchronization: none."""
 
     __slots__ = ("_base_ns", "_even", "_monotonic", "_offsets", "_steady", "even_from_ns", "offset_ns")
 
@@ -42,19 +43,19 @@ class SteadyTime:
         self.offset_ns = 0
         """CLOCK_MONOTONIC minus steady time at the newest pair."""
         self.even_from_ns = -1 << 63
-        """Steady time from which `offset_ns` holds within a µs: what is later needs no call."""
+        """Steady time after which `offset_ns` is exact within 1 µs. Later times need no call."""
         self._base_ns = 0
         """Steady time minus CLOCK_MONOTONIC_RAW."""
         self._steady: list[int] = []
         self._monotonic: list[int] = []
         self._offsets: list[int] = []
         self._even = 0
-        """The pair at `even_from_ns`."""
+        """Index of the pair at `even_from_ns`."""
 
     def add_pair(self, monotonic_ns: int, raw_ns: int, held_raw_ns: int = 0, error_ns: int = 0) -> None:
         """Add a reading of CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW at the same instant, within `error_ns`.
 
-        At `held_raw_ns`, if that is later than the newest pair, the offset was still that of the newest pair.
+        At `held_raw_ns`, the offset was still the offset of the newest pair. Ignored if it is older than that pair.
         """
         if not self._steady:
             self._base_ns = monotonic_ns - raw_ns
@@ -68,15 +69,15 @@ class SteadyTime:
         self._even, self.even_from_ns = even, self._steady[even]
 
     def steady_ns(self, monotonic_ns: int) -> int:
-        """Return the steady time at which CLOCK_MONOTONIC was, or will be, `monotonic_ns`."""
+        """Return the steady time at `monotonic_ns` of CLOCK_MONOTONIC, past or future."""
         return monotonic_ns - self._offset(self._monotonic, monotonic_ns)
 
     def monotonic_ns(self, steady_ns: int) -> int:
-        """Return what CLOCK_MONOTONIC was, or will be, at a steady time."""
+        """Return CLOCK_MONOTONIC at a steady time, past or future."""
         return steady_ns + self._offset(self._steady, steady_ns)
 
     def error_ns(self, steady_ns: int) -> float:
-        """Return the one-sigma error of a conversion: when the rate changed between two pairs is not known."""
+        """Return the one-sigma error of a conversion. The time of a rate change between two pairs is not known."""
         steady, offsets = self._steady, self._offsets
         after = bisect_right(steady, steady_ns)
         if not 1 < after < len(steady):
@@ -89,7 +90,7 @@ class SteadyTime:
 
     @property
     def rate(self) -> float:
-        """How much faster than steady time CLOCK_MONOTONIC ran over the last RATE_NS, per second."""
+        """Rate of CLOCK_MONOTONIC relative to steady time minus 1, over the last RATE_NS."""
         steady, offsets = self._steady, self._offsets
         if len(steady) < 2:
             return 0.0
@@ -101,18 +102,20 @@ class SteadyTime:
         if len(steady) >= PAIRS_MOST:
             del steady[: PAIRS_MOST // 2], monotonic[: PAIRS_MOST // 2], offsets[: PAIRS_MOST // 2]
             self._even = max(self._even - PAIRS_MOST // 2, 0)
-        if steady and steady_ns <= steady[-1]:  # a clock that is read faster than it ticks
+        if steady and steady_ns <= steady[-1]:  # two readings of the clock within one tick
             steady_ns = steady[-1] + 1
         steady.append(steady_ns)
         monotonic.append(steady_ns + offset_ns)
         offsets.append(offset_ns)
 
     def _offset(self, times: list[int], at_ns: int) -> int:
-        """Return the offset at a time of `times`, which are those of the pairs by one of the clocks."""
+        """Return the offset at a time. `times` contains the times of the pairs by one of the clocks."""
         offsets = self._offsets
         after = bisect_right(times, at_ns)
+        # later than the newest pair: constant offset
         if after == len(times):
             return self.offset_ns
+        # earlier than the oldest pair
         if not after:
             return offsets[0]
         before_ns, before = times[after - 1], offsets[after - 1]
@@ -120,23 +123,24 @@ class SteadyTime:
 
 
 UNSTEERED: Final = SteadyTime()
-"""Of a clock that nothing steers, or of which nothing is known. Nobody adds pairs to it."""
+"""Steady time of a clock without steering. No caller adds pairs to it."""
 
 READINGS: Final = 5
-"""Most readings of one measurement."""
+"""Maximum number of readings in one measurement."""
 TIGHT_NS: Final = 1 * NS_PER_US
-"""A reading whose two readings of CLOCK_MONOTONIC are no further apart is used at once."""
+"""Time between the two readings of CLOCK_MONOTONIC, ns, below which imud uses a reading immediately."""
 TOLERANCE_NS: Final = 1 * NS_PER_US
-"""Change of the difference that is not followed, beside the error of the measurement."""
+"""Change of the difference that imud ignores, in addition to the error of the measurement, ns."""
+# time after which imud measures again
 KEPT_NS: Final = 1 * NS_PER_S
 
 
 SUSPENDED_NS: Final = 100 * NS_PER_MS
-"""CLOCK_BOOTTIME that gained so much on CLOCK_MONOTONIC counted a suspend."""
+"""Minimum lead of CLOCK_BOOTTIME over CLOCK_MONOTONIC that counts as a suspend, ns."""
 
 
 def kernel_clock(name: str) -> Callable[[], int]:
-    """Return what reads CLOCK_`name`; CLOCK_MONOTONIC where there is none."""
+    """Return a function that reads CLOCK_`name`; CLOCK_MONOTONIC if the clock does not exist."""
     try:
         read = partial(time.clock_gettime_ns, getattr(time, f"CLOCK_{name}"))
         read()
@@ -146,7 +150,7 @@ def kernel_clock(name: str) -> Callable[[], int]:
 
 
 class HostClock:
-    """Reader of the host's clocks. Synchronization: `now_ns` any thread, the rest one thread."""
+    """Reader of the host clocks. Synchronization: `now_ns` from any thread, all other methods from one thread."""
 
     __slots__ = (
         "_asleep_ns", "_boottime_ns", "_due_ns", "_held_ns", "_least_ns", "_most_ns", "_offset_ns", "_raw_ns",
@@ -160,38 +164,38 @@ class HostClock:
         raw_ns: Callable[[], int] | None = None,
         boottime_ns: Callable[[], int] | None = None,
     ) -> None:
-        """`raw_ns` reads a clock that nothing steers, `boottime_ns` one that counts while the machine is suspended.
+        """`raw_ns` reads a clock without steering, `boottime_ns` a clock that continues during a suspend.
 
-        None for CLOCK_MONOTONIC_RAW and CLOCK_BOOTTIME; with a `raw_ns` alone there are no suspends.
+        None: CLOCK_MONOTONIC_RAW and CLOCK_BOOTTIME. With `raw_ns` only, imud does not detect a suspend.
         """
         self.now_ns = monotonic_ns
         """CLOCK_MONOTONIC, ns."""
         self.error_ns = 0
-        """Bound of the error of what is kept, ns: half of the time that its measurement took."""
+        """Maximum error of the kept offset, ns: half of the duration of its measurement."""
         self.steady: Final = SteadyTime()
-        """CLOCK_MONOTONIC against a time that nothing steers, as of the last `utc_offset_ns`."""
+        """CLOCK_MONOTONIC relative to a time without steering, as of the last `utc_offset_ns`."""
         self._realtime_ns = realtime_ns
         self._raw_ns = raw_ns or kernel_clock("MONOTONIC_RAW")
         self._boottime_ns = boottime_ns or (monotonic_ns if raw_ns else kernel_clock("BOOTTIME"))
         self.suspends = 0
-        """Times that the machine was suspended since the first reading, as of the last `utc_offset_ns`."""
+        """Number of suspends since the first reading, as of the last `utc_offset_ns`."""
         self.on_measured: Callable[[int, int, int], None] | None = None
-        """Called after each measurement with what was added to `steady`: CLOCK_MONOTONIC, raw, and held raw."""
+        """Receives each pair of `steady` after a measurement: CLOCK_MONOTONIC, raw, and held raw."""
         self._asleep_ns = self._boottime_ns() - monotonic_ns()
         self._offset_ns = 0
-        self._least_ns, self._most_ns = 1, 0  # nothing is between
+        self._least_ns, self._most_ns = 1, 0  # empty range: the first read measures
         self._held_ns = 0
         self._due_ns = -1 << 63
 
     @property
     def is_steering_seen(self) -> bool:
-        """Whether there is a clock that nothing steers."""
+        """Whether the host has a clock without steering."""
         return self._raw_ns is not self.now_ns
 
     def utc_offset_ns(self) -> int:
-        """Return CLOCK_REALTIME minus CLOCK_MONOTONIC, ns; bring `steady` up to date.
+        """Return CLOCK_REALTIME minus CLOCK_MONOTONIC, ns. Update `steady`.
 
-        To be called between a reading of CLOCK_MONOTONIC and its conversion by `steady`.
+        Call this method between a reading of CLOCK_MONOTONIC and its conversion by `steady`.
         """
         ahead_ns = self._realtime_ns() - (raw_ns := self._raw_ns())
         if self._least_ns <= ahead_ns <= self._most_ns and raw_ns < self._due_ns:
@@ -201,7 +205,7 @@ class HostClock:
         return self._offset_ns
 
     def kept(self) -> tuple[int, int]:
-        """Return CLOCK_REALTIME minus CLOCK_MONOTONIC as last measured, ns, and the suspends."""
+        """Return the kept value of CLOCK_REALTIME minus CLOCK_MONOTONIC, ns, and the number of suspends."""
         return self._offset_ns, self.suspends
 
     def _measure(self) -> None:
@@ -217,14 +221,14 @@ class HostClock:
                 break
         error_ns, offset_ns = (best_ns + 1) // 2, best_realtime_ns - best_monotonic_ns
         if error_ns <= self.error_ns or abs(offset_ns - self._offset_ns) > error_ns + self.error_ns:
-            self._offset_ns = offset_ns  # measured better, or CLOCK_REALTIME was stepped
+            self._offset_ns = offset_ns  # more exact measurement, or a step of CLOCK_REALTIME
         self.error_ns = error_ns
         held_ns = self._held_ns
         self.steady.add_pair(best_monotonic_ns, best_raw_ns, held_ns, error_ns)
         ahead_ns, tolerance_ns = best_realtime_ns - best_raw_ns, TOLERANCE_NS + best_ns
         self._least_ns, self._most_ns = ahead_ns - tolerance_ns, ahead_ns + tolerance_ns
         self._held_ns, self._due_ns = best_raw_ns, best_raw_ns + KEPT_NS
-        asleep_ns = self._boottime_ns() - now_ns()  # not more than the truth, whenever the thread is preempted
+        asleep_ns = self._boottime_ns() - now_ns()  # a preemption makes the difference smaller, never larger
         self.suspends += asleep_ns > self._asleep_ns + SUSPENDED_NS
         self._asleep_ns = max(self._asleep_ns, asleep_ns)
         if self.on_measured is not None:

@@ -1,18 +1,17 @@
-"""The event loop of the daemon: asyncio's, with readers that are called as soon as their descriptors are seen readable.
+"""Event loop of the daemon: asyncio with readers that run as soon as their descriptors are readable.
 
-asyncio makes a handle of each event, queues it, and runs it in a context: for a read of 6 µs that is as much again,
-a seventh of all instructions of a sample. Readers (`add_reader`) do without:
+asyncio makes a handle of each event, queues it, and runs it in a context. For a read of 6 µs this doubles the time: a
+seventh of all instructions of a sample. Readers (`add_reader`) avoid the handle:
 
-    epoll of readers: descriptors ──readable──▶ callback, at once
-      └─ asyncio's own epoll: writers, signals, transports ──▶ handles, queued as always
+    epoll of readers: descriptors ──readable──▶ callback, immediately
+      └─ epoll of asyncio: writers, signals, transports ──▶ handles, queued
 
-The wait of a turn is that of the outer epoll. So readers come first in every turn, each once; then handles and timers
-have theirs. Writers are asyncio's own, also of a descriptor that has a reader.
+Each turn waits on the outer epoll. In every turn each reader runs once, then handles and timers run. asyncio handles
+writers, also for a descriptor with a reader.
 
-A turn of asyncio around a wait in which only readers were called is for nothing: no handle is ready and no timer is
-due. So the selector waits again itself, until its time is over, until asyncio has an event, or until something was
-given to the loop meanwhile: a callback, a timer, `stop`. What another thread or a signal gives is an event: asyncio
-writes to a descriptor of its own for it.
+If a turn only called readers, the selector waits again. An asyncio turn would do nothing: no handle is ready and no
+timer is due. The selector returns at its timeout, at an asyncio event, or if a reader gave the loop a callback, a timer
+or `stop`. Other threads and signals wake the loop through a descriptor of asyncio.
 """
 
 import asyncio
@@ -29,51 +28,45 @@ T = TypeVar("T")
 Arguments = TypeVarTuple("Arguments")
 
 EVENTS_MAX: Final = 256
-"""Descriptors seen in one turn; those beyond come in the next."""
+"""Maximum number of descriptors in one turn; the next turn handles all others."""
 
 OnError = Callable[[dict[str, Any]], None]
 """`loop.call_exception_handler`."""
 
 
 class Poller(Protocol):
-    """What is used of `select.epoll`."""
+    """The used methods of `select.epoll`."""
 
-    def register(self, fd: int, eventmask: int, /) -> None:
-        """Watch a descriptor. Raises OSError."""
-        ...
+    def register(self, fd: int, eventmask: int, /) -> None: ...
 
-    def unregister(self, fd: int, /) -> None:
-        """Watch it no more. Raises OSError."""
-        ...
+    def unregister(self, fd: int, /) -> None: ...
 
     def poll(self, timeout: float | None, maxevents: int, /) -> list[tuple[int, int]]:
-        """Wait for events, without end for None."""
+        """Wait for events; None waits without a timeout."""
         ...
 
-    def close(self) -> None:
-        """Release the descriptor."""
-        ...
+    def close(self) -> None: ...
 
 
 class ReaderSelector(selectors.EpollSelector):
-    """Selector of asyncio's own descriptors, which calls readers itself. Synchronization: the event loop's thread."""
+    """Selector for asyncio's descriptors that calls readers itself. Synchronization: the thread of the event loop."""
 
     def __init__(self, poller: Poller | None = None) -> None:
-        """`poller` watches readers and the epoll of asyncio's own; None for one of the kernel."""
+        """`poller` watches the readers and the epoll of asyncio; None for an epoll of the kernel."""
         super().__init__()
         self.on_error: OnError | None = None
         self.has_news = False
-        """Whether the loop was given something since the wait began: it must have its turn. Set by the loop."""
+        """Whether the loop received a callback, a timer or `stop` since the wait started. Set by the loop."""
         self._readers: dict[int, Callable[[], object]] = {}
         self._removed: set[int] = set()
-        """Descriptors whose events of the present turn are no longer theirs: the number may be in use again."""
+        """Descriptors that were removed in the present turn. The kernel may already use the number for another file."""
         self._outer: Poller = poller or select.epoll()
         self._poll = self._outer.poll
         self._inner = self.fileno()
         self._outer.register(self._inner, select.EPOLLIN)
 
     def add(self, fd: int, callback: Callable[[], object]) -> None:
-        """Call `callback` in each turn in which the descriptor is readable, in place of the one before."""
+        """Call `callback` in each turn in which the descriptor is readable, in place of its previous callback."""
         self._readers[fd] = callback
         try:
             self._outer.register(fd, select.EPOLLIN)
@@ -81,20 +74,20 @@ class ReaderSelector(selectors.EpollSelector):
             return
 
     def remove(self, fd: int) -> bool:
-        """Call nothing any more. Returns whether there was a reader; it may be closed already."""
+        """Remove the reader of a descriptor, open or closed. Return whether a reader existed."""
         if self._readers.pop(fd, None) is None:
             return False
         self._removed.add(fd)
         try:
             self._outer.unregister(fd)
-        except OSError:  # closed, with which the kernel removed it
+        except OSError:  # the kernel removes a closed descriptor itself
             return True
         return True
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Wait, call the readers whose descriptors are readable, and return asyncio's own events.
+        """Wait, call the readers of all readable descriptors, and return the events of asyncio.
 
-        Returns when there are some, when the time is over, and when the loop was given something by a reader.
+        Returns at an asyncio event, at the timeout, and if a reader gave the loop a callback, a timer or `stop`.
         """
         found: list[tuple[selectors.SelectorKey, int]] = []
         readers, removed, poll = self._readers, self._removed, self._poll
@@ -113,7 +106,7 @@ class ReaderSelector(selectors.EpollSelector):
                 elif not removed or fd not in removed:
                     try:
                         callback()
-                    except Exception as error:  # noqa: BLE001 - as asyncio does with a handle's
+                    except Exception as error:  # noqa: BLE001 - asyncio does the same with the callback of a handle
                         self._failed(callback, error)
             if found or self.has_news:
                 return found
@@ -121,7 +114,7 @@ class ReaderSelector(selectors.EpollSelector):
                 return found
 
     def close(self) -> None:
-        """Release both descriptors; may be called twice."""
+        """Release both descriptors. A second call does nothing."""
         self._readers.clear()
         self._outer.close()
         super().close()
@@ -132,7 +125,7 @@ class ReaderSelector(selectors.EpollSelector):
 
 
 class SampleLoop(asyncio.SelectorEventLoop):
-    """An event loop whose readers cost little. A reader runs in no context (contextvars) and in no task."""
+    """Event loop with cheap readers. A reader runs without a context (contextvars) and without a task."""
 
     def __init__(self, selector: ReaderSelector | None = None) -> None:
         self._reader_selector = selector or ReaderSelector()
@@ -149,7 +142,7 @@ class SampleLoop(asyncio.SelectorEventLoop):
     def call_at(
         self, when: float, callback: Callable[[*Arguments], object], *args: *Arguments, context: Context | None = None
     ) -> asyncio.TimerHandle:
-        """Call `callback` with `args` at a time of the loop's clock; `call_later` does this too."""
+        """Call `callback` with `args` at a time of the loop's clock; also used by `call_later`."""
         self._reader_selector.has_news = True
         return super().call_at(when, callback, *args, context=context)
 
@@ -163,17 +156,19 @@ class SampleLoop(asyncio.SelectorEventLoop):
         self._reader_selector.add(_number_of(fd), partial(callback, *args))
 
     def remove_reader(self, fd: Any) -> bool:
-        """Call nothing any more. Returns whether there was a reader, also one of asyncio's own (`sock_recv`, …)."""
+        """Remove the reader of a descriptor. Return whether a reader existed, also of asyncio itself (`sock_recv`,
+        …).
+        """
         number = _number_of(fd)
         return number >= 0 and (self._reader_selector.remove(number) or super().remove_reader(number))
 
 
 def run(main: Coroutine[Any, Any, T]) -> T:
-    """Run a coroutine to its end in a `SampleLoop`, as `asyncio.run`."""
+    """Run a coroutine to its end in a `SampleLoop`, like `asyncio.run`."""
     with asyncio.Runner(loop_factory=SampleLoop) as runner:
         return runner.run(main)
 
 
 def _number_of(fd: Any) -> int:
-    """The number of a descriptor, or of a file; -1 for a closed one."""
+    """Return the number of a descriptor or file; -1 for a closed file."""
     return fd if isinstance(fd, int) else int(fd.fileno())

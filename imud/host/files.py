@@ -1,7 +1,8 @@
-"""Reads and writes the regular files that imud uses: never waits for a FIFO or a device, never follows a surprise.
+"""Reads and writes of regular files, without waiting for FIFOs or devices and without following replaced paths.
 
-Opening a FIFO waits for its other end, reading /dev/zero never ends, and opening a serial port moves its lines: the
-type is looked at before opening, and again afterwards, because the file may have been exchanged in between.
+Opening a FIFO waits for its other end, a read of /dev/zero never ends, and opening a serial port changes its modem
+lines. imud therefore checks the type before it opens a path. It checks the type again after opening, because another
+program may replace the file in between.
 """
 
 import errno
@@ -27,17 +28,17 @@ KINDS: Final = (
     (stat.S_ISBLK, "a block device"),
     (stat.S_ISSOCK, "a socket"),
 )
-"""What a path may be other than a regular file."""
+"""Names of file types other than regular files."""
 READ_FLAGS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 WRITE_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 class NotRegularFile(OSError):
-    """What stands at a path is no regular file. Example: a FIFO, /dev/zero, a directory."""
+    """Path of a file that is not regular. Example: a FIFO, /dev/zero, a directory."""
 
 
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
-    """Open a regular file for reading. Raises OSError, NotRegularFile for what is none."""
+    """Open a regular file for reading. Raises OSError; NotRegularFile for other types."""
     try:
         _check_regular(os.stat(path), path)
         descriptor = os.open(path, READ_FLAGS)
@@ -52,9 +53,9 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def open_stream(path: str | os.PathLike[str], wait_ms: int) -> BinaryIO:
-    """Open a regular file, or a FIFO that a program writes to, which is waited for. Raises OSError, NotRegularFile.
+    """Open a regular file, or a FIFO with a writer, for reading. Raises OSError, NotRegularFile.
 
-    A FIFO without data and without a writer for `wait_ms` is refused: opening it otherwise would wait without end.
+    Rejects a FIFO without data and without a writer after `wait_ms`. Otherwise opening it would wait forever.
     """
     if not stat.S_ISFIFO(os.stat(path).st_mode):
         return open_regular(path)
@@ -69,16 +70,16 @@ def open_stream(path: str | os.PathLike[str], wait_ms: int) -> BinaryIO:
 
 
 def read_regular(path: str | os.PathLike[str], bytes_max: int) -> bytes:
-    """Return the content of a regular file, `bytes_max` bytes at most. Raises OSError as `open_regular`."""
+    """Return at most `bytes_max` bytes of a regular file. Raises the errors of `open_regular`."""
     with open_regular(path) as file:
         return file.read(bytes_max)
 
 
 def replace_file(path: Path, content: bytes, *, mode: int = 0o640, owner: tuple[int, int] | None = None) -> None:
-    """Write a file that is the old one or the new one, whole, whenever the process or the machine stops.
+    """Replace a file atomically: after a crash, the path contains the complete old or the complete new file.
 
-    With `owner` (uid, gid) it is given to them, and has exactly `mode`; without, the umask takes its bits from `mode`.
-    Raises OSError; the old file is left then. What stands at the temporary name is removed, not followed.
+    With `owner` (uid, gid), the file has this owner and exactly `mode`. Without `owner`, the umask reduces `mode`.
+    Raises OSError and keeps the old file. Removes a file with the temporary name and does not follow it.
     """
     temporary = path.with_name(path.name + ".new")
     with suppress(FileNotFoundError):
@@ -98,7 +99,7 @@ def replace_file(path: Path, content: bytes, *, mode: int = 0o640, owner: tuple[
 
 
 def _own(descriptor: int, mode: int, owner: tuple[int, int]) -> None:
-    """Set owner and mode where they differ: a file system without them (vfat) refuses even to keep them."""
+    """Set owner and mode only if they differ: a file system without owners (vfat) rejects every change."""
     now = os.fstat(descriptor)
     if (now.st_uid, now.st_gid) != owner:
         os.fchown(descriptor, *owner)
@@ -115,11 +116,11 @@ def _check_regular(status: os.stat_result, path: str | os.PathLike[str]) -> None
 
 
 GROUP_ACCESS: Final = stat.S_IRGRP | stat.S_IWGRP
-"""Bits of a mode with which members of the node's group may open it for reading and writing."""
+"""Bits of a mode that let the group read and write."""
 
 
 def group_of(path: str, otherwise: str) -> str:
-    """Return the name of the node's group; `otherwise` if that is root or not known."""
+    """Return the name of the node's group; `otherwise` for the group root or an unknown group."""
     try:
         gid = os.stat(path).st_gid
         return grp.getgrgid(gid).gr_name if gid else otherwise
@@ -128,7 +129,7 @@ def group_of(path: str, otherwise: str) -> str:
 
 
 def user_name() -> str:
-    """Return the name of the user that this process runs as, or its number."""
+    """Return the name of the user of this process, or the number of a user without a name."""
     uid = os.geteuid()
     try:
         return pwd.getpwuid(uid).pw_name
@@ -139,18 +140,18 @@ def user_name() -> str:
 log = logging.getLogger(__name__)
 
 FILE_BYTES_MAX = 1 << 20
-"""256 devices take some 20 kB."""
+"""Maximum size of a state file, bytes. 256 devices need about 20 kB."""
 SAVE_LIMIT_S = 1.0
-"""How long the end of the daemon waits for a disk that does not answer."""
+"""Maximum time that the daemon waits at its end for a slow disk, s."""
 
 T = TypeVar("T")
 
 
 class StateFile:
-    """A JSON file. Every error is reported, and costs the content only. Synchronization: the event loop's thread."""
+    """JSON file. Errors are logged and lose only the content. Synchronization: the thread of the event loop."""
 
     def __init__(self, file: Path | None, thread: str, without: str) -> None:
-        """None as `file` reads and writes nothing; `without` says in messages what the next start does without it."""
+        """`file` None: no reads and writes. `without` describes the next start without the content, for messages."""
         self._file = file
         self._without = without
         self._contents: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
@@ -160,7 +161,7 @@ class StateFile:
             self._thread.start()
 
     def read(self, content_type: type[dict[str, T]]) -> dict[str, T]:
-        """Return the content; empty where there is none that can be used."""
+        """Return the content; empty if there is no valid file."""
         if self._file is None:
             return {}
         try:
@@ -168,24 +169,24 @@ class StateFile:
         except FileNotFoundError:
             return {}
         except (OSError, msgspec.DecodeError, UnicodeError, RecursionError) as error:
-            reason = reason_of(error) if isinstance(error, OSError) else "it is not what imud wrote"
-            log.warning("%s cannot be used: %s; %s", self._file, reason, self._without)
+            reason = reason_of(error) if isinstance(error, OSError) else "it does not contain the JSON that imud writes"
+            log.warning("cannot use %s: %s; %s", self._file, reason, self._without)
             return {}
 
     def write(self, content: object) -> None:
-        """Have the content written soon; of several that wait only the newest is."""
+        """Queue the content for the thread, which writes only the newest content."""
         if self._thread is not None:
             self._contents.put(msgspec.json.encode(content))
 
     def close(self) -> None:
-        """Wait until the file is written, for at most SAVE_LIMIT_S; may be called twice."""
+        """Wait up to SAVE_LIMIT_S until the file is written. A second call does nothing."""
         if self._thread is not None:
             self._contents.put(None)
             self._thread.join(SAVE_LIMIT_S)
             self._thread = None
 
     def _save(self, file: Path) -> None:
-        """Write the newest content whenever there is one. Runs in the thread."""
+        """Write the newest content of the queue. Runs in the thread."""
         while (content := self._contents.get()) is not None:
             ended = False
             while not ended and not self._contents.empty():
@@ -196,7 +197,7 @@ class StateFile:
                 replace_file(file, content)
             except OSError as error:
                 log.warning(
-                    "%s cannot be written: %s; after the next start %s; may this user write to state_dir?",
+                    "cannot write %s: %s; after the next start %s; give this user write permission for state_dir",
                     file, reason_of(error), self._without,
                 )  # fmt: skip
             if ended:

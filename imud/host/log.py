@@ -1,11 +1,11 @@
-"""The daemon's log: lines that cannot be forged, written by a thread, so that a log without a reader stops nothing.
+"""Log of the daemon: one escaped line per message, written by a thread, so that a slow reader does not delay imud.
 
-    log.warning(…) ──▶ LineFormatter: escaped, bounded ──▶ queue, LOG_QUEUE_MESSAGES ──▶ thread ──▶ standard error
+    log.warning(…) ──▶ LineFormatter: escape, cut ──▶ queue, LOG_QUEUE_MESSAGES ──▶ thread ──▶ standard error
 
-What came from outside (names in requests, texts of devices, contents of files, names of nodes) may hold anything:
-`LineFormatter` escapes every message as a whole, so that no call can forget it; `printable` and `shown` bound a single
-value, so that a long one does not push the rest of its message out. A full queue drops the newest messages and counts
-them; the log says how many as soon as it flows again.
+External values (names in requests, texts of devices, contents of files, names of nodes) can contain any characters.
+`LineFormatter` escapes every complete message, so that a caller cannot forget it. `printable` and `shown` limit the
+length of one value, so that a long value does not displace the rest of its message. If the queue is full, the log drops
+the newest messages and later reports their number.
 """
 
 import logging
@@ -24,26 +24,28 @@ from typing import Any, Final
 log = logging.getLogger(__name__)
 
 VALUE_CHARACTERS_MAX: Final = 200
-"""Of one value in a message; the longest product string of a device, a USB descriptor's, has 126."""
+"""Maximum length of one value. The longest product string, of a USB descriptor, has 126 characters."""
 MESSAGE_CHARACTERS_MAX: Final = 2000
-"""Of one message: the list of 256 device names that a reload changed is cut, everything else fits."""
+"""Maximum length of one message. Only the list of 256 changed devices after a reload is longer."""
 TRACEBACK_LINES_MAX: Final = 100
-"""Of one traceback, the newest calls."""
+"""Maximum number of lines of one traceback, newest calls."""
 LOG_QUEUE_MESSAGES: Final = 1000
-"""Messages that wait for the log's reader: a second of the loudest trouble, at most a few MB."""
+"""Maximum number of messages in the queue: 1 s of the highest message rate, a few MB."""
 STDERR: Final = 2
 FLUSH_S: Final = 1.0
-"""How long the end of the process waits for the log's reader."""
+"""Maximum time that the end of the process waits for the reader of the log, s."""
 POLL_MS: Final = 100
-"""How soon the thread notices that its handler was closed while nobody reads."""
+"""Interval at which the thread checks for `close` while the reader does not read, ms."""
 PRIORITIES: Final = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
-"""Priorities of syslog(3) by the least level that has them; all below is 7, debug."""
+"""Priorities of syslog(3) by minimum level. Lower levels have priority 7, debug."""
+# pause after the first repetition, s
 PAUSE_FIRST_S: Final = 1.0
+# maximum pause, s
 PAUSE_MOST_S: Final = 60.0
 KNOWN_MOST: Final = 512
-"""Different messages that are remembered: some for each of 256 devices."""
+"""Maximum number of remembered messages: two for each of 256 devices."""
 SAME_AS: Final = "same_as"
-"""Attribute of a record, by `extra`."""
+"""Attribute of a log record, set with `extra`."""
 NUMBERS: Final = re.compile(r"\d+")
 LEVELS_SHOWN: Final = 4
 ITEMS_SHOWN: Final = 10
@@ -53,12 +55,10 @@ ITEMS_SHOWN: Final = 10
 
 
 def printable(text: str, characters_max: int = VALUE_CHARACTERS_MAX) -> str:
-    """Return `text` in one line of printable characters, the others as escapes (`\\n`, `\\x1b`), cut to a length.
-
-    Lone surrogates, which stand for bytes that are not UTF-8 and which no encoder accepts, are escaped too.
-    """
+    r"""Return `text` as one line of printable characters, with escapes (`\n`, `\x1b`), cut to a length."""
     if len(text) <= characters_max and text.isprintable():
         return text
+    # isprintable is False for lone surrogates too: bytes without UTF-8 meaning, which no encoder accepts
     cut = text[:characters_max]
     escaped = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in cut)
     if len(text) <= characters_max and len(escaped) <= characters_max:
@@ -67,7 +67,7 @@ def printable(text: str, characters_max: int = VALUE_CHARACTERS_MAX) -> str:
 
 
 def shown(value: object, characters_max: int = VALUE_CHARACTERS_MAX) -> str:
-    """Return a Python literal of `value`, escaped and cut in length, in number of items and in depth; never raises."""
+    """Return a Python literal of `value`, escaped, with limited length, depth and number of items. Never raises."""
     try:
         return printable(_SHORT.repr(value), characters_max)
     except Exception as error:  # noqa: BLE001 - a value's own __repr__ may raise anything
@@ -75,7 +75,7 @@ def shown(value: object, characters_max: int = VALUE_CHARACTERS_MAX) -> str:
 
 
 class _ShortRepr(reprlib.Repr):
-    """`reprlib` with this module's limits; bytes are cut before they are converted."""
+    """`reprlib` with the limits of this module. It cuts bytes before it converts them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -84,7 +84,6 @@ class _ShortRepr(reprlib.Repr):
         self.maxstring = self.maxother = self.maxlong = VALUE_CHARACTERS_MAX
 
     def repr_bytes(self, data: bytes, _level: int) -> str:
-        """Return the first bytes as a literal."""
         return repr(data[: self.maxother]) + ("…" if len(data) > self.maxother else "")
 
 
@@ -92,15 +91,17 @@ _SHORT: Final = _ShortRepr()
 
 
 class LineFormatter(logging.Formatter):
-    """Makes one line of each message; only a traceback has more, each indented, so that none looks like a message."""
+    """Formatter that makes one line of each message. The lines of a traceback are indented: they cannot imitate a
+    message.
+    """
 
     def __init__(self, *, journal: bool) -> None:
-        """For the journal each line begins with its priority (sd-daemon(3)), else with the time and the level."""
+        """Journal: each line starts with its priority (sd-daemon(3)). Otherwise: with the time and the level."""
         super().__init__()
         self._journal = journal
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line of `record`, without its end; never raises."""
+        """Return the line of `record` without its end. Never raises."""
         head = f"<{_priority(record.levelno)}>" if self._journal else ""
         level = "" if self._journal else f"{self.formatTime(record)} {record.levelname} "
         line = f"{head}{level}{printable(_message(record), MESSAGE_CHARACTERS_MAX)}"
@@ -111,16 +112,15 @@ class LineFormatter(logging.Formatter):
 
 
 def _priority(level: int) -> int:
-    """The priority of syslog(3) for a level of `logging`."""
     return next((priority for least, priority in PRIORITIES if level >= least), 7)
 
 
 class RepeatFilter(logging.Filter):
-    """Lets trouble that repeats itself through less and less often, with the number of messages left out.
+    """Filter that passes repeated messages less and less often, with the number of suppressed messages.
 
-    Messages are the same when their text before its values, the first value (the device), and what `same_as` gave them
-    are. After the first one there is a pause of PAUSE_FIRST_S, which doubles with every message up to PAUSE_MOST_S;
-    when there was none for that long, it begins anew. Messages below WARNING all pass.
+    Two messages are equal if their format string, their first value (the device) and their `same_as` are equal. The
+    pause after the first message is PAUSE_FIRST_S. It doubles with every passed message up to PAUSE_MOST_S. After
+    PAUSE_MOST_S without the message, the filter starts again. Messages below WARNING always pass.
     """
 
     def __init__(self) -> None:
@@ -128,17 +128,17 @@ class RepeatFilter(logging.Filter):
         self._known: dict[tuple[object, ...], _Repeated] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Decide whether `record` is logged; add to it how many were not."""
+        """Return whether `record` passes. Add the number of suppressed messages to its text."""
         if record.levelno < logging.WARNING:
             return True
         now_s, key = record.created, _key_of(record)
         known = self._known.pop(key, None)
-        if known is None or not 0 <= now_s - known.seen_s <= PAUSE_MOST_S:  # new, over, or the clock was set back
+        if known is None or not 0 <= now_s - known.seen_s <= PAUSE_MOST_S:  # new, expired, or the clock was set back
             self._known[key] = _Repeated(now_s, now_s + PAUSE_FIRST_S, PAUSE_FIRST_S, 0, now_s)
             if len(self._known) > KNOWN_MOST:
                 del self._known[next(iter(self._known))]
             return True
-        self._known[key] = known  # the one that was seen last is the last that is forgotten
+        self._known[key] = known  # the newest message is the last to be forgotten
         known.seen_s = now_s
         if now_s < known.due_s:
             known.left_out += 1
@@ -152,16 +152,16 @@ class RepeatFilter(logging.Filter):
 
 
 def same_as(text: str) -> dict[str, str]:
-    """Return the `extra` of a message whose text is itself a value: it is the same as those of this text.
+    """Return `extra` for a message whose text is a value. Messages with equal texts, except for numbers, are equal.
 
-    Numbers do not count: "3 samples lost" is the same as "5 samples lost", and not the same as "the adapter is gone".
+    "3 samples lost" equals "5 samples lost" and differs from "the adapter is absent".
     """
     return {SAME_AS: NUMBERS.sub("", text)}
 
 
 @dataclass(slots=True)
 class _Repeated:
-    """A message that may come again; times in s."""
+    """State of a repeated message; times in s."""
 
     seen_s: float
     due_s: float
@@ -179,14 +179,14 @@ def _message(record: logging.LogRecord) -> str:
     try:
         return record.getMessage()
     except Exception as error:  # noqa: BLE001 - a value's __str__, or one nested too deep: the message is ours to save
-        return f"{record.msg} ({type(error).__name__} while its values were converted to text)"
+        return f"{record.msg} ({type(error).__name__} in the conversion of its values)"
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
 class LogWriter(logging.Handler):
-    """Writes messages to a descriptor from a thread of its own. Synchronization: any thread may log."""
+    """Handler that writes messages to a descriptor from its own thread. Synchronization: any thread may log."""
 
     def __init__(self, descriptor: int, *, journal: bool = False, messages_max: int = LOG_QUEUE_MESSAGES) -> None:
         super().__init__()
@@ -195,9 +195,9 @@ class LogWriter(logging.Handler):
         self._descriptor = descriptor
         self._queue: queue.Queue[bytes | None] = queue.Queue(messages_max)
         self._refused = 0
-        """Dropped because the queue was full; changed under the handler's lock."""
+        """Number of messages dropped from the full queue. Changed under the lock of the handler."""
         self._unwritten = 0
-        """Dropped because they could not be written; changed by the thread."""
+        """Number of messages dropped after a failed write. Changed by the thread."""
         self._reported = 0
         self._ending = self._abandoned = False
         self._thread = threading.Thread(target=self._run, name="log", daemon=True)
@@ -205,28 +205,28 @@ class LogWriter(logging.Handler):
 
     @property
     def dropped(self) -> int:
-        """Messages dropped so far."""
+        """Number of messages dropped so far."""
         return self._refused + self._unwritten
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Queue a message; drop it if the queue is full. Returns at once."""
+        """Queue a message without blocking; drop it if the queue is full."""
         try:
             self._queue.put_nowait(encoded(self.format(record)))
         except queue.Full:
             self._refused += 1
-        except Exception:  # noqa: BLE001 - a message must not end what it is about
+        except Exception:  # noqa: BLE001 - a failed message must not stop the caller
             self.handleError(record)
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """Count a message that could not be formatted; the default writes to standard error, and may wait there."""
+        """Count a message that failed. The default handler writes to standard error, which may block."""
         self._refused += 1
 
     def close(self) -> None:
-        """Write what is queued, for at most FLUSH_S, and end the thread; may be called twice."""
+        """Write the queued messages for at most FLUSH_S and end the thread. A second call does nothing."""
         if self._abandoned:
             return
         self._ending = True
-        with suppress(queue.Full):  # then the thread sees `_ending` when it has emptied the queue
+        with suppress(queue.Full):  # queue full: the thread sees `_ending` after the last message
             self._queue.put_nowait(None)
         self._thread.join(FLUSH_S)
         self._abandoned = True
@@ -243,7 +243,7 @@ class LogWriter(logging.Handler):
                     return
 
     def _report_dropped(self) -> None:
-        """Write how many messages are missing, if any; the number is kept until that can be written."""
+        """Write the number of newly dropped messages; keep the number until the write succeeds."""
         dropped = self.dropped
         missing = dropped - self._reported
         head = "<4>" if self._journal else "WARNING "
@@ -251,7 +251,7 @@ class LogWriter(logging.Handler):
             self._reported = dropped
 
     def _write(self, line: bytes) -> bool:
-        """Write a line, waiting for the reader as long as the handler is open. Returns whether all was written."""
+        """Write a line. Wait for the reader while the handler is open. Return whether the complete line was written."""
         poll = select.poll()
         poll.register(self._descriptor, select.POLLOUT)
         try:
@@ -264,17 +264,15 @@ class LogWriter(logging.Handler):
 
 
 def encoded(line: str) -> bytes:
-    """Return a line as it is written: UTF-8, with its end."""
+    """Return the bytes of a line: UTF-8 with its end."""
     return line.encode("utf-8", "backslashreplace") + b"\n"
 
 
 @contextmanager
 def log_to(descriptor: int, level: str) -> Iterator[LogWriter]:
-    """Log messages of `level` and above to `descriptor`, and what Python itself reports, until the context ends.
-
-    The journal adds the time, elsewhere the lines have it.
-    """
+    """Log messages of `level` and above, and reports of Python itself, to `descriptor` until the context ends."""
     root = logging.getLogger()
+    # the journal adds the time; other logs contain it in the line
     writer, level_before = LogWriter(descriptor, journal=is_journal(descriptor)), root.level
     writer.addFilter(RepeatFilter())
     hooks_before = sys.unraisablehook, threading.excepthook
@@ -293,7 +291,7 @@ def log_to(descriptor: int, level: str) -> Iterator[LogWriter]:
 
 
 def is_journal(descriptor: int) -> bool:
-    """Whether a descriptor is the stream to the journal that the service manager made (systemd.exec(5))."""
+    """Return whether a descriptor is the journal stream of the service manager (systemd.exec(5))."""
     device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
     try:
         status = os.fstat(descriptor)
@@ -303,15 +301,14 @@ def is_journal(descriptor: int) -> bool:
 
 
 def messages_dropped() -> int:
-    """Return how many messages the log of this process has dropped."""
+    """Return the number of messages that the log of this process has dropped."""
     return sum(handler.dropped for handler in logging.getLogger().handlers if isinstance(handler, LogWriter))
 
 
 def _log_unraisable(error: Any) -> None:
-    """Log an exception that has no caller; Python's own hook writes to standard error, and may wait there."""
+    """Log an exception without a caller. Python's own hook writes to standard error, which may block."""
     log.error("exception ignored in %s", shown(error.object), exc_info=error.exc_value)
 
 
 def _log_thread_error(error: Any) -> None:
-    """Log an exception that ended a thread."""
     log.error("thread %s ended by an exception", error.thread.name if error.thread else "", exc_info=error.exc_value)

@@ -1,4 +1,4 @@
-"""The service manager: notifications by sd_notify(3), one datagram each to NOTIFY_SOCKET, and its watchdog."""
+"""Service manager: sd_notify(3) notifications, one datagram each to NOTIFY_SOCKET, and the watchdog."""
 
 import logging
 import os
@@ -11,15 +11,15 @@ from imud.model.units import NS_PER_S
 log = logging.getLogger(__name__)
 
 STATUS_NS: Final = NS_PER_S
-"""The status line changes at most once a second."""
+"""Minimum time between two changes of the status line, ns."""
 NAMES_SHOWN: Final = 5
-"""Devices that are named in the status line."""
+"""Maximum number of device names in the status line."""
 FINE: Final = ("running", "finished")
-"""States of devices (`DeviceState`) that need nobody's attention."""
+"""Device states (`DeviceState`) that need no action of the user."""
 
 
 def notify(state: str) -> None:
-    """Send `state`, for example `READY=1`; no-op when not started by a service manager."""
+    """Send `state`, for example `READY=1`. Do nothing without a service manager."""
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return
@@ -33,7 +33,7 @@ def notify(state: str) -> None:
 
 
 class ServiceManager:
-    """What the daemon tells the service manager while it runs. Synchronization: the event loop's thread only."""
+    """Notifications of the running daemon. Synchronization: the thread of the event loop only."""
 
     def __init__(self) -> None:
         self._watchdog_s = watchdog_interval_s()
@@ -42,17 +42,17 @@ class ServiceManager:
         self._status_due_ns = 0
 
     def ready(self) -> None:
-        """The daemon is up: outputs are open and devices are searched for."""
+        """Report that all outputs are open and the search for devices runs."""
         notify("READY=1")
 
     def stopping(self) -> None:
-        """The daemon ends."""
+        """Report the end of the daemon."""
         notify("STOPPING=1")
 
     def tick(self, now_ns: int, states: Callable[[], Mapping[str, str]]) -> None:
-        """Feed the watchdog, and tell how the devices are when that has changed. Call it ten times a second.
+        """Feed the watchdog. Report the device states if they changed. Call this method ten times per second.
 
-        `states` returns the state of each device by its name; it is called at most once a second.
+        `states` returns the state of each device by its name. It is called at most once per second.
         """
         if self._watchdog_s is not None and now_ns >= self._watchdog_due_ns:
             notify("WATCHDOG=1")
@@ -67,7 +67,7 @@ class ServiceManager:
 
 
 def status_line(states: Mapping[str, str]) -> str:
-    """Say how many devices run and name those that do not, for `systemctl status`."""
+    """Return the number of running devices and the names of the other devices, for `systemctl status`."""
     if not states:
         return "No devices are configured."
     other = [f"{name} ({state})" for name, state in states.items() if state not in FINE]
@@ -80,7 +80,7 @@ def status_line(states: Mapping[str, str]) -> str:
 
 
 def watchdog_interval_s() -> float | None:
-    """Half of WATCHDOG_USEC in seconds: how often `WATCHDOG=1` must be sent; None where no watchdog is asked for."""
+    """Return half of WATCHDOG_USEC, s: the interval of `WATCHDOG=1`. None if no watchdog is configured."""
     usec = os.environ.get("WATCHDOG_USEC", "")
     pid = os.environ.get("WATCHDOG_PID", str(os.getpid()))
     if not usec.isdecimal() or int(usec) == 0 or pid != str(os.getpid()):

@@ -1,7 +1,7 @@
-"""A thread that sleeps from one deadline, or edge of a line, to the next: for a polled bus, or a trigger line.
+"""Thread for a polled bus or a trigger line. It sleeps until the next deadline or the next edge of a line.
 
-A worker calls a function that returns how long it may sleep; tests call that function themselves, at times they choose
-(`tests/support/virtual_time.py`).
+A worker calls a function that returns the time of the next sleep. Tests call the function themselves at times of their
+choice (`tests/support/virtual_time.py`).
 """
 
 import gc
@@ -17,67 +17,66 @@ from typing import Final, Protocol
 from imud.model.units import NS_PER_S
 
 END_LIMIT_S = 5.0
-"""A transfer on a bus that hangs ends with the controller's own time-out, of one second at most. A write to a disk that
-hangs has none: whoever shares something with such a call leaves it alone."""
+"""Maximum wait for the end of a thread, s. A hanging bus transfer ends at the timeout of the controller, at most 1 s. A
+hanging write to a disk has no timeout: code that shares objects with such a thread must not use them again."""
 
+# An SPI read waits for the interpreter twice: at wake-up and after the transfer. Measured at 1 kHz next to a loop that
+# computes 2 ms of every 20 ms: with the default of 5 ms, reads start 127 to 149 µs late on average, with 0.3 ms 72 to
+# 96 µs. Missed data-ready edges: 0.54 % with 0.5 ms, 0.19 % with 0.3 ms, 0.17 % with 0.2 ms. 0.1 ms costs a quarter
+# more CPU time. With 300 silent metrics clients, a scrape delays samples by 4.1 ms (default) or 0.65 ms (0.5 ms).
 SWITCH_INTERVAL_S: Final = 0.0003
-"""After so long a thread lets another one run that waits (sys.setswitchinterval, for the whole process). A read of an
-SPI bus waits for the interpreter twice, when its thread wakes and after the transfer. Measured at 1 kHz beside a loop
-that computes 2 ms of every 20 ms, three times 8 s of each in turns: with the usual 5 ms reads begin 127 to 149 µs late
-on average, with 0.5 or 0.3 ms 72 to 96 µs. Of data-ready edges 0.54 % were missed with 0.5 ms, because two waits and
-the transfer are longer than a period, 0.19 % with 0.3 ms, 0.17 % with 0.2 ms; 0.1 ms costs a quarter more CPU. A scrape
-of the metrics (`scrape_server`) keeps samples waiting for 4.1 ms with the usual value and 300 silent clients, for
-0.65 ms with 0.5 ms."""
+"""Maximum time, s, that a thread runs while another thread waits (sys.setswitchinterval, for the complete process)."""
 
 SELECT_FDS: Final = 1024
-"""Descriptors that `select` takes are below this (FD_SETSIZE)."""
+"""Limit of descriptor numbers for `select` (FD_SETSIZE)."""
 
 Round = Callable[[], int]
-"""Does what is due, and returns after how many ns it is to be called again; 0 for at once."""
+"""Does the due work and returns the time until its next call, ns; 0: immediately."""
 
 
 class Worker(Protocol):
-    """Caller of a `Round` again and again, one call at a time."""
+    """Caller of a `Round` in a loop, one call at a time."""
 
     def ring(self) -> None:
-        """End the present sleep, or skip the next: there is work. From any thread."""
+        """End the present sleep, or skip the next sleep, because there is work. From any thread."""
         ...
 
     def end(self) -> bool:
-        """Stop calling; return whether the present call is over, for which it waits END_LIMIT_S at most."""
+        """Stop calling. Wait up to END_LIMIT_S for the present call and return whether it has ended."""
         ...
 
 
 class WatchingWorker(Worker, Protocol):
-    """A worker whose sleep descriptors can end as well."""
+    """Worker with descriptors that can end its sleep."""
 
     def watch(self, fd: int, callback: Callable[[], None]) -> bool:
-        """Have a descriptor that becomes readable end the sleep: `callback` is called where the `Round` is, before it.
+        """End the sleep when a descriptor becomes readable: the thread of the `Round` calls `callback` first.
 
-        Once for what came since the last call; nothing is read. Returns whether that is possible. From any thread.
+        One call for all data since the last call; the worker reads no data. Return whether this is possible. From any
+        thread.
         """
         ...
 
     def unwatch(self, fd: int) -> None:
-        """Call nothing for a descriptor, which may be closed already; no-op for one that is not watched."""
+        """Remove a descriptor, open or closed. Do nothing if it is not watched."""
         ...
 
 
 StartWorker = Callable[[str, Round, Callable[[BaseException], None]], Worker]
-"""Starts a worker: its name, what it calls, and what is called with an exception, which ends it."""
+"""Starts a worker: its name, its `Round`, and a function for an exception, which ends the worker."""
 StartWatchingWorker = Callable[[str, Round, Callable[[BaseException], None]], WatchingWorker]
 
 
 def share_interpreter() -> None:
-    """Have threads give way to others after SWITCH_INTERVAL_S. A shorter interval that is set already stays."""
+    """Let a thread give way to other threads after SWITCH_INTERVAL_S. Keep a shorter interval."""
     sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL_S))
 
 
 @contextmanager
 def rare_garbage_collection(allocations: int) -> Iterator[None]:
-    """Have the garbage collector run after so many new objects, and leave out what is there now.
+    """Run the garbage collector after `allocations` new objects and exclude all present objects.
 
-    For a process that makes next to no cycles and holds many objects: each run goes through all of them.
+    For a process with many objects and few cycles, because each collection visits all objects.
     """
     before = gc.get_threshold()
     gc.freeze()
@@ -90,51 +89,51 @@ def rare_garbage_collection(allocations: int) -> Iterator[None]:
 
 
 class WakeEvent:
-    """A wait that another thread can end. A lock's own wait is on CLOCK_MONOTONIC and costs a third of an Event's."""
+    """Wait that another thread can end. The wait of a lock uses CLOCK_MONOTONIC and costs a third of an Event."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._lock.acquire()
 
     def wait(self, seconds: float) -> None:
-        """Return after so much time, or when `ring` was called since the last wait."""
+        """Return after `seconds`, or after a `ring` since the last wait."""
         self._lock.acquire(timeout=seconds)
 
     def ring(self) -> None:
-        """End the present wait, or the next. From any thread."""
-        with suppress(RuntimeError):  # it rings already
+        """End the present wait, or the next wait. From any thread."""
+        with suppress(RuntimeError):  # already ringing
             self._lock.release()
 
 
 class DescriptorWait:
-    """A wait that descriptors can end: each time that something comes, not for as long as it is there (EPOLLET), since
-    another thread reads it. `select` is what has a time-out in µs; that of epoll is in ms.
-    """
+    """Wait that descriptors can end."""
 
     def __init__(self) -> None:
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._epoll = select.epoll()
+        # EPOLLET: one wake-up per arrival of data, because another thread reads the data
         self._epoll.register(self._bell, select.EPOLLIN | select.EPOLLET)
         self._callbacks: dict[int, Callable[[], None]] = {}
 
     @property
     def is_usable(self) -> bool:
-        """Whether `select` takes its descriptor: it does not where a thousand others are open."""
+        """Whether `select` accepts the descriptor; False if about a thousand descriptors are open."""
         return self._epoll.fileno() < SELECT_FDS
 
     def add(self, fd: int, callback: Callable[[], None]) -> None:
-        """Call `callback` in `wait` when something comes on a descriptor."""
+        """Call `callback` in `wait` when data arrives on a descriptor."""
         self._callbacks[fd] = callback
         self._epoll.register(fd, select.EPOLLIN | select.EPOLLET)
 
     def discard(self, fd: int) -> None:
-        """Call nothing for it any more."""
+        """Remove the callback of a descriptor."""
         if self._callbacks.pop(fd, None) is not None:
-            with suppress(OSError):  # closed, with which the kernel removed it
+            with suppress(OSError):  # the kernel removes a closed descriptor itself
                 self._epoll.unregister(fd)
 
     def wait(self, seconds: float) -> None:
-        """Return after so much time, when something came, or when `ring` was called since the last wait."""
+        """Return after `seconds`, after data arrived, or after a `ring` since the last wait."""
+        # the timeout of select has a resolution of 1 µs, the timeout of epoll 1 ms
         select.select((self._epoll,), (), (), seconds)
         for fd, _ in self._epoll.poll(0):
             callback = self._callbacks.get(fd)
@@ -142,7 +141,7 @@ class DescriptorWait:
                 callback()
 
     def ring(self) -> None:
-        """End the present wait, or the next. From any thread."""
+        """End the present wait, or the next wait. From any thread."""
         os.eventfd_write(self._bell, 1)
 
     def close(self) -> None:
@@ -153,26 +152,26 @@ class DescriptorWait:
 
 
 class BusThread:
-    """A `WatchingWorker` that is a thread."""
+    """Thread that is a `WatchingWorker`."""
 
     def __init__(self, name: str, work: Round, failed: Callable[[BaseException], None]) -> None:
         self._work, self._failed = work, failed
         self._wake = WakeEvent()
         self._descriptors: DescriptorWait | None = None
-        """The wait once a descriptor was watched: it costs twice as much."""
+        """Used after the first `watch`. It costs twice as much as a WakeEvent."""
         self._ended = False
         share_interpreter()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def ring(self) -> None:
-        """End the present sleep, or skip the next. From any thread."""
+        """End the present sleep, or skip the next sleep. From any thread."""
         self._wake.ring()
         if self._descriptors is not None:
             self._descriptors.ring()
 
     def watch(self, fd: int, callback: Callable[[], None]) -> bool:
-        """Have a descriptor end the sleep."""
+        """End the sleep when a descriptor becomes readable."""
         descriptors = self._descriptors or DescriptorWait()
         if not descriptors.is_usable:
             descriptors.close()
@@ -183,12 +182,12 @@ class BusThread:
         return True
 
     def unwatch(self, fd: int) -> None:
-        """Call nothing for a descriptor."""
+        """Remove a descriptor."""
         if self._descriptors is not None:
             self._descriptors.discard(fd)
 
     def end(self) -> bool:
-        """Stop after the present transfer; may be called twice."""
+        """Stop after the present transfer. A second call does nothing."""
         self._ended = True
         self.ring()
         self._thread.join(END_LIMIT_S)
@@ -211,6 +210,6 @@ class BusThread:
 
 
 def _sharpen_timer() -> None:
-    """Ask the kernel to wake this thread within 1 µs instead of 50 µs; without the right to, jitter stays."""
+    """Ask the kernel to wake this thread within 1 µs, not 50 µs. Without the permission, jitter remains."""
     with suppress(OSError):
         Path(f"/proc/{threading.get_native_id()}/timerslack_ns").write_text("1", encoding="ascii")

@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""Nouns of imud: units, errors, sample, event, ledger, options."""

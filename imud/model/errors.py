@@ -1,19 +1,19 @@
-"""Errors that imud raises on purpose. Each message names what was expected, what came, and what to look at.
+"""Errors that imud raises on purpose. Each message contains the expected value, the received value and the next step.
 
 ImudError
- ├─ ConfigError          the configuration file cannot be used
- ├─ LinkError            a port, bus or file cannot be used
- │   ├─ LinkMissing      it is not there (unplugged, misspelt); it may come back
- │   ├─ LinkDenied       it is there, but this user may not open it
- │   └─ LinkBusy         another program holds it
- ├─ CommandError         a command to a device
- │   ├─ BadArgument      cannot be sent: an argument is out of range
- │   ├─ NoReply          no reply came in time
- │   └─ Rejected         the device answered that it will not
- ├─ TransferError        one transfer on a bus failed; the next may go through
- ├─ DeviceRefused        another device answers on a bus, or it refuses a setting
+ ├─ ConfigError          invalid configuration file
+ ├─ LinkError            unusable port, bus or file
+ │   ├─ LinkMissing      absent (unplugged, misspelt); it may appear again
+ │   ├─ LinkDenied       present; the user lacks the permission to open it
+ │   └─ LinkBusy         in use by another program
+ ├─ CommandError         failed command to a device
+ │   ├─ BadArgument      imud cannot send it: an argument is out of range
+ │   ├─ NoReply          no reply before the timeout
+ │   └─ Rejected         the device rejected the command
+ ├─ TransferError        one failed transfer on a bus; the next transfer may succeed
+ ├─ DeviceRefused        another device replies on a bus, or the device rejects a setting
  ├─ NothingHeard         detection found no device
- └─ ServerError          the daemon's own interfaces: socket in use, shared memory not writable, protocol violated
+ └─ ServerError          interfaces of the daemon: socket in use, shared memory not writable, protocol violated
 """
 
 import os
@@ -21,62 +21,62 @@ import re
 from enum import StrEnum
 
 _NUMBER = re.compile(r"\[Errno (\d+)\]|\((\d+), ['\"]")
-"""An error number inside the text of a library's error."""
+"""Error number in the text of a library's error."""
 
 
 class ImudError(Exception):
-    """Root of all errors that imud raises on purpose."""
+    """Base class of all errors that imud raises on purpose."""
 
 
 class ConfigError(ImudError):
-    """The configuration file cannot be used. Example: an unknown key, a rate of NaN, a device without a link."""
+    """Invalid configuration file. Example: an unknown key, a rate of NaN, a device without a link."""
 
 
 class LinkError(ImudError):
-    """A port, bus or file cannot be used. Example: the adapter was pulled out while reading."""
+    """Unusable port, bus or file. Example: a replugged adapter during a read."""
 
 
 class LinkMissing(LinkError):
-    """The port is absent, and may appear again. Example: /dev/ttyUSB0 after the cable moved."""
+    """Absent port, which may appear again. Example: /dev/ttyUSB0 after the cable was moved."""
 
 
 class LinkDenied(LinkError):
-    """The port is there but may not be opened. Example: the user is not in group dialout."""
+    """Missing permission for a port. Example: the user is not in the group dialout."""
 
 
 class LinkBusy(LinkError):
-    """Another program holds the port. Example: a terminal program is still open on it."""
+    """Port in use by another program. Example: a terminal program still has it open."""
 
 
 class CommandError(ImudError):
-    """A command could not be carried out by a device."""
+    """Command that a device could not execute."""
 
 
 class BadArgument(CommandError, ValueError):
-    """A command cannot be encoded. Example: a baud rate that the device does not have."""
+    """Command that imud cannot encode. Example: a baud rate that the device does not support."""
 
 
 class NoReply(CommandError):
-    """No reply within the time-out. Example: the device is in another mode, or its receive line is not connected."""
+    """No reply before the timeout. Example: the device is in another mode, or its receive line is not connected."""
 
 
 class Rejected(CommandError):
-    """The device refused a command. Example: `ERR` after a command with a value outside its range."""
+    """Command that the device rejected. Example: `ERR` after a command with a value out of range."""
 
 
 class Trouble(StrEnum):
-    """Kinds of failure of a transfer."""
+    """Kinds of transfer failures."""
 
     ABSENT = "absent"
-    """Nobody acknowledges the address: not powered, not wired, another address."""
+    """No device acknowledges the address: no power, no wire, or another address."""
     STUCK = "stuck"
-    """The bus did not come free in time: a line held low, a short circuit."""
+    """The bus did not become free in time: a line held low, or a short circuit."""
     DISTURBED = "disturbed"
-    """The controller saw an error on the bus, or another controller was quicker."""
+    """The controller detected an error on the bus, or lost the arbitration."""
 
 
 class TransferError(ImudError):
-    """A transfer on a bus failed; the next may succeed. Example: no acknowledgement from address 0x18."""
+    """Failed transfer on a bus; the next transfer may succeed. Example: no acknowledgement from address 0x18."""
 
     def __init__(self, trouble: Trouble, message: str) -> None:
         super().__init__(message)
@@ -84,23 +84,21 @@ class TransferError(ImudError):
 
 
 class DeviceRefused(ImudError):
-    """The device that answers is not the expected one, or refused a setting. Example: a wrong product id."""
+    """Reply from an unexpected device, or a rejected setting. Example: a wrong product id."""
 
 
 class NothingHeard(ImudError):
-    """Detection found no device on a link. Example: nothing valid at any of the six baud rates."""
+    """Detection without a device on the link. Example: no valid frame at any of the six baud rates."""
 
 
 class ServerError(ImudError):
-    """One of the daemon's own interfaces cannot be used. Example: the socket belongs to another running daemon."""
+    """Failure of an interface of the daemon. Example: another running daemon uses the socket."""
 
 
 def reason_of(error: BaseException) -> str:
-    """Describe an error of the operating system or of a library in its words, without numbers, types and tuples.
-
-    Also where a library has put the system's error into a text of its own, as pyserial and asyncio do.
-    """
+    """Return the reason of a system or library error as text, without numbers, types and tuples."""
     number = next((argument for argument in error.args if isinstance(argument, int)), None)
+    # pyserial and asyncio put the number of the system error into their own text
     found = _NUMBER.search(str(error))
     if number is None and found is not None:
         number = int(found[1] or found[2])

@@ -1,4 +1,4 @@
-"""Contract: events of a device other than samples, delivered to subscribers and to the log."""
+"""Events of a device other than samples, for subscribers and the log."""
 
 import logging
 from enum import StrEnum
@@ -8,55 +8,57 @@ import msgspec
 
 
 class EventKind(StrEnum):
-    """Kinds of events; readers must accept kinds they do not know."""
+    """Kinds of events. Readers must accept unknown kinds."""
 
     UP = "up"
-    """The device is found and identified; samples follow."""
+    """imud found and identified the device; samples follow."""
     DOWN = "down"
-    """The device or its link is gone; `detail` has the reason."""
+    """The device or its link is absent; `detail` contains the reason."""
     SYNC = "sync"
     """The source of time stamps changed."""
     LOSS = "loss"
-    """Samples were lost; `detail` has their number and cause. Sent at most once a second and device."""
+    """Samples were lost; `detail` contains their number and the cause. At most once per second and device."""
     CONFIGURATION = "configuration"
-    """The device's own settings, or the daemon's configuration, are not what they were."""
+    """The device settings or the configuration of the daemon changed."""
     ALARM = "alarm"
-    """The alarm line or the alarm status of a device changed."""
+    """The ALARM line or the alarm status of a device changed."""
     MARK = "mark"
-    """A pulse came on SOUT_DIV: `detail` has its time, its number, and the `seq` of the sample it belongs to."""
+    """A pulse arrived on SOUT_DIV. `detail` contains its time, its number and the `seq` of its sample."""
     LINK = "link"
-    """The state of the port or bus changed, though the device may go on: a CAN controller became error-passive."""
+    """The state of the port or bus changed, for example a CAN controller became error-passive. The device may
+    continue.
+    """
     CALIBRATION = "calibration"
-    """Progress of a guided calibration; `detail` has kind, phase, and what was measured. At most twice a second."""
+    """Progress of a guided calibration. `detail` contains kind, phase and measured values. At most twice per second."""
     ATTITUDE = "attitude"
-    """Gravity contradicts the attitude or the mounting at rest; the message says what is likely wrong."""
+    """Gravity at rest contradicts the attitude or the mounting. The message contains the likely cause."""
     RECORDER = "recorder"
-    """The recorder stopped, for example because the disk is full, went on, lost records, or saved a snapshot."""
+    """The recorder stopped (for example: full disk), continued, lost records, or saved a snapshot."""
     MQTT = "mqtt"
-    """The output `mqtt` stopped spooling, for example because the disk is full, or went on."""
+    """The output `mqtt` stopped spooling (for example: full disk) or continued."""
     BAD_FRAME = "bad-frame"
-    """A damaged or unknown frame was heard. Sent at most once a second and device."""
+    """imud received a damaged or unknown frame. At most once per second and device."""
 
 
 def kind_of(name: str) -> EventKind:
-    """Return the kind of this name; one that this imud does not know stays a plain string."""
+    """Return the kind with this name; for an unknown kind, return the name."""
     return EventKind(name) if name in EventKind.__members__.values() else cast("EventKind", name)
 
 
+# kinds without an entry have the level of a warning
 LEVELS: Final = {
     EventKind.UP: logging.INFO,
     EventKind.SYNC: logging.INFO,
-    EventKind.MARK: logging.DEBUG,
-    EventKind.CALIBRATION: logging.DEBUG,
+    EventKind.MARK: logging.DEBUG,  # as frequent as camera triggers
+    EventKind.CALIBRATION: logging.DEBUG,  # twice per second during a calibration
 }
-"""Kinds below a warning; marks are as frequent as camera triggers, progress of a calibration comes twice a second."""
 
 
 class Event(msgspec.Struct, frozen=True, omit_defaults=True):
-    """An event of one device, or of the daemon itself when `device` is empty."""
+    """Event of one device, or of the daemon if `device` is empty."""
 
     t_ns: int
-    """CLOCK_MONOTONIC when it was noticed."""
+    """CLOCK_MONOTONIC at the detection of the event."""
     device: str
     kind: EventKind
     message: str
@@ -70,5 +72,5 @@ class RaiseEvent(Protocol):
     def __call__(
         self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
     ) -> None:
-        """At `now_ns` (CLOCK_MONOTONIC): one sentence for people, and details by name."""
+        """Raise an event at `now_ns` (CLOCK_MONOTONIC) with one sentence for the user and details by name."""
         ...

@@ -1,7 +1,8 @@
-"""The ledger of one device: an account of every byte, frame and lost sample. It closes to zero at every moment.
+"""Ledger of one device: counters of every byte, frame and lost sample. The ledger balances after every callback.
 
-Hot paths add to plain integers; the outputs read them. Synchronization: written and read by the event loop only,
-between two callbacks; another thread asks the loop for a snapshot, because inside a callback the sums are not closed.
+Hot paths add to plain integers; the outputs read them. Synchronization: only the event loop reads and writes the
+ledger, between two callbacks. Another thread requests a snapshot from the loop, because inside a callback the ledger
+does not balance.
 """
 
 from collections.abc import Mapping
@@ -9,31 +10,31 @@ from operator import attrgetter
 from typing import Final
 
 LEDGER_FIELDS: Final = (
-    "bytes_in",  # every byte (or CAN data byte, or register byte) that the link delivered
+    "bytes_in",  # every byte, CAN data byte or register byte from the link
     "bytes_in_good_frames",
-    "bytes_in_bad_frames",  # from a sync word whose frame failed its check, up to where that frame claimed to end
-    "bytes_skipped",  # belong to no frame
-    "bytes_pending",  # may still become a frame
+    "bytes_in_bad_frames",  # from the sync word of a damaged frame to its end by the length field
+    "bytes_skipped",  # outside all frames
+    "bytes_pending",  # possible start of a frame
     "frames_good",
     "frames_in_samples",
-    "frames_in_replies",  # text lines and reply frames
-    "frames_ignored",  # valid, without content that imud decodes
-    "frames_pending",  # valid, waiting for the rest of their sample
+    "frames_in_replies",  # lines of text and reply frames
+    "frames_ignored",  # valid frames without values that imud decodes
+    "frames_pending",  # valid frames of an incomplete sample
     "frames_bad_crc",
     "frames_bad_length",
-    "frames_bad_content",  # check value right, content impossible
-    "unknown_tags",  # sub-packets whose tag is not known; the frame stays good
+    "frames_bad_content",  # correct check value, impossible content
+    "unknown_tags",  # sub-packets with an unknown tag in valid frames
     "samples",
-    "lost_gap_device",  # samples missing by the device's own counter, no cause heard
-    "lost_crc",  # samples missing where a damaged frame was heard
-    "lost_overrun",  # samples missing where the kernel counted an overrun
-    "lost_queue",  # samples a queue of the daemon gave up
-    "replies_late",  # replies that came after their time-out
-    "replies_unsolicited",  # text that answers no request
-    "frames_not_finite",  # good frames whose NaN or infinite values were left out
-    "lost_unknown",  # gaps, not samples: how many are missing is not known within one
+    "lost_gap_device",  # lost samples according to the device counter, without a known cause
+    "lost_crc",  # lost samples at a damaged frame
+    "lost_overrun",  # lost samples at an overrun of the kernel
+    "lost_queue",  # samples dropped from a full queue of the daemon
+    "replies_late",  # replies after the timeout
+    "replies_unsolicited",  # text without a request
+    "frames_not_finite",  # valid frames from which imud removed NaN or infinite values
+    "lost_unknown",  # gaps with an unknown number of lost samples
 )
-"""Names in the order of shared memory; new ones go to the end."""
+"""Names in the order of shared memory. Append new names at the end."""
 
 
 class Ledger:
@@ -70,27 +71,27 @@ class Ledger:
             setattr(self, name, 0)
 
     def bytes_open(self) -> int:
-        """Bytes unaccounted for; 0 in a ledger that closes."""
+        """Return the number of uncounted bytes; 0 if the ledger balances."""
         return bytes_open(self.snapshot())
 
     def frames_open(self) -> int:
-        """Good frames unaccounted for; 0 in a ledger that closes."""
+        """Return the number of uncounted good frames; 0 if the ledger balances."""
         return frames_open(self.snapshot())
 
     def closes(self) -> bool:
-        """Whether both sums are zero."""
+        """Return whether the ledger balances."""
         return self.bytes_open() == 0 and self.frames_open() == 0
 
     def frames_bad(self) -> int:
-        """Damaged frames of every reason."""
+        """Return the number of damaged frames."""
         return self.frames_bad_crc + self.frames_bad_length + self.frames_bad_content
 
     def lost(self) -> int:
-        """Samples lost by every cause; right within one for each gap but `lost_unknown`."""
+        """Return the number of lost samples, within one per gap, without `lost_unknown`."""
         return lost(self.snapshot())
 
     def add_unknown_gap(self) -> None:
-        """Count a gap between samples whose size is not known."""
+        """Count a gap with an unknown number of lost samples."""
         self.lost_unknown += 1
 
     def values(self) -> tuple[int, ...]:
@@ -105,21 +106,21 @@ class Ledger:
 
 _ALL = attrgetter(*LEDGER_FIELDS)
 LOST_FIELDS: Final = tuple(name for name in LEDGER_FIELDS if name.startswith("lost_"))
-"""Losses by their cause."""
+"""Counters of losses by cause."""
 
 
 def lost(counts: Mapping[str, int]) -> int:
-    """Samples lost by every cause in a snapshot, wherever it was read; gaps of unknown size are not among them."""
+    """Return the number of lost samples in a snapshot, without gaps of unknown size."""
     return counts["lost_gap_device"] + counts["lost_crc"] + counts["lost_overrun"] + counts["lost_queue"]
 
 
 def bytes_open(counts: Mapping[str, int]) -> int:
-    """Bytes unaccounted for in a snapshot, wherever it was read; 0 in a ledger that closes."""
+    """Return the number of uncounted bytes in a snapshot; 0 if the ledger balances."""
     accounted = counts["bytes_in_good_frames"] + counts["bytes_in_bad_frames"] + counts["bytes_skipped"]
     return counts["bytes_in"] - accounted - counts["bytes_pending"]
 
 
 def frames_open(counts: Mapping[str, int]) -> int:
-    """Good frames unaccounted for in a snapshot; 0 in a ledger that closes."""
+    """Return the number of uncounted good frames in a snapshot; 0 if the ledger balances."""
     accounted = counts["frames_in_samples"] + counts["frames_in_replies"] + counts["frames_ignored"]
     return counts["frames_good"] - accounted - counts["frames_pending"]

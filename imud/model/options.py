@@ -1,9 +1,9 @@
-"""Settings: their base type, and descriptions of accepted and of rejected values.
+"""Options: their base type, and descriptions of accepted and rejected values.
 
-A part declares its own struct: frozen, keyword-only, unknown keys refused, each field with a default where there is
-one. `imud.config` fills it from YAML through msgspec, which checks types and `msgspec.Meta` bounds. The docstring below
-a field is what docs/configuration.md says of the key; the words are those of errors and of that table.
-Where a pattern says nothing to people, `Meta(extra={"words": "an absolute path"})` does.
+A part declares a struct: frozen, keyword-only, without unknown keys, with defaults where possible. `imud.config` fills
+it from YAML with msgspec, which checks types and `msgspec.Meta` bounds. docs/configuration.md contains the docstring
+below each field. Error messages and that page describe types in the same words. `Meta(extra={"words": "an absolute
+path"})` replaces a pattern that a user cannot read.
 """
 
 import re
@@ -16,14 +16,14 @@ import msgspec
 from msgspec import inspect
 
 SHOWN_CHARACTERS = 60
-"""Of a text in an error."""
+"""Maximum number of characters of a text in an error message."""
 HOST_CHARACTERS = 253
-"""Of a host name (RFC 1035, section 2.3.4)."""
+"""Maximum length of a host name (RFC 1035, section 2.3.4)."""
 _LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
 _STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+)\]")
-"""A step of msgspec's path to what is wrong."""
+"""One step in msgspec's path to an invalid value."""
 UNKNOWN_STEP = "..."
-"""The step to a value of a mapping, whose key msgspec does not tell."""
+"""Step to a value of a mapping; msgspec does not report its key."""
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -31,11 +31,11 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class NoOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of parts that have none."""
+    """Options of a part without options."""
 
 
 def is_ip_address(text: str) -> bool:
-    """Whether a text is an IPv4 or IPv6 address."""
+    """Return whether a text is an IPv4 or IPv6 address."""
     try:
         ip_address(text)
     except ValueError:
@@ -44,19 +44,22 @@ def is_ip_address(text: str) -> bool:
 
 
 def is_host(text: str) -> bool:
-    """Whether a text is an IP address or a host name (RFC 1123, section 2.1), which has a letter in its last label."""
+    """Return whether a text is an IP address or a host name."""
     labels = text.rstrip(".").split(".")
+    # RFC 1123, section 2.1: the last label contains a letter
     is_name = len(text) <= HOST_CHARACTERS and all(map(_LABEL.fullmatch, labels)) and not labels[-1].isdecimal()
     return is_name or is_ip_address(text)
 
 
 def expected(field_type: Any) -> str:
-    """Describe the values of `field_type`, for example `a whole number from 50 to 4000000, or "auto"`."""
+    """Return a description of the values of `field_type`, for example `a whole number from 50 to 4000000, or
+    "auto"`.
+    """
     return _words(inspect.type_info(field_type))
 
 
 def got(value: object) -> str:
-    """Format `value` as it stands in a file, with its kind where that is not obvious."""
+    """Return `value` as in a YAML file; for mappings, lists and null, return a description."""
     if value is None:
         return "nothing"
     if isinstance(value, Mapping):
@@ -69,28 +72,27 @@ def got(value: object) -> str:
 
 
 def shown(value: object) -> str:
-    """Format `value` for a configuration file, in one line of plain ASCII or printable text."""
+    """Return `value` as one line of YAML with printable characters only."""
     text = msgspec.json.encode(value).decode()
     return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
 
 
 class WrongValue(NamedTuple):
-    """What is wrong with one of some named values."""
+    """One invalid value of several named values."""
 
     name: str
-    """Name of the value; empty where the values as a whole are wrong."""
+    """Name of the value; empty if the combination of values is invalid."""
     message: str
-    """What was expected and what came."""
+    """Expected and received value."""
 
     def __str__(self) -> str:
-        """Format both, for example `rate_hz: expected a number, got "fast"`."""
+        """Return both as text, for example `rate_hz: expected a number, got "fast"`."""
         return f"{self.name}: {self.message}" if self.name else self.message
 
 
 def wrong_values(schema: type[msgspec.Struct], given: Mapping[str, Any], what: str = "key") -> list[WrongValue]:
-    """List all that is wrong with values for the fields of `schema`. `what` they are, for people: keys, arguments, …
-
-    What `__post_init__` says of values that do not go together is asked only where each by itself is right.
+    """Return all errors of values for the fields of `schema`. `what` is the word for a value in messages: key,
+    argument.
     """
     fields = {field.name: field for field in msgspec.structs.fields(schema)}
     found = []
@@ -104,11 +106,12 @@ def wrong_values(schema: type[msgspec.Struct], given: Mapping[str, Any], what: s
                 found.append(WrongValue(name, problem))
         elif field.required:
             found.append(WrongValue("", f"expected the {what} {name} ({expected(field.type)}), got none"))
+    # __post_init__ checks the combination only if each value is valid
     return found or disagreements(schema, given)
 
 
 def disagreements(schema: type[msgspec.Struct], given: Mapping[str, Any]) -> list[WrongValue]:
-    """List what `__post_init__` says of values of the right types that do not go together, at most one."""
+    """Return the error of `__post_init__` for a combination of values with correct types; at most one."""
     try:
         msgspec.convert(given, schema)
     except msgspec.ValidationError as error:
@@ -119,7 +122,7 @@ def disagreements(schema: type[msgspec.Struct], given: Mapping[str, Any]) -> lis
 
 
 def value_problem(value: object, field_type: Any) -> str:
-    """Return what is wrong with a value of a field, empty if it fits: what was expected, and what came."""
+    """Return the error of a value with the expected and the received value; empty if the value is valid."""
     info = inspect.type_info(field_type)
     if isinstance(info, inspect.DictType) and isinstance(info.value_type, inspect.StructType):
         for key, given in value.items() if isinstance(value, Mapping) else ():
@@ -135,7 +138,7 @@ def value_problem(value: object, field_type: Any) -> str:
 
 
 def _inside(value: object, place: str) -> str:
-    """Describe the part of `value` at the place that msgspec gives, for example `[1]` or `.a[0]`; empty for none."""
+    """Return a description of the part of `value` at msgspec's path, for example `[1]` or `.a[0]`."""
     if UNKNOWN_STEP in place:
         return ""
     for key, index in _STEP.findall(place):
@@ -149,7 +152,9 @@ def _inside(value: object, place: str) -> str:
 
 
 def unknown_name(what: str, name: str, known: Sequence[str]) -> str:
-    """Format the error for a name that is not among `known`, with the nearest one. `what`: for example `a driver`."""
+    """Return the error for a name that is not in `known`, with the most similar name. `what` is for example `a
+    driver`.
+    """
     near = get_close_matches(name, known, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]}? " if near else ""
     return f"expected {what} that imud knows, got {got(name)}; {hint}known: {', '.join(sorted(known)) or 'none'}"
@@ -182,7 +187,6 @@ def _words(info: inspect.Type) -> str:
 
 
 def _words_of_several(info: inspect.Type) -> str:
-    """Describe lists, and mappings with their keys where these are known."""
     match info:
         case inspect.ListType(item_type=item) | inspect.VarTupleType(item_type=item) | inspect.SetType(item_type=item):
             return f"a list{_length(info)}, each of it {_words(item)}"
@@ -196,7 +200,7 @@ def _words_of_several(info: inspect.Type) -> str:
 
 
 def _natural(value: object) -> list[tuple[str, float]]:
-    """Key that sorts texts with numbers by these, `2 Hz` before `10 Hz`; numbers come before texts, in their order."""
+    """Return a sort key for texts with numbers: `2 Hz` before `10 Hz`, numbers before texts."""
     if not isinstance(value, str):
         return []
     parts = re.split(r"(?<![A-Za-z0-9])([0-9]+(?:\.[0-9]+)?)(?![A-Za-z0-9])", value)

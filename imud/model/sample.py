@@ -1,8 +1,8 @@
-"""The two records of the sample path: a decoded message of a device, and the sample that imud makes of it.
+"""The two records of the sample path: the decoded measurement of a device, and the sample with its time stamp.
 
-A codec yields `Measurement`: device time and physical values, no host time. Only `imud.sampling` makes a `Sample`,
-so a path that skips the clock does not type-check. All values are SI, in the right-handed sensor frame; a field is
-None where the message has none, because absent is not zero.
+A codec returns a `Measurement`: device time and physical values, without host time. Only `imud.sampling` makes a
+`Sample`, so a path without a clock does not pass the type check. All values are SI values in right-handed sensor axes.
+A field is None if the frame does not contain the value, because a missing value is not zero.
 """
 
 from enum import StrEnum
@@ -16,38 +16,38 @@ Pair = tuple[float, float]
 
 
 T_ERR_MOST: Final = 0xFFFF_FFFF
-"""`t_err_ns` is 32 bits wide wherever it is published."""
+"""Maximum of `t_err_ns`, which has 32 bits in all outputs."""
 
 
 class Sync(StrEnum):
-    """Origin of a time stamp, worst first."""
+    """Source of a time stamp, worst first."""
 
     ARRIVAL = "arrival"
-    """Time of arrival less the time on the wire; the device sends no usable time."""
+    """Arrival time minus the time on the wire. The device sends no usable time."""
     REGRESSION = "regression"
-    """Device time fitted to arrival times."""
+    """Device time, fitted to arrival times."""
     EDGE = "edge"
-    """Device time fitted to SOUT or PPS edges that the kernel stamped."""
+    """Device time, fitted to SOUT or PPS edges with time stamps of the kernel."""
     UTC = "utc"
-    """The device itself is disciplined to UTC."""
+    """Device time that the device synchronizes to UTC."""
 
 
 class Measurement(msgspec.Struct, frozen=True, gc=False):
-    """A message of a device, decoded to SI units, without host time."""
+    """Values of one frame in SI units, without host time."""
 
     size_bytes: int
-    """Bytes of the message on the wire, all framing included."""
+    """Size of the frame on the wire, bytes, with all framing."""
     trailing_bytes: int
-    """Bytes of the same read that follow it: they were on the wire later, so the message came earlier than the read."""
+    """Number of bytes after the frame in the same read. The frame arrived earlier than the read by their wire time."""
     dev_ticks: int | None
-    """Device time as sent, in the driver's ticks, still wrapping; None where the message has none."""
+    """Device counter as sent, in ticks of the driver, not unwrapped; None if the frame has no counter."""
     accel_m_s2: Vector3 | None = None
     gyro_rad_s: Vector3 | None = None
     mag_t: Vector3 | None = None
     quat_wxyz: Quaternion | None = None
     """Rotation from body to navigation frame, scalar first."""
     euler_rad: Vector3 | None = None
-    """Roll, pitch, yaw in the device's own convention, which the driver names."""
+    """Roll, pitch, yaw in the convention of the device (`euler_convention` of the driver)."""
     temperature_c: float | None = None
     pressure_pa: float | None = None
     incli_rad: Pair | None = None
@@ -55,27 +55,29 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     status: int | None = None
     """Status bits as sent."""
     pps_age_ms: int | None = None
-    """Time from the last edge on the device's PPS/SIN input to this measurement; wraps as the device says."""
+    """Time from the last edge on the PPS/SIN input of the device to this measurement, ms, not unwrapped."""
 
 
 class Sample(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
-    """A measurement with its host time. Field names are the names in JSON, which leaves absent fields out."""
+    """Measurement with its time stamp. Field names are the names in JSON, which omits absent fields."""
 
     device: str
     """Name of the device in the configuration."""
     seq: int
-    """Counts from 1 per device, +1 for every sample since start: a gap a reader sees is a sample that reader lost."""
+    """Sequence number of the device, starting at 1. A gap in the numbers of a reader is the number of samples it
+    lost.
+    """
     t_ns: int
-    """CLOCK_MONOTONIC of the instant of measurement; strictly increasing, never later than the last byte's arrival."""
+    """CLOCK_MONOTONIC at the instant of the measurement; strictly increasing, never later than the last byte."""
     t_err_ns: int
-    """One-sigma error of `t_ns`: residual spread plus the known bias bound of the source."""
+    """One-sigma error of `t_ns`: residual spread plus the maximum bias of the source."""
     sync: Sync
     t_rx_ns: int
-    """CLOCK_MONOTONIC when the last byte was read."""
+    """CLOCK_MONOTONIC at the read of the last byte."""
     utc_ns: int
-    """`t_ns` on CLOCK_REALTIME (ns since 1970-01-01 UTC), from an offset sampled at arrival."""
+    """`t_ns` on CLOCK_REALTIME (ns since 1970-01-01 UTC), with the clock offset at the arrival."""
     t_dev_ns: int | None = None
-    """Device time unwrapped to 64 bits."""
+    """Device time, unwrapped to 64 bits."""
     accel_m_s2: Vector3 | None = None
     gyro_rad_s: Vector3 | None = None
     mag_t: Vector3 | None = None
@@ -87,7 +89,7 @@ class Sample(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     status: int | None = None
     pps_age_ms: int | None = None
     edge_seq: int | None = None
-    """Number of the rising edge on SOUT, or of the trigger on SIN, that belongs to this sample."""
+    """Number of the rising edge on SOUT, or of the trigger on SIN, for this sample."""
 
 
 SAMPLE_FIELDS: tuple[str, ...] = Sample.__struct_fields__
@@ -98,14 +100,14 @@ class FieldInfo(msgspec.Struct, frozen=True):
 
     name: str
     type: str
-    """JSON type; `number[3]` is an array of three."""
+    """JSON type; `number[3]` is an array of three numbers."""
     unit: str
-    """Unit of the value, SI; empty where it has none."""
+    """SI unit of the value; empty if it has no unit."""
     frame: str
-    """Frame or time scale of the value; empty where it has none."""
+    """Axes or time scale of the value; empty without axes or time scale."""
     meaning: str
     always: bool
-    """False where the member is left out when the message had no such value."""
+    """Whether every sample contains the member."""
 
 
 _SENSOR: Final = "sensor frame, right-handed"
@@ -114,7 +116,7 @@ _MONOTONIC: Final = "CLOCK_MONOTONIC"
 
 SAMPLE_SCHEMA: Final = (
     FieldInfo("device", "string", "", "", "name of the device in the configuration", True),
-    FieldInfo("seq", "integer", "", "", "counts every sample of the device since start; a gap is a loss", True),
+    FieldInfo("seq", "integer", "", "", "sequence number of the device since start; a gap is a loss", True),
     FieldInfo("t_ns", "integer", "ns", _MONOTONIC, "instant of measurement, strictly increasing", True),
     FieldInfo("t_err_ns", "integer", "ns", "", "one-sigma error of t_ns", True),
     FieldInfo("sync", "string", "", "", "source of t_ns, worst first: arrival, regression, edge, utc", True),
@@ -138,8 +140,8 @@ SAMPLE_SCHEMA: Final = (
     ),
     FieldInfo(
         "edge_seq", "integer", "", "",
-        "number of the rising edge on SOUT, or of the trigger on SIN, that belongs to the sample; left out where its "
-        "own was not seen", False,
+        "number of the rising edge on SOUT, or of the trigger on SIN, for the sample; absent if imud did not "
+        "receive the edge", False,
     ),
 )  # fmt: skip
-"""The `schema` method and `imud schema`; in the order of SAMPLE_FIELDS."""
+"""Rows of the method `schema` and of `imud schema`, in the order of SAMPLE_FIELDS."""

@@ -1,6 +1,6 @@
-"""Table: conversion factors to SI units, each the exact definition; a value times its factor is the SI value.
+"""Conversion factors to SI units, each by its exact definition. Value times factor is the SI value.
 
-A factor that belongs to one sensor (counts to m/s²) is in that sensor's file, made from these.
+A factor of one sensor (counts to m/s²) is in the file of that sensor.
 """
 
 import math
@@ -10,7 +10,7 @@ RAD_PER_DEG: Final = math.pi / 180
 """Degrees to radians; also °/s to rad/s."""
 
 STANDARD_GRAVITY_M_S2: Final = 9.80665
-"""1 g by ISO 80000-3, in m/s². Sensors that mean another g name their own."""
+"""1 g by ISO 80000-3, m/s². Sensors with another g define their own constant."""
 
 T_PER_UT: Final = 1e-6
 """Microtesla to tesla."""
@@ -23,9 +23,9 @@ NS_PER_MS: Final = 1_000_000
 NS_PER_US: Final = 1_000
 
 BITS_PER_UART_BYTE: Final = 10
-"""8N1: one start bit, eight data bits, one stop bit."""
+"""Bits of one 8N1 byte: one start bit, eight data bits, one stop bit."""
 
 
 def uart_byte_ns(baud: int) -> int:
-    """Time one 8N1 byte takes on the wire at `baud` bit/s, in ns; 0 for a link without a wire time (baud 0)."""
+    """Return the time of one 8N1 byte on the wire at `baud` bit/s, ns; 0 for baud 0 (a link without wire time)."""
     return BITS_PER_UART_BYTE * NS_PER_S // baud if baud else 0
