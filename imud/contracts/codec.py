@@ -16,10 +16,8 @@ from imud.model.sample import Measurement
 class BadReason(StrEnum):
     """Reasons to reject a frame; each has its own counter in the ledger."""
 
-    CRC = "crc"
-    """The check value does not match: bytes damaged on the wire, or a sync word inside other data."""
-    LENGTH = "length"
-    """The length field is outside the range of the protocol."""
+    CRC = "crc"  # the check value does not match: bytes damaged on the wire, or a sync word inside other data
+    LENGTH = "length"  # the length field is outside the range of the protocol
     CONTENT = "content"
     """The check value is correct and the content is impossible, for example a sub-packet longer than the rest of the
     frame."""
@@ -99,22 +97,17 @@ class Poll:
     """A transfer that imud repeats."""
 
     transfer: Transfer
-    every_ns: int = 0
-    """0: at every deadline of the device. Otherwise the minimum time between two transfers, ns."""
+    every_ns: int = 0  # 0: at every deadline of the device. Otherwise the minimum time between two transfers, ns.
 
 
 class Reading(msgspec.Struct, frozen=True, gc=False):
     """The result of one poll."""
 
-    poll: int
-    """Index of the poll in `polls` of the codec."""
-    data: bytes
-    """All received bytes in their order; empty if the transfer failed."""
+    poll: int  # index of the poll in `polls` of the codec
+    data: bytes  # all received bytes in their order; empty if the transfer failed
     error: TransferError | None
-    start_ns: int
-    """CLOCK_MONOTONIC immediately before the transfer."""
-    end_ns: int
-    """CLOCK_MONOTONIC immediately after the transfer."""
+    start_ns: int  # CLOCK_MONOTONIC immediately before the transfer
+    end_ns: int  # CLOCK_MONOTONIC immediately after the transfer
 
 
 class Vanished(msgspec.Struct, frozen=True):
@@ -130,8 +123,7 @@ class PolledCodec(Protocol):
     """Decoder of the results of polls. Synchronization: one thread."""
 
     ledger: Ledger
-    polls: Sequence[Poll]
-    """Cyclic reads. The first poll returns the samples."""
+    polls: Sequence[Poll]  # Cyclic reads. The first poll returns the samples.
 
     @property
     def stale(self) -> int:

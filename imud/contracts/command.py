@@ -20,17 +20,13 @@ from imud.model.units import RAD_PER_DEG
 class Target:
     """The device that executes an action."""
 
-    settings: Any
-    """Options of the device's driver."""
-    baud: int
-    """Present bit rate of the link, bit/s; 0 if the link has no bit rate."""
-    fixed_baud: int = 0
-    """Bit rate in the configuration, bit/s; 0 if the configuration does not set a bit rate."""
+    settings: Any  # options of the device's driver
+    baud: int  # present bit rate of the link, bit/s; 0 if the link has no bit rate
+    fixed_baud: int = 0  # bit rate in the configuration, bit/s; 0 if the configuration does not set a bit rate
     places: tuple[int, ...] = ()
     """Possible addresses of the device on a polled bus: present, former and configured address. Empty on other
     links."""
-    other_bits_per_s: float = 0.0
-    """Load of the same CAN bus by all other configured devices, bit/s without stuff bits."""
+    other_bits_per_s: float = 0.0  # load of the same CAN bus by all other configured devices, bit/s without stuff bits
 
 
 class Risk(StrEnum):
@@ -40,8 +36,7 @@ class Risk(StrEnum):
 
     NONE = ""
     CONNECTION = "the device may not be reached afterwards"
-    RESET = "all settings of the device are lost"
-    """imud first writes a backup of all readable settings."""
+    RESET = "all settings of the device are lost"  # imud first writes a backup of all readable settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +47,7 @@ class Action:
     bounds (`msgspec.Meta`). The name of a parameter contains its unit. A parameter with a default is optional.
     """
 
-    help: str
-    """Effect of the action, one sentence."""
+    help: str  # effect of the action, one sentence
     begin: Callable[..., Any]
     """`begin(target, *, name: type = default, …)` returns the request script (polled drivers: the transfer script).
 
@@ -100,12 +94,9 @@ class ActionParameter(msgspec.Struct, frozen=True):
     """Description of one argument of an action."""
 
     name: str
-    values: str
-    """Accepted values, for example `a whole number from 1 to 127`."""
-    default: str | None
-    """Default value as JSON; None for a required argument."""
-    required: bool = False
-    """Whether a call must contain this argument."""
+    values: str  # accepted values, for example `a whole number from 1 to 127`
+    default: str | None  # default value as JSON; None for a required argument
+    required: bool = False  # whether a call must contain this argument
 
     def __str__(self) -> str:
         """Return the description, for example `rate_hz (a number; default 100)`."""
@@ -118,8 +109,7 @@ class ActionInfo(msgspec.Struct, frozen=True):
     name: str
     help: str
     parameters: tuple[ActionParameter, ...]
-    risk: Risk = Risk.NONE
-    """Reason for a confirmation, one clause; empty if no confirmation is necessary."""
+    risk: Risk = Risk.NONE  # reason for a confirmation, one clause; empty if no confirmation is necessary
 
 
 def parameters_of(action: Action) -> tuple[ActionParameter, ...]:
@@ -138,10 +128,8 @@ def described(actions: Actions) -> list[ActionInfo]:
 class Handling(StrEnum):
     """Motion of the device during a calibration."""
 
-    REST = "rest"
-    """The device must not move."""
-    TURN = "turn"
-    """The user turns the device slowly, in one place, into as many directions as possible."""
+    REST = "rest"  # the device must not move
+    TURN = "turn"  # the user turns the device slowly, in one place, into as many directions as possible
 
 
 class Kept(StrEnum):
@@ -157,10 +145,8 @@ class Verdict:
     """Progress of a calibration, as the device reports it."""
 
     done: bool
-    words: str
-    """Values of the device as readable text. A new text after the calibration means a new result."""
-    progress: float | None = None
-    """0 … 1; None if the device does not report its progress."""
+    words: str  # Values of the device as readable text. A new text after the calibration means a new result.
+    progress: float | None = None  # 0 … 1; None if the device does not report its progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,10 +155,8 @@ class RestMeans:
 
     accel_m_s2: Vector3 | None
     gyro_rad_s: Vector3 | None
-    euler_rad: Vector3 | None
-    """Roll, pitch, yaw."""
-    incli_rad: Pair | None = None
-    """Inclinometer X and Y."""
+    euler_rad: Vector3 | None  # Roll, pitch, yaw
+    incli_rad: Pair | None = None  # inclinometer X and Y
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,11 +164,9 @@ class Expectation:
     """Expected mean of the samples at rest after a calibration: `value(means)` is at most `limit`."""
 
     name: str
-    unit: str
-    """SI unit of `value` and `limit`."""
+    unit: str  # SI unit of `value` and `limit`
     limit: float
-    value: Callable[[RestMeans], float | None]
-    """Returns the absolute value; None if the samples lack the quantity."""
+    value: Callable[[RestMeans], float | None]  # returns the absolute value; None if the samples lack the quantity
 
 
 # Limit 0.1 °/s: far above the bias of a calibrated sensor, far below the bias of an uncalibrated sensor.
@@ -213,13 +195,10 @@ ACCEL_LEVEL: Final = Expectation(
 class Calibration:
     """One calibration of a device."""
 
-    help: str
-    """Effect of the calibration, one sentence."""
-    section: str
-    """Section of the vendor's manual."""
+    help: str  # effect of the calibration, one sentence
+    section: str  # section of the vendor's manual
     handling: Handling
-    instructions: tuple[str, ...]
-    """Steps of the user before and during the calibration, one sentence per step."""
+    instructions: tuple[str, ...]  # steps of the user before and during the calibration, one sentence per step
     begin: Callable[[Target], Any]
     """Returns the script that starts the calibration. If the device reports the end, the script waits for the end."""
     verdict: Callable[[Target], Any] | None = None
@@ -227,11 +206,9 @@ class Calibration:
     unready: Callable[[Target], Any] | None = None
     """Returns the script that returns a missing precondition, one sentence or empty; None if there is no
     precondition."""
-    expected: tuple[Expectation, ...] = ()
-    """Expected means of the samples at rest after the calibration."""
+    expected: tuple[Expectation, ...] = ()  # expected means of the samples at rest after the calibration
     kept: Kept
-    save: Callable[[Target], Any] | None = None
-    """Returns the script that saves the result; only with Kept.BY_SAVE."""
+    save: Callable[[Target], Any] | None = None  # returns the script that saves the result; only with Kept.BY_SAVE
 
 
 Calibrations = Mapping[str, Calibration]
@@ -252,8 +229,7 @@ class Check(msgspec.Struct, frozen=True):
     """One comparison of samples after a calibration."""
 
     name: str
-    value: float | None
-    """Mean of the samples; None if the samples lack the quantity. Then `passed` is False."""
+    value: float | None  # Mean of the samples; None if the samples lack the quantity. Then `passed` is False.
     limit: float
     unit: str
     passed: bool
@@ -263,12 +239,9 @@ class CalibrationResult(msgspec.Struct, frozen=True):
     """Result of a calibration."""
 
     kind: str
-    verified: bool
-    """Whether the device reports success and all checks passed."""
-    problem: str
-    """Fault and next step, one sentence; empty if `verified`."""
-    device: str
-    """Values of the device as readable text."""
+    verified: bool  # whether the device reports success and all checks passed
+    problem: str  # fault and next step, one sentence; empty if `verified`
+    device: str  # values of the device as readable text
     checks: tuple[Check, ...]
     saved: bool
     kept: Kept

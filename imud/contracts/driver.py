@@ -19,8 +19,7 @@ from imud.model.ledger import Ledger
 from imud.model.options import Options
 
 SensorName = Literal["gyro", "accel"]
-Figure = Annotated[float, Meta(gt=0)] | None
-"""Positive number; None if the vendor does not state it."""
+Figure = Annotated[float, Meta(gt=0)] | None  # positive number; None if the vendor does not state it
 
 
 class SensorFigures(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -83,26 +82,21 @@ class Identity:
     product: str = ""
     serial_number: str = ""
     firmware: str = ""
-    details: Mapping[str, str] | None = None
-    """Other properties, by the names of the device."""
+    details: Mapping[str, str] | None = None  # other properties, by the names of the device
 
 
 class KeyProblem(NamedTuple):
     """A value in the configuration that the driver does not support."""
 
-    part: str
-    """`link` or `options`."""
-    key: str
-    """Key in this part."""
-    message: str
-    """Expected value, received value, and numbers if they matter."""
+    part: str  # `link` or `options`
+    key: str  # key in this part
+    message: str  # expected value, received value, and numbers if they matter
 
 
 class StatusBit(NamedTuple):
     """Meaning of one bit of `Measurement.status`."""
 
-    name: str
-    """Device condition while the bit is set, as readable text."""
+    name: str  # device condition while the bit is set, as readable text
     notable: bool = False
     """Whether a change of the bit is an event: while the bit is set, values are wrong or not valid yet."""
 
@@ -125,43 +119,30 @@ def _unknown_heading(_settings: object, _read_back: Mapping[str, str]) -> Headin
 class Driver:
     """Description of one wire protocol. The subclass decides which links a driver can use."""
 
-    name: str
-    """Family and link, for example `hipnuc-uart`."""
-    title: str
-    """Vendor and products, as readable text."""
-    settings: type[Options]
-    """Type of the driver options (`options` of a device)."""
-    tick_ns: int
-    """Duration of one device tick, ns, or SAMPLE_COUNTER."""
-    tick_modulus: int
-    """Modulus of the device counter: it counts 0 … tick_modulus - 1."""
+    name: str  # family and link, for example `hipnuc-uart`
+    title: str  # vendor and products, as readable text
+    settings: type[Options]  # type of the driver options (`options` of a device)
+    tick_ns: int  # duration of one device tick, ns, or SAMPLE_COUNTER
+    tick_modulus: int  # modulus of the device counter: it counts 0 … tick_modulus - 1
     stamp_modulus: int = 0
     """Modulus of `Measurement.pps_age_ms` without a pulse, ms. imud uses the age to time-stamp frames without device
     time. 0 if the protocol has no such frames."""
-    euler_convention: str
-    """Order, axes and signs of `euler_rad`, as readable text."""
-    navigation_frame: str
-    """Destination frame of the rotation `quat_wxyz`, for example `ENU`."""
-    axes: DeviceAxes = RFU_ENU
-    """Axes, angles and navigation frame for conversions."""
+    euler_convention: str  # Order, axes and signs of `euler_rad`, as readable text
+    navigation_frame: str  # destination frame of the rotation `quat_wxyz`, for example `ENU`
+    axes: DeviceAxes = RFU_ENU  # Axes, angles and navigation frame for conversions
     heading: Callable[[Any, Mapping[str, str]], Heading] = _unknown_heading
     """Returns the reference of yaw from the driver options and the device settings (empty: not read yet)."""
-    actions: Actions = field(default_factory=dict)
-    """Actions of the device, by name."""
-    calibrations: Calibrations = field(default_factory=dict)
-    """Guided calibrations, by kind."""
-    device_settings: SettingsTable | None = None
-    """Table of the device settings; None if the driver does not know them."""
+    actions: Actions = field(default_factory=dict)  # actions of the device, by name
+    calibrations: Calibrations = field(default_factory=dict)  # guided calibrations, by kind
+    device_settings: SettingsTable | None = None  # table of the device settings; None if the driver does not know them
     lines: frozenset[str] = frozenset()
     """GPIO lines that the device can have: names of fields of `imud.contracts.lines.DeviceLines`."""
     alarm_ranges: Callable[[Mapping[str, str]], AlarmRanges] | None = None
     """Returns the meaning of the ALARM line from the device settings; None if no setting describes it."""
-    time_bits: TimeBits = NO_TIME_BITS
-    """Bits of `Measurement.status` about time."""
+    time_bits: TimeBits = NO_TIME_BITS  # bits of `Measurement.status` about time
     status_bits: Mapping[int, StatusBit] = field(default_factory=dict)
     """Meaning of the known bits of `Measurement.status`, by bit number."""
-    data_sheet: DataSheet = field(default_factory=DataSheet)
-    """Noise, resolution and filters from the vendor's manual."""
+    data_sheet: DataSheet = field(default_factory=DataSheet)  # Noise, resolution and filters from the vendor's manual
     shown_settings: Callable[[Mapping[str, str]], Mapping[str, str]] = lambda settings: settings
     """Returns device settings with readable names and units."""
     line_differences: Callable[[Mapping[str, str], DeviceLines], Mapping[str, str]] = lambda _settings, _lines: {}
@@ -244,16 +225,14 @@ class CanDriver(Driver):
     Only frames with samples have a node number here. The codec must confirm the frame."""
     node_settings: Callable[[int], Any]
     """Returns driver options for the device with this node number, all other options at their defaults."""
-    node_title: Callable[[int], str]
-    """Returns a readable name of this device, for example `node 8`."""
+    node_title: Callable[[int], str]  # returns a readable name of this device, for example `node 8`
     identify: Callable[[Any], RequestScript[Identity]]
     """Returns the script that reads the identity and does not change the device."""
     read_settings: Callable[[Any], RequestScript[Mapping[str, str]]]
     """Returns the script that reads the device settings, by the names of the device, and does not change the device."""
     apply_identity: Callable[[CanCodec, Identity], None] = lambda _codec, _identity: None
     """Passes the identity to the codec. The frames can depend on the identity."""
-    sample_frames: int
-    """Number of frames per sample."""
+    sample_frames: int  # number of frames per sample
     example_frames: Callable[[Random], Sequence[CanFrame]]
     """Returns the valid frames of one sample in sending order, with random values, for the default options."""
     cyclic: Callable[[Any], Sequence[CyclicFrame]] = nothing_cyclic
@@ -271,8 +250,7 @@ class PolledDriver(Driver):
 
     tick_ns: int = SAMPLE_COUNTER
     tick_modulus: int = 2
-    link: str
-    """Name of its link, a row of LINKS."""
+    link: str  # name of its link, a row of LINKS
     targets: tuple[int, ...]
     """Values that detection tries if the link has the value `auto`, most likely first: I2C addresses or SPI modes."""
     probe: Callable[[Any], TransferScript[Identity]]

@@ -20,8 +20,7 @@ from imud.model.options import Options
 
 SOUT_WIDTH_US: Final = 80.0
 """Width of a SOUT pulse, µs. The first byte follows the falling edge (HiPNUC manual 1.2.2, PMUX2)."""
-SIN_DELAY_US: Final = 125.0
-"""Mean time from the rising edge on SIN to the start of the frame, µs (HiPNUC manual 1.2.1)."""
+SIN_DELAY_US: Final = 125.0  # mean time from the rising edge on SIN to the start of the frame, µs (HiPNUC manual 1.2.1)
 
 
 class SoutTiming(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -49,21 +48,16 @@ class TriggerTiming(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 class TriggerStamp(NamedTuple):
     """One trigger that imud sent on SIN."""
 
-    t_ns: int
-    """CLOCK_MONOTONIC at the rising edge."""
-    err_ns: int
-    """One-sigma error of `t_ns`."""
-    number: int
-    """Number of the trigger, starting at 1."""
+    t_ns: int  # CLOCK_MONOTONIC at the rising edge
+    err_ns: int  # One-sigma error of `t_ns`
+    number: int  # number of the trigger, starting at 1
 
 
 class UtcReference(NamedTuple):
     """Estimate of UTC by the host."""
 
-    offset_ns: int
-    """UTC (CLOCK_REALTIME) minus CLOCK_MONOTONIC."""
-    error_ns: int
-    """One-sigma error of `offset_ns`."""
+    offset_ns: int  # UTC (CLOCK_REALTIME) minus CLOCK_MONOTONIC
+    error_ns: int  # One-sigma error of `offset_ns`
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +67,7 @@ class TimeBits:
     sync_out: int = 0
     """Set in a frame that belongs to a pulse on SOUT. imud uses the bit after the device has set it once: older
     firmware always sends zero."""
-    not_utc: int = 0
-    """Set while the device time is not synchronized to UTC."""
+    not_utc: int = 0  # set while the device time is not synchronized to UTC
 
 
 NO_TIME_BITS: Final = TimeBits()
@@ -83,12 +76,9 @@ NO_TIME_BITS: Final = TimeBits()
 class Mark(NamedTuple):
     """One pulse on SOUT_DIV, for example the trigger of a camera."""
 
-    t_ns: int
-    """CLOCK_MONOTONIC of the rising edge, as time-stamped by the kernel."""
-    number: int
-    """`Edge.number` of the rising edge."""
-    seq: int | None
-    """`Sample.seq` of the sample of this pulse; None if the sample was lost."""
+    t_ns: int  # CLOCK_MONOTONIC of the rising edge, as time-stamped by the kernel
+    number: int  # `Edge.number` of the rising edge
+    seq: int | None  # `Sample.seq` of the sample of this pulse; None if the sample was lost
 
 
 Offset = Annotated[float, Meta(ge=-100_000, le=100_000)]
@@ -98,10 +88,8 @@ Bias = Annotated[float, Meta(ge=0, le=100_000)]
 class Edge(NamedTuple):
     """One level change of a line."""
 
-    t_ns: int
-    """CLOCK_MONOTONIC, as time-stamped by the kernel."""
-    rising: bool
-    """Whether the line became active."""
+    t_ns: int  # CLOCK_MONOTONIC, as time-stamped by the kernel
+    rising: bool  # whether the line became active
     number: int
     """Number of the edge of this line, starting at 1. It counts rising, falling and lost edges, and continues after the
     line was opened again."""
@@ -239,8 +227,7 @@ LINE_SCHEMAS: Final[Mapping[str, type[LineOptions]]] = {
 class AlarmRange(NamedTuple):
     """Permitted range of one angle. The ALARM line is active while the angle is outside the range."""
 
-    euler_index: int
-    """Index of the angle in `Sample.euler_rad`."""
+    euler_index: int  # index of the angle in `Sample.euler_rad`
     low_deg: float
     high_deg: float
     enabled: bool
@@ -251,23 +238,18 @@ class AlarmRanges(NamedTuple):
 
     by_axis: Mapping[str, AlarmRange]
     """Range by the axis name of the device, without axes that the device settings lack."""
-    pin_setting: str
-    """Name of the setting that selects the function of the pin, for error messages."""
-    mounting_setting: str
-    """Name of the setting for the mounting orientation, for error messages."""
+    pin_setting: str  # name of the setting that selects the function of the pin, for error messages
+    mounting_setting: str  # name of the setting for the mounting orientation, for error messages
 
 
-OnEdges = Callable[[Sequence[Edge]], None]
-"""Receives edges in their order. Called in the thread of the loop."""
-OnLineEnd = Callable[[LinkError], None]
-"""Receives the error that ended the line. Called once; no further calls follow."""
+OnEdges = Callable[[Sequence[Edge]], None]  # Receives edges in their order. Called in the thread of the loop.
+OnLineEnd = Callable[[LinkError], None]  # Receives the error that ended the line. Called once; no further calls follow.
 
 
 class InputLine(Protocol):
     """Input line that delivers edges. Synchronization: the thread of the loop only."""
 
-    title: str
-    """Readable name of the line, for example `gpiochip0 line 17 (GPIO17)`."""
+    title: str  # readable name of the line, for example `gpiochip0 line 17 (GPIO17)`
 
     @property
     def edges_lost(self) -> int:
@@ -343,7 +325,5 @@ class LineFactory:
 
     make_input: Callable[[Any, str, bool], InputLine]
     """Returns a line from `InputOptions`. The last argument is True if only rising edges are necessary."""
-    make_output: Callable[[Any, str], OutputLine]
-    """Returns a line from `OutputOptions`."""
-    start_worker: StartWorker = BusThread
-    """Starts the thread that drives SIN."""
+    make_output: Callable[[Any, str], OutputLine]  # returns a line from `OutputOptions`
+    start_worker: StartWorker = BusThread  # starts the thread that drives SIN

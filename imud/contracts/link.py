@@ -21,16 +21,11 @@ MIXED: Final = -1
 class Claim:
     """Use of a port or bus, or of one address on a bus, by one device."""
 
-    place: str
-    """Port or bus: a path, or the name of an interface."""
-    key: str
-    """Key of the option with the port or bus."""
-    shared: bool = False
-    """Whether several devices can use the place, each with a different part."""
-    part: int | None = None
-    """Part of a shared place, for example a Modbus address; None before detection (`auto`)."""
-    part_key: str = ""
-    """Key of the option with the part."""
+    place: str  # port or bus: a path, or the name of an interface
+    key: str  # key of the option with the port or bus
+    shared: bool = False  # whether several devices can use the place, each with a different part
+    part: int | None = None  # part of a shared place, for example a Modbus address; None before detection (`auto`)
+    part_key: str = ""  # key of the option with the part
     terms: Mapping[str, object] = field(default_factory=dict)
     """Options that must be equal for all devices of a shared place, by key."""
 
@@ -38,10 +33,8 @@ class Claim:
 class Conflict(NamedTuple):
     """Reason why two devices cannot have the same claim."""
 
-    key: str
-    """Key of the option that the user must change."""
-    message: str
-    """Expected value, received value, and the owner of the claim."""
+    key: str  # key of the option that the user must change
+    message: str  # expected value, received value, and the owner of the claim
 
 
 def conflict_of(mine: Claim, other: Claim, owner: str) -> Conflict | None:
@@ -68,10 +61,8 @@ class CanUse:
     """CAN frames of one device on a bus."""
 
     bus: str
-    filters: Sequence[CanFilter]
-    """Filters for the frames that the device sends."""
-    cyclic: Sequence[CyclicFrame]
-    """Frames that imud must send for the device."""
+    filters: Sequence[CanFilter]  # filters for the frames that the device sends
+    cyclic: Sequence[CyclicFrame]  # frames that imud must send for the device
 
     @cached_property
     def _exact(self) -> frozenset[tuple[int, bool]]:
@@ -107,12 +98,10 @@ def id_text(can_id: int, extended: bool) -> str:
 
 S = TypeVar("S", bound=Options)
 
-OnData = Callable[[bytes, int], None]
-"""Receives bytes and CLOCK_MONOTONIC immediately after the read, ns."""
+OnData = Callable[[bytes, int], None]  # receives bytes and CLOCK_MONOTONIC immediately after the read, ns
 OnEnd = Callable[[LinkError | None], None]
 """Receives the error that ended the link, or None at the regular end of a replay. Called once."""
-OnFrames = Callable[[Sequence[CanFrame]], None]
-"""Receives CAN frames, oldest first."""
+OnFrames = Callable[[Sequence[CanFrame]], None]  # receives CAN frames, oldest first
 OnBusNews = Callable[[str, str], None]
 """Receives each change of the bus state, one sentence, and the present problem (empty if there is no problem)."""
 
@@ -124,10 +113,8 @@ class Link(Protocol):
     caller may then use the same object again.
     """
 
-    title: str
-    """Name of the link in messages, for example `/dev/ttyUSB0`."""
-    writable: bool
-    """Whether a device can receive data from imud; False for a replay."""
+    title: str  # name of the link in messages, for example `/dev/ttyUSB0`
+    writable: bool  # whether a device can receive data from imud; False for a replay
 
     def absence(self) -> str:
         """Return why `wait_present` would wait, one sentence; empty if the port is present. Raises LinkError."""
@@ -159,12 +146,9 @@ class Link(Protocol):
 class StreamLink(Link, Protocol):
     """Source of bytes. It opens the port exclusively and runs in the asyncio loop."""
 
-    baud: int
-    """Present baud rate, bit/s; 0 for links without a baud rate."""
-    auto_baud: bool
-    """Whether detection must find the baud rate."""
-    hold_ns: int
-    """Latency timer of a USB adapter, ns: maximum delay of received bytes. 0 without a USB adapter."""
+    baud: int  # present baud rate, bit/s; 0 for links without a baud rate
+    auto_baud: bool  # whether detection must find the baud rate
+    hold_ns: int  # Latency timer of a USB adapter, ns: maximum delay of received bytes. 0 without a USB adapter.
     waiting_bytes: int
     """Number of bytes that the kernel can buffer without loss while the link is paused; 0: the link cannot pause."""
 
@@ -192,12 +176,10 @@ class StreamLink(Link, Protocol):
 class CanLink(Link, Protocol):
     """CAN bus of one device. Several devices share a bus; each has its own link."""
 
-    bus: str
-    """Name of the bus. Links with the same name receive the same frames."""
+    bus: str  # Name of the bus. Links with the same name receive the same frames.
     filters: Sequence[CanFilter]
     """Filters of the frames to deliver, effective when set. The link may deliver other frames too."""
-    bitrate: int
-    """Bit rate of the bus, bit/s, known after `open`; 0 for virtual buses or if it is not known."""
+    bitrate: int  # bit rate of the bus, bit/s, known after `open`; 0 for virtual buses or if it is not known
     gather_ns: int
     """Maximum hold of received frames before the link delivers them together, ns, effective when set; 0: no hold. Each
     frame keeps its own arrival time. A link that cannot hold frames ignores the value."""
@@ -222,16 +204,12 @@ class PolledLink(Link, Protocol):
     loop calls all other methods. `write` raises LinkError, because transfers send all bytes.
     """
 
-    bus: str
-    """Name of the bus. One thread serves all links with the same name."""
-    target: int | None
-    """Configured address or mode; None for `auto`."""
+    bus: str  # Name of the bus. One thread serves all links with the same name.
+    target: int | None  # configured address or mode; None for `auto`
     shared: bool
     """Whether the target selects one of several devices on the bus (I2C). Then each target can have one device only."""
-    rate_hz: float
-    """Polls per second."""
-    bit_rate: int
-    """Baud rate of the bus, bit/s; 0 if the host generates the clock."""
+    rate_hz: float  # polls per second
+    bit_rate: int  # baud rate of the bus, bit/s; 0 if the host generates the clock
 
     def select(self, target: int) -> None:
         """Use this address or mode in all following transfers. Raises LinkError."""
@@ -282,15 +260,11 @@ def _knows_no_problem(_settings: Options, _frames: bool) -> str:
 class LinkType(Generic[S]):
     """Row of a link. Its factories decide which kinds of drivers can use the link."""
 
-    name: str
-    """Key under a device in the configuration."""
+    name: str  # key under a device in the configuration
     settings: type[S]
-    make: Callable[[S], StreamLink] = _no_bytes
-    """Returns a closed byte link from its options."""
-    make_can: Callable[[S], CanLink] = _no_frames
-    """Returns a closed link to a CAN bus from its options."""
-    make_polled: Callable[[S], PolledLink] = _no_transfers
-    """Returns a closed link to a polled bus from its options."""
+    make: Callable[[S], StreamLink] = _no_bytes  # returns a closed byte link from its options
+    make_can: Callable[[S], CanLink] = _no_frames  # returns a closed link to a CAN bus from its options
+    make_polled: Callable[[S], PolledLink] = _no_transfers  # returns a closed link to a polled bus from its options
     bus_of: Callable[[S], str] = _no_bus
     """Returns the name of the shared bus in the options; empty for links without a bus."""
     claims: Callable[[S], Sequence[Claim]] = _claims_nothing

@@ -51,8 +51,7 @@ class RecordingSource(Protocol):
         ...
 
 
-AS_SENT: Final = as_sent()
-"""Axes and angles of HiPNUC devices: default of a batch."""
+AS_SENT: Final = as_sent()  # axes and angles of HiPNUC devices: default of a batch
 DeviceLedger = tuple[str, str, Mapping[str, int]]
 """Name of a device, its driver as in `DeviceStatus.driver`, and its present ledger."""
 
@@ -64,11 +63,9 @@ class Batch:
 
     def __init__(self, device: str, device_id: int, samples: Sequence[Sample], frame: PublishedAxes = AS_SENT) -> None:
         self.device = device
-        self.device_id = device_id
-        """Number of the device in slots."""
+        self.device_id = device_id  # number of the device in slots
         self.samples = samples
-        self.frame = frame
-        """Axes and angles of the samples."""
+        self.frame = frame  # axes and angles of the samples
         self._slots: list[bytes] | None = None
         self._converted: dict[Convention, Batch] | None = None
 
@@ -264,12 +261,10 @@ class PublisherContext:
 class PublisherType:
     """Row of a publisher."""
 
-    name: str
-    """Top-level key in the configuration."""
+    name: str  # Top-level key in the configuration
     settings: type[Options]
     make: Callable[[Any, PublisherContext], Publisher]
-    wanted: Callable[[Any], bool] = attrgetter("enabled")
-    """Whether these options enable the publisher."""
+    wanted: Callable[[Any], bool] = attrgetter("enabled")  # whether these options enable the publisher
     required: bool = True
     """Whether the daemon exits if the first start of the publisher fails. Otherwise the daemon tries again
     periodically."""

@@ -25,13 +25,11 @@ class TextLine(msgspec.Struct, frozen=True, gc=False):
 class ReplyFrame(msgspec.Struct, frozen=True, gc=False):
     """Binary frame that answers a command and contains no sample. On CAN, a reply frame may contain a sample."""
 
-    frame_id: int
-    """Kind of the frame by the protocol; on CAN the identifier."""
+    frame_id: int  # kind of the frame by the protocol; on CAN the identifier
     payload: bytes
 
 
-Message = str | ReplyFrame
-"""Possible reply to a command: a line of text without its end, or a binary frame."""
+Message = str | ReplyFrame  # possible reply to a command: a line of text without its end, or a binary frame
 
 T = TypeVar("T")
 
@@ -40,14 +38,10 @@ T = TypeVar("T")
 class Request:
     """Bytes of a request, and the tests that recognize its reply."""
 
-    payload: bytes
-    """Bytes for the link; empty sends nothing."""
-    name: str
-    """Command as written in the manual, for error messages."""
-    is_end: Callable[[Message], bool]
-    """Returns whether this message ends a positive reply."""
-    is_rejection: Callable[[Message], bool]
-    """Returns whether this message ends a negative reply."""
+    payload: bytes  # bytes for the link; empty sends nothing
+    name: str  # command as written in the manual, for error messages
+    is_end: Callable[[Message], bool]  # returns whether this message ends a positive reply
+    is_rejection: Callable[[Message], bool]  # returns whether this message ends a negative reply
     is_part: Callable[[Message], bool]
     """Returns whether this message can be part of the reply. Other messages are unsolicited."""
     timeout_ns: int = NS_PER_S // 2
@@ -118,8 +112,7 @@ class _Messages:
 class Reply(_Messages):
     """Positive reply. Its last message ends it."""
 
-    sample: Measurement | None = None
-    """Measurement that ended the reply, if the request had `is_sample`."""
+    sample: Measurement | None = None  # measurement that ended the reply, if the request had `is_sample`
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,10 +142,8 @@ class Transfer:
     sends: tuple[bytes, ...]
     """SPI: bytes of each assertion of chip select; the device returns the same number of bytes. I2C: one item to
     write."""
-    read_bytes: int = 0
-    """I2C: number of bytes to read after a repeated start; 0: write only."""
-    gap_us: int = 0
-    """SPI: pause after each assertion of chip select, µs."""
+    read_bytes: int = 0  # I2C: number of bytes to read after a repeated start; 0: write only
+    gap_us: int = 0  # SPI: pause after each assertion of chip select, µs
     at: int | None = None
     """I2C, RS-485: address for this transfer only, for example to look for a device at another address."""
     then_at: int | None = None

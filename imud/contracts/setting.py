@@ -23,8 +23,7 @@ from imud.model.options import Options
 class OnDifference(StrEnum):
     """Reaction of imud if the device settings differ from the declared settings."""
 
-    REPORT = "report"
-    """Report the difference: event, status and metric."""
+    REPORT = "report"  # report the difference: event, status and metric
     APPLY = "apply"
     """Write the settings that take effect immediately. imud writes them again after each restart of the device."""
     APPLY_AND_SAVE = "apply_and_save"
@@ -42,8 +41,7 @@ class Written(StrEnum):
     """Result of a script that writes a setting: how certain the new value is."""
 
     VERIFIED = "written and read back"
-    UNVERIFIED = "written, not verified"
-    """The device confirmed the write and cannot report the value."""
+    UNVERIFIED = "written, not verified"  # the device confirmed the write and cannot report the value
     PENDING = "written and read back, in force after save and restart"
     UNVERIFIED_PENDING = "written, not verified; in force after save and restart"
 
@@ -72,8 +70,7 @@ class Setting:
     saves: bool = False
     """Whether the script itself saves all settings to flash and restarts the device. imud runs it only if saving is
     requested, counts one write to flash, and runs no `save` after it."""
-    readable: bool = True
-    """Whether the device reports the value. Otherwise the result is `written, not verified`."""
+    readable: bool = True  # Whether the device reports the value. Otherwise the result is `written, not verified`.
     agrees: Callable[[Any, Any], bool] = eq
     """`agrees(declared, actual)` compares two values: equality, or a comparison with tolerances or optional parts."""
 
@@ -129,12 +126,9 @@ def _declarable(settings: SettingsTable) -> type[Options]:
 class SettingsState(StrEnum):
     """Result of the newest comparison of declared and actual settings."""
 
-    UNDECLARED = "undeclared"
-    """The configuration declares no settings for the device."""
-    UNKNOWN = "unknown"
-    """imud has not read the device settings since the link was opened."""
-    AGREE = "agree"
-    """All readable settings have the declared values."""
+    UNDECLARED = "undeclared"  # the configuration declares no settings for the device
+    UNKNOWN = "unknown"  # imud has not read the device settings since the link was opened
+    AGREE = "agree"  # all readable settings have the declared values
     DIFFER = "differ"
 
 
@@ -142,8 +136,7 @@ class SettingDifference(msgspec.Struct, frozen=True):
     """One setting with another value than declared."""
 
     declared: Any
-    actual: Any = None
-    """Null if the device does not report the setting."""
+    actual: Any = None  # null if the device does not report the setting
 
 
 class SettingsStatus(msgspec.Struct, frozen=True):
@@ -154,37 +147,27 @@ class SettingsStatus(msgspec.Struct, frozen=True):
     problem: str = ""
     """Reason why imud could not read or write the settings, one sentence; empty if there is no problem."""
     differences: dict[str, SettingDifference] = {}  # msgspec copies a mutable default
-    unverified: tuple[str, ...] = ()
-    """Declared settings that the device accepts and does not report."""
-    read_ns: int | None = None
-    """CLOCK_MONOTONIC of the newest read; null before the first read."""
-    repairs: int = 0
-    """Number of automatic attempts of imud to write the declared settings since start."""
-    flash_writes: int = 0
-    """Number of writes to the flash of this device by imud in all runs, automatic or by command."""
-    flash_writes_day: int = 0
-    """Number of these writes in the last 24 hours."""
+    unverified: tuple[str, ...] = ()  # declared settings that the device accepts and does not report
+    read_ns: int | None = None  # CLOCK_MONOTONIC of the newest read; null before the first read
+    repairs: int = 0  # number of automatic attempts of imud to write the declared settings since start
+    flash_writes: int = 0  # number of writes to the flash of this device by imud in all runs, automatic or by command
+    flash_writes_day: int = 0  # number of these writes in the last 24 hours
 
 
 class SettingInfo(msgspec.Struct, frozen=True):
     """Description and known values of one setting."""
 
     name: str
-    values: str
-    """Accepted values, for example `a whole number from 1 to 127`."""
+    values: str  # accepted values, for example `a whole number from 1 to 127`
     description: str
     unit: str
-    section: str
-    """Section of the vendor's manual."""
+    section: str  # section of the vendor's manual
     effect: Effect
-    connection: bool
-    """Whether the change affects how imud reaches the device."""
+    connection: bool  # whether the change affects how imud reaches the device
     readable: bool
-    declarable: bool
-    """Whether the setting is writable."""
+    declarable: bool  # whether the setting is writable
     declared: Any = None
-    actual: Any = None
-    """Null if the device did not report the setting."""
+    actual: Any = None  # null if the device did not report the setting
     differs: bool = False
 
 
@@ -203,12 +186,10 @@ class PlannedStep(msgspec.Struct, frozen=True):
 
     name: str
     value: Any
-    before: Any = None
-    """Null if the present value is not known."""
+    before: Any = None  # null if the present value is not known
     effect: Effect = Effect.AT_ONCE
     connection: bool = False
-    saves: bool = False
-    """Whether this step writes the flash and restarts the device."""
+    saves: bool = False  # whether this step writes the flash and restarts the device
 
 
 class SettingsPlan(msgspec.Struct, frozen=True):
@@ -230,14 +211,11 @@ class SettingsPlan(msgspec.Struct, frozen=True):
 class StepOutcome(StrEnum):
     """Result of one step."""
 
-    DONE = "done"
-    """The setting was written and read back with the wanted value."""
+    DONE = "done"  # the setting was written and read back with the wanted value
     WRITTEN = "written, in force after a restart"
-    NOT_VERIFIED = "written, not verified"
-    """The device does not report this setting."""
+    NOT_VERIFIED = "written, not verified"  # the device does not report this setting
     FAILED = "failed"
-    NOT_DONE = "not done"
-    """A previous step failed."""
+    NOT_DONE = "not done"  # a previous step failed
 
 
 class AppliedStep(msgspec.Struct, frozen=True):
@@ -247,8 +225,7 @@ class AppliedStep(msgspec.Struct, frozen=True):
     value: Any
     before: Any
     outcome: StepOutcome
-    message: str = ""
-    """Reason of a failure; empty otherwise."""
+    message: str = ""  # reason of a failure; empty otherwise
 
 
 class AppliedSettings(msgspec.Struct, frozen=True):
@@ -257,8 +234,7 @@ class AppliedSettings(msgspec.Struct, frozen=True):
     steps: tuple[AppliedStep, ...] = ()
     saved: bool = False
     restarted: bool = False
-    problem: str = ""
-    """Reason of a failure, one sentence; empty if imud did all planned steps."""
+    problem: str = ""  # reason of a failure, one sentence; empty if imud did all planned steps
     left_out: dict[str, str] = {}  # msgspec copies a mutable default
     differences: dict[str, SettingDifference] = {}  # msgspec copies a mutable default
     """Remaining differences from the wanted values."""

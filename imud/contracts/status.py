@@ -40,47 +40,33 @@ class Deviations(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class DeviceState(StrEnum):
     """States of a device."""
 
-    MISSING = "missing"
-    """The link is absent; imud waits for it."""
-    SEARCHING = "searching"
-    """The link is open; imud has not received a valid frame."""
-    RUNNING = "running"
-    """imud receives samples."""
-    SILENT = "silent"
-    """The link is open and the device has stopped sending samples."""
-    FINISHED = "finished"
-    """A replay is at its end."""
-    FAILED = "failed"
-    """A fault that the user must repair, see `problem`. imud tries again periodically."""
+    MISSING = "missing"  # the link is absent; imud waits for it
+    SEARCHING = "searching"  # the link is open; imud has not received a valid frame
+    RUNNING = "running"  # imud receives samples
+    SILENT = "silent"  # the link is open and the device has stopped sending samples
+    FINISHED = "finished"  # a replay is at its end
+    FAILED = "failed"  # a fault that the user must repair, see `problem`. imud tries again periodically.
 
 
 class ClockStatus(msgspec.Struct, frozen=True):
     """State of the clock of one device."""
 
     sync: Sync = Sync.ARRIVAL
-    offset_ns: int = 0
-    """Host CLOCK_MONOTONIC minus unwrapped device time, at the newest sample."""
+    offset_ns: int = 0  # host CLOCK_MONOTONIC minus unwrapped device time, at the newest sample
     skew_ppm: float = 0.0
     """Rate error of the device clock against the host clock without steering (CLOCK_MONOTONIC_RAW), 1e-6; +40: the
     device clock gains 40 µs per second."""
-    residual_ns: int = 0
-    """One-sigma spread of the lower envelope of arrival times around the fit."""
-    t_err_ns: int = 0
-    """Time stamp error of the newest sample, one sigma."""
-    resets: int = 0
-    """Number of restarts of the device clock (restart of the device, jump of its counter)."""
+    residual_ns: int = 0  # One-sigma spread of the lower envelope of arrival times around the fit
+    t_err_ns: int = 0  # time stamp error of the newest sample, one sigma
+    resets: int = 0  # number of restarts of the device clock (restart of the device, jump of its counter)
     hold_ns: int = 0
     """Latency timer of the link's USB adapter: maximum delay of received bytes; 0 without a USB adapter."""
-    edges: int = 0
-    """Number of pulses on the SOUT line, or of triggers on SIN."""
+    edges: int = 0  # number of pulses on the SOUT line, or of triggers on SIN
     edges_unpaired: int = 0
     """Number of pulses without a sample: the frame was lost, or the device did not send the pulse."""
-    samples_unpaired: int = 0
-    """Number of samples without a pulse of their own while pulses arrived."""
-    triggers_missed: int = 0
-    """Number of triggers on SIN without a frame."""
-    reference_error_ns: int = 0
-    """One-sigma error of the host's estimate of UTC; 0 if there is no estimate."""
+    samples_unpaired: int = 0  # number of samples without a pulse of their own while pulses arrived
+    triggers_missed: int = 0  # number of triggers on SIN without a frame
+    reference_error_ns: int = 0  # One-sigma error of the host's estimate of UTC; 0 if there is no estimate
     steering_ppm: float = 0.0
     """Rate of CLOCK_MONOTONIC relative to CLOCK_MONOTONIC_RAW minus 1, 1e-6: the correction by an NTP client."""
 
@@ -88,117 +74,79 @@ class ClockStatus(msgspec.Struct, frozen=True):
 class KernelCounters(msgspec.Struct, frozen=True):
     """Errors that the kernel counted since the link was opened."""
 
-    overrun: int = 0
-    """Overruns of the UART FIFO or tty buffer (TIOCGICOUNT), and overflows of the CAN receive queue."""
+    overrun: int = 0  # overruns of the UART FIFO or tty buffer (TIOCGICOUNT), and overflows of the CAN receive queue
     framing: int = 0
     parity: int = 0
     break_: int = msgspec.field(default=0, name="break")
-    error_passive: int = 0
-    """Number of times that a CAN controller became error-passive."""
-    bus_off: int = 0
-    """Number of times that a CAN controller went to bus-off."""
+    error_passive: int = 0  # number of times that a CAN controller became error-passive
+    bus_off: int = 0  # number of times that a CAN controller went to bus-off
 
 
 class PollingStatus(msgspec.Struct, frozen=True):
     """Reads of a polled device since start."""
 
-    polls: int = 0
-    """Number of deadlines with a read."""
-    late: int = 0
-    """Number of reads that started later than a quarter of the period after the deadline."""
+    polls: int = 0  # number of deadlines with a read
+    late: int = 0  # number of reads that started later than a quarter of the period after the deadline
     missed: int = 0
     """Number of deadlines without a read, because the host or the bus was busy. Also in `lost_queue` of the ledger."""
-    stale: int = 0
-    """Number of reads with the same bytes as the previous read: the device had no new values."""
-    failed: int = 0
-    """Number of failed transfers."""
-    vanished: int = 0
-    """Number of times that imud had to identify the device again."""
-    late_mean_ns: int = 0
-    """Time from the deadline to the read, mean over `polls`."""
-    late_worst_ns: int = 0
-    """Maximum time from the deadline to the read."""
-    late_sum_ns: int = 0
-    """Sum of the times from the deadline to the read."""
+    stale: int = 0  # number of reads with the same bytes as the previous read: the device had no new values
+    failed: int = 0  # number of failed transfers
+    vanished: int = 0  # number of times that imud had to identify the device again
+    late_mean_ns: int = 0  # time from the deadline to the read, mean over `polls`
+    late_worst_ns: int = 0  # maximum time from the deadline to the read
+    late_sum_ns: int = 0  # sum of the times from the deadline to the read
 
 
 class SerialLineCounters(msgspec.Struct, frozen=True):
     """Unexpected bytes on an RS-485 bus since it was opened."""
 
-    timeouts: int = 0
-    """Number of requests without a reply."""
-    late_bytes: int = 0
-    """Number of bytes received without a pending request."""
-    strange_bytes: int = 0
-    """Number of bytes received before a reply, or in place of a reply."""
-    echoes: int = 0
-    """Number of requests that the adapter echoed; not a fault."""
+    timeouts: int = 0  # number of requests without a reply
+    late_bytes: int = 0  # number of bytes received without a pending request
+    strange_bytes: int = 0  # number of bytes received before a reply, or in place of a reply
+    echoes: int = 0  # number of requests that the adapter echoed; not a fault
 
 
 class LinesStatus(msgspec.Struct, frozen=True):
     """GPIO lines of one device, since start."""
 
-    problems: dict[str, str]
-    """Reason for each line that imud cannot watch or drive, by key of the configuration."""
-    edges: dict[str, int]
-    """Number of received edges, by line."""
-    edges_lost: dict[str, int]
-    """Number of edges that the kernel dropped from a full buffer, by line."""
-    alarm: bool | None = None
-    """Whether the ALARM line is active; None if there is no line or its level is not known."""
-    alarms: int = 0
-    """Number of times that the ALARM line became active."""
-    sin: bool = False
-    """Whether the configuration has a SIN line for this device. The following fields describe it."""
-    triggers: int = 0
-    """Number of rising edges on SIN."""
-    triggers_missed: int = 0
-    """Number of deadlines without an edge, because the host was busy."""
-    trigger_late_mean_ns: int = 0
-    """Time from the deadline to the edge, mean over `triggers`."""
-    trigger_late_worst_ns: int = 0
-    """Maximum time from the deadline to the edge."""
-    trigger_late_sum_ns: int = 0
-    """Sum of the times from the deadline to the edge."""
+    problems: dict[str, str]  # reason for each line that imud cannot watch or drive, by key of the configuration
+    edges: dict[str, int]  # number of received edges, by line
+    edges_lost: dict[str, int]  # number of edges that the kernel dropped from a full buffer, by line
+    alarm: bool | None = None  # whether the ALARM line is active; None if there is no line or its level is not known
+    alarms: int = 0  # number of times that the ALARM line became active
+    sin: bool = False  # Whether the configuration has a SIN line for this device. The following fields describe it.
+    triggers: int = 0  # number of rising edges on SIN
+    triggers_missed: int = 0  # number of deadlines without an edge, because the host was busy
+    trigger_late_mean_ns: int = 0  # time from the deadline to the edge, mean over `triggers`
+    trigger_late_worst_ns: int = 0  # maximum time from the deadline to the edge
+    trigger_late_sum_ns: int = 0  # sum of the times from the deadline to the edge
 
 
 class UtcStatus(msgspec.Struct, frozen=True):
     """Sources of UTC for a device and for the host, since start."""
 
-    source: str
-    """Readable name of the source of RMC sentences; empty if there is no source."""
+    source: str  # readable name of the source of RMC sentences; empty if there is no source
     problem: str
     """Present fault of the source or of the connection to chronyd, one sentence; empty if there is no fault."""
-    sentences: int = 0
-    """Number of sentences from the source."""
-    sent: int = 0
-    """Number of sentences that imud sent to the device."""
+    sentences: int = 0  # number of sentences from the source
+    sent: int = 0  # number of sentences that imud sent to the device
     refused: dict[str, int] = {}  # msgspec copies a mutable default
     """Number of sentences that imud did not send, by cause."""
-    pulses: int = 0
-    """Number of accepted pulses per second."""
-    pulses_ignored: int = 0
-    """Number of pulses outside the rhythm of the other pulses."""
-    chrony_sent: int = 0
-    """Number of samples that imud sent to chronyd."""
+    pulses: int = 0  # number of accepted pulses per second
+    pulses_ignored: int = 0  # number of pulses outside the rhythm of the other pulses
+    chrony_sent: int = 0  # number of samples that imud sent to chronyd
     chrony_refused: int = 0
 
 
 class FrameStatus(msgspec.Struct, frozen=True):
     """Axes, angles and heading of the samples of one device."""
 
-    frame: str
-    """Axes of vectors: sensor axes, or axes of the body with the sensor."""
-    convention: str
-    """`enu-flu` or `ned-frd`; `device`: as the device sends them."""
-    euler_convention: str
-    """Order, axes and signs of `euler_rad`."""
-    navigation_frame: str
-    """Destination frame of the rotation `quat_wxyz`."""
-    heading: Heading
-    """Reference of yaw."""
-    declination_deg: float | None
-    """Declination that imud adds to the heading; None without a declination."""
+    frame: str  # axes of vectors: sensor axes, or axes of the body with the sensor
+    convention: str  # `enu-flu` or `ned-frd`; `device`: as the device sends them
+    euler_convention: str  # Order, axes and signs of `euler_rad`
+    navigation_frame: str  # destination frame of the rotation `quat_wxyz`
+    heading: Heading  # reference of yaw
+    declination_deg: float | None  # declination that imud adds to the heading; None without a declination
     conventions: dict[str, FrameWords]
     """Axes and angles that a client receives if it requests a convention, by name of the convention."""
     problem: str = ""
@@ -227,19 +175,13 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     name: str
     device_id: int
     driver: str
-    link: str
-    """Readable name of the link, for example `/dev/ttyUSB0 at 115200 baud`."""
+    link: str  # readable name of the link, for example `/dev/ttyUSB0 at 115200 baud`
     state: DeviceState
-    problem: str
-    """Reason why the device is not running, one sentence; empty while it is running."""
-    identity: dict[str, str]
-    """`product`, `serial_number`, `firmware` and other properties that the device reported."""
-    settings: dict[str, str]
-    """Device settings as read from the device, with readable names and units if they are known."""
-    rate_hz: float
-    """Samples per second in the last seconds."""
-    expected_rate_hz: float
-    """Sample rate from the device time; 0 if it is not known."""
+    problem: str  # reason why the device is not running, one sentence; empty while it is running
+    identity: dict[str, str]  # `product`, `serial_number`, `firmware` and other properties that the device reported
+    settings: dict[str, str]  # device settings as read from the device, with readable names and units if they are known
+    rate_hz: float  # samples per second in the last seconds
+    expected_rate_hz: float  # sample rate from the device time; 0 if it is not known
     newest_seq: int
     clock: ClockStatus
     ledger: dict[str, int]
@@ -250,32 +192,23 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     latency_sum_ns: int
     temperature_c: float | None
     status_bits: int | None
-    connects: int
-    """Number of times that imud opened the link since start."""
-    status_words: tuple[str, ...] = ()
-    """Names of the known bits of `status_bits` that are set."""
+    connects: int  # number of times that imud opened the link since start
+    status_words: tuple[str, ...] = ()  # names of the known bits of `status_bits` that are set
     status_bit_names: dict[str, str] = {}  # msgspec copies a mutable default
     """Names of the bits of `status`, by number; empty if the driver is not known or has no names."""
     euler_convention: str = ""
     """Order, axes and signs of the published `euler_rad`; empty while the driver is not known."""
-    navigation_frame: str = ""
-    """Destination frame of the rotation `quat_wxyz`; empty while the driver is not known."""
-    frame: FrameStatus | None = None
-    """Axes and angles of published samples; None while the driver is not known."""
-    polling: PollingStatus | None = None
-    """Counters of the polls; None for a device that sends without requests."""
+    navigation_frame: str = ""  # destination frame of the rotation `quat_wxyz`; empty while the driver is not known
+    frame: FrameStatus | None = None  # axes and angles of published samples; None while the driver is not known
+    polling: PollingStatus | None = None  # counters of the polls; None for a device that sends without requests
     serial_line: SerialLineCounters | None = None
     """Counters of the RS-485 bus, equal for all devices of the bus; None for a device on another link."""
-    lines: LinesStatus | None = None
-    """Status of the GPIO lines; None for a device without GPIO lines."""
+    lines: LinesStatus | None = None  # status of the GPIO lines; None for a device without GPIO lines
     utc: UtcStatus | None = None
     """Sources of UTC; None for a device that receives no sentences and has no pulse per second on the host."""
-    hold_ns: int = 0
-    """Present hold of received data, ns; 0: imud processes each sample immediately."""
-    hold_wanted_ns: int = 0
-    """Maximum hold that all clients of its samples accept, ns: the strictest latency request."""
-    hold_by: str = ""
-    """Name of the client with this request; empty if there is no request."""
+    hold_ns: int = 0  # present hold of received data, ns; 0: imud processes each sample immediately
+    hold_wanted_ns: int = 0  # maximum hold that all clients of its samples accept, ns: the strictest latency request
+    hold_by: str = ""  # name of the client with this request; empty if there is no request
     declared: SettingsStatus | None = None
     """Comparison of device settings and declared settings; None if the driver is not known or has no table of
     settings."""
@@ -286,113 +219,71 @@ class DeviceStatus(msgspec.Struct, frozen=True):
 class RecorderStatus(msgspec.Struct, frozen=True):
     """Status of the recorder."""
 
-    file: str
-    """Name of the present file; empty if the recorder is not recording."""
-    problem: str
-    """Reason why the recorder is not recording, one sentence; empty while it is recording."""
-    written_bytes: int
-    """Number of bytes written to files since start."""
-    records: int
-    """Number of records in these files."""
-    records_dropped: int
-    """Number of dropped records: the queue was full, because the disk was too slow."""
-    waiting_bytes: int
-    """Size of the queued records."""
-    files_removed: int
-    """Number of files that the recorder removed to stay within its disk budget."""
-    disk_bytes: int
-    """Size of all recordings in the directory, with snapshots and the present file."""
+    file: str  # name of the present file; empty if the recorder is not recording
+    problem: str  # reason why the recorder is not recording, one sentence; empty while it is recording
+    written_bytes: int  # number of bytes written to files since start
+    records: int  # number of records in these files
+    records_dropped: int  # number of dropped records: the queue was full, because the disk was too slow
+    waiting_bytes: int  # size of the queued records
+    files_removed: int  # number of files that the recorder removed to stay within its disk budget
+    disk_bytes: int  # size of all recordings in the directory, with snapshots and the present file
 
 
 class FlightStatus(msgspec.Struct, frozen=True):
     """Status of the flight recorder."""
 
-    problem: str
-    """Reason why the flight recorder keeps no data, one sentence; empty while it keeps data."""
-    kept_ns: int
-    """Time span of the data in memory."""
+    problem: str  # reason why the flight recorder keeps no data, one sentence; empty while it keeps data
+    kept_ns: int  # time span of the data in memory
     kept_bytes: int
-    records_dropped: int
-    """Number of dropped records: the queue was full, because this host was too slow."""
-    saved: int
-    """Number of snapshots saved to files since start."""
-    failed: int
-    """Number of snapshots that could not be saved."""
-    left_out: int
-    """Number of alerts without a snapshot, because the limit per hour was reached."""
-    sent: int
-    """Number of snapshots sent to clients."""
-    disk_bytes: int
-    """Size of all recordings in the directory without the present file."""
+    records_dropped: int  # number of dropped records: the queue was full, because this host was too slow
+    saved: int  # number of snapshots saved to files since start
+    failed: int  # number of snapshots that could not be saved
+    left_out: int  # number of alerts without a snapshot, because the limit per hour was reached
+    sent: int  # number of snapshots sent to clients
+    disk_bytes: int  # size of all recordings in the directory without the present file
 
 
 class OutputStatus(msgspec.Struct, frozen=True):
     """One destination of an output that sends sentences."""
 
-    name: str
-    """Kind and address, for example `tcp 127.0.0.1:10110`."""
-    sent: int
-    """Number of sentences sent since start, the sum over all clients."""
-    dropped: int
-    """Number of sentences that imud did not send, because the destination was full or absent."""
-    readers: int
-    """Number of connected clients. For a port or an address: 1 while it accepts data, otherwise 0."""
-    problem: str
-    """Reason why imud sends nothing, one sentence; empty while imud sends."""
+    name: str  # kind and address, for example `tcp 127.0.0.1:10110`
+    sent: int  # number of sentences sent since start, the sum over all clients
+    dropped: int  # number of sentences that imud did not send, because the destination was full or absent
+    readers: int  # Number of connected clients. For a port or an address: 1 while it accepts data, otherwise 0.
+    problem: str  # reason why imud sends nothing, one sentence; empty while imud sends
 
 
 class MqttStatus(msgspec.Struct, frozen=True):
     """Status of the output `mqtt`."""
 
-    broker: str
-    """Connected broker; empty if no broker is connected."""
-    problem: str
-    """Reason why imud sends nothing, one sentence; empty while imud sends."""
-    spool_problem: str
-    """Reason why imud does not use the spool, one sentence; empty while imud uses it."""
-    queued: int
-    """Number of samples and events that the output received since start."""
-    spooled: int
-    """Number of messages written to the spool."""
-    sent: int
-    """Number of messages sent, repetitions included."""
-    acknowledged: int
-    """Number of messages that the broker acknowledged."""
-    waiting: int
-    """Number of messages in the spool, with messages of earlier runs."""
-    spool_bytes: int
-    """Disk space of the spool, bytes."""
-    thinned: int
-    """Number of samples that imud reduced to statistics to save disk space."""
-    dropped: dict[str, int]
-    """Number of dropped samples and events, by cause."""
-    reconnects: int
-    """Number of connections after the first connection."""
-    commands: int = 0
-    """Number of requested actions that imud ran or tried to run."""
-    commands_refused: int = 0
-    """Number of rejected requests."""
+    broker: str  # connected broker; empty if no broker is connected
+    problem: str  # reason why imud sends nothing, one sentence; empty while imud sends
+    spool_problem: str  # reason why imud does not use the spool, one sentence; empty while imud uses it
+    queued: int  # number of samples and events that the output received since start
+    spooled: int  # number of messages written to the spool
+    sent: int  # number of messages sent, repetitions included
+    acknowledged: int  # number of messages that the broker acknowledged
+    waiting: int  # number of messages in the spool, with messages of earlier runs
+    spool_bytes: int  # disk space of the spool, bytes
+    thinned: int  # number of samples that imud reduced to statistics to save disk space
+    dropped: dict[str, int]  # number of dropped samples and events, by cause
+    reconnects: int  # number of connections after the first connection
+    commands: int = 0  # number of requested actions that imud ran or tried to run
+    commands_refused: int = 0  # number of rejected requests
 
 
 class ClientStatus(msgspec.Struct, frozen=True):
     """One client of the UNIX socket."""
 
-    number: int
-    """Number of the connection since start."""
+    number: int  # number of the connection since start
     pid: int
     uid: int
-    control: bool
-    """Whether the client has the permission to control devices."""
-    encoding: str
-    """`json` or `binary` while the client has a subscription, otherwise empty."""
-    sent: int
-    """Number of samples written to the client's socket."""
-    dropped: int
-    """Number of dropped samples, because the client did not read fast enough."""
-    queue_samples: int
-    """Number of samples in the client's queue."""
-    queue_bytes: int
-    """Number of bytes in the client's queue, replies included."""
+    control: bool  # whether the client has the permission to control devices
+    encoding: str  # `json` or `binary` while the client has a subscription, otherwise empty
+    sent: int  # number of samples written to the client's socket
+    dropped: int  # number of dropped samples, because the client did not read fast enough
+    queue_samples: int  # number of samples in the client's queue
+    queue_bytes: int  # number of bytes in the client's queue, replies included
 
 
 class SocketStatus(msgspec.Struct, frozen=True):
@@ -400,12 +291,9 @@ class SocketStatus(msgspec.Struct, frozen=True):
 
     path: str
     clients: tuple[ClientStatus, ...]
-    accepted: int
-    """Number of connections since start."""
-    refused: int
-    """Number of rejected connections since start: too many connections, or no permission to read."""
+    accepted: int  # number of connections since start
+    refused: int  # number of rejected connections since start: too many connections, or no permission to read
     evicted: int
     """Number of clients that imud disconnected since start: no reads, too many requests, or a line that was too
     long."""
-    failed: int = 0
-    """Number of clients disconnected since start because of an error in the daemon."""
+    failed: int = 0  # number of clients disconnected since start because of an error in the daemon

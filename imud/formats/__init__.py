@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""Byte formats that several parts share, without I/O."""

@@ -1,7 +1,7 @@
-"""CAN frames (ISO 11898-1), filters, and the kernel's 16-byte `struct can_frame`.
+"""CAN frames (ISO 11898-1), filters, the kernel's 16-byte `struct can_frame`, and candump logs.
 
-Frames travel between a link and a codec as `CanFrame`, and to a link as `struct can_frame`, so that a command is bytes
-on every kind of link.
+A link delivers frames to a codec as `CanFrame`. It sends frames as `struct can_frame`, so that a command consists of
+bytes on every kind of link.
 """
 
 import re
@@ -12,83 +12,77 @@ from typing import BinaryIO, Final, NamedTuple
 
 from imud.model.units import NS_PER_S
 
-DATA_BYTES_MAX: Final = 8
-"""Data bytes of a classical CAN frame (ISO 11898-1)."""
+DATA_BYTES_MAX: Final = 8  # maximum number of data bytes of a classical CAN frame (ISO 11898-1)
 STANDARD_ID_MAX: Final = 0x7FF
 EXTENDED_ID_MAX: Final = 0x1FFF_FFFF
 EXTENDED_FLAG: Final = 0x8000_0000
 """Flag in the identifier of `struct can_frame`: 29 bits (CAN_EFF_FLAG of linux/can.h)."""
-REMOTE_FLAG: Final = 0x4000_0000
-"""Flag there: a remote frame, without data (CAN_RTR_FLAG)."""
+REMOTE_FLAG: Final = 0x4000_0000  # flag in the identifier: a remote frame, without data (CAN_RTR_FLAG)
 ERROR_FLAG: Final = 0x2000_0000
-"""Flag there: an error frame of the controller, no frame of the bus (CAN_ERR_FLAG)."""
+"""Flag in the identifier: an error frame of the controller, not a frame of the bus (CAN_ERR_FLAG)."""
 
 RAW_FRAME: Final = struct.Struct("=IB3x8s")
-"""`struct can_frame` in the machine's byte order: identifier with flags, length, data."""
+"""`struct can_frame` in the byte order of the host: identifier with flags, length, data."""
 STANDARD_OVERHEAD_BITS, EXTENDED_OVERHEAD_BITS = 47, 67
-"""Bits of a frame without its data and stuff bits, with the interframe space of three bits (ISO 11898-1), for
-identifiers of 11 and of 29 bits."""
+"""Length of a frame without data and stuff bits, with three bits of interframe space (ISO 11898-1), for 11 and 29
+bits.
+"""
 
 
 class CanFrame(NamedTuple):
-    """A data frame as received."""
+    """Received data frame."""
 
-    can_id: int
-    """Identifier without flags."""
-    extended: bool
-    """Whether the identifier has 29 bits."""
+    can_id: int  # identifier without flags
+    extended: bool  # whether the identifier has 29 bits
     data: bytes
-    t_rx_ns: int
-    """CLOCK_MONOTONIC of its arrival, ns: the kernel's time stamp where there is one."""
-    after_loss: bool = False
-    """Whether frames are known to be missing right before it."""
+    t_rx_ns: int  # arrival time, CLOCK_MONOTONIC, ns: the time stamp of the kernel if it exists
+    after_loss: bool = False  # whether frames were lost immediately before this frame
 
 
 @dataclass(frozen=True, slots=True)
 class CanFilter:
-    """Frames that a device needs: those whose identifier agrees with `can_id` in the bits of `mask`."""
+    """Filter for identifiers that are equal to `can_id` in the bits of `mask`."""
 
     can_id: int
     mask: int
     extended: bool
 
     def matches(self, can_id: int, extended: bool) -> bool:
-        """Whether a frame passes the filter."""
+        """Return whether a frame passes the filter."""
         return extended == self.extended and not (can_id ^ self.can_id) & self.mask
 
     def overlaps(self, other: "CanFilter") -> bool:
-        """Whether some frame passes both filters."""
+        """Return whether a frame exists that passes both filters."""
         return self.extended == other.extended and not (self.can_id ^ other.can_id) & self.mask & other.mask
 
 
 @dataclass(frozen=True, slots=True)
 class CyclicFrame:
-    """A frame that imud sends at a fixed period because devices need it, such as CANopen SYNC.
+    """Frame that imud sends periodically because devices need it, for example CANopen SYNC.
 
-    One device of a bus has it sent for all of them: a second one with a frame of the same identifier is refused.
+    One device of a bus requests the frame for all devices. imud rejects a second device with the same identifier.
     """
 
     can_id: int
     extended: bool
     data: bytes
-    every_ns: int
-    """Period in whole microseconds; the first frame is sent at once."""
+    every_ns: int  # period in whole microseconds. imud sends the first frame immediately.
 
 
 def frame_bits(extended: bool, data_bytes: int) -> int:
-    """Length of a frame on the wire in bits, interframe space included; stuff bits make it up to 22 % longer."""
+    """Return the bits of a frame on the wire with interframe space. Stuff bits add up to 22 %."""
     return (EXTENDED_OVERHEAD_BITS if extended else STANDARD_OVERHEAD_BITS) + 8 * data_bytes
 
 
 def pack_frame(can_id: int, extended: bool, data: bytes) -> bytes:
-    """A frame as `struct can_frame`. Raises ValueError for an identifier or a length out of range."""
+    """Return a frame as `struct can_frame`. Raises ValueError for an identifier or a length out of range."""
     if not 0 <= can_id <= (EXTENDED_ID_MAX if extended else STANDARD_ID_MAX) or len(data) > DATA_BYTES_MAX:
-        raise ValueError(f"no CAN frame: identifier {can_id:#x}{' (29 bits)' * extended}, {len(data)} data bytes")
+        raise ValueError(f"invalid CAN frame: identifier {can_id:#x}{' (29 bits)' * extended}, {len(data)} data bytes")
     return RAW_FRAME.pack(can_id | EXTENDED_FLAG if extended else can_id, len(data), data)
 
 
 LINE_BYTES_MAX: Final = 512
-"""The longest line, CAN FD with 64 bytes and a long bus name, has some 190."""
+"""Maximum length of a line, bytes. CAN FD with 64 data bytes and a long bus name needs about 190."""
 _FRAME: Final = re.compile(
     rb"\((\d{1,18})\.(\d{1,9})\) +(\S+) +([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#((?:[0-9A-Fa-f]{2}){0,8})(?:_[0-9A-Fa-f])?"
     rb"(?: [RT])?\s*"
@@ -99,22 +93,22 @@ _OTHER: Final = re.compile(
 
 
 class CandumpReader:
-    """Reader of a log from any binary stream. Iterate once: frames with the log's times as `t_rx_ns`, never falling."""
+    """Reader of a candump log from a binary stream. Iterate once. `t_rx_ns` is the time in the log and never
+    decreases.
+    """
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self.passed_over = 0
-        """Valid lines that are no data frame."""
+        self.passed_over = 0  # number of valid lines without a data frame
         self.bad_lines = 0
-        self.first_bad = 0
-        """Number of the first line that is none of a log, from 1; 0 when there is none."""
+        self.first_bad = 0  # number of the first invalid line, starting at 1; 0 if all lines are valid
 
     @property
     def problem(self) -> str:
-        """After iterating: the fault of the file, one sentence; empty when it has none."""
+        """Error of the file after the iteration, one sentence; empty if there is no error."""
         if not self.bad_lines:
             return ""
-        return f"{self.bad_lines} lines are none of a candump log (candump -L), the first is line {self.first_bad}"
+        return f"expected a candump log (candump -L), got {self.bad_lines} invalid lines (first: line {self.first_bad})"
 
     def __iter__(self) -> Iterator[CanFrame]:
         newest_ns, number = 0, 0
@@ -129,6 +123,7 @@ class CandumpReader:
             if can_id & ERROR_FLAG or can_id > EXTENDED_ID_MAX or (len(digits) == 3 and can_id > STANDARD_ID_MAX):
                 self._note(line if can_id & ERROR_FLAG else b"bad", number, passed=bool(can_id & ERROR_FLAG))
                 continue
+            # the clock can step backwards during the log
             newest_ns = max(newest_ns, int(seconds) * NS_PER_S + int(fraction.ljust(9, b"0")))
             yield CanFrame(can_id, len(digits) == 8, bytes.fromhex(data.decode("ascii")), newest_ns)
 

@@ -1,15 +1,16 @@
-r"""Capture files: bytes of a link. A raw capture is the bytes alone; a stamped one has the time of each read.
+r"""Capture files: received bytes of a link. A raw capture contains only the bytes; a stamped capture also the read
+times.
 
-A stamped capture begins with one line of ASCII, then come records to the end of the file, little-endian::
+A stamped capture starts with one line of ASCII. Records follow to the end of the file, little-endian::
 
     #imud-capture 1 driver=hipnuc-uart baud=115200 start_utc_ns=1763717507000000000\n
     ┌───────────────┬─────────────┬───────────────┐
-    │ t_ns i64      │ length u32  │ length bytes  │  t_ns is CLOCK_MONOTONIC right after the read
+    │ t_ns i64      │ length u32  │ length bytes  │  t_ns is CLOCK_MONOTONIC immediately after the read
     └───────────────┴─────────────┴───────────────┘
 
-Values of the first line are percent-encoded (RFC 3986), unknown keys are kept, their order is free. Any file that does
-not begin with the magic is a raw capture. A last record that is cut short (power loss) is normal; a length over
-RECORD_BYTES_MAX or a time before its predecessor's means damage: reading stops there and `problem` says so.
+Values of the first line are percent-encoded (RFC 3986), in any order; the reader keeps unknown keys. A file without the
+magic bytes is a raw capture. The last record may be incomplete (power loss). A length over RECORD_BYTES_MAX or a
+decreasing time means damage: the reader stops and reports it in `problem`.
 """
 
 import struct
@@ -22,50 +23,44 @@ from imud.model.errors import ImudError
 MAGIC: Final = b"#imud-capture "
 VERSION: Final = "1"
 HEADER_BYTES_MAX: Final = 4096
-RECORD_BYTES_MAX: Final = 1 << 20
-"""Largest read of any link; a larger length is damage."""
-RAW_CHUNK_BYTES: Final = 4096
-"""Size of the pieces of a raw capture: as much as a tty hands over at once."""
+RECORD_BYTES_MAX: Final = 1 << 20  # Maximum size of one read of any link. A larger length means damage.
+RAW_CHUNK_BYTES: Final = 4096  # size of the pieces of a raw capture, the maximum of one tty read
 
-RECORD: Final = struct.Struct("<qI")
-"""Head of a record: `t_ns`, length."""
+RECORD: Final = struct.Struct("<qI")  # head of a record: `t_ns`, length
 
 
 class Chunk(NamedTuple):
     """Bytes of one read."""
 
-    t_ns: int | None
-    """CLOCK_MONOTONIC right after the read; None in a raw capture."""
+    t_ns: int | None  # CLOCK_MONOTONIC immediately after the read; None in a raw capture
     data: bytes
 
 
 class CaptureReader:
-    """Reader of a raw or stamped capture from any binary stream, seekable or not. Iterate once.
+    """Reader of a raw or stamped capture from a binary stream, seekable or not. Iterate once.
 
-    The first bytes of the file decide which of the two it is.
+    The first bytes of the file decide between raw and stamped.
     """
 
     def __init__(self, file: BinaryIO) -> None:
-        """Raises ImudError for a stamped capture of another version, or with a broken first line."""
+        """Raises ImudError for a stamped capture of another version or with an invalid first line."""
         self._file = file
         self._offset = 0
-        self.problem = ""
-        """After iterating: how the file is cut short or damaged, one sentence; empty when it is whole."""
-        self.is_damaged = False
-        """After iterating: whether it is damaged, not only cut short."""
+        self.problem = ""  # error of the file after the iteration, one sentence; empty if the file is complete
+        self.is_damaged = False  # after the iteration: whether the file is damaged, not only incomplete
         self._head = _read_fully(file, len(MAGIC))
         self.stamped = self._head == MAGIC
         self.details: Mapping[str, str] = self._read_details() if self.stamped else {}
-        """Everything in the first line, decoded."""
+        """Decoded keys and values of the first line."""
 
     @property
     def baud(self) -> int:
-        """Rate named in the first line, bit/s; 0 when none is."""
+        """Baud rate from the first line, bit/s; 0 if it is missing."""
         return self._number("baud")
 
     @property
     def hold_ns(self) -> int:
-        """Longest time that the adapter held bytes back, as named in the first line, ns; 0 if it is not."""
+        """Latency timer of the adapter from the first line, ns; 0 if it is missing."""
         return self._number("hold_ns")
 
     def __iter__(self) -> Iterator[Chunk]:
@@ -81,7 +76,7 @@ class CaptureReader:
         version, *pairs = line.decode("ascii", "replace").split() or [""]
         if version != VERSION or not line.endswith(b"\n"):
             raise ImudError(
-                f"capture of version {version[:20]!r}: this imud reads version {VERSION}; or is it damaged?"
+                f"cannot read the capture: expected version {VERSION}, got {version[:20]!r}; is the file damaged?"
             )
         return {key: unquote(value) for key, _, value in (pair.partition("=") for pair in pairs)}
 
@@ -95,18 +90,18 @@ class CaptureReader:
         newest_ns: int | None = None
         while header := _read_fully(self._file, RECORD.size):
             if len(header) < RECORD.size:
-                self.problem = f"the last {len(header)} bytes are a record cut short, left out"
+                self.problem = f"the last {len(header)} bytes are an incomplete record; imud ignores them"
                 return
             t_ns, length = RECORD.unpack(header)
             if length > RECORD_BYTES_MAX or (newest_ns is not None and t_ns < newest_ns):
                 self.is_damaged = True
                 self.problem = (
-                    f"damaged at byte {self._offset}: record of {length} bytes at {t_ns} ns; the rest is left out"
+                    f"damaged at byte {self._offset}: record of {length} bytes at {t_ns} ns; imud ignores the rest"
                 )
                 return
             data = _read_fully(self._file, length)
             if len(data) < length:
-                self.problem = f"the last {len(header) + len(data)} bytes are a record cut short, left out"
+                self.problem = f"the last {len(header) + len(data)} bytes are an incomplete record; imud ignores them"
                 return
             self._offset += len(header) + length
             newest_ns = t_ns
@@ -114,8 +109,9 @@ class CaptureReader:
 
 
 def _read_fully(file: BinaryIO, size: int) -> bytes:
-    """Up to `size` bytes; fewer only at the end (a pipe hands over less at a time)."""
+    """Return `size` bytes; fewer bytes only at the end of the file."""
     parts = []
+    # a pipe returns fewer bytes per read
     while size > 0 and (part := file.read(size)):
         parts.append(part)
         size -= len(part)

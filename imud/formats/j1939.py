@@ -1,13 +1,13 @@
-"""The 29-bit identifiers of SAE J1939 and NMEA 2000, which is built on it. SAE J1939-21, section 5.2.
+"""29-bit identifiers of SAE J1939 and NMEA 2000. SAE J1939-21, section 5.2.
 
     28      26   25    24   23          16 15          8 7         0
     +---------+-----+----+---------------+-------------+----------+
     | priority| EDP | DP | PF            | PS          | source   |
     +---------+-----+----+---------------+-------------+----------+
 
-PF below 240 (PDU1): PS is the destination address, and no part of the number. From 240 on (PDU2) PS is part of the
-number, and the message is a broadcast. The parameter group number (PGN) is EDP, DP, PF, PS. Priority only decides the
-arbitration on the bus; receivers ignore it.
+PF below 240 (PDU1): PS is the destination address and not part of the parameter group number (PGN). PF from 240 (PDU2):
+PS is part of the PGN, and the message is a broadcast. The PGN is EDP, DP, PF, PS. Priority decides only the arbitration
+on the bus. Receivers ignore it.
 """
 
 from collections.abc import Container
@@ -15,32 +15,26 @@ from typing import Final, NamedTuple
 
 from imud.formats.can import DATA_BYTES_MAX, CanFilter
 
-GLOBAL: Final = 0xFF
-"""Destination address of broadcasts."""
-ADDRESS_MAX: Final = 253
-"""Highest address of a node; 254 is the null address, of nodes that have none."""
-PDU2_MIN: Final = 240
-"""First PF of broadcasts."""
+GLOBAL: Final = 0xFF  # destination address of broadcasts
+ADDRESS_MAX: Final = 253  # maximum address of a node. 254 is the null address of nodes without an address.
+PDU2_MIN: Final = 240  # minimum PF of broadcasts
 PRIORITY_MAX: Final = 7
 PGN_MAX: Final = 0x3_FFFF
-WITHOUT_PRIORITY: Final = 0x03FF_FFFF
-"""Mask of an identifier without its priority, which distinguishes no messages."""
+WITHOUT_PRIORITY: Final = 0x03FF_FFFF  # mask of an identifier without its priority
 _WITHOUT_SOURCE: Final = WITHOUT_PRIORITY & ~0xFF
 
 
 class J1939Id(NamedTuple):
-    """An identifier, split."""
+    """Parts of a 29-bit identifier."""
 
-    priority: int
-    """0 is the highest, 7 the lowest."""
-    pgn: int
-    """PGN; its low byte is 0 where a destination stands in the identifier."""
+    priority: int  # 0 is the highest, 7 the lowest priority
+    pgn: int  # PGN; its low byte is 0 if the identifier contains a destination
     source: int
     destination: int = GLOBAL
 
 
 def split(can_id: int) -> J1939Id:
-    """The parts of a 29-bit identifier."""
+    """Return the parts of a 29-bit identifier."""
     pgn, destination = can_id >> 8 & PGN_MAX, GLOBAL
     if pgn >> 8 & 0xFF < PDU2_MIN:
         pgn, destination = pgn & ~0xFF, pgn & 0xFF
@@ -48,26 +42,26 @@ def split(can_id: int) -> J1939Id:
 
 
 def join(parts: J1939Id) -> int:
-    """The identifier. Raises ValueError for parts out of range, or a destination with a PDU2 number."""
+    """Return the identifier. Raises ValueError for parts out of range, or a destination with a PDU2 number."""
     priority, pgn, source, destination = parts
     is_for_one = pgn >> 8 & 0xFF < PDU2_MIN
     if not (0 <= priority <= PRIORITY_MAX and 0 <= pgn <= PGN_MAX and 0 <= source <= 0xFF and 0 <= destination <= 0xFF):
-        raise ValueError(f"no J1939 identifier: {parts}")
+        raise ValueError(f"invalid J1939 identifier: {parts}")
     if pgn & 0xFF if is_for_one else destination != GLOBAL:
         raise ValueError(
-            f"no J1939 identifier: PGN {pgn:#x} {'ends in 00' if is_for_one else 'is for all'}, got {parts}"
+            f"invalid J1939 identifier: PGN {pgn:#x} {'ends in 00' if is_for_one else 'is a broadcast'}, got {parts}"
         )
     return priority << 26 | (pgn | destination if is_for_one else pgn) << 8 | source
 
 
 def sender_of(can_id: int, extended: bool, data: bytes, pgns: Container[int]) -> int | None:
-    """The node that sent one of these messages of eight bytes, None for any other frame."""
+    """Return the node that sent a frame of eight bytes with one of these PGNs; None for all other frames."""
     parts = split(can_id)
     is_one = extended and parts.pgn in pgns and len(data) == DATA_BYTES_MAX
     return parts.source if is_one and parts.source <= ADDRESS_MAX else None
 
 
 def filter_of(pgn: int, source: int | None, destination: int = GLOBAL) -> CanFilter:
-    """Messages of one kind, with any priority, from one node or (None) from any."""
+    """Return the filter for one PGN with any priority from one node; None: from any node."""
     can_id = join(J1939Id(0, pgn, source or 0, destination))
     return CanFilter(can_id, _WITHOUT_SOURCE if source is None else WITHOUT_PRIORITY, True)

@@ -1,13 +1,13 @@
-"""Sentences of NMEA 0183 (version 4.11, IEC 61162-1) that carry attitude, heading and rate of turn.
+"""Sentences of NMEA 0183 (version 4.11, IEC 61162-1) with attitude, heading and rate of turn.
 
     $HCHDG,98.3,,,12.6,W*57<CR><LF>
      | |                 |
-     | formatter         XOR of all between $ and *
-     talker: two letters that name the kind of instrument
+     | formatter         XOR of all bytes between $ and *
+     talker: two letters for the kind of instrument
 
-Angles are those of ships: heading clockwise from north, roll positive to starboard (right side down), pitch positive
-with the bow up, rate of turn positive to starboard. That is the convention `ned-frd`. A value that is not known is an
-empty field. The form of PASHR is that of inertial systems (Applanix, OxTS, Trimble); the standard has none.
+Angles have the convention of ships, `ned-frd`: heading clockwise from north, roll positive to starboard (right side
+down), pitch positive with the bow up, rate of turn positive to starboard. An unknown value is an empty field. PASHR has
+the form of inertial systems (Applanix, OxTS, Trimble); the standard does not define PASHR.
 """
 
 import math
@@ -21,24 +21,22 @@ from typing import Final, NamedTuple
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 SENTENCE_BYTES_MAX: Final = 82
-"""Of a sentence, with `$` and the line end (version 4.11, section 5.3.1)."""
+"""Maximum length of a sentence with `$` and line end, bytes (version 4.11, section 5.3.1)."""
 _S_PER_MIN: Final = 60.0
 
 
 class Transducer(NamedTuple):
-    """One measurement of an XDR sentence."""
+    """One value of an XDR sentence."""
 
-    kind: str
-    """A: angular displacement, C: temperature, P: pressure."""
+    kind: str  # A: angular displacement, C: temperature, P: pressure
     value: float
-    unit: str
-    """D: degrees, C: degrees Celsius, B: bars."""
+    unit: str  # D: degrees, C: degrees Celsius, B: bars
     name: str
     decimals: int = 2
 
 
 def checksum(body: bytes) -> int:
-    """XOR of all bytes; `body` stands between `$` and `*`."""
+    """Return the XOR of all bytes of `body`, the part between `$` and `*`."""
     result = 0
     for byte in body:
         result ^= byte
@@ -46,9 +44,9 @@ def checksum(body: bytes) -> int:
 
 
 def sentence(body: str) -> bytes:
-    """A sentence of what stands between `$` and `*`, with checksum and line end.
+    """Return a sentence with checksum and line end from the part between `$` and `*`.
 
-    Raises ValueError for what is longer than a sentence may be.
+    Raises ValueError if the sentence is too long.
     """
     data = body.encode("ascii")
     made = b"$%b*%02X\r\n" % (data, checksum(data))
@@ -58,34 +56,36 @@ def sentence(body: str) -> bytes:
 
 
 def hdt(talker: str, heading_rad: float) -> bytes:
-    """Heading from true north."""
+    """Return a sentence with the heading from true north."""
     return sentence(f"{talker}HDT,{_bearing(heading_rad)},T")
 
 
 def hdm(talker: str, heading_rad: float) -> bytes:
-    """Heading from magnetic north; superseded by HDG, and still what some plotters read."""
+    """Return a sentence with the heading from magnetic north. HDG replaces it; some plotters read only HDM."""
     return sentence(f"{talker}HDM,{_bearing(heading_rad)},M")
 
 
 def hdg(talker: str, heading_rad: float, variation_rad: float | None) -> bytes:
-    """Heading from magnetic north, with the variation (east positive) where it is known; deviation is none."""
+    """Return a sentence with the heading from magnetic north and the known variation (east positive), without
+    deviation.
+    """
     variation = "," if variation_rad is None else f"{abs(math.degrees(variation_rad)):.1f},{'EW'[variation_rad < 0]}"
     return sentence(f"{talker}HDG,{_bearing(heading_rad)},,,{variation}")
 
 
 def rot(talker: str, rate_rad_s: float) -> bytes:
-    """Rate of turn, degrees per minute, positive to starboard."""
+    """Return a sentence with the rate of turn, degrees per minute, positive to starboard."""
     return sentence(f"{talker}ROT,{_fixed(math.degrees(rate_rad_s) * _S_PER_MIN, 1)},A")
 
 
 def xdr(talker: str, transducers: Iterable[Transducer]) -> bytes:
-    """Measurements by name. Raises ValueError for more than fit into a sentence."""
+    """Return a sentence of named values. Raises ValueError if they do not fit into one sentence."""
     fields = [f"{one.kind},{_fixed(one.value, one.decimals)},{one.unit},{one.name}" for one in transducers]
     return sentence(f"{talker}XDR,{','.join(fields)}")
 
 
 def pashr(utc_ns: int, heading_rad: float | None, roll_rad: float, pitch_rad: float) -> bytes:
-    """Attitude with time: heading from true north, empty where it is not known; heave and accuracies are empty.
+    """Return a sentence of attitude and time. An unknown heading, heave and the accuracies are empty.
 
     Both flags are 0: no position, and an inertial sensor without satellites.
     """
@@ -98,7 +98,7 @@ def pashr(utc_ns: int, heading_rad: float | None, roll_rad: float, pitch_rad: fl
 
 
 def _bearing(angle_rad: float, decimals: int = 1) -> str:
-    """An angle of any turn as degrees from 0 to less than 360, also after rounding."""
+    """Return an angle of any turn in degrees, from 0 to less than 360 also after rounding."""
     degrees = round(math.degrees(angle_rad) % 360.0, decimals)
     return f"{0.0 if degrees >= 360.0 else degrees:.{decimals}f}"
 
@@ -108,54 +108,46 @@ def _fixed(value: float, decimals: int) -> str:
 
 
 def _rounded(value: float, decimals: int) -> float:
-    """Rounded, and never a negative zero."""
+    # + 0.0 removes a negative zero
     return round(value, decimals) + 0.0
 
 
 RMC_BYTES_MAX: Final = 120
-"""NMEA 0183 allows 82; receivers that give positions to the millimetre send up to some 100."""
+"""Maximum length of an RMC sentence, bytes. The standard permits 82; receivers with millimetres send about 100."""
 FIRST_YEAR: Final = 1980
 HUNDREDTH_NS: Final = 10 * NS_PER_MS
 
 _SENTENCE: Final = re.compile(rb"\$([A-Z]{2})RMC,([\x20-\x29\x2b-\x7e]*)\*([0-9A-Fa-f]{2})(?:\r?\n)?")
 _TIME: Final = re.compile(rb"([01][0-9]|2[0-3])([0-5][0-9])([0-5][0-9]|60)(?:\.([0-9]{0,9}))?")
 _DATE: Final = re.compile(rb"([0-3][0-9])([01][0-9])([0-9]{2})")
-_STATUS, _DAY, _MODE = 1, 8, 11  # numbers of the fields after the time
+_STATUS, _DAY, _MODE = 1, 8, 11  # indices of the fields; field 0 is the time
 
 
 class RmcFault(StrEnum):
-    """Reasons why bytes are not a usable sentence."""
+    """Reasons to reject an RMC sentence."""
 
-    LENGTH = "length"
-    """Longer than SENTENCE_BYTES_MAX."""
-    FORM = "form"
-    """Not an RMC sentence: another sentence, an incomplete one, or noise."""
-    CHECKSUM = "checksum"
-    """The checksum does not match."""
-    CONTENT = "content"
-    """Time or date is missing or impossible; a receiver without a fix may send them empty."""
+    LENGTH = "length"  # the sentence is longer than RMC_BYTES_MAX
+    FORM = "form"  # not an RMC sentence: another sentence, an incomplete sentence, or noise
+    CHECKSUM = "checksum"  # the checksum does not match
+    CONTENT = "content"  # Time or date is missing or impossible. Receivers without a fix may send empty fields.
 
 
 class Rmc(NamedTuple):
-    """The date and time of a sentence."""
+    """Date and time of an RMC sentence."""
 
-    unix_s: int
-    """The second it names, since 1970-01-01."""
-    fraction_ns: int
-    """Rest of its time, 0 … 999 999 999."""
-    valid: bool
-    """Whether the receiver reports a fix: status A, and mode not N."""
-    leap: bool = False
-    """Whether the second is a leap second (60); `unix_s` is then that of the second after."""
+    unix_s: int  # seconds since 1970-01-01
+    fraction_ns: int  # fraction of the second, 0 … 999 999 999
+    valid: bool  # whether the receiver reports a fix: status A, and mode not N
+    leap: bool = False  # whether the second is a leap second (60). `unix_s` is then the following second.
 
     @property
     def utc_ns(self) -> int:
-        """The instant, ns since 1970-01-01."""
+        """Instant of the sentence, ns since 1970-01-01."""
         return self.unix_s * NS_PER_S + self.fraction_ns
 
 
 def parse(sentence: bytes) -> Rmc | RmcFault:
-    """Decode a sentence, with or without its line end. Returns the fault of any other bytes; never raises."""
+    """Return the decoded sentence, with or without line end, or the fault of other bytes. Never raises an exception."""
     if len(sentence) > RMC_BYTES_MAX:
         return RmcFault.LENGTH
     match = _SENTENCE.fullmatch(sentence)
@@ -168,9 +160,9 @@ def parse(sentence: bytes) -> Rmc | RmcFault:
 
 
 def build(utc_ns: int, *, valid: bool = True) -> bytes:
-    """A `$GPRMC` sentence for an instant (ns since 1970-01-01, from 1980 to 2079), truncated to hundredths of a second.
+    """Return a `$GPRMC` sentence for an instant (ns since 1970-01-01, from 1980 to 2079), truncated to 10 ms.
 
-    For time only: the position is 0° N 0° E. Raises ValueError outside those years.
+    The sentence is for time only: the position is 0° N 0° E. Raises ValueError for other years.
     """
     unix_s, rest_ns = divmod(utc_ns, NS_PER_S)
     at = gmtime(unix_s)
@@ -184,9 +176,9 @@ def build(utc_ns: int, *, valid: bool = True) -> bytes:
 
 
 def as_gprmc(sentence: bytes) -> bytes:
-    """A well-formed RMC sentence of any talker as `$GPRMC` with its line end, for devices that know no other talker.
+    """Return a valid RMC sentence of any talker as `$GPRMC` with line end, for devices that require this talker.
 
-    Raises ValueError for bytes that `parse` refuses.
+    Raises ValueError if `parse` rejects the sentence.
     """
     match = _SENTENCE.fullmatch(sentence)
     if match is None or isinstance(parse(sentence), RmcFault):
@@ -211,11 +203,12 @@ def _content(fields: Sequence[bytes]) -> Rmc | RmcFault:
 
 
 def _midnight_s(year_of_century: int, month: int, day: int) -> int | None:
-    """Unix seconds of a day's beginning, None if there is no such day."""
+    """Return the start of a day in Unix seconds; None if the day does not exist."""
     year = FIRST_YEAR - FIRST_YEAR % 100 + year_of_century
     year += 100 * (year < FIRST_YEAR)
     try:
         seconds = timegm((year, month, day, 0, 0, 0))
     except ValueError:
         return None
+    # timegm accepts impossible days, for example February 30
     return seconds if gmtime(seconds)[:3] == (year, month, day) else None

@@ -1,17 +1,17 @@
-"""Blocks of a recording: compressed, checked, each readable without the others. No I/O but on the given file.
+"""Blocks of a recording: compressed, with a CRC, each readable on its own. No I/O except on the given file.
 
-A file is blocks and nothing else, all integers little-endian::
+A file contains only blocks. All integers are little-endian::
 
     ┌─────────────┬───────────┬──────────┬───────────┬───────────┬──────────────┬──────────┬──────────────┐
     │ magic 8     │ method u8 │ 0 3 bytes│ number u32│ plain u32 │ stored u32   │ crc u32  │ stored bytes │
     └─────────────┴───────────┴──────────┴───────────┴───────────┴──────────────┴──────────┴──────────────┘
 
-`plain` is the size of the content, `stored` that of what follows the head: the content itself (method 0) or a
-Zstandard frame of it (method 1). `crc` is the CRC-32 of the head before it and of the stored bytes. `number` counts the
-blocks of the file from 0, so that a block that is missing shows.
+`plain` is the size of the content. `stored` is the size of the data after the head: the content itself (method 0) or a
+Zstandard frame of it (method 1). `crc` is the CRC-32 of the head before `crc` and of the stored bytes. `number` counts
+the blocks of the file from 0, so that a reader detects missing blocks.
 
-A file is only ever appended to, a whole block by one write: whenever the process is killed, all blocks that were
-written before are whole. A reader takes a block whose CRC is right and looks for the next magic where it is not.
+A writer only appends complete blocks, one write per block. After a kill of the process, all earlier blocks are
+therefore complete. A reader accepts a block with a correct CRC and otherwise searches for the next magic.
 """
 
 import struct
@@ -26,35 +26,30 @@ from imud.formats.records import Kind, Record, SessionRecord, decode_object, rec
 from imud.model.errors import ImudError
 
 MAGIC: Final = b"\x89imudREC"
-"""The first byte is no ASCII: nobody takes the file for text."""
-HEAD: Final = struct.Struct("<8sB3xIIII")
-"""Magic, method, number, plain size, stored size, CRC."""
+"""First bytes of a block. The first byte is not ASCII, so that no program mistakes the file for text."""
+HEAD: Final = struct.Struct("<8sB3xIIII")  # Magic, method, number, plain size, stored size, CRC
 _CRC_BYTES: Final = 4
 PLAIN_MAX: Final = 4 << 20
-"""Largest content of a block: sixteen times what a recorder gathers, for a record that is large itself. A reader
-allocates no more for any file."""
+"""Maximum content of a block, bytes: 16 times BLOCK_BYTES, for one large record. A reader never allocates more."""
 STORED: Final = 0
 ZSTANDARD: Final = 1
-LEVEL: Final = 3
-"""Zstandard's default: level 9 saves 3 % more on IMU data and takes four times as long."""
+LEVEL: Final = 3  # Default level of Zstandard. Level 9 saves 3 % more on IMU data and takes four times as long.
 CHUNK_BYTES: Final = 1 << 16
 
 
 class Block(NamedTuple):
-    """A whole block as read."""
+    """Complete block as read."""
 
     number: int
     content: bytes
-    stored_bytes: int
-    """What it takes in the file, with its head."""
+    stored_bytes: int  # size of the block in the file, with its head
 
 
 class BlockEncoder:
     """Encoder of the blocks of one file. Synchronization: one thread."""
 
     def __init__(self) -> None:
-        self.number = 0
-        """Of the next block."""
+        self.number = 0  # number of the next block
         self._compressor = zstandard.ZstdCompressor(level=LEVEL)
 
     def encode(self, content: bytes) -> bytes:
@@ -71,15 +66,15 @@ class BlockEncoder:
 
 
 class ByteSource(Protocol):
-    """What blocks are read from: a file, or something like one."""
+    """Source of blocks: a file or a similar object."""
 
     def read(self, size: int, /) -> bytes:
-        """Return at least one byte and at most `size`; none at the end."""
+        """Return 1 to `size` bytes; no bytes at the end."""
         ...
 
 
 def renumbered(block: bytes, number: int) -> bytes:
-    """Return a whole block with another number."""
+    """Return a complete block with another number."""
     magic, method, _, plain, stored, _ = HEAD.unpack_from(block)
     head = HEAD.pack(magic, method, number, plain, stored, 0)[:-_CRC_BYTES]
     content = memoryview(block)[HEAD.size :]
@@ -88,25 +83,20 @@ def renumbered(block: bytes, number: int) -> bytes:
 
 
 class BlockReader:
-    """Reader of all whole blocks of a file, seekable or not. Iterate once.
+    """Reader of all complete blocks of a file, seekable or not. Iterate once.
 
-    It never raises for any bytes: what is no block is passed over and counted.
+    It never raises an exception: it skips and counts all other bytes.
     """
 
     def __init__(self, file: ByteSource) -> None:
         self._file = file
         self._buffer = b""
-        self._at = 0
-        """Offset in the file of the first byte of the buffer."""
+        self._at = 0  # offset of the first byte of the buffer in the file
         self._is_at_end = False
-        self.bytes_bad = 0
-        """Bytes that belong to no whole block, except those of a block that is cut short at the end."""
-        self.first_bad = -1
-        """Offset of the first of them; -1 for none."""
-        self.bytes_cut = 0
-        """Bytes of a block at the end of the file whose rest is missing."""
-        self.blocks_missing = 0
-        """Blocks that are missing by their numbers."""
+        self.bytes_bad = 0  # number of bytes outside complete blocks, without an incomplete block at the end
+        self.first_bad = -1  # offset of the first of these bytes; -1 if there are none
+        self.bytes_cut = 0  # size of an incomplete block at the end of the file
+        self.blocks_missing = 0  # number of blocks that are missing according to the block numbers
         self._decompressor = zstandard.ZstdDecompressor()
 
     def __iter__(self) -> Iterator[Block]:
@@ -124,13 +114,13 @@ class BlockReader:
         self._count_bad(0 if self._begins_magic() else len(self._buffer))
 
     def _block_size(self) -> int:
-        """Size of the block that the buffer begins with; 0 for none."""
+        """Return the size of the block at the start of the buffer; 0 if there is no block."""
         magic, method, _number, plain, stored, _crc = HEAD.unpack_from(self._buffer)
         fits = plain <= PLAIN_MAX and (stored == plain if method == STORED else stored < plain)
         return HEAD.size + stored if magic == MAGIC and method in (STORED, ZSTANDARD) and fits else 0
 
     def _decode(self, size: int) -> Block | None:
-        """Return the block that the buffer begins with; None where it is damaged."""
+        """Return the block at the start of the buffer; None if it is damaged."""
         buffer = self._buffer
         _magic, method, number, plain, _stored, crc = HEAD.unpack_from(buffer)
         stored = buffer[HEAD.size : size]
@@ -138,7 +128,7 @@ class BlockReader:
             return None
         if method == ZSTANDARD:
             try:
-                if zstandard.frame_content_size(stored) != plain:  # it decides how much is allocated
+                if zstandard.frame_content_size(stored) != plain:  # this size decides the allocation
                     return None
                 stored = self._decompressor.decompress(stored)
             except zstandard.ZstdError:
@@ -146,7 +136,7 @@ class BlockReader:
         return Block(number, stored, size) if len(stored) == plain else None
 
     def _skip(self, *, cut: bool) -> None:
-        """Go on at the next magic; `cut`: the file ends before the block that begins here, if it is one."""
+        """Skip to the next magic. `cut`: the file ends before the end of the possible block here."""
         found = self._buffer.find(MAGIC, 1)
         if cut and found < 0:
             self.bytes_cut += len(self._buffer)
@@ -162,7 +152,7 @@ class BlockReader:
             self.first_bad = self._at if self.first_bad < 0 else self.first_bad
 
     def _begins_magic(self) -> bool:
-        """Whether what is left is the begin of a block that was cut short in its head."""
+        """Return whether the buffer is the start of a block that ends in its head."""
         return bool(self._buffer) and self._buffer[: len(MAGIC)] == MAGIC[: len(self._buffer)]
 
     def _drop(self, count: int) -> None:
@@ -170,7 +160,7 @@ class BlockReader:
         self._at += count
 
     def _fill(self, size: int) -> bool:
-        """Have at least so many bytes in the buffer; return False where the file has no more."""
+        """Read until the buffer has `size` bytes; return False if the file has fewer bytes."""
         while len(self._buffer) < size and not self._is_at_end:
             chunk = self._file.read(max(CHUNK_BYTES, size - len(self._buffer)))
             self._is_at_end = not chunk
@@ -179,24 +169,25 @@ class BlockReader:
 
 
 def is_recording(begin: bytes) -> bool:
-    """Whether a file that begins with these bytes (at least those of the magic) is a recording."""
+    """Return whether a file that starts with these bytes (at least the length of the magic) is a recording."""
     return begin.startswith(MAGIC)
 
 
 def check_begin(begin: bytes, name: str) -> None:
-    """Raises ImudError for a file that begins otherwise than a recording."""
+    """Raise ImudError if a file does not start like a recording."""
     if not is_recording(begin):
-        raise ImudError(f"{name} is no recording of imud: expected it to begin with {MAGIC!r}, got {begin[:8]!r}")
+        raise ImudError(f"{name} is not a recording of imud: expected the first bytes {MAGIC!r}, got {begin[:8]!r}")
 
 
 BLOCK_BYTES: Final = 256 << 10
-"""Content of a block at most, unless one record is larger: half a minute of a device at 100 Hz. Larger ones are not
-compressed better."""
+"""Maximum content of a block with several records, bytes: 30 s of a device at 100 Hz. Larger blocks compress
+equally.
+"""
 RECORD_BYTES_MAX: Final = PLAIN_MAX - BLOCK_BYTES
 
 
 class BlockGatherer:
-    """Gatherer of records into blocks. Synchronization: one thread."""
+    """Collector of records for blocks. Synchronization: one thread."""
 
     def __init__(self) -> None:
         self._encoder = BlockEncoder()
@@ -204,7 +195,7 @@ class BlockGatherer:
         self._bytes = 0
 
     def add(self, record: bytes) -> bytes:
-        """Add a record; return the block that it did not fit into any more, or nothing.
+        """Add a record. Return the previous block if the record does not fit into it, otherwise no bytes.
 
         Raises ValueError for a record of more than RECORD_BYTES_MAX.
         """
@@ -216,7 +207,7 @@ class BlockGatherer:
         return block
 
     def finish(self) -> bytes:
-        """Return a block of all records so far; nothing without any."""
+        """Return a block of all records since the previous block; no bytes without records."""
         if not self._records:
             return b""
         content = b"".join(self._records)
@@ -224,32 +215,25 @@ class BlockGatherer:
         return self._encoder.encode(content)
 
 
-_LOOKED_AT: Final = frozenset({int(Kind.SESSION)})
-"""Records that the reader itself looks at."""
+_LOOKED_AT: Final = frozenset({int(Kind.SESSION)})  # records that the reader itself evaluates
 
 
 class RecordingReader:
     """Reader of the records of one file, seekable or not. Iterate once.
 
-    Raises ImudError, at the first record, for a file that is no recording or one of another version.
+    The first record raises ImudError for a file that is not a recording or has another version.
     """
 
     def __init__(self, file: ByteSource, name: str) -> None:
         """`name` is for messages."""
         self._name = name
-        self.blocks = BlockReader(file)
-        """What was damaged or missing in the file, while iterating and afterwards."""
-        self.session: SessionRecord | None = None
-        """The newest begin of a file."""
-        self.records_unreadable = 0
-        """Blocks whose content is not made of records: written by something else."""
+        self.blocks = BlockReader(file)  # damaged and missing blocks of the file, during and after the iteration
+        self.session: SessionRecord | None = None  # newest start of a file
+        self.records_unreadable = 0  # number of blocks without valid records: another program wrote them
         self.blocks_read = 0
-        self.stored_bytes = self.plain_bytes = 0
-        """What the blocks take in the file, and what is in them."""
-        self.ended = False
-        """Whether the file has its regular end."""
-        self._is_read = False
-        """Whether the iteration came to the end of the file."""
+        self.stored_bytes = self.plain_bytes = 0  # size of the blocks in the file, and size of their content
+        self.ended = False  # whether the file has a regular end
+        self._is_read = False  # whether the iteration reached the end of the file
 
     def __iter__(self) -> Iterator[Record]:
         for block in self.blocks:
@@ -268,33 +252,34 @@ class RecordingReader:
             self.ended = found[-1].kind == Kind.END if found else self.ended
         self._is_read = True
         if not self.blocks_read:
-            raise ImudError(f"{self._name} is no recording of imud, or nothing of it is left: no whole block is in it")
+            raise ImudError(f"{self._name} is not a recording of imud: expected at least one complete block, got none")
 
     def _look_at(self, record: Record) -> None:
         if record.kind == Kind.SESSION:
             self.session = decode_object(record, SessionRecord)
             if self.session is not None and self.session.version != records.VERSION:
-                raise ImudError(
-                    f"{self._name} has records of version {self.session.version}, this imud reads {records.VERSION}"
-                )
+                expected = f"expected records of version {records.VERSION}, got {self.session.version}"
+                raise ImudError(f"cannot read {self._name}: {expected}")
 
     @property
     def is_damaged(self) -> bool:
-        """After iterating: whether blocks are damaged or missing. A file without its regular end need not be."""
+        """After the iteration: whether blocks are damaged or missing. A file without a regular end may be undamaged."""
         return bool(self.blocks.bytes_bad or self.blocks.blocks_missing or self.records_unreadable)
 
     @property
     def problems(self) -> list[str]:
-        """After iterating: what is wrong with what was read of the file, one sentence each; empty for a whole one."""
+        """Errors of the read part of the file, one sentence each; empty for a complete file."""
         read, found = self.blocks, []
         if read.bytes_bad:
-            found.append(f"{read.bytes_bad} bytes from byte {read.first_bad} on are damaged, and left out")
+            found.append(f"{read.bytes_bad} bytes from byte {read.first_bad} are damaged; imud ignores them")
         if read.blocks_missing:
-            found.append(f"blocks that are missing by their numbers: {read.blocks_missing}")
+            found.append(f"missing blocks according to their numbers: {read.blocks_missing}")
         if read.bytes_cut:
-            found.append(f"the last {read.bytes_cut} bytes are a block cut short, left out")
+            found.append(f"the last {read.bytes_cut} bytes are an incomplete block; imud ignores them")
         if self.records_unreadable:
-            found.append(f"{self.records_unreadable} blocks hold something else than records, left out")
+            found.append(f"{self.records_unreadable} blocks contain no valid records; imud ignores them")
         if self._is_read and not self.ended:
-            found.append("it has no regular end: imud or the machine stopped while it was written, or still writes")
+            found.append(
+                "the file has no regular end: imud or the host stopped during the recording, or it is still running"
+            )
         return found

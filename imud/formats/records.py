@@ -1,14 +1,14 @@
-"""Records: what the content of a block is made of.
+"""Records: the content of the blocks of a recording.
 
-A record is a head of 7 bytes and a body, little-endian; a block has whole records only::
+A record is a head of 7 bytes and a body, little-endian. A block contains complete records only::
 
     ┌──────────┬────────────┬────────────┬──────────────┐
-    │ kind u8  │ device u16 │ length u32 │ length bytes │   device: the daemon's number of it, as in slots
+    │ kind u8  │ device u16 │ length u32 │ length bytes │   device: number of the device, as in slots
     └──────────┴────────────┴────────────┴──────────────┘
 
-What comes often has a fixed layout (`DATA`, `FRAMES`, `READINGS`, `EDGES`, `CLOCKS`), the rest is MessagePack. The
-order of the records is the order in which the daemon did what they say: it is what a replay does again. A record of
-edges or clocks that a read needed stands before that read. A reader passes over kinds that it does not know.
+Frequent records have a fixed layout (`DATA`, `FRAMES`, `READINGS`, `EDGES`, `CLOCKS`). All other records are
+MessagePack. The records have the order of the daemon's operations, which a replay repeats. Edges and clocks that a read
+needs are before this read. A reader skips unknown kinds.
 """
 
 import struct
@@ -21,8 +21,7 @@ import msgspec
 from imud.formats.can import CanFrame
 from imud.model.errors import ImudError, reason_of
 
-VERSION: Final = 1
-"""Of the layout of records; a reader refuses others."""
+VERSION: Final = 1  # Version of the layout of records. A reader rejects other versions.
 HEAD: Final = struct.Struct("<BHI")
 _DATA: Final = struct.Struct("<qqB")
 _FRAME: Final = struct.Struct("<qIBB")
@@ -33,43 +32,29 @@ _LOST: Final = struct.Struct("<QQq")
 _EXTENDED: Final = 1
 _AFTER_LOSS: Final = 2
 _FAILED: Final = 1
-NO_DEVICE: Final = 0xFFFF
-"""Device of records that concern all of them."""
+NO_DEVICE: Final = 0xFFFF  # device number of records about all devices
 
 
 class Kind(IntEnum):
     """Kinds of records."""
 
-    SESSION = 1
-    """The daemon, the host and the file: `SessionRecord`. The first of a file."""
-    DEVICE = 2
-    """A device as configured, with its identity and settings as far as known: `DeviceRecord`."""
-    PATH = 3
-    """The driver of a device from here on, and the state of its codec and clock: `PathRecord`."""
-    CLOCKS = 4
-    """The host's clocks were read: `ClocksRecord`."""
-    DATA = 5
-    """Bytes of one read of a serial port: `DataRecord`."""
-    FRAMES = 6
-    """CAN frames of one read, each with its own stamp."""
-    READINGS = 7
-    """Transfers on I2C, SPI or RS-485: `ReadingRecord`s."""
-    EDGES = 8
-    """Edges of a GPIO line with the kernel's stamps: `EdgesRecord`."""
-    CALL = 9
-    """Anything else that was done to the path or the clock of a device: `CallRecord`."""
-    CHECK = 10
-    """The newest sample and the ledger at this place: `CheckRecord`."""
-    LOST = 11
-    """Records that are missing here: the disk was too slow. `LostRecord`."""
-    EVENT = 12
-    """An event as the socket has it, MessagePack."""
-    END = 13
-    """The regular end of the file: `EndRecord`."""
+    SESSION = 1  # Daemon, host and file: `SessionRecord`. First record of a file.
+    DEVICE = 2  # device as configured, with its known identity and settings: `DeviceRecord`
+    PATH = 3  # driver of a device for the following records, and the state of its codec and clock: `PathRecord`
+    CLOCKS = 4  # reading of the host clocks: `ClocksRecord`
+    DATA = 5  # bytes of one read of a serial port: `DataRecord`
+    FRAMES = 6  # CAN frames of one read, each with its own time stamp
+    READINGS = 7  # transfers on I2C, SPI or RS-485: `ReadingRecord`s
+    EDGES = 8  # edges of a GPIO line with time stamps of the kernel: `EdgesRecord`
+    CALL = 9  # any other call of the path or the clock of a device: `CallRecord`
+    CHECK = 10  # newest sample and ledger at this place: `CheckRecord`
+    LOST = 11  # lost records at this place, because the disk was too slow: `LostRecord`
+    EVENT = 12  # event as sent on the socket, MessagePack
+    END = 13  # regular end of the file: `EndRecord`
 
 
 class Record(NamedTuple):
-    """A record as read."""
+    """Record as read."""
 
     kind: int
     device: int
@@ -77,76 +62,56 @@ class Record(NamedTuple):
 
 
 class SessionRecord(msgspec.Struct, frozen=True):
-    """Where and when a file was begun."""
+    """Start of a file: time, host and versions."""
 
-    version: int
-    """Layout of the records: VERSION."""
-    imud: str
-    """Version of the daemon."""
+    version: int  # layout of the records: VERSION
+    imud: str  # version of the daemon
     python: str
-    host: str
-    """Name and kernel of the machine."""
-    epoch: int
-    """Random number of the daemon's start: files of one run have the same."""
-    number: int
-    """Counts the files of one recording from 0."""
-    t_ns: int
-    """CLOCK_MONOTONIC at the begin."""
-    utc_ns: int
-    """CLOCK_REALTIME then."""
+    host: str  # name and kernel of the host
+    epoch: int  # random number of the start of the daemon, equal in all files of one run
+    number: int  # number of the file in one recording, starting at 0
+    t_ns: int  # CLOCK_MONOTONIC at the start of the file
+    utc_ns: int  # CLOCK_REALTIME at the start of the file
 
 
 class DeviceRecord(msgspec.Struct, frozen=True):
-    """A device of the configuration."""
+    """Device of the configuration."""
 
     name: str
-    driver: str
-    """As configured, `auto` included."""
-    link: str
-    """Name of its link in the configuration, for example `uart`."""
-    where: str
-    """Its port for people."""
-    configuration: dict[str, Any]
-    """What the configuration has below the device, with defaults: link, options, lines, frame, convention."""
+    driver: str  # driver as configured, may be `auto`
+    link: str  # name of the link in the configuration, for example `uart`
+    where: str  # readable name of the port
+    configuration: dict[str, Any]  # configuration of the device with defaults: link, options, lines, frame, convention
     identity: dict[str, str]
     settings: dict[str, str]
 
 
 class PathRecord(msgspec.Struct, frozen=True):
-    """What decodes and dates from here on."""
+    """Codec and clock for the following records."""
 
     driver: str
     options: dict[str, Any]
-    period_ns: int
-    """Polled devices: time between two reads."""
+    period_ns: int  # time between two reads of a polled device, ns
     ledger: dict[str, int]
-    state: bytes
-    """State of codec, clock and path (`imud.recording.state`); empty where it cannot be had."""
+    state: bytes  # state of codec, clock and path (`imud.recording.state`); empty if imud cannot save the state
 
 
 class ClocksRecord(NamedTuple):
-    """A reading of the host's clocks."""
+    """Reading of the host clocks."""
 
     monotonic_ns: int
-    raw_ns: int
-    """CLOCK_MONOTONIC_RAW at the same instant."""
-    held_raw_ns: int
-    """CLOCK_MONOTONIC_RAW when the reading before was last found to hold."""
-    error_ns: int
-    """Bound of the difference between the two instants."""
-    utc_offset_ns: int
-    """CLOCK_REALTIME minus CLOCK_MONOTONIC that holds from here on."""
-    suspends: int
-    """Times that the machine was suspended."""
+    raw_ns: int  # CLOCK_MONOTONIC_RAW at the same instant
+    held_raw_ns: int  # CLOCK_MONOTONIC_RAW at the last confirmation of the previous reading
+    error_ns: int  # maximum difference between the two instants, ns
+    utc_offset_ns: int  # CLOCK_REALTIME minus CLOCK_MONOTONIC for the following records
+    suspends: int  # number of suspends of the host
 
 
 class DataRecord(NamedTuple):
     """Bytes of one read."""
 
-    t_rx_ns: int
-    """CLOCK_MONOTONIC right after the read."""
-    waited_ns: int
-    """How long they may have waited in the kernel; -1 where they were processed at once."""
+    t_rx_ns: int  # CLOCK_MONOTONIC immediately after the read
+    waited_ns: int  # maximum hold of the bytes in the kernel, ns; -1 without a hold
     data: bytes
 
 
@@ -154,14 +119,10 @@ class ReadingRecord(NamedTuple):
     """One transfer."""
 
     poll: int
-    start_ns: int
-    """CLOCK_MONOTONIC right before it."""
-    end_ns: int
-    """CLOCK_MONOTONIC right after it."""
-    trouble: int
-    """0 where it succeeded; otherwise 1 + the place of the trouble in `imud.model.errors.Trouble`."""
-    data: bytes
-    """The bytes read; of a transfer that failed, the error's words in UTF-8."""
+    start_ns: int  # CLOCK_MONOTONIC immediately before the transfer
+    end_ns: int  # CLOCK_MONOTONIC immediately after the transfer
+    trouble: int  # 0 if the transfer succeeded; otherwise 1 + the index of the failure in `imud.model.errors.Trouble`
+    data: bytes  # received bytes; for a failed transfer, the error text in UTF-8
 
 
 class EdgeRecord(NamedTuple):
@@ -175,13 +136,12 @@ class EdgeRecord(NamedTuple):
 class EdgesRecord(NamedTuple):
     """Edges of one line."""
 
-    line: str
-    """Key of the line in the configuration, for example `sout`."""
+    line: str  # key of the line in the configuration, for example `sout`
     edges: list[EdgeRecord]
 
 
 class CallRecord(msgspec.Struct, frozen=True, array_like=True):
-    """A call of a method of the path, the clock, or the data-ready edges."""
+    """Call of a method of the path, the clock, or the data-ready edges."""
 
     target: str
     method: str
@@ -190,36 +150,32 @@ class CallRecord(msgspec.Struct, frozen=True, array_like=True):
 
 
 class CheckRecord(msgspec.Struct, frozen=True):
-    """What a replay must have at this place."""
+    """Expected state of a replay at this place."""
 
-    t_ns: int
-    """CLOCK_MONOTONIC."""
+    t_ns: int  # CLOCK_MONOTONIC
     seq: int
     sample_t_ns: int
-    sample_t_err_ns: int
-    """Of the newest sample; 0 without one."""
+    sample_t_err_ns: int  # error of the newest sample; 0 without a sample
     ledger: dict[str, int]
 
 
 class LostRecord(NamedTuple):
-    """Records that were dropped."""
+    """Number and time of dropped records."""
 
     records: int
     bytes: int
-    t_ns: int
-    """CLOCK_MONOTONIC of the first of them."""
+    t_ns: int  # CLOCK_MONOTONIC of the first dropped record
 
 
 class EndRecord(msgspec.Struct, frozen=True):
-    """The end of a file."""
+    """End of a file."""
 
     t_ns: int
     utc_ns: int
     reason: str
 
 
-LINES: Final = ("sout", "sout_div", "pps", "data_ready", "alarm")
-"""Lines by their number in an EDGES record."""
+LINES: Final = ("sout", "sout_div", "pps", "data_ready", "alarm")  # Lines, by their number in an EDGES record
 
 _encode: Final = msgspec.msgpack.Encoder().encode
 
@@ -230,7 +186,7 @@ def encode(kind: Kind, device: int, body: bytes) -> bytes:
 
 
 def encode_object(kind: Kind, device: int, value: object) -> bytes:
-    """Return a record whose body is MessagePack."""
+    """Return a record with a MessagePack body."""
     return encode(kind, device, _encode(value))
 
 
@@ -238,7 +194,7 @@ _DATA_WHOLE: Final = struct.Struct("<BHIqqB")
 
 
 def encode_data(device: int, data: bytes, t_rx_ns: int, waited_ns: int) -> bytes:
-    """Return a DATA record; `waited_ns` -1 for bytes that were processed at once."""
+    """Return a DATA record; `waited_ns` is -1 for bytes without a hold."""
     return _DATA_WHOLE.pack(Kind.DATA, device, _DATA.size + len(data), t_rx_ns, waited_ns, 0) + data
 
 
@@ -278,7 +234,7 @@ def encode_lost(lost: LostRecord) -> bytes:
 
 
 def records_of(content: bytes) -> Iterator[Record]:
-    """The records of a block's content. Raises ImudError for a content that is not made of whole records."""
+    """Yield the records of a block. Raises ImudError for an incomplete record."""
     at, end = 0, len(content)
     while at < end:
         if end - at < HEAD.size:
@@ -286,17 +242,17 @@ def records_of(content: bytes) -> Iterator[Record]:
         kind, device, length = HEAD.unpack_from(content, at)
         at += HEAD.size
         if length > end - at:
-            raise ImudError(f"a record of {length} bytes in a block that has {end - at} left")
+            raise ImudError(f"cannot read a record: expected {length} bytes, got {end - at} at the end of the block")
         yield Record(kind, device, content[at : at + length])
         at += length
 
 
 def decode_object(record: Record, type_: type[Any]) -> Any:
-    """Return the body of a record as `type_`. Raises ImudError for what is none."""
+    """Return the body of a record as `type_`. Raises ImudError for invalid bytes."""
     try:
         return msgspec.msgpack.decode(record.body, type=type_)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ImudError(f"a record of kind {record.kind} cannot be read: {reason_of(error)}") from None
+        raise ImudError(f"cannot read a record of kind {record.kind}: {reason_of(error)}") from None
 
 
 def decode_data(body: bytes) -> DataRecord:
@@ -335,7 +291,7 @@ def decode_edges(body: bytes) -> EdgesRecord:
     """Return the edges of an EDGES record. Raises ImudError."""
     _check_length(body, 1, "edges")
     if body[0] >= len(LINES) or (len(body) - 1) % _EDGE.size:
-        raise ImudError(f"edges cannot be read: line {body[0]}, {len(body) - 1} bytes")
+        raise ImudError(f"cannot read edges: line {body[0]}, {len(body) - 1} bytes")
     edges = [EdgeRecord(t_ns, bool(rising), number) for t_ns, rising, number in _EDGE.iter_unpack(body[1:])]
     return EdgesRecord(LINES[body[0]], edges)
 
@@ -347,8 +303,8 @@ def decode_clocks(body: bytes) -> ClocksRecord:
 
 
 def decode_lost(body: bytes) -> LostRecord:
-    """Return what is missing. Raises ImudError."""
-    _check_length(body, _LOST.size, "what was lost")
+    """Return the number of lost records. Raises ImudError."""
+    _check_length(body, _LOST.size, "lost records")
     return LostRecord(*_LOST.unpack_from(body))
 
 

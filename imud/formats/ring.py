@@ -1,8 +1,8 @@
-"""The shared-memory ring of one device: a header page, then slots of `imud.formats.slot`, all little-endian.
+"""Shared-memory ring of one device: a header page, then slots of `imud.formats.slot`, all little-endian.
 
-The file is `/run/imud/shm/imud.<device>`. `HEADER_FIELDS` is the one table of the header; the writer, the Python reader
-and the check of the C header are made from it. Three cache lines hold what does not change (but for `state`), one what
-changes with every sample, and the block from 256 to 771 what changes at most ten times a second.
+The file is `/run/imud/shm/imud.<device>`. `HEADER_FIELDS` is the only table of the header. The writer, the Python
+reader and the check of the C header use it. Three cache lines contain the constant fields and `state`, one cache line
+the fields that change with every sample, bytes 256 to 771 the fields that change at most ten times per second.
 
        0         8       12       16     20     24     28       32      40    44     48                  64       128
     +---------+-------+--------+------+------+------+--------+-------+-----+-------+-----------+------+----------+
@@ -15,10 +15,11 @@ changes with every sample, and the block from 256 to 771 what changes at most te
     +-------------------------------------------------------------------------------------------------------------+
 
 Rules for a reader, because the writer has no memory fence:
-- A slot is trusted only if its `seq` before the copy, its CRC-32, and its `seq` after the copy agree.
-- The ledger block likewise: `ledger_update` before and after the copy, and CRC-32 over bytes 256…767.
-- Samples `max(first_seq, newest_seq - slot_count + 1)` … `newest_seq` are in the ring; older ones are missed.
-- `newest_seq`, `first_seq`, `heartbeat_ns`, `state` and every `seq` are aligned and written by one store each.
+- Accept a slot only if its `seq` before the copy, its CRC-32, and its `seq` after the copy agree.
+- Accept the ledger block only if `ledger_update` before and after the copy is equal and the CRC-32 over bytes 256…767
+matches.
+- Samples `max(first_seq, newest_seq - slot_count + 1)` … `newest_seq` are in the ring. Older samples are lost.
+- `newest_seq`, `first_seq`, `heartbeat_ns`, `state` and every `seq` are aligned. The writer sets each with one store.
 """
 
 import os
@@ -34,24 +35,22 @@ from imud.model.errors import ServerError
 from imud.model.ledger import LEDGER_FIELDS
 
 DIRECTORY: Final = "/run/imud/shm"
-"""Where only imud may make names: in /dev/shm any user may put a FIFO or a forged ring into its way."""
+"""Directory in which only imud can create files. In /dev/shm any user could put a FIFO or a forged ring in the way."""
 FILE_PREFIX: Final = "imud."
 OPEN_FLAGS: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-"""For a file that another may have put there: an open that follows no link and does not wait for a FIFO's writer."""
+"""Flags for a file that another user may have created: follow no link and do not wait for the writer of a FIFO."""
 
 MAGIC: Final = b"imudshm\0"
 RING_LAYOUT_VERSION: Final = 1
-HEADER_BYTES: Final = 4096
-"""One page, so that slots begin on a page."""
+HEADER_BYTES: Final = 4096  # size of the header: one page, so that slots start on a page
 LEDGER_ROOM: Final = 59
-"""Counters that fit into the block; new ones take free places and need no new layout version."""
+"""Maximum number of counters in the block. New counters use free places and need no new layout version."""
 
 STATE_LIVE: Final = 1
-STATE_CLOSED: Final = 2
-"""The daemon ended the ring on purpose; nothing will be written to this file any more."""
+STATE_CLOSED: Final = 2  # the daemon closed the ring and does not write to this file again
 
 HEARTBEAT_LIMIT_NS: Final = 1_000_000_000
-"""The heartbeat comes ten times a second: a ring without one for this long has no daemon behind it."""
+"""Maximum age of a heartbeat, ns. The daemon writes ten heartbeats per second; an older ring has no daemon."""
 
 HEADER_FIELDS: Final = (
     SlotField("magic", "s", 8, 0),
@@ -86,7 +85,7 @@ FIRST_WORD: Final = OFFSETS["first_seq"] // 8
 HEARTBEAT_WORD: Final = OFFSETS["heartbeat_ns"] // 8
 LEDGER_UPDATE_WORD: Final = OFFSETS["ledger_update"] // 8
 STATE_HALF_WORD: Final = OFFSETS["state"] // 4
-"""Places in a memoryview of the ring that is cast to u64 (half words: to u32)."""
+"""Index of the field in a memoryview of the ring, cast to u64 (half words: to u32)."""
 
 LEDGER_BLOCK_OFFSET: Final = OFFSETS["ledger_update"]
 LEDGER_CRC_OFFSET: Final = OFFSETS["ledger_crc32"]
@@ -101,56 +100,50 @@ _U64_MASK = 0xFFFF_FFFF_FFFF_FFFF
 
 @dataclass(frozen=True, slots=True)
 class RingHeader:
-    """The header at one moment, ledger block excluded."""
+    """Header at one moment, without the ledger block."""
 
-    epoch: int
-    """Random number of the daemon's start that made the ring."""
+    epoch: int  # random number of the start of the daemon that made the ring
     pid: int
-    state: int
-    """STATE_LIVE or STATE_CLOSED."""
+    state: int  # STATE_LIVE or STATE_CLOSED
     device: str
     device_id: int
-    slot_count: int
-    """A power of two."""
-    newest_seq: int = 0
-    """0 before the first sample."""
-    first_seq: int = 1
-    """Older samples were never written to this ring."""
-    heartbeat_ns: int = 0
-    """CLOCK_MONOTONIC of the last sign of life."""
+    slot_count: int  # a power of two
+    newest_seq: int = 0  # 0 before the first sample
+    first_seq: int = 1  # sequence number of the first sample in this ring
+    heartbeat_ns: int = 0  # CLOCK_MONOTONIC of the newest heartbeat
     ledger_count: int = len(LEDGER_FIELDS)
 
 
 @dataclass(frozen=True, slots=True)
 class LedgerBlock:
-    """The ledger as it stands in shared memory, with the driver that is in use."""
+    """Ledger in shared memory, with the present driver."""
 
-    update: int
-    """Counts from 1, +1 for every change."""
-    driver: str
-    """Empty until the device is found."""
+    update: int  # number of changes, starting at 1
+    driver: str  # empty until imud finds the device
     ledger: dict[str, int]
 
 
 def default_directories(environment: Mapping[str, str]) -> list[str]:
-    """Directories of rings where none is named: the system's, then the user's own in XDG_RUNTIME_DIR, if that is set.
+    """Return the default directories: the directory of the system, then imud/shm in XDG_RUNTIME_DIR if that is set.
 
-    A daemon uses the first in which it may make files; a reader the first that has the ring.
+    A daemon uses the first directory in which it can create files; a reader the first directory with the ring.
     """
     own = environment.get("XDG_RUNTIME_DIR", "")
     return [DIRECTORY, f"{own}/imud/shm"] if own.startswith("/") else [DIRECTORY]
 
 
 def ring_path(directory: str, device: str) -> Path:
-    """The file of `device`. Raises ServerError for a name that would leave `directory` or does not fit the header."""
-    room = next(field.count for field in HEADER_FIELDS if field.name == "device") - 1  # readers in C need the final 0
+    """Return the ring file of `device`. Raises ServerError for a name outside `directory` or longer than the header
+    field.
+    """
+    room = next(field.count for field in HEADER_FIELDS if field.name == "device") - 1  # readers in C need a final 0
     if not device or "/" in device or "\0" in device or len(device.encode()) > room:
         raise ServerError(f"device {device!r}: expected a name of 1 to {room} bytes without '/' for its shared memory")
     return Path(directory, FILE_PREFIX + device)
 
 
 def encode_header(header: RingHeader) -> bytes:
-    """The first HEADER_BYTES of a ring, with an empty ledger block."""
+    """Return the first HEADER_BYTES of a ring, with an empty ledger block."""
     constant = _CONSTANT.pack(
         MAGIC, RING_LAYOUT_VERSION, SLOT_LAYOUT_VERSION, HEADER_BYTES, SLOT_BYTES, header.slot_count,
         header.ledger_count, header.epoch & _U64_MASK, header.pid, header.state, header.device_id,
@@ -161,20 +154,22 @@ def encode_header(header: RingHeader) -> bytes:
 
 
 def decode_header(raw: bytes, where: str) -> RingHeader:
-    """The header in `raw`. Raises ServerError, naming `where`, for anything but a ring of this layout."""
+    """Return the header in `raw`. Raises ServerError with `where` for any other content."""
     if len(raw) < HEADER_BYTES or not raw.startswith(MAGIC):
-        raise ServerError(f"{where} is no ring of imud: expected {MAGIC!r} at its beginning, found {raw[:8]!r}")
+        raise ServerError(f"{where} is not a ring of imud: expected the first bytes {MAGIC!r}, got {raw[:8]!r}")
     _, version, slot_version, *sizes, epoch, pid, state, device_id, device = _CONSTANT.unpack_from(raw)
     header_bytes, slot_bytes, slot_count, ledger_count = sizes
     expected = (RING_LAYOUT_VERSION, SLOT_LAYOUT_VERSION, HEADER_BYTES, SLOT_BYTES)
     found = (version, slot_version, header_bytes, slot_bytes)
     if found != expected:
         raise ServerError(
-            f"{where}: expected layout, slot layout, header bytes and slot bytes {expected}, found {found}:"
-            " daemon and reader are of different versions of imud"
+            f"{where}: expected layout, slot layout, header bytes and slot bytes {expected}, got {found};"
+            " use the same version of imud for daemon and reader"
         )
     if slot_count == 0 or slot_count & (slot_count - 1) or ledger_count > LEDGER_ROOM:
-        raise ServerError(f"{where}: {slot_count} slots and {ledger_count} counters cannot be: the header is damaged")
+        raise ServerError(
+            f"{where}: impossible header: {slot_count} slots and {ledger_count} counters; is the file damaged?"
+        )
     newest_seq, first_seq, heartbeat_ns = _LIVELY.unpack_from(raw, OFFSETS["newest_seq"])
     name = device.rstrip(b"\0").decode("utf-8", "replace")
     return RingHeader(
@@ -183,17 +178,19 @@ def decode_header(raw: bytes, where: str) -> RingHeader:
 
 
 def encode_ledger_block(update: int, driver: str, ledger: Mapping[str, int]) -> bytes:
-    """LEDGER_BLOCK_BYTES bytes; counters that `ledger` does not name are 0, and a driver's name is cut to 31 bytes."""
+    """Return LEDGER_BLOCK_BYTES bytes. Counters that are missing in `ledger` are 0. A driver name is cut to 31
+    bytes.
+    """
     values = [ledger.get(name, 0) & _U64_MASK for name in LEDGER_FIELDS]
     body = _BLOCK.pack(update, driver.encode()[:31], *values, *[0] * (LEDGER_ROOM - len(values)))
     return body + _CRC.pack(zlib.crc32(body))
 
 
 def decode_ledger_block(block: bytes, ledger_count: int) -> LedgerBlock | None:
-    """The inverse; None for a block that is torn. Counters that the writer does not have are left out."""
+    """Return the decoded ledger block without counters that the writer lacks; None for a torn block."""
     body = block[:-4]
     if len(block) != LEDGER_BLOCK_BYTES or zlib.crc32(body) != _CRC.unpack_from(block, len(body))[0]:
         return None
     update, driver, *values = _BLOCK.unpack(body)
-    ledger = dict(zip(LEDGER_FIELDS, values[:ledger_count], strict=False))  # either side may be the newer one
+    ledger = dict(zip(LEDGER_FIELDS, values[:ledger_count], strict=False))  # writer or reader may be newer
     return LedgerBlock(update, driver.rstrip(b"\0").decode("utf-8", "replace"), ledger)

@@ -1,6 +1,6 @@
-"""One `Sample` as 256 fixed little-endian bytes: the slot of the shared-memory ring and of the binary socket encoding.
+"""One `Sample` as 256 bytes, little-endian: slot of the shared-memory ring and of the binary socket encoding.
 
-`SLOT_FIELDS` is the one table of the layout; the packing here and the check of the C header are made from it.
+`SLOT_FIELDS` is the only table of the layout. The encoder and the check of the C header use it.
 
      0        8      16       24      32        40        48        52       56     60         62    63
     +--------+------+--------+-------+---------+---------+---------+--------+------+----------+-----+---+
@@ -9,7 +9,7 @@
     | 64: accel, gyro, mag 3×f64 each | 136: quat 4×f64 | 168: euler 3×f64 | temperature, pressure, incli | 0… | crc |
     +-----------------------------------------------------------------------------------------------+ 252 +-----+
 
-CRC-32 (IEEE 802.3, as zlib.crc32) is over bytes 0…251, the sequence number included.
+The CRC-32 (IEEE 802.3, as zlib.crc32) covers bytes 0…251 with the sequence number.
 """
 
 import struct
@@ -25,14 +25,13 @@ from imud.model.sample import Pair, Quaternion, Sample, Sync, Vector3
 
 SLOT_BYTES: Final = 256
 SLOT_LAYOUT_VERSION: Final = 1
-SEQ_INVALID: Final = 0xFFFF_FFFF_FFFF_FFFF
-"""Stands in `seq` while a slot of shared memory is being written."""
+SEQ_INVALID: Final = 0xFFFF_FFFF_FFFF_FFFF  # value of `seq` while the daemon writes a slot in shared memory
 CRC_OFFSET: Final = SLOT_BYTES - 4
 
 
 @dataclass(frozen=True, slots=True)
 class SlotField:
-    """A field of the slot: its name in C, its `struct` code, how many, and where it begins."""
+    """Field of the slot: name in C, `struct` code, number of elements, offset."""
 
     name: str
     code: str
@@ -93,16 +92,16 @@ PRESENT_BITS: Final = {
     "pps_age_ms": HAS_PPS_AGE,
     "edge_seq": HAS_EDGE,
 }
-"""Bit of `present` that says the field has a value: absent is not zero."""
+"""Bit of `present` for each field: the field has a value. A missing value is not zero."""
 
 SYNC_CODES: Final = {sync: code for code, sync in enumerate(Sync)}
-"""`sync` in the slot: 0 arrival, 1 regression, 2 edge, 3 utc."""
+"""Code of `sync` in the slot: 0 arrival, 1 regression, 2 edge, 3 utc."""
 SYNC_BY_CODE: Final = tuple(Sync)
 
+# all fields are aligned: the native layout is equal, and `struct` packs it twice as fast
 _NATIVE: Final = "@" if sys.byteorder == "little" else "<"
-"""All fields are aligned, so this machine's own layout is the same, and `struct` is twice as fast with it."""
+# fields before the first vector. Two parts, because a call with more than 30 arguments makes a list
 _HEAD_FIELDS: Final = 12
-"""Those before the first vector. A slot is packed in two parts: a call of more than 30 arguments makes a list."""
 _HEAD = struct.Struct(_NATIVE + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[:_HEAD_FIELDS]))
 _VALUES = struct.Struct(_NATIVE + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[_HEAD_FIELDS:-2]) + "24x")
 _BODY = struct.Struct(_NATIVE + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[:-2]) + "24x")
@@ -120,12 +119,12 @@ _ZERO2: Pair = (0.0, 0.0)
 
 
 def encode_slots(samples: Sequence[Sample], device_id: int) -> list[bytes]:
-    """`samples` as SLOT_BYTES bytes each, CRC included. `device_id` is the daemon's number of the device, 0…65535.
+    """Return `samples` as SLOT_BYTES bytes each, with CRC. `device_id` is the device number of the daemon, 0…65535.
 
-    A value that its field cannot hold is replaced as `_fitted` says, so that no sample can stop the daemon.
+    `_fitted` replaces a value that its field cannot hold, so that no sample can stop the daemon.
     """
     try:
-        if len(samples) == 1:  # the usual case, without a call for the list
+        if len(samples) == 1:  # usual case: no call for the list
             return [_encode(samples[0], device_id)]
         return _encode_alike(samples, device_id) or [_encode(sample, device_id) for sample in samples]
     except struct.error:
@@ -133,7 +132,7 @@ def encode_slots(samples: Sequence[Sample], device_id: int) -> list[bytes]:
 
 
 def encode_slot(sample: Sample, device_id: int) -> bytes:
-    """One sample as `encode_slots` makes it."""
+    """Return one sample in the form of `encode_slots`."""
     try:
         return _encode(sample, device_id)
     except struct.error:
@@ -141,7 +140,7 @@ def encode_slot(sample: Sample, device_id: int) -> bytes:
 
 
 def _encode(sample: Sample, device_id: int) -> bytes:
-    """`encode_slot` for values that fit. Raises struct.error for others."""
+    """Return the slot of a sample with valid values. Raises struct.error for other values."""
     present = _ALL_PRESENT
     if (t_dev := sample.t_dev_ns) is None:
         present, t_dev = present - HAS_T_DEV, 0
@@ -184,9 +183,9 @@ def _encode(sample: Sample, device_id: int) -> bytes:
 
 
 def _encode_alike(samples: Sequence[Sample], device_id: int) -> list[bytes]:
-    """`_encode` of samples that have all values of an HI91 message, and no others, in 0.85 of its time.
+    """Return `_encode` of samples with all values of an HI91 frame and no other values, in 0.85 of its time.
 
-    What is present need not be asked for value by value here. Others give an empty list, or struct.error.
+    The function does not check each value for None. For other samples it returns an empty list or raises struct.error.
     """
     head, values, crc, codes, slots = _HEAD.pack, _VALUES.pack, _CRC.pack, SYNC_CODES, list[bytes]()
     for s in samples:
@@ -198,7 +197,7 @@ def _encode_alike(samples: Sequence[Sample], device_id: int) -> list[bytes]:
         if (pps := s.pps_age_ms) is None:
             present, pps = present - HAS_PPS_AGE, 0
         try:
-            ax, ay, az = s.accel_m_s2  # type: ignore[misc]  # None, which most samples never are, raises TypeError
+            ax, ay, az = s.accel_m_s2  # type: ignore[misc]  # a rare None raises TypeError
             gx, gy, gz = s.gyro_rad_s  # type: ignore[misc]
             mx, my, mz = s.mag_t  # type: ignore[misc]
             qw, qx, qy, qz = s.quat_wxyz  # type: ignore[misc]
@@ -216,7 +215,7 @@ def _encode_alike(samples: Sequence[Sample], device_id: int) -> list[bytes]:
 
 
 def _fitted(sample: Sample) -> Sample:
-    """`sample` with integers that the slot can hold: quantities clipped, status bits cut to the low 32."""
+    """Return `sample` with integers that fit: values clipped, status bits cut to the low 32 bits."""
     t_dev, status, pps, edge = sample.t_dev_ns, sample.status, sample.pps_age_ms, sample.edge_seq
     return msgspec.structs.replace(
         sample,
@@ -237,21 +236,20 @@ def _clipped(value: int, low: int, high: int) -> int:
 
 
 def slot_is_whole(slot: bytes) -> bool:
-    """Whether the CRC of a slot matches its content."""
+    """Return whether the CRC of a slot is correct."""
     return len(slot) == SLOT_BYTES and crc32(slot[:CRC_OFFSET]) == _CRC.unpack_from(slot, CRC_OFFSET)[0]
 
 
 def decode_slot(slot: bytes, device: str) -> Sample:
-    """The sample in `slot`; the inverse of `encode_slot`.
-
-    Raises ValueError when the CRC does not match, or for a `sync` of a newer layout.
-    """
+    """Return the sample in `slot`. Raises ValueError for a wrong CRC or an unknown `sync`."""
     if not slot_is_whole(slot):
-        raise ValueError(f"slot of {len(slot)} bytes: expected {SLOT_BYTES} with a matching CRC-32; torn or cut short")
+        raise ValueError(
+            f"slot of {len(slot)} bytes: expected {SLOT_BYTES} bytes with a matching CRC-32; is it torn or incomplete?"
+        )
     v = _BODY.unpack_from(slot)
     has = v[7]
     if v[10] >= len(SYNC_BY_CODE):
-        raise ValueError(f"slot with sync {v[10]}: expected 0 to {len(SYNC_BY_CODE) - 1}; written by a newer imud")
+        raise ValueError(f"slot with sync {v[10]}: expected 0 to {len(SYNC_BY_CODE) - 1}; did a newer imud write it?")
     return Sample(
         device, v[0], v[1], v[6], SYNC_BY_CODE[v[10]], v[2], v[3],
         t_dev_ns=v[4] if has & HAS_T_DEV else None,

@@ -24,12 +24,10 @@ from typing import Final
 
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
-EVEN_NS: Final = 1 * NS_PER_US
-"""Change of the offset that imud ignores, in addition to the errors of the pairs, ns."""
+EVEN_NS: Final = 1 * NS_PER_US  # change of the offset that imud ignores, in addition to the errors of the pairs, ns
 PAIRS_MOST: Final = 4096
 """Maximum number of pairs: 4 s of a device at 1 kHz while CLOCK_MONOTONIC is slewed, otherwise hours."""
-RATE_NS: Final = 2 * NS_PER_S
-"""Time span of the rate, ns; shorter if fewer pairs exist."""
+RATE_NS: Final = 2 * NS_PER_S  # time span of the rate, ns; shorter if fewer pairs exist
 # standard deviation of a uniform distribution with range 1
 SIGMA_OF_RANGE: Final = 1 / sqrt(12)
 
@@ -40,17 +38,14 @@ class SteadyTime:
     __slots__ = ("_base_ns", "_even", "_monotonic", "_offsets", "_steady", "even_from_ns", "offset_ns")
 
     def __init__(self) -> None:
-        self.offset_ns = 0
-        """CLOCK_MONOTONIC minus steady time at the newest pair."""
+        self.offset_ns = 0  # CLOCK_MONOTONIC minus steady time at the newest pair
         self.even_from_ns = -1 << 63
         """Steady time after which `offset_ns` is exact within 1 µs. Later times need no call."""
-        self._base_ns = 0
-        """Steady time minus CLOCK_MONOTONIC_RAW."""
+        self._base_ns = 0  # steady time minus CLOCK_MONOTONIC_RAW
         self._steady: list[int] = []
         self._monotonic: list[int] = []
         self._offsets: list[int] = []
-        self._even = 0
-        """Index of the pair at `even_from_ns`."""
+        self._even = 0  # index of the pair at `even_from_ns`
 
     def add_pair(self, monotonic_ns: int, raw_ns: int, held_raw_ns: int = 0, error_ns: int = 0) -> None:
         """Add a reading of CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW at the same instant, within `error_ns`.
@@ -122,11 +117,9 @@ class SteadyTime:
         return before + (offsets[after] - before) * (at_ns - before_ns) // (times[after] - before_ns)
 
 
-UNSTEERED: Final = SteadyTime()
-"""Steady time of a clock without steering. No caller adds pairs to it."""
+UNSTEERED: Final = SteadyTime()  # Steady time of a clock without steering. No caller adds pairs to it.
 
-READINGS: Final = 5
-"""Maximum number of readings in one measurement."""
+READINGS: Final = 5  # maximum number of readings in one measurement
 TIGHT_NS: Final = 1 * NS_PER_US
 """Time between the two readings of CLOCK_MONOTONIC, ns, below which imud uses a reading immediately."""
 TOLERANCE_NS: Final = 1 * NS_PER_US
@@ -168,17 +161,14 @@ class HostClock:
 
         None: CLOCK_MONOTONIC_RAW and CLOCK_BOOTTIME. With `raw_ns` only, imud does not detect a suspend.
         """
-        self.now_ns = monotonic_ns
-        """CLOCK_MONOTONIC, ns."""
-        self.error_ns = 0
-        """Maximum error of the kept offset, ns: half of the duration of its measurement."""
+        self.now_ns = monotonic_ns  # CLOCK_MONOTONIC, ns
+        self.error_ns = 0  # maximum error of the kept offset, ns: half of the duration of its measurement
         self.steady: Final = SteadyTime()
         """CLOCK_MONOTONIC relative to a time without steering, as of the last `utc_offset_ns`."""
         self._realtime_ns = realtime_ns
         self._raw_ns = raw_ns or kernel_clock("MONOTONIC_RAW")
         self._boottime_ns = boottime_ns or (monotonic_ns if raw_ns else kernel_clock("BOOTTIME"))
-        self.suspends = 0
-        """Number of suspends since the first reading, as of the last `utc_offset_ns`."""
+        self.suspends = 0  # number of suspends since the first reading, as of the last `utc_offset_ns`
         self.on_measured: Callable[[int, int, int], None] | None = None
         """Receives each pair of `steady` after a measurement: CLOCK_MONOTONIC, raw, and held raw."""
         self._asleep_ns = self._boottime_ns() - monotonic_ns()

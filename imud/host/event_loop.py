@@ -27,11 +27,9 @@ from typing import Any, Final, Protocol, TypeVar, TypeVarTuple
 T = TypeVar("T")
 Arguments = TypeVarTuple("Arguments")
 
-EVENTS_MAX: Final = 256
-"""Maximum number of descriptors in one turn; the next turn handles all others."""
+EVENTS_MAX: Final = 256  # maximum number of descriptors in one turn; the next turn handles all others
 
-OnError = Callable[[dict[str, Any]], None]
-"""`loop.call_exception_handler`."""
+OnError = Callable[[dict[str, Any]], None]  # `loop.call_exception_handler`
 
 
 class Poller(Protocol):
@@ -58,8 +56,8 @@ class ReaderSelector(selectors.EpollSelector):
         self.has_news = False
         """Whether the loop received a callback, a timer or `stop` since the wait started. Set by the loop."""
         self._readers: dict[int, Callable[[], object]] = {}
+        # Descriptors that were removed in the present turn. The kernel may already use the number for another file.
         self._removed: set[int] = set()
-        """Descriptors that were removed in the present turn. The kernel may already use the number for another file."""
         self._outer: Poller = poller or select.epoll()
         self._poll = self._outer.poll
         self._inner = self.fileno()

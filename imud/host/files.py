@@ -115,8 +115,7 @@ def _check_regular(status: os.stat_result, path: str | os.PathLike[str]) -> None
         raise NotRegularFile(errno.EINVAL, f"is {kind}, expected a regular file", os.fspath(path))
 
 
-GROUP_ACCESS: Final = stat.S_IRGRP | stat.S_IWGRP
-"""Bits of a mode that let the group read and write."""
+GROUP_ACCESS: Final = stat.S_IRGRP | stat.S_IWGRP  # bits of a mode that let the group read and write
 
 
 def group_of(path: str, otherwise: str) -> str:
@@ -139,10 +138,8 @@ def user_name() -> str:
 
 log = logging.getLogger(__name__)
 
-FILE_BYTES_MAX = 1 << 20
-"""Maximum size of a state file, bytes. 256 devices need about 20 kB."""
-SAVE_LIMIT_S = 1.0
-"""Maximum time that the daemon waits at its end for a slow disk, s."""
+FILE_BYTES_MAX = 1 << 20  # maximum size of a state file, bytes. 256 devices need about 20 kB.
+SAVE_LIMIT_S = 1.0  # maximum time that the daemon waits at its end for a slow disk, s
 
 T = TypeVar("T")
 

@@ -27,25 +27,19 @@ VALUE_CHARACTERS_MAX: Final = 200
 """Maximum length of one value. The longest product string, of a USB descriptor, has 126 characters."""
 MESSAGE_CHARACTERS_MAX: Final = 2000
 """Maximum length of one message. Only the list of 256 changed devices after a reload is longer."""
-TRACEBACK_LINES_MAX: Final = 100
-"""Maximum number of lines of one traceback, newest calls."""
-LOG_QUEUE_MESSAGES: Final = 1000
-"""Maximum number of messages in the queue: 1 s of the highest message rate, a few MB."""
+TRACEBACK_LINES_MAX: Final = 100  # maximum number of lines of one traceback, newest calls
+LOG_QUEUE_MESSAGES: Final = 1000  # maximum number of messages in the queue: 1 s of the highest message rate, a few MB
 STDERR: Final = 2
-FLUSH_S: Final = 1.0
-"""Maximum time that the end of the process waits for the reader of the log, s."""
-POLL_MS: Final = 100
-"""Interval at which the thread checks for `close` while the reader does not read, ms."""
+FLUSH_S: Final = 1.0  # maximum time that the end of the process waits for the reader of the log, s
+POLL_MS: Final = 100  # interval at which the thread checks for `close` while the reader does not read, ms
 PRIORITIES: Final = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
 """Priorities of syslog(3) by minimum level. Lower levels have priority 7, debug."""
 # pause after the first repetition, s
 PAUSE_FIRST_S: Final = 1.0
 # maximum pause, s
 PAUSE_MOST_S: Final = 60.0
-KNOWN_MOST: Final = 512
-"""Maximum number of remembered messages: two for each of 256 devices."""
-SAME_AS: Final = "same_as"
-"""Attribute of a log record, set with `extra`."""
+KNOWN_MOST: Final = 512  # maximum number of remembered messages: two for each of 256 devices
+SAME_AS: Final = "same_as"  # attribute of a log record, set with `extra`
 NUMBERS: Final = re.compile(r"\d+")
 LEVELS_SHOWN: Final = 4
 ITEMS_SHOWN: Final = 10
@@ -194,10 +188,8 @@ class LogWriter(logging.Handler):
         self._journal = journal
         self._descriptor = descriptor
         self._queue: queue.Queue[bytes | None] = queue.Queue(messages_max)
-        self._refused = 0
-        """Number of messages dropped from the full queue. Changed under the lock of the handler."""
-        self._unwritten = 0
-        """Number of messages dropped after a failed write. Changed by the thread."""
+        self._refused = 0  # Number of messages dropped from the full queue. Changed under the lock of the handler.
+        self._unwritten = 0  # Number of messages dropped after a failed write. Changed by the thread.
         self._reported = 0
         self._ending = self._abandoned = False
         self._thread = threading.Thread(target=self._run, name="log", daemon=True)

@@ -10,12 +10,9 @@ from imud.model.units import NS_PER_S
 
 log = logging.getLogger(__name__)
 
-STATUS_NS: Final = NS_PER_S
-"""Minimum time between two changes of the status line, ns."""
-NAMES_SHOWN: Final = 5
-"""Maximum number of device names in the status line."""
-FINE: Final = ("running", "finished")
-"""Device states (`DeviceState`) that need no action of the user."""
+STATUS_NS: Final = NS_PER_S  # minimum time between two changes of the status line, ns
+NAMES_SHOWN: Final = 5  # maximum number of device names in the status line
+FINE: Final = ("running", "finished")  # device states (`DeviceState`) that need no action of the user
 
 
 def notify(state: str) -> None:

@@ -27,11 +27,9 @@ hanging write to a disk has no timeout: code that shares objects with such a thr
 SWITCH_INTERVAL_S: Final = 0.0003
 """Maximum time, s, that a thread runs while another thread waits (sys.setswitchinterval, for the complete process)."""
 
-SELECT_FDS: Final = 1024
-"""Limit of descriptor numbers for `select` (FD_SETSIZE)."""
+SELECT_FDS: Final = 1024  # limit of descriptor numbers for `select` (FD_SETSIZE)
 
-Round = Callable[[], int]
-"""Does the due work and returns the time until its next call, ns; 0: immediately."""
+Round = Callable[[], int]  # does the due work and returns the time until its next call, ns; 0: immediately
 
 
 class Worker(Protocol):
@@ -157,8 +155,8 @@ class BusThread:
     def __init__(self, name: str, work: Round, failed: Callable[[BaseException], None]) -> None:
         self._work, self._failed = work, failed
         self._wake = WakeEvent()
+        # Used after the first `watch`. It costs twice as much as a WakeEvent.
         self._descriptors: DescriptorWait | None = None
-        """Used after the first `watch`. It costs twice as much as a WakeEvent."""
         self._ended = False
         share_interpreter()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)

@@ -20,8 +20,7 @@ import os
 import re
 from enum import StrEnum
 
-_NUMBER = re.compile(r"\[Errno (\d+)\]|\((\d+), ['\"]")
-"""Error number in the text of a library's error."""
+_NUMBER = re.compile(r"\[Errno (\d+)\]|\((\d+), ['\"]")  # error number in the text of a library's error
 
 
 class ImudError(Exception):
@@ -67,12 +66,9 @@ class Rejected(CommandError):
 class Trouble(StrEnum):
     """Kinds of transfer failures."""
 
-    ABSENT = "absent"
-    """No device acknowledges the address: no power, no wire, or another address."""
-    STUCK = "stuck"
-    """The bus did not become free in time: a line held low, or a short circuit."""
-    DISTURBED = "disturbed"
-    """The controller detected an error on the bus, or lost the arbitration."""
+    ABSENT = "absent"  # no device acknowledges the address: no power, no wire, or another address
+    STUCK = "stuck"  # the bus did not become free in time: a line held low, or a short circuit
+    DISTURBED = "disturbed"  # the controller detected an error on the bus, or lost the arbitration
 
 
 class TransferError(ImudError):

@@ -10,20 +10,14 @@ import msgspec
 class EventKind(StrEnum):
     """Kinds of events. Readers must accept unknown kinds."""
 
-    UP = "up"
-    """imud found and identified the device; samples follow."""
-    DOWN = "down"
-    """The device or its link is absent; `detail` contains the reason."""
-    SYNC = "sync"
-    """The source of time stamps changed."""
+    UP = "up"  # imud found and identified the device; samples follow
+    DOWN = "down"  # the device or its link is absent; `detail` contains the reason
+    SYNC = "sync"  # the source of time stamps changed
     LOSS = "loss"
     """Samples were lost; `detail` contains their number and the cause. At most once per second and device."""
-    CONFIGURATION = "configuration"
-    """The device settings or the configuration of the daemon changed."""
-    ALARM = "alarm"
-    """The ALARM line or the alarm status of a device changed."""
-    MARK = "mark"
-    """A pulse arrived on SOUT_DIV. `detail` contains its time, its number and the `seq` of its sample."""
+    CONFIGURATION = "configuration"  # the device settings or the configuration of the daemon changed
+    ALARM = "alarm"  # the ALARM line or the alarm status of a device changed
+    MARK = "mark"  # a pulse arrived on SOUT_DIV. `detail` contains its time, its number and the `seq` of its sample.
     LINK = "link"
     """The state of the port or bus changed, for example a CAN controller became error-passive. The device may
     continue.
@@ -32,12 +26,9 @@ class EventKind(StrEnum):
     """Progress of a guided calibration. `detail` contains kind, phase and measured values. At most twice per second."""
     ATTITUDE = "attitude"
     """Gravity at rest contradicts the attitude or the mounting. The message contains the likely cause."""
-    RECORDER = "recorder"
-    """The recorder stopped (for example: full disk), continued, lost records, or saved a snapshot."""
-    MQTT = "mqtt"
-    """The output `mqtt` stopped spooling (for example: full disk) or continued."""
-    BAD_FRAME = "bad-frame"
-    """imud received a damaged or unknown frame. At most once per second and device."""
+    RECORDER = "recorder"  # the recorder stopped (for example: full disk), continued, lost records, or saved a snapshot
+    MQTT = "mqtt"  # the output `mqtt` stopped spooling (for example: full disk) or continued
+    BAD_FRAME = "bad-frame"  # imud received a damaged or unknown frame. At most once per second and device.
 
 
 def kind_of(name: str) -> EventKind:
@@ -57,12 +48,10 @@ LEVELS: Final = {
 class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     """Event of one device, or of the daemon if `device` is empty."""
 
-    t_ns: int
-    """CLOCK_MONOTONIC at the detection of the event."""
+    t_ns: int  # CLOCK_MONOTONIC at the detection of the event
     device: str
     kind: EventKind
-    message: str
-    """Description, one sentence."""
+    message: str  # Description, one sentence
     detail: dict[str, str | int | float | bool | None] = {}  # msgspec copies a mutable default
 
 

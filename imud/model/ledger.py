@@ -105,8 +105,7 @@ class Ledger:
 
 
 _ALL = attrgetter(*LEDGER_FIELDS)
-LOST_FIELDS: Final = tuple(name for name in LEDGER_FIELDS if name.startswith("lost_"))
-"""Counters of losses by cause."""
+LOST_FIELDS: Final = tuple(name for name in LEDGER_FIELDS if name.startswith("lost_"))  # counters of losses by cause
 
 
 def lost(counts: Mapping[str, int]) -> int:

@@ -15,15 +15,11 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec import inspect
 
-SHOWN_CHARACTERS = 60
-"""Maximum number of characters of a text in an error message."""
-HOST_CHARACTERS = 253
-"""Maximum length of a host name (RFC 1035, section 2.3.4)."""
+SHOWN_CHARACTERS = 60  # maximum number of characters of a text in an error message
+HOST_CHARACTERS = 253  # maximum length of a host name (RFC 1035, section 2.3.4)
 _LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
-_STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+)\]")
-"""One step in msgspec's path to an invalid value."""
-UNKNOWN_STEP = "..."
-"""Step to a value of a mapping; msgspec does not report its key."""
+_STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+)\]")  # one step in msgspec's path to an invalid value
+UNKNOWN_STEP = "..."  # step to a value of a mapping; msgspec does not report its key
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -80,10 +76,8 @@ def shown(value: object) -> str:
 class WrongValue(NamedTuple):
     """One invalid value of several named values."""
 
-    name: str
-    """Name of the value; empty if the combination of values is invalid."""
-    message: str
-    """Expected and received value."""
+    name: str  # name of the value; empty if the combination of values is invalid
+    message: str  # expected and received value
 
     def __str__(self) -> str:
         """Return both as text, for example `rate_hz: expected a number, got "fast"`."""

@@ -15,28 +15,22 @@ Quaternion = tuple[float, float, float, float]
 Pair = tuple[float, float]
 
 
-T_ERR_MOST: Final = 0xFFFF_FFFF
-"""Maximum of `t_err_ns`, which has 32 bits in all outputs."""
+T_ERR_MOST: Final = 0xFFFF_FFFF  # maximum of `t_err_ns`, which has 32 bits in all outputs
 
 
 class Sync(StrEnum):
     """Source of a time stamp, worst first."""
 
-    ARRIVAL = "arrival"
-    """Arrival time minus the time on the wire. The device sends no usable time."""
-    REGRESSION = "regression"
-    """Device time, fitted to arrival times."""
-    EDGE = "edge"
-    """Device time, fitted to SOUT or PPS edges with time stamps of the kernel."""
-    UTC = "utc"
-    """Device time that the device synchronizes to UTC."""
+    ARRIVAL = "arrival"  # Arrival time minus the time on the wire. The device sends no usable time.
+    REGRESSION = "regression"  # device time, fitted to arrival times
+    EDGE = "edge"  # device time, fitted to SOUT or PPS edges with time stamps of the kernel
+    UTC = "utc"  # device time that the device synchronizes to UTC
 
 
 class Measurement(msgspec.Struct, frozen=True, gc=False):
     """Values of one frame in SI units, without host time."""
 
-    size_bytes: int
-    """Size of the frame on the wire, bytes, with all framing."""
+    size_bytes: int  # size of the frame on the wire, bytes, with all framing
     trailing_bytes: int
     """Number of bytes after the frame in the same read. The frame arrived earlier than the read by their wire time."""
     dev_ticks: int | None
@@ -44,16 +38,13 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     accel_m_s2: Vector3 | None = None
     gyro_rad_s: Vector3 | None = None
     mag_t: Vector3 | None = None
-    quat_wxyz: Quaternion | None = None
-    """Rotation from body to navigation frame, scalar first."""
+    quat_wxyz: Quaternion | None = None  # rotation from body to navigation frame, scalar first
     euler_rad: Vector3 | None = None
     """Roll, pitch, yaw in the convention of the device (`euler_convention` of the driver)."""
     temperature_c: float | None = None
     pressure_pa: float | None = None
-    incli_rad: Pair | None = None
-    """Inclinometer X and Y."""
-    status: int | None = None
-    """Status bits as sent."""
+    incli_rad: Pair | None = None  # inclinometer X and Y
+    status: int | None = None  # status bits as sent
     pps_age_ms: int | None = None
     """Time from the last edge on the PPS/SIN input of the device to this measurement, ms, not unwrapped."""
 
@@ -61,23 +52,17 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
 class Sample(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     """Measurement with its time stamp. Field names are the names in JSON, which omits absent fields."""
 
-    device: str
-    """Name of the device in the configuration."""
+    device: str  # name of the device in the configuration
     seq: int
     """Sequence number of the device, starting at 1. A gap in the numbers of a reader is the number of samples it
     lost.
     """
-    t_ns: int
-    """CLOCK_MONOTONIC at the instant of the measurement; strictly increasing, never later than the last byte."""
-    t_err_ns: int
-    """One-sigma error of `t_ns`: residual spread plus the maximum bias of the source."""
+    t_ns: int  # CLOCK_MONOTONIC at the instant of the measurement; strictly increasing, never later than the last byte
+    t_err_ns: int  # One-sigma error of `t_ns`: residual spread plus the maximum bias of the source
     sync: Sync
-    t_rx_ns: int
-    """CLOCK_MONOTONIC at the read of the last byte."""
-    utc_ns: int
-    """`t_ns` on CLOCK_REALTIME (ns since 1970-01-01 UTC), with the clock offset at the arrival."""
-    t_dev_ns: int | None = None
-    """Device time, unwrapped to 64 bits."""
+    t_rx_ns: int  # CLOCK_MONOTONIC at the read of the last byte
+    utc_ns: int  # `t_ns` on CLOCK_REALTIME (ns since 1970-01-01 UTC), with the clock offset at the arrival
+    t_dev_ns: int | None = None  # device time, unwrapped to 64 bits
     accel_m_s2: Vector3 | None = None
     gyro_rad_s: Vector3 | None = None
     mag_t: Vector3 | None = None
@@ -88,8 +73,7 @@ class Sample(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     incli_rad: Pair | None = None
     status: int | None = None
     pps_age_ms: int | None = None
-    edge_seq: int | None = None
-    """Number of the rising edge on SOUT, or of the trigger on SIN, for this sample."""
+    edge_seq: int | None = None  # number of the rising edge on SOUT, or of the trigger on SIN, for this sample
 
 
 SAMPLE_FIELDS: tuple[str, ...] = Sample.__struct_fields__
@@ -99,15 +83,11 @@ class FieldInfo(msgspec.Struct, frozen=True):
     """Description of one member of a sample."""
 
     name: str
-    type: str
-    """JSON type; `number[3]` is an array of three numbers."""
-    unit: str
-    """SI unit of the value; empty if it has no unit."""
-    frame: str
-    """Axes or time scale of the value; empty without axes or time scale."""
+    type: str  # JSON type; `number[3]` is an array of three numbers
+    unit: str  # SI unit of the value; empty if it has no unit
+    frame: str  # axes or time scale of the value; empty without axes or time scale
     meaning: str
-    always: bool
-    """Whether every sample contains the member."""
+    always: bool  # whether every sample contains the member
 
 
 _SENSOR: Final = "sensor frame, right-handed"

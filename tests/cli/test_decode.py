@@ -64,7 +64,7 @@ def test_log_of_a_can_bus(tmp_path: Path, cli: Cli) -> None:
     assert "t_dev_ns" not in first
     assert first["accel_m_s2"] == pytest.approx([0, 0, 9.80665])
     problem, counted = printed.err.splitlines()
-    assert "1 lines are none of a candump log" in problem
+    assert "expected a candump log (candump -L), got 1 invalid lines" in problem
     ledger = json.loads(counted)
     assert (ledger["bytes_in"], ledger["bytes_skipped"]) == (81, 1)
     assert ledger["frames_in_samples"] == 10

@@ -48,9 +48,9 @@ def test_whole_damaged_cut_and_foreign_files(file: Path, cli: Cli, tmp_path: Pat
     page = " ".join(cli("info", tmp_path / "damaged", status=1).out.split())
     assert "begun not known: the block that says it and names the devices is damaged or missing" in page
     assert "duration not known" in page
-    assert "blocks that are missing by their numbers: 1" in page
+    assert "missing blocks according to their numbers: 1" in page
     (tmp_path / "a.csv").write_text("t_ns,accel\n" * 50)
-    cli.refuses("no recording of imud", "info", str(tmp_path / "a.csv"))
+    cli.refuses("not a recording of imud", "info", str(tmp_path / "a.csv"))
     cli.refuses("No such file", "info", str(tmp_path / "none"))
 
 

@@ -66,7 +66,7 @@ def test_a_cut_file_is_replayed_as_far_as_it_goes(recorded: Recorded) -> None:
     assert printed == lines[: len(printed)]
     assert status == (0 if printed else 1)
     assert "no regular end" in report
-    assert "cut short" in report
+    assert "incomplete" in report
 
 
 def test_a_damaged_file_is_an_answer_of_no(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
@@ -82,13 +82,13 @@ def test_a_recording_whose_first_bytes_are_damaged_is_no_capture(recorded: Recor
     file.write_bytes(bytes(8) + recorded[0].read_bytes()[8:])
     for command in (["replay"], ["export", "--to", "csv"]):
         printed = cli(*command, file, status=1).err
-        assert "bytes from byte 0 on are damaged" in printed
+        assert "bytes from byte 0 are damaged" in printed
         assert "the capture" not in printed
 
 
 def test_a_file_that_only_begins_as_a_recording_is_an_error(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "a").write_bytes(b"\x89imudREC" + bytes(100))
-    cli.refuses("no whole block", "replay", tmp_path / "a")
+    cli.refuses("at least one complete block", "replay", tmp_path / "a")
 
 
 def test_a_raw_capture_says_what_it_cannot_know(tmp_path: Path, cli: Cli) -> None:

@@ -45,7 +45,7 @@ def test_no_such_ring_and_no_permission(board: Board, tmp_path: Path, monkeypatc
     with pytest.raises(ServerError, match="is imud running"):
         Ring("imu9", directory=str(tmp_path / "none"))
     (tmp_path / "imud.x").write_bytes(b"hello")
-    with pytest.raises(ServerError, match="is no ring of imud"):
+    with pytest.raises(ServerError, match="is not a ring of imud"):
         Ring("x", directory=str(tmp_path))
     with pytest.raises(ServerError, match=r"no ring of imud: expected a regular file \(-\), found another kind \(d\)"):
         Ring(tmp_path)
@@ -288,7 +288,7 @@ def test_torn_slot_does_not_hold_a_reader_at_a_dead_daemon(board: Board, ring: R
 def test_successor_of_another_layout(board: Board, ring: Ring) -> None:
     board.publisher.close()
     board.path.write_bytes(b"imudshm\0" + bytes(HEADER_BYTES))
-    with pytest.raises(ServerError, match="different versions"):
+    with pytest.raises(ServerError, match="the same version"):
         ring.read()
 
 

@@ -19,5 +19,5 @@ def test_frames_as_the_kernel_has_them() -> None:
     assert RAW_FRAME.unpack(pack_frame(0x1FFF_FFFF, True, b"")) == (0x1FFF_FFFF | EXTENDED_FLAG, 0, bytes(8))
     wrong = [(0x800, False, b""), (-1, False, b""), (0x2000_0000, True, b""), (1, True, bytes(9))]
     for can_id, extended, data in wrong:
-        with pytest.raises(ValueError, match="no CAN frame"):
+        with pytest.raises(ValueError, match="invalid CAN frame"):
             pack_frame(can_id, extended, data)

@@ -29,8 +29,8 @@ def test_check_value_and_frames() -> None:
     assert is_exception(EXCEPTION)
     assert not is_exception(EXCEPTION[:-1] + b"\x00")
     assert not is_exception(framed(5, b"\x03\x02"))
-    assert exception_text(2) == "exception 2: there is no such register"
-    assert exception_text(77) == "exception 77: no meaning known"
+    assert exception_text(2) == "exception 2: the register does not exist"
+    assert exception_text(77) == "exception 77: unknown code"
 
 
 @pytest.mark.parametrize(("baud", "gap_ns"), [(9600, 3_645_831), (19200, 1_822_915), (38400, 1_750_000)])

@@ -44,7 +44,7 @@ def test_the_golden_block_is_read_and_written_and_one_that_compresses_is_a_zstan
     assert found == [b"abc"]
     assert (reader.bytes_bad, reader.bytes_cut, reader.blocks_missing) == (0, 0, 0)
     assert is_recording(GOLDEN)
-    with pytest.raises(ImudError, match=r"a\.csv is no recording of imud: expected"):
+    with pytest.raises(ImudError, match=r"a\.csv is not a recording of imud: expected"):
         check_begin(b"t_ns,accel", "a.csv")
     block = BlockEncoder().encode(b"abcd" * 1000)
     assert block[8] == 1

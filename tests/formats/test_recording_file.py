@@ -51,7 +51,7 @@ def test_a_file_without_its_end_says_so() -> None:
     assert len(list(reader)) == 11
     assert len(reader.problems) == 2
     assert (reader.ended, reader.is_damaged) == (False, False)
-    assert "cut short" in reader.problems[0]
+    assert "incomplete" in reader.problems[0]
     assert "no regular end" in reader.problems[1]
 
 
@@ -61,7 +61,7 @@ def test_damage_and_missing_blocks_are_named() -> None:
     reader = RecordingReader(io.BytesIO(bytes(data)), "a.rec")
     assert len(list(reader)) == 11
     assert "are damaged" in reader.problems[0]
-    assert reader.problems[1] == "blocks that are missing by their numbers: 1"
+    assert reader.problems[1] == "missing blocks according to their numbers: 1"
     assert reader.is_damaged
 
 
@@ -69,17 +69,17 @@ def test_a_block_without_records_costs_only_itself() -> None:
     reader = RecordingReader(io.BytesIO(written(session(), b"\xff" * 9, *reads(2), END, each=True)), "a.rec")
     assert len(list(reader)) == 4
     assert (reader.records_unreadable, reader.blocks_read, reader.is_damaged, reader.ended) == (1, 5, True, True)
-    assert reader.problems == ["1 blocks hold something else than records, left out"]
+    assert reader.problems == ["1 blocks contain no valid records; imud ignores them"]
 
 
 @pytest.mark.parametrize("data", [b"", b"\x89imudREC", b"t_ns,accel\n" * 20])
 def test_a_file_without_blocks_is_no_recording(data: bytes) -> None:
-    with pytest.raises(ImudError, match="no whole block"):
+    with pytest.raises(ImudError, match="at least one complete block"):
         list(RecordingReader(io.BytesIO(data), "a.rec"))
 
 
 def test_sizes_and_versions_are_limited() -> None:
-    with pytest.raises(ImudError, match="records of version 9, this imud reads 1"):
+    with pytest.raises(ImudError, match="records of version 1, got 9"):
         list(RecordingReader(io.BytesIO(written(session(9))), "a.rec"))
     assert RecordingReader(io.BytesIO(written(bytes(RECORD_BYTES_MAX))), "a.rec")
     gatherer, half = BlockGatherer(), bytes(BLOCK_BYTES // 2)

@@ -39,7 +39,7 @@ def test_a_data_record_by_hand_and_objects_that_come_back() -> None:
     call = CallRecord("clock", "link_changed", [], {"byte_ns": 86_806, "hold_ns": 0})
     record = only(records.encode_object(Kind.CALL, 1, call))
     assert records.decode_object(record, CallRecord) == call
-    with pytest.raises(ImudError, match="kind 9 cannot be read"):
+    with pytest.raises(ImudError, match="cannot read a record of kind 9"):
         records.decode_object(record._replace(body=b"\xc1"), CallRecord)
 
 

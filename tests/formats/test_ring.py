@@ -51,7 +51,7 @@ def test_header() -> None:
 
 @pytest.mark.parametrize("raw", [b"", bytes(HEADER_BYTES), encode_header(HEADER)[:-1], b"x" * HEADER_BYTES])
 def test_no_ring_at_all(raw: bytes) -> None:
-    with pytest.raises(ServerError, match=r"/x is no ring"):
+    with pytest.raises(ServerError, match=r"/x is not a ring"):
         decode_header(raw, "/x")
 
 
@@ -61,7 +61,7 @@ COUNTS = [("slot_count", 0), ("slot_count", 4095), ("ledger_count", LEDGER_ROOM 
 
 @pytest.mark.parametrize(
     ("name", "value", "words"),
-    [(*one, "different versions") for one in VERSIONS] + [(*one, "damaged") for one in COUNTS],
+    [(*one, "the same version") for one in VERSIONS] + [(*one, "damaged") for one in COUNTS],
 )
 def test_another_version_and_impossible_counts_are_refused(name: str, value: int, words: str) -> None:
     raw = bytearray(encode_header(HEADER))

@@ -84,7 +84,7 @@ def test_requests_to_all() -> None:
     write = write_register(6, 1)
     check_written(framed(7, write.sends[0]), write)
     for reply, why in (
-        (framed(7, b"\x83\x02"), "exception 2: there is no such register"),
+        (framed(7, b"\x83\x02"), "exception 2: the register does not exist"),
         (good[:-1], "damaged"),
         (good[:-1] + b"\x00", "damaged"),
         (framed(7, b"\x04\x04\x00\x01\xff\xfe"), "function 0x03"),
