@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""Axes, angles, rotation, mounting and gravity, without I/O."""

@@ -1,12 +1,12 @@
-"""Table: conventions of axes and angles: what devices send, and what can be published.
+"""Conventions of axes and angles: conventions of devices, and conventions of published samples.
 
     name       body axes                     navigation frame         Euler angles
     enu-flu    x forward, y left, z up       east, north, up          ZYX; yaw 0 east, counter-clockwise   (REP-103)
     ned-frd    x forward, y right, z down    north, east, down        ZYX; yaw 0 north, clockwise          (aerospace)
 
-A device has axes and an order of angles of its own. Where its heading has no relation to north, its navigation frame is
-level and its x axis is where the heading is 0; then enu-flu keeps that x axis, and ned-frd turns the frame by 180°
-about it.
+A device has its own axes and its own order of angles. If its heading does not refer to north, its navigation frame is
+level and its x axis is the direction of heading 0. Then enu-flu keeps this x axis, and ned-frd rotates the frame by
+180° about it.
 """
 
 from dataclasses import dataclass, replace
@@ -15,32 +15,25 @@ from typing import Final
 
 from imud.attitude.rotation import IDENTITY, Matrix3
 
-FLIP_X: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
-"""Half a turn about x: FLU ↔ FRD."""
-FLIP_Y: Final[Matrix3] = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
-"""Half a turn about y."""
+FLIP_X: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))  # half a turn about x: FLU ↔ FRD
+FLIP_Y: Final[Matrix3] = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))  # half a turn about y
 ENU_TO_NED: Final[Matrix3] = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 RFU_TO_FLU: Final[Matrix3] = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-LFD_TO_FLU: Final[Matrix3] = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
-"""x left, y forward, z down."""
+LFD_TO_FLU: Final[Matrix3] = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))  # LFD: x left, y forward, z down
 
 
 class Convention(StrEnum):
-    """Conventions in which samples can be published."""
+    """Conventions of published samples."""
 
-    ENU_FLU = "enu-flu"
-    """Body x forward, y left, z up; navigation frame east, north, up (REP-103)."""
-    NED_FRD = "ned-frd"
-    """Body x forward, y right, z down; navigation frame north, east, down."""
+    ENU_FLU = "enu-flu"  # body x forward, y left, z up; navigation frame east, north, up (REP-103)
+    NED_FRD = "ned-frd"  # body x forward, y right, z down; navigation frame north, east, down
 
 
 class EulerOrder(StrEnum):
-    """Orders of Euler angles; yaw is always about Z and comes first."""
+    """Orders of Euler angles. The first rotation is always yaw about Z."""
 
-    ZXY = "zxy"
-    """Then pitch about X, then roll about Y (312)."""
-    ZYX = "zyx"
-    """Then pitch about Y, then roll about X (321)."""
+    ZXY = "zxy"  # pitch about X, then roll about Y (312)
+    ZYX = "zyx"  # pitch about Y, then roll about X (321)
 
 
 class Heading(StrEnum):
@@ -48,52 +41,50 @@ class Heading(StrEnum):
 
     MAGNETIC = "magnetic"
     TRUE = "true"
-    RELATIVE = "relative"
-    """Where the device pointed at power-on or at its last heading reset."""
-    UNKNOWN = "unknown"
-    """The device did not tell."""
+    RELATIVE = "relative"  # direction of the device at power-on or at its last heading reset
+    UNKNOWN = "unknown"  # the device did not report its reference
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceAxes:
-    """Axes and angles of a device as it sends them."""
+    """Axes and angles that a device sends."""
 
-    order: EulerOrder = EulerOrder.ZXY
-    """With ZXY its y axis is the one that yaw is counted to (forward), with ZYX its x axis."""
+    order: EulerOrder = EulerOrder.ZXY  # Order of the angles. It also selects the forward axis: y with ZXY, x with ZYX.
     has_north: bool = True
-    """Whether its navigation frame is east, north, up in some reference of north; else level, z up."""
-    z_down: bool = False
-    """Whether its z axis and that of its navigation frame point down."""
+    """Whether the navigation frame is east, north, up with any north reference. Otherwise it is level with z up."""
+    z_down: bool = False  # whether the z axes of the device and of its navigation frame point down
 
     def with_order(self, order: EulerOrder | None) -> "DeviceAxes":
-        """Return the same with another order of angles; None keeps it."""
+        """Return the axes with another order of angles; None keeps the order."""
         return self if order is None else replace(self, order=order)
 
     @property
     def to_body(self) -> Matrix3:
-        """Rotation from the sensor's axes to the body's (FLU) when it lies as its manual draws it."""
+        """Rotation from sensor axes to body axes (FLU) of a device that is mounted as in its manual."""
         if self.order is EulerOrder.ZXY:
             return LFD_TO_FLU if self.z_down else RFU_TO_FLU
         return FLIP_X if self.z_down else IDENTITY
 
     @property
     def to_z_up(self) -> Matrix3:
-        """Rotation from the device's navigation frame to the one with z up and the same horizontal reference."""
+        """Rotation from the device's navigation frame to the navigation frame with z up and the same horizontal
+        reference.
+        """
         if not self.z_down:
             return IDENTITY
         return FLIP_Y if self.order is EulerOrder.ZXY else FLIP_X
 
     @property
     def words(self) -> str:
-        """The sensor's axes, for people."""
+        """Sensor axes as readable text."""
         forward = "x right, y forward" if self.order is EulerOrder.ZXY else "x forward, y left"
         return f"sensor: {forward}, z up, right-handed"
 
 
 RFU_ENU: Final = DeviceAxes()
-"""Of HiPNUC modules: x right, y forward, z up; navigation frame ENU; ZXY (manual V1.5.9, chapter 9)."""
+"""HiPNUC devices: x right, y forward, z up; navigation frame ENU; ZXY (manual V1.5.9, chapter 9)."""
 FLU_LEVEL: Final = DeviceAxes(order=EulerOrder.ZYX, has_north=False)
-"""Of the Forsense IMU61x, assumed: x forward, y left, z up; level navigation frame; ZYX. Its manual states none."""
+"""Forsense IMU61x, assumed: x forward, y left, z up; level navigation frame; ZYX. The manual states no axes."""
 
 
 def body_axes(convention: Convention) -> Matrix3:
@@ -102,7 +93,7 @@ def body_axes(convention: Convention) -> Matrix3:
 
 
 def navigation_axes(convention: Convention, has_north: bool) -> Matrix3:
-    """Return the rotation from a navigation frame with z up to that of a convention."""
+    """Return the rotation from a navigation frame with z up to the navigation frame of a convention."""
     if convention is Convention.ENU_FLU:
         return IDENTITY
     return ENU_TO_NED if has_north else FLIP_X
@@ -119,7 +110,7 @@ EULER_WORDS: Final = {
 
 
 def navigation_words(convention: Convention, has_north: bool) -> str:
-    """Name the navigation frame of a convention, for people."""
+    """Return a readable name of the navigation frame of a convention."""
     down = convention is Convention.NED_FRD
     if has_north:
         return "NED" if down else "ENU"

@@ -1,13 +1,12 @@
-"""Comparison of gravity with the attitude at rest, which finds wrong conventions and wrong mountings.
+"""Comparison of gravity with the attitude at rest. It finds wrong conventions and wrong mountings.
 
-A device at rest measures nothing but gravity: its acceleration points up. Its attitude says where up is as well. Where
-the two directions are far apart for some seconds, the axes or the order of the angles are not what they are taken for.
-A rotation of all vectors and of the attitude together (the mounting) cannot be seen so; but a body that stands level
-has its z axis up, whatever the attitude says.
+The acceleration of a device at rest points up. The attitude also gives the direction of up. If both directions differ
+for some seconds, the configured axes or the configured order of angles is wrong. This comparison does not detect a
+rotation of vectors and attitude together (mounting). But the z axis of a level body points up.
 
-Rest is an angular rate near zero and an acceleration near g, for WINDOW_NS without a break. What is moved slowly, or
-accelerated along a line for long, may count as at rest: the limits of the angles are wider than the error from that.
-All directions are in the sensor's own axes, as the device sends them.
+Rest is an angular rate near zero and an acceleration near g for WINDOW_NS without a break. A slow rotation or a long
+linear acceleration may count as rest. The limits of the angles are larger than the resulting error. All directions are
+in sensor axes.
 """
 
 from collections.abc import Iterator
@@ -18,71 +17,58 @@ from typing import Final
 
 from imud.attitude.conventions import DeviceAxes, EulerOrder
 from imud.attitude.published import AXES, TO_QUAT
-from imud.attitude.rotation import Matrix3, matrix_from_quat, matrix_times
+from imud.attitude.rotation import Matrix3, dot, matrix_from_quat, matrix_times
 from imud.model.sample import Quaternion, Sample, Vector3
 from imud.model.units import NS_PER_S, STANDARD_GRAVITY_M_S2
 
-WINDOW_NS: Final = 5 * NS_PER_S
-"""Rest of this length is judged."""
-BREAK_NS: Final = 2 * NS_PER_S
-"""Samples further apart do not belong to one window."""
+WINDOW_NS: Final = 5 * NS_PER_S  # duration of rest before an evaluation, ns
+BREAK_NS: Final = 2 * NS_PER_S  # maximum time between two samples of one window, ns
 SAMPLES_MIN: Final = 5
-REST_RAD_S: Final = 0.05
-"""Angular rate at rest, at most: 2.9 °/s, above the bias of a gyroscope without calibration."""
+REST_RAD_S: Final = 0.05  # maximum angular rate at rest, rad/s: 2.9 °/s, above the bias of an uncalibrated gyroscope
 REST_M_S2: Final = 0.03 * STANDARD_GRAVITY_M_S2
-"""Distance of the acceleration from g at rest, at most: an accelerometer without calibration is off by 2 %. A sideways
-acceleration that stays within turns the direction by 14°."""
+"""Maximum difference between the acceleration and g at rest, m/s². The error of an uncalibrated accelerometer is 2 %. A
+sideways acceleration within the limit rotates the direction by up to 14°."""
 CONTRADICTION_DEG: Final = 20.0
-LEVEL_DEG: Final = 45.0
-"""A body that stands level is tilted by less: a ship heels, a vehicle stands on a slope."""
-EXPLAINED_DEG: Final = 10.0
-"""A cause is named where it leaves less than this."""
+LEVEL_DEG: Final = 45.0  # maximum tilt of a level body, degrees: a ship heels, a vehicle stands on a slope
+EXPLAINED_DEG: Final = 10.0  # maximum remaining angle of a possible cause, degrees
 
 
 class Contradiction(StrEnum):
-    """What does not fit gravity."""
+    """Kinds of contradictions to gravity."""
 
-    Z_AXIS = "z-axis"
-    """The z axis points the other way."""
-    ORDER = "euler-order"
-    """The angles turn about other axes."""
-    SIGN = "sign"
-    """An angle has the opposite sign."""
-    ATTITUDE = "attitude"
-    """The attitude, by no simple cause."""
-    MOUNTING = "mounting"
-    """The body does not stand level with the mounting that is given."""
+    Z_AXIS = "z-axis"  # the z axis points in the opposite direction
+    ORDER = "euler-order"  # the angles rotate about other axes
+    SIGN = "sign"  # an angle has the opposite sign
+    ATTITUDE = "attitude"  # the attitude is wrong without a simple cause
+    MOUNTING = "mounting"  # the body is not level with the configured mounting
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A contradiction with its explanation."""
+    """Contradiction with its explanation."""
 
     kind: Contradiction
-    message: str
-    """What is seen, and what to change."""
-    angle_deg: float
-    """Between the two directions of up."""
+    message: str  # observation and next step
+    angle_deg: float  # angle between the two directions of up
 
 
 class GravityCheck:
-    """Compares samples at rest. `add` is cheap, and is meant for some samples a second. One thread."""
+    """Check of samples at rest. `add` is cheap; a few samples per second are enough. One thread."""
 
     def __init__(self, device: DeviceAxes, mounting: Matrix3 | None = None) -> None:
-        """`mounting` is the rotation sensor → body (FLU) of a body that stands level at rest; None for no such."""
+        """`mounting`: rotation sensor → body (FLU) of a body that is level at rest; None: no check of the mounting."""
         self.finding: Finding | None = None
-        """What the last window at rest has shown; None where all fits, or none was judged yet."""
+        """Result of the newest window at rest; None if there is no contradiction or no window."""
         self._device = device
         self._mounting = mounting
         self._seq = 0
         self._begin_ns = self._last_ns = 0
         self._count = 0
         self._accel: Vector3 = (0.0, 0.0, 0.0)
-        self._up: dict[str, Vector3] = {}
-        """Sum of the directions of up, by the member of the sample that says so."""
+        self._up: dict[str, Vector3] = {}  # sum of the directions of up, by the member of the sample
 
     def add(self, sample: Sample) -> bool:
-        """Add a sample; return whether a window was judged with it, so that `finding` is new."""
+        """Add a sample. Return whether it completed a window, so that `finding` is new."""
         accel, gyro = sample.accel_m_s2, sample.gyro_rad_s
         if sample.seq == self._seq or accel is None or gyro is None:
             return False
@@ -119,12 +105,11 @@ class GravityCheck:
 
 
 def cos_deg(angle_deg: float) -> float:
-    """Return the cosine of an angle in degrees."""
     return cos(angle_deg / degrees(1.0))
 
 
 def _directions(device: DeviceAxes, sample: Sample) -> Iterator[tuple[str, Vector3]]:
-    """List where up is in the sensor's axes, by each member that says so."""
+    """Yield the direction of up in sensor axes for each attitude member of the sample."""
     quat, euler = sample.quat_wxyz, sample.euler_rad
     if quat is not None and 0.0 < hypot(*quat) < inf:
         yield "quat_wxyz", _up_of(device, quat)
@@ -133,7 +118,7 @@ def _directions(device: DeviceAxes, sample: Sample) -> Iterator[tuple[str, Vecto
 
 
 def _up_of(device: DeviceAxes, quat: Quaternion) -> Vector3:
-    """Return the third row of the matrix sensor → navigation frame: its z axis as the sensor sees it."""
+    # third row of the matrix sensor → navigation frame: its z axis in sensor axes
     x, y, z = matrix_from_quat(quat)[2]
     return (-x, -y, -z) if device.z_down else (x, y, z)
 
@@ -142,35 +127,35 @@ def _up_of(device: DeviceAxes, quat: Quaternion) -> Vector3:
 
 
 def _explained(device: DeviceAxes, member: str, gravity: Vector3, up: Vector3) -> Finding:
-    """Name the first cause that makes the two directions agree."""
+    """Return the finding with the first cause that makes the two directions agree."""
     angle = _angle_deg(gravity, up)
     seen = (
-        f"at rest the acceleration says that up is {axis_words(gravity)} of the sensor, {member} says "
-        f"{axis_words(up)}, {angle:.0f}° away"
+        f"at rest up is {axis_words(gravity)} of the sensor by the acceleration and "
+        f"{axis_words(up)} by {member}, {angle:.0f}° apart"
     )
     for kind, direction, advice in _causes(device, up):
         if _angle_deg(gravity, direction) < min(EXPLAINED_DEG, angle / 2):
             return Finding(kind, f"{seen}: {advice} (docs/frames.md)", angle)
-    advice = "no single axis or sign explains it; look at the device's own mounting and axis settings"
+    advice = "no single axis or sign explains it; check the mounting and axis settings of the device"
     return Finding(Contradiction.ATTITUDE, f"{seen}: {advice} (docs/frames.md)", angle)
 
 
 def _causes(device: DeviceAxes, up: Vector3) -> Iterator[tuple[Contradiction, Vector3, str]]:
-    """List causes: what up would be, and what to do."""
+    """Yield possible causes: kind, resulting direction of up, next step."""
     x, y, z = up
     zxy = device.order is EulerOrder.ZXY
-    change = "take z_down out of frame" if device.z_down else "set frame: {z_down: true}"
-    yield Contradiction.Z_AXIS, (-x, -y, -z), f"its z axis points the other way; {change}"
+    change = "remove z_down from frame" if device.z_down else "set frame: {z_down: true}"
+    yield Contradiction.Z_AXIS, (-x, -y, -z), f"the z axis points in the opposite direction; {change}"
     roll, pitch = _angles(device, up)
     order = EulerOrder.ZYX if zxy else EulerOrder.ZXY
     other = DeviceAxes(order=order, z_down=device.z_down)
     yield (
         Contradiction.ORDER,
         _up_of(other, TO_QUAT[order]((roll, pitch, 0.0))),
-        f"roll and pitch turn about each other's axes; set frame: {{euler_order: {order}}}",
+        f"the axes of roll and pitch are exchanged; set frame: {{euler_order: {order}}}",
     )
     by_roll, by_pitch = ((-x, y, z), (x, -y, z)) if zxy else ((x, -y, z), (-x, y, z))
-    about = "no mounting makes this; look at the device's own axis settings"
+    about = "no mounting has this effect; check the axis settings of the device"
     yield Contradiction.SIGN, by_roll, f"roll has the opposite sign; {about}"
     yield Contradiction.SIGN, by_pitch, f"pitch has the opposite sign; {about}"
     yield Contradiction.SIGN, (-x, -y, z), f"roll and pitch have the opposite sign; {about}"
@@ -181,7 +166,7 @@ def _causes(device: DeviceAxes, up: Vector3) -> Iterator[tuple[Contradiction, Ve
 
 
 def _angles(device: DeviceAxes, up: Vector3) -> tuple[float, float]:
-    """Return roll and pitch of a device that sees up there."""
+    """Return roll and pitch of a device with this direction of up."""
     sign = -1.0 if device.z_down else 1.0
     x, y, z = (sign * value for value in up)
     if device.order is EulerOrder.ZXY:
@@ -196,30 +181,30 @@ def _not_level(mounting: Matrix3, gravity: Vector3) -> Finding:
     advice = "correct the mounting" if near is None else f"up is the sensor's {near} axis, so axes needs z: {near}"
     return Finding(
         Contradiction.MOUNTING,
-        f"at rest up is {axis_words(gravity)} of the sensor, which frame makes {_direction(body)} of the body: if the "
-        f"body stands level now, {advice}; if it need not be level, set frame: {{level_at_rest: false}} "
+        f"at rest up is {axis_words(gravity)} of the sensor and with frame {_direction(body)} of the body: if the "
+        f"body is level now, {advice}; if it is not always level at rest, set frame: {{level_at_rest: false}} "
         "(docs/frames.md)",
         angle,
     )
 
 
 def _direction(body: Vector3) -> str:
-    """Name the side of the body (FLU) that a direction is nearest to."""
+    """Return the side of the body (FLU) nearest to a direction."""
     names = {"x": "front", "-x": "back", "y": "left", "-y": "right", "z": "top", "-z": "bottom"}
-    return f"the {names[max(AXES, key=lambda name: _dot(AXES[name], body))]}"
+    return f"the {names[max(AXES, key=lambda name: dot(AXES[name], body))]}"
 
 
 def nearest_axis(direction: Vector3) -> str | None:
-    """Return the name of the axis within LEVEL_DEG of a direction; None where two are as near."""
-    name = max(AXES, key=lambda one: _dot(AXES[one], direction))
-    return name if _dot(AXES[name], direction) > cos_deg(LEVEL_DEG) else None
+    """Return the name of the axis within LEVEL_DEG of a direction; None if there is none."""
+    name = max(AXES, key=lambda one: dot(AXES[one], direction))
+    return name if dot(AXES[name], direction) > cos_deg(LEVEL_DEG) else None
 
 
 def axis_words(direction: Vector3) -> str:
-    """Describe a direction by the axis that it is near to, else by its three parts."""
+    """Return the name of the axis near a direction, otherwise its three components."""
     name = nearest_axis(direction)
     x, y, z = direction
-    if name is not None and _dot(AXES[name], direction) > cos_deg(EXPLAINED_DEG):
+    if name is not None and dot(AXES[name], direction) > cos_deg(EXPLAINED_DEG):
         return name if name.startswith("-") else f"+{name}"
     return f"({x:+.2f}, {y:+.2f}, {z:+.2f})"
 
@@ -233,9 +218,5 @@ def _unit(v: Vector3) -> Vector3:
     return (v[0] / norm, v[1] / norm, v[2] / norm)
 
 
-def _dot(a: Vector3, b: Vector3) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def _angle_deg(a: Vector3, b: Vector3) -> float:
-    return degrees(acos(max(-1.0, min(1.0, _dot(a, b)))))
+    return degrees(acos(max(-1.0, min(1.0, dot(a, b)))))

@@ -1,18 +1,18 @@
-"""What is published of a device: its axes, angles and navigation frame, and the rotation of samples into them.
+"""Axes, angles and navigation frame of published samples, and the rotation of samples into them.
 
-With S the device's attitude (sensor → navigation frame, as a matrix), M the rotation sensor → published axes, and N
-that of the navigation frame (declination and convention), every sample is turned once:
+S is the attitude of the device (matrix sensor → navigation frame), M the rotation sensor → published axes, and N the
+rotation of the navigation frame (declination and convention). imud rotates every sample once:
 
     vectors    v' = M · v               accel_m_s2, gyro_rad_s, mag_t
     attitude   S' = N · S · Mᵀ          quat_wxyz; euler_rad is computed from it
 
-A sample with only Euler angles, or only a quaternion, has both afterwards. `incli_rad` and what has no direction stay
-as they are. A rotation by quarter turns only exchanges numbers and signs, so it loses no digit, and an element that is
-NaN stays one element.
+A sample with only Euler angles or only a quaternion gets both. `incli_rad` and values without a direction stay
+unchanged. A rotation by quarter turns only exchanges numbers and signs: no digit is lost, and a NaN stays in one
+element.
 
-Where a device sends angles in part (NaN for the others), what does not depend on the missing ones is published: roll
-and pitch without a yaw; each angle if the sensor lies as its manual draws it; and a yaw alone if the sensor is only
-turned about the vertical, as if the body was level.
+If a device sends some angles as NaN, imud publishes the values that do not depend on them: roll and pitch without yaw;
+each angle if the sensor is mounted as in its manual; yaw alone if the sensor is only rotated about the vertical, as if
+the body were level.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -55,21 +55,19 @@ from imud.model.sample import Quaternion, Sample, Vector3
 
 TO_QUAT: Final = {EulerOrder.ZXY: quat_from_euler312, EulerOrder.ZYX: quat_from_euler_zyx}
 TO_EULER: Final = {EulerOrder.ZXY: euler312_from_quat, EulerOrder.ZYX: euler_zyx_from_quat}
-SAME: Final = 1e-9
-"""Rotations whose elements differ by less are the same."""
+SAME: Final = 1e-9  # maximum difference of the elements of two equal rotations
 
 
 class FrameWords(msgspec.Struct, frozen=True):
-    """Axes and angles of samples, for people."""
+    """Axes and angles of samples as readable text."""
 
-    frame: str
-    """Axes of vectors."""
+    frame: str  # axes of vectors
     euler_convention: str
     navigation_frame: str
 
 
 class Rotation:
-    """A rotation of samples. Immutable."""
+    """Rotation of samples. Immutable."""
 
     def __init__(
         self,
@@ -80,8 +78,9 @@ class Rotation:
         *,
         from_angles: bool = False,
     ) -> None:
-        """`vectors` is M, `navigation` is N, `orders` are those of the angles before and after. `mounting` is the part
-        of M that turns the body, not only names its axes. `from_angles`: the device's quaternion is not used."""
+        """`vectors` is M, `navigation` is N, `orders` are the orders of the angles before and after the rotation.
+        `mounting` is the part of M that rotates the body. `from_angles`: ignore the quaternion of the device.
+        """
         self._turn = _vector_function(vectors)
         self._attitude = _quat_function(navigation, vectors)
         self._to_quat, self._to_euler = TO_QUAT[orders[0]], TO_EULER[orders[1]]
@@ -90,7 +89,7 @@ class Rotation:
         self._from_angles = from_angles
 
     def sample(self, sample: Sample) -> Sample:
-        """Return the sample turned."""
+        """Return the rotated sample."""
         turn = self._turn
         accel, gyro, mag = sample.accel_m_s2, sample.gyro_rad_s, sample.mag_t
         quat, euler = self._turned(sample.quat_wxyz, sample.euler_rad)
@@ -105,7 +104,7 @@ class Rotation:
         )  # fmt: skip
 
     def samples(self, samples: Sequence[Sample]) -> list[Sample]:
-        """Return the samples turned."""
+        """Return the rotated samples."""
         return [self.sample(sample) for sample in samples]
 
     def _turned(self, quat: Quaternion | None, euler: Vector3 | None) -> tuple[Quaternion | None, Vector3 | None]:
@@ -113,7 +112,7 @@ class Rotation:
             try:
                 made = self._attitude(quat)
                 return made, self._to_euler(made)
-            except ValueError:  # without direction: zeros of a device that does not know it yet
+            except ValueError:  # a zero quaternion: the device does not know its attitude yet
                 pass
         if euler is None:
             return None, None
@@ -123,7 +122,7 @@ class Rotation:
         return None, self._in_part(euler)
 
     def _in_part(self, euler: Vector3) -> Vector3 | None:
-        """Turn angles of which some are not finite; None where nothing can be said without them."""
+        """Rotate angles if some are not finite; None if no angle is known without them."""
         known = tuple(map(isfinite, euler))
         filled = tuple(angle if is_known else 0.0 for angle, is_known in zip(euler, known, strict=True))
         roll, pitch, yaw = self._to_euler(self._attitude(self._to_quat((filled[0], filled[1], filled[2]))))
@@ -138,22 +137,17 @@ class Rotation:
 
 @dataclass(frozen=True)
 class PublishedAxes:
-    """Axes, angles and navigation frame of what is published of one device. Made by `published_frame`."""
+    """Axes, angles and navigation frame of the published samples of one device. Made by `published_frame`."""
 
-    device: DeviceAxes
-    """What the device sends, as the configuration has it."""
-    mounting: Matrix3
-    """Rotation sensor → body (FLU)."""
-    convention: Convention | None
-    """None: the device's own axes and angles."""
-    declination_deg: float | None
-    """None: the heading is what the device sends."""
-    from_angles: bool = False
-    """Whether the device's Euler angles count, not its quaternion."""
+    device: DeviceAxes  # axes of the device, with the configuration applied
+    mounting: Matrix3  # rotation sensor → body (FLU)
+    convention: Convention | None  # None: axes and angles of the device
+    declination_deg: float | None  # None: the heading of the device
+    from_angles: bool = False  # whether to use the Euler angles of the device and ignore its quaternion
 
     @cached_property
     def rotation(self) -> Rotation | None:
-        """Rotation of what the codec makes into what is published; None where that is the same."""
+        """Rotation from measurements to published samples; None without a rotation."""
         if self.convention is None and self.declination_deg is None:
             return None
         to_navigation = matrix_product(_about_up(-(self.declination_deg or 0.0)), self.device.to_z_up)
@@ -166,7 +160,7 @@ class PublishedAxes:
         )
 
     def rotation_to(self, convention: Convention) -> Rotation | None:
-        """Return the rotation of what is published into what a reader asks for; None where that is the same."""
+        """Return the rotation from published samples to the convention of a client; None without a rotation."""
         return None if convention is self.convention else self._rotations[convention]
 
     @cached_property
@@ -182,12 +176,12 @@ class PublishedAxes:
 
     @property
     def _body(self) -> Matrix3:
-        """Rotation from the body's axes (FLU) to those that are published."""
+        """Rotation from body axes (FLU) to published axes."""
         return transposed(self.device.to_body) if self.convention is None else body_axes(self.convention)
 
     @property
     def _navigation(self) -> Matrix3:
-        """Rotation from the navigation frame with z up to the one that is published."""
+        """Rotation from the navigation frame with z up to the published navigation frame."""
         if self.convention is None:
             return transposed(self.device.to_z_up)
         return navigation_axes(self.convention, self.device.has_north)
@@ -196,28 +190,28 @@ class PublishedAxes:
     def _order(self) -> EulerOrder:
         return self.device.order if self.convention is None else EulerOrder.ZYX
 
-    # --- for people ---------------------------------------------------------------------------------------------------
+    # --- readable text ---------------------------------------------------------------------------------------------
 
     def heading(self, device: Heading) -> Heading:
-        """Return the reference of the published yaw, from that of the device."""
+        """Return the reference of the published yaw for a reference of the device."""
         if self.declination_deg is None or device is Heading.RELATIVE:
             return device
         return Heading.TRUE
 
     def words(self, euler_convention: str, navigation_frame: str) -> FrameWords:
-        """Describe what is published; the arguments are the driver's own words."""
+        """Return the description of published samples; the arguments are the texts of the driver."""
         if self.convention is None:
             return FrameWords(self.device.words, euler_convention, navigation_frame)
         return self.words_of(self.convention)
 
     def words_of(self, convention: Convention) -> FrameWords:
-        """Describe what a reader gets who asks for a convention."""
+        """Return the description of samples in a convention."""
         navigation = navigation_words(convention, self.device.has_north)
         return FrameWords(BODY_WORDS[convention], EULER_WORDS[convention], navigation)
 
 
 def as_sent(device: DeviceAxes = RFU_ENU) -> PublishedAxes:
-    """Return what is published of a device without `frame` and `convention`."""
+    """Return the published axes of a device without the keys `frame` and `convention`."""
     return PublishedAxes(device, device.to_body, None, None)
 
 
@@ -226,9 +220,10 @@ def _about_up(angle_deg: float) -> Matrix3:
 
 
 def _vector_function(matrix: Matrix3) -> Callable[[Vector3], Vector3]:
-    """Return matrix · v as a function; quarter turns pick elements, so that nothing is rounded and no NaN spreads."""
+    """Return the function v → matrix · v."""
     (a, b, c), (d, e, f), (g, h, i) = matrix
     picks = [[(column, value) for column, value in enumerate(row) if value] for row in matrix]
+    # quarter turns select elements: no rounding, and a NaN stays in one element
     if all(len(pick) == 1 for pick in picks):
         ((i0, s0),), ((i1, s1),), ((i2, s2),) = picks
         return lambda v: (s0 * v[i0], s1 * v[i1], s2 * v[i2])
@@ -241,7 +236,7 @@ def _vector_function(matrix: Matrix3) -> Callable[[Vector3], Vector3]:
 
 
 def _quat_function(navigation: Matrix3, vectors: Matrix3) -> Callable[[Quaternion], Quaternion]:
-    """Return n ⊗ q ⊗ m* as a function: it is linear in q, so it is one matrix of 4 × 4."""
+    """Return the function q → n ⊗ q ⊗ m*, linear in q and therefore one 4 × 4 matrix."""
     n = quat_from_matrix(navigation)
     w, x, y, z = quat_from_matrix(vectors)
     back = (w, -x, -y, -z)
@@ -273,19 +268,16 @@ AXES: Final[Mapping[str, Vector3]] = {
     "z": (0.0, 0.0, 1.0),
     "-z": (0.0, 0.0, -1.0),
 }
-"""An axis of the sensor by its name, as a unit vector."""
-BODY: Final = ("forward", "left", "up")
-"""Meaning of the body's x, y, z."""
-LENGTH_TOLERANCE: Final = 1e-3
-"""Of a quaternion written with four digits."""
-SNAP: Final = 1e-12
-"""Elements this near to 0 and ±1 are meant to be these: the cosine of 90° is 6e-17."""
+"""Unit vector of each sensor axis, by name."""
+BODY: Final = ("forward", "left", "up")  # directions of the body's x, y, z
+LENGTH_TOLERANCE: Final = 1e-3  # maximum length error of a mounting quaternion, for values with four digits
+SNAP: Final = 1e-12  # maximum distance of an element from 0 and ±1 that is rounded: the cosine of 90° is 6e-17
 
 
 def matrix_from_axes(x: str, y: str, z: str) -> Matrix3:
-    """Return the rotation sensor → body by which axis of the sensor points forward, left, up: names of AXES.
+    """Return the rotation sensor → body from the sensor axes that point forward, left and up (names of AXES).
 
-    Raises ValueError where two are along one axis, and where they are left-handed (a mirror image).
+    Raises ValueError for two names of one axis and for left-handed axes (a mirror image).
     """
     names = (x, y, z)
     for number, name in enumerate(names):
@@ -299,31 +291,31 @@ def matrix_from_axes(x: str, y: str, z: str) -> Matrix3:
     if not is_rotation(matrix):
         opposite = z.strip("-") if z.startswith("-") else f"-{z}"
         raise ValueError(
-            f"expected right-handed axes, got a mirror image (x: {x}, y: {y}, z: {z}), which no mounting makes; look "
-            f"at the signs: with these x and y, z is {opposite}"
+            f"expected right-handed axes, got a mirror image (x: {x}, y: {y}, z: {z}); check "
+            f"the signs: with these x and y, z is {opposite}"
         )
     return matrix
 
 
 def matrix_from_angles(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Matrix3:
-    """Return the rotation sensor → body of a sensor that is turned so (ZYX, right-handed about the FLU axes)."""
+    """Return the rotation sensor → body for mounting angles (ZYX, right-handed about the FLU axes)."""
     quat = quat_from_euler_zyx((radians(roll_deg), radians(pitch_deg), radians(yaw_deg)))
     return snapped(matrix_from_quat(quat))
 
 
 def matrix_from_mounting_quat(quat_wxyz: Quaternion) -> Matrix3:
-    """Return the rotation sensor → body of a quaternion. Raises ValueError where its length is not 1."""
+    """Return the rotation sensor → body for a quaternion. Raises ValueError if its length is not 1."""
     length = hypot(*quat_wxyz)
     if not abs(length - 1.0) <= LENGTH_TOLERANCE:
-        raise ValueError(f"expected a quaternion of length 1 (scalar first), got one of length {length:.6g}")
+        raise ValueError(f"expected a quaternion of length 1 (scalar first), got length {length:.6g}")
     return snapped(matrix_from_quat(quat_wxyz))
 
 
 def levelling(convention: Convention, roll_deg: float, pitch_deg: float, heading_deg: float) -> Matrix3:
-    """Return the rotation of the body's axes (FLU) that takes away errors of the mounting.
+    """Return the rotation of the body axes (FLU) that corrects mounting errors.
 
-    `roll_deg` and `pitch_deg` are read while the body is level, in the convention that is published; `heading_deg` is
-    added to the heading (clockwise from above).
+    `roll_deg` and `pitch_deg` are the published angles of a level body. `heading_deg` is added to the heading,
+    clockwise from above.
     """
     if not (roll_deg or pitch_deg or heading_deg):
         return IDENTITY
@@ -332,12 +324,12 @@ def levelling(convention: Convention, roll_deg: float, pitch_deg: float, heading
 
 
 def mounted(mounting: Matrix3, level: Matrix3) -> Matrix3:
-    """Return the whole rotation sensor → body."""
+    """Return the complete rotation sensor → body."""
     return snapped(matrix_product(level, mounting))
 
 
 def snapped(matrix: Matrix3) -> Matrix3:
-    """Replace elements that are 0 or ±1 but for rounding."""
+    """Return the matrix with elements near 0 and ±1 rounded."""
     first, second, third = (tuple(_snapped(value) for value in row) for row in matrix)
     return (_vector(first), _vector(second), _vector(third))
 
@@ -357,52 +349,53 @@ Turn = Annotated[float, Meta(ge=-360, le=360)]
 
 
 class MountingAxes(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The axis of the sensor that each axis of the body is."""
+    """Sensor axis for each body axis."""
 
     x: AxisName
-    """The axis of the sensor that points forward in the body."""
+    """Sensor axis that points forward in the body."""
     y: AxisName
-    """The one that points to the left."""
+    """Sensor axis that points to the left."""
     z: AxisName
-    """The one that points up."""
+    """Sensor axis that points up."""
 
 
 class MountingAngles(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How the sensor is turned in the body, from its axes along the body's (x forward, y left, z up)."""
+    """Rotation of the sensor in the body, from sensor axes along the body axes (x forward, y left, z up)."""
 
     roll_deg: Turn = 0.0
-    """Last, about x (forward), right-handed: positive with the left side up."""
+    """Third rotation, about x (forward), right-handed: positive with the left side up."""
     pitch_deg: Turn = 0.0
-    """Second, about y (left), right-handed: positive with the front down."""
+    """Second rotation, about y (left), right-handed: positive with the front down."""
     yaw_deg: Turn = 0.0
-    """First, about z (up), right-handed: positive to the left."""
+    """First rotation, about z (up), right-handed: positive to the left."""
 
 
 class FrameOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How a sensor lies in its body: one of `axes`, `euler`, `quat_wxyz`, or none: as its manual says."""
+    """Mounting of a sensor in its body: one of `axes`, `euler`, `quat_wxyz`; otherwise as in its manual."""
 
     axes: MountingAxes | None = None
-    """Which axis of the sensor points forward (`x`), to the left (`y`) and up (`z`), for example x: y, y: -x, z: z."""
+    """Sensor axes that point forward (`x`), to the left (`y`) and up (`z`), for example x: y, y: -x, z: z."""
     euler: MountingAngles | None = None
-    """How the sensor is turned in the body: `yaw_deg` about z, then `pitch_deg` about y, then `roll_deg` about x."""
+    """Rotation of the sensor in the body: `yaw_deg` about z, then `pitch_deg` about y, then `roll_deg` about x."""
     quat_wxyz: Annotated[list[float], Meta(min_length=4, max_length=4)] | None = None
-    """Rotation from the sensor's axes to the body's, scalar first, of length 1."""
+    """Rotation from sensor axes to body axes, scalar first, of length 1."""
     z_down: bool = False
-    """Whether the sensor's own z axis points down when it lies as its manual says, and its angles count so."""
+    """Whether the z axis of the sensor points down in the mounting of its manual; the angles use the same axes."""
     euler_order: EulerOrder | None = None
-    """Order of the device's angles where it is not the driver's: zyx (x forward) or zxy (y forward)."""
+    """Order of the device's angles, if it differs from the driver: zyx (x forward) or zxy (y forward)."""
     level_roll_deg: Annotated[float, Meta(ge=-45, le=45)] = 0.0
-    """Roll as imud shows it, without this key, while the body is level; it is taken away."""
+    """Published roll of a level body without this key; imud subtracts it."""
     level_pitch_deg: Annotated[float, Meta(ge=-45, le=45)] = 0.0
-    """Pitch as imud shows it, without this key, while the body is level; it is taken away."""
+    """Published pitch of a level body without this key; imud subtracts it."""
     heading_offset_deg: Turn = 0.0
-    """Added to the heading, clockwise from above: the sensor points so far to the left of the body's front."""
+    """Angle that imud adds to the heading, clockwise from above. Positive if the sensor points to the left of the
+    body's front."""
     level_at_rest: bool = True
-    """Whether the body stands level within 45° when it is at rest: imud says when the mounting contradicts that."""
+    """Whether the body is level within 45° at rest. Then imud reports a mounting that contradicts gravity."""
 
     @property
     def has_mounting(self) -> bool:
-        """Whether the file gives a rotation, other than that of the driver or of `z_down`."""
+        """Whether the configuration gives a rotation in addition to `z_down`."""
         return self.axes is not None or self.euler is not None or self.quat_wxyz is not None
 
 
@@ -410,13 +403,13 @@ NO_FRAME: Final = FrameOptions()
 
 
 def axes_of(frame: FrameOptions, device: DeviceAxes) -> DeviceAxes:
-    """Return the axes and angles of a device as the configuration has them, in place of those of its driver."""
+    """Return the axes and angles of a device from the configuration, otherwise from its driver."""
     order = device.order if frame.euler_order is None else frame.euler_order
     return DeviceAxes(order=order, has_north=device.has_north, z_down=frame.z_down)
 
 
 def mounting_of(frame: FrameOptions, device: DeviceAxes) -> Matrix3:
-    """Return the rotation sensor → body (FLU) that the file gives, else that of `device`. Raises ValueError."""
+    """Return the rotation sensor → body (FLU) from the configuration, otherwise from `device`. Raises ValueError."""
     if frame.axes is not None:
         return matrix_from_axes(frame.axes.x, frame.axes.y, frame.axes.z)
     if frame.euler is not None:
@@ -428,7 +421,7 @@ def mounting_of(frame: FrameOptions, device: DeviceAxes) -> Matrix3:
 
 
 def rotation_of(frame: FrameOptions, device: DeviceAxes, convention: Convention) -> Matrix3:
-    """Return the whole rotation sensor → body (FLU), errors of the mounting taken away. Raises ValueError."""
+    """Return the complete rotation sensor → body (FLU), with corrected mounting errors. Raises ValueError."""
     level = levelling(convention, frame.level_roll_deg, frame.level_pitch_deg, frame.heading_offset_deg)
     return mounted(mounting_of(frame, device), level)
 
@@ -436,7 +429,7 @@ def rotation_of(frame: FrameOptions, device: DeviceAxes, convention: Convention)
 def published_frame(
     frame: FrameOptions | None, convention: Convention | None, declination_deg: float | None, device: DeviceAxes
 ) -> PublishedAxes:
-    """Return what is published of a device whose driver gives its axes as `device`. Raises ValueError."""
+    """Return the published axes of a device. `device` contains the axes of its driver. Raises ValueError."""
     if frame is None:
         return PublishedAxes(device, device.to_body, convention, declination_deg)
     wanted = convention or Convention.ENU_FLU

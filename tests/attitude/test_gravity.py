@@ -109,11 +109,11 @@ ORDER, SIGN = Contradiction.ORDER, Contradiction.SIGN
 @pytest.mark.parametrize(
     ("device", "sample", "kind", "words"),
     [
-        (FRD, zyx(10, 5), Contradiction.Z_AXIS, "take z_down out of frame"),
+        (FRD, zyx(10, 5), Contradiction.Z_AXIS, "remove z_down from frame"),
         (
             FLU_LEVEL, zyx(0, 0, z_down=True), Contradiction.Z_AXIS,
-            "at rest the acceleration says that up is -z of the sensor, quat_wxyz says +z, 180° away: its z axis "
-            "points the other way; set frame: {z_down: true} (docs/frames.md)",
+            "at rest up is -z of the sensor by the acceleration and +z by quat_wxyz, 180° apart: the z axis points in "
+            "the opposite direction; set frame: {z_down: true} (docs/frames.md)",
         ),
         # a device with ZXY that is taken for one with ZYX, and the reverse
         *((FLU_LEVEL, turned(zxy(*at), quat_from_euler_zyx), ORDER, "{euler_order: zxy}") for at in LEANING),
@@ -126,7 +126,7 @@ ORDER, SIGN = Contradiction.ORDER, Contradiction.SIGN
         (FLU_LEVEL, seen_as(zyx(20, 60), zyx(60, 20)), ORDER, "roll and pitch are exchanged"),
         (FLU_LEVEL, replace(zyx(0, 0), accel_m_s2=OBLIQUE), Contradiction.ATTITUDE, "(+0.50, +0.60, +0.62)"),
         # the quaternion agrees, the angles do not
-        (FLU_LEVEL, replace(zyx(0, 0), euler_rad=(radians(30), 0.0, 0.0)), Contradiction.ATTITUDE, "euler_rad says"),
+        (FLU_LEVEL, replace(zyx(0, 0), euler_rad=(radians(30), 0.0, 0.0)), Contradiction.ATTITUDE, " by euler_rad, "),
     ],
 )  # fmt: skip
 def test_a_contradiction_has_its_cause(device: DeviceAxes, sample: Sample, kind: Contradiction, words: str) -> None:
@@ -148,7 +148,7 @@ def test_a_contradiction_has_its_cause(device: DeviceAxes, sample: Sample, kind:
     ],
 )
 def test_a_body_that_does_not_stand_level(axes: tuple[str, str, str], sample: Sample, side: str) -> None:
-    words = f"makes the {side} of the body"
+    words = f"with frame the {side} of the body"
     finding = contradiction(FLU_LEVEL, sample, Contradiction.MOUNTING, words, matrix_from_axes(*axes))
     up = nearest_axis(sample.accel_m_s2 or (0, 0, 0))
     assert f"axes needs z: {up};" in finding.message

@@ -94,7 +94,7 @@ def test_the_pipe_is_as_large_as_the_kernel_allows(file: Path, monkeypatch: pyte
 
 def test_an_error_of_the_player_comes_out(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"\x89imudREC" + bytes(100))
-    with pytest.raises(ImudError, match="no whole block"):
+    with pytest.raises(ImudError, match="at least one complete block"):
         play_beside(tmp_path / "a", KeepingSink(), [], lambda _at: None)
 
 

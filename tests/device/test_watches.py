@@ -193,7 +193,7 @@ def test_z_down_is_found_and_cured_either_way() -> None:
     assert right.euler_deg == pytest.approx(BODY_DEG, abs=1e-3)
     made = played("imu61x-uart", in_body(FrameOptions(), device=FLU_LEVEL), frame=FrameOptions(z_down=True))
     (event,) = made.events
-    assert "take z_down out of frame" in event.message
+    assert "remove z_down from frame" in event.message
 
 
 def test_a_wrong_order_of_angles_is_found() -> None:
