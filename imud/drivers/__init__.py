@@ -1,4 +1,4 @@
-"""Wire protocols, a folder each: codec, session, actions, and `driver.py` with the row that names them. No I/O."""
+"""Wire protocols, one folder or module each: codec, commands, settings and the registry row in `driver.py`. No I/O."""
 
 from imud.contracts.driver import Driver
 from imud.contracts.registry import Registry

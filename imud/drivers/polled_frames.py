@@ -1,4 +1,4 @@
-"""Decoding of frames read from a polled device: absent, damaged, stale (the same as before), or a new measurement."""
+"""Decoder for frames of a polled device: absent, damaged, stale (same bytes as before), or a new measurement."""
 
 from collections.abc import Callable, Sequence
 
@@ -6,19 +6,17 @@ from imud.contracts.codec import BadFrame, BadReason, PolledEvent, Vanished
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 
-Measured = tuple[Measurement, bool]
-"""A measurement, and whether all of its values were finite."""
+Measured = tuple[Measurement, bool]  # a measurement, and whether all its values were finite
 
 
 class PolledFrameDecoder:
     """Decoder of frames of fixed size with a check value, one per transfer. Synchronization: one thread.
 
-    In the ledger a stale frame is a good one that is ignored; one that shows an absent device is skipped bytes.
+    The ledger counts a stale frame as good and ignored, and a frame of an absent device as skipped bytes.
     """
 
     def __init__(self, ledger: Ledger, size_bytes: int) -> None:
-        self.stale = 0
-        """Good frames that had the same bytes as the one before."""
+        self.stale = 0  # number of good frames with the same bytes as the previous frame
         self._ledger = ledger
         self._size_bytes = size_bytes
         self._last = b""
@@ -29,7 +27,9 @@ class PolledFrameDecoder:
         bad: Callable[[bytes], BadReason | None],
         measure: Callable[[bytes], Measured],
     ) -> Sequence[PolledEvent]:
-        """Decode one frame: `bad` returns why it is damaged, `measure` is called for new good ones. Never raises."""
+        """Decode one frame. `bad` returns the reason for damage, `measure` decodes a new good frame. Never raises an
+        exception.
+        """
         ledger = self._ledger
         ledger.bytes_in += len(data)
         if len(data) != self._size_bytes or (why := absence(data)):
@@ -59,7 +59,7 @@ class PolledFrameDecoder:
         return (BadFrame(BadReason.NOT_FINITE, data), measurement)
 
     def add_reply(self, data: bytes, *, good: bool) -> None:
-        """Count in the ledger what was read of other registers than those of the samples."""
+        """Count a reply from registers other than the sample registers in the ledger."""
         ledger = self._ledger
         ledger.bytes_in += len(data)
         if good:
@@ -70,7 +70,7 @@ class PolledFrameDecoder:
             ledger.bytes_skipped += len(data)
 
     def reset(self) -> None:
-        """Forget the last frame: the next one is new, even with the same bytes."""
+        """Forget the previous frame: the next frame is new, even with the same bytes."""
         self._last = b""
 
 
@@ -79,13 +79,13 @@ _ZEROS = frozenset({0x00})
 
 
 def absence(data: bytes) -> str:
-    """Return why these bytes come from a line that no device drives; empty if they may be of a device."""
+    """Return why these bytes come from a bus without a device; empty if a device may have sent them."""
     first = data[:1]
     if first not in (b"\xff", b"\x00", b""):
         return ""
     seen = frozenset(data)
     if seen == _ONES:
-        return "only 0xFF is read: is it powered, is its data line wired?"
+        return "received only 0xFF; check the power and the data wire of the device"
     if seen == _ZEROS or not seen:
-        return "only 0x00 is read: is it powered, is its data line wired?"
+        return "received only 0x00; check the power and the data wire of the device"
     return ""

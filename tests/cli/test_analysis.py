@@ -100,7 +100,7 @@ def test_a_report_for_a_supplier(resting_file: Path, tmp_path: Path, cli: Cli, e
 
 
 def test_without_a_sheet_the_report_says_what_the_manual_has(resting_file: Path, cli: Cli) -> None:
-    assert "no figure of noise for any model" in " ".join(cli("noise", "--for", "20s", resting_file).out.split())
+    assert "no noise figures for any model" in " ".join(cli("noise", "--for", "20s", resting_file).out.split())
 
 
 # --- recordings -------------------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ def test_calibrations_are_listed_verified_and_saved(daemon: RunningDaemon, cli: 
     assert "magnetometer_once" in out
     assert "until power-off; it cannot be saved" in out
     out = cli(*words, "level", "--yes", "--save").out
-    assert "  1. Put the module down in the attitude that is to be level, and do not touch it.\n" in out
+    assert "  1. Put the device down in the attitude that must be level, and do not touch it.\n" in out
     assert "\nverified\n  roll: " in out
     assert "°, limit 0.5°: passed\n  saved\n" in out
     *events, result = map(json.loads, cli(*words, "heading", "--yes", "--json").out.splitlines())

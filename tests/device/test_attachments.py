@@ -139,7 +139,7 @@ async def test_reset_is_offered_with_a_line_only_and_also_while_no_device_is_fou
     async with polled(bench) as it:
         assert "trigger" not in it.rig.device.actions  # it has lines, and no SIN
         it.hang()
-        await it.rig.until(lambda: "only 0xFF" in it.rig.device.status().problem, "searching")
+        await it.rig.until(lambda: "received only 0xFF" in it.rig.device.status().problem, "searching")
         with pytest.raises(BadArgument, match="hard"):
             await it.rig.device.act("reset", {"hard": True})
         await it.rig.until(lambda: it.line.is_open, "open")

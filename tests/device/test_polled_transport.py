@@ -93,8 +93,8 @@ async def test_without_a_known_update_rate_the_error_is_the_time_since_the_last_
 
 
 SPI_FAULTS: list[tuple[dict[str, Any], str]] = [
-    ({"line": 0xFF}, "only 0xFF"),
-    ({"line": 0x00}, "only 0x00"),
+    ({"line": 0xFF}, "received only 0xFF"),
+    ({"line": 0x00}, "received only 0x00"),
     ({"error": errno.EIO}, "transfer failed"),
     ({"error": errno.ETIMEDOUT}, "held low"),
     ({"flips": 10**6}, "damaged frames"),
@@ -223,7 +223,7 @@ async def test_setting_that_does_not_take_keeps_it_from_running(bench: PolledBus
     device.faults.ignores_writes = True
     config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 1}, gyro_filter=2)
     async with bench.running(config) as (rig,):
-        await rig.until(lambda: "read back 0xbb" in rig.device.status().problem, "told")
+        await rig.until(lambda: "after the write, got 0xbb" in rig.device.status().problem, "told")
         assert rig.state is DeviceState.SEARCHING
         assert not rig.samples
 
@@ -400,7 +400,7 @@ async def test_settings_are_applied_and_read_again_after_an_action(bench: Polled
         assert isinstance(answer, dict)
         assert answer["gyro_filter"] == rig.device.status().settings["gyro_filter"] == "10 Hz"
         device.faults.ignores_writes = True
-        with pytest.raises(DeviceRefused, match="FILTER_CTRL: wrote 0xd0, read back 0xd4"):
+        with pytest.raises(DeviceRefused, match="FILTER_CTRL: expected 0xd0 after the write, got 0xd4"):
             await rig.device.act("filter", {"gyro_filter": 0})
         assert rig.device.status().settings["gyro_filter"] == "10 Hz"
         await rig.until_samples(5)

@@ -107,7 +107,7 @@ async def test_a_device_that_refuses_all_orders_is_left_as_it_was(bench: Variant
             await bench.device.act(name, {})
     applied = await bench.device.settings_apply({"output_rate_hz": 10}, save=True)
     assert [step.outcome for step in applied.steps] == [StepOutcome.FAILED]
-    assert "reads back as 50" in applied.problem
+    assert "after the write, got 50" in applied.problem
     assert (bench.module.settings, bench.module.flash) == (SLOW, SLOW)
     await bench.samples()
 

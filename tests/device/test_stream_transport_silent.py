@@ -41,7 +41,7 @@ def turns(device: LinkedDevice) -> list[EventKind]:
     ("settings", "why", "link"),
     [
         (NO_RATE, "no message has a rate", LINKS[0]),
-        (ON_MARK, "HI91 on mark, one for each pulse on SIN", LINKS[1]),
+        (ON_MARK, "HI91 on mark, one frame for each pulse on SIN", LINKS[1]),
         (NO_RATE, "no message has a rate", LINKS[2]),
     ],
 )
@@ -192,7 +192,7 @@ async def test_after_an_action_that_fails_the_settings_are_what_the_module_has(d
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
     device.module.receive(b"CONFIG ATT MODE 1\r\n", device.clock.now_ns())  # by somebody else
     await device.wait(0.1)
-    with pytest.raises(CommandError, match="the module refused"):
+    with pytest.raises(CommandError, match="the device rejected the request"):
         await device.act("level", level="automatic")
     assert device.device.status().settings["mode"] == "9-axis"
 
@@ -217,7 +217,7 @@ async def test_status_bits_and_settings_are_shown_by_name(device: LinkedDevice) 
 
 @played(lambda: LinkedDevice(lines=DeviceLines(sout_div=DividedOptions(line="A", divisor=4))))
 async def test_lines_that_the_module_contradicts_are_events_and_shown(device: LinkedDevice) -> None:
-    words = "divisor is 4 in the configuration, and the module divides SOUT by 8"
+    words = "expected divisor 4 from the configuration, got 8 from the device"
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
     assert device.messages.count(f"line sout_div: {words}") == 1
     await device.act("mode", axes=9)
@@ -232,7 +232,7 @@ async def test_output_that_is_declared_to_be_off_is_not_switched_on(device: Link
     device.module.receive(b"LOG DISABLE\r\n", device.clock.now_ns())
     await device.wait(20)
     assert device.samples == []
-    assert "its output is off (LOG DISABLE), though HI91 has 100 Hz" in device.problem
+    assert "its output is disabled (LOG DISABLE); HI91 has the rate 100 Hz" in device.problem
 
 
 @pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARIANTS)

@@ -41,7 +41,7 @@ def test_rows_are_complete(name: str) -> None:
 
     sheet = DRIVERS[name].data_sheet
     assert "manual" in sheet.document
-    assert "no figure of noise" in sheet.document
+    assert "no noise figures" in sheet.document
     assert not sheet.models
     assert sheet.figures_of("HI14") is None
 
@@ -62,7 +62,7 @@ def test_calibrations_filters_and_figures_by_the_longest_begin_of_a_name() -> No
         words = DRIVERS[name].data_sheet.filter_words
         assert words({"gyro_filter": "10 Hz", "accel_filter": "average 16"}, "gyro") == "low-pass 10 Hz"
         assert words({"gyro_filter": "10 Hz", "accel_filter": "average 16"}, "accel") == "low-pass average 16"
-        assert words({}, "accel") == "low-pass 47 Hz as delivered; it was not read back"
+        assert words({}, "accel") == "low-pass 47 Hz (factory setting; imud has not read the filter)"
     assert DRIVERS["hipnuc-uart"].data_sheet.filter_words({}, "gyro") == ""
 
     family, model = ModelFigures(source="a"), ModelFigures(gyro=SensorFigures(random_walk=1e-4), source="b")

@@ -52,8 +52,8 @@ FAULTS: dict[str, tuple[dict[str, object], str]] = {
     "not acknowledged, as on a Raspberry Pi": ({"error": errno.EREMOTEIO}, "no acknowledgement"),
     "bus stuck": ({"error": errno.ETIMEDOUT}, "held low"),
     "arbitration lost again and again": ({"error": errno.EAGAIN}, "transfer failed"),
-    "line high": ({"line": 0xFF}, "only 0xFF"),
-    "line low": ({"line": 0x00}, "only 0x00"),
+    "line high": ({"line": 0xFF}, "received only 0xFF"),
+    "line low": ({"line": 0x00}, "received only 0x00"),
     "wrong id": ({"product_id": b"\x00\x00ICM206"}, "product id"),
     "damaged for good": ({"flips": 1000}, "damaged frames"),
 }

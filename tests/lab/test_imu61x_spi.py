@@ -85,8 +85,8 @@ def test_kind_of_burst_in_every_variant(spi8: Bus[SpiTransfer], variant: str, bu
 
 
 FAULTS: dict[str, tuple[dict[str, object], str]] = {
-    "unplugged, line high": ({"line": 0xFF}, "only 0xFF"),
-    "unplugged, line low": ({"line": 0x00}, "only 0x00"),
+    "unplugged, line high": ({"line": 0xFF}, "received only 0xFF"),
+    "unplugged, line low": ({"line": 0x00}, "received only 0x00"),
     "wrong id": ({"product_id": b"\x00\x00ICM206"}, "PROD_ID"),
     "bus stuck": ({"error": errno.ETIMEDOUT}, "held low"),
     "controller error": ({"error": errno.EIO}, "transfer failed"),
@@ -152,7 +152,7 @@ def test_absent_device_does_not_hold_up_its_neighbour(spi8: Bus[SpiTransfer]) ->
         async with running(*configs) as (absent, there):
             await there.until_samples(30, LIMIT_S)
             assert absent.state is DeviceState.SEARCHING
-            await absent.until(lambda: "only 0x00" in absent.device.status().problem, "the reason", LIMIT_S)
+            await absent.until(lambda: "received only 0x00" in absent.device.status().problem, "the reason", LIMIT_S)
 
     asyncio.run(body())
 

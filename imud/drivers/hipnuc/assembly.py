@@ -1,28 +1,27 @@
 """Assembly of samples from frames without counter and time (CANopen TPDOs, J1939 and NMEA 2000 PGNs).
 
 A device sends the frames of one instant back to back, always in the same order: a burst. Each kind of frame (a TPDO, a
-PGN) has its own rate; the fastest kinds are in every burst, a slower one in every m-th. **Frames of two periods are
-never mixed.** The rule:
+PGN) has its own rate. The fast kinds are in every burst, a slow kind is in every m-th burst. **A sample never contains
+frames of two periods.** The rules:
 
-- Which kinds there are, their order, the period and every m are learned by what is heard. Frames until then, four
-  periods of the fastest kind, and two of its own for each slower one, are ignored. One that joins the fast ones later
-  is ignored for six.
-- A sample begins with the frame that begins a burst. It is whole, and made at once, when all kinds are held that are
-  due in this burst: the fast ones, and those of which the last came m bursts ago (or 2 m, 3 m … where one was lost).
-- It ends when a kind comes that is already held (but an exact repetition right after itself is ignored), or a fast one
-  that stands before the newest one held, or any frame later than 3/4 of a period after the first, or when frames are
-  known to be missing (`reset`). Then it is dropped, as one lost sample; or, if all it lacks is slower kinds, it is a
-  sample without them (but not after `reset`, nor for a device with one fast kind, whose next sample is whole already).
-- A frame that does not begin a burst while nothing is held is ignored: what it belongs to is whole, or dropped, or
-  has lost its beginning. A slower kind that is not due is ignored, and shows that its m has to be learned anew.
-- Bursts of which nothing came are counted by time (`burst_timing`): a gap up to 1 s is loss. A host or a sender that
-  stalls between two bursts, which then come later and back to back, costs nothing.
-- A kind that stays away for ten of its periods is taken as switched off; another one that comes, joins. When nothing
-  fits any more, everything is learned again.
+- imud learns the kinds, their order, the period and every m from the received frames. It ignores all frames until then:
+four periods of the fast kinds and two periods of each slow kind. It ignores a new fast kind for six bursts.
+- The first frame of a burst starts a sample. The sample is complete when it contains all due kinds: the fast kinds and
+each slow kind whose last frame is m bursts old (or 2 m, 3 m … after a loss).
+- A sample ends early at a kind that it already contains (except an exact repetition), at a fast kind before the newest
+frame in the order, at a frame more than 3/4 of a period after the first frame, and at lost frames (`reset`). imud then
+counts a lost sample. If only slow kinds are missing, imud makes the sample without them. It does not do so after
+`reset`, or with one fast kind, because then the next sample is already complete.
+- Without a started sample, imud ignores all frames except the first kind of a burst. It ignores a slow kind that is not
+due and learns its m again.
+- imud counts bursts without any frame by time (`Cadence`): a gap up to 1 s is loss. If a host or a sender stalls and
+the bursts then arrive late and back to back, no sample is lost.
+- A kind that is missing for ten of its periods counts as switched off. A new kind joins. If too many frames do not fit,
+imud learns everything again.
 
-A kind whose period is no whole multiple of the fastest one's has no place in this and stays ignored. What time alone
-can show (the end of one burst and the beginning of the next are lost, unknown to the host) needs times of arrival that
-are right to 1/4 of a period; those of the kernel are.
+A kind with a period that is not a multiple of the fast period is never part of a sample. If the end of one burst and
+the start of the next burst are lost, only the arrival times show the loss. They must be exact within 1/4 of a period,
+as the time stamps of the kernel are.
 """
 
 from collections.abc import Container, Sequence
@@ -33,32 +32,27 @@ from typing import Final, NamedTuple
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S
 
-PERIODS: Final = 4
-"""Periods that must look alike."""
-STEPS_MAX: Final = 64
-"""Number of periods to average where arrival times vary so much that four periods are never alike."""
-FRAMES_MAX: Final = 128
-"""Frames kept while learning; they have room for four periods of more kinds than any device has."""
+PERIODS: Final = 4  # number of equal periods before imud uses a period
+STEPS_MAX: Final = 64  # number of periods for a mean if the arrival times vary too much for PERIODS equal periods
+FRAMES_MAX: Final = 128  # maximum number of frames during learning: enough for four periods of any device
 
 
 class Learned(NamedTuple):
-    """Learned properties of a device's bursts."""
+    """Properties of the bursts of a device."""
 
-    order: tuple[int, ...]
-    """Kinds that are in every burst, as they are sent."""
-    period_ns: int
-    """From burst to burst."""
+    order: tuple[int, ...]  # kinds in every burst, in their order
+    period_ns: int  # time between two bursts, ns
 
 
 class BurstLearning:
-    """Learning from frames in the order they arrive. Synchronization: one thread."""
+    """Learning of the bursts from frames in the order of their arrival. Synchronization: one thread."""
 
     def __init__(self) -> None:
         self._frames: list[tuple[int, int]] = []
         self._steps: list[int] = []
 
     def add_frame(self, kind: int, t_ns: int) -> Learned | None:
-        """Add the kind and time of arrival of one frame; return the bursts once they are known."""
+        """Add the kind and the arrival time of one frame. Return the properties of the bursts once they are known."""
         frames = self._frames
         frames.append((kind, t_ns))
         places = [place for place, (other, _) in enumerate(frames) if other == kind]
@@ -82,7 +76,7 @@ class BurstLearning:
 
 
 def _in_every(slices: Sequence[Sequence[tuple[int, int]]]) -> tuple[int, ...] | None:
-    """Return the kinds that occur once in every slice, if their order is the same in all; else None."""
+    """Return the kinds that occur once in every slice, if their order is the same in all slices; otherwise None."""
     common = set.intersection(*({kind for kind, _ in one} for one in slices))
     orders = {tuple(kind for kind, _ in one if kind in common) for one in slices}
     order = orders.pop()
@@ -90,7 +84,7 @@ def _in_every(slices: Sequence[Sequence[tuple[int, int]]]) -> tuple[int, ...] | 
 
 
 def _from_head(order: tuple[int, ...], frames: Sequence[tuple[int, int]]) -> tuple[int, ...]:
-    """The same cycle of kinds, begun after the longest pause; the lowest kind where all pauses are alike."""
+    """Return the cycle of kinds, started after the longest pause; with the lowest kind if all pauses are equal."""
     heard = [(kind, t_ns) for kind, t_ns in frames if kind in order]
     pauses: dict[int, list[int]] = {kind: [0] for kind in order}
     for (_, before_ns), (kind, t_ns) in pairwise(heard):
@@ -100,16 +94,12 @@ def _from_head(order: tuple[int, ...], frames: Sequence[tuple[int, int]]) -> tup
     return order[begin:] + order[:begin]
 
 
-SILENCE_NS: Final = NS_PER_S
-"""A longer gap is silence of the device, not loss."""
-PERIOD_LEAST_NS: Final = NS_PER_MS
-"""Shortest period: no device sends faster than 1 kHz."""
-STEADY_BURSTS: Final = 2
-"""Number of bursts at the usual distance after which no delayed burst is expected any more."""
+SILENCE_NS: Final = NS_PER_S  # Maximum gap that counts as loss, ns. After a longer gap the device was silent.
+PERIOD_LEAST_NS: Final = NS_PER_MS  # minimum period, ns: no device sends faster than 1 kHz
+STEADY_BURSTS: Final = 2  # number of bursts at the normal distance after which imud expects no delayed burst
 ODD_BURSTS: Final = 8
-"""Number of distances in a row, all shorter or all longer and within 1/4 of each other, that are another rate."""
-SMOOTHING: Final = 16
-"""Weight of what is known of the period against one more distance."""
+"""Number of consecutive distances, all shorter or all longer and equal within 1/4, that mean a new rate."""
+SMOOTHING: Final = 16  # weight of the known period against one new distance
 
 
 class Cadence:
@@ -118,24 +108,23 @@ class Cadence:
     __slots__ = ("_late_ns", "_newest_ns", "_odd_ns", "_silent", "_steady", "period_ns")
 
     def __init__(self, period_ns: int, newest_ns: int) -> None:
-        """`newest_ns`: arrival of the newest burst."""
-        self.period_ns = max(period_ns, PERIOD_LEAST_NS)
-        """Between two bursts."""
+        """`newest_ns`: arrival time of the newest burst."""
+        self.period_ns = max(period_ns, PERIOD_LEAST_NS)  # time between two bursts, ns
         self._newest_ns = newest_ns
-        self._late_ns = 0
-        """Lateness that may still be made up for."""
+        self._late_ns = 0  # delay that short distances may still make up for, ns
         self._silent = False
         self._steady = 0
         self._odd_ns: list[int] = []
 
     @property
     def is_late(self) -> bool:
-        """Whether a gap is not settled yet."""
+        """Whether the number of missing bursts in the newest gap is still unknown."""
         return self._late_ns > 0
 
     def begin(self, t_ns: int) -> tuple[int, int]:
-        """A burst begins to arrive: returns how many bursts are now known to be missing in a gap before it (`is_late`
-        since), and how many of those are loss."""
+        """Start a burst. Return the number of bursts that are now known to be missing in the last gap, and how many of
+        them are lost.
+        """
         step_ns, period_ns = t_ns - self._newest_ns, self.period_ns
         self._newest_ns = t_ns
         if 4 * step_ns > 5 * period_ns:
@@ -168,7 +157,7 @@ class Cadence:
             self._add_odd(step_ns, -1)
 
     def _add_odd(self, step_ns: int, side: int) -> None:
-        """Adopt another rate; what was late by the old one was not."""
+        """Use a new rate after ODD_BURSTS similar distances. A delay relative to the old rate is then not a delay."""
         odd = self._odd_ns
         if odd and ((odd[0] - self.period_ns) * side < 0 or 4 * abs(step_ns - odd[0]) > odd[0]):
             odd.clear()
@@ -185,43 +174,38 @@ class Cadence:
         return missed, lost
 
 
-AWAY_PERIODS: Final = 10
-"""Of a kind, until it is taken as switched off."""
-DROPPED_MAX: Final = 16
-"""Samples dropped in a row, until everything is learned again."""
+AWAY_PERIODS: Final = 10  # number of periods without a kind after which the kind counts as switched off
+DROPPED_MAX: Final = 16  # number of consecutive dropped samples after which imud learns everything again
 STRAYS_MAX: Final = 40
 STRAY_WEIGHT: Final = 2
-"""Frames without a place in a burst, twice their number less that of whole samples, until everything is learned again:
-a device that sends more of a kind than its beginning kind leaves one or more of them per sample."""
+"""Limit and weight of frames without a place in a burst; each complete sample subtracts 1. Above the limit, imud learns
+everything again: a device that sends a kind more often than the first kind of a burst causes such frames."""
 AGREE_FIRST, AGREE_OTHER, AGREE_MULTIPLE = 2, 3, 4
-"""Equal distances in a row that make an m: the first one; another one; one that losses could have made."""
+"""Number of equal consecutive distances for the first m; for another m; for a multiple of the known m (losses can cause
+a multiple)."""
 AGREE_FAST: Final = 6
-"""The same for a kind that is to be in every burst: bursts that are lost whole shorten the distance of a slower one,
-and once it counted as fast, its burst would be taken for the period."""
+"""Number of equal consecutive distances for a kind in every burst. Lost bursts shorten the distance of a slow kind; as
+a fast kind it would change the period."""
 
 
 class _Kind:
-    """One kind of frame."""
+    """State of one kind of frame."""
 
     __slots__ = ("every", "number", "run", "seen", "step")
 
     def __init__(self, number: int, every: int, seen: int) -> None:
         self.number = number
-        self.every = every
-        """Bursts from one of this kind to the next; 0 while unknown."""
-        self.seen = seen
-        """Burst of the newest one."""
-        self.step = 0
-        """Bursts between the newest two."""
-        self.run = 0
-        """Steps of this length in a row."""
+        self.every = every  # bursts between two frames of this kind; 0 if unknown
+        self.seen = seen  # burst of the newest frame
+        self.step = 0  # bursts between the two newest frames
+        self.run = 0  # number of consecutive steps of this length
 
     def is_due(self, since: int) -> bool:
-        """Whether it belongs into the burst `since` bursts after its last one."""
+        """Return whether the kind is due `since` bursts after its last burst."""
         return self.every > 0 and since > 0 and since % self.every == 0
 
     def learn(self, since: int) -> bool:
-        """Learn from the step to one more frame; return whether that changed `every`."""
+        """Learn from the step to one more frame. Return whether `every` changed."""
         self.run = self.run + 1 if since == self.step else 1
         self.step = since
         every = self.every
@@ -236,44 +220,38 @@ class _Kind:
 
 
 class Assembly:
-    """Whole samples of one device, as sets of frames. The ledger's frames are counted here but for `frames_good`, its
-    bytes are the codec's. Synchronization: one thread."""
+    """Assembly of the samples of one device. It counts all frames of the ledger except `frames_good`; the codec counts
+    bytes. Synchronization: one thread.
+    """
 
     def __init__(self, ledger: Ledger, kinds: Container[int] | None = None) -> None:
-        """`kinds`: only these are used, others are ignored; None for all."""
+        """`kinds`: kinds that the assembly uses; None: all."""
         self._ledger = ledger
         self._allowed = kinds
-        self._held: dict[int, bytes] = {}
-        """Data of the sample that is not whole yet, by kind, in the order they came."""
-        self._newest = 0
-        """Kind of the newest frame that had a place, held or already in a sample."""
+        self._held: dict[int, bytes] = {}  # data of the incomplete sample by kind, in the order of arrival
+        self._newest = 0  # kind of the newest frame with a place, in the incomplete sample or in a complete sample
         self._kinds: dict[int, _Kind] = {}
         self._order: list[int] = []
         self._place: dict[int, int] = {}
-        self._fast: frozenset[int] = frozenset()
-        """Kinds in every burst; the first of them begins it."""
+        self._fast: frozenset[int] = frozenset()  # kinds in every burst; the first kind starts the burst
         self._slow: list[_Kind] = []
         self._head = 0
-        self._due: frozenset[int] = frozenset()
-        """Kinds that make the present burst whole."""
-        self._burst = 0
-        """Number of the present burst, or of the newest one."""
-        self._gap = 0
-        """Number of the first burst after the gap that is not settled."""
+        self._due: frozenset[int] = frozenset()  # kinds that complete the present burst
+        self._burst = 0  # number of the present or newest burst
+        self._gap = 0  # number of the first burst after the gap of unknown size
         self._first_ns = self._newest_ns = 0
-        self._is_whole = False
-        """Whether the newest burst became a sample, and nothing came since that has no place."""
+        self._is_whole = False  # whether the newest burst became a sample and no frame without a place followed
         self._dropped = self._strays = 0
         self._cadence = Cadence(0, 0)
         self._learning: BurstLearning | None = BurstLearning()
 
     @property
     def period_ns(self) -> int:
-        """Between two samples; 0 while unknown."""
+        """Time between two samples, ns; 0 if unknown."""
         return self._cadence.period_ns if self._learning is None else 0
 
     def add_frame(self, kind: int, data: bytes, t_rx_ns: int) -> Sequence[tuple[int, bytes]] | None:
-        """Add one frame; return the frames of a sample, in the order they came, when it makes one whole."""
+        """Add one frame. If it completes a sample, return the frames of the sample in the order of arrival."""
         known = self._kinds.get(kind)
         if self._learning is not None or known is None:
             self._ledger.frames_ignored += 1
@@ -296,18 +274,20 @@ class Assembly:
         return self._close() if self._due <= held.keys() else done
 
     def reset(self) -> None:
-        """Drop the incomplete sample, since frames are missing here; those until the next burst begins are ignored."""
+        """Drop the incomplete sample after lost frames. Ignore all frames until the next burst starts."""
         if self._held:
             self._drop_sample()
         self._is_whole = False
 
     def _fits(self, kind: _Kind, t_rx_ns: int) -> bool:
-        """Whether a frame has a place in the present burst, or begins the next one, which it then does."""
-        if self._kinds.get(kind.number) is not kind:  # what ended before it made it unknown
+        """Return whether a frame has a place in the present burst or starts the next burst. It may start the next
+        burst.
+        """
+        if self._kinds.get(kind.number) is not kind:  # the end of the previous sample removed this kind
             return False
         return self._fits_fast(kind, t_rx_ns) if kind.every == 1 else self._fits_slow(kind, t_rx_ns)
 
-    # --- frames that belong into every burst ---------------------------------------------------------------------
+    # --- frames of every burst --------------------------------------------------------------------------------------
 
     def _fits_fast(self, kind: _Kind, t_rx_ns: int) -> bool:
         if not self._held:
@@ -324,7 +304,6 @@ class Assembly:
         return self._learning is None
 
     def _begin(self, t_rx_ns: int) -> None:
-        """Begin a burst."""
         was_late = self._cadence.is_late
         missed, lost = self._cadence.begin(t_rx_ns)
         if missed:
@@ -344,7 +323,7 @@ class Assembly:
             self._due = self._fast.union(due) if due else self._fast
 
     def _close(self) -> list[tuple[int, bytes]]:
-        """Finish the sample: it is whole."""
+        """Return the frames of the complete sample."""
         held, ledger = self._held, self._ledger
         frames = list(held.items())
         held.clear()
@@ -356,13 +335,13 @@ class Assembly:
             self._strays -= 1
         return frames
 
-    # --- slower kinds --------------------------------------------------------------------------------------------
+    # --- slow kinds -------------------------------------------------------------------------------------------------
 
     def _fits_slow(self, kind: _Kind, t_rx_ns: int) -> bool:
-        """Whether a frame of a slower kind has a place in the present burst, or begins the next one."""
+        """Return whether a frame of a slow kind has a place in the present burst or starts the next burst."""
         begins = not self._held and self._place[kind.number] < self._place[self._head]
         if not self._held and ((not begins and not self._is_whole) or kind.number == self._newest):
-            return False  # of an unknown burst, whose beginning is lost; or a repetition
+            return False  # the start of the burst is lost, or a repetition
         since = self._burst + begins - kind.seen
         is_due = kind.is_due(since)
         in_order = not self._held or self._place[kind.number] > self._place[self._newest]
@@ -380,7 +359,7 @@ class Assembly:
         return fits and self._learning is None
 
     def _meet(self, kind: int, t_rx_ns: int) -> None:
-        """Learn from a frame of an unknown kind, or from any while learning."""
+        """Learn from a frame of an unknown kind, or from any frame during learning."""
         if self._allowed is not None and kind not in self._allowed:
             return
         if self._learning is not None:
@@ -394,25 +373,25 @@ class Assembly:
             self._plan()
 
     def _put(self, kind: int, t_rx_ns: int) -> None:
-        """Place a kind by its newest frame: behind the newest frame of the burst, or before the next one."""
+        """Place a kind by its newest frame: after the newest frame of the burst, or before the next burst."""
         order = [other for other in self._order if other != kind]
         follows = bool(self._held) or 2 * (t_rx_ns - self._newest_ns) < self._cadence.period_ns
         order.insert(order.index(self._newest) + 1 if follows else 0, kind)
         self._order = order
         self._place = {other: place for place, other in enumerate(order)}
 
-    # --- frames that do not fit ----------------------------------------------------------------------------------
+    # --- frames without a place -------------------------------------------------------------------------------------
 
     def _ends(self, kind: _Kind, t_rx_ns: int) -> bool:
-        """Whether such a frame shows that the rest of what is held does not come."""
-        # in quarters of a period: the beginning of a burst is not to come long after a slower kind that stands before
+        """Return whether a frame shows that the rest of the incomplete sample is lost."""
+        # in quarters of a period; 2 if a slow kind started the burst: the first fast kind must follow soon
         limit = 3 if self._head in self._held else 2
         if 4 * (t_rx_ns - self._first_ns) > limit * self._cadence.period_ns or kind.number in self._held:
             return True
         return kind.every == 1 and self._place[kind.number] < self._place[self._newest]
 
     def _end(self) -> list[tuple[int, bytes]] | None:
-        """Stop waiting for the rest of the sample."""
+        """End the incomplete sample: return it without its slow kinds, or drop it."""
         frames = self._close() if len(self._fast) > 1 and self._fast <= self._held.keys() else None
         if frames is None:
             self._drop_sample()
@@ -425,7 +404,6 @@ class Assembly:
         return frames
 
     def _drop_sample(self) -> None:
-        """Drop the incomplete sample."""
         self._drop()
         self._ledger.lost_gap_device += 1
         self._is_whole = False
@@ -457,7 +435,7 @@ class Assembly:
         self._learning = BurstLearning()
 
     def _learn(self, learned: Learned, t_rx_ns: int) -> None:
-        """Adopt what was learned; the next burst is the first one that counts."""
+        """Use the learned bursts. The next burst is the first burst that counts."""
         self._learning = None
         self._cadence = Cadence(learned.period_ns, t_rx_ns)
         self._kinds = {number: _Kind(number, 1, self._burst) for number in learned.order}
@@ -466,7 +444,7 @@ class Assembly:
         self._plan()
 
     def _plan(self) -> None:
-        """Plan anew after kinds came, went, or changed their rates."""
+        """Update the plan after a change of kinds or rates."""
         kinds = self._kinds
         fast = [number for number in self._order if number in kinds and kinds[number].every == 1]
         if not fast:

@@ -1,18 +1,17 @@
-"""HiPNUC modules on NMEA 2000, and any other heading or attitude sensor there. Messages: `messages.py`.
+"""HiPNUC devices and other heading or attitude sensors on NMEA 2000.
 
     09F112ss  127250 Vessel Heading     09F113ss  127251 Rate of Turn     0DF119ss  127257 Attitude
 
-ss is the sender's address, which NMEA 2000 gives out anew each time the bus is put together. `source: auto` selects
-the first sender of these messages and keeps it; after SILENT_NS without a message, the next sender. imud claims no
-address and sends no requests.
+ss is the address of the sender, which NMEA 2000 can change each time the bus is assembled. `source: auto` selects the
+first sender of these messages and keeps it; after SILENT_NS without a message, it selects the next sender. imud claims
+no address and sends no requests.
 
-Messages of one instant have the same SID. `common/assembly.py` makes samples by their order and time; frames held with
-another SID than the newest are dropped. A sender whose messages of one instant have SIDs of their own, against the
-standard, would never make a sample: after SID_DOUBTS such samples in a row SIDs are not looked at, until they agree in
-as many samples again.
+Messages of one instant have the same SID. `assembly.py` makes samples by order and time. imud drops frames with another
+SID than the newest frame. A sender with different SIDs for one instant, against the standard, would never make a
+sample: after SID_DOUBTS such samples in a row, imud ignores SIDs until they agree in the same number of samples.
 
-A sender may give its heading twice, from true and from magnetic north. `heading` selects the one to use; `auto` selects
-the reference that comes first and keeps it. The other heading is ignored. Deviation and variation are not applied.
+A sender may send its heading twice, from true and from magnetic north. `heading` selects one; `auto` selects the first
+received reference and keeps it. imud ignores the other heading. It does not apply deviation and variation.
 """
 
 import struct
@@ -40,8 +39,7 @@ from imud.model.units import NS_PER_S
 
 HEADING, RATE_OF_TURN, ATTITUDE = 127250, 127251, 127257
 PGNS: Final = (HEADING, RATE_OF_TURN, ATTITUDE)
-PRIORITIES: Final = {HEADING: 2, RATE_OF_TURN: 2, ATTITUDE: 3}
-"""Defaults of the standard."""
+PRIORITIES: Final = {HEADING: 2, RATE_OF_TURN: 2, ATTITUDE: 3}  # default priorities of the standard
 MESSAGE_BYTES: Final = 8
 
 HEADING_LAYOUT: Final = struct.Struct("<BHhhB")
@@ -51,11 +49,11 @@ RAD_PER_LSB: Final = 1e-4
 RATE_RAD_S_PER_LSB: Final = 1e-6 / 32
 
 I16_MOST, U16_MOST, I32_MOST, SID_MOST = 0x7FFC, 0xFFFC, 0x7FFF_FFFC, 252
-"""Highest counts that are values."""
+"""Maximum counts that are values."""
 
 
 class Reference(IntEnum):
-    """North to which a heading refers."""
+    """Reference of a heading."""
 
     TRUE = 0
     MAGNETIC = 1
@@ -64,24 +62,23 @@ class Reference(IntEnum):
 
 
 class Head(NamedTuple):
-    """Header of a message: all that is known before its values."""
+    """Header of a message."""
 
-    sid: int | None
-    """Number of the instant, the same in all messages of one; None where the sender has none."""
-    reference: Reference | None
-    """Of a heading."""
+    sid: int | None  # number of the instant, equal in all messages of one instant; None without a number
+    reference: Reference | None  # reference of a heading
 
 
 def head_of(pgn: int, data: bytes) -> Head:
-    """Decode the header of a message of eight bytes."""
+    """Return the header of a message of eight bytes."""
     reference = Reference(data[7] & 3) if pgn == HEADING else None
     return Head(data[0] if data[0] <= SID_MOST else None, reference)
 
 
 def measurement_of(messages: Sequence[tuple[int, bytes]], *, heading_elsewhere: bool = False) -> Measurement:
-    """Make one sample of messages (PGN, data) of one instant, each PGN at most once.
+    """Return the measurement of messages (PGN, data) of one instant, each PGN at most once.
 
-    Yaw is that of the heading, else that of the attitude, but for a device that sends its heading in other samples.
+    Yaw is from the heading, otherwise from the attitude. `heading_elsewhere`: the device sends its heading in other
+    samples.
     """
     roll = pitch = yaw = rate = nan
     has_heading = heading_elsewhere
@@ -114,28 +111,28 @@ def _angle(counts: int) -> float:
 
 
 def _counter_clockwise(clockwise: int) -> float:
-    """Yaw in ±π of a clockwise angle in counts."""
+    """Return the yaw in ±π of a clockwise angle in counts."""
     angle = -clockwise * RAD_PER_LSB
     return angle if -pi <= angle <= pi else (angle + pi) % tau - pi
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
 
 def pack_heading(sid: int, yaw_rad: float | None, reference: Reference) -> bytes:
-    """Pack 127250 of a counter-clockwise yaw, without deviation and variation; None is "not available"."""
+    """Return 127250 of a counter-clockwise yaw, without deviation and variation; None means "not available"."""
     counts = 0xFFFF if yaw_rad is None else round(-yaw_rad % tau / RAD_PER_LSB)
     return HEADING_LAYOUT.pack(sid, counts, 0x7FFF, 0x7FFF, 0xFC | reference)
 
 
 def pack_rate_of_turn(sid: int, gyro_z_rad_s: float | None) -> bytes:
-    """Pack 127251 of a counter-clockwise rate."""
+    """Return 127251 of a counter-clockwise rate."""
     counts = 0x7FFF_FFFF if gyro_z_rad_s is None else _clip(-gyro_z_rad_s / RATE_RAD_S_PER_LSB, I32_MOST)
     return RATE_LAYOUT.pack(sid, counts)[:5] + b"\xff\xff\xff"
 
 
 def pack_attitude(sid: int, euler_rad: Vector3, *, has_yaw: bool = True) -> bytes:
-    """Pack 127257 of roll, pitch and a counter-clockwise yaw."""
+    """Return 127257 of roll, pitch and a counter-clockwise yaw."""
     roll, pitch, yaw = (_clip(angle / RAD_PER_LSB, I16_MOST) for angle in euler_rad)
     return ATTITUDE_LAYOUT.pack(sid, -yaw if has_yaw else 0x7FFF, pitch, roll, 0xFF)
 
@@ -145,11 +142,10 @@ def _clip(value: float, most: int) -> int:
 
 
 SILENT_NS: Final = 3 * NS_PER_S
-"""The slowest of the three messages comes once a second by the standard."""
+"""Time without a message after which imud selects another sender, ns. The slowest message has a period of 1 s."""
 SID_DOUBTS: Final = 8
 
-_PGNS: Final = {join(J1939Id(0, pgn, 0)): pgn for pgn in PGNS}
-"""By identifier without priority and source."""
+_PGNS: Final = {join(J1939Id(0, pgn, 0)): pgn for pgn in PGNS}  # PGN by identifier without priority and source
 _REFERENCES: Final = {"true": Reference.TRUE, "magnetic": Reference.MAGNETIC, "auto": None}
 
 
@@ -157,9 +153,10 @@ class HipnucNmea2000Options(Options, frozen=True, kw_only=True, forbid_unknown_f
     """Options of a heading or attitude sensor."""
 
     source: Literal["auto"] | Annotated[int, Meta(ge=0, le=ADDRESS_MAX)] = "auto"
-    """Address of the sender; `auto` for the first who is heard, and another one when that is silent."""
+    """Address of the sender. `auto` selects the first sender that imud receives, and another sender if that sender
+    stops."""
     heading: Literal["auto", "true", "magnetic"] = "auto"
-    """Heading to use where the sender has two; `auto` for the first that is received."""
+    """Heading to use if the sender sends two; `auto` = the first received reference."""
 
 
 class HipnucNmea2000Codec:
@@ -173,7 +170,7 @@ class HipnucNmea2000Codec:
         self._heard_ns = 0
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """Add one frame; return what it completed. Never raises for any frame."""
+        """Add one frame. Return the completed events. Never raises an exception."""
         ledger, size = self.ledger, len(data)
         ledger.bytes_in += size
         pgn = _PGNS.get(can_id & WITHOUT_PRIORITY & ~0xFF) if extended else None
@@ -199,14 +196,14 @@ class HipnucNmea2000Codec:
         return (measurement_of(whole, heading_elsewhere=self._has_heading),)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """No-op: the next frame shows what is lost."""
+        """Do nothing: the next frame shows the loss."""
         return ()
 
     def reset(self) -> None:
-        """Drop the incomplete sample: frames are missing here."""
+        """Drop the incomplete sample after lost frames."""
         self._assembly.reset()
 
-    # --- whose frames --------------------------------------------------------------------------------------------
+    # --- selection of sender and reference --------------------------------------------------------------------------
 
     def _is_sender(self, source: int, t_rx_ns: int) -> bool:
         if source != self._source:
@@ -219,7 +216,7 @@ class HipnucNmea2000Codec:
         return True
 
     def _set_sender(self, source: int | None) -> None:
-        """Begin anew with this sender."""
+        """Start again with this sender."""
         self._source = source
         self._assembly = Assembly(self.ledger)
         self._reference = self._wanted_reference
@@ -229,12 +226,12 @@ class HipnucNmea2000Codec:
         self._sid_doubts = 0
 
     def _is_reference(self, reference: Reference) -> bool:
-        """Whether this is the heading to use; an error counts for both, with its value absent."""
+        """Return whether imud uses this heading. An error counts for both references, without a value."""
         if self._reference is None and reference is not Reference.ERROR:
             self._reference = reference
         return reference in (self._reference, Reference.ERROR)
 
-    # --- messages of one instant ---------------------------------------------------------------------------------
+    # --- messages of one instant ------------------------------------------------------------------------------------
 
     def _match(self, sid: int | None) -> None:
         """Drop the frames of another instant."""
@@ -247,7 +244,7 @@ class HipnucNmea2000Codec:
                 self._uses_sids, self._sid_doubts = False, 0
 
     def _count_sids(self, whole: Sequence[tuple[int, bytes]]) -> None:
-        """Count the SIDs of a whole sample."""
+        """Count complete samples with equal SIDs."""
         if self._uses_sids:
             self._sid_doubts = 0
         elif len(whole) > 1:
@@ -257,11 +254,11 @@ class HipnucNmea2000Codec:
                 self._uses_sids, self._sid_doubts = True, 0
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
 
 def encode(pgn: int, data: bytes, source: int) -> tuple[int, bytes]:
-    """A message as (identifier, data)."""
+    """Return a message as (identifier, data)."""
     return join(J1939Id(PRIORITIES[pgn], pgn, source)), data
 
 
@@ -269,7 +266,6 @@ EXAMPLE_SOURCE: Final = 35
 
 
 def _example_frames(random: Random) -> list[CanFrame]:
-    """A sample of all three, with random values."""
     quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
     euler = euler312_from_quat(quat)
     sid = random.randrange(SID_MOST + 1)
@@ -282,18 +278,16 @@ def _example_frames(random: Random) -> list[CanFrame]:
 
 
 def _filters(settings: HipnucNmea2000Options) -> list[CanFilter]:
-    """The three messages, of one sender or of any."""
     source = None if settings.source == "auto" else settings.source
     return [filter_of(pgn, source) for pgn in PGNS]
 
 
 def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
-    """The sender of one of the messages."""
     return sender_of(can_id, extended, data, PGNS)
 
 
 def _heading(settings: object, _read_back: Mapping[str, str]) -> Heading:
-    """By the heading that is used; with `auto` the first that is received, which is not known beforehand."""
+    """Return the reference of the selected heading; with `auto` it is not known in advance."""
     chosen = settings.heading if isinstance(settings, HipnucNmea2000Options) else "auto"
     return Heading.UNKNOWN if chosen == "auto" else Heading(chosen)
 
@@ -307,7 +301,7 @@ DRIVER: Final = CanDriver(
     tick_ns=SAMPLE_COUNTER,
     tick_modulus=2,
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above, "
-    "0 with the bow to the north of the heading's reference; NaN for an angle that is not sent",
+    "0 with the bow to the north of the heading reference; NaN for an angle that the device does not send",
     navigation_frame="ENU",
     data_sheet=FLOATS,
     heading=_heading,

@@ -10,21 +10,20 @@ Five standard frames of eight data bytes make one sample; identifiers are decima
     │ 105 │ accel z      f32  │ temp i16 │ idx u16│  g, 0.01 °C (the manual's "100 °C" is a misprint), counter
     └─────┴───────────────────┴───────────────────┘
 
-105 closes the sample: the 101 … 104 received since the 105 before belong to it. It alone carries INDEX, which counts
-samples and wraps at 65536. Two samples are never mixed where that can be known:
+Frame 105 completes the sample of the frames 101 … 104 since the previous 105. Its INDEX counts samples and wraps at
+65536. Rules against mixing two samples:
 
-- An identifier received again before a 105 means that a 105 was lost: the frames held are dropped (an exact copy right
-  after the frame itself is a repetition by the bus, and is ignored).
-- A set that came in another order than 101, 102, 103, 104, 105 counts only if INDEX follows that of the 105 before.
-- Where frames are known to be missing (`reset`), the frames held are dropped.
-- A set in order whose INDEX does not follow may still be 101 … 103 of one sample and 104, 105 of a later one, what came
-  between having been lost. The time decides: a set takes S from its first frame to its last, and such a mixture at
-  least one period P more. It counts only if it took no more than S + P/2. S and P are learned from sets whose INDEX
-  follows, which cannot be mixed; before SURE_SETS of them every set in order counts. Where a stalled host or adapter
-  has pressed the times of arrival together, nothing can be known this way.
+- A repeated identifier before a 105 means a lost 105: the codec drops the held frames. It ignores an exact copy
+immediately after the frame, which is a repetition by the bus.
+- A set in another order than 101, 102, 103, 104, 105 counts only if INDEX follows the INDEX of the previous 105.
+- After lost frames (`reset`), the codec drops the held frames.
+- A set in order with a jump of INDEX may contain 101 … 103 of one sample and 104, 105 of a later sample. The time
+decides. A set takes S from its first to its last frame; a mixed set takes at least one period P more. The codec accepts
+a set up to S + P/2. It learns S and P from sets without a jump of INDEX, which cannot be mixed. Before SURE_SETS such
+sets, every set in order counts. If a stalled host or adapter compresses the arrival times, the codec cannot decide.
 
-Frames of a set that stays incomplete are valid and come to nothing (`frames_ignored`); the jump of INDEX to the next
-whole set says how many samples were lost. The device takes no commands over CAN.
+Frames of an incomplete set are valid and ignored (`frames_ignored`). The jump of INDEX to the next complete set is the
+number of lost samples. The device accepts no commands over CAN.
 """
 
 import struct
@@ -56,20 +55,17 @@ from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
 from imud.model.units import RAD_PER_DEG
 
-BASE_ID: Final = 101
-"""Identifier of the first frame, as delivered (decimal)."""
+BASE_ID: Final = 101  # factory identifier of the first frame (decimal)
 SET: Final = struct.Struct("<9fhH")
-"""The data of all five: roll, pitch, yaw; gyro x, y, z; accel x, y, z; temperature; INDEX."""
+"""Data of all five frames: roll, pitch, yaw; gyro x, y, z; accel x, y, z; temperature; INDEX."""
 SET_FRAMES: Final = 5
 FRAME_BYTES: Final = 8
 INDEX_MODULUS: Final = 1 << 16
 C_PER_COUNT: Final = 0.01
 
 DOWN: Final = 4
-UP: Final = 16
-"""Divisors: the part of a difference that the learned times follow at once."""
-SURE_SETS: Final = 8
-"""Number of sets needed to learn from: with fewer, one that came late has too much weight."""
+UP: Final = 16  # Divisors: part of a difference by which the learned times decrease or increase
+SURE_SETS: Final = 8  # number of sets before the learned times count: a late set would have too much weight
 _NEVER_NS: Final = 1 << 63
 
 _CLOSING: Final = SET_FRAMES - 1
@@ -81,27 +77,23 @@ class Imu61xCanOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields
     """Options of an IMU61x on CAN."""
 
     base_id: Annotated[int, Meta(ge=0, le=STANDARD_ID_MAX - _CLOSING)] = BASE_ID
-    """Identifier of the first of the five frames, decimal; the others follow it."""
+    """Identifier of the first of the five frames, decimal; the other identifiers follow."""
 
 
 class _Pace:
-    """Duration of a set on the bus, and of a sample, learned from sets that are certainly whole."""
+    """Duration of a set on the bus, and of a sample, learned from sets that are certainly complete."""
 
     __slots__ = ("_period_ns", "_sets", "_span_ns", "longest_ns")
 
     def __init__(self) -> None:
-        self.longest_ns = _NEVER_NS
-        """Longest duration of a set of one sample, ns."""
+        self.longest_ns = _NEVER_NS  # maximum duration of a set of one sample, ns
         self._span_ns = 0
         self._period_ns = 0
         self._sets = 0
 
     def learn(self, span_ns: int, period_ns: int) -> None:
-        """Add a whole set: `span_ns` from its first frame to its last, ended `period_ns` after the one before.
-
-        Down quickly and up slowly, by no more than twice at once: too low costs a sample next to a lost one, too high
-        could mix two.
-        """
+        """Add a complete set: duration from its first to its last frame, and time since the end of the previous set."""
+        # fast decrease, slow increase: a small value costs one sample next to a loss, a large value could mix two
         self._span_ns = _moved(self._span_ns, span_ns)
         self._period_ns = _moved(self._period_ns, period_ns)
         self._sets += 1
@@ -123,20 +115,15 @@ class Imu61xCanCodec:
     def __init__(self, ledger: Ledger, settings: Imu61xCanOptions) -> None:
         self.ledger = ledger
         self._slots = {settings.base_id + slot: slot for slot in range(SET_FRAMES)}
-        self._held: dict[int, bytes] = {}
-        """Data of 101 … 104 by their place, in the order they came."""
-        self._newest = -1
-        """Place of the newest frame held."""
-        self._first_ns = 0
-        """Arrival of the first frame of the set, ns."""
-        self._index: int | None = None
-        """INDEX of the newest 105."""
-        self._closed_ns = 0
-        """Arrival of the newest 105, ns."""
+        self._held: dict[int, bytes] = {}  # data of 101 … 104 by index, in the order of arrival
+        self._newest = -1  # index of the newest held frame
+        self._first_ns = 0  # arrival of the first frame of the set, ns
+        self._index: int | None = None  # INDEX of the newest 105
+        self._closed_ns = 0  # arrival of the newest 105, ns
         self._pace = _Pace()
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """Decode one frame; return what it completed. Never raises for any frame."""
+        """Decode one frame. Return the completed events. Never raises an exception."""
         ledger, size = self.ledger, len(data)
         ledger.bytes_in += size
         slot = self._slots.get(can_id)
@@ -165,11 +152,11 @@ class Imu61xCanCodec:
         return ()
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Return nothing: a set is decided by its 105 only."""
+        """Return no event: only a 105 completes a set."""
         return ()
 
     def reset(self) -> None:
-        """Drop the frames held: others are missing after them."""
+        """Drop the held frames after lost frames."""
         held, ledger = self._held, self.ledger
         ledger.frames_ignored += len(held)
         ledger.frames_pending -= len(held)
@@ -177,7 +164,7 @@ class Imu61xCanCodec:
         self._newest = -1
 
     def _close(self, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """Finish the set with its 105: it is whole, or lost."""
+        """Return the sample of a set with its 105; no event for an incomplete set."""
         held, ledger, before, pace = self._held, self.ledger, self._index, self._pace
         self._index = index = data[6] | data[7] << 8
         before_ns, self._closed_ns = self._closed_ns, t_rx_ns
@@ -198,12 +185,12 @@ class Imu61xCanCodec:
         ledger.frames_pending -= _CLOSING
         ledger.frames_in_samples += SET_FRAMES
         *values, temperature, _ = SET.unpack(raw)
-        if isfinite(sum(values)):  # 32-bit floats cannot add up to a 64-bit infinity
+        if isfinite(sum(values)):  # 9 finite 32-bit values cannot overflow a 64-bit sum
             return (_measurement(values, temperature, index),)
         return (*self._not_finite(raw), _measurement(values, temperature, index))
 
     def _not_finite(self, raw: bytes) -> list[CodecEvent]:
-        """A `BadFrame` for every frame with NaN or infinity in it."""
+        """Return a `BadFrame` for every frame with NaN or infinity."""
         events: list[CodecEvent] = []
         for slot, layout in enumerate(_FLOATS):
             data = raw[slot * FRAME_BYTES : (slot + 1) * FRAME_BYTES]
@@ -214,7 +201,7 @@ class Imu61xCanCodec:
 
 
 def _measurement(values: Sequence[float], temperature: int, index: int) -> Measurement:
-    """A whole set in SI units, without the groups of values of which one is not finite."""
+    """Return the measurement of a complete set, without groups with a value that is not finite."""
     euler = scaled(values[:3], RAD_PER_DEG)
     return Measurement(
         SET.size, 0, index,
@@ -226,7 +213,7 @@ def _measurement(values: Sequence[float], temperature: int, index: int) -> Measu
     )  # fmt: skip
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
 
 def encode_set(
@@ -238,7 +225,7 @@ def encode_set(
     temperature_c: float,
     base_id: int = BASE_ID,
 ) -> list[tuple[int, bytes]]:
-    """The five frames (identifier, data) of a sample from SI values, `euler_rad` roll, pitch, yaw; INDEX wraps.
+    """Return the five frames (identifier, data) of a sample. `euler_rad` is roll, pitch, yaw; INDEX wraps.
 
     Raises OverflowError beyond f32 and struct.error for a temperature beyond ±327 °C.
     """
@@ -253,7 +240,6 @@ def encode_set(
 
 
 def _example_frames(random: Random) -> list[CanFrame]:
-    """A set with random values."""
     frames = encode_set(
         index=random.randrange(INDEX_MODULUS),
         accel_m_s2=random_vector(random, 9.8),
@@ -265,12 +251,12 @@ def _example_frames(random: Random) -> list[CanFrame]:
 
 
 def _filters(settings: Imu61xCanOptions) -> list[CanFilter]:
-    """The five identifiers, each by itself: other devices may have those next to them."""
+    """Return one filter for each identifier, because other devices may use the adjacent identifiers."""
     return [CanFilter(settings.base_id + slot, STANDARD_ID_MAX, False) for slot in range(SET_FRAMES)]
 
 
 def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
-    """BASE_ID for a frame with one of the identifiers as delivered; a device with others cannot be recognized."""
+    """Return BASE_ID for a frame with a factory identifier. imud cannot recognize other identifiers."""
     slot = can_id - BASE_ID
     return BASE_ID if 0 <= slot < SET_FRAMES and not extended and len(data) == FRAME_BYTES else None
 

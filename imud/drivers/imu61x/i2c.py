@@ -2,9 +2,9 @@
 
     S addr W 0x12 | Sr addr R  accel x y z g | gyro x y z °/s | temperature °C, all f32 | CRC-32 u32 | P
 
-Little-endian. The address is 0x18 as delivered, 0x18 to 0x1B by parameter 30 of the UART. There is no counter and no
-time in a burst: one that repeats the bytes of the one before counts as the same measurement. Identity and filters,
-which are also read at intervals, are in `session.py`.
+Little-endian. The factory address is 0x18; parameter 30 of the UART sets 0x18 to 0x1B. A burst has no counter and no
+time: a burst with the bytes of the previous burst counts as the same measurement. imud also reads identity and filters
+periodically.
 """
 
 import struct
@@ -52,17 +52,17 @@ READ_ID: Final = Transfer((bytes([PROD_ID]),), len(PRODUCT_ID_HEAD) + 1)
 
 
 def write_filter(control: int) -> Transfer:
-    """Write FILTER_CTRL (figure 8)."""
+    """Return the transfer that writes FILTER_CTRL (figure 8)."""
     return Transfer((bytes([FILTER_CTRL, control]),))
 
 
 def probe(_settings: RegisterOptions) -> TransferScript[Identity]:
-    """Read PROD_ID. Raises DeviceRefused for anything but an IMU61x."""
+    """Read PROD_ID. Raises DeviceRefused for another device."""
     return identity_of((yield READ_ID))
 
 
 def set_up(settings: RegisterOptions) -> TransferScript[Mapping[str, str]]:
-    """Write FILTER_CTRL where it differs, read it back. Raises DeviceRefused if it is not the value written."""
+    """Write FILTER_CTRL if it differs and read it back. Raises DeviceRefused if it still differs."""
     present = yield from read_control()
     wanted = wanted_filter(settings, present)
     if present != wanted:
@@ -71,35 +71,33 @@ def set_up(settings: RegisterOptions) -> TransferScript[Mapping[str, str]]:
 
 
 def read_control() -> TransferScript[int]:
-    """Read FILTER_CTRL."""
     return _only((yield READ_FILTER))
 
 
 def write_control(control: int) -> TransferScript[None]:
-    """Write FILTER_CTRL and read it back. Raises DeviceRefused if it is not the value written."""
+    """Write FILTER_CTRL and read it back. Raises DeviceRefused if it differs."""
     yield write_filter(control)
     check_filter(control, (yield from read_control()))
 
 
 def id_problem(data: bytes) -> str:
-    """Compare a PROD_ID that was read later; an empty string if it is the same."""
+    """Return the error of a PROD_ID; empty if there is none."""
     return "" if product_of(data) is not None else f"wrong product id {data.hex(' ')}"
 
 
 def filter_problem(data: bytes, settings: RegisterOptions) -> str:
-    """Compare a FILTER_CTRL that was read later; an empty string if it is as set up."""
+    """Return the difference of a FILTER_CTRL from the options; empty if there is none."""
     wanted = wanted_filter(settings, _only(data))
     if data == bytes([wanted]):
         return ""
-    return f"FILTER_CTRL is {data.hex()}, was set to {wanted:#04x}: the device restarted"
+    return f"the device restarted: expected FILTER_CTRL {wanted:#04x}, got {data.hex()}"
 
 
 def _only(data: bytes) -> int:
     return data[0] if data else 0
 
 
-FRAME: Final = struct.Struct("<7fI")
-"""accel 3 g, gyro 3 °/s, temperature °C, CRC-32 of the 28 bytes before (table 27)."""
+FRAME: Final = struct.Struct("<7fI")  # accel 3 g, gyro 3 °/s, temperature °C, CRC-32 of the 28 bytes before (table 27)
 CRC_OFFSET: Final = 28
 
 READ_BURST: Final = Transfer((bytes([I2C_BURST]),), FRAME.size)
@@ -118,11 +116,11 @@ class Imu61xI2cCodec:
 
     @property
     def stale(self) -> int:
-        """Bursts that repeated the one before."""
+        """Number of bursts with the same bytes as the previous burst."""
         return self._frames.stale
 
     def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
-        """Decode the bytes of one transfer. Never raises."""
+        """Decode the bytes of one transfer. Never raises an exception."""
         if poll == _BURST:
             return self._frames.decode(data, _check, _measure)
         why = id_problem(data) if poll == _ID else filter_problem(data, self._settings)
@@ -130,11 +128,11 @@ class Imu61xI2cCodec:
         return (Vanished(why),) if why else ()
 
     def on_silence(self, poll: int) -> Sequence[PolledEvent]:
-        """No-op: nothing follows from one failed transfer."""
+        """Do nothing: a failed transfer has no further effect."""
         return ()
 
     def reset(self) -> None:
-        """Forget the last burst: the next one is not compared with it."""
+        """Forget the previous burst."""
         self._frames.reset()
 
 
@@ -145,7 +143,7 @@ def _check(data: bytes) -> BadReason | None:
 def _measure(data: bytes) -> Measured:
     ax, ay, az, gx, gy, gz, temperature, _ = FRAME.unpack(data)
     g, rad = M_S2_PER_G, RAD_S_PER_DEG_S
-    accel, gyro = isfinite(ax + ay + az), isfinite(gx + gy + gz)  # sums of floats of 32 bits do not overflow in 64
+    accel, gyro = isfinite(ax + ay + az), isfinite(gx + gy + gz)  # 3 finite 32-bit values cannot overflow a 64-bit sum
     measurement = Measurement(
         FRAME.size, 0, None,
         (ax * g, ay * g, az * g) if accel else None,
@@ -155,11 +153,11 @@ def _measure(data: bytes) -> Measured:
     return measurement, accel and gyro and isfinite(temperature)
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
 
 def encode_burst(*, accel_m_s2: Vector3, gyro_rad_s: Vector3, temperature_c: float) -> bytes:
-    """The 32 bytes of a burst from SI values. Raises OverflowError beyond f32."""
+    """Return the 32 bytes of a burst from SI values. Raises OverflowError beyond f32."""
     g, rad = M_S2_PER_G, RAD_S_PER_DEG_S
     values = struct.pack("<7f", *(a / g for a in accel_m_s2), *(w / rad for w in gyro_rad_s), temperature_c)
     return values + struct.pack("<I", crc32(values))
@@ -172,25 +170,21 @@ def _read(_target: Target) -> TransferScript[Mapping[str, Any]]:
 SETTINGS: Final = SettingsTable(
     table=filter_settings(FilterControl(read_control, write_control)), read=_read, check=check_settings
 )
-"""Lost when the device restarts; what it starts with is parameter 31 of its UART."""
+"""Settings that a restart of the device resets to parameter 31 of its UART."""
 
 
 def _example_reading(random: Random) -> bytes:
-    """A burst with random values."""
     accel_m_s2, gyro_rad_s = random_vector(random, 9.8), random_vector(random, 2)
     return encode_burst(accel_m_s2=accel_m_s2, gyro_rad_s=gyro_rad_s, temperature_c=random.uniform(-40, 85))
 
 
-BUS_HZ: Final = 400_000
-"""The fastest clock of table 25; the one that the bus has is set in the system."""
-BITS_PER_BYTE: Final = 9
-"""Eight and the acknowledgement."""
-OVERHEAD_BITS: Final = 2 * BITS_PER_BYTE + 3
-"""The address twice, start, repeated start and stop."""
+BUS_HZ: Final = 400_000  # Maximum clock of table 25, Hz. The operating system sets the actual clock.
+BITS_PER_BYTE: Final = 9  # eight bits and the acknowledgement
+OVERHEAD_BITS: Final = 2 * BITS_PER_BYTE + 3  # two addresses, start, repeated start and stop
 
 
 def _read_ns(_options: RegisterOptions, _link: Any) -> int:
-    """318 bits, 795 µs."""
+    # 318 bits, 795 µs at 400 kHz
     (register,) = READ_BURST.sends
     bits = OVERHEAD_BITS + (len(register) + READ_BURST.read_bytes) * BITS_PER_BYTE
     return bits * NS_PER_S // BUS_HZ

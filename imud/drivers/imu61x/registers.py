@@ -1,6 +1,6 @@
-"""Settings, set-up, action and row of the Forsense IMU61x on SPI and I2C, where only the transfers differ.
+"""Options, setup, action and registry row of the Forsense IMU61x on SPI and I2C. Only the transfers differ.
 
-Of what can be changed over these buses only the low-pass filters concern the user; all else is set over the UART.
+Users change only the low-pass filters over these buses; the UART changes all other settings.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -41,19 +41,19 @@ from imud.model.options import Options
 from imud.model.units import NS_PER_S
 
 CHECK_NS: Final = 10 * NS_PER_S
-"""Interval of reading identity and settings again: a device that restarted by itself has lost unsaved settings."""
+"""Time between two reads of identity and settings, ns: a device that restarted has lost unsaved settings."""
 
 
 class RegisterOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of an IMU61x on a polled bus."""
 
     accel_filter: FilterChoice | None = None
-    """Low-pass filter of the accelerometer, by name, or by its code in the order of these names (11: 47 Hz); null
-    leaves it as it is."""
+    """Low-pass filter of the accelerometer, by name or by its code in the order of the names (11: 47 Hz); null:
+    unchanged."""
     gyro_filter: FilterChoice | None = None
-    """The same of the gyroscope."""
+    """Low-pass filter of the gyroscope, as for the accelerometer."""
     update_hz: Annotated[float, Meta(ge=0, le=10000)] = 0.0
-    """Rate at which the device renews its registers, per second, for the error of time stamps; 0 if not known."""
+    """Update rate of the device registers, per second, for the time stamp error; 0 if it is not known."""
 
 
 S = TypeVar("S", bound=RegisterOptions)
@@ -64,16 +64,16 @@ SetUp = Callable[[S], TransferScript[Mapping[str, str]]]
 
 
 def identity_of(product_id: bytes) -> Identity:
-    """The identity that PROD_ID states. Raises DeviceRefused for another device, with what to look at."""
+    """Return the identity in PROD_ID. Raises DeviceRefused for another device, with the next step."""
     product = product_of(product_id)
     if product is None:
-        why = absence(product_id) or "another device, or the wrong SPI mode or speed?"
+        why = absence(product_id) or "is it another device, or the wrong SPI mode or speed?"
         raise DeviceRefused(f"PROD_ID: expected 00 00 'IMU61' and a letter, got {product_id.hex(' ')}: {why}")
     return Identity(product=product)
 
 
 def wanted_filter(settings: RegisterOptions, present: int) -> int:
-    """The value that FILTER_CTRL should have, from the value that it has."""
+    """Return the wanted value of FILTER_CTRL for its present value."""
     accel, gyro = filter_codes(present)
     return filter_control(
         accel if settings.accel_filter is None else filter_code(settings.accel_filter),
@@ -82,13 +82,15 @@ def wanted_filter(settings: RegisterOptions, present: int) -> int:
 
 
 def check_filter(wanted: int, got: int) -> None:
-    """Check what FILTER_CTRL reads back after a write. Raises DeviceRefused if it is not the value written."""
+    """Raise DeviceRefused if FILTER_CTRL differs after a write."""
     if got & 0xFF != wanted:
-        raise DeviceRefused(f"FILTER_CTRL: wrote {wanted:#04x}, read back {got & 0xFF:#04x}; is the bus too fast?")
+        raise DeviceRefused(
+            f"FILTER_CTRL: expected {wanted:#04x} after the write, got {got & 0xFF:#04x}; try a slower bus"
+        )
 
 
 def filter_words(control: int) -> Mapping[str, str]:
-    """The filters by name, for people."""
+    """Return the names of the filters."""
     accel, gyro = filter_codes(control)
     return {"accel_filter": FILTERS[accel], "gyro_filter": FILTERS[gyro]}
 
@@ -105,12 +107,11 @@ class FilterControl(NamedTuple):
     """Scripts of a bus that read and write FILTER_CTRL."""
 
     read: Callable[[], TransferScript[int]]
-    write: Callable[[int], TransferScript[None]]
-    """Reads back what it wrote. Raises DeviceRefused."""
+    write: Callable[[int], TransferScript[None]]  # Reads back the written value. Raises DeviceRefused.
 
 
 def filter_settings(control: FilterControl) -> Mapping[str, Setting]:
-    """The two filters as settings. The device loses them when it restarts: over the UART they are saved."""
+    """Return the two filters as settings. A restart of the device resets them; the UART saves them."""
 
     def write(target: Target, accel: FilterChoice | None, gyro: FilterChoice | None) -> TransferScript[None]:
         _require_as_configured(target.settings, accel_filter=accel, gyro_filter=gyro)
@@ -133,20 +134,20 @@ def filter_settings(control: FilterControl) -> Mapping[str, Setting]:
 
 
 def check_settings(target: Target, values: Mapping[str, Any]) -> None:
-    """Raise BadArgument for a filter that `options` fix otherwise."""
+    """Raise BadArgument for a filter that differs from `options`."""
     if isinstance(target.settings, RegisterOptions):
         filters = {name: values.get(name) for name in ("accel_filter", "gyro_filter")}
         _require_as_configured(target.settings, **filters)
 
 
 def _require_as_configured(settings: RegisterOptions, **wanted: FilterChoice | None) -> None:
-    """Raise BadArgument for a filter that `options` fix otherwise: they would soon be written again."""
+    """Raise BadArgument for a filter that differs from `options`, because imud writes `options` again at every
+    setup.
+    """
     for name, choice in wanted.items():
         configured: FilterChoice | None = getattr(settings, name)
         if choice is not None and configured is not None and not same_filter(choice, configured):
-            raise BadArgument(
-                f"{name}: expected {_shown(configured)}, which `options.{name}` says, got {_shown(choice)}"
-            )
+            raise BadArgument(f"{name}: expected {_shown(configured)} from `options.{name}`, got {_shown(choice)}")
 
 
 def _shown(choice: FilterChoice) -> str:
@@ -154,7 +155,7 @@ def _shown(choice: FilterChoice) -> str:
 
 
 def _filter_action(set_up: SetUp[S]) -> Action:
-    """Set the filters by the driver's own `set_up`, which reads them back."""
+    """Return the action that sets the filters with the driver's `set_up`."""
 
     def set_filter(
         target: Target, *, accel_filter: _AccelFilterOrNone = None, gyro_filter: _GyroFilterOrNone = None
@@ -166,8 +167,8 @@ def _filter_action(set_up: SetUp[S]) -> Action:
         return set_up(msgspec.structs.replace(settings, **wanted))
 
     return Action(
-        "set the low-pass filters until the device restarts, null leaves one as it is; answers what they are; "
-        f"`options` set them at every start; by name or code: {FILTER_CODES}",
+        "set the low-pass filters until the device restarts, null: unchanged; returns the filters; "
+        f"imud sets the filters in `options` at every start; by name or code: {FILTER_CODES}",
         set_filter,
     )
 
@@ -186,7 +187,7 @@ def register_driver(
     read_ns: Callable[[Any, Any], int],
     device_settings: SettingsTable,
 ) -> PolledDriver:
-    """The row of the driver on `bus` (`i2c` or `spi`)."""
+    """Return the registry row of the driver on `bus` (`i2c` or `spi`)."""
 
     def check(_options: S, link: Any) -> Sequence[KeyProblem]:
         address = getattr(link, "address", "auto")
@@ -222,38 +223,35 @@ def register_driver(
 
 
 def _update_ns(settings: RegisterOptions) -> int:
-    """Time between two updates of the registers; 0 for not known."""
+    """Return the time between two updates of the registers, ns; 0 if it is not known."""
     return int(NS_PER_S / settings.update_hz) if settings.update_hz else 0
 
 
 BURST: Final = 0x00
 FILTER_CTRL: Final = 0x06
 BURST_CTRL: Final = 0x0C
-"""The high byte, at 0x0D, selects the burst: 0 standard, 1 extended (the vendor's value, not the manual's)."""
+"""The high byte at 0x0D selects the burst: 0 standard, 1 extended (value of the vendor's programs, not of the
+manual).
+"""
 TEMP_HIGH: Final = 0x0E
 ZACCEL_LOW: Final = 0x28
-PROD_ID: Final = 0x6A
-"""The first of four words, 0x6A to 0x70; on I2C of eight bytes."""
+PROD_ID: Final = 0x6A  # first of four words, 0x6A to 0x70; on I2C of eight bytes
 WIN_CTRL: Final = 0x7E
-I2C_BURST: Final = 0x12
-"""The text of 3.3.1; table 26 prints 0x00."""
+I2C_BURST: Final = 0x12  # address in section 3.3.1; table 26 prints 0x00
 
-M_S2_PER_COUNT: Final = 0.2 / 65536 * M_S2_PER_G
-"""Burst: 327680 counts are 1 g."""
+M_S2_PER_COUNT: Final = 0.2 / 65536 * M_S2_PER_G  # burst: 327680 counts are 1 g
 M_S2_PER_COUNT_REGISTER: Final = 0.2 / 1000 / 65536 * M_S2_PER_G
 """Single registers: 65536 counts, one step of the high word, are 0.0002 g."""
-RAD_S_PER_COUNT: Final = 0.016 / 65536 * RAD_S_PER_DEG_S
-"""Burst and single registers: 4096000 counts are 1 °/s."""
-TEMPERATURE_ZERO_COUNTS: Final = 172_621_824
-"""2634 · 65536: the count at 25 °C."""
+RAD_S_PER_COUNT: Final = 0.016 / 65536 * RAD_S_PER_DEG_S  # burst and single registers: 4096000 counts are 1 °/s
+TEMPERATURE_ZERO_COUNTS: Final = 172_621_824  # 2634 · 65536: the count at 25 °C
 C_PER_COUNT: Final = -1 / 263.4 / 65536
 
 
 def temperature_c(counts: int) -> float:
-    """Temperature of TEMP, high and low word joined."""
+    """Return the temperature of TEMP from the joined high and low word."""
     return (counts - TEMPERATURE_ZERO_COUNTS) * C_PER_COUNT + 25.0
 
 
 def temperature_counts(celsius: float) -> int:
-    """The inverse, for the device's side."""
+    """Return the counts of a temperature, for simulated devices."""
     return round((celsius - 25.0) / C_PER_COUNT) + TEMPERATURE_ZERO_COUNTS

@@ -1,5 +1,5 @@
-"""Forsense IMU61x on SPI: decoding of bursts and single registers. Manual "IMU61X Interface Protocol and Instructions",
-chapter 2. Layouts and check values are in `bursts.py`, words in `words.py`, identity and settings in `session.py`.
+"""Forsense IMU61x on SPI: bursts and single registers. Manual "IMU61X Interface Protocol and Instructions", chapter
+2.
 """
 
 import struct
@@ -52,23 +52,23 @@ GAP_US: Final = 10
 
 
 def read(address: int) -> int:
-    """The word that reads a register."""
+    """Return the word that reads a register."""
     return address << 8
 
 
 def write(address: int, value: int) -> int:
-    """The word that writes one byte."""
+    """Return the word that writes one byte."""
     return 0x8000 | address << 8 | value
 
 
 def message(*words: int) -> Transfer:
-    """Words with chip select released between them, and two more for the answers to the last ones."""
-    pipeline = (read(WIN_CTRL),) * PIPELINE_WORDS  # answers with the window, which must be 0 again by then
+    """Return a transfer that releases chip select between words, with two words for the replies to the last words."""
+    pipeline = (read(WIN_CTRL),) * PIPELINE_WORDS  # the window, which must be 0 again
     return Transfer(tuple(word.to_bytes(2, "big") for word in (*words, *pipeline)), gap_us=GAP_US)
 
 
 def answers(data: bytes) -> tuple[int, ...]:
-    """The answer to each word of a message, without the two of the pipeline itself."""
+    """Return the reply to each word of a transfer, without the two words of the pipeline."""
     words = memoryview(data)[PIPELINE_BYTES:]
     return struct.unpack(f">{len(words) // 2}H", words[: len(words) // 2 * 2])
 
@@ -85,21 +85,20 @@ READ_STATE: Final = message(
     CLOSE,
     read(WIN_CTRL),
 )
-"""Identity and settings in one message, both halves of BURST_CTRL, and the window after it was closed."""
+"""Identity and settings in one transfer: both halves of BURST_CTRL, and the window after it was closed."""
 
-BurstKind = Literal["standard", "extended"]
-"""What the device sends for 0x8000."""
+BurstKind = Literal["standard", "extended"]  # reply of the device to 0x8000
 STANDARD_WORDS: Final = 14
 EXTENDED_WORDS: Final = 24
 REGISTER_WORDS: Final = (ZACCEL_LOW - TEMP_HIGH) // 2 + 1
 STANDARD: Final = struct.Struct(">14H")
 EXTENDED: Final = struct.Struct("<10fII")
-"""gyro 3 °/s, accel 3 g, temperature °C, roll pitch yaw °, status, CRC-32 of the 44 bytes before."""
+"""gyro 3 °/s, accel 3 g, temperature °C, roll pitch yaw °, status, CRC-32 of the 44 bytes before"""
 CRC_OFFSET: Final = 44
 
 
 def _burst(words: int) -> Transfer:
-    """0x8000 and as many zeros as bring `words` words through the pipeline, in one selection."""
+    """Return the transfer of a burst: 0x8000, then zeros that move `words` words through the pipeline."""
     return Transfer((write(BURST, 0).to_bytes(2, "big") + bytes(2 * (PIPELINE_WORDS + words - 1)),))
 
 
@@ -108,28 +107,28 @@ READ_EXTENDED: Final = _burst(EXTENDED_WORDS)
 READ_REGISTERS: Final = message(*(read(address) for address in range(TEMP_HIGH, ZACCEL_LOW + 1, 2)))
 READ_TEMPERATURE: Final = message(read(TEMP_HIGH), read(TEMP_HIGH + 2))
 BURSTS: Final[dict[BurstKind, Transfer]] = {"standard": READ_STANDARD, "extended": READ_EXTENDED}
-"""The transfer that reads each kind of burst."""
+"""transfer for each kind of burst"""
 
 
 def sum_matches(frame: bytes, checksum_bits: int) -> bool:
-    """Whether the checksum of a standard burst is right."""
+    """Return whether the checksum of a standard burst is correct."""
     *words, low, high = STANDARD.unpack(frame)
     total = sum(words)
     return low == total & 0xFFFF and (checksum_bits == 16 or high == total >> 16)
 
 
 def little_endian(frame: bytes) -> bytes:
-    """The words of an extended burst as they lie in the memory of a little-endian host."""
+    """Return the words of an extended burst as bytes in little-endian order."""
     return struct.pack("<24H", *struct.unpack(">24H", frame))
 
 
 def crc_matches(memory: bytes) -> bool:
-    """Whether the CRC of an extended burst, as `little_endian` returns it, is right."""
+    """Return whether the CRC of an extended burst in little-endian order is correct."""
     return bool(crc32(memory[:CRC_OFFSET]) == EXTENDED.unpack(memory)[11])
 
 
 def burst_problem(kind: BurstKind, data: bytes, checksum_bits: int) -> str:
-    """Return why bytes that were read are no burst of this kind, pipeline included; empty if they are one."""
+    """Return the error of received bytes, pipeline included; empty for a valid burst of this kind."""
     frame = data[PIPELINE_BYTES:]
     words = STANDARD_WORDS if kind == "standard" else EXTENDED_WORDS
     if len(frame) != 2 * words:
@@ -137,14 +136,14 @@ def burst_problem(kind: BurstKind, data: bytes, checksum_bits: int) -> str:
     if why := absence(frame):
         return why
     good = sum_matches(frame, checksum_bits) if kind == "standard" else crc_matches(little_endian(frame))
-    return "" if good else f"its check value does not match: {frame[:8].hex(' ')} …"
+    return "" if good else f"wrong check value: {frame[:8].hex(' ')} …"
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
 
 def encode_standard(*, accel_m_s2: Vector3, gyro_rad_s: Vector3) -> bytes:
-    """The 14 words of a standard burst from SI values; values beyond 32 bits are cut off."""
+    """Return the 14 words of a standard burst from SI values, cut to 32 bits."""
     counts = [*(round(w / RAD_S_PER_COUNT) for w in gyro_rad_s), *(round(a / M_S2_PER_COUNT) for a in accel_m_s2)]
     words = [word for count in counts for word in (count & 0xFFFF, count >> 16 & 0xFFFF)]
     total = sum(words)
@@ -154,7 +153,7 @@ def encode_standard(*, accel_m_s2: Vector3, gyro_rad_s: Vector3) -> bytes:
 def encode_extended(
     *, accel_m_s2: Vector3, gyro_rad_s: Vector3, temperature_c: float, euler_rad: Vector3, status: int = 0
 ) -> bytes:
-    """The 24 words of an extended burst from SI values. Raises OverflowError beyond f32."""
+    """Return the 24 words of an extended burst from SI values. Raises OverflowError beyond f32."""
     memory = struct.pack(
         "<10fI",
         *(w / RAD_S_PER_DEG_S for w in gyro_rad_s),
@@ -167,47 +166,45 @@ def encode_extended(
     return struct.pack(">24H", *struct.unpack("<24H", memory))
 
 
-MODES: Final = (0, 3)
-"""The manual's, and the one of the vendor's own program: both sample on the rising edge."""
-WINDOW_ID: Final = 0x01
-"""The bit of WIN_CTRL in which the two codes of table 24 differ; no other is defined."""
-BURST_TRIES: Final = 3
-"""One damaged burst, or one write that was lost, is no refusal."""
+MODES: Final = (0, 3)  # SPI modes of the manual and of the vendor's program; both sample on the rising edge
+WINDOW_ID: Final = 0x01  # bit of WIN_CTRL that differs between the two codes of table 24; no other bit is defined
+BURST_TRIES: Final = 3  # maximum number of bursts: one damaged burst or one lost write is not an error
 
 
 class SpiDeviceOptions(RegisterOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of an IMU61x on SPI."""
+    """Options of an IMU61x on SPI."""
 
     burst: Literal["standard", "extended", "registers"] = "standard"
-    """Kind of read: the standard burst; the extended burst, which has temperature and angles; or single registers."""
+    """Kind of read: standard burst; extended burst with temperature and angles; or single registers."""
     checksum_bits: Literal[16, 32] = 32
-    """Checksum of the standard burst: all 32 bits, or only the 16 that the manual has."""
+    """Checksum of the standard burst: all 32 bits, or only the 16 bits of the manual."""
 
 
 # --- state -----------------------------------------------------------------------------------------------------------
 
 
 class State:
-    """State as READ_STATE reads it. Missing bytes count as zeros."""
+    """State in the reply to READ_STATE. Missing bytes count as zeros."""
 
     def __init__(self, data: bytes) -> None:
         _, *words, _, window = (*answers(data), *(0,) * 10)[:10]
         self.product_id = b"".join(word.to_bytes(2, "big") for word in words[:4])
         self.filter = words[4] & 0xFF
-        self.burst_ctrl = (words[5], words[6])
-        """The words at 0x0C and 0x0D."""
+        self.burst_ctrl = (words[5], words[6])  # words at 0x0C and 0x0D
         self.window = window & WINDOW_ID
 
     def differences(self, settings: SpiDeviceOptions) -> str:
-        """Compare filter and window with the settings; an empty string if all agrees. Bursts show by themselves."""
+        """Return the difference of filter and window from the options; empty if there is none. Bursts are checked
+        separately.
+        """
         wanted = wanted_filter(settings, self.filter)
         if self.filter != wanted:
-            return f"FILTER_CTRL is {self.filter:#04x}, expected {wanted:#04x}"
-        return f"WIN_CTRL is {self.window}, expected 0" if self.window else ""
+            return f"expected FILTER_CTRL {wanted:#04x}, got {self.filter:#04x}"
+        return f"expected WIN_CTRL 0, got {self.window}" if self.window else ""
 
     @property
     def kind(self) -> BurstKind:
-        """The kind of burst by BURST_CTRL: extended if any of the places where it may be read says so."""
+        """Kind of burst in BURST_CTRL: extended if one of its four bytes is 1."""
         halves = {byte for word in self.burst_ctrl for byte in word.to_bytes(2, "big")}
         return "extended" if 1 in halves else "standard"
 
@@ -216,21 +213,19 @@ class State:
 
 
 def probe(_settings: SpiDeviceOptions) -> TransferScript[Identity]:
-    """Read PROD_ID1 … 4, and close the window in any case. Raises DeviceRefused for anything but an IMU61x."""
+    """Read PROD_ID1 … 4 and close the window. Raises DeviceRefused for another device."""
     return identity_of((yield from read_state()).product_id)
 
 
 def set_up(settings: SpiDeviceOptions) -> TransferScript[Mapping[str, str]]:
-    """Write FILTER_CTRL and BURST_CTRL where they differ and read back. Raises DeviceRefused if they differ still.
-
-    Where BURST_CTRL reads back is not certain, so a burst itself decides which kind is selected.
-    """
+    """Write FILTER_CTRL and BURST_CTRL if they differ and read them back. Raises DeviceRefused if they still differ."""
     state = yield from read_state()
     wanted = wanted_filter(settings, state.filter)
     if state.filter != wanted:
         yield from write_control(wanted)
     if state.window:
         yield CLOSE_ONLY
+    # the place of BURST_CTRL in a read is not certain: a burst decides the selected kind
     if settings.burst != "registers":
         yield from _select(settings.burst, state, settings.checksum_bits)
     return {**filter_words(wanted), "burst": state.kind if settings.burst == "registers" else settings.burst}
@@ -242,18 +237,17 @@ def read_state() -> TransferScript[State]:
 
 
 def read_control() -> TransferScript[int]:
-    """Read FILTER_CTRL."""
     return (yield from read_state()).filter
 
 
 def write_control(control: int) -> TransferScript[None]:
-    """Write FILTER_CTRL and read it back. Raises DeviceRefused if it is not the value written."""
+    """Write FILTER_CTRL and read it back. Raises DeviceRefused if it differs."""
     yield from _in_window_1(message(OPEN, write(FILTER_CTRL, control), CLOSE))
     check_filter(control, (yield from read_control()))
 
 
 def _select(kind: BurstKind, state: State, checksum_bits: int) -> TransferScript[None]:
-    """Select a kind of burst if it is not, until a burst is of that kind. Raises DeviceRefused."""
+    """Select a kind of burst until a burst has this kind. Raises DeviceRefused."""
     why = ""
     for attempt in range(BURST_TRIES):
         if attempt or state.kind != kind:
@@ -264,13 +258,13 @@ def _select(kind: BurstKind, state: State, checksum_bits: int) -> TransferScript
             return
     low, high = (yield from read_state()).burst_ctrl
     raise DeviceRefused(
-        f"expected a burst of kind {kind}, which was selected: {why}; BURST_CTRL reads {low:#06x} at 0x0C and "
-        f"{high:#06x} at 0x0D; is the bus too fast?"
+        f"expected a burst of the selected kind {kind}: {why}; BURST_CTRL is {low:#06x} at 0x0C and "
+        f"{high:#06x} at 0x0D; try a slower bus"
     )
 
 
 def _in_window_1(transfer: Transfer) -> TransferScript[bytes]:
-    """A message that opens and closes window 1; one that failed on its way may have left it open."""
+    """Make a transfer that opens and closes window 1. Close the window after a failure."""
     try:
         return (yield transfer)
     except TransferError:
@@ -278,27 +272,26 @@ def _in_window_1(transfer: Transfer) -> TransferScript[bytes]:
         raise
 
 
-TEMPERATURE_NS: Final = NS_PER_S
-"""Interval of reading the temperature where the burst has none."""
+TEMPERATURE_NS: Final = NS_PER_S  # time between two reads of the temperature, if the burst does not contain it, ns
 
 POLLS: Final = {
     "standard": (Poll(READ_STANDARD), Poll(READ_STATE, CHECK_NS), Poll(READ_TEMPERATURE, TEMPERATURE_NS)),
     "extended": (Poll(READ_EXTENDED), Poll(READ_STATE, CHECK_NS)),
     "registers": (Poll(READ_REGISTERS), Poll(READ_STATE, CHECK_NS)),
 }
-"""Polls by the setting `burst`, in the order of the codec's polls."""
+"""Polls by the option `burst`, in the order of `polls` of the codec."""
 _BURST, _STATE, _TEMPERATURE = range(3)
 DEVICE_STATUS: Final = 0x7FFF_FFFF
-"""The bits of the extended burst's status that are passed on: bit 31 of a sample's status is imud's own. The manual
-gives none of them a meaning."""
+"""Bits of the extended burst's status that imud passes on. Bit 31 of a sample's status belongs to imud. The manual does
+not define the bits."""
 
 
 class Imu61xSpiCodec:
     """Decoder of bursts or registers. Synchronization: one thread.
 
-    Where a burst has no temperature, samples carry the last one read, at most two seconds old. Registers have no check
-    value: only what no device can send is refused there, and a value may be of two updates (by one step of its high
-    word at most).
+    Without a temperature in the burst, samples contain the newest read value, at most two seconds old. Registers have
+    no check value: the codec rejects only impossible bytes, and a value may consist of two updates (an error of at most
+    one step of its high word).
     """
 
     def __init__(self, ledger: Ledger, settings: SpiDeviceOptions) -> None:
@@ -315,21 +308,21 @@ class Imu61xSpiCodec:
 
     @property
     def stale(self) -> int:
-        """Frames that repeated the one before."""
+        """Number of frames with the same bytes as the previous frame."""
         return self._frames.stale
 
     def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
-        """Decode the bytes of one transfer; those of the pipeline are no part of a frame. Never raises."""
+        """Decode the bytes of one transfer without the bytes of the pipeline. Never raises an exception."""
         if poll == _BURST:
             return self._frames.decode(data[PIPELINE_BYTES:], self._bad, self._measure)
         return self._on_state(data) if poll == _STATE else self._on_temperature(data)
 
     def on_silence(self, poll: int) -> Sequence[PolledEvent]:
-        """No-op: nothing follows from one failed transfer."""
+        """Do nothing: a failed transfer has no further effect."""
         return ()
 
     def reset(self) -> None:
-        """Forget the last frame: the next one is not compared with it."""
+        """Forget the previous frame."""
         self._frames.reset()
         self._temperature_c = None
 
@@ -363,7 +356,7 @@ _THREE: Final = struct.Struct(">3i")
 
 
 def _joined(frame: bytes, at: int) -> tuple[int, int, int]:
-    """Three i32 of low word, high word."""
+    """Return three i32, each of a low word and a high word."""
     words = _SIX.unpack_from(frame, at)
     x, y, z = ((high << 16 | low) for low, high in zip(words[::2], words[1::2], strict=True))
     return _signed(x), _signed(y), _signed(z)
@@ -426,17 +419,17 @@ SETTINGS: Final = SettingsTable(
     read=_read,
     check=check_settings,
 )
-"""Lost when the device restarts; the filters that it starts with are parameter 31 of its UART."""
+"""Settings that a restart of the device resets. The filters after a restart are parameter 31 of its UART."""
 
 
 def _example_reading(random: Random) -> bytes:
-    """A standard burst with random values, the words of the pipeline before it."""
+    """Return a standard burst with random values, after the words of the pipeline."""
     pipeline = random.randbytes(PIPELINE_BYTES)
     return pipeline + encode_standard(accel_m_s2=random_vector(random, 9.8), gyro_rad_s=random_vector(random, 2))
 
 
 def _read_ns(options: SpiDeviceOptions, link: Any) -> int:
-    """The bits at the bus's clock, and the pauses between words: 256 µs for a standard burst at 1 MHz."""
+    # bits at the clock of the bus, and pauses between words: 256 µs for a standard burst at 1 MHz
     transfer = POLLS[options.burst][0].transfer
     bits = 8 * sum(map(len, transfer.sends))
     speed_hz: int = link.speed_hz

@@ -54,7 +54,7 @@ def test_bits_of_a_message_and_the_limit_of_the_bus() -> None:
     messages = {"A": CyclicMessage(8, True, 5), "B": CyclicMessage(8, True, 0)}
     refuse_overload(messages, 0, 26_200)
     refuse_overload(messages, 1e9, 0)
-    with pytest.raises(BadArgument, match=r"got 105 % of that: A every 5 ms 105 %; other devices 0 %"):
+    with pytest.raises(BadArgument, match=r"got 105 % of it: A every 5 ms 105 %; other devices 0 %"):
         refuse_overload(messages, 0, 25_000)
-    with pytest.raises(BadArgument, match=r"got 100 % of that: A every 5 ms 26.2 %; other devices 73.8 %"):
+    with pytest.raises(BadArgument, match=r"got 100 % of it: A every 5 ms 26.2 %; other devices 73.8 %"):
         refuse_overload(messages, 73_801, 100_000)

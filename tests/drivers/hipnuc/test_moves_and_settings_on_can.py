@@ -184,7 +184,7 @@ def test_a_number_that_is_in_force_before_it_is_saved_is_left_at_a_restart(kind:
 
 def test_a_number_that_is_heard_on_the_bus_is_refused_and_nothing_is_written(kind: tuple[Protocol, Any]) -> None:
     protocol, bench = kind
-    with pytest.raises(BadArgument, match=rf"{protocol.noun} 12 is taken: (frame 0x|PGN F).* (on the bus|from it)"):
+    with pytest.raises(BadArgument, match=rf"{protocol.noun} 12 is in use: received its (frame 0x|PGN F)"):
         move(protocol, bench, 12)
     assert not any(protocol.is_write(data) for _, data in bench.sent)
     move(protocol, bench, 8)  # its own number is written all the same
@@ -196,7 +196,7 @@ def test_refused_and_ignored_numbers_are_told(protocol: Protocol) -> None:
     register = frozenset({protocol.register})
     with pytest.raises((Aborted, Rejected), match=r"invalid value|status 1"):
         move(protocol, protocol.make(variant=protocol.variant(refuses=register)), 9)
-    with pytest.raises((DeviceRefused, Rejected), match=r"reads back 8|the module has 8"):
+    with pytest.raises((DeviceRefused, Rejected), match=r"after the write, got 8"):
         move(protocol, protocol.make(variant=protocol.variant(ignores=register)), 9)
 
 
@@ -210,7 +210,7 @@ def test_a_module_that_is_heard_nowhere_is_told_to_go_back(protocol: Protocol) -
 
     action = protocol.make().driver.actions[protocol.noun]
     script = action.script(Target(protocol.options(8), 500_000), action.arguments({protocol.noun: 9}))
-    with pytest.raises(NoReply, match=r"answers neither (as node 9 nor as node 8|at address 9 nor at 8)"):
+    with pytest.raises(NoReply, match=r"replied neither (as node 9 nor as node 8|at address 9 nor at 8)"):
         run_script(script, silent)
     can_id, _, data = RAW_FRAME.unpack(sent[-1])
     assert (can_id & EXTENDED_ID_MAX, data) == (protocol.go_back[0], bytes.fromhex(protocol.go_back[1]))
@@ -222,10 +222,13 @@ def test_a_restart_that_loses_the_module_is_told(protocol: Protocol) -> None:
     bench.run(BOOTED_NS)
     bench.act("bitrate", bitrate=250_000)
     bench.module.hardware = type(bench.module.hardware)(boot_ms=60_000)  # the host does not understand its frames then
-    assert bench.act("restart") == "restarted; it has 250000 bit/s now, which this bus has not"
+    assert (
+        bench.act("restart")
+        == "restarted; the device now uses 250000 bit/s and the bus does not; set the bus to 250000 bit/s"
+    )
     bench = protocol.make(boot_ms=60_000)
     bench.now_ns += 70_000_000_000
-    with pytest.raises(NoReply, match=f"nothing is heard of {protocol.noun} 8 after the restart"):
+    with pytest.raises(NoReply, match=f"no frame of {protocol.noun} 8 after the restart"):
         bench.act("restart")
 
 
@@ -237,7 +240,7 @@ def test_factory_settings_are_in_force_after_a_restart(protocol: Protocol) -> No
     assert "after the next restart" in done
     bench = protocol.make(9, others=(8,))
     bench.run(100_000_000)
-    with pytest.raises(BadArgument, match=f"{protocol.noun} 8 is taken"):
+    with pytest.raises(BadArgument, match=f"{protocol.noun} 8, the factory .* is in use"):
         bench.act("factory_reset")
     assert not any(protocol.is_write(data) for _, data in bench.sent)
 
@@ -256,7 +259,7 @@ def test_a_number_that_is_none_is_not_looked_for(
     monkeypatch.setattr(protocol.session, "read_values", read_values)
     action = protocol.make().driver.actions["restart"]
     script = action.script(Target(protocol.options(8), 500_000), action.arguments({}))
-    with pytest.raises(NoReply, match=f"nothing is heard of {protocol.noun} 8 after the restart"):
+    with pytest.raises(NoReply, match=f"no frame of {protocol.noun} 8 after the restart"):
         run_script(script, lambda _request: Silence(()))
 
 
@@ -299,12 +302,12 @@ def test_a_setting_written_saved_and_restarted_is_what_is_read(protocol: Protoco
 def test_canopen_values_that_do_not_go_together_are_refused() -> None:
     target = CanopenBench().target(125_000, 30_000.0)
     CANOPEN_SETTINGS.check(target, {**CANOPEN.delivered, "bit_rate": 125_000})
-    with pytest.raises(BadArgument, match="expected 125000, the rate of the bus, got 500000"):
+    with pytest.raises(BadArgument, match="expected 125000, the bit rate of the bus, got 500000"):
         CANOPEN_SETTINGS.check(target, {"bit_rate": 500_000})
     with pytest.raises(BadArgument, match=r"tpdo1_interval_ms: expected 0 or 5 … 1000, got 4"):
         CANOPEN_SETTINGS.check(target, {"tpdo1_interval_ms": 4})
     fast = {f"tpdo{tpdo}_interval_ms": 5 for tpdo in TPDOS}  # 586 bits · 200 = 117,200 bit/s
-    with pytest.raises(BadArgument, match=r"got 118 % of that: .*TPDO4 every 5 ms 17.8 %.*; other devices 24 %"):
+    with pytest.raises(BadArgument, match=r"got 118 % of it: .*TPDO4 every 5 ms 17.8 %.*; other devices 24 %"):
         CANOPEN_SETTINGS.check(target, fast)
     # sent when SYNC comes, which does not
     CANOPEN_SETTINGS.check(target, fast | {f"tpdo{tpdo}_by": "sync" for tpdo in TPDOS})
@@ -312,11 +315,11 @@ def test_canopen_values_that_do_not_go_together_are_refused() -> None:
 
 def test_j1939_values_that_do_not_go_together_are_refused() -> None:
     bench = J1939Bench()
-    with pytest.raises(BadArgument, match="expected 125000, the rate of the bus, got 500000"):
+    with pytest.raises(BadArgument, match="expected 125000, the bit rate of the bus, got 500000"):
         J1939_SETTINGS.check(bench.target(125_000), {"bit_rate": 500_000})
     fast = {f"{pgn}_interval_ms": 5 for pgn in ("ff34", "ff37", "ff3d", "ff41")}  # 131 bits · 200 · 4 = 104,800 bit/s
     J1939_SETTINGS.check(bench.target(125_000), fast)
-    with pytest.raises(BadArgument, match=r"got 105 % of that: FF34 every 5 ms 21 %, .*"):
+    with pytest.raises(BadArgument, match=r"got 105 % of it: FF34 every 5 ms 21 %, .*"):
         J1939_SETTINGS.check(bench.target(125_000), fast | {"ff43_interval_ms": 5})
     action = bench.driver.actions["interval"]
 

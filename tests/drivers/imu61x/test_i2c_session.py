@@ -36,5 +36,5 @@ def test_set_up_writes_reads_back_and_leaves_alone() -> None:
     log.clear()
     run_transfer_script(set_up(RegisterOptions()), transfer)
     assert len(log) == 1
-    with pytest.raises(DeviceRefused, match="wrote 0x4b, read back 0xbb"):
+    with pytest.raises(DeviceRefused, match="expected 0x4b after the write, got 0xbb"):
         run_transfer_script(set_up(RegisterOptions(accel_filter=4)), lambda one: b"\xbb" * one.read_bytes)

@@ -180,7 +180,7 @@ def test_state_that_changed_by_itself_is_noticed() -> None:
     stuck = over_spi(device, READ_STATE)
     assert stuck[-2:] == b"\xa5\xfe"
     (event,) = made.decode(1, stuck[:-1] + b"\xff")
-    assert event == Vanished("WIN_CTRL is 1, expected 0")
+    assert event == Vanished("expected WIN_CTRL 0, got 1")
 
 
 def test_words_of_the_manual_and_their_answers() -> None:
@@ -214,10 +214,10 @@ EXTENDED = bursts.encode_extended(
     [
         ("standard", STANDARD, ""),
         ("extended", EXTENDED, ""),
-        ("standard", EXTENDED[:28], "its check value does not match"),
-        ("extended", STANDARD + bytes(20), "its check value does not match"),
-        ("standard", bytes(28), "only 0x00"),
-        ("extended", b"\xff" * 48, "only 0xFF"),
+        ("standard", EXTENDED[:28], "wrong check value"),
+        ("extended", STANDARD + bytes(20), "wrong check value"),
+        ("standard", bytes(28), "received only 0x00"),
+        ("extended", b"\xff" * 48, "received only 0xFF"),
         ("standard", STANDARD[:-1], "expected 28 bytes, got 27"),
         ("extended", b"", "expected 48 bytes, got 0"),
     ],

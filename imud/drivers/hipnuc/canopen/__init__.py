@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""HiPNUC devices on CANopen."""

@@ -1,12 +1,12 @@
-"""CANopen as CiA 301 defines it: identifiers, network management (NMT), and expedited SDO from the client's side.
+"""CANopen by CiA 301: identifiers, network management (NMT), and expedited SDO of a client.
 
-An identifier is a function (upper four bits) plus the node's number; two functions are the whole bus's. Manual
-"IMU配置手冊" V1.5.9, section 5.2:
+An identifier is a function (upper four bits) plus the node number. NMT and SYNC are functions of the complete bus.
+Manual "IMU配置手冊" V1.5.9, section 5.2:
 
     NMT 0x000   SYNC 0x080   EMCY 0x080+n   SDO reply 0x580+n   SDO request 0x600+n   heartbeat 0x700+n
     TPDO1 0x180+n   TPDO2 0x280+n   TPDO3 0x380+n   TPDO4 0x480+n   TPDO6 0x680+n   TPDO7 0x780+n
 
-The last two TPDOs are the vendor's choice; they do not collide with what CiA 301 predefines.
+The vendor chose the identifiers of TPDO6 and TPDO7. They do not collide with the identifiers of CiA 301.
 
 Expedited SDO: CiA 301, section 7.2.4.3, and manual section 5.4.1.
 
@@ -18,7 +18,7 @@ Expedited SDO: CiA 301, section 7.2.4.3, and manual section 5.4.1.
     read                     0x40                  →   0x4F 0x4B 0x47 0x43 (1, 2, 3, 4 bytes), 0x42 (no length given)
     abort, both ways         0x80, data: u32 code
 
-A longer value comes in segments (0x41, 0x40); that transfer is aborted, and the value counts as not readable here.
+A node sends a longer value in segments (0x41, 0x40). imud aborts such a transfer and treats the value as unreadable.
 """
 
 from collections.abc import Callable
@@ -44,36 +44,30 @@ SDO_REPLY: Final = 0x580
 SDO_REQUEST: Final = 0x600
 HEARTBEAT: Final = 0x700
 TPDO_FUNCTIONS: Final = {1: 0x180, 2: 0x280, 3: 0x380, 4: 0x480, 6: 0x680, 7: 0x780}
-"""Functions of the TPDOs by their number."""
+"""Function of each TPDO, by its number."""
 
 
 class NmtCommand(Enum):
-    """Commands of the network management; one byte, followed by the node's number (CiA 301, 7.2.8.2)."""
+    """Commands of the network management: one byte, followed by the node number (CiA 301, 7.2.8.2)."""
 
-    START = 0x01
-    """Operational: TPDOs are sent."""
-    STOP = 0x02
-    """Only NMT and heartbeat work."""
-    PRE_OPERATIONAL = 0x80
-    """SDO remains, TPDOs do not."""
-    RESET_NODE = 0x81
-    """Restart, as by power-on."""
-    RESET_COMMUNICATION = 0x82
-    """Restart of the communication with what is saved."""
+    START = 0x01  # operational: the node sends TPDOs
+    STOP = 0x02  # only NMT and heartbeat work
+    PRE_OPERATIONAL = 0x80  # SDO works, TPDOs do not
+    RESET_NODE = 0x81  # restart, as after power-on
+    RESET_COMMUNICATION = 0x82  # restart of the communication with the saved values
 
 
 class NmtState(Enum):
-    """States that a heartbeat carries (CiA 301, 7.2.8.3.2.2)."""
+    """States in a heartbeat (CiA 301, 7.2.8.3.2.2)."""
 
-    BOOT_UP = 0x00
-    """Sent once after a restart."""
+    BOOT_UP = 0x00  # sent once after a restart
     STOPPED = 0x04
     OPERATIONAL = 0x05
     PRE_OPERATIONAL = 0x7F
 
 
 def state_name(code: int) -> str:
-    """A state in words, for example `pre-operational`; unknown ones as their number."""
+    """Return the name of a state, for example `pre-operational`; the number of an unknown state."""
     try:
         return NmtState(code).name.lower().replace("_", "-")
     except ValueError:
@@ -88,7 +82,9 @@ READ_SIZES: Final = {0x4F: 1, 0x4B: 2, 0x47: 3, 0x43: 4, 0x42: 4}
 READ_SEGMENTED: Final = (0x40, 0x41)
 ABORT: Final = 0x80
 TIMEOUT_NS: Final = NS_PER_S // 2
-FLASH_TIMEOUT_NS: Final = 2 * NS_PER_S  # erasing a flash page takes longer than a reply; the manual gives no time
+FLASH_TIMEOUT_NS: Final = (
+    2 * NS_PER_S
+)  # longer than a reply because the node erases a flash page; the manual states no time
 ABORT_UNSUPPORTED: Final = 0x0504_0001
 
 ABORT_TEXTS: Final = {
@@ -124,45 +120,45 @@ ABORT_TEXTS: Final = {
     0x0800_0023: "object dictionary not present, or its generation failed",
     0x0800_0024: "no data available",
 }
-"""Meanings of SDO abort codes (CiA 301, table 22)."""
+"""Meanings of the SDO abort codes (CiA 301, table 22)."""
 
 
 class Aborted(Rejected):
-    """The node aborted an SDO transfer. Example: the object does not exist in its dictionary."""
+    """SDO transfer that the node aborted. Example: the object does not exist in its dictionary."""
 
     def __init__(self, name: str, code: int) -> None:
-        super().__init__(f"{name}: the node refused: {abort_text(code)} (0x{code:08X})")
+        super().__init__(f"{name}: the node rejected the request: {abort_text(code)} (0x{code:08X})")
         self.code = code
 
 
 def abort_text(code: int) -> str:
-    """An abort code in words."""
+    """Return the meaning of an abort code."""
     return ABORT_TEXTS.get(code, "unknown abort code")
 
 
 def write_frame(index: int, sub: int, data: bytes) -> bytes:
-    """Data of a request that writes 1 … 4 bytes. Raises KeyError for another number."""
+    """Return the data of a request that writes 1 … 4 bytes. Raises KeyError for another length."""
     return bytes([WRITE[len(data)]]) + _address(index, sub) + data.ljust(4, b"\0")
 
 
 def read_frame(index: int, sub: int) -> bytes:
-    """Data of a request that reads."""
+    """Return the data of a read request."""
     return bytes([READ]) + _address(index, sub) + bytes(4)
 
 
 def abort_frame(index: int, sub: int, code: int) -> bytes:
-    """Data of a frame that aborts a transfer."""
+    """Return the data of a frame that aborts a transfer."""
     return bytes([ABORT]) + _address(index, sub) + code.to_bytes(4, "little")
 
 
 def value_of(data: bytes) -> bytes | None:
-    """The value in the reply to a read; None if it would come in segments."""
+    """Return the value in the reply to a read; None if the node sends it in segments."""
     size = READ_SIZES.get(data[0])
     return None if size is None else data[4 : 4 + size]
 
 
 def read_object(node: int, index: int, sub: int) -> RequestScript[bytes | None]:
-    """Read an object: its bytes, or None if it has more than four. Raises Aborted, NoReply."""
+    """Read an object. Return its bytes, or None if it has more than four bytes. Raises Aborted, NoReply."""
     name = f"node {node}, read 0x{index:04X}.{sub}"
     ends = _answers(node, index, sub, (*READ_SIZES, *READ_SEGMENTED))
     data = _reply(name, (yield _request(node, name, read_frame(index, sub), ends, index, sub)))
@@ -183,10 +179,7 @@ def write_object(
     timeout_ns: int = TIMEOUT_NS,
     also: tuple[CanFilter, ...] = (),
 ) -> RequestScript[None]:
-    """Write an unsigned object of 1 … 4 bytes. Raises Aborted, NoReply.
-
-    `also` has the replies of a node that imud does not listen to.
-    """
+    """Write an unsigned object of 1 … 4 bytes. `also`: filters for replies of another node. Raises Aborted, NoReply."""
     name = f"node {node}, write 0x{index:04X}.{sub} = {value}"
     ends = _answers(node, index, sub, (WRITTEN,))
     frame = write_frame(index, sub, value.to_bytes(size, "little"))
@@ -200,9 +193,9 @@ def _request(node: int, name: str, frame: bytes, ends: Callable[[Message], bool]
 
 
 def _reply(name: str, outcome: Outcome) -> bytes:
-    """Data of the frame that answered. Raises Aborted, NoReply."""
+    """Return the data of the reply. Raises Aborted, NoReply."""
     if isinstance(outcome, Silence):
-        raise NoReply(f"{name}: expected a reply, got nothing; is the node's number right, and is the node stopped?")
+        raise NoReply(f"{name}: expected a reply, got none; check the node number and that the node is not stopped")
     data = outcome.frames[-1].payload
     if isinstance(outcome, Rejection):
         raise Aborted(name, int.from_bytes(data[4:], "little"))
@@ -210,7 +203,7 @@ def _reply(name: str, outcome: Outcome) -> bytes:
 
 
 def _answers(node: int, index: int, sub: int, commands: tuple[int, ...]) -> Callable[[Message], bool]:
-    """A test for replies of that node about that object with one of these commands."""
+    """Return a test for replies of this node about this object with one of these commands."""
     can_id, address = SDO_REPLY + node, _address(index, sub)
 
     def holds(message: Message) -> bool:

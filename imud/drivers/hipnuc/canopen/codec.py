@@ -1,6 +1,6 @@
-"""HiPNUC modules on CAN with CANopen. Manual "IMU配置手冊" V1.5.9, chapter 5; corrections ERRATA B5, B6, B17, B18.
+"""HiPNUC devices on CAN with CANopen. Manual "IMU配置手冊" V1.5.9, chapter 5; corrections ERRATA B5, B6, B17, B18.
 
-Standard frames, little-endian, one TPDO per quantity; identifier = function + node number (8 as delivered):
+Standard frames, little-endian, one TPDO per quantity; identifier = function + node number (factory value 8):
 
     ┌───────┬───────┬───────────────────────────────────────┐
     │ TPDO1 │ 0x180 │ accel x, y, z             i16 × 3     │  0.001 G, 1 G = 9.8 m/s²
@@ -11,11 +11,11 @@ Standard frames, little-endian, one TPDO per quantity; identifier = function + n
     │ TPDO7 │ 0x780 │ inclinometer x, y         i32 × 2     │  0.01°
     └───────┴───────┴───────────────────────────────────────┘
 
-1 G is what the firmware divides by, 9.8 m/s², not standard gravity. None of them has a counter or a time: how they
-become samples is the rule of `assembly`. Each TPDO is sent by its own timer, or when SYNC (0x080) comes.
+The firmware divides by 1 G = 9.8 m/s², not by standard gravity. The TPDOs have no counter and no time; `assembly` makes
+samples of them. The node sends each TPDO by its own timer, or after SYNC (0x080).
 
-Other frames of a node: the heartbeat (0x700), whose first is the boot-up message, is a reply when the state changed, or
-is not operational; SDO replies (0x580) are replies; emergencies (0x080 + node) are ignored.
+Other frames of a node: SDO replies (0x580) are reply frames. A heartbeat (0x700, the first is the boot-up message) is a
+reply frame if the state changed or is not operational. Emergencies (0x080 + node) are ignored.
 """
 
 import struct
@@ -50,7 +50,7 @@ FOUR: Final = struct.Struct("<4h")
 ONE_LONG: Final = struct.Struct("<i")
 TWO_LONG: Final = struct.Struct("<2i")
 LAYOUTS: Final = {1: THREE, 2: THREE, 3: THREE, 4: FOUR, 6: ONE_LONG, 7: TWO_LONG}
-"""Data of the TPDOs by their number."""
+"""Data layout of each TPDO, by its number."""
 
 ACCEL_M_S2_PER_LSB: Final = 0.001 * M_S2_PER_G
 GYRO_RAD_S_PER_LSB: Final = 0.1 * RAD_PER_DEG
@@ -64,14 +64,15 @@ class HipnucCanopenOptions(Options, frozen=True, kw_only=True, forbid_unknown_fi
     """Options of a node, and of SYNC."""
 
     node: Annotated[int, Meta(ge=1, le=NODE_MAX)] = NODE_DEFAULT
-    """The node's number; 8 as delivered."""
+    """Node number; factory value 8."""
     tpdos: list[TpdoNumber] | Literal["auto"] = "auto"
-    """TPDOs to make samples of, for example [1, 2, 3]; auto = all that are heard."""
+    """TPDOs that make samples, for example [1, 2, 3]; auto = all received TPDOs."""
     sync_hz: Annotated[float, Meta(ge=0, le=SYNC_HZ_MAX)] = 0.0
-    """SYNC frames per second, for TPDOs of type 1; one device sends for all of a bus. 0 = none, the timers count."""
+    """SYNC frames per second for TPDOs of type 1, sent by one device per bus. 0 = no SYNC, the TPDOs use their
+    timers.
+    """
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a rate that is no rate."""
         if 0 < self.sync_hz < SYNC_HZ_MIN:
             raise ValueError(f"sync_hz: expected 0, or {SYNC_HZ_MIN} to {SYNC_HZ_MAX:g}, got {self.sync_hz}")
 
@@ -88,7 +89,7 @@ class HipnucCanopenCodec:
         self._state = NmtState.OPERATIONAL.value
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """Add one frame; return what it completed. Never raises for any frame."""
+        """Add one frame. Return the completed events. Never raises an exception."""
         ledger, size = self.ledger, len(data)
         ledger.bytes_in += size
         tpdo = self._tpdos.get(can_id)
@@ -103,15 +104,15 @@ class HipnucCanopenCodec:
         return () if frames is None else (_measurement(dict(frames)),)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """No-op: the next frame shows what is lost."""
+        """Do nothing: the next frame shows the loss."""
         return ()
 
     def reset(self) -> None:
-        """Drop the incomplete sample: frames are missing here."""
+        """Drop the incomplete sample after lost frames."""
         self._assembly.reset()
 
     def _other(self, can_id: int, extended: bool, data: bytes) -> Sequence[CodecEvent]:
-        """Decode a frame that is no TPDO of this node."""
+        """Decode a frame other than a TPDO of this node."""
         ledger, size = self.ledger, len(data)
         if extended or can_id not in (self._sdo_id, self._heartbeat_id, self._emergency_id):
             ledger.bytes_skipped += size
@@ -127,7 +128,7 @@ class HipnucCanopenCodec:
         return ()
 
     def _is_news(self, state: int) -> bool:
-        """Note a heartbeat; return whether the state changed, or is one in which the node sends no TPDOs."""
+        """Store the state of a heartbeat. Return whether it changed or the node sends no TPDOs in it."""
         changed = state != self._state
         self._state = state
         if state == NmtState.BOOT_UP.value:
@@ -141,7 +142,7 @@ class HipnucCanopenCodec:
 
 
 def _measurement(frames: Mapping[int, bytes]) -> Measurement:
-    """Make a measurement of a set of TPDOs; without a quaternion its attitude comes from the angles."""
+    """Return the measurement of a set of TPDOs. Without a quaternion, the attitude is computed from the angles."""
     euler = _vector(frames.get(3), EULER_RAD_PER_LSB)
     quat: Quaternion | None = None
     if 4 in frames:
@@ -171,7 +172,7 @@ def _vector(data: bytes | None, factor: float) -> Vector3 | None:
     return (x * factor, y * factor, z * factor)
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
 
 def encode_tpdos(
@@ -183,9 +184,9 @@ def encode_tpdos(
     pressure_pa: float | None = None,
     incli_rad: Pair | None = None,
 ) -> dict[int, bytes]:
-    """Data of the TPDOs by their number, in the order they are sent, from the SI values that are given.
+    """Return the data of the TPDOs by number, in sending order, for the given SI values.
 
-    Raises struct.error for a value beyond its range, for example 32.767 G.
+    Raises struct.error for a value out of range, for example 32.767 G.
     """
     values: dict[int, tuple[Sequence[float] | None, float]] = {
         1: (accel_m_s2, ACCEL_M_S2_PER_LSB),

@@ -1,13 +1,12 @@
-"""Request scripts of a HiPNUC module on CANopen: identity, settings, and every command of its manual.
+"""Request scripts of a HiPNUC device on CANopen: identity, settings, and every command of its manual.
 
-Manual "IMU配置手冊" V1.5.9, section 5.4; objects of CiA 301 where it names none. Settings last until power is off
-unless `save` follows. TPDO rate and type, inclinometer signs and zero apply at once; node number and bit rate need
-`save` and a restart. All raise NoReply and Aborted; ranges of arguments are those of the actions (`actions.py`), and
-what no range can express raises BadArgument here.
+Manual "IMU配置手冊" V1.5.9, section 5.4; otherwise objects of CiA 301. Settings are lost at power-off unless `save`
+follows. TPDO rate and type, inclinometer signs and zero take effect immediately; node number and bit rate after `save`
+and a restart. All scripts raise NoReply and Aborted. The actions in `driver.py` check the ranges of arguments; other
+rules raise BadArgument here.
 
-The manual names no object that can be read. What is written is read back all the same; a node that does not answer
-reads, or refuses them, has then taken the value as far as it confirmed the write: `Written.UNVERIFIED`. Where a node is
-after its number was written, or after a restart, is in `moves.py`.
+The manual names no readable object. imud reads back every written value. If the node does not support the read, the
+confirmation of the write is the only evidence: `Written.UNVERIFIED`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -53,7 +52,7 @@ HEARTBEAT_TIME: Final = 0x1017
 IDENTITY: Final = 0x1018
 IDENTITY_SUBS: Final = {1: "vendor id", 2: "product code", 3: "revision", 4: "serial number"}
 TPDO_OBJECTS: Final = {number: 0x1800 + place for place, number in enumerate(TPDO_FUNCTIONS)}
-"""Communication parameters by the TPDO's number: TPDO6 is 0x1804, TPDO7 is 0x1805 (ERRATA B18)."""
+"""Communication parameters by TPDO number: TPDO6 is 0x1804, TPDO7 is 0x1805 (ERRATA B18)."""
 TPDO_TYPE: Final = 2
 TPDO_TIMER: Final = 5
 CONTROL: Final = 0x2000
@@ -65,17 +64,16 @@ INCLI_ZERO: Final = 0x20A5
 
 BitRate = Literal[1_000_000, 500_000, 250_000, 125_000]
 BIT_RATES: Final[Mapping[int, int]] = {1_000_000: 0, 500_000: 2, 250_000: 3, 125_000: 4}
-"""Codes of 0x209A by bit/s; 1 is not given."""
+"""Code of 0x209A for each bit rate, bit/s; the manual omits code 1."""
 BIT_RATE_OF: Final = {code: bit_s for bit_s, code in BIT_RATES.items()}
-Place = tuple[int, int]
-"""Index and sub-index of an object."""
+Place = tuple[int, int]  # index and sub-index of an object
 SETTING_PLACES: Final[tuple[Place, ...]] = (
     *((index, sub) for index in TPDO_OBJECTS.values() for sub in (TPDO_TYPE, TPDO_TIMER)),
     *((index, 0) for index in (NODE_ID, BIT_RATE, INCLI_SIGN_X, INCLI_SIGN_Y, HEARTBEAT_TIME)),
 )
-"""Objects that can be set and that may be readable."""
+"""Writable objects that may be readable."""
+# 200 Hz … 1 Hz for each TPDO (section 5.1)
 PERIOD_MIN_MS, PERIOD_MAX_MS = 5, 1000
-"""200 Hz … 1 Hz for each TPDO (section 5.1)."""
 SAVE, FACTORY_RESET, RESTART = 0x00, 0x01, 0xFF
 HEARTBEAT_WAIT_NS: Final = 3 * NS_PER_S // 2
 
@@ -83,21 +81,16 @@ HEARTBEAT_WAIT_NS: Final = 3 * NS_PER_S // 2
 class Transmission(Enum):
     """Transmission types of a TPDO (sub-index 2 of its parameters)."""
 
-    SYNC = 0x01
-    """On each SYNC."""
-    TIMER_MANUFACTURER = 0xFE
-    """By its own timer (the table of section 5.2)."""
-    TIMER = 0xFF
-    """By its own timer, as delivered (section 5.4.2)."""
+    SYNC = 0x01  # at each SYNC
+    TIMER_MANUFACTURER = 0xFE  # by its own timer (table of section 5.2)
+    TIMER = 0xFF  # by its own timer, factory value (section 5.4.2)
 
 
 class InclinometerZero(Enum):
     """Operations on the zero of the inclinometer."""
 
-    SET = 2
-    """The present position reads 0, 0."""
-    CANCEL = 5
-    """Back to the true angles."""
+    SET = 2  # the present position reads 0, 0
+    CANCEL = 5  # back to the true angles
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -122,15 +115,15 @@ def identify(node: int) -> RequestScript[Identity]:
 
 
 def read_settings(node: int) -> RequestScript[Mapping[str, str]]:
-    """Ask for all settings by their object and sub-index; those that cannot be read are left out. Raises NoReply."""
+    """Read all settings by object and sub-index, without unreadable objects. Raises NoReply."""
     values = yield from read_values(node, SETTING_PLACES)
     return {f"{index:04X}.{sub}": str(value) for (index, sub), value in values.items()}
 
 
 def read_values(node: int, places: Sequence[Place], *, silent_is_fine: bool = False) -> RequestScript[dict[Place, int]]:
-    """Read objects as numbers; those that the node refuses to read are left out.
+    """Read objects as numbers, without objects that the node does not read. Raises NoReply.
 
-    Raises NoReply; with `silent_is_fine` what comes after a first missing reply is left out instead.
+    With `silent_is_fine`, the script ends at the first missing reply and does not raise.
     """
     values: dict[Place, int] = {}
     for index, sub in places:
@@ -146,7 +139,7 @@ def read_values(node: int, places: Sequence[Place], *, silent_is_fine: bool = Fa
 
 
 def _heartbeat_state(node: int) -> RequestScript[str]:
-    """State in a node's heartbeat while it sends no TPDOs; empty for one that sends, or is not heard."""
+    """Return the state in the heartbeat of a node that sends no TPDOs; empty without a heartbeat."""
     period = yield from _try_read(node, HEARTBEAT_TIME, 0)
     if period is None or not _number(period):
         return ""
@@ -159,51 +152,53 @@ def _heartbeat_state(node: int) -> RequestScript[str]:
 
 
 def set_node_id(node: int, new_node: int) -> RequestScript[Written]:
-    """Give the node another number, 1 … 127; in force after `save` and a restart."""
+    """Set the node number, 1 … 127; effective after `save` and a restart."""
     return (yield from _set(node, NODE_ID, 0, new_node, 4, pending=True))
 
 
 def set_bit_rate(node: int, bit_s: BitRate) -> RequestScript[Written]:
-    """Set the rate of the bus in bit/s; in force after `save` and a restart."""
+    """Set the bit rate of the bus; effective after `save` and a restart."""
     return (yield from _set(node, BIT_RATE, 0, BIT_RATES[bit_s], 4, pending=True))
 
 
 def set_tpdo_period(node: int, tpdo: TpdoNumber, period_ms: int) -> RequestScript[Written]:
-    """Send a TPDO every 5 … 1000 ms by its timer, or never (0); at once. Raises BadArgument for 1 … 4."""
+    """Set the timer of a TPDO, 5 … 1000 ms, or 0: never; effective immediately. Raises BadArgument for 1 … 4."""
     check_period(period_ms)
     return (yield from _set(node, TPDO_OBJECTS[tpdo], TPDO_TIMER, period_ms, 2))
 
 
 def check_period(period_ms: int) -> None:
-    """Raises BadArgument for a period between never and the shortest."""
+    """Raise BadArgument for a period between 0 and the minimum."""
     if 0 < period_ms < PERIOD_MIN_MS:
         raise BadArgument(f"interval_ms: expected 0 or {PERIOD_MIN_MS} … {PERIOD_MAX_MS}, got {period_ms}")
 
 
 def set_tpdo_type(node: int, tpdo: TpdoNumber, transmission: Transmission) -> RequestScript[Written]:
-    """Send a TPDO by its timer, or when SYNC comes; at once."""
+    """Send a TPDO by its timer, or at each SYNC; effective immediately."""
     return (yield from _set(node, TPDO_OBJECTS[tpdo], TPDO_TYPE, transmission.value, 1))
 
 
 def set_inclinometer_sign(node: int, axis: Literal["x", "y"], *, invert: bool) -> RequestScript[Written]:
-    """Turn the sign of one axis of the inclinometer around, or leave it as delivered; at once."""
+    """Set the sign of one axis of the inclinometer; effective immediately."""
     return (yield from _set(node, INCLI_SIGN_X if axis == "x" else INCLI_SIGN_Y, 0, int(invert), 4))
 
 
 def set_inclinometer_signs(node: int, *, invert_x: bool, invert_y: bool) -> RequestScript[Written]:
-    """Set the signs of both axes; at once."""
+    """Set the signs of both axes; effective immediately."""
     x = yield from set_inclinometer_sign(node, "x", invert=invert_x)
     y = yield from set_inclinometer_sign(node, "y", invert=invert_y)
     return Written.VERIFIED if x is y is Written.VERIFIED else Written.UNVERIFIED
 
 
 def set_heartbeat(node: int, period_ms: int) -> RequestScript[Written]:
-    """Send the heartbeat of CiA 301 every so many ms, or never (0); at once. The manual does not name the object."""
+    """Set the interval of the heartbeat of CiA 301, ms; 0: never; effective immediately. The manual omits the
+    object.
+    """
     return (yield from _set(node, HEARTBEAT_TIME, 0, period_ms, 2))
 
 
 def set_inclinometer_zero(node: int, zero: InclinometerZero) -> RequestScript[None]:
-    """Make the present position the inclinometer's zero, or cancel that; at once."""
+    """Make the present position the zero of the inclinometer, or cancel it; effective immediately."""
     yield from write_object(node, INCLI_ZERO, 0, zero.value, 4)
 
 
@@ -213,36 +208,37 @@ def save(node: int) -> RequestScript[None]:
 
 
 def factory_reset(node: int) -> RequestScript[None]:
-    """Restore the factory settings, node number and bit rate included; in force after the next power-on."""
+    """Restore the factory settings with node number and bit rate; effective after the next power-on."""
     yield from write_object(node, CONTROL, 0, FACTORY_RESET, 4, timeout_ns=FLASH_TIMEOUT_NS)
 
 
 def restart_request(node: int) -> Request:
-    """The request for a restart, as by power-on. Whether it is confirmed is not stated, so no reply is waited for."""
+    """Return the request for a restart, as after power-on."""
+    # silent: the manual does not state whether the node confirms it
     frame = write_frame(CONTROL, 0, RESTART.to_bytes(4, "little"))
     payload = pack_frame(SDO_REQUEST + node, False, frame)
     return Request(payload, f"node {node}, restart", never, never, never, silent=True)
 
 
 def nmt(node: int, command: NmtCommand) -> RequestScript[None]:
-    """Send an NMT command, which no node confirms. What follows a reset is for `moves.reset`."""
+    """Send an NMT command, which no node confirms. `reset` follows the node after a reset."""
     yield nmt_request(node, command)
 
 
 def nmt_request(node: int, command: NmtCommand) -> Request:
-    """The request of an NMT command."""
+    """Return the request of an NMT command."""
     payload = pack_frame(NMT, False, bytes([command.value, node]))
     return Request(payload, f"node {node}, NMT {command.name}", never, never, never, silent=True)
 
 
 def _set(node: int, index: int, sub: int, value: int, size: int, *, pending: bool = False) -> RequestScript[Written]:
-    """Write, and read back where that is possible. Raises DeviceRefused where something else stands there then."""
+    """Write an object and read it back if possible. Raises DeviceRefused if the value differs."""
     yield from write_object(node, index, sub, value, size)
     return (yield from verify(node, index, sub, value, pending=pending))
 
 
 def verify(node: int, index: int, sub: int, value: int, *, pending: bool = False) -> RequestScript[Written]:
-    """Read back what was written. Raises DeviceRefused where something else stands there."""
+    """Read back a written value. Raises DeviceRefused if it differs."""
     try:
         found = yield from _try_read(node, index, sub)
     except NoReply:
@@ -250,12 +246,14 @@ def verify(node: int, index: int, sub: int, value: int, *, pending: bool = False
     if found is None:
         return Written.UNVERIFIED_PENDING if pending else Written.UNVERIFIED
     if _number(found) != value:
-        raise DeviceRefused(f"node {node}: expected 0x{index:04X}.{sub} = {value}, reads back {_number(found)}")
+        raise DeviceRefused(
+            f"node {node}: expected 0x{index:04X}.{sub} = {value} after the write, got {_number(found)}"
+        )
     return Written.PENDING if pending else Written.VERIFIED
 
 
 def _try_read(node: int, index: int, sub: int) -> RequestScript[bytes | None]:
-    """Bytes of an object; None where the node has none, or refuses to read it. Raises NoReply."""
+    """Return the bytes of an object; None if the node lacks it or rejects the read. Raises NoReply."""
     try:
         return (yield from read_object(node, index, sub))
     except Aborted:
@@ -267,31 +265,29 @@ def _number(value: bytes) -> int:
 
 
 def _is_heartbeat(node: int) -> Callable[[Message], bool]:
-    """A test for heartbeats of a node."""
     can_id = HEARTBEAT + node
     return lambda message: isinstance(message, ReplyFrame) and message.frame_id == can_id
 
 
 SENT_BY_NODE: Final = frozenset({*TPDO_FUNCTIONS.values(), SDO_REPLY, HEARTBEAT, EMERGENCY})
-"""Functions of frames that a node itself sends."""
+"""Functions of frames that a node sends."""
 LISTEN_NS: Final = 1100 * NS_PER_MS
-"""A TPDO comes at least once a second (section 5.1)."""
-BOOT_NS: Final = 3 * NS_PER_S
-"""Longest time to the boot-up message; the manual gives none."""
+"""Time to listen for a node, ns: it sends each TPDO at least once per second (section 5.1)."""
+BOOT_NS: Final = 3 * NS_PER_S  # maximum time to the boot-up message, ns; the manual states none
 ALL_BOOTS: Final = (CanFilter(HEARTBEAT, FUNCTION_MASK, False),)
 
 
 def change_node(settings: HipnucCanopenOptions, new: int) -> RequestScript[Written]:
-    """Give a node another number, 1 … 127, and follow it where that is in force at once.
+    """Set the node number, 1 … 127, and follow a node that uses it immediately.
 
-    Raises BadArgument for a number that is heard on the bus, DeviceRefused, Aborted, and NoReply for a node that is
-    heard at neither number afterwards; it is commanded to go back then.
+    Raises BadArgument for a number in use on the bus, DeviceRefused, Aborted, and NoReply for a node without reply at
+    both numbers (imud then commands it back).
     """
     node = settings.node
     if new == node:
         return (yield from set_node_id(node, new))
     if heard := (yield from _heard(new)):
-        raise BadArgument(f"node {new} is taken: frame 0x{heard:03X} of it is on the bus")
+        raise BadArgument(f"node {new} is in use: received its frame 0x{heard:03X}; try another number")
     first = yield from _write_number(node, new)
     again = yield from _write_number(node, new)
     if again:
@@ -301,40 +297,42 @@ def change_node(settings: HipnucCanopenOptions, new: int) -> RequestScript[Writt
         return (yield from verify(new, NODE_ID, 0, new))
     yield Request(
         _number_frame(new, node), f"node {new}, back to number {node}", never, never, never, silent=True
-    )  # in case it is there and could not answer
-    confirmed = "confirmed the write and " if first else ""
-    raise NoReply(f"the node {confirmed}answers neither as node {new} nor as node {node}: it was commanded to go back")
+    )  # in case it is there and cannot reply
+    confirmed = "confirmed the write and then " if first else ""
+    raise NoReply(
+        f"the node {confirmed}replied neither as node {new} nor as node {node}; imud commanded it back to {node}"
+    )
 
 
 def restart(settings: HipnucCanopenOptions, bus_bit_s: int) -> RequestScript[str]:
-    """Restart, as by power-on, and follow the node to the number that it has then; return what became of it.
+    """Restart the node, as after power-on, follow it to its number, and return a report.
 
-    `bus_bit_s` is the rate of the bus, 0 where it is not known. Raises NoReply for a node that is not heard afterwards.
+    `bus_bit_s` is the bit rate of the bus; 0 if it is not known. Raises NoReply if the node does not reply afterwards.
     """
     return (yield from _reset(settings, bus_bit_s, restart_request(settings.node)))
 
 
 def reset(settings: HipnucCanopenOptions, bus_bit_s: int, command: NmtCommand) -> RequestScript[str]:
-    """The same by an NMT command that resets."""
+    """Reset the node by an NMT command and follow it like `restart`."""
     return (yield from _reset(settings, bus_bit_s, nmt_request(settings.node, command)))
 
 
 def factory_reset_and_find(settings: HipnucCanopenOptions) -> RequestScript[str]:
-    """Restore the factory settings, in force after a restart: node 8 and 500 kbit/s.
+    """Restore the factory settings, effective after a restart: node 8 and 500 kbit/s.
 
-    Raises BadArgument where another node has number 8, Aborted, NoReply.
+    Raises BadArgument if another node has number 8, Aborted, NoReply.
     """
     if settings.node != NODE_DEFAULT and (yield from _heard(NODE_DEFAULT)):
-        raise BadArgument(f"node {NODE_DEFAULT} is taken: the factory's number is that of another node on the bus")
+        raise BadArgument(f"node {NODE_DEFAULT}, the factory number, is in use by another node; change that node first")
     yield from factory_reset(settings.node)
-    return f"restored; it is node {NODE_DEFAULT} at 500 kbit/s after the next restart"
+    return f"restored; the device is node {NODE_DEFAULT} at 500 kbit/s after the next restart"
 
 
 def _reset(settings: HipnucCanopenOptions, bus_bit_s: int, request: Request) -> RequestScript[str]:
     node = settings.node
     saved = yield from read_values(node, ((NODE_ID, 0), (BIT_RATE, 0)), silent_is_fine=True)
     number = saved.get((NODE_ID, 0), node)
-    if not 1 <= number <= NODE_MAX:  # no number of a node: it will stay where it is
+    if not 1 <= number <= NODE_MAX:  # not a valid number: the node keeps its present number
         number = node
     rate = BIT_RATE_OF.get(saved.get((BIT_RATE, 0), -1), bus_bit_s)
     places = tuple(dict.fromkeys((node, number)))
@@ -343,16 +341,16 @@ def _reset(settings: HipnucCanopenOptions, bus_bit_s: int, request: Request) -> 
         booted = yield from _find(places)
     if booted is None:
         if bus_bit_s and rate != bus_bit_s:
-            return f"restarted; it has {rate} bit/s now, which this bus has not"
+            return f"restarted; the device now uses {rate} bit/s and the bus does not; set the bus to {rate} bit/s"
         words = " or ".join(map(str, places))
-        raise NoReply(f"nothing is heard of node {words} after the restart: has it another bit rate now?")
+        raise NoReply(f"no frame of node {words} after the restart; does it use another bit rate now?")
     if booted != node:
         yield _follow(settings, booted)
     return f"restarted, as node {booted}"
 
 
 def _boot(request: Request, numbers: Sequence[int] | None) -> RequestScript[int | None]:
-    """Send a request that restarts the node; return the number in its boot-up message. `numbers`: None for any."""
+    """Send a request that restarts the node. Return the number in its boot-up message. `numbers`: None for any."""
 
     def ends(message: Message) -> bool:
         is_boot = isinstance(message, ReplyFrame) and message.payload == bytes([NmtState.BOOT_UP.value])
@@ -363,7 +361,7 @@ def _boot(request: Request, numbers: Sequence[int] | None) -> RequestScript[int 
 
 
 def _find(numbers: Sequence[int]) -> RequestScript[int | None]:
-    """The first of some numbers of which anything is heard."""
+    """Return the first number with a received frame."""
     for number in numbers:
         if (yield from _heard(number)):
             return number
@@ -371,16 +369,15 @@ def _find(numbers: Sequence[int]) -> RequestScript[int | None]:
 
 
 def _heard(node: int) -> RequestScript[int]:
-    """Ask a node for its device type, and return the identifier of the first frame that it sends, of any kind; 0 for
-    none."""
+    """Request the device type of a node. Return the identifier of its first frame of any kind; 0 without a frame."""
     also = tuple(CanFilter(function + node, STANDARD_ID_MAX, False) for function in sorted(SENT_BY_NODE))
     payload = pack_frame(SDO_REQUEST + node, False, read_frame(DEVICE_TYPE, 0))
-    outcome = yield Request(payload, f"node {node}, is it there", _is_from(node), never, never, LISTEN_NS, also=also)
+    outcome = yield Request(payload, f"node {node}, present?", _is_from(node), never, never, LISTEN_NS, also=also)
     return outcome.frames[-1].frame_id if isinstance(outcome, Reply) else 0
 
 
 def _write_number(node: int, value: int) -> RequestScript[bool]:
-    """Write the object of the number, and return whether that node confirmed it. Raises Aborted."""
+    """Write the node number. Return whether the node confirmed it. Raises Aborted."""
     also = (CanFilter(SDO_REPLY + node, STANDARD_ID_MAX, False),)
     try:
         yield from write_object(node, NODE_ID, 0, value, 4, also=also)
@@ -394,7 +391,7 @@ def _number_frame(node: int, value: int) -> bytes:
 
 
 def _follow(settings: HipnucCanopenOptions, node: int) -> Request:
-    """Listen to the node under another number from now on."""
+    """Return a request that makes imud use another node number."""
     moved = replace(settings, node=node)
     return Request(b"", f"node {settings.node}, now {node}", never, never, never, silent=True, settings=moved)
 

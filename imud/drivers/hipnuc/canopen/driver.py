@@ -1,4 +1,4 @@
-"""Table: the row `DRIVER` of HiPNUC modules on CANopen."""
+"""Row `DRIVER` of HiPNUC devices on CANopen: settings and actions."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -12,8 +12,7 @@ from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, DataSheet
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import Effect, Setting, SettingsTable, Written
 from imud.drivers.hipnuc.bus_load import MS_PER_S, CyclicMessage, refuse_other_rate, refuse_overload
-from imud.drivers.hipnuc.canopen import commands as moves
-from imud.drivers.hipnuc.canopen import commands as session
+from imud.drivers.hipnuc.canopen import commands
 from imud.drivers.hipnuc.canopen.cia301 import (
     EMERGENCY,
     FUNCTION_MASK,
@@ -69,37 +68,37 @@ _BY_OF: Final[Mapping[int, By]] = {
 
 
 def interval_name(tpdo: int) -> str:
-    """Name of the setting of a TPDO's interval."""
+    """Return the name of the setting for the interval of a TPDO."""
     return f"tpdo{tpdo}_interval_ms"
 
 
 def transmission_name(tpdo: int) -> str:
-    """Name of the setting of a TPDO's transmission."""
+    """Return the name of the setting for the transmission of a TPDO."""
     return f"tpdo{tpdo}_by"
 
 
 def values_of(values: Mapping[Place, int]) -> dict[str, Any]:
-    """Settings by name from objects; what stands in none of the forms of the table is left out."""
+    """Return settings by name from objects, without values outside the table."""
     reported: dict[str, Any] = {}
     for tpdo, index in TPDO_OBJECTS.items():
         reported[interval_name(tpdo)] = values.get((index, TPDO_TIMER))
         reported[transmission_name(tpdo)] = _BY_OF.get(values.get((index, TPDO_TYPE), -1))
-    signs = {"incli_x_reversed": session.INCLI_SIGN_X, "incli_y_reversed": session.INCLI_SIGN_Y}
+    signs = {"incli_x_reversed": commands.INCLI_SIGN_X, "incli_y_reversed": commands.INCLI_SIGN_Y}
     reported |= {name: {0: False, 1: True}.get(values.get((index, 0), -1)) for name, index in signs.items()}
-    reported["heartbeat_ms"] = values.get((session.HEARTBEAT_TIME, 0))
-    reported["bit_rate"] = BIT_RATE_OF.get(values.get((session.BIT_RATE, 0), -1))
-    reported["node"] = values.get((session.NODE_ID, 0))
+    reported["heartbeat_ms"] = values.get((commands.HEARTBEAT_TIME, 0))
+    reported["bit_rate"] = BIT_RATE_OF.get(values.get((commands.BIT_RATE, 0), -1))
+    reported["node"] = values.get((commands.NODE_ID, 0))
     return {name: value for name, value in reported.items() if value is not None}
 
 
 def set_interval(target: Target, tpdo: TpdoNumber, interval_ms: int) -> RequestScript[Written]:
-    """Set a TPDO's interval. Raises BadArgument where the TPDOs of the node are then more than the bus carries."""
-    session.check_period(interval_ms)
+    """Set the interval of a TPDO. Raises BadArgument if the TPDOs of the node then exceed the bit rate of the bus."""
+    commands.check_period(interval_ms)
     if interval_ms and target.baud:
         places = [(index, sub) for index in TPDO_OBJECTS.values() for sub in (TPDO_TYPE, TPDO_TIMER)]
-        present = yield from session.read_values(target.settings.node, places, silent_is_fine=True)
+        present = yield from commands.read_values(target.settings.node, places, silent_is_fine=True)
         _refuse_overload(target, values_of(present) | {interval_name(tpdo): interval_ms})
-    return (yield from session.set_tpdo_period(target.settings.node, tpdo, interval_ms))
+    return (yield from commands.set_tpdo_period(target.settings.node, tpdo, interval_ms))
 
 
 def _refuse_overload(target: Target, values: Mapping[str, Any]) -> None:
@@ -116,7 +115,7 @@ def _refuse_overload(target: Target, values: Mapping[str, Any]) -> None:
 
 
 def _check(target: Target, values: Mapping[str, Any]) -> None:
-    """Refuse another bit rate than that of the bus, and more than it carries. Raises BadArgument."""
+    """Raise BadArgument for another bit rate than the bus, and for TPDOs that exceed it."""
     refuse_other_rate(target, values)
     for tpdo in TPDOS:
         if 0 < values.get(interval_name(tpdo), 0) < PERIOD_MIN_MS:
@@ -126,7 +125,7 @@ def _check(target: Target, values: Mapping[str, Any]) -> None:
 
 
 def _read(target: Target) -> RequestScript[dict[str, Any]]:
-    return values_of((yield from session.read_values(target.settings.node, SETTING_PLACES, silent_is_fine=True)))
+    return values_of((yield from commands.read_values(target.settings.node, SETTING_PLACES, silent_is_fine=True)))
 
 
 def _interval_setting(tpdo: TpdoNumber) -> Setting:
@@ -136,28 +135,28 @@ def _interval_setting(tpdo: TpdoNumber) -> Setting:
             Meta(
                 ge=0,
                 le=PERIOD_MAX_MS,
-                description=f"interval of the message with the {CONTENT[tpdo]}, {PERIOD_MIN_MS} or more; 0 for never",
+                description=f"interval of the message with the {CONTENT[tpdo]}, at least {PERIOD_MIN_MS}; 0: never",
                 extra={"unit": "ms", "section": "5.4.1"},
             ),
         ],
-        write=lambda target, interval_ms: session.set_tpdo_period(target.settings.node, tpdo, interval_ms),
+        write=lambda target, interval_ms: commands.set_tpdo_period(target.settings.node, tpdo, interval_ms),
     )
 
 
 def _transmission_setting(tpdo: TpdoNumber) -> Setting:
-    words = (
-        f"when the message with the {CONTENT[tpdo]} is sent: at its interval, or when SYNC comes (`options.sync_hz`)"
-    )
+    words = f"trigger of the message with the {CONTENT[tpdo]}: its interval, or SYNC (`options.sync_hz`)"
     return Setting(
         type=Annotated[By, Meta(description=words, extra={"section": "5.4.2"})],
-        write=lambda target, by: session.set_tpdo_type(target.settings.node, tpdo, TRANSMISSIONS[by]),
+        write=lambda target, by: commands.set_tpdo_type(target.settings.node, tpdo, TRANSMISSIONS[by]),
     )
 
 
 def _sign(axis: Literal["x", "y"]) -> Setting:
     return Setting(
-        type=Annotated[bool, Meta(description="sign of the inclinometer turned around", extra={"section": "5.4.1"})],
-        write=lambda target, invert: session.set_inclinometer_sign(target.settings.node, axis, invert=invert),
+        type=Annotated[
+            bool, Meta(description="whether the sign of the inclinometer is reversed", extra={"section": "5.4.1"})
+        ],
+        write=lambda target, invert: commands.set_inclinometer_sign(target.settings.node, axis, invert=invert),
     )
 
 
@@ -173,37 +172,39 @@ SETTINGS: Final = SettingsTable(
                 Meta(
                     ge=0,
                     le=65535,
-                    description="interval of the heartbeat, 0 for none; not every firmware has it",
+                    description="interval of the heartbeat, 0: never; some firmware versions lack it",
                     extra={"unit": "ms", "section": "CiA 301, 7.5.2.17"},
                 ),
             ],
-            write=lambda target, period_ms: session.set_heartbeat(target.settings.node, period_ms),
+            write=lambda target, period_ms: commands.set_heartbeat(target.settings.node, period_ms),
         ),
         "bit_rate": Setting(
             type=Annotated[
                 BitRate,
                 Meta(
-                    description="that of the bus: a module that would take another one at its restart is set back",
+                    description="bit rate of the bus; use it to undo a changed bit rate before the restart",
                     extra={"unit": "bit/s", "section": "5.4.1"},
                 ),
             ],
-            write=lambda target, rate: session.set_bit_rate(target.settings.node, rate),
+            write=lambda target, rate: commands.set_bit_rate(target.settings.node, rate),
             effect=Effect.AFTER_RESTART,
             connection=True,
         ),
         "node": Setting(
             type=Annotated[
                 int,
-                Meta(ge=1, le=NODE_MAX, description="one that nothing on the bus has", extra={"section": "5.4.1"}),
+                Meta(
+                    ge=1, le=NODE_MAX, description="node number that is unused on the bus", extra={"section": "5.4.1"}
+                ),
             ],
-            write=lambda target, node: moves.change_node(target.settings, node),
+            write=lambda target, node: commands.change_node(target.settings, node),
             effect=Effect.AFTER_RESTART,
             connection=True,
         ),
     },
     read=_read,
-    save=lambda target: session.save(target.settings.node),
-    restart=lambda target: moves.restart(target.settings, target.baud),
+    save=lambda target: commands.save(target.settings.node),
+    restart=lambda target: commands.restart(target.settings, target.baud),
     check=_check,
 )
 
@@ -214,7 +215,6 @@ _ZEROS: Final = {"here": InclinometerZero.SET, "cancel": InclinometerZero.CANCEL
 
 
 def _simple(words: str, begin: Callable[[int], RequestScript[None]], risk: Risk = Risk.NONE) -> Action:
-    """An action without arguments."""
     return Action(words, lambda target: begin(target.settings.node), risk)
 
 
@@ -227,7 +227,7 @@ def _interval(
         Meta(
             ge=0,
             le=PERIOD_MAX_MS,
-            description="time from one to the next, 5 or more; 0 for never",
+            description="time between two messages, at least 5; 0: never",
             extra={"unit": "ms", "section": "5.4.1"},
         ),
     ],
@@ -242,12 +242,12 @@ def _transmission(
     by: Annotated[
         Literal["timer", "sync"],
         Meta(
-            description="SYNC must be sent by something on the bus: `options.sync_hz` makes imud do it",
+            description="for `sync`, a node must send SYNC; with `options.sync_hz`, imud sends it",
             extra={"section": "5.4.2"},
         ),
     ],
 ) -> RequestScript[str]:
-    return session.set_tpdo_type(target.settings.node, tpdo, TRANSMISSIONS[by])
+    return commands.set_tpdo_type(target.settings.node, tpdo, TRANSMISSIONS[by])
 
 
 def _bitrate(
@@ -255,27 +255,27 @@ def _bitrate(
     *,
     bitrate: Annotated[BitRate, Meta(description="rate of the bus", extra={"unit": "bit/s", "section": "5.4.1"})],
 ) -> RequestScript[str]:
-    return session.set_bit_rate(target.settings.node, bitrate)
+    return commands.set_bit_rate(target.settings.node, bitrate)
 
 
 def _node(
     target: Target,
     *,
     node: Annotated[
-        int, Meta(ge=1, le=NODE_MAX, description="one that no other node of the bus has", extra={"section": "5.4.1"})
+        int, Meta(ge=1, le=NODE_MAX, description="node number that is unused on the bus", extra={"section": "5.4.1"})
     ],
 ) -> RequestScript[str]:
-    return moves.change_node(target.settings, node)
+    return commands.change_node(target.settings, node)
 
 
 def _zero(
     target: Target, *, zero: Annotated[Literal["here", "cancel"], Meta(extra={"section": "5.4.1"})]
 ) -> RequestScript[None]:
-    return session.set_inclinometer_zero(target.settings.node, _ZEROS[zero])
+    return commands.set_inclinometer_zero(target.settings.node, _ZEROS[zero])
 
 
 def _direction(target: Target, *, x_reversed: Reversed, y_reversed: Reversed) -> RequestScript[str]:
-    return session.set_inclinometer_signs(target.settings.node, invert_x=x_reversed, invert_y=y_reversed)
+    return commands.set_inclinometer_signs(target.settings.node, invert_x=x_reversed, invert_y=y_reversed)
 
 
 def _nmt(
@@ -284,53 +284,56 @@ def _nmt(
     command: Annotated[
         Literal["start", "stop", "pre_operational", "reset_node", "reset_communication"],
         Meta(
-            description="`stop` and `pre_operational` end the samples until `start`",
+            description="after `stop` and `pre_operational` the node sends no samples until `start`",
             extra={"section": "CiA 301, 7.2.8.2"},
         ),
     ],
 ) -> RequestScript[str | None]:
     made = NmtCommand[command.upper()]
     if made in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION):
-        return moves.reset(target.settings, target.baud, made)
-    return session.nmt(target.settings.node, made)
+        return commands.reset(target.settings, target.baud, made)
+    return commands.nmt(target.settings.node, made)
 
 
 ACTIONS: Final[Actions] = {
-    "save": replace(_simple("write all settings to flash", session.save), saves=True),
+    "save": replace(_simple("write all settings to flash", commands.save), saves=True),
     "restart": Action(
-        "restart it and wait until it is heard, also under another number; what was not saved is lost",
-        lambda target: moves.restart(target.settings, target.baud),
+        "restart the device and wait for its frames, also from a new node number; unsaved settings are lost",
+        lambda target: commands.restart(target.settings, target.baud),
     ),
     "factory_reset": Action(
-        "factory settings, node 8 and 500 kbit/s included, in force after a restart; refused if another node of the "
-        "bus has number 8",
-        lambda target: moves.factory_reset_and_find(target.settings),
+        "restore the factory settings with node 8 and 500 kbit/s, effective after a restart; imud rejects it if "
+        "another node on the bus has number 8",
+        lambda target: commands.factory_reset_and_find(target.settings),
         Risk.RESET,
     ),
-    "interval": Action("how often a TPDO is sent by its timer; at once. Refused if the bus cannot carry it", _interval),
-    "transmission": Action("send a TPDO by its timer, or when SYNC comes; at once", _transmission),
+    "interval": Action(
+        "set the timer of a TPDO, effective immediately; imud rejects more than the bus can carry", _interval
+    ),
+    "transmission": Action("send a TPDO by its timer or at each SYNC, effective immediately", _transmission),
     "bitrate": Action(
-        "set the bit rate, in force after `save` and `restart`: the node is off the bus then, and disturbs it, until "
-        "interface and all other nodes have the same",
+        "set the bit rate, effective after `save` and `restart`: then the node disturbs the bus until the "
+        "interface and all other nodes use the same bit rate",
         _bitrate,
         Risk.CONNECTION,
     ),
     "node": Action(
-        "set its number, in force after `save` and `restart`, in some modules at once: imud follows. Refused if "
-        "something on the bus has it already",
+        "set the node number, effective after `save` and `restart`, in some devices immediately; imud follows the "
+        "device and rejects a number that is in use",
         _node,
         Risk.CONNECTION,
     ),
-    "zero": Action("make the present position the inclinometer's zero, or cancel that; at once", _zero),
-    "direction": Action("turn the signs of the inclinometer, or leave them as delivered; at once", _direction),
-    "nmt": Action("start or stop its TPDOs, or reset it, and follow it then", _nmt),
+    "zero": Action(
+        "make the present position the zero of the inclinometer, or cancel it; effective immediately", _zero
+    ),
+    "direction": Action("reverse the signs of the inclinometer, or restore them; effective immediately", _direction),
+    "nmt": Action("start or stop the TPDOs, or reset the node and follow it", _nmt),
 }
 
 US_PER_S: Final = NS_PER_S // NS_PER_US
 
 
 def _example_frames(random: Random) -> list[CanFrame]:
-    """TPDO1 … TPDO4 with random values."""
     frames = encode_tpdos(
         accel_m_s2=(random.gauss(0, 5), random.gauss(0, 5), random.gauss(0, 5)),
         gyro_rad_s=(random.gauss(0, 2), random.gauss(0, 2), random.gauss(0, 2)),
@@ -349,7 +352,7 @@ _SIZES: Final = {function: LAYOUTS[number].size for number, function in TPDO_FUN
 
 
 def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
-    """The sender of what has a TPDO's function and length."""
+    """Return the node number of a frame with the function and the length of a TPDO."""
     node = can_id & NODE_MASK
     return node if node and not extended and _SIZES.get(can_id & FUNCTION_MASK) == len(data) else None
 

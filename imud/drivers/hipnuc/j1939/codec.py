@@ -1,13 +1,13 @@
 """HiPNUC CH0x0/CH10x/HI14 on SAE J1939. Manual "IMU配置手冊" V1.5.9, chapter 6.
 
-    0CFF3408   priority 3 | PGN FF34 | source 08, the module's address     eight bytes, see `messages.py`
-    0CEF5508   a reply to imud, see `session.py`
+    0CFF3408   priority 3 | PGN FF34 | source 08, the address of the device     eight bytes of values
+    0CEF5508   reply to imud, see `commands.py`
 
-Several modules share a bus and have different addresses; priority means nothing on reception. A module sends each PGN
-that is switched on at its own interval, with neither counter nor time: `common/assembly.py` makes samples of them.
+Several devices share a bus and have different addresses. A receiver ignores the priority. A device sends each enabled
+PGN at its own interval, without counter and time; `assembly.py` makes samples of them.
 
-FF2F (UTC) is accepted and ignored. It is a calendar time which jumps when the module's receiver finds out what
-time it is, it has an interval of its own, and no source says of which instant it is: no device time for a sample.
+imud ignores FF2F (UTC), because it is not a device time: it jumps when the receiver of the device finds the time, it
+has its own interval, and no document states its instant.
 """
 
 import struct
@@ -39,15 +39,13 @@ from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
 
 MeasuredName = Literal["FF34", "FF37", "FF3A", "FF3D", "FF41", "FF43", "FF46", "FF4A"]
-"""A message that samples are made of, by the last four digits of its number."""
-PgnName = MeasuredName | Literal["FF2F"]
-"""Any message."""
+"""Message that makes samples, by the last four digits of its PGN."""
+PgnName = MeasuredName | Literal["FF2F"]  # any message
 ACCEL, GYRO, ROLL_PITCH, HEADING, INCLINOMETER = 0xFF34, 0xFF37, 0xFF3D, 0xFF41, 0xFF4A
 MAG, TEMPERATURE, QUATERNION, UTC = 0xFF3A, 0xFF43, 0xFF46, 0xFF2F
 PGNS: Final = (UTC, ACCEL, GYRO, MAG, ROLL_PITCH, HEADING, TEMPERATURE, QUATERNION, INCLINOMETER)
 """All PGNs, in rising order."""
-MEASURED: Final = PGNS[1:]
-"""Messages that become samples."""
+MEASURED: Final = PGNS[1:]  # PGNs that make samples
 PRIORITY: Final = 3
 MESSAGE_BYTES: Final = 8
 
@@ -58,21 +56,19 @@ QUATERNION_LAYOUT: Final = struct.Struct("<4h")
 TEMPERATURE_LAYOUT: Final = struct.Struct("<hHi")
 UTC_LAYOUT: Final = struct.Struct("<6BH")
 
-TURN: Final = 360_000
-"""Counts of a full turn."""
+TURN: Final = 360_000  # counts of a full turn
 HALF_TURN: Final = TURN // 2
-TEMPERATURE_MOST_C: Final = 150.0
-"""Highest valid temperature: no module works beyond."""
+TEMPERATURE_MOST_C: Final = 150.0  # maximum valid temperature, °C: above the operating range of all devices
 UNIT_TOLERANCE: Final = 0.02
+# year 0 in FF2F (assumed)
 YEAR_ZERO: Final = 2000
-"""Of the year in FF2F (assumed)."""
 
 _NOTHING: Final = bytes([0xFF]) * MESSAGE_BYTES
 _ZERO_VECTOR: Final = bytes(6)
 
 
 def measurement_of(messages: Sequence[tuple[int, bytes]]) -> Measurement:
-    """Make one sample of messages of eight bytes (PGN, data) of one instant, each PGN at most once."""
+    """Return the measurement of messages of one instant (PGN, eight bytes), each PGN at most once."""
     parts = _Parts()
     for pgn, data in messages:
         _DECODE[pgn](parts, data)
@@ -102,7 +98,7 @@ class _Parts:
 
     @property
     def euler(self) -> Vector3 | None:
-        """The known ones of roll, pitch and yaw."""
+        """Roll, pitch and yaw; NaN for an unknown angle, None without any angle."""
         roll, pitch, yaw = self.roll, self.pitch, self.yaw
         return (roll, pitch, yaw) if roll == roll or pitch == pitch or yaw == yaw else None  # noqa: PLR0124 - no NaN
 
@@ -163,58 +159,58 @@ def _vector(data: bytes, factor: float) -> Vector3:
 
 
 def _angle(counts: int) -> float:
-    """Decode an angle to rad; NaN beyond a full turn."""
+    """Return an angle, rad; NaN beyond a full turn."""
     return counts * EULER_RAD_PER_LSB if -TURN <= counts <= TURN else nan
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
 
 def pack_accel(accel_m_s2: Vector3) -> bytes:
-    """Pack FF34. Values beyond the range are clipped, here and in all of these."""
+    """Return FF34. This function and the following functions clip values to the range."""
     return _pack_vector(accel_m_s2, ACCEL_M_S2_PER_LSB)
 
 
 def pack_gyro(gyro_rad_s: Vector3) -> bytes:
-    """Pack FF37."""
+    """Return FF37."""
     return _pack_vector(gyro_rad_s, GYRO_RAD_S_PER_LSB)
 
 
 def pack_mag(mag_t: Vector3) -> bytes:
-    """Pack FF3A."""
+    """Return FF3A."""
     return _pack_vector(mag_t, MAG_T_PER_LSB)
 
 
 def pack_roll_pitch(roll_rad: float, pitch_rad: float) -> bytes:
-    """Pack FF3D."""
+    """Return FF3D."""
     return TWO_ANGLES.pack(counts_of(roll_rad / EULER_RAD_PER_LSB, 32), counts_of(pitch_rad / EULER_RAD_PER_LSB, 32))
 
 
 def pack_heading(yaw_rad: float, *, twice: bool = True) -> bytes:
-    """Pack FF41 of a counter-clockwise yaw; `twice` as newer firmware does, else with zeros in the reserved bytes."""
+    """Return FF41 of a counter-clockwise yaw; `twice` as newer firmware, otherwise with zeros in the reserved bytes."""
     counter_clockwise = round(yaw_rad / EULER_RAD_PER_LSB)
     signed = (counter_clockwise + HALF_TURN) % TURN - HALF_TURN
     return HEADING_LAYOUT.pack(-counter_clockwise % TURN, signed if twice else 0)
 
 
 def pack_inclinometer(x_rad: float, y_rad: float) -> bytes:
-    """Pack FF4A."""
+    """Return FF4A."""
     return pack_roll_pitch(x_rad, y_rad)
 
 
 def pack_temperature(temperature_c: float, pressure_pa: float) -> bytes:
-    """Pack FF43."""
+    """Return FF43."""
     celsius, pressure = temperature_c / TEMPERATURE_C_PER_LSB, pressure_pa / PRESSURE_PA_PER_LSB
     return TEMPERATURE_LAYOUT.pack(counts_of(celsius, 16), 0, counts_of(pressure, 32))
 
 
 def pack_quaternion(quat_wxyz: Quaternion) -> bytes:
-    """Pack FF46."""
+    """Return FF46."""
     return QUATERNION_LAYOUT.pack(*(counts_of(q / QUAT_PER_LSB, 16) for q in quat_wxyz))
 
 
 def pack_utc(year: int, month: int, day: int, second_of_day: float) -> bytes:
-    """Pack FF2F."""
+    """Return FF2F."""
     whole, millisecond = divmod(int(second_of_day * 1000), 1000)
     minutes, second = divmod(whole, 60)
     return UTC_LAYOUT.pack(year - YEAR_ZERO, month, day, *divmod(minutes, 60), second, millisecond)
@@ -224,21 +220,19 @@ def _pack_vector(vector: Vector3, factor: float) -> bytes:
     return VECTOR.pack(*(counts_of(value / factor, 16) for value in vector), 0)
 
 
-CONFIGURE: Final = 0xEF00
-"""PGN of requests and replies (proprietary A)."""
-HOST_ADDRESS: Final = 0x55
-"""Source address in the manual's example, and destination of all replies."""
+CONFIGURE: Final = 0xEF00  # PGN of requests and replies (proprietary A)
+HOST_ADDRESS: Final = 0x55  # source address in the manual's example, and destination of all replies
 
 
 @dataclass(frozen=True, slots=True)
 class J1939Node:
-    """A module and the address under which imud talks to it."""
+    """Device, and the address of imud in requests to it."""
 
     address: int
     host: int = HOST_ADDRESS
 
     def reply_ids(self) -> frozenset[int]:
-        """Identifiers of replies, without priority."""
+        """Return the identifiers of replies, without priority."""
         return frozenset(
             join(J1939Id(0, CONFIGURE, self.address, destination)) for destination in (self.host, HOST_ADDRESS)
         )
@@ -249,29 +243,29 @@ Address = Annotated[int, Meta(ge=0, le=ADDRESS_MAX)]
 
 
 class HipnucJ1939Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of a module on J1939."""
+    """Options of a device on J1939."""
 
     address: Address = FACTORY_ADDRESS
-    """The module's address on the bus (J1939 source address); it can be set to 1 … 128."""
+    """Address of the device on the bus (J1939 source address); its setting accepts 1 … 128."""
     pgns: Literal["auto"] | Annotated[tuple[MeasuredName, ...], Meta(min_length=1)] = "auto"
-    """Messages that samples are made of; `auto` for all that come."""
+    """Messages that make samples; `auto` = all received messages."""
     host_address: Address = HOST_ADDRESS
-    """The address under which imud talks to the module; 0x55, which is 85, as in the manual."""
+    """Address of imud in requests to the device; 0x55 (85) as in the manual."""
 
     @property
     def peer(self) -> J1939Node:
-        """Address of the module, and imud's own."""
+        """Addresses of the device and of imud."""
         return J1939Node(self.address, self.host_address)
 
     def measured(self) -> tuple[int, ...]:
-        """PGNs that samples are made of."""
+        """Return the PGNs that make samples."""
         if self.pgns == "auto":
             return MEASURED
         return tuple(int(name, 16) for name in self.pgns)
 
 
 class HipnucJ1939Codec:
-    """Decoder of the frames of one module. Synchronization: one thread."""
+    """Decoder of the frames of one device. Synchronization: one thread."""
 
     def __init__(self, ledger: Ledger, settings: HipnucJ1939Options) -> None:
         self.ledger = ledger
@@ -281,7 +275,7 @@ class HipnucJ1939Codec:
         self._assembly = Assembly(ledger)
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """Add one frame; return what it completed. Never raises for any frame."""
+        """Add one frame. Return the completed events. Never raises an exception."""
         ledger, size = self.ledger, len(data)
         ledger.bytes_in += size
         key = can_id & WITHOUT_PRIORITY
@@ -305,17 +299,17 @@ class HipnucJ1939Codec:
         return () if whole is None else (measurement_of(whole),)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """No-op: the next frame shows what is lost."""
+        """Do nothing: the next frame shows the loss."""
         return ()
 
     def reset(self) -> None:
-        """Drop the incomplete sample: frames are missing here."""
+        """Drop the incomplete sample after lost frames."""
         self._assembly.reset()
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
 
 def encode(pgn: int, data: bytes, address: int = FACTORY_ADDRESS) -> tuple[int, bytes]:
-    """A message as (identifier, data)."""
+    """Return a message as (identifier, data)."""
     return join(J1939Id(PRIORITY, pgn, address)), data

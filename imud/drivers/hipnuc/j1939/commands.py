@@ -1,20 +1,22 @@
-"""Request scripts of a HiPNUC module on J1939: registers behind PGN EF00. Manual "IMU配置手冊" V1.5.9, section 6.2.
+"""Request scripts of a HiPNUC device on J1939: registers behind PGN EF00. Manual "IMU配置手冊" V1.5.9, section 6.2.
 
-    0CEFddss   | register u16 | command u8 | status u8 | value u32 |    dd the module, ss imud; little-endian
-    0CEFssdd   | the same     | the same   | reserved  | value     |    the module's reply
+    0CEFddss   | register u16 | command u8 | status u8 | value u32 |    dd the device, ss imud; little-endian
+    0CEFssdd   | the same     | the same   | reserved  | value     |    the device's reply
 
-Command 6 writes and 3 reads. A reply is matched by its sender, its register and its command. It comes to the sender of
-the request, or, in firmware that knows only one host, to 0x55. A status other than 0 in it means that the module
-refused.
+Command 6 writes, command 3 reads. A reply has the sender, the register and the command of its request. Its destination
+is the sender of the request, or 0x55 in firmware that knows only one host. A status other than 0 means rejection.
 
-Departures from the manual's table: FF4A's interval row prints command 0x60, which is 0x06 as in all others; the value
-of a read is reserved there, and 1 here, as in the vendor's own programs; register 0x0096 (send a message once) stands
-in these, that its value is the PGN is assumed; so is that the PGNs of newer firmware have their intervals where the
-others have them. It has no reply: the message is the answer. Registers 0x70 to 0x78 are those of Modbus; that a value
-has two characters of the name, the first in the higher byte, is a guess, so a name that is no text is left out.
+Differences from the manual's table:
+- The interval row of FF4A prints command 0x60 in place of 0x06.
+- The value of a read is reserved there, and 1 here, as in the vendor's programs.
+- Register 0x0096 (send a message once) is from these programs. imud assumes that its value is the PGN, and that the
+  PGNs
+of newer firmware have their intervals at the same offset. The register has no reply: the message is the reply.
+- Registers 0x70 to 0x78 are the Modbus registers. imud assumes two characters of the name per value, the first in the
+high byte. It ignores a name that is not text.
 
-Settings are lost at a restart unless saved. What can be read is read back after it was written; zero, save and factory
-reset cannot. Where a module is after its address was written, or after a restart, is in `moves.py`.
+Settings are lost at a restart unless they are saved. imud reads back every written value; zero, save and factory reset
+are not readable.
 """
 
 import struct
@@ -41,8 +43,7 @@ from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of
 from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.units import NS_PER_MS, NS_PER_S
 
-LAYOUT: Final = struct.Struct("<HBBI")
-"""register, command, status, value."""
+LAYOUT: Final = struct.Struct("<HBBI")  # register, command, status, value
 HEAD: Final = struct.Struct("<HB")
 STATUS_AT: Final = 3
 READ: Final = 0x03
@@ -57,41 +58,32 @@ Y_SIGN: Final = 0x009F
 ZERO: Final = 0x00A5
 PRODUCT_NAME: Final = tuple(range(0x70, 0x78))
 VERSION: Final = 0x78
-READ_VALUE: Final = 1
-"""Value in a read: reserved by the manual, 1 in the vendor's programs, which suits both readings."""
-REQUEST: Final = 0xEA00
-"""PGN that asks for another one (J1939-21)."""
+READ_VALUE: Final = 1  # value of a read: reserved in the manual, 1 in the vendor's programs
+REQUEST: Final = 0xEA00  # PGN that requests another PGN (J1939-21)
 REQUEST_PRIORITY: Final = 6
-CLAIMED: Final = 0xEE00
-"""PGN Address Claimed (J1939-81), to all."""
-INTERVALS: Final = {pgn: 0x0100 | pgn & 0xFF for pgn in PGNS}
-"""Register of the interval of each message, ms."""
+CLAIMED: Final = 0xEE00  # PGN Address Claimed (J1939-81), a broadcast
+INTERVALS: Final = {pgn: 0x0100 | pgn & 0xFF for pgn in PGNS}  # register of the interval of each message, ms
 
 SAVE, FACTORY, RESTART = 0x00, 0x01, 0xFF
-"""Values of CONTROL."""
+"""values of CONTROL"""
 BitRate = Literal[1_000_000, 800_000, 500_000, 250_000, 125_000]
-BITRATES: Final[tuple[BitRate, ...]] = get_args(BitRate)
-"""In bit/s, by their code in BITRATE."""
+BITRATES: Final[tuple[BitRate, ...]] = get_args(BitRate)  # bit rates by their code in BITRATE, bit/s
 MODULE_ADDRESS_MIN, MODULE_ADDRESS_MAX = 1, 128
 INTERVAL_MIN_MS, INTERVAL_MAX_MS = 5, 1000
 
-REPLY_TIMEOUT_NS: Final = 500 * NS_PER_MS  # the manual gives none; J1939-21 gives a node 200 ms
+REPLY_TIMEOUT_NS: Final = 500 * NS_PER_MS  # the manual states none; J1939-21 gives a node 200 ms
 PRESENT_TIMEOUT_NS: Final = 250 * NS_PER_MS
-"""The same where a register may not exist, which is not answered, and many are read."""
+"""Timeout of registers that may not exist, ns. Such registers do not reply, and imud reads many of them."""
 FLASH_TIMEOUT_NS: Final = 5 * NS_PER_S // 2
-CLAIM_NS: Final = 250 * NS_PER_MS
-"""J1939-81: a node claims its address within 250 ms."""
-SILENT_MAX: Final = 2
-"""Registers in a row without a reply after which a module counts as one that answers no reads."""
+CLAIM_NS: Final = 250 * NS_PER_MS  # maximum time of an address claim, ns (J1939-81)
+SILENT_MAX: Final = 2  # number of registers in a row without reply before imud stops the read
 
 
 class Zero(Enum):
     """Operations on the zero of the angles."""
 
-    HERE = 2
-    """The present position is zero."""
-    CANCEL = 5
-    """Back to the physical angles."""
+    HERE = 2  # the present position is zero
+    CANCEL = 5  # back to the physical angles
 
 
 def exchange(
@@ -103,7 +95,7 @@ def exchange(
     timeout_ns: int = REPLY_TIMEOUT_NS,
     also: tuple[CanFilter, ...] = (),
 ) -> Request:
-    """Make a request: one frame to the module, and its reply. `also`: replies of a module that is not listened to."""
+    """Return a request: one frame to the device, and its reply. `also`: filters for replies of another device."""
     ids = peer.reply_ids()
     head = HEAD.pack(register, command)
 
@@ -127,17 +119,17 @@ def exchange(
 
 
 def read(peer: J1939Node, register: int) -> RequestScript[int]:
-    """The value of a register. Raises NoReply, Rejected."""
+    """Return the value of a register. Raises NoReply, Rejected."""
     name = f"read register {register:#06x}"
     outcome = yield exchange(peer, register, READ, READ_VALUE, name)
     if isinstance(outcome, Silence):
-        raise NoReply(f"{name} at address {peer.address}: expected a reply, got none; is `options.address` right?")
+        raise NoReply(f"{name} at address {peer.address}: expected a reply, got none; check `options.address`")
     _refuse(name, outcome)
     return _value(outcome)
 
 
 def identify(peer: J1939Node) -> RequestScript[Identity]:
-    """Read its address, its name and firmware, and the NAME that it claims its address with. Raises NoReply."""
+    """Read address, product name, firmware, and the NAME of its address claim. Raises NoReply."""
     address = yield from read(peer, ADDRESS)
     details = {"address": str(address)}
     name = yield from _claimed_name(peer)
@@ -149,7 +141,7 @@ def identify(peer: J1939Node) -> RequestScript[Identity]:
 
 
 def read_settings(peer: J1939Node) -> RequestScript[Mapping[str, str]]:
-    """Read all that can be read. Registers that do not answer are left out, but for the first. Raises NoReply."""
+    """Read all readable settings. Ignores registers without reply, except the first. Raises NoReply."""
     settings = {"address": str((yield from read(peer, ADDRESS)))}
     rows = {"bitrate": BITRATE, "x_reversed": X_SIGN, "y_reversed": Y_SIGN}
     rows |= {f"interval_ms_{pgn:04X}": register for pgn, register in INTERVALS.items()}
@@ -163,7 +155,9 @@ def read_settings(peer: J1939Node) -> RequestScript[Mapping[str, str]]:
 
 
 def read_values(peer: J1939Node, registers: Sequence[int]) -> RequestScript[dict[int, int]]:
-    """Read registers; those that do not answer, or refuse, are left out; all, where the first ones do not answer."""
+    """Read registers. The result does not contain registers without reply; it is empty if the first ones do not
+    reply.
+    """
     values: dict[int, int] = {}
     silent = 0
     for register in registers:
@@ -178,17 +172,17 @@ def read_values(peer: J1939Node, registers: Sequence[int]) -> RequestScript[dict
 
 
 def set_interval(peer: J1939Node, pgn: int, interval_ms: int) -> RequestScript[Written]:
-    """Set how often a message is sent, 5 … 1000 ms. Raises NoReply, Rejected, as all of these do."""
+    """Set the interval of a message, 5 … 1000 ms. Like all functions below, raises NoReply, Rejected."""
     return _write_checked(peer, INTERVALS[pgn], interval_ms, f"interval of {pgn:04X}")
 
 
 def set_bitrate(peer: J1939Node, bitrate: BitRate) -> RequestScript[Written]:
-    """Set the bit rate of the bus; in force after `save` and `restart`."""
+    """Set the bit rate of the bus; effective after `save` and `restart`."""
     return _write_checked(peer, BITRATE, BITRATES.index(bitrate), "bit rate", pending=True)
 
 
 def set_address(peer: J1939Node, address: int) -> RequestScript[Written]:
-    """Set the address on the bus, 1 … 128; in force after `save` and `restart`."""
+    """Set the address on the bus, 1 … 128; effective after `save` and `restart`."""
     return _write_checked(peer, ADDRESS, address, "address", pending=True)
 
 
@@ -198,12 +192,12 @@ def set_direction(peer: J1939Node, axis: Literal["X", "Y"], is_reversed: bool) -
 
 
 def zero(peer: J1939Node, what: Zero) -> RequestScript[None]:
-    """Make the present position zero, or undo that."""
+    """Make the present position zero, or undo it."""
     return _write(peer, ZERO, what.value, "zero")
 
 
 def send_once(peer: J1939Node, pgn: int) -> RequestScript[None]:
-    """Have a message sent once, in addition to its interval. The message itself is the answer."""
+    """Send a message once, in addition to its interval. The message is the reply."""
     name = f"send {pgn:04X} once"
     asked = exchange(peer, ONCE, WRITE, pgn, name)
     wanted = filter_of(pgn, peer.address)
@@ -223,24 +217,24 @@ def save(peer: J1939Node) -> RequestScript[None]:
 
 
 def factory_reset(peer: J1939Node) -> RequestScript[None]:
-    """Restore the factory settings, address and bit rate included: it may leave the bus before it replies."""
+    """Restore the factory settings with address and bit rate. The device may leave the bus before it replies."""
     outcome = yield exchange(peer, CONTROL, WRITE, FACTORY, "factory reset", FLASH_TIMEOUT_NS)
     _refuse("factory reset", outcome)
 
 
 def restart_request(peer: J1939Node) -> Request:
-    """The request for a restart; no reply is stated."""
+    """Return the request for a restart, for which the manual states no reply."""
     return exchange(peer, CONTROL, WRITE, RESTART, "restart")
 
 
 def verify(peer: J1939Node, register: int, value: int, name: str, *, pending: bool = False) -> RequestScript[Written]:
-    """Read back what was written. Raises Rejected where something else stands there."""
+    """Read back a written value. Raises Rejected if it differs."""
     try:
         now = yield from read(peer, register)
     except (NoReply, Rejected):
         return Written.UNVERIFIED_PENDING if pending else Written.UNVERIFIED
     if now != value:
-        raise Rejected(f"{name}: wrote {value}, the module has {now}")
+        raise Rejected(f"{name}: expected {value} after the write, got {now}")
     return Written.PENDING if pending else Written.VERIFIED
 
 
@@ -256,13 +250,12 @@ def _write(
 def _write_checked(
     peer: J1939Node, register: int, value: int, name: str, *, pending: bool = False
 ) -> RequestScript[Written]:
-    """Write and read back."""
     yield from _write(peer, register, value, name)
     return (yield from verify(peer, register, value, name, pending=pending))
 
 
 def _claimed_name(peer: J1939Node) -> RequestScript[int | None]:
-    """The NAME with which the module claims its address (J1939-81); None where it does not."""
+    """Return the NAME of the device's address claim (J1939-81); None without a claim."""
     wanted = filter_of(CLAIMED, peer.address)
     can_id = join(J1939Id(REQUEST_PRIORITY, REQUEST, peer.host, peer.address))
     frame = pack_frame(can_id, True, CLAIMED.to_bytes(3, "little").ljust(LAYOUT.size, b"\0"))
@@ -275,7 +268,7 @@ def _claimed_name(peer: J1939Node) -> RequestScript[int | None]:
 
 
 def _product(values: Mapping[int, int]) -> str:
-    """The name of the product; empty where it is no text."""
+    """Return the product name; empty if it is not text."""
     if any(values.get(register, 0) > 0xFFFF for register in PRODUCT_NAME):
         return ""
     text = b"".join(values.get(register, 0).to_bytes(2, "big") for register in PRODUCT_NAME).rstrip(b"\0 ")
@@ -287,9 +280,9 @@ def _status(message: Message) -> int:
 
 
 def _refuse(name: str, outcome: Outcome) -> None:
-    """Raises Rejected for an answer with a status."""
+    """Raise Rejected if the reply contains a status."""
     if isinstance(outcome, Rejection):
-        raise Rejected(f"{name}: the module refused, with status {_status(outcome.frames[-1])}")
+        raise Rejected(f"{name}: the device rejected the request with status {_status(outcome.frames[-1])}")
 
 
 def _value(outcome: Outcome) -> int:
@@ -298,23 +291,22 @@ def _value(outcome: Outcome) -> int:
 
 
 LISTEN_NS: Final = 1100 * NS_PER_MS
-"""A message comes at least once a second (section 6.2.2)."""
-BOOT_NS: Final = 3 * NS_PER_S
-"""Longest time until an address is claimed after a restart; the manual gives none."""
+"""Time to listen for a device, ns: it sends each message at least once per second (section 6.2.2)."""
+BOOT_NS: Final = 3 * NS_PER_S  # maximum time to the address claim after a restart, ns; the manual states none
 SOURCE_MASK: Final = 0xFF
 
 
 def change_address(settings: HipnucJ1939Options, new: int) -> RequestScript[Written]:
-    """Give a module another address, 1 … 128, and follow it where that is in force at once.
+    """Set the address of a device, 1 … 128, and follow a device that uses it immediately.
 
-    Raises BadArgument for an address that is heard on the bus, Rejected, and NoReply for a module that is heard at
-    neither address afterwards; it is commanded to go back then.
+    Raises BadArgument for an address in use on the bus, Rejected, and NoReply for a device without reply at both
+    addresses (imud then commands it back).
     """
     peer = settings.peer
     if new == peer.address:
         return (yield from set_address(peer, new))
     if heard := (yield from _heard(settings, new)):
-        raise BadArgument(f"address {new} is taken: PGN {split(heard).pgn:04X} comes from it")
+        raise BadArgument(f"address {new} is in use: received its PGN {split(heard).pgn:04X}; try another address")
     there = J1939Node(new, peer.host)
     first = yield from _write_address(peer, new)
     if (yield from _write_address(peer, new)):
@@ -324,17 +316,17 @@ def change_address(settings: HipnucJ1939Options, new: int) -> RequestScript[Writ
         return (yield from verify(there, ADDRESS, new, "address"))
     back = exchange(there, ADDRESS, WRITE, peer.address, f"back to address {peer.address}")
     yield Request(back.payload, back.name, never, never, never, silent=True)
-    confirmed = "confirmed the write and " if first else ""
+    confirmed = "confirmed the write and then " if first else ""
     raise NoReply(
-        f"the module {confirmed}answers neither at address {new} nor at {peer.address}: it was commanded to go back"
+        f"the device {confirmed}replied neither at address {new} nor at {peer.address}; imud commanded it back"
     )
 
 
 def restart(settings: HipnucJ1939Options, bus_bit_s: int) -> RequestScript[str]:
-    """Restart, and follow the module to the address that it has then; return what became of it.
+    """Restart the device, follow it to its address, and return a report.
 
-    `bus_bit_s` is the rate of the bus, 0 where it is not known. Raises Rejected, and NoReply for a module that is not
-    heard afterwards.
+    `bus_bit_s` is the bit rate of the bus; 0 if it is not known. Raises Rejected, and NoReply if the device does not
+    reply afterwards.
     """
     peer = settings.peer
     saved = yield from read_values(peer, (ADDRESS, BITRATE))
@@ -342,7 +334,7 @@ def restart(settings: HipnucJ1939Options, bus_bit_s: int) -> RequestScript[str]:
     rate = BITRATES[code] if code < len(BITRATES) else bus_bit_s
     saved_address = saved.get(ADDRESS, peer.address)
     valid = 0 <= saved_address <= ADDRESS_MAX
-    address = saved_address if valid else peer.address  # not an address of a node: it will stay where it is
+    address = saved_address if valid else peer.address  # not a valid address: the device keeps its present one
     places = tuple(dict.fromkeys((peer.address, address)))
     found = yield from _claim(restart_request(peer), (*places, FACTORY_ADDRESS) if saved else None)
     for place in places if found is None else ():
@@ -351,32 +343,32 @@ def restart(settings: HipnucJ1939Options, bus_bit_s: int) -> RequestScript[str]:
             break
     if found is None:
         if bus_bit_s and rate != bus_bit_s:
-            return f"restarted; it has {rate} bit/s now, which this bus has not"
+            return f"restarted; the device now uses {rate} bit/s and the bus does not; set the bus to {rate} bit/s"
         words = " or ".join(map(str, places))
-        raise NoReply(f"nothing is heard of address {words} after the restart: has it another bit rate now?")
+        raise NoReply(f"no frame of address {words} after the restart; does it use another bit rate now?")
     if found != peer.address:
         yield _follow(settings, found)
     return f"restarted, at address {found}"
 
 
 def factory_reset_and_find(settings: HipnucJ1939Options) -> RequestScript[str]:
-    """Restore the factory settings, address 8 and its bit rate included; in force after a restart at the latest.
+    """Restore the factory settings with address 8 and its bit rate, effective after a restart at the latest.
 
-    Raises BadArgument where another module has address 8, Rejected.
+    Raises BadArgument if another device has address 8, Rejected.
     """
     if settings.address != FACTORY_ADDRESS and (yield from _heard(settings, FACTORY_ADDRESS)):
         raise BadArgument(
-            f"address {FACTORY_ADDRESS} is taken: the factory's address is that of another node on the bus"
+            f"address {FACTORY_ADDRESS}, the factory address, is in use by another node; change that node first"
         )
     yield from factory_reset(settings.peer)
     if settings.address != FACTORY_ADDRESS and (yield from _heard(settings, FACTORY_ADDRESS)):
         yield _follow(settings, FACTORY_ADDRESS)
         return f"restored, at address {FACTORY_ADDRESS}"
-    return f"restored; it has address {FACTORY_ADDRESS} after the next restart at the latest"
+    return f"restored; the device has address {FACTORY_ADDRESS} after the next restart at the latest"
 
 
 def _claim(request: Request, places: Sequence[int] | None) -> RequestScript[int | None]:
-    """Send the request for a restart; return the address that is claimed then. `places`: None for any."""
+    """Send the request for a restart. Return the claimed address. `places`: None for any address."""
 
     def ends(message: Message) -> bool:
         if not isinstance(message, ReplyFrame) or split(message.frame_id).pgn != CLAIMED:
@@ -386,12 +378,12 @@ def _claim(request: Request, places: Sequence[int] | None) -> RequestScript[int 
     claims = (filter_of(CLAIMED, None),)
     outcome = yield Request(request.payload, request.name, ends, request.is_rejection, never, BOOT_NS, also=claims)
     if isinstance(outcome, Rejection):
-        raise Rejected("restart: the module refused")
+        raise Rejected("restart: the device rejected the request")
     return split(outcome.frames[-1].frame_id).source if isinstance(outcome, Reply) else None
 
 
 def _heard(settings: HipnucJ1939Options, address: int) -> RequestScript[int]:
-    """Ask a module for its address; return the identifier of the first frame from there, of any kind, 0 for none."""
+    """Request the address register. Return the identifier of the first frame from the address; 0 without a frame."""
     asked = exchange(J1939Node(address, settings.host_address), ADDRESS, READ, READ_VALUE, f"address {address}")
     also = (CanFilter(address, SOURCE_MASK, True),)
     outcome = yield Request(asked.payload, asked.name, _is_from(address), never, never, LISTEN_NS, also=also)
@@ -399,16 +391,16 @@ def _heard(settings: HipnucJ1939Options, address: int) -> RequestScript[int]:
 
 
 def _write_address(peer: J1939Node, value: int) -> RequestScript[bool]:
-    """Write the register of the address; return whether that module confirmed it. Raises Rejected."""
+    """Write the address register. Return whether the device confirmed it. Raises Rejected."""
     also = tuple(CanFilter(one, 0x03FF_FFFF, True) for one in sorted(peer.reply_ids()))
     outcome = yield exchange(peer, ADDRESS, WRITE, value, f"address {value}", also=also)
     if isinstance(outcome, Rejection):
-        raise Rejected(f"address {value}: the module refused, with status {outcome.frames[-1].payload[3]}")
+        raise Rejected(f"address {value}: the device rejected the request with status {outcome.frames[-1].payload[3]}")
     return isinstance(outcome, Reply)
 
 
 def _follow(settings: HipnucJ1939Options, address: int) -> Request:
-    """Listen to the module at another address from now on."""
+    """Return a request that makes imud use another address."""
     moved = with_fields(settings, address=address)
     return Request(b"", f"now at address {address}", never, never, never, silent=True, settings=moved)
 

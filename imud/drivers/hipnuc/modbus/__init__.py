@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""HiPNUC devices on RS-485 with Modbus RTU."""

@@ -1,21 +1,22 @@
 """HiPNUC CH0x0/CH10x/HI14 on RS-485: one block of registers per sample. Manual "IMU配置手冊" V1.5.9, chapter 4.
 
     50 03 00 34 00 1A crc  →  50 03 34 | accel 3 | gyro 3 | mag 3 | roll pitch yaw i32 | °C | Pa i32 | quaternion 4 |
-                                         inclinometer 2 | uptime ms u32 | crc      i16 where not said, high byte first
+                                         inclinometer 2 | uptime ms u32 | crc      otherwise i16, high byte first
 
-The manual's block ends at 0x4B; UPTIME is of newer firmware. A module that answers the longer block with an exception,
-or does not answer it, is asked for the manual's 24 registers. "Illegal data address" decides it until another module is
-there. Other exceptions, and silence, can have other causes: they count only before the longer block was ever answered,
-and it is tried again when the module is identified the next time.
+The block in the manual ends at 0x4B; newer firmware adds UPTIME. If a device rejects the longer block with an exception
+or does not reply, imud reads the 24 registers of the manual. The exception "illegal data address" is final until
+another device is connected. Other exceptions and missing replies can have other causes. They count only before the
+first reply to the longer block, and imud tries the longer block again after the next identification.
 
-Two scales differ between modules and are decided by the values, then kept:
-- the quaternion: the one of the two that gives unit length;
-- the inclinometer: two axes (±180°, ±90°, 180/32768 degrees a count) or one (0 … 360°, 360/32768). Y is reserved in
-  products with one, so a Y that is not zero, or a negative X, means two; a Y of zero while the module is pitched means
-  one. That the reserved register reads as zero is a guess. Until it is decided, and where both read as zero (a product
-  without inclinometer), there is no value.
-Likewise a guess, after the manual's own example: a field of zero, and a temperature of zero together with a pressure of
-zero, are sensors that the product does not have. Which pressures are one: `common/air.py`.
+Two scales depend on the device. imud decides them by the values and keeps them:
+- Quaternion: the scale that gives unit length.
+- Inclinometer: two axes (±180°, ±90°, 180/32768 degrees per count) or one axis (0 … 360°, 360/32768). Y is reserved in
+single-axis products. A Y other than zero or a negative X means two axes. A Y of zero at a pitched device means one axis
+(assumption: the reserved register reads zero). Before the decision, and while both are zero (a product without
+inclinometer), the value is None.
+
+Assumptions from the manual's example: a magnetic field of zero, and a temperature and pressure that are both zero, mean
+that the product lacks the sensor. `pressure_of` decides which pressures are valid.
 """
 
 import struct
@@ -64,46 +65,46 @@ from imud.model.units import NS_PER_S
 
 BLOCK: Final = struct.Struct(">3h3h3h3ihi4h2h")
 """accel, gyro, mag, roll pitch yaw, temperature, pressure, quaternion wxyz, inclinometer: registers 0x34 … 0x4B."""
-UPTIME: Final = struct.Struct(">I")
-"""Registers 0x4C … 0x4D, ms."""
+UPTIME: Final = struct.Struct(">I")  # registers 0x4C … 0x4D, ms
 DATA_AT: Final = 3
 CHECK_NS: Final = 10 * NS_PER_S
-"""Interval of reading the serial number again: another module can take a place on the line unnoticed."""
+"""Time between two reads of the serial number, ns: another device can replace the device without a gap."""
 SILENT_MAX: Final = 2
-"""Replies in a row that may be missing before the shorter block is tried; the device is given up after three."""
+"""Number of missing replies in a row before imud tries the shorter block. After three, the device counts as missing."""
 UNIT_TOLERANCE: Final = 0.02
-"""Tolerance of a quaternion's length: the two scales are a factor of 3.3 apart, rounding costs 1e-4."""
-PITCHED_RAD: Final = radians(1.0)
-"""A dual-axis inclinometer shows 182 counts here."""
+"""Maximum length error of a quaternion. The two scales differ by a factor of 3.3; rounding changes the length by
+1e-4.
+"""
+PITCHED_RAD: Final = radians(1.0)  # minimum pitch for a decision: a dual-axis inclinometer then shows 182 counts
 
 READ_BLOCK: Final = read_registers(BLOCK_FIRST, BLOCK_REGISTERS)
 READ_SHORT_BLOCK: Final = read_registers(BLOCK_FIRST, SHORT_BLOCK_REGISTERS)
 READ_SERIAL: Final = read_registers(BY_NAME["SN"].address, BY_NAME["SN"].count)
 READ_STATUS: Final = read_registers(BY_NAME["MAIN_STATUS"].address, BY_NAME["MAIN_STATUS"].count)
 STATUS_NS: Final = NS_PER_S
-"""Interval of reading MAIN_STATUS, which the block does not have: `status` of a sample is at most so much older."""
+"""Time between two reads of MAIN_STATUS, which is not in the block: maximum age of `status` of a sample, ns."""
 _SAMPLE, _SERIAL, _STATUS = 0, 1, 2
 
 
 class HipnucModbusOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a module on RS-485."""
+    """Options of a device on RS-485."""
 
     inclinometer: Literal["auto", "single", "dual"] = "auto"
     """Axes of an inclinometer product: `single` has X from 0 to 360°, `dual` X ±180° and Y ±90°; `auto` decides by the
-    values, which takes a tilt of more than 1°."""
+    values, after a tilt of more than 1°."""
     update_hz: Annotated[float, Meta(ge=0, le=10000)] = 0.0
-    """Rate at which the device renews its registers, per second, for the error of time stamps; 0 if not known."""
+    """Update rate of the device registers, per second, for the time stamp error; 0 if it is not known."""
 
 
 def update_ns(settings: HipnucModbusOptions) -> int:
-    """Longest time between two updates of the registers, 0 for not known."""
+    """Return the maximum time between two updates of the registers, ns; 0 if it is not known."""
     return int(NS_PER_S / settings.update_hz) if settings.update_hz else 0
 
 
 class HipnucModbusCodec:
     """Decoder of blocks of registers. Synchronization: one thread.
 
-    What the module said of its registers stays, after `reset` too; scales and serial number are learned anew.
+    `reset` keeps the known set of registers. It forgets scales and serial number.
     """
 
     def __init__(self, ledger: Ledger, settings: HipnucModbusOptions) -> None:
@@ -117,11 +118,11 @@ class HipnucModbusCodec:
 
     @property
     def stale(self) -> int:
-        """Blocks that repeated the one before."""
+        """Number of blocks with the same bytes as the previous block."""
         return self._stale_before + self._book.stale
 
     def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
-        """Decode one reply. Never raises."""
+        """Decode one reply. Never raises an exception."""
         if poll == _SERIAL:
             return self._decode_serial(data)
         if poll == _STATUS:
@@ -132,16 +133,16 @@ class HipnucModbusCodec:
         return self._book.decode(data, self._bad, self._measure)
 
     def on_silence(self, poll: int) -> Sequence[PolledEvent]:
-        """Try the shorter block after SILENT_MAX missing replies to a longer one that was never answered."""
+        """Use the shorter block after SILENT_MAX missing replies, if the longer block never had a reply."""
         if poll != _SAMPLE or self._short or self._answered:
             return ()
         self._silent += 1
         if self._silent < SILENT_MAX:
             return ()
-        return self._shorten(sure=False, why="it does not answer to the registers up to 0x4D")
+        return self._shorten(sure=False, why="no reply to a read of the registers up to 0x4D")
 
     def reset(self) -> None:
-        """Forget scales and serial number: another module may be there."""
+        """Forget scales and serial number, because another device may be connected."""
         if self._short and not self._sure and not self._just_shortened:
             self._read_block(short=False)
         self._just_shortened = False
@@ -156,7 +157,7 @@ class HipnucModbusCodec:
         missing = data[2] == ILLEGAL_ADDRESS
         if not self._short and (missing or not self._answered):
             self._book.add_reply(data, good=True)
-            return self._shorten(sure=missing, why=f"it answers {exception_text(data[2])} to the registers up to 0x4D")
+            return self._shorten(sure=missing, why=f"{exception_text(data[2])} for a read of the registers up to 0x4D")
         self.ledger.bytes_in += len(data)
         self.ledger.bytes_in_bad_frames += len(data)
         self.ledger.frames_bad_content += 1
@@ -165,10 +166,10 @@ class HipnucModbusCodec:
     def _shorten(self, *, sure: bool, why: str) -> Sequence[PolledEvent]:
         self._read_block(short=True, sure=sure)
         self._just_shortened = True
-        return (Vanished(f"{why}: reading up to 0x4B, without the device's time"),)
+        return (Vanished(f"{why}; imud reads up to 0x4B, without device time"),)
 
     def _read_block(self, *, short: bool, sure: bool = False) -> None:
-        """Read this block from now on; `sure`: the module said that it has no other."""
+        """Read this block in all following polls. `sure`: the device reported that it has no other block."""
         self._short, self._sure = short, sure
         self._just_shortened = self._answered = False
         self._silent = 0
@@ -179,14 +180,14 @@ class HipnucModbusCodec:
     def _decode_serial(self, data: bytes) -> Sequence[PolledEvent]:
         whole = len(data) == READ_SERIAL.read_bytes and is_whole(data) and not absence(data)
         self._book.add_reply(data, good=whole or is_exception(data))
-        if not whole:  # damaged, or a firmware that does not like this read: nothing is known
+        if not whole:  # damaged, or the firmware does not support this read
             return ()
         serial, before = data[DATA_AT:-CRC_BYTES], self._serial
         self._serial = serial
         if not before or serial == before:
             return ()
         self._read_block(short=False)
-        return (Vanished(f"serial number {serial.hex().upper()}, was {before.hex().upper()}: another module"),)
+        return (Vanished(f"another device: serial number {serial.hex().upper()}, was {before.hex().upper()}"),)
 
     def _decode_status(self, data: bytes) -> Sequence[PolledEvent]:
         whole = len(data) == READ_STATUS.read_bytes and is_whole(data) and data[1] == READ_HOLDING
@@ -245,17 +246,17 @@ _INCLI: Final = {"auto": 0.0, "single": INCLI_SINGLE_RAD_PER_LSB, "dual": INCLI_
 
 
 def _dual_y_rad(roll_rad: float, pitch_rad: float) -> float:
-    """Compute the Y axis of a dual-axis inclinometer in this attitude: atan2(gy, gz) of the vertical in the body."""
+    """Return the Y axis of a dual-axis inclinometer in this attitude: atan2(gy, gz) of the vertical in sensor axes."""
     return atan2(sin(pitch_rad), cos(pitch_rad) * cos(roll_rad))
 
 
 def _polls(*, short: bool) -> Sequence[Poll]:
-    """Cyclic reads; firmware without UPTIME has no MAIN_STATUS either."""
+    # firmware without UPTIME has no MAIN_STATUS either
     serial = Poll(READ_SERIAL, CHECK_NS)
     return (Poll(READ_SHORT_BLOCK), serial) if short else (Poll(READ_BLOCK), serial, Poll(READ_STATUS, STATUS_NS))
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
 
 def pack_block(
@@ -271,7 +272,7 @@ def pack_block(
     incli_counts: tuple[int, int] = (0, 0),
     quat_per_lsb: float = QUAT_PER_LSB,
 ) -> bytes:
-    """Pack registers 0x34 … 0x4D from SI values, clipped to their range; up to 0x4B without `uptime_ms`."""
+    """Return registers 0x34 … 0x4D from SI values, clipped to their range; up to 0x4B without `uptime_ms`."""
     data = BLOCK.pack(
         *(counts_of(a / ACCEL_M_S2_PER_LSB, 16) for a in accel_m_s2),
         *(counts_of(w / GYRO_RAD_S_PER_LSB, 16) for w in gyro_rad_s),

@@ -1,4 +1,4 @@
-"""Table: the row `DRIVER` of HiPNUC modules on RS-485."""
+"""Row `DRIVER` of HiPNUC devices on RS-485: actions, calibrations and settings."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -22,7 +22,7 @@ from imud.drivers.hipnuc.common import (
     levels,
     magnetometer,
 )
-from imud.drivers.hipnuc.modbus import commands as session
+from imud.drivers.hipnuc.modbus import commands
 from imud.drivers.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusOptions, pack_block, update_ns
 from imud.drivers.hipnuc.modbus.commands import LineMounting, probe, set_up
 from imud.drivers.hipnuc.modbus.registers import (
@@ -41,7 +41,6 @@ from imud.model.units import NS_PER_MS
 
 
 def _simple(words: str, begin: Callable[[], TransferScript[None]], risk: Risk = Risk.NONE) -> Action:
-    """An action without arguments."""
     return Action(words, lambda _target: begin(), risk)
 
 
@@ -50,38 +49,38 @@ def _address(
     *,
     address: Annotated[
         int,
-        Meta(ge=1, le=ID_MAX, description="one that no other module of the line has", extra={"section": "4.3.3"}),
+        Meta(ge=1, le=ID_MAX, description="address that is unused on the bus", extra={"section": "4.3.3"}),
     ],
 ) -> TransferScript[str]:
-    return session.change_address(session.places_of(target)[0], address)
+    return commands.change_address(commands.places_of(target)[0], address)
 
 
 def _restart(target: Target) -> TransferScript[str]:
-    return session.restart(session.places_of(target), target.baud)
+    return commands.restart(commands.places_of(target), target.baud)
 
 
 def _factory_reset(target: Target) -> TransferScript[str]:
-    return session.factory_reset(session.places_of(target), target.baud)
+    return commands.factory_reset(commands.places_of(target), target.baud)
 
 
 def _baud(
     _target: Target,
     *,
-    baud: Annotated[BaudRate, Meta(description="rate of the line", extra={"unit": "bit/s", "section": "4.3.2"})],
+    baud: Annotated[BaudRate, Meta(description="baud rate of the bus", extra={"unit": "bit/s", "section": "4.3.2"})],
 ) -> TransferScript[str]:
-    return session.set_baud(baud)
+    return commands.set_baud(baud)
 
 
 def _attitude_mode(
     _target: Target, *, axes: Annotated[Literal[6, 9], Meta(extra={"section": "4.3.6"})]
 ) -> TransferScript[str]:
-    return session.set_heading_mode(AttitudeMode.NINE_AXIS if axes == 9 else AttitudeMode.SIX_AXIS)
+    return commands.set_heading_mode(AttitudeMode.NINE_AXIS if axes == 9 else AttitudeMode.SIX_AXIS)
 
 
 def _level(
     _target: Target, *, level: Annotated[Literal["relative", "automatic", "cancel"], Meta(extra={"section": "4.3.5"})]
 ) -> TransferScript[None]:
-    return session.auto_level(LevelReset[level.upper()])
+    return commands.auto_level(LevelReset[level.upper()])
 
 
 def _mounting(
@@ -89,70 +88,72 @@ def _mounting(
     *,
     mounting: Annotated[Literal["level", "y_down", "y_up", "x_up", "x_down"], Meta(extra={"section": "4.3.4"})],
 ) -> TransferScript[str]:
-    return session.set_mounting(LineMounting[mounting.upper()])
+    return commands.set_mounting(LineMounting[mounting.upper()])
 
 
 def _read(
-    _target: Target, *, register: Annotated[str, Meta(description="its name in the manual", extra={"section": "4.2"})]
+    _target: Target,
+    *,
+    register: Annotated[str, Meta(description="name of the register in the manual", extra={"section": "4.2"})],
 ) -> TransferScript[tuple[int, ...]]:
     found = BY_NAME.get(register.upper())
     if found is None or found.access is Access.WRITE:
         known = ", ".join(one.name for one in BY_NAME.values() if one.access is not Access.WRITE)
         raise BadArgument(f"register: expected one of {known}, got {register[:64]!r}")
-    return session.read(found)
+    return commands.read(found)
 
 
 ACTIONS: Final[Actions] = {
-    "save": replace(_simple("write all settings to flash", session.save), saves=True),
-    "restart": Action("restart, as by power-on, and wait until it answers; what is not saved is lost", _restart),
+    "save": replace(_simple("write all settings to flash", commands.save), saves=True),
+    "restart": Action("restart the device and wait until it replies; unsaved settings are lost", _restart),
     "factory_reset": Action(
-        "factory settings, and restart: imud follows it to address 80 if no other module has that and the line has the "
-        "factory's 115200 baud",
+        "restore the factory settings and restart: imud follows the device to address 80 if no other device uses it "
+        "and the bus has the factory baud rate 115200",
         _factory_reset,
         Risk.RESET,
     ),
     "address": Action(
-        "set its address and follow it there; not saved. Refused if another module of the line answers there",
+        "set the address without saving and follow the device; imud rejects an address that is in use",
         _address,
         Risk.CONNECTION,
     ),
     "baud": Action(
-        "set the baud rate, in force after `save` and `restart`: imud then hears nothing of it until the line and all "
-        "other modules have the same",
+        "set the baud rate, effective after `save` and `restart`: then imud receives nothing from the device until the "
+        "bus and all other devices use the same baud rate",
         _baud,
         Risk.CONNECTION,
     ),
-    "attitude_mode": Action("six axes, or nine with the magnetometer", _attitude_mode),
-    "level": Action("make the present attitude level, or cancel that; the module must be at rest", _level),
-    "mounting": Action("say how the module is mounted", _mounting),
-    "read": Action("read a register, as words of 16 bits", _read),
+    "attitude_mode": Action("set 6-axis mode, or 9-axis mode with the magnetometer", _attitude_mode),
+    "level": Action("make the present attitude level, or cancel it; the device must be at rest", _level),
+    "mounting": Action("set the mounting of the device", _mounting),
+    "read": Action("read a register as words of 16 bits", _read),
 }
 
 DONE_PERCENT: Final = 100
 
 
 def _nine_axes_needed(_target: Target) -> TransferScript[str]:
-    (mode,) = yield from session.read(BY_NAME["HEADING_MODE"])
+    (mode,) = yield from commands.read(BY_NAME["HEADING_MODE"])
     if mode == AttitudeMode.SIX_AXIS.value:
         return f"{NINE_AXES_NEEDED}: action attitude_mode, axes=9"
     return ""
 
 
 def _nothing_to_start(_target: Target) -> TransferScript[None]:
-    """In 9-axis mode the module calibrates by itself."""
+    # in 9-axis mode the device calibrates without a command
     return
     yield  # makes it a generator
 
 
 def _magnetometer_verdict(_target: Target) -> TransferScript[Verdict]:
-    (state,) = yield from session.read(BY_NAME["MAG_CALIBRATION"])
-    (percent,) = yield from session.read(BY_NAME["MAG_PROGRESS"])
+    (state,) = yield from commands.read(BY_NAME["MAG_CALIBRATION"])
+    (percent,) = yield from commands.read(BY_NAME["MAG_PROGRESS"])
     return Verdict(percent >= DONE_PERCENT, f"state {state}, {percent} %", min(percent / DONE_PERCENT, 1.0))
 
 
 CALIBRATIONS: Final[Calibrations] = {
     "magnetometer": magnetometer(_nothing_to_start, _magnetometer_verdict, _nine_axes_needed),
-    **levels("4.3.5", 15, lambda kind: lambda _target: session.auto_level(kind), lambda _target: session.save()),
+    **levels("4.3.5", 15, lambda kind: lambda _target: commands.auto_level(kind), lambda _target: commands.save()),
 }
 
 Mode = Literal["6-axis", "9-axis"]
@@ -163,7 +164,7 @@ _MODE_OF: Final = {mode.value: name for name, mode in MODES.items()}
 
 
 def _read_settings(_target: Target) -> TransferScript[dict[str, object]]:
-    baud, address, heading = yield from session.read_present()
+    baud, address, heading = yield from commands.read_present()
     found: dict[str, object] = {}
     if heading in _MODE_OF:
         found["mode"] = _MODE_OF[heading]
@@ -175,12 +176,12 @@ def _read_settings(_target: Target) -> TransferScript[dict[str, object]]:
 
 
 def _check(target: Target, values: Mapping[str, Any]) -> None:
-    """A module of another rate than its line is lost, and spoils the replies of the others."""
+    """Raise BadArgument for another baud rate than the bus: such a device is lost and disturbs the others."""
     baud = values.get("baud")
     if baud is not None and target.baud and baud != target.baud:
         raise BadArgument(
-            f"baud: expected {target.baud}, the rate of the line, got {baud}; to change the rate of a line give all of "
-            "its modules the new one with the actions `baud`, `save` and `restart`, then set `rs485.baud`"
+            f"baud: expected {target.baud}, the baud rate of the bus, got {baud}; to change it, set it in all "
+            "devices with the actions `baud`, `save` and `restart`, then in `rs485.baud`"
         )
 
 
@@ -189,13 +190,13 @@ SETTINGS: Final = SettingsTable(
         "mode": Setting(
             type=Annotated[
                 Mode,
-                Meta(description="without or with the magnetometer in the heading", extra={"section": "4.3.6"}),
+                Meta(description="heading without or with the magnetometer", extra={"section": "4.3.6"}),
             ],
-            write=lambda _target, mode: session.set_heading_mode(MODES[mode]),
+            write=lambda _target, mode: commands.set_heading_mode(MODES[mode]),
         ),
         "mounting": Setting(
-            type=Annotated[Mounting, Meta(description="the axis that points up or down", extra={"section": "4.3.4"})],
-            write=lambda _target, mounting: session.set_mounting(LineMounting[mounting.upper()]),
+            type=Annotated[Mounting, Meta(description="axis that points up or down", extra={"section": "4.3.4"})],
+            write=lambda _target, mounting: commands.set_mounting(LineMounting[mounting.upper()]),
             effect=Effect.AFTER_RESTART,
             readable=False,
         ),
@@ -203,11 +204,11 @@ SETTINGS: Final = SettingsTable(
             type=Annotated[
                 BaudRate,
                 Meta(
-                    description="that of the line: a module that would take another one at its restart is set back",
+                    description="baud rate of the bus; use it to undo a changed baud rate before the restart",
                     extra={"unit": "bit/s", "section": "4.3.2"},
                 ),
             ],
-            write=lambda _target, baud: session.set_baud(baud),
+            write=lambda _target, baud: commands.set_baud(baud),
             effect=Effect.AFTER_RESTART,
             connection=True,
         ),
@@ -217,23 +218,22 @@ SETTINGS: Final = SettingsTable(
                 Meta(
                     ge=1,
                     le=ID_MAX,
-                    description="one that no other module of the line has",
+                    description="address that is unused on the bus",
                     extra={"section": "4.3.3"},
                 ),
             ],
-            write=lambda target, address: session.change_address(session.places_of(target)[0], address),
+            write=lambda target, address: commands.change_address(commands.places_of(target)[0], address),
             connection=True,
         ),
     },
     read=_read_settings,
-    save=lambda _target: session.save(),
-    restart=lambda target: session.restart(session.places_of(target), target.baud),
+    save=lambda _target: commands.save(),
+    restart=lambda target: commands.restart(commands.places_of(target), target.baud),
     check=_check,
 )
 
 
 def _example_reading(random: Random) -> bytes:
-    """A block with random values."""
     quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
 
     def three(spread: float) -> Vector3:

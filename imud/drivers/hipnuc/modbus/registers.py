@@ -1,9 +1,9 @@
-"""Registers of HiPNUC modules on Modbus: all of manual "IMU配置手冊" V1.5.9, section 4.2, and those of newer firmware.
+"""Modbus registers of HiPNUC devices: manual "IMU配置手冊" V1.5.9, section 4.2, and registers of newer firmware.
 
-Values of two registers have the high word first. Three departures from the table of the manual: the quaternion is
-signed and its scale is 2⁻¹⁵ in older firmware and 0.0001 in newer (the codec decides by the values); 0.011 of the
-inclinometer is 360/32768 or 180/32768, by product; MAIN_STATUS, the two of the magnetic calibration and UPTIME are of
-newer firmware, as the vendor's own programs read them.
+Values of two registers have the high word first. Differences from the table in the manual: the quaternion is signed;
+its scale is 2⁻¹⁵ in older firmware and 0.0001 in newer firmware (the codec decides by the values). 0.011 of the
+inclinometer is 360/32768 or 180/32768, by product. MAIN_STATUS, MAG_CALIBRATION, MAG_PROGRESS and UPTIME are registers
+of newer firmware, as in the vendor's programs.
 """
 
 import struct
@@ -45,22 +45,17 @@ class Access(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """A value in the registers: address, width, and scale to SI."""
+    """Value in the registers: address, width, and scale to SI."""
 
     name: str
     address: int
-    kind: str
-    """u16, i16, u32, i32, or text."""
-    count: int
-    """Registers that it takes."""
+    kind: str  # u16, i16, u32, i32, or text
+    count: int  # number of registers
     access: Access
     meaning: str
-    scale: float = 1.0
-    """SI value of one count; 1 where it is a plain number or decided elsewhere."""
-    unit: str = ""
-    """SI unit; empty for a plain number."""
-    values: tuple[int, ...] | range = ()
-    """Values that may be written, where these are limited."""
+    scale: float = 1.0  # SI value of one count; 1 for a plain number, or if the codec decides the scale
+    unit: str = ""  # SI unit; empty for a plain number
+    values: tuple[int, ...] | range = ()  # writable values; empty without a limit
 
 
 QUAT_OLD_PER_LSB: Final = 2.0**-15
@@ -69,18 +64,17 @@ INCLI_DUAL_RAD_PER_LSB: Final = tau / 2 / 32768
 
 BaudRate = Literal[4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600, 256000]
 BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
-"""By their code in UART1_BAUD (section 4.3.2); code 9 is not in the manual, the vendor's own programs have it."""
+"""Baud rates by their code in UART1_BAUD (section 4.3.2). Code 9 is from the vendor's programs, not from the manual."""
 FACTORY_BAUD: Final[BaudRate] = 115200
-ID_MAX: Final = 128
-"""Highest ID that register MD_ID takes; more by serial number only."""
+ID_MAX: Final = 128  # maximum ID of register MD_ID; higher IDs require the serial number
 
 _R, _W, _RW = Access.READ, Access.WRITE, Access.BOTH
 
 REGISTERS: Final = (
-    Register("CTRL", 0x00, "u16", 1, _W, "0 saves all settings, 1 restores the factory's, 0xFF restarts",
+    Register("CTRL", 0x00, "u16", 1, _W, "0 saves all settings, 1 restores the factory settings, 0xFF restarts",
              values=(0x0000, 0x0001, 0x00FF)),
     Register("UART1_BAUD", 0x04, "u16", 1, _RW, "baud rate by code, after a restart", values=range(len(BAUD_RATES))),
-    Register("MD_ID", 0x05, "u16", 1, _RW, "address on the line, at once in force", values=range(1, ID_MAX + 1)),
+    Register("MD_ID", 0x05, "u16", 1, _RW, "address on the bus, effective immediately", values=range(1, ID_MAX + 1)),
     Register("HEADING_MODE", 0x06, "u16", 1, _RW, "0 six axes, heading from power-on; 1 nine axes", values=(0, 1)),
     Register("MAIN_STATUS", 0x09, "u16", 1, _R, "status bits, as in HI91"),
     Register("MAG_CALIBRATION", 0x0A, "u16", 1, _R, "state of the magnetic calibration"),
@@ -113,18 +107,17 @@ REGISTERS: Final = (
     Register("SET_LV", 0xA5, "u16", 1, _W, "2 level here, 3 only when nearly level, 5 cancels", values=(2, 3, 5)),
     Register("URFR", 0xA6, "u16", 1, _W, "mounting: 0 level, 1 Y down, 2 Y up, 3 X up, 4 X down", values=range(5)),
 )  # fmt: skip
-"""In the order of their addresses."""
+"""in the order of their addresses"""
 
 BY_NAME: Final = {register.name: register for register in REGISTERS}
 
 BLOCK_FIRST: Final = BY_NAME["ACCX"].address
 BLOCK_REGISTERS: Final = BY_NAME["UPTIME"].address + 2 - BLOCK_FIRST
-"""0x34 … 0x4D: all that is measured, and the device's time."""
+"""0x34 … 0x4D: all measured values and the device time"""
 SHORT_BLOCK_REGISTERS: Final = BY_NAME["UPTIME"].address - BLOCK_FIRST
-"""0x34 … 0x4B: the same in firmware without UPTIME."""
+"""0x34 … 0x4B: the block of firmware without UPTIME"""
 IDENTITY_FIRST: Final = BY_NAME["PNAME"].address
-IDENTITY_REGISTERS: Final = 20
-"""0x70 … 0x83, as in the manual's example (section 4.4)."""
+IDENTITY_REGISTERS: Final = 20  # 0x70 … 0x83, as in the example of the manual (section 4.4)
 
 CUSTOM: Final = 0x50
 SET_ID_BY_SERIAL: Final = 0x0031
@@ -132,8 +125,7 @@ RANDOMISE_IDS: Final = 0x0030
 SERIAL_BYTES: Final = 8
 NAME_BYTES: Final = 16
 VERSIONS: Final = struct.Struct(">HH")
-SERIAL_AT: Final = 2 * (BY_NAME["SN"].address - IDENTITY_FIRST)
-"""Name, versions and serial number in registers 0x70 … 0x83."""
+SERIAL_AT: Final = 2 * (BY_NAME["SN"].address - IDENTITY_FIRST)  # offset of the serial number in registers 0x70 … 0x83
 FACTORY_ID: Final = 0x50
 WRITE_REPLY_BYTES: Final = 8
 
@@ -144,21 +136,21 @@ BY_CHANCE: Final = struct.Struct(">BHHHHH")
 
 
 def read_registers(first: int, count: int) -> Transfer:
-    """Read `count` registers from `first` on."""
+    """Return the transfer that reads `count` registers from `first`."""
     if not 1 <= count <= REGISTERS_MAX or not 0 <= first <= 0x10000 - count:
         raise BadArgument(f"read: expected 1 … {REGISTERS_MAX} registers of 0x0000 … 0xFFFF, got {count} at {first}")
     return Transfer((READ.pack(READ_HOLDING, first, count),), READ_OVERHEAD_BYTES + 2 * count)
 
 
 def write_register(register: int, value: int) -> Transfer:
-    """Write one register."""
+    """Return the transfer that writes one register."""
     if not 0 <= register <= 0xFFFF or not 0 <= value <= 0xFFFF:
         raise BadArgument(f"write: expected register and value of 0 … 0xFFFF, got {value} to {register}")
     return Transfer((WRITE.pack(WRITE_SINGLE, register, value),), WRITE_REPLY_BYTES)
 
 
 def set_id_by_serial(serial_number: str, new_id: int) -> Transfer:
-    """Give the module with this serial number (16 hexadecimal digits) an ID; a broadcast."""
+    """Return the broadcast that sets the ID of the device with this serial number (16 hexadecimal digits)."""
     check_id("ID", new_id)
     serial = serial_bytes(serial_number)
     data_bytes = len(serial) + 2
@@ -166,7 +158,7 @@ def set_id_by_serial(serial_number: str, new_id: int) -> Transfer:
 
 
 def randomise_ids(lowest: int, highest: int) -> Transfer:
-    """Make every module choose a random ID from `lowest` to `highest`; a broadcast. Ranges of one ID are refused."""
+    """Return the broadcast that makes every device choose a random ID from `lowest` to `highest`, at least two IDs."""
     check_id("lowest ID", lowest)
     check_id("highest ID", highest)
     if lowest >= highest:
@@ -175,17 +167,15 @@ def randomise_ids(lowest: int, highest: int) -> Transfer:
 
 
 def check_id(name: str, value: int) -> int:
-    """Check that an address is one of a slave. Raises BadArgument.
-
-    The manual gives 1 … 128, 1 … 255 and 1 … 0xFF; Modbus has 1 … 247.
-    """
+    """Return a valid slave address. Raises BadArgument."""
+    # the manual gives 1 … 128, 1 … 255 and 1 … 0xFF; Modbus has 1 … 247
     if isinstance(value, bool) or not isinstance(value, int) or value not in SLAVES:
         raise BadArgument(f"{name}: expected {SLAVES.start} … {SLAVES.stop - 1}, got {value!r}")
     return value
 
 
 def serial_bytes(serial_number: str) -> bytes:
-    """A serial number as it is sent. Raises BadArgument."""
+    """Return the bytes of a serial number. Raises BadArgument."""
     try:
         serial = bytes.fromhex(serial_number)
     except ValueError:
@@ -197,38 +187,40 @@ def serial_bytes(serial_number: str) -> bytes:
 
 
 def registers_of(reply: bytes, count: int) -> tuple[int, ...]:
-    """The registers of a reply to a read. Raises DeviceRefused with the reason if it is none."""
+    """Return the registers of a reply to a read. Raises DeviceRefused for another reply."""
     _check(reply, READ_HOLDING, READ_OVERHEAD_BYTES + 2 * count)
     if reply[2] != 2 * count:
-        raise DeviceRefused(f"expected {2 * count} bytes of registers, the reply says {reply[2]}")
+        raise DeviceRefused(f"expected {2 * count} bytes of registers, got a reply of {reply[2]}")
     return struct.unpack_from(f">{count}H", reply, 3)
 
 
 def check_written(reply: bytes, request: Transfer) -> None:
-    """Whether the reply confirms a write. Raises DeviceRefused with the reason if it does not."""
+    """Raise DeviceRefused if the reply does not confirm a write."""
     _check(reply, WRITE_SINGLE, WRITE_REPLY_BYTES)
     if reply[1:-CRC_BYTES] != request.sends[0]:
-        raise DeviceRefused(f"expected {request.sends[0].hex(' ')} to be confirmed, got {reply[1:-CRC_BYTES].hex(' ')}")
+        raise DeviceRefused(
+            f"expected the confirmation {request.sends[0].hex(' ')}, got {reply[1:-CRC_BYTES].hex(' ')}"
+        )
 
 
 def _check(reply: bytes, function: int, size: int) -> None:
     if is_exception(reply):
-        raise DeviceRefused(f"the module answered function 0x{reply[1] & 0x7F:02x} with {exception_text(reply[2])}")
+        raise DeviceRefused(f"the device replied to function 0x{reply[1] & 0x7F:02x} with {exception_text(reply[2])}")
     if len(reply) != size or not is_whole(reply):
         raise DeviceRefused(f"damaged reply of {len(reply)} bytes, expected {size}: {reply[:16].hex(' ')}")
     if reply[1] != function:
         raise DeviceRefused(f"expected a reply of function 0x{function:02x}, got 0x{reply[1]:02x}")
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
 
 def registers_reply(data: bytes) -> bytes:
-    """A reply to a read, without address and CRC."""
+    """Return a reply to a read, without address and CRC."""
     return bytes([READ_HOLDING, len(data)]) + data
 
 
 def pack_identity(product: str, firmware: int, loader: int, serial: bytes) -> bytes:
-    """Registers 0x70 … 0x83."""
+    """Return registers 0x70 … 0x83."""
     head = product.encode("ascii")[:NAME_BYTES].ljust(NAME_BYTES, b"\0") + VERSIONS.pack(firmware, loader)
     return (head.ljust(SERIAL_AT, b"\0") + serial).ljust(2 * IDENTITY_REGISTERS, b"\0")

@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""HiPNUC devices on UART, RS-232 and USB."""

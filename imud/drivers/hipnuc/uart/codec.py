@@ -5,17 +5,17 @@
     | 5A | A5 |length |crc  | payload         |    integers and floats little-endian
     +----+----+-------+-----+-----------------+
 
-`crc` is CRC-16/XMODEM over bytes 0…3 and the payload. The payload is a row of sub-packets, each a tag byte and as many
-bytes as its tag says: 0x91 (HI91, floats, 76 bytes), 0x92 (HI92, integers, 48 bytes). Lines of text, the replies to
-commands (`commands.py`), stand between the frames and may be cut by them (`replies.py`).
+`crc` is CRC-16/XMODEM over bytes 0…3 and the payload. The payload is a sequence of sub-packets; the tag byte defines
+the size: 0x91 (HI91, floats, 76 bytes), 0x92 (HI92, integers, 48 bytes). Lines of text, the replies to commands
+(`commands.py`), are between the frames and may be split by frames (`replies.py`).
 
-Strategy. A frame whose check fails spends only its sync word, because a real frame may begin inside the false one.
-What follows up to its claimed end counts as part of it unless it turns out to be good. While a claimed frame is
-incomplete everything waits, at most FRAME_BYTES_MAX; `flush` ends the wait when the line went idle.
-At 1 kHz the decoder is on the sample path, so HI91 frames back to back, which is what a stream consists of, are decoded
-by `_decode_run`: one match finds them, the CRC starts from that of the header, NaN is looked for in the high bytes of
-all floats of all frames at once, and one `iter_unpack` goes through all payloads. Everything else goes one by one.
-`make bench-instructions` measures it.
+If the check of a frame fails, the codec skips only its sync word, because a valid frame may start inside the false
+frame. The bytes up to its end by the length field count as bad unless they are valid frames. The codec holds the bytes
+of an incomplete frame, at most FRAME_BYTES_MAX. `flush` ends the wait when the link is idle.
+
+Fast path: at 1 kHz, consecutive HI91 frames go through `_decode_run`. One match finds them, the CRC starts from the CRC
+of the header, one check of the high bytes of all floats finds NaN, and one `iter_unpack` reads all payloads. All other
+frames are decoded one by one. `make bench-instructions` measures the cost.
 """
 
 import re
@@ -48,38 +48,38 @@ from imud.model.sample import Measurement, Quaternion, Vector3
 from imud.model.units import RAD_PER_DEG, T_PER_UT
 
 HI91: Final = struct.Struct("<BHbfI3f3f3f3f4f")
-"""tag, pps_sync_stamp or status, temperature °C, pressure Pa, system_time ms, accel G, gyro °/s, mag µT,
-roll pitch yaw °, quaternion wxyz (section 3.3.1)."""
+"""tag, pps_sync_stamp or status, temperature °C, pressure Pa, system_time ms, accel G, gyro °/s, mag µT, roll pitch yaw
+°, quaternion wxyz (section 3.3.1)."""
 HI92: Final = struct.Struct("<BHbHh2x3h3h3h3i4h")
 """tag, status, temperature °C, pps_sync_stamp ms, pressure - 100000 Pa, reserved, gyro, accel, mag, roll pitch yaw,
-quaternion wxyz (section 3.3.2). Gyro stands before accel here."""
+quaternion wxyz (section 3.3.2). In HI92, gyro is before accel."""
 TAG_HI91: Final = 0x91
 TAG_HI92: Final = 0x92
 
 PPS_STAMP_MODULUS_MS: Final = 8192
-"""pps_sync_stamp counts 0 … 8191 ms and wraps when no edge comes (in a recording at 100 Hz, 8190 is followed by 8)."""
+"""Modulus of pps_sync_stamp without an edge, ms (in a recording at 100 Hz, 8 follows 8190)."""
 
-ACCEL_M_S2_PER_LSB: Final = 0.0048828
-"""Of HI92, as printed; 160 / 32768 would be 2.6e-6 more."""
-GYRO_RAD_S_PER_LSB: Final = 0.001
-"""Of HI92."""
+ACCEL_M_S2_PER_LSB: Final = 0.0048828  # scale of HI92 as printed; 160 / 32768 would be 2.6e-6 larger
+GYRO_RAD_S_PER_LSB: Final = 0.001  # scale of HI92
 PRESSURE_OFFSET_PA: Final = 100_000
 
 
 HI91_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") + "xBBbfI16f")
-"""HI91 behind its tag, the word in two bytes: in the machine's own layout `struct` reads a float in half the time."""
+"""HI91 after its tag, the word as two bytes. In the native layout, `struct` reads a float in half the time."""
 HI91_HIGH_BYTES: Final = slice(7, None, 4)
-"""High bytes of all floats, and of system_time, in HI91 sub-packets back to back, because 76 is a multiple of 4. An
-exponent of all ones (NaN, infinity) needs 0x7F or 0xFF there; finite values above 1.7e38 and 9 of every 1193 hours of
-system time have them too."""
+"""Slice of the high bytes of all floats and of system_time in adjacent HI91 sub-packets (76 is a multiple of 4). The
+high byte of NaN and infinity is 0x7F or 0xFF. Finite values above 1.7e38 have the same high bytes, and system_time in 9
+of 1193 hours."""
 
 
 def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing: int) -> Measurement:
-    """The measurement of HI91_VALUES, where NaN and infinity stay; `size` and `trailing` are those of the frame."""
+    """Return the measurement of HI91_VALUES with NaN and infinity. `size` and `trailing` describe the frame."""
     low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz = values
-    # local names: a global costs twice as much, and there are thirty of them per frame
+    # a global name costs twice as much as a local name, and a frame uses thirty of them
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
-    if not PRESSURE_MIN_PA <= pressure <= PRESSURE_MAX_PA:  # `pressure_of`; a call each costs a tenth of a frame
+    if (
+        not PRESSURE_MIN_PA <= pressure <= PRESSURE_MAX_PA
+    ):  # `pressure_of` without a call, which costs a tenth of a frame
         temperature, pressure = temperature_beside(temperature, pressure), None
     word = low + 256 * high
     return Measurement(
@@ -91,14 +91,12 @@ def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing
 
 
 def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int) -> list[Measurement]:
-    """`decode_hi91` of sub-packets back to back, one of each frame, written out: the call is a twentieth of the cost.
-
-    `trailing` bytes follow the first frame.
-    """
+    """Return `decode_hi91` of adjacent sub-packets, one per frame. `trailing` bytes follow the first frame."""
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
     low_pa, high_pa = PRESSURE_MIN_PA, PRESSURE_MAX_PA
     made: list[Measurement] = []
     make, keep = Measurement, made.append
+    # decode_hi91 inline: the call costs a twentieth of the time
     for (
         low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
     ) in HI91_VALUES.iter_unpack(hi91s):  # fmt: skip
@@ -129,17 +127,17 @@ _GROUPS: Final = ("accel_m_s2", "gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad")
 
 
 def _finite_groups(m: Measurement) -> Measurement:
-    """Decode without the groups of values of which one is NaN or infinite."""
+    """Return the measurement without groups that contain NaN or infinity."""
     absent = [name for name in _GROUPS if not all(map(isfinite, getattr(m, name)))]
     return msgspec.structs.replace(m, **dict.fromkeys(absent))
 
 
 def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
-    """Decode HI92, which has no device time: `dev_ticks` is None."""
     (
         _, status, temperature, pps_ms, pressure, gx, gy, gz, ax, ay, az, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
     ) = HI92.unpack_from(data, at)  # fmt: skip
     a, w, b, angle, q = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, MAG_T_PER_LSB, EULER_RAD_PER_LSB, QUAT_PER_LSB
+    # no device time: `dev_ticks` is None
     return Measurement(
         size, trailing, None,
         (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w), (mx * b, my * b, mz * b),
@@ -150,12 +148,11 @@ def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailin
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """A kind of sub-packet."""
+    """Kind of sub-packet."""
 
-    size: int
-    """In bytes, tag included."""
+    size: int  # size with tag, bytes
     decode: Callable[[bytes, int, bool, int, int], tuple[Measurement, bool]]
-    """`decode(data, at, word_is_status, size, trailing)` returns the measurement, and whether all is finite."""
+    """`decode(data, at, word_is_status, size, trailing)` returns the measurement and whether all values are finite."""
 
 
 PACKETS: Final = {TAG_HI91: Packet(HI91.size, _decode_hi91), TAG_HI92: Packet(HI92.size, _decode_hi92)}
@@ -173,7 +170,7 @@ def pack_hi91(
     pressure_pa: float,
     word_1_2: int = 0,
 ) -> bytes:
-    """An HI91 sub-packet. Values are clipped to the format's range, time wraps at 2³² ms; NaN is sent as it is."""
+    """Return an HI91 sub-packet. Values are clipped to the range, time wraps at 2³² ms, NaN is sent unchanged."""
     values = (
         *(a / M_S2_PER_G for a in accel_m_s2),
         *(w / RAD_PER_DEG for w in gyro_rad_s),
@@ -203,7 +200,7 @@ def pack_hi92(
     pressure_pa: float,
     status: int = 0,
 ) -> bytes:
-    """An HI92 sub-packet. Values are clipped to the format's range. Raises ValueError, OverflowError if not finite."""
+    """Return an HI92 sub-packet. Values are clipped to the range. Raises ValueError, OverflowError if not finite."""
     return HI92.pack(
         TAG_HI92,
         _clip(status, 0, 0xFFFF),
@@ -235,68 +232,66 @@ def _clip_float(value: float) -> float:
 
 SYNC: Final = b"\x5a\xa5"
 HEADER: Final = struct.Struct("<2sHH")  # sync word, payload length, CRC
-PAYLOAD_BYTES_MAX: Final = 512  # section 3.1; devices build frames in a buffer of 512 bytes, header included
+PAYLOAD_BYTES_MAX: Final = 512  # section 3.1; devices make frames in a buffer of 512 bytes, with header
 FRAME_BYTES_MAX: Final = HEADER.size + PAYLOAD_BYTES_MAX
 
 STATUS_SINCE_APP_VER: Final = 169
-"""Firmware 1.6.9 and newer sends MAIN_STATUS in bytes 1-2 of HI91; before, pps_sync_stamp as in the manual."""
+"""First firmware version (1.6.9) with MAIN_STATUS in bytes 1-2 of HI91; older firmware sends pps_sync_stamp there."""
 TIME_BITS: Final = TimeBits(sync_out=1 << 12, not_utc=1 << 11)
-"""Status bits about time in MAIN_STATUS: pulse on SOUT with this frame; `system_time` not synchronised to UTC."""
+"""Status bits of MAIN_STATUS about time: frame with a SOUT pulse; `system_time` not synchronized to UTC."""
 
 _HI91_FRAME_BYTES: Final = HEADER.size + HI91.size
 _HI91_HEAD: Final = SYNC + HI91.size.to_bytes(2, "little")
 _RUN_SEED: Final = crc16_xmodem(_HI91_HEAD, 0)
-_RUN_FRAMES_MAX: Final = 64  # a run is copied out of the buffer; this bounds what one damaged frame makes copy again
+_RUN_FRAMES_MAX: Final = (
+    64  # imud copies a run out of the buffer; the limit bounds repeated copies after a damaged frame
+)
 _RUN: Final = re.compile(
     rb"(?s:%b..%b.{%d}){1,%d}" % (re.escape(_HI91_HEAD), re.escape(bytes([TAG_HI91])), HI91.size - 1, _RUN_FRAMES_MAX)
 )
-"""HI91 frames back to back by header and tag."""
+"""Pattern of adjacent HI91 frames by header and tag."""
 _RUN_PARTS: Final = struct.Struct(f"<4xH{HI91.size}s")  # CRC and payload
+# Pattern of a line directly before the idle time: at least two characters and both line end characters. Shorter text
+# can occur by chance inside an incomplete frame, which `flush` would drop.
 _IDLE_LINE: Final = re.compile(rb"[\t\x20-\x7e]{2,%d}\r\n\Z" % LINE_CHARACTERS_MAX)
-"""A line right before the port went idle: two characters at least and both characters of the line's end, which the
-device always sends. Less comes by chance inside half a frame, which would then be dropped."""
 
 
 class HipnucOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of a module on a UART."""
+    """Options of a device on a UART."""
 
     hi91_word: Literal["auto", "pps", "status"] = "auto"
-    """Meaning of bytes 1-2 of HI91: time since the last PPS edge (firmware before 1.6.9) or status bits (since).
-    `auto` decides by the firmware version that the device reports, `pps` until that is known."""
+    """Meaning of bytes 1-2 of HI91: time since the last PPS edge (firmware before 1.6.9) or status bits (newer
+    firmware). `auto` decides by the firmware version that the device reports, and uses `pps` before."""
 
 
 class HipnucCodec:
-    """Decoder of frames and lines of text from bytes in any split. Synchronization: one thread.
+    """Decoder of frames and lines of text from a byte stream. Synchronization: one thread.
 
-    Every sub-packet that is known becomes one `Measurement`, with the size of the whole frame, so that all of a frame
-    come to the same time. A sub-packet cut off by the end of the payload makes the whole frame bad. A frame with NaN or
-    infinity is delivered without the values concerned, after a `BadFrame` (not-finite); its bytes and
-    itself count as good.
+    Every known sub-packet becomes one `Measurement` with the size of the complete frame, so that all sub-packets of a
+    frame have the same time. A sub-packet that is cut off by the end of the payload makes the frame bad. For a frame
+    with NaN or infinity, the codec returns a `BadFrame` (not-finite) and the measurement without these values; the
+    frame counts as good.
     """
 
     def __init__(self, ledger: Ledger, settings: HipnucOptions) -> None:
         self.ledger = ledger
-        self.word_is_status = settings.hi91_word == "status"
-        """Whether bytes 1-2 of HI91 are status bits."""
+        self.word_is_status = settings.hi91_word == "status"  # whether bytes 1-2 of HI91 are status bits
         self._word_is_fixed = settings.hi91_word != "auto"
         self._lines = LineFinder(ledger)
-        self._tail = b""
-        """Incomplete rest of the bytes: begins with a sync word, or is the first half of one."""
-        self._bad_ahead = 0
-        """Claimed rest of a damaged frame, in bytes from the begin of the tail."""
-        self._barred_ahead = 0
-        """The same of one that came whole: no line is found in it."""
+        self._tail = b""  # incomplete rest of the bytes: starts with a sync word, or is the first half of a sync word
+        self._bad_ahead = 0  # rest of a damaged frame by its length field, in bytes from the start of the tail
+        self._barred_ahead = 0  # rest of a complete damaged frame, in which the codec does not look for lines
 
     def learn_app_ver(self, app_ver: int) -> None:
-        """Set the firmware's version number, 169 for 1.6.9. A configured meaning of HI91 bytes 1-2 stays."""
+        """Set the firmware version, 169 for 1.6.9. Do nothing if the configuration defines the meaning of bytes 1-2."""
         if not self._word_is_fixed:
             self.word_is_status = app_ver >= STATUS_SINCE_APP_VER
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
-        """Add bytes in the order they came; return what they completed. Never raises for any bytes."""
+        """Decode the next bytes of the stream. Return the completed events. Never raises an exception."""
         self.ledger.bytes_in += len(data)
         if len(data) == _HI91_FRAME_BYTES and data.startswith(_HI91_HEAD) and not (self._tail or self._bad_ahead):
-            payload = data[HEADER.size :]  # a read that is one plain HI91 frame, as from a port at 1 kHz
+            payload = data[HEADER.size :]  # fast path: the read is exactly one HI91 frame, as at 1 kHz
             high_bytes = payload[HI91_HIGH_BYTES]
             if (
                 crc16_xmodem(payload, _RUN_SEED) == data[4] | data[5] << 8
@@ -312,14 +307,16 @@ class HipnucCodec:
         return self._scan(self._tail + data if self._tail else data, 0)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Drop an incomplete frame if a whole message waits inside it; no-op otherwise. The line is idle."""
+        """Drop an incomplete frame that contains a complete frame or line. imud calls this method when the link is
+        idle.
+        """
         events: list[CodecEvent] = []
         while give_up := self._whole_inside():
             events += self._scan(self._tail, give_up)
         return events
 
     def reset(self) -> None:
-        """Skip what is pending: the stream broke. The known firmware version stays."""
+        """Count the pending bytes as skipped. The known firmware version stays."""
         self._lines.clear()
         self.ledger.bytes_skipped += len(self._tail)
         self._tail = b""
@@ -327,7 +324,7 @@ class HipnucCodec:
         self.ledger.bytes_pending = 0
 
     def _scan(self, data: bytes, give_up: int) -> list[CodecEvent]:
-        """Decode all that is complete in `data`, where incomplete frames that begin before `give_up` are bad."""
+        """Decode all complete frames in `data`. Incomplete frames that start before `give_up` are bad."""
         events: list[CodecEvent] = []
         at, total = 0, len(data)
         while at < total:
@@ -349,7 +346,7 @@ class HipnucCodec:
         return events
 
     def _decode_frame(self, data: bytes, at: int, give_up: int, events: list[CodecEvent]) -> int:
-        """Decode the frame at `at`; return where it ends, or `at` if it is not complete yet."""
+        """Decode the frame at `at`. Return its end, or `at` if it is incomplete."""
         total = len(data)
         if (run := _RUN.match(data, at)) and (after := self._decode_run(data, at, run.end(), events)) > at:
             return after
@@ -368,7 +365,7 @@ class HipnucCodec:
         return end
 
     def _decode_run(self, data: bytes, at: int, end: int, events: list[CodecEvent]) -> int:
-        """Decode HI91 frames back to back up to the first whose CRC does not match; return where they end."""
+        """Decode adjacent HI91 frames up to the first wrong CRC. Return their end."""
         size, crc_of, seed = _HI91_FRAME_BYTES, crc16_xmodem, _RUN_SEED
         payloads: list[bytes] = []
         keep = payloads.append
@@ -380,7 +377,7 @@ class HipnucCodec:
         end = at + count * size
         hi91s = b"".join(payloads)
         high_bytes = hi91s[HI91_HIGH_BYTES]
-        if 0x7F in high_bytes or 0xFF in high_bytes:  # `_decode_payload` finds out, at three times the cost
+        if 0x7F in high_bytes or 0xFF in high_bytes:  # maybe NaN: `_decode_payload` checks it at three times the cost
             for begin in range(at, end, size):
                 self._decode_payload(data, begin, begin + size, events)
             return end
@@ -392,7 +389,7 @@ class HipnucCodec:
         return end
 
     def _decode_payload(self, data: bytes, at: int, end: int, events: list[CodecEvent]) -> None:
-        """Decode the sub-packets of a frame whose CRC matches, from `at` to `end` with its header."""
+        """Decode the sub-packets of a frame with a correct CRC, from `at` to `end` with its header."""
         ledger = self.ledger
         found: list[Measurement] = []
         finite = True
@@ -423,7 +420,7 @@ class HipnucCodec:
         events += found
 
     def _spend_sync(self, data: bytes, at: int, end: int, reason: BadReason, events: list[CodecEvent]) -> int:
-        """Reject the frame from `at` to its claimed `end`: consume the sync word only."""
+        """Reject the frame from `at` to its `end` by the length field: skip only the sync word."""
         ledger = self.ledger
         if reason is BadReason.CRC:
             ledger.frames_bad_crc += 1
@@ -438,7 +435,9 @@ class HipnucCodec:
         return at + len(SYNC)
 
     def _whole_inside(self) -> int:
-        """Find the begin of the first whole frame in the tail, or the end of a line that the tail ends with; else 0."""
+        """Return the start of the first complete frame in the tail, or the end of a line at the end of the tail;
+        otherwise 0.
+        """
         tail = self._tail
         at = tail.find(SYNC, len(SYNC))
         while at >= 0:
@@ -449,7 +448,7 @@ class HipnucCodec:
 
 
 def _is_whole(data: bytes, at: int) -> bool:
-    """Whether a frame with a matching CRC begins at `at`."""
+    """Return whether a frame with a correct CRC starts at `at`."""
     if len(data) - at < HEADER.size:
         return False
     length: int
@@ -461,11 +460,11 @@ def _is_whole(data: bytes, at: int) -> bool:
     return crc16_xmodem(data[begin:end], crc16_xmodem(data[at : at + 4], 0)) == crc
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
 
 def encode_frame(payload: bytes) -> bytes:
-    """A frame around `payload`. Raises ValueError for a payload that is empty or above PAYLOAD_BYTES_MAX."""
+    """Return a frame with `payload`. Raises ValueError for an empty payload or more than PAYLOAD_BYTES_MAX bytes."""
     if not 1 <= len(payload) <= PAYLOAD_BYTES_MAX:
         raise ValueError(f"payload of {len(payload)} bytes: expected 1 … {PAYLOAD_BYTES_MAX}")
     head = SYNC + len(payload).to_bytes(2, "little")
@@ -482,7 +481,5 @@ def _framed(pack: Callable[_Values, bytes]) -> Callable[_Values, bytes]:
     return encode
 
 
-encode_hi91 = _framed(pack_hi91)
-"""A whole HI91 frame from SI values; see `pack_hi91`."""
-encode_hi92 = _framed(pack_hi92)
-"""A whole HI92 frame from SI values; see `pack_hi92`."""
+encode_hi91 = _framed(pack_hi91)  # returns a complete HI91 frame from SI values; see `pack_hi91`
+encode_hi92 = _framed(pack_hi92)  # returns a complete HI92 frame from SI values; see `pack_hi92`

@@ -1,13 +1,13 @@
-r"""ASCII commands of HiPNUC modules (replies: `replies.py`). Manual "IMU配置手冊" V1.5.9, chapter 2 and section 8.2.
+r"""ASCII commands of HiPNUC devices (replies: `replies.py`). Manual "IMU配置手冊" V1.5.9, chapter 2 and section 8.2.
 
     LOG HI91 ONTIME 0.01\r\n   →   OK\r\n        done
-                               →   ERR…\r\n      refused
-                               →   (nothing)     not understood: unknown commands get no reply at all
+                               →   ERR…\r\n      rejected
+                               →   (nothing)     unknown command: the device does not reply
     LOG VERSION\r\n            →   PNAME=HI14R3\r\n … OK\r\n
 
-Each function returns a `Request`. Types say what an argument can be; ranges are those of the actions (`actions.py`),
-and what no range can express raises BadArgument here. Settings last until power is off unless `save_config` follows;
-`mounting` takes effect after `save_config` and `reboot`.
+Most functions return a `Request`. Types define the arguments; the actions in `driver.py` define ranges; other rules
+raise BadArgument here. Settings are lost at power-off unless `save_config` follows; `mounting` takes effect after
+`save_config` and `reboot`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,100 +35,80 @@ from imud.model.units import BITS_PER_UART_BYTE, NS_PER_S
 LINE_END: Final = "\r\n"
 BaudRate = Literal[115200, 921600, 460800, 256000, 230400, 9600]
 BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
-"""Rates of SERIALCONFIG (section 2.2.3) and 230400 of table 3.7; the factory default first."""
+"""Baud rates of SERIALCONFIG (section 2.2.3) and 230400 of table 3.7; the factory value first."""
 REPLY_TIMEOUT_NS: Final = NS_PER_S // 2
-FLASH_TIMEOUT_NS: Final = 5 * NS_PER_S  # erasing flash can take 2 s and more; the manual gives no time
+FLASH_TIMEOUT_NS: Final = 5 * NS_PER_S  # erasing the flash can take more than 2 s; the manual states no time
 
 OutputRate = Literal[0, 1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100, 125, 200, 250, 500, 1000]
 RATES_HZ: Final[tuple[OutputRate, ...]] = get_args(OutputRate)[1:]
-"""Output rates: section 2.2.5 lists some periods "and so on", which is read as every whole rate with a period of whole
+"""Output rates: section 2.2.5 lists some periods "and so on". imud accepts every whole rate with a period of whole
 milliseconds, up to table 3.7."""
 LINE_SHARE_MAX: Final = 0.95
-"""Share of the line that frames may take: table 3.7 goes up to 94 % (HI92 with 200 Hz at 115200 baud)."""
+"""Maximum share of the baud rate for frames: table 3.7 goes up to 94 % (HI92 with 200 Hz at 115200 baud)."""
 SOUT_DIVIDER_MAX: Final = 64
 PIN_MAX: Final = 9
-ROTATION_TOLERANCE: Final = 1e-3
-"""Tolerance of nine numbers typed with three decimals against a rotation matrix."""
+ROTATION_TOLERANCE: Final = 1e-3  # tolerance of a rotation matrix of nine numbers with three decimals
 
 
 class OutputMessage(StrEnum):
     """Output messages."""
 
-    HI91 = "HI91"
-    """Floats, with device time. `IMU91` is its other name."""
-    HI92 = "HI92"
-    """Integers, without device time."""
+    HI91 = "HI91"  # floats, with device time; also called `IMU91`
+    HI92 = "HI92"  # integers, without device time
 
 
 MAX_RATE_HZ: Final = {
     OutputMessage.HI91: {9600: 10, 115200: 100, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
     OutputMessage.HI92: {9600: 10, 115200: 200, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
 }
-"""Highest output rate by baud rate (table 3.7)."""
+"""Maximum output rate by baud rate (table 3.7)."""
 FRAME_BYTES: Final = {OutputMessage.HI91: 6 + 76, OutputMessage.HI92: 6 + 48}
-"""Size of a frame with its header (sections 3.1, 3.3)."""
+"""Size of a frame with its header, bytes (sections 3.1, 3.3)."""
 
 
 class YawMode(Enum):
     """Meanings of the angle of `yaw`."""
 
-    RELATIVE = 0
-    """Added to the present yaw."""
-    ABSOLUTE = 1
-    """Replaces the present yaw."""
+    RELATIVE = 0  # added to the present yaw
+    ABSOLUTE = 1  # replaces the present yaw
 
 
 class PinFunction(Enum):
-    """Functions of the multi-purpose pins (firmware 1.5.5 and newer), with the pin they have by default."""
+    """Functions of the multi-purpose pins (firmware 1.5.5 and newer), with their default pin."""
 
-    SIN = 1
-    """Input of sync or PPS pulses; IO1."""
-    SOUT = 2
-    """High for 80 µs before each frame; IO2."""
-    LED = 3
-    """IO5."""
-    SOUT_DIV = 4
-    """Every n-th SOUT pulse, see `sout_divider`; IO6."""
-    ALARM = 5
-    """High while an angle is out of range, see `alarm`; IO9."""
+    SIN = 1  # input of sync or PPS pulses; IO1
+    SOUT = 2  # high for 80 µs before each frame; IO2
+    LED = 3  # IO5
+    SOUT_DIV = 4  # every n-th SOUT pulse, see `sout_divider`; IO6
+    ALARM = 5  # high while an angle is out of range, see `alarm`; IO9
 
 
-PinName = Literal["sin", "sout", "led", "sout_div", "alarm"]
-"""Names of `PinFunction`."""
+PinName = Literal["sin", "sout", "led", "sout_div", "alarm"]  # names of `PinFunction`
 
 
 class AlarmAxis(StrEnum):
-    """The axis whose angle the alarm watches."""
+    """Axis of the angle that the alarm watches."""
 
     X = "X"
     Y = "Y"
 
 
 class Mounting(Enum):
-    """The nine mountings of section 2.2.4. The value is the URFR matrix, from new sensor axes to the old ones.
+    """The nine mountings of section 2.2.4. The value is the URFR matrix, from new sensor axes to the old axes.
 
-    Each is named by the new axis that points up, or down, while the old Z axis does; that is what the third row of the
-    matrix says, and what the manual's words in brackets say. Its "turned by ±90° about Y" has the other sign.
+    The name gives the new axis that points up or down while the old Z axis points up. It agrees with the third row of
+    the matrix and with the manual's text in brackets. The manual's "turned by ±90° about Y" has the opposite sign.
     """
 
-    LEVEL = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-    """Z up, nothing turned: the default."""
-    Y_DOWN = ((1, 0, 0), (0, 0, 1), (0, -1, 0))
-    """Printed as turned by -90° about X: Y down."""
-    Y_UP = ((1, 0, 0), (0, 0, -1), (0, 1, 0))
-    """Printed as turned by 90° about X: Y up."""
-    Z_DOWN = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
-    """Turned by 180° about X: Z down, X as before."""
-    X_UP = ((0, 0, -1), (0, 1, 0), (1, 0, 0))
-    """Printed as turned by 90° about Y: X up."""
-    X_DOWN = ((0, 0, 1), (0, 1, 0), (-1, 0, 0))
-    """Printed as turned by -90° about Y: X down."""
-    Z_DOWN_X_BACK = ((-1, 0, 0), (0, 1, 0), (0, 0, -1))
-    """Turned by 180° about Y: Z down, X where -X was."""
-    LEVEL_X_LEFT = ((0, -1, 0), (1, 0, 0), (0, 0, 1))
-    """Turned by 90° about Z: Z up, X where Y was."""
-    LEVEL_X_RIGHT = ((0, 1, 0), (-1, 0, 0), (0, 0, 1))
-    """Turned by -90° about Z: Z up, X where -Y was."""
+    LEVEL = ((1, 0, 0), (0, 1, 0), (0, 0, 1))  # Z up, no rotation: the default
+    Y_DOWN = ((1, 0, 0), (0, 0, 1), (0, -1, 0))  # The manual prints: turned by -90° about X. Y down.
+    Y_UP = ((1, 0, 0), (0, 0, -1), (0, 1, 0))  # The manual prints: turned by 90° about X. Y up.
+    Z_DOWN = ((1, 0, 0), (0, -1, 0), (0, 0, -1))  # rotated by 180° about X: Z down, X unchanged
+    X_UP = ((0, 0, -1), (0, 1, 0), (1, 0, 0))  # The manual prints: turned by 90° about Y. X up.
+    X_DOWN = ((0, 0, 1), (0, 1, 0), (-1, 0, 0))  # The manual prints: turned by -90° about Y. X down.
+    Z_DOWN_X_BACK = ((-1, 0, 0), (0, 1, 0), (0, 0, -1))  # rotated by 180° about Y: Z down, X in place of -X
+    LEVEL_X_LEFT = ((0, -1, 0), (1, 0, 0), (0, 0, 1))  # rotated by 90° about Z: Z up, X in place of Y
+    LEVEL_X_RIGHT = ((0, 1, 0), (-1, 0, 0), (0, 0, 1))  # rotated by -90° about Z: Z up, X in place of -Y
 
 
 MountingName = Literal[
@@ -138,7 +118,7 @@ MountingName = Literal[
 
 
 class Query(StrEnum):
-    """Reports that LOG asks for; each reply is lines and then OK."""
+    """Reports of LOG; each reply is some lines and then OK."""
 
     VERSION = "VERSION"
     USRCONFIG = "USRCONFIG"
@@ -150,7 +130,7 @@ class Query(StrEnum):
 
 
 def reboot() -> Request:
-    """Restart, as by power-on. The module does not answer."""
+    """Restart the device, as after power-on. It does not reply."""
     return _command("REBOOT", silent=True)
 
 
@@ -160,7 +140,7 @@ def save_config() -> Request:
 
 
 def factory_reset() -> Request:
-    """Restore the factory settings, the baud rate included. When they come into force is not known: `session.py`."""
+    """Restore the factory settings with the baud rate. `reset_to_factory` makes them effective."""
     return _command("FRESET", timeout_ns=FLASH_TIMEOUT_NS)
 
 
@@ -170,12 +150,12 @@ def unlog_all() -> Request:
 
 
 def serial_config(baud: BaudRate) -> Request:
-    """Set the baud rate: at once, even before the answer, or after `save_config` and `reboot` (`session.py`)."""
+    """Set the baud rate: effective immediately, even before the reply, or after `save_config` and `reboot`."""
     return _command(f"SERIALCONFIG {baud}")
 
 
 def attitude_mode(mode: AttitudeMode) -> Request:
-    """Choose 6-axis or 9-axis (AHRS) mode."""
+    """Set 6-axis or 9-axis (AHRS) mode."""
     return _command(f"CONFIG ATT MODE {mode.value}")
 
 
@@ -190,23 +170,23 @@ def yaw(mode: YawMode, angle_deg: float) -> Request:
 
 
 def mounting(matrix: Mounting | Matrix3) -> Request:
-    """Set the rotation from new sensor axes to the old ones (URFR). Raises BadArgument for what is no rotation."""
+    """Set the rotation from new sensor axes to the old axes (URFR). Raises BadArgument for another matrix."""
     rows: Matrix3 = matrix.value if isinstance(matrix, Mounting) else matrix
     if [len(row) for row in rows] != [3, 3, 3] or not is_rotation(rows, ROTATION_TOLERANCE):
         raise BadArgument(
-            f"CONFIG IMU URFR: expected a rotation (three rows of three, orthonormal within {ROTATION_TOLERANCE:g}, "
-            f"determinant +1), got {rows}; a mirrored or scaled axis is not a mounting"
+            f"CONFIG IMU URFR: expected a rotation matrix (3 x 3, orthonormal within {ROTATION_TOLERANCE:g}, "
+            f"determinant +1), got {rows}"
         )
     return _command("CONFIG IMU URFR " + ",".join(_text(value) for row in rows for value in row))
 
 
 def magnetic_calibration(enabled: bool) -> Request:
-    """Turn the calibration of the magnetometer in the background on (the default) or off (section 8.2)."""
+    """Enable (default) or disable the background calibration of the magnetometer (section 8.2)."""
     return _command(f"CONFIG IMU EN_MCAL {int(enabled)}")
 
 
 def pin_function(function: PinFunction, pin: int) -> Request:
-    """Give `function` to pin IO1 … IO9. Not every product has every pin."""
+    """Set the function of pin IO1 … IO9. Some products lack some pins."""
     return _command(f"CONFIG PMUX{function.value} IO{pin}")
 
 
@@ -219,43 +199,43 @@ def alarm(axis: AlarmAxis, min_deg: float, max_deg: float, enabled: bool) -> Req
 
 
 def sout_divider(divider: int) -> Request:
-    """Divide SOUT pulses by 1 … 64 for the SOUT_DIV pin."""
+    """Set the divisor of SOUT pulses for the SOUT_DIV pin, 1 … 64."""
     return _command(f"CONFIG PMUX4 DIV{divider}")
 
 
 def log_enable() -> Request:
-    """Send data frames (the default)."""
+    """Enable data frames (default)."""
     return _command("LOG ENABLE")
 
 
 def log_disable() -> Request:
-    """Send no data frames, whatever their rates."""
+    """Disable data frames of all rates."""
     return _command("LOG DISABLE")
 
 
 def log_ontime(message: OutputMessage, rate_hz: OutputRate) -> Request:
-    """Send `message` at a rate, or not at all (0). Whether the line carries it is for `require_room`."""
+    """Set the rate of a message; 0: off. `require_room` checks the baud rate."""
     return _command(f"LOG {message} ONTIME {_text(1 / rate_hz if rate_hz else 0)}")
 
 
 def log_onmark(message: OutputMessage) -> Request:
-    """Send `message` once for each pulse on SIN or `log_once`. Turn timed output off first (`unlog_all`)."""
+    """Send `message` once for each pulse on SIN or `log_once`. First disable timed output (`unlog_all`)."""
     return _command(f"LOG {message} ONMARK 1")
 
 
 def log_once(message: OutputMessage) -> Request:
-    """Send `message` once, as a pulse on SIN would. `log_onmark` comes first."""
+    """Send `message` once, as after a pulse on SIN. Requires `log_onmark`."""
     return _command(f"LOG {message} ONMARK ONCE")
 
 
 def ask(query: Query) -> Request:
-    """Ask for one of the four reports."""
+    """Request one of the four reports."""
     is_part = is_version_line if query is Query.VERSION else is_setting_line
     return _command(f"LOG {query}", is_part=is_part, messages_min=2)
 
 
 def max_rate_hz(message: OutputMessage, baud: int) -> int:
-    """Highest output rate of `message` at `baud` (table 3.7). Raises BadArgument for a rate the table does not have."""
+    """Return the maximum output rate of `message` at `baud` (table 3.7). Raises BadArgument for other baud rates."""
     rates = MAX_RATE_HZ[message]
     if baud not in rates:
         known = ", ".join(map(str, sorted(rates)))
@@ -264,7 +244,7 @@ def max_rate_hz(message: OutputMessage, baud: int) -> int:
 
 
 def require_room(rates_hz: Mapping[OutputMessage, float], baud: int) -> None:
-    """Raise BadArgument where the line does not carry all messages together, or one of them is above table 3.7."""
+    """Raise BadArgument if the serial port cannot carry all messages, or if one message exceeds table 3.7."""
     for message, rate_hz in rates_hz.items():
         if rate_hz > max_rate_hz(message, baud):
             raise BadArgument(
@@ -299,26 +279,24 @@ def _command(
 
 
 def _text(value: float) -> str:
-    """A number as the manual writes it: no exponent, no trailing zeros, no minus before zero."""
+    """Return a number as in the manual: no exponent, no trailing zeros, no minus before zero."""
     text = f"{value:.6f}".rstrip("0").rstrip(".")
     return "0" if text == "-0" else text
 
 
-BOOT_NS: Final = NS_PER_S
-"""From REBOOT until it answers; the manual gives no time."""
+BOOT_NS: Final = NS_PER_S  # time from REBOOT to the first try, ns; the manual states none
 BOOT_TRIES: Final = 5
 LOOK_TRIES: Final = 2
-"""Bytes sent at another rate may stand in the module's line buffer and spoil the first question."""
+"""Number of tries per baud rate. Bytes sent at another baud rate can spoil the first request in the device's buffer."""
 FACTORY_BAUD: Final = BAUD_RATES[0]
-WAKE_HZ: Final = 100
-"""Output rate as delivered (section 3.2)."""
+WAKE_HZ: Final = 100  # factory output rate (section 3.2)
 
 
 def identify() -> RequestScript[Identity]:
-    """Ask for product, serial number and firmware (LOG VERSION).
+    """Read product, serial number and firmware (LOG VERSION).
 
-    `details` has every value by the device's own name; `firmware` is "1.5.6" for APP_VER=156. A reply without a product
-    has lost bytes, as the first one after a plug can. Raises NoReply, Rejected.
+    `details` contains every value by the name of the device; `firmware` is "1.5.6" for APP_VER=156. Raises NoReply,
+    Rejected. A reply without a product has lost bytes, which happens to the first reply after a replug.
     """
     outcome = yield ask(Query.VERSION)
     lines = _lines(outcome, Query.VERSION)
@@ -330,10 +308,10 @@ def identify() -> RequestScript[Identity]:
 
 
 def read_settings() -> RequestScript[Mapping[str, str]]:
-    """Ask for all settings (LOG USRCONFIG, COMCONFIG, MAGCONFIG) in one mapping, by the device's own names.
+    """Read all settings (LOG USRCONFIG, COMCONFIG, MAGCONFIG) as one mapping, by the names of the device.
 
-    A line without a name is filed as "COMCONFIG 1", "COMCONFIG 2" and so on. A module without magnetometer may not know
-    MAGCONFIG: no answer to that one is no error (a guess, no such module was seen). Raises NoReply, Rejected.
+    A line without a name gets the name "COMCONFIG 1", "COMCONFIG 2" and so on. No reply to MAGCONFIG is not an error,
+    because a device without magnetometer may not know it (assumption). Raises NoReply, Rejected.
     """
     settings: dict[str, str] = {}
     for query in (Query.USRCONFIG, Query.COMCONFIG, Query.MAGCONFIG):
@@ -347,32 +325,34 @@ def read_settings() -> RequestScript[Mapping[str, str]]:
 
 
 def _lines(outcome: Outcome, query: Query) -> tuple[str, ...]:
-    """Lines of a good reply. Raises NoReply or Rejected for another outcome."""
+    """Return the lines of a positive reply. Raises NoReply or Rejected for another outcome."""
     if isinstance(outcome, Silence):
-        heard = f"got {len(outcome.lines)} lines and no end" if outcome.lines else "got nothing"
+        heard = f"got {len(outcome.lines)} lines without OK" if outcome.lines else "got no reply"
         raise NoReply(
-            f"LOG {query}: expected lines up to OK, {heard}; "
-            "is the host's transmit line connected, and the baud rate right?"
+            f"LOG {query}: expected lines up to OK, {heard}; check the transmit wire of the host and the baud rate"
         )
-    if isinstance(outcome, Rejection):
-        raise Rejected(f"LOG {query}: the module refused: {' / '.join(outcome.lines)}")
+    raise_if_rejected(f"LOG {query}", outcome)
     return outcome.lines
 
 
+def raise_if_rejected(name: str, outcome: Outcome) -> None:
+    if isinstance(outcome, Rejection):
+        raise Rejected(f"{name}: the device rejected the request: {' / '.join(outcome.lines)}")
+
+
 def send(request: Request) -> RequestScript[None]:
-    """Send one command. Raises NoReply (also for a command unknown to this firmware) and Rejected."""
+    """Send one command. Raises NoReply (also for a command that the firmware does not know) and Rejected."""
     outcome = yield request
     if isinstance(outcome, Silence):
-        raise NoReply(f"{request.name}: expected OK, got nothing; is the host's transmit line connected?")
-    if isinstance(outcome, Rejection):
-        raise Rejected(f"{request.name}: the module refused: {' / '.join(outcome.lines)}")
+        raise NoReply(f"{request.name}: expected OK, got no reply; check the transmit wire of the host")
+    raise_if_rejected(request.name, outcome)
 
 
 # --- output -----------------------------------------------------------------------------------------------------------
 
 
 def ask_outputs() -> RequestScript[ComConfig | None]:
-    """Ask which messages are sent and when (LOG COMCONFIG); None where the module does not tell that."""
+    """Read which messages the device sends at which rate (LOG COMCONFIG); None if the device does not report it."""
     outcome = yield ask(Query.COMCONFIG)
     if not isinstance(outcome, Reply):
         return None
@@ -381,13 +361,13 @@ def ask_outputs() -> RequestScript[ComConfig | None]:
 
 
 def rates_hz(config: ComConfig | None) -> dict[OutputMessage, float]:
-    """Output rates of the messages that have one; messages on mark are sent when they are asked for."""
+    """Return the output rates of all timed messages."""
     periods_s = config.periods_s if config is not None else {}
     return {OutputMessage(name): 1 / period_s for name, period_s in periods_s.items() if period_s > 0}
 
 
 def set_output(message: OutputMessage, rate_hz: OutputRate, baud: int) -> RequestScript[None]:
-    """Send a message at a rate, or not at all (0). Raises BadArgument where the line does not carry all messages."""
+    """Set the rate of a message; 0: off. Raises BadArgument if the serial port cannot carry all messages."""
     if rate_hz and baud in BAUD_RATES:
         require_room({message: rate_hz}, baud)
         present = rates_hz((yield from ask_outputs()))
@@ -396,10 +376,10 @@ def set_output(message: OutputMessage, rate_hz: OutputRate, baud: int) -> Reques
 
 
 def wake() -> RequestScript[bool | None]:
-    """Let frames out (LOG ENABLE) where a message has a rate by the module's own settings.
+    """Enable frames (LOG ENABLE) if a message has a rate in the device settings.
 
-    Returns whether it acknowledged; None where nothing was changed, because no message has a rate or one is on mark: a
-    module that is set so is meant to be silent. Raises NoReply, Rejected.
+    Return True, or None without a change if no message has a rate or one is on mark: such a device is silent by its
+    settings. Raises NoReply, Rejected.
     """
     config = yield from ask_outputs()
     if config is None or config.on_mark or not rates_hz(config):
@@ -409,110 +389,105 @@ def wake() -> RequestScript[bool | None]:
 
 
 def why_silent(settings: Mapping[str, str]) -> str:
-    """Say why it answers and sends no samples, from its settings (`read_settings`)."""
+    """Return why a device with these settings (`read_settings`) replies and sends no samples."""
     config = parse_comconfig(lines_of(settings))
     if rates := rates_hz(config):
         message, rate_hz = max(rates.items(), key=lambda item: item[1])
-        return f"its output is off (LOG DISABLE), though {message} has {rate_hz:g} Hz"
+        return f"its output is disabled (LOG DISABLE); {message} has the rate {rate_hz:g} Hz"
     if config.on_mark:
-        return f"{' and '.join(sorted(config.on_mark))} on mark, one for each pulse on SIN"
+        return f"{' and '.join(sorted(config.on_mark))} on mark, one frame for each pulse on SIN"
     return "no message has a rate" if config.periods_s else "its output is off, or on mark"
 
 
 def wake_by_force(baud: int) -> RequestScript[str]:
-    """Let frames out and, where no message has a rate, send HI91; return what was done. Not saved.
+    """Enable frames, set a rate for HI91 if no message has a rate, and return a report. Nothing is saved.
 
-    HI91 is sent with 100 Hz or what the line carries. Raises NoReply, Rejected.
+    The rate of HI91 is 100 Hz, or 10 Hz at 9600 baud. Raises NoReply, Rejected.
     """
     yield from send(log_enable())
     config = yield from ask_outputs()
     if config is None:
-        return "LOG ENABLE; it does not tell the rates of its messages: where no sample comes, set one with output"
+        return "LOG ENABLE; the device does not report its output rates; if no sample arrives, set a rate with output"
     if rates_hz(config):
         return "LOG ENABLE"
     rate_hz: OutputRate = 10 if baud == min(BAUD_RATES) else WAKE_HZ
     yield from send(log_ontime(OutputMessage.HI91, rate_hz))
-    return f"LOG ENABLE; HI91 at {rate_hz} Hz, which is not saved"
+    return f"LOG ENABLE; HI91 at {rate_hz} Hz, not saved"
 
 
 # --- restart and baud rate --------------------------------------------------------------------------------------------
 
 
 def restart(present_baud: int = 0) -> RequestScript[Identity]:
-    """Restart and wait until it answers. What was not saved is lost, also a baud rate. Raises NoReply."""
+    """Restart the device and wait until it replies. Unsaved settings are lost, also a baud rate. Raises NoReply."""
     yield reboot()
     identity, _ = yield from _found_after_boot([present_baud])
     return identity
 
 
 def change_baud(baud: BaudRate, present_baud: int) -> RequestScript[int]:
-    """Set the baud rate, save, restart, and follow; return the rate. Saves all other settings too.
+    """Set the baud rate, save all settings, restart and follow the device. Return the baud rate.
 
-    The restart shows that the rate was saved, and puts in force what needs one.
-
-    Raises BadArgument where the line would not carry the present output, NoReply, and Rejected where the module answers
-    at the old rate only; the line is then left there.
+    The restart verifies the saved baud rate and makes other settings effective. Raises BadArgument if the serial port
+    cannot carry the present output, NoReply, and Rejected if the device replies only at the old baud rate, which imud
+    keeps.
     """
     require_room(rates_hz((yield from ask_outputs())), baud)
     outcome = yield serial_config(baud)
     answered = _is_answer(outcome, f"SERIALCONFIG {baud}")
     heard = yield from _find((present_baud, baud) if answered else (baud, present_baud))
     if heard == present_baud != baud and not answered:
-        raise NoReply(f"SERIALCONFIG {baud}: expected OK, got nothing; the module stays at {present_baud} baud")
+        raise NoReply(f"SERIALCONFIG {baud}: expected OK, got no reply; the device keeps {present_baud} baud")
     yield from send(save_config())
     yield reboot()
     _, heard = yield from _found_after_boot((baud, present_baud))
     if heard != baud:
-        raise Rejected(f"SERIALCONFIG {baud}: the module stays at {heard} baud")
+        raise Rejected(f"SERIALCONFIG {baud}: the device keeps {heard} baud")
     return heard
 
 
 def reset_to_factory(present_baud: int) -> RequestScript[int]:
-    """Restore the factory settings, restart so that they are in force, and follow; return the baud rate.
-
-    Raises NoReply, Rejected.
-    """
+    """Restore the factory settings, restart and follow the device. Return the baud rate. Raises NoReply, Rejected."""
     outcome = yield factory_reset()
     answered = _is_answer(outcome, "FRESET")
     heard = yield from _find((present_baud, FACTORY_BAUD) if answered else (FACTORY_BAUD, present_baud))
     if not answered and heard == present_baud:
-        raise NoReply("FRESET: expected OK, got nothing; read the settings to see whether it was carried out")
+        raise NoReply("FRESET: expected OK, got no reply; read the settings to check the result")
     yield reboot()
     _, heard = yield from _found_after_boot((FACTORY_BAUD, present_baud))
     return heard
 
 
 def advice(baud: int, fixed_baud: int) -> str:
-    """Say what to change in a configuration that fixes another baud rate; empty where nothing is to be changed."""
+    """Return the necessary change of a configuration that fixes another baud rate; empty if none is necessary."""
     if fixed_baud in (0, baud):
         return ""
     return f"change `baud: {fixed_baud}` in the configuration to {baud} or auto: imud uses it at its next start"
 
 
 def _is_answer(outcome: Outcome, name: str) -> bool:
-    """Whether the module answered well. Raises Rejected."""
-    if isinstance(outcome, Rejection):
-        raise Rejected(f"{name}: the module refused: {' / '.join(outcome.lines)}")
+    """Return whether the device acknowledged. Raises Rejected."""
+    raise_if_rejected(name, outcome)
     return isinstance(outcome, Reply)
 
 
 def _find(bauds: Sequence[int]) -> RequestScript[int]:
-    """Return the first of some rates at which it answers; the line stays there. Raises NoReply, at the first one."""
+    """Return the first baud rate at which the device replies and keep it. Raises NoReply and restores the first one."""
     for baud in dict.fromkeys(bauds):
         yield pause(0, baud=baud)
         if (yield from _answers(LOOK_TRIES)) is not None:
             return baud
     yield pause(0, baud=bauds[0])
     rates = " or ".join(str(baud) for baud in dict.fromkeys(bauds))
-    raise NoReply(f"LOG VERSION: expected an answer at {rates} baud, got nothing; `baud: auto` tries all rates")
+    raise NoReply(f"LOG VERSION: expected a reply at {rates} baud, got none; `baud: auto` tries all rates")
 
 
 def _found_after_boot(bauds: Sequence[int]) -> RequestScript[tuple[Identity, int]]:
-    """Ask until it answers after a restart, at the likely rates first, then at all others. Raises NoReply.
+    """Wait for a reply after a restart, at the likely baud rates first, then at all others. Raises NoReply.
 
-    A rate that was in force without being saved is lost by a restart, and which was saved is not known.
+    An unsaved baud rate is lost by a restart, and the saved baud rate is not known.
     """
-    yield pause(BOOT_NS)  # at the present rate: REBOOT may still be on its way out of the port
+    yield pause(BOOT_NS)  # at the present baud rate: REBOOT may still be in the buffer of the port
     likely = dict.fromkeys(bauds)
     others = [baud for baud in BAUD_RATES if baud not in likely] if bauds[0] else []
     for baud in (*likely, *others):
@@ -521,11 +496,11 @@ def _found_after_boot(bauds: Sequence[int]) -> RequestScript[tuple[Identity, int
         if identity is not None:
             return identity, baud
     yield pause(0, baud=bauds[0])
-    raise NoReply("LOG VERSION: expected an answer after the restart, got nothing at any baud rate")
+    raise NoReply("LOG VERSION: expected a reply after the restart, got none at any baud rate")
 
 
 def _answers(tries: int) -> RequestScript[Identity | None]:
-    """Ask for the identity some times; None for no answer."""
+    """Request the identity several times; None without a reply."""
     for _ in range(tries):
         try:
             return (yield from identify())

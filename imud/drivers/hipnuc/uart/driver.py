@@ -1,4 +1,4 @@
-"""Table: the row `DRIVER` of HiPNUC modules on a UART."""
+"""Row `DRIVER` of HiPNUC devices on a UART: actions and calibrations."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -22,7 +22,7 @@ from imud.contracts.command import (
     Verdict,
 )
 from imud.contracts.driver import Identity, StreamDriver
-from imud.contracts.script import Rejection, Request, RequestScript, Silence
+from imud.contracts.script import Request, RequestScript, Silence
 from imud.drivers.hipnuc.common import (
     FLOATS,
     MAIN_STATUS,
@@ -34,7 +34,6 @@ from imud.drivers.hipnuc.common import (
     magnetometer,
 )
 from imud.drivers.hipnuc.uart import commands
-from imud.drivers.hipnuc.uart import commands as session
 from imud.drivers.hipnuc.uart.codec import (
     HEADER,
     PPS_STAMP_MODULUS_MS,
@@ -75,7 +74,7 @@ from imud.drivers.hipnuc.uart.settings import (
     message_limits,
     shown,
 )
-from imud.model.errors import NoReply, Rejected
+from imud.model.errors import NoReply
 from imud.model.units import NS_PER_MS
 
 Message = Annotated[OutputMessage, Meta(extra={"section": "2.2.5"})]
@@ -86,48 +85,47 @@ _MOUNTINGS: Final = {mounting.name.lower(): mounting for mounting in Mounting}
 
 
 def _simple(words: str, make: Callable[[], Request], risk: Risk = Risk.NONE) -> Action:
-    """An action without arguments that is one command."""
     return Action(words, lambda _target: send(make()), risk)
 
 
 def _restart(target: Target) -> RequestScript[Identity]:
-    return session.restart(target.baud)
+    return commands.restart(target.baud)
 
 
 def _factory_reset(target: Target) -> RequestScript[dict[str, int | str]]:
-    return _followed(target, session.reset_to_factory(target.baud))
+    return _followed(target, commands.reset_to_factory(target.baud))
 
 
 def _followed(target: Target, script: RequestScript[int]) -> RequestScript[dict[str, int | str]]:
-    """Answer the baud rate at which the module is now, and what to change in the configuration."""
+    """Return the new baud rate of the device, and a necessary change of the configuration."""
     baud = yield from script
     answer: dict[str, int | str] = {"baud": baud}
-    if advice := session.advice(baud, target.fixed_baud):
+    if advice := commands.advice(baud, target.fixed_baud):
         answer["configuration"] = advice
     return answer
 
 
 def _wake(target: Target) -> RequestScript[str]:
-    return session.wake_by_force(target.baud)
+    return commands.wake_by_force(target.baud)
 
 
 def _baud(
     target: Target,
     *,
-    baud: Annotated[BaudRate, Meta(description="rate of the line", extra={"unit": "bit/s", "section": "2.2.3"})],
+    baud: Annotated[
+        BaudRate, Meta(description="baud rate of the serial port", extra={"unit": "bit/s", "section": "2.2.3"})
+    ],
 ) -> RequestScript[dict[str, int | str]]:
-    return _followed(target, session.change_baud(baud, target.baud))
+    return _followed(target, commands.change_baud(baud, target.baud))
 
 
 def _output(
     target: Target,
     *,
     message: Message,
-    rate_hz: Annotated[
-        OutputRate, Meta(description="output rate, 0 for off", extra={"unit": "Hz", "section": "2.2.5"})
-    ],
+    rate_hz: Annotated[OutputRate, Meta(description="output rate, 0: off", extra={"unit": "Hz", "section": "2.2.5"})],
 ) -> RequestScript[None]:
-    return session.set_output(message, rate_hz, target.baud)
+    return commands.set_output(message, rate_hz, target.baud)
 
 
 def _output_on_mark(_target: Target, *, message: Message) -> RequestScript[None]:
@@ -158,7 +156,7 @@ def _yaw(
     _target: Target,
     *,
     angle_deg: Degrees,
-    relative: Annotated[bool, Meta(description="add it to the present one")] = False,
+    relative: Annotated[bool, Meta(description="whether to add the angle to the present heading")] = False,
 ) -> RequestScript[None]:
     return send(commands.yaw(YawMode.RELATIVE if relative else YawMode.ABSOLUTE, angle_deg))
 
@@ -169,7 +167,7 @@ def _mounting(
     turned: Annotated[
         MountingName | Annotated[list[float], Meta(min_length=9, max_length=9)],
         Meta(
-            description="new axis that points up or down where Z pointed up, or the nine numbers C00 … C22 of URFR",
+            description="new axis that points up or down in place of Z, or the nine numbers C00 … C22 of URFR",
             extra={"section": "2.2.4"},
         ),
     ],
@@ -188,7 +186,7 @@ def _pin(
     _target: Target,
     *,
     function: Annotated[PinName, Meta(extra={"section": "2.2.4"})],
-    pin: Annotated[int, Meta(ge=1, le=PIN_MAX, description="1 for IO1, and so on", extra={"section": "2.2.4"})],
+    pin: Annotated[int, Meta(ge=1, le=PIN_MAX, description="number of the pin, 1 for IO1", extra={"section": "2.2.4"})],
 ) -> RequestScript[None]:
     return send(commands.pin_function(PinFunction[function.upper()], pin))
 
@@ -207,29 +205,35 @@ def _sout_divider(
 
 ACTIONS: Final[Actions] = {
     "save": replace(_simple("write all settings to flash", commands.save_config), saves=True),
-    "restart": Action("restart it and wait until it answers; what was not saved is lost", _restart),
+    "restart": Action("restart the device and wait until it replies; unsaved settings are lost", _restart),
     "factory_reset": Action(
-        "factory settings, the baud rate (115200) included: restart it, so that they are in force, and follow",
+        "restore the factory settings with 115200 baud, restart the device and follow it",
         _factory_reset,
         Risk.RESET,
     ),
     "wake": Action(
-        "let frames out, and send HI91 where no message has a rate, also in place of output on mark; not saved", _wake
+        "enable frames, and send HI91 if no message has a rate, also in place of output on mark; not saved", _wake
     ),
-    "baud": Action("set the baud rate, save, restart and follow", _baud, Risk.CONNECTION, saves=True),
-    "output": Action("send a message by itself at a rate, or not at all (0)", _output),
+    "baud": Action(
+        "set the baud rate, save all settings, restart the device and follow it", _baud, Risk.CONNECTION, saves=True
+    ),
+    "output": Action("set the output rate of a message; 0: off", _output),
     "output_on_mark": Action("send a message for each pulse on SIN", _output_on_mark),
-    "output_once": Action("send a message once, as a pulse on SIN would", _output_once),
-    "output_none": _simple("send nothing by itself", commands.unlog_all),
-    "output_enabled": Action("let frames out, or none whatever their rates", _output_enabled),
-    "mode": Action("6 axes, or 9 with the magnetometer", _mode),
-    "level": Action("make the present pitch and roll zero, level when nearly level, or cancel; at rest only", _level),
+    "output_once": Action("send a message once, as after a pulse on SIN", _output_once),
+    "output_none": _simple("set the output rate of all messages to 0", commands.unlog_all),
+    "output_enabled": Action("enable or disable the frames of all rates", _output_enabled),
+    "mode": Action("set 6-axis mode, or 9-axis mode with the magnetometer", _mode),
+    "level": Action(
+        "make the present pitch and roll zero, or level a nearly level device, or cancel; only at rest", _level
+    ),
     "yaw": Action("set the heading; lost at power-off", _yaw),
-    "mounting": Action("how the module is mounted; needs save and restart", _mounting),
-    "magnetic_calibration": Action("calibrate the magnetometer in the background", _magnetic_calibration),
-    "pin": Action("give a function to a pin", _pin),
+    "mounting": Action("set the mounting of the device; requires save and restart", _mounting),
+    "magnetic_calibration": Action(
+        "enable or disable the background calibration of the magnetometer", _magnetic_calibration
+    ),
+    "pin": Action("set the function of a pin", _pin),
     "alarm": Action("watch an angle with the alarm pin", _alarm),
-    "sout_divider": Action("divide SOUT for SOUT_DIV", _sout_divider),
+    "sout_divider": Action("set the divisor of SOUT pulses for SOUT_DIV", _sout_divider),
 }
 
 
@@ -245,15 +249,14 @@ def _start_magnetometer(_target: Target) -> RequestScript[None]:
 
 
 def _magnetometer_verdict(_target: Target) -> RequestScript[Verdict]:
-    """Ask for the bias of the magnetometer. Raises NoReply, Rejected."""
+    """Read the bias of the magnetometer. Raises NoReply, Rejected."""
     outcome = yield ask(Query.MAGCONFIG)
     if isinstance(outcome, Silence):
-        raise NoReply("LOG MAGCONFIG: expected lines up to OK, got nothing; has the module a magnetometer?")
-    if isinstance(outcome, Rejection):
-        raise Rejected(f"LOG MAGCONFIG: the module refused: {' / '.join(outcome.lines)}")
+        raise NoReply("LOG MAGCONFIG: expected lines up to OK, got no reply; does the device have a magnetometer?")
+    commands.raise_if_rejected("LOG MAGCONFIG", outcome)
     bias = parse_magconfig(outcome.lines).bias_ut
     if bias is None:
-        return Verdict(done=False, words="it does not tell its bias")
+        return Verdict(done=False, words="the device does not report its bias")
     words = "bias " + ", ".join(f"{value:g}" for value in bias) + " µT"
     return Verdict(done=any(bias), words=words)
 
@@ -273,7 +276,7 @@ CALIBRATIONS: Final[Calibrations] = {
     "magnetometer": _MAGNETOMETER,
     "magnetometer_once": replace(
         _MAGNETOMETER,
-        help="the same, and with `save` no further calibration in the background",
+        help="measure the magnetic field of the mount; `save` disables the background calibration",
         section="8.2",
         kept=Kept.BY_SAVE,
         save=_keep_magnetometer,
@@ -283,7 +286,7 @@ CALIBRATIONS: Final[Calibrations] = {
         help="make the present heading zero",
         section="2.2.4",
         handling=Handling.REST,
-        instructions=("Point the module to where its heading is to be zero, and do not touch it.",),
+        instructions=("Point the device in the direction of heading zero, and do not touch it.",),
         begin=lambda _target: send(commands.yaw(YawMode.ABSOLUTE, 0.0)),
         expected=(YAW_ZERO,),
         kept=Kept.NEVER,
@@ -292,7 +295,7 @@ CALIBRATIONS: Final[Calibrations] = {
 
 
 def _example_frame(random: Random) -> bytes:
-    """HI91 or HI92 with random values; one in four carries both."""
+    """Return HI91 or HI92 with random values; one frame in four contains both."""
     quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
     common: Mapping[str, Any] = {
         "accel_m_s2": (random.gauss(0, 5), random.gauss(0, 5), random.gauss(9.8, 5)),

@@ -1,13 +1,14 @@
-"""Replies of HiPNUC modules to ASCII commands: kinds of lines, and the four reports of LOG as records.
+"""Replies of HiPNUC devices to ASCII commands: kinds of lines, and the four reports of LOG as records.
 
-Manual "IMU配置手冊" V1.5.9 sections 2.2.5 and 8.1.1, which show one line of USRCONFIG and one of MAGCONFIG; LOG VERSION
-as modules with firmware 1.5.6 answer it:
+Manual "IMU配置手冊" V1.5.9, sections 2.2.5 and 8.1.1, which show one line of USRCONFIG and one line of MAGCONFIG; LOG
+VERSION as sent by firmware 1.5.6:
 
     PNAME=HI14R3 | BUILD=Oct 15 2024 | UUID=043995698D6E1708 | APP_VER=156 | BL_VER=109 | OK
     ATT_MODE: 0  | …                                                                    | OK
     …            | MB=14.14, -2.08, -8.75                                               | OK
 
-The rest is not documented, so every line is kept: NAME=VALUE and NAME: VALUE by name, others as they came.
+The manual does not document other lines, so imud keeps every line: NAME=VALUE and NAME: VALUE by name, others
+unchanged.
 """
 
 import re
@@ -31,47 +32,45 @@ _DIVISOR: Final = re.compile(r"(?:.*\bDIV)?\s*(\d{1,2})\b")
 
 
 def is_end(line: str) -> bool:
-    """Whether `line` ends a reply well."""
+    """Return whether `line` ends a positive reply."""
     return line.strip() == "OK"
 
 
 def is_rejection(line: str) -> bool:
-    """Whether `line` is a refusal: ERR with any text, but not a setting whose name begins with it."""
+    """Return whether `line` is a rejection: ERR with any text, but not a setting with a name that starts with ERR."""
     return line.startswith("ERR") and "=" not in line
 
 
 def is_version_line(line: str) -> bool:
-    """Whether `line` can be part of the reply to LOG VERSION."""
+    """Return whether `line` can be part of the reply to LOG VERSION."""
     match = _VALUE_LINE.fullmatch(line)
     return match is not None and match[1] in _VERSION_NAMES
 
 
 def is_setting_line(line: str) -> bool:
-    """Whether `line` can be part of another report. Their form is not documented: anything but a version line."""
+    """Return whether `line` can be part of another report. Their form is not documented: anything but a version
+    line.
+    """
     return not is_version_line(line)
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A reply split into lines by name, as far as its form is known."""
+    """Lines of a reply, by name if they have a known form."""
 
-    values: Mapping[str, str]
-    """Values by the device's own names."""
-    other: tuple[str, ...]
-    """Lines of another form, as they came."""
+    values: Mapping[str, str]  # values by the names of the device
+    other: tuple[str, ...]  # lines of another form, unchanged
 
 
 @dataclass(frozen=True, slots=True)
 class Version:
-    """Reply to LOG VERSION. Fields are empty or None where the device sends none."""
+    """Reply to LOG VERSION. Fields are empty or None if the device does not send them."""
 
     product: str
     build: str
     uuid: str
-    app_ver: int | None
-    """156 for firmware 1.5.6."""
-    bl_ver: int | None
-    """Version of the boot loader."""
+    app_ver: int | None  # 156 for firmware 1.5.6
+    bl_ver: int | None  # version of the boot loader
     report: Report
 
 
@@ -79,26 +78,20 @@ class Version:
 class UserConfig:
     """Reply to LOG USRCONFIG."""
 
-    att_mode: int | None
-    """0: 6-axis, 1: 9-axis."""
-    urfr: Matrix3 | None
-    """Rotation from new sensor axes to the old ones."""
-    magnetic_calibration: bool | None
-    """Whether calibration runs in the background (EN_MCAL)."""
-    pins: Mapping[int, int]
-    """Pin (1 for IO1) by the number of its function (1 for PMUX1)."""
+    att_mode: int | None  # 0: 6-axis, 1: 9-axis
+    urfr: Matrix3 | None  # rotation from new sensor axes to the old axes
+    magnetic_calibration: bool | None  # whether the background calibration is enabled (EN_MCAL)
+    pins: Mapping[int, int]  # pin (1 for IO1) by the number of its function (1 for PMUX1)
     sout_divisor: int | None
     report: Report
 
 
 @dataclass(frozen=True, slots=True)
 class ComConfig:
-    """Reply to LOG COMCONFIG. Its form is in no source: output periods are looked for as the command writes them."""
+    """Reply to LOG COMCONFIG. Its form is not documented: imud looks for output periods in the form of the command."""
 
-    periods_s: Mapping[str, float]
-    """Output periods by message (`HI91`, `HI92`); 0 is off."""
-    on_mark: frozenset[str]
-    """Messages that are sent for each pulse on SIN."""
+    periods_s: Mapping[str, float]  # output periods by message (`HI91`, `HI92`); 0 is off
+    on_mark: frozenset[str]  # messages for each pulse on SIN
     baud: int | None
     report: Report
 
@@ -107,13 +100,12 @@ class ComConfig:
 class MagConfig:
     """Reply to LOG MAGCONFIG."""
 
-    bias_ut: Vector3 | None
-    """Offset that calibration found (`MB`), in µT; all zero means not calibrated."""
+    bias_ut: Vector3 | None  # offset of the calibration (`MB`), µT; all zero: not calibrated
     report: Report
 
 
 def parse_report(lines: Sequence[str]) -> Report:
-    """Parse the lines of a reply by name; the end line and comments (`/* … */`) are left out."""
+    """Return the lines of a reply by name, without the end line and comments (`/* … */`)."""
     values: dict[str, str] = {}
     other: list[str] = []
     for line in lines:
@@ -128,12 +120,12 @@ def parse_report(lines: Sequence[str]) -> Report:
 
 
 def lines_of(values: Mapping[str, str]) -> list[str]:
-    """Return settings as one flat mapping (`session.read_settings`) in lines again, for the functions below."""
+    """Return settings from `read_settings` as lines, for the functions below."""
     return [text if name.startswith("COMCONFIG ") else f"{name}: {text}" for name, text in values.items()]
 
 
 def parse_version(lines: Sequence[str]) -> Version:
-    """Parse the reply to LOG VERSION."""
+    """Return the values of a reply to LOG VERSION."""
     report = parse_report(lines)
     get = report.values.get
     return Version(
@@ -142,7 +134,7 @@ def parse_version(lines: Sequence[str]) -> Version:
 
 
 def parse_usrconfig(lines: Sequence[str]) -> UserConfig:
-    """Parse the reply to LOG USRCONFIG."""
+    """Return the values of a reply to LOG USRCONFIG."""
     report = parse_report(lines)
     get = report.values.get
     pins = {number: _PIN.match(get(f"PMUX{number}", "")) for number in range(1, 6)}
@@ -159,7 +151,7 @@ def parse_usrconfig(lines: Sequence[str]) -> UserConfig:
 
 
 def parse_comconfig(lines: Sequence[str]) -> ComConfig:
-    """Parse the reply to LOG COMCONFIG."""
+    """Return the values of a reply to LOG COMCONFIG."""
     periods_s = {f"HI{message}": float(period) for line in lines for message, period in _OUTPUT.findall(line)}
     on_mark = frozenset(f"HI{message}" for line in lines for message in _MARKED.findall(line))
     report = parse_report(lines)
@@ -167,7 +159,7 @@ def parse_comconfig(lines: Sequence[str]) -> ComConfig:
 
 
 def parse_magconfig(lines: Sequence[str]) -> MagConfig:
-    """Parse the reply to LOG MAGCONFIG."""
+    """Return the values of a reply to LOG MAGCONFIG."""
     report = parse_report(lines)
     return MagConfig(_vector(report.values.get("MB", "")), report)
 
@@ -198,38 +190,34 @@ def _matrix(text: str) -> Matrix3 | None:
 
 
 LINE_CHARACTERS_MAX: Final = 255
-"""Longest line, without its end: replies of the manual are below 80. More means that the line end was lost."""
+"""Maximum length of a line without its end. Replies in the manual are below 80; more means a lost line end."""
 
 _PRINTABLE: Final = bytes([0x09, *range(0x20, 0x7F)])
 
 
 class LineFinder:
-    """Finder of text lines across reads and frames; counts every byte in the ledger: good, bad, skipped, or pending.
+    """Finder of text lines across reads and frames. It counts every byte in the ledger: good, bad, skipped, or pending.
 
-    What looks like a line inside a damaged frame is none: its first characters may be the frame's last bytes.
+    Text inside a damaged frame is not a line, because its first characters may be the last bytes of the frame.
     Synchronization: one thread. Holds at most LINE_CHARACTERS_MAX + 1 bytes.
     """
 
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
-        self._held = b""
-        """Printable characters without a line end yet, with the CR that may belong to it."""
-        self._held_bad = 0
-        """Number of the held bytes, from the first on, that lie inside a damaged frame's claimed length."""
-        self._held_barred = 0
-        """Number of these that lie inside a damaged frame that came whole."""
-        self._overlong = False
-        """The line is longer than allowed: it is dropped up to its end."""
+        self._held = b""  # printable characters without a line end, with a possible CR
+        self._held_bad = 0  # number of the first held bytes inside a damaged frame by its length field
+        self._held_barred = 0  # number of these bytes inside a complete damaged frame
+        self._overlong = False  # whether the line is too long: the finder drops it up to its end
 
     @property
     def pending_bytes(self) -> int:
-        """Bytes held for a line that has not ended."""
+        """Number of bytes of the incomplete line."""
         return len(self._held)
 
     def add(self, data: bytes, bad: int, barred: int) -> list[TextLine]:
-        """Add bytes that belong to no frame; return whole lines.
+        """Add bytes outside frames. Return complete lines.
 
-        The first `bad` of them are inside a damaged frame, the first `barred` inside one that came whole.
+        The first `bad` bytes are inside a damaged frame, the first `barred` bytes inside a complete damaged frame.
         """
         lines: list[TextLine] = []
         start = 0
@@ -242,17 +230,17 @@ class LineFinder:
         return lines
 
     def break_off(self) -> None:
-        """Drop the incomplete line: bytes other than text followed."""
+        """Drop the incomplete line, because bytes other than text follow."""
         self._drop(len(self._held))
         self._overlong = False
 
     def clear(self) -> None:
-        """Skip the held bytes: the stream broke."""
+        """Skip the held bytes after an interruption of the stream."""
         self._held_bad = self._held_barred = 0
         self.break_off()
 
     def _extend(self, part: bytes, bad: int, barred: int) -> None:
-        """Append `part`, which has no LF, and keep the printable characters after the last other byte."""
+        """Append `part` without LF. Keep the printable characters after the last other byte."""
         self._held_bad += min(bad, len(part))
         self._held_barred += min(barred, len(part))
         held = self._held = self._held + part
@@ -268,7 +256,9 @@ class LineFinder:
             self._drop(characters)
 
     def _end(self, bad: bool, barred: bool, lines: list[TextLine]) -> None:
-        """Finish a line at its LF; `bad`: that lies inside a damaged frame, `barred`: inside one that came whole."""
+        """Finish a line at its LF. `bad`: the LF is inside a damaged frame, `barred`: inside a complete damaged
+        frame.
+        """
         ledger = self._ledger
         text = self._held.removesuffix(b"\r")
         if text and not (self._overlong or barred or self._held_barred):
@@ -285,7 +275,7 @@ class LineFinder:
             ledger.bytes_skipped += 1
 
     def _drop(self, count: int) -> None:
-        """Drop the first `count` bytes held."""
+        """Drop the first `count` held bytes."""
         bad = min(count, self._held_bad)
         self._ledger.bytes_in_bad_frames += bad
         self._ledger.bytes_skipped += count - bad

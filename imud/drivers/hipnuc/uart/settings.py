@@ -1,8 +1,7 @@
-"""Settings that a HiPNUC module on a UART keeps itself: manual "IMU配置手冊" V1.5.9, chapter 2 and section 8.2.
+"""Settings of a HiPNUC device on a UART: manual "IMU配置手冊" V1.5.9, chapter 2 and section 8.2.
 
-They are read from LOG USRCONFIG, COMCONFIG and MAGCONFIG (`replies.py`). The manual shows one line of each report, so
-a value in a form that is not known counts as not reported. `values_of` returns what is known by name, `shown` the same
-in words.
+imud reads them from LOG USRCONFIG, COMCONFIG and MAGCONFIG (`replies.py`). The manual shows one line of each report, so
+imud ignores values of an unknown form. `values_of` returns the known values by name, `shown` as readable text.
 """
 
 import re
@@ -19,7 +18,6 @@ from imud.contracts.script import RequestScript
 from imud.contracts.setting import Effect, Setting, SettingsTable
 from imud.drivers.hipnuc.common import AttitudeMode
 from imud.drivers.hipnuc.uart import commands
-from imud.drivers.hipnuc.uart import commands as session
 from imud.drivers.hipnuc.uart.commands import (
     BAUD_RATES,
     MAX_RATE_HZ,
@@ -40,10 +38,8 @@ from imud.drivers.hipnuc.uart.replies import lines_of, parse_comconfig, parse_ma
 from imud.model.errors import BadArgument
 from imud.model.options import Options
 
-PIN_SETTING: Final = "PMUX5"
-"""Selects what the pin does."""
-MOUNTING_SETTING: Final = "URFR"
-"""Rotates the sensor frame, and with it the axes X and Y."""
+PIN_SETTING: Final = "PMUX5"  # selects the function of the pin
+MOUNTING_SETTING: Final = "URFR"  # rotates the sensor axes, also X and Y of the alarm
 EULER_INDEX: Final = {"X": 1, "Y": 0}
 
 _NUMBER = r"[-+]?[0-9]+(?:\.[0-9]*)?"
@@ -54,7 +50,7 @@ _VALUES: Final = re.compile(
 
 
 def alarm_ranges(settings: Mapping[str, str]) -> AlarmRanges:
-    """Read the ranges from the device's settings; an axis that they do not give is missing."""
+    """Return the alarm ranges in the device settings, without axes that the settings lack."""
     by_axis: dict[str, AlarmRange] = {}
     for name, value in settings.items():
         named, values = _NAME.fullmatch(name.strip()), _VALUES.fullmatch(value.strip())
@@ -76,7 +72,7 @@ Angle = Annotated[float, Meta(ge=-180, le=180, extra={"unit": "°"})]
 
 
 class AngleAlarm(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Range of one angle; the alarm pin is high outside of it."""
+    """Range of one angle. The alarm pin is high outside the range."""
 
     min_deg: Angle
     max_deg: Angle
@@ -87,7 +83,7 @@ class AngleAlarm(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 def values_of(raw: Mapping[str, str]) -> dict[str, Any]:
-    """Return the settings by name from the module's own words (`session.read_settings`); absent where not reported."""
+    """Return the reported settings by name, from the device's text (`read_settings`)."""
     lines = lines_of(raw)
     user, com, mag = parse_usrconfig(lines), parse_comconfig(lines), parse_magconfig(lines)
     rates = {name.lower(): _whole_rate(period_s) for name, period_s in com.periods_s.items()}
@@ -110,7 +106,7 @@ def values_of(raw: Mapping[str, str]) -> dict[str, Any]:
 
 
 def shown(raw: Mapping[str, str]) -> dict[str, str]:
-    """Return the settings by name, in words with units; what is not known keeps the module's own name and text."""
+    """Return the settings by name, as text with units. Unknown settings keep the name and text of the device."""
     return {name: text for name, text in _words(raw) if text} | _unknown(raw)
 
 
@@ -134,7 +130,7 @@ def _words(raw: Mapping[str, str]) -> Iterator[tuple[str, str]]:
 
 
 def _unknown(raw: Mapping[str, str]) -> dict[str, str]:
-    """Lines of the module that say nothing that is known."""
+    """Return the lines of the device that contain no known setting."""
     known = values_of(raw)
     return {name: text for name, text in raw.items() if values_of({k: v for k, v in raw.items() if k != name}) == known}
 
@@ -148,13 +144,13 @@ def _alarm_words(alarm: AngleAlarm) -> str:
 
 
 def _whole_rate(period_s: float) -> float:
-    """Return the rate of a period, as a whole number where it is one."""
+    """Return the rate of a period, as an integer if possible."""
     rate_hz = round(1 / period_s, 3) if period_s else 0
     return int(rate_hz) if rate_hz == int(rate_hz) else rate_hz
 
 
 def _mounting_name(urfr: Matrix3) -> str | list[float]:
-    """Return the name of a mounting, or its nine numbers where it has none."""
+    """Return the name of a mounting; its nine numbers if it has no name."""
     numbers = [value for row in urfr for value in row]
     return next((one.name.lower() for one in Mounting if _near(_numbers(one), numbers)), numbers)
 
@@ -168,14 +164,14 @@ def _near(one: list[float], other: list[float]) -> bool:
 
 
 def _read(_target: Target) -> RequestScript[dict[str, Any]]:
-    return values_of((yield from session.read_settings()))
+    return values_of((yield from commands.read_settings()))
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
 def _output(_target: Target, value: Output) -> RequestScript[None]:
-    """Set each message that is named. Whether the line carries them is for `check`: the baud rate is set after them."""
+    """Set each named message. `check` compares the load with the baud rate, which imud sets later."""
     for name, rate in value.items():
         message = OutputMessage(name.upper())
         yield from send(commands.log_ontime(message, 0 if rate == ON_MARK else rate))
@@ -220,7 +216,7 @@ def _write_alarm(_target: Target, value: dict[Axis, AngleAlarm]) -> RequestScrip
 
 
 def _baud(target: Target, value: BaudRate) -> RequestScript[int]:
-    return session.change_baud(value, target.baud)
+    return commands.change_baud(value, target.baud)
 
 
 def _save(_target: Target) -> RequestScript[None]:
@@ -228,14 +224,14 @@ def _save(_target: Target) -> RequestScript[None]:
 
 
 def _restart(target: Target) -> RequestScript[Any]:
-    return session.restart(target.baud)
+    return commands.restart(target.baud)
 
 
-# --- comparing and checking -------------------------------------------------------------------------------------------
+# --- comparison and checks --------------------------------------------------------------------------------------
 
 
 def _has_all(declared: Mapping[str, Any], actual: Mapping[str, Any]) -> bool:
-    """Whether the actual values have those that are declared; what is not declared may be anything."""
+    """Return whether the actual values contain all declared values."""
     plain = msgspec.to_builtins(actual)
     return all(plain.get(name) == value for name, value in msgspec.to_builtins(declared).items())
 
@@ -246,7 +242,7 @@ def _same_mounting(declared: MountingName | list[float], actual: MountingName | 
 
 
 def _check(target: Target, values: Mapping[str, Any]) -> None:
-    """Refuse more output than the line carries, two functions on one pin, and an empty range of an alarm."""
+    """Raise BadArgument for too much output, two functions on one pin, and an empty range of an alarm."""
     baud = values.get("baud", target.baud)
     output = values.get("output", {})
     if baud in BAUD_RATES:
@@ -255,7 +251,7 @@ def _check(target: Target, values: Mapping[str, Any]) -> None:
     taken: dict[int, str] = {}
     for function, pin in values.get("pins", {}).items():
         if pin in taken:
-            raise BadArgument(f"pins: expected a pin of its own for {function}, got IO{pin}, which {taken[pin]} has")
+            raise BadArgument(f"pins: expected an unused pin for {function}, got IO{pin}; {taken[pin]} uses it")
         taken[pin] = function
     for axis, one in msgspec.to_builtins(values.get("alarm", {})).items():
         if not one["min_deg"] < one["max_deg"]:
@@ -270,12 +266,12 @@ def _described(value_type: Any, description: str, section: str, unit: str = "") 
 SETTINGS: Final = SettingsTable(
     table={
         "mode": Setting(
-            type=_described(Modes, "six axes, or nine with the magnetometer for the heading", "2.2.4"), write=_mode
+            type=_described(Modes, "attitude without or with the magnetometer for the heading", "2.2.4"), write=_mode
         ),
         "mounting": Setting(
             type=_described(
                 MountingName | Annotated[list[float], Meta(min_length=9, max_length=9)],
-                "new sensor axis that points up or down where Z pointed up, or the nine numbers C00 … C22 of URFR",
+                "new sensor axis that points up or down in place of Z, or the nine numbers C00 … C22 of URFR",
                 "2.2.4",
             ),
             write=_mounting,
@@ -283,11 +279,13 @@ SETTINGS: Final = SettingsTable(
             agrees=_same_mounting,
         ),
         "magnetic_calibration": Setting(
-            type=_described(bool, "calibration of the magnetometer in the background", "8.2"),
+            type=_described(bool, "whether the background calibration of the magnetometer is enabled", "8.2"),
             write=_magnetic_calibration,
         ),
         "pins": Setting(
-            type=_described(dict[PinName, Pin], "pin of each function, 1 for IO1; others stay as they are", "2.2.4"),
+            type=_described(
+                dict[PinName, Pin], "pin of each function, 1 for IO1; other functions are unchanged", "2.2.4"
+            ),
             write=_pins,
             agrees=_has_all,
         ),
@@ -300,7 +298,7 @@ SETTINGS: Final = SettingsTable(
         "alarm": Setting(
             type=_described(
                 dict[Axis, AngleAlarm],
-                "angle about each axis outside of which the alarm pin is high; others stay as they are",
+                "angles outside which the alarm pin is high, by axis; other axes are unchanged",
                 "2.2.4",
                 "°",
             ),
@@ -310,7 +308,7 @@ SETTINGS: Final = SettingsTable(
         "output": Setting(
             type=_described(
                 Output,
-                "rate of each message, 0 for off, or on_mark for one at each pulse on SIN; others stay as they are",
+                "rate of each message, 0: off, on_mark: one frame for each pulse on SIN; other messages are unchanged",
                 "2.2.5",
                 "Hz",
             ),
@@ -318,20 +316,20 @@ SETTINGS: Final = SettingsTable(
             agrees=_has_all,
         ),
         "output_enabled": Setting(
-            type=_described(bool, "whether frames are sent at all, whatever their rates", "2.2.5"),
+            type=_described(bool, "whether the device sends frames of any rate", "2.2.5"),
             write=_output_enabled,
             readable=False,
         ),
         "magnetometer_bias": Setting(
             type=_described(
                 list[float],
-                "offset that the calibration of the magnetometer found; zero: not calibrated",
+                "offset from the calibration of the magnetometer; zero: not calibrated",
                 "8.1.1",
                 "µT",
             )
         ),
         "baud": Setting(
-            type=_described(BaudRate, "rate of the line; saves all other settings too", "2.2.3", "bit/s"),
+            type=_described(BaudRate, "baud rate of the serial port; saves all other settings too", "2.2.3", "bit/s"),
             write=_baud,
             connection=True,
             saves=True,
@@ -342,20 +340,20 @@ SETTINGS: Final = SettingsTable(
     restart=_restart,
     check=_check,
 )
-"""Settings of a module, in the order in which they are written. The level (CONFIG ATT RST) and the heading (CONFIG YAW)
-are taken from the attitude at that moment, so they are actions."""
+"""Settings of a device, in writing order. Level (CONFIG ATT RST) and heading (CONFIG YAW) depend on the present
+attitude, so they are actions."""
 
 FUNCTIONS: Final = {"sin": "sin", "pps": "sin", "sout": "sout", "sout_div": "sout_div", "alarm": "alarm"}
-"""Function of the module's pin by the key of the line."""
+"""Function of the device pin by key of the GPIO line."""
 
 
 def line_differences(settings: Mapping[str, str], lines: DeviceLines) -> dict[str, str]:
-    """Return what the module's settings contradict, one sentence by the line's key, from `session.read_settings`."""
+    """Return contradictions of GPIO lines and device settings (`read_settings`), one sentence by key of the line."""
     return _differences(values_of(settings), lines)
 
 
 def declared_line_differences(values: Mapping[str, Any], lines: DeviceLines) -> dict[str, str]:
-    """Return what declared settings contradict. What is declared in part is not compared: the module has the rest."""
+    """Return contradictions of GPIO lines and declared settings. A partial declaration is not compared."""
     known = dict(values)
     if set(known.get("output") or ()) != set(get_args(MessageName)):
         known.pop("output", None)
@@ -364,18 +362,18 @@ def declared_line_differences(values: Mapping[str, Any], lines: DeviceLines) -> 
 
 
 def message_limits(values: Mapping[str, Any], lines: DeviceLines, fed: bool) -> list[str]:
-    """Return what HI92 cannot do of all that the configuration has, if declared settings have the module send it.
+    """Return the restrictions of HI92 with this configuration, if the declared settings enable HI92.
 
-    `fed`: sentences with UTC are sent to the module.
+    `fed`: imud sends sentences with UTC to the device.
     """
     output = values.get("output") or {}
     if not output.get("hi92"):
         return []
     found = []
     if fed or lines.pps is not None:
-        found.append("HI92 never shows UTC: its samples are dated by the host; those of HI91 can be on UTC")
+        found.append("HI92 has no UTC: the host time-stamps its samples; HI91 can have UTC time stamps")
     if output.get("hi91"):
-        found.append("HI92 beside HI91 is dated by its arrival; alone it is dated by its stamp")
+        found.append("HI92 next to HI91 is time-stamped by its arrival; alone it is time-stamped by its pps_sync_stamp")
     return found
 
 
@@ -392,39 +390,51 @@ def _differences(values: Mapping[str, Any], lines: DeviceLines) -> dict[str, str
 
 
 def _shared_pins(pins: Mapping[str, int], lines: DeviceLines) -> Iterator[tuple[str, str]]:
-    """Two functions on one pin: which of them the module serves is not known."""
+    """Yield the lines whose pin has two functions: the active function is not known."""
     for key, function in FUNCTIONS.items():
         if getattr(lines, key) is None or function not in pins:
             continue
         others = [other for other, pin in pins.items() if pin == pins[function] and other != function]
         if others:
-            yield key, f"the module has {function} and {' and '.join(others)} on IO{pins[function]}: set one with pin"
+            yield (
+                key,
+                f"the device has {function} and {' and '.join(others)} on IO{pins[function]}: move one (action pin)",
+            )
 
 
 def _divisor(divisor: int | None, lines: DeviceLines) -> Iterator[tuple[str, str]]:
     configured = lines.sout_div.divisor if lines.sout_div is not None else divisor
     if divisor is not None and configured != divisor:
-        yield "sout_div", f"divisor is {configured} in the configuration, and the module divides SOUT by {divisor}"
+        yield "sout_div", f"expected divisor {configured} from the configuration, got {divisor} from the device"
 
 
 def _marks(output: Mapping[str, Any] | None, baud: int | None, lines: DeviceLines) -> Iterator[tuple[str, str]]:
-    """Triggers need a message on mark that the line carries at their rate; a pulse per second needs none."""
+    """Yield contradictions of messages on mark: triggers need a message on mark, a pulse per second must not have
+    one.
+    """
     if output is None:
         return
     marked = [OutputMessage(name.upper()) for name, rate in output.items() if rate == ON_MARK]
     if lines.sin is not None:
         if not marked:
-            yield "sin", "no message of the module is on mark, so that triggers make no samples: output_on_mark sets it"
+            yield (
+                "sin",
+                "no message of the device is on mark, so triggers make no samples: try output_on_mark",
+            )
         for message in marked:
             most_hz = MAX_RATE_HZ[message].get(baud or 0)
             if baud in BAUD_RATES and most_hz is not None and lines.sin.rate_hz > most_hz:
-                yield "sin", f"{lines.sin.rate_hz:g} triggers a second, and {baud} baud carry {most_hz} Hz of {message}"
+                got = f"{lines.sin.rate_hz:g} Hz"
+                yield "sin", f"expected triggers of at most {most_hz} Hz for {message} at {baud} baud, got {got}"
         if marked == [OutputMessage.HI92]:
-            yield "sin", "HI92 on mark has no time of its own: samples are not paired with triggers, HI91 is"
+            yield "sin", "HI92 on mark has no device time: imud cannot pair its samples with triggers; use HI91"
     if lines.pps is not None and marked:
-        yield "pps", f"{' and '.join(marked)} on mark: each pulse per second makes a sample; output sets a rate"
+        yield (
+            "pps",
+            f"{' and '.join(marked)} on mark: each pulse per second makes a sample; set a rate with the action output",
+        )
 
 
 def _alarm_differences(alarm: Mapping[str, Any] | None, lines: DeviceLines) -> Iterator[tuple[str, str]]:
     if alarm is not None and lines.alarm is not None and not any(one.enabled for one in alarm.values()):
-        yield "alarm", "the module watches no angle, so that the line stays low: alarm sets a range"
+        yield "alarm", "the device watches no angle, so the line stays low: set a range with the action alarm"

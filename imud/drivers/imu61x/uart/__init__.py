@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""Forsense IMU61x on UART."""

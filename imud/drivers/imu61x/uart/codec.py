@@ -2,14 +2,12 @@
 
     AHRS, id 0x0002, 44 bytes   timer µs u32 | pitch | roll | yaw ° | accel 3 g | gyro 3 °/s | temperature °C, all f32
 
-Framing is in `framing.py`, the other frames in `replies.py`, commands in `commands.py`. Pitch
-comes before roll. The quaternion is computed from the angles, whose convention is assumed (`common.EULER_CONVENTION`).
+The device sends pitch before roll. imud computes the quaternion from the angles. The manual does not define their
+convention; imud assumes `common.EULER_CONVENTION`. The timer counts µs and wraps after 71.6 minutes.
 
-The timer counts µs and wraps after 71.6 minutes.
-
-Strategy. A read is one AHRS frame, or several back to back, nearly always: `feed` itself and `_decode_run` take those
-whose values are finite. NaN and infinity are looked for in the high bytes of all floats at once. All else goes through
-`framing.FrameFinder`. `make bench-instructions` measures it.
+Fast path: a read usually contains only complete AHRS frames. `feed` and `_decode_run` decode these frames if all values
+are finite. They check the high bytes of all floats in one step. `FrameFinder` processes all other input. `make
+bench-instructions` measures the cost.
 """
 
 import re
@@ -34,31 +32,28 @@ from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
 from imud.model.units import RAD_PER_DEG
 
-DEVICE_SYNC: Final = b"\xaa\x55"
-"""Begins what the device sends."""
-HOST_SYNC: Final = b"\x55\xaa"
-"""Begins what the host sends."""
+DEVICE_SYNC: Final = b"\xaa\x55"  # start of a frame from the device
+HOST_SYNC: Final = b"\x55\xaa"  # start of a frame from the host
 HEADER: Final = struct.Struct("<2sHH")  # sync word, id, payload length
 CRC_BYTES: Final = 4
 OVERHEAD_BYTES: Final = HEADER.size + CRC_BYTES
 PAYLOAD_BYTES_MAX: Final = 256
-"""The longest known payload has 66 bytes (S1, whose length differs by model); a false length then hides at most five
-samples, 23 ms at 115200 baud."""
+"""Maximum length of a payload, bytes. The longest known payload has 66 bytes (S1, depends on the model). A false length
+then hides at most five samples, 23 ms at 115200 baud."""
 FRAME_BYTES_MAX: Final = OVERHEAD_BYTES + PAYLOAD_BYTES_MAX
 
 
 class Frame(msgspec.Struct, frozen=True, gc=False):
-    """A frame whose CRC matches."""
+    """Frame with a correct CRC."""
 
     frame_id: int
     payload: bytes
     raw: bytes
-    trailing_bytes: int
-    """Bytes of the same read that follow it."""
+    trailing_bytes: int  # number of bytes of the same read after the frame
 
 
 def encode_frame(sync: bytes, frame_id: int, payload: bytes) -> bytes:
-    """A frame around `payload`. Raises ValueError for a payload that is empty or above PAYLOAD_BYTES_MAX."""
+    """Return a frame with `payload`. Raises ValueError for an empty payload or more than PAYLOAD_BYTES_MAX bytes."""
     if not 1 <= len(payload) <= PAYLOAD_BYTES_MAX:
         raise ValueError(f"payload of {len(payload)} bytes: expected 1 … {PAYLOAD_BYTES_MAX}")
     body = HEADER.pack(sync, frame_id, len(payload)) + payload
@@ -66,31 +61,28 @@ def encode_frame(sync: bytes, frame_id: int, payload: bytes) -> bytes:
 
 
 class FrameFinder:
-    """Finder of the frames of one direction in bytes of any split. Synchronization: one thread.
+    """Finder of the frames of one direction in a byte stream. Synchronization: one thread.
 
-    Books into the ledger every byte and every damaged frame, but not the frames it returns: only the caller knows
-    whether they are good.
+    It counts every byte and every damaged frame in the ledger. The caller counts the returned frames, because only the
+    caller knows whether their content is valid.
     """
 
     def __init__(self, ledger: Ledger, sync: bytes) -> None:
         self._ledger = ledger
         self._sync = sync
-        self._tail = b""
-        """Incomplete rest of the bytes: begins with a sync word, or is the first half of one."""
-        self._bad_ahead = 0
-        """Claimed rest of a damaged frame, in bytes from the begin of the tail."""
-        self.idle = True
-        """Whether the next bytes can be decoded without the earlier ones. To be read only."""
+        self._tail = b""  # incomplete rest of the bytes: starts with a sync word, or is the first half of a sync word
+        self._bad_ahead = 0  # rest of a damaged frame by its length field, in bytes from the start of the tail
+        self.idle = True  # Whether no earlier bytes are pending. Read-only for the codec.
 
     def feed(self, data: bytes) -> Sequence[Frame | BadFrame]:
-        """Add bytes in the order they came; return what they completed. Never raises for any bytes."""
+        """Add the next bytes of the stream. Return the completed frames. Never raises an exception."""
         self._ledger.bytes_in += len(data)
         return self._scan(self._tail + data if self._tail else data, 0)
 
     def feed_rest(self, data: bytes, take_run: Callable[[bytes], int]) -> Sequence[Frame | BadFrame]:
-        """Add bytes as `feed`, of which `take_run` takes whole frames first; it returns how many bytes those have.
+        """Add bytes like `feed`. `take_run` first consumes complete frames and returns their total size.
 
-        It is given what waited together with `data`, unless that may belong to a damaged frame.
+        `take_run` receives the pending bytes with `data`, unless they may belong to a damaged frame.
         """
         self._ledger.bytes_in += len(data)
         if self._tail:
@@ -98,14 +90,14 @@ class FrameFinder:
         return self._scan(data, 0, 0 if self._bad_ahead else take_run(data))
 
     def flush(self) -> Sequence[Frame | BadFrame]:
-        """Drop an incomplete frame if a whole one waits inside it; no-op otherwise. Called when the line is idle."""
+        """Drop an incomplete frame that contains a complete frame. imud calls this method when the link is idle."""
         found: list[Frame | BadFrame] = []
         while drop_before := self._whole_inside():
             found += self._scan(self._tail, drop_before)
         return found
 
     def reset(self) -> None:
-        """Skip what is pending: the stream broke."""
+        """Count the pending bytes as skipped."""
         self._ledger.bytes_skipped += len(self._tail)
         self._tail = b""
         self._bad_ahead = 0
@@ -113,7 +105,7 @@ class FrameFinder:
         self._ledger.bytes_pending = 0
 
     def _scan(self, data: bytes, drop_before: int, at: int = 0) -> list[Frame | BadFrame]:
-        """Find all that is complete in `data` from `at`; incomplete frames that begin before `drop_before` are bad."""
+        """Return all complete frames in `data` from `at`. Incomplete frames that start before `drop_before` are bad."""
         found: list[Frame | BadFrame] = []
         sync, total = self._sync, len(data)
         while at < total:
@@ -135,7 +127,7 @@ class FrameFinder:
         return found
 
     def _frame_at(self, data: bytes, at: int, drop_before: int, found: list[Frame | BadFrame]) -> int:
-        """Find the frame whose sync word is at `at`; return where it ends, or `at` if it is not complete yet."""
+        """Find the frame with its sync word at `at`. Return its end, or `at` if it is incomplete."""
         total = len(data)
         if total - at < HEADER.size:
             return self._spend_sync(data, at, total, BadReason.CRC, found) if at < drop_before else at
@@ -155,13 +147,13 @@ class FrameFinder:
         return end
 
     def _skip(self, at: int, end: int) -> None:
-        """Count bytes that belong to no frame; those that a damaged frame claimed count as its."""
+        """Count bytes outside frames. Bytes of a damaged frame by its length field are bad."""
         bad = max(min(self._bad_ahead, end) - at, 0)
         self._ledger.bytes_in_bad_frames += bad
         self._ledger.bytes_skipped += end - at - bad
 
     def _spend_sync(self, data: bytes, at: int, end: int, reason: BadReason, found: list[Frame | BadFrame]) -> int:
-        """Spend only the sync word of what begins at `at` and claims to reach `end`: it is no frame."""
+        """Reject the frame from `at` to its `end` by the length field: skip only the sync word."""
         ledger = self._ledger
         if reason is BadReason.CRC:
             ledger.frames_bad_crc += 1
@@ -173,7 +165,9 @@ class FrameFinder:
         return at + len(self._sync)
 
     def _whole_inside(self) -> int:
-        """Find the first frame with a matching CRC in the tail, after its own sync word; 0 for none."""
+        """Return the start of the first frame with a correct CRC in the tail, after its own sync word; 0 if there is
+        none.
+        """
         tail, sync = self._tail, self._sync
         at = tail.find(sync, len(sync))
         while at > 0:
@@ -192,39 +186,31 @@ def _crc_matches(raw: bytes) -> bool:
 STATUS_FRAME: Final = 0x00FF
 PARAMETER_FRAME: Final = 0x0006
 
-_STATUS_HEAD: Final = struct.Struct("<IIH3I")  # 22 bytes: what every model sends
+_STATUS_HEAD: Final = struct.Struct("<IIH3I")  # 22 bytes that every model sends
 _STATUS_REST: Final = struct.Struct("<IHHBBBB32s")
+# End offset of each member of the rest. An incomplete member is absent.
 _STATUS_STEPS: Final = tuple(_STATUS_HEAD.size + n for n in (4, 6, 8, 9, 10, 11, 12, 44))
-"""End offset of each member of the rest; a member that is not complete is absent."""
 STATUS_BYTES_MIN: Final = _STATUS_HEAD.size
-PARAMETERS: Final = struct.Struct("<ffIIii")
-"""P1, and R1 of commands: value, 0, index, 0, 0, 0 (tables 8 and 11)."""
+PARAMETERS: Final = struct.Struct("<ffIIii")  # P1, and R1 of commands: value, 0, index, 0, 0, 0 (tables 8 and 11)
 ACKNOWLEDGEMENT: Final = struct.Struct("<HH")
 
-RESULT_DONE: Final = 0
-"""Result of K1 for a command that was carried out; assumed."""
+RESULT_DONE: Final = 0  # result in K1 for an executed command; assumed
 
 
 class Parameter(IntEnum):
-    """Parameters that can be read, by their index (table 9)."""
+    """Readable parameters by their index (table 9)."""
 
-    BAUD = 3
-    """Rate of the UART, bit/s."""
-    GYRO_X_OFF = 8
-    """Zero bias found by the static calibration, °/s; Y and Z as well."""
+    BAUD = 3  # baud rate of the UART, bit/s
+    GYRO_X_OFF = 8  # zero bias from the static calibration, °/s; also Y and Z
     GYRO_Y_OFF = 9
     GYRO_Z_OFF = 10
-    INSTALL_X_OFF = 16
-    """Mounting error angle, °; Y and Z as well."""
+    INSTALL_X_OFF = 16  # mounting error angle, °; also Y and Z
     INSTALL_Y_OFF = 17
     INSTALL_Z_OFF = 18
-    AHRS_RATE = 21
-    """AHRS frames per second, Hz."""
-    BUS_MODE = 27
-    """The second bus, next to the UART, see `commands.BusMode`."""
+    AHRS_RATE = 21  # AHRS frames per second, Hz
+    BUS_MODE = 27  # bus in addition to the UART, see `commands.BusMode`
     I2C_ADDRESS = 30
-    FILTER = 31
-    """Filter codes as in FILTER_CTRL, see `filter_codes` of `common/family.py`."""
+    FILTER = 31  # filter codes as in FILTER_CTRL, see `common.filter_codes`
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,8 +228,7 @@ class Status:
     voltage: int | None = None
     user_config_status: int | None = None
     calibration_status: int | None = None
-    imu_health: bytes | None = None
-    """32 bytes."""
+    imu_health: bytes | None = None  # 32 bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,12 +244,11 @@ class Acknowledgement:
     """K1."""
 
     command: int
-    result: int
-    """The raw value."""
+    result: int  # the raw value
 
 
 def is_reply(frame_id: int, payload: bytes) -> bool:
-    """Whether a frame is S1, P1 or K1 by its id and length."""
+    """Return whether a frame is S1, P1 or K1 by its id and length."""
     size = len(payload)
     return (
         size == ACKNOWLEDGEMENT.size
@@ -274,7 +258,7 @@ def is_reply(frame_id: int, payload: bytes) -> bool:
 
 
 def parse_status(message: Message) -> Status | None:
-    """S1 of any length from 22 bytes on; None for anything else."""
+    """Return S1 of 22 bytes or more; None for another message."""
     if not isinstance(message, ReplyFrame) or message.frame_id != STATUS_FRAME:
         return None
     payload = message.payload
@@ -290,7 +274,7 @@ def parse_status(message: Message) -> Status | None:
 
 
 def parse_parameter(message: Message) -> ParameterValue | None:
-    """P1; None for anything else. Its value may be NaN or infinite."""
+    """Return P1; None for another message. Its value may be NaN or infinite."""
     if not isinstance(message, ReplyFrame) or message.frame_id != PARAMETER_FRAME:
         return None
     if len(message.payload) < PARAMETERS.size:
@@ -300,17 +284,17 @@ def parse_parameter(message: Message) -> ParameterValue | None:
 
 
 def parse_acknowledgement(message: Message) -> Acknowledgement | None:
-    """K1; None for anything else."""
+    """Return K1; None for another message."""
     if not isinstance(message, ReplyFrame) or len(message.payload) != ACKNOWLEDGEMENT.size:
         return None
     return Acknowledgement(*ACKNOWLEDGEMENT.unpack(message.payload))
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
 
 def pack_status(status: Status) -> bytes:
-    """Payload of S1, up to the first member that is None."""
+    """Return the payload of S1, up to the first member that is None."""
     head = _STATUS_HEAD.pack(status.software_version, status.hardware_version, status.model, *status.serial_number)
     rest = (
         status.system_status, status.cpu_load, status.drop_rate, status.i2c_master, status.voltage,
@@ -324,46 +308,47 @@ def pack_status(status: Status) -> bytes:
 
 
 def pack_parameters(value: float, index: int) -> bytes:
-    """Payload of P1 and of a command (R1). Raises OverflowError for a value beyond 32-bit floats."""
+    """Return the payload of P1 or of a command (R1). Raises OverflowError for a value beyond f32."""
     return PARAMETERS.pack(value, 0.0, index, 0, 0, 0)
 
 
 def pack_acknowledgement(command: int, result: int) -> bytes:
-    """Payload of K1."""
+    """Return the payload of K1."""
     return ACKNOWLEDGEMENT.pack(command, result)
 
 
 AHRS_FRAME_BYTES: Final = OVERHEAD_BYTES + 44
 
 AHRS: Final = struct.Struct("<I10f")
-"""timer µs, pitch roll yaw °, accel x y z g, gyro x y z °/s, temperature °C (table 4)."""
+"""timer µs, pitch roll yaw °, accel x y z g, gyro x y z °/s, temperature °C (table 4)"""
 AHRS_FRAME: Final = 0x0002
 TIMER_MODULUS: Final = 2**32
 
 _HEAD: Final = HEADER.pack(DEVICE_SYNC, AHRS_FRAME, AHRS.size)
-_ONLY: Final = struct.Struct(f"<{HEADER.size}xI10f{CRC_BYTES}x")  # the values of a whole frame
+_ONLY: Final = struct.Struct(
+    f"<{HEADER.size}xI10f{CRC_BYTES}x"
+)  # timer and 10 floats of one frame; skips header and CRC
+# Slice of the high bytes of all floats in a frame. The high byte of NaN and infinity is 0x7F or 0xFF. Finite values
+# above 1.7e38 have the same high bytes.
 _ONLY_HIGH_BYTES: Final = slice(HEADER.size + 7, AHRS_FRAME_BYTES - CRC_BYTES, 4)
-"""High bytes of the floats of a whole frame. An exponent of all ones (NaN, infinity) needs 0x7F or 0xFF there; finite
-values above 1.7e38 have them too."""
+# pattern of adjacent AHRS frames by their headers
 _RUN: Final = re.compile(rb"(?s:%b.{%d})+" % (re.escape(_HEAD), AHRS_FRAME_BYTES - HEADER.size))
-"""AHRS frames back to back by their headers."""
 _RUN_PARTS: Final = struct.Struct(f"<{HEADER.size}x{AHRS.size}sI")  # payload and CRC
 _RUN_SEED: Final = inverted_crc32(_HEAD, CRC_START)
+# AHRS in the native layout, in which `struct` reads a float in half the time
 _RUN_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") + "I10f")
-"""AHRS in the machine's own layout: there `struct` reads a float in half the time."""
+# Slice of the high bytes of all timers and floats in adjacent payloads. The high byte of the timer is 0x7F or 0xFF for
+# 34 s in 71.6 minutes.
 _RUN_HIGH_BYTES: Final = slice(3, None, 4)
-"""High bytes of the timers and floats in payloads back to back; a timer's are 0x7F or 0xFF for 34 s of its 71.6
-minutes."""
-_HIGH_BYTES_APART: Final = slice(7, None, 4)
-"""High bytes of the floats of a payload, without the timer's."""
+_HIGH_BYTES_APART: Final = slice(7, None, 4)  # slice of the high bytes of the floats of a payload
 
 
 class Imu61xCodec:
-    """Decoder of bytes in any split into measurements and reply frames. Synchronization: one thread.
+    """Decoder of a byte stream into measurements and reply frames. Synchronization: one thread.
 
-    Frames of an unknown kind are counted (`frames_ignored`) and dropped. Frames of a known kind that are too short are
-    bad. A frame with NaN or infinity is delivered without the values concerned, after a `BadFrame` (not-finite) that
-    reports it; its bytes and itself count as good.
+    It counts frames of an unknown kind (`frames_ignored`) and drops them. Short frames of a known kind are bad. For a
+    frame with NaN or infinity, it returns a `BadFrame` (not-finite) and the measurement without these values; the frame
+    counts as good.
     """
 
     def __init__(self, ledger: Ledger, _settings: Options | None = None) -> None:
@@ -371,7 +356,7 @@ class Imu61xCodec:
         self._finder = FrameFinder(ledger, DEVICE_SYNC)
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
-        """Decode bytes in the order they came; return what they completed. Never raises for any bytes."""
+        """Decode the next bytes of the stream. Return the completed events. Never raises an exception."""
         if len(data) == AHRS_FRAME_BYTES and self._finder.idle and inverted_crc32(data, CRC_START) == CRC_INVERSION:
             high_bytes = data[_ONLY_HIGH_BYTES]
             if data.startswith(_HEAD) and 0x7F not in high_bytes and 0xFF not in high_bytes:
@@ -384,13 +369,15 @@ class Imu61xCodec:
         return self._decode(data)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Return whole frames that wait inside a longer frame that never came. Called when the line is idle."""
+        """Return the complete frames inside an incomplete longer frame. imud calls this method when the link is
+        idle.
+        """
         events: list[CodecEvent] = []
         self._add_found(self._finder.flush(), events)
         return events
 
     def reset(self) -> None:
-        """Skip what is pending: the stream broke."""
+        """Count the pending bytes as skipped."""
         self._finder.reset()
 
     def _decode(self, data: bytes) -> Sequence[CodecEvent]:
@@ -399,7 +386,7 @@ class Imu61xCodec:
         return events
 
     def _decode_run(self, data: bytes, events: list[CodecEvent]) -> int:
-        """Decode AHRS frames back to back at the begin, up to one that is damaged or not finite; return their size."""
+        """Decode the adjacent AHRS frames at the start, up to a damaged or not finite frame. Return their size."""
         run = _RUN.match(data)
         if run is None:
             return 0
@@ -431,7 +418,7 @@ class Imu61xCodec:
                 self._add_frame(frame, events)
 
     def _add_frame(self, frame: Frame, events: list[CodecEvent]) -> None:
-        """Count a frame whose CRC matches, and add the event that it is."""
+        """Count a frame with a correct CRC and add its event."""
         ledger, size = self.ledger, len(frame.raw)
         reply = is_reply(frame.frame_id, frame.payload)
         measured = frame.frame_id == AHRS_FRAME and not reply
@@ -454,7 +441,9 @@ class Imu61xCodec:
     def _measure(self, frame: Frame, events: list[CodecEvent]) -> None:
         values = AHRS.unpack_from(frame.payload)
         size, trailing = len(frame.raw), frame.trailing_bytes
-        if isfinite(sum(values)):  # 32-bit floats cannot add up to a 64-bit infinity
+        if isfinite(
+            sum(values)
+        ):  # 11 finite 32-bit values cannot overflow a 64-bit sum: the sum is finite only if all values are finite
             events += _finite_measurements((values,), size, trailing)
             return
         self.ledger.frames_not_finite += 1
@@ -471,12 +460,10 @@ def _is_finite(payload: bytes) -> bool:
 
 
 def _finite_measurements(frames: Iterable[Sequence[Any]], size: int, trailing: int) -> list[Measurement]:
-    """AHRS frames back to back by their values, all of which are finite; `trailing` bytes follow the first frame.
-
-    The quaternion is `quat_from_euler_zyx`, written out for speed: a call is a twentieth of the cost of a frame.
-    """
+    """Return the measurements of adjacent AHRS frames with finite values; `trailing` bytes follow the first frame."""
     made: list[Measurement] = []
     keep, make, g, rad, cosine, sine = made.append, Measurement, M_S2_PER_G, RAD_PER_DEG, cos, sin
+    # quat_from_euler_zyx inline: a call costs a twentieth of a frame
     for us, pitch_deg, roll_deg, yaw_deg, ax, ay, az, gx, gy, gz, temperature_c in frames:
         roll, pitch, yaw = roll_deg * rad, pitch_deg * rad, yaw_deg * rad
         half_roll, half_pitch, half_yaw = roll * 0.5, pitch * 0.5, yaw * 0.5
@@ -496,7 +483,7 @@ def _finite_measurements(frames: Iterable[Sequence[Any]], size: int, trailing: i
 
 
 def _partial_measurement(values: Sequence[Any], size: int, trailing: int) -> Measurement:
-    """The same without the groups of values of which one is NaN or infinite."""
+    """Return the measurement without groups that contain NaN or infinity."""
     us, pitch, roll, yaw = values[:4]
     euler = scaled((roll, pitch, yaw), RAD_PER_DEG)
     return Measurement(
@@ -509,16 +496,15 @@ def _partial_measurement(values: Sequence[Any], size: int, trailing: int) -> Mea
     )  # fmt: skip
 
 
-# --- the device's side ------------------------------------------------------------------------------------------------
+# --- encoder for simulated devices ------------------------------------------------------------------------------
 
-K1_FRAME: Final = 0x000C
-"""Id under which the simulator sends K1; no source has it, the codec takes any."""
+K1_FRAME: Final = 0x000C  # id of K1 from the simulator; no document states it, and the codec accepts any id
 
 
 def encode_ahrs(
     *, timer_us: int, accel_m_s2: Vector3, gyro_rad_s: Vector3, euler_rad: Vector3, temperature_c: float
 ) -> bytes:
-    """A whole AHRS frame from SI values, `euler_rad` roll, pitch, yaw; time wraps. Raises OverflowError beyond f32."""
+    """Return a complete AHRS frame from SI values. `euler_rad` is roll, pitch, yaw. Raises OverflowError beyond f32."""
     roll, pitch, yaw = euler_rad
     payload = AHRS.pack(
         timer_us % TIMER_MODULUS,
@@ -531,15 +517,15 @@ def encode_ahrs(
 
 
 def encode_status(status: Status) -> bytes:
-    """A whole S1 frame."""
+    """Return a complete S1 frame."""
     return encode_frame(DEVICE_SYNC, STATUS_FRAME, pack_status(status))
 
 
 def encode_parameter(index: int, value: float) -> bytes:
-    """A whole P1 frame."""
+    """Return a complete P1 frame."""
     return encode_frame(DEVICE_SYNC, PARAMETER_FRAME, pack_parameters(value, index))
 
 
 def encode_acknowledgement(command: int, result: int = RESULT_DONE, frame_id: int = K1_FRAME) -> bytes:
-    """A whole K1 frame."""
+    """Return a complete K1 frame."""
     return encode_frame(DEVICE_SYNC, frame_id, pack_acknowledgement(command, result))

@@ -1,4 +1,4 @@
-"""Table: the row `DRIVER` of the Forsense IMU61x on a UART."""
+"""Row `DRIVER` of the Forsense IMU61x on a UART: actions and calibrations."""
 
 from collections.abc import Callable, Mapping
 from random import Random
@@ -32,9 +32,7 @@ from imud.drivers.imu61x.common import (
     random_vector,
     relative_heading,
 )
-from imud.drivers.imu61x.uart import commands
-from imud.drivers.imu61x.uart import settings as following
-from imud.drivers.imu61x.uart import settings as session
+from imud.drivers.imu61x.uart import commands, settings
 from imud.drivers.imu61x.uart.codec import (
     RESULT_DONE,
     TIMER_MODULUS,
@@ -50,7 +48,7 @@ from imud.drivers.imu61x.uart.commands import (
     Imu61xUartOptions,
     acknowledged,
     answered,
-    in_contact,
+    in_command_mode,
     read3,
     require_fit,
     settled,
@@ -75,20 +73,18 @@ from imud.model.sample import Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 POLL_NS: Final = 500 * NS_PER_MS
-POLLS_MAX: Final = 120
-"""A minute; the manual gives no time."""
+POLLS_MAX: Final = 120  # one minute; the manual states no time
 GYRO_NS: Final = 10 * NS_PER_S
-"""Time for the gyroscope of a device that does not tell when it has finished (assumed)."""
+"""Time for the gyroscope calibration of a device that does not report its end, ns (assumed)."""
 
 Finished = Callable[[], RequestScript[tuple[bool, str]]]
-"""Asks whether the calibration is over, and for the device's state in words."""
+"""Returns whether the calibration has ended, and the state of the device as text."""
 
 
 def calibrate_gyro(*, done: int = RESULT_DONE, rest: int = 0) -> RequestScript[Vector3]:
-    """Measure the gyroscope's zero bias (CMD 10), the device at rest; return it in °/s. Not saved.
+    """Measure the zero bias of the gyroscope at rest (CMD 10). Return it in °/s. Not saved.
 
-    `done` is the result of an acknowledgement, `rest` the calibration status, that means finished.
-    Raises NoReply, Rejected.
+    `done`: result of an acknowledgement, `rest`: calibration status, that mean finished. Raises NoReply, Rejected.
     """
 
     def calibrate() -> RequestScript[Vector3]:
@@ -101,11 +97,11 @@ def calibrate_gyro(*, done: int = RESULT_DONE, rest: int = 0) -> RequestScript[V
             yield from _until("gyro calibration", lambda: _by_status(rest))
         return (yield from read3(GYRO_OFFSETS))
 
-    return in_contact(calibrate)
+    return in_command_mode(calibrate)
 
 
 def calibrate_installation(*, done: int = RESULT_DONE, rest: int = 0) -> RequestScript[Vector3]:
-    """Measure the mounting error (CMD 7) and wait for the end; return the angles about X, Y, Z in °. Not saved.
+    """Measure the mounting error (CMD 7) and wait for the end. Return the angles about X, Y, Z in °. Not saved.
 
     `done` and `rest` as for the gyroscope. Raises NoReply, Rejected.
     """
@@ -118,12 +114,12 @@ def calibrate_installation(*, done: int = RESULT_DONE, rest: int = 0) -> Request
         yield from _until("installation calibration", finished)
         return (yield from read3(INSTALLATION_ANGLES))
 
-    return in_contact(calibrate)
+    return in_command_mode(calibrate)
 
 
 def installation_status() -> RequestScript[int | None]:
-    """Read the state of the installation calibration (CMD 8); None where the reply has none. Raises NoReply."""
-    return in_contact(_installation_status)
+    """Read the state of the installation calibration (CMD 8); None if the reply does not contain it. Raises NoReply."""
+    return in_command_mode(_installation_status)
 
 
 def _installation_status() -> RequestScript[int | None]:
@@ -134,7 +130,7 @@ def _installation_status() -> RequestScript[int | None]:
     return status.calibration_status if status is not None else None
 
 
-# --- the end ----------------------------------------------------------------------------------------------------------
+# --- end of a calibration ---------------------------------------------------------------------------------------
 
 
 def _until(what: str, finished: Finished) -> RequestScript[None]:
@@ -145,7 +141,7 @@ def _until(what: str, finished: Finished) -> RequestScript[None]:
         if over:
             return
     raise NoReply(
-        f"{what}: expected its end within {POLLS_MAX * POLL_NS / NS_PER_S:.0f} s, got {words}; is the device at rest?"
+        f"{what}: expected its end within {POLLS_MAX * POLL_NS / NS_PER_S:.0f} s, got {words}; keep the device at rest"
     )
 
 
@@ -160,7 +156,7 @@ def _by_result(done: int) -> RequestScript[tuple[bool, str]]:
 
 
 def _until_changed(before: Vector3) -> RequestScript[None]:
-    """Wait for new offsets, GYRO_NS at most: those of before may be found again."""
+    """Wait for new offsets, at most GYRO_NS, because the new offsets may be equal to the old ones."""
     for _ in range(GYRO_NS // POLL_NS):
         yield pause(POLL_NS)
         if (yield from read3(GYRO_OFFSETS)) != before:
@@ -170,31 +166,30 @@ def _until_changed(before: Vector3) -> RequestScript[None]:
 Heading = Annotated[
     float, Meta(ge=0, le=360, description="the new heading", extra={"unit": "°", "section": "1.6, table 12, CMD 4"})
 ]
-Answer = Mapping[str, Any]
-"""What an action answers, by name."""
+Answer = Mapping[str, Any]  # result of an action, by name
 
 _BUS_NOTE: Final = (
-    "in force at once or at the next start, which the manual leaves open; a host on the bus that was selected before "
-    "loses the device: there, a driver and link of the new bus belong in the configuration"
+    "effective immediately or after the next start (not documented); a host on the previously selected bus "
+    "loses the device: change driver and link in its configuration"
 )
 _ADDRESS_NOTE: Final = (
-    "in force at once or at the next start, which the manual leaves open; a host that reads it at the old address "
-    "loses it: there, `i2c.address` must be the new one, or `auto`"
+    "effective immediately or after the next start (not documented); a host that uses the old address "
+    "loses the device: change `i2c.address` in its configuration to the new address or `auto`"
 )
-_STOP_NOTE: Final = "no samples until `start_streaming`; saved now, it starts silent at every power-on"
+_STOP_NOTE: Final = "no samples until `start_streaming`; with `save`, the device is silent after every power-on"
 
 
 def _done(target: Target) -> int:
     return codes_of(target).result_done
 
 
-def _factory_reset(target: Target) -> RequestScript[following.BaudChange]:
-    return following.with_advice(following.factory_reset(target.baud, done=_done(target)), target.fixed_baud)
+def _factory_reset(target: Target) -> RequestScript[settings.BaudChange]:
+    return settings.with_advice(settings.factory_reset(target.baud, done=_done(target)), target.fixed_baud)
 
 
-def _baud(target: Target, *, baud: Baud) -> RequestScript[following.BaudChange]:
-    script = following.change_baud(baud, target.baud, done=_done(target))
-    return following.with_advice(script, target.fixed_baud)
+def _baud(target: Target, *, baud: Baud) -> RequestScript[settings.BaudChange]:
+    script = settings.change_baud(baud, target.baud, done=_done(target))
+    return settings.with_advice(script, target.fixed_baud)
 
 
 def _rate(target: Target, *, rate_hz: OutputRate) -> RequestScript[None]:
@@ -202,34 +197,34 @@ def _rate(target: Target, *, rate_hz: OutputRate) -> RequestScript[None]:
         try:
             require_fit(rate_hz, target.baud)
         except BadArgument as error:
-            raise BadArgument(f"rate_hz: {error}; set that first (`baud`)") from None
-    return session.write_parameter(Parameter.AHRS_RATE, rate_hz)
+            raise BadArgument(f"rate_hz: {error}; first change the baud rate with the action `baud`") from None
+    return settings.write_parameter(Parameter.AHRS_RATE, rate_hz)
 
 
 def _filter(_target: Target, *, accel_filter: AccelFilter, gyro_filter: GyroFilter) -> RequestScript[Answer]:
     accel, gyro = filter_code(accel_filter), filter_code(gyro_filter)
-    yield from session.write_filters(accel, gyro)
+    yield from settings.write_filters(accel, gyro)
     return {"accel_filter": FILTERS[accel], "gyro_filter": FILTERS[gyro]}
 
 
 def _i2c_address(_target: Target, *, address: Address) -> RequestScript[Answer]:
     number = i2c_address(address)
-    yield from session.write_parameter(Parameter.I2C_ADDRESS, number)
+    yield from settings.write_parameter(Parameter.I2C_ADDRESS, number)
     return {"i2c_address": f"{number:#04x}", "configuration": _ADDRESS_NOTE}
 
 
 def _bus(_target: Target, *, bus: SecondBus) -> RequestScript[Answer]:
-    yield from session.write_parameter(Parameter.BUS_MODE, BusMode[bus.upper()])
+    yield from settings.write_parameter(Parameter.BUS_MODE, BusMode[bus.upper()])
     return {"second_bus": bus, "configuration": _BUS_NOTE}
 
 
 def _stop(target: Target) -> RequestScript[Answer]:
-    yield from session.stop_streaming(done=_done(target))
+    yield from settings.stop_streaming(done=_done(target))
     return {"output_mode": "command", "configuration": _STOP_NOTE}
 
 
 def _heading(target: Target, *, heading_deg: Heading = 0.0) -> RequestScript[None]:
-    return session.reset_heading(heading_deg, done=_done(target))
+    return settings.reset_heading(heading_deg, done=_done(target))
 
 
 def _gyro(target: Target) -> RequestScript[Vector3]:
@@ -242,60 +237,59 @@ def _installation(target: Target) -> RequestScript[Vector3]:
 
 ACTIONS: Final[Actions] = {
     "status": Action(
-        "ask for versions, model and state, by name; names that end in _raw have no documented unit",
-        lambda _target: session.device_status(),
+        "read versions, model and state; names that end in _raw have no documented unit",
+        lambda _target: settings.device_status(),
     ),
     "settings": Action(
-        "read all settings from the device, units in their names", lambda _target: session.read_settings()
+        "read all settings from the device, with units in their names", lambda _target: settings.read_settings()
     ),
-    "sample_once": Action(
-        "ask for one sample, also in command mode; answers and publishes it", lambda _target: session.sample_once()
-    ),
+    "sample_once": Action("read and publish one sample, also in command mode", lambda _target: settings.sample_once()),
     "start_streaming": Action(
-        "send samples; waits for the first", lambda target: session.start_streaming(done=_done(target))
+        "start sending samples and wait for the first sample",
+        lambda target: settings.start_streaming(done=_done(target)),
     ),
     "stop_streaming": Action(
-        "command mode: send nothing but replies, until `start_streaming`; cuts off all programs that read samples",
+        "enter command mode: send only replies until `start_streaming`; no program receives samples",
         _stop,
     ),
-    "save": Action("write all parameters to flash", lambda target: session.save(done=_done(target)), saves=True),
+    "save": Action("write all parameters to flash", lambda target: settings.save(done=_done(target)), saves=True),
     "restart": Action(
-        "restart it, wait until it answers, and see that its timer began again; what was not saved is lost",
-        lambda target: following.restart(done=_done(target)),
+        "restart the device, wait until it replies and check that its timer restarted; unsaved settings are lost",
+        lambda target: settings.restart(done=_done(target)),
     ),
     "factory_reset": Action(
-        "factory settings, read back, saved, and followed to their 115200 baud, which a fixed `uart.baud` must then be",
+        "restore, check and save the factory settings and follow the device to 115200 baud; then change a fixed "
+        "`uart.baud`",
         _factory_reset,
         Risk.RESET,
         saves=True,
     ),
     "baud": Action(
-        "set and save the baud rate and follow; a fixed `uart.baud` in the configuration must then be the new one",
+        "set and save the baud rate and follow the device; then change a fixed `uart.baud` in the configuration",
         _baud,
         Risk.CONNECTION,
         saves=True,
     ),
-    "rate": Action("set the output rate, as far as the baud rate carries it", _rate),
+    "rate": Action("set the output rate; the baud rate limits it", _rate),
     "filter": Action(f"set the low-pass filters, by name or code: {FILTER_CODES}", _filter),
     "i2c_address": Action(
-        "set the I2C address; a host that reads the device at the old one loses it until `i2c.address` there is the "
-        "new one",
+        "set the I2C address; a host that uses the old address loses the device until you change its `i2c.address`",
         _i2c_address,
     ),
     "bus": Action(
-        "set the second bus, next to the UART; a host on the other bus loses the device, and needs the other link and "
+        "select the bus in addition to the UART; a host on the other bus loses the device and needs another link and "
         "driver",
         _bus,
     ),
     "heading": Action("set the heading", _heading),
     "calibrate_gyro": Action(
-        "measure the gyroscope's bias, the device at rest, and wait for the end; answers it in °/s", _gyro
+        "measure the bias of the gyroscope at rest and wait for the end; returns it in °/s", _gyro
     ),
     "calibrate_installation": Action(
-        "measure the mounting error and wait for its end; answers the angles in °", _installation
+        "measure the mounting error and wait for the end; returns the angles in °", _installation
     ),
     "installation_status": Action(
-        "state of the installation calibration, as sent", lambda _target: installation_status()
+        "read the state of the installation calibration, as sent", lambda _target: installation_status()
     ),
 }
 
@@ -312,11 +306,12 @@ CALIBRATIONS: Final[Calibrations] = {
         kept=Kept.BY_SAVE,
         save=_SAVE,
     ),
+    # no document states the effect of the angles on the samples: imud returns and does not check them
     "installation": Calibration(
         help="measure the mounting error and wait for the end",
         section="1.6, CMD 7 and 8",
         handling=Handling.REST,
-        instructions=("Mount the device, bring the body that carries it to level, and let it rest.",),
+        instructions=("Mount the device, level the body with the device, and let it rest.",),
         begin=ACTIONS["calibrate_installation"].begin,
         kept=Kept.BY_SAVE,
         save=_SAVE,
@@ -325,17 +320,15 @@ CALIBRATIONS: Final[Calibrations] = {
         help="make the present heading zero",
         section="1.6, CMD 4",
         handling=Handling.REST,
-        instructions=("Point the device to where its heading is to be zero, and do not touch it.",),
+        instructions=("Point the device in the direction of heading zero, and do not touch it.",),
         begin=ACTIONS["heading"].begin,
         expected=(YAW_ZERO,),
         kept=Kept.NEVER,
     ),
 }
-"""What the angles of `installation` do to the samples is in no source: they are answered and not checked."""
 
 
 def _example_frame(random: Random) -> bytes:
-    """An AHRS frame with random values."""
     return encode_ahrs(
         timer_us=random.randrange(TIMER_MODULUS),
         accel_m_s2=random_vector(random, 9.8),

@@ -1,7 +1,7 @@
-"""Settings that an IMU61x on a UART keeps: parameters of tables 9 and 12, and the output mode. Manual, 1.5 and 1.6.
+"""Settings of an IMU61x on a UART: parameters of tables 9 and 12, and the output mode. Manual, 1.5 and 1.6.
 
-Values are numbers with the unit in the name of the setting, or names in place of the device's codes. Whether parameters
-27 and 30 come into force at once or at the next start is not documented.
+Values are numbers with the unit in the name of the setting, or names in place of the device's codes. The manual does
+not state whether parameters 27 and 30 take effect immediately or after the next start.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -42,7 +42,7 @@ from imud.drivers.imu61x.uart.commands import (
     RateHz,
     acknowledged,
     answered,
-    in_contact,
+    in_command_mode,
     ordered,
     read,
     result_of,
@@ -55,35 +55,34 @@ from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 SAMPLE_NS: Final = 3 * NS_PER_S
-"""Wait for the first sample after the order to stream: three times the longest period, 1 s."""
+"""Maximum time to the first sample after the command to stream, ns: three times the longest period, 1 s."""
 QUIET_NS: Final = 1200 * NS_PER_MS
-"""Without a sample for longer than the longest period, the stream has stopped."""
+"""Time without a sample after which the stream has stopped, ns: more than the longest period."""
 DRAIN_NS: Final = 200 * NS_PER_MS
-"""Time for samples that were on their way when the stream stopped: 512 bytes at 115200 baud, and an adapter."""
+"""Time for samples in buffers when the stream stops, ns: 512 bytes at 115200 baud, and an adapter."""
 
 GYRO_OFFSETS: Final = (Parameter.GYRO_X_OFF, Parameter.GYRO_Y_OFF, Parameter.GYRO_Z_OFF)
 INSTALLATION_ANGLES: Final = (Parameter.INSTALL_X_OFF, Parameter.INSTALL_Y_OFF, Parameter.INSTALL_Z_OFF)
 
-ParameterValues = Mapping[Parameter, float]
-"""Parameters as read; one that the device does not answer for is left out."""
+ParameterValues = Mapping[Parameter, float]  # parameters as read, without parameters that the device does not report
 
 # --- identity and status ----------------------------------------------------------------------------------------------
 
 
 def identify() -> RequestScript[Identity]:
-    """Ask for versions, model and serial number (CMD 1). Raises NoReply.
+    """Read versions, model and serial number (CMD 1). Raises NoReply.
 
-    A device that answers only in command mode misses the samples of the exchange, some 20 ms.
+    If the device replies only in command mode, the samples of about 20 ms are lost.
     """
 
     def ask() -> RequestScript[Identity]:
         return identity_of((yield from settled(CONTACT_TRIES)))
 
-    return in_contact(ask)
+    return in_command_mode(ask)
 
 
 def identity_of(status: Status) -> Identity:
-    """Make the identity from S1. The numbers of the models are not documented."""
+    """Return the identity in S1. The manual does not document the model numbers."""
     details = {"hardware_version": str(status.hardware_version), "model_number": str(status.model)}
     return Identity("IMU61x", _serial_number(status), str(status.software_version), details)
 
@@ -93,18 +92,18 @@ def _serial_number(status: Status) -> str:
 
 
 def device_status() -> RequestScript[Mapping[str, Any]]:
-    """Ask for S1 (CMD 1); return its members by name, see `status_words`. Raises NoReply."""
+    """Read S1 (CMD 1). Return its members by name, see `status_words`. Raises NoReply."""
 
     def ask() -> RequestScript[Mapping[str, Any]]:
         return status_words((yield from settled(CONTACT_TRIES)))
 
-    return in_contact(ask)
+    return in_command_mode(ask)
 
 
 def status_words(status: Status) -> Mapping[str, Any]:
-    """Name the members of S1 that were sent. Names that end in `_raw` have a number without a documented unit.
+    """Return the present members of S1 by name. Names that end in `_raw` have no documented unit.
 
-    Bits are in hexadecimal: of the system's status, and of `imu_health`, 32 bytes.
+    The bits of the system status and of `imu_health`, 32 bytes, are hexadecimal.
     """
     words = {
         "serial_number": _serial_number(status),
@@ -124,16 +123,16 @@ def status_words(status: Status) -> Mapping[str, Any]:
 
 
 def sample_once() -> RequestScript[Mapping[str, Any]]:
-    """Ask for one sample (CMD 2), or have the next one while it streams; return it in SI units. Raises NoReply."""
+    """Read one sample (CMD 2), or the next sample of the stream. Return it in SI units. Raises NoReply."""
 
     def ask() -> RequestScript[Mapping[str, Any]]:
         return sample_words((yield from sample()))
 
-    return in_contact(ask)
+    return in_command_mode(ask)
 
 
 def sample_words(measurement: Measurement) -> Mapping[str, Any]:
-    """Name the values of an AHRS frame; those that were not finite are left out."""
+    """Return the finite values of an AHRS frame by name."""
     words = {
         "timer_us": measurement.dev_ticks,
         "accel_m_s2": measurement.accel_m_s2,
@@ -148,19 +147,19 @@ def sample_words(measurement: Measurement) -> Mapping[str, Any]:
 
 
 def read_settings() -> RequestScript[Mapping[str, str]]:
-    """Read all parameters of table 9 (CMD 6), by the names of imud's settings, for people. Raises NoReply.
+    """Read all parameters of table 9 (CMD 6) as readable text, by the names of imud's settings. Raises NoReply.
 
-    A parameter that the device does not answer for is left out: not every model has every one (assumed).
+    The result does not contain parameters without a reply: some models lack some parameters (assumed).
     """
 
     def ask() -> RequestScript[Mapping[str, str]]:
         return parameter_words((yield from read_parameters()))
 
-    return in_contact(ask)
+    return in_command_mode(ask)
 
 
 def read_parameters() -> RequestScript[ParameterValues]:
-    """Read all parameters of table 9, in contact. Raises NoReply where it does not even answer for the baud rate."""
+    """Read all parameters of table 9. Raises NoReply if the device does not reply for the baud rate either."""
     values = {Parameter.BAUD: (yield from read(Parameter.BAUD))}
     for parameter in Parameter:
         if parameter is Parameter.BAUD:
@@ -173,7 +172,7 @@ def read_parameters() -> RequestScript[ParameterValues]:
 
 
 def parameter_words(values: ParameterValues) -> Mapping[str, str]:
-    """Name parameters as imud's settings do, units in the names; a value that is none of the manual's as a number."""
+    """Return parameters as text by the names of imud's settings. Undocumented values are numbers."""
     words: dict[str, str] = {}
     for name, parameter in (("baud", Parameter.BAUD), ("output_rate_hz", Parameter.AHRS_RATE)):
         if parameter in values:
@@ -207,30 +206,31 @@ def _number(value: float) -> str:
 
 
 def start_streaming(*, done: int = RESULT_DONE) -> RequestScript[None]:
-    """Start streaming of AHRS frames (CMD 3, mode 1), and wait for one. Raises Rejected, and NoReply for no sample."""
+    """Start streaming of AHRS frames (CMD 3, mode 1) and wait for a frame. Raises Rejected; NoReply without a
+    sample.
+    """
     for _ in range(CONTACT_TRIES):
         if (yield from ordered(commands.output_mode(OutputMode.STREAM), done)):
             break
     if not isinstance((yield commands.await_sample(SAMPLE_NS)), Reply):
         raise NoReply(
             f"output mode STREAM: expected a sample within {SAMPLE_NS / NS_PER_S:.0f} s, got none; "
-            "is the host's transmit line connected?"
+            "check the transmit wire of the host"
         )
 
 
 def wake() -> RequestScript[bool]:
-    """Start streaming if the device answers; return whether it acknowledged, with any result. Raises NoReply.
-
-    Not saved. Whether it streams then, is seen by its samples.
+    """Start streaming if the device replies. Return whether it acknowledged with any result. Not saved. Raises
+    NoReply.
     """
     yield from answered(commands.ask_status())
     return (yield from resume_streaming())
 
 
 def stop_streaming(*, done: int = RESULT_DONE) -> RequestScript[None]:
-    """Enter command mode (CMD 3, mode 100), in which the device only replies, and see that samples end.
+    """Enter command mode (CMD 3, mode 100), in which the device only replies, and check that samples end.
 
-    Raises NoReply for no answer, and Rejected where it refuses or streams on.
+    Raises NoReply without a reply, and Rejected if the device rejects the command or continues to stream.
     """
     yield from ordered(commands.output_mode(OutputMode.COMMAND), done)
     yield from settled()
@@ -240,18 +240,16 @@ def stop_streaming(*, done: int = RESULT_DONE) -> RequestScript[None]:
 
 
 def save(*, done: int = RESULT_DONE) -> RequestScript[None]:
-    """Write all parameters to flash (CMD 5). Raises Rejected, and NoReply without an acknowledgement.
-
-    The output mode is one of them, so a device that obeys while it streams is not taken out of that: what is saved in
-    command mode starts silent. One that obeys in command mode only cannot keep that mode (assumed: it could never be
-    saved as streaming).
-    """
+    """Write all parameters to flash (CMD 5). Raises Rejected; NoReply without an acknowledgement."""
 
     def ask() -> RequestScript[None]:
         yield from acknowledged(commands.save(), done)
         yield from settled()
 
-    return in_contact(ask, CONTACT_TRIES)
+    # The output mode is a parameter too. A device that accepts commands while it streams therefore stays in this mode:
+    # saved in command mode, it would be silent after power-on. A device that accepts commands only in command mode
+    # cannot keep that mode (assumed: otherwise it could never save streaming).
+    return in_command_mode(ask, CONTACT_TRIES)
 
 
 # --- parameters and heading -------------------------------------------------------------------------------------------
@@ -264,9 +262,9 @@ _SETTERS: Final[Mapping[Parameter, Callable[[int], Request]]] = {
 
 
 def write_parameter(parameter: Parameter, value: int | BusMode) -> RequestScript[None]:
-    """Set a parameter and read it back; not saved. Raises BadArgument, NoReply, and Rejected if it reads otherwise.
+    """Set a parameter and read it back; not saved. Raises BadArgument, NoReply, and Rejected if the value differs.
 
-    The baud rate is not set this way, see `following.change_baud`; offsets and angles come from calibrations.
+    `change_baud` sets the baud rate; calibrations set offsets and angles.
     """
     if isinstance(value, BusMode) and parameter is Parameter.BUS_MODE:
         request = commands.set_bus_mode(value)
@@ -274,9 +272,9 @@ def write_parameter(parameter: Parameter, value: int | BusMode) -> RequestScript
         request = _SETTERS[parameter](value)
     else:
         settable = ", ".join(name.name for name in (*_SETTERS, Parameter.BUS_MODE))
-        raise BadArgument(f"parameter {parameter.name} = {value}: expected one of {settable}, with a value of its kind")
+        raise BadArgument(f"parameter {parameter.name} = {value}: expected one of {settable} with a value of its type")
     wanted = value.value if isinstance(value, BusMode) else value
-    return in_contact(lambda: _write(request, parameter, wanted))
+    return in_command_mode(lambda: _write(request, parameter, wanted))
 
 
 def _write(request: Request, parameter: Parameter, wanted: int) -> RequestScript[None]:
@@ -284,44 +282,46 @@ def _write(request: Request, parameter: Parameter, wanted: int) -> RequestScript
     found = yield from read(parameter)
     if found != wanted:
         word = "" if result is None else f", acknowledged with result {result}"
-        raise Rejected(f"{request.name}: reads back as {found:g}{word}")
+        raise Rejected(f"{request.name}: expected {wanted} after the write, got {found:g}{word}")
 
 
 def write_filters(accel: int | None, gyro: int | None) -> RequestScript[None]:
-    """Set the codes of the low-pass filters, None to leave one as it is, and read back. Raises as `write_parameter`."""
+    """Set the codes of the low-pass filters, None: unchanged, and read them back. Raises the errors of
+    `write_parameter`.
+    """
 
     def ask() -> RequestScript[None]:
         present = yield from read(Parameter.FILTER)
         if present not in range(0x100):
-            raise Rejected(f"parameter FILTER: expected 0 to 255, read {present:g}")
+            raise Rejected(f"parameter FILTER: expected 0 to 255, got {present:g}")
         present_accel, present_gyro = filter_codes(int(present))
         codes = (present_accel if accel is None else accel, present_gyro if gyro is None else gyro)
         request = commands.set_filter(*codes)
         yield from _write(request, Parameter.FILTER, codes[0] << 4 | codes[1])
 
-    return in_contact(ask)
+    return in_command_mode(ask)
 
 
 def reset_heading(heading_deg: float, *, done: int = RESULT_DONE) -> RequestScript[None]:
-    """Make the heading 0° … 360° (CMD 4). Raises NoReply, Rejected."""
+    """Set the heading, 0° … 360° (CMD 4). Raises NoReply, Rejected."""
 
     def ask() -> RequestScript[None]:
         yield from acknowledged(commands.reset_heading(heading_deg), done)
         yield from settled()
 
-    return in_contact(ask)
+    return in_command_mode(ask)
 
 
 LOOK_TRIES: Final = 3
-"""A device in the middle of a false frame, made of bytes at another rate, or quiet after an answer, may miss two."""
+"""Number of tries per baud rate. Bytes at another baud rate, or a busy device, can cost two of them."""
 BOOT_NS: Final = NS_PER_S
-BOOT_TRIES: Final = 5
-"""Number of searches after a restart; with their time-outs longer than the 3 s that section 2.2 names."""
+BOOT_TRIES: Final = 5  # number of searches after a restart; with their timeouts longer than the 3 s in section 2.2
 US_PER_S: Final = NS_PER_S // NS_PER_US
 TIMER_US: Final = 2**32
 OLD_US: Final = 15 * US_PER_S
-"""Least age of the timer before a restart: more than the time in which the device is searched for afterwards, so that
-a timer that began again shows less."""
+"""Minimum age of the timer before a restart, µs: longer than the search after it, so that a restarted timer is
+smaller.
+"""
 
 FACTORY: Final[Mapping[Parameter, int]] = {
     Parameter.BAUD: BAUD_RATES[0],
@@ -330,7 +330,7 @@ FACTORY: Final[Mapping[Parameter, int]] = {
     Parameter.I2C_ADDRESS: I2C_ADDRESSES[0],
     Parameter.FILTER: FILTER_DEFAULT,
 }
-"""The defaults that tables 1, 9 and 12 name."""
+"""Factory settings of tables 1, 9 and 12."""
 FACTORY_BAUD: Final = FACTORY[Parameter.BAUD]
 
 
@@ -338,16 +338,15 @@ FACTORY_BAUD: Final = FACTORY[Parameter.BAUD]
 class BaudChange:
     """Result of a successful change of the baud rate."""
 
-    baud: int
-    """The rate at which the device answered last; the line has it as well."""
-    saved: bool
-    """Whether the device acknowledged that it saved its parameters."""
-    configuration: str = ""
-    """What to change in the configuration; empty for nothing."""
+    baud: int  # baud rate of the last reply; the serial port uses it too
+    saved: bool  # whether the device acknowledged the save of its parameters
+    configuration: str = ""  # necessary change of the configuration; empty if none is necessary
 
 
 def with_advice(script: RequestScript[BaudChange], fixed_baud: int) -> RequestScript[BaudChange]:
-    """Make the same script; its answer says what to change where the configuration fixes the rate (0: it does not)."""
+    """Return the same script; its result contains the change for a configuration with another baud rate (0: none
+    fixed).
+    """
     change = yield from script
     if fixed_baud in (0, change.baud):
         return change
@@ -359,28 +358,28 @@ def with_advice(script: RequestScript[BaudChange], fixed_baud: int) -> RequestSc
 
 
 def restart(*, done: int = RESULT_DONE) -> RequestScript[Identity]:
-    """Restart (CMD 9) and wait until it answers again. Parameters that were not saved are lost.
+    """Restart the device (CMD 9) and wait until it replies. Unsaved parameters are lost.
 
-    Raises NoReply where it does not come back or sends no AHRS frame, and Rejected where its timer went on.
+    Raises NoReply if the device does not reply or sends no AHRS frame, and Rejected if its timer did not restart.
     """
     before_us = yield from _old_timer()
-    result = yield from in_contact(_restart)
+    result = yield from in_command_mode(_restart)
     yield pause(BOOT_NS)
     identity, after_us = yield from _back()
     if after_us >= before_us:
         word = "no acknowledgement" if result is None else f"acknowledgement {result}"
         raise Rejected(
-            f"restart: expected a timer that begins again, got {before_us / US_PER_S:.1f} s before and "
+            f"restart: expected a restarted timer, got {before_us / US_PER_S:.1f} s before and "
             f"{after_us / US_PER_S:.1f} s after it, and {word} ({done} is done)"
         )
     return identity
 
 
 def _old_timer() -> RequestScript[int]:
-    """The timer, µs, once it can be distinguished from one that has just begun, and does not turn over soon."""
+    """Return the timer, µs, once it is older than a restarted timer can be and does not wrap soon."""
     while True:
-        timer_us = (yield from in_contact(sample)).dev_ticks
-        assert timer_us is not None  # every AHRS frame has it
+        timer_us = (yield from in_command_mode(sample)).dev_ticks
+        assert timer_us is not None  # every AHRS frame contains it
         if timer_us < OLD_US:
             yield pause((OLD_US - timer_us) * NS_PER_US)
         elif timer_us > TIMER_US - 2 * OLD_US:
@@ -394,18 +393,16 @@ def _restart() -> RequestScript[int | None]:
 
 
 def _back() -> RequestScript[tuple[Identity, int]]:
-    """Wait for the device after a restart."""
-
     def ask() -> RequestScript[tuple[Identity, int]]:
         status = yield from settled(CONTACT_TRIES)
         return identity_of(status), (yield from sample()).dev_ticks or 0
 
     for _ in range(BOOT_TRIES - 1):
         try:
-            return (yield from in_contact(ask))
+            return (yield from in_command_mode(ask))
         except NoReply:
             continue
-    return (yield from in_contact(ask))
+    return (yield from in_command_mode(ask))
 
 
 # --- baud rate --------------------------------------------------------------------------------------------------------
@@ -414,14 +411,12 @@ def _back() -> RequestScript[tuple[Identity, int]]:
 def change_baud(
     baud: int, present_baud: int, *, done: int = RESULT_DONE, save: bool = True
 ) -> RequestScript[BaudChange]:
-    """Set the baud rate of device and line from `present_baud` to `baud`, and save it.
+    """Set the baud rate of device and serial port from `present_baud` to `baud`, and save it. The device streams
+    afterwards.
 
-    Whether the device changes at once or at its next start is not documented, so it is searched at both rates. The
-    rate is saved only after a reply at the new rate, or a report of it at the old one; without `save` in the second
-    case only, where it comes into force in no other way. Leaves it streaming.
-    Raises BadArgument for a rate that does not carry the output rate of the device, Rejected where it stays at the old
-    rate (the line too) or refuses to save, and NoReply where it is not heard; if nothing was saved, it has the old rate
-    again after power-on.
+    Raises BadArgument for a baud rate that is too low for the output rate, Rejected if the device keeps the old baud
+    rate (the serial port then too) or rejects the save, and NoReply if it does not reply; if nothing was saved,
+    power-off restores the old baud rate.
     """
     return with_undo(_change_baud(baud, present_baud, done, save), STREAM)
 
@@ -439,20 +434,22 @@ def _change_baud(baud: int, present_baud: int, done: int, save: bool) -> Request
         raise BadArgument(f"baud: {error}; lower the output rate first") from None
     yield request
     saved = False
+    # The manual does not state whether the change is immediate or at the next start: look at both baud rates. Save only
+    # after a reply at the new baud rate, or if the device reports it at the old one (then also without `save`).
     found = yield from _look((baud, present_baud))
-    if found == (present_baud, baud) != (baud, baud):  # set, but in force at the next start only
+    if found == (present_baud, baud) != (baud, baud):  # set, but effective only after the next start
         yield from resume_streaming()
         saved = yield from _save(done)
-        yield from in_contact(_restart)
+        yield from in_command_mode(_restart)
         yield pause(BOOT_NS)
         found = yield from _look((baud, present_baud), BOOT_TRIES)
     if found is None:
-        yield from resume_streaming()  # at the present rate, where the search ended
-        kept = "it may have been saved" if saved else "switch its power off and on: nothing was saved"
+        yield from resume_streaming()  # at the present baud rate, at which the search ended
+        kept = "it may have been saved" if saved else "nothing was saved: switch the device off and on"
         raise NoReply(_unheard(f"{request.name}: {kept}", (baud, present_baud)))
     yield from resume_streaming()
     if found[0] != baud:
-        raise Rejected(f"{request.name}: the device stays at {present_baud} baud")
+        raise Rejected(f"{request.name}: the device keeps {present_baud} baud")
     if save:
         saved = (yield from _save(done)) or saved
     return BaudChange(baud, saved)
@@ -464,8 +461,8 @@ def _change_baud(baud: int, present_baud: int, done: int, save: bool) -> Request
 def factory_reset(present_baud: int, *, done: int = RESULT_DONE) -> RequestScript[BaudChange]:
     """Restore and save the factory settings (CMD 15), follow the device to its baud rate, and read its parameters back.
 
-    One that changes at its next start is restarted. Leaves it streaming, as delivered. Raises NoReply, and Rejected
-    where a parameter reads otherwise than `FACTORY`.
+    The script restarts a device that changes only at its next start. The device streams afterwards. Raises NoReply, and
+    Rejected if a parameter differs from `FACTORY`.
     """
     return with_undo(_factory_reset(present_baud, done), STREAM)
 
@@ -482,9 +479,9 @@ def _factory_reset(present_baud: int, done: int) -> RequestScript[BaudChange]:
     pending = found is not None and found[0] != FACTORY_BAUD == found[1]
     if found is not None and (pending or (others and not refused)):
         yield from resume_streaming()
-        if pending:  # the parameters have the new values, which the restart must not lose
+        if pending:  # the restart must not lose the new values
             yield from _save(done)
-        yield from in_contact(_restart)
+        yield from in_command_mode(_restart)
         yield pause(BOOT_NS)
         found = yield from _look(bauds, BOOT_TRIES)
         others = {} if found is None else (yield from _not_factory())
@@ -495,14 +492,12 @@ def _factory_reset(present_baud: int, done: int) -> RequestScript[BaudChange]:
         words = ", ".join(f"{parameter.name} {value:g}" for parameter, value in others.items())
         expected = ", ".join(f"{parameter.name} {FACTORY[parameter]}" for parameter in others)
         word = "none" if result is None else str(result)
-        raise Rejected(
-            f"factory reset: expected {expected}, read back {words}; acknowledgement {word} ({done} is done)"
-        )
+        raise Rejected(f"factory reset: expected {expected}, got {words}; acknowledgement {word} ({done} is done)")
     return BaudChange(found[0], (yield from _save(done)))
 
 
 def _not_factory() -> RequestScript[Mapping[Parameter, float]]:
-    """The parameters that are not as delivered; one that the device does not have is left out."""
+    """Read the parameters that differ from the factory settings, without parameters that the device lacks."""
     others = {}
     for parameter, expected in FACTORY.items():
         try:
@@ -518,14 +513,14 @@ def _not_factory() -> RequestScript[Mapping[Parameter, float]]:
 
 
 def _save(done: int) -> RequestScript[bool]:
-    """Save; return whether the device acknowledged. Raises Rejected."""
-    return (yield from in_contact(lambda: ordered(commands.save(), done), CONTACT_TRIES))
+    """Save. Return whether the device acknowledged. Raises Rejected."""
+    return (yield from in_command_mode(lambda: ordered(commands.save(), done), CONTACT_TRIES))
 
 
 def _look(bauds: Sequence[int], tries: int = LOOK_TRIES) -> RequestScript[tuple[int, float] | None]:
-    """Find the device, and enter command mode; return the rate it answers at and the rate it reports.
+    """Find the device and enter command mode. Return the baud rate of the reply and the baud rate that it reports.
 
-    The line is left at that rate, or at the last of `bauds` where it is not heard.
+    The serial port keeps this baud rate, or the last of `bauds` without a reply.
     """
     for baud in tuple(dict.fromkeys(bauds)) * tries:
         heard = yield commands.output_mode(OutputMode.COMMAND, baud=baud)
@@ -538,11 +533,12 @@ def _look(bauds: Sequence[int], tries: int = LOOK_TRIES) -> RequestScript[tuple[
 
 def _unheard(what: str, bauds: Sequence[int]) -> str:
     rates = " and ".join(str(baud) for baud in dict.fromkeys(bauds))
-    return f"{what}; expected an answer at {rates} baud, got none: is the host's transmit line connected?"
+    return f"{what}; expected a reply at {rates} baud, got none; check the transmit wire of the host"
 
 
 Baud = Annotated[
-    BaudRate, Meta(description="rate of the UART", extra={"unit": "bit/s", "section": "1.6, table 12, parameter 3"})
+    BaudRate,
+    Meta(description="baud rate of the UART", extra={"unit": "bit/s", "section": "1.6, table 12, parameter 3"}),
 ]
 OutputRate = Annotated[
     RateHz, Meta(description="AHRS frames per second", extra={"unit": "Hz", "section": "1.6, table 12, parameter 21"})
@@ -550,7 +546,7 @@ OutputRate = Annotated[
 OutputModeName = Annotated[
     Literal["stream", "command"],
     Meta(
-        description="`stream`: sends AHRS frames; `command`: sends nothing but replies",
+        description="`stream`: AHRS frames; `command`: only replies",
         extra={"section": "1.6, table 12, CMD 3"},
     ),
 ]
@@ -561,7 +557,7 @@ Address = Annotated[
 SecondBus = Annotated[
     Literal["uart_only", "spi", "i2c", "by_pin"],
     Meta(
-        description="the bus next to the UART; `by_pin`: a pin that is open or low selects SPI, high selects I2C",
+        description="bus in addition to the UART; `by_pin`: a pin selects it, SPI if open or low, I2C if high",
         extra={"section": "1.6, table 12, parameter 27"},
     ),
 ]
@@ -571,21 +567,21 @@ _Three = Annotated[list[float], Meta(min_length=3, max_length=3)]
 GyroOffset = Annotated[
     _Three,
     Meta(
-        description="zero bias about X, Y, Z, as the static calibration found it",
+        description="zero bias about X, Y, Z from the static calibration",
         extra={"unit": "°/s", "section": "1.5, table 9, parameters 8 to 10"},
     ),
 ]
 InstallationAngles = Annotated[
     _Three,
     Meta(
-        description="mounting error about X, Y, Z, as the installation calibration found it",
+        description="mounting error about X, Y, Z from the installation calibration",
         extra={"unit": "°", "section": "1.5, table 9, parameters 16 to 18"},
     ),
 ]
 
 
 def codes_of(target: Target) -> Imu61xUartOptions:
-    """The codes that the configuration gives, or the assumed ones."""
+    """Return the codes of the configuration, or the assumed codes."""
     return target.settings if isinstance(target.settings, Imu61xUartOptions) else Imu61xUartOptions()
 
 
@@ -594,12 +590,12 @@ def codes_of(target: Target) -> Imu61xUartOptions:
 
 def _read(_target: Target) -> RequestScript[Mapping[str, Any]]:
     streams = isinstance((yield commands.await_sample(QUIET_NS)), Reply)
-    values = yield from in_contact(read_parameters)
+    values = yield from in_command_mode(read_parameters)
     return {**settings_of(values), "output_mode": "stream" if streams else "command"}
 
 
 def settings_of(values: ParameterValues) -> Mapping[str, Any]:
-    """The settings in parameters as read; a value for which there are no words in the manual is left out."""
+    """Return the settings in parameters, without undocumented values."""
     whole = {parameter: int(value) for parameter, value in values.items() if value in range(2_000_000)}
     found: dict[str, Any] = {}
     for name, parameter in (("baud", Parameter.BAUD), ("output_rate_hz", Parameter.AHRS_RATE)):
@@ -668,8 +664,7 @@ SETTINGS: Final = SettingsTable(
     restart=lambda target: restart(done=codes_of(target).result_done),
     check=_check,
 )
-"""What the device keeps; `output_rate_hz` and `baud` must go together.
+"""Settings of the device. `output_rate_hz` and `baud` depend on each other.
 
-Filters are two halves of one parameter, each written by itself. A baud rate is saved by its own script only where the
-device changes at its next start.
-"""
+The two filters are halves of one parameter; each has its own write. The script of the baud rate saves only if the
+device changes at its next start."""

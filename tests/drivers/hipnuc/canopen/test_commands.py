@@ -97,7 +97,7 @@ def test_settings_are_read_back_and_compared() -> None:
         command = 0x4B if data[0] == 0x40 else 0x60
         return Reply((ReplyFrame(0x588, bytes([command]) + data[1:4] + b"\7\0\0\0"),))
 
-    with pytest.raises(DeviceRefused, match=r"0x1800\.5 = 10, reads back 7"):
+    with pytest.raises(DeviceRefused, match=r"0x1800\.5 = 10 after the write, got 7"):
         run_script(session.set_tpdo_period(8, 1, 10), answer)
 
 
@@ -115,7 +115,7 @@ def test_which_frames_make_a_number_taken() -> None:
     bench = CanopenBench(NodeSettings(node=8), others=(12,))
     bench.others[0].objects.settings = NodeSettings(node=12, periods_ms=QUIET.periods_ms)
     bench.run(100_000_000)
-    with pytest.raises(BadArgument, match=r"frame 0x58C of it"):
+    with pytest.raises(BadArgument, match=r"its frame 0x58C"):
         bench.run_script(moves.change_node(bench.settings, 12))
     request = next(moves.change_node(HipnucCanopenOptions(node=8), 12))
     assert {wanted.can_id for wanted in request.also} == {

@@ -125,6 +125,6 @@ def test_an_interval_that_the_bus_cannot_carry_says_what_it_costs() -> None:
 
     # 95 bits · 200 + (95 + 95 + 111 + 111) · 100 + 79 · 20 = 61,780 bit/s: 49.4 % of 125 kbit/s, of which TPDO1 15.2 %
     assert interval(125_000, 63_000.0) is Written.VERIFIED
-    with pytest.raises(BadArgument, match=r"got 101 % of that: TPDO1 every 5 ms 15.2 %, .*; other devices 51.2 %"):
+    with pytest.raises(BadArgument, match=r"got 101 % of it: TPDO1 every 5 ms 15.2 %, .*; other devices 51.2 %"):
         interval(125_000, 64_000.0)
     assert interval(0, 1e9) is Written.VERIFIED  # a virtual bus has no rate

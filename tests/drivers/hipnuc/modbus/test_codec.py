@@ -254,13 +254,13 @@ def test_identity_is_watched_and_settings_are_read() -> None:
     assert made.decode(1, first) == made.decode(1, first) == ()
     assert made.decode(1, EXCEPTION) == made.decode(1, first[:-1] + b"\x00") == made.decode(1, b"") == ()
     (event,) = made.decode(1, second)
-    assert event == Vanished("serial number 0202020202020202, was 0101010101010101: another module")
+    assert event == Vanished("another device: serial number 0202020202020202, was 0101010101010101")
     made.reset()
     assert made.decode(1, second) == ()
     assert made.ledger.closes()
     for name in (b"\x00" * 16, b"\xff" * 16, b"AB\x01" + b"\x00" * 13):
         reply = framed(3, registers_reply(name + bytes(24)))
-        with pytest.raises(DeviceRefused, match="name of a product"):
+        with pytest.raises(DeviceRefused, match="product name"):
             run_transfer_script(probe(HipnucModbusOptions()), lambda _, reply=reply: reply)  # type: ignore[misc]  # bound now
     asked: list[Transfer] = []
 

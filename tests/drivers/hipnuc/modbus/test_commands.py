@@ -76,7 +76,7 @@ def test_a_module_is_followed_to_another_address(bench: ModbusBench) -> None:
 
 
 def test_an_address_that_another_module_has_is_refused_before_anything_is_written(bench: ModbusBench) -> None:
-    with pytest.raises(BadArgument, match="address 12 is taken: the module with serial number A00000000000000C"):
+    with pytest.raises(BadArgument, match="address 12 is in use by the device with serial number A00000000000000C"):
         bench.run(change_address(7, 12))
     assert not any(request[0] == 6 for _, request in bench.sent)
     assert bench.at == 7
@@ -89,19 +89,19 @@ def test_an_address_that_another_module_has_is_refused_before_anything_is_writte
 
 def test_addresses_that_are_taken_not_accepted_or_lost() -> None:
     bench = ModbusBench(module(7), module(12, serial=0x0F), module(12, serial=0xF0))
-    with pytest.raises(BadArgument, match="address 12 is taken: something answers"):
+    with pytest.raises(BadArgument, match="address 12 is in use: got a reply"):
         bench.run(change_address(7, 12))
     bench = ModbusBench(module(7), module(12, mute=2))
-    with pytest.raises(BadArgument, match="taken"):
+    with pytest.raises(BadArgument, match="in use"):
         bench.run(change_address(7, 12))
     with pytest.raises(BadArgument, match=r"1 … 128, got 129"):
         ModbusBench().run(change_address(7, 129))
     bench = ModbusBench(module(7), module(80))
-    with pytest.raises(BadArgument, match="address 80 is taken"):
+    with pytest.raises(BadArgument, match="address 80 is in use"):
         bench.run(factory_reset((7,), BAUD))
     assert not any(request[0] == 6 for _, request in bench.sent)
     bench = ModbusBench(module(7, variant=SlaveVariant(ignores=frozenset({"MD_ID"}))))
-    with pytest.raises(DeviceRefused, match="wrote 9, the module has 7"):
+    with pytest.raises(DeviceRefused, match="expected 9 after the write, got 7"):
         bench.run(change_address(7, 9))
     bench = ModbusBench(module(7, variant=SlaveVariant(refuses=frozenset({"MD_ID"}))))
     with pytest.raises(DeviceRefused, match="the value is not allowed"):
@@ -125,13 +125,16 @@ def test_addresses_that_are_taken_not_accepted_or_lost() -> None:
 @pytest.mark.manual("B 4.3.1 restart")
 def test_a_rate_is_in_force_after_saving_and_restarting(bench: ModbusBench) -> None:
     if bench.slave.variant.rate_at_once:
-        with pytest.raises(NoReply, match="it has 9600 baud at once"):
+        with pytest.raises(NoReply, match="it now uses 9600 baud"):
             bench.run(set_baud(9600))
         return
     assert bench.run(set_baud(9600)) is Written.PENDING
     assert bench.slave.baud == BAUD
     bench.run(save())
-    assert restarted(bench) == "restarted; it has 9600 baud now, which this line has not"
+    assert (
+        restarted(bench)
+        == "restarted; the device now uses 9600 baud and the RS-485 bus does not; set the bus to 9600 baud"
+    )
     assert bench.slave.baud == 9600
 
 
@@ -156,7 +159,7 @@ def test_mounting_level_and_factory_settings(bench: ModbusBench) -> None:
 
 def test_modules_that_do_not_answer_as_expected() -> None:
     bench = ModbusBench(module(7, variant=SlaveVariant(ignores=frozenset({"HEADING_MODE"}))))
-    with pytest.raises(DeviceRefused, match="wrote 1, the module has 0"):
+    with pytest.raises(DeviceRefused, match="expected 1 after the write, got 0"):
         bench.run(set_heading_mode(NINE))
 
     def answer(transfer: Transfer) -> bytes:
@@ -166,7 +169,7 @@ def test_modules_that_do_not_answer_as_expected() -> None:
     assert run_transfer_script(set_heading_mode(NINE), answer) is Written.UNVERIFIED
 
     bench = ModbusBench(module(7, variant=SlaveVariant(boot_ms=60_000)))
-    with pytest.raises(NoReply, match="does not answer at address 7 after its restart"):
+    with pytest.raises(NoReply, match="does not reply at address 7 after its restart"):
         restarted(bench)
 
     made = module(7)

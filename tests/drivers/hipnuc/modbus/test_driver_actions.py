@@ -43,7 +43,7 @@ def test_what_is_sent(name: str, given: dict[str, object], sent: str) -> None:
 
 def test_actions_without_an_address_and_reading_by_name() -> None:
     action = DRIVER.actions["address"]
-    with pytest.raises(BadArgument, match="expected the address of the module"):
+    with pytest.raises(BadArgument, match="expected a device on an RS-485 bus with a known address"):
         action.script(Target(HipnucModbusOptions(), 0), action.arguments({"address": 9}))
     bench = ModbusBench(module(7))
     assert act(bench, "read", register="MD_ID") == (7,)

@@ -88,12 +88,12 @@ def test_requests_to_all() -> None:
         (good[:-1], "damaged"),
         (good[:-1] + b"\x00", "damaged"),
         (framed(7, b"\x04\x04\x00\x01\xff\xfe"), "function 0x03"),
-        (framed(7, b"\x03\x05\x00\x01\xff\xfe"), "the reply says 5"),
+        (framed(7, b"\x03\x05\x00\x01\xff\xfe"), "got a reply of 5"),
         (b"", "damaged"),
     ):
         with pytest.raises(DeviceRefused, match=why):
             registers_of(reply, 2)
-    with pytest.raises(DeviceRefused, match="to be confirmed"):
+    with pytest.raises(DeviceRefused, match="expected the confirmation"):
         check_written(framed(7, write_register(6, 0).sends[0]), write)
 
 

@@ -76,7 +76,7 @@ REFUSED: list[tuple[Callable[[], object], str]] = [
     (lambda: c.mounting(((2, 0, 0), (0, 1, 0), (0, 0, 1))), "orthonormal"),
     (lambda: c.mounting(((1, 0.01, 0), (0, 1, 0), (0, 0, 1))), "orthonormal"),
     (lambda: c.mounting(((math.nan, 0, 0), (0, 1, 0), (0, 0, 1))), "orthonormal"),
-    (lambda: c.mounting(two_rows), "three rows"),
+    (lambda: c.mounting(two_rows), "3 x 3"),
     (lambda: c.alarm(c.AlarmAxis.X, 5, -5, True), "minimum below the maximum"),
     (lambda: c.alarm(c.AlarmAxis.X, 5, 5, True), "minimum below the maximum"),
     (lambda: c.require_room({H91: 200}, 115200), "at most 100 Hz at 115200 baud, got 200 Hz"),

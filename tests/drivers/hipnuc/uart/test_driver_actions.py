@@ -120,10 +120,10 @@ def test_bad_arguments_send_nothing(name: str, arguments: dict[str, Any], messag
 def test_refusal_silence_output_and_restart() -> None:
     with pytest.raises(Rejected, match="ERR 3"):
         sent("save", [Rejection(("ERR 3",))])
-    with pytest.raises(NoReply, match="SAVECONFIG: expected OK, got nothing"):
+    with pytest.raises(NoReply, match="SAVECONFIG: expected OK, got no reply"):
         sent("save", [Silence(())])
     left: list[Outcome] = [OK, OK, *([Silence(())] * 7)]
-    with pytest.raises(NoReply, match="expected an answer at 115200 or 921600 baud"):
+    with pytest.raises(NoReply, match="expected a reply at 115200 or 921600 baud"):
         sent("baud", left, baud=921600)
 
     requests, _ = sent("output", [Reply(("LOG HI92 ONTIME 0.1", "OK")), OK], message="HI91", rate_hz=100)

@@ -49,7 +49,7 @@ def test_commands(kind: str, begun: list[str], saved: list[str]) -> None:
     [
         (("MB=14.14, -2.08, -8.75", "OK"), Verdict(True, "bias 14.14, -2.08, -8.75 µT")),
         (("MB=0.00, 0.00, 0.00", "OK"), Verdict(False, "bias 0, 0, 0 µT")),
-        (("MC=1", "OK"), Verdict(False, "it does not tell its bias")),
+        (("MC=1", "OK"), Verdict(False, "the device does not report its bias")),
     ],
 )
 @pytest.mark.manual("B 8.1.1 result")
@@ -62,9 +62,9 @@ def test_verdict_of_the_magnetometer(lines: tuple[str, ...], verdict: Verdict) -
 def test_no_magnetometer() -> None:
     ask = CALIBRATIONS["magnetometer"].verdict
     assert ask is not None
-    with pytest.raises(NoReply, match="has the module a magnetometer"):
+    with pytest.raises(NoReply, match="does the device have a magnetometer"):
         sent(ask(TARGET), Silence(()))
-    with pytest.raises(Rejected, match="LOG MAGCONFIG: the module refused: ERR"):
+    with pytest.raises(Rejected, match="LOG MAGCONFIG: the device rejected the request: ERR"):
         sent(ask(TARGET), Rejection(("ERR",)))
 
 

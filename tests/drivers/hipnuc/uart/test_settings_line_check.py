@@ -23,21 +23,25 @@ MARKED = Output(on_mark=True)
     ("lines", "settings", "found"),
     [
         (SOUT, ModuleSettings(), {}),
-        (SOUT, ModuleSettings(pins=(1, 2, 2, 6, 9)), {"sout": "the module has sout and led on IO2: set one with pin"}),
+        (SOUT, ModuleSettings(pins=(1, 2, 2, 6, 9)), {"sout": "the device has sout and led on IO2: move one"}),
         (DIVIDED, ModuleSettings(sout_div=4), {}),
         (
             DIVIDED,
             ModuleSettings(),
-            {"sout_div": "divisor is 4 in the configuration, and the module divides SOUT by 8"},
+            {"sout_div": "expected divisor 4 from the configuration, got 8 from the device"},
         ),
         (SIN, ModuleSettings(baud=921600, hi91=MARKED), {}),
-        (SIN, ModuleSettings(), {"sin": "no message of the module is on mark"}),
-        (SIN, ModuleSettings(hi91=MARKED), {"sin": "200 triggers a second, and 115200 baud carry 100 Hz of HI91"}),
-        (SIN, ModuleSettings(hi91=Output(), hi92=MARKED), {"sin": "HI92 on mark has no time of its own"}),
+        (SIN, ModuleSettings(), {"sin": "no message of the device is on mark"}),
+        (
+            SIN,
+            ModuleSettings(hi91=MARKED),
+            {"sin": "expected triggers of at most 100 Hz for HI91 at 115200 baud, got 200 Hz"},
+        ),
+        (SIN, ModuleSettings(hi91=Output(), hi92=MARKED), {"sin": "HI92 on mark has no device time"}),
         (PPS, ModuleSettings(), {}),
         (PPS, ModuleSettings(hi91=MARKED), {"pps": "HI91 on mark: each pulse per second makes a sample"}),
         (ALARM, ModuleSettings(alarm_y=AlarmSetting(-5, 5, True)), {}),
-        (ALARM, ModuleSettings(), {"alarm": "the module watches no angle"}),
+        (ALARM, ModuleSettings(), {"alarm": "the device watches no angle"}),
     ],
 )
 def test_what_the_module_contradicts_is_found(
@@ -57,11 +61,11 @@ def test_what_the_module_does_not_tell_is_not_compared(lines: DeviceLines) -> No
 @pytest.mark.parametrize(
     ("lines", "declared", "found"),
     [
-        (SIN, {"output": {"hi91": 0, "hi92": "on_mark"}}, {"sin": "HI92 on mark has no time of its own"}),
-        (SIN, {"output": {"hi91": 100, "hi92": 0}}, {"sin": "no message of the module is on mark"}),
+        (SIN, {"output": {"hi91": 0, "hi92": "on_mark"}}, {"sin": "HI92 on mark has no device time"}),
+        (SIN, {"output": {"hi91": 100, "hi92": 0}}, {"sin": "no message of the device is on mark"}),
         (SIN, {"output": {"hi91": "on_mark", "hi92": 0}}, {}),
         (SIN, {"output": {"hi92": "on_mark"}}, {}),  # the module may have HI91 on mark
-        (DIVIDED, {"sout_divisor": 8}, {"sout_div": "divisor is 4 in the configuration"}),
+        (DIVIDED, {"sout_divisor": 8}, {"sout_div": "expected divisor 4 from the configuration"}),
         (SOUT, {"pins": {"sout": 2, "led": 2}}, {"sout": "sout and led on IO2"}),
         (ALARM, {"alarm": {"x": {"min_deg": -5, "max_deg": 5, "enabled": False}}}, {}),  # Y may be watched
     ],
@@ -80,7 +84,7 @@ def test_check_refuses_a_line_that_declared_settings_contradict() -> None:
         "devices:\n  bow:\n    driver: hipnuc-uart\n    uart: {port: /dev/ttyUSB0, baud: 921600}\n"
         "    lines: {sin: {line: GPIO1, rate_hz: 10}}\n    settings: {output: {hi91: 0, hi92: on_mark}}\n"
     )
-    with pytest.raises(ConfigError, match=r"f:5:\d+: devices\.bow\.lines\.sin: .*HI92 on mark has no time of its own"):
+    with pytest.raises(ConfigError, match=r"f:5:\d+: devices\.bow\.lines\.sin: .*HI92 on mark has no device time"):
         config.parse(text, "f", TABLES)
 
 
@@ -90,9 +94,14 @@ def test_check_refuses_a_line_that_declared_settings_contradict() -> None:
         ({}, DeviceLines(), True, []),
         ({"output": {"hi91": 100, "hi92": 0}}, DeviceLines(), True, []),
         ({"output": {"hi92": 100}}, DeviceLines(), False, []),
-        ({"output": {"hi92": 100}}, DeviceLines(), True, ["HI92 never shows UTC"]),
-        ({"output": {"hi92": 100}}, DeviceLines(pps=PpsOptions(line="GPIO1")), False, ["HI92 never shows UTC"]),
-        ({"output": {"hi91": 50, "hi92": 50}}, DeviceLines(), False, ["HI92 beside HI91 is dated by its arrival"]),
+        ({"output": {"hi92": 100}}, DeviceLines(), True, ["HI92 has no UTC"]),
+        ({"output": {"hi92": 100}}, DeviceLines(pps=PpsOptions(line="GPIO1")), False, ["HI92 has no UTC"]),
+        (
+            {"output": {"hi91": 50, "hi92": 50}},
+            DeviceLines(),
+            False,
+            ["HI92 next to HI91 is time-stamped by its arrival"],
+        ),
     ],
 )
 def test_what_hi92_cannot_do_is_said(

@@ -20,7 +20,7 @@ def _baud() -> RequestScript[float]:
 def test_contact_leaves_the_mode_as_it_was(variant: str) -> None:
     for mode in OutputMode:
         far = variant_bench(variant, Imu61xSettings(mode=mode))
-        assert far.run(contact.in_contact(_baud)) == 115200
+        assert far.run(contact.in_command_mode(_baud)) == 115200
         far.samples(800)
         assert bool(far.samples(1000)) is (mode is OutputMode.STREAM)
 
@@ -28,7 +28,7 @@ def test_contact_leaves_the_mode_as_it_was(variant: str) -> None:
 def test_every_request_in_command_mode_can_be_undone() -> None:
     """A script that is cancelled anywhere after CMD 3 leaves the bytes that make the device stream."""
     far = imu61x_bench(answers_while_streaming=False)
-    script = contact.in_contact(_baud)
+    script = contact.in_command_mode(_baud)
     request = next(script)
     undone = []
     with pytest.raises(StopIteration):  # noqa: PT012  # driven by hand
@@ -55,7 +55,7 @@ def test_a_device_that_never_answers_again_is_no_reply() -> None:
     script = contact.settled()
     request = next(script)
     asked = 1
-    with pytest.raises(NoReply, match="status: expected a reply, got nothing"):  # noqa: PT012  # driven by hand
+    with pytest.raises(NoReply, match="status: expected a reply, got none"):  # noqa: PT012  # driven by hand
         while True:
             request = script.send(Silence(()))
             asked += 1

@@ -40,7 +40,7 @@ def test_every_action(variant: str, name: str) -> None:
     far = variant_bench(variant, uptime_us=20_000_000)
     options = Imu61xUartOptions(result_done=done(variant))
     if variant == "no K1" and name in WITHOUT_K1 and name != "installation_status":
-        with pytest.raises(CommandError, match="whether it is done is not known"):
+        with pytest.raises(CommandError, match="it is not known whether the device executed the command"):
             act(far, name, options, **ARGUMENTS.get(name, {}))
     else:
         act(far, name, options, **ARGUMENTS.get(name, {}))
@@ -109,8 +109,8 @@ def test_parameters_are_set_and_stay() -> None:
     assert act(far, "filter", accel_filter=3, gyro_filter="15 Hz") == {"accel_filter": "5 Hz", "gyro_filter": "15 Hz"}
     address, bus = act(far, "i2c_address", address=0x19), act(far, "bus", bus="i2c")
     assert address["i2c_address"] == "0x19"
-    assert "`i2c.address` must be the new one" in address["configuration"]
-    assert "a host on the bus that was selected before loses the device" in bus["configuration"]
+    assert "change `i2c.address`" in address["configuration"]
+    assert "a host on the previously selected bus loses the device" in bus["configuration"]
     act(far, "save")
     far.restart()
     settings = far.module.settings
@@ -119,7 +119,7 @@ def test_parameters_are_set_and_stay() -> None:
 
 def test_a_rate_that_the_line_does_not_carry_is_refused_before_anything_is_sent() -> None:
     far = imu61x_bench()
-    words = "rate_hz: expected at most 200 Hz at 115200 baud, got 400 Hz, .* 400 Hz need 230400 baud; set that first"
+    words = "rate_hz: expected at most 200 Hz at 115200 baud, got 400 Hz .* 400 Hz need 230400 baud; first change"
     with pytest.raises(BadArgument, match=words):
         act(far, "rate", rate_hz=400)
     assert far.asked == []
@@ -131,7 +131,7 @@ def test_a_rate_that_the_line_does_not_carry_is_refused_before_anything_is_sent(
     assert len(far.samples(100)) >= 35
     assert "10 = 40 Hz, 11 = 47 Hz, 12 = average 4" in ACTIONS["filter"].help
     for name, words in (
-        ("stop_streaming", "cuts off"),
+        ("stop_streaming", "no program receives samples"),
         ("baud", "`uart.baud`"),
         ("factory_reset", "`uart.baud`"),
         ("i2c_address", "`i2c.address`"),

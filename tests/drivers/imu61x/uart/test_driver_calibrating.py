@@ -56,7 +56,7 @@ def test_installation_calibration_ends_with_the_angles(variant: str) -> None:
 def test_without_an_acknowledgement_it_is_not_known_whether_it_began(
     script: Callable[[], RequestScript[object]],
 ) -> None:
-    with pytest.raises(NoReply, match="though the device answers: whether it is done is not known"):
+    with pytest.raises(NoReply, match="got none from a device that replies: it is not known whether"):
         imu61x_bench(acknowledges=False).run(script())
     refuses = frozenset({Command.CALIBRATE_GYRO, Command.CALIBRATE_INSTALLATION})
     with pytest.raises(Rejected, match=r"calibration: expected result 0 \(done\), got 2"):
@@ -68,7 +68,9 @@ def test_results_and_codes_of_calibrations() -> None:
     with pytest.raises(Rejected, match=r"gyro calibration: expected result 0 \(done\), got 2"):
         far.run(calibrating.calibrate_gyro())
 
-    with pytest.raises(Rejected, match=r"expected result 0 .*got 1: it refused, or `options.result_done`"):
+    with pytest.raises(
+        Rejected, match=r"expected result 0 .*got 1: the device rejected the command or `options.result_done`"
+    ):
         imu61x_bench(result_done=1).run(calibrating.calibrate_gyro())
 
     far = imu61x_bench(noise=Noise(3))

@@ -82,7 +82,7 @@ def test_what_is_saved_is_there_after_a_restart(variant: str) -> None:
     assert SETTINGS.restart is not None
     write(far, "gyro_filter", "5 Hz", variant)
     if variant == "no K1":
-        with pytest.raises(NoReply, match="whether it is done is not known"):
+        with pytest.raises(NoReply, match="it is not known whether the device executed the command"):
             far.run(SETTINGS.save(target(far, variant)))
     else:
         far.run(SETTINGS.save(target(far, variant)))

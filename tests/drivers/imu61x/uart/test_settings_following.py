@@ -32,7 +32,7 @@ def test_a_restart_that_did_not_happen_is_an_error(variant: str) -> None:
     far = variant_bench(variant, uptime_us=20_000_000)
     behaviour = replace(far.module.hardware.behaviour, ignores=frozenset({Command.RESTART}))
     far = imu61x_bench(behaviour=behaviour, uptime_us=20_000_000)
-    with pytest.raises(Rejected, match=r"expected a timer that begins again, got 2\d\.\d s before and 2\d\.\d s after"):
+    with pytest.raises(Rejected, match=r"expected a restarted timer, got 2\d\.\d s before and 2\d\.\d s after"):
         far.run(following.restart(done=done(variant)))
 
 
@@ -56,7 +56,7 @@ def test_a_young_timer_and_one_that_turns_over_soon_are_waited_for(uptime_us: in
     assert far.run(following.restart()).product == "IMU61x"
     assert far.now_ns - begun_ns < 60e9
     still = imu61x_bench(uptime_us=uptime_us, ignores=frozenset({Command.RESTART}))
-    with pytest.raises(Rejected, match="timer that begins again"):
+    with pytest.raises(Rejected, match="restarted timer"):
         still.run(following.restart())
 
 
@@ -89,9 +89,7 @@ def test_a_baud_rate_that_does_not_carry_the_output_rate_is_refused(baud: int) -
     """400 Hz of 54 bytes of 10 bits are 216000 bit/s: 230400 carries them, 115200 does not."""
     far = imu61x_bench(Imu61xSettings(baud=921600, rate_hz=400))
     if baud == 115200:
-        words = (
-            "baud: expected at most 200 Hz at 115200 baud, got 400 Hz, .* 216000 bit/s .*; lower the output rate first"
-        )
+        words = "baud: expected at most 200 Hz at 115200 baud, got 400 Hz .216000 bit/s.*; lower the output rate first"
         with pytest.raises(BadArgument, match=words):
             far.run(following.change_baud(baud, 921600))
         assert (far.baud, far.module.baud, far.module.flash.baud) == (921600, 921600, 921600)
@@ -103,7 +101,7 @@ def test_a_baud_rate_that_does_not_carry_the_output_rate_is_refused(baud: int) -
 def test_rates_that_are_refused_not_saved_or_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """The lost device takes a third rate, by some fault of its own: power off and on brings it back."""
     far = imu61x_bench(refuses=frozenset({Command.SET_PARAMETER}))
-    with pytest.raises(Rejected, match="stays at 115200 baud"):
+    with pytest.raises(Rejected, match="keeps 115200 baud"):
         far.run(following.change_baud(921600, 115200))
     assert far.baud == 115200
     assert far.streams()
@@ -117,7 +115,7 @@ def test_rates_that_are_refused_not_saved_or_lost(monkeypatch: pytest.MonkeyPatc
     far = imu61x_bench()
     wrong = lambda settings, index, value: replace(settings, baud=1500000)  # noqa: E731
     monkeypatch.setattr("imud.sim.imu61x.uart.changed", wrong)
-    with pytest.raises(NoReply, match="switch its power off and on: nothing was saved"):
+    with pytest.raises(NoReply, match="nothing was saved: switch the device off and on"):
         far.run(following.change_baud(460800, 115200))
     assert far.baud == 115200
     far.restart()
@@ -156,14 +154,14 @@ def test_factory_reset_is_read_back_and_the_line_follows(variant: str, present: 
 
 def test_factory_resets_that_are_refused_or_act_at_the_next_start(monkeypatch: pytest.MonkeyPatch) -> None:
     far = imu61x_bench(Imu61xSettings(rate_hz=50), refuses=frozenset({Command.FACTORY_RESET}))
-    words = r"expected AHRS_RATE 100, read back AHRS_RATE 50; acknowledgement 2 \(0 is done\)"
+    words = r"expected AHRS_RATE 100, got AHRS_RATE 50; acknowledgement 2 \(0 is done\)"
     with pytest.raises(Rejected, match=words):
         far.run(following.factory_reset(115200))
     assert "restart" not in far.asked
     assert far.streams()
 
     far = imu61x_bench(Imu61xSettings(filter_control=0x44), ignores=frozenset({Command.FACTORY_RESET}))
-    with pytest.raises(Rejected, match="expected FILTER 187, read back FILTER 68; acknowledgement none"):
+    with pytest.raises(Rejected, match="expected FILTER 187, got FILTER 68; acknowledgement none"):
         far.run(following.factory_reset(115200))
 
     far = imu61x_bench(Imu61xSettings(rate_hz=50), reset_acts_at_start=True)

@@ -138,12 +138,12 @@ def test_refusals_and_silence_are_errors() -> None:
     far = imu61x_bench(QUIET, refuses=frozenset({Command.AHRS}))
     with pytest.raises(Rejected, match="AHRS once: expected a sample, got an acknowledgement with result 2"):
         far.run(session.sample_once())
-    with pytest.raises(NoReply, match="AHRS once: expected a sample, got nothing"):
+    with pytest.raises(NoReply, match="AHRS once: expected a sample, got none"):
         imu61x_bench(QUIET, ignores=frozenset({Command.AHRS})).run(session.sample_once())
 
     far = imu61x_bench()
     far.connected = False
-    with pytest.raises(NoReply, match="status: expected a reply, got nothing; is the host's transmit line connected"):
+    with pytest.raises(NoReply, match="status: expected a reply, got none; check the transmit wire of the host"):
         far.run(session.identify())
     assert far.streams()
 
@@ -159,7 +159,7 @@ def test_refusals_and_silence_are_errors() -> None:
         silent.run(session.start_streaming())
 
     far = imu61x_bench(refuses=frozenset({Command.SET_PARAMETER}))
-    words = "set parameter AHRS_RATE to 200: reads back as 100, acknowledged with result 2"
+    words = "set parameter AHRS_RATE to 200: expected 200 after the write, got 100, acknowledged with result 2"
     with pytest.raises(Rejected, match=words):
         far.run(session.write_parameter(Parameter.AHRS_RATE, 200))
 
@@ -188,7 +188,9 @@ ORDERS: dict[Command, Callable[[], RequestScript[object]]] = {
 @pytest.mark.manual("A 1.7 K1")
 def test_a_refusal_is_an_error_that_names_the_option(command: Command) -> None:
     far = imu61x_bench(refuses=frozenset({command}))
-    with pytest.raises(Rejected, match=r"expected result 0 \(done\), got 2: it refused, or `options.result_done`"):
+    with pytest.raises(
+        Rejected, match=r"expected result 0 \(done\), got 2: the device rejected the command or `options.result_done`"
+    ):
         far.run(ORDERS[command]())
     assert far.streams()
 
@@ -196,7 +198,7 @@ def test_a_refusal_is_an_error_that_names_the_option(command: Command) -> None:
 @pytest.mark.parametrize("command", [Command.SAVE, Command.HEADING])
 def test_an_order_without_an_acknowledgement_is_not_known_to_be_done(command: Command) -> None:
     far = imu61x_bench(acknowledges=False)
-    with pytest.raises(NoReply, match="though the device answers: whether it is done is not known"):
+    with pytest.raises(NoReply, match="got none from a device that replies: it is not known whether"):
         far.run(ORDERS[command]())
 
 
