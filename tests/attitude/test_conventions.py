@@ -1,4 +1,4 @@
-"""Axes of conventions and of devices against drawings: where front, left and up are."""
+"""Axes of conventions and devices, compared with drawings: directions of front, left and up."""
 
 import pytest
 
@@ -29,7 +29,7 @@ def test_navigation_axes() -> None:
     east, north, up = 1.0, 2.0, 3.0
     assert matrix_times(navigation_axes(Convention.ENU_FLU, True), (east, north, up)) == (east, north, up)
     assert matrix_times(navigation_axes(Convention.NED_FRD, True), (east, north, up)) == (north, east, -up)
-    # without a north the x axis stays where it is
+    # without north, the x axis stays unchanged
     assert matrix_times(navigation_axes(Convention.ENU_FLU, False), (1, 2, 3)) == (1, 2, 3)
     assert matrix_times(navigation_axes(Convention.NED_FRD, False), (1, 2, 3)) == (1, -2, -3)
     assert is_rotation(ENU_TO_NED)
@@ -44,7 +44,7 @@ def test_navigation_axes() -> None:
         (DeviceAxes(order=EulerOrder.ZXY, z_down=True), (0, 1, 0), (1, 0, 0), (0, 0, -1)),  # left, front, down
     ],
 )
-def test_where_front_left_and_up_are_in_the_axes_of_a_device(
+def test_front_left_and_up_in_the_axes_of_a_device(
     axes: DeviceAxes, front: Vector3, left: Vector3, up: Vector3
 ) -> None:
     assert [matrix_times(axes.to_body, v) for v in (front, left, up)] == list(FRONT_LEFT_UP)
@@ -52,7 +52,7 @@ def test_where_front_left_and_up_are_in_the_axes_of_a_device(
 
 
 def test_a_frame_with_z_down_keeps_the_direction_that_yaw_is_counted_from() -> None:
-    """With ZYX the x axis of the sensor lies along x of the frame at yaw 0, with ZXY its y axis along y."""
+    """At yaw 0, the x axis (ZYX) or the y axis (ZXY) of the sensor is parallel to the same axis of the frame."""
     assert matrix_times(DeviceAxes(order=EulerOrder.ZYX, z_down=True).to_z_up, (1, 2, 3)) == (1, -2, -3)
     assert matrix_times(DeviceAxes(order=EulerOrder.ZXY, z_down=True).to_z_up, (1, 2, 3)) == (-1, 2, -3)
     assert matrix_times(RFU_ENU.to_z_up, (1, 2, 3)) == (1, 2, 3)
@@ -72,7 +72,7 @@ def test_words() -> None:
 
 
 @pytest.mark.parametrize("name", DRIVERS)
-def test_the_axes_of_a_driver_are_those_of_its_words(name: str) -> None:
+def test_the_axes_of_a_driver_match_its_description(name: str) -> None:
     driver = DRIVERS[name]
     assert (driver.axes.order is EulerOrder.ZXY) == ("312" in driver.euler_convention)
     assert (driver.axes.order is EulerOrder.ZYX) == ("ZYX" in driver.euler_convention)

@@ -1,4 +1,4 @@
-"""The check of gravity at rest: silent for right conventions and in motion, a cause for each mistake."""
+"""Gravity check at rest: no finding for correct conventions and in motion, a cause for each error."""
 
 import csv
 from collections.abc import Callable, Iterator
@@ -27,13 +27,13 @@ from tests.support.files import SHARED
 G = 9.80665
 TICK_NS = NS_PER_S // 10
 LEANING = ((30, 0), (0, 30), (25, -35))
-"""Roll and pitch."""
+"""Roll and pitch, degrees."""
 OBLIQUE = (0.5 * G, 0.6 * G, (1 - 0.25 - 0.36) ** 0.5 * G)
 FRD = DeviceAxes(order=EulerOrder.ZYX, has_north=False, z_down=True)
 
 
 def zyx(roll_deg: float, pitch_deg: float, yaw_deg: float = 40.0, z_down: bool = False) -> Sample:
-    """A sample at rest of a device with ZYX whose attitude is true."""
+    """Return a sample at rest of a device with ZYX and correct attitude."""
     euler = (radians(roll_deg), radians(pitch_deg), radians(yaw_deg))
     quat = quat_from_euler_zyx(euler)
     x, y, z = matrix_times(transposed(matrix_from_quat(quat)), (0, 0, -G if z_down else G))
@@ -43,7 +43,7 @@ def zyx(roll_deg: float, pitch_deg: float, yaw_deg: float = 40.0, z_down: bool =
 
 
 def zxy(roll_deg: float, pitch_deg: float, yaw_deg: float = 40.0) -> Sample:
-    """A sample at rest of a device with ZXY (312) whose attitude is true."""
+    """Return a sample at rest of a device with ZXY (312) and correct attitude."""
     euler = (radians(roll_deg), radians(pitch_deg), radians(yaw_deg))
     quat = quat_from_euler312(euler)
     accel = matrix_times(transposed(matrix_from_quat(quat)), (0, 0, G))
@@ -51,13 +51,13 @@ def zxy(roll_deg: float, pitch_deg: float, yaw_deg: float = 40.0) -> Sample:
 
 
 def ticks(sample: Sample, seconds: float = 5.2, start: int = 1) -> Iterator[Sample]:
-    """The same values ten times a second."""
+    """Yield the same values ten times per second."""
     for number in range(start, start + int(seconds * 10)):
         yield replace(sample, seq=number, t_ns=number * TICK_NS)
 
 
 def found(device: DeviceAxes, sample: Sample, mounting: Matrix3 | None = None) -> Finding | None:
-    """What a window of rest finds; one window is judged in it."""
+    """Return the finding of one window at rest."""
     check = GravityCheck(device, mounting)
     assert sum(check.add(one) for one in ticks(sample)) == 1
     return check.finding
@@ -66,7 +66,7 @@ def found(device: DeviceAxes, sample: Sample, mounting: Matrix3 | None = None) -
 def contradiction(
     device: DeviceAxes, sample: Sample, kind: Contradiction, words: str, mounting: Matrix3 | None = None
 ) -> Finding:
-    """The finding of a window of rest, which must be of this kind and say these words."""
+    """Return the finding of one window at rest. Check its kind and its text."""
     finding = found(device, sample, mounting)
     assert finding is not None
     assert finding.kind is kind
@@ -75,7 +75,7 @@ def contradiction(
 
 
 @given(st.floats(-179, 179), st.floats(-89, 89), st.floats(-180, 180))
-def test_nothing_is_found_in_any_attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> None:
+def test_no_finding_in_any_attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> None:
     assert found(FLU_LEVEL, zyx(roll_deg, pitch_deg, yaw_deg)) is None
     assert found(FRD, zyx(roll_deg, pitch_deg, yaw_deg, z_down=True)) is None
     assert found(RFU_ENU, zxy(roll_deg, pitch_deg, yaw_deg)) is None
@@ -84,7 +84,7 @@ def test_nothing_is_found_in_any_attitude(roll_deg: float, pitch_deg: float, yaw
 @pytest.mark.parametrize("member", ["quat_wxyz", "euler_rad"])
 @pytest.mark.parametrize(("roll", "pitch"), [(0, 0), (25, 0), (10, -30), (170, 20)])
 def test_the_z_axis_points_down(member: str, roll: float, pitch: float) -> None:
-    """Seen from one of the two members; the other one is absent."""
+    """The sample contains only one of the two attitude members."""
     one = zyx(roll, pitch, z_down=True)
     one = replace(one, quat_wxyz=None) if member == "euler_rad" else replace(one, euler_rad=None)
     finding = contradiction(FLU_LEVEL, one, Contradiction.Z_AXIS, "set frame: {z_down: true}")
@@ -93,12 +93,12 @@ def test_the_z_axis_points_down(member: str, roll: float, pitch: float) -> None:
 
 
 def seen_as(said: Sample, true: Sample) -> Sample:
-    """A sample with the attitude of one and the acceleration of another."""
+    """Return a sample with the attitude of `said` and the acceleration of `true`."""
     return replace(said, accel_m_s2=true.accel_m_s2)
 
 
 def turned(sample: Sample, convert: Callable[[Vector3], Quaternion]) -> Sample:
-    """A sample whose quaternion is made of its angles in another order."""
+    """Return a sample with a quaternion from its angles in another order."""
     assert sample.euler_rad is not None
     return replace(sample, quat_wxyz=convert(sample.euler_rad))
 
@@ -115,7 +115,7 @@ ORDER, SIGN = Contradiction.ORDER, Contradiction.SIGN
             "at rest up is -z of the sensor by the acceleration and +z by quat_wxyz, 180° apart: the z axis points in "
             "the opposite direction; set frame: {z_down: true} (docs/frames.md)",
         ),
-        # a device with ZXY that is taken for one with ZYX, and the reverse
+        # a device with ZXY that is configured as ZYX, and the reverse
         *((FLU_LEVEL, turned(zxy(*at), quat_from_euler_zyx), ORDER, "{euler_order: zxy}") for at in LEANING),
         *((RFU_ENU, turned(zyx(*at), quat_from_euler312), ORDER, "{euler_order: zyx}") for at in LEANING),
         *(
@@ -125,7 +125,7 @@ ORDER, SIGN = Contradiction.ORDER, Contradiction.SIGN
         ),
         (FLU_LEVEL, seen_as(zyx(20, 60), zyx(60, 20)), ORDER, "roll and pitch are exchanged"),
         (FLU_LEVEL, replace(zyx(0, 0), accel_m_s2=OBLIQUE), Contradiction.ATTITUDE, "(+0.50, +0.60, +0.62)"),
-        # the quaternion agrees, the angles do not
+        # the quaternion is correct, the angles are wrong
         (FLU_LEVEL, replace(zyx(0, 0), euler_rad=(radians(30), 0.0, 0.0)), Contradiction.ATTITUDE, " by euler_rad, "),
     ],
 )  # fmt: skip
@@ -139,15 +139,15 @@ def test_a_contradiction_has_its_cause(device: DeviceAxes, sample: Sample, kind:
 @pytest.mark.parametrize(
     ("axes", "sample", "side"),
     [
-        (("x", "y", "z"), zyx(180, 0), "bottom"),  # mounted upside down, and the file says nothing of it
-        (("x", "-y", "-z"), zyx(0, 0), "bottom"),  # the file says so, and it is not
-        (("x", "-z", "y"), zyx(-90, 0), "bottom"),  # on the other side than the file says
+        (("x", "y", "z"), zyx(180, 0), "bottom"),  # upside down, and the configuration has no mounting
+        (("x", "-y", "-z"), zyx(0, 0), "bottom"),  # configured upside down, mounted upright
+        (("x", "-z", "y"), zyx(-90, 0), "bottom"),  # mounted on the other side than configured
         (("x", "y", "z"), zyx(90, 0), "left"),
         (("x", "y", "z"), zyx(0, -90), "front"),
-        (("-y", "x", "z"), zyx(0, 90), "right"),  # its x axis points down, and the body's left is that axis
+        (("-y", "x", "z"), zyx(0, 90), "right"),  # the x axis points down and is configured as left
     ],
 )
-def test_a_body_that_does_not_stand_level(axes: tuple[str, str, str], sample: Sample, side: str) -> None:
+def test_a_body_that_is_not_level(axes: tuple[str, str, str], sample: Sample, side: str) -> None:
     words = f"with frame the {side} of the body"
     finding = contradiction(FLU_LEVEL, sample, Contradiction.MOUNTING, words, matrix_from_axes(*axes))
     up = nearest_axis(sample.accel_m_s2 or (0, 0, 0))
@@ -163,11 +163,11 @@ def test_a_body_that_does_not_stand_level(axes: tuple[str, str, str], sample: Sa
     ],
 )  # fmt: skip
 def test_a_right_mounting(axes: tuple[str, str, str], sample: Sample) -> None:
-    """On a slope of 40° too."""
+    """Also on a slope of 40°."""
     assert found(FLU_LEVEL, sample, matrix_from_axes(*axes)) is None
 
 
-def test_a_mounting_between_two_axes_names_none() -> None:
+def test_a_mounting_between_two_axes_names_no_axis() -> None:
     tilted = replace(zyx(0, 0), accel_m_s2=(0, -0.6 * G, -0.8 * G), quat_wxyz=None, euler_rad=None)
     straight = matrix_from_axes("x", "y", "z")
     contradiction(FLU_LEVEL, tilted, Contradiction.MOUNTING, "up is the sensor's -z axis", straight)
@@ -200,7 +200,7 @@ def test_a_bias_of_gyroscope_and_accelerometer_is_rest() -> None:
     assert judged(biased) == 1
 
 
-def test_one_sample_in_motion_and_a_pause_begin_anew() -> None:
+def test_a_sample_in_motion_and_a_pause_restart_the_window() -> None:
     samples = list(ticks(WRONG, 9.9))
     samples[49] = replace(samples[49], gyro_rad_s=(1.0, 0, 0))
     assert judged(iter(samples)) == 0, "4.9 s before it and 5 s after it"
@@ -209,7 +209,7 @@ def test_one_sample_in_motion_and_a_pause_begin_anew() -> None:
 
 
 def test_the_same_sample_counts_once() -> None:
-    """Between two samples of a slow device the check is called several times."""
+    """The watch can call the check several times between two samples."""
     check = GravityCheck(FLU_LEVEL)
     assert not any(check.add(replace(WRONG, t_ns=number * NS_PER_S)) for number in range(20))
     slow = [replace(WRONG, seq=number, t_ns=number * NS_PER_S) for number in range(7)]
@@ -217,7 +217,7 @@ def test_the_same_sample_counts_once() -> None:
     assert WINDOW_NS // NS_PER_S >= SAMPLES_MIN
 
 
-def test_what_has_no_vectors_is_left_out() -> None:
+def test_samples_without_vectors_are_ignored() -> None:
     assert judged(replace(one, gyro_rad_s=None) for one in ticks(WRONG, 20)) == 0
     assert judged(replace(one, accel_m_s2=None) for one in ticks(WRONG, 20)) == 0
     assert found(FLU_LEVEL, replace(WRONG, quat_wxyz=None, euler_rad=None)) is None
@@ -237,21 +237,21 @@ def test_the_finding_ends_when_rest_shows_no_contradiction() -> None:
     assert check.finding is None
 
 
-def test_an_error_of_a_sensor_is_no_contradiction() -> None:
-    """15° of difference come from acceleration and from a filter that is not settled; 25° do not."""
+def test_a_sensor_error_is_not_a_contradiction() -> None:
+    """15° of difference come from acceleration and from an unsettled filter; 25° do not."""
     for angle_deg, is_found in ((15, False), (25, True)):
         tilt = radians(angle_deg)
         one = replace(zyx(0, 0), accel_m_s2=(G * sin(tilt), 0, G * cos(tilt)))
         assert (found(FLU_LEVEL, one) is not None) == is_found
 
 
-# --- a real module ----------------------------------------------------------------------------------------------------
+# --- recording of a device -------------------------------------------------------------------------------------------
 
 RECORDING = SHARED / "data" / "hi91-static-100hz.csv"
 
 
 def recorded() -> Iterator[Sample]:
-    """Ten samples a second of a recording of a HiPNUC module."""
+    """Yield ten samples per second of a recording of a HiPNUC device."""
     with RECORDING.open() as file:
         rows = list(csv.DictReader(file))
     for number, row in enumerate(rows[::10]):
@@ -269,7 +269,7 @@ def recorded() -> Iterator[Sample]:
 
 @pytest.mark.skipif(not RECORDING.exists(), reason=f"the recording {RECORDING} is not on this machine")
 def test_a_real_module_agrees_with_its_driver() -> None:
-    """It lies still, is moved by hand, and lies still again, each time for less than a window."""
+    """The device is at rest, then moved by hand, then at rest again, each time for less than a window."""
     samples = list(recorded())
     assert judged(iter(samples)) == 0
     for one in (samples[0], samples[-1]):

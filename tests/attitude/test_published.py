@@ -1,4 +1,4 @@
-"""Samples in body axes and in both conventions, against values computed by hand, and what no rotation may change."""
+"""Samples in body axes and in both conventions, compared with values computed by hand, and invariants of rotations."""
 
 from math import cos, hypot, isnan, nan, pi, radians, sin, sqrt
 
@@ -67,21 +67,21 @@ def degrees_of(euler: Vector3 | None) -> Vector3:
 
 
 def same_rotation(a: Quaternion | None, b: Quaternion) -> bool:
-    """Whether two quaternions are the same rotation: q and -q are."""
+    """Return whether two quaternions are the same rotation: q and -q are."""
     assert a is not None
     return abs(abs(sum(x * y for x, y in zip(a, b, strict=True))) - 1.0) < 1e-12
 
 
-# --- nothing to do ----------------------------------------------------------------------------------------------------
+# --- no rotation ------------------------------------------------------------------------------------------------------
 
 
-def test_without_frame_and_convention_nothing_is_turned() -> None:
+def test_without_frame_and_convention_samples_are_unchanged() -> None:
     assert frame(device=RFU_ENU).rotation is None
     assert as_sent(FLU_LEVEL).rotation is None
     assert frame(convention=NED).rotation_to(NED) is None
 
 
-def test_what_has_no_direction_stays() -> None:
+def test_values_without_a_direction_are_unchanged() -> None:
     after = turned(sample((1, 2, 3), (10, 20, 30)), frame(convention=NED))
     before = sample()
     for name in Sample.__struct_fields__:
@@ -90,10 +90,10 @@ def test_what_has_no_direction_stays() -> None:
     assert (after.gyro_rad_s, after.mag_t) == (None, None), "what is absent stays absent"
 
 
-# --- conventions, from a HiPNUC module: x right, y forward, z up; ENU; pitch about x, roll about y --------------------
+# --- conventions, from a HiPNUC device: x right, y forward, z up; ENU; pitch about x, roll about y --------------------
 
 LEVEL_NORTH = sample((0, 0, G), (0, 0, 0), (1, 0, 0, 0), gyro=(0.1, 0.2, 0.3), mag=(0, 30e-6, -20e-6))
-"""It turns to the front (x right, down at the front by 0.1 …), the field points north and down."""
+"""The device rotates to the front (x right, down at the front by 0.1 …). The field points north and down."""
 
 
 ENU_TURN, NED_TURN = (HALF, 0.0, 0.0, HALF), (1.0, 0.0, 0.0, 0.0)
@@ -119,7 +119,7 @@ def test_a_hipnuc_module_in_both_conventions(
 @pytest.mark.parametrize(("convention", "expected"), [(ENU, (10, -30, 0)), (NED, (10, 30, 90))])
 @pytest.mark.parametrize("members", ["euler", "quat", "both"])
 def test_bow_east_nose_up_right_side_down(convention: Convention, expected: Vector3, members: str) -> None:
-    """As a HiPNUC module says it: yaw -90° (east), pitch +30° (nose up), roll +10° (right side down)."""
+    """As a HiPNUC device sends it: yaw -90° (east), pitch +30° (nose up), roll +10° (right side down)."""
     euler = (radians(10), radians(30), radians(-90))
     quat = quat_from_euler312(euler)
     up = (-cos(radians(30)) * sin(radians(10)), sin(radians(30)), cos(radians(30)) * cos(radians(10)))
@@ -137,20 +137,22 @@ def test_bow_east_nose_up_right_side_down(convention: Convention, expected: Vect
 
 
 def test_an_imu61x_keeps_the_direction_of_its_power_on() -> None:
-    """It has no north: at its power-on yaw is 0 in both conventions; to the left is + in one, - in the other."""
+    """The device has no north: at power-on yaw is 0 in both conventions. Left is + in one convention and - in the
+    other.
+    """
     one = sample((0, 0, G), (10, 20, 30))
     assert degrees_of(turned(one, frame(convention=ENU)).euler_rad) == pytest.approx((10, 20, 30))
     assert degrees_of(turned(one, frame(convention=NED)).euler_rad) == pytest.approx((10, -20, -30))
 
 
-# --- mountings, of a sensor whose own axes are FLU --------------------------------------------------------------------
+# --- mountings of a sensor with FLU axes ------------------------------------------------------------------------------
 
 SIN30, COS30 = sin(radians(30)), cos(radians(30))
 TURNS = [
-    # name; the three ways; what the sensor says: accel, gyro, (roll, pitch, yaw); what the body does
+    # name; the three keys; values of the sensor: accel, gyro, (roll, pitch, yaw); motion of the body
     (
         "upside down", ("x", "-y", "-z"), (180, 0, 0), (0, 1, 0, 0),
-        # the body is level, its front at 20°, and it turns to the left
+        # the body is level, its front at 20°, and it rotates to the left
         (0, 0, -G), (0, 0, -0.5), (180, 0, 20), (0, 0, G), (0, 0, 0.5), (0, 0, 20),
     ),
     (
@@ -159,7 +161,7 @@ TURNS = [
     ),
     (
         "turned 90° to the left", ("-y", "x", "z"), (0, 0, 90), (HALF, 0, 0, HALF),
-        # the body's nose is 30° up and turns to the left about the vertical of the body, its front at 20°
+        # the nose of the body is 30° up, its front at 20°, and it rotates to the left about its vertical
         (0, -G * SIN30, G * COS30), (0, 0, 0.5), (-30, 0, 110), (G * SIN30, 0, G * COS30), (0, 0, 0.5), (0, -30, 20),
     ),
 ]  # fmt: skip
@@ -192,8 +194,8 @@ def test_a_mounting_is_taken_away(
     assert same_rotation(made.quat_wxyz, wanted)
 
 
-def test_a_module_in_any_mounting_shows_the_same_as_one_that_is_mounted_straight() -> None:
-    """A body with two modules of different axes and mountings: both show the attitude of the body."""
+def test_devices_in_different_mountings_report_the_same_attitude() -> None:
+    """A body with two devices of different axes and mountings: both report the attitude of the body."""
     attitude = quat_from_euler_zyx((0.2, -0.4, 2.0))
     matrix = matrix_from_quat(attitude)
     up = matrix[2]
@@ -213,7 +215,7 @@ def test_a_module_in_any_mounting_shows_the_same_as_one_that_is_mounted_straight
 
 @pytest.mark.parametrize("convention", [ENU, NED])
 def test_roll_and_pitch_that_were_read_level_are_taken_away(convention: Convention) -> None:
-    """What imud shows without the keys, written into them, becomes zero; the heading stays."""
+    """The published roll and pitch become zero if they are written into the keys. The heading does not change."""
     one = sample((0, 0, G), (2, -3, 40))
     shown = degrees_of(turned(one, frame(convention=convention)).euler_rad)
     settings = FrameOptions(level_roll_deg=shown[0], level_pitch_deg=shown[1])
@@ -225,13 +227,13 @@ def test_a_heading_offset_is_added_clockwise() -> None:
     settings = FrameOptions(heading_offset_deg=15)
     assert degrees_of(turned(one, frame(settings, NED)).euler_rad)[2] == pytest.approx(40 + 15)
     assert degrees_of(turned(one, frame(settings, ENU)).euler_rad)[2] == pytest.approx(-40 - 15)
-    # the sensor points 15° to the left of the front, so what it sees ahead is to the left of the front
+    # the sensor points 15° to the left of the front: its forward direction is left of the body's front
     mag = turned(one, frame(settings, ENU)).mag_t
     assert mag == pytest.approx((cos(radians(15)), sin(radians(15)), 0.0))
 
 
 def test_a_declination_turns_the_heading_and_nothing_else() -> None:
-    """Magnetic heading 90° where magnetic north is 5° east of true north: true heading 95°."""
+    """Magnetic heading 90°, magnetic north 5° east of true north: true heading 95°."""
     one = sample((1, 2, 3), (10, 20, -90), mag=(1, 2, 3))
     ned = turned(one, frame(None, NED, 5.0, RFU_ENU))
     assert degrees_of(ned.euler_rad) == pytest.approx((10, 20, 95))
@@ -242,7 +244,7 @@ def test_a_declination_turns_the_heading_and_nothing_else() -> None:
     assert (own.accel_m_s2, own.mag_t) == ((1, 2, 3), (1, 2, 3))
 
 
-def test_what_the_heading_counts_from() -> None:
+def test_the_reference_of_the_heading() -> None:
     true = frame(None, None, 5.0, RFU_ENU)
     assert true.heading(Heading.MAGNETIC) is Heading.TRUE
     assert true.heading(Heading.UNKNOWN) is Heading.TRUE, "the configuration says that it is magnetic"
@@ -250,34 +252,34 @@ def test_what_the_heading_counts_from() -> None:
     assert frame().heading(Heading.MAGNETIC) is Heading.MAGNETIC
 
 
-# --- what the device is -----------------------------------------------------------------------------------------------
+# --- axes of the device -----------------------------------------------------------------------------------------------
 
 
 UPSIDE_DOWN = MountingAxes(x="y", y="x", z="-z")
 Z_DOWN = sample((0.5, 0.25, -G), (10, 20, 30), gyro=(1, 2, 3))
-"""Sample of a device with the axes front, right, down and with the angles of an aircraft."""
+"""Sample of a device with axes front, right, down and with angles as in aviation."""
 
 
 @pytest.mark.parametrize(
     ("one", "published", "accel", "gyro", "euler"),
     [
-        # as the vendor's driver publishes them
+        # as published by the vendor's driver
         (Z_DOWN, frame(FrameOptions(z_down=True)), (0.5, -0.25, G), (1, -2, -3), (10, -20, -30)),
         (Z_DOWN, frame(FrameOptions(z_down=True), NED), (0.5, 0.25, -G), (1, 2, 3), (10, 20, 30)),
-        # turned 90° to the left in the body: its x axis points left, its y axis (right of that) to the front; the body
-        # is level, its front at 20° to the left. `axes` names axes of the device, z down
+        # rotated 90° to the left in the body: its x axis points left, its y axis (right of x) to the front. The body is
+        # level, its front at 20° to the left. `axes` names device axes, z down.
         (
             sample((0, 0, -G), (0, 0, -110), gyro=(1, 2, 3)), frame(FrameOptions(z_down=True, axes=UPSIDE_DOWN)),
             (0, 0, G), (2, 1, -3), (0, 0, 20),
         ),
-        # a HiPNUC module upside down: its y axis still points forward, its x axis to the left, its z axis down
+        # a HiPNUC device upside down: its y axis points forward, its x axis left, its z axis down
         (
             sample((0, 0, -G), (180, 0, 0), gyro=(0.1, 0.2, 0.3)),
             frame(FrameOptions(axes=UPSIDE_DOWN), NED, device=RFU_ENU), (0, 0, -G), (0.2, -0.1, 0.3), (0, 0, 0),
         ),
     ],
 )  # fmt: skip
-def test_a_device_whose_z_axis_points_down(
+def test_a_device_with_z_down(
     one: Sample, published: PublishedAxes, accel: Vector3, gyro: Vector3, euler: Vector3
 ) -> None:
     made = turned(one, published)
@@ -286,7 +288,7 @@ def test_a_device_whose_z_axis_points_down(
 
 
 def test_another_order_of_angles() -> None:
-    """The device says pitch 30° and means about its x axis, y forward: its quaternion is not used."""
+    """The device sends pitch 30° about its x axis, y forward. imud does not use its quaternion."""
     one = replace(sample((0, G * SIN30, G * COS30), (0, 30, 0)), quat_wxyz=quat_from_euler_zyx((0, radians(30), 0)))
     made = turned(one, frame(FrameOptions(euler_order=EulerOrder.ZXY)))
     assert made.accel_m_s2 == pytest.approx((G * SIN30, 0, G * COS30)), "its y axis is the front, nose up"
@@ -294,34 +296,34 @@ def test_another_order_of_angles() -> None:
     assert matrix_from_quat(made.quat_wxyz or (0, 0, 0, 0))[2] == pytest.approx((SIN30, 0, COS30))
 
 
-# --- angles in part ---------------------------------------------------------------------------------------------------
+# --- partial angles ---------------------------------------------------------------------------------------------------
 
 
 def known(euler: Vector3 | None) -> tuple[object, ...]:
-    """Angles in degrees, None for those that are NaN."""
+    """Return angles in degrees, None for NaN."""
     return tuple(None if isnan(one) else pytest.approx(one, abs=1e-9) for one in degrees_of(euler))
 
 
 @pytest.mark.parametrize(
     ("said", "settings", "expected"),
     [
-        ((nan, nan, -90), None, (None, None, 90)),  # a compass: its heading
+        ((nan, nan, -90), None, (None, None, 90)),  # a compass sends only the heading
         ((10, nan, nan), None, (10, None, None)),
         ((10, 30, nan), None, (10, 30, None)),
         ((10, 30, nan), FrameOptions(axes=MountingAxes(x="y", y="x", z="-z")), (-170, 30, None)),  # upside down
         ((nan, nan, -90), FrameOptions(axes=MountingAxes(x="-x", y="-y", z="z")), (None, None, 0)),  # back to front
-        ((nan, nan, -90), FrameOptions(axes=MountingAxes(x="y", y="x", z="-z")), None),  # its tilt decides
+        ((nan, nan, -90), FrameOptions(axes=MountingAxes(x="y", y="x", z="-z")), None),  # the tilt decides
         ((10, nan, nan), FrameOptions(axes=MountingAxes(x="-x", y="-y", z="z")), None),
     ],
 )  # fmt: skip
 def test_angles_in_part(said: Vector3, settings: FrameOptions | None, expected: tuple[float | None, ...]) -> None:
-    """From a module with x right, y forward; published in ned-frd."""
+    """Samples of a device with x right, y forward, published in ned-frd."""
     made = turned(sample(euler_deg=said), frame(settings, NED, device=RFU_ENU))
     assert made.quat_wxyz is None
     assert made.euler_rad is None if expected is None else known(made.euler_rad) == expected
 
 
-def test_a_quaternion_counts_more_than_the_angles_unless_it_has_no_direction() -> None:
+def test_the_quaternion_has_priority_unless_it_is_zero() -> None:
     made = turned(sample(euler_deg=(0, 0, 30), quat=(HALF, 0, 0, HALF)), frame(convention=ENU))
     assert degrees_of(made.euler_rad) == pytest.approx((0, 0, 90))
     made = turned(sample(euler_deg=(0, 0, 30), quat=(0, 0, 0, 0)), frame(convention=ENU))
@@ -336,7 +338,7 @@ def test_an_element_that_is_nan_stays_one_element_in_quarter_turns() -> None:
     assert isnan(made.gyro_rad_s[1])
 
 
-# --- what no rotation may change --------------------------------------------------------------------------------------
+# --- invariants -------------------------------------------------------------------------------------------------------
 
 VECTORS = st.tuples(*[st.floats(-50, 50)] * 3)
 QUATS = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: hypot(*q) > 0.1).map(quat_normalized)
@@ -360,7 +362,7 @@ FRAMES = st.builds(
 def test_lengths_and_the_direction_of_gravity_are_kept(
     published: PublishedAxes, accel: Vector3, gyro: Vector3, mag: Vector3, quat: Quaternion
 ) -> None:
-    """How far a vector is from the vertical, and two vectors from each other, is the same before and after."""
+    """Angles between vectors, and between a vector and the vertical, are equal before and after a rotation."""
     one = Sample("bow", 1, 1, 1, Sync.ARRIVAL, 1, 1, accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, quat_wxyz=quat)
     made = turned(one, published)
     assert made.quat_wxyz is not None
@@ -382,10 +384,10 @@ def _triple(a: Vector3, b: Vector3, c: Vector3) -> float:
 
 
 @given(st.none() | MOUNTINGS, DEVICES, VECTORS, QUATS)
-def test_what_a_client_asks_for_is_what_the_device_would_be_configured_to(
+def test_a_requested_convention_equals_a_configured_convention(
     settings: FrameOptions | None, device: DeviceAxes, accel: Vector3, quat: Quaternion
 ) -> None:
-    """Configured as one convention and asked for as the other, and back again. Levelling is read in one convention."""
+    """Publish in one convention and request the other, and back. Levelling angles refer to one convention."""
     if settings is not None:
         settings = replace(settings, level_pitch_deg=0.0)
     one = Sample("bow", 1, 1, 1, Sync.ARRIVAL, 1, 1, accel_m_s2=accel, quat_wxyz=quat)
@@ -436,10 +438,10 @@ def test_no_value_of_a_device_raises(
     assert made.quat_wxyz is None or made.euler_rad is not None, "a quaternion never without its angles"
 
 
-# --- words ------------------------------------------------------------------------------------------------------------
+# --- readable text ----------------------------------------------------------------------------------------------------
 
 
-def test_words_of_what_is_published() -> None:
+def test_description_of_published_samples() -> None:
     own = as_sent(RFU_ENU).words("312", "ENU")
     assert (own.frame, own.euler_convention, own.navigation_frame) == (RFU_ENU.words, "312", "ENU")
     down = frame(FrameOptions(), NED, device=RFU_ENU).words("312", "ENU")

@@ -1,4 +1,4 @@
-"""The rotation sensor → body of each way to give it, against values computed by hand."""
+"""Rotation sensor → body for each key, compared with values computed by hand."""
 
 from contextlib import suppress
 from itertools import product
@@ -22,7 +22,7 @@ HALF = sqrt(0.5)
 C30, S30 = cos(radians(30)), sin(radians(30))
 
 SENSOR: Vector3 = (1.0, 2.0, 3.0)
-"""A vector in the sensor's axes; where it lies in the body follows from a drawing of the mounting."""
+"""Vector in sensor axes. A drawing of the mounting gives its direction in the body."""
 MOUNTINGS = [
     # name, x y z by axes, roll pitch yaw in degrees, quaternion, the vector in the body
     ("as the body", ("x", "y", "z"), (0, 0, 0), (1, 0, 0, 0), (1, 2, 3)),
@@ -35,7 +35,7 @@ MOUNTINGS = [
     ("on its left side: its y axis points down", ("x", "z", "-y"), (-90, 0, 0), (HALF, -HALF, 0, 0), (1, 3, -2)),
     ("upright: its x axis points down", ("z", "y", "-x"), (0, 90, 0), (HALF, 0, HALF, 0), (3, 2, -1)),
     ("upright: its x axis points up", ("-z", "y", "x"), (0, -90, 0), (HALF, 0, -HALF, 0), (-3, 2, 1)),
-    # first 90° to the left about z, then 90° about the sensor's new x axis: that one points left, its y axis up
+    # first 90° to the left about z, then 90° about the new x axis of the sensor: x points left, y up
     ("on its side and turned", ("z", "x", "y"), (90, 0, 90), (0.5, 0.5, 0.5, 0.5), (3, 1, 2)),
 ]  # fmt: skip
 
@@ -50,15 +50,15 @@ def test_the_three_ways_agree_with_the_drawing(
     assert matrix_from_mounting_quat(quat) == by_axes
 
 
-def test_an_angle_that_is_no_quarter() -> None:
-    """30° to the left: the sensor's x axis points to the front and, by half its length, to the left."""
+def test_an_angle_of_30_degrees() -> None:
+    """30° to the left: the x axis of the sensor points to the front and, with half its length, to the left."""
     matrix = matrix_from_angles(0, 0, 30)
     assert matrix_times(matrix, (1, 0, 0)) == pytest.approx((C30, S30, 0))
     nose_down = matrix_from_angles(0, 30, 0)
     assert matrix_times(nose_down, (1, 0, 0)) == pytest.approx((C30, 0, -S30))
     left_side_up = matrix_from_angles(30, 0, 0)
     assert matrix_times(left_side_up, (0, 1, 0)) == pytest.approx((0, C30, S30))
-    # yaw first: the sensor's x axis is pitched in its new direction, to the left
+    # yaw first: the x axis of the sensor is pitched in its new direction, to the left
     assert matrix_times(matrix_from_angles(0, 30, 90), (1, 0, 0)) == pytest.approx((0, C30, -S30))
 
 
@@ -79,32 +79,32 @@ def test_every_choice_of_axes_is_a_rotation_or_is_refused() -> None:
         (("x", "-x", "z"), r"three different axes of the sensor, got x forward and -x left"),
     ],
 )
-def test_axes_that_no_sensor_can_have_are_refused(axes: tuple[str, str, str], words: str) -> None:
+def test_impossible_axes_are_rejected(axes: tuple[str, str, str], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         matrix_from_axes(*axes)
 
 
 @pytest.mark.parametrize("quat", [(1.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (float("nan"), 0.0, 0.0, 0.0)])
-def test_a_quaternion_that_is_no_rotation_is_refused(quat: tuple[float, float, float, float]) -> None:
+def test_an_invalid_quaternion_is_rejected(quat: tuple[float, float, float, float]) -> None:
     with pytest.raises(ValueError, match="of length 1"):
         matrix_from_mounting_quat(quat)
     assert is_rotation(matrix_from_mounting_quat((0.7071, 0.7071, 0.0, 0.0))), "four digits are enough"
 
 
-def test_levelling_takes_away_what_was_read() -> None:
-    """A sensor that lies 10° nose-down and is meant to be level: its x axis is what the body's is, turned back up."""
+def test_levelling_subtracts_the_published_angles() -> None:
+    """A sensor with 10° nose-down error: its x axis is the x axis of the body, rotated back up."""
     level = levelling(Convention.ENU_FLU, 0.0, 10.0, 0.0)
     ten = radians(10)
-    gravity_in_sensor = (-sin(ten), 0.0, cos(ten))  # nose down: up has a part to the back
+    gravity_in_sensor = (-sin(ten), 0.0, cos(ten))  # nose down: up has a component to the back
     assert matrix_times(level, gravity_in_sensor) == pytest.approx((0, 0, 1))
-    # in ned-frd the same reading has the other sign: nose down is negative there
+    # in ned-frd, nose down is negative
     assert levelling(Convention.NED_FRD, 0.0, -10.0, 0.0) == level
     left_up = levelling(Convention.NED_FRD, 10.0, 0.0, 0.0)
     assert matrix_times(left_up, (0.0, sin(ten), cos(ten))) == pytest.approx((0, 0, 1))
 
 
 def test_a_sensor_that_points_to_the_left_has_a_heading_offset() -> None:
-    """Its x axis lies 90° to the left of the front: 90° are added to its heading."""
+    """The x axis points 90° to the left of the front: imud adds 90° to the heading."""
     assert levelling(Convention.ENU_FLU, 0.0, 0.0, 90.0) == matrix_from_axes("-y", "x", "z")
     assert levelling(Convention.NED_FRD, 0.0, 0.0, 90.0) == matrix_from_axes("-y", "x", "z")
 

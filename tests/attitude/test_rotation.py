@@ -1,4 +1,4 @@
-"""Attitude: the manual's example, known turns, every way there and back, straight up and down, and a real recording."""
+"""Attitude: the manual's example, known rotations, round trips, pitch ±90°, and a recording."""
 
 import csv
 import math
@@ -44,7 +44,7 @@ def degrees(euler_rad: Vector3) -> Vector3:
 
 
 def angle_between(a: Quaternion, b: Quaternion) -> float:
-    """Angle of the rotation from a to b, in rad; from the sine, which keeps its digits near zero."""
+    """Return the angle of the rotation from a to b, rad. The sine keeps its digits near zero."""
     dot = sum(x * y for x, y in zip(a, b, strict=True))
     sign = math.copysign(1.0, dot)
     return 4 * math.asin(min(1.0, math.dist(a, [sign * x for x in b]) / 2))
@@ -74,7 +74,7 @@ def test_turns_about_one_axis(quat: Quaternion, euler_deg: Vector3) -> None:
 
 @pytest.mark.manual("B 9.2 matrix of a quaternion")
 def test_the_matrix_turns_body_to_navigation() -> None:
-    """A body turned left by 90° has its x axis (east before) pointing north."""
+    """A body that is rotated left by 90° has its x axis (before: east) pointing north."""
     assert matrix_times(matrix_from_quat((HALF, 0.0, 0.0, HALF)), (1, 0, 0)) == pytest.approx((0, 1, 0), abs=1e-15)
     assert matrix_times(matrix_from_euler312((0, math.pi / 2, 0)), (0, 1, 0)) == pytest.approx((0, 0, 1), abs=1e-15)
 
@@ -91,7 +91,7 @@ def test_quaternion_to_matrix_or_euler_and_back(quat: Quaternion) -> None:
 
 @given(angles, steep, angles)
 def test_euler_to_quaternion_and_back_is_the_same_rotation(roll: float, pitch: float, yaw: float) -> None:
-    """Straight up and down the angles are not unique, the rotation is."""
+    """At pitch ±90°, the angles are not unique; the rotation is."""
     quat = quat_from_euler312((roll, pitch, yaw))
     assert math.hypot(*quat) == pytest.approx(1)
     euler = euler312_from_quat(quat)
@@ -105,7 +105,7 @@ def test_euler_to_quaternion_and_back_is_the_same_rotation(roll: float, pitch: f
 @given(st.floats(-3, 3), st.floats(-0.5, 0.5), st.floats(-3, 3))
 @pytest.mark.manual("B 9.1 angles of a quaternion")
 def test_the_manual_formula_gives_the_same(roll: float, pitch: float, yaw: float) -> None:
-    """Section 9.1 as printed, away from its weak spots."""
+    """Section 9.1 as printed, away from its singularities."""
     q0, q1, q2, q3 = quat_from_euler312((roll, pitch, yaw))
     printed = (
         -math.atan2(2 * (q1 * q3 - q0 * q2), q0**2 - q1**2 - q2**2 + q3**2),
@@ -143,7 +143,7 @@ def test_quaternions_without_direction_are_refused(quat: Quaternion, convert: Ca
         ((math.nan, 0, 0), (0, 1, 0), (0, 0, 1)),
     ],
 )
-def test_what_is_no_rotation_is_refused(matrix: Matrix3) -> None:
+def test_other_matrices_are_rejected(matrix: Matrix3) -> None:
     assert not is_rotation(matrix)
     with pytest.raises(ValueError, match="orthonormal"):
         quat_from_matrix(matrix)
@@ -155,7 +155,7 @@ def test_euler_from_matrix_agrees_with_euler_from_quaternion() -> None:
 
 @pytest.mark.skipif(not RECORDING.exists(), reason=f"the recording is not at {RECORDING}; set IMUD_SHARED")
 def test_recording_of_a_module_at_rest() -> None:
-    """1,000 rows: the quaternion gives the angles that the module itself computed."""
+    """1,000 rows: the quaternion gives the angles that the device computed."""
     with RECORDING.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 1000
@@ -187,7 +187,7 @@ def test_zyx_turns_about_the_axes(euler_deg: Vector3, quat: Quaternion) -> None:
 
 @given(roll=angles, pitch=st.floats(-1.57, 1.57), yaw=angles)
 def test_zyx_is_the_product_of_its_turns(roll: float, pitch: float, yaw: float) -> None:
-    """Against the same turns written as 312 turns about one axis each, multiplied as matrices."""
+    """Compare with the same rotations as 312 rotations about one axis each, multiplied as matrices."""
     about_z, about_y, about_x = (matrix_from_euler312(one) for one in ((0, 0, yaw), (pitch, 0, 0), (0, roll, 0)))
     wanted = matrix_product(matrix_product(about_z, about_y), about_x)
     for row, other in zip(matrix_from_quat(quat_from_euler_zyx((roll, pitch, yaw))), wanted, strict=True):
@@ -202,17 +202,17 @@ def test_zyx_and_back_is_the_same_rotation(roll: float, pitch: float, yaw: float
 
 
 @given(roll=angles, pitch=st.floats(-1.5, 1.5), yaw=angles)
-def test_zyx_angles_come_back(roll: float, pitch: float, yaw: float) -> None:
+def test_round_trip_of_zyx_angles(roll: float, pitch: float, yaw: float) -> None:
     found = euler_zyx_from_matrix(matrix_from_quat(quat_from_euler_zyx((roll, pitch, yaw))))
     for value, wanted in zip(found, (roll, pitch, yaw), strict=True):
         assert math.remainder(value - wanted, 2 * math.pi) == pytest.approx(0, abs=1e-9)
 
 
 @given(angles, steep, angles, st.sampled_from([1e-170, 1e-3, 1.0, -2.0, 1e170]))
-def test_zyx_angles_of_a_quaternion_of_any_length_are_those_of_its_matrix(
+def test_zyx_angles_of_a_quaternion_of_any_length_equal_the_angles_of_its_matrix(
     roll: float, pitch: float, yaw: float, length: float
 ) -> None:
-    """Its square may leave the range of a float at both ends."""
+    """The square can overflow or underflow."""
     w, x, y, z = quat_from_euler_zyx((roll, pitch, yaw))
     quat = (w * length, x * length, y * length, z * length)
     found, wanted = euler_zyx_from_quat(quat), euler_zyx_from_matrix(matrix_from_quat(quat))

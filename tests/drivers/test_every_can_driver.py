@@ -1,4 +1,4 @@
-"""What every CAN codec must do, from its row in DRIVERS alone: foreign, missing, repeated and random frames."""
+"""Requirements of every CAN codec, from its row in DRIVERS: foreign, missing, repeated and random frames."""
 
 from collections.abc import Callable, Iterable, Sequence
 from random import Random
@@ -21,7 +21,7 @@ every_driver = pytest.mark.parametrize("name", list(DRIVERS))
 PERIOD_NS = 10_000_000
 FRAME_NS = 250_000
 LEARNING_SETS = 10
-"""Some devices' samples are known only by what they sent before."""
+"""Some devices' samples depend on earlier frames."""
 
 
 def every_driver_and_seed(test: Callable[[str, int], None]) -> Callable[..., None]:
@@ -30,7 +30,7 @@ def every_driver_and_seed(test: Callable[[str, int], None]) -> Callable[..., Non
 
 
 def make(driver: CanDriver) -> CanCodec:
-    """A codec that has learnt what there is to learn of the device; its ledger is new."""
+    """Return a codec that has learned the device, with a new ledger."""
     codec = driver.make_codec(Ledger(), driver.settings())
     for frame in (frame for number in range(LEARNING_SETS) for frame in timed(driver, Random(number), number)):
         codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns)
@@ -42,7 +42,7 @@ def make(driver: CanDriver) -> CanCodec:
 
 
 def timed(driver: CanDriver, random: Random, number: int) -> list[CanFrame]:
-    """A set at its time: the device sends with a steady period, and the frames of a set back to back."""
+    """Return a set at its time: a steady period, with the frames of a set back to back."""
     frames = driver.example_frames(random)
     return [f._replace(t_rx_ns=number * PERIOD_NS + place * FRAME_NS) for place, f in enumerate(frames)]
 
@@ -52,7 +52,7 @@ def is_own(driver: CanDriver, frame: CanFrame) -> bool:
 
 
 def foreign(driver: CanDriver, random: Random) -> CanFrame:
-    """A frame of another device: any identifier that is not the device's own, often one beside it."""
+    """Return a frame of another device: any other identifier, often an adjacent one."""
     while True:
         extended = random.random() < 0.4
         most = EXTENDED_ID_MAX if extended else STANDARD_ID_MAX
@@ -74,7 +74,7 @@ def sets(driver: CanDriver, random: Random, count: int) -> list[Sequence[CanFram
 
 @every_driver_and_seed
 def test_frames_of_a_sample_make_one(name: str, seed: int) -> None:
-    """A receiver may get a frame twice when the sender saw an error in its last bits (ISO 11898-1)."""
+    """A receiver may get a frame twice if the sender detected an error in its last bits (ISO 11898-1)."""
     driver, random = DRIVERS[name], Random(seed)
     groups = sets(driver, random, 8)
     codec = make(driver)
@@ -110,7 +110,7 @@ def test_frames_of_others_change_nothing(name: str, seed: int) -> None:
 
 @every_driver_and_seed
 def test_missing_frames_cost_their_samples_only(name: str, seed: int) -> None:
-    """Values are never mixed: each measurement is one of those that the whole sets give."""
+    """Values are never mixed: each measurement is equal to a measurement of a complete set."""
     driver, random = DRIVERS[name], Random(seed)
     groups = sets(driver, random, 12)
     whole = [measurements(feed_checked(make(driver), group))[0] for group in groups]
@@ -150,7 +150,7 @@ def test_any_frames_in_any_order_never_raise(name: str, seed: int) -> None:
 
 
 @every_driver_and_seed
-def test_reset_never_mixes_what_was_before_with_what_comes(name: str, seed: int) -> None:
+def test_reset_separates_bytes_before_and_after(name: str, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
     before, after = sets(driver, random, 2)
     cut = random.randrange(len(before))

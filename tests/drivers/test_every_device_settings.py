@@ -1,6 +1,6 @@
-"""The settings of every driver by its table alone: described, declarable, written as declared and read as accepted.
+"""Settings of every driver, from its table: descriptions, declarations, write and read.
 
-Simulated modules behind a pseudo-terminal are set to an example of each setting by the running daemon, and say so.
+The running daemon writes an example of each setting to simulated devices behind a pseudo-terminal and reads it back.
 """
 
 import sys
@@ -31,7 +31,7 @@ EVERY = [(name, setting) for name, table in TABLES.items() for setting in table.
 every_table = pytest.mark.parametrize("name", TABLES)
 every_setting = pytest.mark.parametrize(("driver", "name"), EVERY)
 PLACES = ("baud", "address", "node", "bit_rate", "i2c_address")
-"""Settings that would take a module away from its test."""
+"""Settings that would disconnect the device from its test."""
 
 
 def table_of(driver: str) -> SettingsTable:
@@ -45,7 +45,7 @@ def info_of(driver: str, name: str) -> SettingInfo:
 
 
 def example(info: inspect.Type, last: bool = False) -> Any:
-    """A value of a type; the other one with `last`, where there is more than one."""
+    """Return a value of a type; with `last` another value, if there is one."""
     value: Any = None
     match info:
         case inspect.Metadata(type=inner):
@@ -70,14 +70,14 @@ def example(info: inspect.Type, last: bool = False) -> Any:
 
 
 def examples(driver: str, name: str) -> list[Any]:
-    """Two JSON values of a setting, the same one twice where it has only one."""
+    """Return two JSON values of a setting, twice the same value if there is only one."""
     info = inspect.type_info(table_of(driver).table[name].type)
     return [example(info), example(info, last=True)]
 
 
 @every_table
-def test_tables_can_do_what_their_settings_need(name: str) -> None:
-    """With nothing told by the device all that can be read differs, and nothing else."""
+def test_tables_have_the_scripts_that_settings_require(name: str) -> None:
+    """Only readable settings differ while the device has reported nothing."""
     table = table_of(name)
     assert table.table
     settings = table.table.values()
@@ -128,14 +128,14 @@ def test_every_setting_describes_itself_and_can_be_declared(driver: str, name: s
         assert differences(table, wanted, wanted, {}) == {}
         target = Target(DRIVERS[driver].settings(), 0)
         plan = make_plan(table, target, wanted, {}, {}, save=True, unsaved=False)
-        if plan.left_out:  # an own setting of a bus on which nothing can be saved
+        if plan.left_out:  # device settings on a bus without a save command
             assert table.save is None
         else:
             assert [step.name for step in plan.steps] == [name]
 
 
 def errors_but_of_the_link(device: str, link: str) -> list[str]:
-    """What is wrong with the device's settings in a configuration whose link has no keys."""
+    """Return the errors of the device settings in a configuration with a link without keys."""
     body = "".join(f"    {line}\n" for line in device.splitlines())
     try:
         config.parse(f"devices:\n  bow:\n{body}    {link}: {{}}\n", "f")
@@ -154,8 +154,8 @@ def simulated_device(driver: str, port: Path) -> dict[str, Any]:
 
 @pytest.mark.live
 @pytest.mark.parametrize("name", [name for name in SIMULATORS if name in TABLES])
-def test_a_simulated_module_takes_every_setting_and_tells_it(name: str, tmp_path: Path) -> None:
-    """One after the other, to the one value and to the other; what cannot go together is refused in words."""
+def test_a_simulated_device_accepts_and_reports_every_setting(name: str, tmp_path: Path) -> None:
+    """Write one value, then the other value. imud rejects an impossible combination with an error."""
     table = table_of(name)
     settable = [one for one, setting in table.table.items() if setting.write is not None and one not in PLACES]
     with ExitStack() as stack:
@@ -180,7 +180,7 @@ def test_a_simulated_module_takes_every_setting_and_tells_it(name: str, tmp_path
 
 
 def takes(client: Client, name: str, value: Any) -> bool:
-    """Whether the module takes a value, which it has then; else it does not go together with what it has."""
+    """Return whether the device accepts a value. Otherwise the value excludes another setting of the device."""
     try:
         done = client.call("settings.apply", device="bow", settings={name: value}, save=True)
     except RpcError as error:

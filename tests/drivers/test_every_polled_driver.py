@@ -1,4 +1,4 @@
-"""Every polled driver by its row in DRIVERS alone: damage is reported, nothing raises, ledgers close."""
+"""Every polled driver, from its row in DRIVERS: damage is reported, no exception is raised, ledgers balance."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -21,7 +21,7 @@ from tests.support.codec_invariants import decode_polled
 
 NAMES = [driver.name for driver in of_kind(DRIVERS.values(), PolledDriver)]
 TRANSFERS_MAX = 20
-"""No script has more transfers, whatever is answered."""
+"""Maximum number of transfers of any script, for any replies."""
 
 every_driver = pytest.mark.parametrize("name", NAMES)
 
@@ -61,7 +61,7 @@ def test_good_frames_make_one_measurement_each(name: str, seed: int) -> None:
 
 @every_driver_and_seed
 def test_damage_never_passes_silently(name: str, seed: int) -> None:
-    """One wrong bit, one wrong byte, or a run of them: the same measurement, or none and an event that says so."""
+    """One wrong bit, one wrong byte, or a run of them: the same measurement, or no measurement and an event."""
     driver, random = row(name), Random(seed)
     data = driver.example_reading(random)
     (good,) = make(driver).decode(0, data)
@@ -92,7 +92,7 @@ def test_any_bytes_of_any_length_raise_nothing(name: str, data: bytes, poll: int
 
 @every_driver
 @pytest.mark.parametrize("line", [0x00, 0xFF])
-def test_a_line_that_no_device_drives_is_a_device_that_vanished(name: str, line: int) -> None:
+def test_a_bus_without_a_device_reports_vanished(name: str, line: int) -> None:
     driver = row(name)
     codec = make(driver)
     data = bytes([line]) * len(driver.example_reading(Random(1)))
@@ -103,8 +103,8 @@ def test_a_line_that_no_device_drives_is_a_device_that_vanished(name: str, line:
 
 
 @every_driver_and_seed
-def test_scripts_end_whatever_is_answered(name: str, seed: int) -> None:
-    """With noise and failures in any order they return, or raise what they may, and never go on without end."""
+def test_scripts_end_after_any_replies(name: str, seed: int) -> None:
+    """Scripts return after noise and failures in any order, or raise a permitted error."""
     driver, random = row(name), Random(seed)
     transfers = 0
 

@@ -1,4 +1,4 @@
-"""Every driver by its row in DRIVERS alone: the row, its examples, its calibrations and its data sheet are complete."""
+"""Every driver, from its row in DRIVERS: the row, its examples, its calibrations and its data sheet are complete."""
 
 from collections.abc import Callable
 from random import Random
@@ -15,7 +15,7 @@ every_driver = pytest.mark.parametrize("name", DRIVERS)
 
 
 def example_of(driver: Driver) -> Callable[[Random], object]:
-    """The maker of examples, whatever they are: a frame, the frames of a sample, or the bytes of a poll."""
+    """Return the maker of examples: a frame, the frames of a sample, or the bytes of a poll."""
     if isinstance(driver, StreamDriver):
         return driver.example_frame
     if isinstance(driver, CanDriver):

@@ -1,4 +1,4 @@
-"""What every stream codec must do, from its row in DRIVERS alone: any split, damage and noise, a ledger that closes."""
+"""Requirements of every stream codec, from its row in DRIVERS: any split, damage and noise, a balanced ledger."""
 
 from collections.abc import Callable, Iterable, Sequence
 from random import Random
@@ -17,7 +17,7 @@ from tests.support.codec_invariants import cut, untimed
 from tests.support.codec_invariants import feed_stream as feed_checked
 
 IDLE = 2000
-"""So many zero bytes complete any frame that is only claimed."""
+"""Number of zero bytes that complete any claimed frame."""
 
 DRIVERS = {driver.name: driver for driver in of_kind(devices.DRIVERS.values(), StreamDriver)}
 every_driver = pytest.mark.parametrize("name", list(DRIVERS))
@@ -37,7 +37,7 @@ def measurements(events: Iterable[CodecEvent]) -> list[CodecEvent]:
 
 
 def noise(driver: StreamDriver, random: Random) -> bytes:
-    """Damage of one kind, without a whole frame in it."""
+    """Return damage of one kind, without a complete frame."""
     frame = driver.example_frame(random)
     flipped = bytearray(frame)
     flipped[random.randrange(len(frame))] ^= 1 << random.randrange(8)
@@ -45,18 +45,18 @@ def noise(driver: StreamDriver, random: Random) -> bytes:
     text = random.choice((b"APP_VER=156\r\n", b"OK\n", b"\r", b"Z", b"no end", b"\r\n", b"x" * 400))
     kinds = (
         random.randbytes(random.randint(1, 60)),
-        frame[: random.randrange(1, len(frame))],  # cut short
-        frame[random.randrange(1, len(frame)) :],  # beginning lost
+        frame[: random.randrange(1, len(frame))],  # truncated
+        frame[random.randrange(1, len(frame)) :],  # start lost
         bytes(flipped),
-        head + random.randbytes(random.randint(0, 6)),  # a lie about the length
-        frame[:2] * random.randint(1, 5) + head,  # sync words in a row
+        head + random.randbytes(random.randint(0, 6)),  # a wrong length
+        frame[:2] * random.randint(1, 5) + head,  # adjacent sync words
         text,
     )
     return random.choice(kinds)
 
 
 @every_driver_and_seed
-def test_frames_back_to_back_all_come_out(name: str, seed: int) -> None:
+def test_adjacent_frames_are_all_decoded(name: str, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
     frames = [driver.example_frame(random) for _ in range(12)]
     alone = [event for frame in frames for event in make(driver).feed(frame)]
@@ -117,8 +117,8 @@ def test_random_bytes_never_raise(name: str, data: bytes, seed: int) -> None:
 
 
 @every_driver_and_seed
-def test_flush_delivers_what_waits_inside_a_longer_frame(name: str, seed: int) -> None:
-    """A header that claims more than comes hides the frames behind it until the line is idle."""
+def test_flush_returns_frames_inside_an_incomplete_frame(name: str, seed: int) -> None:
+    """A header with a too large length hides the following frames until the link is idle."""
     driver, random = DRIVERS[name], Random(seed)
     frames = [driver.example_frame(random) for _ in range(3)]
     expected = [event for frame in frames for event in make(driver).feed(frame)]
@@ -132,8 +132,8 @@ def test_flush_delivers_what_waits_inside_a_longer_frame(name: str, seed: int) -
 
 
 @every_driver_and_seed
-def test_flush_destroys_nothing_and_reset_skips_what_is_pending(name: str, seed: int) -> None:
-    """A frame that pauses in the middle still comes, however often the line counts as idle meanwhile."""
+def test_flush_keeps_and_reset_skips_pending_bytes(name: str, seed: int) -> None:
+    """A frame with a pause in its middle still arrives, even if the link counts as idle several times."""
     driver, random = DRIVERS[name], Random(seed)
     frame = driver.example_frame(random)
     expected = untimed(make(driver).feed(frame))

@@ -14,7 +14,7 @@ def test_length_of_a_frame(extended: bool, data_bytes: int, bits: int) -> None:
     assert frame_bits(extended, data_bytes) == bits
 
 
-def test_frames_as_the_kernel_has_them() -> None:
+def test_frames_in_the_layout_of_the_kernel() -> None:
     assert RAW_FRAME.unpack(pack_frame(0x7FF, False, b"ab")) == (0x7FF, 2, b"ab" + bytes(6))
     assert RAW_FRAME.unpack(pack_frame(0x1FFF_FFFF, True, b"")) == (0x1FFF_FFFF | EXTENDED_FLAG, 0, bytes(8))
     wrong = [(0x800, False, b""), (-1, False, b""), (0x2000_0000, True, b""), (1, True, bytes(9))]

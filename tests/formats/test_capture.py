@@ -19,11 +19,11 @@ GOLDEN = (
     b"\x02\x01\x00\x00\x00\x00\x00\x00\x03\x00\x00\x00abc"
     b"\x03\x01\x00\x00\x00\x00\x00\x00\x01\x00\x00\x00d"
 )
-"""Two reads at 258 and 259 ns, written by hand from the format's description."""
+"""Two reads at 258 and 259 ns, written by hand from the description of the format."""
 
 
 class Dripping(io.RawIOBase):
-    """A pipe that hands over one byte at a time and cannot seek."""
+    """Pipe that returns one byte at a time and cannot seek."""
 
     def __init__(self, data: bytes) -> None:
         self._data = io.BytesIO(data)
@@ -101,7 +101,7 @@ def test_other_versions_and_broken_first_lines_are_refused(line: bytes) -> None:
 
 
 @pytest.mark.parametrize("baud", ["", "fast", "-1", "²", "9" * 30])
-def test_a_rate_that_is_no_number_is_unknown(baud: str) -> None:
+def test_an_invalid_baud_rate_is_unknown(baud: str) -> None:
     file = io.BytesIO()
     CaptureWriter(file, details={"note": baud})
     header = file.getvalue().replace(b"note=", b"baud=")
@@ -109,7 +109,7 @@ def test_a_rate_that_is_no_number_is_unknown(baud: str) -> None:
 
 
 @given(st.lists(st.tuples(st.binary(max_size=50), st.integers(-(1 << 62), 1 << 62))))
-def test_what_is_written_is_read_with_times_that_never_run_back(reads: list[tuple[bytes, int]]) -> None:
+def test_round_trip_with_times_that_never_decrease(reads: list[tuple[bytes, int]]) -> None:
     file = io.BytesIO()
     writer = CaptureWriter(file)
     for data, t_ns in reads:
@@ -122,7 +122,7 @@ def test_what_is_written_is_read_with_times_that_never_run_back(reads: list[tupl
         assert times[-1] == max(t_ns for data, t_ns in reads if data)
 
 
-def test_what_a_writer_refuses_and_splits() -> None:
+def test_limits_of_the_writer() -> None:
     file = io.BytesIO()
     CaptureWriter(file).write(bytes(RECORD_BYTES_MAX + 1), 1)
     assert [(t_ns, len(data)) for t_ns, data in chunks(file.getvalue())] == [(1, RECORD_BYTES_MAX), (1, 1)]
@@ -133,7 +133,7 @@ def test_what_a_writer_refuses_and_splits() -> None:
     assert len(file.getvalue()) <= 100
     assert writer.bytes_refused == 60
     assert not writer.write(b"", 9)
-    assert not writer.write(b"a", 9)  # it would fit, but a capture has no holes
+    assert not writer.write(b"a", 9)  # the record would fit, but a capture has no gaps
     with pytest.raises(ValueError, match="can be read back"):
         CaptureWriter(io.BytesIO(), details={"note": "x" * 5000})
 

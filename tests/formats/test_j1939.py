@@ -26,7 +26,7 @@ def test_known_identifiers(can_id: int, parts: J1939Id) -> None:
 
 
 @given(st.integers(0, EXTENDED_ID_MAX))
-def test_every_identifier_comes_back(can_id: int) -> None:
+def test_round_trip_of_every_identifier(can_id: int) -> None:
     assert join(split(can_id)) == can_id
 
 
@@ -38,11 +38,11 @@ def test_every_identifier_comes_back(can_id: int) -> None:
         J1939Id(3, 0xFF34, 256),
         J1939Id(3, 0xEF00, 8, 256),
         J1939Id(3, 0xEF01, 8, 5),  # a destination in the number
-        J1939Id(3, 0xFF34, 8, 5),  # a destination for what is for all
+        J1939Id(3, 0xFF34, 8, 5),  # a destination in a broadcast
         J1939Id(-1, 0xFF34, 8),
     ],
 )
-def test_what_no_identifier_can_say(parts: J1939Id) -> None:
+def test_invalid_identifiers(parts: J1939Id) -> None:
     with pytest.raises(ValueError, match="J1939"):
         join(parts)
 
@@ -63,7 +63,7 @@ def test_filters_and_senders() -> None:
     assert not reply.matches(0x18EF0855, True)
     pgns = (0xFF34,)
     assert [sender_of(can_id, True, bytes(8), pgns) for can_id in (0x0CFF3400, 0x1CFF34FD)] == [0, 253]
-    assert sender_of(0x0CFF34FE, True, bytes(8), pgns) is None  # has no address
+    assert sender_of(0x0CFF34FE, True, bytes(8), pgns) is None  # a node without an address
     assert sender_of(0x0CFF3708, True, bytes(8), pgns) is None
     assert sender_of(0x0CFF3408, False, bytes(8), pgns) is None
     assert sender_of(0x0CFF3408, True, bytes(7), pgns) is None

@@ -1,4 +1,4 @@
-"""Frames of Modbus RTU, and the reply among all that can come back."""
+"""Modbus RTU frames, and the reply among all possible received bytes."""
 
 from random import Random
 
@@ -46,7 +46,7 @@ def test_the_reply_is_found_in_any_split(seed: int, echo: bool, known: bool, exc
     found = finder(echo if known else None)
     while stream:
         size = random.randint(1, len(stream))
-        assert found.missing <= len(stream)  # who sleeps for what is missing never sleeps too long
+        assert found.missing <= len(stream)  # a lower bound: a sleep for these bytes is never too long
         got, stream = found.feed(stream[:size]), stream[size:]
         assert got == (None if stream else reply)
     assert found.strange == 0
@@ -59,7 +59,7 @@ def test_bytes_that_are_not_the_reply_are_skipped_and_counted() -> None:
     assert found.feed(b"\x05\x03" + REPLY[:4]) is None
     assert found.feed(REPLY[4:]) == REPLY
     assert found.strange == len(OTHER) + 2
-    # What a module owes from before: it is asked for another number of registers now.
+    # late reply to a previous request: imud now requests another number of registers
     old = framed(5, bytes.fromhex("03 06 11 22 33 44 55 66"))
     found = finder()
     assert found.feed(old) is None
@@ -71,7 +71,7 @@ def test_a_damaged_reply_is_returned_only_in_its_place() -> None:
     damaged = REPLY[:-1] + bytes([REPLY[-1] ^ 1])
     assert finder().feed(damaged) == damaged
     late = finder()
-    assert late.feed(OTHER + damaged) is None  # behind something strange only a whole one is believed
+    assert late.feed(OTHER + damaged) is None  # after unknown bytes, only a frame with a correct CRC is a reply
     assert late.feed(REPLY) == REPLY
     assert late.strange == len(OTHER) + len(damaged)
     found = finder()

@@ -1,4 +1,4 @@
-"""Sentences by hand, and as pynmea2 reads them."""
+"""NMEA 0183 sentences, written by hand and read by pynmea2."""
 
 import math
 from math import radians
@@ -16,7 +16,7 @@ ANGLES = st.floats(-4 * math.pi, 4 * math.pi)
 
 
 def fields(sentence: bytes) -> list[str]:
-    """What pynmea2 finds between the formatter and the checksum, which it checks."""
+    """Return the fields that pynmea2 reads between formatter and checksum. pynmea2 checks the checksum."""
     text = sentence.decode()
     assert text.endswith("\r\n")
     assert len(sentence) <= SENTENCE_BYTES_MAX
@@ -25,7 +25,7 @@ def fields(sentence: bytes) -> list[str]:
 
 
 def test_headings_and_rates_of_turn() -> None:
-    # a Vector heading sensor's, in the collection of examples of gpsd
+    # from a Vector heading sensor, in the examples of gpsd
     assert nmea0183.hdg("HC", radians(101.1), radians(-7.1)) == b"$HCHDG,101.1,,,7.1,W*3C\r\n"
     assert fields(nmea0183.hdt("HE", radians(98.3))) == ["98.3", "T"]
     assert fields(nmea0183.hdm("HC", radians(-1.5))) == ["358.5", "M"]

@@ -1,4 +1,4 @@
-"""RMC sentences against printed examples, a second implementation, and bad bytes."""
+"""RMC sentences, compared with printed examples and a second implementation, and invalid bytes."""
 
 from datetime import UTC, datetime
 from random import Random
@@ -64,12 +64,12 @@ def test_examples(data: bytes, expected: Rmc) -> None:
         (sentence("GPRMC,120000,A,,,,,,,010025,,,A"), RmcFault.CONTENT),
     ],
 )
-def test_what_is_wrong_is_named(data: bytes, fault: RmcFault) -> None:
+def test_faults_are_named(data: bytes, fault: RmcFault) -> None:
     assert parse(data) == fault
 
 
 @given(st.integers(unix_s(1980, 1, 1, 0, 0, 0) * NS_PER_S, unix_s(2080, 1, 1, 0, 0, 0) * NS_PER_S - 1), st.booleans())
-def test_what_is_built_says_the_instant(utc_ns: int, valid: bool) -> None:
+def test_built_sentences_contain_the_instant(utc_ns: int, valid: bool) -> None:
     data = build(utc_ns, valid=valid)
     rmc = parse(data)
     assert isinstance(rmc, Rmc)
@@ -86,7 +86,7 @@ def test_years_that_two_digits_cannot_say_are_refused(year: int) -> None:
         build(unix_s(year, 6, 1, 0, 0, 0) * NS_PER_S)
 
 
-def test_another_talker_becomes_gp_and_says_the_same() -> None:
+def test_another_talker_becomes_gp_with_the_same_values() -> None:
     other = sentence("GNRMC,083559.00,A,4717.11437,N,00833.91522,E,0.004,77.52,091202,,,A,V")
     changed = as_gprmc(other.rstrip())
     assert changed.startswith(b"$GPRMC,083559.00,A,4717.11437,N")
@@ -103,11 +103,11 @@ def test_no_bytes_raise(data: bytes) -> None:
         assert isinstance(parse(line), Rmc | RmcFault)
 
 
-def test_no_damage_of_one_byte_goes_unseen() -> None:
+def test_every_damaged_byte_is_detected() -> None:
     random, good = Random(3), parse(UBLOX)
     for at in range(1, len(UBLOX) - 2):
         other = random.choice([byte for byte in range(256) if byte != UBLOX[at]])
         damaged = UBLOX[:at] + bytes([other]) + UBLOX[at + 1 :]
-        assert isinstance(parse(damaged), RmcFault) or parse(damaged) == good  # the checksum's letters may be small
+        assert isinstance(parse(damaged), RmcFault) or parse(damaged) == good  # lower case is valid
     for at in range(len(UBLOX)):
         assert at >= len(UBLOX) - 2 or isinstance(parse(UBLOX[:at] + UBLOX[at + 1 :]), RmcFault)

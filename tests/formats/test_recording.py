@@ -1,4 +1,4 @@
-"""Blocks of recordings: golden bytes, every cut, every damaged byte, foreign bytes between them."""
+"""Blocks of recordings: golden bytes, every truncation, every damaged byte, foreign bytes between blocks."""
 
 import io
 import struct
@@ -24,7 +24,7 @@ from imud.model.errors import ImudError
 
 GOLDEN_HEAD = b"\x89imudREC" + b"\0" + b"\0\0\0" + b"\0\0\0\0" + b"\3\0\0\0" + b"\3\0\0\0"
 GOLDEN = GOLDEN_HEAD + zlib.crc32(GOLDEN_HEAD + b"abc").to_bytes(4, "little") + b"abc"
-"""A stored block, written by hand from the description."""
+"""A stored block, written by hand from the description of the format."""
 
 
 def blocks_of(data: bytes) -> tuple[list[bytes], BlockReader]:
@@ -95,7 +95,7 @@ def test_no_bytes_raise(data: bytes) -> None:
 
 
 def valid_crc(stored: bytes, plain: int, method: int = 1) -> bytes:
-    """Return a block with these contents and the CRC of them."""
+    """Return a block with these fields and a correct CRC."""
     head = HEAD.pack(MAGIC, method, 0, plain, len(stored), 0)[:-4]
     return head + struct.pack("<I", zlib.crc32(stored, zlib.crc32(head))) + stored
 
@@ -114,7 +114,7 @@ DAMAGED = {
     "another method": valid_crc(b"abc", 3, method=2),
     "stored bytes of another size": valid_crc(b"abc", 4, method=0),
 }
-"""Blocks whose CRC is valid, as another program or a defect writes them."""
+"""Blocks with a correct CRC and invalid content, from another program or a defect."""
 
 
 @pytest.mark.parametrize("block", DAMAGED.values(), ids=DAMAGED)

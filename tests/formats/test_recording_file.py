@@ -1,4 +1,4 @@
-"""Recordings as files: records through blocks, and what is said of a file that is not whole."""
+"""Recordings as files: records in blocks, and the errors of incomplete files."""
 
 import io
 
@@ -32,7 +32,7 @@ def reads(count: int) -> list[bytes]:
     return [records.encode_data(0, number.to_bytes(4, "little") * 50, number, -1) for number in range(count)]
 
 
-def test_records_come_back_in_their_order_from_as_many_blocks_as_they_need() -> None:
+def test_round_trip_of_records_over_several_blocks() -> None:
     made = [session(), *reads(5000), END]
     reader = RecordingReader(io.BytesIO(written(*made)), "a.rec")
     found = list(reader)
@@ -45,7 +45,7 @@ def test_records_come_back_in_their_order_from_as_many_blocks_as_they_need() -> 
     assert reader.problems == []
 
 
-def test_a_file_without_its_end_says_so() -> None:
+def test_a_file_without_an_end_is_reported() -> None:
     data = written(session(), *reads(10), END, each=True)
     reader = RecordingReader(io.BytesIO(data[:-5]), "a.rec")
     assert len(list(reader)) == 11
@@ -73,7 +73,7 @@ def test_a_block_without_records_costs_only_itself() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"\x89imudREC", b"t_ns,accel\n" * 20])
-def test_a_file_without_blocks_is_no_recording(data: bytes) -> None:
+def test_a_file_without_blocks_is_not_a_recording(data: bytes) -> None:
     with pytest.raises(ImudError, match="at least one complete block"):
         list(RecordingReader(io.BytesIO(data), "a.rec"))
 

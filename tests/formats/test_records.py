@@ -1,4 +1,4 @@
-"""Records of recordings: each kind back as it was written, layouts by hand, and errors for what is none."""
+"""Records of recordings: round trip of each kind, layouts by hand, and errors for invalid records."""
 
 import struct
 from collections.abc import Callable
@@ -30,7 +30,7 @@ def only(data: bytes) -> Record:
     return record
 
 
-def test_a_data_record_by_hand_and_objects_that_come_back() -> None:
+def test_a_data_record_by_hand_and_round_trip_of_objects() -> None:
     data = records.encode_data(3, b"\x5a\xa5", 258, -1)
     assert data == b"\x05\x03\x00\x13\x00\x00\x00" + struct.pack("<qq", 258, -1) + b"\0\x5a\xa5"
     record = only(data)
@@ -60,13 +60,13 @@ CLOCKS, LOST = ClocksRecord(1, -2, 3, 4, 5, 6), LostRecord(1, 2, -3)
         (Kind.LOST, records.encode_lost(LOST), LOST),
     ],
 )
-def test_records_come_back(kind: Kind, data: bytes, value: object) -> None:
+def test_round_trip_of_records(kind: Kind, data: bytes, value: object) -> None:
     assert only(data).kind == kind
     assert DECODERS[kind](only(data).body) == value
 
 
 @pytest.mark.parametrize("line", records.LINES)
-def test_edges_come_back(line: str) -> None:
+def test_round_trip_of_edges(line: str) -> None:
     edges = [EdgeRecord(-5, True, 1), EdgeRecord(1 << 60, False, 1 << 40)]
     assert records.decode_edges(only(records.encode_edges(0, line, edges)).body) == (line, edges)
 

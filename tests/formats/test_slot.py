@@ -55,7 +55,7 @@ GOLDEN = (
     "e7030000"  # 999
     + "00" * 24
 )  # fmt: skip
-"""Written out by hand: a power of two 2**n as f64 has the exponent bits 1023 + n and no others."""
+"""Written by hand: a power of two 2**n as f64 has only the exponent bits 1023 + n."""
 
 
 def crc32_bit_by_bit(data: bytes) -> int:
@@ -85,7 +85,7 @@ def test_presence_bit_of_each_field(name: str) -> None:
     decoded = decode_slot(slot, "imu0")
     assert getattr(decoded, name) == value
     assert all(getattr(decoded, other) is None for other in PRESENT_BITS if other != name)
-    zero: Any = tuple(0.0 for _ in value) if isinstance(value, tuple) else 0  # zero is not absent
+    zero: Any = tuple(0.0 for _ in value) if isinstance(value, tuple) else 0  # zero differs from absent
     decoded = decode_slot(encode_slot(msgspec.structs.replace(BARE, **{name: zero}), 0), "imu0")
     assert getattr(decoded, name) == zero
 
@@ -110,14 +110,14 @@ def test_any_flipped_bit_and_the_sync_of_a_newer_layout_are_found() -> None:
 
 
 @pytest.mark.parametrize("slot", [b"", bytes(SLOT_BYTES), encode_slot(FULL, 1)[:-1], b"\xff" * SLOT_BYTES])
-def test_what_was_never_a_slot(slot: bytes) -> None:
+def test_bytes_that_are_not_a_slot(slot: bytes) -> None:
     assert not slot_is_whole(slot)
 
 
 @pytest.mark.parametrize(
     ("field", "value", "stored"),
     [
-        ("t_err_ns", 1 << 32, 0xFFFF_FFFF),  # 4.3 s: "at least this bad" is the truth
+        ("t_err_ns", 1 << 32, 0xFFFF_FFFF),  # 4.3 s is clipped to the maximum
         ("t_err_ns", -1, 0),
         ("status", 0x1_8000_0001, 0x8000_0001),
         ("status", -1, 0xFFFF_FFFF),

@@ -1,4 +1,4 @@
-"""The host's clocks: exact under preemption, new after a step, right while they are slewed, cheap in between."""
+"""Host clocks: exact under preemption, updated after a step, correct while slewed, cheap in between."""
 
 import time
 from itertools import pairwise
@@ -13,17 +13,17 @@ CALL_NS = 100
 
 
 class Host:
-    """Three clocks that take their time to be read, and a thread that is preempted between two readings at will."""
+    """Three clocks with a read time, and a thread that can be preempted between two reads."""
 
     def __init__(self) -> None:
         self.raw = 1000 * NS_PER_S
         self.steered_ns = 0
         self.rate = 0.0
-        """By how much CLOCK_MONOTONIC is fast."""
+        """Rate error of CLOCK_MONOTONIC."""
         self.ahead_ns = AHEAD_NS
         self.calls = 0
         self.preempted: dict[int, int] = {}
-        """For how long before which call."""
+        """Duration of the preemption before each call, ns."""
         self.clock = HostClock(self.monotonic_ns, self.realtime_ns, self.raw_ns)
 
     def sleep(self, ns: int) -> None:
@@ -49,7 +49,7 @@ class Host:
         return self.clock.utc_offset_ns()
 
 
-def test_the_first_reading_measures_and_what_is_kept_costs_two_calls() -> None:
+def test_the_first_reading_measures_and_later_readings_cost_two_calls() -> None:
     host = Host()
     begun = host.calls
     first, calls = host.offset_ns(), host.calls
@@ -82,7 +82,7 @@ def test_a_host_that_is_never_undisturbed_gives_the_tightest_of_some_readings() 
     host.preempted = dict.fromkeys(range(1, 10_000), 10 * NS_PER_US)
     host.offset_ns()
     calls = host.calls
-    for _ in range(50):  # it is not measured again at every read
+    for _ in range(50):  # not every read measures again
         host.sleep(NS_PER_MS)
         host.offset_ns()
     assert host.calls == calls + 2 * 50
@@ -94,7 +94,7 @@ def test_a_step_of_the_wall_clock_or_a_leap_second_is_seen_by_the_next_reading(s
     before = host.offset_ns()
     host.ahead_ns += step_ns
     assert abs(host.offset_ns() - before - step_ns) <= 2 * CALL_NS
-    assert abs(host.clock.steady.offset_ns) <= 2 * CALL_NS  # the time stamps do not move
+    assert abs(host.clock.steady.offset_ns) <= 2 * CALL_NS  # the time stamps do not change
 
 
 def test_a_step_below_the_tolerance_is_seen_within_a_second() -> None:
@@ -132,17 +132,17 @@ def test_the_kept_difference_does_not_wander_while_it_is_measured_again_and_agai
 
 
 def test_after_a_suspend_and_a_stopped_machine_nothing_moves() -> None:
-    host = Host()  # CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW stop together, CLOCK_REALTIME is ahead by the suspend
+    host = Host()  # CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW stop together; CLOCK_REALTIME leads by the suspend
     before = host.offset_ns()
     host.ahead_ns += 3600 * NS_PER_S
     assert abs(host.offset_ns() - before - 3600 * NS_PER_S) <= 2 * CALL_NS
     assert abs(host.clock.steady.offset_ns) <= 2 * CALL_NS
-    host.sleep(3600 * NS_PER_S)  # a machine whose clocks go on while it is stopped
+    host.sleep(3600 * NS_PER_S)  # a host with clocks that run during a suspend
     assert abs(host.offset_ns() - before - 3600 * NS_PER_S) <= 2 * CALL_NS
     assert abs(host.clock.steady.offset_ns) <= 2 * CALL_NS
 
 
-def test_a_suspend_is_told_from_a_step_and_from_a_thread_that_was_away() -> None:
+def test_a_suspend_differs_from_a_step_and_from_a_preemption() -> None:
     host, asleep_ns = Host(), 0
     clock = HostClock(host.monotonic_ns, host.realtime_ns, host.raw_ns, lambda: host.monotonic_ns() + asleep_ns)
     for number in range(1, 30):
@@ -159,7 +159,7 @@ def test_a_suspend_is_told_from_a_step_and_from_a_thread_that_was_away() -> None
         assert clock.suspends == count
 
 
-def test_a_coarse_clock_is_no_harm() -> None:
+def test_a_coarse_clock_is_supported() -> None:
     now = [1000 * NS_PER_S]
     clock = HostClock(lambda: now[0], lambda: now[0] + AHEAD_NS, lambda: now[0])
     for _ in range(10):
@@ -168,7 +168,7 @@ def test_a_coarse_clock_is_no_harm() -> None:
         now[0] += 4 * NS_PER_MS
 
 
-def test_without_the_raw_clock_the_monotonic_one_stands_in(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_raw_clock_the_monotonic_clock_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_clock: int) -> int:
         raise OSError(22, "Invalid argument")
 

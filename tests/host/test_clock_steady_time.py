@@ -1,4 +1,4 @@
-"""Conversion between CLOCK_MONOTONIC and steady time: exact at pairs, linear between them, honest about the rest."""
+"""Conversion between CLOCK_MONOTONIC and steady time: exact at pairs, linear between them, with a correct error."""
 
 from random import Random
 
@@ -9,12 +9,12 @@ from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 BEGIN_NS = 700 * NS_PER_S
 RAW_NS = 699 * NS_PER_S
-"""CLOCK_MONOTONIC_RAW at the beginning: it is a second behind by what was slewed before."""
+"""CLOCK_MONOTONIC_RAW at the start: 1 s behind because of an earlier slew."""
 FAST = 83_333e-6
 
 
 def slewed(rate: float, pairs: int, step_ns: int = 10 * NS_PER_MS) -> SteadyTime:
-    """A clock that runs `rate` fast from the beginning, with a pair per step."""
+    """Return a clock that runs `rate` fast from the start, with a pair per step."""
     steady = SteadyTime()
     for i in range(pairs):
         steady.add_pair(BEGIN_NS + int(i * step_ns * (1 + rate)), RAW_NS + i * step_ns)
@@ -65,7 +65,7 @@ def test_both_conversions_are_each_other_s_reverse_and_rise() -> None:
 
 
 def test_a_time_at_which_the_offset_was_still_the_old_one_is_a_pair() -> None:
-    """The slew began between 0.9 and 1 s, not at 0: what was before 0.9 s is not moved by it."""
+    """The slew started between 0.9 and 1 s, not at 0: it does not change times before 0.9 s."""
     steady = SteadyTime()
     steady.add_pair(BEGIN_NS, RAW_NS)
     steady.add_pair(BEGIN_NS + 1_008_333_300, RAW_NS + NS_PER_S, RAW_NS + 900 * NS_PER_MS)
@@ -74,18 +74,18 @@ def test_a_time_at_which_the_offset_was_still_the_old_one_is_a_pair() -> None:
     assert steady.rate == pytest.approx(8_333_300 / NS_PER_S)
 
 
-def test_the_offset_of_the_newest_pair_holds_as_far_back_as_it_is_even() -> None:
-    steady = slewed(20e-6, 101)  # 200 ns a step
+def test_the_newest_offset_holds_while_it_was_constant() -> None:
+    steady = slewed(20e-6, 101)  # 200 ns per step
     assert abs(steady.monotonic_ns(steady.even_from_ns) - steady.even_from_ns - steady.offset_ns) <= EVEN_NS
     last_ns = BEGIN_NS + NS_PER_S
     assert steady.even_from_ns == last_ns - 5 * 10 * NS_PER_MS
     steady = slewed(FAST, 101)
     assert steady.even_from_ns == last_ns
     steady.add_pair(BEGIN_NS + 2 * NS_PER_S + 83_333_000, RAW_NS + 2 * NS_PER_S)
-    assert steady.even_from_ns == last_ns  # the slew is over
+    assert steady.even_from_ns == last_ns  # the slew has ended
 
 
-def test_pairs_that_are_no_better_do_not_shorten_that() -> None:
+def test_less_exact_pairs_do_not_shorten_the_constant_time() -> None:
     steady = SteadyTime()
     for i in range(100):
         steady.add_pair(BEGIN_NS + i * NS_PER_S + (i % 2) * 3 * NS_PER_US, RAW_NS + i * NS_PER_S, 0, NS_PER_US)
@@ -93,7 +93,7 @@ def test_pairs_that_are_no_better_do_not_shorten_that() -> None:
 
 
 def test_a_change_of_the_rate_between_two_pairs_is_in_the_error() -> None:
-    """The truth is anywhere in a triangle above the chord: at most a quarter of the step times the change."""
+    """The true time is in a triangle above the chord: at most a quarter of the step times the change."""
     steady = slewed(0.0, 5)
     now_ns, raw = BEGIN_NS + 40 * NS_PER_MS, RAW_NS + 40 * NS_PER_MS
     for _ in range(4):
@@ -106,14 +106,14 @@ def test_a_change_of_the_rate_between_two_pairs_is_in_the_error() -> None:
     assert steady.error_ns(BEGIN_NS - NS_PER_S) == steady.error_ns(BEGIN_NS + NS_PER_S) == 0.0
 
 
-def test_memory_is_bounded_and_what_is_left_stays_right() -> None:
+def test_memory_is_bounded_and_the_rest_stays_correct() -> None:
     steady = slewed(FAST, 2 * PAIRS_MOST + 10, NS_PER_MS)
     last_ns = BEGIN_NS + (2 * PAIRS_MOST + 9) * NS_PER_MS
     for back_ns in (0, 3 * NS_PER_MS // 2, NS_PER_S, RATE_NS):
         steady_ns = last_ns - back_ns
         assert steady.monotonic_ns(steady_ns) == pytest.approx(BEGIN_NS + (steady_ns - BEGIN_NS) * (1 + FAST), abs=2)
-    assert steady.monotonic_ns(BEGIN_NS) > BEGIN_NS  # no longer known
-    steady = slewed(FAST, PAIRS_MOST + 1, NS_PER_MS)  # half of the pairs just went
+    assert steady.monotonic_ns(BEGIN_NS) > BEGIN_NS  # the pair is no longer known
+    steady = slewed(FAST, PAIRS_MOST + 1, NS_PER_MS)  # half of the pairs were removed
     oldest_ns = BEGIN_NS + (PAIRS_MOST // 2) * NS_PER_MS
     assert steady.monotonic_ns(oldest_ns) == pytest.approx(BEGIN_NS + (oldest_ns - BEGIN_NS) * (1 + FAST), abs=2)
 

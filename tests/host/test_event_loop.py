@@ -1,4 +1,4 @@
-"""Readers of the daemon's loop: called when their descriptors are readable, and by nothing else."""
+"""Readers of the daemon's event loop: called when their descriptors are readable, and never otherwise."""
 
 import asyncio
 import os
@@ -17,12 +17,12 @@ from tests.support.event_loops import in_loop
 TURNS = 3
 LIMIT_S = 60
 Pair = tuple[socket.socket, socket.socket]
-"""Two ends of a connection; the first is watched."""
+"""Two ends of a connection; the loop watches the first."""
 
 
 @pytest.fixture
 def pairs() -> Iterator[list[Pair]]:
-    """Three connections, closed at the end."""
+    """Yield three connections and close them at the end."""
     made = [socket.socketpair() for _ in range(3)]
     for ours, _ in made:
         ours.setblocking(False)
@@ -48,7 +48,7 @@ def read(sock: socket.socket, seen: list[str], word: str) -> None:
 
 
 def loop_in_use() -> SampleLoop:
-    """The running loop, which these tests are about."""
+    """Return the running loop, which these tests check."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, SampleLoop)
     return loop
@@ -121,7 +121,9 @@ async def test_a_reader_removed_by_another_in_the_same_turn_is_not_called(pairs:
 
 @in_loop
 async def test_an_event_is_not_that_of_a_new_descriptor_with_the_same_number(pairs: list[Pair]) -> None:
-    """Two are readable in one turn; the first closes the second and opens a descriptor of that number."""
+    """Two descriptors are readable in one turn. The first reader closes the second descriptor and opens another one
+    with the same number.
+    """
     loop, spurious = loop_in_use(), list[str]()
     *two, new = pairs
 
@@ -142,7 +144,7 @@ async def test_an_event_is_not_that_of_a_new_descriptor_with_the_same_number(pai
 
 @in_loop
 async def test_a_descriptor_that_was_closed_with_its_reader_can_have_another(pairs: list[Pair]) -> None:
-    """The kernel forgets the old one by itself."""
+    """The kernel removes the closed descriptor itself."""
     loop, seen, (first, _), (ours, theirs) = loop_in_use(), list[bytes](), pairs[0], pairs[1]
     number = first.fileno()
     loop.add_reader(number, lambda: seen.append(b"old"))
@@ -178,7 +180,7 @@ async def test_reader_and_writer_of_a_descriptor_are_independent(pair: Pair) -> 
 
 
 @in_loop
-async def test_an_error_of_a_reader_goes_to_the_handler_of_the_loop_and_the_others_go_on(pairs: list[Pair]) -> None:
+async def test_an_error_of_a_reader_goes_to_the_handler_of_the_loop(pairs: list[Pair]) -> None:
     loop, seen, reported = loop_in_use(), list[bytes](), list[dict[str, Any]]()
     loop.set_exception_handler(lambda _loop, context: reported.append(context))
 
@@ -207,7 +209,7 @@ async def test_a_reader_without_end_leaves_their_turns_to_tasks_timers_and_other
     loop.add_reader(ours, read, ours, seen, "other")
     loop.call_later(0.001, timer.set_result, None)
     theirs.send(b"a")
-    await timer  # the limit of the test ends a loop whose timers have no turn
+    await timer  # the limit of the test ends a loop that never runs its timers
     assert "other" in seen
     assert seen.count("flood") > 1
     loop.remove_reader(flood)
@@ -215,7 +217,7 @@ async def test_a_reader_without_end_leaves_their_turns_to_tasks_timers_and_other
 
 
 @in_loop
-async def test_what_a_reader_schedules_is_done_in_the_same_turn(pair: Pair) -> None:
+async def test_callbacks_of_a_reader_run_in_the_same_turn(pair: Pair) -> None:
     loop, order, (ours, theirs) = loop_in_use(), list[str](), pair
 
     def read_and_schedule() -> None:
@@ -304,7 +306,6 @@ def send_signal(loop: SampleLoop, done: asyncio.Future[None]) -> None:
 
 
 def add_writer(loop: SampleLoop, done: asyncio.Future[None]) -> None:
-    """Watch a descriptor that accepts data immediately."""
     ours, theirs = socket.socketpair()
 
     def write() -> None:
@@ -332,10 +333,10 @@ def add_writer(loop: SampleLoop, done: asyncio.Future[None]) -> None:
     ],
     ids=["soon", "later", "at", "future", "threadsafe", "thread", "executor", "task", "signal", "writer"],
 )
-def test_what_a_reader_gives_to_the_loop_is_done_at_once(
+def test_callbacks_of_a_reader_end_the_wait(
     pair: Pair, give: Callable[[SampleLoop, asyncio.Future[None]], object]
 ) -> None:
-    """No timer and no other event ends the wait of the loop: without its turn the test would end by its limit."""
+    """No timer and no other event ends the wait of the loop: otherwise the limit of the test ends it."""
     ours, theirs = pair
 
     async def main() -> None:
@@ -359,7 +360,7 @@ def test_what_a_reader_gives_to_the_loop_is_done_at_once(
 
 @in_loop
 async def test_a_descriptor_of_the_same_number_is_watched_from_the_next_wait_of_a_turn_on(pairs: list[Pair]) -> None:
-    """The reader replaces its descriptor; what comes to the new one is seen though the loop did not turn."""
+    """The reader replaces its descriptor. The loop receives data on the new descriptor in the same turn."""
     loop, seen, (first, first_far), (second, second_far) = loop_in_use(), list[bytes](), pairs[0], pairs[1]
     done = loop.create_future()
 

@@ -1,4 +1,4 @@
-"""Only regular files are read, and finding out that something is none takes no time and moves nothing."""
+"""imud reads only regular files. The check of the type never blocks and has no side effect."""
 
 import os
 import socket
@@ -34,7 +34,7 @@ def link_to(target: str) -> Callable[[Path], None]:
         (link_to("/dev/stdin/none"), "Not a directory|No such file"),
     ],
 )
-def test_what_is_no_file_is_refused_at_once(make: Callable[[Path], None], words: str, tmp_path: Path) -> None:
+def test_other_file_types_are_rejected_immediately(make: Callable[[Path], None], words: str, tmp_path: Path) -> None:
     make(tmp_path / "it")
     with pytest.raises(OSError, match=words):
         open_regular(tmp_path / "it")
@@ -45,7 +45,7 @@ def test_a_path_with_a_null_character() -> None:
         open_regular("a\0b")
 
 
-def test_what_is_exchanged_between_look_and_opening(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_replaced_between_check_and_opening(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, opened = tmp_path / "it", os.open
     path.write_bytes(b"data")
 

@@ -1,4 +1,4 @@
-"""A message is one line whatever it is made of, and no reader of the log makes the one who logs wait."""
+"""Each message is one line for any content, and a slow reader of the log never delays the caller."""
 
 import logging
 import os
@@ -35,7 +35,7 @@ WRITE_S = 60.0
 
 @pytest.fixture(autouse=True)
 def _time_to_write(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the end wait longer for the last messages: a loaded host writes slowly."""
+    """Wait longer for the last messages at the end, because a loaded host writes slowly."""
     monkeypatch.setattr("imud.host.log.FLUSH_S", WRITE_S)
 
 
@@ -47,7 +47,7 @@ HOSTILE = (
 
 
 def nested(levels: int) -> object:
-    """What 974 brackets of a request become."""
+    """Return the value of 974 nested brackets in a request."""
     value: object = {}
     for number in range(levels):
         value = [value] if number % 2 else {"a": value}
@@ -55,13 +55,13 @@ def nested(levels: int) -> object:
 
 
 def formatted(message: str, *values: object, **more: object) -> str:
-    """The line of one message."""
+    """Return the line of one message."""
     record = logging.LogRecord("imud", logging.WARNING, __file__, 1, message, values, None)
     record.__dict__.update(more)
     return LineFormatter(journal=True).format(record)
 
 
-# --- the journal, and repeated trouble --------------------------------------------------------------------------------
+# --- journal, repeated messages ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -76,23 +76,23 @@ def test_lines_for_the_journal_begin_with_their_priority(level: int, priority: i
 
 
 def passed(repeats: RepeatFilter, t_s: float, message: str, *values: object, level: int = logging.WARNING) -> str:
-    """The line that passes the filter at a time; empty for none."""
+    """Return the line that passes the filter at a time; empty if none passes."""
     record = logging.LogRecord("imud", level, __file__, 1, message, values, None)
     record.created = t_s
     return LineFormatter(journal=True).format(record) if repeats.filter(record) else ""
 
 
-def test_repeated_trouble_is_told_less_and_less_often() -> None:
+def test_repeated_messages_pass_less_and_less_often() -> None:
     repeats = RepeatFilter()
     told = {t: line for t in range(200) if (line := passed(repeats, 1000 + t, "%s: %d lost", "bow", t))}
     assert list(told) == [0, 1, 3, 7, 15, 31, 63, 123, 183]
     assert told[1] == "<4>bow: 1 lost"
     assert told[7] == "<4>bow: 7 lost, 3 more like it in 4 s"
     assert told[183] == "<4>bow: 183 lost, 59 more like it in 60 s"
-    assert passed(repeats, 1300, "%s: %d lost", "bow", 1) == "<4>bow: 1 lost"  # after a minute of quiet it is new
+    assert passed(repeats, 1300, "%s: %d lost", "bow", 1) == "<4>bow: 1 lost"  # new after one quiet minute
 
 
-def test_other_trouble_is_told_at_once() -> None:
+def test_other_messages_pass_immediately() -> None:
     repeats = RepeatFilter()
     assert passed(repeats, 0, "%s: %d lost", "bow", 1)
     assert not passed(repeats, 0, "%s: %d lost", "bow", 2)
@@ -105,7 +105,7 @@ def test_other_trouble_is_told_at_once() -> None:
     assert passed(repeats, 0, "nothing %s", 5)
 
 
-def test_texts_that_are_values_are_told_apart_and_numbers_in_them_are_not() -> None:
+def test_texts_differ_except_for_numbers() -> None:
     repeats, told = RepeatFilter(), []
     for text in ("3 samples lost", "5 samples lost", "the adapter is gone"):
         values = {"msg": "%s: %s", "args": ("bow", text), "levelno": logging.WARNING, "created": 0.0}
@@ -113,7 +113,7 @@ def test_texts_that_are_values_are_told_apart_and_numbers_in_them_are_not() -> N
     assert told == [True, False, True]
 
 
-def test_what_is_remembered_is_bounded() -> None:
+def test_remembered_messages_are_bounded() -> None:
     repeats = RepeatFilter()
     for number in range(KNOWN_MOST + 1):
         assert passed(repeats, 0, f"message {number}")
@@ -132,7 +132,7 @@ def test_printable_is_one_bounded_line_for_every_encoding(text: str) -> None:
     line.encode("utf-8")
 
 
-def test_printable_says_what_it_hides() -> None:
+def test_printable_marks_a_cut() -> None:
     assert printable("Überseeschiff 3 °C") == "Überseeschiff 3 °C"
     assert printable("a\nb\x1b\udc80\u202e") == r"a\nb\x1b\udc80\u202e"
     assert printable("x" * 300, 10) == "x" * 9 + "…"
@@ -213,12 +213,12 @@ def test_messages_arrive_in_order_and_whole_at_the_end() -> None:
 
 
 @pytest.mark.live
-def test_a_log_that_nobody_reads_stops_nothing_and_says_what_is_missing() -> None:
+def test_a_log_without_a_reader_never_blocks_and_reports_dropped_messages() -> None:
     with pipe(full=True) as (reader, descriptor), log_to(descriptor, "info") as writer:
         for number in range(5000):
             log.info("message %d", number)
         dropped = writer.dropped
-        assert 3900 < dropped <= 4000  # all but what the queue holds, and what the thread has in its hand
+        assert 3900 < dropped <= 4000  # messages outside the queue and the thread
         assert messages_dropped() == dropped
         text = read_until(reader, b"messages dropped").decode()
         lines = text.splitlines()
@@ -244,7 +244,7 @@ def test_the_end_does_not_wait_for_a_reader_that_reads_nothing(monkeypatch: pyte
         writer.close()
         assert waits == [WRITE_S] * 2, "the second time it returns at once"
         no_thread_is_left()
-        # a pipe with room for a page says that it can be written; a longer write would wait in it
+        # a pipe with one free page is writable; a longer write would block
         assert len(os.read(reader, select.PIPE_BUF)) == select.PIPE_BUF
         with log_to(descriptor, "info"):
             try:
@@ -301,7 +301,7 @@ class Unclosable:
         raise KeyError("not closed")
 
 
-def test_a_file_is_written_and_what_python_reports_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_receives_messages_and_reports_of_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hooks = print, repr
     monkeypatch.setattr(sys, "unraisablehook", hooks[0])
     monkeypatch.setattr(threading, "excepthook", hooks[1])

@@ -10,7 +10,7 @@ import pytest
 from imud.host.service_manager import STATUS_NS, ServiceManager, notify, status_line, watchdog_interval_s
 
 NO_PROCESS = str(1 << 30)
-"""Above the largest number of a process (proc(5), pid_max)."""
+"""Number above the largest process id (proc(5), pid_max)."""
 
 
 @pytest.mark.parametrize("is_abstract", [False, True])

@@ -1,4 +1,4 @@
-"""Messages have the system's and libraries' errors in words, and no message is made of such an error as it is."""
+"""Messages contain system and library errors as readable text, and no code formats such an error directly."""
 
 import ast
 import errno
@@ -17,7 +17,7 @@ FOREIGN = {
     "OSError", "PermissionError", "FileNotFoundError", "ConnectionError", "error", "ValidationError", "DecodeError",
     "UnicodeDecodeError", "UnicodeError", "SerialException", "CanError", "TypeError",
 }  # fmt: skip
-"""Errors whose text is for programmers: `[Errno 2] No such file …`, `(25, 'Inappropriate …')`, "Expected `int`"."""
+"""Errors with text for programmers: `[Errno 2] No such file …`, `(25, 'Inappropriate …')`, "Expected `int`"."""
 ALLOWED = {
     ("imud/formats/jsonrpc.py", "parse_object"): "what is wrong with JSON, and at which byte, in plain words",
     ("imud/model/options.py", "value_problem"): "takes the place out of it, nothing else",
@@ -45,7 +45,7 @@ def test_reason_of(error: Exception, words: str) -> None:
 
 
 def foreign_texts() -> Iterator[tuple[str, str, int]]:
-    """File, function and line of each place where a foreign error becomes part of a text as it is."""
+    """Yield file, function and line of each place that formats a foreign error directly."""
     for path in sorted((ROOT / "imud").rglob("*.py")):
         text = path.read_text()
         nodes = list(ast.walk(ast.parse(text))) if "except" in text else []
@@ -61,7 +61,7 @@ def _line_of(node: ast.stmt) -> int:
 
 
 def _texts_of(handler: ast.ExceptHandler) -> Iterator[int]:
-    """Lines of a handler of foreign errors that format the error, pass it to str() or log it."""
+    """Yield the lines of an error handler that format the error, pass it to str() or log it."""
     kinds = handler.type.elts if isinstance(handler.type, ast.Tuple) else [handler.type]
     names = {kind.attr if isinstance(kind, ast.Attribute) else getattr(kind, "id", "") for kind in kinds}
     if not names & FOREIGN or handler.name is None:

@@ -1,4 +1,4 @@
-"""The ledger's two sums."""
+"""The two sums of the ledger."""
 
 from imud.model.ledger import LEDGER_FIELDS, Ledger
 

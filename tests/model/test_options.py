@@ -1,4 +1,4 @@
-"""Wrong values are described in words, for every structure that users fill: the configuration, options, arguments."""
+"""Error texts of wrong values, for every structure that users fill: configuration, options, arguments."""
 
 import re
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ from imud.publishers.socket.methods import METHODS
 from tests.support import references
 
 LEAKS = re.compile(r"`|\$|Object|missing required|ValidationError|<class|Expected|NoneType|\bstr\b|\bint\b|\bfloat\b")
-"""Words of msgspec and of Python, which mean nothing to a user."""
+"""Words of msgspec and of Python that a user does not know."""
 WRONG: tuple[Any, ...] = (
     None, True, -1, 10**30, 1.5, -1e9, "", "no such word", "a\nb", [], [1], ["x"], [None], [[1]], {}, {"a": 1},
     {"a": {"b": [1]}},
@@ -23,7 +23,7 @@ WRONG: tuple[Any, ...] = (
 
 
 def schemas() -> Iterator[Any]:
-    """All structures that are filled from what a user writes."""
+    """Yield all structures that imud fills with values of the user."""
     for title, _, schema in references.settings_parts():
         yield pytest.param(schema, id=title)
     for name, schema in LINE_SCHEMAS.items():

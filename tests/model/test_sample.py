@@ -1,4 +1,4 @@
-"""The schema of a sample describes every member in its order, as the C and JSON readers see them."""
+"""The schema of a sample describes every member in its order."""
 
 from imud.lines.sync import ALARM_STATUS
 from imud.model.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, Sample
@@ -12,12 +12,12 @@ def test_every_member_has_its_row_in_its_place() -> None:
     assert [name for name, field in BY_NAME.items() if not field.always] == list(optional)
 
 
-def test_the_bit_of_the_alarm_line_is_the_one_that_is_told() -> None:
+def test_the_bit_of_the_alarm_line_is_documented() -> None:
     assert ALARM_STATUS == 1 << 31
     assert "bit 31" in BY_NAME["status"].meaning
 
 
-def test_what_an_edge_is_the_number_of() -> None:
+def test_the_meaning_of_edge_seq() -> None:
     meaning = BY_NAME["edge_seq"].meaning
     assert "rising edge on SOUT" in meaning
     assert "trigger on SIN" in meaning

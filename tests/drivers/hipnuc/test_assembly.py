@@ -1,4 +1,4 @@
-"""How samples are assembled from frames without a counter, on streams of a made-up device: data tell the burst."""
+"""Assembly of samples from frames without a counter. The data of the test frames identify the burst."""
 
 from collections.abc import Callable, Iterable, Mapping
 from random import Random
@@ -15,12 +15,12 @@ MS = 1_000_000
 PERIOD_NS = 5 * MS
 FRAME_NS = 240_000
 LEARNING = 6
-"""Bursts until the fast kinds are known, the one that begins in the middle included."""
+"""Number of bursts until the fast kinds are known, with the first incomplete burst."""
 EQUAL = {1: 1, 2: 1, 3: 1}
 MIXED = {1: 1, 2: 1, 3: 2, 6: 10}
-"""200, 200, 100 and 20 Hz: every so many bursts."""
+"""200, 200, 100 and 20 Hz, as multiples of the burst period."""
 LEADING = {7: 4, 1: 1, 2: 1}
-"""A slow kind is sent first."""
+"""Order in which a slow kind is first."""
 
 
 class Frame(NamedTuple):
@@ -31,7 +31,7 @@ class Frame(NamedTuple):
 
 
 def stream(kinds: Mapping[int, int], bursts: Iterable[int], period_ns: int = PERIOD_NS) -> list[Frame]:
-    """The frames of some bursts at their times; the data are the number of the burst and the kind."""
+    """Yield the frames of some bursts at their times. The data are the number of the burst and the kind."""
     frames = []
     for burst in bursts:
         due = [kind for kind, every in kinds.items() if burst % every == 0]
@@ -49,7 +49,7 @@ class AssemblyBench:
         """Burst and kinds of each sample."""
 
     def feed(self, frames: Iterable[Frame]) -> list[int]:
-        """The bursts that became samples; checks that none is mixed and that the ledger closes."""
+        """Return the bursts that became samples. Check that no sample is mixed and that the ledger balances."""
         before = len(self.made)
         for frame in frames:
             self.ledger.frames_good += 1
@@ -167,7 +167,7 @@ def test_bursts_that_are_lost_whole_are_counted(kinds: dict[int, int], lost: int
 @pytest.mark.parametrize("kinds", [EQUAL, MIXED, LEADING])
 @pytest.mark.parametrize("stall_ns", [4 * MS, 7_300_000, 60 * MS, 1500 * MS])
 def test_a_stall_between_two_bursts_costs_nothing(kinds: dict[int, int], stall_ns: int) -> None:
-    """All that was sent meanwhile comes at once when the stall ends."""
+    """All frames of the stall arrive together at its end."""
     rig = learnt(kinds)
     begin_ns = 10**9 + 60 * PERIOD_NS - MS
     frames = [
@@ -185,7 +185,7 @@ def test_a_stall_between_two_bursts_costs_nothing(kinds: dict[int, int], stall_n
 
 
 @pytest.mark.parametrize("kinds", [EQUAL, MIXED])
-def test_frames_that_come_twice_cost_nothing(kinds: dict[int, int]) -> None:
+def test_repeated_frames_cost_no_sample(kinds: dict[int, int]) -> None:
     rig, random = learnt(kinds), Random(3)
     frames = [frame for frame in stream(kinds, range(40, 140)) for _ in range(random.choice((1, 1, 2)))]
     assert rig.feed(frames) == list(range(40, 140))
@@ -193,7 +193,7 @@ def test_frames_that_come_twice_cost_nothing(kinds: dict[int, int]) -> None:
 
 
 def test_kinds_that_are_switched_off_or_stay_out() -> None:
-    """Kinds that are not selected stay out too, and a kind of 50 ms next to a period of 20 ms, between bursts."""
+    """Also kinds that are not selected, and a kind of 50 ms next to a period of 20 ms, between bursts."""
     rig = learnt(EQUAL)
     made = rig.feed(stream({1: 1, 3: 1}, range(40, 80)))
     assert made == list(range(50, 80))
@@ -205,7 +205,7 @@ def test_kinds_that_are_switched_off_or_stay_out() -> None:
     rig = learnt(MIXED)
     off, on = stream({1: 1, 2: 1, 3: 2}, range(40, 300)), stream(MIXED, range(300, 400))
     assert rig.feed(off) == list(range(40, 300))
-    *head, last = stream({1: 1, 2: 1, 3: 2}, [300])  # kind 6 is no longer waited for
+    *head, last = stream({1: 1, 2: 1, 3: 2}, [300])  # the assembly no longer waits for kind 6
     assert rig.feed([*head, last]) == [300]
     assert rig.feed(on[4:]) == list(range(301, 400))
     assert rig.kinds_of(380) == (1, 2, 3, 6)
@@ -234,7 +234,7 @@ def test_a_kind_that_is_switched_on_joins(new: dict[int, int]) -> None:
 
 
 @pytest.mark.parametrize("period_ns", [PERIOD_NS // 2, 2 * PERIOD_NS, 4 * PERIOD_NS])
-def test_another_rate_of_all_is_no_loss(period_ns: int) -> None:
+def test_a_new_rate_is_not_a_loss(period_ns: int) -> None:
     rig = learnt(EQUAL)
     begin_ns = 10**9 + 40 * PERIOD_NS
     frames = [
@@ -263,7 +263,7 @@ def test_another_rate_of_some_is_learnt(before: dict[int, int], after: dict[int,
 
 
 def test_order_alone_and_learning_under_loss() -> None:
-    """Without times: 1 and 3 of a burst, then 2 and 3 of the next; 2 stands before the 3 that is held."""
+    """Without times: 1 and 3 of a burst, then 2 and 3 of the next burst. 2 is before the held 3 in the order."""
     rig = AssemblyBench()
     rig.feed(frame._replace(t_ns=0) for frame in stream(EQUAL, range(30)))
     frames = without(stream(EQUAL, range(30, 40)), lambda f: (f.burst, f.kind) in ((32, 2), (33, 1)))
@@ -288,7 +288,9 @@ def test_order_alone_and_learning_under_loss() -> None:
 
 @given(seed=st.integers(0, 2**32), kinds=st.sampled_from([EQUAL, MIXED, LEADING, {1: 1, 6: 20}, {1: 1, 2: 2, 3: 4}]))
 def test_periods_are_never_mixed(seed: int, kinds: dict[int, int]) -> None:
-    """Any loss, of single frames and of runs, at any time, learning included; each sample is of one burst (`feed`)."""
+    """Any loss, of single frames and of runs, at any time, also during learning. Each sample is from one burst
+    (`feed`).
+    """
     random = Random(seed)
     rig = AssemblyBench()
     rate = random.choice((0.0, 0.02, 0.2))

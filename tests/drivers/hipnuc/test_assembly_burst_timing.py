@@ -1,4 +1,4 @@
-"""Loss told from lateness by the times of bursts; the period is 5 ms, times are in ms."""
+"""Loss and delay by the times of bursts. The period is 5 ms; times are in ms."""
 
 import pytest
 
@@ -17,7 +17,7 @@ def lost(*times_ms: float) -> int:
     ("times_ms", "expected"),
     [
         ((5, 10), 0),
-        ((9.4, 13.2, 15), 0),  # the second one is held up less, but still late
+        ((9.4, 13.2, 15), 0),  # the second burst is delayed less, but still late
         ((12, 12.1, 15), 0),
         ((38, 38.1, 38.2, 38.3, 38.4, 38.5, 38.6, 40), 0),
         ((5, 11.2, 15, 19, 25), 0),
@@ -30,7 +30,7 @@ def lost(*times_ms: float) -> int:
         ((10, 30, 40, 60, 70, 90, 100, 120), 16),
     ],
 )
-def test_what_is_not_made_up_for_is_loss(times_ms: tuple[float, ...], expected: int) -> None:
+def test_a_remaining_delay_is_a_loss(times_ms: tuple[float, ...], expected: int) -> None:
     assert lost(*times_ms) == expected
 
 

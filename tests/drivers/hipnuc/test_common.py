@@ -1,4 +1,4 @@
-"""Values as whole counts of a signed field, values that are an air pressure, and the load of a bus."""
+"""Values as counts of a signed field, valid air pressures, and the load of a bus."""
 
 from math import inf, nan
 
@@ -26,7 +26,7 @@ def test_nearest_count_in_the_range(value: float, bits: int, counts: int) -> Non
     assert counts_of(value, bits) == counts
 
 
-def test_no_number_has_no_count() -> None:
+def test_nan_has_no_count() -> None:
     with pytest.raises(ValueError, match="NaN"):
         counts_of(nan, 16)
 

@@ -1,4 +1,4 @@
-"""The zero of an inclinometer on a bus: made of the driver's actions."""
+"""Zero of an inclinometer on a bus, made of the actions of the driver."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What yaw counts from, by the settings that a module reported."""
+"""Reference of yaw from the settings that a device reported."""
 
 import pytest
 

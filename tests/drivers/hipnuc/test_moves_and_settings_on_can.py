@@ -1,6 +1,6 @@
-"""HiPNUC modules on CAN: settings are written, saved and read back, and a module is followed to another number.
+"""HiPNUC devices on CAN: write, save and read settings, and follow a device to another number.
 
-Most tests run on CANopen and on J1939, over everything that no manual settles.
+Most tests run on CANopen and on J1939, with all behaviors that no manual documents.
 """
 
 from collections.abc import Callable, Mapping
@@ -32,22 +32,22 @@ PGNS = ("ff2f", "ff34", "ff37", "ff3a", "ff3d", "ff41", "ff43", "ff46", "ff4a")
 
 
 class Protocol(NamedTuple):
-    """A protocol on CAN by the names and values that differ."""
+    """Protocol on CAN, described by the names and values that differ."""
 
     noun: str
-    """Setting and action of the number of a module."""
+    """Setting and action of the number of a device."""
     restarted: str
-    """Answer of a restart, without the number."""
+    """Result of a restart, without the number."""
     make: Callable[..., CanopenBench | J1939Bench]
-    """Makes a bench of a module with a number."""
+    """Returns a bench of a device with a number."""
     variants: Mapping[str, Any]
     variant: Callable[..., Any]
     register: int
-    """Place of the number in the module."""
+    """Place of the number in the device."""
     values: Mapping[str, tuple[object, ...]]
     """Values of every setting, in the order of the table."""
     of_each_form: tuple[str, ...]
-    """Settings that every kind of module must take; the other settings have the same forms."""
+    """Settings that every kind of device must accept. The other settings have the same forms."""
     delivered: Mapping[str, object]
     wrong: Mapping[str, object]
     settings: SettingsTable
@@ -56,7 +56,7 @@ class Protocol(NamedTuple):
     place: Any
     number_of: Callable[[Any], int]
     go_back: tuple[int, str]
-    """Identifier and data of the frame that commands a lost module to go back from 9 to 8."""
+    """Identifier and data of the frame that commands a lost device from 9 back to 8."""
     is_write: Callable[[bytes], bool]
 
 
@@ -109,7 +109,7 @@ J1939 = Protocol(
     },
     of_each_form=("ff34_interval_ms", "x_reversed", "bit_rate", "address"),
     delivered={
-        **{f"{pgn}_interval_ms": 100 for pgn in ("ff34", "ff37", "ff3d", "ff41")},  # the other ones are not on
+        **{f"{pgn}_interval_ms": 100 for pgn in ("ff34", "ff37", "ff3d", "ff41")},  # the other messages are off
         "x_reversed": False,
         "y_reversed": False,
         "bit_rate": 500_000,
@@ -130,7 +130,7 @@ EVERY = [(protocol, name) for protocol in (CANOPEN, J1939) for name in protocol.
 
 @pytest.fixture(params=EVERY, ids=[name for _, name in EVERY])
 def kind(request: pytest.FixtureRequest) -> tuple[Protocol, Any]:
-    """A protocol, and a bench with a module of each kind and another module with the number 12."""
+    """Yield a protocol, a bench with a device of each kind, and another device with the number 12."""
     protocol, name = request.param
     bench = protocol.make(boot_ms=300, variant=protocol.variants[name], others=(12,))
     bench.run(BOOTED_NS)
@@ -174,7 +174,7 @@ def test_a_module_is_followed_to_another_number(kind: tuple[Protocol, Any]) -> N
     assert len(bench.measured) > before + 5
 
 
-def test_a_number_that_is_in_force_before_it_is_saved_is_left_at_a_restart(kind: tuple[Protocol, Any]) -> None:
+def test_an_unsaved_number_is_lost_at_a_restart(kind: tuple[Protocol, Any]) -> None:
     protocol, bench = kind
     if is_at_once(bench.module.hardware.variant):
         move(protocol, bench, 9)
@@ -182,17 +182,17 @@ def test_a_number_that_is_in_force_before_it_is_saved_is_left_at_a_restart(kind:
         assert numbers(protocol, bench) == (8, 8)
 
 
-def test_a_number_that_is_heard_on_the_bus_is_refused_and_nothing_is_written(kind: tuple[Protocol, Any]) -> None:
+def test_a_number_in_use_is_rejected_without_a_write(kind: tuple[Protocol, Any]) -> None:
     protocol, bench = kind
     with pytest.raises(BadArgument, match=rf"{protocol.noun} 12 is in use: received its (frame 0x|PGN F)"):
         move(protocol, bench, 12)
     assert not any(protocol.is_write(data) for _, data in bench.sent)
-    move(protocol, bench, 8)  # its own number is written all the same
+    move(protocol, bench, 8)  # imud writes its own number anyway
     assert numbers(protocol, bench) == (8, 8)
 
 
 @both
-def test_refused_and_ignored_numbers_are_told(protocol: Protocol) -> None:
+def test_rejected_and_ignored_numbers_are_reported(protocol: Protocol) -> None:
     register = frozenset({protocol.register})
     with pytest.raises((Aborted, Rejected), match=r"invalid value|status 1"):
         move(protocol, protocol.make(variant=protocol.variant(refuses=register)), 9)
@@ -201,7 +201,7 @@ def test_refused_and_ignored_numbers_are_told(protocol: Protocol) -> None:
 
 
 @both
-def test_a_module_that_is_heard_nowhere_is_told_to_go_back(protocol: Protocol) -> None:
+def test_a_lost_device_is_commanded_back(protocol: Protocol) -> None:
     sent: list[bytes] = []
 
     def silent(request: Request) -> Outcome:
@@ -217,11 +217,11 @@ def test_a_module_that_is_heard_nowhere_is_told_to_go_back(protocol: Protocol) -
 
 
 @both
-def test_a_restart_that_loses_the_module_is_told(protocol: Protocol) -> None:
+def test_a_restart_that_loses_the_device_is_reported(protocol: Protocol) -> None:
     bench = protocol.make(boot_ms=300)
     bench.run(BOOTED_NS)
     bench.act("bitrate", bitrate=250_000)
-    bench.module.hardware = type(bench.module.hardware)(boot_ms=60_000)  # the host does not understand its frames then
+    bench.module.hardware = type(bench.module.hardware)(boot_ms=60_000)  # afterwards, the host cannot read its frames
     assert (
         bench.act("restart")
         == "restarted; the device now uses 250000 bit/s and the bus does not; set the bus to 250000 bit/s"
@@ -247,9 +247,7 @@ def test_factory_settings_are_in_force_after_a_restart(protocol: Protocol) -> No
 
 @pytest.mark.parametrize("told", [254, 0xF006_0102])
 @both
-def test_a_number_that_is_none_is_not_looked_for(
-    protocol: Protocol, told: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_invalid_number_is_not_searched(protocol: Protocol, told: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Found by fuzzing: such a number made an identifier that no frame can have, a ValueError."""
 
     def read_values(*_arguments: object, **_more: object) -> RequestScript[dict[object, int]]:
@@ -286,8 +284,8 @@ def test_present_values_are_read_and_nothing_is_written(kind: tuple[Protocol, An
 
 
 @both
-def test_a_setting_written_saved_and_restarted_is_what_is_read(protocol: Protocol) -> None:
-    """Each kind of module takes one setting of each form; the real one takes all."""
+def test_a_saved_setting_is_read_after_a_restart(protocol: Protocol) -> None:
+    """Each kind of device accepts one setting of each form; the real one accepts all."""
     for variant, (name, values) in product(protocol.variants.values(), protocol.values.items()):
         if name in protocol.of_each_form or variant == protocol.variant():
             bench = protocol.make(boot_ms=100, variant=variant)
@@ -309,7 +307,7 @@ def test_canopen_values_that_do_not_go_together_are_refused() -> None:
     fast = {f"tpdo{tpdo}_interval_ms": 5 for tpdo in TPDOS}  # 586 bits · 200 = 117,200 bit/s
     with pytest.raises(BadArgument, match=r"got 118 % of it: .*TPDO4 every 5 ms 17.8 %.*; other devices 24 %"):
         CANOPEN_SETTINGS.check(target, fast)
-    # sent when SYNC comes, which does not
+    # sent at each SYNC, and SYNC is off
     CANOPEN_SETTINGS.check(target, fast | {f"tpdo{tpdo}_by": "sync" for tpdo in TPDOS})
 
 

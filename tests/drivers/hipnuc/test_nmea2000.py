@@ -1,4 +1,6 @@
-"""PGNs 127250, 127251 and 127257: values by hand, values that are none, an independent library both ways, and SIDs."""
+"""PGNs 127250, 127251 and 127257: values by hand, invalid values, an independent library in both directions, and
+SIDs.
+"""
 
 import math
 import struct
@@ -38,7 +40,7 @@ def make(**options: object) -> HipnucNmea2000Codec:
 def burst(
     value: int, source: int = 35, *, sids: tuple[int, int, int] | None = None, reference: Reference = Reference.TRUE
 ) -> list[Frame]:
-    """The three messages; `value` is roll in counts, so that samples are known apart."""
+    """Return the three messages; `value` is roll in counts and identifies the sample."""
     a, b, c = sids or (value % 253,) * 3
     return [
         encode(HEADING, messages.pack_heading(a, 0.5, reference), source),
@@ -57,7 +59,7 @@ def feed(codec: HipnucNmea2000Codec, frames: list[Frame], t_ns: int) -> list[int
 
 
 def learned(**options: object) -> HipnucNmea2000Codec:
-    """A codec that has heard enough; the next burst begins at 1 s."""
+    """Return a codec that has learned the bursts; the next burst starts at 1 s."""
     codec = make(**options)
     for n in range(10):
         feed(codec, burst(n), n * 100 * MS)
@@ -76,7 +78,7 @@ def test_heading_is_clockwise_from_north(counts: int, yaw_rad: float) -> None:
 
 
 def test_rate_of_turn_and_attitude() -> None:
-    """y of the sensor is the bow: heading 90°, pitch 30° takes it east and up."""
+    """The y axis of the sensor is the bow: heading 90° and pitch 30° point it east and up."""
     # 3200000 · 3.125e-8 = 0.1 rad/s to starboard
     found = measured((RATE_OF_TURN, "05 00d43000 ffffff"))
     assert found.gyro_rad_s == pytest.approx((math.nan, math.nan, -0.1), nan_ok=True)
@@ -95,7 +97,7 @@ def test_rate_of_turn_and_attitude() -> None:
     assert bow == pytest.approx((math.cos(math.pi / 6), 0, 0.5), abs=1e-4)
 
 
-def test_heading_goes_before_the_yaw_of_the_attitude() -> None:
+def test_the_heading_has_priority_over_the_yaw_of_the_attitude() -> None:
     attitude = (ATTITUDE, "05 1027 0000 0000 ff")
     for order in ((0, 1), (1, 0)):
         rows = [attitude, (HEADING, "05 983a ff7f ff7f fd")]  # 1.5 rad
@@ -129,7 +131,7 @@ def test_the_next_lower_values_are_values() -> None:
 
 
 @pytest.mark.manual("B 7 NMEA 2000")
-def test_the_library_reads_what_we_encode() -> None:
+def test_the_library_decodes_our_messages() -> None:
     pgns = pytest.importorskip("nmea2000.pgns")
     random = Random(1)
     for _ in range(25):
@@ -154,7 +156,7 @@ def test_the_library_reads_what_we_encode() -> None:
 
 
 @pytest.mark.manual("B 7 NMEA 2000")
-def test_we_read_what_the_library_encodes() -> None:
+def test_we_decode_messages_of_the_library() -> None:
     pgns = pytest.importorskip("nmea2000.pgns")
     random = Random(2)
     for _ in range(25):
@@ -218,7 +220,7 @@ def test_sids_and_senders_are_never_mixed() -> None:
     codec = learned()
     lost_before = codec.ledger.lost()
     first, second = burst(50), burst(51)
-    # the end of one instant and the beginning of the next are lost, and what is left comes in order
+    # the end of one instant and the start of the next are lost; the other frames are in order
     assert feed(codec, [first[0], *second[1:]], 1000 * MS) == []
     assert feed(codec, burst(52), 1100 * MS) == [52]
     assert codec.ledger.lost() == lost_before + 1
@@ -237,7 +239,7 @@ def test_sids_and_senders_are_never_mixed() -> None:
     for n in range(40):
         found = feed(codec, burst(n, sids=(n % 7, 100 + n, 200)), n * 100 * MS)
     assert found == [39]
-    for n in range(40, 40 + SID_DOUBTS):  # they agree: from now on they count again
+    for n in range(40, 40 + SID_DOUBTS):  # they agree: imud uses them again
         assert feed(codec, burst(n), n * 100 * MS) == [n]
     assert feed(codec, burst(99, sids=(1, 2, 2)), (40 + SID_DOUBTS) * 100 * MS) == []
 
@@ -246,11 +248,11 @@ def test_sids_and_senders_are_never_mixed() -> None:
     assert codec.ledger.bytes_skipped == 24
     found = [value for n in range(2, 42) for value in feed(codec, burst(n), n * 100 * MS + 800 * MS)]
     assert found == list(range(2, 42))
-    assert feed(codec, burst(1, source=36), 4950 * MS) == []  # the first one was heard 50 ms before
+    assert feed(codec, burst(1, source=36), 4950 * MS) == []  # received 50 ms after the first sender
     assert feed(codec, burst(42), 5000 * MS) == [42]
     found = [value for n in range(12) for value in feed(codec, burst(n, source=36), 9000 * MS + n * 100 * MS)]
     assert found[-1] == 11
-    assert feed(codec, burst(3), 10300 * MS) == []  # the old one is somebody else now
+    assert feed(codec, burst(3), 10300 * MS) == []  # the old address now belongs to another sender
 
 
 @pytest.mark.parametrize(
@@ -274,7 +276,7 @@ def test_a_sender_of_two_headings(heading: str, yaw: float) -> None:
 
 
 def test_yaw_is_not_taken_from_two_places() -> None:
-    """Heading every second time: between, yaw is absent, not that of the attitude."""
+    """The heading is in every second sample. In the other samples yaw is absent, not the yaw of the attitude."""
     codec = make()
     events: list[CodecEvent] = []
     for n in range(40):

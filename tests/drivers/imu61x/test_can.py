@@ -1,4 +1,4 @@
-"""Frames of the IMU61x on CAN, made and computed by hand, and the rules by which five of them become a sample."""
+"""IMU61x frames on CAN, computed by hand, and the rules that make a sample of five frames."""
 
 import math
 import struct
@@ -109,15 +109,15 @@ def test_incomplete_mixed_and_disordered_sets() -> None:
 
     codec = make()
     first, second = sample(1, 1.0), sample(2, 2.0)
-    events = feed(codec, first[:4] + second[1:])  # the first one's 105 and the second one's 101 are lost
+    events = feed(codec, first[:4] + second[1:])  # lost: 105 of the first sample and 101 of the second sample
     assert events == []
     late = sample(9, 3.0)
-    events = feed(codec, second[2:4] + late[:2] + late[4:])  # joined inside a set, then 105, 103 and 104 lost
+    events = feed(codec, second[2:4] + late[:2] + late[4:])  # imud starts inside a set; then 105, 103 and 104 are lost
     assert events == []
 
     codec = make()
     mixed = [sample(4)[n] for n in (2, 0, 3, 1, 4)]
-    assert indices(feed(codec, mixed)) == []  # nothing is known before
+    assert indices(feed(codec, mixed)) == []  # no INDEX is known before
     mixed = [sample(5)[n] for n in (2, 0, 3, 1, 4)]
     assert indices(feed(codec, mixed)) == [5]
     mixed = [sample(7)[n] for n in (2, 0, 3, 1, 4)]
@@ -132,7 +132,7 @@ FRAME_NS = 250_000
 def timed(
     codec: Imu61xCanCodec, index: int, places: str = "12345", *, late_ns: int = 0, period_ns: int = PERIOD_NS
 ) -> list[int | None]:
-    """Feed some of the frames of a sample, sent one after the other, at the time that its INDEX says."""
+    """Feed some frames of a sample back to back, at the time of its INDEX."""
     events: list[CodecEvent] = []
     for place, (can_id, data) in enumerate(sample(index, float(index % 100))):
         if str(place + 1) in places:
@@ -143,15 +143,15 @@ def timed(
 
 
 def learned(period_ns: int = PERIOD_NS) -> Imu61xCanCodec:
-    """A codec that has seen samples up to INDEX 9, as few as it needs."""
+    """Return a codec after samples up to INDEX 9, the minimum that it needs."""
     codec = make()
     assert [timed(codec, index, period_ns=period_ns) for index in range(1, 10)] == [[index] for index in range(1, 10)]
     return codec
 
 
 @pytest.mark.parametrize("cut", range(1, 5))
-def test_frames_of_two_samples_in_order_are_told_by_time(cut: int) -> None:
-    """1 … `cut` of one sample and the rest of another, what was between them lost: in order, and yet no sample."""
+def test_time_separates_frames_of_two_samples(cut: int) -> None:
+    """Frames 1 … `cut` of one sample and the rest of another sample. The frames between them are lost: no sample."""
     codec = learned()
     first, rest = "12345"[:cut], "12345"[cut:]
     assert timed(codec, 10, first) + timed(codec, 11, rest) == []
@@ -161,11 +161,11 @@ def test_frames_of_two_samples_in_order_are_told_by_time(cut: int) -> None:
     assert timed(codec, 78) == [78]
 
 
-def test_time_tells_whole_sets_from_mixed_ones() -> None:
-    """At 100 Hz, on a bus that is nearly full, before a period is known, and after a pause or at another rate."""
+def test_time_separates_complete_and_mixed_sets() -> None:
+    """At 100 Hz, on a nearly full bus, before the period is known, after a pause and at another rate."""
     codec = learned()
     assert [timed(codec, index) for index in (17, 18, 400, 401)] == [[17], [18], [400], [401]]
-    # the last frame 4.9 ms late: 5.9 ms are less than 1 ms + half of 10 ms
+    # the last frame is 4.9 ms late: 5.9 ms is less than 1 ms + half of 10 ms
     assert timed(codec, 410, "1234") + timed(codec, 410, "5", late_ns=4_900_000) == [410]
     assert timed(codec, 420, "1234") + timed(codec, 420, "5", late_ns=5_100_000) == []
 
@@ -178,14 +178,14 @@ def test_time_tells_whole_sets_from_mixed_ones() -> None:
     codec = make()
     assert timed(codec, 1, "123") + timed(codec, 2, "45") == [2]
     assert [timed(codec, index) for index in range(3, 10)] == [[index] for index in range(3, 10)]
-    assert timed(codec, 10, "123") + timed(codec, 12, "45") == [12]  # seven sets were seen whose INDEX follows
+    assert timed(codec, 10, "123") + timed(codec, 12, "45") == [12]  # after seven sets without a jump of INDEX
     timed(codec, 13)
     assert timed(codec, 14, "123") + timed(codec, 15, "45") == []
 
     codec = make()
     for index in range(1, 20):
         timed(codec, index)
-    assert timed(codec, 20, late_ns=10**9) == [20]  # a second late, and the next come on time again
+    assert timed(codec, 20, late_ns=10**9) == [20]  # one second late; the following sets are on time
     assert timed(codec, 121, "123") + timed(codec, 122, "45") == []
     codec.reset()
     begin, fast_ns = 1000, 2_500_000

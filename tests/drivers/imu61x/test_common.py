@@ -1,4 +1,4 @@
-"""Check value, product ids and filter codes against the manual's own words."""
+"""Check value, product ids and filter codes, compared with the manual."""
 
 import pytest
 
@@ -31,7 +31,7 @@ def test_crc_is_the_reflected_polynomial_from_one_without_inversion(data: bytes)
 
 @pytest.mark.manual("A 1.2 CRC", "A 1.3 acceleration", "A 2.4.2 codes", "A 2.4.2 default", "A 2.4.2 layout")
 def test_crc_gravity_products_and_filters() -> None:
-    """The manual writes 0x44 for 10 Hz and 0xBB for 47 Hz, accelerometer in the high half."""
+    """The manual has 0x44 for 10 Hz and 0xBB for 47 Hz, accelerometer in the high half byte."""
     assert crc32(bytes.fromhex("55AA 0300 1800 0000803F") + bytes(20)) == 0xE88ED852
     assert crc32(b"123456789") == 0x3A8639CB
     assert crc32(memoryview(b"123456789")) == 0x3A8639CB

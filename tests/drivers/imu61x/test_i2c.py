@@ -1,4 +1,4 @@
-"""I2C bursts of the IMU61x: hand-computed bytes, and replies that show another device or setting."""
+"""I2C bursts of the IMU61x: bytes by hand, and replies of another device or with another setting."""
 
 import struct
 
@@ -56,7 +56,7 @@ def test_damaged_stale_absent_and_foreign_bytes() -> None:
     assert made.ledger.closes()
 
 
-def test_infinite_value_is_left_out_and_told() -> None:
+def test_infinite_values_are_removed_and_reported() -> None:
     values = struct.pack("<7f", 0, 0, 1, float("inf"), 0, 0, 25)
     bad, m = codec().decode(0, values + struct.pack("<I", slow_crc(values)))
     assert isinstance(bad, BadFrame)

@@ -1,7 +1,7 @@
-"""One truth, four buses: the same motion at the same instants, read in every format, is true to half a step.
+"""One motion on four buses: the values in every format are correct within half a step.
 
-No noise and no time passes: the simulated devices are asked for what they measured at instants that all of them have.
-The resolutions are worked out by hand from the manual's layouts; half a step is the most that rounding can cost.
+The simulated devices measure at common instants, without noise and without real time. The resolutions are computed by
+hand from the layouts in the manual; half a step is the maximum rounding error.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,13 +28,13 @@ from imud.sim.physics import swing
 from tests.support.simulated_modules import over_i2c, over_spi
 
 EPOCH_NS = 5_000_000_000
-"""Zero of the motion, the same for all devices."""
+"""Start of the motion, equal for all devices."""
 STEP_NS = 10_000_000
 INSTANTS = [EPOCH_NS + 500_000_000 + n * STEP_NS for n in range(1, 201)]
-"""2 s of motion from 510 ms after power-on, where all have booted."""
+"""2 s of motion from 510 ms after power-on, when all devices have booted."""
 MOTION = swing(9.80665)
 
-# Steps of a 32-bit float, 24 bits of fraction: a value in [2^n, 2^(n+1)) comes in steps of 2^(n-23).
+# Steps of a 32-bit float with 24 bits of fraction: a value in [2^n, 2^(n+1)) has steps of 2^(n-23).
 # accel below 2 g: steps of 2^-23 g, half is 2^-24 = 5.96e-8 g = 5.85e-7 m/s²
 # gyro below 128 °/s: 2^-17 °/s, half is 2^-18 = 3.81e-6 °/s = 6.66e-8 rad/s
 # angles below 128°: half is 2^-18 = 3.81e-6° = 6.66e-8 rad; temperature below 64 °C: 2^-18, half is 2^-19 = 1.91e-6 °C
@@ -52,9 +52,9 @@ HALF_STEPS = {
     # temperature 1 / 263.4 / 65536 = 5.7931e-8 °C, half is 2.8965e-8
     "spi registers": {"accel_m_s2": 1.4965e-8, "gyro_rad_s": 2.1306e-9, "temperature_c": 2.8966e-8},
 }
-"""Maximum error of each value that a format carries, half a step, in SI."""
+"""Maximum error of each value in a format: half a step, SI."""
 ROUNDING = 1 + 1e-6
-"""Arithmetic of 64-bit floats on the way, and the last digit of the numbers above."""
+"""Rounding of 64-bit floats, and of the last digit of the numbers above."""
 
 
 def by_uart() -> list[Measurement]:
@@ -76,7 +76,7 @@ def by_polls(
     codec: PolledCodec,
     transfer: Callable[[Imu61xRegisters, Transfer], bytes],
 ) -> list[Measurement]:
-    """Set the device up, then read it at each instant."""
+    """Set up the device, then read it at each instant."""
     now_ns = EPOCH_NS
     device = Imu61xRegisters(lambda: now_ns, motion=MOTION)
     run_transfer_script(set_up, lambda one: transfer(device, one))

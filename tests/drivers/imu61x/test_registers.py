@@ -1,4 +1,4 @@
-"""The filter action that the drivers on I2C and SPI share, against the simulated device."""
+"""The filter action of the drivers on I2C and SPI, with the simulated device."""
 
 from collections.abc import Callable, Mapping
 
@@ -18,7 +18,7 @@ from tests.support.simulated_modules import over_i2c, over_spi
 
 
 class Wires:
-    """One device that hangs on both buses."""
+    """One device on both buses."""
 
     def __init__(self) -> None:
         self.device = Imu61xRegisters(lambda: 0)
@@ -29,7 +29,7 @@ class Wires:
         return run_transfer_script(action.script(Target(settings, 0), action.arguments(given)), self.over(driver))
 
     def over(self, driver: PolledDriver) -> Callable[[Transfer], bytes]:
-        """Transfers on the driver's bus."""
+        """Make transfers on the bus of the driver."""
 
         def transfer(one: Transfer) -> bytes:
             self.transfers += 1
@@ -52,13 +52,13 @@ def test_filters_are_set_and_answered(driver: PolledDriver, settings: RegisterOp
     assert wires.device.filter == 0x40
     wires = Wires()
     wires.act(driver, settings)
-    assert wires.transfers == (1 if driver is I2C else 2)  # the register; on SPI a burst as well
+    assert wires.transfers == (1 if driver is I2C else 2)  # the register; on SPI also a burst
     assert wires.device.filter == 0xBB
 
 
 @pytest.mark.parametrize("driver", [I2C, SPI])
-def test_what_the_configuration_says_stays(driver: PolledDriver) -> None:
-    """The daemon sets it up again as the options say, so another value would not last ten seconds."""
+def test_configured_filters_stay(driver: PolledDriver) -> None:
+    """The daemon writes the options again, so another value would last at most ten seconds."""
     settings = driver.settings(gyro_filter=3)
     wires = Wires()
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""SPI frames of the IMU61x: hand-computed words, every burst, every answer that is not a good one."""
+"""SPI frames of the IMU61x: words by hand, every burst, every invalid reply."""
 
 import struct
 from collections.abc import Sequence
@@ -82,7 +82,7 @@ def test_standard_burst_in_si() -> None:
 
 
 def slow_crc(data: bytes) -> int:
-    """Bit by bit: reflected 0xEDB88320, start value 1, no final XOR."""
+    """Return the CRC-32 bit by bit: reflected 0xEDB88320, start value 1, no final XOR."""
     register = 1
     for byte in data:
         register ^= byte
@@ -109,7 +109,7 @@ def test_extended_burst_in_si() -> None:
     assert m.status == 0x01020304
     assert m.quat_wxyz == pytest.approx((0.65328148, 0.65328148, -0.27059805, -0.27059805))
 
-    # bit 31 of a sample's status is imud's own: the ALARM line is active, which such a device does not have
+    # bit 31 of a sample's status belongs to imud: an active ALARM line, which this device does not have
     m = one(codec("extended").decode(0, PIPELINE + extended(1, 0, -1, 0, 0.5, 1, 25, 90, 0, -45, status=0xC0000001)))
     assert m.status == 0x40000001
 
@@ -143,7 +143,7 @@ def test_temperature_read_between_bursts_is_in_the_samples_after_it() -> None:
     made = codec()
     made.decode(2, PIPELINE + bytes.fromhex("0a4a0000"))
     assert one(made.decode(0, PIPELINE + GOLDEN)).temperature_c == 25.0
-    made.decode(2, PIPELINE + bytes.fromhex("fff00000"))  # above 35 °C counts are negative
+    made.decode(2, PIPELINE + bytes.fromhex("fff00000"))  # counts are negative above 35 °C
     other = with_sum(bytes.fromhex("0001") + GOLDEN[2:24])
     assert one(made.decode(0, PIPELINE + other)).temperature_c == pytest.approx(35 + 16 / 263.4)
     made.decode(2, PIPELINE + b"\xff" * 4)
@@ -152,8 +152,8 @@ def test_temperature_read_between_bursts_is_in_the_samples_after_it() -> None:
 
 
 @pytest.mark.parametrize("data", [b"\xff" * 28, b"\x00" * 28, b"", GOLDEN[:-1]])
-def test_no_device_is_no_damage(data: bytes) -> None:
-    """Zeros would pass the checksum."""
+def test_a_missing_device_is_not_damage(data: bytes) -> None:
+    """The checksum of zeros would match."""
     made = codec()
     (event,) = made.decode(0, PIPELINE + data)
     assert isinstance(event, Vanished)

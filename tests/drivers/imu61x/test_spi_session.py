@@ -1,4 +1,4 @@
-"""Transfer scripts of the IMU61x on SPI: identity, filters and kind of burst, on the simulated device."""
+"""Transfer scripts of the IMU61x on SPI: identity, filters and kind of burst, with the simulated device."""
 
 from typing import Literal
 
@@ -13,7 +13,7 @@ from tests.support.simulated_modules import over_spi
 
 
 class Wire:
-    """A simulated device with a failure at one of its transfers."""
+    """Simulated device with a failure at one of its transfers."""
 
     def __init__(self, *, fail_at: int = -1, deaf: bool = False, behaviour: RegisterBehaviour | None = None) -> None:
         self.device = Imu61xRegisters(lambda: 0, behaviour=behaviour)
@@ -25,7 +25,7 @@ class Wire:
         number = len(self.sent)
         self.sent.append(" ".join(item.hex() for item in transfer.sends))
         if number == self._fail_at:
-            self.device.spi(transfer.sends[:3])  # it breaks off in window 1
+            self.device.spi(transfer.sends[:3])  # the transfer fails in window 1
             raise TransferError(Trouble.DISTURBED, "by the test")
         data = over_spi(self.device, transfer)
         if self._deaf:
@@ -45,18 +45,18 @@ def test_probe_and_set_up() -> None:
     wire = Wire()
     words = run_transfer_script(set_up(SpiDeviceOptions()), wire.transfer)
     assert words == {"accel_filter": "47 Hz", "gyro_filter": "47 Hz", "burst": "standard"}
-    assert len(wire.sent) == 2  # the state, and a burst
+    assert len(wire.sent) == 2  # the state and a burst
     settings = SpiDeviceOptions(accel_filter=4, gyro_filter=4, burst="extended")
     words = run_transfer_script(set_up(settings), wire.transfer)
     assert words == {"accel_filter": "10 Hz", "gyro_filter": "10 Hz", "burst": "extended"}
-    assert wire.sent[3] == "fe01 8644 fe00 7e00 7e00"  # the manual's example of 10 Hz: 0x8644
+    assert wire.sent[3] == "fe01 8644 fe00 7e00 7e00"  # 10 Hz in the manual's example: 0x8644
     assert wire.sent[5] == "fe01 8d01 fe00 7e00 7e00"
     assert len(wire.sent) == 7
     assert (wire.device.filter, wire.device.extended, wire.device.window) == (0x44, 1, 0)
 
     wire = Wire()
     wire.device.extended = 1
-    flips = iter([0, 0, 1, 0, 0])  # the first burst after it was selected
+    flips = iter([0, 0, 1, 0, 0])  # the first burst after the selection
 
     def transfer(one: Transfer) -> bytes:
         wire.device.faults.flips = next(flips)

@@ -1,4 +1,4 @@
-"""SDO frames as the manual prints them, and replies."""
+"""SDO frames from the manual, and replies."""
 
 import pytest
 
@@ -51,7 +51,7 @@ def test_write_and_its_confirmation() -> None:
         "60 A0 20 00",
     ],
 )
-def test_what_is_no_confirmation(other: ReplyFrame | str) -> None:
+def test_invalid_confirmations(other: ReplyFrame | str) -> None:
     request = next(write_object(8, 0x20A0, 0, 9, 4))
     assert not request.is_end(other)
     assert not request.is_rejection(other)

@@ -1,4 +1,4 @@
-"""TPDOs of the manual and by hand, in SI units computed by hand, and what the codec does with all other frames."""
+"""TPDOs of the manual with SI values computed by hand, and the handling of all other frames."""
 
 import math
 from math import pi
@@ -112,7 +112,7 @@ def test_which_frames_count() -> None:
     data = bytes.fromhex("60 00 20 00 00 00 00 00")
     assert codec.feed_frame(0x588, False, data, 0) == (ReplyFrame(0x588, data),)
     assert codec.feed_frame(0x588, False, data[:7], 0) == (BadFrame(BadReason.LENGTH, data[:7]),)
-    assert codec.feed_frame(0x608, False, data, 0) == ()  # of another master
+    assert codec.feed_frame(0x608, False, data, 0) == ()  # from another master
     assert codec.ledger.frames_in_replies == 1
     assert codec.ledger.closes()
     codec = make(node=9)
@@ -166,7 +166,7 @@ def test_filters_sync_and_names_of_the_row() -> None:
         (0x588, 8, None),
     ],
 )
-def test_the_node_is_told_by_identifier_and_length(can_id: int, size: int, node: int | None) -> None:
+def test_identifier_and_length_identify_the_node(can_id: int, size: int, node: int | None) -> None:
     assert DRIVER.node_of(can_id, False, bytes(size)) == node
     assert DRIVER.node_of(can_id, True, bytes(size)) is None
 

@@ -1,4 +1,4 @@
-"""Every SDO command that the manual prints, and conversations with the simulated module."""
+"""Every SDO command in the manual, and scripts against the simulated device."""
 
 from typing import Literal
 
@@ -102,7 +102,7 @@ def test_settings_are_read_back_and_compared() -> None:
 
 
 @pytest.mark.parametrize("reads", ["ignored", "aborted"])
-def test_a_node_that_cannot_be_read_has_taken_what_it_confirmed(reads: Literal["ignored", "aborted"]) -> None:
+def test_a_confirmed_write_to_an_unreadable_node_is_unverified(reads: Literal["ignored", "aborted"]) -> None:
     bench = CanopenBench(variant=NodeVariant(reads=reads))
     assert bench.run_script(session.set_tpdo_period(8, 7, 20)) is Written.UNVERIFIED
     assert bench.module.objects.settings.periods_ms[7] == 20
@@ -111,7 +111,7 @@ def test_a_node_that_cannot_be_read_has_taken_what_it_confirmed(reads: Literal["
 
 
 def test_which_frames_make_a_number_taken() -> None:
-    """Also SDO replies, but not 0x600 + node and 0x200 + node, which are sent to a node."""
+    """Also SDO replies, but not 0x600 + node and 0x200 + node, which other nodes send to the node."""
     bench = CanopenBench(NodeSettings(node=8), others=(12,))
     bench.others[0].objects.settings = NodeSettings(node=12, periods_ms=QUIET.periods_ms)
     bench.run(100_000_000)

@@ -1,4 +1,4 @@
-"""Named actions of a CANopen module: what goes to the bus, and what the simulated module does."""
+"""Actions of a CANopen device: frames on the bus, and their effect on the simulated device."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from tests.support.simulated_modules import QUIET, CanopenBench
 
 
 def begun(name: str, at: int = 8, /, **given: object) -> RequestScript[Any]:
-    """The conversation of an action with the node that the settings name."""
+    """Return the script of an action for the node in the options."""
     action = DRIVER.actions[name]
     conversation: RequestScript[Any] = action.script(
         Target(HipnucCanopenOptions(node=at), 500_000), action.arguments(given)
@@ -115,7 +115,7 @@ def test_the_module_obeys() -> None:
     assert bench.module.node == bench.settings.node == 9
 
 
-def test_an_interval_that_the_bus_cannot_carry_says_what_it_costs() -> None:
+def test_an_interval_above_the_bus_load_is_rejected_with_numbers() -> None:
     bench = CanopenBench(NodeSettings(node=8))
 
     def interval(bit_rate: int, others_bit_s: float) -> object:
@@ -123,7 +123,7 @@ def test_an_interval_that_the_bus_cannot_carry_says_what_it_costs() -> None:
         target = bench.target(bit_rate, others_bit_s)
         return bench.run_script(action.script(target, action.arguments({"tpdo": 1, "interval_ms": 5})))
 
-    # 95 bits · 200 + (95 + 95 + 111 + 111) · 100 + 79 · 20 = 61,780 bit/s: 49.4 % of 125 kbit/s, of which TPDO1 15.2 %
+    # 95 bits · 200 + (95 + 95 + 111 + 111) · 100 + 79 · 20 = 61,780 bit/s: 49.4 % of 125 kbit/s (TPDO1: 15.2 %)
     assert interval(125_000, 63_000.0) is Written.VERIFIED
     with pytest.raises(BadArgument, match=r"got 101 % of it: TPDO1 every 5 ms 15.2 %, .*; other devices 51.2 %"):
         interval(125_000, 64_000.0)

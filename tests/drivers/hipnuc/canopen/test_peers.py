@@ -1,5 +1,6 @@
-"""The canopen library on python-can's virtual bus: its client against the simulated module, and its LocalNode as the
-device under the codec and the conversations. Waits end with what they wait for; the limit is only for a failure."""
+"""The library canopen on python-can's virtual bus: its client with the simulated device, and its LocalNode as the
+device for the codec and the scripts. A wait ends with its event; the limit applies only to a failure.
+"""
 
 import math
 import struct
@@ -31,7 +32,7 @@ pytestmark = pytest.mark.live
 
 NODE = 8
 ACCEL, GYRO = 0x2100, 0x2101
-"""Objects of their node that its TPDOs carry."""
+"""Objects of their node that the TPDOs contain."""
 QUIET = dict.fromkeys((1, 2, 3, 4, 6, 7), 0)
 
 
@@ -81,14 +82,14 @@ def variable(name: str, index: int, sub: int, kind: int) -> ODVariable:
 @pytest.fixture
 def network(request: pytest.FixtureRequest) -> Iterator[canopen.Network]:
     network = canopen.Network()
-    network.NOTIFIER_CYCLE = 0.02  # how long its thread goes on after the test
+    network.NOTIFIER_CYCLE = 0.02  # maximum time of its thread after the test
     network.connect(interface="virtual", channel=request.node.name)
     yield network
     network.disconnect()
 
 
 class Pump(threading.Thread):
-    """The simulated module on a bus, in real time."""
+    """The simulated device on a bus, in real time."""
 
     def __init__(self, channel: str, factory: NodeSettings) -> None:
         super().__init__()
@@ -166,7 +167,7 @@ def test_their_client_hears_our_tpdos(remote: canopen.RemoteNode, network: canop
     remote.sdo[0x1800][2].raw = 1
     network.sync.transmit()
     assert accel.wait_for_reception(LIMIT_S) is not None
-    assert 500 < accel[2].raw < 1500  # mG, upright within the swing of the motion
+    assert 500 < accel[2].raw < 1500  # mG, upright within the range of the motion
     got = threading.Event()
     network.subscribe(0x788, lambda can_id, data, timestamp: got.set())
     remote.sdo[0x1805][5].raw = 10
@@ -174,7 +175,7 @@ def test_their_client_hears_our_tpdos(remote: canopen.RemoteNode, network: canop
 
 
 class Host:
-    """The codec and a session on a bus, blocking."""
+    """Codec and script runner on a bus, blocking."""
 
     def __init__(self, channel: str) -> None:
         self.bus = can.Bus(channel, interface="virtual")
@@ -182,7 +183,7 @@ class Host:
         self.session = Session(self.codec.ledger)
         self.periods = 0
         self.limit_s = LIMIT_S
-        """Real time until a request is given up: their node runs in a thread."""
+        """Real time limit of a request: their node runs in a thread."""
 
     def events(self, timeout_s: float) -> list[CodecEvent]:
         message = self.bus.recv(timeout_s)
@@ -190,7 +191,7 @@ class Host:
             return []
         extended, data = message.is_extended_id, bytes(message.data)
         self.periods += message.arbitration_id == 0x180 + NODE
-        # times of a bus that the machine cannot spoil: TPDO1 begins each period
+        # fixed times, independent of the load of the host: TPDO1 starts each period
         t_ns = self.periods * 10_000_000 + (message.arbitration_id != 0x180 + NODE) * 250_000
         return list(self.codec.feed_frame(message.arbitration_id, extended, data, t_ns))
 
@@ -250,7 +251,7 @@ def test_our_conversations_with_their_node(local: canopen.LocalNode, host: Host)
     assert settings["1804.5"] == "50"
     assert settings["1801.2"] == "1"
     assert settings["209A.0"] == "3"
-    assert "20A0.0" not in settings  # never set there: no data available
+    assert "20A0.0" not in settings  # never written there: no data available
 
     assert local.id == NODE
     with pytest.raises(cia301.Aborted, match="object does not exist"):
@@ -268,7 +269,7 @@ def test_our_conversations_with_their_node(local: canopen.LocalNode, host: Host)
     assert identity.serial_number == "0x00000014"
 
 
-def test_their_node_obeys_our_nmt_and_its_heartbeat_is_heard(local: canopen.LocalNode, host: Host) -> None:
+def test_their_node_executes_our_nmt_and_sends_its_heartbeat(local: canopen.LocalNode, host: Host) -> None:
     local.nmt.state = "RESET"
     assert host.events(LIMIT_S) == [ReplyFrame(0x708, b"\0")]
     run_script(session.nmt(NODE, NmtCommand.START), host.ask)
@@ -283,7 +284,7 @@ def test_their_node_obeys_our_nmt_and_its_heartbeat_is_heard(local: canopen.Loca
 
 
 def test_their_tpdos_are_our_samples(network: canopen.Network, local: canopen.LocalNode, host: Host) -> None:
-    """Two TPDOs per period, mapped, packed and sent by their node; all wait on the bus before the first is read."""
+    """Their node maps, packs and sends two TPDOs per period. All frames are on the bus before the first read."""
     for number, index in ((1, ACCEL), (2, GYRO)):
         tpdo = local.tpdo[number]
         tpdo.cob_id = 0x080 + 0x100 * number + NODE

@@ -38,7 +38,7 @@ def feed(codec: HipnucJ1939Codec, frames: list[tuple[int, bytes]], t_ns: int) ->
 
 
 def burst(value: int, address: int = 8, *more: tuple[int, bytes]) -> list[tuple[int, bytes]]:
-    """The four messages of every module; `value` counts in roll, so that samples are known apart."""
+    """Return the four messages of every device; `value` is roll in counts and identifies the sample."""
     rows = (
         (messages.ACCEL, bytes.fromhex("000000000008") + bytes(2)),
         (messages.GYRO, bytes(8)),
@@ -49,13 +49,13 @@ def burst(value: int, address: int = 8, *more: tuple[int, bytes]) -> list[tuple[
 
 
 def counts(events: list[CodecEvent]) -> list[int]:
-    """`value` of each sample."""
+    """Return `value` of each sample."""
     rolls = [event.euler_rad[0] for event in events if isinstance(event, Measurement) and event.euler_rad]
     return [round(math.degrees(roll) * 1000) for roll in rolls]
 
 
 def learned(**options: object) -> HipnucJ1939Codec:
-    """A codec that has heard enough; the next burst begins at 100 ms."""
+    """Return a codec that has learned the bursts; the next burst starts at 100 ms."""
     codec = make(**options)
     for n in range(10):
         feed(codec, burst(n), n * 10 * MS)
@@ -93,7 +93,7 @@ def test_attitude() -> None:
     sent = measured(0xFF46, "881300008813f01b")  # 0.5, 0, 0.5, 0.7152: length 1.0055
     assert sent.quat_wxyz == pytest.approx((0.5, 0.0, 0.5, 0.7152))
     assert sent.euler_rad is None
-    # the quaternion of the module goes before the computed one
+    # the quaternion of the device has priority over the computed quaternion
     three = [(0xFF3D, bytes(8)), (0xFF41, bytes(8)), (0xFF46, bytes.fromhex("0000102700000000"))]
     assert messages.measurement_of(three).quat_wxyz == pytest.approx((0, 1, 0, 0))
     assert messages.measurement_of(three[:2]).quat_wxyz == (1, 0, 0, 0)
@@ -107,7 +107,7 @@ def test_attitude() -> None:
 )  # fmt: skip
 @pytest.mark.manual("B 6.1.4 FF41")
 def test_heading_is_clockwise_and_yaw_is_not(clockwise: int, yaw_deg: float) -> None:
-    for second in (0, -1, 12345):  # what the other bytes say does not count
+    for second in (0, -1, 12345):  # the codec ignores the other bytes
         data = clockwise.to_bytes(4, "little") + second.to_bytes(4, "little", signed=True)
         found = messages.measurement_of([(0xFF41, data)]).euler_rad
         assert found is not None
@@ -158,7 +158,7 @@ def test_one_negative_count_is_a_value() -> None:
     assert measured(0xFF34, "ffffffffffff0000").accel_m_s2 == pytest.approx((-0.00478514,) * 3, abs=1e-8)
     assert measured(0xFF3D, "ffffffff00000000").euler_rad == pytest.approx((-1.74532925e-5, 0, math.nan), nan_ok=True)
     assert measured(0xFF43, "0000000052c59a00").temperature_c == 0.0  # with a pressure it is 0 °C
-    placeholder = measured(0xFF43, "9a090000e7030000")  # 24.58 °C, 999: a module without a barometer
+    placeholder = measured(0xFF43, "9a090000e7030000")  # 24.58 °C, 999: a device without a barometer
     assert placeholder.temperature_c == pytest.approx(24.58)
     assert placeholder.pressure_pa is None
     assert measured(0xFF43, "9a090000a0860100").pressure_pa == pytest.approx(1000)  # 100000 counts of 0.01 Pa
@@ -189,7 +189,7 @@ def test_the_vendors_signal_definitions_agree() -> None:
 
 
 def some_payload(pgn: int, random: Random) -> bytes:
-    """Random counts, within the range where they are values."""
+    """Return random counts within the valid range."""
     if pgn in (messages.ROLL_PITCH, messages.INCLINOMETER):
         return messages.TWO_ANGLES.pack(random.randint(-360_000, 360_000), random.randint(-360_000, 360_000))
     if pgn == messages.HEADING:
@@ -203,7 +203,7 @@ def some_payload(pgn: int, random: Random) -> bytes:
 
 
 def compare(ours: Measurement, theirs: dict[str, float]) -> int:
-    """Assert that all signals are equal; return how many there were."""
+    """Check that all signals are equal. Return their number."""
     values: dict[str, float] = {}
     for prefix, (field, factor) in SIGNALS.items():
         if (vector := getattr(ours, field)) is not None:
@@ -224,7 +224,7 @@ def compare(ours: Measurement, theirs: dict[str, float]) -> int:
 
 
 @pytest.mark.manual("B 6 identifiers")
-def test_a_burst_makes_a_sample_whatever_its_priority() -> None:
+def test_a_burst_of_any_priority_makes_a_sample() -> None:
     codec = learned()
     (sample,) = feed(codec, burst(1234), 100 * MS)
     assert isinstance(sample, Measurement)

@@ -1,4 +1,4 @@
-"""Every row of the manual's table 6.2.2 as it goes to the bus, replies and their matching, and what is refused."""
+"""Every row of table 6.2.2 in the manual as frames on the bus, reply matching, and rejected values."""
 
 from collections.abc import Callable
 
@@ -28,7 +28,7 @@ def sent(request: Request) -> Frame:
 
 
 def played(conversation: RequestScript[object], *outcomes: Outcome | bytes | None) -> tuple[list[Frame], object]:
-    """The frames that were sent, and what came out; each is answered with data from the module, None for silence."""
+    """Return the sent frames and the result; `answers` contains the data of each reply, None for silence."""
     frames: list[Frame] = []
     answers = iter(outcomes)
 
@@ -94,7 +94,7 @@ def test_every_row_of_the_manual(name: str, arguments: dict[str, object], data: 
     assert (result in (Written.VERIFIED, Written.PENDING)) == (name in READABLE)
 
 
-def test_silence_and_values_that_did_not_take_are_told() -> None:
+def test_missing_replies_and_unchanged_values_are_reported() -> None:
     with pytest.raises(Rejected, match="restart: the device rejected the request"):
         J1939Bench(variant=J1939Variant(refuses=frozenset({session.CONTROL}))).act("restart")
     begins: list[Callable[[], RequestScript[object]]] = [
@@ -122,8 +122,8 @@ def test_silence_and_values_that_did_not_take_are_told() -> None:
 
 
 @pytest.mark.parametrize("status", [1, 0x5A, 0xFF])
-def test_an_answer_with_a_status_is_no_success(status: int) -> None:
-    """Byte 3 of the answer, in writes and in reads."""
+def test_a_reply_with_a_status_is_a_rejection(status: int) -> None:
+    """Byte 3 of the reply, in writes and in reads."""
     for begin, head in (
         (session.save(PEER), "000006"),
         (session.zero(PEER, Zero.HERE), "A50006"),
@@ -141,7 +141,7 @@ def test_an_answer_with_a_status_is_no_success(status: int) -> None:
 
 
 def test_which_frames_answer_a_request() -> None:
-    """A message that is sent once is its own answer."""
+    """A message that is sent once is its own reply."""
     request = next(session.send_once(PEER, 0xFF43))
     assert request.is_end(ReplyFrame(0x0CFF4308, bytes(8)))
     assert not request.is_end(ReplyFrame(0x0CFF4309, bytes(8)))
@@ -188,9 +188,9 @@ def test_arguments_are_checked_before_anything_is_sent(name: str, arguments: dic
     [
         (0x0CEF5508, "3701030064000000", True),
         (0x18EF5508, "3701030064000000", True),  # another priority
-        (0x0CEF2008, "3701030064000000", True),  # to the asking address
-        (0x0CEF5509, "3701030064000000", False),  # another module
-        (0x0CEF2108, "3701030064000000", False),  # to somebody else
+        (0x0CEF2008, "3701030064000000", True),  # to the requesting address
+        (0x0CEF5509, "3701030064000000", False),  # from another device
+        (0x0CEF2108, "3701030064000000", False),  # to another host
         (0x0CEF5508, "3401030064000000", False),  # another register
         (0x0CEF5508, "3701060064000000", False),  # another command
         (0x0CEF5508, "37010300640000", False),
@@ -208,7 +208,7 @@ def test_a_reply_is_matched_by_sender_register_and_command(can_id: int, data: st
 
 def test_all_that_can_be_read() -> None:
     replies = [
-        "9C00030008000000", "9A00030002000000", "9E00030001000000", "9F00030000000000", None,  # FF2F: not known
+        "9C00030008000000", "9A00030002000000", "9E00030001000000", "9F00030000000000", None,  # FF2F is unknown
         "3401030064000000", "370103000A000000", None, "3D01030064000000", "4101030064000000", None, None, None,
     ]  # fmt: skip
     frames, settings = played(

@@ -1,4 +1,4 @@
-"""The manual's own replies with values by hand, and what the codec decides from what it reads."""
+"""Replies of the manual with values by hand, and the scales that the codec decides."""
 
 from math import radians
 
@@ -27,12 +27,12 @@ IDENTITY = bytes.fromhex(
     "50 03 28 48 49 31 34 52 32 4E 2D 34 38 35 2D 30 30 30 00 00 98 00 6B" + "00" * 10
     + "04 7D 95 5F 8D 2A 17 08 00 00 4D 0C"
 )  # fmt: skip
-"""Section 4.4, with the three zeros that the print lost: its CRC says where."""
+"""Section 4.4, with the three zeros that the print omits, according to the CRC."""
 SENSORS = bytes.fromhex(
     "50 03 30 FF 01 03 B0 06 50 FC C9 FF 7C 00 91 01 D5 FD DB FD 27 00 00 21 FF 00 00 7F F6 FF FD 73 E7" + "00" * 6
     + "10 A6 0D 59 DD 4E 86 A8 06 30 17 82 1E CE"
 )  # fmt: skip
-"""Section 4.5, with the one zero that the print lost."""
+"""Section 4.5, with the zero that the print omits."""
 EXCEPTION = framed(0x50, b"\x83\x02")
 
 
@@ -41,7 +41,7 @@ def codec(**options: object) -> HipnucModbusCodec:
 
 
 def short(**options: object) -> HipnucModbusCodec:
-    """One that knows already that there is no UPTIME."""
+    """Return a codec that already uses the block without UPTIME."""
     made = codec(**options)
     made.decode(0, EXCEPTION)
     made.reset()
@@ -124,7 +124,7 @@ def test_identity_sensors_and_the_block_of_newer_firmware() -> None:
 @pytest.mark.parametrize(
     ("counts", "pressure_pa"), [(0, None), (99_900, None), (100_000, 1_000), (12_000_000, 120_000), (12_000_001, None)]
 )
-def test_a_module_without_barometer_has_no_pressure(counts: int, pressure_pa: float | None) -> None:
+def test_a_device_without_barometer_has_no_pressure(counts: int, pressure_pa: float | None) -> None:
     """99,900 counts of 0.01 Pa are the placeholder 999 in Pa."""
     words = "0000" * 9 + "0000 0000" * 3 + "09D0" + counts.to_bytes(4, "big").hex() + "2710 0000 0000 0000"
     m = measured(codec(), framed(1, registers_reply(bytes.fromhex(words + "0000 0000 0001 2345"))))
@@ -132,7 +132,7 @@ def test_a_module_without_barometer_has_no_pressure(counts: int, pressure_pa: fl
     assert m.pressure_pa == pressure_pa
 
 
-def test_the_block_of_the_manual_is_read_where_there_is_no_longer_one() -> None:
+def test_the_short_block_is_read_from_older_firmware() -> None:
     made = codec()
     assert made.polls[0].transfer == READ_BLOCK
     (event,) = made.decode(0, EXCEPTION)
@@ -186,7 +186,7 @@ def test_any_exception_to_the_first_reading_leads_to_the_block_of_the_manual(cod
     made.reset()
     assert made.polls[0].transfer == READ_SHORT_BLOCK
     assert measured(made, SENSORS).dev_ticks is None
-    made.reset()  # identified again: it may have been busy the first time
+    made.reset()  # identified again: the device may have been busy before
     assert made.polls[0].transfer == READ_BLOCK
     assert made.ledger.closes()
 
@@ -198,7 +198,7 @@ def test_scale_of_the_quaternion_is_decided_once(per_lsb: float) -> None:
     assert measured(made, block(quat=(0, 0, 0, 0), per_lsb=per_lsb)).quat_wxyz is None
     half = (0.5, -0.5, 0.5, -0.5)
     assert measured(made, block(quat=half, per_lsb=per_lsb)).quat_wxyz == pytest.approx(half, abs=1e-4)
-    odd = measured(made, block(quat=(0.25, 0.0, 0.0, 0.0), per_lsb=per_lsb))  # not of unit length: the scale stays
+    odd = measured(made, block(quat=(0.25, 0.0, 0.0, 0.0), per_lsb=per_lsb))  # not of unit length: same scale
     assert odd.quat_wxyz == pytest.approx((0.25, 0, 0, 0), abs=1e-4)
     made.reset()
     assert measured(made, block(quat=(0.25, 0.0, 0.0, 0.0), per_lsb=per_lsb)).quat_wxyz is None
@@ -207,11 +207,11 @@ def test_scale_of_the_quaternion_is_decided_once(per_lsb: float) -> None:
 @pytest.mark.parametrize(
     ("incli", "pitch_deg", "degrees_read"),
     [
-        ((0, 0), 20.0, None),  # a product without
+        ((0, 0), 20.0, None),  # a product without inclinometer
         ((1584, 6018), 33.0, (8.7012, 33.0579)),  # two axes, as in the manual
-        ((-16384, 0), 0.0, (-90.0, 0.0)),  # a negative angle is none of one axis
-        ((16384, 0), 5.0, (180.0, 0.0)),  # Y would show 5 degrees if there was one
-        ((16384, 0), 0.2, None),  # cannot be told while level
+        ((-16384, 0), 0.0, (-90.0, 0.0)),  # one axis has no negative angle
+        ((16384, 0), 5.0, (180.0, 0.0)),  # Y would be 5 degrees with two axes
+        ((16384, 0), 0.2, None),  # undecided while the device is level
     ],
 )
 @pytest.mark.manual("B 4.2 inclinometer")
@@ -229,7 +229,7 @@ def test_axes_of_the_inclinometer_are_kept_or_configured() -> None:
     assert measured(made, block(incli=(16384, 0), pitch_deg=5, uptime_ms=6)).incli_rad == (radians(90), 0)
     assert measured(codec(inclinometer="single"), block(incli=(8192, 0))).incli_rad == (radians(90), 0)
     assert measured(codec(inclinometer="dual"), block(incli=(0, 0))).incli_rad == (0, 0)
-    for mag_t in ((3e-5, 0.0, 0.0), (0.0, 3e-5, 0.0), (0.0, 0.0, 3e-5)):  # one axis is enough for a field
+    for mag_t in ((3e-5, 0.0, 0.0), (0.0, 3e-5, 0.0), (0.0, 0.0, 3e-5)):  # one non-zero axis means a magnetic field
         assert measured(codec(), block(mag_t=mag_t)).mag_t == pytest.approx(mag_t, abs=2e-8)
 
     made = codec()
@@ -243,7 +243,7 @@ def test_axes_of_the_inclinometer_are_kept_or_configured() -> None:
     made.reset()
     assert measured(made, block(uptime_ms=8)).status is None
     made.decode(0, EXCEPTION)
-    assert len(made.polls) == 2  # firmware without UPTIME has none
+    assert len(made.polls) == 2  # firmware without UPTIME has no MAIN_STATUS
     assert made.ledger.closes()
 
 

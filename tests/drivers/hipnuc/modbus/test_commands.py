@@ -1,4 +1,4 @@
-"""Scripts that change a module, run on the simulated line, over everything that no manual settles."""
+"""Scripts that change a device on the simulated bus, for all behaviors that no manual documents."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,7 +35,7 @@ NINE = AttitudeMode.NINE_AXIS
 
 @pytest.fixture(params=SLAVE_VARIANTS)
 def bench(request: pytest.FixtureRequest) -> ModbusBench:
-    """A module of each kind, and another module on the line."""
+    """Yield a device of each kind, with another device on the bus."""
     return ModbusBench(module(7, variant=SLAVE_VARIANTS[request.param]), module(12))
 
 
@@ -44,7 +44,7 @@ def restarted(bench: ModbusBench) -> str:
 
 
 @pytest.mark.manual("B 4.3.1 save")
-def test_what_is_written_is_read_back_and_saved_only_when_told(bench: ModbusBench) -> None:
+def test_settings_are_read_back_and_saved_only_on_request(bench: ModbusBench) -> None:
     assert bench.run(set_heading_mode(NINE)) is Written.VERIFIED
     assert [request[0] for _, request in bench.sent] == [6, 3]
     assert bench.run(read(BY_NAME["HEADING_MODE"])) == (1,)
@@ -113,7 +113,7 @@ def test_addresses_that_are_taken_not_accepted_or_lost() -> None:
     def transfer(transfer: Transfer) -> bytes:
         answer = bench.transfer(transfer)
         if transfer.sends[0][0] == 6:
-            bench.slave.mute = 6  # three tries at either address: noise hides it
+            bench.slave.mute = 6  # three tries at each address against noise
         return answer
 
     with pytest.raises(NoReply, match="neither at address 9 nor at 7"):
@@ -157,7 +157,7 @@ def test_mounting_level_and_factory_settings(bench: ModbusBench) -> None:
     assert bench.at == 80
 
 
-def test_modules_that_do_not_answer_as_expected() -> None:
+def test_devices_with_unexpected_replies() -> None:
     bench = ModbusBench(module(7, variant=SlaveVariant(ignores=frozenset({"HEADING_MODE"}))))
     with pytest.raises(DeviceRefused, match="expected 1 after the write, got 0"):
         bench.run(set_heading_mode(NINE))
@@ -179,7 +179,7 @@ def test_modules_that_do_not_answer_as_expected() -> None:
     assert "115200 baud and address 80" in bench.run(factory_reset((7,), 9600))
 
 
-def test_absence_and_refusals_are_always_told() -> None:
+def test_absence_and_rejections_are_reported() -> None:
     bench = ModbusBench(module(7, dead=True))
     begins: list[Callable[[], TransferScript[Any]]] = [
         lambda: restart((7,), BAUD),

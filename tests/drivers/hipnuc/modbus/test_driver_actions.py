@@ -1,4 +1,4 @@
-"""Named actions of a module on RS-485, on the simulated one."""
+"""Actions of a device on RS-485, with the simulated device."""
 
 import pytest
 
@@ -35,7 +35,7 @@ def act(bench: ModbusBench, name: str, **given: object) -> object:
     ],
 )
 @pytest.mark.manual("B 4.3.1 save", "B 4.3.4 mounting", "B 4.3.5 level", "B 4.3.6 axes")
-def test_what_is_sent(name: str, given: dict[str, object], sent: str) -> None:
+def test_requests_as_sent(name: str, given: dict[str, object], sent: str) -> None:
     bench = ModbusBench()
     act(bench, name, **given)
     assert next(request.hex() for _, request in bench.sent if request[0] == 6) == sent
@@ -66,7 +66,7 @@ def test_actions_without_an_address_and_reading_by_name() -> None:
         ("level", {"level": 3}, "automatic"),
     ],
 )
-def test_what_a_module_cannot_take_is_not_sent(name: str, given: dict[str, object], names: str) -> None:
+def test_unsupported_values_are_not_sent(name: str, given: dict[str, object], names: str) -> None:
     bench = ModbusBench()
     with pytest.raises(BadArgument, match=names):
         act(bench, name, **given)

@@ -1,4 +1,4 @@
-"""What the calibrations of a HiPNUC module on RS-485 write, and what they make of its registers."""
+"""Requests of the calibrations of a HiPNUC device on RS-485, and the meaning of its registers."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ TARGET = Target(None, 0)
 
 
 def value_of(script: Any, registers: dict[int, int]) -> tuple[list[Transfer], object]:
-    """Run a script on registers of one word each; a write is echoed. Returns the transfers and its value."""
+    """Run a script on registers of one word each; writes are echoed. Return the transfers and the result."""
     made: list[Transfer] = []
 
     def transfer(wanted: Transfer) -> bytes:

@@ -1,4 +1,4 @@
-"""The table of settings, read and written over all kinds of modules."""
+"""Read and write of the table of settings with all kinds of devices."""
 
 from typing import Any
 
@@ -60,7 +60,7 @@ def test_present_values_are_read_and_nothing_is_written(bench: ModbusBench) -> N
 
 
 @pytest.mark.parametrize("name", VALUES)
-def test_a_setting_written_saved_and_restarted_is_what_is_read(bench: ModbusBench, name: str) -> None:
+def test_a_saved_setting_is_read_after_a_restart(bench: ModbusBench, name: str) -> None:
     setting = SETTINGS.table[name]
     for value in VALUES[name]:
         written = write(bench, name, value)

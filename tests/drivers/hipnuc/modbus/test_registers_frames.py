@@ -1,4 +1,4 @@
-"""Every request that the manual prints, byte by byte, and what cannot be asked."""
+"""Every request in the manual, byte by byte, and rejected requests."""
 
 import pytest
 
@@ -74,7 +74,7 @@ def test_printed_requests(printed: str, asked: object) -> None:
 
 @pytest.mark.manual("B 4.6 address by serial number", "B 4.6 random addresses", "B 4.1.1 read")
 def test_requests_to_all() -> None:
-    """Section 4.6: sub-command, length of what follows, then the data. No reply is expected."""
+    """Section 4.6: sub-command, length of the data, then the data. No reply is expected."""
     by_serial = set_id_by_serial("047D955F8D2A1708", 0x22)
     assert by_serial == Transfer((bytes.fromhex("50 0031 000A 047D955F8D2A1708 0022"),), 0)
     assert randomise_ids(1, 247) == Transfer((bytes.fromhex("50 0030 0006 0001 00F7 FFFF"),), 0)
@@ -114,7 +114,7 @@ def test_requests_to_all() -> None:
         (lambda: write_register(0, 0x10000), "0xFFFF"),
     ],
 )
-def test_what_cannot_be_asked(begin: object, names: str) -> None:
+def test_invalid_requests(begin: object, names: str) -> None:
     assert callable(begin)
     with pytest.raises(BadArgument) as refused:
         begin()
@@ -123,7 +123,7 @@ def test_what_cannot_be_asked(begin: object, names: str) -> None:
 
 @pytest.mark.manual("B 4.2 registers")
 def test_table_of_registers() -> None:
-    """Section 4.2 and what newer firmware has: no gap in the block, nothing twice, what is written is bounded."""
+    """Section 4.2 and newer firmware: no gap in the block, no duplicate, limits for writable registers."""
     taken = [
         address for register in REGISTERS for address in range(register.address, register.address + register.count)
     ]

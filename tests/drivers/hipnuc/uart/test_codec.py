@@ -1,4 +1,4 @@
-"""HiPNUC frames: the manual's example, a hand-made HI92, both meanings of HI91 bytes 1-2, damage by kind, text."""
+"""HiPNUC frames: the manual's example, an HI92 by hand, both meanings of HI91 bytes 1-2, damage by kind, text."""
 
 import math
 import struct
@@ -30,13 +30,13 @@ from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 
-# Manual V1.5.9 section 3.5. The text below it says CRC 0x516C, the table 0xBB14; 0xBB14 is right.
+# Manual V1.5.9 section 3.5. Its text contains CRC 0x516C, its table 0xBB14; 0xBB14 is correct.
 MANUAL_HI91 = bytes.fromhex(
     "5A A5 4C 00 14 BB 91 08 15 23 09 A2 C4 47 08 15 1C 00 CC E8 61 BE 9A 35 56 3E 65 EA 72 3F 31 D0 7C BD 75 DD C5 BB"
     "6B D7 24 BC 89 88 FC 40 01 00 6A 41 AB 2A 70 C2 96 D4 50 41 ED 03 43 41 41 F4 F4 C2 CC CA F8 BE 73 6A 19 BE"
     "F0 00 1C 3D 8D 37 5C 3F"
 )
-# Made by hand from the table of section 3.3.2.
+# made by hand from the table of section 3.3.2
 HI92_PAYLOAD = bytes.fromhex(
     "92  34 12  FB  E8 03  D0 07  00 00"  # status 0x1234, -5 °C, 1000 ms, 100000 + 2000 Pa, reserved
     "E8 03  18 FC  F4 01"  # gyro 1000, -1000, 500
@@ -57,7 +57,7 @@ LEVEL: dict[str, Any] = {
 
 
 def crc_bit_by_bit(data: bytes) -> int:
-    """CRC-16 as section 3.4 writes it in C, independent of the product's."""
+    """Return CRC-16 as in section 3.4 (C code), independent of the codec."""
     crc = 0
     for byte in data:
         crc ^= byte << 8
@@ -144,7 +144,7 @@ def test_frames_back_to_back_are_decoded_like_one(word: str) -> None:
     check_manual_values(alone)
     run = make(hi91_word=word).feed(3 * MANUAL_HI91)
     assert run == [msgspec.structs.replace(alone, trailing_bytes=frames * len(MANUAL_HI91)) for frames in (2, 1, 0)]
-    general = make(hi91_word=word).feed(framed(MANUAL_HI91[HEADER.size :] + b"\x00"))  # an unknown tag behind it
+    general = make(hi91_word=word).feed(framed(MANUAL_HI91[HEADER.size :] + b"\x00"))  # an unknown tag after it
     assert general == [msgspec.structs.replace(alone, size_bytes=len(MANUAL_HI91) + 1)]
 
 
@@ -247,7 +247,7 @@ def test_lengths_of_payloads_and_every_single_bit_error() -> None:
         assert codec.ledger.closes()
 
 
-def test_bytes_of_damaged_frames_are_booked_as_such() -> None:
+def test_bytes_of_damaged_frames_count_as_bad() -> None:
     codec = make()
     damaged = MANUAL_HI91[:-1] + b"\x00"
     events = codec.feed(b"\x01\x02" + damaged + b"\x03" + MANUAL_HI91)
@@ -263,7 +263,7 @@ def test_bytes_of_damaged_frames_are_booked_as_such() -> None:
     assert reasons(events) == [BadReason.CRC]
     assert isinstance(events[1], Measurement)
     ledger = codec.ledger
-    # the claim is 206 bytes, of which 82 are good; one byte more came
+    # the length field claims 206 bytes (82 of them valid); one more byte arrived
     assert (ledger.bytes_in_bad_frames, ledger.bytes_in_good_frames, ledger.bytes_skipped) == (124, 82, 1)
 
     codec = make()
@@ -291,7 +291,7 @@ def test_bytes_of_damaged_frames_are_booked_as_such() -> None:
     codec = make()
     codec.feed(HEADER.pack(b"\x5a\xa5", 100, 0x1234) + MANUAL_HI91)
     assert isinstance(codec.flush()[-1], Measurement)
-    codec.feed(bytes(20))  # 106 bytes claimed: 18 of these belong to the claim
+    codec.feed(bytes(20))  # 106 bytes claimed: these 18 bytes belong to them
     assert (codec.ledger.bytes_in_bad_frames, codec.ledger.bytes_skipped) == (6 + 18, 2)
     codec = make()
     codec.feed(HEADER.pack(b"\x5a\xa5", 3, 0x1234) + b"\x00\x00Z")
@@ -300,7 +300,7 @@ def test_bytes_of_damaged_frames_are_booked_as_such() -> None:
     assert (codec.ledger.bytes_in_bad_frames, codec.ledger.bytes_skipped) == (9, 1)
 
 
-def test_not_finite_values_are_left_out_and_told() -> None:
+def test_values_that_are_not_finite_are_removed_and_reported() -> None:
     names = ("accel_m_s2", "gyro_rad_s", "mag_t", "euler_rad", "quat_wxyz", "pressure_pa")
     for name in names:
         good = LEVEL[name]
@@ -325,7 +325,7 @@ def test_not_finite_values_are_left_out_and_told() -> None:
 
 
 OLD_MANUAL = bytes.fromhex("5AA54C006C519100A03B01A80297BDBB04009CA0653EA226453FF2C53D3FDDA9CDBC54A6D5BC5E4CBEBD")
-"""Beginning of a frame in the vendor's older manual; bytes 7 … 13: reserved, 0x3B, -4.2e-25 as a float."""
+"""Start of a frame in the vendor's older manual; bytes 7 … 13: reserved, 0x3B, -4.2e-25 as a float."""
 
 
 @pytest.mark.parametrize("frames", [1, 3])
@@ -335,7 +335,7 @@ OLD_MANUAL = bytes.fromhex("5AA54C006C519100A03B01A80297BDBB04009CA0653EA226453F
         (101_325.0, 21, (21, 101_325.0)),
         (0.0, 21, (21, None)),  # firmware without a barometer
         (999.0, 21, (21, None)),
-        (-4.2e-25, 59, (None, None)),  # what stood in the buffer
+        (-4.2e-25, 59, (None, None)),  # old content of the buffer
         (999.9, 59, (None, None)),
         (1000.0, 21, (21, 1000.0)),
         (120_000.0, 21, (21, 120_000.0)),
@@ -346,7 +346,7 @@ OLD_MANUAL = bytes.fromhex("5AA54C006C519100A03B01A80297BDBB04009CA0653EA226453F
 def test_no_barometer_no_pressure(
     pressure_pa: float, temperature_c: int, expected: tuple[float | None, float | None], frames: int
 ) -> None:
-    """Alone and in a run of frames, which is decoded another way."""
+    """Alone and in a run of frames, which has its own decoder."""
     frame = hi91(5, pressure_pa=pressure_pa, temperature_c=temperature_c)
     events = make().feed(frame * frames)
     assert len(events) == frames
@@ -398,10 +398,10 @@ def test_clipping_the_check_value_and_a_driver_of_other_settings() -> None:
     m = one(make().feed(encode_hi92(pps_stamp_ms=99999, **far)))
     assert m.accel_m_s2 == pytest.approx((159.994, -159.9996, 0.0), abs=1e-2)
     assert m.gyro_rad_s == pytest.approx((32.767, -32.768, 0.0))
-    assert (m.temperature_c, m.pressure_pa, m.pps_age_ms) == (127, None, 65535)  # 132767 Pa are no pressure
+    assert (m.temperature_c, m.pressure_pa, m.pps_age_ms) == (127, None, 65535)  # 132767 Pa is not an air pressure
     m = one(make().feed(encode_hi91(system_time_ms=2**32 + 7, **(far | {"accel_m_s2": (1e300, 0.0, 0.0)}))))
     assert m.dev_ticks == 7
-    assert (m.temperature_c, m.pressure_pa) == (None, None)  # 1e6 Pa: bytes that nothing wrote
+    assert (m.temperature_c, m.pressure_pa) == (None, None)  # 1e6 Pa: bytes that the firmware did not write
     assert m.accel_m_s2 is not None
     assert m.accel_m_s2[0] == pytest.approx(3.4028e38 * 9.8, rel=1e-4)
     assert crc_hqx(b"123456789", 0) == 0x31C3
@@ -437,8 +437,10 @@ def test_damaged_frames_among_lines() -> None:
 
 @pytest.mark.parametrize("text", [b"AOK\r\n", b"KERR\r\n", b"OK\r\nOK\r\n", b"\nOK\r\n"])
 @pytest.mark.parametrize("step", [1, 7, 1000])
-def test_what_looks_like_a_line_inside_a_damaged_frame_is_none(text: bytes, step: int) -> None:
-    """Its first characters may be bytes of the frame: `AOK` is a byte of a sample and a reply, or four bytes of one."""
+def test_text_inside_a_damaged_frame_is_not_a_line(text: bytes, step: int) -> None:
+    """The first characters may be bytes of the frame: `AOK` is a byte of a sample and a reply, or four bytes of a
+    sample.
+    """
     damaged = HEADER.pack(b"\x5a\xa5", 76, 0x1234) + b"\x91" + bytes(20) + text + bytes(55 - len(text))
     data = damaged + b"OK\r\n" + MANUAL_HI91
     codec = make()

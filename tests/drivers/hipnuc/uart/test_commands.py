@@ -1,4 +1,4 @@
-"""HiPNUC commands: byte for byte as the manual prints them, and what is refused before it is sent."""
+"""HiPNUC commands: bytes as printed in the manual, and arguments that imud rejects before it sends them."""
 
 import math
 from collections.abc import Callable
@@ -69,7 +69,7 @@ def test_commands_are_as_printed(request_: Request, text: str) -> None:
 
 
 IDENTITY = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-two_rows: Any = IDENTITY[:2]  # of a wrong type on purpose
+two_rows: Any = IDENTITY[:2]  # a wrong type on purpose
 
 REFUSED: list[tuple[Callable[[], object], str]] = [
     (lambda: c.mounting(((1, 0, 0), (0, 1, 0), (0, 0, -1))), "determinant"),
@@ -85,7 +85,7 @@ REFUSED: list[tuple[Callable[[], object], str]] = [
 
 
 @pytest.mark.parametrize(("make", "message"), REFUSED)
-def test_bad_arguments_are_refused_with_what_was_expected(make: Callable[[], object], message: str) -> None:
+def test_invalid_arguments_are_rejected_with_the_expected_values(make: Callable[[], object], message: str) -> None:
     with pytest.raises(BadArgument, match=message) as caught:
         make()
     assert "expected" in str(caught.value)

@@ -1,4 +1,4 @@
-"""Conversations with a HiPNUC module: who it is, how it is set, and no reply, refusals and late replies told apart."""
+"""Scripts with a HiPNUC device: identity, settings, missing replies, rejections and late replies."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -81,7 +81,7 @@ def test_no_reply_and_one_that_lost_its_product(outcome: Outcome, words: str) ->
 
 
 def test_a_late_version_is_not_taken_for_the_settings() -> None:
-    """LOG VERSION times out, LOG USRCONFIG goes out, and only then the version arrives, with its OK."""
+    """LOG VERSION times out, imud sends LOG USRCONFIG, and then the late reply to LOG VERSION arrives with its OK."""
     ledger = Ledger()
     session = Session(ledger)
     session.start(ask(Query.VERSION), 0)
@@ -130,7 +130,7 @@ def test_a_module_that_refuses_or_does_not_know_another_rate_stays_reachable() -
 
 
 class Forgetful(HipnucLine):
-    """A module that answers OK to SAVECONFIG and saves nothing."""
+    """Device that replies OK to SAVECONFIG and saves nothing."""
 
     def ask(self, request: Request) -> Outcome:
         outcome = super().ask(request)
@@ -157,7 +157,7 @@ def test_a_rate_that_was_not_saved_after_all_is_reported_after_the_restart() -> 
 def test_a_baud_rate_that_does_not_carry_the_present_output_is_refused(
     settings: ModuleSettings, baud: int, words: str
 ) -> None:
-    """10 Hz of HI91 are 8200 bit/s, 5 Hz of HI92 2700 bit/s."""
+    """10 Hz of HI91 need 8200 bit/s, 5 Hz of HI92 2700 bit/s."""
     line = HipnucLine(settings)
     with pytest.raises(BadArgument, match=words):
         line.act("baud", baud=baud)
@@ -166,7 +166,7 @@ def test_a_baud_rate_that_does_not_carry_the_present_output_is_refused(
 
 @pytest.mark.manual("B 2.2.5 output and line", "B 2.2.5 ONTIME")
 def test_the_sum_of_all_messages_is_refused_and_a_sum_that_fits_is_not() -> None:
-    """100 Hz of HI91 take 82000 bit/s of 115200; HI92 takes 540 bit per frame: 95 % leave 50 Hz and not 100."""
+    """100 Hz of HI91 need 82000 of 115200 bit/s. HI92 needs 540 bits per frame: 95 % leave 50 Hz and not 100."""
     line = HipnucLine()
     with pytest.raises(BadArgument, match="got 136000 bit/s by HI91 at 100 Hz and HI92 at 100 Hz"):
         line.act("output", message="HI92", rate_hz=100)

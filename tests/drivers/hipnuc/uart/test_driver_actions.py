@@ -1,4 +1,4 @@
-"""What a HiPNUC module can be told by name: what goes over the wire, and what the simulated module does."""
+"""Actions of a HiPNUC device: bytes on the wire, and their effect on the simulated device."""
 
 import math
 from typing import Any
@@ -16,7 +16,7 @@ VERSION = Reply(("PNAME=HI14R3", "OK"))
 
 
 def sent(name: str, answers: list[Outcome] | None = None, **arguments: Any) -> tuple[list[Request], object]:
-    """The requests of an action, answered in turn, and its value."""
+    """Return the requests of an action, with one reply each, and its result."""
     action = ACTIONS[name]
     left = list(answers or [OK])
     requests: list[Request] = []
@@ -86,7 +86,7 @@ HALF_TURN = "a number from -180 to 180"
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
-        ("output", {"message": "HI91", "rate_hz": 500}, "expected at most 100 Hz"),  # more than 115200 baud carry
+        ("output", {"message": "HI91", "rate_hz": 500}, "expected at most 100 Hz"),  # too much for 115200 baud
         ("output", {"message": "HI91", "rate_hz": 300}, RATES),
         ("output", {"message": "HI93", "rate_hz": 1}, 'one of "HI91", "HI92"'),
         ("output_on_mark", {"message": None}, 'one of "HI91", "HI92"'),

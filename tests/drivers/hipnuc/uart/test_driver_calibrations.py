@@ -1,4 +1,4 @@
-"""What the calibrations of a HiPNUC module send, and what they make of its replies."""
+"""Requests of the calibrations of a HiPNUC device, and the meaning of its replies."""
 
 import pytest
 

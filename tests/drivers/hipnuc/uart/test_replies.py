@@ -1,4 +1,4 @@
-"""Replies of HiPNUC modules: what ends them, what belongs to them, and what stands in them."""
+"""Replies of HiPNUC devices: their end, their parts, and their values."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Settings of a HiPNUC module: read by name and in words, written, read back, saved, on every simulated variant."""
+"""Settings of a HiPNUC device: read by name and as text, written, read back, saved, on every simulated variant."""
 
 from itertools import product
 from typing import Any
@@ -29,13 +29,13 @@ DELIVERED = {
 
 
 def read(line: HipnucLine) -> dict[str, Any]:
-    """Settings as the table reads them, as JSON has them."""
+    """Return the settings that the table reads, as JSON values."""
     values: dict[str, Any] = msgspec.to_builtins(line.run(SETTINGS.read(Target(None, line.baud))))
     return values
 
 
 @pytest.mark.manual("B 3.2 factory output", "B 2.2.4 when CONFIG acts")
-def test_a_module_as_delivered_and_the_table() -> None:
+def test_factory_settings_and_the_table() -> None:
     line = HipnucLine()
     assert read(line) == DELIVERED
     for name, value in DELIVERED.items():
@@ -95,7 +95,7 @@ def test_the_same_in_words_with_units() -> None:
         {"URFR": "1,0,0,0,1,0,0,0,inf", "BAUD": "123", "ALARM_X": "-5,5", "COMCONFIG 1": "LOG HI93 ONTIME 1"},
     ],
 )
-def test_what_is_not_told_in_a_known_form_is_absent_and_shown_as_it_came(raw: dict[str, str]) -> None:
+def test_lines_of_an_unknown_form_are_shown_unchanged(raw: dict[str, str]) -> None:
     assert values_of(raw) == {}
     assert shown(raw) == raw
 
@@ -153,12 +153,12 @@ def test_written_read_back_saved_and_kept_over_a_restart(
     ],
 )
 @pytest.mark.manual("B 2.2.4 PMUX")
-def test_what_does_not_go_together_is_refused(values: dict[str, Any], words: str) -> None:
+def test_impossible_combinations_are_rejected(values: dict[str, Any], words: str) -> None:
     with pytest.raises(BadArgument, match=words):
         SETTINGS.check(Target(None, 115200), values)
 
 
-def test_what_goes_together_is_not() -> None:
+def test_possible_combinations_are_accepted() -> None:
     for values in (
         DELIVERED,
         {"output": {"hi91": 1000}, "baud": 921600},

@@ -1,4 +1,4 @@
-"""Ranges of the ALARM pin out of the settings, on the simulated module and by hand."""
+"""Ranges of the ALARM pin from the settings, of the simulated device and by hand."""
 
 import pytest
 
@@ -35,7 +35,7 @@ def test_the_modules_own_lines_are_read() -> None:
         ("pmux5_y", "-5,5,0,1", y(-5, 5)),
         ("IO_ALARM", "x,-5,5,0,1", x(-5, 5)),
         ("PMUX5", "IO9", {}),
-        ("PMUX5", "-5,5,0,1", {}),  # which axis?
+        ("PMUX5", "-5,5,0,1", {}),  # the axis is missing
         ("ALARM_X", "-5,5,0,2", {}),
         ("ALARM_X", "-5,5,1", {}),
         ("URFR", "1,0,0,0,1,0,0,0,1", {}),

@@ -1,4 +1,4 @@
-"""Lines of the configuration against the module's settings, as the simulated module reports them."""
+"""GPIO lines of the configuration, compared with the device settings of the simulated device."""
 
 import pytest
 
@@ -44,7 +44,7 @@ MARKED = Output(on_mark=True)
         (ALARM, ModuleSettings(), {"alarm": "the device watches no angle"}),
     ],
 )
-def test_what_the_module_contradicts_is_found(
+def test_contradictions_of_the_device_are_found(
     lines: DeviceLines, settings: ModuleSettings, found: dict[str, str]
 ) -> None:
     differences = line_differences(HipnucLine(settings).run(read_settings()), lines)
@@ -54,7 +54,7 @@ def test_what_the_module_contradicts_is_found(
 
 
 @pytest.mark.parametrize("lines", [SOUT, DIVIDED, SIN, PPS, ALARM])
-def test_what_the_module_does_not_tell_is_not_compared(lines: DeviceLines) -> None:
+def test_unreported_settings_are_not_compared(lines: DeviceLines) -> None:
     assert line_differences({"ATT_MODE": "0"}, lines) == {}
 
 
@@ -64,13 +64,13 @@ def test_what_the_module_does_not_tell_is_not_compared(lines: DeviceLines) -> No
         (SIN, {"output": {"hi91": 0, "hi92": "on_mark"}}, {"sin": "HI92 on mark has no device time"}),
         (SIN, {"output": {"hi91": 100, "hi92": 0}}, {"sin": "no message of the device is on mark"}),
         (SIN, {"output": {"hi91": "on_mark", "hi92": 0}}, {}),
-        (SIN, {"output": {"hi92": "on_mark"}}, {}),  # the module may have HI91 on mark
+        (SIN, {"output": {"hi92": "on_mark"}}, {}),  # the device may have HI91 on mark
         (DIVIDED, {"sout_divisor": 8}, {"sout_div": "expected divisor 4 from the configuration"}),
         (SOUT, {"pins": {"sout": 2, "led": 2}}, {"sout": "sout and led on IO2"}),
-        (ALARM, {"alarm": {"x": {"min_deg": -5, "max_deg": 5, "enabled": False}}}, {}),  # Y may be watched
+        (ALARM, {"alarm": {"x": {"min_deg": -5, "max_deg": 5, "enabled": False}}}, {}),  # the device may watch Y
     ],
 )
-def test_what_declared_settings_contradict_is_found(
+def test_contradictions_of_declared_settings_are_found(
     lines: DeviceLines, declared: dict[str, object], found: dict[str, str]
 ) -> None:
     differences = declared_line_differences(declared, lines)
@@ -104,7 +104,7 @@ def test_check_refuses_a_line_that_declared_settings_contradict() -> None:
         ),
     ],
 )
-def test_what_hi92_cannot_do_is_said(
+def test_limits_of_hi92_are_reported(
     declared: dict[str, object], lines: DeviceLines, fed: bool, found: list[str]
 ) -> None:
     limits = message_limits(declared, lines, fed)

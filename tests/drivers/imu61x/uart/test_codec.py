@@ -1,4 +1,4 @@
-"""Golden frames with SI values by hand, false lengths, content that cannot be, and how every byte is booked."""
+"""Golden frames with SI values by hand, false lengths, impossible content, and the ledger of every byte."""
 
 import struct
 from math import inf, nan, pi, sqrt
@@ -69,7 +69,7 @@ def only(events: object) -> Measurement:
     "A 1.3 timer",
 )
 def test_golden_ahrs_frame() -> None:
-    """Where the axes of the body point at roll -45°, pitch 30°, yaw 90°, by hand: Rz(90°) Ry(30°) Rx(-45°)."""
+    """Directions of the body axes at roll -45°, pitch 30°, yaw 90°, by hand: Rz(90°) Ry(30°) Rx(-45°)."""
     measurement = only(codec().feed(GOLDEN))
     assert measurement.size_bytes == len(GOLDEN) == 54
     assert measurement.trailing_bytes == 0
@@ -96,15 +96,15 @@ def test_golden_ahrs_frame() -> None:
     assert quat is not None
     x, y, z = zip(*matrix_from_quat(quat), strict=True)
     root = sqrt(0.5)
-    assert x == pytest.approx((0, sqrt(0.75), -0.5), abs=1e-12)  # yaw 90° turns forward to y, pitch 30° nose below
+    assert x == pytest.approx((0, sqrt(0.75), -0.5), abs=1e-12)  # forward points to y and 30° down
     assert z == pytest.approx((-root, root * 0.5, root * sqrt(0.75)), abs=1e-12)
     assert y == pytest.approx((-root, -root * 0.5, -root * sqrt(0.75)), abs=1e-12)
     assert sum(q * q for q in quat) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("before", [b"", b"?"])
-def test_a_run_and_the_general_way_give_the_same_as_a_frame_in_a_read(before: bytes) -> None:
-    """A run is at the begin of a read; behind another byte each frame goes the general way."""
+def test_the_fast_path_equals_the_general_path(before: bytes) -> None:
+    """A run is at the start of a read. After another byte, the codec decodes each frame on its own."""
     slow = codec()
     first, second = slow.feed(before + GOLDEN + GOLDEN)
     fast = only(codec().feed(GOLDEN))
@@ -145,7 +145,7 @@ def test_a_run_ends_before_a_frame_that_is_damaged_or_not_finite() -> None:
 
 
 def test_values_near_infinity_and_quaternions_to_the_last_bit() -> None:
-    """High bytes 0x7F and 0xFF, in which NaN and infinity are looked for: of the timer, and of finite 2e38."""
+    """High bytes 0x7F and 0xFF, which may mean NaN or infinity: of the timer, and of finite 2e38."""
     late = [with_crc(AHRS_HEX.replace("78563412", f"785634{high}")) for high in ("7F", "FF")]
     large = with_crc(AHRS_HEX.replace("00001242", struct.pack("<f", -2e38).hex()))
     for frame in (*late, large):
@@ -191,7 +191,7 @@ def test_values_near_infinity_and_quaternions_to_the_last_bit() -> None:
         (9, {"temperature_c"}),
     ],
 )
-def test_what_is_not_finite_is_left_out_and_told(place: int, missing: set[str], value: float) -> None:
+def test_groups_that_are_not_finite_are_removed_and_reported(place: int, missing: set[str], value: float) -> None:
     values = [1.0] * 10
     values[place] = value
     frame = encode_frame(DEVICE_SYNC, AHRS_FRAME, struct.pack("<I10f", 5, *values))
@@ -243,7 +243,7 @@ def test_frames_of_other_kinds_and_lengths() -> None:
 
 @pytest.mark.parametrize("length", [0, PAYLOAD_BYTES_MAX + 1, 0xFFFF])
 @pytest.mark.manual("A 1.2 ID and length")
-def test_a_length_beyond_the_maximum_is_refused_at_once(length: int) -> None:
+def test_a_length_above_the_maximum_is_rejected_immediately(length: int) -> None:
     lie = b"\xaa\x55\x02\x00" + length.to_bytes(2, "little")
     tested = codec()
     bad, measurement = tested.feed(lie + GOLDEN)
@@ -288,7 +288,9 @@ def test_frames_inside_damaged_ones_and_false_lengths() -> None:
 
 @pytest.mark.parametrize("end", [b"\xaa", b"\xaa\x55", b"\xaa\x55\x02\x00\x00"])
 def test_bytes_where_a_damaged_frame_claimed_to_be_are_its_in_any_split(end: bytes) -> None:
-    """A damaged frame ends with what may begin another: given up later, it was part of the damaged one all the same."""
+    """A damaged frame ends with a possible start of another frame. If that fails later, its bytes belong to the damaged
+    frame.
+    """
     damaged = GOLDEN[: -len(end)] + end
     stream = damaged + bytes([0xFF] * 40)
     whole, split = codec(), codec()
@@ -296,7 +298,7 @@ def test_bytes_where_a_damaged_frame_claimed_to_be_are_its_in_any_split(end: byt
     for place in range(len(stream)):
         split.feed(stream[place : place + 1])
     assert whole.ledger.snapshot() == split.ledger.snapshot()
-    header_bytes = 6 if len(end) > 1 else len(end)  # a whole sync word claims a header
+    header_bytes = 6 if len(end) > 1 else len(end)  # a complete sync word claims a header
     assert whole.ledger.bytes_in_bad_frames == len(damaged) - len(end) + header_bytes
     assert whole.ledger.closes()
 

@@ -1,4 +1,4 @@
-"""S1, P1 and K1: golden payloads, every length of S1, and what is none of them."""
+"""S1, P1 and K1: golden payloads, every length of S1, and other messages."""
 
 import pytest
 
@@ -50,7 +50,7 @@ def test_s1() -> None:
 
 @pytest.mark.parametrize("size", [STATUS_BYTES_MIN, 25, 26, 28, 30, 31, 32, 33, 34, 65, 66, 89])
 @pytest.mark.manual("A 1.4 frame")
-def test_s1_of_any_length_says_what_is_there_whole(size: int) -> None:
+def test_s1_of_any_length_contains_its_complete_members(size: int) -> None:
     ends = {
         "system_status": 26, "cpu_load": 28, "drop_rate": 30, "i2c_master": 31, "voltage": 32,
         "user_config_status": 33, "calibration_status": 34, "imu_health": 66,
@@ -65,7 +65,7 @@ def test_s1_of_any_length_says_what_is_there_whole(size: int) -> None:
 
 
 @pytest.mark.parametrize("message", [ReplyFrame(0xFF, S1[:21]), ReplyFrame(0xFE, S1), "S1", ReplyFrame(6, bytes(24))])
-def test_what_is_no_s1(message: ReplyFrame | str) -> None:
+def test_messages_other_than_s1(message: ReplyFrame | str) -> None:
     assert parse_status(message) is None
 
 

@@ -1,4 +1,4 @@
-"""Every command of table 12: golden bytes, and which message ends its reply."""
+"""Every command of table 12: golden bytes, and the message that ends its reply."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,7 @@ from imud.model.errors import BadArgument
 from imud.model.sample import Measurement
 
 STREAM_HEX = "55AA 0300 1800 0000803F" + 20 * "00" + "52D88EE8"
-"""A command frame that a device obeyed."""
+"""Command frame that a device executed."""
 
 
 @pytest.mark.manual("A 1.6 request", "A 1.6 CMD 1", "A 1.6 CMD 2", "A 1.3 rate and line")
@@ -97,8 +97,8 @@ def test_every_parameter_can_be_read(index: int) -> None:
 
 
 @pytest.mark.manual("A 1.3 rate and line")
-def test_bare_numbers_are_no_members_of_enums_and_rates_fit_the_line() -> None:
-    # a type checker refuses it; without one it still makes no frame
+def test_plain_numbers_are_not_enum_members_and_rates_fit() -> None:
+    # a type checker rejects it; without a type checker no frame is made either
     makers: list[Callable[[Any], Request]] = [c.set_bus_mode, c.output_mode, c.read_parameter]
     for make, value in zip(makers, (1, 1, 21), strict=True):
         with pytest.raises(AttributeError):

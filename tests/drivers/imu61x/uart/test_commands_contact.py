@@ -1,4 +1,4 @@
-"""Steps of scripts: contact in either mode, results by one option, what is sent when a device stays quiet."""
+"""Steps of scripts: both modes, results by one option, and the requests to a device without replies."""
 
 import pytest
 
@@ -17,7 +17,7 @@ def _baud() -> RequestScript[float]:
 
 
 @every_variant
-def test_contact_leaves_the_mode_as_it_was(variant: str) -> None:
+def test_command_mode_is_restored(variant: str) -> None:
     for mode in OutputMode:
         far = variant_bench(variant, Imu61xSettings(mode=mode))
         assert far.run(contact.in_command_mode(_baud)) == 115200
@@ -26,7 +26,7 @@ def test_contact_leaves_the_mode_as_it_was(variant: str) -> None:
 
 
 def test_every_request_in_command_mode_can_be_undone() -> None:
-    """A script that is cancelled anywhere after CMD 3 leaves the bytes that make the device stream."""
+    """A script that is cancelled after CMD 3 leaves the bytes that make the device stream."""
     far = imu61x_bench(answers_while_streaming=False)
     script = contact.in_command_mode(_baud)
     request = next(script)
@@ -51,7 +51,7 @@ def test_result_is_judged_by_the_option() -> None:
     assert contact.result_of(Reply(("text",))) is None
 
 
-def test_a_device_that_never_answers_again_is_no_reply() -> None:
+def test_a_device_without_replies_raises_no_reply() -> None:
     script = contact.settled()
     request = next(script)
     asked = 1

@@ -1,4 +1,4 @@
-"""Actions of an IMU61x on a UART, against the simulated device."""
+"""Actions of an IMU61x on a UART, with the simulated device."""
 
 from math import nan
 from typing import Any
@@ -28,15 +28,15 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "baud": {"baud": 230400},
 }
 CODED = [name for name, one in VARIANTS.items() if one.result_done]
-"""Variants whose result for done is not 0."""
+"""Variants with another result than 0 for done."""
 WITHOUT_K1 = ("save", "heading", "calibrate_gyro", "calibrate_installation", "installation_status")
-"""What only an acknowledgement can tell of; where CMD 8 has no other answer, it is one of them."""
+"""Actions with no evidence but an acknowledgement; also CMD 8 without another reply."""
 
 
 @pytest.mark.parametrize("variant", ["obeys while it streams", "no K1", *CODED])
 @pytest.mark.parametrize("name", ACTIONS)
 def test_every_action(variant: str, name: str) -> None:
-    """The scripts of the actions are tested in every variant; here an action must reach them with its arguments."""
+    """Other tests run the scripts in every variant; here an action must pass its arguments to the script."""
     far = variant_bench(variant, uptime_us=20_000_000)
     options = Imu61xUartOptions(result_done=done(variant))
     if variant == "no K1" and name in WITHOUT_K1 and name != "installation_status":
@@ -57,7 +57,7 @@ ORDERS = (
 
 @pytest.mark.parametrize("name", ORDERS)
 def test_every_order_to_a_device_that_refuses_is_an_error(name: str) -> None:
-    """It keeps what it had, and streams on."""
+    """The device keeps its values and continues to stream."""
     settings = Imu61xSettings(rate_hz=200)
     far = imu61x_bench(settings, behaviour=REFUSING, uptime_us=20_000_000)
     with pytest.raises(CommandError):
@@ -174,7 +174,7 @@ def test_a_fixed_rate_in_the_configuration_is_to_be_changed(name: str) -> None:
     ],
 )
 @pytest.mark.manual("A 1.6 other values")
-def test_what_the_device_would_not_take_is_refused(name: str, arguments: dict[str, Any], named: str) -> None:
+def test_unsupported_values_are_rejected(name: str, arguments: dict[str, Any], named: str) -> None:
     far = imu61x_bench()
     with pytest.raises(BadArgument, match=named):
         act(far, name, **arguments)

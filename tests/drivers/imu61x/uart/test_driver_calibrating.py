@@ -1,4 +1,4 @@
-"""Calibrations of simulated devices in all variants: their end is what the device says of itself, not K1."""
+"""Calibrations of simulated devices in all variants. The status of the device decides the end, not K1."""
 
 from collections.abc import Callable
 from math import radians
@@ -27,13 +27,13 @@ def test_gyro_calibration_takes_the_bias_off(variant: str) -> None:
     before = far.samples(2000)
     begun_ns = far.now_ns
     offsets_deg_s = far.run(calibrating.calibrate_gyro(done=done(variant)))
-    assert 3e9 <= far.now_ns - begun_ns < 8e9  # 3 s of calibration, and what the device is quiet
+    assert 3e9 <= far.now_ns - begun_ns < 8e9  # 3 s of calibration and the quiet time of the device
     far.samples(800)
     after = far.samples(2000)
     assert any(abs(radians(offset)) > 3e-4 for offset in offsets_deg_s)
     for axis in range(3):
         means = [sum(m.gyro_rad_s[axis] for m in part if m.gyro_rad_s) / len(part) for part in (before, after)]
-        assert means[0] - means[1] == pytest.approx(radians(offsets_deg_s[axis]), abs=2.5e-4)  # the bias wanders
+        assert means[0] - means[1] == pytest.approx(radians(offsets_deg_s[axis]), abs=2.5e-4)  # the bias drifts
         assert abs(means[1]) < 2.5e-4
 
 

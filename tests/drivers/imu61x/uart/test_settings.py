@@ -1,4 +1,4 @@
-"""Settings of an IMU61x on a UART, against simulated devices in all variants."""
+"""Settings of an IMU61x on a UART, with simulated devices in all variants."""
 
 from typing import Any
 
@@ -76,7 +76,7 @@ def test_each_setting_is_written_and_reads_back(variant: str, name: str, value: 
 
 @every_variant
 @pytest.mark.manual("A 1.6 CMD 5")
-def test_what_is_saved_is_there_after_a_restart(variant: str) -> None:
+def test_saved_settings_survive_a_restart(variant: str) -> None:
     far = variant_bench(variant, uptime_us=20_000_000)
     assert SETTINGS.save is not None
     assert SETTINGS.restart is not None
@@ -99,7 +99,7 @@ def test_a_refusing_device_is_an_error(name: str) -> None:
     assert read(far) == FACTORY
 
 
-def test_what_goes_together_and_what_can_be_declared() -> None:
+def test_combinations_and_declarations() -> None:
     present = Target(None, 115200)
     SETTINGS.check(present, {"output_rate_hz": 200})
     SETTINGS.check(present, {"output_rate_hz": 400, "baud": 230400})

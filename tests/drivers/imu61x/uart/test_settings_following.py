@@ -1,4 +1,4 @@
-"""Restart, baud rate and factory reset of simulated devices in all variants: what they show decides."""
+"""Restart, baud rate and factory reset of simulated devices in all variants: the read-back decides."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,7 +17,7 @@ from tests.support.simulated_modules import done, every_variant, imu61x_bench, v
 
 @every_variant
 @pytest.mark.manual("A 1.6 CMD 9")
-def test_restart_loses_what_was_not_saved_and_begins_the_timer_again(variant: str) -> None:
+def test_restart_loses_unsaved_settings_and_restarts_the_timer(variant: str) -> None:
     far = variant_bench(variant, uptime_us=20_000_000)
     far.run(session.write_parameter(Parameter.AHRS_RATE, 10))
     assert far.module.settings.rate_hz == 10
@@ -28,7 +28,7 @@ def test_restart_loses_what_was_not_saved_and_begins_the_timer_again(variant: st
 
 @every_variant
 def test_a_restart_that_did_not_happen_is_an_error(variant: str) -> None:
-    """It acknowledges or not, and its timer goes on."""
+    """The device acknowledges or not, and its timer continues."""
     far = variant_bench(variant, uptime_us=20_000_000)
     behaviour = replace(far.module.hardware.behaviour, ignores=frozenset({Command.RESTART}))
     far = imu61x_bench(behaviour=behaviour, uptime_us=20_000_000)
@@ -50,7 +50,7 @@ def test_restarts_that_are_refused_seen_or_without_end() -> None:
 
 @pytest.mark.parametrize("uptime_us", [0, 2**32 - 5_000_000, 2**32 - 25_000_000])
 def test_a_young_timer_and_one_that_turns_over_soon_are_waited_for(uptime_us: int) -> None:
-    """0.5 s after power-on, after a restart it shows more; close to its end it turns over by itself."""
+    """0.5 s after power-on, a restarted timer would be larger; near its end the timer wraps by itself."""
     far = imu61x_bench(uptime_us=uptime_us)
     begun_ns = far.now_ns
     assert far.run(following.restart()).product == "IMU61x"
@@ -76,7 +76,7 @@ def test_the_baud_rate_changes_and_the_device_is_kept(variant: str, baud: int, p
 
 
 @every_variant
-def test_without_save_flash_is_written_only_where_the_rate_comes_into_force_in_no_other_way(variant: str) -> None:
+def test_without_save_flash_is_written_only_if_the_baud_rate_requires_it(variant: str) -> None:
     far = variant_bench(variant)
     far.run(following.change_baud(460800, 115200, done=done(variant), save=False))
     assert far.baud == far.module.baud == 460800
@@ -86,7 +86,7 @@ def test_without_save_flash_is_written_only_where_the_rate_comes_into_force_in_n
 
 @pytest.mark.parametrize("baud", [115200, 230400])
 def test_a_baud_rate_that_does_not_carry_the_output_rate_is_refused(baud: int) -> None:
-    """400 Hz of 54 bytes of 10 bits are 216000 bit/s: 230400 carries them, 115200 does not."""
+    """400 Hz of 54 bytes of 10 bits need 216000 bit/s: 230400 baud is enough, 115200 is not."""
     far = imu61x_bench(Imu61xSettings(baud=921600, rate_hz=400))
     if baud == 115200:
         words = "baud: expected at most 200 Hz at 115200 baud, got 400 Hz .216000 bit/s.*; lower the output rate first"
@@ -99,7 +99,7 @@ def test_a_baud_rate_that_does_not_carry_the_output_rate_is_refused(baud: int) -
 
 
 def test_rates_that_are_refused_not_saved_or_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lost device takes a third rate, by some fault of its own: power off and on brings it back."""
+    """The lost device uses a third baud rate because of a fault: power-off and power-on restore it."""
     far = imu61x_bench(refuses=frozenset({Command.SET_PARAMETER}))
     with pytest.raises(Rejected, match="keeps 115200 baud"):
         far.run(following.change_baud(921600, 115200))
@@ -129,7 +129,7 @@ CHANGES: list[Callable[[], RequestScript[object]]] = [
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_nothing_is_changed_without_contact(change: Callable[[], RequestScript[object]]) -> None:
+def test_nothing_changes_without_replies(change: Callable[[], RequestScript[object]]) -> None:
     far = imu61x_bench()
     far.connected = False
     with pytest.raises(NoReply, match="nothing was changed"):

@@ -1,4 +1,4 @@
-"""Request scripts against simulated devices in all variants: identity, status, settings, modes, saving, heading."""
+"""Request scripts with simulated devices in all variants: identity, status, settings, modes, saving, heading."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -165,7 +165,7 @@ def test_refusals_and_silence_are_errors() -> None:
 
 
 def test_streaming_is_started_again_when_the_answer_fails() -> None:
-    """The device obeys and its answers are lost: it must not be left silent."""
+    """The device executes the command and its replies are lost: it must not stay silent."""
     far = imu61x_bench(answers_while_streaming=False)
     script = session.identify()
     request = next(script)
@@ -206,7 +206,7 @@ def test_an_order_without_an_acknowledgement_is_not_known_to_be_done(command: Co
     ("parameter", "value"),
     [(Parameter.BAUD, 115200), (Parameter.GYRO_X_OFF, 0), (Parameter.BUS_MODE, 1), (Parameter.AHRS_RATE, BusMode.SPI)],
 )
-def test_what_cannot_be_set_is_refused_before_anything_is_sent(parameter: Parameter, value: int | BusMode) -> None:
+def test_read_only_parameters_are_rejected_before_sending(parameter: Parameter, value: int | BusMode) -> None:
     far = imu61x_bench()
     with pytest.raises(BadArgument):
         far.run(session.write_parameter(parameter, value))
@@ -218,7 +218,7 @@ def test_what_cannot_be_set_is_refused_before_anything_is_sent(parameter: Parame
 @pytest.mark.manual("A 1.6 CMD 4")
 def test_heading_reset(variant: str, heading_deg: float) -> None:
     if variant == "no K1":
-        return  # see above: not known to be done
+        return  # see above: it is not known whether it was executed
     far = variant_bench(variant)
     far.run(session.reset_heading(heading_deg, done=done(variant)))
     assert far.streams()
