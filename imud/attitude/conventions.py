@@ -50,8 +50,8 @@ class DeviceAxes:
     """Axes and angles that a device sends."""
 
     order: EulerOrder = EulerOrder.ZXY  # Order of the angles. It also selects the forward axis: y with ZXY, x with ZYX.
+    # Whether the navigation frame is east, north, up with any north reference. Otherwise it is level with z up.
     has_north: bool = True
-    """Whether the navigation frame is east, north, up with any north reference. Otherwise it is level with z up."""
     z_down: bool = False  # whether the z axes of the device and of its navigation frame point down
 
     def with_order(self, order: EulerOrder | None) -> "DeviceAxes":
@@ -81,10 +81,10 @@ class DeviceAxes:
         return f"sensor: {forward}, z up, right-handed"
 
 
+# HiPNUC devices: x right, y forward, z up; navigation frame ENU; ZXY (manual V1.5.9, chapter 9)
 RFU_ENU: Final = DeviceAxes()
-"""HiPNUC devices: x right, y forward, z up; navigation frame ENU; ZXY (manual V1.5.9, chapter 9)."""
+# Forsense IMU61x, assumed: x forward, y left, z up; level navigation frame; ZYX. The manual states no axes.
 FLU_LEVEL: Final = DeviceAxes(order=EulerOrder.ZYX, has_north=False)
-"""Forsense IMU61x, assumed: x forward, y left, z up; level navigation frame; ZYX. The manual states no axes."""
 
 
 def body_axes(convention: Convention) -> Matrix3:

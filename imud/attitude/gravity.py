@@ -25,9 +25,9 @@ WINDOW_NS: Final = 5 * NS_PER_S  # duration of rest before an evaluation, ns
 BREAK_NS: Final = 2 * NS_PER_S  # maximum time between two samples of one window, ns
 SAMPLES_MIN: Final = 5
 REST_RAD_S: Final = 0.05  # maximum angular rate at rest, rad/s: 2.9 °/s, above the bias of an uncalibrated gyroscope
+# Maximum difference between the acceleration and g at rest, m/s². The error of an uncalibrated accelerometer is 2 %. A
+# sideways acceleration within the limit rotates the direction by up to 14°.
 REST_M_S2: Final = 0.03 * STANDARD_GRAVITY_M_S2
-"""Maximum difference between the acceleration and g at rest, m/s². The error of an uncalibrated accelerometer is 2 %. A
-sideways acceleration within the limit rotates the direction by up to 14°."""
 CONTRADICTION_DEG: Final = 20.0
 LEVEL_DEG: Final = 45.0  # maximum tilt of a level body, degrees: a ship heels, a vehicle stands on a slope
 EXPLAINED_DEG: Final = 10.0  # maximum remaining angle of a possible cause, degrees
@@ -57,8 +57,8 @@ class GravityCheck:
 
     def __init__(self, device: DeviceAxes, mounting: Matrix3 | None = None) -> None:
         """`mounting`: rotation sensor → body (FLU) of a body that is level at rest; None: no check of the mounting."""
+        # Result of the newest window at rest; None if there is no contradiction or no window
         self.finding: Finding | None = None
-        """Result of the newest window at rest; None if there is no contradiction or no window."""
         self._device = device
         self._mounting = mounting
         self._seq = 0

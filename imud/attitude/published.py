@@ -260,6 +260,7 @@ def _same(a: Matrix3, b: Matrix3) -> bool:
     return all(abs(x - y) <= SAME for row, other in zip(a, b, strict=True) for x, y in zip(row, other, strict=True))
 
 
+# Unit vector of each sensor axis, by name
 AXES: Final[Mapping[str, Vector3]] = {
     "x": (1.0, 0.0, 0.0),
     "-x": (-1.0, 0.0, 0.0),
@@ -268,7 +269,6 @@ AXES: Final[Mapping[str, Vector3]] = {
     "z": (0.0, 0.0, 1.0),
     "-z": (0.0, 0.0, -1.0),
 }
-"""Unit vector of each sensor axis, by name."""
 BODY: Final = ("forward", "left", "up")  # directions of the body's x, y, z
 LENGTH_TOLERANCE: Final = 1e-3  # maximum length error of a mounting quaternion, for values with four digits
 SNAP: Final = 1e-12  # maximum distance of an element from 0 and ±1 that is rounded: the cosine of 90° is 6e-17

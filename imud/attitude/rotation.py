@@ -21,9 +21,9 @@ from imud.model.sample import Quaternion, Vector3
 Matrix3 = tuple[Vector3, Vector3, Vector3]  # rows of a 3 × 3 matrix
 IDENTITY: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
+# Limit of cos(pitch) below which roll and yaw rotate about the same axis: yaw gets the complete rotation. The error is
+# about cos(pitch), otherwise about 1e-16 / cos(pitch); both are 1e-8 rad at the limit.
 GIMBAL_COS_PITCH: Final = 1e-8
-"""Limit of cos(pitch) below which roll and yaw rotate about the same axis: yaw gets the complete rotation. The error is
-about cos(pitch), otherwise about 1e-16 / cos(pitch); both are 1e-8 rad at the limit."""
 
 
 def quat_normalized(quat_wxyz: Quaternion) -> Quaternion:

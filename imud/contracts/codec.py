@@ -18,20 +18,19 @@ class BadReason(StrEnum):
 
     CRC = "crc"  # the check value does not match: bytes damaged on the wire, or a sync word inside other data
     LENGTH = "length"  # the length field is outside the range of the protocol
+    # The check value is correct and the content is impossible, for example a sub-packet longer than the rest of the
+    # frame
     CONTENT = "content"
-    """The check value is correct and the content is impossible, for example a sub-packet longer than the rest of the
-    frame."""
+    # The frame is valid. Its measurement follows, without the values that were NaN or infinity.
     NOT_FINITE = "not-finite"
-    """The frame is valid. Its measurement follows, without the values that were NaN or infinity."""
 
 
 class BadFrame(msgspec.Struct, frozen=True, gc=False):
     """Bytes that begin like a frame and are not a frame, or (reason NOT_FINITE) a valid frame without some values."""
 
     reason: BadReason
+    # Received bytes from the sync word to the end of the frame by its length field; fewer bytes if the rest is missing
     raw: bytes
-    """Received bytes from the sync word to the end of the frame by its length field; fewer bytes if the rest is
-    missing."""
 
 
 CodecEvent = Measurement | TextLine | ReplyFrame | BadFrame
@@ -88,7 +87,7 @@ class CanCodec(Protocol):
         ...
 
     def reset(self) -> None:
-        """Discard the frames of an incomplete sample. imud calls this method after lost frames (overrun, bus off)."""
+        """Discard the frames of an incomplete sample. imud calls this method after lost frames (overrun, bus down)."""
         ...
 
 

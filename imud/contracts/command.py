@@ -23,9 +23,8 @@ class Target:
     settings: Any  # options of the device's driver
     baud: int  # present bit rate of the link, bit/s; 0 if the link has no bit rate
     fixed_baud: int = 0  # bit rate in the configuration, bit/s; 0 if the configuration does not set a bit rate
+    # Possible addresses of the device on a polled bus: present, former and configured address. Empty on other links.
     places: tuple[int, ...] = ()
-    """Possible addresses of the device on a polled bus: present, former and configured address. Empty on other
-    links."""
     other_bits_per_s: float = 0.0  # load of the same CAN bus by all other configured devices, bit/s without stuff bits
 
 
@@ -54,8 +53,8 @@ class Action:
     The script returns the result of the action, a value that JSON can represent. `begin` and the script raise
     BadArgument."""
     risk: Risk = Risk.NONE
+    # Whether the action writes the flash of the device. imud counts these writes and limits them per day.
     saves: bool = False
-    """Whether the action writes the flash of the device. imud counts these writes and limits them per day."""
 
     @property
     def parameters(self) -> type[Options]:
@@ -155,7 +154,7 @@ class RestMeans:
 
     accel_m_s2: Vector3 | None
     gyro_rad_s: Vector3 | None
-    euler_rad: Vector3 | None  # Roll, pitch, yaw
+    euler_rad: Vector3 | None  # roll, pitch, yaw
     incli_rad: Pair | None = None  # inclinometer X and Y
 
 
@@ -199,13 +198,12 @@ class Calibration:
     section: str  # section of the vendor's manual
     handling: Handling
     instructions: tuple[str, ...]  # steps of the user before and during the calibration, one sentence per step
+    # Returns the script that starts the calibration. If the device reports the end, the script waits for the end.
     begin: Callable[[Target], Any]
-    """Returns the script that starts the calibration. If the device reports the end, the script waits for the end."""
+    # Returns the script that requests the progress and returns a Verdict; None if `begin` waits for the end
     verdict: Callable[[Target], Any] | None = None
-    """Returns the script that requests the progress and returns a Verdict; None if `begin` waits for the end."""
+    # Returns the script that returns a missing precondition, one sentence or empty; None if there is no precondition
     unready: Callable[[Target], Any] | None = None
-    """Returns the script that returns a missing precondition, one sentence or empty; None if there is no
-    precondition."""
     expected: tuple[Expectation, ...] = ()  # expected means of the samples at rest after the calibration
     kept: Kept
     save: Callable[[Target], Any] | None = None  # returns the script that saves the result; only with Kept.BY_SAVE

@@ -54,16 +54,16 @@ def _no_filter(_settings: Mapping[str, str], _sensor: SensorName) -> str:
 class DataSheet:
     """Facts about the sensors from the vendor's documents."""
 
+    # Title and version of the manual and its statement about noise, one sentence; empty if there is no manual
     document: str = ""
-    """Title and version of the manual and its statement about noise, one sentence; empty if there is no manual."""
+    # Noise figures by the first characters of the product name; empty if the manual has no figures
     models: Mapping[str, ModelFigures] = field(default_factory=dict)
-    """Noise figures by the first characters of the product name; empty if the manual has no figures."""
+    # Angular rate of one count on the wire, rad/s; None for floats, or if the scale depends on the frame
     gyro_step_rad_s: float | None = None
-    """Angular rate of one count on the wire, rad/s; None for floats, or if the scale depends on the frame."""
+    # Acceleration of one count on the wire, m/s²; None for floats, or if the scale depends on the frame
     accel_step_m_s2: float | None = None
-    """Acceleration of one count on the wire, m/s²; None for floats, or if the scale depends on the frame."""
+    # Describes the low-pass filter of a sensor from the device settings; empty if the filter is not known
     filter_words: Callable[[Mapping[str, str], SensorName], str] = _no_filter
-    """Describes the low-pass filter of a sensor from the device settings; empty if the filter is not known."""
 
     def figures_of(self, product: str) -> ModelFigures | None:
         """Return the figures with the longest matching start of the product name; None if no start matches."""
@@ -71,8 +71,8 @@ class DataSheet:
         return self.models[max(fitting, key=len)] if fitting else None
 
 
+# Value of `tick_ns` if the device counter counts samples. A tick is one sample; its duration is not known.
 SAMPLE_COUNTER = 0
-"""Value of `tick_ns` if the device counter counts samples. A tick is one sample; its duration is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +97,8 @@ class StatusBit(NamedTuple):
     """Meaning of one bit of `Measurement.status`."""
 
     name: str  # device condition while the bit is set, as readable text
+    # Whether a change of the bit is an event: while the bit is set, values are wrong or not valid yet
     notable: bool = False
-    """Whether a change of the bit is an event: while the bit is set, values are wrong or not valid yet."""
 
 
 def status_words(bits: Mapping[int, StatusBit], status: int | None) -> tuple[str, ...]:
@@ -124,38 +124,36 @@ class Driver:
     settings: type[Options]  # type of the driver options (`options` of a device)
     tick_ns: int  # duration of one device tick, ns, or SAMPLE_COUNTER
     tick_modulus: int  # modulus of the device counter: it counts 0 … tick_modulus - 1
+    # Modulus of `Measurement.pps_age_ms` without a pulse, ms. imud uses the age to time-stamp frames without device
+    # time. 0 if the protocol has no such frames.
     stamp_modulus: int = 0
-    """Modulus of `Measurement.pps_age_ms` without a pulse, ms. imud uses the age to time-stamp frames without device
-    time. 0 if the protocol has no such frames."""
-    euler_convention: str  # Order, axes and signs of `euler_rad`, as readable text
+    euler_convention: str  # order, axes and signs of `euler_rad`, as readable text
     navigation_frame: str  # destination frame of the rotation `quat_wxyz`, for example `ENU`
-    axes: DeviceAxes = RFU_ENU  # Axes, angles and navigation frame for conversions
+    axes: DeviceAxes = RFU_ENU  # axes, angles and navigation frame for conversions
+    # Returns the reference of yaw from the driver options and the device settings (empty: not read yet)
     heading: Callable[[Any, Mapping[str, str]], Heading] = _unknown_heading
-    """Returns the reference of yaw from the driver options and the device settings (empty: not read yet)."""
     actions: Actions = field(default_factory=dict)  # actions of the device, by name
     calibrations: Calibrations = field(default_factory=dict)  # guided calibrations, by kind
     device_settings: SettingsTable | None = None  # table of the device settings; None if the driver does not know them
+    # GPIO lines that the device can have: names of fields of `imud.contracts.lines.DeviceLines`
     lines: frozenset[str] = frozenset()
-    """GPIO lines that the device can have: names of fields of `imud.contracts.lines.DeviceLines`."""
+    # Returns the meaning of the ALARM line from the device settings; None if no setting describes it
     alarm_ranges: Callable[[Mapping[str, str]], AlarmRanges] | None = None
-    """Returns the meaning of the ALARM line from the device settings; None if no setting describes it."""
     time_bits: TimeBits = NO_TIME_BITS  # bits of `Measurement.status` about time
+    # Meaning of the known bits of `Measurement.status`, by bit number
     status_bits: Mapping[int, StatusBit] = field(default_factory=dict)
-    """Meaning of the known bits of `Measurement.status`, by bit number."""
-    data_sheet: DataSheet = field(default_factory=DataSheet)  # Noise, resolution and filters from the vendor's manual
+    data_sheet: DataSheet = field(default_factory=DataSheet)  # noise, resolution and filters from the vendor's manual
+    # Returns device settings with readable names and units
     shown_settings: Callable[[Mapping[str, str]], Mapping[str, str]] = lambda settings: settings
-    """Returns device settings with readable names and units."""
+    # Finds GPIO lines in the configuration that contradict the device settings. Returns a reason, one sentence, by key.
     line_differences: Callable[[Mapping[str, str], DeviceLines], Mapping[str, str]] = lambda _settings, _lines: {}
-    """Finds GPIO lines in the configuration that contradict the device settings. Returns a reason, one sentence, by
-    key."""
+    # Finds GPIO lines that contradict the values of the declared settings, before imud has read the device settings
     declared_line_differences: Callable[[Mapping[str, Any], DeviceLines], Mapping[str, str]] = lambda _declared, _: {}
-    """Finds GPIO lines that contradict the values of the declared settings, before imud has read the device
-    settings."""
+    # Returns restrictions that `imud check` prints, one sentence each. The arguments are the values of the declared
+    # settings, the GPIO lines, and whether imud sends UTC sentences to the device.
     limits: Callable[[Mapping[str, Any], DeviceLines, bool], Sequence[str]] = lambda _declared, _lines, _fed: ()
-    """Returns restrictions that `imud check` prints, one sentence each. The arguments are the values of the declared
-    settings, the GPIO lines, and whether imud sends UTC sentences to the device."""
+    # Finds problems of driver options together with link options. Both are valid on their own.
     check: Callable[[Any, Any], Sequence[KeyProblem]] = no_problems
-    """Finds problems of driver options together with link options. Both are valid on their own."""
 
     def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
         """Return the problems of `options` together with the link options, for `imud check`.
@@ -169,24 +167,24 @@ class Driver:
 class StreamDriver(Driver):
     """Driver of a device that sends a byte stream without requests (UART, RS-232, USB serial)."""
 
+    # Baud rates of the device, bit/s, most likely first. Detection tries them in this order.
     baud_rates: tuple[int, ...]
-    """Baud rates of the device, bit/s, most likely first. Detection tries them in this order."""
+    # Returns a codec that counts into the ledger, from the driver options
     make_codec: Callable[[Ledger, Any], StreamCodec]
-    """Returns a codec that counts into the ledger, from the driver options."""
+    # Returns the script that reads the identity and does not change the device
     identify: Callable[[], RequestScript[Identity]]
-    """Returns the script that reads the identity and does not change the device."""
+    # Returns the script that reads the device settings, by the names of the device, and does not change the device
     read_settings: Callable[[], RequestScript[Mapping[str, str]]]
-    """Returns the script that reads the device settings, by the names of the device, and does not change the device."""
+    # Passes the identity to the codec. The meaning of a field can depend on the firmware.
     apply_identity: Callable[[StreamCodec, Identity], None] = lambda _codec, _identity: None
-    """Passes the identity to the codec. The meaning of a field can depend on the firmware."""
+    # Returns the script that makes a silent device send samples; None if the device always sends. The script saves
+    # nothing. Its result: whether the device acknowledged, or None if the device settings disable the output (then the
+    # script changes nothing). Raises NoReply if the device does not reply.
     wake: Callable[[], RequestScript[bool | None]] | None = None
-    """Returns the script that makes a silent device send samples; None if the device always sends. The script saves
-    nothing. Its result: whether the device acknowledged, or None if the device settings disable the output (then the
-    script changes nothing). Raises NoReply if the device does not reply."""
+    # Returns why a device with these settings replies and sends no samples, one clause
     why_silent: Callable[[Mapping[str, str]], str] = lambda _settings: "its output is off"
-    """Returns why a device with these settings replies and sends no samples, one clause."""
+    # Returns one valid frame with random values, for property tests and fault injection
     example_frame: Callable[[Random], bytes]
-    """Returns one valid frame with random values, for property tests and fault injection."""
 
     def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
         """Return the problems of the driver options, and an unsupported baud rate."""
@@ -215,28 +213,28 @@ def nothing_cyclic(_settings: Any) -> Sequence[CyclicFrame]:
 class CanDriver(Driver):
     """Driver of a device on a CAN bus, which other devices may use too."""
 
+    # Returns a codec that counts into the ledger, from the driver options
     make_codec: Callable[[Ledger, Any], CanCodec]
-    """Returns a codec that counts into the ledger, from the driver options."""
+    # Returns the filters for all frames of the device, replies included, from the driver options
     filters: Callable[[Any], Sequence[CanFilter]]
-    """Returns the filters for all frames of the device, replies included, from the driver options."""
     node_of: Callable[[int, bool, bytes], int | None]
     """Returns the node number of the device that sends this frame (identifier, whether it has 29 bits, data), or None.
 
     Only frames with samples have a node number here. The codec must confirm the frame."""
+    # Returns driver options for the device with this node number, all other options at their defaults
     node_settings: Callable[[int], Any]
-    """Returns driver options for the device with this node number, all other options at their defaults."""
     node_title: Callable[[int], str]  # returns a readable name of this device, for example `node 8`
+    # Returns the script that reads the identity and does not change the device
     identify: Callable[[Any], RequestScript[Identity]]
-    """Returns the script that reads the identity and does not change the device."""
+    # Returns the script that reads the device settings, by the names of the device, and does not change the device
     read_settings: Callable[[Any], RequestScript[Mapping[str, str]]]
-    """Returns the script that reads the device settings, by the names of the device, and does not change the device."""
+    # Passes the identity to the codec. The frames can depend on the identity.
     apply_identity: Callable[[CanCodec, Identity], None] = lambda _codec, _identity: None
-    """Passes the identity to the codec. The frames can depend on the identity."""
     sample_frames: int  # number of frames per sample
+    # Returns the valid frames of one sample in sending order, with random values, for the default options
     example_frames: Callable[[Random], Sequence[CanFrame]]
-    """Returns the valid frames of one sample in sending order, with random values, for the default options."""
+    # Returns the frames that imud sends cyclically while the link is open. Read-only links do not send them.
     cyclic: Callable[[Any], Sequence[CyclicFrame]] = nothing_cyclic
-    """Returns the frames that imud sends cyclically while the link is open. Read-only links do not send them."""
 
 
 T = TypeVar("T")
@@ -251,20 +249,19 @@ class PolledDriver(Driver):
     tick_ns: int = SAMPLE_COUNTER
     tick_modulus: int = 2
     link: str  # name of its link, a row of LINKS
+    # Values that detection tries if the link has the value `auto`, most likely first: I2C addresses or SPI modes
     targets: tuple[int, ...]
-    """Values that detection tries if the link has the value `auto`, most likely first: I2C addresses or SPI modes."""
+    # Returns the script that reads the identity and changes nothing. Raises DeviceRefused if another device replies.
     probe: Callable[[Any], TransferScript[Identity]]
-    """Returns the script that reads the identity and changes nothing. Raises DeviceRefused if another device
-    replies."""
+    # Returns the script that writes the options to the device, reads them back and returns them by the names of the
+    # device. Raises DeviceRefused.
     set_up: Callable[[Any], TransferScript[Mapping[str, str]]]
-    """Returns the script that writes the options to the device, reads them back and returns them by the names of the
-    device. Raises DeviceRefused."""
+    # Returns a codec that counts into the ledger, from the driver options
     make_codec: Callable[[Ledger, Any], PolledCodec]
-    """Returns a codec that counts into the ledger, from the driver options."""
+    # Returns the maximum time between two updates of the device registers, ns; 0 if it is not known
     update_ns: Callable[[Any], int]
-    """Returns the maximum time between two updates of the device registers, ns; 0 if it is not known."""
+    # Returns the bytes of the first poll with random values, for property tests and fault injection
     example_reading: Callable[[Random], bytes]
-    """Returns the bytes of the first poll with random values, for property tests and fault injection."""
+    # Returns the minimum bus time of one read of the samples, ns, from the driver options and the link options; 0 if it
+    # is not known. The sum over all devices of a bus shows whether the bus can carry their rates.
     read_ns: Callable[[Any, Any], int] = lambda _options, _link: 0
-    """Returns the minimum bus time of one read of the samples, ns, from the driver options and the link options; 0 if
-    it is not known. The sum over all devices of a bus shows whether the bus can carry their rates."""

@@ -18,8 +18,8 @@ from imud.host.threads import BusThread, StartWorker
 from imud.model.errors import LinkError
 from imud.model.options import Options
 
+# Width of a SOUT pulse, µs. The first byte follows the falling edge (HiPNUC manual 1.2.2, PMUX2).
 SOUT_WIDTH_US: Final = 80.0
-"""Width of a SOUT pulse, µs. The first byte follows the falling edge (HiPNUC manual 1.2.2, PMUX2)."""
 SIN_DELAY_US: Final = 125.0  # mean time from the rising edge on SIN to the start of the frame, µs (HiPNUC manual 1.2.1)
 
 
@@ -49,7 +49,7 @@ class TriggerStamp(NamedTuple):
     """One trigger that imud sent on SIN."""
 
     t_ns: int  # CLOCK_MONOTONIC at the rising edge
-    err_ns: int  # One-sigma error of `t_ns`
+    err_ns: int  # one-sigma error of `t_ns`
     number: int  # number of the trigger, starting at 1
 
 
@@ -57,16 +57,16 @@ class UtcReference(NamedTuple):
     """Estimate of UTC by the host."""
 
     offset_ns: int  # UTC (CLOCK_REALTIME) minus CLOCK_MONOTONIC
-    error_ns: int  # One-sigma error of `offset_ns`
+    error_ns: int  # one-sigma error of `offset_ns`
 
 
 @dataclass(frozen=True, slots=True)
 class TimeBits:
     """Masks of the status bits about time; 0 if the device does not have the bit."""
 
+    # Set in a frame that belongs to a pulse on SOUT. imud uses the bit after the device has set it once: older firmware
+    # always sends zero.
     sync_out: int = 0
-    """Set in a frame that belongs to a pulse on SOUT. imud uses the bit after the device has set it once: older
-    firmware always sends zero."""
     not_utc: int = 0  # set while the device time is not synchronized to UTC
 
 
@@ -90,9 +90,9 @@ class Edge(NamedTuple):
 
     t_ns: int  # CLOCK_MONOTONIC, as time-stamped by the kernel
     rising: bool  # whether the line became active
+    # Number of the edge of this line, starting at 1. It counts rising, falling and lost edges, and continues after the
+    # line was opened again.
     number: int
-    """Number of the edge of this line, starting at 1. It counts rising, falling and lost edges, and continues after the
-    line was opened again."""
 
 
 class LineOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -218,10 +218,10 @@ class DeviceLines(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Pulse per second at SIN of the device, also connected to the host."""
 
 
+# Option types, by key of `DeviceLines`
 LINE_SCHEMAS: Final[Mapping[str, type[LineOptions]]] = {
     field.name: get_args(field.type)[0] for field in fields(DeviceLines)
 }
-"""Option types, by key of `DeviceLines`."""
 
 
 class AlarmRange(NamedTuple):
@@ -236,8 +236,8 @@ class AlarmRange(NamedTuple):
 class AlarmRanges(NamedTuple):
     """Meaning of the ALARM line, from the device settings."""
 
+    # Range by the axis name of the device, without axes that the device settings lack
     by_axis: Mapping[str, AlarmRange]
-    """Range by the axis name of the device, without axes that the device settings lack."""
     pin_setting: str  # name of the setting that selects the function of the pin, for error messages
     mounting_setting: str  # name of the setting for the mounting orientation, for error messages
 
@@ -296,9 +296,9 @@ class WatchedInput(Protocol):
         ...
 
 
+# Returns a watched line from its options and a readable purpose. The third argument receives rising edges. The last
+# argument receives a message when the line fails for a new reason, and when it is open again.
 WatchLine = Callable[[InputOptions, str, OnEdges, Callable[[str], None]], WatchedInput]
-"""Returns a watched line from its options and a readable purpose. The third argument receives rising edges. The last
-argument receives a message when the line fails for a new reason, and when it is open again."""
 
 
 class OutputLine(Protocol):
@@ -323,7 +323,7 @@ class OutputLine(Protocol):
 class LineFactory:
     """Factory of closed lines, from their options and a readable purpose, for example `bow sout`."""
 
+    # Returns a line from `InputOptions`. The last argument is True if only rising edges are necessary.
     make_input: Callable[[Any, str, bool], InputLine]
-    """Returns a line from `InputOptions`. The last argument is True if only rising edges are necessary."""
     make_output: Callable[[Any, str], OutputLine]  # returns a line from `OutputOptions`
     start_worker: StartWorker = BusThread  # starts the thread that drives SIN

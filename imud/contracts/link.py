@@ -26,8 +26,8 @@ class Claim:
     shared: bool = False  # whether several devices can use the place, each with a different part
     part: int | None = None  # part of a shared place, for example a Modbus address; None before detection (`auto`)
     part_key: str = ""  # key of the option with the part
+    # Options that must be equal for all devices of a shared place, by key
     terms: Mapping[str, object] = field(default_factory=dict)
-    """Options that must be equal for all devices of a shared place, by key."""
 
 
 class Conflict(NamedTuple):
@@ -99,11 +99,11 @@ def id_text(can_id: int, extended: bool) -> str:
 S = TypeVar("S", bound=Options)
 
 OnData = Callable[[bytes, int], None]  # receives bytes and CLOCK_MONOTONIC immediately after the read, ns
+# Receives the error that ended the link, or None at the regular end of a replay. Called once.
 OnEnd = Callable[[LinkError | None], None]
-"""Receives the error that ended the link, or None at the regular end of a replay. Called once."""
 OnFrames = Callable[[Sequence[CanFrame]], None]  # receives CAN frames, oldest first
+# Receives each change of the bus state, one sentence, and the present problem (empty if there is no problem)
 OnBusNews = Callable[[str, str], None]
-"""Receives each change of the bus state, one sentence, and the present problem (empty if there is no problem)."""
 
 
 class Link(Protocol):
@@ -149,8 +149,8 @@ class StreamLink(Link, Protocol):
     baud: int  # present baud rate, bit/s; 0 for links without a baud rate
     auto_baud: bool  # whether detection must find the baud rate
     hold_ns: int  # Latency timer of a USB adapter, ns: maximum delay of received bytes. 0 without a USB adapter.
+    # Number of bytes that the kernel can buffer without loss while the link is paused; 0: the link cannot pause
     waiting_bytes: int
-    """Number of bytes that the kernel can buffer without loss while the link is paused; 0: the link cannot pause."""
 
     def pause(self) -> None:
         """Deliver no bytes until `resume`; the kernel buffers them. Only for links with `waiting_bytes`."""
@@ -177,12 +177,12 @@ class CanLink(Link, Protocol):
     """CAN bus of one device. Several devices share a bus; each has its own link."""
 
     bus: str  # Name of the bus. Links with the same name receive the same frames.
+    # Filters of the frames to deliver, effective when set. The link may deliver other frames too.
     filters: Sequence[CanFilter]
-    """Filters of the frames to deliver, effective when set. The link may deliver other frames too."""
     bitrate: int  # bit rate of the bus, bit/s, known after `open`; 0 for virtual buses or if it is not known
+    # Maximum hold of received frames before the link delivers them together, ns, effective when set; 0: no hold. Each
+    # frame keeps its own arrival time. A link that cannot hold frames ignores the value.
     gather_ns: int
-    """Maximum hold of received frames before the link delivers them together, ns, effective when set; 0: no hold. Each
-    frame keeps its own arrival time. A link that cannot hold frames ignores the value."""
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
         """Start the delivery of frames. Requires a running loop and an open bus."""
@@ -206,8 +206,8 @@ class PolledLink(Link, Protocol):
 
     bus: str  # Name of the bus. One thread serves all links with the same name.
     target: int | None  # configured address or mode; None for `auto`
+    # Whether the target selects one of several devices on the bus (I2C). Then each target can have one device only.
     shared: bool
-    """Whether the target selects one of several devices on the bus (I2C). Then each target can have one device only."""
     rate_hz: float  # polls per second
     bit_rate: int  # baud rate of the bus, bit/s; 0 if the host generates the clock
 
@@ -265,10 +265,10 @@ class LinkType(Generic[S]):
     make: Callable[[S], StreamLink] = _no_bytes  # returns a closed byte link from its options
     make_can: Callable[[S], CanLink] = _no_frames  # returns a closed link to a CAN bus from its options
     make_polled: Callable[[S], PolledLink] = _no_transfers  # returns a closed link to a polled bus from its options
+    # Returns the name of the shared bus in the options; empty for links without a bus
     bus_of: Callable[[S], str] = _no_bus
-    """Returns the name of the shared bus in the options; empty for links without a bus."""
+    # Returns the ports, buses and addresses that a link with these options uses
     claims: Callable[[S], Sequence[Claim]] = _claims_nothing
-    """Returns the ports, buses and addresses that a link with these options uses."""
     problem: Callable[[S, bool], str] = _knows_no_problem
     """Returns why `open` would reject these options; empty if no reason is known. It does not open the port.
 

@@ -17,12 +17,12 @@ from imud.model.event import Event
 from imud.model.options import Options
 from imud.model.sample import Sample
 
+# Receives a complete record (`imud.formats.records`) and does not block. Called in the thread of the event loop.
 PutRecord = Callable[[bytes], None]
-"""Receives a complete record (`imud.formats.records`) and does not block. Called in the thread of the event loop."""
 
+# Starts to send the data of a flight recorder as a recording to a client's socket, which it then closes. Returns the
+# length of the recording, s, without blocking. Raises ServerError. Called in the thread of the event loop.
 TakeSnapshot = Callable[[socket], float]
-"""Starts to send the data of a flight recorder as a recording to a client's socket, which it then closes. Returns the
-length of the recording, s, without blocking. Raises ServerError. Called in the thread of the event loop."""
 
 
 class RecordingSource(Protocol):
@@ -52,8 +52,8 @@ class RecordingSource(Protocol):
 
 
 AS_SENT: Final = as_sent()  # axes and angles of HiPNUC devices: default of a batch
+# Name of a device, its driver as in `DeviceStatus.driver`, and its present ledger
 DeviceLedger = tuple[str, str, Mapping[str, int]]
-"""Name of a device, its driver as in `DeviceStatus.driver`, and its present ledger."""
 
 
 class Batch:
@@ -208,14 +208,11 @@ class Devices(Protocol):
 class PublisherClock:
     """Clocks of the host and of the event loop."""
 
-    now_ns: Callable[[], int]
-    """Returns CLOCK_MONOTONIC, ns. Any thread may call it."""
-    utc_offset_ns: Callable[[], int]
-    """Returns CLOCK_REALTIME minus CLOCK_MONOTONIC, ns."""
+    now_ns: Callable[[], int]  # Returns CLOCK_MONOTONIC, ns. Any thread may call it.
+    utc_offset_ns: Callable[[], int]  # returns CLOCK_REALTIME minus CLOCK_MONOTONIC, ns
+    # Returns this offset with its error; None if CLOCK_REALTIME is not synchronized. Any thread may call it.
     utc_reference: Callable[[], UtcReference | None]
-    """Returns this offset with its error; None if CLOCK_REALTIME is not synchronized. Any thread may call it."""
-    cpu_ns: Callable[[], int]
-    """Returns the CPU time of the event loop's thread, ns."""
+    cpu_ns: Callable[[], int]  # returns the CPU time of the event loop's thread, ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,36 +222,30 @@ class OutputFacts:
     Synchronization: the event loop's thread only.
     """
 
+    # Functions that return the clients of an output
     clients: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
-    """Functions that return the clients of an output."""
     recorders: list[Callable[[], RecorderStatus]] = field(default_factory=list)
     flights: list[Callable[[], FlightStatus]] = field(default_factory=list)
+    # Functions that return the state of the ports of an output that sends sentences
     sentences: list[Callable[[], Sequence[OutputStatus]]] = field(default_factory=list)
-    """Functions that return the state of the ports of an output that sends sentences."""
     mqtts: list[Callable[[], MqttStatus]] = field(default_factory=list)
-    snapshots: list[TakeSnapshot] = field(default_factory=list)
-    """Functions of flight recorders that send a snapshot."""
-    rings: dict[str, str] = field(default_factory=dict)
-    """Path of the ring file of each device in shared memory."""
+    snapshots: list[TakeSnapshot] = field(default_factory=list)  # functions of flight recorders that send a snapshot
+    rings: dict[str, str] = field(default_factory=dict)  # path of the ring file of each device in shared memory
+    # Devices that have no ring file because imud cannot create it now
     without_ring: set[str] = field(default_factory=set)
-    """Devices that have no ring file because imud cannot create it now."""
 
 
 @dataclass(frozen=True, slots=True)
 class PublisherContext:
     """The parts of the daemon that outputs may use."""
 
-    epoch: int
-    """Random number of this start of the daemon, 64 bits. Readers use it to recognize a restart."""
+    epoch: int  # Random number of this start of the daemon, 64 bits. Readers use it to recognize a restart.
     clock: PublisherClock
     devices: Devices
     outputs: OutputFacts
-    latencies: Latencies
-    """Register of the latencies that readers need."""
-    watch_line: WatchLine
-    """Watches a GPIO line that belongs to no device."""
-    raise_event: Callable[[Event], None]
-    """Sends an event of the daemon to all outputs."""
+    latencies: Latencies  # register of the latencies that readers need
+    watch_line: WatchLine  # watches a GPIO line that belongs to no device
+    raise_event: Callable[[Event], None]  # sends an event of the daemon to all outputs
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,6 +256,5 @@ class PublisherType:
     settings: type[Options]
     make: Callable[[Any, PublisherContext], Publisher]
     wanted: Callable[[Any], bool] = attrgetter("enabled")  # whether these options enable the publisher
+    # Whether the daemon exits if the first start of the publisher fails. Otherwise the daemon tries again periodically.
     required: bool = True
-    """Whether the daemon exits if the first start of the publisher fails. Otherwise the daemon tries again
-    periodically."""

@@ -42,27 +42,27 @@ class Request:
     name: str  # command as written in the manual, for error messages
     is_end: Callable[[Message], bool]  # returns whether this message ends a positive reply
     is_rejection: Callable[[Message], bool]  # returns whether this message ends a negative reply
+    # Returns whether this message can be part of the reply. Other messages are unsolicited.
     is_part: Callable[[Message], bool]
-    """Returns whether this message can be part of the reply. Other messages are unsolicited."""
     timeout_ns: int = NS_PER_S // 2
+    # The device never replies to this request, for example because it restarts. The request is complete when sent.
     silent: bool = False
-    """The device never replies to this request, for example because it restarts. The request is complete when sent."""
+    # Minimum number of messages in a positive reply, with its end. An earlier end belongs to a late reply.
     messages_min: int = 1
-    """Minimum number of messages in a positive reply, with its end. An earlier end belongs to a late reply."""
+    # New baud rate of the link for this and all following requests, bit/s; 0: unchanged. Serial ports only.
     baud: int = 0
-    """New baud rate of the link for this and all following requests, bit/s; 0: unchanged. Serial ports only."""
+    # New driver options for this and all following requests, after the node number changed; None: unchanged. CAN only.
+    # A script without a reply from the new node number restores the former options.
     settings: Any = None
-    """New driver options for this and all following requests, after the node number changed; None: unchanged. CAN only.
-    A script without a reply from the new node number restores the former options."""
+    # Additional filters for reply frames of any device, CAN only. The codec counts these frames as usual: frames of
+    # other devices are skipped.
     also: tuple[CanFilter, ...] = ()
-    """Additional filters for reply frames of any device, CAN only. The codec counts these frames as usual: frames of
-    other devices are skipped."""
+    # Bytes that imud sends if the script is cancelled at this request while the link is open. imud does not wait for a
+    # reply. The field exists because a closed generator cannot send.
     undo: bytes = b""
-    """Bytes that imud sends if the script is cancelled at this request while the link is open. imud does not wait for a
-    reply. The field exists because a closed generator cannot send."""
+    # Returns whether this measurement ends a positive reply (`Reply.sample`). None: no measurement ends it. imud also
+    # publishes the measurement. Byte links only.
     is_sample: Callable[[Measurement], bool] | None = None
-    """Returns whether this measurement ends a positive reply (`Reply.sample`). None: no measurement ends it. imud also
-    publishes the measurement. Byte links only."""
 
 
 def never(_message: Message) -> bool:
@@ -139,26 +139,25 @@ def says_nothing(value: T) -> RequestScript[T]:
 class Transfer:
     """One transaction on a polled bus, in one system call."""
 
+    # SPI: bytes of each assertion of chip select; the device returns the same number of bytes. I2C: one item to write.
     sends: tuple[bytes, ...]
-    """SPI: bytes of each assertion of chip select; the device returns the same number of bytes. I2C: one item to
-    write."""
     read_bytes: int = 0  # I2C: number of bytes to read after a repeated start; 0: write only
     gap_us: int = 0  # SPI: pause after each assertion of chip select, µs
+    # I2C, RS-485: address for this transfer only, for example to look for a device at another address
     at: int | None = None
-    """I2C, RS-485: address for this transfer only, for example to look for a device at another address."""
+    # I2C, RS-485: address of the device after this transfer, also if the transfer fails, and after the script. A script
+    # without a reply from the new address restores the former address (`at` and `then_at`).
     then_at: int | None = None
-    """I2C, RS-485: address of the device after this transfer, also if the transfer fails, and after the script. A
-    script without a reply from the new address restores the former address (`at` and `then_at`)."""
+    # imud does not poll the device between this transfer and the next transfer of the script, because the device can be
+    # at another address
     holds: bool = False
-    """imud does not poll the device between this transfer and the next transfer of the script, because the device can
-    be at another address."""
+    # RS-485: maximum time to the start of the reply, ms. 0 or a smaller value than in the link options: the link
+    # options.
     reply_ms: int = 0
-    """RS-485: maximum time to the start of the reply, ms. 0 or a smaller value than in the link options: the link
-    options."""
 
 
+# Script of transfers. It may catch TransferError to clean up. It must not catch DeviceRefused.
 TransferScript = Generator[Transfer, bytes, T]
-"""Script of transfers. It may catch TransferError to clean up. It must not catch DeviceRefused."""
 
 
 def run_transfer_script(script: TransferScript[T], transfer: Callable[[Transfer], bytes]) -> T:

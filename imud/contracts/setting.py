@@ -24,10 +24,10 @@ class OnDifference(StrEnum):
     """Reaction of imud if the device settings differ from the declared settings."""
 
     REPORT = "report"  # report the difference: event, status and metric
+    # Write the settings that take effect immediately. imud writes them again after each restart of the device.
     APPLY = "apply"
-    """Write the settings that take effect immediately. imud writes them again after each restart of the device."""
+    # Write all settings and save them to the flash of the device. Restart the device if necessary.
     APPLY_AND_SAVE = "apply_and_save"
-    """Write all settings and save them to the flash of the device. Restart the device if necessary."""
 
 
 class Effect(StrEnum):
@@ -63,16 +63,16 @@ class Setting:
 
     The script raises CommandError, TransferError or DeviceRefused if the device rejects the value."""
     effect: Effect = Effect.AT_ONCE
+    # Whether the change affects how imud reaches the device (baud rate, address, node number). imud writes such a
+    # setting last. Its script follows the device and returns to the former connection if the device does not reply: by
+    # `Request.baud` on UART, `Request.settings` on CAN, `Transfer.then_at` on RS-485 and I2C.
     connection: bool = False
-    """Whether the change affects how imud reaches the device (baud rate, address, node number). imud writes such a
-    setting last. Its script follows the device and returns to the former connection if the device does not reply: by
-    `Request.baud` on UART, `Request.settings` on CAN, `Transfer.then_at` on RS-485 and I2C."""
+    # Whether the script itself saves all settings to flash and restarts the device. imud runs it only if saving is
+    # requested, counts one write to flash, and runs no `save` after it.
     saves: bool = False
-    """Whether the script itself saves all settings to flash and restarts the device. imud runs it only if saving is
-    requested, counts one write to flash, and runs no `save` after it."""
     readable: bool = True  # Whether the device reports the value. Otherwise the result is `written, not verified`.
+    # `agrees(declared, actual)` compares two values: equality, or a comparison with tolerances or optional parts
     agrees: Callable[[Any, Any], bool] = eq
-    """`agrees(declared, actual)` compares two values: equality, or a comparison with tolerances or optional parts."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,10 +84,10 @@ class SettingsTable:
     """Returns the script that reads the present values, by name and in the types of the table.
 
     The result does not contain settings that the device lacks or does not report. The script changes nothing."""
+    # Returns the script that writes all settings to flash; None if the device has no flash for settings
     save: Callable[[Target], Any] | None = None
-    """Returns the script that writes all settings to flash; None if the device has no flash for settings."""
+    # Returns the script that restarts the device and waits for it; None if imud cannot restart the device
     restart: Callable[[Target], Any] | None = None
-    """Returns the script that restarts the device and waits for it; None if imud cannot restart the device."""
     check: Callable[[Target, Mapping[str, Any]], None] = nothing_wrong
     """Raises BadArgument for values that exclude each other, for example more output than the baud rate can carry.
 
@@ -144,8 +144,8 @@ class SettingsStatus(msgspec.Struct, frozen=True):
 
     state: SettingsState
     on_difference: OnDifference
+    # Reason why imud could not read or write the settings, one sentence; empty if there is no problem
     problem: str = ""
-    """Reason why imud could not read or write the settings, one sentence; empty if there is no problem."""
     differences: dict[str, SettingDifference] = {}  # msgspec copies a mutable default
     unverified: tuple[str, ...] = ()  # declared settings that the device accepts and does not report
     read_ns: int | None = None  # CLOCK_MONOTONIC of the newest read; null before the first read
@@ -198,8 +198,8 @@ class SettingsPlan(msgspec.Struct, frozen=True):
     steps: tuple[PlannedStep, ...] = ()
     save: bool = False
     restart: bool = False
+    # Reason for each setting that differs and that imud will not write, by name
     left_out: dict[str, str] = {}  # msgspec copies a mutable default
-    """Reason for each setting that differs and that imud will not write, by name."""
     risk: Risk = Risk.NONE
 
     @property
@@ -236,8 +236,8 @@ class AppliedSettings(msgspec.Struct, frozen=True):
     restarted: bool = False
     problem: str = ""  # reason of a failure, one sentence; empty if imud did all planned steps
     left_out: dict[str, str] = {}  # msgspec copies a mutable default
+    # Remaining differences from the wanted values
     differences: dict[str, SettingDifference] = {}  # msgspec copies a mutable default
-    """Remaining differences from the wanted values."""
+    # Necessary change of the configuration, so that imud finds the device at its next start; empty if no change is
+    # necessary
     advice: str = ""
-    """Necessary change of the configuration, so that imud finds the device at its next start; empty if no change is
-    necessary."""

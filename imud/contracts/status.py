@@ -53,22 +53,22 @@ class ClockStatus(msgspec.Struct, frozen=True):
 
     sync: Sync = Sync.ARRIVAL
     offset_ns: int = 0  # host CLOCK_MONOTONIC minus unwrapped device time, at the newest sample
+    # Rate error of the device clock against the host clock without steering (CLOCK_MONOTONIC_RAW), 1e-6; +40: the
+    # device clock gains 40 µs per second
     skew_ppm: float = 0.0
-    """Rate error of the device clock against the host clock without steering (CLOCK_MONOTONIC_RAW), 1e-6; +40: the
-    device clock gains 40 µs per second."""
-    residual_ns: int = 0  # One-sigma spread of the lower envelope of arrival times around the fit
+    residual_ns: int = 0  # one-sigma spread of the lower envelope of arrival times around the fit
     t_err_ns: int = 0  # time stamp error of the newest sample, one sigma
     resets: int = 0  # number of restarts of the device clock (restart of the device, jump of its counter)
+    # Latency timer of the link's USB adapter: maximum delay of received bytes; 0 without a USB adapter
     hold_ns: int = 0
-    """Latency timer of the link's USB adapter: maximum delay of received bytes; 0 without a USB adapter."""
     edges: int = 0  # number of pulses on the SOUT line, or of triggers on SIN
+    # Number of pulses without a sample: the frame was lost, or the device did not send the pulse
     edges_unpaired: int = 0
-    """Number of pulses without a sample: the frame was lost, or the device did not send the pulse."""
     samples_unpaired: int = 0  # number of samples without a pulse of their own while pulses arrived
     triggers_missed: int = 0  # number of triggers on SIN without a frame
-    reference_error_ns: int = 0  # One-sigma error of the host's estimate of UTC; 0 if there is no estimate
+    reference_error_ns: int = 0  # one-sigma error of the host's estimate of UTC; 0 if there is no estimate
+    # Rate of CLOCK_MONOTONIC relative to CLOCK_MONOTONIC_RAW minus 1, 1e-6: the correction by an NTP client
     steering_ppm: float = 0.0
-    """Rate of CLOCK_MONOTONIC relative to CLOCK_MONOTONIC_RAW minus 1, 1e-6: the correction by an NTP client."""
 
 
 class KernelCounters(msgspec.Struct, frozen=True):
@@ -87,8 +87,8 @@ class PollingStatus(msgspec.Struct, frozen=True):
 
     polls: int = 0  # number of deadlines with a read
     late: int = 0  # number of reads that started later than a quarter of the period after the deadline
+    # Number of deadlines without a read, because the host or the bus was busy. Also in `lost_queue` of the ledger.
     missed: int = 0
-    """Number of deadlines without a read, because the host or the bus was busy. Also in `lost_queue` of the ledger."""
     stale: int = 0  # number of reads with the same bytes as the previous read: the device had no new values
     failed: int = 0  # number of failed transfers
     vanished: int = 0  # number of times that imud had to identify the device again
@@ -126,13 +126,13 @@ class UtcStatus(msgspec.Struct, frozen=True):
     """Sources of UTC for a device and for the host, since start."""
 
     source: str  # readable name of the source of RMC sentences; empty if there is no source
+    # Present fault of the source or of the connection to chronyd, one sentence; empty if there is no fault
     problem: str
-    """Present fault of the source or of the connection to chronyd, one sentence; empty if there is no fault."""
     sentences: int = 0  # number of sentences from the source
     sent: int = 0  # number of sentences that imud sent to the device
+    # Number of sentences that imud did not send, by cause
     refused: dict[str, int] = {}  # msgspec copies a mutable default
-    """Number of sentences that imud did not send, by cause."""
-    pulses: int = 0  # number of accepted pulses per second
+    pulses: int = 0  # number of accepted PPS pulses
     pulses_ignored: int = 0  # number of pulses outside the rhythm of the other pulses
     chrony_sent: int = 0  # number of samples that imud sent to chronyd
     chrony_refused: int = 0
@@ -143,17 +143,18 @@ class FrameStatus(msgspec.Struct, frozen=True):
 
     frame: str  # axes of vectors: sensor axes, or axes of the body with the sensor
     convention: str  # `enu-flu` or `ned-frd`; `device`: as the device sends them
-    euler_convention: str  # Order, axes and signs of `euler_rad`
+    euler_convention: str  # order, axes and signs of `euler_rad`
     navigation_frame: str  # destination frame of the rotation `quat_wxyz`
     heading: Heading  # reference of yaw
     declination_deg: float | None  # declination that imud adds to the heading; None without a declination
+    # Axes and angles that a client receives if it requests a convention, by name of the convention
     conventions: dict[str, FrameWords]
-    """Axes and angles that a client receives if it requests a convention, by name of the convention."""
+    # Contradiction between gravity and attitude or mounting, or between the heading and the configuration; empty if
+    # there is no contradiction
     problem: str = ""
-    """Contradiction between gravity and attitude or mounting, or between the heading and the configuration; empty if
-    there is no contradiction."""
 
 
+# Upper bounds of the latency histogram, ns. One more bucket without a bound follows.
 LATENCY_BOUNDS_NS = (
     50_000,
     100_000,
@@ -166,7 +167,6 @@ LATENCY_BOUNDS_NS = (
     20_000_000,
     50_000_000,
 )
-"""Upper bounds of the latency histogram, ns. One more bucket without a bound follows."""
 
 
 class DeviceStatus(msgspec.Struct, frozen=True):
@@ -186,34 +186,33 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     clock: ClockStatus
     ledger: dict[str, int]
     kernel: KernelCounters
+    # Number of samples per bucket of LATENCY_BOUNDS_NS: time from measurement to publication. The last bucket has no
+    # upper bound.
     latency_buckets: tuple[int, ...]
-    """Number of samples per bucket of LATENCY_BOUNDS_NS: time from measurement to publication. The last bucket has no
-    upper bound."""
     latency_sum_ns: int
     temperature_c: float | None
     status_bits: int | None
     connects: int  # number of times that imud opened the link since start
     status_words: tuple[str, ...] = ()  # names of the known bits of `status_bits` that are set
+    # Names of the bits of `status`, by number; empty if the driver is not known or has no names
     status_bit_names: dict[str, str] = {}  # msgspec copies a mutable default
-    """Names of the bits of `status`, by number; empty if the driver is not known or has no names."""
+    # Order, axes and signs of the published `euler_rad`; empty while the driver is not known
     euler_convention: str = ""
-    """Order, axes and signs of the published `euler_rad`; empty while the driver is not known."""
     navigation_frame: str = ""  # destination frame of the rotation `quat_wxyz`; empty while the driver is not known
     frame: FrameStatus | None = None  # axes and angles of published samples; None while the driver is not known
     polling: PollingStatus | None = None  # counters of the polls; None for a device that sends without requests
+    # Counters of the RS-485 bus, equal for all devices of the bus; None for a device on another link
     serial_line: SerialLineCounters | None = None
-    """Counters of the RS-485 bus, equal for all devices of the bus; None for a device on another link."""
     lines: LinesStatus | None = None  # status of the GPIO lines; None for a device without GPIO lines
+    # Sources of UTC; None for a device that receives no sentences and has no pulse per second on the host
     utc: UtcStatus | None = None
-    """Sources of UTC; None for a device that receives no sentences and has no pulse per second on the host."""
     hold_ns: int = 0  # present hold of received data, ns; 0: imud processes each sample immediately
     hold_wanted_ns: int = 0  # maximum hold that all clients of its samples accept, ns: the strictest latency request
     hold_by: str = ""  # name of the client with this request; empty if there is no request
+    # Comparison of device settings and declared settings; None if the driver is not known or has no table of settings
     declared: SettingsStatus | None = None
-    """Comparison of device settings and declared settings; None if the driver is not known or has no table of
-    settings."""
+    # Noise of the samples from the configuration; None if the configuration does not give it
     noise: Deviations | None = None
-    """Noise of the samples from the configuration; None if the configuration does not give it."""
 
 
 class RecorderStatus(msgspec.Struct, frozen=True):
@@ -293,7 +292,6 @@ class SocketStatus(msgspec.Struct, frozen=True):
     clients: tuple[ClientStatus, ...]
     accepted: int  # number of connections since start
     refused: int  # number of rejected connections since start: too many connections, or no permission to read
+    # Number of clients that imud disconnected since start: no reads, too many requests, or a line that was too long
     evicted: int
-    """Number of clients that imud disconnected since start: no reads, too many requests, or a line that was too
-    long."""
     failed: int = 0  # number of clients disconnected since start because of an error in the daemon

@@ -15,14 +15,14 @@ from imud.model.units import NS_PER_S
 DATA_BYTES_MAX: Final = 8  # maximum number of data bytes of a classical CAN frame (ISO 11898-1)
 STANDARD_ID_MAX: Final = 0x7FF
 EXTENDED_ID_MAX: Final = 0x1FFF_FFFF
+# Flag in the identifier of `struct can_frame`: 29 bits (CAN_EFF_FLAG of linux/can.h)
 EXTENDED_FLAG: Final = 0x8000_0000
-"""Flag in the identifier of `struct can_frame`: 29 bits (CAN_EFF_FLAG of linux/can.h)."""
 REMOTE_FLAG: Final = 0x4000_0000  # flag in the identifier: a remote frame, without data (CAN_RTR_FLAG)
+# Flag in the identifier: an error frame of the controller, not a frame of the bus (CAN_ERR_FLAG)
 ERROR_FLAG: Final = 0x2000_0000
-"""Flag in the identifier: an error frame of the controller, not a frame of the bus (CAN_ERR_FLAG)."""
 
+# `struct can_frame` in the byte order of the host: identifier with flags, length, data
 RAW_FRAME: Final = struct.Struct("=IB3x8s")
-"""`struct can_frame` in the byte order of the host: identifier with flags, length, data."""
 STANDARD_OVERHEAD_BITS, EXTENDED_OVERHEAD_BITS = 47, 67
 """Length of a frame without data and stuff bits, with three bits of interframe space (ISO 11898-1), for 11 and 29
 bits.
@@ -81,8 +81,8 @@ def pack_frame(can_id: int, extended: bool, data: bytes) -> bytes:
     return RAW_FRAME.pack(can_id | EXTENDED_FLAG if extended else can_id, len(data), data)
 
 
+# Maximum length of a line, bytes. CAN FD with 64 data bytes and a long bus name needs about 190.
 LINE_BYTES_MAX: Final = 512
-"""Maximum length of a line, bytes. CAN FD with 64 data bytes and a long bus name needs about 190."""
 _FRAME: Final = re.compile(
     rb"\((\d{1,18})\.(\d{1,9})\) +(\S+) +([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#((?:[0-9A-Fa-f]{2}){0,8})(?:_[0-9A-Fa-f])?"
     rb"(?: [RT])?\s*"

@@ -50,8 +50,8 @@ class CaptureReader:
         self.is_damaged = False  # after the iteration: whether the file is damaged, not only incomplete
         self._head = _read_fully(file, len(MAGIC))
         self.stamped = self._head == MAGIC
+        # Decoded keys and values of the first line
         self.details: Mapping[str, str] = self._read_details() if self.stamped else {}
-        """Decoded keys and values of the first line."""
 
     @property
     def baud(self) -> int:

@@ -21,18 +21,18 @@ import msgspec
 from imud.formats.slot import SLOT_BYTES
 from imud.model.errors import ServerError
 
+# Version of the protocol. It increases if an old client could misread the server, not for new methods and members.
 PROTOCOL: Final = 1
-"""Version of the protocol. It increases if an old client could misread the server, not for new methods and members."""
 DEFAULT_PATH: Final = "/run/imud/imud.sock"
+# Maximum length of a request without newline, bytes. A `watch` with every field of 1,000 devices needs half of it.
 LINE_MAX_BYTES: Final = 65536
-"""Maximum length of a request without newline, bytes. A `watch` with every field of 1,000 devices needs half of it."""
+# Maximum number of arrays and objects in a request. It limits the nesting; arguments of actions have at most three.
 NESTED_MAX: Final = 64
-"""Maximum number of arrays and objects in a request. It limits the nesting; arguments of actions have at most three."""
+# Maximum number of members and elements in a request, counted by commas. Enough for all devices with all fields.
 ITEMS_MAX: Final = 2048
-"""Maximum number of members and elements in a request, counted by commas. Enough for all devices with all fields."""
 FRAME_HEADER: Final = struct.Struct("<I")
+# Maximum length of a frame, bytes. A client that reads a larger length has lost the frame boundary.
 FRAME_MAX_BYTES: Final = 1 << 24
-"""Maximum length of a frame, bytes. A client that reads a larger length has lost the frame boundary."""
 
 RequestId = int | float | str | None
 

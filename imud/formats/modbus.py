@@ -23,11 +23,12 @@ BROADCAST: Final = 0  # address of all slaves; no slave replies
 SLAVES: Final = range(1, 248)  # addresses of slaves
 
 FRAME_GAP_CHARACTERS: Final = 3.5
+# Silence between two frames above 19200 baud, ns. 3.5 characters would be too short to detect.
 FAST_GAP_NS: Final = 1_750 * NS_PER_US
-"""Silence between two frames above 19200 baud, ns. 3.5 characters would be too short to detect."""
 FAST_BAUD: Final = 19200
 
 ILLEGAL_ADDRESS: Final = 2
+# Meaning of the exception codes ("MODBUS Application Protocol" V1.1b3, chapter 7)
 EXCEPTIONS: Final = {
     1: "the function is not supported",
     ILLEGAL_ADDRESS: "the register does not exist",
@@ -37,7 +38,6 @@ EXCEPTIONS: Final = {
     6: "the device is busy",
     8: "the memory of the device has a parity error",
 }
-"""Meaning of the exception codes ("MODBUS Application Protocol" V1.1b3, chapter 7)."""
 
 
 def crc16_modbus(data: bytes) -> int:
@@ -101,8 +101,8 @@ class ReplyFinder:
 
         If it is not known, the request must not be WRITE_SINGLE: its reply is equal to its echo.
         """
+        # Whether the port received the echo of the request; None before the decision
         self.echo_seen: bool | None = None
-        """Whether the port received the echo of the request; None before the decision."""
         self.strange = 0  # number of bytes outside echo and reply
         self._request = request
         self._size = reply_bytes

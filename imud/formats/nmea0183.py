@@ -20,8 +20,8 @@ from typing import Final, NamedTuple
 
 from imud.model.units import NS_PER_MS, NS_PER_S
 
+# Maximum length of a sentence with `$` and line end, bytes (version 4.11, section 5.3.1)
 SENTENCE_BYTES_MAX: Final = 82
-"""Maximum length of a sentence with `$` and line end, bytes (version 4.11, section 5.3.1)."""
 _S_PER_MIN: Final = 60.0
 
 
@@ -112,8 +112,8 @@ def _rounded(value: float, decimals: int) -> float:
     return round(value, decimals) + 0.0
 
 
+# Maximum length of an RMC sentence, bytes. The standard permits 82; receivers with millimetres send about 100.
 RMC_BYTES_MAX: Final = 120
-"""Maximum length of an RMC sentence, bytes. The standard permits 82; receivers with millimetres send about 100."""
 FIRST_YEAR: Final = 1980
 HUNDREDTH_NS: Final = 10 * NS_PER_MS
 

@@ -25,12 +25,12 @@ from imud.formats import records
 from imud.formats.records import Kind, Record, SessionRecord, decode_object, records_of
 from imud.model.errors import ImudError
 
+# First bytes of a block. The first byte is not ASCII, so that no program mistakes the file for text.
 MAGIC: Final = b"\x89imudREC"
-"""First bytes of a block. The first byte is not ASCII, so that no program mistakes the file for text."""
 HEAD: Final = struct.Struct("<8sB3xIIII")  # Magic, method, number, plain size, stored size, CRC
 _CRC_BYTES: Final = 4
+# Maximum content of a block, bytes: 16 times BLOCK_BYTES, for one large record. A reader never allocates more.
 PLAIN_MAX: Final = 4 << 20
-"""Maximum content of a block, bytes: 16 times BLOCK_BYTES, for one large record. A reader never allocates more."""
 STORED: Final = 0
 ZSTANDARD: Final = 1
 LEVEL: Final = 3  # Default level of Zstandard. Level 9 saves 3 % more on IMU data and takes four times as long.
@@ -179,10 +179,8 @@ def check_begin(begin: bytes, name: str) -> None:
         raise ImudError(f"{name} is not a recording of imud: expected the first bytes {MAGIC!r}, got {begin[:8]!r}")
 
 
+# Maximum content of a block with several records, bytes: 30 s of a device at 100 Hz. Larger blocks compress equally.
 BLOCK_BYTES: Final = 256 << 10
-"""Maximum content of a block with several records, bytes: 30 s of a device at 100 Hz. Larger blocks compress
-equally.
-"""
 RECORD_BYTES_MAX: Final = PLAIN_MAX - BLOCK_BYTES
 
 

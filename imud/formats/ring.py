@@ -34,23 +34,23 @@ from imud.formats.slot import SLOT_BYTES, SLOT_LAYOUT_VERSION, SlotField
 from imud.model.errors import ServerError
 from imud.model.ledger import LEDGER_FIELDS
 
+# Directory in which only imud can create files. In /dev/shm any user could put a FIFO or a forged ring in the way.
 DIRECTORY: Final = "/run/imud/shm"
-"""Directory in which only imud can create files. In /dev/shm any user could put a FIFO or a forged ring in the way."""
 FILE_PREFIX: Final = "imud."
+# Flags for a file that another user may have created: follow no link and do not wait for the writer of a FIFO
 OPEN_FLAGS: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-"""Flags for a file that another user may have created: follow no link and do not wait for the writer of a FIFO."""
 
 MAGIC: Final = b"imudshm\0"
 RING_LAYOUT_VERSION: Final = 1
 HEADER_BYTES: Final = 4096  # size of the header: one page, so that slots start on a page
+# Maximum number of counters in the block. New counters use free places and need no new layout version.
 LEDGER_ROOM: Final = 59
-"""Maximum number of counters in the block. New counters use free places and need no new layout version."""
 
 STATE_LIVE: Final = 1
 STATE_CLOSED: Final = 2  # the daemon closed the ring and does not write to this file again
 
+# Maximum age of a heartbeat, ns. The daemon writes ten heartbeats per second; an older ring has no daemon.
 HEARTBEAT_LIMIT_NS: Final = 1_000_000_000
-"""Maximum age of a heartbeat, ns. The daemon writes ten heartbeats per second; an older ring has no daemon."""
 
 HEADER_FIELDS: Final = (
     SlotField("magic", "s", 8, 0),
@@ -84,8 +84,8 @@ NEWEST_WORD: Final = OFFSETS["newest_seq"] // 8
 FIRST_WORD: Final = OFFSETS["first_seq"] // 8
 HEARTBEAT_WORD: Final = OFFSETS["heartbeat_ns"] // 8
 LEDGER_UPDATE_WORD: Final = OFFSETS["ledger_update"] // 8
+# Index of the field in a memoryview of the ring, cast to u64 (half words: to u32)
 STATE_HALF_WORD: Final = OFFSETS["state"] // 4
-"""Index of the field in a memoryview of the ring, cast to u64 (half words: to u32)."""
 
 LEDGER_BLOCK_OFFSET: Final = OFFSETS["ledger_update"]
 LEDGER_CRC_OFFSET: Final = OFFSETS["ledger_crc32"]

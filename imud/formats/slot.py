@@ -78,6 +78,7 @@ HAS_STATUS: Final = 1 << 9
 HAS_PPS_AGE: Final = 1 << 10
 HAS_EDGE: Final = 1 << 11
 
+# Bit of `present` for each field: the field has a value. A missing value is not zero.
 PRESENT_BITS: Final = {
     "t_dev_ns": HAS_T_DEV,
     "accel_m_s2": HAS_ACCEL,
@@ -92,10 +93,9 @@ PRESENT_BITS: Final = {
     "pps_age_ms": HAS_PPS_AGE,
     "edge_seq": HAS_EDGE,
 }
-"""Bit of `present` for each field: the field has a value. A missing value is not zero."""
 
+# Code of `sync` in the slot: 0 arrival, 1 regression, 2 edge, 3 utc
 SYNC_CODES: Final = {sync: code for code, sync in enumerate(Sync)}
-"""Code of `sync` in the slot: 0 arrival, 1 regression, 2 edge, 3 utc."""
 SYNC_BY_CODE: Final = tuple(Sync)
 
 # all fields are aligned: the native layout is equal, and `struct` packs it twice as fast

@@ -25,8 +25,8 @@ from typing import Final
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 EVEN_NS: Final = 1 * NS_PER_US  # change of the offset that imud ignores, in addition to the errors of the pairs, ns
+# Maximum number of pairs: 4 s of a device at 1 kHz while CLOCK_MONOTONIC is slewed, otherwise hours
 PAIRS_MOST: Final = 4096
-"""Maximum number of pairs: 4 s of a device at 1 kHz while CLOCK_MONOTONIC is slewed, otherwise hours."""
 RATE_NS: Final = 2 * NS_PER_S  # time span of the rate, ns; shorter if fewer pairs exist
 # standard deviation of a uniform distribution with range 1
 SIGMA_OF_RANGE: Final = 1 / sqrt(12)
@@ -39,8 +39,8 @@ class SteadyTime:
 
     def __init__(self) -> None:
         self.offset_ns = 0  # CLOCK_MONOTONIC minus steady time at the newest pair
+        # Steady time after which `offset_ns` is exact within 1 µs. Later times need no call.
         self.even_from_ns = -1 << 63
-        """Steady time after which `offset_ns` is exact within 1 µs. Later times need no call."""
         self._base_ns = 0  # steady time minus CLOCK_MONOTONIC_RAW
         self._steady: list[int] = []
         self._monotonic: list[int] = []
@@ -120,16 +120,16 @@ class SteadyTime:
 UNSTEERED: Final = SteadyTime()  # Steady time of a clock without steering. No caller adds pairs to it.
 
 READINGS: Final = 5  # maximum number of readings in one measurement
+# Time between the two readings of CLOCK_MONOTONIC, ns, below which imud uses a reading immediately
 TIGHT_NS: Final = 1 * NS_PER_US
-"""Time between the two readings of CLOCK_MONOTONIC, ns, below which imud uses a reading immediately."""
+# Change of the difference that imud ignores, in addition to the error of the measurement, ns
 TOLERANCE_NS: Final = 1 * NS_PER_US
-"""Change of the difference that imud ignores, in addition to the error of the measurement, ns."""
 # time after which imud measures again
 KEPT_NS: Final = 1 * NS_PER_S
 
 
+# Minimum lead of CLOCK_BOOTTIME over CLOCK_MONOTONIC that counts as a suspend, ns
 SUSPENDED_NS: Final = 100 * NS_PER_MS
-"""Minimum lead of CLOCK_BOOTTIME over CLOCK_MONOTONIC that counts as a suspend, ns."""
 
 
 def kernel_clock(name: str) -> Callable[[], int]:
@@ -163,14 +163,14 @@ class HostClock:
         """
         self.now_ns = monotonic_ns  # CLOCK_MONOTONIC, ns
         self.error_ns = 0  # maximum error of the kept offset, ns: half of the duration of its measurement
+        # CLOCK_MONOTONIC relative to a time without steering, as of the last `utc_offset_ns`
         self.steady: Final = SteadyTime()
-        """CLOCK_MONOTONIC relative to a time without steering, as of the last `utc_offset_ns`."""
         self._realtime_ns = realtime_ns
         self._raw_ns = raw_ns or kernel_clock("MONOTONIC_RAW")
         self._boottime_ns = boottime_ns or (monotonic_ns if raw_ns else kernel_clock("BOOTTIME"))
         self.suspends = 0  # number of suspends since the first reading, as of the last `utc_offset_ns`
+        # Receives each pair of `steady` after a measurement: CLOCK_MONOTONIC, raw, and held raw
         self.on_measured: Callable[[int, int, int], None] | None = None
-        """Receives each pair of `steady` after a measurement: CLOCK_MONOTONIC, raw, and held raw."""
         self._asleep_ns = self._boottime_ns() - monotonic_ns()
         self._offset_ns = 0
         self._least_ns, self._most_ns = 1, 0  # empty range: the first read measures

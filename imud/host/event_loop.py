@@ -53,8 +53,8 @@ class ReaderSelector(selectors.EpollSelector):
         """`poller` watches the readers and the epoll of asyncio; None for an epoll of the kernel."""
         super().__init__()
         self.on_error: OnError | None = None
+        # Whether the loop received a callback, a timer or `stop` since the wait started. Set by the loop.
         self.has_news = False
-        """Whether the loop received a callback, a timer or `stop` since the wait started. Set by the loop."""
         self._readers: dict[int, Callable[[], object]] = {}
         # Descriptors that were removed in the present turn. The kernel may already use the number for another file.
         self._removed: set[int] = set()

@@ -23,17 +23,17 @@ from typing import Any, Final
 
 log = logging.getLogger(__name__)
 
+# Maximum length of one value. The longest product string, of a USB descriptor, has 126 characters.
 VALUE_CHARACTERS_MAX: Final = 200
-"""Maximum length of one value. The longest product string, of a USB descriptor, has 126 characters."""
+# Maximum length of one message. Only the list of 256 changed devices after a reload is longer.
 MESSAGE_CHARACTERS_MAX: Final = 2000
-"""Maximum length of one message. Only the list of 256 changed devices after a reload is longer."""
 TRACEBACK_LINES_MAX: Final = 100  # maximum number of lines of one traceback, newest calls
 LOG_QUEUE_MESSAGES: Final = 1000  # maximum number of messages in the queue: 1 s of the highest message rate, a few MB
 STDERR: Final = 2
 FLUSH_S: Final = 1.0  # maximum time that the end of the process waits for the reader of the log, s
 POLL_MS: Final = 100  # interval at which the thread checks for `close` while the reader does not read, ms
+# Priorities of syslog(3) by minimum level. Lower levels have priority 7, debug.
 PRIORITIES: Final = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
-"""Priorities of syslog(3) by minimum level. Lower levels have priority 7, debug."""
 # pause after the first repetition, s
 PAUSE_FIRST_S: Final = 1.0
 # maximum pause, s

@@ -16,16 +16,16 @@ from typing import Final, Protocol
 
 from imud.model.units import NS_PER_S
 
+# Maximum wait for the end of a thread, s. A hanging bus transfer ends at the timeout of the controller, at most 1 s. A
+# hanging write to a disk has no timeout: code that shares objects with such a thread must not use them again.
 END_LIMIT_S = 5.0
-"""Maximum wait for the end of a thread, s. A hanging bus transfer ends at the timeout of the controller, at most 1 s. A
-hanging write to a disk has no timeout: code that shares objects with such a thread must not use them again."""
 
 # An SPI read waits for the interpreter twice: at wake-up and after the transfer. Measured at 1 kHz next to a loop that
 # computes 2 ms of every 20 ms: with the default of 5 ms, reads start 127 to 149 µs late on average, with 0.3 ms 72 to
 # 96 µs. Missed data-ready edges: 0.54 % with 0.5 ms, 0.19 % with 0.3 ms, 0.17 % with 0.2 ms. 0.1 ms costs a quarter
 # more CPU time. With 300 silent metrics clients, a scrape delays samples by 4.1 ms (default) or 0.65 ms (0.5 ms).
+# Maximum time, s, that a thread runs while another thread waits (sys.setswitchinterval, for the complete process)
 SWITCH_INTERVAL_S: Final = 0.0003
-"""Maximum time, s, that a thread runs while another thread waits (sys.setswitchinterval, for the complete process)."""
 
 SELECT_FDS: Final = 1024  # limit of descriptor numbers for `select` (FD_SETSIZE)
 
@@ -60,8 +60,8 @@ class WatchingWorker(Worker, Protocol):
         ...
 
 
+# Starts a worker: its name, its `Round`, and a function for an exception, which ends the worker
 StartWorker = Callable[[str, Round, Callable[[BaseException], None]], Worker]
-"""Starts a worker: its name, its `Round`, and a function for an exception, which ends the worker."""
 StartWatchingWorker = Callable[[str, Round, Callable[[BaseException], None]], WatchingWorker]
 
 

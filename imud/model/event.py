@@ -13,19 +13,17 @@ class EventKind(StrEnum):
     UP = "up"  # imud found and identified the device; samples follow
     DOWN = "down"  # the device or its link is absent; `detail` contains the reason
     SYNC = "sync"  # the source of time stamps changed
+    # Samples were lost; `detail` contains their number and the cause. At most once per second and device.
     LOSS = "loss"
-    """Samples were lost; `detail` contains their number and the cause. At most once per second and device."""
     CONFIGURATION = "configuration"  # the device settings or the configuration of the daemon changed
     ALARM = "alarm"  # the ALARM line or the alarm status of a device changed
     MARK = "mark"  # a pulse arrived on SOUT_DIV. `detail` contains its time, its number and the `seq` of its sample.
+    # The state of the port or bus changed, for example a CAN controller became error-passive. The device may continue.
     LINK = "link"
-    """The state of the port or bus changed, for example a CAN controller became error-passive. The device may
-    continue.
-    """
+    # Progress of a guided calibration. `detail` contains kind, phase and measured values. At most twice per second.
     CALIBRATION = "calibration"
-    """Progress of a guided calibration. `detail` contains kind, phase and measured values. At most twice per second."""
+    # Gravity at rest contradicts the attitude or the mounting. The message contains the likely cause.
     ATTITUDE = "attitude"
-    """Gravity at rest contradicts the attitude or the mounting. The message contains the likely cause."""
     RECORDER = "recorder"  # the recorder stopped (for example: full disk), continued, lost records, or saved a snapshot
     MQTT = "mqtt"  # the output `mqtt` stopped spooling (for example: full disk) or continued
     BAD_FRAME = "bad-frame"  # imud received a damaged or unknown frame. At most once per second and device.

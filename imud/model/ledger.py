@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from operator import attrgetter
 from typing import Final
 
+# Names in the order of shared memory. Append new names at the end.
 LEDGER_FIELDS: Final = (
     "bytes_in",  # every byte, CAN data byte or register byte from the link
     "bytes_in_good_frames",
@@ -34,7 +35,6 @@ LEDGER_FIELDS: Final = (
     "frames_not_finite",  # valid frames from which imud removed NaN or infinite values
     "lost_unknown",  # gaps with an unknown number of lost samples
 )
-"""Names in the order of shared memory. Append new names at the end."""
 
 
 class Ledger:

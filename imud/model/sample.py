@@ -31,34 +31,32 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     """Values of one frame in SI units, without host time."""
 
     size_bytes: int  # size of the frame on the wire, bytes, with all framing
+    # Number of bytes after the frame in the same read. The frame arrived earlier than the read by their wire time.
     trailing_bytes: int
-    """Number of bytes after the frame in the same read. The frame arrived earlier than the read by their wire time."""
+    # Device counter as sent, in ticks of the driver, not unwrapped; None if the frame has no counter
     dev_ticks: int | None
-    """Device counter as sent, in ticks of the driver, not unwrapped; None if the frame has no counter."""
     accel_m_s2: Vector3 | None = None
     gyro_rad_s: Vector3 | None = None
     mag_t: Vector3 | None = None
     quat_wxyz: Quaternion | None = None  # rotation from body to navigation frame, scalar first
+    # Roll, pitch, yaw in the convention of the device (`euler_convention` of the driver)
     euler_rad: Vector3 | None = None
-    """Roll, pitch, yaw in the convention of the device (`euler_convention` of the driver)."""
     temperature_c: float | None = None
     pressure_pa: float | None = None
     incli_rad: Pair | None = None  # inclinometer X and Y
     status: int | None = None  # status bits as sent
+    # Time from the last edge on the PPS/SIN input of the device to this measurement, ms, not unwrapped
     pps_age_ms: int | None = None
-    """Time from the last edge on the PPS/SIN input of the device to this measurement, ms, not unwrapped."""
 
 
 class Sample(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     """Measurement with its time stamp. Field names are the names in JSON, which omits absent fields."""
 
     device: str  # name of the device in the configuration
+    # Sequence number of the device, starting at 1. A gap in the numbers of a reader is the number of samples it lost.
     seq: int
-    """Sequence number of the device, starting at 1. A gap in the numbers of a reader is the number of samples it
-    lost.
-    """
     t_ns: int  # CLOCK_MONOTONIC at the instant of the measurement; strictly increasing, never later than the last byte
-    t_err_ns: int  # One-sigma error of `t_ns`: residual spread plus the maximum bias of the source
+    t_err_ns: int  # one-sigma error of `t_ns`: residual spread plus the maximum bias of the source
     sync: Sync
     t_rx_ns: int  # CLOCK_MONOTONIC at the read of the last byte
     utc_ns: int  # `t_ns` on CLOCK_REALTIME (ns since 1970-01-01 UTC), with the clock offset at the arrival
@@ -94,6 +92,7 @@ _SENSOR: Final = "sensor frame, right-handed"
 _VECTORS: Final = "frame of the device, right-handed"
 _MONOTONIC: Final = "CLOCK_MONOTONIC"
 
+# Rows of the method `schema` and of `imud schema`, in the order of SAMPLE_FIELDS
 SAMPLE_SCHEMA: Final = (
     FieldInfo("device", "string", "", "", "name of the device in the configuration", True),
     FieldInfo("seq", "integer", "", "", "sequence number of the device since start; a gap is a loss", True),
@@ -124,4 +123,3 @@ SAMPLE_SCHEMA: Final = (
         "receive the edge", False,
     ),
 )  # fmt: skip
-"""Rows of the method `schema` and of `imud schema`, in the order of SAMPLE_FIELDS."""

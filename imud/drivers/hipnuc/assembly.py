@@ -97,8 +97,8 @@ def _from_head(order: tuple[int, ...], frames: Sequence[tuple[int, int]]) -> tup
 SILENCE_NS: Final = NS_PER_S  # Maximum gap that counts as loss, ns. After a longer gap the device was silent.
 PERIOD_LEAST_NS: Final = NS_PER_MS  # minimum period, ns: no device sends faster than 1 kHz
 STEADY_BURSTS: Final = 2  # number of bursts at the normal distance after which imud expects no delayed burst
+# Number of consecutive distances, all shorter or all longer and equal within 1/4, that mean a new rate
 ODD_BURSTS: Final = 8
-"""Number of consecutive distances, all shorter or all longer and equal within 1/4, that mean a new rate."""
 SMOOTHING: Final = 16  # weight of the known period against one new distance
 
 
@@ -177,15 +177,15 @@ class Cadence:
 AWAY_PERIODS: Final = 10  # number of periods without a kind after which the kind counts as switched off
 DROPPED_MAX: Final = 16  # number of consecutive dropped samples after which imud learns everything again
 STRAYS_MAX: Final = 40
+# Limit and weight of frames without a place in a burst; each complete sample subtracts 1. Above the limit, imud learns
+# everything again: a device that sends a kind more often than the first kind of a burst causes such frames.
 STRAY_WEIGHT: Final = 2
-"""Limit and weight of frames without a place in a burst; each complete sample subtracts 1. Above the limit, imud learns
-everything again: a device that sends a kind more often than the first kind of a burst causes such frames."""
 AGREE_FIRST, AGREE_OTHER, AGREE_MULTIPLE = 2, 3, 4
 """Number of equal consecutive distances for the first m; for another m; for a multiple of the known m (losses can cause
 a multiple)."""
+# Number of equal consecutive distances for a kind in every burst. Lost bursts shorten the distance of a slow kind; as a
+# fast kind it would change the period.
 AGREE_FAST: Final = 6
-"""Number of equal consecutive distances for a kind in every burst. Lost bursts shorten the distance of a slow kind; as
-a fast kind it would change the period."""
 
 
 class _Kind:

@@ -56,8 +56,8 @@ from imud.model.sample import Measurement, Vector3
 from imud.model.units import RAD_PER_DEG
 
 BASE_ID: Final = 101  # factory identifier of the first frame (decimal)
+# Data of all five frames: roll, pitch, yaw; gyro x, y, z; accel x, y, z; temperature; INDEX
 SET: Final = struct.Struct("<9fhH")
-"""Data of all five frames: roll, pitch, yaw; gyro x, y, z; accel x, y, z; temperature; INDEX."""
 SET_FRAMES: Final = 5
 FRAME_BYTES: Final = 8
 INDEX_MODULUS: Final = 1 << 16

@@ -19,9 +19,9 @@ from imud.model.sample import Vector3
 from imud.model.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
 
 CRC_START: Final = 0xFFFFFFFE  # start value for `zlib.crc32`, which inverts start value and result: register value 1
+# Inversion of the result of `zlib.crc32`. Also the result over data with its check value, because the register is then
+# 0.
 CRC_INVERSION: Final = 0xFFFFFFFF
-"""Inversion of the result of `zlib.crc32`. Also the result over data with its check value, because the register is then
-0."""
 
 
 def crc32(data: bytes | bytearray | memoryview) -> int:
@@ -35,8 +35,8 @@ def crc32(data: bytes | bytearray | memoryview) -> int:
 
 # --- units: the device sends floats in g, °/s, ° and °C ----------------------------------------------------------
 
+# 1 g of the device is standard gravity (not defined in the manual; the vendor's driver uses 9.80665)
 M_S2_PER_G: Final = STANDARD_GRAVITY_M_S2
-"""1 g of the device is standard gravity (not defined in the manual; the vendor's driver uses 9.80665)."""
 RAD_S_PER_DEG_S: Final = RAD_PER_DEG  # 1 °/s of the device
 
 
@@ -62,11 +62,11 @@ The vendor contradicts itself about the axes: its ROS 1 driver reverses Y and Z,
 down. Its ROS 2 driver and its serial library do not. imud passes on the values as sent. If a level device reports -9.8
 m/s² in Z, its Z points down: `frame: {z_down: true}` in the configuration corrects it. imud reports this case when the
 device is at rest (`imud.attitude.gravity`)."""
+# Destination frame of the rotation `quat_wxyz`, which imud computes from the Euler angles
 NAVIGATION_FRAME: Final = (
     "level, Z up (assumed, the manual states none; with the device's Z down it is Z down); "
     "heading from power-on or the last heading reset"
 )
-"""Destination frame of the rotation `quat_wxyz`, which imud computes from the Euler angles."""
 
 
 def relative_heading(_settings: object, _read_back: Mapping[str, str]) -> Heading:
@@ -76,12 +76,12 @@ def relative_heading(_settings: object, _read_back: Mapping[str, str]) -> Headin
 
 # --- identity (tables 22 and 28) --------------------------------------------------------------------------------------
 
+# First seven of the eight bytes of PROD_ID, registers 0x6A … 0x71. The last byte is the product.
 PRODUCT_ID_HEAD: Final = b"\x00\x00IMU61"
-"""First seven of the eight bytes of PROD_ID, registers 0x6A … 0x71. The last byte is the product."""
+# Product by the last byte of PROD_ID
 PRODUCTS: Final[Mapping[int, str]] = MappingProxyType(
     {ord("2"): "IMU612", ord("4"): "IMU614", ord("8"): "IMU618", ord("A"): "IMU6132A", ord("B"): "IMU6132B"}
 )
-"""Product by the last byte of PROD_ID."""
 
 
 def product_of(product_id: bytes) -> str | None:
@@ -101,15 +101,15 @@ def product_id_of(product: str) -> bytes:
 
 # --- filters (table 21; parameter 31 of the UART has the same codes) --------------------------------------------------
 
+# Low-pass filter: corner frequency of an IIR filter, or number of samples of a moving average
 FilterName = Literal[
     "0.2 Hz", "1 Hz", "2 Hz", "5 Hz", "10 Hz", "15 Hz", "20 Hz", "25 Hz", "30 Hz", "35 Hz", "40 Hz", "47 Hz",
     "average 4", "average 16", "average 32", "average 64",
 ]  # fmt: skip
-"""Low-pass filter: corner frequency of an IIR filter, or number of samples of a moving average."""
 FILTERS: Final[tuple[FilterName, ...]] = get_args(FilterName)  # low-pass filters by code 0 … 15
 FILTER_DEFAULT: Final = 0xBB  # 47 Hz for both sensors, the factory setting
+# Table 21 in one line, for help texts and documents
 FILTER_CODES: Final = ", ".join(f"{code} = {name}" for code, name in enumerate(FILTERS))
-"""Table 21 in one line, for help texts and documents."""
 FilterCode = Annotated[int, Meta(ge=0, le=len(FILTERS) - 1)]  # an index of FILTERS
 FilterChoice = FilterName | FilterCode  # a filter by name, or by its code in table 21
 ACCEL_FILTER: Final = Meta(
@@ -148,8 +148,8 @@ def filter_codes(control: int) -> tuple[int, int]:
 
 I2cAddress = Literal[0x18, 0x19, 0x1A, 0x1B]  # 7-bit address that a device can have
 I2C_ADDRESSES: Final[tuple[I2cAddress, ...]] = get_args(I2cAddress)  # all I2C addresses, factory setting first
+# An I2C address as hexadecimal text or as a number
 I2cAddressChoice = Literal["0x18", "0x19", "0x1a", "0x1b", "0x1A", "0x1B", 0x18, 0x19, 0x1A, 0x1B]
-"""An I2C address as hexadecimal text or as a number."""
 
 
 def i2c_address(choice: int | str) -> int:

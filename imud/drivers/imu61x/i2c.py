@@ -167,10 +167,10 @@ def _read(_target: Target) -> TransferScript[Mapping[str, Any]]:
     return filter_words((yield from read_control()))
 
 
+# Settings that a restart of the device resets to parameter 31 of its UART
 SETTINGS: Final = SettingsTable(
     table=filter_settings(FilterControl(read_control, write_control)), read=_read, check=check_settings
 )
-"""Settings that a restart of the device resets to parameter 31 of its UART."""
 
 
 def _example_reading(random: Random) -> bytes:

@@ -40,8 +40,8 @@ from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.units import NS_PER_S
 
+# Time between two reads of identity and settings, ns: a device that restarted has lost unsaved settings
 CHECK_NS: Final = 10 * NS_PER_S
-"""Time between two reads of identity and settings, ns: a device that restarted has lost unsaved settings."""
 
 
 class RegisterOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -229,10 +229,8 @@ def _update_ns(settings: RegisterOptions) -> int:
 
 BURST: Final = 0x00
 FILTER_CTRL: Final = 0x06
+# The high byte at 0x0D selects the burst: 0 standard, 1 extended (value of the vendor's programs, not of the manual)
 BURST_CTRL: Final = 0x0C
-"""The high byte at 0x0D selects the burst: 0 standard, 1 extended (value of the vendor's programs, not of the
-manual).
-"""
 TEMP_HIGH: Final = 0x0E
 ZACCEL_LOW: Final = 0x28
 PROD_ID: Final = 0x6A  # first of four words, 0x6A to 0x70; on I2C of eight bytes
@@ -240,8 +238,8 @@ WIN_CTRL: Final = 0x7E
 I2C_BURST: Final = 0x12  # address in section 3.3.1; table 26 prints 0x00
 
 M_S2_PER_COUNT: Final = 0.2 / 65536 * M_S2_PER_G  # burst: 327680 counts are 1 g
+# Single registers: 65536 counts, one step of the high word, are 0.0002 g
 M_S2_PER_COUNT_REGISTER: Final = 0.2 / 1000 / 65536 * M_S2_PER_G
-"""Single registers: 65536 counts, one step of the high word, are 0.0002 g."""
 RAD_S_PER_COUNT: Final = 0.016 / 65536 * RAD_S_PER_DEG_S  # burst and single registers: 4096000 counts are 1 °/s
 TEMPERATURE_ZERO_COUNTS: Final = 172_621_824  # 2634 · 65536: the count at 25 °C
 C_PER_COUNT: Final = -1 / 263.4 / 65536

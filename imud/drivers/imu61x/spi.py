@@ -76,6 +76,7 @@ def answers(data: bytes) -> tuple[int, ...]:
 OPEN: Final = write(WIN_CTRL, 1)
 CLOSE: Final = write(WIN_CTRL, 0)
 CLOSE_ONLY: Final = message(CLOSE)
+# Identity and settings in one transfer: both halves of BURST_CTRL, and the window after it was closed
 READ_STATE: Final = message(
     OPEN,
     *(read(PROD_ID + 2 * n) for n in range(4)),
@@ -85,15 +86,14 @@ READ_STATE: Final = message(
     CLOSE,
     read(WIN_CTRL),
 )
-"""Identity and settings in one transfer: both halves of BURST_CTRL, and the window after it was closed."""
 
 BurstKind = Literal["standard", "extended"]  # reply of the device to 0x8000
 STANDARD_WORDS: Final = 14
 EXTENDED_WORDS: Final = 24
 REGISTER_WORDS: Final = (ZACCEL_LOW - TEMP_HIGH) // 2 + 1
 STANDARD: Final = struct.Struct(">14H")
+# gyro 3 °/s, accel 3 g, temperature °C, roll pitch yaw °, status, CRC-32 of the 44 bytes before
 EXTENDED: Final = struct.Struct("<10fII")
-"""gyro 3 °/s, accel 3 g, temperature °C, roll pitch yaw °, status, CRC-32 of the 44 bytes before"""
 CRC_OFFSET: Final = 44
 
 
@@ -106,8 +106,8 @@ READ_STANDARD: Final = _burst(STANDARD_WORDS)
 READ_EXTENDED: Final = _burst(EXTENDED_WORDS)
 READ_REGISTERS: Final = message(*(read(address) for address in range(TEMP_HIGH, ZACCEL_LOW + 1, 2)))
 READ_TEMPERATURE: Final = message(read(TEMP_HIGH), read(TEMP_HIGH + 2))
+# transfer for each kind of burst
 BURSTS: Final[dict[BurstKind, Transfer]] = {"standard": READ_STANDARD, "extended": READ_EXTENDED}
-"""transfer for each kind of burst"""
 
 
 def sum_matches(frame: bytes, checksum_bits: int) -> bool:
@@ -274,16 +274,16 @@ def _in_window_1(transfer: Transfer) -> TransferScript[bytes]:
 
 TEMPERATURE_NS: Final = NS_PER_S  # time between two reads of the temperature, if the burst does not contain it, ns
 
+# Polls by the option `burst`, in the order of `polls` of the codec
 POLLS: Final = {
     "standard": (Poll(READ_STANDARD), Poll(READ_STATE, CHECK_NS), Poll(READ_TEMPERATURE, TEMPERATURE_NS)),
     "extended": (Poll(READ_EXTENDED), Poll(READ_STATE, CHECK_NS)),
     "registers": (Poll(READ_REGISTERS), Poll(READ_STATE, CHECK_NS)),
 }
-"""Polls by the option `burst`, in the order of `polls` of the codec."""
 _BURST, _STATE, _TEMPERATURE = range(3)
+# Bits of the extended burst's status that imud passes on. Bit 31 of a sample's status belongs to imud. The manual does
+# not define the bits.
 DEVICE_STATUS: Final = 0x7FFF_FFFF
-"""Bits of the extended burst's status that imud passes on. Bit 31 of a sample's status belongs to imud. The manual does
-not define the bits."""
 
 
 class Imu61xSpiCodec:
@@ -414,12 +414,12 @@ def _read(_target: Target) -> TransferScript[Mapping[str, Any]]:
     return {**filter_words(state.filter), "burst": state.kind}
 
 
+# Settings that a restart of the device resets. The filters after a restart are parameter 31 of its UART.
 SETTINGS: Final = SettingsTable(
     table={**filter_settings(FilterControl(read_control, write_control)), "burst": Setting(type=Burst)},
     read=_read,
     check=check_settings,
 )
-"""Settings that a restart of the device resets. The filters after a restart are parameter 31 of its UART."""
 
 
 def _example_reading(random: Random) -> bytes:

@@ -43,8 +43,8 @@ EMERGENCY: Final = 0x080
 SDO_REPLY: Final = 0x580
 SDO_REQUEST: Final = 0x600
 HEARTBEAT: Final = 0x700
+# Function of each TPDO, by its number
 TPDO_FUNCTIONS: Final = {1: 0x180, 2: 0x280, 3: 0x380, 4: 0x480, 6: 0x680, 7: 0x780}
-"""Function of each TPDO, by its number."""
 
 
 class NmtCommand(Enum):
@@ -87,6 +87,7 @@ FLASH_TIMEOUT_NS: Final = (
 )  # longer than a reply because the node erases a flash page; the manual states no time
 ABORT_UNSUPPORTED: Final = 0x0504_0001
 
+# Meanings of the SDO abort codes (CiA 301, table 22)
 ABORT_TEXTS: Final = {
     0x0503_0000: "toggle bit not alternated",
     0x0504_0000: "SDO protocol timed out",
@@ -120,7 +121,6 @@ ABORT_TEXTS: Final = {
     0x0800_0023: "object dictionary not present, or its generation failed",
     0x0800_0024: "no data available",
 }
-"""Meanings of the SDO abort codes (CiA 301, table 22)."""
 
 
 class Aborted(Rejected):

@@ -49,8 +49,8 @@ THREE: Final = struct.Struct("<3h")
 FOUR: Final = struct.Struct("<4h")
 ONE_LONG: Final = struct.Struct("<i")
 TWO_LONG: Final = struct.Struct("<2i")
+# Data layout of each TPDO, by its number
 LAYOUTS: Final = {1: THREE, 2: THREE, 3: THREE, 4: FOUR, 6: ONE_LONG, 7: TWO_LONG}
-"""Data layout of each TPDO, by its number."""
 
 ACCEL_M_S2_PER_LSB: Final = 0.001 * M_S2_PER_G
 GYRO_RAD_S_PER_LSB: Final = 0.1 * RAD_PER_DEG

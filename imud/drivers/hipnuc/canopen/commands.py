@@ -51,8 +51,8 @@ DEVICE_NAME: Final = 0x1008
 HEARTBEAT_TIME: Final = 0x1017
 IDENTITY: Final = 0x1018
 IDENTITY_SUBS: Final = {1: "vendor id", 2: "product code", 3: "revision", 4: "serial number"}
+# Communication parameters by TPDO number: TPDO6 is 0x1804, TPDO7 is 0x1805 (ERRATA B18)
 TPDO_OBJECTS: Final = {number: 0x1800 + place for place, number in enumerate(TPDO_FUNCTIONS)}
-"""Communication parameters by TPDO number: TPDO6 is 0x1804, TPDO7 is 0x1805 (ERRATA B18)."""
 TPDO_TYPE: Final = 2
 TPDO_TIMER: Final = 5
 CONTROL: Final = 0x2000
@@ -63,8 +63,8 @@ NODE_ID: Final = 0x20A0
 INCLI_ZERO: Final = 0x20A5
 
 BitRate = Literal[1_000_000, 500_000, 250_000, 125_000]
+# Code of 0x209A for each bit rate, bit/s; the manual omits code 1
 BIT_RATES: Final[Mapping[int, int]] = {1_000_000: 0, 500_000: 2, 250_000: 3, 125_000: 4}
-"""Code of 0x209A for each bit rate, bit/s; the manual omits code 1."""
 BIT_RATE_OF: Final = {code: bit_s for bit_s, code in BIT_RATES.items()}
 Place = tuple[int, int]  # index and sub-index of an object
 SETTING_PLACES: Final[tuple[Place, ...]] = (
@@ -269,10 +269,10 @@ def _is_heartbeat(node: int) -> Callable[[Message], bool]:
     return lambda message: isinstance(message, ReplyFrame) and message.frame_id == can_id
 
 
+# Functions of frames that a node sends
 SENT_BY_NODE: Final = frozenset({*TPDO_FUNCTIONS.values(), SDO_REPLY, HEARTBEAT, EMERGENCY})
-"""Functions of frames that a node sends."""
+# Time to listen for a node, ns: it sends each TPDO at least once per second (section 5.1)
 LISTEN_NS: Final = 1100 * NS_PER_MS
-"""Time to listen for a node, ns: it sends each TPDO at least once per second (section 5.1)."""
 BOOT_NS: Final = 3 * NS_PER_S  # maximum time to the boot-up message, ns; the manual states none
 ALL_BOOTS: Final = (CanFilter(HEARTBEAT, FUNCTION_MASK, False),)
 

@@ -38,13 +38,13 @@ from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
 
+# Message that makes samples, by the last four digits of its PGN
 MeasuredName = Literal["FF34", "FF37", "FF3A", "FF3D", "FF41", "FF43", "FF46", "FF4A"]
-"""Message that makes samples, by the last four digits of its PGN."""
 PgnName = MeasuredName | Literal["FF2F"]  # any message
 ACCEL, GYRO, ROLL_PITCH, HEADING, INCLINOMETER = 0xFF34, 0xFF37, 0xFF3D, 0xFF41, 0xFF4A
 MAG, TEMPERATURE, QUATERNION, UTC = 0xFF3A, 0xFF43, 0xFF46, 0xFF2F
+# All PGNs, in rising order
 PGNS: Final = (UTC, ACCEL, GYRO, MAG, ROLL_PITCH, HEADING, TEMPERATURE, QUATERNION, INCLINOMETER)
-"""All PGNs, in rising order."""
 MEASURED: Final = PGNS[1:]  # PGNs that make samples
 PRIORITY: Final = 3
 MESSAGE_BYTES: Final = 8

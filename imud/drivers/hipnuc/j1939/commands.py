@@ -72,8 +72,8 @@ MODULE_ADDRESS_MIN, MODULE_ADDRESS_MAX = 1, 128
 INTERVAL_MIN_MS, INTERVAL_MAX_MS = 5, 1000
 
 REPLY_TIMEOUT_NS: Final = 500 * NS_PER_MS  # the manual states none; J1939-21 gives a node 200 ms
+# Timeout of registers that may not exist, ns. Such registers do not reply, and imud reads many of them.
 PRESENT_TIMEOUT_NS: Final = 250 * NS_PER_MS
-"""Timeout of registers that may not exist, ns. Such registers do not reply, and imud reads many of them."""
 FLASH_TIMEOUT_NS: Final = 5 * NS_PER_S // 2
 CLAIM_NS: Final = 250 * NS_PER_MS  # maximum time of an address claim, ns (J1939-81)
 SILENT_MAX: Final = 2  # number of registers in a row without reply before imud stops the read
@@ -290,8 +290,8 @@ def _value(outcome: Outcome) -> int:
     return value
 
 
+# Time to listen for a device, ns: it sends each message at least once per second (section 6.2.2)
 LISTEN_NS: Final = 1100 * NS_PER_MS
-"""Time to listen for a device, ns: it sends each message at least once per second (section 6.2.2)."""
 BOOT_NS: Final = 3 * NS_PER_S  # maximum time to the address claim after a restart, ns; the manual states none
 SOURCE_MASK: Final = 0xFF
 

@@ -63,26 +63,24 @@ from imud.model.options import Options
 from imud.model.sample import Measurement, Pair, Quaternion, Vector3
 from imud.model.units import NS_PER_S
 
+# accel, gyro, mag, roll pitch yaw, temperature, pressure, quaternion wxyz, inclinometer: registers 0x34 … 0x4B
 BLOCK: Final = struct.Struct(">3h3h3h3ihi4h2h")
-"""accel, gyro, mag, roll pitch yaw, temperature, pressure, quaternion wxyz, inclinometer: registers 0x34 … 0x4B."""
 UPTIME: Final = struct.Struct(">I")  # registers 0x4C … 0x4D, ms
 DATA_AT: Final = 3
+# Time between two reads of the serial number, ns: another device can replace the device without a gap
 CHECK_NS: Final = 10 * NS_PER_S
-"""Time between two reads of the serial number, ns: another device can replace the device without a gap."""
+# Number of missing replies in a row before imud tries the shorter block. After three, the device counts as missing.
 SILENT_MAX: Final = 2
-"""Number of missing replies in a row before imud tries the shorter block. After three, the device counts as missing."""
+# Maximum length error of a quaternion. The two scales differ by a factor of 3.3; rounding changes the length by 1e-4.
 UNIT_TOLERANCE: Final = 0.02
-"""Maximum length error of a quaternion. The two scales differ by a factor of 3.3; rounding changes the length by
-1e-4.
-"""
 PITCHED_RAD: Final = radians(1.0)  # minimum pitch for a decision: a dual-axis inclinometer then shows 182 counts
 
 READ_BLOCK: Final = read_registers(BLOCK_FIRST, BLOCK_REGISTERS)
 READ_SHORT_BLOCK: Final = read_registers(BLOCK_FIRST, SHORT_BLOCK_REGISTERS)
 READ_SERIAL: Final = read_registers(BY_NAME["SN"].address, BY_NAME["SN"].count)
 READ_STATUS: Final = read_registers(BY_NAME["MAIN_STATUS"].address, BY_NAME["MAIN_STATUS"].count)
+# Time between two reads of MAIN_STATUS, which is not in the block: maximum age of `status` of a sample, ns
 STATUS_NS: Final = NS_PER_S
-"""Time between two reads of MAIN_STATUS, which is not in the block: maximum age of `status` of a sample, ns."""
 _SAMPLE, _SERIAL, _STATUS = 0, 1, 2
 
 

@@ -51,8 +51,8 @@ SAVE: Final = 0x0000
 FACTORY_RESET: Final = 0x0001
 RESTART: Final = 0x00FF
 FLASH_MS: Final = 2500  # maximum time to the confirmation of a save, ms; 2 s were observed
+# Number of requests without reply before an address counts as unused or a device as absent: noise can destroy one
 TRIES: Final = 3
-"""Number of requests without reply before an address counts as unused or a device as absent: noise can destroy one."""
 # together 3 s for a restart; the manual states no time
 BOOT_TRIES: Final = 30
 BOOT_REPLY_MS: Final = 100

@@ -63,13 +63,14 @@ INCLI_SINGLE_RAD_PER_LSB: Final = tau / 32768
 INCLI_DUAL_RAD_PER_LSB: Final = tau / 2 / 32768
 
 BaudRate = Literal[4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600, 256000]
+# Baud rates by their code in UART1_BAUD (section 4.3.2). Code 9 is from the vendor's programs, not from the manual.
 BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
-"""Baud rates by their code in UART1_BAUD (section 4.3.2). Code 9 is from the vendor's programs, not from the manual."""
 FACTORY_BAUD: Final[BaudRate] = 115200
 ID_MAX: Final = 128  # maximum ID of register MD_ID; higher IDs require the serial number
 
 _R, _W, _RW = Access.READ, Access.WRITE, Access.BOTH
 
+# in the order of their addresses
 REGISTERS: Final = (
     Register("CTRL", 0x00, "u16", 1, _W, "0 saves all settings, 1 restores the factory settings, 0xFF restarts",
              values=(0x0000, 0x0001, 0x00FF)),
@@ -107,15 +108,14 @@ REGISTERS: Final = (
     Register("SET_LV", 0xA5, "u16", 1, _W, "2 level here, 3 only when nearly level, 5 cancels", values=(2, 3, 5)),
     Register("URFR", 0xA6, "u16", 1, _W, "mounting: 0 level, 1 Y down, 2 Y up, 3 X up, 4 X down", values=range(5)),
 )  # fmt: skip
-"""in the order of their addresses"""
 
 BY_NAME: Final = {register.name: register for register in REGISTERS}
 
 BLOCK_FIRST: Final = BY_NAME["ACCX"].address
+# 0x34 … 0x4D: all measured values and the device time
 BLOCK_REGISTERS: Final = BY_NAME["UPTIME"].address + 2 - BLOCK_FIRST
-"""0x34 … 0x4D: all measured values and the device time"""
+# 0x34 … 0x4B: the block of firmware without UPTIME
 SHORT_BLOCK_REGISTERS: Final = BY_NAME["UPTIME"].address - BLOCK_FIRST
-"""0x34 … 0x4B: the block of firmware without UPTIME"""
 IDENTITY_FIRST: Final = BY_NAME["PNAME"].address
 IDENTITY_REGISTERS: Final = 20  # 0x70 … 0x83, as in the example of the manual (section 4.4)
 

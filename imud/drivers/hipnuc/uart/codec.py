@@ -47,29 +47,29 @@ from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
 from imud.model.units import RAD_PER_DEG, T_PER_UT
 
+# tag, pps_sync_stamp or status, temperature °C, pressure Pa, system_time ms, accel G, gyro °/s, mag µT, roll pitch yaw
+# °, quaternion wxyz (section 3.3.1)
 HI91: Final = struct.Struct("<BHbfI3f3f3f3f4f")
-"""tag, pps_sync_stamp or status, temperature °C, pressure Pa, system_time ms, accel G, gyro °/s, mag µT, roll pitch yaw
-°, quaternion wxyz (section 3.3.1)."""
+# tag, status, temperature °C, pps_sync_stamp ms, pressure - 100000 Pa, reserved, gyro, accel, mag, roll pitch yaw,
+# quaternion wxyz (section 3.3.2). In HI92, gyro is before accel.
 HI92: Final = struct.Struct("<BHbHh2x3h3h3h3i4h")
-"""tag, status, temperature °C, pps_sync_stamp ms, pressure - 100000 Pa, reserved, gyro, accel, mag, roll pitch yaw,
-quaternion wxyz (section 3.3.2). In HI92, gyro is before accel."""
 TAG_HI91: Final = 0x91
 TAG_HI92: Final = 0x92
 
+# Modulus of pps_sync_stamp without an edge, ms (in a recording at 100 Hz, 8 follows 8190)
 PPS_STAMP_MODULUS_MS: Final = 8192
-"""Modulus of pps_sync_stamp without an edge, ms (in a recording at 100 Hz, 8 follows 8190)."""
 
 ACCEL_M_S2_PER_LSB: Final = 0.0048828  # scale of HI92 as printed; 160 / 32768 would be 2.6e-6 larger
 GYRO_RAD_S_PER_LSB: Final = 0.001  # scale of HI92
 PRESSURE_OFFSET_PA: Final = 100_000
 
 
+# HI91 after its tag, the word as two bytes. In the native layout, `struct` reads a float in half the time.
 HI91_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") + "xBBbfI16f")
-"""HI91 after its tag, the word as two bytes. In the native layout, `struct` reads a float in half the time."""
+# Slice of the high bytes of all floats and of system_time in adjacent HI91 sub-packets (76 is a multiple of 4). The
+# high byte of NaN and infinity is 0x7F or 0xFF. Finite values above 1.7e38 have the same high bytes, and system_time in
+# 9 of 1193 hours.
 HI91_HIGH_BYTES: Final = slice(7, None, 4)
-"""Slice of the high bytes of all floats and of system_time in adjacent HI91 sub-packets (76 is a multiple of 4). The
-high byte of NaN and infinity is 0x7F or 0xFF. Finite values above 1.7e38 have the same high bytes, and system_time in 9
-of 1193 hours."""
 
 
 def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing: int) -> Measurement:
@@ -151,8 +151,8 @@ class Packet:
     """Kind of sub-packet."""
 
     size: int  # size with tag, bytes
+    # `decode(data, at, word_is_status, size, trailing)` returns the measurement and whether all values are finite
     decode: Callable[[bytes, int, bool, int, int], tuple[Measurement, bool]]
-    """`decode(data, at, word_is_status, size, trailing)` returns the measurement and whether all values are finite."""
 
 
 PACKETS: Final = {TAG_HI91: Packet(HI91.size, _decode_hi91), TAG_HI92: Packet(HI92.size, _decode_hi92)}
@@ -235,10 +235,10 @@ HEADER: Final = struct.Struct("<2sHH")  # sync word, payload length, CRC
 PAYLOAD_BYTES_MAX: Final = 512  # section 3.1; devices make frames in a buffer of 512 bytes, with header
 FRAME_BYTES_MAX: Final = HEADER.size + PAYLOAD_BYTES_MAX
 
+# First firmware version (1.6.9) with MAIN_STATUS in bytes 1-2 of HI91; older firmware sends pps_sync_stamp there
 STATUS_SINCE_APP_VER: Final = 169
-"""First firmware version (1.6.9) with MAIN_STATUS in bytes 1-2 of HI91; older firmware sends pps_sync_stamp there."""
+# Status bits of MAIN_STATUS about time: frame with a SOUT pulse; `system_time` not synchronized to UTC
 TIME_BITS: Final = TimeBits(sync_out=1 << 12, not_utc=1 << 11)
-"""Status bits of MAIN_STATUS about time: frame with a SOUT pulse; `system_time` not synchronized to UTC."""
 
 _HI91_FRAME_BYTES: Final = HEADER.size + HI91.size
 _HI91_HEAD: Final = SYNC + HI91.size.to_bytes(2, "little")
@@ -246,10 +246,10 @@ _RUN_SEED: Final = crc16_xmodem(_HI91_HEAD, 0)
 _RUN_FRAMES_MAX: Final = (
     64  # imud copies a run out of the buffer; the limit bounds repeated copies after a damaged frame
 )
+# Pattern of adjacent HI91 frames by header and tag
 _RUN: Final = re.compile(
     rb"(?s:%b..%b.{%d}){1,%d}" % (re.escape(_HI91_HEAD), re.escape(bytes([TAG_HI91])), HI91.size - 1, _RUN_FRAMES_MAX)
 )
-"""Pattern of adjacent HI91 frames by header and tag."""
 _RUN_PARTS: Final = struct.Struct(f"<4xH{HI91.size}s")  # CRC and payload
 # Pattern of a line directly before the idle time: at least two characters and both line end characters. Shorter text
 # can occur by chance inside an incomplete frame, which `flush` would drop.

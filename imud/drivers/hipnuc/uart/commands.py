@@ -34,17 +34,17 @@ from imud.model.units import BITS_PER_UART_BYTE, NS_PER_S
 
 LINE_END: Final = "\r\n"
 BaudRate = Literal[115200, 921600, 460800, 256000, 230400, 9600]
+# Baud rates of SERIALCONFIG (section 2.2.3) and 230400 of table 3.7; the factory value first
 BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
-"""Baud rates of SERIALCONFIG (section 2.2.3) and 230400 of table 3.7; the factory value first."""
 REPLY_TIMEOUT_NS: Final = NS_PER_S // 2
 FLASH_TIMEOUT_NS: Final = 5 * NS_PER_S  # erasing the flash can take more than 2 s; the manual states no time
 
 OutputRate = Literal[0, 1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100, 125, 200, 250, 500, 1000]
+# Output rates: section 2.2.5 lists some periods "and so on". imud accepts every whole rate with a period of whole
+# milliseconds, up to table 3.7.
 RATES_HZ: Final[tuple[OutputRate, ...]] = get_args(OutputRate)[1:]
-"""Output rates: section 2.2.5 lists some periods "and so on". imud accepts every whole rate with a period of whole
-milliseconds, up to table 3.7."""
+# Maximum share of the baud rate for frames: table 3.7 goes up to 94 % (HI92 with 200 Hz at 115200 baud)
 LINE_SHARE_MAX: Final = 0.95
-"""Maximum share of the baud rate for frames: table 3.7 goes up to 94 % (HI92 with 200 Hz at 115200 baud)."""
 SOUT_DIVIDER_MAX: Final = 64
 PIN_MAX: Final = 9
 ROTATION_TOLERANCE: Final = 1e-3  # tolerance of a rotation matrix of nine numbers with three decimals
@@ -57,13 +57,13 @@ class OutputMessage(StrEnum):
     HI92 = "HI92"  # integers, without device time
 
 
+# Maximum output rate by baud rate (table 3.7)
 MAX_RATE_HZ: Final = {
     OutputMessage.HI91: {9600: 10, 115200: 100, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
     OutputMessage.HI92: {9600: 10, 115200: 200, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
 }
-"""Maximum output rate by baud rate (table 3.7)."""
+# Size of a frame with its header, bytes (sections 3.1, 3.3)
 FRAME_BYTES: Final = {OutputMessage.HI91: 6 + 76, OutputMessage.HI92: 6 + 48}
-"""Size of a frame with its header, bytes (sections 3.1, 3.3)."""
 
 
 class YawMode(Enum):
@@ -111,10 +111,10 @@ class Mounting(Enum):
     LEVEL_X_RIGHT = ((0, 1, 0), (-1, 0, 0), (0, 0, 1))  # rotated by -90° about Z: Z up, X in place of -Y
 
 
+# Names of `Mounting`
 MountingName = Literal[
     "level", "y_down", "y_up", "z_down", "x_up", "x_down", "z_down_x_back", "level_x_left", "level_x_right"
 ]
-"""Names of `Mounting`."""
 
 
 class Query(StrEnum):
@@ -286,8 +286,8 @@ def _text(value: float) -> str:
 
 BOOT_NS: Final = NS_PER_S  # time from REBOOT to the first try, ns; the manual states none
 BOOT_TRIES: Final = 5
+# Number of tries per baud rate. Bytes sent at another baud rate can spoil the first request in the device's buffer.
 LOOK_TRIES: Final = 2
-"""Number of tries per baud rate. Bytes sent at another baud rate can spoil the first request in the device's buffer."""
 FACTORY_BAUD: Final = BAUD_RATES[0]
 WAKE_HZ: Final = 100  # factory output rate (section 3.2)
 

@@ -189,8 +189,8 @@ def _matrix(text: str) -> Matrix3 | None:
     return ((a, b, c), (d, e, f), (g, h, i))
 
 
+# Maximum length of a line without its end. Replies in the manual are below 80; more means a lost line end.
 LINE_CHARACTERS_MAX: Final = 255
-"""Maximum length of a line without its end. Replies in the manual are below 80; more means a lost line end."""
 
 _PRINTABLE: Final = bytes([0x09, *range(0x20, 0x7F)])
 

@@ -263,6 +263,8 @@ def _described(value_type: Any, description: str, section: str, unit: str = "") 
     return Annotated[value_type, Meta(description=description, extra={"section": section, "unit": unit})]
 
 
+# Settings of a device, in writing order. Level (CONFIG ATT RST) and heading (CONFIG YAW) depend on the present
+# attitude, so they are actions.
 SETTINGS: Final = SettingsTable(
     table={
         "mode": Setting(
@@ -340,11 +342,9 @@ SETTINGS: Final = SettingsTable(
     restart=_restart,
     check=_check,
 )
-"""Settings of a device, in writing order. Level (CONFIG ATT RST) and heading (CONFIG YAW) depend on the present
-attitude, so they are actions."""
 
+# Function of the device pin by key of the GPIO line
 FUNCTIONS: Final = {"sin": "sin", "pps": "sin", "sout": "sout", "sout_div": "sout_div", "alarm": "alarm"}
-"""Function of the device pin by key of the GPIO line."""
 
 
 def line_differences(settings: Mapping[str, str], lines: DeviceLines) -> dict[str, str]:

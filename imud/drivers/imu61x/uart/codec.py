@@ -37,9 +37,9 @@ HOST_SYNC: Final = b"\x55\xaa"  # start of a frame from the host
 HEADER: Final = struct.Struct("<2sHH")  # sync word, id, payload length
 CRC_BYTES: Final = 4
 OVERHEAD_BYTES: Final = HEADER.size + CRC_BYTES
+# Maximum length of a payload, bytes. The longest known payload has 66 bytes (S1, depends on the model). A false length
+# then hides at most five samples, 23 ms at 115200 baud.
 PAYLOAD_BYTES_MAX: Final = 256
-"""Maximum length of a payload, bytes. The longest known payload has 66 bytes (S1, depends on the model). A false length
-then hides at most five samples, 23 ms at 115200 baud."""
 FRAME_BYTES_MAX: Final = OVERHEAD_BYTES + PAYLOAD_BYTES_MAX
 
 
@@ -319,8 +319,8 @@ def pack_acknowledgement(command: int, result: int) -> bytes:
 
 AHRS_FRAME_BYTES: Final = OVERHEAD_BYTES + 44
 
+# timer µs, pitch roll yaw °, accel x y z g, gyro x y z °/s, temperature °C (table 4)
 AHRS: Final = struct.Struct("<I10f")
-"""timer µs, pitch roll yaw °, accel x y z g, gyro x y z °/s, temperature °C (table 4)"""
 AHRS_FRAME: Final = 0x0002
 TIMER_MODULUS: Final = 2**32
 

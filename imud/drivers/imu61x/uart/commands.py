@@ -36,15 +36,15 @@ from imud.model.sample import Measurement, Vector3
 from imud.model.units import BITS_PER_UART_BYTE, NS_PER_MS, NS_PER_S
 
 BaudRate = Literal[115200, 921600, 460800, 230400, 1500000]  # baud rate of table 12, bit/s
+# All baud rates: factory setting first, then the usual rates for 200 and 400 Hz
 BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
-"""All baud rates: factory setting first, then the usual rates for 200 and 400 Hz."""
 RateHz = Literal[1, 10, 50, 100, 200, 400]  # AHRS output rate of table 12
 RATES_HZ: Final[tuple[RateHz, ...]] = get_args(RateHz)
+# Timeout of a reply, ns. 76 bytes take 7 ms at 115200 baud, and a USB adapter holds them for 16 ms.
 REPLY_TIMEOUT_NS: Final = 300 * NS_PER_MS
-"""Timeout of a reply, ns. 76 bytes take 7 ms at 115200 baud, and a USB adapter holds them for 16 ms."""
 FLASH_TIMEOUT_NS: Final = 5 * NS_PER_S  # timeout while the device erases and writes flash, which may take 2 s, ns
+# Timeout of a calibration, ns; the acknowledgement may arrive at its start or at its end (assumed)
 CALIBRATION_TIMEOUT_NS: Final = 10 * NS_PER_S
-"""Timeout of a calibration, ns; the acknowledgement may arrive at its start or at its end (assumed)."""
 
 
 class Command(Enum):
@@ -258,10 +258,10 @@ T = TypeVar("T")
 STREAM_TRIES: Final = 5  # maximum number of requests to stream: a silent device costs more than four repetitions
 SETTLE_TRIES: Final = 10  # maximum number of status requests after a slow command: 3 s
 CONTACT_TRIES: Final = 5  # maximum number of status requests after other commands: 1.5 s
+# Maximum number of commands to enter command mode. Without acknowledgement and reply, the device is absent.
 ENTER_TRIES: Final = 2
-"""Maximum number of commands to enter command mode. Without acknowledgement and reply, the device is absent."""
+# Bytes that start streaming: undo of every script that may leave the device in command mode
 STREAM: Final = output_mode(OutputMode.STREAM).payload
-"""Bytes that start streaming: undo of every script that may leave the device in command mode."""
 
 
 class Imu61xUartOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):

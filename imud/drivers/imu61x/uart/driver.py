@@ -74,11 +74,11 @@ from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 POLL_NS: Final = 500 * NS_PER_MS
 POLLS_MAX: Final = 120  # one minute; the manual states no time
+# Time for the gyroscope calibration of a device that does not report its end, ns (assumed)
 GYRO_NS: Final = 10 * NS_PER_S
-"""Time for the gyroscope calibration of a device that does not report its end, ns (assumed)."""
 
+# Returns whether the calibration has ended, and the state of the device as text
 Finished = Callable[[], RequestScript[tuple[bool, str]]]
-"""Returns whether the calibration has ended, and the state of the device as text."""
 
 
 def calibrate_gyro(*, done: int = RESULT_DONE, rest: int = 0) -> RequestScript[Vector3]:

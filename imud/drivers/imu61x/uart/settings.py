@@ -54,12 +54,12 @@ from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
+# Maximum time to the first sample after the command to stream, ns: three times the longest period, 1 s
 SAMPLE_NS: Final = 3 * NS_PER_S
-"""Maximum time to the first sample after the command to stream, ns: three times the longest period, 1 s."""
+# Time without a sample after which the stream has stopped, ns: more than the longest period
 QUIET_NS: Final = 1200 * NS_PER_MS
-"""Time without a sample after which the stream has stopped, ns: more than the longest period."""
+# Time for samples in buffers when the stream stops, ns: 512 bytes at 115200 baud, and an adapter
 DRAIN_NS: Final = 200 * NS_PER_MS
-"""Time for samples in buffers when the stream stops, ns: 512 bytes at 115200 baud, and an adapter."""
 
 GYRO_OFFSETS: Final = (Parameter.GYRO_X_OFF, Parameter.GYRO_Y_OFF, Parameter.GYRO_Z_OFF)
 INSTALLATION_ANGLES: Final = (Parameter.INSTALL_X_OFF, Parameter.INSTALL_Y_OFF, Parameter.INSTALL_Z_OFF)
@@ -194,8 +194,8 @@ def parameter_words(values: ParameterValues) -> Mapping[str, str]:
     return words
 
 
+# Values of parameter 27 by number: `uart_only`, `spi`, `i2c`, `by_pin`
 BUS_NAMES: Final[Mapping[float, str]] = {mode.value: mode.name.lower() for mode in BusMode}
-"""Values of parameter 27 by number: `uart_only`, `spi`, `i2c`, `by_pin`."""
 
 
 def _number(value: float) -> str:
@@ -312,17 +312,16 @@ def reset_heading(heading_deg: float, *, done: int = RESULT_DONE) -> RequestScri
     return in_command_mode(ask)
 
 
+# Number of tries per baud rate. Bytes at another baud rate, or a busy device, can cost two of them.
 LOOK_TRIES: Final = 3
-"""Number of tries per baud rate. Bytes at another baud rate, or a busy device, can cost two of them."""
 BOOT_NS: Final = NS_PER_S
 BOOT_TRIES: Final = 5  # number of searches after a restart; with their timeouts longer than the 3 s in section 2.2
 US_PER_S: Final = NS_PER_S // NS_PER_US
 TIMER_US: Final = 2**32
+# Minimum age of the timer before a restart, µs: longer than the search after it, so that a restarted timer is smaller
 OLD_US: Final = 15 * US_PER_S
-"""Minimum age of the timer before a restart, µs: longer than the search after it, so that a restarted timer is
-smaller.
-"""
 
+# Factory settings of tables 1, 9 and 12
 FACTORY: Final[Mapping[Parameter, int]] = {
     Parameter.BAUD: BAUD_RATES[0],
     Parameter.AHRS_RATE: 100,
@@ -330,7 +329,6 @@ FACTORY: Final[Mapping[Parameter, int]] = {
     Parameter.I2C_ADDRESS: I2C_ADDRESSES[0],
     Parameter.FILTER: FILTER_DEFAULT,
 }
-"""Factory settings of tables 1, 9 and 12."""
 FACTORY_BAUD: Final = FACTORY[Parameter.BAUD]
 
 
