@@ -17,9 +17,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from enum import Enum
 from math import isnan
+from random import Random
 from typing import Any, Final
 
 from imud.attitude.conventions import Heading
+from imud.attitude.rotation import quat_normalized
 from imud.contracts.command import (
     ACCEL_LEVEL,
     INCLINATION_ZERO,
@@ -33,6 +35,7 @@ from imud.contracts.command import (
     Target,
 )
 from imud.contracts.driver import DataSheet, StatusBit
+from imud.model.sample import Quaternion, Vector3
 from imud.model.units import RAD_PER_DEG, T_PER_UT
 
 M_S2_PER_G: Final = 9.8  # G of the firmware, m/s²: it divides by 9.8, not by standard gravity
@@ -51,6 +54,16 @@ def counts_of(value: float, bits: int) -> int:
         raise ValueError("NaN has no count")
     most = 1 << bits - 1
     return round(max(-most, min(most - 1, value)))
+
+
+def random_vector(random: Random, spread: float) -> Vector3:
+    """Return three random numbers around zero, for the examples of the property tests."""
+    return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
+
+
+def random_quaternion(random: Random) -> Quaternion:
+    """Return a random unit quaternion, for the examples of the property tests."""
+    return quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
 
 
 PRESSURE_MIN_PA: Final = 1_000.0
@@ -75,11 +88,11 @@ def temperature_beside(temperature_c: float, pressure_pa: float) -> float | None
 
 DOCUMENT: Final = "HiPNUC IMU configuration manual V1.5.9 (CH0x0, CH10x, HI14): no noise figures for any model"
 FLOATS: Final = DataSheet(document=DOCUMENT)  # data sheet of the UART protocol
+# Data sheet of Modbus and J1939
 REGISTERS: Final = DataSheet(document=DOCUMENT, gyro_step_rad_s=GYRO_RAD_S_PER_LSB, accel_step_m_s2=ACCEL_M_S2_PER_LSB)
-"""Data sheet of Modbus and J1939."""
 
+# Names of the setting for the attitude mode in ASCII commands and Modbus
 SETTINGS: Final = ("ATT_MODE", "heading_mode", "mode")
-"""Names of the setting for the attitude mode in ASCII commands and Modbus."""
 HEADINGS: Final = {
     "0": Heading.RELATIVE,
     "six axes": Heading.RELATIVE,

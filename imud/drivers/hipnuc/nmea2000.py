@@ -24,12 +24,12 @@ from typing import Annotated, Final, Literal, NamedTuple
 from msgspec import Meta
 
 from imud.attitude.conventions import Heading
-from imud.attitude.rotation import euler312_from_quat, quat_from_euler312, quat_normalized
+from imud.attitude.rotation import euler312_from_quat, quat_from_euler312
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity
 from imud.contracts.script import says_nothing
 from imud.drivers.hipnuc.assembly import Assembly
-from imud.drivers.hipnuc.common import FLOATS
+from imud.drivers.hipnuc.common import FLOATS, random_quaternion
 from imud.formats.can import CanFilter, CanFrame
 from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, sender_of
 from imud.model.ledger import Ledger
@@ -141,8 +141,8 @@ def _clip(value: float, most: int) -> int:
     return max(-most, min(most, round(value)))
 
 
+# Time without a message after which imud selects another sender, ns. The slowest message has a period of 1 s.
 SILENT_NS: Final = 3 * NS_PER_S
-"""Time without a message after which imud selects another sender, ns. The slowest message has a period of 1 s."""
 SID_DOUBTS: Final = 8
 
 _PGNS: Final = {join(J1939Id(0, pgn, 0)): pgn for pgn in PGNS}  # PGN by identifier without priority and source
@@ -266,7 +266,7 @@ EXAMPLE_SOURCE: Final = 35
 
 
 def _example_frames(random: Random) -> list[CanFrame]:
-    quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
+    quat = random_quaternion(random)
     euler = euler312_from_quat(quat)
     sid = random.randrange(SID_MOST + 1)
     made = (

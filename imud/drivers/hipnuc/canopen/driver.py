@@ -49,7 +49,7 @@ from imud.drivers.hipnuc.canopen.commands import (
     identify,
     read_settings,
 )
-from imud.drivers.hipnuc.common import DOCUMENT, inclinometer_zero
+from imud.drivers.hipnuc.common import DOCUMENT, inclinometer_zero, random_vector
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_S, NS_PER_US
@@ -335,8 +335,8 @@ US_PER_S: Final = NS_PER_S // NS_PER_US
 
 def _example_frames(random: Random) -> list[CanFrame]:
     frames = encode_tpdos(
-        accel_m_s2=(random.gauss(0, 5), random.gauss(0, 5), random.gauss(0, 5)),
-        gyro_rad_s=(random.gauss(0, 2), random.gauss(0, 2), random.gauss(0, 2)),
+        accel_m_s2=random_vector(random, 5),
+        gyro_rad_s=random_vector(random, 2),
         euler_rad=(random.uniform(-3, 3), random.uniform(-1.5, 1.5), random.uniform(-3, 3)),
         quat_wxyz=(random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1)),
     )

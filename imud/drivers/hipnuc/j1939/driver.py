@@ -7,13 +7,13 @@ from typing import Annotated, Any, Final, Literal
 
 from msgspec import Meta
 
-from imud.attitude.rotation import euler312_from_quat, quat_normalized
+from imud.attitude.rotation import euler312_from_quat
 from imud.contracts.command import Action, Actions, Risk, Target
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import Effect, Setting, SettingsTable, Written
 from imud.drivers.hipnuc.bus_load import CyclicMessage, refuse_other_rate, refuse_overload
-from imud.drivers.hipnuc.common import REGISTERS, inclinometer_zero
+from imud.drivers.hipnuc.common import REGISTERS, inclinometer_zero, random_quaternion, random_vector
 from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import (
     CONFIGURE,
@@ -36,7 +36,6 @@ from imud.drivers.hipnuc.j1939.commands import (
 )
 from imud.formats.can import CanFilter, CanFrame
 from imud.formats.j1939 import filter_of, sender_of
-from imud.model.sample import Vector3
 
 CONTENT: Final = {
     codec.UTC: "UTC", codec.ACCEL: "acceleration", codec.GYRO: "angular rate", codec.MAG: "magnetic field",
@@ -50,6 +49,7 @@ def interval_name(pgn: int) -> str:
     return f"{pgn:04x}_interval_ms"
 
 
+# Registers of the settings, by name, in the order of the table
 SETTING_REGISTERS: Final = {
     **{interval_name(pgn): register for pgn, register in INTERVALS.items()},
     "x_reversed": commands.X_SIGN,
@@ -57,7 +57,6 @@ SETTING_REGISTERS: Final = {
     "bit_rate": commands.BITRATE,
     "address": commands.ADDRESS,
 }
-"""Registers of the settings, by name, in the order of the table."""
 
 
 def values_of(values: Mapping[int, int]) -> dict[str, Any]:
@@ -248,15 +247,12 @@ ACTIONS: Final[Actions] = {
 
 def _example_frames(random: Random) -> list[CanFrame]:
     """Return a sample of the four PGNs that every device sends, with random values."""
-    quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
+    quat = random_quaternion(random)
     roll, pitch, yaw = euler312_from_quat(quat)
 
-    def three(spread: float) -> Vector3:
-        return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
-
     made = (
-        encode(codec.ACCEL, codec.pack_accel(three(9.8))),
-        encode(codec.GYRO, codec.pack_gyro(three(2))),
+        encode(codec.ACCEL, codec.pack_accel(random_vector(random, 9.8))),
+        encode(codec.GYRO, codec.pack_gyro(random_vector(random, 2))),
         encode(codec.ROLL_PITCH, codec.pack_roll_pitch(roll, pitch)),
         encode(codec.HEADING, codec.pack_heading(yaw)),
     )

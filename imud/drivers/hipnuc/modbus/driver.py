@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, Literal
 
 from msgspec import Meta
 
-from imud.attitude.rotation import euler312_from_quat, quat_normalized
+from imud.attitude.rotation import euler312_from_quat
 from imud.contracts.command import Action, Actions, Calibrations, Risk, Target, Verdict
 from imud.contracts.driver import PolledDriver
 from imud.contracts.script import TransferScript
@@ -21,6 +21,8 @@ from imud.drivers.hipnuc.common import (
     heading_by_mode,
     levels,
     magnetometer,
+    random_quaternion,
+    random_vector,
 )
 from imud.drivers.hipnuc.modbus import commands
 from imud.drivers.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusOptions, pack_block, update_ns
@@ -36,7 +38,6 @@ from imud.drivers.hipnuc.modbus.registers import (
 )
 from imud.formats.modbus import SLAVES, framed
 from imud.model.errors import BadArgument
-from imud.model.sample import Vector3
 from imud.model.units import NS_PER_MS
 
 
@@ -234,15 +235,12 @@ SETTINGS: Final = SettingsTable(
 
 
 def _example_reading(random: Random) -> bytes:
-    quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
-
-    def three(spread: float) -> Vector3:
-        return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
+    quat = random_quaternion(random)
 
     data = pack_block(
-        accel_m_s2=three(9.8), gyro_rad_s=three(2), mag_t=three(5e-5), euler_rad=euler312_from_quat(quat),
-        quat_wxyz=quat, temperature_c=random.uniform(-40, 85), pressure_pa=random.uniform(80_000, 110_000),
-        uptime_ms=random.randrange(2**32),
+        accel_m_s2=random_vector(random, 9.8), gyro_rad_s=random_vector(random, 2), mag_t=random_vector(random, 5e-5),
+        euler_rad=euler312_from_quat(quat), quat_wxyz=quat, temperature_c=random.uniform(-40, 85),
+        pressure_pa=random.uniform(80_000, 110_000), uptime_ms=random.randrange(2**32),
     )  # fmt: skip
     return framed(FACTORY_ID, registers_reply(data))
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, Literal
 
 from msgspec import Meta
 
-from imud.attitude.rotation import euler312_from_quat, quat_normalized
+from imud.attitude.rotation import euler312_from_quat
 from imud.contracts.codec import StreamCodec
 from imud.contracts.command import (
     YAW_ZERO,
@@ -32,6 +32,8 @@ from imud.drivers.hipnuc.common import (
     heading_by_mode,
     levels,
     magnetometer,
+    random_quaternion,
+    random_vector,
 )
 from imud.drivers.hipnuc.uart import commands
 from imud.drivers.hipnuc.uart.codec import (
@@ -296,11 +298,11 @@ CALIBRATIONS: Final[Calibrations] = {
 
 def _example_frame(random: Random) -> bytes:
     """Return HI91 or HI92 with random values; one frame in four contains both."""
-    quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
+    quat = random_quaternion(random)
     common: Mapping[str, Any] = {
         "accel_m_s2": (random.gauss(0, 5), random.gauss(0, 5), random.gauss(9.8, 5)),
-        "gyro_rad_s": (random.gauss(0, 2), random.gauss(0, 2), random.gauss(0, 2)),
-        "mag_t": (random.gauss(0, 5e-5), random.gauss(0, 5e-5), random.gauss(0, 5e-5)),
+        "gyro_rad_s": random_vector(random, 2),
+        "mag_t": random_vector(random, 5e-5),
         "quat_wxyz": quat,
         "euler_rad": euler312_from_quat(quat),
         "temperature_c": random.uniform(-40, 85),
