@@ -297,7 +297,7 @@ def change_node(settings: HipnucCanopenOptions, new: int) -> RequestScript[Writt
         return (yield from verify(new, NODE_ID, 0, new))
     yield Request(
         _number_frame(new, node), f"node {new}, back to number {node}", never, never, never, silent=True
-    )  # in case it is there and cannot reply
+    )  # the node may already use the new number and not reply
     confirmed = "confirmed the write and then " if first else ""
     raise NoReply(
         f"the node {confirmed}replied neither as node {new} nor as node {node}; imud commanded it back to {node}"

@@ -236,7 +236,6 @@ SETTINGS: Final = SettingsTable(
 
 def _example_reading(random: Random) -> bytes:
     quat = random_quaternion(random)
-
     data = pack_block(
         accel_m_s2=random_vector(random, 9.8), gyro_rad_s=random_vector(random, 2), mag_t=random_vector(random, 5e-5),
         euler_rad=euler312_from_quat(quat), quat_wxyz=quat, temperature_c=random.uniform(-40, 85),
