@@ -93,7 +93,7 @@ async def measure(directory: str, clients: int, encoding: str, rate_hz: float, r
     batches = iter([make_batch(seq) for seq in range(1, 2 + SAMPLES_PER_ROUND * rounds)])
     server.publish(next(batches))
     message = b"x" * (empty(socks) or 700)
-    sends = [connection.outbox._send for connection in server.hub.connections.values()]
+    sends = [connection._send for connection in server.hub.connections.values()]
 
     def publish() -> None:
         for _ in range(SAMPLES_PER_ROUND):

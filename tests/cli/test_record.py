@@ -104,7 +104,7 @@ def test_a_recording_or_file_that_cannot_be_made(words: tuple[object, ...], tmp_
     cli.refuses("exists already: expected the name of a new file", *words, there)
     cli.refuses("No such file or directory", *words, tmp_path / "no" / "folder")
     cli.refuses("no device named 'keel'; there are: bow, mast", *words, "--device", "keel", tmp_path / "d")
-    cli.refuses("there is no flight recorder", *words, "--snapshot", tmp_path / "e")
+    cli.refuses("the flight recorder is off", *words, "--snapshot", tmp_path / "e")
     for option in (("--for", "1s"), ("--device", "bow")):
         cli.refuses("--snapshot: expected neither --device nor --for", *words, "--snapshot", *option)
     cli.refuses("expected a duration as 90s, 10min or 2h, got 'soon'", *words, "--for", "soon")

@@ -1,9 +1,9 @@
-"""What all clients of the socket share: devices, newest samples, subscriptions, delivery of batches and events."""
+"""Common state of all clients of the socket: devices, newest samples, subscriptions, recordings."""
 
 import asyncio
 import logging
 import socket
-from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Sequence
 from typing import Any, Final
 
 from imud.contracts.publisher import Batch, PublisherContext
@@ -12,8 +12,8 @@ from imud.formats.jsonrpc import Code, RpcError, encode_notification
 from imud.model.errors import ImudError, reason_of
 from imud.model.event import Event
 from imud.publishers.recorder.client_stream import ClientRecording, stream_pair
-from imud.publishers.socket.admission import Quota, RateLimitedLog
-from imud.publishers.socket.client import ClientConnection
+from imud.publishers.socket.admission import Quota
+from imud.publishers.socket.client import ClientConnection, Clients
 from imud.publishers.socket.messages import DeviceNotice
 from imud.publishers.socket.outbox import Pool
 from imud.publishers.socket.scheduler import TokenBucket
@@ -22,35 +22,33 @@ from imud.publishers.socket.subscription import DeliveryPlan, Subscription
 log = logging.getLogger(__name__)
 
 RECORDINGS_MAX: Final = 4
-"""At a time, of all clients: each has a thread and up to 16 MiB of records that wait."""
-
-CheckFds = Callable[[Sequence[int]], None]
-"""Raises RpcError where clients may not use these descriptors."""
+"""Maximum number of recordings of all clients. Each has a thread and a queue of up to 16 MiB."""
 
 
 class ClientRecordings:
-    """The recordings of all clients. Synchronization: the event loop's thread only."""
+    """The recordings of all clients. Synchronization: the event loop's thread.
 
-    def __init__(self, context: PublisherContext, check_fds: CheckFds) -> None:
+    `check_fds` raises RpcError if clients may not use these descriptors.
+    """
+
+    def __init__(self, context: PublisherContext, check_fds: Callable[[Sequence[int]], None]) -> None:
         self._context = context
         self._check_fds = check_fds
         self._ids: dict[str, int] = {}
         self._running: dict[int, ClientRecording] = {}
-        """By number of the connection."""
+        """Recordings by client number."""
         self._ending: list[ClientRecording] = []
-        """Those that still send what waited when they were stopped."""
+        """Stopped recordings that still send their queue."""
 
-    # --- the clients' side -------------------------------------------------------------------------------------------
+    # --- requests of a client -----------------------------------------------------------------------------------------
 
     def start(self, connection: ClientConnection, devices: Collection[str] | None) -> int:
-        """Record for a client; return the descriptor for it, which goes with the reply. Raises RpcError."""
+        """Start the recording of a client. Return the descriptor for the reply. Raises RpcError."""
         if connection.number in self._running:
-            raise RpcError(Code.UNAVAILABLE, "record.start: this connection records already; record.stop ends that")
+            raise RpcError(Code.UNAVAILABLE, "record.start: this connection already records; stop it with record.stop")
         count = len(self._running) + len(self._ending)
         if count >= RECORDINGS_MAX:
-            raise RpcError(
-                Code.UNAVAILABLE, f"record.start: {count} recordings run already, as many as there may be at a time"
-            )
+            raise RpcError(Code.UNAVAILABLE, f"record.start: {count} recordings are running, the maximum")
         ours, fd = self._lend(connection, "record.start")
         try:
             made = ClientRecording(self._context, devices, ours)
@@ -60,11 +58,11 @@ class ClientRecordings:
         for name, device_id in self._ids.items():
             made.add_device(name, device_id)
         self._running[connection.number] = made
-        log.info("client %d (pid %d, uid %d) records", connection.number, connection.peer.pid, connection.peer.uid)
+        log.info("client %d (pid %d, uid %d) records", connection.number, connection.peer.pid, connection.uid)
         return fd
 
     def stop(self, connection: ClientConnection) -> tuple[bool, int]:
-        """End the recording of a client regularly; return whether there was one, and the records that it lost."""
+        """Stop the recording of a client. Return whether it had one, and the number of dropped records."""
         made = self._running.pop(connection.number, None)
         if made is None:
             return False, 0
@@ -73,12 +71,12 @@ class ClientRecordings:
         return True, made.records_dropped
 
     def snapshot(self, connection: ClientConnection) -> tuple[float, int]:
-        """Send a client what the flight recorder has: its length, s, and the descriptor. Raises RpcError."""
+        """Send the content of the flight recorder. Return its duration, s, and the descriptor. Raises RpcError."""
         if not self._context.outputs.snapshots:
             raise RpcError(
                 Code.UNAVAILABLE,
-                "record.snapshot: there is no flight recorder; `recorder: {flight: {enabled: true}}` in the "
-                "configuration makes one",
+                "record.snapshot: the flight recorder is off; set `recorder: {flight: {enabled: true}}` in the "
+                "configuration",
             )
         ours, fd = self._lend(connection, "record.snapshot")
         try:
@@ -88,14 +86,14 @@ class ClientRecordings:
             raise RpcError(Code.UNAVAILABLE, f"record.snapshot: {error}") from None
 
     def remove(self, connection: ClientConnection) -> None:
-        """End the recording of a client that has gone; no-op if absent."""
+        """Abort the recording of a client that has ended. Do nothing if it has none."""
         made = self._running.pop(connection.number, None)
         if made is not None:
             made.close()
-            log.info("client %d records no more: its connection has ended", connection.number)
+            log.info("client %d stopped recording: its connection has ended", connection.number)
 
     def _lend(self, connection: ClientConnection, method: str) -> tuple[socket.socket, int]:
-        """Make a pair of sockets; return the daemon's, and the client's descriptor. Raises RpcError."""
+        """Make a pair of sockets. Return the daemon's socket and the client's descriptor. Raises RpcError."""
         try:
             ours, theirs = stream_pair()
         except OSError as error:
@@ -109,16 +107,16 @@ class ClientRecordings:
             theirs.close()
             raise
 
-    # --- the daemon's side -------------------------------------------------------------------------------------------
+    # --- calls of the hub ---------------------------------------------------------------------------------------------
 
     def add_device(self, name: str, device_id: int) -> None:
-        """A device appears."""
+        """Add a device to the recordings."""
         self._ids[name] = device_id
         for made in self._running.values():
             made.add_device(name, device_id)
 
     def remove_device(self, name: str) -> None:
-        """A device leaves, or is made anew."""
+        """Remove a device, which may be added again."""
         self._ids.pop(name, None)
         for made in self._running.values():
             made.remove_device(name)
@@ -129,12 +127,12 @@ class ClientRecordings:
             made.event(event)
 
     def tick(self, now_ns: int) -> None:
-        """Record checks and losses, and forget what is over."""
+        """Check all recordings, and close the finished ones."""
         for number, made in list(self._running.items()):
             made.tick(now_ns)
             if made.ended:
                 self._running.pop(number).close()
-                log.info("client %d records no more: it has closed its descriptor", number)
+                log.info("client %d stopped recording: it has closed its descriptor", number)
         for made in list(self._ending):
             made.tick(now_ns)
             if made.ended:
@@ -142,7 +140,7 @@ class ClientRecordings:
                 made.close()
 
     def close(self) -> None:
-        """End all recordings regularly; may be called twice."""
+        """Stop all recordings regularly. A second call does nothing."""
         for made in self._running.values():
             made.stop("imud stopped")
         for made in (*self._running.values(), *self._ending):
@@ -152,96 +150,89 @@ class ClientRecordings:
 
 
 WAKE_NS: Final = 300_000
-"""Waking clients takes so long in one turn of the event loop; the others are woken in the next."""
+"""Maximum time to wake clients in one turn of the event loop, ns. imud wakes the other clients in the next turn."""
 CLIENTS_PER_LOOK: Final = 16
+"""Number of clients that imud wakes between two reads of the clock."""
 
 
-class Hub:
-    """Keeps the clients and what each of them asked for. Synchronization: the event loop's thread."""
+class Hub(Clients):
+    """The devices, the newest samples, and the subscriptions of all clients. Synchronization: the event loop's thread.
 
-    def __init__(self, path: str, context: PublisherContext, quota: Quota, time: TokenBucket, pool: Pool) -> None:
+    `handle_line` carries out a request (methods.py).
+    """
+
+    def __init__(
+        self,
+        path: str,
+        context: PublisherContext,
+        quota: Quota,
+        time: TokenBucket,
+        pool: Pool,
+        handle_line: Callable[["Hub", ClientConnection, bytes], None],
+    ) -> None:
+        super().__init__(pool, context.clock.now_ns)
         self.path = path
-        self.control_group = "the control group"
-        """Whose members may change things, for people."""
         self.context = context
+        self.control_group = "the control group"
+        """Name of the group that may control, for error messages."""
+        self.devices: dict[str, int] = {}
+        """The `device_id` of each device."""
+        self.newest: dict[str, Batch] = {}
+        """The newest batch of each device."""
+        self.recordings = ClientRecordings(context, quota.check_fds)
         self._quota = quota
         self._time = time
-        self._pool = pool
-        self._devices: dict[str, int] = {}
-        self._newest: dict[str, Batch] = {}
-        self._connections: dict[int, ClientConnection] = {}
+        self._handle_line = handle_line
         self._subscriptions: dict[int, Subscription] = {}
         self._events: dict[int, Collection[str] | None] = {}
-        """Devices whose events a client gets, None for all; clients without events are absent."""
+        """Devices with events for a client, None for all. A client without events is absent."""
         self._plans: dict[str, DeliveryPlan] = {}
         self._work: dict[int, asyncio.Future[None]] = {}
-        """Requests that take their time, by the number of the client."""
+        """Running request of a client, by client number."""
         self._wanting_wake: dict[str, dict[ClientConnection, None]] = {}
-        """Clients that have a descriptor to be woken by, by device."""
-        self.recordings = ClientRecordings(context, quota.check_fds)
-        """What clients record."""
-        self._accepted = 0
-        self._refused = 0
-        self._evicted = 0
-        self._failed = 0
-        self._failures = RateLimitedLog(context.clock.now_ns)
+        """Clients with a waker, by device."""
         self._to_wake: dict[str, list[ClientConnection]] = {}
-        """Clients that are still to be woken for the newest batch of a device."""
-
-    @property
-    def devices(self) -> Mapping[str, int]:
-        """The daemon's number of each device, by name."""
-        return self._devices
-
-    @property
-    def newest(self) -> Mapping[str, Batch]:
-        """The newest sample of each device that has one: the last of its batch."""
-        return self._newest
-
-    @property
-    def connections(self) -> Mapping[int, ClientConnection]:
-        """The clients by number."""
-        return self._connections
+        """Clients that imud has not woken yet for the newest batch of a device."""
 
     # --- devices, samples, events -------------------------------------------------------------------------------------
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Add a device; clients that watch all get its number before its first sample."""
-        self._devices[name] = device_id
+        """Add a device. Clients that watch all devices get its number before its first sample."""
+        self.devices[name] = device_id
         self.recordings.add_device(name, device_id)
         watching = self._subscriptions.items()
-        everything = [self._connections[number] for number, wanted in watching if wanted.devices is None]
+        everything = [self.connections[number] for number, wanted in watching if wanted.devices is None]
         post_all(everything, encode_notification("device", DeviceNotice(name, device_id)))
 
     def remove_device(self, name: str) -> None:
-        """Remove a device; subscriptions that name it stay, for it may be added again."""
-        device_id = self._devices.pop(name, None)
+        """Remove a device. Subscriptions that name it stay, because it may be added again."""
+        device_id = self.devices.pop(name, None)
         if device_id is not None:
             matching = [number for number, wanted in self._subscriptions.items() if wanted.matches(name)]
             notice = encode_notification("device_removed", DeviceNotice(name, device_id))
-            post_all([self._connections[number] for number in matching], notice)
+            post_all([self.connections[number] for number in matching], notice)
         self.recordings.remove_device(name)
-        self._newest.pop(name, None)
+        self.newest.pop(name, None)
         self._plans.pop(name, None)
 
     def publish(self, batch: Batch) -> None:
         """Send a batch to all clients that watch its device."""
         device = batch.device
-        self._newest[device] = batch
+        self.newest[device] = batch
         plan = self._plans.get(device)
         if plan is None:
             plan = self._plans[device] = self._new_plan(device)
         plan.send(batch, self.context.clock.now_ns, self._time)
         if device in self._wanting_wake:
-            # Not now: a client that wakes reads shared memory, whose publisher may have its turn after this one.
+            # later: a woken client reads shared memory, and its publisher may run after this one
             asyncio.get_running_loop().call_soon(self._wake_all, device)
 
     def event(self, event: Event) -> None:
-        """Send an event to all clients that asked for it; those of the daemon itself ("") go to all that get any."""
+        """Send an event to the clients that asked for it. Events of the daemon (device "") go to all of them."""
         self.recordings.event(event)
         device = event.device
         wanting = [
-            self._connections[number]
+            self.connections[number]
             for number, devices in self._events.items()
             if devices is None or not device or device in devices
         ]
@@ -251,15 +242,14 @@ class Hub:
                 post_all(some, encode_notification("event", event, texts=texts))
 
     def _new_plan(self, device: str) -> DeliveryPlan:
-        """The plan for a device, with the clients that watch it."""
-        plan = DeliveryPlan(self._pool.next_order)
+        plan = DeliveryPlan(self.pool.next_order)
         for number, wanted in self._subscriptions.items():
             if wanted.matches(device):
-                plan.add(wanted, self._connections[number].outbox)
+                plan.add(wanted, self.connections[number])
         return plan
 
     def _wake_all(self, device: str) -> None:
-        """Wake all clients that want it; those left of the round before come first."""
+        """Wake all clients with a waker for `device`; first the clients that the last batch did not wake yet."""
         waiting = self._to_wake.get(device)
         if waiting:
             left = dict.fromkeys(waiting)
@@ -269,7 +259,7 @@ class Hub:
             self._wake_some(device)
 
     def _wake_some(self, device: str) -> None:
-        """Wake clients, from the end of the list, for WAKE_NS, then go on in the next turn of the event loop."""
+        """Wake clients, from the end of the list, for WAKE_NS. Continue in the next turn of the event loop."""
         now_ns, waiting = self.context.clock.now_ns, self._to_wake[device]
         end_ns = now_ns() + WAKE_NS
         while waiting:
@@ -295,146 +285,119 @@ class Hub:
             if not wanting:
                 del self._wanting_wake[device]
 
-    # --- what a client asks for ---------------------------------------------------------------------------------------
+    # --- requests of a client -----------------------------------------------------------------------------------------
+
+    def answer(self, connection: ClientConnection, line: bytes) -> None:
+        self._handle_line(self, connection, line)
 
     def subscribe(self, connection: ClientConnection, subscription: Subscription) -> None:
-        """Send samples to a client from now on, in place of those it watched before.
+        """Send samples to a client, in place of its previous subscription.
 
-        Raises RpcError when its user has too many forms of samples.
+        Raises RpcError if the clients of its user watch too many selections of fields.
         """
         old = self._subscriptions.get(connection.number)
-        self._quota.exchange_form(connection.peer.uid, old and old.key, subscription.key)
+        self._quota.exchange_form(connection.uid, old and old.key, subscription.key)
         self._stop_sending(connection)
         self._subscriptions[connection.number] = subscription
         self.context.latencies.ask(_asker(connection), subscription.latency_ns, subscription.devices)
         for device, plan in self._plans.items():
             if subscription.matches(device):
-                plan.add(subscription, connection.outbox)
+                plan.add(subscription, connection)
 
     def unsubscribe(self, connection: ClientConnection) -> None:
-        """Send no more samples to a client; no-op if it watches none."""
+        """Stop sending samples to a client. Do nothing if it has no subscription."""
         subscription = self._stop_sending(connection)
         if subscription is not None:
-            self._quota.exchange_form(connection.peer.uid, subscription.key, None)
+            self._quota.exchange_form(connection.uid, subscription.key, None)
             self.context.latencies.release(_asker(connection))
 
     def _stop_sending(self, connection: ClientConnection) -> Subscription | None:
-        """Send what the client watches no more; returns what that was."""
+        """Remove and return the subscription of a client."""
         subscription = self._subscriptions.pop(connection.number, None)
         if subscription is not None:
             for device, plan in self._plans.items():
                 if subscription.matches(device):
-                    plan.discard(subscription, connection.outbox)
+                    plan.discard(subscription, connection)
         return subscription
 
     def subscribe_events(self, connection: ClientConnection, devices: Collection[str] | None) -> None:
-        """Send events of `devices` (None for all) to a client from now on, in place of those before."""
+        """Send events of `devices` (None for all) to a client, in place of its previous selection."""
         self._events[connection.number] = devices
 
     def unsubscribe_events(self, connection: ClientConnection) -> None:
-        """Send no more events to a client; no-op if it gets none."""
+        """Stop sending events to a client."""
         self._events.pop(connection.number, None)
 
     def make_waker(self, connection: ClientConnection, device: str, latency_ns: int = 0) -> int:
-        """Make a descriptor that wakes a client after batches of `device`, so late at most.
+        """Make a descriptor that wakes a client at most `latency_ns` after a batch of `device`.
 
-        Raises RpcError as `ClientWakers.make`.
+        Raises RpcError as `ClientWakers.make`, or if the user has too many wakers.
         """
-        self._quota.check_waker(connection.peer, self._connections.values())
+        uid = connection.uid
+        self._quota.check_waker(uid, sum(len(one.wakers) for one in self.connections.values() if one.uid == uid))
         fd = connection.wakers.make(device, self._quota.check_fds)
         self._wanting_wake.setdefault(device, {})[connection] = None
         self.context.latencies.ask(_asker(connection, device), latency_ns, (device,))
         return fd
 
     def wakes(self, device: str) -> bool:
-        """Whether batches of `device` wake any client."""
+        """Return whether a client has a waker for `device`."""
         return device in self._wanting_wake
 
     def busy(self, connection: ClientConnection) -> bool:
-        """Whether a request of the client is still being carried out."""
+        """Return whether a request of the client still runs."""
         return connection.number in self._work
 
     def do_later(self, connection: ClientConnection, work: Coroutine[Any, Any, None]) -> None:
-        """Carry out a request that takes its time. It goes on when the client leaves."""
+        """Run a request that takes time. It continues if the client leaves."""
         number = connection.number
         task = self._work[number] = asyncio.ensure_future(work)
         task.add_done_callback(lambda _done: self._work.pop(number, None))
 
     # --- clients ------------------------------------------------------------------------------------------------------
 
-    def next_number(self) -> int:
-        """Count an accepted connection; the count is its number."""
-        self._accepted += 1
-        return self._accepted
-
-    @property
-    def accepted(self) -> int:
-        """Connections accepted since start; the number of the newest."""
-        return self._accepted
-
-    def add(self, connection: ClientConnection) -> None:
-        """Add a client that was accepted."""
-        self._connections[connection.number] = connection
-
     def remove(self, connection: ClientConnection) -> None:
-        """Remove a client and all it asked for; no-op if absent."""
+        """Remove a client and its subscriptions. Do nothing if it is unknown."""
         number = connection.number
-        self._connections.pop(number, None)
+        self.connections.pop(number, None)
         self.unsubscribe(connection)
         self._events.pop(number, None)
         self.recordings.remove(connection)
         for device in list(self._wanting_wake):
             self._forget_waker(connection, device)
 
-    def count_refused(self) -> None:
-        """Count a connection that was refused."""
-        self._refused += 1
-
-    def count_evicted(self) -> None:
-        """Count a client that is disconnected for what it did."""
-        self._evicted += 1
-
-    def count_failed(self, error: Exception) -> None:
-        """Count a client that was ended by an internal error; log the first, and one a minute of more."""
-        self._failed += 1
-        count = self._failures.count()
-        if count:
-            log.error("an internal error while a client was served (%d since the last report)", count, exc_info=error)
-
     def clients(self) -> tuple[ClientStatus, ...]:
-        """The state of every client."""
+        """Return the state of every client."""
         return tuple(self.each_client())
 
     def each_client(self) -> Iterator[ClientStatus]:
-        """The state of every client that is there now, each as it is when its turn comes."""
-        for number, connection in list(self._connections.items()):
-            yield connection.status(self._encoding(number))
+        """Yield the state of every present client, as it is at that moment."""
+        for number, connection in list(self.connections.items()):
+            wanted = self._subscriptions.get(number)
+            yield connection.status(str(wanted.form) if wanted else "")
 
     def status(self, clients: tuple[ClientStatus, ...] | None = None) -> SocketStatus:
-        """The state of the socket; `clients` are those asked for before, None: now."""
+        """Return the state of the socket with `clients`; None for the present clients."""
         if clients is None:
             clients = self.clients()
-        return SocketStatus(self.path, clients, self._accepted, self._refused, self._evicted, self._failed)
+        return SocketStatus(self.path, clients, self.accepted, self.refused, self.evicted, self._failed)
 
-    def tick(self) -> None:
-        """Close clients that lingered long enough."""
-        for connection in list(self._connections.values()):
+    def tick(self, now_ns: int) -> None:
+        """Close clients whose time to read their queue is over, and check the recordings. Called every 100 ms."""
+        for connection in list(self.connections.values()):
             try:
                 connection.tick()
             except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
                 connection.on_failure(error)
+        self.recordings.tick(now_ns)
 
     def close(self) -> None:
-        """Close every client and cancel what is still being carried out; may be called twice."""
+        """Close every client and cancel running requests. A second call does nothing."""
         self.recordings.close()
-        for connection in list(self._connections.values()):
+        for connection in list(self.connections.values()):
             connection.close()
         for task in list(self._work.values()):
             task.cancel()
-
-    def _encoding(self, number: int) -> str:
-        wanted = self._subscriptions.get(number)
-        return str(wanted.form) if wanted else ""
 
 
 def post_all(connections: Iterable[ClientConnection], body: bytes) -> None:
@@ -447,5 +410,5 @@ def post_all(connections: Iterable[ClientConnection], body: bytes) -> None:
 
 
 def _asker(connection: ClientConnection, notified: str = "") -> str:
-    """A client as who asks for a latency: for what it watches, or for being woken by a device."""
+    """Return the name of a client in latency requests: for its subscription, or for its waker of a device."""
     return f"client {connection.number}" + (f", notify {notified}" if notified else "")

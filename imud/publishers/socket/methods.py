@@ -232,7 +232,7 @@ def _send(connection: ClientConnection, request: RpcRequest, answer: Answer) -> 
         texts = connection.text_numbers and answer.big_numbers
         connection.post(encode_result(request.request_id, answer.result, texts=texts), answer.fd)
     if answer.framed_from_here:
-        connection.use_frames()
+        connection.framed = True
 
 
 def _answer_in_pieces(connection: ClientConnection, request: RpcRequest, pieces: Pieces) -> Iterator[int]:

@@ -1,23 +1,22 @@
-"""Sends to one client: straight from `publish` while its socket has room, through a bounded queue while it has not.
+"""Sends to one client: directly from `publish` while its socket has room, otherwise through a bounded queue.
 
-Goal: at 1 kHz one `send` per client and batch is the whole cost. A client with nothing queued gets the bytes that all
-clients share, in one system call; a queue, sent by the scheduler (serving.py), exists only while a socket is full or
-while `publish` has used up its time.
+At 1 kHz one `send` per client and batch is the complete cost: a client without a queue gets the bytes that all clients
+share. A queue exists only while a socket is full, or if `publish` has used up its time. The scheduler sends it.
 
-Order is kept. Two queues hold what waits, joined by an order number, because they are bounded differently: samples go
-oldest first when there are too many, replies never, but a client for which too many gather is disconnected. A message
-that was sent in part is finished before anything else and cannot be dropped. A queue of samples holds references to
-deliveries, which all clients of one form share: messages, or, where `publish` had no time to encode, the batch, which
-is encoded when the first client sends it.
+The order of messages is kept. Samples and replies wait in two queues with common order numbers, because their bounds
+differ. imud drops the oldest samples, but never a reply: it disconnects a client with too many replies. imud finishes a
+partly sent message before all others and never drops it. The queue of samples contains deliveries, which the clients
+of one form share: messages, or a batch that `publish` had no time to encode.
 """
 
 import array
 import socket
+from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Final, Protocol
+from typing import Final
 
 from imud.attitude.conventions import Convention
 from imud.contracts.publisher import Batch
@@ -27,123 +26,101 @@ from imud.model.errors import reason_of
 from imud.model.sample import Sample
 
 ALWAYS_FIELDS: Final = ("device", "seq", "t_ns")
-"""Members of every JSON sample, whatever was selected: without them it cannot be identified."""
+"""Members of every JSON sample, for any selection of fields: they identify the sample."""
 MESSAGE_GUESS_BYTES: Final = 700
-"""What a sample with the values of a whole HI91 message has as JSON."""
+"""Size of a JSON sample with all values of an HI91 frame."""
 _HEAD: Final = b'{"jsonrpc":"2.0","method":"sample","params":'
 _TAIL: Final = b"}"
 _SLOT_HEADER: Final = FRAME_HEADER.pack(SLOT_BYTES)
 
 
-class Encoding(Protocol):
-    """Makes messages of samples. One message is one sample, so that a queue can drop by the sample."""
+class Encoding(ABC):
+    """Base class of the encodings of samples. A message contains one sample, so that a queue can drop one sample."""
 
-    @property
-    def message_bytes(self) -> int:
-        """Size of the message that was encoded last; a guess before the first."""
-        ...
+    message_bytes: int
+    """Size of the last message; an estimate before the first."""
 
+    def __init__(self, convention: Convention | None = None) -> None:
+        """Convert samples to `convention` if it is not None."""
+        self._convention = convention
+
+    @abstractmethod
     def encode(self, batch: Batch) -> list[bytes]:
-        """Every sample of the batch as a message."""
-        ...
+        """Return a message for each sample of the batch."""
 
+    @abstractmethod
     def encode_one(self, batch: Batch, index: int) -> bytes:
-        """One sample of the batch as a message."""
-        ...
+        """Return a message for one sample of the batch."""
 
+    @abstractmethod
     def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
-        """`message`, of `device`, with the number of samples dropped before it, by device."""
-        ...
+        """Add the numbers of samples dropped before `message`, by device. `device` is the device of `message`."""
 
 
-class JsonEncoding:
-    """`sample` notifications, all members or the selected ones, as lines or as frames."""
+class JsonEncoding(Encoding):
+    """`sample` notifications with all members or with selected members, as lines or as frames."""
 
-    def __init__(self, fields: tuple[str, ...] | None, framed: bool, texts: bool = False) -> None:
-        """`texts`: integers that may exceed 2⁵³ are text."""
+    def __init__(
+        self, fields: tuple[str, ...] | None, framed: bool, texts: bool = False, convention: Convention | None = None
+    ) -> None:
+        """Write integers that may exceed 2⁵³ as strings if `texts` is true."""
+        super().__init__(convention)
         self._texts = texts
         self._wrap = frame_of if framed else line_of
         self._select = None if fields is None else selector(fields)
-        self._last: bytes = bytes(MESSAGE_GUESS_BYTES)
-
-    @property
-    def message_bytes(self) -> int:
-        """Size of the notification that was encoded last."""
-        return len(self._last)
+        self.message_bytes = MESSAGE_GUESS_BYTES
 
     def encode(self, batch: Batch) -> list[bytes]:
-        """Every sample of the batch as a notification."""
+        if self._convention is not None:
+            batch = batch.converted(self._convention)
         messages = [self._message(sample) for sample in batch.samples]
-        self._last = messages[-1]
+        self.message_bytes = len(messages[-1])
         return messages
 
     def encode_one(self, batch: Batch, index: int) -> bytes:
-        """One sample of the batch as a notification."""
-        self._last = self._message(batch.samples[index])
-        return self._last
+        if self._convention is not None:
+            batch = batch.converted(self._convention)
+        message = self._message(batch.samples[index])
+        self.message_bytes = len(message)
+        return message
 
     def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
-        """Add the device's own number as a member of the sample, and put notifications of the others before it."""
         notices = [_dropped_notice(name, count, self._wrap) for name, count in dropped.items() if name != device]
         own = dropped.get(device)
-        if own is not None:
+        if own is not None:  # a member of the sample itself
             body = message[message.index(_HEAD) :].rstrip(b"\n")
             message = self._wrap(b'%b,"dropped":%d}}' % (body[:-2], own))
         return b"".join((*notices, message))
 
     def _message(self, sample: Sample) -> bytes:
-        shown: object = self._select(sample) if self._select else sample
-        return self._wrap(_HEAD + encode(with_texts(shown) if self._texts else shown) + _TAIL)
+        selected: object = self._select(sample) if self._select else sample
+        return self._wrap(_HEAD + encode(with_texts(selected) if self._texts else selected) + _TAIL)
 
 
-class BinaryEncoding:
-    """Frames of one slot each."""
+class BinaryEncoding(Encoding):
+    """Frames with one slot each."""
 
     message_bytes = FRAME_HEADER.size + SLOT_BYTES
 
     def encode(self, batch: Batch) -> list[bytes]:
-        """Every sample of the batch as a frame."""
+        if self._convention is not None:
+            batch = batch.converted(self._convention)
         slots = batch.slots()
-        if len(slots) == 1:  # the usual case, without a call for the list
+        if len(slots) == 1:  # the usual case: faster than a list comprehension
             return [_SLOT_HEADER + slots[0]]
         return [_SLOT_HEADER + slot for slot in slots]
 
     def encode_one(self, batch: Batch, index: int) -> bytes:
-        """One sample of the batch as a frame."""
+        if self._convention is not None:
+            batch = batch.converted(self._convention)
         return _SLOT_HEADER + batch.slots()[index]
 
     def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
-        """Put `dropped` notifications before the slot."""
         return b"".join((*(_dropped_notice(name, count, frame_of) for name, count in dropped.items()), message))
 
 
-class ConvertedEncoding:
-    """Another encoding, of samples in a convention that the client asked for."""
-
-    def __init__(self, encoding: Encoding, convention: Convention) -> None:
-        self._encoding = encoding
-        self._convention = convention
-
-    @property
-    def message_bytes(self) -> int:
-        """Size of the message that was encoded last."""
-        return self._encoding.message_bytes
-
-    def encode(self, batch: Batch) -> list[bytes]:
-        """Every sample of the batch as a message."""
-        return self._encoding.encode(batch.converted(self._convention))
-
-    def encode_one(self, batch: Batch, index: int) -> bytes:
-        """One sample of the batch as a message."""
-        return self._encoding.encode_one(batch.converted(self._convention), index)
-
-    def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
-        """Add the number of samples dropped, as the other encoding does."""
-        return self._encoding.with_dropped(message, device, dropped)
-
-
 def selector(fields: tuple[str, ...]) -> Callable[[Sample], dict[str, object]]:
-    """Return a function that gives the selected members of a sample and ALWAYS_FIELDS; absent ones are left out."""
+    """Return a function that returns the selected members and ALWAYS_FIELDS of a sample, without absent members."""
     names = tuple(dict.fromkeys((*ALWAYS_FIELDS, *fields)))
     values = attrgetter(*names)
 
@@ -159,17 +136,17 @@ def _dropped_notice(device: str, count: int, wrap: Callable[[bytes], bytes]) -> 
 
 
 CHUNK_BYTES: Final = 32768
-"""Queued messages are sent together up to this size: what a socket buffer of the usual 208 KiB takes at once."""
+"""Size at which a piece of the queue is complete. A socket buffer of the usual 208 KiB has room for it."""
 SAMPLE_BYTES: Final = 300
-"""What a sample in a queue needs in addition to its message, most of it shared by the clients of a form."""
+"""Memory of a queued sample without its message. Clients of one form share most of it."""
 REPLY_BYTES: Final = 200
-"""What a reply in a queue needs in addition to its text: the objects around it."""
+"""Memory of the objects around a queued reply."""
 NO_FD: Final = -1
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """How much may wait for one client."""
+    """Maximum queue of one client."""
 
     samples: int
     sample_bytes: int
@@ -178,11 +155,11 @@ class Limits:
 
 
 class Delivery:
-    """Samples of one batch in one form, or those of `chosen` indices; encoded on first use, for all clients.
+    """Samples of one batch in one form, all or the `chosen` indices. The first client that sends it encodes it.
 
-    What is encoded does not hold the batch: a sample is some thirty small objects, whose memory the interpreter keeps
-    until its end when thousands have waited (20 clients of 100 devices that do not read for 8 s: 29 MB, as messages
-    11).
+    A delivery with messages does not refer to the batch. A sample consists of about 30 small objects, and the
+    interpreter keeps their memory until it ends. 20 clients of 100 devices that read nothing for 8 s would cost 29 MB
+    as samples, and cost 11 MB as messages.
     """
 
     __slots__ = ("_batch", "_chosen", "_messages", "count", "device", "each_bytes", "encoding", "order")
@@ -203,10 +180,10 @@ class Delivery:
         self.count = len(batch.samples) if chosen is None else len(chosen)
         self._messages = messages
         self.each_bytes = SAMPLE_BYTES + (encoding.message_bytes if messages is None else len(messages[0]))
-        """Memory that a message and its sample need; before it is encoded, by the one encoded last."""
+        """Memory of a sample with its message; with the size of the last message before encoding."""
 
     def messages(self) -> Sequence[bytes]:
-        """The samples as messages."""
+        """Return the samples as messages."""
         if self._messages is None:
             encoding, batch = self.encoding, self._batch
             assert batch is not None
@@ -219,62 +196,64 @@ class Delivery:
 
 
 class Pool:
-    """All memory that clients make the daemon hold: half of `limit_bytes` for samples, half for everything else.
+    """All memory that imud holds for clients: half of `limit_bytes` for samples, half for everything else.
 
-    Samples: each client that waits has an equal share of three eighths of the limit. The share shrinks with each client
-    that begins to wait; when half of the limit is full in between, all are cut to their share at once.
+    Samples: three eighths of the limit, in equal shares for the clients with a queue. The share shrinks with each
+    client that begins to queue. If the queued samples reach half of the limit, all clients lose the samples above their
+    share.
 
-    Everything else (replies, messages that were sent in part, what clients have sent and is not carried out yet,
-    answers in the making): over the limit, clients are disconnected until it is kept. Of the user that makes the daemon
-    hold most, it is the client with most, times how long none of it has moved: one that reads its reply, however
-    large, stays before one that does not. Time is counted in moves of all clients, so that no clock is needed.
+    Everything else: replies, partly sent messages, requests that are not carried out yet, unfinished answers. Above
+    half of the limit, imud evicts clients: of the user with the most memory, the client with the highest product of
+    memory and time without progress. Thus a client that reads a large reply stays, and a client that does not read is
+    evicted. The time is the number of progress events of all clients, so that no clock is necessary.
     """
 
-    def __init__(self, limit_bytes: int) -> None:
+    def __init__(self, limit_bytes: int, limits: Limits) -> None:
+        self.limits = limits
         self._share_bytes = limit_bytes * 3 // 8
         self._half_bytes = limit_bytes // 2
         self._waiting: dict[Outbox, None] = {}
         self._holding: dict[Outbox, None] = {}
-        """Clients for which anything but samples is held."""
+        """Clients with memory other than samples."""
         self._sample_bytes = 0
         self._other_bytes = 0
         self._order = 0
         self._moves = 0
 
     def next_order(self) -> int:
-        """The number of the next message that is queued, for all clients: within each they ascend."""
+        """Return the order number of the next queued message. The numbers of all clients ascend."""
         self._order += 1
         return self._order
 
     def next_move(self) -> int:
-        """Count that something moved that is held for a client."""
+        """Count a progress event of a client."""
         self._moves += 1
         return self._moves
 
     @property
     def held_bytes(self) -> int:
-        """All that is held for all clients."""
+        """Memory held for all clients."""
         return self._sample_bytes + self._other_bytes
 
     @property
     def share_bytes(self) -> int:
-        """The samples that may wait for one client: an equal share for each that waits."""
+        """Maximum memory of the queued samples of one client."""
         return self._share_bytes // (len(self._waiting) or 1)
 
     def add(self, outbox: "Outbox") -> None:
-        """Count a client for which something waits from now on."""
+        """Add a client with a queue."""
         self._waiting[outbox] = None
 
     def remove(self, outbox: "Outbox") -> None:
-        """Count a client no longer."""
+        """Remove a client whose queue is empty."""
         self._waiting.pop(outbox, None)
 
     def count_samples(self, size_bytes: int) -> None:
-        """Add to the bytes of samples that wait; negative to subtract."""
+        """Add to the memory of queued samples; subtract if negative."""
         self._sample_bytes += size_bytes
 
     def count_others(self, outbox: "Outbox", size_bytes: int) -> None:
-        """Add to the bytes of everything else that is held for a client; negative to subtract."""
+        """Add to the other memory of a client; subtract if negative."""
         self._other_bytes += size_bytes
         if outbox.held_bytes:
             self._holding[outbox] = None
@@ -282,22 +261,23 @@ class Pool:
             self._holding.pop(outbox, None)
 
     def evict(self) -> None:
-        """Report clients to their owners until what is held in addition to samples is within the limit.
+        """Evict clients until the memory other than samples is within its half.
 
-        Not to be called while samples are sent to a list of clients: one of them could be closed in between.
+        Do not call this method while `put_samples` sends to a list of clients: it could close one of them.
         """
         while self._other_bytes > self._half_bytes and self._holding:
             worst = self._worst()
             del self._holding[worst]
-            worst.flood()
+            worst.evict(HOLDS_TOO_MUCH)
 
     def trim(self) -> None:
-        """Drop samples of clients that have more than the share, which shrinks with each client that waits."""
+        """Drop the samples of clients above their share."""
         for outbox in self._waiting:
             outbox.trim()
 
     def trim_if_full(self) -> None:
-        """The same when too many wait for all; it frees an eighth of the limit, so it is seldom."""
+        """Call `trim` if the queued samples exceed half of the limit."""
+        # rare: it frees an eighth of the limit
         if self._sample_bytes > self._half_bytes:
             self.trim()
 
@@ -313,88 +293,80 @@ class Pool:
         )
 
 
-class Owner(Protocol):
-    """Whose outbox it is."""
-
-    @property
-    def uid(self) -> int:
-        """The user that it serves."""
-        ...
-
-    def on_broken(self, reason: str) -> None:
-        """The socket failed."""
-        ...
-
-    def on_flooded(self) -> None:
-        """More is held for the client than may be."""
-        ...
-
-    def on_full(self) -> None:
-        """The socket is full: call `flush` when it is writable."""
-        ...
-
-    def on_deferred(self) -> None:
-        """Samples wait although the socket may have room: call `flush` when there is time."""
-        ...
-
-    def on_emptied(self) -> None:
-        """All that waited is sent."""
-        ...
+HOLDS_TOO_MUCH: Final = "its unread replies and unfinished requests occupy too much memory"
 
 
-class Outbox:
-    """The sending side of one non-blocking socket. Synchronization: the event loop's thread."""
+class Outbox(ABC):
+    """Base class of a client: the sending side of its non-blocking socket.
+
+    Synchronization: the event loop's thread.
+    """
 
     __slots__ = (
-        "_limits", "_owned_bytes", "_owner", "_partial", "_partial_fd", "_pool", "_replies", "_sample_bytes",
-        "_sample_count", "_samples", "_send", "_skip", "_sock", "_unreported", "dropped", "held_bytes", "moved",
-        "reply_bytes", "sent", "uid", "waiting",
+        "_limits", "_owned_bytes", "_partial", "_partial_fd", "_pool", "_replies", "_sample_bytes", "_sample_count",
+        "_samples", "_send", "_skip", "_sock", "_unreported", "dropped", "held_bytes", "moved", "reply_bytes", "sent",
+        "uid", "waiting",
     )  # fmt: skip
 
-    def __init__(self, sock: socket.socket, limits: Limits, pool: Pool, owner: Owner) -> None:
+    def __init__(self, sock: socket.socket, pool: Pool, uid: int) -> None:
+        self.uid = uid
         self.sent = 0
-        """Samples given to the socket."""
+        """Number of samples passed to the socket."""
         self.dropped = 0
-        """Samples dropped."""
+        """Number of dropped samples."""
         self.waiting = False
-        """Whether anything waits; then everything new has to wait behind it."""
+        """Whether anything is queued; then imud appends new messages to the queue."""
         self.reply_bytes = 0
-        """Bytes of replies that wait."""
+        """Size of the queued replies."""
         self.held_bytes = 0
-        """All but samples that the daemon holds for the client, as the pool has it."""
+        """Memory held for the client without samples, as counted in the pool."""
         self.moved = 0
-        """The pool's count of moves when something of it was sent or carried out last."""
-        self.uid = owner.uid
+        """Count of the pool at the last progress of this client."""
         self._owned_bytes = 0
         self._sock = sock
         self._send = sock.send
-        self._limits = limits
+        self._limits = pool.limits
         self._pool = pool
-        self._owner = owner
         self._samples: deque[Delivery] = deque()
         self._skip = 0
-        """Samples of the first delivery that were sent or dropped already."""
+        """Number of samples of the first delivery that are already sent or dropped."""
         self._sample_count = 0
         self._sample_bytes = 0
         self._replies: deque[tuple[int, bytes, int]] = deque()
         self._partial = b""
+        """Unsent rest of a message, or messages taken from the queues."""
         self._partial_fd = NO_FD
         self._unreported: dict[str, int] = {}
-        """Samples dropped per device that no message has reported to the client yet."""
+        """Number of dropped samples per device that no message has reported to the client yet."""
+
+    @abstractmethod
+    def on_broken(self, reason: str) -> None:
+        """End the connection because the socket failed. `put_samples` calls this method while it sends to others."""
+
+    @abstractmethod
+    def evict(self, reason: str) -> None:
+        """End the connection because the client exceeded a limit."""
+
+    @abstractmethod
+    def on_full(self) -> None:
+        """Call `flush` when the socket is writable."""
+
+    @abstractmethod
+    def on_deferred(self) -> None:
+        """Call `flush` when there is time. The socket may have room."""
+
+    @abstractmethod
+    def on_emptied(self) -> None:
+        """Note that the queue is sent completely."""
 
     @property
     def queue_samples(self) -> int:
-        """Whole samples that wait."""
+        """Number of completely queued samples."""
         return self._sample_count
 
     @property
-    def queue_replies(self) -> int:
-        """Whole messages other than samples that wait."""
-        return len(self._replies)
-
-    @property
     def queue_bytes(self) -> int:
-        """Bytes that wait."""
+        """Size of the queue."""
         return self._sample_bytes + self.reply_bytes + len(self._partial)
 
     @staticmethod
@@ -402,10 +374,8 @@ class Outbox:
         outboxes: Iterable["Outbox"], messages: Sequence[bytes], batch: Batch, encoding: Encoding,
         chosen: Sequence[int] | None = None,
     ) -> None:  # fmt: skip
-        """Send samples of one device to several clients: the same bytes, one `send` each.
-
-        The loop is in here because a call per client would cost as much as all the rest around `send`.
-        """
+        """Send samples of one device to several clients: the same bytes, one `send` each."""
+        # one loop here: a method call per client would cost as much as all other code around `send`
         whole = messages[0] if len(messages) == 1 else b"".join(messages)
         size, samples = len(whole), len(messages)
         delivery: Delivery | None = None
@@ -419,7 +389,7 @@ class Outbox:
             except BlockingIOError:
                 count = 0
             except OSError as error:
-                outbox._owner.on_broken(reason_of(error))
+                outbox.on_broken(reason_of(error))
                 continue
             if count == size:
                 outbox.sent += samples
@@ -428,14 +398,14 @@ class Outbox:
                 outbox._keep_rest(count, delivery)
 
     def defer(self, delivery: Delivery) -> None:
-        """Queue samples for the scheduler to send, because `publish` has no more time."""
+        """Queue samples because `publish` has no more time. The scheduler sends them."""
         self._queue_samples(delivery)
         if not self.waiting:
             self._wait()
-            self._owner.on_deferred()
+            self.on_deferred()
 
     def put_reply(self, message: bytes, fd: int = NO_FD) -> None:
-        """Send anything that is not a sample; with `fd`, a copy of that descriptor goes with its first byte."""
+        """Send a message other than a sample, and a copy of the descriptor `fd` with its first byte if given."""
         if not self.waiting:
             self._partial, self._partial_fd = message, fd
             self.flush()
@@ -444,24 +414,20 @@ class Outbox:
         self.reply_bytes += len(message)
         self._count_held()
         if len(self._replies) > self._limits.replies or self.reply_bytes > self._limits.reply_bytes:
-            self.flood()
+            self.evict(HOLDS_TOO_MUCH)
         else:
             self._pool.evict()
 
     def count_owned(self, size_bytes: int) -> None:
-        """Set what the owner itself holds for the client: its input, and an answer in the making."""
+        """Set the memory of the client's input and of its unfinished answer."""
         if size_bytes != self._owned_bytes:
             self._owned_bytes = size_bytes
             self.moved = self._pool.next_move()
             self._count_held()
             self._pool.evict()
 
-    def flood(self) -> None:
-        """Report to the owner that more is held for the client than may be."""
-        self._owner.on_flooded()
-
     def trim(self) -> None:
-        """Drop the oldest samples that are more than may wait: whole deliveries, while a later one is there."""
+        """Drop the oldest samples above the limit: complete deliveries, but single samples of the last delivery."""
         limits, samples = self._limits, self._samples
         most_bytes = min(limits.sample_bytes, self._pool.share_bytes)
         while self._sample_count > limits.samples or self._sample_bytes > most_bytes:
@@ -478,8 +444,8 @@ class Outbox:
             self._unreported[device] = self._unreported.get(device, 0) + count
             self.dropped += count
 
-    def close(self) -> None:
-        """Drop everything that waits; the owner closes the socket."""
+    def discard(self) -> None:
+        """Discard the queue, because the connection ends."""
         self.waiting = False
         self._samples.clear()
         self._replies.clear()
@@ -493,7 +459,7 @@ class Outbox:
     # --- queueing ---------------------------------------------------------------------------------------------------
 
     def _keep_rest(self, count: int, delivery: Delivery) -> None:
-        """The socket took `count` bytes of a delivery: keep the rest, the cut message apart."""
+        """Queue the rest of a delivery, of which the socket took `count` bytes."""
         messages = delivery.messages()
         whole = 0
         while count >= len(messages[whole]):
@@ -509,7 +475,7 @@ class Outbox:
             self._queue_samples(delivery)
         self._wait()
         self._count_held()
-        self._owner.on_full()
+        self.on_full()
 
     def _queue_samples(self, delivery: Delivery) -> None:
         self._samples.append(delivery)
@@ -520,14 +486,14 @@ class Outbox:
         self._pool.trim_if_full()
 
     def _count_samples(self, count: int, delivery: Delivery) -> None:
-        """Add samples of a delivery to those that wait; negative to subtract."""
+        """Add samples of a delivery to the queue; subtract if negative."""
         size_bytes = count * delivery.each_bytes
         self._sample_count += count
         self._sample_bytes += size_bytes
         self._pool.count_samples(size_bytes)
 
     def _count_held(self) -> None:
-        """Have the pool count what is held besides samples as it is now."""
+        """Update the memory without samples in the pool."""
         held = self.reply_bytes + REPLY_BYTES * len(self._replies) + len(self._partial) + self._owned_bytes
         change = held - self.held_bytes
         if change:
@@ -537,7 +503,7 @@ class Outbox:
             self._pool.count_others(self, change)
 
     def _take_sample(self) -> tuple[Delivery, int]:
-        """Remove the oldest sample from the queue: its delivery and its place in it."""
+        """Remove the oldest sample from the queue. Return its delivery and its index."""
         delivery, place = self._samples[0], self._skip
         self._count_samples(-1, delivery)
         self._skip += 1
@@ -551,29 +517,29 @@ class Outbox:
             self.waiting = True
             self._pool.add(self)
 
-    # --- sending what waited ----------------------------------------------------------------------------------------
+    # --- sending the queue ------------------------------------------------------------------------------------------
 
     def flush(self) -> bool:
-        """Send one piece of what waits. Returns whether there is more and the socket may have room."""
+        """Send one piece of the queue. Return whether the queue contains more and the socket may have room."""
         try:
             if not self._partial and not self._next():
                 return self._emptied()
             count = self._send_partial()
         except BlockingIOError:
-            self._keep(self._owner.on_full)
+            self._keep(self.on_full)
             return False
         except OSError as error:
-            self._owner.on_broken(reason_of(error))
+            self.on_broken(reason_of(error))
             return False
         self._partial = self._partial[count:]
         if self._partial or self._samples or self._replies:
             self.moved = self._pool.next_move()
-            self._keep(self._owner.on_deferred)
+            self._keep(self.on_deferred)
             return self.waiting
         return self._emptied()
 
     def _keep(self, report: Callable[[], None]) -> None:
-        """Keep what is not sent yet, and report that; all that is held may be too much then."""
+        """Keep the unsent rest, call `report`, and evict clients if their memory exceeds the limit."""
         self._wait()
         self._count_held()
         report()
@@ -584,7 +550,7 @@ class Outbox:
             self.waiting = False
             self._pool.remove(self)
             self._count_held()
-            self._owner.on_emptied()
+            self.on_emptied()
         return False
 
     def _send_partial(self) -> int:
@@ -592,11 +558,11 @@ class Outbox:
             return self._send(self._partial)
         rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [self._partial_fd]))
         count = self._sock.sendmsg([self._partial], [rights])
-        self._partial_fd = NO_FD  # it went with the first byte
+        self._partial_fd = NO_FD  # sent with the first byte
         return count
 
     def _next(self) -> bool:
-        """Move what is sent next into `_partial`: some messages, or one reply with its descriptor. False if none is."""
+        """Move the next messages to `_partial`, or one reply with its descriptor. Return False if there is none."""
         chunk: list[bytes] = []
         size = 0
         samples, replies = self._samples, self._replies

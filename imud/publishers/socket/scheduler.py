@@ -1,87 +1,64 @@
-"""The scheduler of serving: clients that can be served stand in line, and each turn of the event loop has a time limit.
+"""Scheduler of the clients: serves them in each turn of the event loop, for a limited time.
 
-    client's socket ──▶ epoll ──▶ line ──least CPU time first──▶ serve(), one piece ──▶ epoll, or the line
+    socket of a client ──▶ epoll ──▶ queue, least CPU time first ──▶ serve(), one piece ──▶ epoll, or the queue
 
-All clients' sockets are in one epoll object, which is one descriptor of the event loop: however many clients have
-something to say, the loop sees one event, and between two turns of at most TURN_NS it reads samples.
-An armed socket reports once (EPOLLONESHOT) and is armed again when its client has nothing more to do, so a client that
-is out of its allowance costs nothing until `tick` puts it in line again.
+One epoll object contains the sockets of all clients. The event loop sees one descriptor, and reads samples between two
+turns of at most TURN_NS. A socket reports one event (EPOLLONESHOT). The scheduler arms the socket again when its client
+has no more work. Thus a client without allowance costs nothing until `tick` puts it in the queue again.
 
-The order is that of a fair queue: each user has a run time, the CPU time that serving took, and each client has its own
-within its user. The user with the least is next, and of that user's clients the one with the least; clients that have
-used little of their allowance go before all others. One that comes back from waiting starts at most CREDIT_NS behind
-the one served last, so what was consumed long ago does not count.
+The queue is fair between users and between the clients of a user. A *run time* is the CPU time that serving took. The
+user with the least run time is next, and of this user the client with the least run time. Clients that used little of
+their allowance go before all others. A user or a client that had no work gets a run time at most CREDIT_NS below the
+run time of the one served last, so unused time of the past gives no advantage.
 """
 
 import asyncio
 import logging
 import select
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from enum import Enum, auto
 from heapq import heappop, heappush
-from typing import Final, Protocol
+from typing import Final
 
 from imud.model.units import NS_PER_S
 
 log = logging.getLogger(__name__)
 
 TURN_NS: Final = 1_000_000
-"""Serving in one turn of the event loop: a period of a 1 kHz device, whose samples are read between two turns."""
+"""Maximum time of serving in one turn of the event loop, ns: the sample period of a 1 kHz device."""
 PIECES_MAX: Final = 64
-"""A turn has so many pieces at most, whatever the clock says."""
+"""Maximum number of pieces in one turn."""
 COLLECT_NS: Final = 200_000
-"""Within a turn, sockets are looked at again after so long, so that a client that asks little is next at once."""
+"""Interval between two polls of the sockets within a turn, ns. imud then serves clients with few requests first."""
 EVENTS_MAX: Final = 512
 SERVING_PER_S_NS: Final = 600_000_000
-"""Time per second for serving, large sends to watchers included; the rest is the devices' and other programs'."""
+"""Time for serving per second, ns, with batches to many clients. The rest is for devices and other programs."""
 SERVING_BURST_NS: Final = 20_000_000
 PAUSE_S: Final = 0.002
-"""When that is used up, only clients with most of their own allowance are served for so long, …"""
+"""Time between two turns while the time for serving is used up. These turns serve only light clients."""
 PAUSE_MAX_NS: Final = 10_000_000
-"""… but one turn in so long is everybody's."""
+"""Interval of the turns that serve every client, ns."""
 PIECE_NS: Final = 2_000
-"""What a piece costs in addition to the CPU time measured: the scheduler itself."""
+"""CPU time of the scheduler for one piece, ns."""
 CREDIT_NS: Final = 1_000_000
+"""Maximum lead of a client or user that had no work, ns of run time."""
 CPU_PER_S_NS: Final = 100_000_000
-"""CPU time that one client may use of each second: 1,500 `poll` requests."""
+"""CPU time of a client per second, ns: 1,500 `poll` requests."""
 CPU_BURST_NS: Final = 200_000_000
 CPU_LIGHT_NS: Final = 150_000_000
-"""A client with so much of it left is light: it is served even when the time for serving is used up."""
+"""Minimum unused CPU time of a light client, ns. imud serves light clients also if the time for serving is used up."""
 CPU_NEW_NS: Final = 100_000_000
-"""What a new client has, so that connecting again does not make it a light one."""
+"""CPU time of a new client, ns: less than CPU_LIGHT_NS, because a new connection must not make a light client."""
 BYTES_PER_S: Final = 262_144
-"""Bytes that one client may send each second: 4,000 requests of usual length."""
+"""Maximum number of bytes per second from a client: 4,000 requests of usual length."""
 BYTES_BURST: Final = 1 << 20
 OVER_TICKS_MAX: Final = 100
-"""A client that asks for more than its allowance for so many ticks (100 ms each) is evicted."""
-
-
-class ServedClient(Protocol):
-    """Who is served."""
-
-    def on_ready(self, events: int) -> None:
-        """The socket reported these events (EPOLLIN …)."""
-        ...
-
-    def serve(self) -> bool:
-        """Do one bounded piece of work. Returns whether there is more to do without waiting for the socket."""
-        ...
-
-    def wanted_events(self) -> int:
-        """The events of the socket to wait for; 0 for none."""
-        ...
-
-    def on_failure(self, error: Exception) -> None:
-        """`serve` raised, which is an internal error: end the connection."""
-        ...
-
-    def on_overload(self) -> None:
-        """It asked for more than its allowance for too long: end the connection."""
-        ...
+"""Number of ticks (100 ms each) without allowance after which imud evicts a client."""
 
 
 class TokenBucket:
-    """An allowance: `rate` per second, of which `burst` may gather."""
+    """An allowance: `rate` per second, at most `burst`."""
 
     __slots__ = ("_at_ns", "_burst", "_rate", "level")
 
@@ -90,33 +67,33 @@ class TokenBucket:
         self._burst = burst
         self._at_ns = now_ns
         self.level: float = burst if level is None else level
-        """What may be used now; negative after a piece that used more than there was."""
+        """Unused allowance; negative after a piece that used more."""
 
     def use(self, amount: int) -> None:
-        """Subtract what was used; the debt is at most `burst`."""
+        """Subtract the used amount; the debt is at most `burst`."""
         self.level = max(-self._burst, self.level - amount)
 
     def fill(self, now_ns: int) -> None:
-        """Add what has gathered since the last call."""
+        """Add the allowance of the time since the last call."""
         self.level = min(self._burst, self.level + self._rate * (now_ns - self._at_ns) / NS_PER_S)
         self._at_ns = now_ns
 
 
 class _State(Enum):
     IDLE = auto()
-    """Armed, or waiting for nothing."""
-    IN_LINE = auto()
+    """The client has no work, or its socket is armed."""
+    QUEUED = auto()
     SERVED = auto()
     """`serve` runs."""
     PARKED = auto()
-    """Out of its allowance."""
+    """The client has work and no allowance."""
     GONE = auto()
 
 
 class _User:
-    """The clients of one user that stand in line."""
+    """The clients of one user."""
 
-    __slots__ = ("clients", "line", "run_ns", "served_ns", "uid")
+    __slots__ = ("clients", "queue", "run_ns", "served_ns", "uid")
 
     def __init__(self, uid: int, run_ns: int) -> None:
         self.uid = uid
@@ -124,42 +101,27 @@ class _User:
         self.run_ns = run_ns
         self.served_ns = 0
         """Run time of the client that was served last."""
-        self.line: list[tuple[bool, int, int, Turn]] = []
-        """A heap: whether the client is not a light one, its run time, its number."""
+        self.queue: list[tuple[bool, int, int, ScheduledClient]] = []
+        """Heap of the queued clients: False for a light client, run time, number."""
 
     def urgency(self) -> tuple[bool, int]:
-        """The less, the sooner it is served."""
-        return self.line[0][0], self.run_ns
+        """Return the key of the queue: the user with the smallest key is next."""
+        return self.queue[0][0], self.run_ns
 
 
-class Turn:
-    """A client's place in the schedule, for that client's own use."""
+class ScheduledClient(ABC):
+    """Base class of a client: its allowance, and its state in the scheduler."""
 
-    __slots__ = ("_cpu", "_data", "_scheduler", "client", "fd", "number", "over_ticks", "run_ns", "state", "user")
-
-    def __init__(
-        self, scheduler: "Scheduler", client: ServedClient, fd: int, number: int, user: _User, now_ns: int
-    ) -> None:
-        self.client = client
+    def __init__(self, scheduler: "Scheduler", fd: int, number: int, uid: int) -> None:
+        now_ns = scheduler.now_ns()
         self.fd = fd
         self.number = number
-        self.user = user
-        self.run_ns = user.served_ns
         self.state = _State.IDLE
         self.over_ticks = 0
         self._cpu = TokenBucket(CPU_PER_S_NS, CPU_BURST_NS, now_ns, CPU_NEW_NS)
         self._data = TokenBucket(BYTES_PER_S, BYTES_BURST, now_ns)
-        self._scheduler = scheduler
-
-    def line_up(self) -> None:
-        """Have the client served when its turn comes; no-op if it is in line."""
-        if self.state is _State.IDLE:
-            self._scheduler.line_up(self)
-
-    def arm(self) -> None:
-        """Wait for the events that the client wants; no-op while it is in line, after which that is done anyhow."""
-        if self.state is _State.IDLE:
-            self._scheduler.arm(self)
+        self.user = scheduler.add(self, uid)
+        self.run_ns = self.user.served_ns
 
     def count_bytes(self, count: int) -> None:
         """Count bytes that the client sent."""
@@ -178,109 +140,128 @@ class Turn:
 
     @property
     def is_light(self) -> bool:
-        """Whether the client has used little of its allowance of late."""
+        """Whether the client has recently used little of its allowance."""
         return self._cpu.level >= CPU_LIGHT_NS and self._data.level >= 0
 
     def fill(self, now_ns: int) -> None:
-        """Add what the client may use by now."""
+        """Add the allowance of the time since the last call."""
         self._cpu.fill(now_ns)
         self._data.fill(now_ns)
 
-    def leave(self) -> None:
-        """Be served no more; may be called twice."""
-        if self.state is not _State.GONE:
-            self._scheduler.remove(self)
+    @abstractmethod
+    def on_ready(self, events: int) -> None:
+        """Note the events that the socket reported (EPOLLIN …)."""
+
+    @abstractmethod
+    def serve(self) -> bool:
+        """Do one piece of work. Return whether the client has more work without an event of its socket."""
+
+    @abstractmethod
+    def wanted_events(self) -> int:
+        """Return the events of the socket to wait for; 0 for no events."""
+
+    @abstractmethod
+    def on_failure(self, error: Exception) -> None:
+        """End the connection because another method raised an exception, which is an internal error."""
+
+    @abstractmethod
+    def evict(self, reason: str) -> None:
+        """End the connection because the client exceeded a limit."""
 
 
 class Scheduler:
     """Serves clients in turns. Synchronization: the event loop's thread.
 
-    `now_ns` is the clock that limits a turn, `cpu_ns` that of the CPU time of this thread, `time` what is left of the
-    time for serving, in ns.
+    `now_ns` is the clock that limits a turn, `cpu_ns` the CPU time of this thread, `time` the allowance for serving.
     """
 
     def __init__(self, now_ns: Callable[[], int], cpu_ns: Callable[[], int], time: TokenBucket) -> None:
-        self._now_ns = now_ns
+        self.now_ns = now_ns
         self._cpu_ns = cpu_ns
         self.serving_time = time
-        """What is left of the time for serving."""
         self._served_all_ns = 0
+        """Time of the last turn that served every client."""
         self._loop = asyncio.get_running_loop()
         self._epoll = select.epoll()
         self._loop.add_reader(self._epoll.fileno(), self._on_events)
         self._next_turn: asyncio.Handle | None = None
         self._pausing = False
-        """Whether the next turn comes after a pause."""
-        self._places: dict[int, Turn] = {}
+        """Whether the next turn begins after a pause."""
+        self._clients: dict[int, ScheduledClient] = {}
+        """All clients by descriptor."""
         self._users: dict[int, _User] = {}
-        self._in_line: dict[_User, None] = {}
-        """Users with clients in line."""
+        self._queued: dict[_User, None] = {}
+        """Users with queued clients."""
         self._served_ns = 0
         """Run time of the user that was served last."""
-        self._parked: dict[Turn, None] = {}
+        self._parked: dict[ScheduledClient, None] = {}
 
-    def add(self, client: ServedClient, fd: int, number: int, uid: int) -> Turn:
-        """Wait for requests of a client from now on; clients of one user have the same `uid`."""
-        self._epoll.register(fd, select.EPOLLIN | select.EPOLLONESHOT)
+    def add(self, client: ScheduledClient, uid: int) -> _User:
+        """Wait for input of a new client. Return the user `uid`, who may have other clients."""
+        self._epoll.register(client.fd, select.EPOLLIN | select.EPOLLONESHOT)
         user = self._users.get(uid)
         if user is None:
             user = self._users[uid] = _User(uid, self._served_ns)
         user.clients += 1
-        place = self._places[fd] = Turn(self, client, fd, number, user, self._now_ns())
-        return place
+        self._clients[client.fd] = client
+        return user
 
-    def remove(self, place: Turn) -> None:
-        """Serve a client no more."""
-        place.state = _State.GONE
-        self._places.pop(place.fd, None)
-        self._parked.pop(place, None)
+    def remove(self, client: ScheduledClient) -> None:
+        """Do not serve a client any longer. A second call does nothing."""
+        if client.state is _State.GONE:
+            return
+        client.state = _State.GONE
+        self._clients.pop(client.fd, None)
+        self._parked.pop(client, None)
         if not self._epoll.closed:
-            self._epoll.unregister(place.fd)
-        place.user.clients -= 1
-        if not place.user.clients:
-            del self._users[place.user.uid]
-            self._in_line.pop(place.user, None)
+            self._epoll.unregister(client.fd)
+        user = client.user
+        user.clients -= 1
+        if not user.clients:
+            del self._users[user.uid]
+            self._queued.pop(user, None)
 
-    def line_up(self, place: Turn) -> None:
-        """Put a client that waits for nothing in line."""
-        user = place.user
-        place.state = _State.IN_LINE
-        place.run_ns = max(place.run_ns, user.served_ns - CREDIT_NS)
-        if not user.line:
+    def enqueue(self, client: ScheduledClient) -> None:
+        """Put a client in the queue. Do nothing unless the client is idle."""
+        if client.state is not _State.IDLE:
+            return
+        user = client.user
+        client.state = _State.QUEUED
+        client.run_ns = max(client.run_ns, user.served_ns - CREDIT_NS)
+        if not user.queue:
             user.run_ns = max(user.run_ns, self._served_ns - CREDIT_NS)
-            self._in_line[user] = None
-        heappush(user.line, (not place.is_light, place.run_ns, place.number, place))
+            self._queued[user] = None
+        heappush(user.queue, (not client.is_light, client.run_ns, client.number, client))
         if self._next_turn is None:
-            self._schedule(True)
+            self._schedule(pause=False)
 
-    def arm(self, place: Turn) -> None:
-        """Wait for the events that a client wants."""
-        events = place.client.wanted_events()
-        if events:
-            self._epoll.modify(place.fd, events | select.EPOLLONESHOT)
+    def arm(self, client: ScheduledClient) -> None:
+        """Wait for the events that a client wants. Do nothing unless the client is idle: `_serve` arms it later."""
+        if client.state is _State.IDLE:
+            events = client.wanted_events()
+            if events:
+                self._epoll.modify(client.fd, events | select.EPOLLONESHOT)
 
     def tick(self) -> None:
-        """Put clients in line again that may use some time now, and evict those that never get along with theirs."""
-        now_ns = self._now_ns()
-        for place in list(self._places.values()):
-            place.fill(now_ns)
-            place.over_ticks = place.over_ticks + 1 if place.state is _State.PARKED else max(0, place.over_ticks - 1)
-        for place in list(self._parked):
-            if place.over_ticks > OVER_TICKS_MAX:
-                self._overload(place)
-            elif not place.is_over:
-                del self._parked[place]
-                place.state = _State.IDLE
-                self.line_up(place)
-
-    def _overload(self, place: Turn) -> None:
-        try:
-            place.client.on_overload()
-        except Exception as error:  # noqa: BLE001 - whatever one client meets ends that client, not the daemon
-            self._fail(place, error)
+        """Fill the allowances. Queue parked clients with a new allowance. Evict clients that exceed theirs for 10 s."""
+        now_ns = self.now_ns()
+        for client in list(self._clients.values()):
+            client.fill(now_ns)
+            is_parked = client.state is _State.PARKED
+            client.over_ticks = client.over_ticks + 1 if is_parked else max(0, client.over_ticks - 1)
+        for client in list(self._parked):
+            if client.over_ticks > OVER_TICKS_MAX:
+                try:
+                    client.evict("it keeps asking for more than the allowance of a client")
+                except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
+                    self._fail(client, error)
+            elif not client.is_over:
+                del self._parked[client]
+                client.state = _State.IDLE
+                self.enqueue(client)
 
     def close(self) -> None:
-        """Serve nobody any more; may be called twice."""
+        """Stop serving. A second call does nothing."""
         if self._epoll.closed:
             return
         if self._next_turn is not None:
@@ -291,105 +272,104 @@ class Scheduler:
     # --- a turn -----------------------------------------------------------------------------------------------------
 
     def _on_events(self) -> None:
-        """Sockets have events: serve once in this turn of the event loop, so that samples are read before and after."""
+        # serve in the next turn of the event loop, so that the loop reads samples before and after
         if self._next_turn is None or self._pausing:
-            self._schedule(True)
+            self._schedule(pause=False)
+
+    def _schedule(self, *, pause: bool) -> None:
+        """Run `_turn` in the next turn of the event loop, or after a pause."""
+        if self._next_turn is not None:
+            self._next_turn.cancel()
+        self._next_turn = self._loop.call_later(PAUSE_S, self._turn) if pause else self._loop.call_soon(self._turn)
+        self._pausing = pause
 
     def _turn(self) -> None:
-        """Serve pieces until the time is used up or nobody is in line."""
+        """Serve pieces until TURN_NS is over, or the queue contains no client that may be served."""
         if self._next_turn is not None:
             self._next_turn.cancel()
             self._next_turn = None
-        begun_ns = now_ns = self._now_ns()
+        begun_ns = now_ns = self.now_ns()
         self.serving_time.fill(begun_ns)
-        all_of_them = self.serving_time.level > 0 or begun_ns - self._served_all_ns >= PAUSE_MAX_NS
-        if all_of_them:
+        serves_all = self.serving_time.level > 0 or begun_ns - self._served_all_ns >= PAUSE_MAX_NS
+        if serves_all:
             self._served_all_ns = begun_ns
         end_ns, collect_ns = begun_ns + TURN_NS, begun_ns + COLLECT_NS
         self._collect()
         for _ in range(PIECES_MAX):
-            place = self._next(all_of_them)
-            if place is None:
+            client = self._next(serves_all)
+            if client is None:
                 break
-            self._serve(place)
-            now_ns = self._now_ns()
+            self._serve(client)
+            now_ns = self.now_ns()
             if now_ns >= end_ns:
                 break
             if now_ns >= collect_ns:
                 collect_ns = now_ns + COLLECT_NS
                 self._collect()
         self.serving_time.use(now_ns - begun_ns)
-        if self._in_line and not self._epoll.closed:
-            self._schedule(all_of_them)
-
-    def _schedule(self, at_once: bool) -> None:
-        """Have the next turn in the next turn of the event loop, or after a pause."""
-        if self._next_turn is not None:
-            self._next_turn.cancel()
-        self._next_turn = self._loop.call_soon(self._turn) if at_once else self._loop.call_later(PAUSE_S, self._turn)
-        self._pausing = not at_once
+        if self._queued and not self._epoll.closed:
+            self._schedule(pause=not serves_all)
 
     def _collect(self) -> None:
-        """Put those in line whose sockets have events."""
+        """Queue the clients with events on their sockets."""
         if self._epoll.closed:
             return
         for fd, events in self._epoll.poll(0, EVENTS_MAX):
-            place = self._places.get(fd)
-            if place is not None:
-                self._on_ready(place, events)
+            client = self._clients.get(fd)
+            if client is not None:
+                try:
+                    client.on_ready(events)
+                    self.enqueue(client)
+                except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
+                    self._fail(client, error)
 
-    def _on_ready(self, place: Turn, events: int) -> None:
-        try:
-            place.client.on_ready(events)
-            place.line_up()
-        except Exception as error:  # noqa: BLE001 - as above
-            self._fail(place, error)
-
-    def _next(self, all_of_them: bool) -> Turn | None:
-        """Take the next client out of the line; None if there is none, or none of those that may be served now."""
-        while self._in_line:
-            user = min(self._in_line, key=_User.urgency) if len(self._in_line) > 1 else next(iter(self._in_line))
-            heavy, _, _, place = user.line[0]
-            here = place.state is _State.IN_LINE
-            if here and heavy and not all_of_them:
+    def _next(self, serves_all: bool) -> ScheduledClient | None:
+        """Take the next client from the queue; None if the queue is empty, or if only light clients are served."""
+        while self._queued:
+            user = min(self._queued, key=_User.urgency) if len(self._queued) > 1 else next(iter(self._queued))
+            is_heavy, _, _, client = user.queue[0]
+            is_queued = client.state is _State.QUEUED  # a client that left stays in the heap until now
+            if is_queued and is_heavy and not serves_all:
                 return None
-            heappop(user.line)
-            if not user.line:
-                del self._in_line[user]
-            if here:
+            heappop(user.queue)
+            if not user.queue:
+                del self._queued[user]
+            if is_queued:
                 user.run_ns = max(user.run_ns, self._served_ns - CREDIT_NS)
-                user.served_ns = max(user.served_ns, place.run_ns)
+                user.served_ns = max(user.served_ns, client.run_ns)
                 self._served_ns = max(self._served_ns, user.run_ns)
-                return place
+                return client
         return None
 
-    def _serve(self, place: Turn) -> None:
-        place.state = _State.SERVED
-        client, begun_ns = place.client, self._cpu_ns()
+    def _serve(self, client: ScheduledClient) -> None:
+        """Serve one piece, then queue, park or arm the client."""
+        client.state = _State.SERVED
+        begun_ns = self._cpu_ns()
         try:
-            more = client.serve()
-        except Exception as error:  # noqa: BLE001 - whatever one client's request meets ends that client, not the daemon
-            self._fail(place, error)
-            more = True
-        place.charge(self._cpu_ns() - begun_ns + PIECE_NS)
-        if place.state is not _State.SERVED:
+            has_more = client.serve()
+        except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
+            self._fail(client, error)
+            has_more = True
+        client.charge(self._cpu_ns() - begun_ns + PIECE_NS)
+        if client.state is not _State.SERVED:  # the client has left
             return
-        place.state = _State.IDLE
-        if not more:
-            try:
-                self.arm(place)
-            except Exception as error:  # noqa: BLE001 - as above
-                self._fail(place, error)
-        elif place.is_over:
-            place.state = _State.PARKED
-            self._parked[place] = None
-        else:
-            self.line_up(place)
-
-    def _fail(self, place: Turn, error: Exception) -> None:
-        """End a client after an internal error; one that cannot even be ended is served no more."""
+        if has_more and client.is_over:
+            client.state = _State.PARKED
+            self._parked[client] = None
+            return
+        client.state = _State.IDLE
+        if has_more:
+            self.enqueue(client)
+            return
         try:
-            place.client.on_failure(error)
+            self.arm(client)
+        except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
+            self._fail(client, error)
+
+    def _fail(self, client: ScheduledClient, error: Exception) -> None:
+        """End a client after an internal error. If that fails too, remove the client from the scheduler."""
+        try:
+            client.on_failure(error)
         except Exception:
-            log.exception("client %d cannot be ended, and is served no more", place.number)
-            place.leave()
+            log.exception("cannot end client %d after an internal error; it is no longer served", client.number)
+            self.remove(client)

@@ -24,20 +24,17 @@ import msgspec
 from imud.contracts.publisher import PublisherContext, PublisherType
 from imud.formats.jsonrpc import DEFAULT_PATH, Code, RpcError, encode_error, line_of
 from imud.model.errors import ServerError, reason_of
-from imud.model.event import Event
 from imud.model.options import Options, shown
 from imud.publishers.socket.admission import (
     Guard,
-    Peer,
     Quota,
     RateLimitedLog,
     Rights,
-    Shares,
     gid_of,
     peer_of,
     raise_fd_limit,
 )
-from imud.publishers.socket.client import ClientConnection, ServerSide
+from imud.publishers.socket.client import ClientConnection
 from imud.publishers.socket.hub import Hub
 from imud.publishers.socket.methods import handle_line, hello
 from imud.publishers.socket.outbox import Limits, Pool
@@ -280,78 +277,64 @@ class SocketServer:
     def __init__(self, settings: SocketOptions, context: PublisherContext) -> None:
         self._settings = settings
         self._context = context
-        shares = Shares(settings.clients_max, settings.clients_per_user)
-        self._quota = Quota(shares, os.geteuid(), raise_fd_limit(), context.clock.now_ns)
-        self.pool = Pool(settings.memory_mb * MIB)
-        """What is held for clients."""
+        own_uid = os.geteuid()
+        self._quota = Quota(
+            settings.clients_max, settings.clients_per_user, own_uid, raise_fd_limit(), context.clock.now_ns
+        )  # fmt: skip
         self._time = TokenBucket(SERVING_PER_S_NS, SERVING_BURST_NS, context.clock.now_ns())
-        self.hub = Hub(settings.path, context, self._quota, self._time, self.pool)
+        limits = Limits(settings.queue_samples, settings.queue_bytes)
+        pool = Pool(settings.memory_mb * MIB, limits)
+        self.hub = Hub(settings.path, context, self._quota, self._time, pool, handle_line)
+        # without a method of this class: each would cost one more call per batch or event
         self.publish: Final = self.hub.publish
-        self._side: ServerSide | None = None
+        self.event: Final = self.hub.event
+        self.add_device: Final = self.hub.add_device
+        self.remove_device: Final = self.hub.remove_device
+        self._scheduler: Scheduler | None = None
         self._listener: Listener | None = None
-        self._guard = Guard(os.geteuid(), None, None)
+        self._guard = Guard(own_uid, None, None)
         self._paused = False
+        """Whether imud accepts no client until the next tick."""
         self._pauses = RateLimitedLog(context.clock.now_ns)
 
     def start(self) -> None:
-        """Listen. Raises ServerError and leaves nothing behind when that is not possible."""
+        """Listen. Raises ServerError, and leaves no file behind, if that is not possible."""
         settings = self._settings
         self._guard = Guard(os.geteuid(), gid_of(settings.group), gid_of(settings.control_group))
         self._name_control_group(settings.control_group)
         self._listener = Listener(Path(settings.path), settings.group, settings.control_group)
-        self._side = ServerSide(
-            self._on_line,
-            self.hub.remove,
-            self.hub.count_evicted,
-            self.hub.count_failed,
-            Limits(settings.queue_samples, settings.queue_bytes),
-            self.pool,
-            Scheduler(self._context.clock.now_ns, self._context.clock.cpu_ns, self._time),
-        )
+        self._scheduler = Scheduler(self._context.clock.now_ns, self._context.clock.cpu_ns, self._time)
         asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)
         self._context.outputs.clients.append(self.hub.clients)
 
     def _name_control_group(self, group: str) -> None:
-        """Name the group in refusals, and say what to do where it does not exist."""
+        """Set the name of the group for error messages. Warn if the group does not exist."""
         self.hub.control_group = f"group {group!r}"
         if self._guard.control_gid is None:
-            hint = f"`sudo groupadd --system {group}` makes it, then imud has to be restarted"
-            self.hub.control_group += f", which does not exist on this machine: {hint}"
-            log.warning("no group %r (socket.control_group): only root can change things; %s", group, hint)
-
-    def add_device(self, name: str, device_id: int) -> None:
-        """A device appears."""
-        self.hub.add_device(name, device_id)
-
-    def remove_device(self, name: str) -> None:
-        """A device leaves."""
-        self.hub.remove_device(name)
-
-    def event(self, event: Event) -> None:
-        """Send the event to the clients that asked for it."""
-        self.hub.event(event)
+            hint = f"make it with `sudo groupadd --system {group}`, then restart imud"
+            self.hub.control_group += f", which does not exist on this host; {hint}"
+            log.warning("group %r (socket.control_group) does not exist: only root can change things; %s", group, hint)
 
     def tick(self, now_ns: int) -> None:
-        """Close what lingered long enough, fill allowances; accept again after a pause."""
-        self.hub.tick()
-        if self._side is not None:
-            self._side.scheduler.tick()
-            self.pool.trim()
+        """Close lingering clients, fill allowances, and accept clients again after a pause. Called every 100 ms."""
+        self.hub.tick(now_ns)
+        if self._scheduler is not None:
+            self._scheduler.tick()
+            self.hub.pool.trim()
         self._quota.tick()
-        self.hub.recordings.tick(now_ns)
         if self._paused and self._listener is not None:
             self._paused = False
             asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)
 
     def close(self) -> None:
-        """Stop listening, close every client, remove the socket file if it is ours; may be called twice."""
-        if self._listener is None or self._side is None:
+        """Stop listening, close every client, remove the socket file if it is ours. A second call does nothing."""
+        if self._listener is None or self._scheduler is None:
             return
         asyncio.get_running_loop().remove_reader(self._listener.sock)
         self._listener.close()
         self._listener = None
         self.hub.close()
-        self._side.scheduler.close()
+        self._scheduler.close()
         self._context.outputs.clients.remove(self.hub.clients)
 
     # --- clients ----------------------------------------------------------------------------------------------------
@@ -373,7 +356,7 @@ class SocketServer:
             self._welcome(sock)
 
     def _pause(self, error: OSError) -> None:
-        """Stop accepting until the next tick: out of descriptors or memory, an immediate retry would be a busy loop."""
+        """Accept no client until the next tick. Without a pause, a lack of descriptors would cause a busy loop."""
         assert self._listener is not None
         count = self._pauses.count()
         if count:
@@ -382,53 +365,50 @@ class SocketServer:
         self._paused = True
 
     def _welcome(self, sock: socket.socket) -> None:
-        """Let a client in or refuse it. Whatever it meets ends that client, not the daemon."""
-        before = self.hub.accepted
+        """Greet a client, or refuse it."""
+        connection: ClientConnection | None = None
         try:
-            self._let_in(sock)
+            connection = self._let_in(sock)
+            if connection is not None:
+                connection.post(hello(self.hub, connection))
         except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
-            made = self.hub.connections.get(before + 1)
-            if made is not None:
-                made.on_failure(error)
+            if connection is not None:
+                connection.on_failure(error)
             else:
                 self.hub.count_failed(error)
                 sock.close()
 
-    def _let_in(self, sock: socket.socket) -> None:
+    def _let_in(self, sock: socket.socket) -> ClientConnection | None:
+        """Return a new client; None if it is refused or has already left."""
         try:
             peer = peer_of(sock)
-        except OSError:  # gone already
+        except OSError:  # the client has left
             sock.close()
-            return
+            return None
         rights = self._guard.rights_of(peer)
+        hub = self.hub
         try:
-            reserved = self._admit(peer, rights, sock.fileno())
+            if Rights.READ not in rights:
+                message = f"uid {peer.uid} may not read: expected root or a member of group {self._settings.group!r}"
+                raise RpcError(Code.DENIED, message)
+            places = [connection.place for connection in hub.connections.values()]
+            place = self._quota.admit(peer, rights, sock.fileno(), places)
         except RpcError as refusal:
-            self.hub.count_refused()
+            hub.refused += 1
             _refuse(sock, refusal)
-            return
-        assert self._side is not None
-        connection = ClientConnection(self.hub.next_number(), sock, peer, rights, self._side, reserved)
-        self.hub.add(connection)
-        connection.post(hello(self.hub, connection))
-
-    def _admit(self, peer: Peer, rights: Rights, fd: int) -> bool:
-        """Return whether the client's place is a reserved one. Raises RpcError when it is refused."""
-        if Rights.READ not in rights:
-            message = f"uid {peer.uid} may not read: expected root or a member of group {self._settings.group!r}"
-            raise RpcError(Code.DENIED, message)
-        return self._quota.admit(peer, rights, fd, self.hub.connections.values())
-
-    def _on_line(self, connection: ClientConnection, line: bytes) -> None:
-        handle_line(self.hub, connection, line)
+            return None
+        assert self._scheduler is not None
+        connection = ClientConnection(sock, peer, rights, place, hub, self._scheduler)
+        hub.connections[connection.number] = connection
+        return connection
 
 
 def _refuse(sock: socket.socket, error: RpcError) -> None:
-    """Send the reason and close. The socket is new, so its buffer has room for the line."""
+    """Send the reason and close. The buffer of a new socket has room for the line."""
     try:
         sock.send(line_of(encode_error(error)))
     except OSError as problem:
-        log.debug("a refused client left first: %s", reason_of(problem))
+        log.debug("a refused client left before the reply: %s", reason_of(problem))
     sock.close()
 
 

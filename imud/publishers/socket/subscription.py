@@ -8,7 +8,7 @@ from typing import Final
 
 from imud.attitude.conventions import Convention
 from imud.contracts.publisher import Batch
-from imud.publishers.socket.outbox import BinaryEncoding, ConvertedEncoding, Delivery, Encoding, JsonEncoding, Outbox
+from imud.publishers.socket.outbox import BinaryEncoding, Delivery, Encoding, JsonEncoding, Outbox
 from imud.publishers.socket.scheduler import TokenBucket
 from imud.publishers.thinning import NOTHING, RateThinner
 
@@ -18,7 +18,6 @@ NEVER_NS: Final = 1 << 63
 CLIENTS_PER_LOOK: Final = 32
 FORMS_AT_ONCE: Final = 16
 """So many forms are encoded while a batch is sent. Others are encoded when their clients are served, in their time."""
-_BINARY: Final = BinaryEncoding()
 ChosenSamples = Mapping[float, tuple[int, ...]]
 """Indices of the samples of a batch that go to clients with a rate, by that rate."""
 
@@ -67,9 +66,9 @@ class Subscription:
 
     def encoding(self) -> Encoding:
         """Make the encoding of these messages."""
-        binary = self.form is Form.BINARY
-        encoding: Encoding = _BINARY if binary else JsonEncoding(self.fields, self.framed, self.text_numbers)
-        return encoding if self.convention is None else ConvertedEncoding(encoding, self.convention)
+        if self.form is Form.BINARY:
+            return BinaryEncoding(self.convention)
+        return JsonEncoding(self.fields, self.framed, self.text_numbers, self.convention)
 
     def matches(self, device: str) -> bool:
         """Whether samples of `device` are wanted."""

@@ -64,7 +64,7 @@ async def test_reading_is_not_enough(server: SocketServer, monkeypatch: pytest.M
     code, message = await peer.error("command", device="imu0", name="output")
     assert code == -32001
     assert message.startswith("command: expected root or a member of group 'imud-test-control', which does not")
-    assert "`sudo groupadd --system imud-test-control` makes it" in message
+    assert "make it with `sudo groupadd --system imud-test-control`" in message
     # readers may read the last known settings; all other requests need the right to control
     found = await peer.result("settings.get", device="imu0")
     assert found["settings"][0]["actual"] == "6-axis"

@@ -102,7 +102,7 @@ async def test_a_recording_comes_through_the_descriptor_to_its_regular_end(recor
     server.tick(NOW_NS)
     source.deliver()
     assert await peer.error("record.start") == (
-        -32004, "record.start: this connection records already; record.stop ends that",
+        -32004, "record.start: this connection already records; stop it with record.stop",
     )  # fmt: skip
     for device in ("imu0", "imu1"):
         server.event(Event(NOW_NS, device, EventKind.UP, "found"))
@@ -167,7 +167,7 @@ async def test_the_maximum_counts_recordings_that_run_and_those_that_still_send(
     peers = [await RecordingPeer.greeted(server) for _ in range(RECORDINGS_MAX + 1)]
     for peer in peers[:-1]:
         await peer.result("record.start")
-    full = (-32004, f"record.start: {RECORDINGS_MAX} recordings run already, as many as there may be at a time")
+    full = (-32004, f"record.start: {RECORDINGS_MAX} recordings are running, the maximum")
     assert await peers[-1].error("record.start") == full
     peers[0].close()  # ends its recording immediately
     await until(lambda: len(server.hub.connections) == RECORDINGS_MAX)

@@ -199,7 +199,7 @@ def test_a_mistake_in_an_action_ends_that_client_only(tmp_path: Path, caplog: py
             other.close()
 
     run(body)
-    assert caplog.text.count("an internal error while a client was served") == 1
+    assert caplog.text.count("internal error while serving a client") == 1
 
 
 @in_server()

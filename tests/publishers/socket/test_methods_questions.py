@@ -82,17 +82,17 @@ async def test_samples_and_other_clients_come_between_and_requests_keep_their_or
     await until(lambda: 0 < fleet.taken < DEVICES)
     fleet.server.publish(batch("imu0", 1))
     connection, _ = fleet.server.hub.connections.values()
-    assert fleet.server.pool.held_bytes > 1000  # the answer in the making counts
+    assert fleet.server.hub.pool.held_bytes > 1000  # the answer in the making counts
     assert (await watching.message())["params"]["seq"] == 1
     assert fleet.taken < DEVICES
     assert [(await asking.message())["id"] for _ in range(2)] == [1, 2]
     assert connection.unread_bytes == 0
-    assert fleet.server.pool.held_bytes == 0
+    assert fleet.server.hub.pool.held_bytes == 0
     # a client that leaves while its answer is made leaves nothing
     fleet.taken = 0
     await asking.send(lines[0].encode() + b"\n")
     await until(lambda: fleet.taken > 0)
     asking.close()
     await until(lambda: len(fleet.server.hub.connections) == 1)
-    assert fleet.server.pool.held_bytes == 0
+    assert fleet.server.hub.pool.held_bytes == 0
     assert fleet.server.hub.status().failed == 0

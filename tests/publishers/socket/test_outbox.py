@@ -16,6 +16,7 @@ from imud.formats.jsonrpc import encode_notification
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.publishers.socket.client import BYTE, ClientConnection
 from imud.publishers.socket.outbox import (
+    NO_FD,
     REPLY_BYTES,
     SAMPLE_BYTES,
     BinaryEncoding,
@@ -139,7 +140,7 @@ async def test_replies_keep_their_place_and_are_never_dropped(server: SocketServ
     for number in range(20):
         await peer.send(b'{"jsonrpc":"2.0","id":%d,"method":"unheard-of"}\n' % number)
     (connection,) = server.hub.connections.values()
-    await until(lambda: connection.outbox.queue_replies == 20)
+    await until(lambda: len(connection._replies) == 20)
     for _ in range(20):
         seq += 1
         server.publish(batch("imu0", seq))
@@ -199,8 +200,8 @@ async def test_a_descriptor_waits_its_turn_behind_what_is_queued(server: SocketS
     await until(lambda: bool(connection.wakers))
     server.publish(batch("imu1", 8000, 2))  # waits behind the reply
     assert await descriptors(peer, connection) == 1
-    await until(lambda: not connection.outbox.waiting)
-    assert connection.wakers.client_ends == 0  # sent, so the daemon has no copy left
+    await until(lambda: not connection.waiting)
+    assert connection.wakers._wakers["imu0"].client_end == NO_FD  # sent, so the daemon closed its copy
     data, fds, _flags, _address = socket.recv_fds(peer.sock, 65536, 4)
     assert b'"seq":8001' in data
     assert not fds
@@ -280,20 +281,28 @@ class Trickle:
         return self.sock.send(data[: self.rng.choice([1, 3, 10, 1000, 100_000])])
 
 
-class Sink:
-    """An owner that has nothing to do: the test sends what waits."""
+MANY = Limits(4096, 1 << 22)
 
-    uid = 0
-    on_broken = on_flooded = staticmethod(pytest.fail)
 
-    def on_full(self) -> None:
-        """The test sends again."""
+class TestOutbox(Outbox):
+    """An outbox without a connection. The test calls `flush`."""
 
-    def on_deferred(self) -> None:
-        """The test sends again."""
+    __test__ = False
 
-    def on_emptied(self) -> None:
-        """Nothing is kept for it."""
+    def __init__(self, sock: object, pool: Pool, uid: int = 0) -> None:
+        super().__init__(sock, pool, uid)  # type: ignore[arg-type]  # a part of a socket is enough
+
+    def on_broken(self, reason: str) -> None:
+        pytest.fail(reason)
+
+    def evict(self, reason: str) -> None:
+        pytest.fail(reason)
+
+    def on_full(self) -> None: ...
+
+    def on_deferred(self) -> None: ...
+
+    def on_emptied(self) -> None: ...
 
 
 def drained(sock: socket.socket) -> bytes:
@@ -312,7 +321,7 @@ def test_messages_stay_whole_wherever_a_send_is_cut(seed: int) -> None:
         ours.setblocking(False)
         theirs.setblocking(False)
         encoding = JsonEncoding(("sync",), framed=False)
-        outbox = Outbox(Trickle(ours, rng), Limits(20, 1 << 20), Pool(1 << 26), Sink())  # type: ignore[arg-type]  # all that Outbox uses
+        outbox = TestOutbox(Trickle(ours, rng), Pool(1 << 26, Limits(20, 1 << 20)))
         peer = Peer(theirs)
         seq = 0
         seen: list[tuple[str, int, dict[str, int]]] = []
@@ -339,7 +348,7 @@ def test_messages_stay_whole_wherever_a_send_is_cut(seed: int) -> None:
         assert others == 10
         assert assert_accounted(seen, ("imu0",)) == {"imu0": outbox.dropped}
         assert outbox.sent == len(seen)
-        outbox.close()
+        outbox.discard()
         ours.close()
         theirs.close()
 
@@ -351,7 +360,7 @@ def test_what_waits_as_messages_holds_no_samples() -> None:
     ours, theirs = socket.socketpair()
     ours.setblocking(False)
     encoding = BinaryEncoding()
-    outbox = Outbox(ours, Limits(4096, 1 << 22), Pool(1 << 26), Sink())
+    outbox = TestOutbox(ours, Pool(1 << 26, MANY))
     batches = [batch("imu0", seq) for seq in range(1, 2001)]
     for one in batches:
         Outbox.put_samples([outbox], encoding.encode(one), one, encoding)
@@ -365,7 +374,7 @@ def test_what_waits_as_messages_holds_no_samples() -> None:
     assert delivery.messages() == encoding.encode(late)
     references.append(sys.getrefcount(late))
     assert references == [references[0], references[0] + 1, references[0]]
-    outbox.close()
+    outbox.discard()
     ours.close()
     theirs.close()
 
@@ -376,7 +385,7 @@ BIG_BYTES = 400_000
 
 def held_bytes(server: SocketServer) -> int:
     connections = server.hub.connections.values()
-    return sum(one.outbox.queue_bytes + one.unread_bytes for one in connections)
+    return sum(one.queue_bytes + one.unread_bytes for one in connections)
 
 
 @in_server(memory_mb=8)
@@ -391,7 +400,7 @@ async def test_large_replies_that_nobody_reads_stay_within_the_memory_and_a_good
     for one in list(server.hub.connections.values()):
         if one is not connection:
             one.post(encode_notification("big", big))
-            assert held_bytes(server) <= server.pool.held_bytes <= 8 << 20
+            assert held_bytes(server) <= server.hub.pool.held_bytes <= 8 << 20
     connection.post(encode_notification("big", big + "good"))  # the largest of all, and the last
     assert tracemalloc.get_traced_memory()[0] < 8 << 20
     tracemalloc.stop()
@@ -403,7 +412,7 @@ async def test_large_replies_that_nobody_reads_stay_within_the_memory_and_a_good
     for peer in (good, *silent):
         peer.close()
     await until(lambda: not server.hub.connections)
-    assert server.pool.held_bytes == 0
+    assert server.hub.pool.held_bytes == 0
 
 
 @in_server(memory_mb=8)
@@ -414,12 +423,12 @@ async def test_half_lines_are_counted_and_evicted(server: SocketServer) -> None:
         with suppress(ConnectionResetError, BrokenPipeError):
             await peer.send(b"x" * 60_000)
     await until(lambda: server.hub.status().evicted > 40)  # 69 half lines fit into 4 MiB
-    assert held_bytes(server) == server.pool.held_bytes <= 4 << 20
+    assert held_bytes(server) == server.hub.pool.held_bytes <= 4 << 20
     assert len(await good.result("devices")) == 2
     for peer in (good, *silent):
         peer.close()
     await until(lambda: not server.hub.connections)
-    assert server.pool.held_bytes == 0
+    assert server.hub.pool.held_bytes == 0
 
 
 class Blocked:
@@ -436,31 +445,22 @@ class Blocked:
         return len(data)
 
 
-class Evicted(Sink):
-    def __init__(self, uid: int) -> None:
-        self.uid = uid
+class BlockedOutbox(TestOutbox):
+    """An outbox of a `Blocked` socket, which may be evicted."""
+
+    def __init__(self, pool: Pool, uid: int = 1) -> None:
+        super().__init__(Blocked(), pool, uid)
         self.gone = False
-        self.outbox: Outbox | None = None
 
-    def on_flooded(self) -> None:  # type: ignore[override]  # a method in place of the other's failure
-        assert self.outbox is not None
+    def evict(self, reason: str) -> None:
         self.gone = True
-        self.outbox.close()
+        self.discard()
 
 
-MANY = Limits(4096, 1 << 22)
-
-
-def blocked(pool: Pool, uid: int = 1, limits: Limits = MANY) -> tuple[Evicted, Outbox]:
-    owner = Evicted(uid)
-    owner.outbox = Outbox(Blocked(), limits, pool, owner)  # type: ignore[arg-type]  # all that Outbox uses
-    return owner, owner.outbox
-
-
-def waiting(pool: Pool, uid: int, size_bytes: int) -> Evicted:
-    owner, outbox = blocked(pool, uid)
+def waiting(pool: Pool, uid: int, size_bytes: int) -> BlockedOutbox:
+    outbox = BlockedOutbox(pool, uid)
     outbox.put_reply(bytes(size_bytes))
-    return owner
+    return outbox
 
 
 def put(outbox: Outbox, first: int, count: int) -> None:
@@ -474,8 +474,8 @@ EACH_BYTES = SAMPLE_BYTES + 4 + SLOT_BYTES
 
 @pytest.mark.parametrize("limits", [Limits(5, 1 << 22), Limits(4096, 5 * EACH_BYTES)])
 def test_exactly_the_limit_of_samples_may_wait(limits: Limits) -> None:
-    pool = Pool(1 << 26)
-    _owner, outbox = blocked(pool, limits=limits)
+    pool = Pool(1 << 26, limits)
+    outbox = BlockedOutbox(pool)
     put(outbox, 1, 3)
     put(outbox, 4, 2)
     assert (outbox.queue_samples, outbox.queue_bytes, outbox.dropped) == (5, 5 * EACH_BYTES, 0)
@@ -485,14 +485,13 @@ def test_exactly_the_limit_of_samples_may_wait(limits: Limits) -> None:
     assert (outbox.queue_samples, outbox.queue_bytes, outbox.dropped) == (5, 5 * EACH_BYTES, 21)
     outbox.put_reply(bytes(70))
     assert (outbox.queue_bytes, pool.held_bytes) == (5 * EACH_BYTES + 70, 5 * EACH_BYTES + 70 + REPLY_BYTES)
-    outbox.close()
+    outbox.discard()
     assert (outbox.queue_bytes, pool.held_bytes) == (0, 0)
 
 
 def test_messages_that_waited_go_in_pieces() -> None:
     sock = Blocked()
-    owner = Evicted(1)
-    outbox = Outbox(sock, MANY, Pool(1 << 26), owner)  # type: ignore[arg-type]  # all that Outbox uses
+    outbox = TestOutbox(sock, Pool(1 << 26, MANY))
     put(outbox, 1, 300)
     sock.room = True
     while outbox.flush():
@@ -503,24 +502,24 @@ def test_messages_that_waited_go_in_pieces() -> None:
 @pytest.mark.parametrize("sizes", [(30, 30, 30), (1, 99)])
 def test_exactly_the_limit_of_replies_may_wait(sizes: tuple[int, ...]) -> None:
     """The first message was sent in part, so that it does not count."""
-    pool = Pool(1 << 26)
-    owner, outbox = blocked(pool, limits=Limits(20, 1 << 20, replies=3, reply_bytes=100))
+    pool = Pool(1 << 26, Limits(20, 1 << 20, replies=3, reply_bytes=100))
+    outbox = BlockedOutbox(pool)
     outbox.put_reply(bytes(1000))
     for size_bytes in sizes:
         outbox.put_reply(bytes(size_bytes))
-    assert not owner.gone
+    assert not outbox.gone
     outbox.count_owned(50)
     held_bytes = 1000 + sum(sizes) + REPLY_BYTES * len(sizes) + 50
     assert (outbox.held_bytes, pool.held_bytes) == (held_bytes, held_bytes)
     outbox.put_reply(bytes(1))
-    assert owner.gone
+    assert outbox.gone
     assert pool.held_bytes == 0
 
 
 def test_the_share_of_a_client_shrinks_with_each_that_waits() -> None:
     """Three eighths of the memory are for samples; at half of the memory all clients are cut to their share."""
-    pool = Pool(16 * EACH_BYTES)  # shares of 6, 3 and 2 samples, and 8 samples for all
-    first, second, third = (blocked(pool)[1] for _ in range(3))
+    pool = Pool(16 * EACH_BYTES, MANY)  # shares of 6, 3 and 2 samples, and 8 samples for all
+    first, second, third = (BlockedOutbox(pool) for _ in range(3))
 
     def waiting_samples() -> list[int]:
         return [outbox.queue_samples for outbox in (first, second, third)]
@@ -536,19 +535,19 @@ def test_the_share_of_a_client_shrinks_with_each_that_waits() -> None:
     pool.trim()
     assert waiting_samples() == [2, 1, 1]  # the first two samples of the second client are one delivery
     assert pool.held_bytes == 4 * EACH_BYTES
-    second.close()
+    second.discard()
     put(first, 11, 1)
     assert waiting_samples() == [3, 0, 1]
 
 
 def test_the_user_that_holds_most_loses_the_client_that_does_not_move() -> None:
-    pool = Pool(2_000_000)
+    pool = Pool(2_000_000, MANY)
     one = waiting(pool, 1, 300_000)
     many = [waiting(pool, 2, 100_000) for _ in range(8)]
     assert not one.gone  # the largest, but of a user that holds less
     assert sum(owner.gone for owner in many) == 1
     assert pool.held_bytes <= 1_000_000
-    pool = Pool(2_000_000)
+    pool = Pool(2_000_000, MANY)
     owners = [waiting(pool, 1, 300_000) for _ in range(3)]
     late = waiting(pool, 1, 400_000)
     assert [owner.gone for owner in (*owners, late)] == [True, False, False, False]
@@ -556,11 +555,11 @@ def test_the_user_that_holds_most_loses_the_client_that_does_not_move() -> None:
 
 def test_samples_are_cut_at_once_when_more_and_more_clients_wait() -> None:
     """Each had the share of those that waited when its own came; without a tick they must not add up."""
-    pool = Pool(1 << 20)
+    pool = Pool(1 << 20, MANY)
     encoding = BinaryEncoding()
     some = batch("imu0", 1, 50)
     messages = encoding.encode(some)
-    outboxes = [blocked(pool)[1] for _ in range(32)]
+    outboxes = [BlockedOutbox(pool) for _ in range(32)]
     most = 0
     for outbox in outboxes:
         for _ in range(40):
@@ -568,5 +567,5 @@ def test_samples_are_cut_at_once_when_more_and_more_clients_wait() -> None:
             most = max(most, pool.held_bytes)
     assert 1 << 18 < most <= (1 << 19) + 30_000  # a batch is 28 kB
     for outbox in outboxes:
-        outbox.close()
+        outbox.discard()
     assert pool.held_bytes == 0

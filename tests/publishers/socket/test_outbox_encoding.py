@@ -13,7 +13,7 @@ from imud.attitude.published import FrameOptions, MountingAxes, PublishedAxes, a
 from imud.contracts.publisher import Batch
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.model.sample import Sample
-from imud.publishers.socket.outbox import BinaryEncoding, ConvertedEncoding, JsonEncoding
+from imud.publishers.socket.outbox import BinaryEncoding, JsonEncoding
 from imud.publishers.socket.server import SocketServer
 from tests.support.socket_rig import Peer, in_server, sample
 
@@ -160,16 +160,14 @@ def test_a_batch_is_turned_once_for_all_clients() -> None:
 
 def test_losses_are_reported_with_converted_samples() -> None:
     batch = published([SENT, replace(SENT, seq=2)])
-    plain, turned = (
-        JsonEncoding(None, framed=False),
-        ConvertedEncoding(JsonEncoding(None, framed=False), Convention.NED_FRD),
-    )
+    plain = JsonEncoding(None, framed=False)
+    turned = JsonEncoding(None, framed=False, convention=Convention.NED_FRD)
     first, second = turned.encode(batch)
     assert turned.encode_one(batch, 1) == second
     assert first != plain.encode(batch)[0]
     assert b'"dropped":3' in turned.with_dropped(first, "imu0", {"imu0": 3})
     assert turned.message_bytes == len(second)
-    binary = ConvertedEncoding(BinaryEncoding(), Convention.NED_FRD)
+    binary = BinaryEncoding(Convention.NED_FRD)
     assert binary.message_bytes == BinaryEncoding.message_bytes
     assert binary.encode(batch) == BinaryEncoding().encode(batch.converted(Convention.NED_FRD))
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from imud.publishers.socket import scheduler as serving
-from imud.publishers.socket.scheduler import Scheduler, TokenBucket, Turn
+from imud.publishers.socket.scheduler import ScheduledClient, Scheduler, TokenBucket
 from tests.support.socket_rig import in_context, until
 
 MS = 1_000_000
@@ -24,10 +24,11 @@ class Clock:
         return self.ns
 
 
-class Worker:
+class Worker(ScheduledClient):
     """A client with `pieces` pieces of work of `cost_ns` each."""
 
-    def __init__(self, name: str, rig: "SchedulerBench", pieces: int, cost_ns: int) -> None:
+    def __init__(self, name: str, rig: "SchedulerBench", uid: int, pieces: int, cost_ns: int) -> None:
+        super().__init__(rig.scheduler, rig.socks[-2].fileno(), len(rig.socks), uid)
         self.name, self.rig = name, rig
         self.pieces, self.cost_ns = pieces, cost_ns
         self.error: Exception | None = None
@@ -53,8 +54,11 @@ class Worker:
         self.failures.append(error)
         self.error = None
 
-    def on_overload(self) -> None:
+    def evict(self, reason: str) -> None:
         self.overloads += 1
+
+    def enqueue(self) -> None:
+        self.rig.scheduler.enqueue(self)
 
 
 class SchedulerBench:
@@ -67,12 +71,9 @@ class SchedulerBench:
         self.scheduler = Scheduler(self.clock, self.clock, time)
         self.socks: list[socket.socket] = []
 
-    def add(self, name: str, uid: int, pieces: int, cost_ns: int) -> tuple[Worker, Turn]:
-        ours, theirs = socket.socketpair()
-        self.socks += [ours, theirs]
-        worker = Worker(name, self, pieces, cost_ns)
-        place = self.scheduler.add(worker, ours.fileno(), len(self.socks), uid)
-        return worker, place
+    def add(self, name: str, uid: int, pieces: int, cost_ns: int) -> Worker:
+        self.socks += socket.socketpair()
+        return Worker(name, self, uid, pieces, cost_ns)
 
 
 @asynccontextmanager
@@ -88,7 +89,7 @@ async def scheduling(_folder: Path) -> AsyncIterator[SchedulerBench]:
 
 @in_context("rig", scheduling)
 async def test_a_turn_is_limited_and_other_callbacks_run_in_between(rig: SchedulerBench) -> None:
-    rig.add("busy", 1, 100, MS // 4)[1].line_up()
+    rig.add("busy", 1, 100, MS // 4).enqueue()
     for _ in range(20):
         asyncio.get_running_loop().call_soon(rig.log.append, "sample")
         await asyncio.sleep(0)
@@ -100,8 +101,8 @@ async def test_a_turn_is_limited_and_other_callbacks_run_in_between(rig: Schedul
 @in_context("rig", scheduling)
 async def test_the_client_that_used_least_is_next_within_its_user_and_among_users(rig: SchedulerBench) -> None:
     for number in range(8):
-        rig.add(f"many{number}", 1, 50, MS // 4)[1].line_up()
-    rig.add("one", 2, 50, MS // 4)[1].line_up()
+        rig.add(f"many{number}", 1, 50, MS // 4).enqueue()
+    rig.add("one", 2, 50, MS // 4).enqueue()
     await until(lambda: len(rig.log) >= 60)
     assert 26 <= rig.log[:60].count("one") <= 34  # half of the time for each user
     counts = [rig.log[:60].count(f"many{number}") for number in range(8)]
@@ -111,18 +112,18 @@ async def test_the_client_that_used_least_is_next_within_its_user_and_among_user
 @in_context("rig", scheduling)
 async def test_a_newcomer_goes_before_those_that_use_much(rig: SchedulerBench) -> None:
     for number in range(20):
-        rig.add(f"many{number}", 1, 1000, MS // 2)[1].line_up()
+        rig.add(f"many{number}", 1, 1000, MS // 2).enqueue()
     await until(lambda: len(rig.log) > 100)
     before = len(rig.log)
-    rig.add("good", 1, 1, MS // 10)[1].line_up()
+    rig.add("good", 1, 1, MS // 10).enqueue()
     await until(lambda: "good" in rig.log)
     assert rig.log.index("good") - before <= 20  # one round of the others at most
 
 
 @in_context("rig", scheduling)
 async def test_who_asks_too_much_is_parked_put_in_line_by_ticks_and_evicted(rig: SchedulerBench) -> None:
-    worker, place = rig.add("busy", 1, 1_000_000, 5 * MS)
-    place.line_up()
+    worker = rig.add("busy", 1, 1_000_000, 5 * MS)
+    worker.enqueue()
     for _ in range(200):
         await asyncio.sleep(0)
     used = len(rig.log)
@@ -142,34 +143,34 @@ async def test_who_asks_too_much_is_parked_put_in_line_by_ticks_and_evicted(rig:
 
 @in_context("rig", scheduling)
 async def test_a_client_has_an_allowance_of_cpu_time_and_of_bytes(rig: SchedulerBench) -> None:
-    place = rig.add("talker", 1, 5, 0)[1]
+    client = rig.add("talker", 1, 5, 0)
     now_ns = rig.clock()
-    place.fill(now_ns + 499 * MS)
-    assert not place.is_light
-    place.fill(now_ns + 500 * MS)  # 100 ms that a new client has, and 100 ms a second
-    assert place.is_light
-    place.count_bytes(1 << 20)
-    assert (place.is_over, place.is_light) == (False, True)
-    place.count_bytes(262_144)
-    assert (place.is_over, place.is_light) == (True, False)
-    place.fill(now_ns + 1499 * MS)
-    assert place.is_over
-    place.fill(now_ns + 1501 * MS)
-    assert not place.is_over
-    place.charge(200 * MS)  # all that can gather
-    assert not place.is_over
-    place.charge(1)
-    assert place.is_over
-    place.charge(1000 * MS)  # the debt is at most what can gather
-    place.fill(now_ns + 3500 * MS)
-    assert place.is_over
-    place.fill(now_ns + 3502 * MS)
-    assert not place.is_over
+    client.fill(now_ns + 499 * MS)
+    assert not client.is_light
+    client.fill(now_ns + 500 * MS)  # 100 ms that a new client has, and 100 ms a second
+    assert client.is_light
+    client.count_bytes(1 << 20)
+    assert (client.is_over, client.is_light) == (False, True)
+    client.count_bytes(262_144)
+    assert (client.is_over, client.is_light) == (True, False)
+    client.fill(now_ns + 1499 * MS)
+    assert client.is_over
+    client.fill(now_ns + 1501 * MS)
+    assert not client.is_over
+    client.charge(200 * MS)  # all that can gather
+    assert not client.is_over
+    client.charge(1)
+    assert client.is_over
+    client.charge(1000 * MS)  # the debt is at most what can gather
+    client.fill(now_ns + 3500 * MS)
+    assert client.is_over
+    client.fill(now_ns + 3502 * MS)
+    assert not client.is_over
 
 
 @in_context("rig", scheduling)
 async def test_a_turn_has_a_limited_number_of_pieces(rig: SchedulerBench) -> None:
-    rig.add("free", 1, 1000, 0)[1].line_up()
+    rig.add("free", 1, 1000, 0).enqueue()
     await asyncio.sleep(0)
     assert len(rig.log) == 64
 
@@ -177,9 +178,9 @@ async def test_a_turn_has_a_limited_number_of_pieces(rig: SchedulerBench) -> Non
 @in_context("rig", scheduling)
 async def test_sockets_are_looked_at_again_within_a_turn(rig: SchedulerBench) -> None:
     """After 0.2 ms, so that a client that asks little is next."""
-    busy, place = rig.add("busy", 1, 100, MS // 10)
+    busy = rig.add("busy", 1, 100, MS // 10)
     rig.add("asking", 2, 1, 0)
-    place.line_up()
+    busy.enqueue()
     rig.on_piece = lambda: rig.socks[3].send(b"x") if rig.log == ["busy"] else None
     await asyncio.sleep(0)
     assert rig.log[:4] == ["busy", "busy", "asking", "busy"]
@@ -190,11 +191,11 @@ async def test_sockets_are_looked_at_again_within_a_turn(rig: SchedulerBench) ->
 @pytest.mark.parametrize("uid", [1, 2])
 @in_context("rig", scheduling)
 async def test_a_client_that_waited_long_is_ahead_for_a_millisecond(rig: SchedulerBench, uid: int) -> None:
-    rig.add("busy", 1, 1000, MS // 4)[1].line_up()
-    idle = rig.add("idle", uid, 1000, MS // 4)[1]
+    rig.add("busy", 1, 1000, MS // 4).enqueue()
+    idle = rig.add("idle", uid, 1000, MS // 4)
     await until(lambda: len(rig.log) >= 100)
     count = len(rig.log)
-    idle.line_up()
+    idle.enqueue()
     await until(lambda: len(rig.log) >= count + 12)
     later = rig.log[count:]
     assert later.index("busy") in (4, 5)
@@ -204,15 +205,15 @@ async def test_a_client_that_waited_long_is_ahead_for_a_millisecond(rig: Schedul
 @in_context("rig", scheduling)
 async def test_when_the_time_for_serving_is_used_up_only_light_clients_are_served(rig: SchedulerBench) -> None:
     for number in range(4):
-        rig.add(f"heavy{number}", 1, 10_000, MS // 2)[1].line_up()
-    good, place = rig.add("good", 1, 1, MS // 10)
-    place.fill(rig.clock() + 1000 * MS)  # it has been there, silent, for a second
+        rig.add(f"heavy{number}", 1, 10_000, MS // 2).enqueue()
+    good = rig.add("good", 1, 1, MS // 10)
+    good.fill(rig.clock() + 1000 * MS)  # it has been there, silent, for a second
     await until(lambda: len(rig.log) >= 8)
     rig.scheduler.serving_time.use(2_000 * MS)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     before = len(rig.log)
-    place.line_up()
+    good.enqueue()
     await until(lambda: "good" in rig.log[before:])
     assert len(rig.log) - before <= 3  # at most the turn that everybody has in 10 ms
     assert not good.pieces
@@ -220,7 +221,7 @@ async def test_when_the_time_for_serving_is_used_up_only_light_clients_are_serve
 
 @in_context("rig", scheduling)
 async def test_without_time_for_serving_all_clients_are_served_every_10_ms(rig: SchedulerBench) -> None:
-    rig.add("heavy", 1, 10_000, MS // 2)[1].line_up()
+    rig.add("heavy", 1, 10_000, MS // 2).enqueue()
     await until(lambda: bool(rig.log))
     rig.scheduler.serving_time.use(2_000 * MS)
     for _ in range(2):
@@ -235,23 +236,23 @@ async def test_without_time_for_serving_all_clients_are_served_every_10_ms(rig: 
 
 @in_context("rig", scheduling)
 async def test_an_error_ends_that_client_and_no_other(rig: SchedulerBench, caplog: pytest.LogCaptureFixture) -> None:
-    bad, place = rig.add("bad", 1, 2, 1000)
+    bad = rig.add("bad", 1, 2, 1000)
     bad.error = RecursionError("deep")
-    other, other_place = rig.add("other", 1, 3, 1000)
-    place.line_up()
-    other_place.line_up()
+    other = rig.add("other", 1, 3, 1000)
+    bad.enqueue()
+    other.enqueue()
     await until(lambda: not other.pieces and not bad.pieces)
     assert [str(error) for error in bad.failures] == ["deep"]
     assert not other.failures
 
 
-@pytest.mark.parametrize("where", ["on_overload", "on_ready", "wanted_events"])
+@pytest.mark.parametrize("where", ["evict", "on_ready", "wanted_events"])
 @in_context("rig", scheduling)
 async def test_an_error_outside_of_a_piece_ends_that_client_too(
     rig: SchedulerBench, where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """None of them may reach the loop, whose handler ends the daemon; `run` fails then."""
-    bad, place = rig.add("bad", 1, 10_000 if where == "on_overload" else 1, 5 * MS)
+    bad = rig.add("bad", 1, 10_000 if where == "evict" else 1, 5 * MS)
 
     def broken(*_: object) -> int:
         raise ZeroDivisionError(where)
@@ -260,7 +261,7 @@ async def test_an_error_outside_of_a_piece_ends_that_client_too(
     if where == "on_ready":
         rig.socks[1].send(b"x")
     else:
-        place.line_up()
+        bad.enqueue()
     for _ in range(serving.OVER_TICKS_MAX + 10):
         for _ in range(30):
             await asyncio.sleep(0)
@@ -269,8 +270,8 @@ async def test_an_error_outside_of_a_piece_ends_that_client_too(
         if bad.failures:
             break
     assert str(bad.failures[0]) == where
-    other, other_place = rig.add("other", 1, 1, 1000)
-    other_place.line_up()
+    other = rig.add("other", 1, 1, 1000)
+    other.enqueue()
     await until(lambda: not other.pieces)
 
 
@@ -278,27 +279,27 @@ async def test_an_error_outside_of_a_piece_ends_that_client_too(
 async def test_a_client_that_cannot_even_be_ended_is_served_no_more(
     rig: SchedulerBench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    bad, place = rig.add("bad", 1, 1000, 1000)
+    bad = rig.add("bad", 1, 1000, 1000)
     bad.error = RecursionError("deep")
 
     def broken(_error: Exception) -> None:
         raise ZeroDivisionError
 
     monkeypatch.setattr(bad, "on_failure", broken)
-    other, other_place = rig.add("other", 1, 3, 1000)
-    place.line_up()
-    other_place.line_up()
+    other = rig.add("other", 1, 3, 1000)
+    bad.enqueue()
+    other.enqueue()
     await until(lambda: not other.pieces)
     assert rig.log.count("bad") == 1
-    assert "served no more" in caplog.text
+    assert "no longer served" in caplog.text
 
 
 @in_context("rig", scheduling)
 async def test_a_client_that_left_is_not_served(rig: SchedulerBench) -> None:
-    _, place = rig.add("gone", 1, 5, 1000)
-    _, other = rig.add("other", 1, 1, 1000)
-    place.line_up()
-    place.leave()
-    place.leave()
-    other.line_up()
+    gone = rig.add("gone", 1, 5, 1000)
+    other = rig.add("other", 1, 1, 1000)
+    gone.enqueue()
+    rig.scheduler.remove(gone)
+    rig.scheduler.remove(gone)
+    other.enqueue()
     await until(lambda: rig.log == ["other"])
