@@ -1,4 +1,4 @@
-"""The methods of the UNIX socket: a table of name → parameters and handler, and the way from a line to its reply."""
+"""Methods of the UNIX socket: the table METHODS, and the path from a line to its reply."""
 
 from collections.abc import Callable, Collection, Coroutine, Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import msgspec
 from imud import __version__
 from imud.attitude.conventions import Convention
 from imud.contracts.command import ActionInfo, CalibrationInfo, CalibrationResult, described, infos
-from imud.contracts.publisher import Batch
+from imud.contracts.publisher import Batch, DeviceControl
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
 from imud.formats.jsonrpc import (
@@ -68,92 +68,19 @@ from imud.publishers.socket.outbox import NO_FD, selector
 from imud.publishers.socket.subscription import Form, Subscription
 
 DEVICES_PER_PIECE: Final = 8
-"""About 0.3 ms; 0.5 ms with big numbers as text."""
+"""Number of devices in one piece of an answer: about 0.3 ms; 0.5 ms with big numbers as strings."""
 CLIENTS_PER_PIECE: Final = 64
-"""About as long: their state is small."""
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What a method answers."""
-
-    result: object
-    fd: int = NO_FD
-    """A descriptor whose copy goes with the reply."""
-    framed_from_here: bool = False
-    """Whether everything after this reply goes out as frames."""
-    big_numbers: bool = True
-    """Whether integers in it may exceed 2⁵³ and are not text yet; names of members are no data then."""
-
-
-Pieces = Generator[int, None, Answer]
-"""An answer that is made in pieces; each yields the bytes that it holds by then."""
-
-
-def devices(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces:
-    """The devices, each in one line."""
-    rings = hub.context.outputs.rings
-    lines = (
-        DeviceSummary(
-            one.name, one.device_id, one.driver, one.link, one.state, one.problem, one.identity, one.rate_hz,
-            one.clock.sync, rings.get(one.name),
-        )
-        for one in hub.context.devices.each_status()
-    )  # fmt: skip
-    made = yield from _encoded(lines, DEVICES_PER_PIECE, connection.text_numbers)
-    return Answer(made, big_numbers=False)
-
-
-def status(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces:
-    """The full state: each device with its clock and ledger, the socket with its clients."""
-    texts = connection.text_numbers
-    made = yield from _encoded(hub.context.devices.each_status(), DEVICES_PER_PIECE, texts)
-    held_bytes = sum(map(len, made))
-    clients = yield from _encoded(hub.each_client(), CLIENTS_PER_PIECE, texts, held_bytes)
-    now_ns = hub.context.clock.now_ns()
-    socket = msgspec.structs.asdict(hub.status(())) | {"clients": clients}
-    return Answer({"now_ns": str(now_ns) if texts else now_ns, "devices": made, "socket": socket}, big_numbers=False)
-
-
-def schema(hub: Hub, _connection: ClientConnection, _params: NoParams) -> Pieces:
-    """What the members of samples mean, per device where that differs, and how a slot is laid out."""
-    names: list[str] = []
-
-    def frames() -> Iterator[DeviceFrame]:
-        for device in hub.context.devices.each_status():
-            names.append(device.name)
-            yield _frame_of(device)
-
-    made = yield from _encoded(frames(), DEVICES_PER_PIECE, texts=False)
-    bounds, states = list(LATENCY_BOUNDS_NS), list(DeviceState)
-    result = SchemaResult(PROTOCOL, list(SAMPLE_SCHEMA), {}, SLOT_SCHEMA, bounds, states)
-    of_devices = {"devices": dict(zip(names, made, strict=True))}
-    return Answer(msgspec.structs.asdict(result) | of_devices, big_numbers=False)
-
-
-def _encoded(
-    values: Iterable[object], per_piece: int, texts: bool, held_bytes: int = 0
-) -> Generator[int, None, list[msgspec.Raw]]:
-    """Encode values, so many in each piece; `held_bytes` are those that the answer holds before."""
-    made: list[msgspec.Raw] = []
-    for value in values:
-        if made and not len(made) % per_piece:
-            yield held_bytes
-        body = encode(with_texts(value) if texts else value)
-        held_bytes += len(body)
-        made.append(msgspec.Raw(body))
-    return made
-
-
-def _frame_of(device: DeviceStatus) -> DeviceFrame:
-    """Axes and angles of a device's samples; without a known driver only that."""
-    known = DeviceFrame(device.driver, device.euler_convention, device.navigation_frame, device.status_bit_names)
-    frame = device.frame
-    if frame is not None:
-        known.frame, known.convention, known.heading = frame.frame, frame.convention, frame.heading
-        known.declination_deg, known.conventions = frame.declination_deg, frame.conventions
-    return known
-
+"""Number of clients in one piece of an answer: about 0.3 ms."""
+RATE_MIN_HZ: Final = 0.001
+"""Minimum `rate_hz`. A lower rate is probably a wrong unit, and `poll` can replace it."""
+RATE_MAX_HZ: Final = 1_000_000
+"""Maximum `rate_hz`, above the rate of any sensor. A much higher rate exceeds the range of the period count."""
+LATENCY_MAX_MS: Final = 60_000
+"""Maximum `latency_ms`. A higher value is probably a wrong unit."""
+LATENCY_OF_RATE_MAX_MS: Final = 20.0
+"""Maximum latency of a client that only defines `rate_hz`, ms."""
+NAME_MAX: Final = 64
+"""Maximum length of the name of an action or calibration, more than twice the longest name."""
 
 SLOT_SCHEMA: Final = SlotSchema(
     bytes=SLOT_BYTES,
@@ -164,48 +91,52 @@ SLOT_SCHEMA: Final = SlotSchema(
     sync_codes={str(name): code for name, code in SYNC_CODES.items()},
 )
 
-RATE_MIN_HZ: Final = 0.001
-"""Slower than one sample in 1,000 s is a mistake of units more likely than a wish; `poll` serves it."""
-RATE_MAX_HZ: Final = 1_000_000
-"""No sensor is as fast; far above, the count of periods would leave the range of a float."""
 
-LATENCY_MAX_MS: Final = 60_000
-"""More is a mistake of units more likely than a wish."""
-LATENCY_OF_RATE_MAX_MS: Final = 20.0
-"""A client that says only at which rate it wants samples gets them so late at most."""
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer of a method."""
 
-NAME_MAX: Final = 64
-"""Characters of an action's name; the longest has fewer than half of it."""
-
-P = TypeVar("P", bound=msgspec.Struct)
+    result: object
+    fd: int = NO_FD
+    """Descriptor of which imud sends a copy with the reply."""
+    framed_from_here: bool = False
+    """Whether imud sends frames after this reply."""
+    big_numbers: bool = True
+    """Whether `result` may contain integers above 2⁵³ that are not converted to strings yet."""
 
 
+Pieces = Generator[int, None, Answer]
+"""An answer in pieces. Each piece yields the number of bytes that the answer occupies so far."""
 Later = Coroutine[Any, Any, object]
-"""A result that takes its time; other requests of the client are answered before it. May raise ImudError."""
+"""A result that takes time. imud answers other requests of the client before it. May raise ImudError."""
+P = TypeVar("P", bound=msgspec.Struct)
 
 
 @dataclass(frozen=True, slots=True)
 class Method(Generic[P]):
-    """A row of the table."""
+    """A row of METHODS."""
 
     params: type[P]
     run: Callable[[Hub, ClientConnection, P], Answer | Pieces | Later]
     right: Rights = Rights.READ
-    """The permission that the client needs."""
+    """The right that the client needs."""
     acts: bool = False
-    """Whether it does more than answer: only then is a request without a reply carried out."""
+    """Whether the method has an effect other than its reply. Otherwise imud ignores a request without `id`."""
     result: Any = Any
     """Type of the result."""
 
 
+# --- requests and replies -------------------------------------------------------------------------------------------
+
+
 def hello(hub: Hub, connection: ClientConnection) -> bytes:
-    """The notification that greets a client."""
+    """Return the notification that greets a client."""
     rights = [right.name.lower() for right in Rights if right in connection.rights and right.name]
     return encode_notification("hello", Greeting(PROTOCOL, __version__, hub.context.epoch, rights))
 
 
 def handle_line(hub: Hub, connection: ClientConnection, line: bytes) -> None:
-    """Carry out the request in `line` and send the reply. The connection stays open whatever the line is."""
+    """Carry out the request in `line` and send the reply. The connection stays open for every line."""
     try:
         request = parse_request(line)
     except RpcError as error:
@@ -227,35 +158,8 @@ def handle_line(hub: Hub, connection: ClientConnection, line: bytes) -> None:
         hub.do_later(connection, _answer_later(connection, request, answer))
 
 
-def _send(connection: ClientConnection, request: RpcRequest, answer: Answer) -> None:
-    if request.wants_reply:
-        texts = connection.text_numbers and answer.big_numbers
-        connection.post(encode_result(request.request_id, answer.result, texts=texts), answer.fd)
-    if answer.framed_from_here:
-        connection.framed = True
-
-
-def _answer_in_pieces(connection: ClientConnection, request: RpcRequest, pieces: Pieces) -> Iterator[int]:
-    """Make the answer and send it at the end."""
-    answer = yield from pieces
-    _send(connection, request, answer)
-
-
-async def _answer_later(connection: ClientConnection, request: RpcRequest, later: Later) -> None:
-    """Wait for the result and send it."""
-    try:
-        try:
-            result = await later
-            body = encode_result(request.request_id, result, texts=connection.text_numbers)
-        except ImudError as error:
-            body = encode_error(RpcError(Code.FAILED, str(error), request.request_id))
-        if request.wants_reply:
-            connection.post(body)
-    except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
-        connection.on_failure(error)
-
-
 def _call(hub: Hub, connection: ClientConnection, request: RpcRequest) -> Answer | Pieces | Later | None:
+    """Check the request, and run its method. Raises RpcError."""
     method = METHODS.get(request.method)
     if method is None:
         message = f"no method {request.method[:64]!r}; there are: {', '.join(METHODS)}"
@@ -272,22 +176,109 @@ def _call(hub: Hub, connection: ClientConnection, request: RpcRequest) -> Answer
     return method.run(hub, connection, params)
 
 
-# --- questions ------------------------------------------------------------------------------------------------------
+def _send(connection: ClientConnection, request: RpcRequest, answer: Answer) -> None:
+    if request.wants_reply:
+        texts = connection.text_numbers and answer.big_numbers
+        connection.post(encode_result(request.request_id, answer.result, texts=texts), answer.fd)
+    if answer.framed_from_here:
+        connection.framed = True
+
+
+def _answer_in_pieces(connection: ClientConnection, request: RpcRequest, pieces: Pieces) -> Iterator[int]:
+    answer = yield from pieces
+    _send(connection, request, answer)
+
+
+async def _answer_later(connection: ClientConnection, request: RpcRequest, later: Later) -> None:
+    try:
+        try:
+            result = await later
+            body = encode_result(request.request_id, result, texts=connection.text_numbers)
+        except ImudError as error:
+            body = encode_error(RpcError(Code.FAILED, str(error), request.request_id))
+        if request.wants_reply:
+            connection.post(body)
+    except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
+        connection.on_failure(error)
+
+
+# --- devices, status, schema ----------------------------------------------------------------------------------------
+
+
+def _devices(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces:
+    rings = hub.context.outputs.rings
+    summaries = (
+        DeviceSummary(
+            one.name, one.device_id, one.driver, one.link, one.state, one.problem, one.identity, one.rate_hz,
+            one.clock.sync, rings.get(one.name),
+        )
+        for one in hub.context.devices.each_status()
+    )  # fmt: skip
+    made = yield from _encoded(summaries, DEVICES_PER_PIECE, connection.text_numbers)
+    return Answer(made, big_numbers=False)
+
+
+def _status(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces:
+    texts = connection.text_numbers
+    made = yield from _encoded(hub.context.devices.each_status(), DEVICES_PER_PIECE, texts)
+    held_bytes = sum(map(len, made))
+    clients = yield from _encoded(hub.each_client(), CLIENTS_PER_PIECE, texts, held_bytes)
+    now_ns = hub.context.clock.now_ns()
+    socket = msgspec.structs.asdict(hub.status(())) | {"clients": clients}
+    return Answer({"now_ns": str(now_ns) if texts else now_ns, "devices": made, "socket": socket}, big_numbers=False)
+
+
+def _schema(hub: Hub, _connection: ClientConnection, _params: NoParams) -> Pieces:
+    names: list[str] = []
+
+    def frames() -> Iterator[DeviceFrame]:
+        for device in hub.context.devices.each_status():
+            names.append(device.name)
+            yield _frame_of(device)
+
+    made = yield from _encoded(frames(), DEVICES_PER_PIECE, texts=False)
+    bounds, states = list(LATENCY_BOUNDS_NS), list(DeviceState)
+    result = SchemaResult(PROTOCOL, list(SAMPLE_SCHEMA), {}, SLOT_SCHEMA, bounds, states)
+    of_devices = {"devices": dict(zip(names, made, strict=True))}
+    return Answer(msgspec.structs.asdict(result) | of_devices, big_numbers=False)
+
+
+def _encoded(
+    values: Iterable[object], per_piece: int, texts: bool, held_bytes: int = 0
+) -> Generator[int, None, list[msgspec.Raw]]:
+    """Encode `per_piece` values in each piece. `held_bytes` is the size of the earlier parts of the answer."""
+    made: list[msgspec.Raw] = []
+    for value in values:
+        if made and not len(made) % per_piece:
+            yield held_bytes
+        body = encode(with_texts(value) if texts else value)
+        held_bytes += len(body)
+        made.append(msgspec.Raw(body))
+    return made
+
+
+def _frame_of(device: DeviceStatus) -> DeviceFrame:
+    """Return the axes and angles of a device's samples. Without a known driver, optional members are absent."""
+    known = DeviceFrame(device.driver, device.euler_convention, device.navigation_frame, device.status_bit_names)
+    frame = device.frame
+    if frame is not None:
+        known.frame, known.convention, known.heading = frame.frame, frame.convention, frame.heading
+        known.declination_deg, known.conventions = frame.declination_deg, frame.conventions
+    return known
 
 
 def _options(hub: Hub, connection: ClientConnection, params: OptionsParams) -> Answer:
-    """Set how messages are written on this connection; a `watch` that runs goes on as it is."""
+    """Set the form of big numbers on this connection. A running `watch` does not change."""
     if params.big_numbers is not None:
         connection.text_numbers = params.big_numbers is BigNumbers.STRING
     form = BigNumbers.STRING if connection.text_numbers else BigNumbers.NUMBER
     return Answer(OptionsResult(form, hub.context.epoch))
 
 
-# --- samples --------------------------------------------------------------------------------------------------------
+# --- samples and events ---------------------------------------------------------------------------------------------
 
 
 def _watch(hub: Hub, connection: ClientConnection, params: WatchParams) -> Answer:
-    """Send samples from now on; replaces what the client watched before."""
     devices = _known_devices(hub, params.devices)
     fields = _known_fields(params.fields)
     rate_hz = _rate(params.rate_hz)
@@ -305,13 +296,12 @@ def _watch(hub: Hub, connection: ClientConnection, params: WatchParams) -> Answe
 
 
 def _unwatch(hub: Hub, connection: ClientConnection, _params: NoParams) -> Answer:
-    """Send no more samples; what already waits for the client is still sent."""
+    """Stop sending samples. imud still sends the queued samples."""
     hub.unsubscribe(connection)
     return Answer(NothingMore())
 
 
 def _poll(hub: Hub, _connection: ClientConnection, params: PollParams) -> Answer:
-    """The newest sample of each device that has one."""
     names = _known_devices(hub, params.devices) or tuple(hub.devices)
     fields = _known_fields(params.fields)
     newest = [_newest_of(hub.newest[name], params.convention) for name in names if name in hub.newest]
@@ -320,14 +310,13 @@ def _poll(hub: Hub, _connection: ClientConnection, params: PollParams) -> Answer
 
 
 def _newest_of(batch: Batch, convention: Convention | None) -> Sample:
-    """The last sample of a batch, in the convention that is asked for."""
+    """Return the last sample of a batch, in `convention` if it is not None."""
     rotation = None if convention is None else batch.frame.rotation_to(convention)
     sample = batch.samples[-1]
     return sample if rotation is None else rotation.sample(sample)
 
 
 def _events(hub: Hub, connection: ClientConnection, params: EventsParams) -> Answer:
-    """Send events from now on, or no more; replaces what was asked before."""
     devices = _known_devices(hub, params.devices)
     enable = params.enable is not False
     if enable:
@@ -338,107 +327,74 @@ def _events(hub: Hub, connection: ClientConnection, params: EventsParams) -> Ans
 
 
 def _notify(hub: Hub, connection: ClientConnection, params: NotifyParams) -> Answer:
-    """Send a descriptor that becomes readable with each batch of one device; it replaces an earlier one."""
     _known_devices(hub, [params.device])
     latency_ms = _latency_ms(params.latency_ms, 0.0)
     fd = hub.make_waker(connection, params.device, round(latency_ms * NS_PER_MS))
     return Answer(NotifyResult(params.device, latency_ms), fd)
 
 
-# --- commands -------------------------------------------------------------------------------------------------------
+# --- commands, calibrations, settings -------------------------------------------------------------------------------
+
+
+def _control(hub: Hub, device: str) -> DeviceControl:
+    """Return the control of a device. Raises RpcError if the device is unknown."""
+    _known_devices(hub, [device])
+    return hub.context.devices.control(device)
 
 
 def _actions(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> Answer:
-    """The actions of a device."""
-    _known_devices(hub, [params.device])
-    return Answer(described(hub.context.devices.control(params.device).actions))
+    return Answer(described(_control(hub, params.device).actions))
 
 
 def _command(hub: Hub, connection: ClientConnection, params: CommandParams) -> Later:
-    """Run an action of a device; the reply comes when it is done."""
-    _known_devices(hub, [params.device])
+    control = _control(hub, params.device)
     _refuse_second(hub, connection, "command")
     _check_name("command", params.name)
-    return _done(hub, params)
-
-
-async def _done(hub: Hub, params: CommandParams) -> object:
-    return await hub.context.devices.control(params.device).act(params.name, params.arguments or {})
+    return control.act(params.name, params.arguments or {})
 
 
 def _calibrations(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> Answer:
-    """The guided calibrations of a device."""
-    _known_devices(hub, [params.device])
-    return Answer(infos(hub.context.devices.control(params.device).calibrations))
+    return Answer(infos(_control(hub, params.device).calibrations))
 
 
 def _calibrate(hub: Hub, connection: ClientConnection, params: CalibrateParams) -> Later:
-    """Run a guided calibration; its progress goes out as events, and the reply comes at its end."""
-    _known_devices(hub, [params.device])
+    control = _control(hub, params.device)
     _refuse_second(hub, connection, "calibrate")
     _check_name("calibrate", params.kind)
-    return _calibrated(hub, params)
-
-
-async def _calibrated(hub: Hub, params: CalibrateParams) -> object:
-    return await hub.context.devices.control(params.device).calibrate(params.kind, save=bool(params.save))
+    return control.calibrate(params.kind, save=bool(params.save))
 
 
 def _stop_calibration(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> Answer:
-    """End the calibration that runs, whoever began it."""
-    _known_devices(hub, [params.device])
-    return Answer(StopResult(hub.context.devices.control(params.device).stop_calibration()))
+    """Stop the running calibration of a device, also if another client started it."""
+    return Answer(StopResult(_control(hub, params.device).stop_calibration()))
 
 
 def _settings(hub: Hub, connection: ClientConnection, params: SettingsParams) -> Later:
-    """The device's own settings, as reported last or asked for now."""
-    _known_devices(hub, [params.device])
+    control = _control(hub, params.device)
     if params.fresh:
         if Rights.CONTROL not in connection.rights:
             message = f"settings.get: for fresh, expected root or a member of {hub.control_group}"
             raise RpcError(Code.DENIED, message)
         _refuse_second(hub, connection, "settings.get")
-    return hub.context.devices.control(params.device).settings_report(fresh=bool(params.fresh))
+    return control.settings_report(fresh=bool(params.fresh))
 
 
 def _settings_plan(hub: Hub, connection: ClientConnection, params: SettingsChangeParams) -> Later:
-    """What would make the device as wanted; nothing is written."""
-    _known_devices(hub, [params.device])
+    control = _control(hub, params.device)
     _refuse_second(hub, connection, "settings.plan")
-    return hub.context.devices.control(params.device).settings_plan(params.settings, save=bool(params.save))
+    return control.settings_plan(params.settings, save=bool(params.save))
 
 
 def _settings_apply(hub: Hub, connection: ClientConnection, params: SettingsChangeParams) -> Later:
-    """Make the device as wanted; the reply comes when it is done or has failed, with how the device is then."""
-    _known_devices(hub, [params.device])
+    control = _control(hub, params.device)
     _refuse_second(hub, connection, "settings.apply")
-    return hub.context.devices.control(params.device).settings_apply(params.settings, save=bool(params.save))
-
-
-# --- recordings -----------------------------------------------------------------------------------------------------
-
-
-def _record_start(hub: Hub, connection: ClientConnection, params: RecordParams) -> Answer:
-    """Send a descriptor from which the client reads a recording of what happens from now on."""
-    devices = _known_devices(hub, params.devices)
-    fd = hub.recordings.start(connection, devices)
-    return Answer(RecordResult(None if devices is None else list(devices)), fd)
-
-
-def _record_stop(hub: Hub, connection: ClientConnection, _params: NoParams) -> Answer:
-    """End the recording of this connection."""
-    return Answer(RecordStopResult(*hub.recordings.stop(connection)))
-
-
-def _record_snapshot(hub: Hub, connection: ClientConnection, _params: NoParams) -> Answer:
-    """Send a descriptor from which the client reads what the flight recorder has."""
-    seconds, fd = hub.recordings.snapshot(connection)
-    return Answer(SnapshotResult(seconds), fd)
+    return control.settings_apply(params.settings, save=bool(params.save))
 
 
 def _refuse_second(hub: Hub, connection: ClientConnection, method: str) -> None:
     if hub.busy(connection):
-        raise RpcError(Code.UNAVAILABLE, f"{method}: the one before is not done yet; wait for its reply")
+        message = f"{method}: the previous request of this connection is not finished; wait for its reply"
+        raise RpcError(Code.UNAVAILABLE, message)
 
 
 def _check_name(method: str, name: str) -> None:
@@ -446,10 +402,28 @@ def _check_name(method: str, name: str) -> None:
         raise RpcError(Code.INVALID_PARAMS, f"{method}: expected a name of at most {NAME_MAX} printable characters")
 
 
+# --- recordings -----------------------------------------------------------------------------------------------------
+
+
+def _record_start(hub: Hub, connection: ClientConnection, params: RecordParams) -> Answer:
+    devices = _known_devices(hub, params.devices)
+    fd = hub.recordings.start(connection, devices)
+    return Answer(RecordResult(None if devices is None else list(devices)), fd)
+
+
+def _record_stop(hub: Hub, connection: ClientConnection, _params: NoParams) -> Answer:
+    return Answer(RecordStopResult(*hub.recordings.stop(connection)))
+
+
+def _record_snapshot(hub: Hub, connection: ClientConnection, _params: NoParams) -> Answer:
+    seconds, fd = hub.recordings.snapshot(connection)
+    return Answer(SnapshotResult(seconds), fd)
+
+
 METHODS: Final[Mapping[str, Method[Any]]] = {
-    "devices": Method(NoParams, devices, result=list[DeviceSummary]),
-    "status": Method(NoParams, status, result=StatusResult),
-    "schema": Method(NoParams, schema, result=SchemaResult),
+    "devices": Method(NoParams, _devices, result=list[DeviceSummary]),
+    "status": Method(NoParams, _status, result=StatusResult),
+    "schema": Method(NoParams, _schema, result=SchemaResult),
     "options": Method(OptionsParams, _options, acts=True, result=OptionsResult),
     "watch": Method(WatchParams, _watch, acts=True, result=WatchResult),
     "unwatch": Method(NoParams, _unwatch, acts=True, result=NothingMore),
@@ -474,21 +448,21 @@ METHODS: Final[Mapping[str, Method[Any]]] = {
 
 
 def _known_devices(hub: Hub, names: list[str] | None) -> tuple[str, ...] | None:
-    """The names without repetition, None for all. Raises RpcError."""
+    """Return the names without repetition; None for all devices. Raises RpcError."""
     return None if names is None else _known("device", names, hub.devices)
 
 
 def _known_fields(names: list[str] | None) -> tuple[str, ...] | None:
-    """The names in the order of `schema`, so that one set has one form; None for all. Raises RpcError."""
+    """Return the names in the order of `schema`; None for all fields. Raises RpcError."""
     if names is None:
         return None
     known = set(_known("field", names, SAMPLE_FIELDS))
-    return tuple(name for name in SAMPLE_FIELDS if name in known)
+    return tuple(name for name in SAMPLE_FIELDS if name in known)  # one order: imud encodes a selection once
 
 
 def _known(kind: str, names: list[str], known: Collection[str]) -> tuple[str, ...]:
     if not names:
-        raise RpcError(Code.INVALID_PARAMS, f"{kind}s: an empty list asks for nothing; leave it out for all")
+        raise RpcError(Code.INVALID_PARAMS, f"{kind}s: expected at least one name; leave `{kind}s` out for all")
     for name in names:
         if name not in known:
             message = f"no {kind} named {name[:64]!r}; there are: {', '.join(known) or 'none'}"
@@ -497,19 +471,20 @@ def _known(kind: str, names: list[str], known: Collection[str]) -> tuple[str, ..
 
 
 def _rate(rate_hz: float | None) -> float:
-    """The rate, 0.0 for every sample. Raises RpcError."""
+    """Return the rate, Hz; 0.0 for every sample. Raises RpcError."""
     if not rate_hz:
         return 0.0
-    if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:  # false for NaN, too
+    if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:  # false for NaN too
         message = f"rate_hz: expected 0 (every sample) or {RATE_MIN_HZ} … {RATE_MAX_HZ}, got {rate_hz}"
         raise RpcError(Code.INVALID_PARAMS, message)
     return float(rate_hz)
 
 
 def _latency_ms(latency_ms: float | None, rate_hz: float) -> float:
-    """The latency that is asked for; left out, a period of the rate, and 0 for every sample. Raises RpcError."""
+    """Return the latency, ms. The default is a period of the rate, and 0 for every sample. Raises RpcError."""
     if latency_ms is None:
         return min(1000.0 / rate_hz, LATENCY_OF_RATE_MAX_MS) if rate_hz else 0.0
-    if not 0 <= latency_ms <= LATENCY_MAX_MS:  # false for NaN, too
-        raise RpcError(Code.INVALID_PARAMS, f"latency_ms: expected 0 (at once) … {LATENCY_MAX_MS}, got {latency_ms}")
+    if not 0 <= latency_ms <= LATENCY_MAX_MS:  # false for NaN too
+        message = f"latency_ms: expected 0 (no delay) … {LATENCY_MAX_MS}, got {latency_ms}"
+        raise RpcError(Code.INVALID_PARAMS, message)
     return float(latency_ms)

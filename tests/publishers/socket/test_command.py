@@ -127,6 +127,6 @@ async def test_one_change_at_a_time(server: SocketServer) -> None:
         ("command", {"name": "output"}), ("calibrate", {"kind": "heading"}),
     ):  # fmt: skip
         code, message = await peer.error(method, device="imu0", **more)
-        assert (code, "the one before is not done yet" in message) == (-32004, True)
+        assert (code, "is not finished; wait for its reply" in message) == (-32004, True)
     socket_rig.done_late.set()
     assert (await peer.message())["id"] == 90

@@ -68,7 +68,7 @@ async def test_what_is_no_latency_is_refused(scene: Scene, method: str, latency_
     _server, asked, peer = scene
     devices = {"devices": ["imu0"]} if method == "watch" else {"device": "imu0"}
     _code, message = await peer.error(method, latency_ms=latency_ms, **devices)
-    assert message.startswith("latency_ms: expected 0 (at once) … 60000")
+    assert message.startswith("latency_ms: expected 0 (no delay) … 60000")
     assert asked == {}
 
 

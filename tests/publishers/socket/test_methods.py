@@ -65,7 +65,7 @@ async def test_bad_lines(server: SocketServer, line: bytes, code: int, request_i
         ("watch", {"rate_hz": True}, "rate_hz: expected a number, or null, got true"),
         ("watch", {"rate_hz": "fast"}, 'got "fast"'),
         ("watch", {"devices": ["imu7"]}, "no device named 'imu7'; there are: imu0, imu1"),
-        ("watch", {"devices": []}, "empty list"),
+        ("watch", {"devices": []}, "devices: expected at least one name"),
         ("watch", {"devices": "imu0"}, 'expected a list, each of it text, or null, got "imu0"'),
         ("watch", {"devices": [1]}, "got a list with 1 at [0]"),
         ("watch", {"fields": ["accel"]}, "no field named 'accel'; there are: device, seq, t_ns"),
