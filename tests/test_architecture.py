@@ -158,7 +158,6 @@ LONG_MODULES = {
     "imud.publishers.nmea0183": "one output: sentences, ports and TCP",
     "imud.publishers.recorder.flight": "one state machine: the flight recorder",
     "imud.publishers.shm": "one output: rings and their directory",
-    "imud.publishers.socket.outbox": "one state machine: queue and encodings of a client",
     "imud.sampling.clock": "one state machine with a fast path",
     "imud.sampling.device_time": "one algorithm: device time",
     "imud.sampling.path": "the path of the samples, for streams, CAN and polled devices",

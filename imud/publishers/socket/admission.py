@@ -99,7 +99,6 @@ class Guard:
     control_gid: int | None
 
     def rights_of(self, peer: Peer) -> Rights:
-        """Return the rights of `peer`."""
         rights = Rights.NONE
         if peer.uid in (0, self.own_uid) or self.read_gid in peer.groups:
             rights |= Rights.READ

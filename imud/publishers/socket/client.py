@@ -49,7 +49,6 @@ class Waker:
 
     @property
     def fds(self) -> tuple[int, int]:
-        """Both descriptors."""
         return self._sock.fileno(), self._theirs.fileno()
 
     def close_copy(self) -> None:
@@ -324,7 +323,6 @@ class ClientConnection(Outbox, ScheduledClient):
         )
 
     def _step(self) -> None:
-        """Make the next piece of the answer."""
         assert self._work is not None
         work_bytes = next(self._work, None)
         if work_bytes is None:

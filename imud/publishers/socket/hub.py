@@ -86,7 +86,7 @@ class ClientRecordings:
             raise RpcError(Code.UNAVAILABLE, f"record.snapshot: {error}") from None
 
     def remove(self, connection: ClientConnection) -> None:
-        """Abort the recording of a client that has ended. Do nothing if it has none."""
+        """Abort the recording, if any, of a client that has ended."""
         made = self._running.pop(connection.number, None)
         if made is not None:
             made.close()
@@ -110,7 +110,6 @@ class ClientRecordings:
     # --- calls of the hub ---------------------------------------------------------------------------------------------
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Add a device to the recordings."""
         self._ids[name] = device_id
         for made in self._running.values():
             made.add_device(name, device_id)
@@ -122,7 +121,6 @@ class ClientRecordings:
             made.remove_device(name)
 
     def event(self, event: Event) -> None:
-        """Record an event."""
         for made in self._running.values():
             made.event(event)
 
@@ -325,7 +323,6 @@ class Hub(Clients):
         self._events[connection.number] = devices
 
     def unsubscribe_events(self, connection: ClientConnection) -> None:
-        """Stop sending events to a client."""
         self._events.pop(connection.number, None)
 
     def make_waker(self, connection: ClientConnection, device: str, latency_ns: int = 0) -> int:
@@ -367,7 +364,6 @@ class Hub(Clients):
             self._forget_waker(connection, device)
 
     def clients(self) -> tuple[ClientStatus, ...]:
-        """Return the state of every client."""
         return tuple(self.each_client())
 
     def each_client(self) -> Iterator[ClientStatus]:
@@ -401,7 +397,6 @@ class Hub(Clients):
 
 
 def post_all(connections: Iterable[ClientConnection], body: bytes) -> None:
-    """Send one JSON object to several clients."""
     for connection in connections:
         try:
             connection.post(body)

@@ -1,6 +1,6 @@
-"""Types of the socket's messages: parameters and results of the methods, and the notifications.
+"""Types of the socket's messages: parameters and results of the methods, and notifications.
 
-docs/socket.schema.json is generated from them, and tests check every message of their servers against it.
+docs/socket.schema.json is generated from these types. Tests check every message of a server against it.
 """
 
 from enum import StrEnum
@@ -17,29 +17,29 @@ from imud.publishers.socket.subscription import Form
 
 
 class BigNumbers(StrEnum):
-    """Forms of integers that may exceed 2⁵³, beyond which JavaScript and others round: `epoch` and members in ns."""
+    """Form of integers that may exceed 2⁵³ (`epoch`, members in ns). JavaScript and others round larger numbers."""
 
     NUMBER = "number"
     """JSON numbers."""
     STRING = "string"
-    """Text of decimal digits."""
+    """Strings of decimal digits."""
 
 
 # --- parameters -----------------------------------------------------------------------------------------------------
 
 
 class NoParams(msgspec.Struct):
-    """For methods without parameters."""
+    """Parameters of a method without parameters."""
 
 
 class OptionsParams(msgspec.Struct):
-    """Parameters of `options`; what is left out or null stays as it is."""
+    """Parameters of `options`. A parameter that is absent or null does not change."""
 
     big_numbers: BigNumbers | None = None
 
 
 class WatchParams(msgspec.Struct):
-    """Parameters of `watch`; left out or null: all, all, every sample, JSON, as the device is set, latency by rate."""
+    """Parameters of `watch`. Default: all devices and fields, every sample, `json`, convention of the device."""
 
     devices: list[str] | None = None
     fields: list[str] | None = None
@@ -47,63 +47,49 @@ class WatchParams(msgspec.Struct):
     encoding: Form | None = None
     convention: Convention | None = None
     latency_ms: float | None = None
-    """How late samples may be; 0: each at once."""
+    """Maximum hold of a sample; default: a period of `rate_hz`, at most 20."""
 
 
 class PollParams(msgspec.Struct):
-    """Parameters of `poll`."""
-
     devices: list[str] | None = None
     fields: list[str] | None = None
     convention: Convention | None = None
 
 
 class EventsParams(msgspec.Struct):
-    """Parameters of `events`."""
-
     devices: list[str] | None = None
     enable: bool | None = None
 
 
 class DeviceParams(msgspec.Struct):
-    """Parameters of methods about one device."""
-
     device: str
 
 
 class NotifyParams(msgspec.Struct):
-    """Parameters of `notify`."""
-
     device: str
     latency_ms: float | None = None
-    """How late the descriptor may become readable; left out, null or 0: with each sample at once."""
+    """Maximum delay until the descriptor becomes readable; default 0."""
 
 
 class CommandParams(msgspec.Struct):
-    """Parameters of `command`."""
-
     device: str
     name: str
     arguments: dict[str, Any] | None = None
 
 
 class CalibrateParams(msgspec.Struct):
-    """Parameters of `calibrate`."""
-
     device: str
     kind: str
     save: bool | None = None
 
 
 class SettingsParams(msgspec.Struct):
-    """Parameters of `settings.get`."""
-
     device: str
     fresh: bool | None = None
 
 
 class SettingsChangeParams(msgspec.Struct):
-    """Parameters of `settings.plan` and `settings.apply`; settings that are left out or null are the declared ones."""
+    """Parameters of `settings.plan` and `settings.apply`. Default of `settings`: the declared settings."""
 
     device: str
     settings: dict[str, Any] | None = None
@@ -111,21 +97,19 @@ class SettingsChangeParams(msgspec.Struct):
 
 
 class RecordParams(msgspec.Struct):
-    """Parameters of `record.start`."""
-
     devices: list[str] | None = None
-    """Names; left out or null: all, also those that appear later."""
+    """Default: all devices, also devices that imud adds later."""
 
 
 # --- results --------------------------------------------------------------------------------------------------------
 
 
 class NothingMore(msgspec.Struct):
-    """Result of a method that has none: an empty object."""
+    """Result of a method without a result: an empty object."""
 
 
 class OptionsResult(msgspec.Struct):
-    """Result of `options`: all that hold now, and the epoch of the greeting in that form."""
+    """Result of `options`: all present options, and the epoch in the requested form."""
 
     big_numbers: BigNumbers
     epoch: int
@@ -136,7 +120,7 @@ class DeviceSummary(msgspec.Struct):
 
     name: str
     device_id: int
-    """The daemon's number of the device, as in slots."""
+    """Number of the device, as in slots."""
     driver: str
     link: str
     state: DeviceState
@@ -145,12 +129,10 @@ class DeviceSummary(msgspec.Struct):
     rate_hz: float
     sync: Sync
     ring: str | None
-    """Path of its shared memory; null without one."""
+    """Path of the shared memory of the device; null without shared memory."""
 
 
 class StatusResult(msgspec.Struct):
-    """Result of `status`."""
-
     now_ns: int
     """CLOCK_MONOTONIC."""
     devices: list[DeviceStatus]
@@ -158,13 +140,13 @@ class StatusResult(msgspec.Struct):
 
 
 class DeviceFrame(msgspec.Struct, omit_defaults=True):
-    """Axes and angles of a device's samples; without a known driver only the first four."""
+    """Axes and angles of a device's samples. Only the first four members are present if the driver is unknown."""
 
     driver: str
     euler_convention: str
     navigation_frame: str
     status_bits: dict[str, str]
-    """Name of each bit of `status`, by its number."""
+    """Name of each bit of `status`, by bit number."""
     frame: str | msgspec.UnsetType = msgspec.UNSET
     convention: str | msgspec.UnsetType = msgspec.UNSET
     heading: Heading | msgspec.UnsetType = msgspec.UNSET
@@ -173,114 +155,96 @@ class DeviceFrame(msgspec.Struct, omit_defaults=True):
 
 
 class SlotMember(msgspec.Struct):
-    """A field of a slot."""
-
     name: str
     struct: str
     """Type of one number as in Python's `struct`: Q u64, q i64, I u32, H u16, B u8, d f64, s bytes."""
     count: int
-    """How many of them stand there, one after the other."""
+    """Number of adjacent values."""
     offset: int
-    """First byte."""
+    """Offset of the first byte."""
 
 
 class SlotSchema(msgspec.Struct):
-    """Layout of a slot."""
-
     bytes: int
     layout_version: int
     byte_order: str
     fields: list[SlotMember]
     present_bits: dict[str, int]
-    """Bit of `present` for each field that may be absent."""
+    """Bit of `present` for each optional field."""
     sync_codes: dict[str, int]
     """Number of each source of time stamps in `sync`."""
 
 
 class SchemaResult(msgspec.Struct):
-    """Result of `schema`."""
-
     protocol: int
     fields: list[FieldInfo]
     devices: dict[str, DeviceFrame]
     slot: SlotSchema
     latency_bounds_ns: list[int]
-    """Upper bounds of the members of `latency_buckets`, ns; a last bucket without bound follows."""
+    """Upper bounds of `latency_buckets`, ns. The last bucket has no bound."""
     states: list[DeviceState]
     """Values of `state`."""
 
 
 class WatchResult(msgspec.Struct, omit_defaults=True):
-    """Result of `watch`."""
-
     encoding: Form
     devices: dict[str, int]
-    """The daemon's number of each device that is watched, as in slots."""
+    """Number of each watched device, as in slots."""
     rate_hz: float
     latency_ms: float
-    """How late samples may be for this client."""
+    """Maximum hold of a sample for this client."""
     convention: Convention | None = None
-    """The one that was asked for; left out where none was."""
+    """The requested convention; absent without a request."""
 
 
 class PollResult(msgspec.Struct, omit_defaults=True):
-    """Result of `poll`."""
-
     now_ns: int
     """CLOCK_MONOTONIC."""
     samples: Annotated[list[Any], msgspec.Meta(extra_json_schema={"items": {"$ref": "#/$defs/Sample"}})]
-    """The newest sample of each device that has one; with `fields` the members that were asked for."""
+    """The newest sample of each device, with the requested members. Devices without a sample are absent."""
     convention: Convention | None = None
 
 
 class EventsResult(msgspec.Struct):
-    """Result of `events`."""
-
     enable: bool
 
 
 class NotifyResult(msgspec.Struct):
-    """Result of `notify`, which carries the descriptor."""
+    """Result of `notify`. The descriptor is part of the same message."""
 
     device: str
     latency_ms: float
 
 
 class StopResult(msgspec.Struct):
-    """Result of `stop_calibration`."""
-
     stopped: bool
 
 
 class RecordResult(msgspec.Struct):
-    """Result of `record.start`, which carries the descriptor."""
+    """Result of `record.start`. The descriptor is part of the same message."""
 
     devices: list[str] | None
-    """What is recorded; null for all."""
+    """Recorded devices; null for all."""
 
 
 class RecordStopResult(msgspec.Struct):
-    """Result of `record.stop`."""
-
     stopped: bool
-    """Whether there was a recording; what waits for the client still comes before end of file."""
+    """Whether a recording was running. imud still sends its queue, then end of file."""
     records_dropped: int
-    """Records that had no room because the client did not read; the recording says where."""
+    """Number of records that imud dropped because the client did not read. The recording marks each loss."""
 
 
 class SnapshotResult(msgspec.Struct):
-    """Result of `record.snapshot`, which carries the descriptor."""
+    """Result of `record.snapshot`. The descriptor is part of the same message."""
 
     seconds: float
-    """How long the snapshot is."""
+    """Duration of the snapshot."""
 
 
 # --- notifications --------------------------------------------------------------------------------------------------
 
 
 class Greeting(msgspec.Struct):
-    """Parameters of `hello`."""
-
     protocol: int
     version: str
     epoch: int
@@ -290,15 +254,11 @@ class Greeting(msgspec.Struct):
 
 
 class DeviceNotice(msgspec.Struct):
-    """Parameters of `device` and `device_removed`."""
-
     device: str
     device_id: int
 
 
 class DroppedNotice(msgspec.Struct):
-    """Parameters of `dropped`."""
-
     device: str
     dropped: int
 

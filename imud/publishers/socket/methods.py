@@ -98,7 +98,7 @@ class Answer:
 
     result: object
     fd: int = NO_FD
-    """Descriptor of which imud sends a copy with the reply."""
+    """Descriptor; imud sends a copy with the reply."""
     framed_from_here: bool = False
     """Whether imud sends frames after this reply."""
     big_numbers: bool = True

@@ -183,7 +183,6 @@ class Delivery:
         """Memory of a sample with its message; with the size of the last message before encoding."""
 
     def messages(self) -> Sequence[bytes]:
-        """Return the samples as messages."""
         if self._messages is None:
             encoding, batch = self.encoding, self._batch
             assert batch is not None
@@ -459,7 +458,7 @@ class Outbox(ABC):
     # --- queueing ---------------------------------------------------------------------------------------------------
 
     def _keep_rest(self, count: int, delivery: Delivery) -> None:
-        """Queue the rest of a delivery, of which the socket took `count` bytes."""
+        """Queue the rest of a delivery. The socket took its first `count` bytes."""
         messages = delivery.messages()
         whole = 0
         while count >= len(messages[whole]):

@@ -1,11 +1,10 @@
-"""The UNIX socket publisher: JSON-RPC 2.0 for questions, samples as JSON lines or binary slots (docs/socket.md).
+"""UNIX socket output: requests in JSON-RPC 2.0, samples as JSON lines or binary slots (docs/socket.md).
 
-    Listener ──accept──▶ Guard, Quota ──▶ Connection ◀──its turn── Scheduler;  line ──▶ rpc.handle_line ──▶ Hub
+    Listener ──accept──▶ Guard, Quota ──▶ ClientConnection ◀──serve── Scheduler;  line ──▶ handle_line ──▶ Hub
     publish(batch) ──▶ Hub ──▶ DeliveryGroup per form ──the same bytes──▶ Outbox per client ──▶ send, or a bounded queue
 
-Samples go out while they are published; everything else that clients cause is done by the scheduler (serving.py), in
-pieces and in a limited time per turn of the event loop. No asyncio streams: measured elsewhere, they cost three times
-as much per sample.
+`publish` sends samples directly. The scheduler does all other work for clients, in pieces and for a limited time per
+turn of the event loop. asyncio streams would cost three times as much per sample.
 """
 
 import asyncio
@@ -46,27 +45,27 @@ BACKLOG: Final = 128
 SOCKET_MODE: Final = 0o660
 DIRECTORY_MODE: Final = 0o755
 PID_DIGITS: Final = 7
-"""The kernel's largest limit of process numbers is 4,194,304 (proc(5), pid_max)."""
+"""Maximum digits of a process number: 4,194,304 (proc(5), pid_max)."""
 PATH_MAX_BYTES: Final = 107 - len(".") - PID_DIGITS
-"""An address has room for 107 bytes and a zero (unix(7)); the name it is bound by is longer by the process number."""
+"""Maximum length of `socket.path`, bytes. An address has 107 bytes and a zero (unix(7)), and the name that imud binds
+has the process number in addition."""
 ACL_XATTR: Final = "system.posix_acl_access"
 _ACL_HEADER: Final = struct.Struct("<I")
 _ACL_ENTRY: Final = struct.Struct("<HHI")
 _ACL_VERSION: Final = 2
 _USER_OBJ, _GROUP_OBJ, _GROUP, _MASK, _OTHER = 0x01, 0x04, 0x08, 0x10, 0x20
-"""Tags of entries (linux/posix_acl.h), which stand in this order."""
+"""Tags of ACL entries (linux/posix_acl.h). The kernel expects the entries in this order."""
 _RW: Final = 6
 _NO_ID: Final = 0xFFFF_FFFF
 PROBE_TIMEOUT_S: Final = 0.5
-"""A live daemon's kernel answers a connect at once; a full backlog waits, and is a sign of life."""
+"""Time limit of a test connection, s. The kernel accepts it immediately unless the backlog is full."""
 
 
 class Listener:
-    """Owns the socket file at `path`, mode 0660, group `group` and an ACL entry for `control_group` where these exist.
+    """The socket file at `path`: mode 0660, group `group`, an ACL entry for `control_group` if the group exists.
 
-    The kernel refuses all others when they connect. A file open to every user, with the check left to `accept`, would
-    let them fill the backlog, which is one for all, and cost the daemon some 20 µs for each attempt.
-    Raises ServerError, and leaves nothing bound then.
+    The kernel refuses other users at connect(2). If `accept` refused them, they could fill the common backlog, and each
+    attempt would cost the daemon 20 µs. Raises ServerError, and removes its file, if it cannot listen.
     """
 
     def __init__(self, path: Path, group: str, control_group: str = "") -> None:
@@ -97,17 +96,17 @@ class Listener:
         self.sock.listen(BACKLOG)
 
     def _take_place(self) -> None:
-        """Rename the file to its place. Raises ServerError when another daemon is there, before or right after."""
+        """Rename the file to `path`. Raises ServerError if another daemon serves `path`, before or just after."""
         left_behind = _check_free(self.path)
         self._file.rename(self.path)
         self._file = self.path
         if _inode_of(self.path) != self._inode:
-            raise ServerError(f"another daemon took {self.path} just now: give each a socket.path of its own")
+            raise ServerError(f"another daemon has just taken {self.path}; set another socket.path for one of them")
         if left_behind:
-            log.info("replaced the socket that a daemon left behind at %s", self.path)
+            log.info("replaced the socket %s of a daemon that no longer runs", self.path)
 
     def close(self) -> None:
-        """Stop listening and remove the file if it is still ours; may be called twice."""
+        """Stop listening, and remove the file if it is still ours. A second call does nothing."""
         if self.sock.fileno() < 0:
             return
         try:
@@ -130,81 +129,78 @@ def _make_directory(directory: Path) -> None:
         directory.mkdir(DIRECTORY_MODE, parents=True, exist_ok=True)
     except OSError as error:
         raise ServerError(
-            f"cannot make the directory {directory} for the socket: {error.strerror}; run imud as a service, whose "
-            f"RuntimeDirectory= makes it, or give socket.path a place this user may write to"
+            f"cannot make the directory {directory} for the socket: {error.strerror}; run imud as a service "
+            f"(RuntimeDirectory= makes the directory), or set socket.path to a writable directory"
         ) from error
 
 
 def _check_length(path: Path) -> None:
     size_bytes = len(os.fsencode(path))
     if size_bytes > PATH_MAX_BYTES:
-        raise ServerError(f"a socket path has at most {PATH_MAX_BYTES} bytes, this one has {size_bytes}: {path}")
+        raise ServerError(f"socket.path: expected at most {PATH_MAX_BYTES} bytes, got {size_bytes}: {path}")
 
 
 def _check_free(path: Path) -> bool:
-    """Whether a dead daemon left a socket there. Raises ServerError for a live one's and for other files."""
+    """Return whether `path` is the socket of a dead daemon. Raises ServerError for other files and live daemons."""
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
         return False
     except OSError as error:
-        raise ServerError(f"cannot look at {path}: {error.strerror}") from error
+        raise ServerError(f"cannot check {path}: {error.strerror}") from error
     if not stat.S_ISSOCK(mode):
-        raise ServerError(f"{path} is in the way: expected a socket or nothing, found another kind of file")
-    if _is_alive(path):
         raise ServerError(
-            f"another daemon serves {path}: stop it first (systemctl stop imud), or set another socket.path"
+            f"cannot make the socket {path}: another kind of file has this name; remove it, or set another socket.path"
         )
+    if _is_alive(path):
+        raise ServerError(f"another daemon serves {path}; stop it (systemctl stop imud), or set another socket.path")
     return True
 
 
 def _remove_leftovers(path: Path) -> None:
-    """Remove what daemons that died while they started have left beside `path`."""
+    """Remove temporary sockets of daemons that died during their start."""
     for file in path.parent.glob("*"):
         stem, _, number = file.name.rpartition(".")
         if stem == path.name and number.isdecimal() and _is_leftover(file, int(number)):
-            with suppress(OSError):  # harmless, unless it has our own number; then `bind` reports it
+            with suppress(OSError):  # harmless; if it has our process number, `bind` reports it
                 file.unlink()
-                log.info("removed %s, left behind by a daemon that died while it started", file)
+                log.info("removed %s of a daemon that died during its start", file)
 
 
 def _is_leftover(file: Path, pid: int) -> bool:
-    """Whether a socket's process is dead, or has died and passed its number on to us, as in a container's every start.
-
-    Another container's processes cannot be seen from here; if it is between its `bind` and `listen`, it has to start
-    again.
-    """
+    """Return whether the process of a socket is dead. In a container, a dead process often had our process number."""
+    # a daemon in another container is invisible: between its `bind` and `listen`, its start fails
     if pid != os.getpid() and Path(f"/proc/{pid}").exists():
         return False
     try:
         return file.is_socket() and not _is_alive(file)
-    except ServerError:  # not accessible to us
+    except ServerError:  # no permission
         return False
 
 
 def _is_alive(path: Path) -> bool:
-    """Whether a process listens. Raises ServerError where that cannot be determined."""
+    """Return whether a process listens. Raises ServerError if a connection is impossible for another reason."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(PROBE_TIMEOUT_S)
         try:
             probe.connect(os.fspath(path))
         except (ConnectionRefusedError, FileNotFoundError):
             return False
-        except (TimeoutError, BlockingIOError):
+        except (TimeoutError, BlockingIOError):  # the backlog is full, so a daemon runs
             return True
         except OSError as error:
-            raise ServerError(f"cannot determine whether {path} is in use: {_reason(error, path)}") from error
+            raise ServerError(f"cannot check whether a daemon serves {path}: {_reason(error, path)}") from error
     return True
 
 
 def _set_access(file: Path, path: Path, group: str) -> None:
-    """Mode and group of `file`, which is to become `path`."""
+    """Set mode and group of `file`, which becomes `path`."""
     file.chmod(SOCKET_MODE)
     gid = gid_of(group)
     if gid is None:
         log.warning(
-            "no group %r (socket.group): only root and the daemon's own user can read from %s; "
-            "`sudo groupadd --system %s` makes it, then imud has to be restarted",
+            "group %r (socket.group) does not exist: only root and the daemon's own user can read from %s; "
+            "make it with `sudo groupadd --system %s`, then restart imud",
             group, path, group,
         )  # fmt: skip
         return
@@ -215,7 +211,7 @@ def _set_access(file: Path, path: Path, group: str) -> None:
 
 
 def _admit(file: Path, path: Path, gid: int | None) -> None:
-    """Let members of a further group connect, by an ACL (acl(5)); no-op for None."""
+    """Let the members of another group connect, by an ACL (acl(5)). Do nothing if `gid` is None."""
     if gid is None:
         return
     entries = ((_USER_OBJ, _RW, _NO_ID), (_GROUP_OBJ, _RW, _NO_ID), (_GROUP, _RW, gid), (_MASK, _RW, _NO_ID),
@@ -225,20 +221,20 @@ def _admit(file: Path, path: Path, gid: int | None) -> None:
         os.setxattr(file, ACL_XATTR, acl)
     except OSError as error:
         log.warning(
-            "cannot give %s an ACL (%s): members of the control group must be members of the read group too",
+            "cannot set the ACL of %s: %s; add the members of socket.control_group to socket.group",
             path, error.strerror,
         )  # fmt: skip
 
 
 def _reason(error: OSError, file: Path) -> str:
     if error.errno == errno.EADDRINUSE:
-        return f"{file} is in the way, remove it"
+        return f"the file {file} exists; remove it"
     return error.strerror or str(error)
 
 
 ACCEPTS_PER_TURN: Final = 16
 ACCEPT_NS: Final = 300_000
-"""Accepting in one turn of the event loop, three clients with their greetings."""
+"""Maximum time of accepting clients in one turn of the event loop, ns: three clients with their greetings."""
 MIB: Final = 1 << 20
 
 
@@ -248,24 +244,24 @@ class SocketOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     enabled: bool = True
     """Whether imud serves the socket."""
     path: Annotated[str, msgspec.Meta(pattern="^/.*[^/]$", extra={"words": "an absolute path"})] = DEFAULT_PATH
-    """Where the socket is, an absolute path."""
+    """Absolute path of the socket."""
     group: str = "imud"
-    """Members of this group may read; the socket file belongs to it."""
+    """Group that may read. The socket file belongs to it."""
     control_group: str = "imud-control"
-    """Members of this group may also change things."""
+    """Group that may also control devices: commands, settings, calibrations, recordings."""
     clients_max: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256
-    """At most so many clients at a time; one more gets an error and is disconnected."""
+    """Maximum number of clients. imud refuses more clients with an error."""
     clients_per_user: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 128
-    """At most so many of them belong to one user; not for root and the daemon's own user."""
+    """Maximum number of clients of one user. It does not apply to root and the daemon's own user."""
     memory_mb: Annotated[int, msgspec.Meta(ge=8, le=4096)] = 64
-    """At most so much memory for all that clients make imud hold: what waits for them, and what they have sent."""
+    """Maximum memory for all clients, MiB: queues, requests, and unfinished answers."""
     queue_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 4096
-    """At most so many samples wait for a client that does not read; 4096 are 4 s at 1 kHz. The oldest are dropped."""
+    """Maximum queue of a client that does not read, samples: 4096 are 4 s at 1 kHz. imud drops the oldest samples."""
     queue_bytes: Annotated[int, msgspec.Meta(ge=4096, le=1 << 30)] = 4 << 20
-    """At most so many bytes of samples wait for a client that does not read."""
+    """Maximum queue of a client that does not read, bytes."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a path that no socket can have."""
+        """Raise ValueError if the path is too long for a socket."""
         if len(os.fsencode(self.path)) > PATH_MAX_BYTES:
             size = len(os.fsencode(self.path))
             raise ValueError(f"path: expected at most {PATH_MAX_BYTES} bytes, got {size}: {shown(self.path)}")

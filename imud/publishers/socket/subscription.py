@@ -1,4 +1,4 @@
-"""What clients watch (devices, form, rate), and the plan by which a batch goes to all that watch its device."""
+"""Subscriptions of clients, and the plan that sends a batch to all clients that watch its device."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,17 +13,18 @@ from imud.publishers.socket.scheduler import TokenBucket
 from imud.publishers.thinning import NOTHING, RateThinner
 
 PUBLISH_NS: Final = 1_000_000
-"""Sending a batch takes so long at most; the clients that are left are served by the scheduler, in several turns."""
+"""Maximum time to send a batch, ns. The scheduler serves the remaining clients, in several turns."""
 NEVER_NS: Final = 1 << 63
 CLIENTS_PER_LOOK: Final = 32
+"""Number of clients between two reads of the clock."""
 FORMS_AT_ONCE: Final = 16
-"""So many forms are encoded while a batch is sent. Others are encoded when their clients are served, in their time."""
+"""Maximum number of forms that imud encodes in `publish`. It encodes other forms when it serves their clients."""
 ChosenSamples = Mapping[float, tuple[int, ...]]
-"""Indices of the samples of a batch that go to clients with a rate, by that rate."""
+"""Indices of the samples for clients with a rate, by rate."""
 
 
 class Form(StrEnum):
-    """Encodings of samples by their names in the protocol."""
+    """Encoding of samples in the protocol."""
 
     JSON = "json"
     """One notification per sample."""
@@ -32,31 +33,29 @@ class Form(StrEnum):
 
 
 FormKey = tuple[Form, tuple[str, ...] | None, bool, Convention | None, bool]
-"""What clients that get the same messages have in common: encoding, fields, frames or lines, axes and angles, big
-numbers as text."""
+"""Key of clients that get the same messages: encoding, fields, framed, convention, big numbers as strings."""
 
 
 @dataclass(slots=True)
 class Subscription:
-    """The parameters of a `watch`, checked."""
+    """The checked parameters of a `watch`."""
 
     devices: Collection[str] | None
-    """None for all, those that appear later included."""
+    """Watched devices; None for all devices, also devices that imud adds later."""
     fields: tuple[str, ...] | None
     """Members of a JSON sample in addition to ALWAYS_FIELDS; None for all."""
     rate_hz: float
-    """At most so many samples per second and device; 0 for all."""
+    """Maximum number of samples per second and device; 0 for all."""
     form: Form
     framed: bool = False
-    """Whether messages go out as frames."""
+    """Whether imud sends messages as frames."""
     convention: Convention | None = None
-    """Axes and angles of samples; None for those of the device's configuration."""
+    """Axes and angles of samples; None for the convention in the configuration of the device."""
     text_numbers: bool = False
-    """Whether integers of JSON samples that may exceed 2⁵³ are text."""
+    """Whether integers of JSON samples that may exceed 2⁵³ are strings."""
     latency_ns: int = 0
-    """How late samples may be; 0: each at once."""
+    """Maximum hold of a sample, ns."""
     key: FormKey = field(init=False)
-    """What clients have in common that get the same messages."""
 
     def __post_init__(self) -> None:
         json = self.form is Form.JSON
@@ -65,57 +64,56 @@ class Subscription:
         )  # fmt: skip
 
     def encoding(self) -> Encoding:
-        """Make the encoding of these messages."""
+        """Return a new encoding of the samples."""
         if self.form is Form.BINARY:
             return BinaryEncoding(self.convention)
         return JsonEncoding(self.fields, self.framed, self.text_numbers, self.convention)
 
     def matches(self, device: str) -> bool:
-        """Whether samples of `device` are wanted."""
         return self.devices is None or device in self.devices
 
 
 class DeliveryGroup:
-    """Clients that get samples of one device in the same form: each message is encoded once for all of them.
+    """Clients of one device with the same form. imud encodes each message once for all of them.
 
-    The lists are replaced, never changed: a client may leave while a batch is being sent to them. They are made for the
-    next batch, not for each client that comes or goes: 256 clients that watch something else all the time cost the
-    group no more than its batches do.
+    The lists of clients are replaced, never changed, because a client may leave while imud sends a batch to its list.
+    imud makes the lists for the next batch, not for each change. Thus 256 clients that change their subscription all
+    the time cost little.
     """
 
     def __init__(self, encoding: Encoding, order: Callable[[], int]) -> None:
         self.encoding = encoding
         self._order = order
         self._rates_hz: dict[Outbox, float] = {}
-        """The clients; 0 for one that gets every sample."""
+        """Rate of each client; 0 for every sample."""
         self._changed = False
-        """Whether the lists are not those of the clients any more."""
+        """Whether the lists are out of date."""
         self._direct: list[list[Outbox]] = []
-        """Of clients that get every sample, in lists of CLIENTS_PER_LOOK at most."""
+        """Clients with every sample, in lists of at most CLIENTS_PER_LOOK."""
         self._thinned: dict[float, list[Outbox]] = {}
-        """Of clients that get samples at a rate, by it."""
+        """Clients with a rate, by rate."""
 
     def __contains__(self, outbox: Outbox) -> bool:
         return outbox in self._rates_hz
 
     @property
     def is_small(self) -> bool:
-        """Whether sending to all takes so little time that no look at the clock is needed."""
+        """Whether the group has so few clients that imud need not limit the time to send."""
         return len(self._rates_hz) <= CLIENTS_PER_LOOK
 
     def add(self, outbox: Outbox, rate_hz: float) -> None:
-        """Add a client; with the rate 0 it gets every sample."""
+        """Add a client. With the rate 0 it gets every sample."""
         self._rates_hz[outbox] = rate_hz
         self._changed = True
 
     def discard(self, outbox: Outbox) -> bool:
-        """Remove a client if it is there; return whether none is left."""
+        """Remove a client. Return whether the group is empty."""
         self._rates_hz.pop(outbox, None)
         self._changed = True
         return not self._rates_hz
 
     def send(self, batch: Batch, chosen: ChosenSamples, now_ns: Callable[[], int], end_ns: int) -> None:
-        """Send the batch to every client of the group until `end_ns`, then queue it for the others."""
+        """Send the batch to the clients of the group until `end_ns`, then queue it for the others."""
         if self._changed:
             self._make_lists()
         encoding = self.encoding
@@ -134,7 +132,7 @@ class DeliveryGroup:
                 self._send_parts(_in_parts(outboxes), some, batch, indices, now_ns, end_ns)
 
     def defer(self, batch: Batch, chosen: ChosenSamples) -> None:
-        """Queue the batch for every client of the group; it is encoded when the first of them is served."""
+        """Queue the batch for every client. imud encodes it when it serves the first client."""
         if self._changed:
             self._make_lists()
         for indices, outboxes in self._due(chosen):
@@ -151,7 +149,7 @@ class DeliveryGroup:
                 self._thinned.setdefault(rate_hz, []).append(outbox)
 
     def _due(self, chosen: ChosenSamples) -> list[tuple[tuple[int, ...], list[Outbox]]]:
-        """Which samples of a batch go to which clients of those that get only some."""
+        """Return the indices of samples for the clients with a rate, with these clients."""
         thinned = self._thinned
         return [(indices, thinned[rate_hz]) for rate_hz, indices in chosen.items() if rate_hz in thinned]
 
@@ -159,7 +157,7 @@ class DeliveryGroup:
         self, parts: Iterable[list[Outbox]], messages: Sequence[bytes], batch: Batch, chosen: Sequence[int] | None,
         now_ns: Callable[[], int], end_ns: int,
     ) -> None:  # fmt: skip
-        """Send to clients in parts of CLIENTS_PER_LOOK, with a look at the clock before each; queue after `end_ns`."""
+        """Send to lists of clients until `end_ns`, then queue. Read the clock before each list."""
         delivery: Delivery | None = None
         for outboxes in parts:
             if delivery is None and now_ns() < end_ns:
@@ -179,9 +177,9 @@ def _in_parts(outboxes: list[Outbox]) -> list[list[Outbox]]:
 
 
 class DeliveryPlan:
-    """Where batches of one device go: a group of clients for each form that is wanted.
+    """The clients that watch one device: a group for each form.
 
-    `order` gives the number of the next message that is queued.
+    `order` returns the order number of the next queued message.
     """
 
     def __init__(self, order: Callable[[], int]) -> None:
@@ -190,15 +188,15 @@ class DeliveryPlan:
         self._groups: dict[FormKey, DeliveryGroup] = {}
         self._order: tuple[DeliveryGroup, ...] = ()
         self._only: DeliveryGroup | None = None
-        """The group of a plan that has one, of few clients."""
+        """The only group, if it is small; otherwise None."""
         self._thins = False
-        """Whether any client has a rate."""
+        """Whether a client has a rate."""
 
     def __len__(self) -> int:
         return len(self._groups)
 
     def add(self, wanted: Subscription, outbox: Outbox) -> None:
-        """Send to a client that watches the device, and is not in the plan."""
+        """Add a client that is not in the plan."""
         key = wanted.key
         group = self._groups.get(key)
         if group is None:
@@ -210,7 +208,7 @@ class DeliveryPlan:
         self._note_groups()
 
     def discard(self, wanted: Subscription, outbox: Outbox) -> None:
-        """Send to a client no more; no-op if absent."""
+        """Remove a client. Do nothing if it is unknown."""
         key = wanted.key
         group = self._groups.get(key)
         if group is None or outbox not in group:
@@ -228,9 +226,9 @@ class DeliveryPlan:
         self._only = order[0] if len(order) == 1 and order[0].is_small else None
 
     def send(self, batch: Batch, now_ns: Callable[[], int], time: TokenBucket) -> None:
-        """Send a batch to all clients of the plan: to few at once, to many for PUBLISH_NS, then through their queues.
+        """Send a batch to all clients: to a small group without a time limit, otherwise for PUBLISH_NS, then queue it.
 
-        `time` is what is left of the time for serving; without any, most of many clients get it through their queues.
+        `time` is the allowance for serving. If it is used up, imud queues the batch for most of many clients.
         """
         groups = self._order
         if not groups:

@@ -83,8 +83,8 @@ async def test_a_failed_start_leaves_nothing(tmp_path: Path, monkeypatch: pytest
 async def test_a_missing_group_is_a_warning_only(server: SocketServer, caplog: pytest.LogCaptureFixture) -> None:
     assert os.stat(server.hub.path).st_mode & 0o777 == 0o660
     assert [record.levelname for record in caplog.records] == ["WARNING"]
-    assert "no group 'no-such-group-here' (socket.group)" in caplog.text
-    assert "`sudo groupadd --system no-such-group-here` makes it" in caplog.text
+    assert "group 'no-such-group-here' (socket.group) does not exist" in caplog.text
+    assert "make it with `sudo groupadd --system no-such-group-here`" in caplog.text
 
 
 GROUP = "no-such-group-here"
@@ -148,7 +148,7 @@ def test_a_path_of_the_greatest_length(tmp_path: Path, monkeypatch: pytest.Monke
     path = tmp_path / ("x" * (PATH_MAX_BYTES - len(str(tmp_path)) - 1))
     as_process(monkeypatch, 4_194_303, lambda: Listener(path, GROUP)).close()
     longer = path.with_name(path.name + "x")
-    with pytest.raises(ServerError, match=f"at most {PATH_MAX_BYTES} bytes, this one has {PATH_MAX_BYTES + 1}"):
+    with pytest.raises(ServerError, match=f"at most {PATH_MAX_BYTES} bytes, got {PATH_MAX_BYTES + 1}"):
         Listener(longer, GROUP)
 
 
@@ -181,7 +181,7 @@ def test_another_replaces_the_file_at_once(tmp_path: Path, monkeypatch: pytest.M
         other.rename(path)
 
     around_rename(monkeypatch, lambda: None, replace)
-    with pytest.raises(ServerError, match="just now"):
+    with pytest.raises(ServerError, match="has just taken"):
         Listener(path, GROUP)
     assert [file.name for file in tmp_path.iterdir()] == ["imud.sock"]  # the other's
 
@@ -215,6 +215,6 @@ def test_leftovers_of_dead_daemons_go_and_nothing_else(tmp_path: Path) -> None:
 def test_a_file_in_the_way_of_the_first_name(tmp_path: Path) -> None:
     file = tmp_path / f"imud.sock.{os.getpid()}"
     file.touch()
-    with pytest.raises(ServerError, match=f"{file.name} is in the way"):
+    with pytest.raises(ServerError, match=f"{file.name} exists; remove it"):
         Listener(tmp_path / "imud.sock", GROUP)
     assert list(tmp_path.iterdir()) == [file]
