@@ -1,4 +1,4 @@
-"""Readers for programs on the gateway: `Client` for the UNIX socket, `Ring` for shared memory."""
+"""Readers for programs on the host: `Client` for the UNIX socket, `Ring` for shared memory."""
 
 from imud.client.connection import Client, EventStream, Hello, Watch
 from imud.client.ring import Ring, RingRead

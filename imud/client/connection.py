@@ -5,7 +5,7 @@
         for sample in imud.watch(rate_hz=100):
             print(sample.t_ns, sample.accel_m_s2)
 
-A lost connection raises LinkMissing; to connect again, make another Client. Synchronization: one thread at a time.
+A lost connection raises LinkMissing. Make another Client to connect again. Synchronization: one thread at a time.
 """
 
 import errno
@@ -17,7 +17,7 @@ from contextlib import ExitStack
 from math import isfinite
 from time import monotonic
 from types import TracebackType
-from typing import Any, Final, Protocol, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 import msgspec
 
@@ -37,66 +37,59 @@ from imud.model.event import Event, kind_of
 from imud.model.options import wrong_values
 from imud.model.sample import Sample
 
+RECV_BYTES: Final = 65536
+FDS_MAX: Final = 4
+INBOX_MAX: Final = 65536
+"""Maximum number of messages kept for an iterator while the client waits for another message."""
 _DEVICE_ID_OFFSET: Final = next(field.offset for field in SLOT_FIELDS if field.name == "device_id")
 
-
 T = TypeVar("T")
+Message = dict[str, Any] | bytes
+"""A JSON object, or complete slots."""
 
 
 class DeviceNumber(msgspec.Struct, frozen=True):
-    """The number of a device in slots."""
+    """Parameters of `device`."""
 
     device: str
     device_id: int
 
 
 class DroppedSamples(msgspec.Struct, frozen=True):
-    """How many samples of a device were dropped."""
+    """Parameters of `dropped`, or members of a sample with drops."""
 
     device: str
     dropped: int
 
 
 class ReceivedEvent(msgspec.Struct, frozen=True):
-    """An event as it came."""
+    """Parameters of `event`."""
 
     t_ns: int
     device: str
     kind: str
-    """Of an older or newer daemon it may be one that this client does not know."""
+    """Kind of the event. A daemon of another version may send an unknown kind."""
     message: str
     detail: dict[str, Any] = {}  # msgspec copies a mutable default
 
 
-class Source(Protocol):
-    """Receiver of messages for the iterators."""
-
-    def kept_message(self, names: frozenset[str]) -> dict[str, Any] | bytes | None:
-        """A message that came before, or None."""
-        ...
-
-    def next_message(self, names: frozenset[str], timeout_s: float | None) -> dict[str, Any] | bytes:
-        """The next message: slots, or a notification with one of these methods."""
-        ...
-
-
 class Watch:
-    """Iterator over samples; ends when the client subscribes anew or unsubscribes.
+    """Iterator over samples. It ends when the client calls `watch` or `unwatch`.
 
-    `on_dropped`, where it is set, is called with device and number before the first sample after the loss.
+    The iterator calls `on_dropped`, if it is set, with device and number before the first sample after the loss.
     """
 
     NAMES: Final = frozenset(("sample", "dropped", "device"))
 
-    def __init__(self, source: Source, devices: Mapping[str, int], timeout_s: float | None) -> None:
+    def __init__(self, client: "Client", devices: Mapping[str, int], timeout_s: float | None) -> None:
         self.device_ids = dict(devices)
-        """Device → its number in slots."""
+        """Number of each device in slots."""
         self.dropped: dict[str, int] = {}
-        """Samples per device that the daemon dropped because this client read too slowly."""
+        """Number of samples per device that the daemon dropped because this client read too slowly."""
         self.on_dropped: Callable[[str, int], None] | None = None
         self._ended = False
         self._names = {number: name for name, number in self.device_ids.items()}
-        self._source = source
+        self._client = client
         self._timeout_s = timeout_s
         self._ready: deque[Sample] = deque()
 
@@ -105,29 +98,29 @@ class Watch:
 
     def __next__(self) -> Sample:
         while not self._ready:
-            message = self._source.kept_message(self.NAMES)
+            message = self._client.kept_message(self.NAMES)
             if message is None and self._ended:
                 raise StopIteration
-            self._handle(self._source.next_message(self.NAMES, self._timeout_s) if message is None else message)
+            self._handle(self._client.next_message(self.NAMES, self._timeout_s) if message is None else message)
         return self._ready.popleft()
 
     def end(self) -> None:
-        """Stop the iteration after the samples that came already."""
+        """Stop the iteration after the samples that the client has received."""
         self._ended = True
 
-    def _handle(self, message: dict[str, Any] | bytes) -> None:
+    def _handle(self, message: Message) -> None:
         if isinstance(message, bytes):
             for start in range(0, len(message), SLOT_BYTES):
                 self._ready.append(self._decode(message[start : start + SLOT_BYTES]))
             return
         params = params_of(message)
         if message["method"] == "device":
-            known = _understood(params, DeviceNumber, "the number of a device")
+            known = _decoded(params, DeviceNumber, "the number of a device")
             self.device_ids[known.device] = known.device_id
             self._names[known.device_id] = known.device
             return
         if params.get("dropped"):
-            lost = _understood(params, DroppedSamples, "a number of dropped samples")
+            lost = _decoded(params, DroppedSamples, "a number of dropped samples")
             self._note_dropped(lost.device, lost.dropped)
         params.pop("dropped", None)
         if message["method"] == "sample":
@@ -142,7 +135,7 @@ class Watch:
         number = int.from_bytes(slot[_DEVICE_ID_OFFSET : _DEVICE_ID_OFFSET + 2], "little")
         name = self._names.get(number)
         if name is None:
-            raise ServerError(f"a slot of device number {number}; known are {self._names}")
+            raise ServerError(f"expected a slot of a known device number ({self._names}), got {number}")
         try:
             return decode_slot(slot, name)
         except ValueError as error:
@@ -154,49 +147,49 @@ class EventStream:
 
     NAMES: Final = frozenset(("event",))
 
-    def __init__(self, source: Source, timeout_s: float | None) -> None:
-        self._source = source
+    def __init__(self, client: "Client", timeout_s: float | None) -> None:
+        self._client = client
         self._timeout_s = timeout_s
 
     def __iter__(self) -> Self:
         return self
 
     def __next__(self) -> Event:
-        message = self._source.next_message(self.NAMES, self._timeout_s)
+        message = self._client.next_message(self.NAMES, self._timeout_s)
         assert isinstance(message, dict)
         return event_of(params_of(message))
 
 
 def sample_of(params: Mapping[str, Any]) -> Sample:
-    """The sample in a JSON notification; null is NaN. Raises ServerError."""
+    """Return the sample in a JSON notification; null becomes NaN. Raises ServerError."""
     values = {name: _with_nan(value) for name, value in params.items()}
     try:
         return msgspec.convert(values, Sample)
     except msgspec.ValidationError as error:
         wrong = "; ".join(map(str, wrong_values(Sample, values, "member")))
-        raise ServerError(f"a sample that is not understood: {wrong}") from error
+        raise ServerError(f"cannot decode a sample: {wrong}") from error
 
 
 def event_of(params: Mapping[str, Any]) -> Event:
-    """Decode the event in a JSON notification. An unknown kind stays a plain string. Raises ServerError."""
-    received = _understood(params, ReceivedEvent, "an event")
+    """Return the event in a JSON notification. An unknown kind stays a string. Raises ServerError."""
+    received = _decoded(params, ReceivedEvent, "an event")
     return Event(received.t_ns, received.device, kind_of(received.kind), received.message, received.detail)
 
 
 def params_of(message: Mapping[str, Any]) -> dict[str, Any]:
-    """The members of a notification. Raises ServerError."""
+    """Return the parameters of a notification. Raises ServerError."""
     params = message.get("params", {})
     if not isinstance(params, dict):
-        raise ServerError(f"a notification {message.get('method')!r:.80} whose members are not understood")
+        raise ServerError(f"cannot decode the notification {message.get('method')!r:.80}: expected an object as params")
     return params
 
 
-def _understood(params: Mapping[str, Any], kind: type[T], what: str) -> T:
-    """The members of a notification in this form; `what` is for the message. Raises ServerError."""
+def _decoded(params: Mapping[str, Any], kind: type[T], name: str) -> T:
+    """Return the parameters of a notification as `kind`. `name` is for the error. Raises ServerError."""
     try:
         return msgspec.convert(params, kind)
     except msgspec.ValidationError as error:
-        raise ServerError(f"{what} that is not understood: {reason_of(error)}") from error
+        raise ServerError(f"cannot decode {name}: {reason_of(error)}") from error
 
 
 def _with_nan(value: object) -> object:
@@ -207,21 +200,11 @@ def _with_nan(value: object) -> object:
     return value
 
 
-RECV_BYTES: Final = 65536
-FDS_MAX: Final = 4
-INBOX_MAX: Final = 65536
-"""Messages kept for an iterator while another one, or a question, waits for something else."""
-
-Message = dict[str, Any] | bytes
-"""A JSON object, or whole slots."""
-
-
 class Hello(msgspec.Struct, frozen=True):
-    """The daemon's greeting."""
+    """Greeting of the daemon."""
 
     protocol: int
     version: str
-    """Version of the daemon."""
     epoch: int
     """Random number of this start of the daemon."""
     rights: tuple[str, ...]
@@ -229,45 +212,44 @@ class Hello(msgspec.Struct, frozen=True):
 
 
 class WatchAnswer(msgspec.Struct, frozen=True):
-    """The answer to `watch`, as far as the client needs it."""
+    """Reply to `watch`, without the members that the client does not use."""
 
     devices: dict[str, int]
-    """Device → its number in slots."""
     convention: str | None = None
 
 
 class PollAnswer(msgspec.Struct, frozen=True):
-    """The answer to `poll`."""
+    """Reply to `poll`."""
 
     samples: list[dict[str, Any]]
     convention: str | None = None
 
 
 class StopAnswer(msgspec.Struct, frozen=True):
-    """The answer to `record.stop`."""
+    """Reply to `record.stop`."""
 
     records_dropped: int
 
 
 class SnapshotAnswer(msgspec.Struct, frozen=True):
-    """The answer to `record.snapshot`."""
+    """Reply to `record.snapshot`."""
 
     seconds: float
 
 
 class Client:
-    """A connection to the daemon at `path`, by default where `default_path` says.
+    """A connection to the daemon at `path`; None for `default_path()`.
 
-    Raises LinkMissing (no daemon there), LinkDenied (no permission), ServerError (answers that are not the protocol's),
-    TimeoutError where an answer takes longer than `timeout_s`. RpcError, a ServerError, is what the daemon refused.
+    Every method raises LinkMissing (no daemon at the path, or connection lost), LinkDenied (no permission), RpcError
+    (the daemon refuses the request), ServerError (invalid reply), or TimeoutError (no reply within `timeout_s`).
     """
 
     def __init__(self, path: str | os.PathLike[str] | None = None, *, timeout_s: float = 5.0) -> None:
         self.path = default_path() if path is None else os.fspath(path)
         self.timeout_s = timeout_s
         self._buffer = bytearray()
-        self.given_up = 0
-        """Messages discarded because no iterator read them while `INBOX_MAX` others waited."""
+        self.discarded = 0
+        """Number of messages above INBOX_MAX that the client discarded because no iterator read them."""
         self._inbox: deque[Message] = deque()
         self._watch: Watch | None = None
         self._fds: list[int] = []
@@ -288,37 +270,37 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Disconnect; may be called twice."""
+        """Disconnect. A second call does nothing."""
         self._sock.close()
         while self._fds:
             os.close(self._fds.pop())
 
     def fileno(self) -> int:
-        """The descriptor, to wait on with others."""
+        """Return the descriptor of the socket, for select or poll."""
         return self._sock.fileno()
 
-    # --- questions --------------------------------------------------------------------------------------------------
+    # --- requests ---------------------------------------------------------------------------------------------------
 
     def devices(self) -> list[dict[str, Any]]:
-        """Request the list of devices, one mapping each."""
+        """Return the devices."""
         return self._answer("devices", list[dict[str, Any]])
 
     def status(self) -> dict[str, Any]:
-        """Request the full status: `now_ns`, `devices`, `socket`."""
+        """Return the complete status: `now_ns`, `devices`, `socket`."""
         return self._answer("status", dict[str, Any])
 
     def schema(self) -> dict[str, Any]:
-        """Descriptions of the members of samples: `fields`, `devices`, `slot`."""
+        """Return the descriptions of the members of samples: `fields`, `devices`, `slot`."""
         return self._answer("schema", dict[str, Any])
 
     def poll(self, devices: Iterable[str] | None = None, convention: str | None = None) -> list[Sample]:
-        """Request the newest sample of each device that has one; `convention` as for `watch`."""
+        """Return the newest sample of each device, without devices that have no sample. `convention` as for `watch`."""
         reply = self._answer("poll", PollAnswer, devices=_listed(devices), convention=convention)
         _check_convention(reply.convention, convention)
         return [sample_of(params) for params in reply.samples]
 
     def call(self, method: str, **params: object) -> Any:
-        """Call a method by its name; parameters that are None are left out. Returns the result as JSON values."""
+        """Call a method and return its result as JSON values. Leave out the parameters that are None."""
         self._id += 1
         chosen = {name: value for name, value in params.items() if value is not None}
         self._send(line_of(encode_request(method, chosen, self._id)))
@@ -327,7 +309,7 @@ class Client:
             message = self._receive(deadline_s, method)
             if isinstance(message, bytes) or "id" not in message or "method" in message:
                 self._keep(message)
-            elif message["id"] in (self._id, None):  # another id is of a call that timed out
+            elif message["id"] in (self._id, None):  # other ids: late replies after a timeout
                 if "error" in message:
                     raise rpc_error(message["error"])
                 return message.get("result")
@@ -344,13 +326,15 @@ class Client:
         convention: str | None = None,
         latency_ms: float | None = None,
     ) -> Watch:
-        """Subscribe to samples; an endless iterator that replaces an earlier one. None asks for all.
+        """Return an endless iterator over samples. It replaces the previous iterator.
 
-        `fields` names the values that are wanted of JSON samples, the others are None then; binary ones are complete
-        always. `convention` is `enu-flu` or `ned-frd`, None for what the configuration says; ServerError where the
-        daemon does not know it. Samples come up to `latency_ms` late, several at once, which costs less CPU on both
-        sides; 0 is at once, None a period of `rate_hz`, at most 20 ms, and at once without a rate. Waiting longer than
-        `timeout_s` for a sample raises TimeoutError.
+        - `devices`, `rate_hz`: None for all devices and every sample.
+        - `fields`: members of JSON samples, None for all. Other members are None. Binary samples are complete.
+        - `convention`: `enu-flu`, `ned-frd`, or None for the convention of the configuration. ServerError if the daemon
+          does not know it.
+        - `latency_ms`: maximum hold of a sample. A hold costs less CPU time on both sides. 0 for no hold, None for a
+          period of `rate_hz`, at most 20 ms; no hold without a rate.
+        - `timeout_s`: the iterator raises TimeoutError if no sample arrives in this time.
         """
         wanted = None if fields is None else sorted({*fields, "t_err_ns", "sync", "t_rx_ns", "utc_ns"})
         reply = self._answer(
@@ -362,26 +346,25 @@ class Client:
         _check_convention(reply.convention, convention)
         self._end_watch()
         while self.kept_message(Watch.NAMES) is not None:
-            pass  # of the earlier one
+            pass  # samples of the previous iterator
         self._watch = Watch(self, reply.devices, timeout_s)
         return self._watch
 
     def unwatch(self) -> None:
-        """End the subscription. The iterator still returns the samples received meanwhile, then ends."""
+        """End the subscription. The iterator returns the samples received so far, then ends."""
         self.call("unwatch")
         self._end_watch()
 
     def events(self, devices: Iterable[str] | None = None, timeout_s: float | None = None) -> EventStream:
-        """Subscribe to events; an endless iterator. Waiting longer than `timeout_s` for one raises TimeoutError."""
+        """Return an endless iterator over events. It raises TimeoutError if no event arrives in `timeout_s`."""
         self.call("events", devices=_listed(devices))
         return EventStream(self, timeout_s)
 
     def notify(self, device: str, latency_ms: float | None = None) -> int:
-        """A descriptor that is readable after each batch of samples of `device`, for `Ring.wait`; the caller closes it.
+        """Return a descriptor for `Ring.wait`, readable after each batch of samples of `device`. The caller closes it.
 
-        A batch is written up to `latency_ms` late; None and 0: each sample at once. How many bytes are in it means
-        nothing: read them all. It ends with the connection, and when `notify` is asked for the same device again, which
-        gives a new one.
+        `latency_ms` is the maximum hold of a sample; None for 0. Read all bytes: their number has no meaning. The
+        descriptor ends with the connection, or when `notify` makes another one for this device.
         """
         self.call("notify", device=device, latency_ms=_finite(latency_ms))
         return self._descriptor("notify")
@@ -389,28 +372,30 @@ class Client:
     # --- recordings -------------------------------------------------------------------------------------------------
 
     def record(self, devices: Iterable[str] | None = None) -> int:
-        """A descriptor from which a recording is read, to end of file; the caller closes it.
+        """Start a recording of `devices`, None for all. Return the descriptor to read it from. The caller closes it.
 
-        None records all devices. It needs the permission to control. What is not read in time is missing in the
-        recording, which says so.
+        The user needs the right to control. If the caller reads too slowly, imud drops records, and marks the loss in
+        the recording.
         """
         self.call("record.start", devices=_listed(devices))
         return self._descriptor("record.start")
 
     def stop_recording(self) -> int:
-        """End the recording of this connection; what waits still comes. Return how many records were not read."""
+        """Stop the recording. imud still sends its queue, then end of file. Return the number of dropped records."""
         return self._answer("record.stop", StopAnswer).records_dropped
 
     def snapshot(self) -> tuple[int, float]:
-        """A descriptor from which the last minutes are read, as with `record`, and how long they are, s.
+        """Return a descriptor to read the flight recorder's content from, as `record`, and its duration, s.
 
-        RpcError where the configuration has no flight recorder.
+        Raises RpcError if the configuration has no flight recorder.
         """
         seconds = self._answer("record.snapshot", SnapshotAnswer).seconds
         return self._descriptor("record.snapshot"), seconds
 
+    # --- messages ---------------------------------------------------------------------------------------------------
+
     def kept_message(self, names: frozenset[str]) -> Message | None:
-        """Return the oldest such message among those kept while waiting for another; None for none."""
+        """Remove and return the oldest kept message with a method in `names`; None if there is no such message."""
         for index, message in enumerate(self._inbox):
             if _is_one_of(message, names):
                 del self._inbox[index]
@@ -418,7 +403,7 @@ class Client:
         return None
 
     def next_message(self, names: frozenset[str], timeout_s: float | None) -> Message:
-        """Receive the next message: slots, or a notification whose method is among `names`; others are kept."""
+        """Return the next message with a method in `names`; slots count as `sample`. Keep other messages."""
         kept = self.kept_message(names)
         if kept is not None:
             return kept
@@ -428,14 +413,12 @@ class Client:
         return message
 
     def _answer(self, method: str, kind: type[T], **params: object) -> T:
-        """Call a method whose answer is of this form. Raises ServerError for one that is not."""
+        """Call a method and return its result as `kind`. Raises ServerError if the result has another form."""
         result = self.call(method, **params)
         try:
             return msgspec.convert(result, kind)
         except msgspec.ValidationError as error:
-            raise ServerError(f"{self.path}: the answer to {method} is not understood: {reason_of(error)}") from error
-
-    # --- messages ---------------------------------------------------------------------------------------------------
+            raise ServerError(f"{self.path}: cannot decode the reply to {method}: {reason_of(error)}") from error
 
     def _greet(self) -> Hello:
         message = self._receive(monotonic() + self.timeout_s, "hello")
@@ -447,23 +430,23 @@ class Client:
         try:
             hello = msgspec.convert(message.get("params"), Hello)
         except msgspec.ValidationError as error:
-            raise ServerError(f"{self.path}: expected the greeting of an imud daemon, got another one") from error
+            raise ServerError(f"{self.path}: cannot decode the greeting; is this the socket of imud?") from error
         if hello.protocol != PROTOCOL:
-            raise ServerError(f"{self.path}: the daemon speaks protocol {hello.protocol}, this client {PROTOCOL}")
+            raise ServerError(f"{self.path}: expected protocol {PROTOCOL}, got {hello.protocol}; update imud")
         return hello
 
     def _descriptor(self, method: str) -> int:
-        """The descriptor that came with an answer. Raises ServerError for none."""
+        """Return the descriptor of the last reply. Raises ServerError if the reply contained none."""
         if not self._fds:
-            raise ServerError(f"the daemon's answer to {method} came without a descriptor")
+            raise ServerError(f"expected a descriptor in the reply to {method}, got a reply without it")
         return self._fds.pop()
 
     def _keep(self, message: Message) -> None:
-        """Keep a message for another iterator; without one that reads, only the newest are kept."""
+        """Keep a message for another iterator; at most the INBOX_MAX newest messages."""
         self._inbox.append(message)
         if len(self._inbox) > INBOX_MAX:
             self._inbox.popleft()
-            self.given_up += 1
+            self.discarded += 1
 
     def _end_watch(self) -> None:
         if self._watch is not None:
@@ -475,21 +458,21 @@ class Client:
             self._sock.settimeout(self.timeout_s)
             self._sock.sendall(data)
         except TimeoutError:
-            raise TimeoutError(f"{self.path}: the daemon read nothing for {self.timeout_s} s") from None
+            raise TimeoutError(f"{self.path}: the daemon did not read the request for {self.timeout_s} s") from None
         except OSError as error:
             raise _lost(self.path, error) from error
 
-    def _receive(self, deadline_s: float | None, what: str) -> Message:
-        """Receive the next message in order of arrival."""
+    def _receive(self, deadline_s: float | None, name: str) -> Message:
+        """Return the next message in order of arrival. `name` is the expected message, for the error."""
         while (message := self._parse()) is None:
             left_s = None if deadline_s is None else deadline_s - monotonic()
             if left_s is not None and left_s <= 0:
-                raise TimeoutError(f"{self.path}: waited in vain for {what}")
+                raise TimeoutError(f"{self.path}: no {name} within the time limit")
             try:
                 self._sock.settimeout(left_s)
                 data, fds, _flags, _address = socket.recv_fds(self._sock, RECV_BYTES, FDS_MAX)
             except TimeoutError:
-                raise TimeoutError(f"{self.path}: waited in vain for {what}") from None
+                raise TimeoutError(f"{self.path}: no {name} within the time limit") from None
             except OSError as error:
                 raise _lost(self.path, error) from error
             self._fds.extend(fds)
@@ -499,7 +482,7 @@ class Client:
         return message
 
     def _parse(self) -> Message | None:
-        """Remove a whole message from the buffer and return it; None while there is none."""
+        """Remove and return a complete message from the buffer; None if there is none."""
         buffer = self._buffer
         if not self._framed:
             end = buffer.find(b"\n")
@@ -512,7 +495,7 @@ class Client:
             return None
         (length,) = FRAME_HEADER.unpack_from(buffer)
         if length > FRAME_MAX_BYTES:
-            raise ServerError(f"{self.path}: a frame of {length} bytes; the boundary between frames is lost")
+            raise ServerError(f"{self.path}: expected a frame of at most {FRAME_MAX_BYTES} bytes, got {length} bytes")
         end = FRAME_HEADER.size + length
         if len(buffer) < end:
             return None
@@ -526,20 +509,20 @@ class Client:
         except RpcError as error:
             raise ServerError(f"{self.path}: expected a JSON object, {error}: {body[:80]!r}") from error
         if not isinstance(message.get("method", ""), str):
-            raise ServerError(f"{self.path}: expected a method that is text, got {body[:80]!r}")
+            raise ServerError(f"{self.path}: expected a string as method, got {body[:80]!r}")
         return message
 
 
 def default_path() -> str:
-    """The socket's path: the environment variable IMUD_SOCKET; where that is not set or empty, /run/imud/imud.sock."""
+    """Return the environment variable IMUD_SOCKET; /run/imud/imud.sock if it is not set or empty."""
     return os.environ.get("IMUD_SOCKET") or DEFAULT_PATH
 
 
 def rpc_error(error: object) -> RpcError:
-    """The exception for the `error` member of a reply."""
+    """Return the exception for the member `error` of a reply."""
     if isinstance(error, dict):
         return RpcError(error.get("code", 0), str(error.get("message", "without a message")))
-    return RpcError(0, f"an error that is not understood: {error!r}")
+    return RpcError(0, f"cannot decode the error {error!r}")
 
 
 def _is_one_of(message: Message, names: frozenset[str]) -> bool:
@@ -547,9 +530,9 @@ def _is_one_of(message: Message, names: frozenset[str]) -> bool:
 
 
 def _check_convention(given: str | None, convention: str | None) -> None:
-    """Raise ServerError where the daemon ignored the convention."""
+    """Raise ServerError if the daemon ignored the convention."""
     if convention is not None and given != convention:
-        raise ServerError(f"the daemon gives no samples as {convention}: it is older than this client")
+        raise ServerError(f"the daemon does not know the convention {convention}; update the daemon")
 
 
 def _listed(names: Iterable[str] | None) -> list[str] | None:
@@ -559,7 +542,7 @@ def _listed(names: Iterable[str] | None) -> list[str] | None:
 
 
 def _finite(value: float | None) -> float | None:
-    """Raise ValueError for what JSON does not have, and would arrive as null: as if nothing was asked for."""
+    """Return `value`. Raise ValueError if it is NaN or infinite: JSON would send null, which is the default."""
     if value is not None and not isfinite(value):
         raise ValueError(f"expected a finite number, got {value}")
     return value

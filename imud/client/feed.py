@@ -1,10 +1,9 @@
-"""A thread that reads the daemon for a view: its status, samples and events, connected again after a restart.
+"""Thread that reads status, samples and events of the daemon for a view. It connects again after a restart.
 
     feed = Feed("/run/imud/imud.sock", on_news, Wish(rate_hz=4.0))
     feed.start()
 
-`imud top` and `imud web` are two of them. What is wanted can be changed at any time, also to nothing: then there is no
-connection to the daemon.
+`imud top` and `imud web` use it. `Feed.want` changes the wish at any time. With the wish None, the feed disconnects.
 """
 
 from collections.abc import Callable
@@ -21,59 +20,59 @@ from imud.model.event import Event
 from imud.model.sample import Sample
 
 STATUS_S: Final = 1.0
-"""Time between two looks at the status, for few devices."""
+"""Time between two status requests, s, for up to STATUS_DEVICES devices."""
 STATUS_DEVICES: Final = 50
-"""With more devices the status is asked for less often: each costs the daemon some 50 µs."""
+"""With more devices, the time between two requests grows: each device costs the daemon 50 µs."""
 RETRY_S: Final = 1.0
 SAME_CLOCK_NS: Final = 2_000_000_000
-"""CLOCK_MONOTONIC begins with the start of a machine: clocks that are this near are taken for one, read at different
-times, since an answer takes its time on a busy machine."""
+"""Maximum difference of one clock that the daemon and the feed read at different times, ns. CLOCK_MONOTONIC of another
+host differs by the time between the boots."""
 SAMPLES_MAX: Final = 4096
-"""Of one piece of news; what comes beyond waits in the socket, and the daemon counts what does not fit there."""
+"""Maximum number of samples in one `News`. More samples stay in the socket, until the daemon drops samples."""
 
 
 class Wish(NamedTuple):
-    """What a view reads in addition to status and events."""
+    """The data that a view reads in addition to status and events."""
 
     devices: tuple[str, ...] | None = None
-    """Devices whose samples are wanted, as far as the daemon has them; None for all."""
+    """Devices to watch; None for all. The feed ignores devices that the daemon does not know."""
     rate_hz: float | None = None
-    """At most so many samples a second of each; None for every sample."""
+    """Maximum number of samples per second and device; None for every sample."""
     news_s: float = 0.25
-    """Time between two pieces of news."""
+    """Time between two `News`, s."""
     newest: bool = False
-    """Whether the newest sample of every device is wanted, whatever `devices` says."""
+    """Whether to read the newest sample of every device, for any `devices`."""
     newest_s: float = STATUS_S
-    """Time between two looks at these."""
+    """Time between two reads of the newest samples, s."""
 
 
 class News(NamedTuple):
-    """What happened since the news before."""
+    """Data received since the previous `News`."""
 
     problem: str = ""
-    """Why there is no daemon now; empty while there is one."""
+    """Reason for the missing connection; empty if the feed is connected."""
     statuses: tuple[DeviceStatus, ...] | None = None
-    """None where it was not asked for."""
+    """State of each device; None if the feed did not request it this time."""
     clients: int = 0
-    """Of the daemon, with `statuses`."""
+    """Number of clients of the daemon, if `statuses` is not None."""
     now_ns: int = 0
-    """CLOCK_MONOTONIC of the daemon's machine."""
+    """CLOCK_MONOTONIC of the daemon's host."""
     ahead_ns: int = 0
-    """That clock minus the one of this machine; 0 where it is the same."""
+    """CLOCK_MONOTONIC of the daemon's host minus that clock of this host; 0 on the same host."""
     samples: tuple[Sample, ...] = ()
     events: tuple[Event, ...] = ()
     newest: tuple[Sample, ...] | None = None
-    """The newest sample of each device that has one; None where it was not asked for."""
+    """Newest sample of each device; None if the feed did not request it this time."""
     newest_ns: int = 0
-    """CLOCK_MONOTONIC when they were asked for."""
+    """Time of the request for `newest`, CLOCK_MONOTONIC of the daemon's host."""
     hello: Hello | None = None
-    """The greeting of the daemon, in the first news of a connection."""
+    """Greeting of the daemon, in the first `News` of a connection."""
     dropped: int = 0
-    """Samples that the daemon dropped because this feed read too slowly."""
+    """Number of samples that the daemon dropped because this feed read too slowly."""
 
 
 class Feed:
-    """Reader of the daemon at `path`. Synchronization: `on_news` is called in the feed's thread."""
+    """Reader of the daemon at `path`. Synchronization: the feed's thread calls `on_news`."""
 
     def __init__(self, path: str, on_news: Callable[[News], None], wanted: Wish | None) -> None:
         self._path = path
@@ -85,11 +84,10 @@ class Feed:
         self._thread = Thread(target=self._run, name="feed", daemon=True)
 
     def start(self) -> None:
-        """Begin to read."""
         self._thread.start()
 
     def close(self) -> None:
-        """End, within a second or so; may be called twice."""
+        """Stop the thread; wait up to 2 s. A second call does nothing."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
@@ -97,13 +95,13 @@ class Feed:
             self._thread.join(2 * STATUS_S)
 
     def want(self, wanted: Wish | None) -> None:
-        """Read this from now on; None to read nothing, without a connection to the daemon."""
+        """Change the wish; None to disconnect."""
         with self._changed:
             self._wanted = wanted
             self._changed.notify_all()
 
     def _run(self) -> None:
-        while self._wait_for_a_view():
+        while self._wait_for_wish():
             try:
                 with Client(self._path) as client:
                     self._read(client)
@@ -112,14 +110,14 @@ class Feed:
                 with self._changed:
                     self._changed.wait_for(lambda: self._stopped, RETRY_S)
 
-    def _wait_for_a_view(self) -> bool:
-        """Wait until something is wanted; False at the end."""
+    def _wait_for_wish(self) -> bool:
+        """Wait until the wish is not None. Return False after `close`."""
         with self._changed:
             self._changed.wait_for(lambda: self._stopped or self._wanted is not None)
             return not self._stopped
 
     def _read(self, client: Client) -> None:
-        """Read until the end, until nothing is wanted, or until the connection is lost, which raises."""
+        """Read until `close`, or until the wish is None. Raises ImudError if the connection is lost."""
         client.events()
         reading = _Reading(client)
         hello: Hello | None = client.hello
@@ -131,21 +129,21 @@ class Feed:
 
 
 def clock_ahead_ns(daemon_now_ns: int) -> int:
-    """Return CLOCK_MONOTONIC of the daemon's machine, which an answer had just now, minus that of this machine.
+    """Return CLOCK_MONOTONIC of the daemon's host, from a reply just received, minus that clock of this host.
 
-    0 where both are one clock; they are not where SSH forwards the socket from another machine.
+    Return 0 on the same host. The hosts differ if SSH forwards the socket.
     """
     ahead_ns = daemon_now_ns - monotonic_ns()
     return ahead_ns if abs(ahead_ns) > SAME_CLOCK_NS else 0
 
 
 def utc_offset_ns(ahead_ns: int) -> int:
-    """Return what makes UTC of a time of the daemon, with the CLOCK_REALTIME of this machine."""
+    """Return UTC minus CLOCK_MONOTONIC of the daemon, with CLOCK_REALTIME of this host, ns."""
     return time_ns() - monotonic_ns() - ahead_ns
 
 
 class _Reading:
-    """One connection: when what is asked for next, and which devices are watched."""
+    """One connection: times of the next requests, and the watched devices."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
@@ -156,11 +154,11 @@ class _Reading:
         self._dropped = 0
         self._ahead_ns = 0
         self._first_event: Event | None = None
-        """One that came while there were no samples to wait for."""
+        """Event that arrived while the feed watched no device."""
 
     def next(self, wanted: Wish) -> News:
-        """Ask for what is due, and wait for samples and events for `wanted.news_s`."""
-        news = self._asked(wanted)
+        """Send due requests, then collect samples and events for `wanted.news_s`."""
+        news = self._requested(wanted)
         self._follow(wanted)
         samples = self._samples(wanted.news_s)
         events = self._events()
@@ -168,7 +166,7 @@ class _Reading:
         now_ns = monotonic_ns() + self._ahead_ns
         return news._replace(samples=samples, events=events, dropped=dropped, now_ns=now_ns, ahead_ns=self._ahead_ns)
 
-    def _asked(self, wanted: Wish) -> News:
+    def _requested(self, wanted: Wish) -> News:
         news = News()
         now_s = monotonic()
         if now_s >= self._status_due_s:
@@ -184,7 +182,7 @@ class _Reading:
         return news
 
     def _follow(self, wanted: Wish) -> None:
-        """Watch what is wanted now, as far as it is in the configuration."""
+        """Watch the known devices of the wish."""
         devices = None if wanted.devices is None else tuple(name for name in wanted.devices if name in self._known)
         chosen = (devices, wanted.rate_hz, wanted.news_s)
         if chosen == self._watched:
@@ -194,7 +192,7 @@ class _Reading:
                 self._client.unwatch()
                 self._watch = None
         else:
-            # Every sample may be as late as the news: the daemon sends several at once, which costs both less.
+            # without a rate, a hold of `news_s` saves CPU time on both sides: the daemon sends several samples together
             latency_ms = None if wanted.rate_hz is not None else wanted.news_s * 1e3
             self._watch = self._client.watch(
                 devices, rate_hz=wanted.rate_hz, timeout_s=wanted.news_s, latency_ms=latency_ms
@@ -206,7 +204,7 @@ class _Reading:
         self._dropped += count
 
     def _samples(self, limit_s: float) -> tuple[Sample, ...]:
-        """Take what comes in this time."""
+        """Return the samples that arrive in this time."""
         found: list[Sample] = []
         end_s = monotonic() + limit_s
         try:
@@ -221,7 +219,7 @@ class _Reading:
         return tuple(found)
 
     def _events(self) -> tuple[Event, ...]:
-        """Take the events that came meanwhile."""
+        """Return the events that arrived in the meantime."""
         found: list[Event] = []
         if self._first_event is not None:
             found.append(self._first_event)

@@ -1,15 +1,15 @@
-"""Reads the shared-memory ring of one device (`imud.formats.ring`): samples without a system call per sample.
+"""Reader of the shared-memory ring of one device (`imud.formats.ring`), without a system call per sample.
 
     with Ring("imu0") as ring:
         while True:
             for sample in ring.read().samples:
                 print(sample.seq, sample.accel_m_s2)
-            ring.wait(wake_fd, timeout_s=1.0)       # a descriptor of one's own, from `imud.client.Client.notify`
+            ring.wait(wake_fd, timeout_s=1.0)       # descriptor from `imud.client.Client.notify`
 
-Nothing here waits busily: a slot that is not whole yet is given by a later call. A daemon that restarts makes a new
-file, and so does one whose file was removed or cut; `read` and `latest` change over to it by themselves as soon as the
-old one is closed, cut, or its heartbeat is stale. Each call looks at the file's size first, because reading a page that
-was cut off ends the process by SIGBUS; only root and the daemon's user can cut it between that and the copy.
+The reader never waits busily: a later call returns a slot that is incomplete now. The daemon makes a new file after a
+restart, or if the file was removed or truncated. `read` and `latest` change to the new file when the old file is closed
+or truncated, or its heartbeat is too old. Each call checks the size of the file first, because a read of a truncated
+page ends the process (SIGBUS). Only root and the daemon's user can truncate the file between check and read.
 """
 
 import mmap
@@ -50,41 +50,42 @@ from imud.model.sample import Sample
 
 ROOT_UID = 0
 _ATTEMPTS = 3
-"""The writer may overtake one copy, hardly three in a row."""
+"""Number of attempts to copy a slot. The writer may overwrite it during one copy, but not during three copies."""
 _DRAIN_BYTES = 4096
-"""Far more than wait in a descriptor of the daemon's, so that one read takes all."""
+"""Size of one read from the descriptor, much more than it contains, bytes."""
 _NAME = re.compile(r"[\w-]{1,63}", re.ASCII)
 _SHOWN_MAX = 32
 
 
 class RingRead(NamedTuple):
-    """What one `read` found."""
+    """Result of `read`."""
 
     samples: list[Sample]
     """New samples, oldest first."""
     missed: int
-    """Samples that were overwritten before they could be read, since the `read` before."""
+    """Number of samples overwritten before this `read`, since the previous `read`."""
 
 
 class Ring:
-    """An open ring. Synchronization: one thread; every thread or process may open its own."""
+    """An open ring. Synchronization: one thread. Every thread or process may open its own Ring."""
 
     def __init__(
         self, device_or_path: str | Path, *, directory: str | None = None, from_oldest: bool = False,
         owner_uid: int = ROOT_UID, now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:  # fmt: skip
-        """Open by device name, or by path if there is a '/' in it; `read` gives the samples that come from now on.
+        """Open the ring of a device, or the file at a path that contains '/'.
 
-        `from_oldest`: it begins with the oldest sample that is still in the ring.
+        - `directory`: folder of the rings; None for `default_directory`.
+        - `from_oldest`: `read` begins with the oldest sample in the ring. Otherwise it begins with the next sample.
+        - `owner_uid`: accepted owner of the file, in addition to root and the owner of its folder. Set it to the
+          daemon's user if the folder is shared, such as /dev/shm.
 
-        A name is looked up in `directory`, by default as `default_directory` says. The file must belong to root, to
-        the owner of the directory it is in, or to `owner_uid`, the daemon's user where that directory is a shared one
-        such as /dev/shm. Raises ServerError: no such ring, not permitted, of another user, or of another layout.
+        Raises ServerError if there is no ring, no permission, another owner, or another layout.
         """
         text = str(device_or_path)
         self.path = Path(text) if "/" in text else ring_path(directory or default_directory(text), text)
         self.missed = 0
-        """Samples missed since opening."""
+        """Number of samples that `read` missed since opening."""
         self._now_ns = now_ns
         self._owner_uid = owner_uid
         self._change_to(_RingFile.open(self.path, owner_uid))
@@ -93,25 +94,25 @@ class Ring:
 
     @property
     def header(self) -> RingHeader:
-        """Epoch, process, device and sizes, which do not change while the ring lives; the rest as at opening."""
+        """The header at the time of opening. Epoch, process, device and sizes never change."""
         return self._header
 
     @property
     def epoch(self) -> int:
-        """Random number of the daemon's start; another one after a restart."""
+        """Random number of the daemon's start. A restart changes it."""
         return self._header.epoch
 
     @property
     def newest_seq(self) -> int:
-        """Sequence number of the newest sample, 0 before the first or when the file was cut."""
+        """Sequence number of the newest sample; 0 before the first sample, or if the file is truncated."""
         return self._newest() if self._whole() else 0
 
     def alive(self, now_ns: int) -> bool:
-        """Whether a daemon writes this ring, at `now_ns` of CLOCK_MONOTONIC."""
+        """Return whether a daemon writes this ring at `now_ns`, CLOCK_MONOTONIC."""
         return self._whole() and self._live(now_ns)
 
     def latest(self) -> Sample | None:
-        """The newest sample, None before the first. Does not move `read`. Raises as `reopen`."""
+        """Return the newest sample; None before the first. `read` still returns this sample. Raises as `reopen`."""
         whole = self._whole()
         if not (whole and self._live(self._now_ns())) and not self.reopen() and not whole:
             return None
@@ -123,7 +124,7 @@ class Ring:
         return None
 
     def read(self) -> RingRead:
-        """All samples since the `read` before. Raises as `reopen`."""
+        """Return all samples since the previous `read`. Raises as `reopen`."""
         whole = self._whole()
         found = self._collect() if whole else RingRead([], 0)
         if not found.samples and not found.missed and not (whole and self._live(self._now_ns())) and self.reopen():
@@ -132,7 +133,7 @@ class Ring:
         return found
 
     def ledger(self) -> LedgerBlock | None:
-        """The ledger and the driver in use; None before the first, while it is written, and when the file was cut."""
+        """Return the ledger and the driver; None before the first, during a write, or if the file is truncated."""
         if not self._whole():
             return None
         words, at = self._words, LEDGER_BLOCK_OFFSET
@@ -144,11 +145,11 @@ class Ring:
         return None
 
     def reopen(self) -> bool:
-        """Change to the new ring of this device, if there is one; False if not.
+        """Change to the new ring file of this device. Return False if there is no new file.
 
-        Samples come from the first on, or where the same daemon goes on with its numbers, from the last one read on;
-        those that the ring no longer holds count as missed. Raises ServerError when there is a file that cannot be
-        used, for example one of another user or another layout version.
+        `read` then begins with the first sample of the new ring. If the same daemon continues its sequence numbers,
+        `read` continues after the last sample, and overwritten samples count as missed. Raises ServerError if the new
+        file is unusable, for example because of its owner or its layout version.
         """
         try:
             status = self.path.lstat()
@@ -161,7 +162,7 @@ class Ring:
         except ServerError:
             if os.path.lexists(self.path):
                 raise
-            return False  # removed since
+            return False  # removed in the meantime
         continued = file.header.epoch == self.epoch and file.header.first_seq >= self._next
         self._next = self._next if continued else 1
         self.close()
@@ -169,9 +170,9 @@ class Ring:
         return True
 
     def wait(self, fd: int, timeout_s: float | None = None) -> bool:
-        """Wait until `fd`, of `imud.client.Client.notify`, is readable, and drain it; False after `timeout_s`.
+        """Wait until `fd`, from `imud.client.Client.notify`, is readable, and empty it. Return False after `timeout_s`.
 
-        Raises LinkMissing when the daemon ended it: it would be readable for ever.
+        Raises LinkMissing if the daemon ended the descriptor.
         """
         poller = select.poll()
         poller.register(fd, select.POLLIN)
@@ -182,10 +183,10 @@ class Ring:
                 return True
         except BlockingIOError:  # another thread or process was faster
             return True
-        raise LinkMissing(f"{self.path}: the daemon ended the descriptor; connect to its socket and ask for another")
+        raise LinkMissing(f"{self.path}: the daemon ended the descriptor; connect to its socket and call notify again")
 
     def close(self) -> None:
-        """Release the ring; may be called twice."""
+        """Close the ring. A second call does nothing."""
         for view in (self._words, self._halves):
             view.release()
         self._memory.close()
@@ -201,14 +202,14 @@ class Ring:
 
     def _change_to(self, file: "_RingFile") -> None:
         self._header, self._memory, self._fd, self._inode = file
-        self._close_descriptor = weakref.finalize(self, os.close, self._fd)  # also for a ring that nobody closes
+        self._close_descriptor = weakref.finalize(self, os.close, self._fd)  # also if the user does not call `close`
         with memoryview(self._memory) as view:
             self._words, self._halves = view.cast("Q"), view.cast("I")
         self._torn = (0, 0)
         self._size_bytes = len(self._memory)
 
     def _whole(self) -> bool:
-        """Whether the file still has every page that is mapped."""
+        """Return whether the file still contains every mapped page."""
         return os.lseek(self._fd, 0, os.SEEK_END) >= self._size_bytes
 
     def _newest(self) -> int:
@@ -217,11 +218,12 @@ class Ring:
     def _live(self, now_ns: int) -> bool:
         if self._halves[STATE_HALF_WORD] != STATE_LIVE:
             return False
-        return abs(now_ns - self._words[HEARTBEAT_WORD]) < HEARTBEAT_LIMIT_NS  # far in the future is no sign of life
+        # abs: a heartbeat in the future is invalid too
+        return abs(now_ns - self._words[HEARTBEAT_WORD]) < HEARTBEAT_LIMIT_NS
 
     def _collect(self) -> RingRead:
         newest, missed = self._newest(), 0
-        if 0 < newest < self._next - 1:  # the numbers began anew in the same ring
+        if 0 < newest < self._next - 1:  # the sequence numbers restarted in the same ring
             self._next = self._oldest(newest)
         samples: list[Sample] = []
         while self._next <= newest:
@@ -246,12 +248,13 @@ class Ring:
         return self._memory[at : at + size_bytes]
 
     def _oldest(self, newest: int) -> int:
-        """The oldest sample the ring can hold when `newest` is its newest; `newest` + 1 when it holds none."""
+        """Return the oldest sequence number in the ring if `newest` is the newest; `newest` + 1 if it is empty."""
         kept, first = max(newest - self._header.slot_count + 1, 1), self._words[FIRST_WORD]
-        return first if kept < first <= newest + 1 else kept  # `first` may be seen before the `newest` it belongs to
+        # above `newest` + 1: the writer has changed `first` since `newest` was read
+        return first if kept < first <= newest + 1 else kept
 
     def _slot(self, seq: int) -> Sample | None:
-        """Sample `seq` if its slot is whole and still its own."""
+        """Return sample `seq`; None if its slot is incomplete or contains another sample."""
         at = HEADER_BYTES + (seq & (self._header.slot_count - 1)) * SLOT_BYTES
         word = at >> 3
         if self._words[word] != seq:
@@ -264,11 +267,11 @@ class Ring:
         return sample if sample.seq == seq == self._words[word] else None
 
     def _overtaken(self) -> bool:
-        """Whether the writer has meanwhile begun to use the slot of `_next` anew."""
+        """Return whether the writer has reused the slot of `_next`."""
         return self._oldest(self._newest()) > self._next
 
     def _never_whole(self) -> bool:
-        """Whether `_next`, not whole before, still is not although newer samples were finished: it never will be."""
+        """Return whether slot `_next` will stay incomplete: it was incomplete before, and newer slots are complete."""
         newest = self._newest()
         seq, newest_then = self._torn
         if seq != self._next:
@@ -278,9 +281,9 @@ class Ring:
 
 
 def default_directory(device: str = "") -> str:
-    """The directory where a ring is looked up by name: the environment variable IMUD_SHM, if that is set.
+    """Return the folder of the rings: the environment variable IMUD_SHM if it is not empty.
 
-    Otherwise /run/imud/shm, or $XDG_RUNTIME_DIR/imud/shm if the ring of `device` is only there.
+    Otherwise /run/imud/shm, or $XDG_RUNTIME_DIR/imud/shm if only this folder contains the ring of `device`.
     """
     named = os.environ.get("IMUD_SHM")
     if named:
@@ -292,7 +295,7 @@ def default_directory(device: str = "") -> str:
 
 
 class _RingFile(NamedTuple):
-    """A ring's file, open and mapped."""
+    """An open and mapped ring file."""
 
     header: RingHeader
     memory: mmap.mmap
@@ -301,22 +304,22 @@ class _RingFile(NamedTuple):
 
     @classmethod
     def open(cls, path: Path, owner_uid: int) -> Self:
-        """Raises ServerError for anything but a ring that may be read and believed."""
+        """Open the file. Raises ServerError if it is not a readable ring of a trusted owner."""
         try:
             descriptor = os.open(path, OPEN_FLAGS)
         except FileNotFoundError:
             raise ServerError(f"{path}: no such ring; {_what_there_is(path)}") from None
         except PermissionError as error:
             raise ServerError(
-                f"{path} may not be read; is this user in the group that `ls -l {path}` shows?"
+                f"cannot read {path}: no permission; add this user to the group of the file (ls -l {path})"
             ) from error
         except OSError as error:
-            raise ServerError(f"{path} cannot be read: {error.strerror}") from error
+            raise ServerError(f"cannot read {path}: {error.strerror}") from error
         try:
             return cls._mapped(descriptor, path, owner_uid)
         except OSError as error:
             os.close(descriptor)
-            raise ServerError(f"{path} cannot be read: {error.strerror}") from error
+            raise ServerError(f"cannot read {path}: {error.strerror}") from error
         except ServerError:
             os.close(descriptor)
             raise
@@ -326,30 +329,29 @@ class _RingFile(NamedTuple):
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             kind = stat.filemode(status.st_mode)[0]
-            raise ServerError(f"{path} is no ring of imud: expected a regular file (-), found another kind ({kind})")
+            raise ServerError(f"{path} is no ring of imud: expected a regular file (-), got another kind ({kind})")
         _check_owner(path, status.st_uid, owner_uid)
         header = decode_header(os.pread(descriptor, HEADER_BYTES, 0), str(path))
         expected_bytes = HEADER_BYTES + header.slot_count * SLOT_BYTES
         if status.st_size < expected_bytes:
-            raise ServerError(f"{path}: expected {expected_bytes} bytes, found {status.st_size}; the file was cut")
+            raise ServerError(f"{path}: expected {expected_bytes} bytes, got {status.st_size}; the file is truncated")
         memory = mmap.mmap(descriptor, expected_bytes, prot=mmap.PROT_READ)
         return cls(header, memory, descriptor, (status.st_dev, status.st_ino))
 
 
 def _check_owner(path: Path, found_uid: int, owner_uid: int) -> None:
-    """Raise ServerError where a user may have planted the file who is neither trusted nor named.
-
-    The owner of the directory may replace every file in it anyway. The header's pid is no proof: it can be forged.
-    """
+    """Raise ServerError if the owner of the file is not trusted, because any user could have made it."""
+    # the owner of the folder can replace every file in it; the pid in the header can be forged
     directory_uid = path.parent.stat().st_uid
     if found_uid not in (ROOT_UID, directory_uid, owner_uid):
         raise ServerError(
-            f"{path} belongs to user {found_uid}, who may have planted it: expected root or user {directory_uid}, the"
-            f" owner of {path.parent}; if the daemon runs as user {found_uid}, name that user (owner_uid)"
+            f"{path} belongs to user {found_uid}: expected root or user {directory_uid}, the owner of {path.parent}; "
+            f"set owner_uid={found_uid} if the daemon runs as this user"
         )
 
 
 def _what_there_is(path: Path) -> str:
     names = sorted(file.name.removeprefix(FILE_PREFIX) for file in path.parent.glob(FILE_PREFIX + "*"))
-    shown = [name for name in names if _NAME.fullmatch(name)][:_SHOWN_MAX]  # in a shared directory: anybody's
+    # a shared folder may contain files of any user
+    shown = [name for name in names if _NAME.fullmatch(name)][:_SHOWN_MAX]
     return f"there are rings for: {', '.join(shown)}" if shown else "there are none: is imud running, with shm enabled?"

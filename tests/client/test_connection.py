@@ -166,14 +166,14 @@ def test_events(served: Daemon) -> None:
         served.do(lambda server: server.event(down))
         assert next(events) == down
         short = client.events(timeout_s=0.01)
-        with pytest.raises(TimeoutError, match="waited in vain for event"):
+        with pytest.raises(TimeoutError, match="no event within"):
             next(short)
 
 
 def test_an_event_of_a_kind_to_come_is_accepted() -> None:
     event = event_of({"t_ns": 1, "device": "imu0", "kind": "earthquake", "message": "m", "later": 1})
     assert event.kind == "earthquake"
-    with pytest.raises(ServerError, match="an event that is not understood"):
+    with pytest.raises(ServerError, match="cannot decode an event"):
         event_of({"t_ns": 1})
 
 
@@ -264,12 +264,16 @@ def answering(path: Path, answer: bytes) -> Iterator[None]:
         (b'{"jsonrpc":"2.0","id":null,"error":{"code":-32001,"message":"uid 5 may not"}}\n', LinkDenied, "uid 5 may"),
         (b"SSH-2.0\n", ServerError, "expected a JSON object"),
         (b"{}\n", ServerError, "expected the daemon's hello"),
-        (HELLO.replace(b'"protocol":1', b'"protocol":2'), ServerError, "speaks protocol 2, this client 1"),
-        (HELLO.replace(b'"epoch":7', b'"epoch":"x"'), ServerError, "expected the greeting of an imud daemon"),
-        (b"", TimeoutError, "waited in vain for hello"),
-        (HELLO + b'{"id":1,"result":{"devices":{}}}\n\xff\xff\xff\xff', ServerError, "boundary"),
+        (HELLO.replace(b'"protocol":1', b'"protocol":2'), ServerError, "expected protocol 1, got 2"),
+        (HELLO.replace(b'"epoch":7', b'"epoch":"x"'), ServerError, "cannot decode the greeting"),
+        (b"", TimeoutError, "no hello within"),
+        (HELLO + b'{"id":1,"result":{"devices":{}}}\n\xff\xff\xff\xff', ServerError, "expected a frame of at most"),
         (HELLO + b'{"id":1,"result":{"devices":{"a":0}}}\n\x00\x01\x00\x00' + bytes(256), ServerError, "CRC"),
-        (HELLO + b'{"id":1,"result":{"devices":{}}}\n\x00\x01\x00\x00' + bytes(256), ServerError, "device number 0"),
+        (
+            HELLO + b'{"id":1,"result":{"devices":{}}}\n\x00\x01\x00\x00' + bytes(256),
+            ServerError,
+            "known device number .*, got 0",
+        ),
     ],
 )
 def test_servers_that_misbehave(tmp_path: Path, answer: bytes, error: type[Exception], words: str) -> None:
@@ -285,5 +289,5 @@ def test_a_daemon_that_does_not_know_conventions_is_no_silent_mistake(tmp_path: 
     path = tmp_path / "s"
     with answering(path, HELLO + b'{"id":1,"result":{"devices":{},"samples":[]}}\n'), Client(path) as client:
         ask = client.watch if method == "watch" else client.poll
-        with pytest.raises(ServerError, match="gives no samples as ned-frd: it is older"):
+        with pytest.raises(ServerError, match="does not know the convention ned-frd"):
             ask(convention="ned-frd")

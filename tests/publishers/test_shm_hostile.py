@@ -415,9 +415,9 @@ def test_full_tmpfs(tmp_path: Path) -> None:
 def test_reader_does_not_wait_for_a_fifo(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "imud.x")
     (tmp_path / "imud.y").symlink_to("imud.x")
-    with pytest.raises(ServerError, match=r"expected a regular file \(-\), found another kind \(p\)"):
+    with pytest.raises(ServerError, match=r"expected a regular file \(-\), got another kind \(p\)"):
         Ring(tmp_path / "imud.x")
-    with pytest.raises(ServerError, match="cannot be read"):
+    with pytest.raises(ServerError, match="cannot read"):
         Ring(tmp_path / "imud.y")
 
 
