@@ -115,12 +115,12 @@ class Watch:
             return
         params = params_of(message)
         if message["method"] == "device":
-            known = _decoded(params, DeviceNumber, "the number of a device")
+            known = _decoded(params, DeviceNumber, "device")
             self.device_ids[known.device] = known.device_id
             self._names[known.device_id] = known.device
             return
         if params.get("dropped"):
-            lost = _decoded(params, DroppedSamples, "a number of dropped samples")
+            lost = _decoded(params, DroppedSamples, "dropped")
             self._note_dropped(lost.device, lost.dropped)
         params.pop("dropped", None)
         if message["method"] == "sample":
@@ -172,7 +172,7 @@ def sample_of(params: Mapping[str, Any]) -> Sample:
 
 def event_of(params: Mapping[str, Any]) -> Event:
     """Return the event in a JSON notification. An unknown kind stays a string. Raises ServerError."""
-    received = _decoded(params, ReceivedEvent, "an event")
+    received = _decoded(params, ReceivedEvent, "event")
     return Event(received.t_ns, received.device, kind_of(received.kind), received.message, received.detail)
 
 
@@ -185,11 +185,11 @@ def params_of(message: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _decoded(params: Mapping[str, Any], kind: type[T], name: str) -> T:
-    """Return the parameters of a notification as `kind`. `name` is for the error. Raises ServerError."""
+    """Return the parameters of the notification `name` as `kind`. Raises ServerError."""
     try:
         return msgspec.convert(params, kind)
     except msgspec.ValidationError as error:
-        raise ServerError(f"cannot decode {name}: {reason_of(error)}") from error
+        raise ServerError(f"cannot decode the notification {name!r}: {reason_of(error)}") from error
 
 
 def _with_nan(value: object) -> object:

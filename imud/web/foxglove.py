@@ -1,4 +1,4 @@
-"""Relay of the daemon's samples, events and status to a viewer, as messages of a dialect (`imud.bridges`)."""
+"""Server for Foxglove viewers: relays samples, events and status of the daemon in a dialect of `imud.bridges`."""
 
 import asyncio
 import secrets
@@ -32,36 +32,36 @@ from imud.model.sample import Sample
 from imud.web.guard import is_loopback, is_own_host
 
 ROUND_S: Final = 0.25
-"""Time between two looks at events and at who looks: a tenth would be no better to a person, and costs more."""
+"""Time between two checks for events and for subscriptions of viewers, s."""
 STATUS_S: Final = 1.0
 RETRY_S: Final = 1.0
-"""Time between two attempts to reach the daemon."""
+"""Time between two attempts to connect to the daemon, s."""
 NORTH: Final = "ENU"
-"""Navigation frame of a device whose heading has to do with north, as the status has it."""
+"""Navigation frame in the status of a device with a heading relative to north."""
 
 
 class Viewer(Protocol):
-    """What shows messages, or has clients that do."""
+    """Receiver of messages: the server, or a recorder of a test."""
 
     @property
     def is_looked_at(self) -> bool:
-        """Whether a viewer wants samples now."""
+        """Whether a client has a subscription."""
         ...
 
     def open(self, channel: MessageChannel[Any]) -> None:
-        """Offer a channel; no-op for one whose topic is offered already."""
+        """Offer a channel. Do nothing if its topic is already offered."""
         ...
 
     def close_topic(self, topic: str) -> None:
-        """Offer it no more; no-op for one that is not."""
+        """Stop offering a topic. Do nothing if it is not offered."""
         ...
 
     def send(self, channel: MessageChannel[Any], item: object, utc_ns: int) -> None:
-        """Make a message of `item` for those who want it."""
+        """Encode `item` and send it to the subscribed clients."""
         ...
 
     def problem(self, text: str) -> None:
-        """Show why nothing comes; empty: it does."""
+        """Show why no messages arrive; empty if they arrive."""
         ...
 
 
@@ -79,10 +79,10 @@ class Relay:
         noise: Mapping[str, Deviations] | None = None,
         utc_offset_ns: Callable[[int], int] = lambda now_ns: utc_offset_ns(clock_ahead_ns(now_ns)),
     ) -> None:
-        """`devices` are those that are shown, none: all; each at most `rate_hz`, None: every sample.
+        """Relay `devices` (empty: all) with at most `rate_hz` samples per second (None: every sample).
 
-        `utc_offset_ns` gets what the daemon's CLOCK_MONOTONIC was just now, and returns what makes UTC of it.
-        `noise`, by device, is taken in place of what the daemon's configuration has.
+        `utc_offset_ns` receives the present CLOCK_MONOTONIC of the daemon and returns UTC minus this time, ns.
+        `noise` replaces the noise in the daemon's configuration, by device.
         """
         self._path = path
         self._viewer = viewer
@@ -91,7 +91,7 @@ class Relay:
         self._noise = noise or {}
         self._utc_offset_of = utc_offset_ns
         self._utc_offset_ns = 0
-        """As of the newest status."""
+        """UTC minus CLOCK_MONOTONIC at the newest status."""
         self._dialect = dialect
         self._events = dialect.events()
         self._diagnostics = dialect.diagnostics()
@@ -100,7 +100,7 @@ class Relay:
         self._stop = ThreadEvent()
 
     def run(self) -> None:
-        """Relay until `stop`."""
+        """Relay until `stop`. Connect again if the connection is lost."""
         self._viewer.open(self._events)
         self._viewer.open(self._diagnostics)
         while not self._stop.is_set():
@@ -113,11 +113,11 @@ class Relay:
                 self._stop.wait(RETRY_S)
 
     def stop(self) -> None:
-        """End `run`, within a round."""
+        """End `run` within ROUND_S."""
         self._stop.set()
 
     def _read(self, client: Client) -> None:
-        """Relay until the end, or until the connection is lost, which raises."""
+        """Relay until `stop`. Raises ImudError if the connection is lost."""
         events = client.events(self._wanted or None, timeout_s=ROUND_S)
         watch: Watch | None = None
         due_s = 0.0
@@ -141,13 +141,13 @@ class Relay:
                 self._show_event(event_of(params_of(message)))
 
     def _show_samples(self, watch: Watch) -> None:
-        """Relay what comes in a round, each at once."""
+        """Relay the samples that arrive in ROUND_S."""
         end_s = monotonic() + ROUND_S
         with suppress(TimeoutError):
             while monotonic() < end_s:
                 sample = next(watch)
                 device = self._devices.get(sample.device)
-                if device is not None:  # one that was configured just now is shown with the next status
+                if device is not None:  # imud shows a new device after the next status
                     device.show(sample)
 
     def _show_event(self, event: Event) -> None:
@@ -164,18 +164,18 @@ class Relay:
         self._utc_offset_ns = self._utc_offset_of(answer["now_ns"])
         utc_ns = answer["now_ns"] + self._utc_offset_ns
         self._viewer.problem("")
-        there = {status.name: status for status in statuses if not self._wanted or status.name in self._wanted}
-        for name in self._devices.keys() - there.keys():
+        shown = {status.name: status for status in statuses if not self._wanted or status.name in self._wanted}
+        for name in self._devices.keys() - shown.keys():
             gone = self._devices.pop(name)
             gone.close(kept=frozenset().union(*(device.topics for device in self._devices.values())))
-        for name, status in there.items():
+        for name, status in shown.items():
             known = self._devices.get(name)
             noise = (status.noise or Deviations()).updated(self._noise.get(name, Deviations()))
             frames = MessageFrames(name, has_north=_has_north(status), deviations=noise)
             if known is None or known.frames != frames:
                 known = self._devices[name] = _ShownDevice(self._viewer, self._dialect, frames)
             known.show_status(status, utc_ns)
-        self._show_diagnoses(self._diagnosis.of(there.values(), utc_ns))
+        self._show_diagnoses(self._diagnosis.of(shown.values(), utc_ns))
         unknown = [name for name, device in self._devices.items() if not device.is_offered]
         for sample in client.poll(unknown, convention=Convention.ENU_FLU) if unknown else ():
             self._devices[sample.device].show(sample)
@@ -194,11 +194,11 @@ class _ShownDevice:
 
     @property
     def is_offered(self) -> bool:
-        """Whether channels of its samples are offered: what they are is known from the first sample."""
+        """Whether channels of samples are offered. The first sample determines these channels."""
         return bool(self._open)
 
     def show(self, sample: Sample) -> None:
-        """Send the messages of a sample; a channel is offered with the first sample that has something for it."""
+        """Send the messages of a sample. Offer a channel with its first message."""
         for channel in self._channels:
             if channel.topic not in self._open:
                 if channel.encode(sample) is None:
@@ -208,22 +208,21 @@ class _ShownDevice:
             self._viewer.send(channel, sample, sample.utc_ns)
 
     def show_status(self, status: DeviceStatus, utc_ns: int) -> None:
-        """Send the status."""
         self._viewer.send(self._status, (status, utc_ns), utc_ns)
 
     @property
     def topics(self) -> frozenset[str]:
-        """Topics that are offered for it; that of transforms is one for all devices."""
+        """Offered topics of the device. All devices share the topic of transforms."""
         return frozenset((*self._open, self._status.topic))
 
     def close(self, kept: Collection[str]) -> None:
-        """Offer nothing of it any more but the topics that others have as well."""
+        """Stop offering the topics of the device, except topics of other devices (`kept`)."""
         for topic in self.topics.difference(kept):
             self._viewer.close_topic(topic)
 
 
 def _has_north(status: DeviceStatus) -> bool:
-    """Whether the navigation frame of its samples in enu-flu is ENU; while its driver is not known, as if it was."""
+    """Return whether the navigation frame of samples in enu-flu is ENU; True while the driver is unknown."""
     if status.frame is None:
         return True
     words = status.frame.conventions.get(str(Convention.ENU_FLU))
@@ -231,32 +230,32 @@ def _has_north(status: DeviceStatus) -> bool:
 
 
 VIEWERS: Final = ("file://", "https://app.foxglove.dev")
-"""Foxglove and Lichtblick as programs, and Foxglove in the browser."""
+"""Origins of the desktop programs Foxglove and Lichtblick, and of Foxglove in the browser."""
 SCHEMES: Final = ("http", "https")
 
 
 class ViewerOrigins:
-    """The rule of one server."""
+    """Accepted hosts and origins of one server."""
 
     def __init__(self, *, names: Iterable[str] = (), origins: Iterable[str] = ()) -> None:
-        """`names` are further names of this host, `origins` further sites. Raises BadArgument for what is no origin."""
+        """Accept additional `names` of this host and additional `origins`. Raises BadArgument for an invalid origin."""
         self._names: Collection[str] = {"localhost", *(name.lower() for name in names)}
         self._origins = {*VIEWERS, *(_checked(origin) for origin in origins)}
 
     def problem(self, host: str, origin: str) -> str:
-        """Return why a request is refused; empty where it may pass. `origin` is empty where there is none."""
+        """Return the reason to refuse a request; empty to accept it. `origin` is empty without the header Origin."""
         if not is_own_host(host, self._names):
             return (
                 f"expected an IP address or one of {', '.join(sorted(self._names))} as the host, got {host[:80]!r}; "
-                "another name of this host is given with --host NAME"
+                "add another name of this host with --host NAME"
             )
-        if not origin or origin.lower() in self._origins or _is_of_this_machine(origin):
+        if not origin or origin.lower() in self._origins or _is_local(origin):
             return ""
-        return f"pages of {origin[:80]!r} may not read; they may with --allow-origin {origin[:80]}"
+        return f"pages of {origin[:80]!r} may not read; allow them with --allow-origin {origin[:80]}"
 
 
-def _is_of_this_machine(origin: str) -> bool:
-    """Decide whether a page is served by this machine: who serves it could read without a browser."""
+def _is_local(origin: str) -> bool:
+    """Return whether this host serves the page. A program on this host could read without a browser."""
     parts = _parts(origin)
     return parts is not None and is_loopback(parts[1])
 
@@ -268,7 +267,7 @@ def _checked(origin: str) -> str:
 
 
 def _parts(origin: str) -> tuple[str, str] | None:
-    """Split an origin into scheme and host name; None for what is none."""
+    """Return scheme and host name of an origin; None if it is invalid."""
     origin = origin.lower()
     try:
         parts = urlsplit(origin)
@@ -281,27 +280,27 @@ def _parts(origin: str) -> tuple[str, str] | None:
 
 
 HEAD_BYTES_MAX: Final = 16384
-"""Of a request: a browser sends about 600 bytes, and its cookies for this host."""
+"""Maximum size of a request head, bytes. A browser sends about 600 bytes and its cookies for this host."""
 HEAD_S: Final = 10.0
-"""Time for the request to come."""
+"""Time limit for the request head, s."""
 CONNECTIONS_MAX: Final = 32
-"""Viewers at a time: each has a backlog of 1024 messages in the server."""
+"""Maximum number of viewers. The server has a queue of 1024 messages for each."""
 READ_BYTES: Final = 65536
 GATHER_S: Final = 0.005
-"""Pause after each read of messages: the server writes each message alone, and a viewer draws every 16 ms."""
+"""Pause after each read of messages, s. The server writes each message separately. A viewer draws every 16 ms."""
 NOTES_MAX: Final = 20
-"""Refusals that are printed, each once: a page may try again for ever."""
+"""Maximum number of printed refusals. The gate prints each text once, because a page may try again forever."""
 
 
 class ViewerGate:
-    """The gate in front of a server, in a thread of its own. Synchronization: `close` in the thread that made it."""
+    """Checks connections and forwards them to a server, in a thread of its own. Call `close` in the creating thread."""
 
     def __init__(
         self, host: str, port: int, server: tuple[str, int], origins: ViewerOrigins, *, note: Callable[[str], None]
     ) -> None:
-        """Listen on `host` and `port` (0: a free one) for the server at the address and port `server`.
+        """Listen on `host` and `port` (0: any free port), and forward to the address and port `server`.
 
-        `note` is called in another thread with each refusal for the first time. Raises ServerError.
+        The gate's thread calls `note` with each new refusal. Raises ServerError if it cannot listen.
         """
         self._server = server
         self._origins = origins
@@ -318,14 +317,14 @@ class ViewerGate:
         self._ready.wait()
 
     def close(self) -> None:
-        """End all connections; may be called twice."""
+        """Close all connections. A second call does nothing."""
         if self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._stopped.set)
         self._thread.join()
 
     def _run(self) -> None:
         with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
-            runner.run(self._serve())  # the runner cancels the connections that are left
+            runner.run(self._serve())  # the runner cancels the remaining connections
 
     async def _serve(self) -> None:
         listening = await asyncio.start_server(self._accept, sock=self._socket, limit=HEAD_BYTES_MAX)
@@ -334,14 +333,12 @@ class ViewerGate:
         listening.close()
 
     def _accept(self, reader: StreamReader, writer: StreamWriter) -> None:
-        """Serve a connection; its writer is closed even where the gate ends before the task has begun."""
         task = self._loop.create_task(self._take(reader, writer))
         self._connections.add(task)
         task.add_done_callback(self._connections.discard)
-        task.add_done_callback(lambda _: writer.close())
+        task.add_done_callback(lambda _: writer.close())  # also if the gate closes before the task starts
 
     async def _take(self, reader: StreamReader, writer: StreamWriter) -> None:
-        """Serve a connection to its end."""
         try:
             async with asyncio.timeout(HEAD_S):
                 head = await reader.readuntil(b"\r\n\r\n")
@@ -352,22 +349,22 @@ class ViewerGate:
             else:
                 await self._join(head, reader, writer)
         except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # it went away, or it is no viewer
+            pass  # the client has left, or it is not a viewer
 
     def _judge(self, head: bytes) -> tuple[str, str]:
-        """Return the HTTP status and the words of a refusal; empty words where the request may pass."""
+        """Return HTTP status and reason of a refusal. The reason is empty if the gate accepts the request."""
         if len(self._connections) > CONNECTIONS_MAX:
-            return "503 Service Unavailable", f"{CONNECTIONS_MAX} viewers are connected, which is the most"
+            return "503 Service Unavailable", f"{CONNECTIONS_MAX} viewers are connected, the maximum; close one"
         request, _, rest = head.partition(b"\r\n")
         try:
             headers = parse_headers(BytesIO(rest))
         except (HTTPException, MessageError):
-            return "400 Bad Request", "expected a request of a WebSocket"
+            return "400 Bad Request", "expected a WebSocket request"
         hosts, origins = headers.get_all("Host", []), headers.get_all("Origin", [])
         if headers.defects or len(hosts) != 1 or len(origins) > 1 or not request.endswith(b" HTTP/1.1"):
-            return "400 Bad Request", "expected a request of a WebSocket"
+            return "400 Bad Request", "expected a WebSocket request"
         if headers.get("Upgrade", "").lower() != "websocket":
-            return "426 Upgrade Required", "expected a WebSocket: open ws:// and this address in a viewer"
+            return "426 Upgrade Required", "expected a WebSocket request; open ws:// and this address in a viewer"
         problem = self._origins.problem(hosts[0].strip(), origins[0].strip() if origins else "")
         if problem and problem not in self._noted and len(self._noted) < NOTES_MAX:
             self._noted.add(problem)
@@ -375,23 +372,23 @@ class ViewerGate:
         return "403 Forbidden", problem
 
     async def _join(self, head: bytes, reader: StreamReader, writer: StreamWriter) -> None:
-        """Pass bytes on in both directions until one end closes."""
+        """Forward bytes in both directions until one end closes."""
         server_reader, server_writer = await asyncio.open_connection(*self._server, limit=READ_BYTES)
         server_writer.write(head)
-        ways = (
-            asyncio.create_task(_pass_on(reader, server_writer, 0.0)),
-            asyncio.create_task(_pass_on(server_reader, writer, GATHER_S)),
+        copies = (
+            asyncio.create_task(_forward(reader, server_writer, 0.0)),
+            asyncio.create_task(_forward(server_reader, writer, GATHER_S)),
         )
         try:
-            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(copies, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            server_writer.close()  # before the wait: the end of the gate may cancel that
-            for way in ways:
-                way.cancel()
-            await asyncio.gather(*ways, return_exceptions=True)
+            server_writer.close()  # before `gather`, which may be cancelled
+            for copy in copies:
+                copy.cancel()
+            await asyncio.gather(*copies, return_exceptions=True)
 
 
-async def _pass_on(reader: StreamReader, writer: StreamWriter, pause_s: float) -> None:
+async def _forward(reader: StreamReader, writer: StreamWriter, pause_s: float) -> None:
     with suppress(OSError):
         while data := await reader.read(READ_BYTES):
             writer.write(data)
@@ -400,7 +397,7 @@ async def _pass_on(reader: StreamReader, writer: StreamWriter, pause_s: float) -
 
 
 def _listening(host: str, port: int) -> socket.socket:
-    """Open the socket. Raises ServerError naming what to look at."""
+    """Return a listening socket. Raises ServerError."""
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family)
@@ -417,18 +414,15 @@ def _refusal(status: str, problem: str) -> bytes:
 
 
 STATUS_ID: Final = "daemon"
-"""Of the status message that says why nothing comes."""
+"""Id of the status message with the reason for missing messages."""
 LOOPBACK: Final = IPv4Network("127.0.0.0/8")
 
 
 class FoxgloveServer:
-    """A server, which is a `Viewer`. Synchronization: one thread; the library has its own."""
+    """A `Viewer` that serves Foxglove clients. Synchronization: one thread; the library has its own threads."""
 
     def __init__(self, host: str, port: int, origins: ViewerOrigins, *, note: Callable[[str], None]) -> None:
-        """`note` says a problem for people, once each, also in the gate's thread.
-
-        Raises ServerError where the address cannot be had.
-        """
+        """Listen. `note` prints a problem; the gate's thread calls it too. Raises ServerError if it cannot listen."""
         self._note = note
         self._problem = ""
         self._context = foxglove.Context()
@@ -436,8 +430,8 @@ class FoxgloveServer:
         behind = hidden_address()
         try:
             self._server = foxglove.start_server(name="imud", host=behind, port=0, context=self._context)
-        except RuntimeError as error:  # what foxglove-sdk makes of every error of the operating system
-            raise ServerError(f"foxglove-sdk cannot listen on {behind}, behind imud's own port: {error}") from error
+        except RuntimeError as error:  # foxglove-sdk raises it for every error of the operating system
+            raise ServerError(f"foxglove-sdk cannot listen on the internal address {behind}: {error}") from error
         try:
             self._gate = ViewerGate(host, port, (behind, self._server.port), origins, note=note)
         except ServerError:
@@ -447,11 +441,9 @@ class FoxgloveServer:
 
     @property
     def is_looked_at(self) -> bool:
-        """Whether a client has subscribed to anything."""
         return any(channel.has_sinks() for channel in self._channels.values())
 
     def open(self, channel: MessageChannel[Any]) -> None:
-        """Offer a channel; no-op for one whose topic is offered already."""
         if channel.topic not in self._channels:
             name, encoding, data = channel.schema
             self._channels[channel.topic] = foxglove.Channel(
@@ -462,13 +454,11 @@ class FoxgloveServer:
             )
 
     def close_topic(self, topic: str) -> None:
-        """Offer it no more; no-op for one that is not."""
         channel = self._channels.pop(topic, None)
         if channel is not None:
             channel.close()
 
     def send(self, channel: MessageChannel[Any], item: object, utc_ns: int) -> None:
-        """Make a message of `item` if a client wants it, and send it."""
         offered = self._channels[channel.topic]
         if offered.has_sinks():
             data = channel.encode(item)
@@ -476,7 +466,7 @@ class FoxgloveServer:
                 offered.log(data, log_time=max(utc_ns, 0))
 
     def problem(self, text: str) -> None:
-        """Show clients and the terminal why nothing comes; empty: it does."""
+        # to the clients and to the terminal
         if text == self._problem:
             return
         self._problem = text
@@ -484,15 +474,16 @@ class FoxgloveServer:
             self._note(text)
             self._server.publish_status(text, StatusLevel.Error, STATUS_ID)
         else:
-            self._note("samples come again")
+            self._note("connected to the daemon again")
             self._server.remove_status([STATUS_ID])
 
     def close(self) -> None:
-        """End the server; may be called twice."""
+        """Stop the server. A second call does nothing."""
         self._gate.close()
         self._server.stop()
 
 
 def hidden_address() -> str:
-    """Choose one of 16 million addresses of this machine: with its port, no page finds the server by trying."""
+    """Return a random loopback address."""
+    # one of 16 million: a page cannot find the server behind the gate by trying
     return str(LOOPBACK[1 + secrets.randbelow(LOOPBACK.num_addresses - 2)])

@@ -1,11 +1,11 @@
-"""Who may ask what: the header Host, the header Origin, the token, the cookie that a browser gets for it.
+"""Access control of the web servers: headers Host and Origin, the token, and the cookie of a browser.
 
-- **Host** keeps out pages of other names that resolve to this address (DNS rebinding): a page cannot be served under an
-  IP address or `localhost` by another party, so these are good; other names have to be given.
-- **Origin** keeps out requests that pages of other sites send from the same browser. Browsers send it with every POST
-  and every WebSocket. A program that has the token may leave it out.
-- **The token** is never in a URL, which logs keep. A browser exchanges it for a cookie that scripts cannot read and
-  that no other site can send (HttpOnly, SameSite=Strict); a program sends it as `Authorization: Bearer`.
+- **Host** refuses pages with another name for this address (DNS rebinding). IP addresses and `localhost` are accepted,
+  because no other party can serve a page under them. The user configures other names.
+- **Origin** refuses requests of other sites in the same browser. Browsers send this header with every POST and
+  WebSocket. A program with the token may omit it.
+- **The token** is never part of a URL, because logs contain URLs. A browser exchanges it for a cookie that scripts
+  cannot read and other sites cannot send (HttpOnly, SameSite=Strict). A program sends it as `Authorization: Bearer`.
 """
 
 import hashlib
@@ -18,30 +18,30 @@ from typing import Final, NamedTuple
 from imud.model.errors import BadArgument, reason_of
 
 TOKEN_CHARACTERS_MIN: Final = 20
-"""Of letters and digits these are more than 100 bits: nobody guesses them, however fast they ask."""
+"""Minimum length of the token: 20 letters and digits are more than 100 bits, too many to guess."""
 TOKEN_BYTES_MAX: Final = 1024
 COOKIE: Final = "imud-session"
 SESSION_S: Final = 12 * 3600
-"""A browser asks for the token again after a working day."""
+"""Lifetime of a cookie, s: one working day."""
 BEARER: Final = "Bearer "
 
 
 class WebRights(NamedTuple):
-    """What one request may."""
+    """Permissions of one request."""
 
     read: bool
     control: bool
     by_cookie: bool = False
-    """Whether it is by the cookie, which a browser sends by itself."""
+    """Whether the permission is from the cookie, which a browser sends automatically."""
 
 
 class WebGuard:
-    """The rules of one server. `now_s` is the time since 1970-01-01 UTC."""
+    """Access rules of one server. `now_s` is the time since 1970-01-01 UTC."""
 
     def __init__(
         self, token: bytes, now_s: Callable[[], float], *, reading_needs_token: bool, names: Collection[str] = ()
     ) -> None:
-        """`token` is empty where there is none: then nobody controls anything. `names`: further names of this host."""
+        """No request may control if `token` is empty. `names` are additional names of this host."""
         self._token = token
         self._now_s = now_s
         self._reading_needs_token = reading_needs_token
@@ -49,43 +49,43 @@ class WebGuard:
 
     @property
     def has_token(self) -> bool:
-        """Whether there is anything to log in with."""
+        """Whether a login is possible."""
         return bool(self._token)
 
     def host_problem(self, host: str | None) -> str:
-        """Return why the header Host is not accepted; empty where it is."""
+        """Return the reason to refuse the header Host; empty to accept it."""
         if is_own_host(host or "", self._names):
             return ""
         return f"expected an IP address or one of {', '.join(sorted(self._names))} as the host; see imud web --host"
 
     def origin_problem(self, origin: str | None, host: str | None, *, with_token: bool) -> str:
-        """Return why the header Origin of a POST or a WebSocket is not accepted; empty where it is."""
+        """Return the reason to refuse the header Origin of a POST or WebSocket; empty to accept it."""
         if origin is None:
             return "" if with_token else "expected the header Origin, or the token in the header Authorization"
         scheme, _, place = origin.partition("://")
         if scheme in ("http", "https") and place and place.lower() == (host or "").lower():
             return ""
-        return "expected a request of this server's own page, got one of another site"
+        return "expected a request of a page of this server, got a request of another site"
 
     def rights(self, authorization: str | None, cookie: str | None) -> WebRights:
-        """Return what a request with these headers may."""
+        """Return the permissions of a request with these headers."""
         by_header = (authorization or "").startswith(BEARER) and self.is_token((authorization or "")[len(BEARER) :])
         by_cookie = not by_header and self.is_session(cookie or "")
         return WebRights(not self._reading_needs_token or by_header or by_cookie, by_header or by_cookie, by_cookie)
 
     def is_token(self, words: str) -> bool:
-        """Compare with the token, in a time that does not depend on where they differ."""
+        """Return whether `words` is the token, in constant time."""
         return bool(self._token) and hmac.compare_digest(
             _digest(words.encode("utf-8", "replace")), _digest(self._token)
         )
 
     def new_session(self) -> str:
-        """Make the value of a cookie: its end and a signature. It stays good when the server is restarted."""
+        """Return a new cookie: its end and a signature. It stays valid after a restart of the server."""
         end = str(int(self._now_s()) + SESSION_S)
         return f"{end}.{self._signature(end)}"
 
     def is_session(self, cookie: str) -> bool:
-        """Decide whether a cookie is one that was given and has not ended."""
+        """Return whether a cookie is valid and has not expired."""
         end, _, signature = cookie.partition(".")
         if not self._token or not (end.isascii() and end.isdecimal() and len(end) <= 12):
             return False
@@ -97,7 +97,7 @@ class WebGuard:
 
 
 def host_name(host: str) -> str:
-    """Take the name out of a header Host: without its port, without the brackets of an IPv6 address."""
+    """Return the name in a header Host, without the port and the brackets of an IPv6 address."""
     host = host.lower()
     if host.startswith("["):
         return host[1:].partition("]")[0]
@@ -106,13 +106,12 @@ def host_name(host: str) -> str:
 
 
 def is_own_host(host: str, names: Collection[str]) -> bool:
-    """Decide whether a header Host is an IP address or a known name: no page of another site is served under it."""
+    """Return whether a header Host is an IP address or a name in `names`."""
     name = host_name(host)
     return name in names or is_address(name)
 
 
 def is_address(name: str) -> bool:
-    """Decide whether a name is an IP address."""
     try:
         ip_address(name)
     except ValueError:
@@ -121,12 +120,12 @@ def is_address(name: str) -> bool:
 
 
 def is_loopback(address: str) -> bool:
-    """Decide whether only this machine reaches an address that is listened on."""
+    """Return whether only this host can connect to an address."""
     return address == "localhost" or (is_address(address) and ip_address(address).is_loopback)
 
 
 def read_token(path: str) -> bytes:
-    """Read a token from a file: its first line. Raises BadArgument naming what is wrong with it."""
+    """Return the token in the first line of a file. Raises BadArgument if it is not readable or too short."""
     try:
         with Path(path).open("rb") as file:
             token = file.read(TOKEN_BYTES_MAX).split(b"\n", 1)[0].strip()
@@ -141,7 +140,7 @@ def read_token(path: str) -> bytes:
 
 
 def safety_headers() -> Mapping[str, str]:
-    """Headers of every answer: the page runs its own scripts only, is in no frame, tells no other site of itself."""
+    """Return the headers of every reply: only scripts of this server, no embedding in a frame, no Referer header."""
     policy = (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
         "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -157,5 +156,5 @@ def safety_headers() -> Mapping[str, str]:
 
 
 def _digest(words: bytes) -> bytes:
-    """Bytes of the same length for every text, so that not even the length can be measured."""
+    # equal lengths: the time of the comparison must not depend on the length of the token
     return hashlib.sha256(words).digest()

@@ -1,7 +1,7 @@
-"""The hub: what all browsers together look at, and each message of the daemon to those that look at its device.
+"""Hub of the browsers: requests the data that all pages need, and sends each message to the pages that show it.
 
-It has one connection to the daemon (the feed), and none while nobody looks. Synchronization: `take` is called in the
-feed's thread; everything else in the event loop.
+The hub uses one connection to the daemon (the feed), and none while no page is visible. Synchronization: the feed's
+thread calls `take`. The event loop calls all other methods.
 """
 
 import asyncio
@@ -9,11 +9,11 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from math import isfinite
 from threading import BoundedSemaphore
-from typing import Final, Protocol
+from typing import Final
 
 import msgspec
 
-from imud.client.feed import News, Wish
+from imud.client.feed import Feed, News, Wish
 from imud.contracts.setting import SettingsState
 from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
 from imud.model.event import Event, EventKind
@@ -24,38 +24,38 @@ from imud.web import messages
 from imud.web.messages import VECTORS, Bucket, Look, Range, RawMessage
 
 LATE_PERIODS: Final = 2
-"""A bucket ends that long after its interval even where no later sample came."""
+"""Number of periods after its interval at which a bucket ends if no later sample arrives."""
 
 
 class Bucketing:
-    """Buckets of one device at one rate. Their intervals begin at whole multiples of the period of CLOCK_MONOTONIC."""
+    """Buckets of one device at one rate. Intervals begin at multiples of the period of CLOCK_MONOTONIC."""
 
     def __init__(self, rate_hz: int) -> None:
         self._period_ns = NS_PER_S // rate_hz
         self._open: list[Sample] = []
         self._number = -1
-        """Of the interval of the open bucket, since the clock's zero."""
+        """Number of the interval of the open bucket."""
 
     def add(self, samples: Iterable[Sample], now_ns: int) -> list[Bucket]:
-        """Take samples in order, and return the buckets that are complete."""
+        """Add samples in order. Return the complete buckets."""
         done = []
         for sample in samples:
             number = sample.t_ns // self._period_ns
             if number != self._number:
-                done += self._ended()
+                done += self._end()
                 self._number = number
             self._open.append(sample)
         if now_ns >= (self._number + 1 + LATE_PERIODS) * self._period_ns:
-            done += self._ended()
+            done += self._end()
         return done
 
-    def _ended(self) -> list[Bucket]:
+    def _end(self) -> list[Bucket]:
         samples, self._open = self._open, []
         return [bucket_of(samples)] if samples else []
 
 
 def bucket_of(samples: Sequence[Sample]) -> Bucket:
-    """Make the bucket of one sample or more of one device. Values that are not finite are left out."""
+    """Return the bucket of samples of one device, at least one. Ignore values that are not finite."""
     first, last = samples[0], samples[-1]
     ranges = {name: _range([getattr(sample, name) for sample in samples]) for name in VECTORS}
     return Bucket(
@@ -75,7 +75,7 @@ def bucket_of(samples: Sequence[Sample]) -> Bucket:
 
 
 def raw_of(device: str, member: str, samples: Iterable[Sample]) -> RawMessage | None:
-    """Every value of a vector; None where no sample has it."""
+    """Return every value of a vector; None if no sample contains it."""
     found = [
         (sample.seq, sample.t_ns / NS_PER_S, vector)
         for sample in samples
@@ -103,24 +103,24 @@ def _last(vectors: Sequence[tuple[float, ...] | None]) -> tuple[float, ...] | No
 
 
 FRAMES_MAX: Final = 100
-"""Messages of samples and events that wait: 2 s at 50 Hz. Of state and status only the newest waits, each once."""
+"""Maximum number of queued messages with samples and events: 2 s at 50 Hz. Other messages replace each other."""
 WINDOW_MAX: Final = 100
-"""Messages that were sent and are not acknowledged: 2 s at 50 Hz, while pages acknowledge four times a second."""
+"""Maximum number of unacknowledged messages: 2 s at 50 Hz. A page acknowledges four times per second."""
 
 
 class Mailbox:
-    """Messages for one browser. Synchronization: one event loop."""
+    """Queue of messages for one browser. Synchronization: one event loop."""
 
     def __init__(self) -> None:
         self.dropped = 0
-        """Messages left out."""
+        """Number of dropped messages."""
         self._newest: dict[str, str] = {}
         self._frames: deque[str] = deque()
-        self._on_the_way = 0
+        self._unacknowledged = 0
         self._changed = asyncio.Event()
 
     def put(self, message: str) -> None:
-        """Add a message behind those that wait; the oldest goes where there are too many."""
+        """Append a message. Drop the oldest message if the queue is full."""
         if len(self._frames) >= FRAMES_MAX:
             self._frames.popleft()
             self.dropped += 1
@@ -128,31 +128,30 @@ class Mailbox:
         self._changed.set()
 
     def put_newest(self, subject: str, message: str) -> None:
-        """Add a message of which only the newest on its subject is of use; one that waits is replaced."""
+        """Queue a message, in place of a queued message with the same subject."""
         self._newest[subject] = message
         self._changed.set()
 
     def acknowledge(self, messages: int) -> None:
-        """Note that the page has dealt with so many; more than were sent is all of them."""
-        self._on_the_way = max(0, self._on_the_way - max(0, messages))
+        """Count messages that the page has processed."""
+        self._unacknowledged = max(0, self._unacknowledged - max(0, messages))
         self._changed.set()
 
     def forget(self) -> None:
-        """Throw away what waits: the page shows something else now."""
+        """Discard the queue, because the page shows something else."""
         self._frames.clear()
         self._newest.clear()
 
     @property
     def waiting(self) -> int:
-        """Messages that wait."""
         return len(self._newest) + len(self._frames)
 
     async def take(self) -> str:
-        """Wait for the next message to send, and for room on the way."""
-        while not self.waiting or self._on_the_way >= WINDOW_MAX:
+        """Wait until there is a message and fewer than WINDOW_MAX are unacknowledged. Return the message."""
+        while not self.waiting or self._unacknowledged >= WINDOW_MAX:
             self._changed.clear()
             await self._changed.wait()
-        self._on_the_way += 1
+        self._unacknowledged += 1
         if self._newest:
             return self._newest.pop(next(iter(self._newest)))
         return self._frames.popleft()
@@ -160,45 +159,37 @@ class Mailbox:
 
 EVENTS_KEPT: Final = 200
 NEWEST_S: Final = 0.5
-"""Time between two pictures of the overview."""
+"""Time between two updates of the overview, s."""
 OVERVIEW_NEWS_S: Final = 0.25
 WAITING_MAX: Final = 8
-"""Pieces of news that the loop has not taken yet; beyond, the feed waits, and the daemon counts what it cannot send."""
+"""Maximum number of `News` that the event loop has not processed. Then the feed waits, and the daemon drops samples."""
 WAIT_S: Final = 1.0
-"""How long the feed waits for a loop that does not run; then the news are left out."""
+"""Maximum wait of the feed for the event loop, s. Then the hub drops the `News`."""
 DEVICES_MAX: Final = 32
-"""Devices whose every sample is read at a time; at 1 kHz each costs about 1 % of a core."""
-
-
-class DaemonFeed(Protocol):
-    """What reads the daemon."""
-
-    def want(self, wanted: Wish | None) -> None:
-        """Read this from now on."""
-        ...
+"""Maximum number of devices with all samples. At 1 kHz, each costs about 1 % of a core."""
 
 
 class Browser:
-    """One page that is open."""
+    """One open page."""
 
     def __init__(self) -> None:
         self.look = Look()
         self.mailbox = Mailbox()
-        self.left_out = (0, 0)
-        """What the page was informed of: messages left out, and samples."""
+        self.reported = (0, 0)
+        """Numbers of dropped messages and samples that the page knows."""
 
 
 class BrowserHub:
-    """All browsers."""
+    """The open pages, and the newest data of the daemon."""
 
     def __init__(self, call_soon: Callable[[Callable[[News], None], News], object]) -> None:
         """`call_soon` calls a function in the event loop, from any thread."""
         self.browsers: set[Browser] = set()
         self.dropped_samples = 0
-        """By the daemon, since start."""
+        """Number of samples that the daemon dropped since start."""
         self._call_soon = call_soon
         self._room = BoundedSemaphore(WAITING_MAX)
-        self._feed: DaemonFeed | None = None
+        self._feed: Feed | None = None
         self._state = messages.StateMessage("connecting to the daemon", "", "")
         self._statuses: dict[str, DeviceStatus] = {}
         self._clients = 0
@@ -206,48 +197,46 @@ class BrowserHub:
         self._buckets: dict[tuple[str, int], Bucketing] = {}
         self._newest: dict[str, Sample] = {}
         self._watched: tuple[str, ...] = ()
-        """Devices whose samples are wanted."""
+        """Devices with samples for a page."""
 
-    def attach(self, feed: DaemonFeed) -> None:
-        """Use this feed."""
+    def attach(self, feed: Feed) -> None:
         self._feed = feed
 
     # --- browsers ---------------------------------------------------------------------------------------------------
 
     def add(self, browser: Browser) -> None:
-        """Take a page that was opened."""
         self.browsers.add(browser)
 
     def remove(self, browser: Browser) -> None:
-        """Forget a page that was closed; no-op if it is."""
+        """Remove a closed page. A second call does nothing."""
         self.browsers.discard(browser)
         self._want()
 
     def look(self, browser: Browser, look: Look) -> None:
-        """Show a page something else."""
+        """Process a message of a page: its acknowledgements, and the view that it shows."""
         browser.mailbox.acknowledge(look.acknowledged)
         wanted = msgspec.structs.replace(look, acknowledged=0)
         if wanted == browser.look:
             return
-        is_elsewhere = (wanted.look, wanted.device) != (browser.look.look, browser.look.device)
+        is_other_view = (wanted.look, wanted.device) != (browser.look.look, browser.look.device)
         browser.look = wanted
-        if is_elsewhere:
+        if is_other_view:
             browser.mailbox.forget()
         self._want()
-        if is_elsewhere and wanted.look != "nothing":
-            self._show_at_once(browser)
+        if is_other_view and wanted.look != "nothing":
+            self._send_known(browser)
         if wanted.look == "device" and wanted.device not in self._watched:
-            words = f"{DEVICES_MAX} other devices are looked at, which is the most; close some of their pages"
+            words = f"pages of {DEVICES_MAX} other devices are open, the maximum; close one of them"
             browser.mailbox.put(_text(messages.ProblemMessage(words)))
 
-    def _show_at_once(self, browser: Browser) -> None:
-        """Send what is known, so that the page is not empty until the next status."""
+    def _send_known(self, browser: Browser) -> None:
+        """Send the state and the kept events, so that the page is not empty until the next status."""
         browser.mailbox.put_newest("state", _text(self._state))
         if self._events:
             browser.mailbox.put(_text(messages.EventsMessage(tuple(self._events))))
 
     def _want(self) -> None:
-        """Let the feed read what all pages together need."""
+        """Request the data that all pages need from the feed."""
         looks = [one.look for one in self.browsers if one.look.look != "nothing"]
         named = {look.device for look in looks if look.look == "device"}
         stay = [name for name in self._watched if name in named]
@@ -266,7 +255,7 @@ class BrowserHub:
     # --- news -------------------------------------------------------------------------------------------------------
 
     def take(self, news: News) -> None:
-        """Hand news to the event loop; called in the feed's thread, which waits while the loop is behind."""
+        """Pass `news` to the event loop. The feed's thread calls this method, and waits if the loop is late."""
         if self._room.acquire(timeout=WAIT_S):
             self._call_soon(self._take_in_loop, news)
 
@@ -277,7 +266,7 @@ class BrowserHub:
             self._room.release()
 
     def spread(self, news: News) -> None:
-        """Send news to the browsers that they are for."""
+        """Send the data in `news` to the pages that show it."""
         self._spread_state(news)
         if news.statuses is not None:
             self._statuses = {status.name: status for status in news.statuses}
@@ -336,7 +325,7 @@ class BrowserHub:
                 )
 
     def _to(self, is_for: Callable[[Look], bool], message: messages.ToPage, subject: str = "") -> None:
-        """Encode a message once, and give it to the browsers that it is for."""
+        """Encode a message once, and queue it for each page for which `is_for` is true."""
         found = [one for one in self.browsers if is_for(one.look)]
         if not found:
             return
@@ -346,19 +335,19 @@ class BrowserHub:
                 browser.mailbox.put_newest(subject, text)
             else:
                 browser.mailbox.put(text)
-            left_out = (browser.mailbox.dropped, self.dropped_samples)
-            if left_out != browser.left_out:
-                browser.left_out = left_out
-                browser.mailbox.put_newest("dropped", _text(messages.DroppedMessage(*left_out)))
+            dropped = (browser.mailbox.dropped, self.dropped_samples)
+            if dropped != browser.reported:
+                browser.reported = dropped
+                browser.mailbox.put_newest("dropped", _text(messages.DroppedMessage(*dropped)))
 
 
 def hub_of(loop: asyncio.AbstractEventLoop) -> BrowserHub:
-    """Make the hub of a running loop."""
+    """Return a new hub for a running event loop."""
     return BrowserHub(loop.call_soon_threadsafe)
 
 
 def status_message(name: str, status: DeviceStatus | None, now_ns: int) -> messages.StatusMessage:
-    """Make the message of a device's whole status; of one that is not in the configuration too."""
+    """Return the message with the complete status of a device; with null if the device is not configured."""
     bounds_s = tuple(bound / NS_PER_S for bound in LATENCY_BOUNDS_NS)
     if status is None:
         return messages.StatusMessage(name, now_ns / NS_PER_S, None, 0, 0, 0, bounds_s)
@@ -368,7 +357,7 @@ def status_message(name: str, status: DeviceStatus | None, now_ns: int) -> messa
 
 
 def row_of(status: DeviceStatus, newest: Sample | None, now_ns: int) -> messages.DeviceRow:
-    """Make the row of a device in the overview."""
+    """Return the row of a device in the overview."""
     ledger = _counts(status)
     return messages.DeviceRow(
         name=status.name,
@@ -395,12 +384,12 @@ def row_of(status: DeviceStatus, newest: Sample | None, now_ns: int) -> messages
 
 
 def _is_progress(event: messages.NewEvent) -> bool:
-    """Decide whether an event is one of many within a calibration, of which a page that opens needs the next only."""
+    """Return whether an event reports progress of a calibration. The hub does not keep it for new pages."""
     return event.event == EventKind.CALIBRATION and event.detail.get("phase") not in ("begin", "end")
 
 
 def _counts(status: DeviceStatus) -> dict[str, int]:
-    """The ledger, with zero for what a daemon of another version does not count."""
+    """Return the ledger, with 0 for counters that a daemon of another version does not have."""
     return dict.fromkeys(LEDGER_FIELDS, 0) | status.ledger
 
 

@@ -1,5 +1,8 @@
-"""Contract of the messages between `imud web` and its page: JSON objects on a WebSocket. Times are s as floating-point
-numbers, since JavaScript has no integers of 64 bits; at an uptime of a year a double still resolves 4 ns."""
+"""Messages between `imud web` and its page: JSON objects on a WebSocket.
+
+Times are floating-point numbers in s, because JavaScript has no 64-bit integers. After a year of uptime, a double has a
+resolution of 4 ns.
+"""
 
 from typing import Any, Final, Literal, TypeVar
 
@@ -8,60 +11,57 @@ import msgspec
 T = TypeVar("T")
 
 RATES_HZ: Final = (10, 20, 50)
-"""Buckets per second that a page can ask for."""
+"""Possible numbers of buckets per second."""
 VECTORS: Final = ("accel_m_s2", "gyro_rad_s", "mag_t", "euler_rad")
-"""Members of a sample that buckets have."""
+"""Members of a sample with minimum and maximum in a bucket."""
 SPECTRA: Final = ("accel_m_s2", "gyro_rad_s", "mag_t")
-"""Members of a sample whose every value a page can ask for."""
+"""Members of a sample that a page can request completely."""
 
 Range = tuple[tuple[float, ...], tuple[float, ...]]
-"""Least values of the axes, and greatest."""
+"""Minimum and maximum of each axis."""
 
 
 class Bucket(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The samples of one device in one interval of time. A member is left out where no sample had it."""
+    """The samples of one device in one interval. A member is absent if no sample contains it."""
 
     first_s: float
     """Time of the first sample, CLOCK_MONOTONIC."""
     last_s: float
-    """Time of the last one."""
+    """Time of the last sample, CLOCK_MONOTONIC."""
     utc_s: float
-    """Time of the last one since 1970-01-01 UTC."""
+    """Time of the last sample since 1970-01-01 UTC."""
     count: int
-    """Samples."""
     seq: int
-    """`seq` of the last one."""
+    """Sequence number of the last sample."""
     sync: str
-    """Source of its time."""
+    """Source of the time stamp of the last sample."""
     t_err_s: float
-    """Greatest stated error of a time stamp, one sigma."""
+    """Maximum time stamp error, one sigma."""
     latency_s: float
-    """Greatest time from measurement to the arrival of the last byte."""
+    """Maximum time from the measurement to the arrival of the last byte."""
     accel_m_s2: Range | None = None
     gyro_rad_s: Range | None = None
     mag_t: Range | None = None
     euler_rad: Range | None = None
+    # the last value in the interval
     quat_wxyz: tuple[float, ...] | None = None
-    """Of the last sample that had one."""
     temperature_c: float | None = None
-    """Of the last sample that had one."""
     pressure_pa: float | None = None
-    """Of the last sample that had one."""
 
 
 class ToPage(msgspec.Struct, frozen=True, tag_field="kind"):
-    """What the page gets."""
+    """Base of the messages to the page."""
 
 
 class StateMessage(ToPage, frozen=True, tag="state"):
-    """Whether there is a daemon."""
+    """State of the connection to the daemon."""
 
     problem: str
-    """Why there is none; empty while there is one."""
+    """Reason for a missing connection; empty if connected."""
     version: str
-    """Of the daemon, empty while not known."""
+    """Version of the daemon; empty while unknown."""
     epoch: str
-    """Random number of the daemon's start as text, empty while not known."""
+    """Random number of the daemon's start as a string; empty while unknown."""
 
 
 class DeviceRow(msgspec.Struct, frozen=True):
@@ -78,13 +78,13 @@ class DeviceRow(msgspec.Struct, frozen=True):
     expected_rate_hz: float
     lost: int
     closes: bool
-    """Whether its ledger does."""
+    """Whether its ledger balances."""
     differs: bool
     """Whether its settings differ from the declared ones."""
     alarm: bool
     temperature_c: float | None
     age_s: float | None
-    """Of its newest sample; null before the first."""
+    """Age of the newest sample; null before the first sample."""
     t_err_s: float | None
     sync: str
     euler_rad: tuple[float, ...] | None
@@ -96,21 +96,21 @@ class OverviewMessage(ToPage, frozen=True, tag="overview"):
     """All devices."""
 
     clients: int
-    """Of the daemon's socket."""
+    """Number of clients of the daemon's socket."""
     devices: tuple[DeviceRow, ...]
 
 
 class StatusMessage(ToPage, frozen=True, tag="status"):
-    """The whole status of one device, as docs/socket.md has it; null where the daemon has no such device."""
+    """Complete status of one device (docs/socket.md); null if the device is not configured."""
 
     device: str
     now_s: float
     status: dict[str, Any] | None
     lost: int
     bytes_open: int
-    """0 in a ledger that closes."""
+    """0 if the ledger balances."""
     frames_open: int
-    """0 in a ledger that closes."""
+    """0 if the ledger balances."""
     latency_bounds_s: tuple[float, ...]
 
 
@@ -123,15 +123,15 @@ class SamplesMessage(ToPage, frozen=True, tag="samples"):
 
 
 class RawMessage(ToPage, frozen=True, tag="raw"):
-    """Every value of one vector of one device, for a spectrum; samples without it are left out."""
+    """Every value of one vector of one device, for a spectrum, without samples that do not contain it."""
 
     device: str
     member: str
     seq: tuple[int, ...]
-    """A step of more than 1: samples that the page did not get. What imud did not get is a step in `t_s` only."""
+    """Sequence numbers. A step above 1: samples that the page did not get. A step in `t_s` also shows lost samples."""
     t_s: tuple[float, ...]
     axes: tuple[tuple[float, ...], ...]
-    """Values of x, of y, of z."""
+    """Values of x, y and z."""
 
 
 class NewEvent(msgspec.Struct, frozen=True):
@@ -145,35 +145,35 @@ class NewEvent(msgspec.Struct, frozen=True):
 
 
 class EventsMessage(ToPage, frozen=True, tag="events"):
-    """Events as they come; to a new page those that are remembered."""
+    """New events; for a new page, the kept events."""
 
     events: tuple[NewEvent, ...]
 
 
 class DroppedMessage(ToPage, frozen=True, tag="dropped"):
-    """Messages left out because this browser, or `imud web` itself, was too slow."""
+    """Numbers of dropped messages and samples, because this browser or `imud web` was too slow."""
 
     messages: int
     samples: int
-    """Of all devices that are looked at, dropped by the daemon."""
+    """Number of samples that the daemon dropped, of the devices of all pages."""
 
 
 class ProblemMessage(ToPage, frozen=True, tag="problem"):
-    """What was wrong with a message of the page."""
+    """Error in a message of the page."""
 
     message: str
 
 
 class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the page shows now: the overview, one device, or nothing (a tab that is hidden)."""
+    """View of the page: the overview, one device, or nothing (hidden tab)."""
 
     look: Literal["overview", "device", "nothing"] = "nothing"
     device: str = ""
     rate_hz: Literal[10, 20, 50] = 20
     spectrum: Literal["", "accel_m_s2", "gyro_rad_s", "mag_t"] = ""
     acknowledged: int = 0
-    """Messages that the page has dealt with since its last message. A page that only acknowledges leaves out `look`
-    by sending the one of before."""
+    """Number of messages that the page has processed since its last message. A page that only acknowledges repeats its
+    view."""
 
 
 class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -183,18 +183,18 @@ class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CallRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a question or an order."""
+    """Body of a request."""
 
     method: str
     params: dict[str, Any] = {}  # msgspec copies a mutable default
 
 
 encode: Final = msgspec.json.Encoder().encode
-"""JSON; NaN and infinity are null."""
+"""Encoder of JSON; NaN and infinity become null."""
 
 
 def decode_body(body: bytes | str, kind: type[T]) -> T:
-    """What a page sent, in this form. Raises ValueError for anything else."""
+    """Return a message of a page as `kind`. Raises ValueError if it has another form."""
     try:
         return msgspec.json.decode(body, type=kind)
     except RecursionError as error:

@@ -1,8 +1,8 @@
-"""The HTTP server of `imud web` (aiohttp): the page, its WebSocket, logging in, questions and orders.
+"""HTTP server of `imud web` (aiohttp): the page, its WebSocket, login, and requests to the daemon.
 
-GET  /                 the page; its files below /static/, the same for everybody
-GET  /api/session      what this browser may
-POST /api/login        {"token": …}: a cookie in exchange        POST /api/logout
+GET  /                 the page; its files are below /static/
+GET  /api/session      the permissions of this browser
+POST /api/login        {"token": …}: returns a cookie        POST /api/logout
 GET  /api/stream       WebSocket: `messages.Look` from the page, `messages.ToPage` to it
 POST /api/call         {"method": …, "params": {…}}: a method of docs/socket.md
 """
@@ -31,42 +31,42 @@ CONTROLLING: Final = frozenset(("settings.plan", "settings.apply", "command", "c
 """Methods that need the right to control, here and at the daemon."""
 ANSWER_S: Final = 10.0
 LONG_ANSWER_S: Final = 660.0
-"""Longer than the daemon lets any calibration run."""
+"""Time limit of long requests, s. The daemon ends a calibration after 600 s."""
 LONG: Final = frozenset(("command", "calibrate", "settings.apply"))
 ANSWER_BYTES_MAX: Final = 1 << 22
-"""The answer of `schema` for 256 devices is a tenth of it."""
+"""Maximum size of a reply, bytes: ten times the reply to `schema` for 256 devices."""
 AT_A_TIME_MAX: Final = 16
-"""Questions and orders on their way; each is a connection to the daemon."""
+"""Maximum number of concurrent requests. Each uses a connection to the daemon."""
 
 
 class Busy(ServerError):
-    """Too many questions at a time."""
+    """Too many concurrent requests."""
 
 
 class Calls:
-    """The way to the daemon at `path`. Synchronization: one event loop."""
+    """Requests to the daemon at `path`. Synchronization: one event loop."""
 
     def __init__(self, path: str) -> None:
         self._path = path
         self._count = 0
 
     async def call(self, method: str, params: Mapping[str, Any]) -> Any:
-        """Call a method of the daemon and return its result as JSON values.
+        """Call a method of the daemon. Return its result as JSON values.
 
-        Raises RpcError (what the daemon refused), LinkMissing, LinkDenied, ServerError, TimeoutError, and Busy.
+        Raises RpcError (the daemon refuses the request), LinkMissing, LinkDenied, ServerError, TimeoutError, Busy.
         """
         if self._count >= AT_A_TIME_MAX:
-            raise Busy(f"{AT_A_TIME_MAX} requests are on their way, which is the most at a time; try again")
+            raise Busy(f"the limit of {AT_A_TIME_MAX} concurrent requests is reached; try again later")
         self._count += 1
         try:
             async with asyncio.timeout(LONG_ANSWER_S if method in LONG else ANSWER_S):
-                return await self._called(method, params)
+                return await self._request(method, params)
         except TimeoutError:
-            raise TimeoutError(f"{self._path}: the daemon did not answer {method}") from None
+            raise TimeoutError(f"{self._path}: no reply of the daemon to {method} within the time limit") from None
         finally:
             self._count -= 1
 
-    async def _called(self, method: str, params: Mapping[str, Any]) -> Any:
+    async def _request(self, method: str, params: Mapping[str, Any]) -> Any:
         try:
             reader, writer = await asyncio.open_unix_connection(self._path, limit=ANSWER_BYTES_MAX)
         except PermissionError as error:
@@ -95,7 +95,7 @@ class Calls:
         try:
             line = await reader.readline()
         except ValueError:
-            raise ServerError(f"{self._path}: a line of more than {ANSWER_BYTES_MAX} bytes") from None
+            raise ServerError(f"{self._path}: expected a reply of at most {ANSWER_BYTES_MAX} bytes") from None
         if not line.endswith(b"\n"):
             raise LinkMissing(f"{self._path}: the daemon closed the connection")
         return parse_object(line)
@@ -103,22 +103,22 @@ class Calls:
 
 STATIC: Final = Path(__file__).parent / "static"
 BODY_BYTES_MAX: Final = 65536
-"""Of a POST: as much as a line of the daemon's socket."""
+"""Maximum body of a POST, bytes: the maximum line of the daemon's socket."""
 LOOK_BYTES_MAX: Final = 4096
-"""Of a message of a page: a device's name is the longest part of it."""
+"""Maximum message of a page, bytes. The name of a device is its longest part."""
 BROWSERS_MAX: Final = 64
-"""Pages at a time: memory, and the time to send to all of them."""
+"""Maximum number of open pages. It limits the memory and the time to send."""
 HEARTBEAT_S: Final = 20.0
-"""A page that does not answer a ping within half of it is gone."""
+"""Time between two pings of a page, s. A page that does not reply in half of this time is closed."""
 FAILURES_MAX: Final = 8
 FAILURE_S: Final = 2.0
-"""A wrong token is answered that late, and only so many at a time: four guesses a second."""
+"""Delay of the reply to a wrong token, s. With at most FAILURES_MAX at a time, four guesses per second are possible."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class WebServer:
-    """The server for the daemon at `path`. `make_app` makes what aiohttp runs."""
+    """HTTP server for the daemon at `path`. aiohttp runs the application of `make_app`."""
 
     def __init__(self, path: str, guard: WebGuard) -> None:
         self._guard = guard
@@ -126,10 +126,10 @@ class WebServer:
         self._path = path
         self._failures = 0
         self.hub: BrowserHub | None = None
-        """While the app runs."""
+        """The hub; None before the application runs."""
 
     def make_app(self) -> web.Application:
-        """Make the application with all routes."""
+        """Return the application with all routes."""
         app = web.Application(middlewares=[self._guarded], client_max_size=BODY_BYTES_MAX)
         app.router.add_get("/", self._page)
         app.router.add_get("/api/session", self._session)
@@ -151,11 +151,11 @@ class WebServer:
         yield
         await asyncio.get_running_loop().run_in_executor(None, feed.close)
 
-    # --- who may ----------------------------------------------------------------------------------------------------
+    # --- permissions ------------------------------------------------------------------------------------------------
 
     @web.middleware
     async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse what another site could have sent."""
+        """Refuse requests that another site could have sent."""
         headers = request.headers
         if problem := self._guard.host_problem(headers.get("Host")):
             return _refusal(421, problem)
@@ -181,7 +181,7 @@ class WebServer:
         except ValueError:
             return _refusal(400, 'expected a token, as {"token": "…"}')
         if not self._guard.has_token:
-            return _refusal(403, "this server was started without a token: nothing can be controlled")
+            return _refusal(403, "this server has no token, so no login is possible; start imud web with --token-file")
         if not self._guard.is_token(token):
             return await self._wrong_token()
         response = _answer({"control": True})
@@ -190,13 +190,13 @@ class WebServer:
 
     async def _wrong_token(self) -> web.Response:
         if self._failures >= FAILURES_MAX:
-            return _refusal(429, "too many wrong tokens at a time; wait some seconds")
+            return _refusal(429, "too many wrong tokens; try again in a few seconds")
         self._failures += 1
         try:
             await asyncio.sleep(FAILURE_S)
         finally:
             self._failures -= 1
-        return _refusal(401, "this is not the token")
+        return _refusal(401, "wrong token")
 
     async def _logout(self, _request: web.Request) -> web.StreamResponse:
         response = _answer({"control": False})
@@ -211,9 +211,9 @@ class WebServer:
     async def _stream(self, request: web.Request) -> web.StreamResponse:
         assert self.hub is not None
         if not self._rights_of(request).read:
-            return _refusal(401, "expected the token: log in first")
+            return _refusal(401, "no permission; log in with the token")
         if len(self.hub.browsers) >= BROWSERS_MAX:
-            return _refusal(503, f"{BROWSERS_MAX} pages are open, which is the most")
+            return _refusal(503, f"{BROWSERS_MAX} pages are open, the maximum; close one")
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LOOK_BYTES_MAX, compress=False)
         await socket.prepare(request)
         browser = Browser()
@@ -222,7 +222,7 @@ class WebServer:
         try:
             async for message in socket:
                 if message.type is WSMsgType.TEXT:
-                    self._looked(browser, message.data)
+                    self._look(browser, message.data)
         finally:
             self.hub.remove(browser)
             sending.cancel()
@@ -230,12 +230,12 @@ class WebServer:
                 await sending
         return socket
 
-    def _looked(self, browser: Browser, text: str) -> None:
+    def _look(self, browser: Browser, text: str) -> None:
         assert self.hub is not None
         try:
             self.hub.look(browser, messages.decode_body(text, messages.Look))
         except ValueError:
-            problem = messages.ProblemMessage("the page asked for something that imud web does not know: reload it")
+            problem = messages.ProblemMessage("imud web does not know this request of the page; reload the page")
             browser.mailbox.put_newest("problem", messages.encode(problem).decode())
 
     async def _call(self, request: web.Request) -> web.StreamResponse:
@@ -248,7 +248,7 @@ class WebServer:
             return _refusal(404, f"no method {asked.method!r}; there are: {', '.join(sorted(READING | CONTROLLING))}")
         is_control = asked.method in CONTROLLING or asked.params.get("fresh") not in (None, False)
         if not (rights.control if is_control else rights.read):
-            return _refusal(401, "expected the token: log in first")
+            return _refusal(401, "no permission; log in with the token")
         return await self._answered(asked)
 
     async def _answered(self, asked: messages.CallRequest) -> web.Response:
@@ -263,7 +263,6 @@ class WebServer:
 
 
 async def _send_all(browser: Browser, socket: web.WebSocketResponse) -> None:
-    """Send what comes for a page until its connection ends."""
     with suppress(ConnectionError):
         while True:
             await socket.send_str(await browser.mailbox.take())

@@ -173,7 +173,7 @@ def test_events(served: Daemon) -> None:
 def test_an_event_of_a_kind_to_come_is_accepted() -> None:
     event = event_of({"t_ns": 1, "device": "imu0", "kind": "earthquake", "message": "m", "later": 1})
     assert event.kind == "earthquake"
-    with pytest.raises(ServerError, match="cannot decode an event"):
+    with pytest.raises(ServerError, match="cannot decode the notification 'event'"):
         event_of({"t_ns": 1})
 
 

@@ -78,7 +78,7 @@ def test_a_calibration_is_seen_without_the_token_and_stopped_with_it(page: Page,
         ask = """const { call } = await import('/static/util.js');
             return call(args[0], { device: 'bow', kind: 'level' }).catch((error) => error.message)"""
         for method in ("calibrate", "stop_calibration"):
-            assert page.module(ask, method) == "expected the token: log in first"
+            assert page.module(ask, method) == "no permission; log in with the token"
         running: Future[Any] = pool.submit(client.call, "calibrate", device="bow", kind="magnetometer")
         page.until(COVERED)
         page.until_text("#calibration-progress", "of the directions and turns")

@@ -105,7 +105,7 @@ def test_pages_of_other_sites_are_refused_and_named_once(echo: Echo) -> None:
         for _ in range(2):
             refused = answer(gate, head("Origin: https://attacker.example"))
             assert refused.startswith("HTTP/1.1 403 Forbidden\r\n")
-            assert "they may with --allow-origin https://attacker.example" in refused
+            assert "allow them with --allow-origin https://attacker.example" in refused
     assert len(notes) == 1
     assert notes[0].startswith("refused a connection: pages of 'https://attacker.example' may not read")
     assert echo.ended == 0

@@ -68,7 +68,7 @@ def test_messages_reach_a_client_that_subscribed() -> None:
         asyncio.run(talk(server))
         server.problem("no daemon")
         server.problem("")
-    assert notes == ["no daemon", "samples come again"]
+    assert notes == ["no daemon", "connected to the daemon again"]
 
 
 def test_the_server_behind_the_gate_is_not_found_by_trying_and_ends_if_a_port_is_taken() -> None:

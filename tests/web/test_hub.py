@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from imud.client.connection import Hello
-from imud.client.feed import News, Wish
+from imud.client.feed import Feed, News, Wish
 from imud.contracts.status import DeviceState
 from imud.model.event import Event, EventKind
 from imud.web.hub import DEVICES_MAX, EVENTS_KEPT, WAITING_MAX, Browser, BrowserHub, row_of, status_message
@@ -18,8 +18,11 @@ from tests.support.socket_rig import sample
 HELLO = Hello(1, "0.1.0", 2**62 + 1, ("read",))
 
 
-class FakeFeed:
+class FakeFeed(Feed):
+    """A feed without a thread, which keeps the wishes."""
+
     def __init__(self) -> None:
+        super().__init__("", lambda _news: None, None)
         self.wanted: list[Wish | None] = []
 
     def want(self, wanted: Wish | None) -> None:
@@ -209,7 +212,7 @@ async def test_devices_beyond_the_most_are_said_to_be() -> None:
     for number in range(DEVICES_MAX):
         opened(hub, look="device", device=f"imu{number}")
     late = opened(hub, look="device", device="a")
-    assert any("most" in one["message"] for one in await heard(late, "problem"))
+    assert any("maximum" in one["message"] for one in await heard(late, "problem"))
     wanted = feed.wanted[-1]
     assert wanted is not None
     assert wanted.devices is not None

@@ -156,7 +156,7 @@ def test_settings_are_planned_only_with_the_token(page: Page, site: Site, tmp_pa
         page.driver.get(f"{url}#/device/bow")
         page.until("return document.querySelector('#login-dialog').open", what="the token is asked for")
         enter(page, "wrong")
-        page.until_text("#login-problem", "this is not the token")
+        page.until_text("#login-problem", "wrong token")
         enter(page, TOKEN)
         page.until("return !document.querySelector('#login-dialog').open")
         page.until("return document.querySelector('[data-setting=\"mode\"] input')")

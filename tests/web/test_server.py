@@ -210,7 +210,7 @@ async def test_wrong_tokens_are_answered_late_and_only_so_many(tmp_path: Path, m
             one.cancel()
     monkeypatch.setattr(web_app, "FAILURE_S", 0.0)
     async with running(tmp_path) as site:
-        assert await site.post("/api/login", {"token": "wrong"}) == (401, {"error": "this is not the token"})
+        assert await site.post("/api/login", {"token": "wrong"}) == (401, {"error": "wrong token"})
     async with running(tmp_path, token="") as site:
         assert (await site.post("/api/login", {"token": ""}))[0] == 403
 
@@ -308,7 +308,7 @@ async def test_a_page_that_takes_nothing_holds_up_no_other_and_nothing_piles_up_
 async def test_what_a_page_sends_wrong_is_reported_to_it(tmp_path: Path) -> None:
     async with running(tmp_path) as site:
         socket = await site.stream(look="everything")
-        assert "reload it" in (await message(socket, "problem"))["message"]
+        assert "reload the page" in (await message(socket, "problem"))["message"]
         for text in ("{", "[]", '{"look": "overview", "more": 1}', '{"rate_hz": 7}', '{"acknowledged": "x"}'):
             await socket.send_str(text)
             assert (await message(socket, "problem"))["message"]
