@@ -55,7 +55,7 @@ def test_a_magnetometer_is_calibrated_with_the_token(page: Page, tmp_path: Path,
         result = page.text("#calibration-result")
         assert "field strength 45.1 µT, at most 67 µT: passed" in result
         assert "residual of the field" in result
-        assert f"The device says: {BIAS}" in result
+        assert f"The device reports: {BIAS}" in result
         page.until(f"{COVERED} >= arguments[0]", COVERAGE_WANTED * 48)  # the events may come after the answer
         assert "field\n45.1 µT" in page.text("#calibration .facts")
         assert not page.js("return document.querySelector('#calibration-stop').getClientRects().length")
@@ -73,7 +73,7 @@ def test_a_calibration_is_seen_without_the_token_and_stopped_with_it(page: Page,
         Client(daemon.socket, timeout_s=LIMIT_S) as client,
     ):
         open_page(page, url, "bow")
-        page.until("return document.querySelector('#calibration').textContent.includes('Log in to begin it.')")
+        page.until("return document.querySelector('#calibration').textContent.includes('Log in to start it.')")
         assert not page.js("return document.querySelector('#calibration button')")
         ask = """const { call } = await import('/static/util.js');
             return call(args[0], { device: 'bow', kind: 'level' }).catch((error) => error.message)"""

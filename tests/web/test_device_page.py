@@ -150,19 +150,19 @@ STATUS = msgspec.structs.replace(
 WORDS = {
     "clock": ("error 31.0 µs", "0 resets"),
     "polling": ("4,211 reads", "223 late", "227 missed", "229 stale", "233 failed",
-                "41.0 µs after the deadline", "913 µs at worst", "vanished once"),
-    "line": ("311 requests unanswered", "313 bytes unasked", "317 strange", "331 echoes"),
+                "41.0 µs after the deadline", "913 µs at worst", "disappeared once"),
+    "line": ("311 requests without reply", "313 late bytes", "317 unexpected bytes", "331 echoes"),
     "sout": ("5,003 edges, 509 lost",),
     "alarm": ("ACTIVE, raised 3 times; 6 edges, 0 lost",),
-    "pulses": ("4,101", "17 belong to no sample", "19 samples without one"),
-    "sin": ("6,007 triggers, 601 missed", "613 µs at worst", "23 unanswered", "(it is used by another program)"),
+    "pulses": ("4,101", "17 without a sample", "19 samples without a pulse"),
+    "sin": ("6,007 triggers, 601 missed", "613 µs at worst", "23 without reply", "(it is used by another program)"),
     "pps": ("no such line",),
     "utc": ("gpsd at localhost: 7,001 sentences, 701 sent, not sent: no fix 709", "719 pulses, 727 ignored",
             "chronyd accepted 733, refused 739", "(no fix)"),
     "settings": ("mode is 6-axis, declared 9-axis", "not reported by the device: baud"),
     "status": ("gyroscope-saturated",),
     "present": ("mode 6-axis",),
-    "latency": ("samples wait 5.0 ms to be processed together", "allowed by shared memory"),
+    "latency": ("imud holds samples for 5.0 ms", "allowed by shared memory"),
 }  # fmt: skip
 
 
@@ -196,5 +196,5 @@ def test_a_setting_that_is_not_as_declared_is_marked_on_the_page_and_in_the_over
         assert found["magnetic_calibration"] == ["", "true", "true"]
         assert [name for name, (kind, *_) in rows if kind] == ["mode"]
         page.click(".back")
-        page.until_text(".card", "settings differ from the declared ones")
+        page.until_text(".card", "settings differ from the declared settings")
         assert page.problems() == []

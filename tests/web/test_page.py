@@ -137,7 +137,7 @@ def test_ledger_latency_status_and_settings_are_those_of_the_daemon(page: Page, 
     page.until("return document.querySelectorAll('[data-setting]').length > 3")
     page.until("return document.querySelectorAll('#calibration details').length > 0")
     page.until("return document.querySelectorAll('#actions details').length > 3")
-    assert "Log in to begin it." in page.js("return document.querySelector('#calibration').textContent")
+    assert "Log in to start it." in page.js("return document.querySelector('#calibration').textContent")
     assert page.js("return getComputedStyle(document.querySelector('#settings .buttons + .buttons')).display") == "none"
     page.until("return window.imud.view.attitude.quaternion")
     assert page.js("return document.querySelector('#attitude3d canvas').toDataURL().length") > 3000

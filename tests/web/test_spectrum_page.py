@@ -76,7 +76,7 @@ def test_lost_samples_are_counted_and_a_vibration_keeps_its_frequency_and_size(p
     assert line == pytest.approx(2.0**2 / 2, rel=0.1), "the mean square of a sine of 2 m/s²"
     assert power.sum() - line < 0.02 * line, "pieces put together without a gap would have lines beside it"
     assert gaps > 1 or missing == pytest.approx(segments * 256 / 10 + 512 / 10, abs=40), "one in ten of the transformed"
-    assert f"{missing} missing samples filled, begun again at {gaps} longer gap" in note
+    assert f"{missing} lost samples filled, restarted at {gaps} longer gap" in note
 
 
 def even(rng: np.random.Generator, scatter: float) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-// What `imud status` prints of a device (imud/cli/status.py), as rows of name and text.
+// Status of a device as rows of name and text, as `imud status` prints it (imud/cli/status.py).
 
 import { duration, number, shown } from "./util.js";
 
@@ -12,13 +12,13 @@ export function aboutRows({ status, lost, bytes_open, frames_open }) {
   const { clock, ledger, kernel } = status;
   const rows = [
     ["link", `${status.link}, driver ${status.driver}, opened ${times(status.connects)}`],
-    ["identity", pairs(status.identity) || "not known"],
-    ["rate", `${number(status.rate_hz, 1)} Hz seen, ${number(status.expected_rate_hz, 1)} Hz by the device's clock`],
+    ["identity", pairs(status.identity) || "unknown"],
+    ["rate", `${number(status.rate_hz, 1)} Hz measured, ${number(status.expected_rate_hz, 1)} Hz by the device time`],
     ["clock", `${clock.sync}, skew ${number(clock.skew_ppm, 2)} ppm, residual ${seconds(clock.residual_ns)}, error ${seconds(clock.t_err_ns)}, ${number(clock.resets)} resets`],
     ["latency", latency(status)],
     ["samples", `${number(ledger.samples)}; lost ${number(lost)} (device ${number(ledger.lost_gap_device)}, damaged ${number(ledger.lost_crc)}, ` +
       `overrun ${number(ledger.lost_overrun)}, queue ${number(ledger.lost_queue)}), ${number(ledger.lost_unknown)} gaps of unknown size`],
-    ["bytes", `${number(ledger.bytes_in)}: the ledger ${bytes_open || frames_open ? "DOES NOT CLOSE" : "closes"}`],
+    ["bytes", `${number(ledger.bytes_in)}: the ledger ${bytes_open || frames_open ? "DOES NOT BALANCE" : "balances"}`],
     ["kernel", `${number(kernel.overrun)} overruns, ${number(kernel.framing)} framing, ${number(kernel.parity)} parity`],
   ];
   if (status.temperature_c !== null) rows.splice(3, 0, ["temperature", `${number(status.temperature_c, 1)} °C`]);
@@ -26,12 +26,12 @@ export function aboutRows({ status, lost, bytes_open, frames_open }) {
   return [...rows, ...parts(status)];
 }
 
-/** Rows that only some devices have. */
+/** Return the rows that only some devices have. */
 function parts(status) {
   const rows = [];
   if (status.declared && status.declared.state !== "undeclared") rows.push(["settings", declared(status.declared)]);
   if (Object.keys(status.status_bit_names).length && status.status_bits !== null)
-    rows.push(["status", status.status_words.join(", ") || "no bit that is known is set"]);
+    rows.push(["status", status.status_words.join(", ") || "no known bit is set"]);
   if (Object.keys(status.settings).length) rows.push(["present", pairs(status.settings)]);
   if (status.polling) rows.push(["polling", polling(status.polling)]);
   if (status.serial_line) rows.push(["line", serialLine(status.serial_line)]);
@@ -43,7 +43,7 @@ function parts(status) {
 function latency(status) {
   const count = status.latency_buckets.reduce((a, b) => a + b, 0);
   const mean = count ? `${seconds(status.latency_sum_ns / count)} mean over ${number(count)} samples` : "no samples";
-  return `${mean}; samples wait ${seconds(status.hold_ns)} to be processed together, ${seconds(status.hold_wanted_ns)} allowed by ${status.hold_by || "everybody"}`;
+  return `${mean}; imud holds samples for ${seconds(status.hold_ns)}, ${seconds(status.hold_wanted_ns)} allowed by ${status.hold_by || "all clients"}`;
 }
 
 function axes(frame) {
@@ -63,15 +63,15 @@ function declared(settings) {
 function polling(polls) {
   return `${number(polls.polls)} reads, ${number(polls.late)} late, ${number(polls.missed)} missed, ${number(polls.stale)} stale, ` +
     `${number(polls.failed)} failed; ${seconds(polls.late_mean_ns)} after the deadline, ${seconds(polls.late_worst_ns)} at worst; ` +
-    `vanished ${times(polls.vanished)}`;
+    `disappeared ${times(polls.vanished)}`;
 }
 
 function serialLine(line) {
-  return `${number(line.timeouts)} requests unanswered; ${number(line.late_bytes)} bytes unasked, ${number(line.strange_bytes)} strange; ` +
-    `${number(line.echoes)} echoes (all devices of the line)`;
+  return `${number(line.timeouts)} requests without reply; ${number(line.late_bytes)} late bytes, ${number(line.strange_bytes)} unexpected bytes; ` +
+    `${number(line.echoes)} echoes (all devices of the bus)`;
 }
 
-/** A row for each input line, for SIN, and for what cannot be watched or driven. */
+/** Return a row for each input line, for SIN, and for each line that imud cannot watch or drive. */
 function lines(status, clock) {
   const { problems } = status;
   const rows = Object.entries(status.edges).map(([name, edges]) => {
@@ -80,16 +80,16 @@ function lines(status, clock) {
     return [name, words.join("; ") + inBrackets(problems[name])];
   });
   if (clock.edges)
-    rows.push(["pulses", `${number(clock.edges)}, of which ${number(clock.edges_unpaired)} belong to no sample; ${number(clock.samples_unpaired)} samples without one`]);
+    rows.push(["pulses", `${number(clock.edges)}, ${number(clock.edges_unpaired)} without a sample; ${number(clock.samples_unpaired)} samples without a pulse`]);
   if (status.sin)
     rows.push(["sin", `${number(status.triggers)} triggers, ${number(status.triggers_missed)} missed; ${seconds(status.trigger_late_mean_ns)} after the ` +
-      `deadline, ${seconds(status.trigger_late_worst_ns)} at worst; ${number(clock.triggers_missed)} unanswered${inBrackets(problems.sin)}`]);
+      `deadline, ${seconds(status.trigger_late_worst_ns)} at worst; ${number(clock.triggers_missed)} without reply${inBrackets(problems.sin)}`]);
   const others = Object.keys(problems).filter((name) => !(name in status.edges) && name !== "sin");
   return [...rows, ...others.sort().map((name) => [name, problems[name]])];
 }
 
 function alarmLevel(isActive) {
-  if (isActive === null) return "level not known";
+  if (isActive === null) return "level unknown";
   return isActive ? "ACTIVE" : "inactive";
 }
 
@@ -101,5 +101,5 @@ function utc(status) {
   if (status.pulses || status.pulses_ignored) words.push(`${number(status.pulses)} pulses, ${number(status.pulses_ignored)} ignored`);
   if (status.chrony_sent || status.chrony_refused)
     words.push(`chronyd accepted ${number(status.chrony_sent)}, refused ${number(status.chrony_refused)}`);
-  return (words.join("; ") || "nothing yet") + inBrackets(status.problem);
+  return (words.join("; ") || "no data yet") + inBrackets(status.problem);
 }

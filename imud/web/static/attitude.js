@@ -1,10 +1,10 @@
-// The attitude as a block on a compass, from the quaternion body → navigation frame.
+// The attitude as a block on a compass. The quaternion rotates from the body to the navigation frame.
 
 import { cleared, el } from "./util.js";
 
 const SIZE = 300;
 const BODY = [1.0, 0.7, 0.18]; // half edges along x, y, z of the device
-const CAMERA = { azimuth: -2.3, elevation: 0.5 }; // looked at from the south-west, above
+const CAMERA = { azimuth: -2.3, elevation: 0.5 }; // view from the south-west, from above
 const GROUND = -1.6; // height of the compass
 const QUARTERS = [["E", 1, 0], ["N", 0, 1], ["W", -1, 0], ["S", 0, -1]];
 const FACES = [[0, 1], [0, -1], [1, 1], [1, -1], [2, 1], [2, -1]];
@@ -22,20 +22,20 @@ export class AttitudeView {
     this.quaternion = null;
   }
 
-  /** frame: the navigation frame of the quaternion, as `status` has it. */
+  /** frame: the navigation frame of the quaternion (member of `status`). */
   set(quaternion, frame) {
     this.isNed = frame.startsWith("NED");
     this.quaternion = quaternion;
     this.draw();
   }
 
-  /** A vector of the device in east, north, up. */
+  /** Return a vector of the device in east, north, up. */
   toEnu(vector) {
     const [a, b, c] = rotate(this.quaternion, vector);
     return this.isNed ? [b, a, -c] : [a, b, c];
   }
 
-  /** East, north, up on the canvas: x, y, and depth (larger is nearer). */
+  /** Return the position on the canvas of east, north, up: x, y, and depth (larger is nearer). */
   project([e, n, u]) {
     const { azimuth, elevation } = CAMERA;
     const right = e * -Math.sin(azimuth) + n * Math.cos(azimuth);
@@ -52,17 +52,17 @@ export class AttitudeView {
     context.font = "13px system-ui, sans-serif";
     context.textAlign = "center";
     context.textBaseline = "middle";
-    context.lineJoin = context.lineCap = "round"; // a corner of a thin face would else have a long spike
+    context.lineJoin = context.lineCap = "round"; // otherwise the corner of a thin face has a long spike
     this.drawCompass(context, style);
     if (this.quaternion) {
-      this.drawAxes(context, false); // those that point away stand behind the block
+      this.drawAxes(context, false); // axes that point away are behind the block
       this.drawBody(context, style);
       this.drawAxes(context, true);
     }
     this.drawNames(context, style);
   }
 
-  /** Names of the quarters and axes, in front of everything, in a border of the panel's colour: the block hides none. */
+  /** Draw the names of directions and axes in front of the block, with a border in the color of the panel. */
   drawNames(context, style) {
     const quiet = style.getPropertyValue("--quiet");
     const names = QUARTERS.map(([name, e, n]) => [name, quiet, [1.85 * e, 1.85 * n, GROUND]]);
@@ -119,7 +119,7 @@ export class AttitudeView {
     }
   }
 
-  /** Colour, name, and both ends of the device's axes outside of the block. */
+  /** Return color, name and both ends of each axis of the device, outside of the block. */
   axes() {
     return ["#d1495b", "#2e8b57", "#3a7bd5"].map((colour, axis) => {
       const end = [0, 0, 0];

@@ -1,4 +1,4 @@
-// Guided calibrations with the sphere of directions that were covered, and the actions of a device.
+// Guided calibrations with the sphere of covered directions, and the actions of a device.
 
 import { CoverageSphere } from "./sphere.js";
 import { call, DEGREE, el, facts, marked, number, quantity, shown } from "./util.js";
@@ -26,7 +26,7 @@ export class CalibrationView {
   async load() {
     try {
       const found = await call("calibrations", { device: this.device });
-      this.list.replaceChildren(...found.map((one) => this.entry(one)), ...(found.length ? [] : [el("p", { class: "quiet", text: "This device has none." })]));
+      this.list.replaceChildren(...found.map((one) => this.entry(one)), ...(found.length ? [] : [el("p", { class: "quiet", text: "This device has no calibrations." })]));
     } catch (error) {
       this.list.replaceChildren(el("p", { class: "quiet", text: error.message }));
     }
@@ -35,16 +35,16 @@ export class CalibrationView {
   entry(one) {
     const steps = el("ol", {}, ...one.instructions.map((words) => el("li", { text: words })));
     const save = one.kept === SAVED_ON_REQUEST ? el("input", { type: "checkbox" }) : null;
-    const begin = el("button", { type: "button", text: `Begin ${one.kind}`, onclick: () => this.begin(one.kind, save?.checked ?? false) });
+    const begin = el("button", { type: "button", text: `Start ${one.kind}`, onclick: () => this.begin(one.kind, save?.checked ?? false) });
     begin.disabled = !this.running.hidden;
     this.begins.push(begin);
     const control = el("div", { class: "buttons" }, begin, save && el("label", {}, save, " save a verified result"));
-    const words = this.session.control ? control : el("p", { class: "quiet", text: "Log in to begin it." });
+    const words = this.session.control ? control : el("p", { class: "quiet", text: "Log in to start it." });
     return el("details", { "data-kind": one.kind }, el("summary", {}, el("b", { text: one.kind }), ": ", ...marked(one.help)), steps,
-      el("p", { class: "quiet", text: `The result lasts: ${one.kept}. Manual, section ${one.section}.` }), words);
+      el("p", { class: "quiet", text: `The result is kept: ${one.kept}. Manual, section ${one.section}.` }), words);
   }
 
-  /** Whether a calibration goes on, whoever began it. */
+  /** Show whether a calibration runs, also if another client started it. */
   setRunning(is) {
     this.running.hidden = !is;
     for (const button of this.begins) button.disabled = is;
@@ -52,7 +52,7 @@ export class CalibrationView {
   }
 
   async begin(kind, save) {
-    this.prepare(`calibration ${kind} begins`);
+    this.prepare(`calibration ${kind} starts`);
     this.isOwn = true;
     try {
       const done = await call("calibrate", { device: this.device, kind, save });
@@ -61,7 +61,7 @@ export class CalibrationView {
         return el("li", { text: words }, el("b", { class: one.passed ? "good" : "problem", text: one.passed ? "passed" : "not passed" }));
       });
       const words = done.verified ? `${kind} is verified${done.saved ? " and saved" : ""}` : `${kind}: ${done.problem}`;
-      const device = done.device ? [el("p", { class: "quiet", text: `The device says: ${done.device}` })] : [];
+      const device = done.device ? [el("p", { class: "quiet", text: `The device reports: ${done.device}` })] : [];
       this.result.replaceChildren(el("p", { class: done.verified ? "good" : "problem", text: words }), el("ul", {}, ...checks), ...device);
     } catch (error) {
       this.result.replaceChildren(el("p", { class: "problem", text: error.message }));
@@ -70,10 +70,10 @@ export class CalibrationView {
   }
 
   prepare(words) {
-    this.isOwn = false; // the answer of the own call says more than the event of its end, which may come after it
+    this.isOwn = false; // the reply to the own request contains more than the event of the end, which may arrive later
     this.result.replaceChildren();
     this.turning.hidden = true;
-    this.bar.removeAttribute("value"); // no share is known yet
+    this.bar.removeAttribute("value"); // the progress is unknown
     this.progress.textContent = words;
     this.setRunning(true);
   }
@@ -86,7 +86,7 @@ export class CalibrationView {
     }
   }
 
-  /** Show an event of the kind `calibration`, whoever began it. */
+  /** Show an event of the kind `calibration`, also if another client started it. */
   onEvent({ message, detail }) {
     if (detail.phase === "begin" && this.running.hidden) this.prepare(message);
     this.progress.textContent = message;
@@ -108,9 +108,9 @@ function turningRows(detail) {
   const turned = ["x", "y", "z"].map((axis) => [`turned about ${axis}`, `${number((detail[`turned_${axis}_rad`] ?? 0) / DEGREE)}° of 360°`]);
   return [
     ["directions", `${quantity(detail.coverage, "")} of the sphere`], ...turned,
-    ["field", detail.field_t ? quantity(detail.field_t, "T") : "not known yet"],
-    ["residual", detail.field_t ? quantity(detail.residual, "") : "not known yet"],
-    ["the device says", detail.device || "–"],
+    ["field", detail.field_t ? quantity(detail.field_t, "T") : "unknown"],
+    ["residual", detail.field_t ? quantity(detail.residual, "") : "unknown"],
+    ["device reports", detail.device || "–"],
   ];
 }
 
@@ -128,7 +128,7 @@ export class ActionsView {
     try {
       const found = await call("actions", { device: this.device });
       const entries = found.map((one) => this.entry(one));
-      this.list.replaceChildren(...entries, ...(found.length ? [] : [el("p", { class: "quiet", text: "This device has none." })]));
+      this.list.replaceChildren(...entries, ...(found.length ? [] : [el("p", { class: "quiet", text: "This device has no actions." })]));
     } catch (error) {
       this.list.replaceChildren(el("p", { class: "quiet", text: error.message }));
     }

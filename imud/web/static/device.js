@@ -1,4 +1,4 @@
-// The page of one device.
+// View of one device.
 
 import { aboutRows } from "./about.js";
 import { AttitudeView } from "./attitude.js";
@@ -31,7 +31,7 @@ export class DevicePage {
     this.frame = "ENU";
     this.offset_s = null; // from the daemon's clock to wall-clock time
     this.plots = new Map(PLOTS.map(([member, title, ...more]) => [member, new RollingPlot(member, title, ...more)]));
-    this.stamps = new RollingPlot("stamps", "Time stamps", "ms", ["stated error", "latency"], { scale: 1e3, decimals: 3, isLog: true });
+    this.stamps = new RollingPlot("stamps", "Time stamps", "ms", ["time stamp error", "latency"], { scale: 1e3, decimals: 3, isLog: true });
     for (const plot of this.plots.values()) plot.node.hidden = true;
     this.attitude = new AttitudeView();
     this.spectrum = new SpectrumPlot(() => this.look());
@@ -73,7 +73,7 @@ export class DevicePage {
     this.stream.look({ look: "device", device: this.name, rate_hz: this.rate_hz, spectrum: this.spectrum.member });
   }
 
-  /** After logging in or out: panels that show more or less then. */
+  /** Make the panels that depend on the login. */
   onSession() {
     this.calibration = new CalibrationView(this.name, this.session);
     this.settings = new SettingsView(this.name, this.session);
@@ -89,7 +89,7 @@ export class DevicePage {
 
   onPause() {
     this.isPaused = !this.isPaused;
-    setText(this.pause, this.isPaused ? "Go on" : "Pause");
+    setText(this.pause, this.isPaused ? "Continue" : "Pause");
   }
 
   onMessage(message) {
@@ -124,9 +124,9 @@ export class DevicePage {
   showStatus(message) {
     const { status } = message;
     this.status = message;
-    setText(this.state, status ? status.state : "gone");
+    setText(this.state, status ? status.state : "removed");
     this.state.className = `pill ${["running", "finished"].includes(status?.state) ? "good" : "bad"}`;
-    const trouble = status ? status.problem : `${this.name} is not in the configuration of the daemon`;
+    const trouble = status ? status.problem : `the configuration of the daemon does not contain ${this.name}`;
     setText(this.trouble, trouble);
     this.trouble.hidden = !trouble;
     this.setOffset(Date.now() / 1000 - message.now_s);
@@ -151,14 +151,14 @@ export class DevicePage {
     while (this.events.childElementCount > EVENTS_KEPT) this.events.lastChild.remove();
   }
 
-  /** By the device's first samples, or by the first status of a device that sends none. */
+  /** Set the offset from the first sample, or from the first status if no sample arrived. */
   setOffset(offset_s) {
     if (this.offset_s !== null) return;
     this.offset_s = offset_s;
     for (const when of this.events.querySelectorAll("time")) when.textContent = this.clockTime(Number(when.dataset.t));
   }
 
-  /** Local time of day of a time of the daemon's clock. */
+  /** Return the local time of day of a time of the daemon's clock. */
   clockTime(t_s) {
     if (this.offset_s === null) return "";
     const at = new Date((t_s + this.offset_s) * 1000);

@@ -1,11 +1,11 @@
-// The even grid of samples from their time stamps, by the rule of imud/analysis/series.py (`imud spectrum`): the true rate,
-// which samples are missing, and where a run ends. What never reached imud leaves no step in `seq`, only one in time.
+// Regular grid of the samples from their time stamps, as in imud/analysis/series.py (`imud spectrum`): the true rate, the lost
+// samples, and the ends of runs. A lost sample causes a step in time, but no step in `seq`.
 
-export const FILL_MOST = 4; // missing samples in a row that are filled; more end a run
-const SCATTER_MOST = 0.2; // scatter of the stamps, in periods, up to which a missing sample is located
-const STEP_FOR_PERIOD = 4; // device time in whole ms makes single steps uneven
+export const FILL_MOST = 4; // maximum number of adjacent lost samples that are filled; more end a run
+const SCATTER_MOST = 0.2; // maximum scatter of the time stamps, in periods, at which a single lost sample is visible
+const STEP_FOR_PERIOD = 4; // periods per step: device time in whole ms makes single steps irregular
 const REFINEMENTS = 4;
-const PAUSE_S = 1; // silence of so long ends a run whatever the stamps scatter by
+const PAUSE_S = 1; // a silence of this length ends a run for any scatter
 
 function median(values) {
   const sorted = Float64Array.from(values).sort();
@@ -16,13 +16,13 @@ function median(values) {
 const differences = (values) => Array.from({ length: values.length - 1 }, (_, index) => values[index + 1] - values[index]);
 const whole = (ratio) => Math.max(Math.round(ratio), 1);
 
-/** Standard deviation of one stamp, from those of differences of two, without outliers. */
+/** Return the standard deviation of one time stamp, from the differences of two, without outliers. */
 function scatterOf(residuals) {
   const middle = median(residuals);
   return (1.4826 * median(residuals.map((one) => Math.abs(one - middle)))) / Math.SQRT2;
 }
 
-/** Least-squares period, of the parts between long gaps: a pause need not be whole periods. */
+/** Return the least-squares period of the parts between long gaps. A gap may contain a fraction of a period. */
 function slope(times, steps) {
   let [above, below] = [0, 0];
   for (let first = 0, end = 1; end <= times.length; end += 1) {
@@ -40,9 +40,9 @@ function slope(times, steps) {
   return above / below;
 }
 
-/** times: stamps in s, rising, more than STEP_FOR_PERIOD; numbers: `seq` of the samples. steps: periods from each sample
- *  to the next, 1 where none is missing; isLocated: whether the stamps are good enough to see a single missing sample.
- *  Where they are not, only a step in `numbers` or a silence says that samples are missing. */
+/** Return the grid. times: ascending time stamps in s, more than STEP_FOR_PERIOD. numbers: `seq` of the samples.
+ *  steps: periods between two samples, 1 if no sample is lost between them. isLocated: whether a single lost sample is visible
+ *  in the time stamps. Otherwise only a step in `numbers` or a silence shows lost samples. */
 export function gridOf(times, numbers) {
   const steps_s = differences(times);
   const far = times.slice(STEP_FOR_PERIOD).map((time, index) => time - times[index]);
@@ -56,14 +56,14 @@ export function gridOf(times, numbers) {
   const isLocated = scatter_s <= SCATTER_MOST * period_s;
   if (!isLocated) {
     const jumps = differences(numbers);
-    const usual = median(jumps); // a vector that only each fourth sample has steps by 4
+    const usual = median(jumps); // 4 for a vector in every fourth sample
     steps = steps_s.map((step_s, index) => (step_s > PAUSE_S ? whole(step_s / period_s) : whole(jumps[index] / usual)));
   }
   return { rate_hz: 1 / slope(times, steps), steps, scatter_s, isLocated };
 }
 
-/** Values at places 0 … count - 1 from those at `places` (rising from 0 to count - 1 or more): the missing ones by a
- *  natural cubic spline, since a straight line would take power from a vibration. */
+/** Return values at 0 … count - 1 from the values at `places` (ascending from 0 to count - 1 or more). A natural cubic spline
+ *  fills the gaps: a straight line would reduce the power of a vibration. */
 export function filled(places, values, count) {
   if (places[count - 1] === count - 1) return values.slice(0, count);
   const bends = secondDerivatives(places, values);
@@ -79,7 +79,7 @@ export function filled(places, values, count) {
   return found;
 }
 
-/** Of the natural cubic spline, at its knots: a tridiagonal system, solved forwards and backwards. */
+/** Return the second derivatives of the natural cubic spline at its knots. Solve a tridiagonal system. */
 function secondDerivatives(places, values) {
   const n = places.length;
   const bends = new Float64Array(n);

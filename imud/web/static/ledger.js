@@ -1,4 +1,4 @@
-// The ledger as bars whose parts add up, and the latency histogram.
+// The ledger as bars with parts that add up, and the histogram of latencies.
 
 import { duration, el, number, setText } from "./util.js";
 
@@ -12,8 +12,8 @@ const BARS = [
     ["ignored", "frames_ignored", "warn"], ["pending", "frames_pending", "wait"],
   ]],
   ["samples", "Samples measured", null, [
-    ["published", "samples", "good"], ["lost by the device", "lost_gap_device", "warn"], ["damaged", "lost_crc", "bad"],
-    ["lost by overruns", "lost_overrun", "bad2"], ["lost in queues", "lost_queue", "bad3"],
+    ["published", "samples", "good"], ["lost (device)", "lost_gap_device", "warn"], ["lost (CRC)", "lost_crc", "bad"],
+    ["lost (overrun)", "lost_overrun", "bad2"], ["dropped (queue)", "lost_queue", "bad3"],
   ]],
 ];
 
@@ -52,7 +52,7 @@ export class LedgerView {
       });
       bar.dataset.total = total;
       const open = total - all;
-      setText(sum, whole ? `${number(total)} in; the parts ${open ? `leave ${number(open)} open` : "add up"}` : `${number(total)} in all`);
+      setText(sum, whole ? `${number(total)} received; ${open ? `${number(open)} unaccounted for` : "the parts add up"}` : `${number(total)} in total`);
       sum.classList.toggle("problem", open !== 0);
     }
     this.node.dataset.closes = String(bytes_open === 0 && frames_open === 0);

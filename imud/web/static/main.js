@@ -1,4 +1,4 @@
-// The page: which view is shown, the state of the daemon, logging in.
+// The page: selects the view, shows the state of the daemon, and logs in.
 
 import { DevicePage } from "./device.js";
 import { Overview } from "./overview.js";
@@ -26,8 +26,8 @@ function onMessage(message) {
     if (isRestart) view?.onRestart?.();
   } else if (message.kind === "dropped") {
     const parts = [];
-    if (message.messages) parts.push(`${message.messages} messages left out: this browser is slow`);
-    if (message.samples) parts.push(`${message.samples} samples dropped: imud web is slow`);
+    if (message.messages) parts.push(`${message.messages} messages dropped: this browser is too slow`);
+    if (message.samples) parts.push(`${message.samples} samples dropped: imud web is too slow`);
     byId("dropped").hidden = !parts.length;
     setText(byId("dropped"), parts.join("; "));
   } else if (message.kind === "problem") {
@@ -39,7 +39,7 @@ function onMessage(message) {
 
 function showState() {
   const pill = byId("daemon");
-  const problem = isLinked ? state.problem : "no connection to imud web; trying again";
+  const problem = isLinked ? state.problem : "no connection to imud web; the page tries again";
   setText(pill, problem ? "not connected" : `imud ${state.version}`);
   pill.className = `pill ${problem ? "bad" : "good"}`;
   document.body.classList.toggle("stale", Boolean(problem));

@@ -1,4 +1,4 @@
-// All devices at a glance.
+// Overview of all devices.
 
 import { DEGREE, duration, el, length, number, setText } from "./util.js";
 
@@ -7,7 +7,7 @@ const FACTS = [
   ["attitude", (row) => (row.euler_rad ? row.euler_rad.map((one) => number(one / DEGREE, 1)).join(" / ") + "°" : "–")],
   ["|a|", (row) => (row.accel_m_s2 ? `${number(length(row.accel_m_s2), 2)} m/s²` : "–")],
   ["|ω|", (row) => (row.gyro_rad_s ? `${number(length(row.gyro_rad_s) / DEGREE, 1)} °/s` : "–")],
-  ["stamp", (row) => (row.sync ? `±${duration(row.t_err_s)}, ${row.sync}` : "–")],
+  ["time stamp", (row) => (row.sync ? `±${duration(row.t_err_s)}, ${row.sync}` : "–")],
   ["lost", (row) => number(row.lost)],
   ["age", (row) => duration(row.age_s)],
   ["temperature", (row) => (row.temperature_c === null ? "–" : `${number(row.temperature_c, 1)} °C`)],
@@ -17,7 +17,7 @@ export class Overview {
   constructor(main, stream) {
     this.summary = el("p", { id: "summary", class: "quiet" });
     this.grid = el("div", { class: "cards" });
-    this.none = el("p", { class: "quiet", hidden: true, text: "The configuration of the daemon has no devices: see imud setup." });
+    this.none = el("p", { class: "quiet", hidden: true, text: "The configuration contains no devices. Add one with: imud setup" });
     main.append(el("h1", { text: "Devices" }), this.summary, this.none, this.grid);
     this.cards = new Map();
     stream.look({ look: "overview" });
@@ -26,7 +26,7 @@ export class Overview {
   onMessage(message) {
     if (message.kind !== "overview") return;
     const well = message.devices.filter((row) => row.is_well).length;
-    setText(this.summary, `${well} of ${message.devices.length} devices well, ${message.clients} ${message.clients === 1 ? "client" : "clients"} of the daemon`);
+    setText(this.summary, `${well} of ${message.devices.length} devices run without a problem; the daemon has ${message.clients} ${message.clients === 1 ? "client" : "clients"}`);
     this.none.hidden = message.devices.length > 0;
     const names = message.devices.map((row) => row.name);
     if (names.join("\n") !== [...this.cards.keys()].join("\n")) {
@@ -56,8 +56,8 @@ function draw(card, row) {
   card.state.className = `pill ${row.is_well ? "good" : "bad"}`;
   setText(card.about, [row.identity.product, row.driver, row.link].filter(Boolean).join(" · "));
   const notes = [row.problem];
-  if (!row.closes) notes.push("the ledger does not close");
-  if (row.differs) notes.push("settings differ from the declared ones");
+  if (!row.closes) notes.push("the ledger does not balance");
+  if (row.differs) notes.push("settings differ from the declared settings");
   if (row.alarm) notes.push("ALARM is active");
   setText(card.notes, notes.filter(Boolean).join("; "));
   for (const [fact, text] of FACTS) setText(card.values.get(fact), text(row));

@@ -1,23 +1,23 @@
-// Rolling plots (uPlot): per axis a line through the least and one through the greatest value of each bucket, and the
-// area between them, so that peaks stay whatever the rate.
+// Rolling plots (uPlot). Each axis has a line through the minimum and a line through the maximum of each bucket, and the
+// area between them. Thus peaks are visible at any rate.
 
 import { el, number, setText } from "./util.js";
 
 export const COLOURS = ["#d1495b", "#2e8b57", "#3a7bd5"];
 const AREA = "40"; // opacity, in hexadecimal
 const DRAW_MS = 66;
-const HOLE_BUCKETS = 3; // without buckets for that many periods the line is broken
+const HOLE_BUCKETS = 3; // number of periods without buckets that breaks the line
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
 export const ink = () => (dark.matches ? "#a9b4c4" : "#5b6675");
 export const grid = () => (dark.matches ? "#2b3443" : "#e4e8ee");
 
-/** Labels of a linear axis. */
+/** Return the labels of a linear axis. */
 export function labels(_, splits) {
   return splits.map((at) => at.toLocaleString("en", { maximumFractionDigits: 6, useGrouping: false }).replace("-", "−"));
 }
 
-/** Labels of a logarithmic axis: powers of ten only. */
+/** Return the labels of a logarithmic axis: only powers of ten. */
 export function powers(_, splits) {
   return splits.map((at) => (at && Math.abs(Math.log10(at) - Math.round(Math.log10(at))) < 1e-9 ? String(Number(at.toPrecision(1))) : ""));
 }
@@ -31,7 +31,7 @@ export class RollingPlot {
     this.isAngle = isAngle;
     this.isLog = isLog;
     this.decimals = decimals;
-    this.offset_s = null; // from the daemon's clock to wall-clock time, fixed when the plot begins
+    this.offset_s = null; // from the daemon's clock to UTC, constant after the first bucket
     this.values = axes.map((name, index) => {
       const value = el("output");
       const mark = el("i", { class: `mark axis${index}` });
@@ -60,7 +60,7 @@ export class RollingPlot {
     const axis = (more) => ({ stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 }, ...more });
     const series = this.axes.flatMap((name, index) => {
       const line = { stroke: COLOURS[index], width: 1.25, points: { show: false }, spanGaps: false };
-      return [{ ...line, label: `${name} greatest` }, { ...line, label: `${name} least` }];
+      return [{ ...line, label: `${name} maximum` }, { ...line, label: `${name} minimum` }];
     });
     const bands = this.axes.map((_, index) => ({ series: [1 + 2 * index, 2 + 2 * index], fill: COLOURS[index] + AREA }));
     const seconds = (_, splits) => splits.map((at) => new Date(at * 1000).toTimeString().slice(0, 8));
@@ -76,14 +76,14 @@ export class RollingPlot {
     );
   }
 
-  /** Add a bucket: its first and last time, least and greatest values per axis (null where there are none). */
+  /** Add a bucket with its first and last time, and minimum and maximum per axis (null without values). */
   add(bucket, range, period_s, span_s) {
     this.span_s = span_s;
     this.offset_s ??= bucket.utc_s - bucket.last_s;
     const x = (bucket.first_s + bucket.last_s) / 2 + this.offset_s;
     const xs = this.data[0];
     const before = xs.at(-1);
-    if (before !== undefined && x <= before) this.data.forEach((one) => (one.length = 0)); // the host was restarted
+    if (before !== undefined && x <= before) this.data.forEach((one) => (one.length = 0)); // the host has restarted
     else if (before !== undefined && x - before > HOLE_BUCKETS * Math.max(period_s, this.step_s ?? 0)) {
       this.push(before + period_s, null);
       this.step_s = undefined;
@@ -107,7 +107,7 @@ export class RollingPlot {
     });
   }
 
-  /** Whether an angle went over the half turn in this bucket or since the one before. */
+  /** Return whether an angle passed ±180° in this bucket or since the previous bucket. */
   isStep(index, least, greatest) {
     const before = this.data[1 + 2 * index].at(-1);
     return greatest - least > Math.PI || (before !== null && before !== undefined && Math.abs(greatest - before / this.scale) > Math.PI);
@@ -133,7 +133,7 @@ export class RollingPlot {
     this.showValues();
   }
 
-  /** Values under the cursor, or the newest. */
+  /** Show the values at the cursor, or the newest values. */
   showValues() {
     const at = this.plot?.cursor.idx ?? this.data[0].length - 1;
     this.values.forEach(({ value }, index) => {

@@ -1,4 +1,4 @@
-// Settings of a device: declared, actual, difference; with the token also new values, planned before they are written.
+// Settings of a device: declared, actual, difference. After a login also new values: a plan first, then the change.
 
 import { call, el, shown } from "./util.js";
 
@@ -24,7 +24,7 @@ export class SettingsView {
     this.load();
   }
 
-  /** What the daemon knows of the settings may have changed: a device that came back was read again. Fields keep their text. */
+  /** Load the settings again if their status changed, for example after a replug. The input fields keep their text. */
   onStatus(status) {
     const known = JSON.stringify([status.state, status.declared, status.settings]);
     if (known === this.known) return;
@@ -32,7 +32,7 @@ export class SettingsView {
     this.load(false, new Map([...this.inputs].map(([name, input]) => [name, input.value])));
   }
 
-  /** fresh: the device itself is asked, which needs the token; texts: of fields, by name. */
+  /** Load the settings. fresh: read them from the device, which needs a login. texts: texts of the input fields, by name. */
   async load(fresh = false, texts = new Map()) {
     try {
       this.show(await call("settings.get", fresh ? { device: this.device, fresh } : { device: this.device }), texts);
@@ -61,7 +61,7 @@ export class SettingsView {
     }));
   }
 
-  /** What was written into the fields: numbers, true, false, lists as in JSON, everything else text. */
+  /** Return the values of the input fields: JSON (numbers, true, false, lists), or text. */
   given() {
     const found = {};
     for (const [name, input] of this.inputs) {
@@ -81,8 +81,8 @@ export class SettingsView {
     try {
       const plan = await call("settings.plan", asked);
       const steps = plan.steps.map((step) => el("li", { text: `${step.name}: ${shown(step.before)} → ${shown(step.value)}` }));
-      const left = Object.entries(plan.left_out).map(([name, why]) => el("li", { text: `${name} is left out: ${why}` }));
-      const words = plan.steps.length ? "This would be done:" : "Nothing is to be done.";
+      const left = Object.entries(plan.left_out).map(([name, why]) => el("li", { text: `${name} is not written: ${why}` }));
+      const words = plan.steps.length ? "Planned changes:" : "No change is necessary.";
       const apply = el("button", { type: "button", text: "Apply", onclick: () => this.apply(asked) });
       this.result.replaceChildren(el("p", { text: words }), el("ul", {}, ...steps, ...left),
         ...(plan.risk ? [el("p", { class: "problem", text: plan.risk })] : []), ...(plan.steps.length ? [apply] : []));

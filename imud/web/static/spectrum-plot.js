@@ -1,4 +1,4 @@
-// The spectrum as a plot, with the highest peak named.
+// Plot of the spectrum, with the frequency of the highest peak.
 
 import { COLOURS, grid, ink, powers } from "./plots.js";
 import { Spectrum } from "./spectrum.js";
@@ -7,17 +7,17 @@ import { AXES, el, number, setText } from "./util.js";
 const UNITS = { accel_m_s2: "m/s²/√Hz", gyro_rad_s: "rad/s/√Hz", mag_t: "T/√Hz" };
 const NAMES = { accel_m_s2: "accelerometer", gyro_rad_s: "gyroscope", mag_t: "magnetometer" };
 
-/** What was done about samples that are missing. */
+/** Return a sentence about lost samples. */
 function gapWords({ missing, gaps, isLocated }) {
-  const again = `begun again at ${number(gaps)} longer ${gaps === 1 ? "gap" : "gaps"}`;
-  const words = missing ? `${number(missing)} missing samples filled, ${again}` : gaps ? `Begun again at ${number(gaps)} ${gaps === 1 ? "gap" : "gaps"}` : "No sample is missing";
-  return isLocated ? `${words}.` : `${words}, as far as can be seen: the stamps scatter too much to show a single missing one.`;
+  const again = `restarted at ${number(gaps)} longer ${gaps === 1 ? "gap" : "gaps"}`;
+  const words = missing ? `${number(missing)} lost samples filled, ${again}` : gaps ? `Restarted at ${number(gaps)} ${gaps === 1 ? "gap" : "gaps"}` : "No sample is lost";
+  return isLocated ? `${words}.` : `${words}. The time stamps scatter too much to show a single lost sample.`;
 }
 
-const OFF = "Choose a vector. Every sample of it is sent then, and transformed here.";
+const OFF = "Choose a vector. imud web then sends each of its samples, and this page computes the spectrum.";
 
 export class SpectrumPlot {
-  /** onChoice(member) when another vector is chosen; "" for none. */
+  /** Call onChoice(member) when the user chooses a vector; "" for no vector. */
   constructor(onChoice) {
     this.spectrum = new Spectrum();
     const choices = Object.entries(NAMES).map(([member, name]) => el("option", { value: member, text: name }));
@@ -58,7 +58,7 @@ export class SpectrumPlot {
 
   draw() {
     const { frequencies, axes } = this.spectrum.result();
-    // Frequency 0 is left out: it is the mean, which was taken away.
+    // without frequency 0: the mean is subtracted
     this.data = [frequencies.slice(1), ...axes.map((axis) => axis.slice(1).map((value) => value || null))];
     if (!this.plot) this.begin();
     this.plot.setData(this.data);
@@ -70,7 +70,7 @@ export class SpectrumPlot {
     const words = peaks.map((one, axis) => `${AXES[axis]} ${number(one.frequency, 2)} Hz`).join(", ");
     const { points, rate_hz, segments } = this.spectrum;
     setText(this.note,
-      `Highest peaks: ${words}. From every sample, at ${number(rate_hz, 2)} Hz by the time stamps: Hann window, ${points} points, ` +
+      `Highest peaks: ${words}. From all samples at ${number(rate_hz, 2)} Hz (by the time stamps): Hann window, ${points} points, ` +
       `mean of ${segments.length} segments, resolution ${number(rate_hz / points, 2)} Hz. ${gapWords(this.spectrum)}`);
   }
 

@@ -1,6 +1,6 @@
-// Amplitude spectral density of one vector, computed here from every sample (not from buckets): Welch's method with a
-// Hann window, segments that overlap by a half, the mean of the newest of them, at the sample rate by the time stamps.
-// A few missing samples are filled, and no segment reaches across more of them (grid.js).
+// Amplitude spectral density of one vector from all samples (not from buckets): Welch's method with a Hann window, the mean
+// of the newest segments, which overlap by a half. The sample rate is from the time stamps. The page fills a few lost samples.
+// A longer gap ends a segment (grid.js).
 
 import { FILL_MOST, filled, gridOf } from "./grid.js";
 
@@ -8,9 +8,9 @@ const SEGMENT_S = 4;
 const POINTS_MIN = 128;
 const POINTS_MAX = 4096;
 const SEGMENTS_MAX = 8;
-const RATE_STEP = 0.02; // with another rate than before, by so much, the spectrum begins again
+const RATE_STEP = 0.02; // relative change of the rate that restarts the spectrum
 
-/** Fourier transform in place; lengths are powers of two. */
+/** Fourier transform in place. The length is a power of two. */
 export function fft(re, im) {
   const n = re.length;
   for (let i = 1, j = 0; i < n; i += 1) {
@@ -38,7 +38,7 @@ export function fft(re, im) {
   }
 }
 
-/** One-sided power spectral density of one segment, unit² / Hz; the mean is left out. */
+/** Return the one-sided power spectral density of one segment, unit² / Hz, without the mean. */
 export function density(values, rate_hz) {
   const n = values.length;
   const mean = values.reduce((sum, value) => sum + value, 0) / n;
@@ -61,13 +61,13 @@ export function density(values, rate_hz) {
 
 export class Spectrum {
   constructor() {
-    this.gaps = 0; // so long that the spectrum was begun again
-    this.missing = 0; // samples in shorter ones, which were filled
+    this.gaps = 0; // number of gaps that restarted the spectrum
+    this.missing = 0; // number of filled samples in shorter gaps
     this.isLocated = true;
     this.begin([], [], [[], [], []]);
   }
 
-  /** Begin again, with these samples. */
+  /** Restart with these samples. */
   begin(times, numbers, axes) {
     [this.times, this.numbers, this.axes] = [times, numbers, axes];
     this.segments = [];
@@ -75,12 +75,12 @@ export class Spectrum {
     this.rate_hz = 0;
   }
 
-  /** Take a message `raw`; true where there is a new spectrum. */
+  /** Process a message `raw`. Return true if there is a new spectrum. */
   add(raw) {
     let isNew = false;
     raw.seq.forEach((seq, index) => {
       if (raw.t_s[index] <= this.times.at(-1)) {
-        this.begin([], [], [[], [], []]); // the host was restarted
+        this.begin([], [], [[], [], []]); // the host has restarted
         this.gaps += 1;
       }
       this.times.push(raw.t_s[index]);
@@ -114,7 +114,7 @@ export class Spectrum {
     return true;
   }
 
-  /** Make a segment of the oldest samples, and keep its second half for the next one. */
+  /** Make a segment from the oldest samples. Keep its second half for the next segment. */
   transform(steps) {
     const places = [0];
     for (const step of steps) places.push(places.at(-1) + step);
@@ -125,7 +125,7 @@ export class Spectrum {
     for (const values of [this.times, this.numbers, ...this.axes]) values.splice(0, kept);
   }
 
-  /** Frequencies in Hz and, per axis, unit / √Hz. */
+  /** Return the frequencies in Hz, and for each axis the density in unit / √Hz. */
   result() {
     const bins = this.points / 2 + 1;
     const frequencies = Array.from({ length: bins }, (_, k) => (k * this.rate_hz) / this.points);

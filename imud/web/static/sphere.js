@@ -1,12 +1,12 @@
-// The sphere of a calibration: 48 cells of equal area, the covered ones filled. A cell is a sixth of an octant, by the order of
-// |x|, |y|, |z|. Which cell a pixel shows is worked out once.
+// Sphere of a calibration: 48 cells of equal area, with the covered cells filled. A cell is a sixth of an octant, by the order
+// of |x|, |y|, |z|. The page computes the cell of each pixel once.
 
 import { rotate } from "./attitude.js";
 import { cleared, el } from "./util.js";
 
 const SIZE = 240;
 const RADIUS = SIZE * 0.4;
-const TILT = [0.4508, 0.0999, 0.1919, -0.866]; // turned by −125° about z, then by 25° about the horizontal: x, y, z in front
+const TILT = [0.4508, 0.0999, 0.1919, -0.866]; // −125° about z, then 25° about the horizontal axis: x, y and z point to the front
 const ORDERS = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
 const SIZES = [0.85, 0.48, 0.2];
 const NONE = 255;
@@ -14,7 +14,7 @@ const CIRCLE_STEPS = 90;
 const NEAR_OPACITY = 220; // of 255
 const FAR_OPACITY = 60;
 
-/** The middle of cell 0 … 47: an octant by signs (bit 0: x < 0), then the order of the absolute values. */
+/** Return the center of cell 0 … 47: the octant by signs (bit 0: x < 0), then the order of the absolute values. */
 export function cellDirection(cell) {
   const octant = Math.floor(cell / ORDERS.length);
   const direction = [0, 0, 0];
@@ -22,13 +22,13 @@ export function cellDirection(cell) {
   return direction;
 }
 
-/** Which cells a mask of 48 bits in hexadecimal has. */
+/** Return the cells in a mask of 48 bits in hexadecimal. */
 export function coveredCells(mask) {
   const bits = BigInt(`0x${mask || "0"}`);
   return Array.from({ length: 48 }, (_, cell) => Boolean((bits >> BigInt(cell)) & 1n));
 }
 
-/** The cell in which a direction lies. */
+/** Return the cell of a direction. */
 export function cellOf(direction) {
   const octant = direction.reduce((bits, value, axis) => bits | ((value < 0) << axis), 0);
   const sizes = direction.map(Math.abs);
@@ -36,13 +36,13 @@ export function cellOf(direction) {
   return octant * ORDERS.length + order;
 }
 
-/** A direction on the canvas: x, y, and depth (larger is nearer). */
+/** Return a direction on the canvas: x, y, and depth (larger is nearer). */
 export function onSphere(direction) {
   const [x, away, z] = rotate(TILT, direction);
   return [SIZE / 2 + x * RADIUS, SIZE / 2 - z * RADIUS, -away];
 }
 
-/** Which cell each pixel of a square canvas shows, and which lies behind it; NONE beside the sphere. */
+/** Return the front cell and the back cell of each pixel of a square canvas; NONE outside of the sphere. */
 function cellMap(pixels) {
   const back = [TILT[0], -TILT[1], -TILT[2], -TILT[3]];
   const near = new Uint8Array(pixels * pixels).fill(NONE);
@@ -59,7 +59,7 @@ function cellMap(pixels) {
   return { pixels, near, far };
 }
 
-/** Great circles between the cells, in pieces: planes through two axes, and planes between two axes. */
+/** Return the great circles between the cells, in pieces: in planes through two axes, and between two axes. */
 function edges() {
   const pieces = [];
   for (const normal of [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1], [0, 1, -1]]) {
@@ -80,7 +80,7 @@ function edges() {
 
 export class CoverageSphere {
   constructor() {
-    this.canvas = el("canvas", { class: "sphere", role: "img", "aria-label": "directions that were covered" });
+    this.canvas = el("canvas", { class: "sphere", role: "img", "aria-label": "covered directions" });
     this.edges = edges();
     this.draw("0");
   }
@@ -118,12 +118,12 @@ export class CoverageSphere {
     }
   }
 
-  /** Covered cells in a colour, those behind shining through. */
+  /** Draw the covered cells; cells at the back are visible through the front. */
   filled(context, covered, colour) {
     const { pixels, near, far } = this.map;
     const image = context.createImageData(pixels, pixels);
     context.fillStyle = colour;
-    const rgb = [1, 3, 5].map((at) => parseInt(context.fillStyle.slice(at, at + 2), 16)); // "#rrggbb", as the canvas has it
+    const rgb = [1, 3, 5].map((at) => parseInt(context.fillStyle.slice(at, at + 2), 16)); // format of the canvas: "#rrggbb"
     for (let index = 0; index < near.length; index += 1) {
       if (near[index] === NONE) continue;
       const opacity = covered[near[index]] ? NEAR_OPACITY : covered[far[index]] ? FAR_OPACITY : 0;

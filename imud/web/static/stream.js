@@ -1,12 +1,12 @@
-// The WebSocket to imud web: connected again when it is lost, quiet while the page is hidden.
+// WebSocket to imud web. It connects again after a loss, and requests nothing while the page is hidden.
 
 const RETRY_FIRST_MS = 500;
 const RETRY_MOST_MS = 5000;
 const ACKNOWLEDGE_MS = 250;
 
 export class Stream {
-  /** onMessage(message) for each message; onLink(connected) when the connection comes and goes; mayRead(): whether it
-   *  would be accepted. */
+  /** Call onMessage(message) for each message, and onLink(connected) when the connection opens or closes. Connect only if
+   *  mayRead() is true. */
   constructor(onMessage, onLink, mayRead) {
     this.mayRead = mayRead;
     this.onMessage = onMessage;
@@ -44,7 +44,7 @@ export class Stream {
     };
   }
 
-  /** Show something else: a message `Look` of imud/web/messages.py. */
+  /** Change the view: a message `Look` of imud/web/messages.py. */
   look(wish) {
     this.wish = wish;
     this.send();

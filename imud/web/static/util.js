@@ -1,4 +1,4 @@
-// Parts of the page, and numbers as text. Texts of devices are never taken as HTML.
+// Elements of the page, and numbers as text. The page never inserts texts of devices as HTML.
 
 export function el(tag, attributes = {}, ...children) {
   const node = document.createElement(tag);
@@ -15,7 +15,7 @@ export function el(tag, attributes = {}, ...children) {
 export const DEGREE = Math.PI / 180;
 export const AXES = ["x", "y", "z"];
 
-/** The context of a square canvas of `size` CSS pixels, cleared, as sharp as the screen. */
+/** Return the cleared context of a square canvas of `size` CSS pixels, in the resolution of the screen. */
 export function cleared(canvas, size) {
   const scale = Math.max(devicePixelRatio || 1, 1);
   const pixels = Math.round(size * scale);
@@ -26,7 +26,7 @@ export function cleared(canvas, size) {
   return context;
 }
 
-/** A number with so many decimals and a true minus sign; "–" for none. */
+/** Return a number as text with `decimals` digits and a minus sign; "–" for null. */
 export function number(value, decimals = 0) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   const text = value.toLocaleString("en", { minimumFractionDigits: decimals, maximumFractionDigits: decimals });
@@ -37,7 +37,7 @@ export function length(vector) {
   return vector ? Math.hypot(...vector) : null;
 }
 
-/** A time in s with a fitting unit. */
+/** Return a time in s as text with a suitable unit. */
 export function duration(seconds) {
   if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return "–";
   const size = Math.abs(seconds);
@@ -51,7 +51,7 @@ export function duration(seconds) {
 
 const SHOWN_UNITS = { rad: [1 / DEGREE, "°"], "rad/s": [1 / DEGREE, "°/s"], T: [1e6, "µT"], "": [100, "%"] };
 
-/** A value in SI with three digits and the unit that people read; a value without a unit is a share. */
+/** Return an SI value as text with three digits in a usual unit. A value without a unit is a ratio. */
 export function quantity(value, unit) {
   if (value === null || value === undefined) return "–";
   const [factor, name] = SHOWN_UNITS[unit] ?? [1, unit];
@@ -61,35 +61,35 @@ export function quantity(value, unit) {
   return name === "°" ? text + name : `${text} ${name}`;
 }
 
-/** A value of a setting or an identity as text. */
+/** Return a value of a setting or of an identity as text. */
 export function shown(value) {
   if (value === null || value === undefined) return "–";
   return typeof value === "object" ? JSON.stringify(value) : String(value);
 }
 
-/** A text whose words between backticks are those of a command line. */
+/** Return the parts of a text, with the parts between backticks as code. */
 export function marked(text) {
   return text.split("`").map((part, index) => (index % 2 ? el("code", { text: part }) : part));
 }
 
-/** A panel with its title. */
+/** Return a panel with a title. */
 export function panel(id, title, ...children) {
   return el("section", { id, class: "panel" }, el("h2", { text: title }), ...children);
 }
 
-/** Rows of name and value. */
+/** Return a list of rows with name and value. */
 export function facts(rows) {
   const list = el("dl", { class: "facts" });
   for (const [name, value] of rows) list.append(el("dt", { text: name }), el("dd", { text: value }));
   return list;
 }
 
-/** Replace the text of a node only where it differs: the browser draws less. */
+/** Set the text of a node if it differs, so that the browser draws less. */
 export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
-/** A question or an order to the daemon; throws Error with what was wrong. */
+/** Send a request to the daemon. Return its result. Throws Error with the message of the daemon. */
 export async function call(method, params) {
   const response = await fetch("/api/call", {
     method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ method, params }),
