@@ -1,4 +1,4 @@
-"""Contract: what takes news of a feed in tests, which wait for what they need."""
+"""A receiver of `News` for tests."""
 
 from collections.abc import Callable
 from queue import Queue
@@ -9,14 +9,14 @@ LIMIT_S = 60.0
 
 
 class Listener:
-    """Takes news; the test waits for what it needs."""
+    """A receiver that waits for a condition."""
 
     def __init__(self) -> None:
         self._news: Queue[News] = Queue()
         self.on_news = self._news.put
 
     def wait_for(self, is_there: Callable[[News], object]) -> News:
-        """Return the first news of which something holds; those before are gone."""
+        """Return the first `News` that fulfills a condition. Discard earlier `News`."""
         while not is_there(news := self._news.get(timeout=LIMIT_S)):
             pass
         return news

@@ -1,4 +1,4 @@
-"""The blocking client against the real server, and against servers that misbehave."""
+"""The blocking client with the real server, and with invalid servers."""
 
 import math
 import os
@@ -51,7 +51,7 @@ def test_questions(served: Daemon) -> None:
 
 
 def test_a_convention_is_asked_for(served: Daemon) -> None:
-    """A module with x right, y forward, z up: its y is the front."""
+    """A device with x right, y forward, z up: its y axis points to the front."""
     with Client(served.path) as client:
         publish(served, batch("imu0", 4))
         (newest,) = client.poll(convention="enu-flu")
@@ -63,7 +63,7 @@ def test_a_convention_is_asked_for(served: Daemon) -> None:
             client.watch(convention="up")
 
 
-def test_what_the_daemon_refuses_is_raised_and_the_connection_lives_on(served: Daemon) -> None:
+def test_a_refused_request_raises_and_the_connection_stays_open(served: Daemon) -> None:
     with Client(served.path) as client:
         with pytest.raises(RpcError, match="there are: imu0, imu1") as caught:
             client.watch(["imu7"])
@@ -80,12 +80,12 @@ def test_what_the_daemon_refuses_is_raised_and_the_connection_lives_on(served: D
 
 
 @pytest.mark.parametrize("encoding", ["json", "binary"])
-def test_watch_gives_whole_samples_and_questions_go_between(served: Daemon, encoding: str) -> None:
+def test_watch_returns_complete_samples_between_requests(served: Daemon, encoding: str) -> None:
     with Client(served.path) as client:
         watch = client.watch(encoding=encoding, timeout_s=60)
         assert watch.device_ids == DEVICES
         publish(served, batch("imu0", 1, 2), batch("imu1", 123))
-        assert len(client.devices()) == 2  # samples that come meanwhile wait
+        assert len(client.devices()) == 2  # the client keeps samples that arrive before the reply
         publish(served, batch("imu0", 3))
         wanted = [sample("imu0", 1), sample("imu0", 2), sample("imu1", 123), sample("imu0", 3)]
         assert list(islice(watch, 4)) == wanted
@@ -115,7 +115,7 @@ def test_watch_selects_and_a_second_watch_ends_the_first(served: Daemon) -> None
 
 
 @pytest.mark.parametrize("encoding", ["json", "binary"])
-def test_dropped_samples_are_told(served: Daemon, encoding: str) -> None:
+def test_dropped_samples_are_reported(served: Daemon, encoding: str) -> None:
     with Client(served.path) as client:
         watch = client.watch(encoding=encoding, timeout_s=60)
         calls: list[tuple[str, int]] = []
@@ -183,7 +183,7 @@ def test_notify_gives_a_descriptor_that_wakes(served: Daemon) -> None:
         publish(served, batch("imu0"))
         fd = client.notify("imu0")
         publish(served, batch("imu0", 2, 3), batch("imu1"), batch("imu0", 5))
-        assert len(client.devices()) == 2  # behind the wake-ups
+        assert len(client.devices()) == 2  # the reply arrives after the wake-ups
         assert os.read(fd, 64)
         with pytest.raises(BlockingIOError):
             os.read(fd, 64)
@@ -202,7 +202,7 @@ def test_path_of_the_environment(served: Daemon, monkeypatch: pytest.MonkeyPatch
     with Client() as client:
         assert client.path == served.path
     with pytest.raises(LinkMissing, match="no daemon at /nowhere"):
-        Client("/nowhere")  # an argument counts more
+        Client("/nowhere")  # the argument has priority over IMUD_SOCKET
     monkeypatch.setenv("IMUD_SOCKET", "")
     assert default_path() == "/run/imud/imud.sock"
     monkeypatch.delenv("IMUD_SOCKET")
@@ -226,7 +226,7 @@ def test_no_daemon_there_and_no_permission(tmp_path: Path, monkeypatch: pytest.M
         Client("/x")
 
 
-def test_the_daemon_goes_away(tmp_path: Path) -> None:
+def test_a_daemon_that_ends_raises_link_missing(tmp_path: Path) -> None:
     with daemon(tmp_path) as served:
         client = Client(served.path)
         watch = client.watch()
@@ -276,7 +276,7 @@ def answering(path: Path, answer: bytes) -> Iterator[None]:
         ),
     ],
 )
-def test_servers_that_misbehave(tmp_path: Path, answer: bytes, error: type[Exception], words: str) -> None:
+def test_invalid_servers_raise_errors(tmp_path: Path, answer: bytes, error: type[Exception], words: str) -> None:
     path = tmp_path / "s"
     limit_s = 0.2 if error is TimeoutError else 60
     with answering(path, answer), pytest.raises(error, match=words), Client(path, timeout_s=limit_s) as client:
@@ -284,8 +284,8 @@ def test_servers_that_misbehave(tmp_path: Path, answer: bytes, error: type[Excep
 
 
 @pytest.mark.parametrize("method", ["watch", "poll"])
-def test_a_daemon_that_does_not_know_conventions_is_no_silent_mistake(tmp_path: Path, method: str) -> None:
-    """An older one ignores the parameter, and would give the axes of the device."""
+def test_a_daemon_without_conventions_raises_an_error(tmp_path: Path, method: str) -> None:
+    """An older daemon ignores the parameter and sends the axes of the device."""
     path = tmp_path / "s"
     with answering(path, HELLO + b'{"id":1,"result":{"devices":{},"samples":[]}}\n'), Client(path) as client:
         ask = client.watch if method == "watch" else client.poll

@@ -1,4 +1,4 @@
-"""The thread that reads the daemon for views."""
+"""The thread that reads the daemon for a view."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -35,7 +35,7 @@ def clients(served: Daemon) -> int:
 
 
 def until(condition: Callable[[], object], heard: Listener) -> None:
-    """Look again with each piece of news until something is so."""
+    """Check a condition with each `News` until it is true."""
     while not condition():
         heard.wait_for(lambda news: True)
 
@@ -56,7 +56,7 @@ def test_the_first_news_have_the_greeting_and_every_sample_comes(tmp_path: Path)
         assert found == [*range(1, 51)]
 
 
-def test_there_is_no_connection_while_nothing_is_wanted(tmp_path: Path) -> None:
+def test_the_feed_is_disconnected_without_a_wish(tmp_path: Path) -> None:
     with daemon(tmp_path) as served, feeding(str(served.path), None) as (feed, heard):
         assert clients(served) == 0
         feed.want(OVERVIEW)
@@ -85,7 +85,7 @@ def test_newest_samples_and_events_come_without_a_watch(tmp_path: Path) -> None:
         assert found == ["is there", "is not there"]
 
 
-def test_a_device_that_the_daemon_does_not_have_is_left_out(tmp_path: Path) -> None:
+def test_the_feed_ignores_unknown_devices(tmp_path: Path) -> None:
     with daemon(tmp_path) as served, feeding(str(served.path), Wish(("gone",), news_s=0.02)) as (feed, heard):
         assert not heard.wait_for(lambda news: news.statuses).problem
         feed.want(Wish(("gone", "imu1"), news_s=0.03))
@@ -113,7 +113,7 @@ def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> Non
         feed.close()
 
 
-def test_the_time_of_the_news_is_that_of_the_daemons_machine(tmp_path: Path) -> None:
+def test_news_contain_the_time_of_the_daemons_host(tmp_path: Path) -> None:
     with daemon(tmp_path) as served, feeding(str(served.path), OVERVIEW) as (_, heard):
         news = heard.wait_for(lambda news: news.statuses)
         assert news.ahead_ns == pytest.approx(NOW_NS - monotonic_ns(), abs=LIMIT_S * NS_PER_S)
@@ -122,7 +122,7 @@ def test_the_time_of_the_news_is_that_of_the_daemons_machine(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_clocks_that_are_near_are_one_clock(monkeypatch: pytest.MonkeyPatch, sign: int) -> None:
+def test_a_small_difference_of_clocks_counts_as_one_clock(monkeypatch: pytest.MonkeyPatch, sign: int) -> None:
     monkeypatch.setattr("imud.client.feed.monotonic_ns", lambda: NOW_NS)
-    assert clock_ahead_ns(NOW_NS + sign * SAME_CLOCK_NS) == 0  # the answer may be late
+    assert clock_ahead_ns(NOW_NS + sign * SAME_CLOCK_NS) == 0  # the reply may be late
     assert clock_ahead_ns(NOW_NS + sign * (SAME_CLOCK_NS + 1)) == sign * (SAME_CLOCK_NS + 1)

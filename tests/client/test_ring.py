@@ -66,7 +66,7 @@ def test_directory_of_the_environment(board: Board, tmp_path: Path, monkeypatch:
     with Ring(DEVICE) as ring:
         assert ring.path == board.path
     with pytest.raises(ServerError, match=r"/nowhere/imud\.imu0: no such ring"):
-        Ring(DEVICE, directory="/nowhere")  # an argument counts more
+        Ring(DEVICE, directory="/nowhere")  # the argument has priority over IMUD_SHM
     monkeypatch.setenv("IMUD_SHM", "")
     assert default_directory() == "/run/imud/shm"
     monkeypatch.delenv("IMUD_SHM")
@@ -93,7 +93,7 @@ def test_owner(board: Board) -> None:
 
 @needs_root
 def test_owner_of_a_ring_that_is_opened_again(board: Board) -> None:
-    """A ring that another user plants in the place of one that is gone is refused; the daemon's next one is taken."""
+    """The reader refuses a file of another user at the path of a removed ring. It opens the next file of the daemon."""
     board.publish([1])
     os.chown(board.path, DAEMON_UID, -1)
     with Ring(board.path, from_oldest=True, owner_uid=DAEMON_UID, now_ns=lambda: board.now_ns) as ring:
@@ -112,7 +112,7 @@ def test_reader_cannot_write(board: Board) -> None:
     assert sorted(line.split()[1] for line in maps if line.endswith(str(board.path))) == ["r--s", "rw-s"]
 
 
-def test_read_gives_what_comes_after_opening(board: Board, ring: Ring) -> None:
+def test_read_returns_the_samples_after_opening(board: Board, ring: Ring) -> None:
     assert ring.latest() is None
     board.publish(range(1, 6))
     assert ring.latest() == make_sample(5)
@@ -126,7 +126,7 @@ def test_read_gives_what_comes_after_opening(board: Board, ring: Ring) -> None:
 
 
 @pytest.mark.parametrize(("count", "expected"), [(0, []), (3, [1, 2, 3]), (SLOTS + 2, [*range(3, SLOTS + 3)])])
-def test_read_can_begin_with_the_oldest_that_is_left(board: Board, count: int, expected: list[int]) -> None:
+def test_read_can_begin_with_the_oldest_sample_in_the_ring(board: Board, count: int, expected: list[int]) -> None:
     board.publish(range(1, count + 1))
     with Ring(board.path, from_oldest=True, now_ns=lambda: board.now_ns) as ring:
         assert numbers(ring) == (expected, 0)
@@ -135,7 +135,7 @@ def test_read_can_begin_with_the_oldest_that_is_left(board: Board, count: int, e
 
 
 @pytest.mark.parametrize("count", [1, SLOTS - 1, SLOTS, SLOTS + 1, 3 * SLOTS + 5])
-def test_slow_reader_learns_exactly_what_it_missed(board: Board, ring: Ring, count: int) -> None:
+def test_a_slow_reader_gets_the_exact_number_of_missed_samples(board: Board, ring: Ring, count: int) -> None:
     board.publish(range(1, count + 1))
     first = max(1, count - SLOTS + 1)
     assert numbers(ring) == (list(range(first, count + 1)), first - 1)
@@ -158,12 +158,12 @@ def test_every_sample_is_read_or_missed(board: Board, ring: Ring, seed: int) -> 
 
 
 @pytest.mark.parametrize("name", TORN)
-def test_torn_slot_is_refused_until_it_is_whole_or_lost(board: Board, ring: Ring, name: str) -> None:
+def test_an_incomplete_slot_is_refused_until_it_is_complete_or_overwritten(board: Board, ring: Ring, name: str) -> None:
     board.publish([1, 2])
     board.poke(slot_at(2), TORN[name])
     assert ring.latest() is None
     assert numbers(ring) == ([1], 0)
-    assert numbers(ring) == ([], 0)  # it may still come: a store that another core sees late
+    assert numbers(ring) == ([], 0)  # it may still arrive: another core may see the store late
     board.poke(slot_at(2), WHOLE)
     assert numbers(ring) == ([2], 0)
     board.publish([3])
@@ -175,7 +175,7 @@ def test_torn_slot_is_refused_until_it_is_whole_or_lost(board: Board, ring: Ring
 
 
 class MeanwhileMap(mmap.mmap):
-    """Lets something happen between the look at a slot's number and the copy, or right after the copy."""
+    """Runs a function between the read of a slot's sequence number and its copy, or just after the copy."""
 
     before: Callable[[], None] | None = None
     after: Callable[[], None] | None = None
@@ -230,13 +230,13 @@ def test_latest_overtaken_while_copying(board: Board) -> None:
         assert ring.latest() == make_sample(SLOTS + 1)
 
 
-def test_numbers_with_a_gap_and_numbers_that_begin_anew(board: Board, ring: Ring) -> None:
+def test_sequence_numbers_with_a_gap_and_after_a_restart(board: Board, ring: Ring) -> None:
     board.publish([1, 2, 3])
     board.publish([5000, 5001])
     assert numbers(ring) == ([5000, 5001], 4999)
     board.publish([1, 2])
     assert numbers(ring) == ([1, 2], 0)
-    # the reader sees the new first number before the new newest number
+    # the reader sees the new `first` before the new `newest`
     board.poke(OFFSETS["first_seq"], struct.pack("<Q", 5000))
     board.publish([3])
     assert numbers(ring) == ([3], 0)
@@ -248,7 +248,7 @@ def test_restart_after_a_clean_end(board: Board, ring: Ring, tmp_path: Path) -> 
     board.publish([1, 2, 3])
     board.publisher.close()
     assert not ring.alive(board.now_ns)
-    assert numbers(ring) == ([1, 2, 3], 0)  # the old ring is read to its end
+    assert numbers(ring) == ([1, 2, 3], 0)  # the reader reads the old ring to its end
     assert numbers(ring) == ([], 0)
     assert ring.epoch == 77
     successor = Board(tmp_path, epoch=78)
@@ -266,7 +266,7 @@ def test_restart_after_a_daemon_that_died(board: Board, ring: Ring, tmp_path: Pa
     successor = Board(tmp_path, epoch=78)
     successor.publish(range(1, SLOTS + 4))
     board.now_ns = START_NS + 999_999_999
-    assert numbers(ring) == ([], 0)  # the old heartbeat is not stale yet
+    assert numbers(ring) == ([], 0)  # the old heartbeat is still valid
     board.now_ns += 1
     assert ring.latest() == make_sample(SLOTS + 3)
     assert numbers(ring) == (list(range(4, SLOTS + 4)), 3)
@@ -293,7 +293,7 @@ def test_successor_of_another_layout(board: Board, ring: Ring) -> None:
 
 
 def test_heartbeat_ledger_and_reopen(board: Board, ring: Ring) -> None:
-    assert not ring.reopen()  # nothing changed
+    assert not ring.reopen()  # the file did not change
     assert ring.alive(START_NS + 999_999_999)
     assert not ring.alive(START_NS + 1_000_000_000)
     assert ring.ledger() is None
@@ -350,7 +350,7 @@ def test_wait_also_when_another_was_faster(ring: Ring, monkeypatch: pytest.Monke
         assert waker.wake()
         waker.close()
         assert ring.wait(fd)
-        for _ in range(2):  # readable for ever: no busy loop
+        for _ in range(2):  # the descriptor stays readable; the error prevents a busy loop
             with pytest.raises(LinkMissing, match="call notify again"):
                 ring.wait(fd)
     finally:
@@ -374,4 +374,4 @@ def test_close_twice(board: Board) -> None:
     ring.close()
     ring.close()
     maps = Path("/proc/self/maps").read_text().splitlines()
-    assert [line.split()[1] for line in maps if line.endswith(str(board.path))] == ["rw-s"]  # the writer's only
+    assert [line.split()[1] for line in maps if line.endswith(str(board.path))] == ["rw-s"]  # the writer

@@ -1,4 +1,4 @@
-"""A real browser (Debian's chromium, headless) and `imud web` as a process, for tests and pictures of the page."""
+"""A real browser (chromium of Debian, headless) and a process `imud web`, for tests and pictures of the page."""
 
 import os
 import shutil
@@ -34,7 +34,7 @@ class Page:
         return self.driver.execute_script(script, *arguments)
 
     def module(self, script: str, *arguments: object) -> Any:
-        """Run the body of an async function in the page, where `import()` works, and return its value."""
+        """Run the body of an async function in the page. `import()` works there. Return its value."""
         body = f"const done = arguments[arguments.length - 1]; (async (...args) => {{ {script} }})(...arguments)"
         answer = self.driver.execute_async_script(
             f"{body}.then((value) => done([value]), (error) => done(String(error)));", *arguments
@@ -114,10 +114,10 @@ def serving_web(socket: Path, *words: str, port: int = 0) -> Iterator[str]:
 
 
 class Sender:
-    """A module at the end of a cable that measures at 200 Hz; what it sends of each measurement is chosen."""
+    """A device at a virtual serial port that measures at 200 Hz. The test defines its frames."""
 
     def __init__(self, cable: Cable, frame_of: Callable[[int], bytes]) -> None:
-        """`frame_of` makes the bytes of a measurement, from its number; none: its frame is lost."""
+        """`frame_of` returns the frame of a measurement by number; empty for a lost frame."""
         self.measured = 0
         self._cable = cable
         self._frame_of = frame_of
@@ -139,7 +139,7 @@ class Sender:
             frame = self._frame_of(self.measured)
             self.measured += 1
             while frame and not self._stopped.is_set():
-                with suppress(BlockingIOError):  # the daemon is late, or it has ended
+                with suppress(BlockingIOError):  # the daemon reads too slowly, or has ended
                     frame = frame[os.write(self._cable.master, frame) :]
                 if frame:
                     sleep(LOOK_S)
@@ -147,13 +147,13 @@ class Sender:
 
 
 def upright(value_of: Callable[[int], float]) -> Callable[[int], bytes]:
-    """Frames of a module that stands still, with this acceleration along z (m/s²), each PERIOD_MS of its own time."""
+    """Frames of a device at rest with this acceleration along z, m/s². The device time has steps of PERIOD_MS."""
     return lambda number: hi91(number * PERIOD_MS, value_of(number))
 
 
 @contextmanager
 def sent_by(folder: Path, port: Cable) -> Iterator[RunningDaemon]:
-    """A daemon that reads the module at the end of a cable as `bow`."""
+    """A daemon that reads the device at the virtual port as `bow`."""
     with running_daemon(folder, {"bow": device(port.name)}, python=()) as daemon:
         yield daemon
 

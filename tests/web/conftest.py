@@ -1,4 +1,4 @@
-"""Runs `async` tests in a loop. One browser for all tests of a page. Keeps the picture of a failed test."""
+"""Runs `async` tests in an event loop. Uses one browser for all tests. Saves the picture of a failed test."""
 
 import inspect
 from collections.abc import Iterator
@@ -17,12 +17,12 @@ from tests.web.browser import Page, browser, serving_web
 __all__ = ["cli"]
 
 PICTURES: Final = ROOT / "build/web"
-"""Where what the browser showed goes when a test failed, by the name of the test."""
+"""Folder for the picture of a failed test."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run an `async` test in a new loop."""
+    """Run an `async` test in a new event loop."""
     if not inspect.iscoroutinefunction(pyfuncitem.obj):
         return None
     names = inspect.signature(pyfuncitem.obj).parameters
@@ -32,7 +32,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 @pytest.fixture(scope="session")
 def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """One browser for all tests that do not need another size."""
+    """The browser of all tests without another window size."""
     with browser(tmp_path_factory.mktemp("browser")) as one:
         yield one
 

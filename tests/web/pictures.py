@@ -1,8 +1,7 @@
 """Takes the screenshots of `imud web` for README.md and docs/views.md: `make web-pictures`.
 
-Simulated modules in a real browser: one whose settings are not all as declared, that shakes with an engine and loses a
-sample now and then; one with a bad cable; one that falls silent; one that is not there; one that is turned. They make
-web-*.png in docs/pictures.
+The browser shows five simulated devices: a vibrating device with lost samples and a wrong setting, a device with a bad
+cable, a silent device, a missing device, and a rotating device. The files are docs/pictures/web-*.png.
 """
 
 import shutil
@@ -35,9 +34,9 @@ DECLARED: Final = {"bow": {"mode": "9-axis", "magnetic_calibration": True, "outp
 ABSENT: Final = "stern"
 STATES: Final = {"bow": "running", "mast": "running", "crane": "silent", ABSENT: "missing"}
 COLOURS_MAX: Final = 256
-"""Of a picture, which has few: its file is a third as large, and looks the same."""
+"""Number of colors of a picture. The file is a third as large and looks the same."""
 FULL = "return window.imud.view.plots.get('accel_m_s2').data[0].length >= 580"
-"""Nearly half a minute at 20 Hz."""
+"""Number of points in a plot: nearly half a minute at 20 Hz."""
 TOKEN = "a-token-for-pictures-only"
 
 
@@ -93,7 +92,7 @@ def ports() -> Iterator[None]:
 
 
 def save(name: str, png: bytes) -> None:
-    """Write a picture with a palette of its most frequent colours; the others become the nearest of these."""
+    """Write a picture with a palette of its most frequent colors. Replace other colors by the nearest one."""
     with Image.open(BytesIO(png)) as read:
         whole = np.asarray(read.convert("RGB"))
     colours, places, counts = np.unique(whole.reshape(-1, 3), axis=0, return_inverse=True, return_counts=True)
@@ -133,9 +132,9 @@ def desktop(folder: Path, url: str, bow: Module, daemon: RunningDaemon) -> None:
         daemon.wait_for("bow", "running")
         page.until_text("#event-list", "up")
         page.until_text("#about", "mode is 6-axis, declared 9-axis")
-        page.click("#settings .buttons button")  # what was read before the module was there again
+        page.click("#settings .buttons button")  # reads the settings again: the device was missing before
         page.until("return document.querySelector('[data-setting=mode].differs')")
-        page.js("window.imud.view.clear()")  # the pause would be in the plots
+        page.js("window.imud.view.clear()")  # otherwise the plots show the pause
         choose(page, "#spectrum-of", "accel_m_s2")
         page.until(FULL)
         page.until("return window.imud.view.spectrum.spectrum.segments.length >= 8")
@@ -152,7 +151,7 @@ def phone(folder: Path, url: str) -> None:
 
 
 def calibration(folder: Path) -> None:
-    """The panel of a calibration while the module is turned."""
+    """Take the panel of a calibration during the rotation of the device."""
     token = folder / "token"
     token.write_text(TOKEN)
     with (
@@ -163,7 +162,7 @@ def calibration(folder: Path) -> None:
         open_page(page, url, "bow")
         log_in(page, TOKEN)
         page.until("return document.querySelector('#calibration [data-kind=magnetometer] button')")
-        page.js("document.querySelector('header').hidden = true")  # it would stand over the panel
+        page.js("document.querySelector('header').hidden = true")  # it would cover the panel
         page.click("#calibration [data-kind=magnetometer] button")
         page.until("return Number(document.querySelector('#calibration canvas').dataset.covered) > 12")
         (panel,) = page.driver.find_elements("css selector", "#calibration")

@@ -1,4 +1,4 @@
-"""Calibrations through the page in a real browser: a module that is turned, its sphere, its result."""
+"""Calibrations on the page in a real browser: a rotating device, the sphere, the result."""
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -29,7 +29,7 @@ PIXEL = """const { onSphere, coveredCells, cellDirection } = await import('/stat
     const { sphere } = window.imud.view.calibration;
     sphere.draw(args[0]);
     return coveredCells(args[0]).map((is, cell) => [is, onSphere(cellDirection(cell))[2] > 0.3, colour(cell)]);"""
-"""Of each cell of a mask: whether it is covered, whether it is in front, and the colour in its middle."""
+"""For each cell of a mask: whether it is covered, whether it is in front, and the color of its center."""
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def test_a_magnetometer_is_calibrated_with_the_token(page: Page, tmp_path: Path,
         assert "field strength 45.1 µT, at most 67 µT: passed" in result
         assert "residual of the field" in result
         assert f"The device reports: {BIAS}" in result
-        page.until(f"{COVERED} >= arguments[0]", COVERAGE_WANTED * 48)  # the events may come after the answer
+        page.until(f"{COVERED} >= arguments[0]", COVERAGE_WANTED * 48)  # the events may arrive after the reply
         assert "field\n45.1 µT" in page.text("#calibration .facts")
         assert not page.js("return document.querySelector('#calibration-stop').getClientRects().length")
         assert not page.js("return document.querySelector(arguments[0]).disabled", BEGIN.format("level"))
@@ -67,7 +67,7 @@ def test_a_magnetometer_is_calibrated_with_the_token(page: Page, tmp_path: Path,
 
 def test_a_calibration_is_seen_without_the_token_and_stopped_with_it(page: Page, tmp_path: Path, token: str) -> None:
     with (
-        turned_module(tmp_path, speed=1) as daemon,  # it does not end before it is stopped
+        turned_module(tmp_path, speed=1) as daemon,  # slow: the calibration is still running at the stop
         serving_web(daemon.socket, "--token-file", token) as url,
         ThreadPoolExecutor(1) as pool,
         Client(daemon.socket, timeout_s=LIMIT_S) as client,
@@ -99,7 +99,7 @@ def test_a_calibration_is_seen_without_the_token_and_stopped_with_it(page: Page,
         assert [one for one in page.problems() if "401" not in one] == []
 
 
-def test_the_sphere_has_the_colour_of_what_is_covered_and_errors_are_shown(
+def test_the_sphere_shows_covered_cells_and_the_page_shows_errors(
     page: Page, site: tuple[RunningDaemon, str], token: str
 ) -> None:
     daemon, _ = site

@@ -1,4 +1,4 @@
-"""The page of a device in a real browser: vectors and angles as a module sent them, its status, its settings."""
+"""The page of a device in a real browser: vectors and angles of the frames, status, settings."""
 
 import math
 from collections.abc import Sequence
@@ -26,18 +26,18 @@ pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.liv
 Rows = NDArray[np.float64]
 PLOTTED = """return Object.fromEntries([...window.imud.view.plots].map(([member, plot]) =>
     [member, plot.data.map((values) => [...values])]))"""
-"""Of each plot: times, then greatest and least value of each axis."""
+"""For each plot: times, then maximum and minimum of each axis."""
 RISE = {
     "accel_m_s2": (0.004, -0.003, 0.002),
     "gyro_rad_s": (0.005, -0.006, 0.007),
     "mag_t": (1e-8, -2e-8, 3e-8),
     "euler_rad": (0.0004, -0.0003, 0.0),
 }
-"""How much each axis grows from a measurement to the next."""
+"""Increase of each axis between two measurements."""
 TURN_RAD = 0.02
-"""The same of yaw, which goes over ±180° each 314 measurements, 1.6 s."""
+"""Increase of yaw, which passes ±180° every 314 measurements (1.6 s)."""
 SHOWN = {"gyro_rad_s": math.degrees(1.0), "mag_t": 1e6, "euler_rad": math.degrees(1.0), "accel_m_s2": 1.0}
-"""°/s per rad/s, µT per T, ° per rad."""
+"""Factors of the plots: °/s per rad/s, µT per T, ° per rad."""
 
 
 def wrapped(angle_rad: float) -> float:
@@ -50,7 +50,7 @@ def vector(member: str, number: int) -> list[float]:
 
 
 def ramps(number: int) -> bytes:
-    """A measurement in which no axis has the value of another one, or of another measurement."""
+    """Return a measurement. Each axis and each measurement has another value."""
     values: dict[str, Any] = {member: vector(member, number) for member in RISE}
     return encode_hi91(
         system_time_ms=number * PERIOD_MS, quat_wxyz=(1.0, 0.0, 0.0, 0.0), temperature_c=20.0, pressure_pa=1e5, **values
@@ -92,7 +92,7 @@ def test_every_vector_and_angle_is_plotted_as_it_was_sent_in_the_units_of_people
 
 
 def _is_turn(number: int) -> bool:
-    """Whether yaw went over the half turn since the measurement before."""
+    """Return whether yaw passed ±180° since the previous measurement."""
     return abs(vector("euler_rad", number)[2] - vector("euler_rad", number - 1)[2]) > math.pi
 
 
@@ -146,7 +146,7 @@ STATUS = msgspec.structs.replace(
         unverified=("baud",),
     ),
 )
-"""A status with everything that a device can have, each count another number."""
+"""A status with all optional parts. Each counter has another value."""
 WORDS = {
     "clock": ("error 31.0 µs", "0 resets"),
     "polling": ("4,211 reads", "223 late", "227 missed", "229 stale", "233 failed",
@@ -179,14 +179,13 @@ def test_the_status_panel_has_every_row_of_imud_status(scripts: Page) -> None:
     assert not {"polling", "line", "sin", "utc", "settings", "pulses"} & set(plain), "rows that this device has not"
 
 
-def test_a_setting_that_is_not_as_declared_is_marked_on_the_page_and_in_the_overview(
-    page: Page, tmp_path: Path
-) -> None:
+def test_a_setting_with_a_difference_is_marked_on_the_page_and_in_the_overview(page: Page, tmp_path: Path) -> None:
     declared = {"mode": "9-axis", "magnetic_calibration": True}
     with daemon_with_module(tmp_path, "--rate", "100", settings=declared) as daemon, serving_web(daemon.socket) as url:
         open_page(page, url, "bow")
         page.until_text("#about", "mode is 6-axis, declared 9-axis")
-        page.until("return document.querySelector('[data-setting=mode]')?.className")  # actual values come after names
+        # actual values arrive after the names
+        page.until("return document.querySelector('[data-setting=mode]')?.className")
         rows = page.js(
             """return [...document.querySelectorAll('[data-setting]')].map((row) =>
                 [row.dataset.setting, [row.className, row.cells[1].innerText, row.cells[2].innerText]])"""

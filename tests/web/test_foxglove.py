@@ -1,4 +1,4 @@
-"""The relay between a daemon and a viewer: what is offered, what is sent, and when nothing is asked for."""
+"""The relay between a daemon and a viewer: offered topics, messages, and no requests without a subscription."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -85,7 +85,7 @@ def test_samples_events_and_status_come(tmp_path: Path) -> None:
         assert imu.message["linear_acceleration"] == {"x": -0.5, "y": -0.125, "z": 9.75}
         assert imu.message["angular_velocity"] == {"x": 0.5, "y": -0.25, "z": -0.75}
         assert imu.message["angular_velocity_covariance"] == [0.25, 0, 0, 0, 0.25, 0, 0, 0, 0.25]
-        assert imu.message["linear_acceleration_covariance"] == [1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-4]  # of the status
+        assert imu.message["linear_acceleration_covariance"] == [1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-4]  # from the status
         assert imu.utc_ns == 1_790_000_000_007_000_000
         stamp = viewer.wait_for("/imu0/stamp")
         assert (stamp.message["seq"], stamp.message["t_err_ns"]) == (7, 12_000)
@@ -95,20 +95,20 @@ def test_samples_events_and_status_come(tmp_path: Path) -> None:
         assert (event.message["level"], event.utc_ns) == (3, 5 + OFFSET_NS)
 
 
-def test_while_nobody_looks_no_samples_are_asked_for_and_events_still_come(tmp_path: Path) -> None:
+def test_without_a_subscription_events_arrive_and_samples_are_not_requested(tmp_path: Path) -> None:
     viewer = FakeViewer()
     viewer.is_looked_at = False
     with daemon(tmp_path) as served, relaying(served.path, viewer):
         viewer.wait_for("/imu1/status")
         served.do(lambda server: server.publish(batch("imu0", 1)))
         served.do(lambda server: server.event(Event(5, "imu1", EventKind.UP, "is there")))
-        missing = {"/events", "open /imu0/imu/data"}  # opened with the newest sample, before the event or after it
+        missing = {"/events", "open /imu0/imu/data"}  # opened with the newest sample, before or after the event
         while missing:
             missing.discard(viewer.said.get(timeout=LIMIT_S).topic)
         assert not served.do(lambda server: any(client.encoding for client in server.hub.clients()))
         viewer.is_looked_at = True
         while not served.do(lambda server: any(client.encoding for client in server.hub.clients())):
-            viewer.said.get(timeout=LIMIT_S)  # until the relay watches, with one of the next statuses
+            viewer.said.get(timeout=LIMIT_S)  # the relay subscribes with one of the next status messages
         served.do(lambda server: server.publish(batch("imu0", 2)))
         viewer.wait_for("/imu0/stamp", lambda said: said.message["seq"] == 2)
 
@@ -126,7 +126,7 @@ def test_only_the_wanted_device_is_shown(tmp_path: Path) -> None:
             assert not said.topic.startswith("/imu0")
 
 
-def test_it_goes_on_after_the_daemon_was_restarted(tmp_path: Path) -> None:
+def test_the_relay_continues_after_a_restart_of_the_daemon(tmp_path: Path) -> None:
     viewer = FakeViewer()
     with daemon(tmp_path) as served:
         path = served.path

@@ -1,4 +1,4 @@
-"""The gate before a server that repeats what it gets: who comes through, who is refused, and what ends with what."""
+"""The gate in front of an echo server: accepted and refused requests, and the end of connections."""
 
 import gc
 import socket
@@ -111,7 +111,7 @@ def test_pages_of_other_sites_are_refused_and_named_once(echo: Echo) -> None:
     assert echo.ended == 0
 
 
-def test_what_is_no_viewer_is_refused(echo: Echo) -> None:
+def test_requests_of_other_programs_are_refused(echo: Echo) -> None:
     for request_, status in [
         (head("Origin: file://", "Origin: https://attacker.example"), 400),
         (head("Host: 127.0.0.1"), 400),
@@ -127,7 +127,7 @@ def test_what_is_no_viewer_is_refused(echo: Echo) -> None:
         assert echo.ended == 0
 
 
-def test_a_head_without_end_and_one_that_does_not_come(echo: Echo, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_endless_and_a_missing_request_head(echo: Echo, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "HEAD_S", 0.05)
     with gated(echo) as gate:
         with connect(gate) as connection:
@@ -144,7 +144,7 @@ def is_closed(connection: socket.socket) -> bool:
         return True
 
 
-def test_only_so_many_at_a_time(echo: Echo) -> None:
+def test_the_number_of_viewers_is_limited(echo: Echo) -> None:
     with gated(echo) as gate:
         viewers = [connect(gate) for _ in range(CONNECTIONS_MAX)]
         for viewer in viewers:
@@ -164,7 +164,7 @@ def answer_starts(gate: ViewerGate) -> bytes:
 
 
 def test_the_gate_ends_beside_its_viewers_and_leaves_nothing_open(echo: Echo) -> None:
-    """A leftover is seen twice: its thread of the server goes on, and asyncio warns when it is collected."""
+    """An open connection is visible in two ways: its server thread continues, and asyncio warns at its destruction."""
     rounds, viewers_at_a_time = 3, 10
     for _ in range(rounds):
         with gated(echo) as gate:
@@ -178,7 +178,7 @@ def test_the_gate_ends_beside_its_viewers_and_leaves_nothing_open(echo: Echo) ->
     wait_until(lambda: echo.ended == rounds * viewers_at_a_time, "every connection behind ends")
 
 
-def test_closing_ends_connections_and_a_server_that_is_gone_too(echo: Echo) -> None:
+def test_close_and_the_end_of_the_server_end_the_connections(echo: Echo) -> None:
     with gated(echo) as gate, connect(gate) as connection:
         connection.sendall(head())
         assert received(connection, len(head())) == head()

@@ -1,4 +1,4 @@
-"""Whose pages may read."""
+"""Origins of pages that may read."""
 
 import pytest
 
@@ -26,7 +26,7 @@ def test_viewers_and_pages_of_this_host_may_read_and_other_sites_are_named() -> 
         assert f"--allow-origin {origin}" in problem
 
 
-def test_only_names_that_nobody_else_can_have_are_good() -> None:
+def test_only_own_host_names_are_accepted() -> None:
     for host in ("localhost:8765", "[::1]:8765", "192.168.1.7:8765", "gateway.example:8765"):
         assert RULE.problem(host, "file://") == "", host
     for host in ("attacker.example:8765", "127.0.0.1.attacker.example", ""):
@@ -35,6 +35,6 @@ def test_only_names_that_nobody_else_can_have_are_good() -> None:
 
 
 @pytest.mark.parametrize("words", ["viewer.example", "*", "null", "https://", "https://viewer.example/page", "ftp://a"])
-def test_what_is_no_origin_is_refused(words: str) -> None:
+def test_an_invalid_origin_is_refused(words: str) -> None:
     with pytest.raises(BadArgument, match=r"--allow-origin: expected a site as https://viewer\.example:8080"):
         ViewerOrigins(origins=[words])

@@ -1,4 +1,4 @@
-"""The server of Foxglove's protocol, heard by aiohttp as a bare WebSocket client; and the command as a process."""
+"""The Foxglove server with a WebSocket client of aiohttp, and the command as a process."""
 
 import asyncio
 import json
@@ -84,7 +84,7 @@ def test_the_server_behind_the_gate_is_not_found_by_trying_and_ends_if_a_port_is
 
 @pytest.mark.live
 def test_the_command_shows_what_the_device_sent(tmp_path: Path) -> None:
-    """A module on a line, the daemon, `imud foxglove`, and a client of the protocol."""
+    """A device at a serial port, the daemon, `imud foxglove`, and a client of the protocol."""
 
     async def look(url: str, send: Callable[[], None]) -> tuple[int, Any]:
         async with connected(url) as client:
@@ -121,7 +121,7 @@ def test_arguments_that_are_refused(cli: Cli) -> None:
     cli.refuses("--rate: expected", "foxglove", "--rate", "nan")
 
 
-def test_the_warning_stands_before_the_first_sample(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
+def test_the_warning_precedes_the_first_sample(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     monkeypatch.setattr("imud.web.foxglove.Relay.run", lambda _relay: None)
     handler = signal.getsignal(signal.SIGTERM)
     try:
@@ -134,7 +134,7 @@ def test_the_warning_stands_before_the_first_sample(monkeypatch: pytest.MonkeyPa
         signal.signal(signal.SIGTERM, handler)
 
 
-def test_without_the_library_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
+def test_without_the_library_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
     monkeypatch.delitem(sys.modules, "imud.web.foxglove", raising=False)
     cli.refuses("pip install 'imud[foxglove]'", "foxglove")

@@ -1,4 +1,4 @@
-"""Host, Origin, token, cookie."""
+"""Access control: Host, Origin, token, cookie."""
 
 from pathlib import Path
 

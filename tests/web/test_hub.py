@@ -1,4 +1,4 @@
-"""Who gets what, and what is read of the daemon for it."""
+"""Messages to the pages, and the requests to the daemon."""
 
 import json
 from collections.abc import Callable
@@ -19,7 +19,7 @@ HELLO = Hello(1, "0.1.0", 2**62 + 1, ("read",))
 
 
 class FakeFeed(Feed):
-    """A feed without a thread, which keeps the wishes."""
+    """A feed without a thread. It keeps the wishes."""
 
     def __init__(self) -> None:
         super().__init__("", lambda _news: None, None)
@@ -59,7 +59,7 @@ def news(first: int = 1, count: int = 1, **more: Any) -> News:
     return News(samples=samples, now_ns=samples[-1].t_ns + 1, **more)
 
 
-def test_what_is_read_is_what_all_pages_together_need() -> None:
+def test_the_feed_reads_the_data_that_all_pages_need() -> None:
     hub, feed = make()
     one = opened(hub, look="overview")
     assert feed.wanted[-1] == Wish((), news_s=0.25, newest=True, newest_s=0.5)
@@ -151,7 +151,7 @@ async def test_overview_page_and_state() -> None:
     assert (await heard(late, "state"))[0]["problem"] == "the connection is lost"
 
 
-async def test_events_come_and_new_pages_get_those_that_are_remembered() -> None:
+async def test_new_pages_get_the_kept_events() -> None:
     hub, _ = make()
     browser = opened(hub, look="overview")
     for number in range(EVENTS_KEPT + 1):
@@ -176,7 +176,7 @@ async def test_events_come_and_new_pages_get_those_that_are_remembered() -> None
     assert [event["message"] for event in late["events"]] == ["begin", "end"]
 
 
-async def test_dropped_messages_and_samples_are_told() -> None:
+async def test_dropped_messages_and_samples_are_reported() -> None:
     hub, _ = make()
     slow = opened(hub, look="device", device="bow", rate_hz=50)
     quick = opened(hub, look="device", device="bow", rate_hz=50)
@@ -196,7 +196,7 @@ async def test_dropped_messages_and_samples_are_told() -> None:
     assert {"kind": "dropped", "messages": 0, "samples": 12} in await heard(browser)
 
 
-def test_a_loop_that_is_behind_lets_the_feed_wait() -> None:
+def test_the_feed_waits_for_a_late_event_loop() -> None:
     waiting: list[Callable[[], None]] = []
     hub = BrowserHub(lambda function, news: waiting.append(lambda: function(news)))
     for _ in range(WAITING_MAX):
@@ -207,7 +207,7 @@ def test_a_loop_that_is_behind_lets_the_feed_wait() -> None:
     assert len(waiting) == WAITING_MAX
 
 
-async def test_devices_beyond_the_most_are_said_to_be() -> None:
+async def test_devices_above_the_maximum_are_reported() -> None:
     hub, feed = make()
     for number in range(DEVICES_MAX):
         opened(hub, look="device", device=f"imu{number}")
@@ -220,7 +220,7 @@ async def test_devices_beyond_the_most_are_said_to_be() -> None:
     assert "a" not in wanted.devices
 
 
-def test_a_ledger_of_another_version_counts_as_zero_what_it_does_not_have() -> None:
+def test_missing_counters_of_another_version_are_zero() -> None:
     status = msgspec.structs.replace(device("bow"), ledger={"bytes_in": 5, "bytes_pending": 5})
     assert status_message("bow", status, 0).lost == 0
     assert row_of(status, None, 0).closes

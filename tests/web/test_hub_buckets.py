@@ -1,4 +1,4 @@
-"""Buckets of samples: boundaries, peaks, and what is not finite or not there."""
+"""Buckets of samples: boundaries, peaks, and missing or infinite values."""
 
 from math import inf, nan
 
@@ -47,7 +47,7 @@ def test_buckets() -> None:
     assert bucket_of([good, bad, at(2, 3)]).quat_wxyz == (0.5, 0.5, 0.5, 0.5)
 
 
-def test_raw_values_keep_their_numbers_so_that_holes_are_seen() -> None:
+def test_raw_values_keep_their_sequence_numbers() -> None:
     raw = raw_of("bow", "accel_m_s2", [at(0, 1, 1.0), at(1, 2, nan), at(2, 5, 3.0)])
     assert raw is not None
     assert (raw.seq, raw.t_s) == ((1, 5), (80000.0, 80000.002))

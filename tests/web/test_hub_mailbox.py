@@ -1,4 +1,4 @@
-"""What waits for one browser."""
+"""The queue of messages for one browser."""
 
 import asyncio
 
@@ -43,7 +43,7 @@ async def test_a_page_that_does_not_acknowledge_gets_no_more() -> None:
     assert not waiting.done()
     mailbox.acknowledge(1)
     assert await waiting == "one more"
-    mailbox.acknowledge(10**9)  # more than was sent
+    mailbox.acknowledge(10**9)  # more messages than sent
     mailbox.acknowledge(-5)
     mailbox.put("and one")
     assert await mailbox.take() == "and one"

@@ -1,4 +1,4 @@
-"""The page in a real browser: what is plotted is what a module sent, restarts, telephones, the token."""
+"""The page in a real browser: plots of the sent frames, restarts, phones, the token."""
 
 from pathlib import Path
 from typing import Any
@@ -27,14 +27,14 @@ TURNING = {
     "t_s": 5.0, "device": "bow", "event": "calibration", "message": "half of the directions",
     "detail": {"cells": "0000000000ff", "field_t": 48.5e-6, "residual": 0.025},
 }  # fmt: skip
-"""An event of a calibration, as docs/socket.md has it."""
+"""An event of a calibration (docs/socket.md)."""
 
 
 def peaks(number: int) -> float:
     return 9.5 if number % PEAK_EVERY else 20.0 + number / PEAK_EVERY / 8
 
 
-def test_what_is_plotted_is_what_was_sent_and_every_peak_of_it(page: Page, tmp_path: Path) -> None:
+def test_the_plot_contains_every_sent_peak(page: Page, tmp_path: Path) -> None:
     with cable(tmp_path) as port, Sender(port, upright(peaks)) as sender, sent_by(tmp_path, port) as daemon:
         daemon.wait_for("bow", "running")
         with serving_web(daemon.socket) as url:
@@ -85,7 +85,7 @@ def test_directions_and_rotations_are_those_of_the_daemon(scripts: Page) -> None
     assert turned == pytest.approx([0, 1, 0]), "a quarter turn about z takes x to y"
 
 
-def test_the_page_goes_on_after_a_restart_of_the_daemon_and_of_imud_web(page: Page, tmp_path: Path) -> None:
+def test_the_page_continues_after_a_restart_of_the_daemon_and_of_imud_web(page: Page, tmp_path: Path) -> None:
     with cable(tmp_path) as port, Sender(port, upright(peaks)):
         with sent_by(tmp_path, port) as daemon:
             daemon.wait_for("bow", "running")

@@ -1,4 +1,4 @@
-"""The HTTP server: who may, what is answered, the WebSocket."""
+"""The HTTP server: permissions, replies, the WebSocket."""
 
 import asyncio
 import base64
@@ -62,17 +62,17 @@ async def running(
 
 
 def small_socket(host: str, port: int, family: socket.AddressFamily) -> socket.socket:
-    """A listening socket, whose connections have as little room for what is sent as there can be."""
+    """Return a listening socket with the minimum send buffer."""
     listening = get_port_socket(host, port, family)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, StalledPage.BUFFER_BYTES)
     return listening
 
 
 class StalledPage:
-    """A page whose connection takes nothing more: it goes on sending, as if it drew all, and reads no byte."""
+    """A page that reads no byte, and still acknowledges messages."""
 
     BUFFER_BYTES = 4096
-    """Of its kernel, as little as there can be."""
+    """Minimum receive buffer of the kernel."""
 
     def __init__(self, site: Site) -> None:
         url = site.client.make_url("")
@@ -196,7 +196,7 @@ async def test_reading_can_need_the_token_too(tmp_path: Path) -> None:
         await socket.close()
 
 
-async def test_wrong_tokens_are_answered_late_and_only_so_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_replies_to_wrong_tokens_are_delayed_and_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web_app, "FAILURE_S", 3600.0)
     async with running(tmp_path) as site:
         guesses = [
@@ -221,7 +221,7 @@ BAD_BODIES = (
 )  # fmt: skip
 
 
-async def test_bad_bodies_and_errors_of_the_daemon_are_told_in_words(tmp_path: Path) -> None:
+async def test_bad_bodies_and_errors_of_the_daemon_are_reported(tmp_path: Path) -> None:
     async with running(tmp_path) as site:
         for bad in BAD_BODIES:
             for path in ("/api/call", "/api/login"):
@@ -265,10 +265,10 @@ async def test_samples_statuses_and_events_come_while_a_page_is_open_and_nothing
         await until(lambda: not site.daemon.hub.connections)
 
 
-async def test_a_page_that_takes_nothing_holds_up_no_other_and_nothing_piles_up_for_it(
+async def test_a_page_that_does_not_read_delays_no_other_page_and_its_queue_is_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its connection is full, and it acknowledges all the same, so that nothing but the connection can stop it."""
+    """The page acknowledges although its connection is full, so that only the connection can stop the server."""
     rounds, samples, waiting_max = 50, 400, 20
     look = {"look": "device", "device": "imu0", "rate_hz": 50, "spectrum": "accel_m_s2"}
 
@@ -305,7 +305,7 @@ async def test_a_page_that_takes_nothing_holds_up_no_other_and_nothing_piles_up_
             await watched(site, stalled)
 
 
-async def test_what_a_page_sends_wrong_is_reported_to_it(tmp_path: Path) -> None:
+async def test_an_invalid_message_of_a_page_is_reported_to_it(tmp_path: Path) -> None:
     async with running(tmp_path) as site:
         socket = await site.stream(look="everything")
         assert "reload the page" in (await message(socket, "problem"))["message"]

@@ -1,4 +1,4 @@
-"""Questions and orders to the daemon, each on a connection of its own."""
+"""Requests to the daemon. Each uses its own connection."""
 
 import asyncio
 from pathlib import Path
@@ -42,7 +42,7 @@ async def test_long_orders_hold_up_no_others_and_are_bounded(tmp_path: Path) -> 
         assert await asyncio.gather(*waiting) == [{"waited": "imu0"}] * AT_A_TIME_MAX
 
 
-async def test_without_a_daemon_it_says_where_it_looked(tmp_path: Path) -> None:
+async def test_without_a_daemon_the_error_names_the_path(tmp_path: Path) -> None:
     with pytest.raises(LinkMissing, match=r"no daemon at .*/none: No such file"):
         await Calls(str(tmp_path / "none")).call("schema", {})
 
@@ -57,7 +57,7 @@ async def test_without_a_daemon_it_says_where_it_looked(tmp_path: Path) -> None:
         (b'{"jsonrpc":"2.0","id":null,"error":{"code":-32002,"message":"too many clients"}}\n', "too many clients"),
     ],
 )
-async def test_answers_that_are_none(sent: bytes, problem: str, tmp_path: Path) -> None:
+async def test_invalid_replies_raise_errors(sent: bytes, problem: str, tmp_path: Path) -> None:
     async def serve(_reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(sent)
         writer.close()

@@ -1,4 +1,4 @@
-"""The spectrum in a real browser: frequency and size of a vibration, and samples that are missing."""
+"""The spectrum in a real browser: frequency and amplitude of a vibration, and lost samples."""
 
 import math
 from collections.abc import Callable
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.liv
 WAVE_HZ = 20.0
 RATE_HZ = 200
 LOST = (7, 20, 21, 33)
-"""Of each 40 measurements, those whose frame is lost: one in ten, never more than two in a row."""
+"""Numbers of the lost frames in each 40 measurements: one in ten, at most two adjacent."""
 PAUSE = range(900, 930)
 GRID_OF = "const { gridOf } = await import('/static/grid.js'); return gridOf(args[0], args[1])"
 SEGMENTS = "return window.imud.view.spectrum.spectrum.segments.length >= arguments[0]"
@@ -52,7 +52,7 @@ def test_transform_and_filling_are_those_of_numpy_and_imud_spectrum(scripts: Pag
 
 
 def test_lost_samples_are_counted_and_a_vibration_keeps_its_frequency_and_size(page: Page, tmp_path: Path) -> None:
-    """They are lost before imud: `seq` has no step where they were, only the time has one."""
+    """The frames are lost before imud, so that only the time has a step, and not `seq`."""
     with cable(tmp_path) as port, sent_by(tmp_path, port) as daemon, serving_web(daemon.socket) as url:
         open_page(page, url, "bow")
         choose(page, "#spectrum-of", "accel_m_s2")
@@ -80,7 +80,7 @@ def test_lost_samples_are_counted_and_a_vibration_keeps_its_frequency_and_size(p
 
 
 def even(rng: np.random.Generator, scatter: float) -> NDArray[np.float64]:
-    """Times of 400 samples at 200.03 Hz, whose stamps scatter by so many periods."""
+    """Return the times of 400 samples at 200.03 Hz. Their scatter is given in periods."""
     times = 100.0 + (np.arange(400) + rng.normal(scale=scatter, size=400).clip(-0.45, 0.45)) / 200.03
     return np.asarray(np.sort(times))
 
@@ -95,7 +95,7 @@ STAMPS: dict[str, Callable[[np.random.Generator], NDArray[np.float64]]] = {
 }
 
 
-def test_missing_samples_are_those_that_imud_spectrum_finds(scripts: Page) -> None:
+def test_the_page_finds_the_same_lost_samples_as_imud_spectrum(scripts: Page) -> None:
     for kind, stamps in STAMPS.items():
         times = stamps(np.random.default_rng(3))
         expected = grid_of(np.rint((times - 90.0) * 1e9).astype(np.int64))

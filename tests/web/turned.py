@@ -1,4 +1,4 @@
-"""A module with a magnetometer that is turned into all directions, in real time: for tests and pictures."""
+"""A device with a magnetometer that rotates into all directions, in real time, for tests and pictures."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,14 +13,14 @@ from tests.support.daemon_process import RunningDaemon, running_daemon
 from tests.support.pty_port import plugged
 
 SPEED: Final = 8
-"""So many times faster than a hand: all directions within some seconds."""
+"""Speed relative to a hand: all directions within a few seconds."""
 HARD_IRON_T: Final = (14.14e-6, -2.08e-6, -8.75e-6)
 BIAS: Final = "bias 14.14, -2.08, -8.75 µT"
 
 
 @contextmanager
 def turned_module(folder: Path, speed: float = SPEED) -> Iterator[RunningDaemon]:
-    """A daemon with a module in nine-axis mode, `bow`, that is turned, and has iron beside it."""
+    """A daemon with a rotating device `bow` in 9-axis mode, with iron near it."""
     motion = Swing(roll=(Sine(3.1, 0.043 * speed),), pitch=(Sine(1.4, 0.071 * speed),), yaw=(Sine(3.1, 0.037 * speed),))
     hardware = HipnucHardware(motion=motion, hard_iron_t=HARD_IRON_T)
     module = HipnucModule(monotonic_ns(), ModuleSettings(att_mode=1), hardware)

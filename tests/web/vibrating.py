@@ -1,6 +1,6 @@
-"""`python -m tests.web.vibrating`: `python -m imud.sim` with one motion more, `--motion engine`, for the pictures.
+"""`python -m tests.web.vibrating`: `python -m imud.sim` with an additional motion for the pictures, `--motion engine`.
 
-A vessel whose engine runs: it rolls, pitches and yaws slowly, and shakes with the engine and twice as fast.
+A vessel with a running engine: slow roll, pitch and yaw, and vibration at the frequency of the engine and twice of it.
 """
 
 import sys

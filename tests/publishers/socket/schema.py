@@ -1,7 +1,7 @@
-"""The JSON Schema of every message of the UNIX socket, made from the types, and a checker of messages.
+"""JSON Schema of every message of the UNIX socket, made from the types, and a checker of messages.
 
-docs/socket.schema.json is open, as the protocol is: members that a reader does not know are allowed. `MessageChecker`
-is closed: a message of a server of the tests may only have what is described.
+docs/socket.schema.json allows unknown members, as the protocol does. `MessageChecker` allows only described
+members in the messages of a test server.
 """
 
 import json
@@ -19,14 +19,14 @@ from imud.publishers.socket.outbox import ALWAYS_FIELDS
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 DIGITS: Final = "^-?[0-9]+$"
 OPEN_ENUMS: Final = ("EventKind",)
-"""Choices to which later versions may add; readers must accept others."""
+"""Enumerations that later versions may extend. Readers must accept unknown values."""
 ID: Final = {"type": ["string", "number", "null"]}
 
 Schema = dict[str, Any]
 
 
 def socket_document() -> Schema:
-    """The whole schema: requests, replies and notifications by name in `$defs`, and any of them at the top."""
+    """Return the schema: any message, with requests, replies and notifications by name in `$defs`."""
     requests = {name: method.params for name, method in METHODS.items()}
     results = {name: method.result for name, method in METHODS.items()}
     incoming, described = _components(list(requests.values()))
@@ -72,11 +72,11 @@ class MessageChecker:
 
     @property
     def able(self) -> bool:
-        """Whether messages can be checked here."""
+        """Whether the package jsonschema is installed."""
         return find_spec("jsonschema") is not None
 
     def check(self, name: str, message: object) -> None:
-        """Raise AssertionError unless `message` is what `$defs` has under this name."""
+        """Raise AssertionError unless `message` is valid for the entry `name` of `$defs`."""
         if not self.able:
             return
         validator = self._validators.get(name)
@@ -90,7 +90,7 @@ class MessageChecker:
         assert not errors, f"{name}: {errors[:3]}"
 
     def check_sent(self, message: dict[str, Any], method: str | None) -> None:
-        """Check a message of the server; `method` is that of the request with its id, None where that is unknown."""
+        """Check a message of the server. `method` is the method of its request, None if unknown."""
         if message.get("method") in NOTIFICATIONS:
             self.check(f"notification.{message['method']}", message)
         elif "error" in message:
@@ -133,7 +133,7 @@ def _notification(name: str, params: Schema) -> Schema:
 
 
 def _as_sent(schema: Any) -> None:
-    """What the encoder does: NaN is null, and members that may exceed 53 bits can be text."""
+    """Apply the rules of the encoder: NaN is null, and integers that may exceed 53 bits can be strings."""
     if isinstance(schema, list):
         for one in schema:
             _as_sent(one)
@@ -155,7 +155,7 @@ def _allow_text(schema: Schema) -> None:
 
 
 def _finish(components: dict[str, Schema]) -> None:
-    """What types cannot say: a selection of fields, the number of drops, and choices that may grow."""
+    """Add facts that are not in the types: optional fields, the member `dropped`, extensible enumerations."""
     sample = components["Sample"]
     sample["required"] = list(ALWAYS_FIELDS)
     sample["properties"]["dropped"] = {
@@ -167,7 +167,7 @@ def _finish(components: dict[str, Schema]) -> None:
 
 
 def _close(schema: Any) -> None:
-    """Allow no members but the described ones."""
+    """Allow only described members."""
     if isinstance(schema, dict):
         if "properties" in schema:
             schema.setdefault("additionalProperties", False)

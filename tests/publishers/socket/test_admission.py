@@ -1,4 +1,4 @@
-"""Who gets in: no user locks out another, root and the control group always get in, devices keep their descriptors."""
+"""Admission: no user locks out another, root and the control group always connect, devices keep their descriptors."""
 
 import resource
 
@@ -29,7 +29,7 @@ class House:
         return ""
 
     def fill(self, uids: tuple[int, ...], rights: Rights = READ) -> int:
-        """Let clients of these users in, in turns, until none of them gets in; how many did."""
+        """Connect clients of these users in turns until all are refused. Return the number of new clients."""
         before = len(self.clients)
         while [uid for uid in uids if not self.connect(uid, rights)]:
             pass
@@ -51,7 +51,7 @@ def test_one_user_gets_its_share_and_others_get_in() -> None:
 def test_many_users_leave_places_for_root_and_control() -> None:
     house = House()
     outcomes = [house.connect(1000 + number) for number in range(70)]
-    assert outcomes.count("") == 48  # 64 less the 16 reserved
+    assert outcomes.count("") == 48  # 64 minus 16 reserved places
     assert all("reserved" in words for words in outcomes[48:])
     assert house.connect(0, ALL) == ""
     assert house.connect(OWN_UID) == ""
@@ -59,8 +59,8 @@ def test_many_users_leave_places_for_root_and_control() -> None:
     assert [house.connect(2001, ALL) for _ in range(14)].count("") == 3
 
 
-def test_root_and_another_member_get_in_beside_two_readers_and_a_member_that_take_all() -> None:
-    """With the defaults: 128 and 112 clients of two readers and 16 of one member of the control group are 256."""
+def test_root_and_another_member_connect_when_other_users_take_all_places() -> None:
+    """Defaults: without reserved places, 128 + 112 clients of two readers and 16 of one member would be all 256."""
     house = House(clients=256, per_user=128)
     assert house.fill((1000, 1001)) == 240
     assert house.fill((2000,), ALL) == 3
@@ -69,14 +69,14 @@ def test_root_and_another_member_get_in_beside_two_readers_and_a_member_that_tak
     assert [house.connect(0, ALL) for _ in range(4)] == [""] * 4
 
 
-def test_root_has_places_that_nobody_else_can_take_not_even_the_daemon_s_own_user() -> None:
+def test_no_other_user_can_take_the_places_of_root() -> None:
     house = House(clients=256, per_user=128)
     house.fill(tuple(range(1000, 1010)))
     house.fill((OWN_UID, *range(2000, 2010)), ALL)
     assert len(house.clients) == 252
     assert "for root" in house.connect(2011, ALL)
     assert [house.connect(0, ALL) for _ in range(5)].count("") == 4
-    assert len(house.clients) == 256  # the total is kept
+    assert len(house.clients) == 256  # the limit of all clients
     assert "socket.clients_max" in house.connect(0, ALL)
     house = House(clients=256, per_user=128)
     assert house.fill((OWN_UID,)) == 243
@@ -84,11 +84,11 @@ def test_root_has_places_that_nobody_else_can_take_not_even_the_daemon_s_own_use
     assert house.connect(0, ALL) == ""
 
 
-def test_places_that_come_free_do_not_give_a_member_more_of_the_reserved_ones() -> None:
+def test_free_places_do_not_give_a_member_more_reserved_places() -> None:
     house = House(clients=256, per_user=128)
     house.fill((1000, 1001))
     house.fill((2000,), ALL)
-    for _ in range(10):  # takes what readers leave, who come back for more
+    for _ in range(10):  # the member takes places of readers, and the readers connect again
         house.leave(1000, 30)
         house.fill((2000,), ALL)
         house.fill((1000, 1001))
@@ -103,7 +103,7 @@ def test_places_that_come_free_do_not_give_a_member_more_of_the_reserved_ones() 
         house.leave(0, 1)
 
 
-def test_members_and_root_with_many_clients_have_their_own_places_too() -> None:
+def test_members_and_root_with_many_clients_keep_their_reserved_places() -> None:
     house = House(clients=256, per_user=128)
     assert [house.connect(2000, ALL) for _ in range(20)] == [""] * 20
     house.fill((1000, 1001))
@@ -113,7 +113,7 @@ def test_members_and_root_with_many_clients_have_their_own_places_too() -> None:
     assert house.fill((1000, 1001)) == 240
     house = House(clients=256, per_user=128)
     assert [house.connect(0, ALL) for _ in range(20)] == [""] * 20
-    assert house.fill((1000, 1001)) == 224  # the others of root have open places
+    assert house.fill((1000, 1001)) == 224  # the other 16 clients of root have open places
     assert [house.connect(uid, ALL) for uid in (2000, 2001, 2002, 2003)] == [""] * 4
 
 
@@ -140,7 +140,7 @@ def test_connecting_again_and_again_is_limited_by_user() -> None:
         assert "uid 1000 connects more than 64 times per second" in outcomes[-1]
         outcomes.clear()
     assert house.connect(1001) == ""
-    house.quota.tick()  # 1000 is still in debt, and is not forgotten
+    house.quota.tick()  # uid 1000 has no allowance yet, so `tick` keeps it
     assert house.connect(1000) != ""
     for _ in range(1000):
         assert house.connect(0) == ""
@@ -156,7 +156,7 @@ def test_a_user_that_has_not_connected_lately_is_forgotten(monkeypatch: pytest.M
 
     monkeypatch.setattr(quota, "TokenBucket", make)
     house = House()
-    for milliseconds, buckets in ((0, 1), (15, 1), (17, 2)):  # a token takes 15.6 ms
+    for milliseconds, buckets in ((0, 1), (15, 1), (17, 2)):  # one connection per 15.6 ms
         house.now_ns += milliseconds * MS
         house.quota.tick()
         house.connect(1000)
@@ -168,7 +168,7 @@ def test_high_descriptors_are_kept_for_devices() -> None:
     assert house.connect(1000, fd=767) == ""
     assert "descriptor" in house.connect(1000, fd=768)
     assert "descriptor" in house.connect(OWN_UID, fd=784)
-    assert [house.connect(uid, ALL, fd=783) for uid in (0, 2000)] == ["", ""]  # one for each reserved place
+    assert [house.connect(uid, ALL, fd=783) for uid in (0, 2000)] == ["", ""]  # a descriptor of a reserved place
     assert "descriptor" in house.connect(0, ALL, fd=784)
     house.quota.check_fds((5, 767))
     with pytest.raises(RpcError, match="file descriptors for clients are in use"):
@@ -193,9 +193,9 @@ def test_selections_of_fields_are_limited() -> None:
         with pytest.raises(RpcError, match="16 selections"):
             house.quota.exchange_form(1000, None, 99)
     with pytest.raises(RpcError, match="16 selections"):
-        house.quota.exchange_form(1000, 3, 99)  # another client has that form, too
+        house.quota.exchange_form(1000, 3, 99)  # another client has form 3 too
     house.quota.exchange_form(1001, None, 99)
-    house.quota.exchange_form(1000, 4, 99)  # its own form goes
+    house.quota.exchange_form(1000, 4, 99)  # no other client has form 4
     house.quota.exchange_form(1000, 99, None)
     house.quota.exchange_form(1000, None, 100)
     with pytest.raises(RpcError, match="16 selections"):
@@ -204,12 +204,12 @@ def test_selections_of_fields_are_limited() -> None:
 
 def test_a_frequent_message_is_logged_once_a_minute_with_its_count() -> None:
     now_ns = 0
-    seldom = RateLimitedLog(lambda: now_ns)
-    assert [seldom.count() for _ in range(5)] == [1, 0, 0, 0, 0]
+    limited = RateLimitedLog(lambda: now_ns)
+    assert [limited.count() for _ in range(5)] == [1, 0, 0, 0, 0]
     now_ns = 60_000 * MS - 1
-    assert seldom.count() == 0
+    assert limited.count() == 0
     now_ns += 1
-    assert [seldom.count() for _ in range(2)] == [6, 0]
+    assert [limited.count() for _ in range(2)] == [6, 0]
 
 
 def test_the_limit_of_descriptors_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:

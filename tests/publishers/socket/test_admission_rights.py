@@ -1,4 +1,4 @@
-"""Who may do what, by the kernel's word."""
+"""Rights of clients by the credentials of the kernel."""
 
 import asyncio
 import os
@@ -23,7 +23,7 @@ NONE, READ, ALL = Rights.NONE, Rights.READ, Rights.READ | Rights.CONTROL
     ("uid", "groups", "expected"),
     [
         (0, (), ALL),
-        (500, (), READ),  # the daemon's own user
+        (500, (), READ),  # the user of the daemon
         (1000, (), NONE),
         (1000, (7, 80), READ),
         (1000, (7, 90), ALL),
@@ -70,7 +70,7 @@ def open_directory() -> Iterator[Path]:
 
 
 MANY_GROUPS = [*map(str, range(70_000, 70_300)), "daemon", "bin"]
-"""More groups than Python has room for."""
+"""More than 256 groups, the maximum of Python's getsockopt."""
 
 
 @needs_root

@@ -1,4 +1,4 @@
-"""Descriptors that wake clients: for what, until when, and that no client makes the daemon wait with them."""
+"""Descriptors that wake clients. No client can block the daemon with its descriptor."""
 
 import asyncio
 import os
@@ -30,7 +30,7 @@ def copies_held(connection: ClientConnection) -> list[Waker]:
 
 
 async def wakened() -> None:
-    """Return behind the wake-ups of what is published already."""
+    """Wait until imud has woken the clients of the published batches."""
     done = asyncio.Event()
     asyncio.get_running_loop().call_soon(done.set)
     await done.wait()
@@ -54,7 +54,7 @@ async def test_notify_wakes_for_batches_of_one_device(server: SocketServer) -> N
     assert read_all(fd) is None
     for first in (1, 3):
         server.publish(batch("imu0", first, 2))
-        assert read_all(fd) is None  # not yet: shared memory may have its turn after this
+        assert read_all(fd) is None  # not yet: the output shm may run later
         await wakened()
         assert read_all(fd) == BYTE
     other = await notified(peer, "imu1")
@@ -73,7 +73,7 @@ async def test_notify_again_ends_the_old_descriptor(server: SocketServer) -> Non
     peer = await Peer.greeted(server)
     before = len(os.listdir("/proc/self/fd"))
     fds = [await notified(peer) for _ in range(5)]
-    assert len(os.listdir("/proc/self/fd")) == before + 5 + 1  # ours, and one of the daemon's
+    assert len(os.listdir("/proc/self/fd")) == before + 5 + 1  # five of the client, one of the daemon
     server.publish(batch())
     await wakened()
     assert [read_all(fd) for fd in fds] == [b"", b"", b"", b"", BYTE]
@@ -82,7 +82,7 @@ async def test_notify_again_ends_the_old_descriptor(server: SocketServer) -> Non
 
 
 def test_many_clients_are_woken_in_several_turns(tmp_path: Path) -> None:
-    """A turn takes 0.3 ms. imud looks at the clock after 16 clients."""
+    """imud wakes clients for 0.3 ms per turn, and reads the clock after 16 clients."""
     now_ns, step_ns = NOW_NS, 0
 
     def clock() -> int:
@@ -107,10 +107,10 @@ def test_many_clients_are_woken_in_several_turns(tmp_path: Path) -> None:
     run(body)
 
 
-@pytest.mark.timeout(60)  # a daemon that waits never returns
+@pytest.mark.timeout(60)  # a blocked daemon never returns
 @in_server()
 async def test_no_client_makes_the_daemon_wait(server: SocketServer) -> None:
-    """One clears O_NONBLOCK of its descriptor and never reads; the others are woken on and on."""
+    """A client clears O_NONBLOCK of its descriptor and never reads. imud still wakes the other client."""
     hostile, other = await Peer.greeted(server), await Peer.greeted(server)
     held, fd = await notified(hostile), await notified(other)
     os.set_blocking(held, True)
@@ -120,7 +120,7 @@ async def test_no_client_makes_the_daemon_wait(server: SocketServer) -> None:
         server.publish(batch("imu0", seq))
         await wakened()
         assert read_all(fd) == BYTE
-    assert 1 <= len(os.read(held, 4096)) <= 64  # was full; "64 bytes at once are plenty"
+    assert 1 <= len(os.read(held, 4096)) <= 64  # the buffer was full; docs/socket.md: 64 bytes are enough
     server.publish(batch("imu0", 301))
     await wakened()
     assert read_all(held) == BYTE
@@ -146,7 +146,7 @@ async def test_a_client_that_closes_its_descriptor_is_not_woken_any_more(server:
     await wakened()
     assert not second.wakers
     server.publish(batch("imu0", 4))
-    assert not server.hub.wakes("imu0")  # no client is left to wake
+    assert not server.hub.wakes("imu0")  # no waker is left
     for peer in (closing, other):
         assert len(await peer.result("devices")) == 2
 
@@ -162,7 +162,7 @@ async def test_unread_replies_do_not_gather_descriptors(server: SocketServer) ->
         line = b'{"jsonrpc":"2.0","id":%d,"method":"notify","params":{"device":"%s"}}\n'
         await peer.send(line % (number, device.encode()))
     await until(lambda: len(connection.wakers) == 2)
-    assert len(os.listdir("/proc/self/fd")) == before + 4  # both ends of two
+    assert len(os.listdir("/proc/self/fd")) == before + 4  # both ends of two wakers
     replies = (await peer.messages(7))[1:]
     assert ["error" in reply for reply in replies] == [False, True, True, True, True, False]
     assert "ask again" in replies[1]["error"]["message"]
@@ -172,7 +172,7 @@ async def test_unread_replies_do_not_gather_descriptors(server: SocketServer) ->
 
 
 @in_server()
-async def test_no_descriptor_to_be_had(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_notify_without_a_free_descriptor(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_arguments: object) -> None:
         raise OSError(24, "Too many open files")
 
@@ -185,5 +185,5 @@ async def test_no_descriptor_to_be_had(server: SocketServer, monkeypatch: pytest
     assert "Too many open files" in message
     server.publish(batch())
     await wakened()
-    assert read_all(fd) == BYTE  # the old one is still there
+    assert read_all(fd) == BYTE  # the old waker still works
     os.close(fd)

@@ -1,4 +1,4 @@
-"""`actions` and `command`: replies that come late, refusals, the right it needs, and clients that leave."""
+"""`actions` and `command`: late replies, errors, the necessary right, and clients that leave."""
 
 import asyncio
 import json
@@ -47,7 +47,9 @@ async def test_other_requests_are_answered_before_a_late_reply(server: SocketSer
     ],
 )
 @in_server()
-async def test_what_fails_says_why(server: SocketServer, name: str, arguments: dict[str, Any], words: str) -> None:
+async def test_a_failed_command_gives_a_reason(
+    server: SocketServer, name: str, arguments: dict[str, Any], words: str
+) -> None:
     peer = await Peer.greeted(server)
     await peer.send(request(1, name, **arguments))
     error = (await peer.message())["error"]
@@ -85,7 +87,7 @@ async def test_a_group_that_exists_is_named(server: SocketServer, monkeypatch: p
     )
 
 
-def test_it_goes_on_when_the_client_leaves_and_ends_with_the_server(tmp_path: Path) -> None:
+def test_a_command_continues_without_its_client_and_ends_with_the_server(tmp_path: Path) -> None:
     async def body() -> None:
         async with serving(tmp_path) as server:
             peer = await Peer.greeted(server)
@@ -117,7 +119,7 @@ async def test_settings_are_planned_and_applied_as_asked_for(server: SocketServe
 
 
 @in_server()
-async def test_one_change_at_a_time(server: SocketServer) -> None:
+async def test_a_connection_runs_one_change_at_a_time(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     params = {"device": "imu0", "settings": {"wait": 1}}
     line = {"jsonrpc": "2.0", "id": 90, "method": "settings.apply", "params": params}

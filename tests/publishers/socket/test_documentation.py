@@ -1,4 +1,4 @@
-"""Every example of docs/socket.md is played against the server."""
+"""Each example in docs/socket.md runs against the server."""
 
 import json
 import os

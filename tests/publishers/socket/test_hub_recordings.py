@@ -1,4 +1,4 @@
-"""`record.start`, `.stop`, `.snapshot`: descriptors with recordings, who may have them, and when they end."""
+"""`record.start`, `.stop`, `.snapshot`: descriptors, rights, and the end of a recording."""
 
 import asyncio
 import os
@@ -58,14 +58,14 @@ class RecordingPeer(Peer):
 
 
 async def tick_until(server: SocketServer, condition: Callable[[], bool]) -> None:
-    """Tick as the daemon does until something is so; `run` limits the time."""
+    """Call `tick`, as the daemon does, until the condition is true. `run` limits the time."""
     while not condition():
         server.tick(NOW_NS)
         await asyncio.sleep(0.001)
 
 
 async def recording_of(server: SocketServer, peer: RecordingPeer) -> list[Record]:
-    """The records that come through the descriptor, to end of file; they must be whole."""
+    """Return the records from the descriptor, to end of file. They must be complete."""
     fd = peer.fds.pop()
     os.set_blocking(fd, False)
 
@@ -116,7 +116,8 @@ async def test_a_recording_comes_through_the_descriptor_to_its_regular_end(recor
     kinds = [record.kind for record in found]
     assert kinds[:3] == [Kind.SESSION, Kind.CALL, Kind.DEVICE]
     assert Kind.DATA in kinds
-    assert (kinds.count(Kind.EVENT), kinds.count(Kind.DEVICE)) == (2, 2)  # described again when it was added again
+    assert kinds.count(Kind.EVENT) == 2
+    assert kinds.count(Kind.DEVICE) == 2  # described again when the device was added again
     assert {record.device for record in found if record.kind in (Kind.DEVICE, Kind.CHECK, Kind.EVENT)} == {1}
     assert decode_object(found[-1], EndRecord).reason == "it was stopped"
     assert source.listening == []
@@ -145,7 +146,7 @@ async def test_it_ends_with_the_connection_and_with_the_descriptor(recorded: Rec
 
 
 @pytest.mark.parametrize("stopped", [False, True])
-def test_imud_that_stops_ends_it_regularly(tmp_path: Path, stopped: bool) -> None:
+def test_a_stop_of_imud_ends_a_recording_regularly(tmp_path: Path, stopped: bool) -> None:
 
     async def body() -> None:
         async with recording(tmp_path) as (server, source):
@@ -169,10 +170,10 @@ async def test_the_maximum_counts_recordings_that_run_and_those_that_still_send(
         await peer.result("record.start")
     full = (-32004, f"record.start: {RECORDINGS_MAX} recordings are running, the maximum")
     assert await peers[-1].error("record.start") == full
-    peers[0].close()  # ends its recording immediately
+    peers[0].close()  # this ends its recording immediately
     await until(lambda: len(server.hub.connections) == RECORDINGS_MAX)
     await peers[-1].result("record.start")
-    for peer in peers[1:3]:  # end with the next tick
+    for peer in peers[1:3]:  # these recordings end with the next tick
         await peer.result("record.stop")
     assert await peers[1].error("record.start") == full
     await recording_of(server, peers[1])
@@ -232,7 +233,7 @@ def test_a_request_that_fails_leaves_no_descriptor(
                 monkeypatch.setattr(BusThread, "__init__", fail)
                 why = "the daemon cannot record: can't start new thread"
             before = open_descriptors()
-            for _ in range(2):  # the second needs that the first has given its descriptor back
+            for _ in range(2):  # the second call succeeds only if the first closed its descriptor
                 assert await peer.error(method) == (-32004, f"{method}: {why}")
             assert (open_descriptors(), len(checked), len(set(checked))) == (before, 4, 2)
             refusing.append(True)
@@ -246,7 +247,7 @@ def test_a_request_that_fails_leaves_no_descriptor(
 
 
 @in_server()
-async def test_a_snapshot_is_what_the_flight_recorder_sends(server: SocketServer) -> None:
+async def test_a_snapshot_contains_the_data_of_the_flight_recorder(server: SocketServer) -> None:
     def take(sock: socket.socket) -> float:
         with sock:
             sock.send(b"a snapshot")

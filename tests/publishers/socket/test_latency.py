@@ -1,4 +1,4 @@
-"""What latency the clients of the socket ask for, and that they ask no more when they leave."""
+"""Latency requests of clients, until the clients leave."""
 
 import os
 from collections.abc import AsyncIterator, Collection
@@ -29,7 +29,7 @@ class Latencies:
 
 @asynccontextmanager
 async def listening(directory: Path) -> AsyncIterator[tuple[SocketServer, Asked, Peer]]:
-    """Start a server with one client; give the latencies that its clients ask for, too."""
+    """Start a server with one client. Yield also the latency requests."""
     latencies = Latencies()
     async with serving(directory, latencies=latencies) as server:
         yield server, latencies.asked, await Peer.greeted(server)
@@ -52,7 +52,7 @@ async def listening(directory: Path) -> AsyncIterator[tuple[SocketServer, Asked,
     ],
 )
 @in_context("scene", listening)
-async def test_a_watch_asks_for_what_is_given_or_goes_with_its_rate(
+async def test_a_watch_requests_its_latency_or_a_period_of_its_rate(
     scene: Scene, params: dict[str, Any], latency_ms: float
 ) -> None:
     _server, asked, peer = scene
@@ -64,7 +64,7 @@ async def test_a_watch_asks_for_what_is_given_or_goes_with_its_rate(
 @pytest.mark.parametrize("latency_ms", [-0.001, 60_001, 1e300])
 @pytest.mark.parametrize("method", ["watch", "notify"])
 @in_context("scene", listening)
-async def test_what_is_no_latency_is_refused(scene: Scene, method: str, latency_ms: float) -> None:
+async def test_invalid_latencies_are_refused(scene: Scene, method: str, latency_ms: float) -> None:
     _server, asked, peer = scene
     devices = {"devices": ["imu0"]} if method == "watch" else {"device": "imu0"}
     _code, message = await peer.error(method, latency_ms=latency_ms, **devices)
@@ -73,7 +73,7 @@ async def test_what_is_no_latency_is_refused(scene: Scene, method: str, latency_
 
 
 @in_context("scene", listening)
-async def test_another_watch_replaces_what_was_asked_and_unwatch_ends_it(scene: Scene) -> None:
+async def test_a_watch_replaces_the_latency_request_and_unwatch_ends_it(scene: Scene) -> None:
     _server, asked, peer = scene
     await peer.ask("watch", latency_ms=5)
     await peer.ask("watch", latency_ms=9, devices=["imu1"])
@@ -83,7 +83,7 @@ async def test_another_watch_replaces_what_was_asked_and_unwatch_ends_it(scene: 
 
 
 @in_context("scene", listening)
-async def test_who_leaves_asks_for_nothing_any_more(scene: Scene) -> None:
+async def test_a_client_that_leaves_withdraws_its_latency_request(scene: Scene) -> None:
     server, asked, peer = scene
     other = await Peer.greeted(server)
     fd = await notified(peer)
@@ -97,7 +97,7 @@ async def test_who_leaves_asks_for_nothing_any_more(scene: Scene) -> None:
 
 
 @in_context("scene", listening)
-async def test_a_descriptor_that_is_closed_asks_for_nothing_any_more(scene: Scene) -> None:
+async def test_a_closed_descriptor_withdraws_its_latency_request(scene: Scene) -> None:
     server, asked, peer = scene
     os.close(await notified(peer))
     assert len(asked) == 1

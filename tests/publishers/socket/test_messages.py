@@ -1,4 +1,4 @@
-"""The types of the messages: their JSON Schema is in docs, servers and examples keep to it; big numbers can be text."""
+"""Types of messages: the JSON Schema in docs is up to date, and servers and examples are valid. Big numbers."""
 
 import ast
 import json
@@ -30,7 +30,7 @@ def test_the_file_in_docs_is_of_these_types() -> None:
 
 
 @needs_jsonschema
-def test_it_is_a_schema_and_finds_what_is_wrong() -> None:
+def test_the_schema_is_valid_and_finds_invalid_messages() -> None:
     from jsonschema import Draft202012Validator
 
     whole = socket_document()
@@ -45,7 +45,7 @@ def test_it_is_a_schema_and_finds_what_is_wrong() -> None:
 
 def test_every_method_has_a_described_result() -> None:
     free = {name for name, method in METHODS.items() if method.result is Any}
-    assert free <= {"command"}  # an action answers what it likes
+    assert free <= {"command"}  # the result of an action can have any type
 
 
 def test_every_notification_of_the_server_is_described() -> None:
@@ -68,7 +68,7 @@ def test_the_requests_of_the_document_are_of_these_types() -> None:
 
 
 @in_server()
-async def test_parameters_that_may_be_left_out_may_be_null(server: SocketServer) -> None:
+async def test_optional_parameters_may_be_null(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     nothing: dict[str, Any] = {"devices": None, "fields": None, "convention": None}
     assert (await peer.result("watch", **nothing, rate_hz=None, encoding=None))["encoding"] == "json"
@@ -77,13 +77,13 @@ async def test_parameters_that_may_be_left_out_may_be_null(server: SocketServer)
     assert (await peer.result("options", big_numbers=None))["big_numbers"] == "number"
 
 
-def test_every_parameter_that_has_a_default_may_be_null() -> None:
+def test_every_parameter_with_a_default_may_be_null() -> None:
     fields = [(name, one) for name, method in METHODS.items() for one in msgspec.structs.fields(method.params)]
     assert [(name, one.name) for name, one in fields if not one.required and NoneType not in get_args(one.type)] == []
 
 
 @in_server()
-async def test_big_numbers_are_text_where_that_is_asked_for(server: SocketServer) -> None:
+async def test_big_numbers_are_strings_on_request(server: SocketServer) -> None:
     plain, text = await Peer.greeted(server), await Peer.greeted(server)
     assert await text.result("options", big_numbers="string") == {
         "big_numbers": "string", "epoch": str(EPOCH),
@@ -111,7 +111,7 @@ async def test_big_numbers_are_text_where_that_is_asked_for(server: SocketServer
 
 
 @in_server()
-async def test_clients_that_watch_a_device_are_told_that_it_left(server: SocketServer) -> None:
+async def test_clients_that_watch_a_removed_device_get_device_removed(server: SocketServer) -> None:
     everything, one, other = [await Peer.greeted(server) for _ in range(3)]
     await everything.result("watch")
     await one.result("watch", devices=["imu0"])

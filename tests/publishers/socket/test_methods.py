@@ -1,4 +1,4 @@
-"""Whatever a client sends, it gets an error by the book, and server and other clients live on."""
+"""Invalid input: the client gets the specified error, and the server continues to serve other clients."""
 
 import asyncio
 from pathlib import Path
@@ -129,7 +129,7 @@ async def test_notifications_act_and_are_not_answered(server: SocketServer) -> N
 async def test_half_lines_several_requests_and_blank_lines(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     lines = b"".join(b'{"jsonrpc":"2.0","id":%d,"method":"poll"}\n\r\n\n' % number for number in range(25))
-    await peer.send(lines)  # more than one turn's worth
+    await peer.send(lines)  # more requests than one turn serves
     assert [reply["id"] for reply in await peer.messages(25)] == list(range(25))
     line = b'{"jsonrpc":"2.0","id":"cut","method":"poll"}\n'
     for cut in range(1, len(line), 7):
@@ -165,17 +165,17 @@ async def test_a_line_over_the_limit_ends_the_connection(server: SocketServer, n
 
 
 @in_server()
-async def test_one_client_s_flood_of_requests_leaves_turns_to_others(server: SocketServer) -> None:
+async def test_many_requests_of_one_client_leave_turns_to_other_clients(server: SocketServer) -> None:
     flood, other = await Peer.greeted(server), await Peer.greeted(server)
     await flood.send(b'{"jsonrpc":"2.0","id":1,"method":"poll"}\n' * 1000)
     await other.result("poll")
     while b"\n" not in flood.buffer:
         flood.buffer += await asyncio.get_running_loop().sock_recv(flood.sock, 1 << 20)
-    assert flood.buffer.count(b"\n") < 200  # of 1000, when the other was answered
+    assert flood.buffer.count(b"\n") < 200  # of 1000, at the reply to the other client
 
 
 @in_server()
-async def test_a_name_that_would_forge_a_line_of_the_log_is_refused(server: SocketServer) -> None:
+async def test_a_name_with_control_characters_is_refused(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     for name, expected in (("x\nERROR forged", -32602), ("x" * 65, -32602), ("x" * 64, -32005)):
         code, _ = await peer.error("command", device="imu0", name=name)
@@ -183,7 +183,7 @@ async def test_a_name_that_would_forge_a_line_of_the_log_is_refused(server: Sock
         assert (await peer.error("calibrate", device="imu0", kind=name))[0] == expected
 
 
-def test_a_mistake_in_an_action_ends_that_client_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_internal_error_in_an_action_ends_only_its_client(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     async def body() -> None:
         async with serving(tmp_path) as server:
             other = await Peer.greeted(server)
@@ -203,7 +203,7 @@ def test_a_mistake_in_an_action_ends_that_client_only(tmp_path: Path, caplog: py
 
 
 @in_server()
-async def test_a_mistake_in_answering_ends_that_client_only(
+async def test_an_internal_error_in_a_reply_ends_only_its_client(
     server: SocketServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
@@ -221,11 +221,11 @@ async def test_a_mistake_in_answering_ends_that_client_only(
 
 @in_server()
 async def test_empty_lines_use_up_the_allowance_of_their_client(server: SocketServer) -> None:
-    """30 clients with 7 MB of them each kept the daemon busy for minutes."""
+    """Before the limit, 30 clients with 7 MB of empty lines each kept the daemon busy for minutes."""
     peer, other = await Peer.greeted(server), await Peer.greeted(server)
     peer.sock.setblocking(False)
     written, full = 0, 0
-    while full < 200:  # nothing is read any more
+    while full < 200:  # the server no longer reads
         try:
             written += peer.sock.send(b"\n" * 65_536)
             full = 0

@@ -1,4 +1,4 @@
-"""Answers about many devices are made in pieces, with samples in between, and are whole in the end."""
+"""imud makes replies about many devices in pieces, with samples in between. The replies are complete."""
 
 import asyncio
 import json
@@ -18,11 +18,11 @@ TURN_NS = 1_000_000
 
 DEVICES = 100
 DEVICE_NS = 30_000
-"""What the state of a running device takes."""
+"""Time to make the status of a running device, ns."""
 
 
 class Fleet:
-    """A server with many devices, whose clock moves when the state of one is taken."""
+    """A server with many devices. Its clock advances with each device status."""
 
     def __init__(self, directory: Path) -> None:
         self.now_ns = NOW_NS
@@ -82,13 +82,13 @@ async def test_samples_and_other_clients_come_between_and_requests_keep_their_or
     await until(lambda: 0 < fleet.taken < DEVICES)
     fleet.server.publish(batch("imu0", 1))
     connection, _ = fleet.server.hub.connections.values()
-    assert fleet.server.hub.pool.held_bytes > 1000  # the answer in the making counts
+    assert fleet.server.hub.pool.held_bytes > 1000  # the unfinished reply counts
     assert (await watching.message())["params"]["seq"] == 1
     assert fleet.taken < DEVICES
     assert [(await asking.message())["id"] for _ in range(2)] == [1, 2]
     assert connection.unread_bytes == 0
     assert fleet.server.hub.pool.held_bytes == 0
-    # a client that leaves while its answer is made leaves nothing
+    # if a client leaves, imud discards its unfinished reply
     fleet.taken = 0
     await asking.send(lines[0].encode() + b"\n")
     await until(lambda: fleet.taken > 0)

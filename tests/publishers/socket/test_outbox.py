@@ -1,4 +1,4 @@
-"""Slow clients delay nothing; their oldest samples are dropped first, and they learn how many."""
+"""Slow clients delay no other client. imud drops their oldest samples first and reports the number."""
 
 import asyncio
 import json
@@ -31,7 +31,7 @@ from tests.support.socket_rig import Peer, batch, in_server, run, until
 
 
 async def read_samples(peer: Peer, last: dict[str, int]) -> list[tuple[str, int, dict[str, int]]]:
-    """Device, seq and the drops reported before it, until the last sample of every device has come."""
+    """Return device, seq and the reported drops of each sample, up to the last sample of each device."""
     seen: list[tuple[str, int, dict[str, int]]] = []
     reported: dict[str, int] = {}
     left = dict(last)
@@ -62,7 +62,7 @@ def _json(body: bytes) -> dict[str, Any]:
 
 
 def assert_accounted(seen: list[tuple[str, int, dict[str, int]]], devices: tuple[str, ...]) -> dict[str, int]:
-    """Every sample came in order or is among those reported as dropped. Returns the drops by device."""
+    """Assert that each sample arrived in order or was reported as dropped. Return the drops by device."""
     dropped = dict.fromkeys(devices, 0)
     newest = dict.fromkeys(devices, 0)
     for device, seq, reported in seen:
@@ -78,7 +78,7 @@ def assert_accounted(seen: list[tuple[str, int, dict[str, int]]], devices: tuple
 
 @pytest.mark.parametrize("encoding", ["json", "binary"])
 @in_server(queue_samples=100)
-async def test_a_client_that_does_not_read_loses_the_oldest_and_slows_nobody(
+async def test_a_client_that_does_not_read_loses_the_oldest_samples_and_delays_no_other(
     server: SocketServer, encoding: str
 ) -> None:
     total = 1000
@@ -94,13 +94,13 @@ async def test_a_client_that_does_not_read_loses_the_oldest_and_slows_nobody(
     first, second = sorted(server.hub.clients(), key=lambda client: client.number)
     assert first.queue_samples == 100
     assert first.queue_bytes < 200_000
-    assert first.dropped > total  # of 2 × total
+    assert first.dropped > total  # of 2 × total samples
     assert (second.dropped, second.sent, second.queue_samples) == (0, 2 * total, 0)
     seen = await read_samples(slow, {"imu0": total, "imu1": total})
     dropped = assert_accounted(seen, ("imu0", "imu1"))
     assert sum(dropped.values()) == first.dropped
-    assert sum(bool(reported) for _, _, reported in seen) == 1  # one loss, reported at once
-    server.publish(batch("imu0", total + 1))  # the writer is gone again, the queue empty
+    assert sum(bool(reported) for _, _, reported in seen) == 1  # one report of all drops
+    server.publish(batch("imu0", total + 1))  # the queue is empty, so this sample is sent directly
     assert [await read_one(peer) for peer in (slow, fast)] == [("imu0", total + 1)] * 2
 
 
@@ -123,7 +123,7 @@ async def test_the_queue_is_bounded_in_bytes_too(server: SocketServer) -> None:
         server.publish(batch("imu0", seq))
     (client,) = server.hub.clients()
     assert 0 < client.queue_samples < 40
-    # a message that was sent in part is no part of the bound
+    # the limit does not include a partly sent message
     assert client.queue_bytes <= 8192 + 1000
     assert_accounted(await read_samples(peer, {"imu0": 1000}), ("imu0",))
 
@@ -160,7 +160,7 @@ async def test_replies_keep_their_place_and_are_never_dropped(server: SocketServ
 
 
 @in_server()
-async def test_who_asks_without_reading_is_disconnected(server: SocketServer) -> None:
+async def test_a_client_that_requests_without_reading_is_disconnected(server: SocketServer) -> None:
     asking, other = await Peer.greeted(server), await Peer.greeted(server)
     line = b'{"jsonrpc":"2.0","id":1,"method":"schema"}\n'
 
@@ -176,14 +176,14 @@ async def test_who_asks_without_reading_is_disconnected(server: SocketServer) ->
 
 
 @in_server()
-async def test_a_client_that_leaves_during_publish_harms_nobody(server: SocketServer) -> None:
+async def test_a_client_that_leaves_during_publish_does_not_affect_others(server: SocketServer) -> None:
     peers = [await Peer.greeted(server) for _ in range(3)]
     for peer in peers:
         await peer.result("watch")
     await peers[0].result("notify", device="imu0")
     peers[0].close()
     peers[1].close()
-    server.publish(batch("imu0", 1))  # the loop had no turn: the server learns of it here
+    server.publish(batch("imu0", 1))  # the event loop did not run: this send detects the lost client
     server.publish(batch("imu0", 2))
     assert len(server.hub.connections) == 1
     assert [(await peers[2].message())["params"]["seq"] for _ in range(2)] == [1, 2]
@@ -191,14 +191,14 @@ async def test_a_client_that_leaves_during_publish_harms_nobody(server: SocketSe
 
 
 @in_server(queue_samples=3)
-async def test_a_descriptor_waits_its_turn_behind_what_is_queued(server: SocketServer) -> None:
+async def test_a_descriptor_waits_behind_the_queue(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     await peer.result("watch")
     fill(server)
     (connection,) = server.hub.connections.values()
     await peer.send(b'{"jsonrpc":"2.0","id":7,"method":"notify","params":{"device":"imu0"}}\n')
     await until(lambda: bool(connection.wakers))
-    server.publish(batch("imu1", 8000, 2))  # waits behind the reply
+    server.publish(batch("imu1", 8000, 2))  # queued after the reply
     assert await descriptors(peer, connection) == 1
     await until(lambda: not connection.waiting)
     assert connection.wakers._wakers["imu0"].client_end == NO_FD  # sent, so the daemon closed its copy
@@ -218,7 +218,7 @@ def fill(server: SocketServer) -> None:
 
 
 async def descriptors(peer: Peer, connection: ClientConnection) -> int:
-    """Read until the reply with id 7; count the descriptors that came."""
+    """Read up to the reply with id 7. Return the number of received descriptors."""
     found: list[int] = []
     data = bytearray()
     at = 0
@@ -232,7 +232,7 @@ async def descriptors(peer: Peer, connection: ClientConnection) -> int:
         if fds:
             at = len(data)
             found += fds
-    assert at - READ_BYTES <= data.index(b'{"jsonrpc":"2.0","id":7,') < at  # with the first byte of its reply
+    assert at - READ_BYTES <= data.index(b'{"jsonrpc":"2.0","id":7,') < at  # at the start of its reply
     assert connection.wakers.wake("imu0")
     assert [os.read(fd, 64) for fd in found] == [BYTE]
     for fd in found:
@@ -241,7 +241,7 @@ async def descriptors(peer: Peer, connection: ClientConnection) -> int:
 
 
 @in_server()
-async def test_large_answers_reach_a_client_that_ended_its_side(server: SocketServer) -> None:
+async def test_large_replies_reach_a_client_that_has_shut_down_its_side(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     (connection,) = server.hub.connections.values()
     note = encode_notification("big", "x" * 500_000)
@@ -253,7 +253,7 @@ async def test_large_answers_reach_a_client_that_ended_its_side(server: SocketSe
 
 
 @in_server()
-async def test_who_lingers_without_reading_is_closed_by_ticks(server: SocketServer) -> None:
+async def test_ticks_close_a_lingering_client_that_does_not_read(server: SocketServer) -> None:
     await Peer.greeted(server)
     (connection,) = server.hub.connections.values()
     connection.post(encode_notification("big", "x" * 500_000))
@@ -266,7 +266,7 @@ async def test_who_lingers_without_reading_is_closed_by_ticks(server: SocketServ
 
 
 class Trickle:
-    """A socket that takes as many bytes as it likes, and often none."""
+    """A socket that accepts a random number of bytes, often none."""
 
     def __init__(self, sock: socket.socket, rng: random.Random) -> None:
         self.sock = sock
@@ -355,8 +355,8 @@ def test_messages_stay_whole_wherever_a_send_is_cut(seed: int) -> None:
     run(body)
 
 
-def test_what_waits_as_messages_holds_no_samples() -> None:
-    """Thousands of samples that waited once would leave their memory to the process for good."""
+def test_queued_messages_hold_no_samples() -> None:
+    """The interpreter would never release the memory of thousands of queued samples."""
     ours, theirs = socket.socketpair()
     ours.setblocking(False)
     encoding = BinaryEncoding()
@@ -365,8 +365,8 @@ def test_what_waits_as_messages_holds_no_samples() -> None:
     for one in batches:
         Outbox.put_samples([outbox], encoding.encode(one), one, encoding)
     assert outbox.queue_samples > 100
-    assert len({sys.getrefcount(each) for each in batches[:-1]}) == 1  # of those sent, and of those that wait
-    # encoded when it is sent: a batch that `publish` had no time for
+    assert len({sys.getrefcount(each) for each in batches[:-1]}) == 1  # equal for sent and queued batches
+    # a batch that `publish` had no time to encode
     late = batch("imu0", 2001)
     references = [sys.getrefcount(late)]
     delivery = Delivery(1 << 60, late, encoding, None)
@@ -389,7 +389,7 @@ def held_bytes(server: SocketServer) -> int:
 
 
 @in_server(memory_mb=8)
-async def test_large_replies_that_nobody_reads_stay_within_the_memory_and_a_good_client_gets_its_own(
+async def test_unread_large_replies_stay_within_the_memory_and_a_good_client_gets_its_reply(
     server: SocketServer,
 ) -> None:
     big = "x" * BIG_BYTES
@@ -401,7 +401,7 @@ async def test_large_replies_that_nobody_reads_stay_within_the_memory_and_a_good
         if one is not connection:
             one.post(encode_notification("big", big))
             assert held_bytes(server) <= server.hub.pool.held_bytes <= 8 << 20
-    connection.post(encode_notification("big", big + "good"))  # the largest of all, and the last
+    connection.post(encode_notification("big", big + "good"))  # the largest and last message
     assert tracemalloc.get_traced_memory()[0] < 8 << 20
     tracemalloc.stop()
     evicted = server.hub.status().evicted
@@ -432,7 +432,7 @@ async def test_half_lines_are_counted_and_evicted(server: SocketServer) -> None:
 
 
 class Blocked:
-    """A socket that takes nothing until it has room."""
+    """A socket that accepts no data until `room` is true."""
 
     def __init__(self) -> None:
         self.room = False
@@ -446,7 +446,7 @@ class Blocked:
 
 
 class BlockedOutbox(TestOutbox):
-    """An outbox of a `Blocked` socket, which may be evicted."""
+    """An outbox with a `Blocked` socket. imud may evict it."""
 
     def __init__(self, pool: Pool, uid: int = 1) -> None:
         super().__init__(Blocked(), pool, uid)
@@ -469,7 +469,7 @@ def put(outbox: Outbox, first: int, count: int) -> None:
 
 
 EACH_BYTES = SAMPLE_BYTES + 4 + SLOT_BYTES
-"""Memory of a binary sample that waits."""
+"""Memory of a queued binary sample, bytes."""
 
 
 @pytest.mark.parametrize("limits", [Limits(5, 1 << 22), Limits(4096, 5 * EACH_BYTES)])
@@ -480,7 +480,8 @@ def test_exactly_the_limit_of_samples_may_wait(limits: Limits) -> None:
     put(outbox, 4, 2)
     assert (outbox.queue_samples, outbox.queue_bytes, outbox.dropped) == (5, 5 * EACH_BYTES, 0)
     put(outbox, 6, 1)
-    assert (outbox.queue_samples, outbox.queue_bytes, outbox.dropped) == (3, 3 * EACH_BYTES, 3)  # a whole delivery
+    # imud dropped a complete delivery
+    assert (outbox.queue_samples, outbox.queue_bytes, outbox.dropped) == (3, 3 * EACH_BYTES, 3)
     put(outbox, 7, 20)
     assert (outbox.queue_samples, outbox.queue_bytes, outbox.dropped) == (5, 5 * EACH_BYTES, 21)
     outbox.put_reply(bytes(70))
@@ -489,19 +490,19 @@ def test_exactly_the_limit_of_samples_may_wait(limits: Limits) -> None:
     assert (outbox.queue_bytes, pool.held_bytes) == (0, 0)
 
 
-def test_messages_that_waited_go_in_pieces() -> None:
+def test_a_queue_is_sent_in_pieces() -> None:
     sock = Blocked()
     outbox = TestOutbox(sock, Pool(1 << 26, MANY))
     put(outbox, 1, 300)
     sock.room = True
     while outbox.flush():
         pass
-    assert sock.sent == [127 * 260, 127 * 260, 46 * 260]  # a piece ends with the message that makes it 32 KiB
+    assert sock.sent == [127 * 260, 127 * 260, 46 * 260]  # a piece ends with the message that reaches 32 KiB
 
 
 @pytest.mark.parametrize("sizes", [(30, 30, 30), (1, 99)])
 def test_exactly_the_limit_of_replies_may_wait(sizes: tuple[int, ...]) -> None:
-    """The first message was sent in part, so that it does not count."""
+    """The first message is partly sent, so it does not count."""
     pool = Pool(1 << 26, Limits(20, 1 << 20, replies=3, reply_bytes=100))
     outbox = BlockedOutbox(pool)
     outbox.put_reply(bytes(1000))
@@ -517,7 +518,7 @@ def test_exactly_the_limit_of_replies_may_wait(sizes: tuple[int, ...]) -> None:
 
 
 def test_the_share_of_a_client_shrinks_with_each_that_waits() -> None:
-    """Three eighths of the memory are for samples; at half of the memory all clients are cut to their share."""
+    """Samples may use 3/8 of the memory. At 1/2 of the memory, imud cuts all clients to their share."""
     pool = Pool(16 * EACH_BYTES, MANY)  # shares of 6, 3 and 2 samples, and 8 samples for all
     first, second, third = (BlockedOutbox(pool) for _ in range(3))
 
@@ -533,18 +534,18 @@ def test_the_share_of_a_client_shrinks_with_each_that_waits() -> None:
     put(third, 1, 1)
     assert waiting_samples() == [3, 3, 1]
     pool.trim()
-    assert waiting_samples() == [2, 1, 1]  # the first two samples of the second client are one delivery
+    assert waiting_samples() == [2, 1, 1]  # the second client loses a delivery of two samples
     assert pool.held_bytes == 4 * EACH_BYTES
     second.discard()
     put(first, 11, 1)
     assert waiting_samples() == [3, 0, 1]
 
 
-def test_the_user_that_holds_most_loses_the_client_that_does_not_move() -> None:
+def test_the_user_with_most_memory_loses_the_client_without_progress() -> None:
     pool = Pool(2_000_000, MANY)
     one = waiting(pool, 1, 300_000)
     many = [waiting(pool, 2, 100_000) for _ in range(8)]
-    assert not one.gone  # the largest, but of a user that holds less
+    assert not one.gone  # the largest client, but its user occupies less
     assert sum(owner.gone for owner in many) == 1
     assert pool.held_bytes <= 1_000_000
     pool = Pool(2_000_000, MANY)
@@ -553,8 +554,8 @@ def test_the_user_that_holds_most_loses_the_client_that_does_not_move() -> None:
     assert [owner.gone for owner in (*owners, late)] == [True, False, False, False]
 
 
-def test_samples_are_cut_at_once_when_more_and_more_clients_wait() -> None:
-    """Each had the share of those that waited when its own came; without a tick they must not add up."""
+def test_samples_are_cut_immediately_when_more_clients_wait() -> None:
+    """Each client reached its share at another number of clients. Without a tick, the sum stays within the limit."""
     pool = Pool(1 << 20, MANY)
     encoding = BinaryEncoding()
     some = batch("imu0", 1, 50)

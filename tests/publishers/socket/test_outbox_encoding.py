@@ -1,4 +1,4 @@
-"""Samples as messages, in the axes and angles that a client asks for: JSON, binary, poll, and what `schema` says."""
+"""Messages with samples in the requested convention: JSON, binary, `poll`, and `schema`."""
 
 import asyncio
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ SENT = replace(
     sample("imu0", 1), accel_m_s2=(0.125, 9.75, -0.5), gyro_rad_s=(0.25, 0.5, -0.75), mag_t=(1e-5, 2e-5, 3e-5),
     quat_wxyz=(1.0, 0.0, 0.0, 0.0), euler_rad=(0.0, 0.0, 0.0),
 )  # fmt: skip
-"""Of a HiPNUC module (x right, y forward, z up) that points north."""
+"""Sample of a HiPNUC device (x right, y forward, z up) that points north."""
 EXPECTED: dict[str | None, dict[str, Any]] = {
     None: {
         "accel_m_s2": [0.125, 9.75, -0.5], "gyro_rad_s": [0.25, 0.5, -0.75], "mag_t": [1e-5, 2e-5, 3e-5],
@@ -37,7 +37,7 @@ EXPECTED: dict[str | None, dict[str, Any]] = {
         "quat_wxyz": [1, 0, 0, 0], "euler_rad": [0, 0, 0],
     },
 }  # fmt: skip
-"""By the convention that a client asks for."""
+"""Expected values by requested convention."""
 
 
 def published(samples: Sequence[Sample], frame: PublishedAxes | None = None) -> Batch:
@@ -47,7 +47,7 @@ def published(samples: Sequence[Sample], frame: PublishedAxes | None = None) -> 
 
 
 def assert_is(values: dict[str, Any], convention: str | None) -> None:
-    """The values of a sample are those of the table; a quaternion and its negative are the same."""
+    """Assert the values of a sample. A quaternion and its negative are equal."""
     for name, expected in EXPECTED[convention].items():
         found = list(values[name])
         if name == "quat_wxyz" and sum(a * b for a, b in zip(found, expected, strict=True)) < 0:
@@ -72,16 +72,16 @@ FRAMES = {
         published_frame(FrameOptions(axes=MountingAxes(x="y", y="x", z="-z")), None, None, RFU_ENU),
     ),
 }  # fmt: skip
-"""The same body, seen by modules whose samples are published in three ways."""
+"""The same body, measured by devices with three configured conventions."""
 
 
 @pytest.mark.parametrize("name", FRAMES)
 @pytest.mark.parametrize("convention", ["enu-flu", "ned-frd"])
 @in_server()
-async def test_a_client_gets_what_it_asks_for_whatever_is_configured(
+async def test_a_client_gets_the_requested_convention_for_every_configuration(
     server: SocketServer, name: str, convention: str
 ) -> None:
-    """As JSON, as binary slots, and from `poll`."""
+    """Yield the samples as JSON, as binary slots, and from `poll`."""
     lines, frames = await Peer.greeted(server), await Peer.greeted(server)
     assert (await lines.result("watch", convention=convention))["convention"] == convention
     assert (await frames.result("watch", encoding="binary", convention=convention))["convention"] == convention
@@ -109,7 +109,7 @@ async def test_clients_side_by_side(server: SocketServer) -> None:
     some = (await few.message())["params"]
     assert some == {"device": "imu0", "seq": 1, "t_ns": SENT.t_ns, "accel_m_s2": [9.75, -0.125, -0.5]}
     assert_is((await plain.result("poll"))["samples"][0], None)
-    # another watch without a convention replaces the one with
+    # a new watch without a convention replaces the old watch
     await down.result("watch")
     server.publish(published([SENT]))
     assert_is((await down.message())["params"], None)
@@ -126,7 +126,7 @@ async def test_an_unknown_convention_is_refused(server: SocketServer) -> None:
 
 
 @in_server()
-async def test_schema_and_status_say_what_a_client_gets(server: SocketServer) -> None:
+async def test_schema_and_status_describe_the_conventions(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     known = (await peer.result("schema"))["devices"]["imu0"]
     assert known["frame"] == "sensor: x right, y forward, z up, right-handed"
@@ -174,7 +174,7 @@ def test_losses_are_reported_with_converted_samples() -> None:
 
 @in_server()
 async def test_a_slow_reader_gets_converted_samples_from_its_queue(server: SocketServer) -> None:
-    """What is encoded later than it is published has the convention, too."""
+    """imud encodes these samples after `publish`. They have the convention too."""
     peer = await Peer.greeted(server)
     await peer.result("watch", convention="ned-frd", fields=["accel_m_s2"])
     count = 0

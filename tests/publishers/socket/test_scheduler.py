@@ -1,4 +1,4 @@
-"""The scheduler: turns are limited, the least user is next, abuse is parked and evicted, errors are contained."""
+"""Scheduler: limited turns, fair order, parked and evicted clients, and errors that end only one client."""
 
 import asyncio
 import select
@@ -25,7 +25,7 @@ class Clock:
 
 
 class Worker(ScheduledClient):
-    """A client with `pieces` pieces of work of `cost_ns` each."""
+    """A client with `pieces` pieces of work. Each costs `cost_ns`."""
 
     def __init__(self, name: str, rig: "SchedulerBench", uid: int, pieces: int, cost_ns: int) -> None:
         super().__init__(rig.scheduler, rig.socks[-2].fileno(), len(rig.socks), uid)
@@ -99,7 +99,7 @@ async def test_a_turn_is_limited_and_other_callbacks_run_in_between(rig: Schedul
 
 
 @in_context("rig", scheduling)
-async def test_the_client_that_used_least_is_next_within_its_user_and_among_users(rig: SchedulerBench) -> None:
+async def test_the_user_and_the_client_with_the_least_run_time_are_next(rig: SchedulerBench) -> None:
     for number in range(8):
         rig.add(f"many{number}", 1, 50, MS // 4).enqueue()
     rig.add("one", 2, 50, MS // 4).enqueue()
@@ -110,24 +110,24 @@ async def test_the_client_that_used_least_is_next_within_its_user_and_among_user
 
 
 @in_context("rig", scheduling)
-async def test_a_newcomer_goes_before_those_that_use_much(rig: SchedulerBench) -> None:
+async def test_a_new_client_is_served_before_busy_clients(rig: SchedulerBench) -> None:
     for number in range(20):
         rig.add(f"many{number}", 1, 1000, MS // 2).enqueue()
     await until(lambda: len(rig.log) > 100)
     before = len(rig.log)
     rig.add("good", 1, 1, MS // 10).enqueue()
     await until(lambda: "good" in rig.log)
-    assert rig.log.index("good") - before <= 20  # one round of the others at most
+    assert rig.log.index("good") - before <= 20  # at most one round of the others
 
 
 @in_context("rig", scheduling)
-async def test_who_asks_too_much_is_parked_put_in_line_by_ticks_and_evicted(rig: SchedulerBench) -> None:
+async def test_a_client_above_its_allowance_is_parked_and_evicted(rig: SchedulerBench) -> None:
     worker = rig.add("busy", 1, 1_000_000, 5 * MS)
     worker.enqueue()
     for _ in range(200):
         await asyncio.sleep(0)
     used = len(rig.log)
-    assert used * 5 * MS <= serving.CPU_NEW_NS + serving.CPU_PER_S_NS  # then nothing for it any more
+    assert used * 5 * MS <= serving.CPU_NEW_NS + serving.CPU_PER_S_NS  # then it is parked
     rig.clock.ns += 500 * MS
     rig.scheduler.tick()
     await until(lambda: len(rig.log) > used)
@@ -147,7 +147,7 @@ async def test_a_client_has_an_allowance_of_cpu_time_and_of_bytes(rig: Scheduler
     now_ns = rig.clock()
     client.fill(now_ns + 499 * MS)
     assert not client.is_light
-    client.fill(now_ns + 500 * MS)  # 100 ms that a new client has, and 100 ms a second
+    client.fill(now_ns + 500 * MS)  # 100 ms for a new client, and 100 ms per second
     assert client.is_light
     client.count_bytes(1 << 20)
     assert (client.is_over, client.is_light) == (False, True)
@@ -157,11 +157,11 @@ async def test_a_client_has_an_allowance_of_cpu_time_and_of_bytes(rig: Scheduler
     assert client.is_over
     client.fill(now_ns + 1501 * MS)
     assert not client.is_over
-    client.charge(200 * MS)  # all that can gather
+    client.charge(200 * MS)  # the maximum allowance
     assert not client.is_over
     client.charge(1)
     assert client.is_over
-    client.charge(1000 * MS)  # the debt is at most what can gather
+    client.charge(1000 * MS)  # the debt is at most the maximum allowance
     client.fill(now_ns + 3500 * MS)
     assert client.is_over
     client.fill(now_ns + 3502 * MS)
@@ -177,7 +177,7 @@ async def test_a_turn_has_a_limited_number_of_pieces(rig: SchedulerBench) -> Non
 
 @in_context("rig", scheduling)
 async def test_sockets_are_looked_at_again_within_a_turn(rig: SchedulerBench) -> None:
-    """After 0.2 ms, so that a client that asks little is next."""
+    """After 0.2 ms, so that a client with few requests is next."""
     busy = rig.add("busy", 1, 100, MS // 10)
     rig.add("asking", 2, 1, 0)
     busy.enqueue()
@@ -190,7 +190,7 @@ async def test_sockets_are_looked_at_again_within_a_turn(rig: SchedulerBench) ->
 
 @pytest.mark.parametrize("uid", [1, 2])
 @in_context("rig", scheduling)
-async def test_a_client_that_waited_long_is_ahead_for_a_millisecond(rig: SchedulerBench, uid: int) -> None:
+async def test_an_idle_client_has_a_lead_of_one_millisecond(rig: SchedulerBench, uid: int) -> None:
     rig.add("busy", 1, 1000, MS // 4).enqueue()
     idle = rig.add("idle", uid, 1000, MS // 4)
     await until(lambda: len(rig.log) >= 100)
@@ -207,7 +207,7 @@ async def test_when_the_time_for_serving_is_used_up_only_light_clients_are_serve
     for number in range(4):
         rig.add(f"heavy{number}", 1, 10_000, MS // 2).enqueue()
     good = rig.add("good", 1, 1, MS // 10)
-    good.fill(rig.clock() + 1000 * MS)  # it has been there, silent, for a second
+    good.fill(rig.clock() + 1000 * MS)  # it has sent nothing for a second
     await until(lambda: len(rig.log) >= 8)
     rig.scheduler.serving_time.use(2_000 * MS)
     await asyncio.sleep(0)
@@ -215,7 +215,7 @@ async def test_when_the_time_for_serving_is_used_up_only_light_clients_are_serve
     before = len(rig.log)
     good.enqueue()
     await until(lambda: "good" in rig.log[before:])
-    assert len(rig.log) - before <= 3  # at most the turn that everybody has in 10 ms
+    assert len(rig.log) - before <= 3  # at most one turn that serves all clients, every 10 ms
     assert not good.pieces
 
 
@@ -229,13 +229,13 @@ async def test_without_time_for_serving_all_clients_are_served_every_10_ms(rig: 
         count = len(rig.log)
         await until(lambda count=count: len(rig.log) > count)  # type: ignore[misc]
         count = len(rig.log)
-        rig.clock.ns += 8 * MS  # the turn itself took 1 ms
+        rig.clock.ns += 8 * MS  # the turn took 1 ms
         await asyncio.sleep(0.01)  # several pauses of 2 ms
         assert len(rig.log) == count
 
 
 @in_context("rig", scheduling)
-async def test_an_error_ends_that_client_and_no_other(rig: SchedulerBench, caplog: pytest.LogCaptureFixture) -> None:
+async def test_an_error_ends_only_its_client(rig: SchedulerBench, caplog: pytest.LogCaptureFixture) -> None:
     bad = rig.add("bad", 1, 2, 1000)
     bad.error = RecursionError("deep")
     other = rig.add("other", 1, 3, 1000)
@@ -248,10 +248,10 @@ async def test_an_error_ends_that_client_and_no_other(rig: SchedulerBench, caplo
 
 @pytest.mark.parametrize("where", ["evict", "on_ready", "wanted_events"])
 @in_context("rig", scheduling)
-async def test_an_error_outside_of_a_piece_ends_that_client_too(
+async def test_an_error_outside_of_a_piece_ends_only_its_client(
     rig: SchedulerBench, where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """None of them may reach the loop, whose handler ends the daemon; `run` fails then."""
+    """No exception may reach the handler of the event loop, which ends the daemon."""
     bad = rig.add("bad", 1, 10_000 if where == "evict" else 1, 5 * MS)
 
     def broken(*_: object) -> int:
@@ -276,7 +276,7 @@ async def test_an_error_outside_of_a_piece_ends_that_client_too(
 
 
 @in_context("rig", scheduling)
-async def test_a_client_that_cannot_even_be_ended_is_served_no_more(
+async def test_a_client_that_cannot_be_ended_is_not_served_again(
     rig: SchedulerBench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     bad = rig.add("bad", 1, 1000, 1000)

@@ -1,4 +1,4 @@
-"""The socket server end to end: greeting, questions, samples in both encodings, events, limits."""
+"""Socket server end to end: greeting, requests, samples in both encodings, events, limits."""
 
 import asyncio
 import itertools
@@ -97,7 +97,7 @@ async def test_json_samples_have_the_names_of_the_design_and_only_the_selected_m
     assert params == {"device": "imu1", "seq": 1, "t_ns": 80_000_001_000_000, "gyro_rad_s": [0.25, 0.5, -0.75]}
 
 
-@pytest.mark.parametrize("seq", [1, 0x7B])  # 0x7B is `{`: a slot that begins like JSON
+@pytest.mark.parametrize("seq", [1, 0x7B])  # 0x7B is `{`: the slot begins like JSON
 @in_server()
 async def test_binary_frames_hold_one_slot_each(server: SocketServer, seq: int) -> None:
     peer = await Peer.greeted(server)
@@ -142,7 +142,7 @@ def test_framed_json_is_never_as_long_as_slots() -> None:
 
 
 @in_server()
-async def test_a_watch_replaces_the_one_before_and_unwatch_ends_it(server: SocketServer) -> None:
+async def test_a_watch_replaces_the_previous_watch_and_unwatch_ends_it(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     await peer.result("watch", devices=["imu0"])
     await peer.result("watch", devices=["imu1"])
@@ -179,12 +179,12 @@ async def test_poll_gives_the_newest_of_each_device(server: SocketServer) -> Non
     chosen = await peer.result("poll", devices=["imu1"], fields=["t_ns", "sync"])
     assert chosen["samples"] == [{"device": "imu1", "seq": 5, "t_ns": 80_000_005_000_000, "sync": "regression"}]
     server.remove_device("imu0")
-    server.add_device("imu0", 0)  # nothing of its former life is left
+    server.add_device("imu0", 0)  # the old sample is not returned
     assert [s["seq"] for s in (await peer.result("poll"))["samples"]] == [5]
 
 
 @in_server()
-async def test_events_go_to_those_who_want_them(server: SocketServer) -> None:
+async def test_events_go_to_the_clients_that_requested_them(server: SocketServer) -> None:
     everything, one, none = [await Peer.greeted(server) for _ in range(3)]
     await everything.result("events")
     await one.result("events", devices=["imu1"])
@@ -205,7 +205,7 @@ async def test_events_go_to_those_who_want_them(server: SocketServer) -> None:
 async def test_one_set_of_fields_has_one_form_in_any_order(server: SocketServer) -> None:
     fields = ["sync", "mag_t", "gyro_rad_s", "t_err_ns", "accel_m_s2"]
     peers = []
-    for number in range(2 * FORMS_PER_USER):  # 16 different forms are what a user may have
+    for number in range(2 * FORMS_PER_USER):  # a user may have 16 forms
         peers.append(await Peer.greeted(server))
         random.Random(number).shuffle(fields)
         await peers[-1].result("watch", fields=fields)
@@ -221,8 +221,8 @@ async def test_a_user_s_clients_watch_a_limited_number_of_selections(server: Soc
     for peer, fields in zip(peers[:-1], choices[:FORMS_PER_USER], strict=True):
         await peer.result("watch", fields=fields)
     assert (await peers[-1].error("watch", fields=choices[FORMS_PER_USER]))[0] == -32004
-    await peers[0].result("watch", fields=choices[FORMS_PER_USER])  # in place of its own
-    await peers[-1].result("watch", fields=choices[1])  # one that there is
+    await peers[0].result("watch", fields=choices[FORMS_PER_USER])  # replaces its own form
+    await peers[-1].result("watch", fields=choices[1])  # an existing form
 
 
 def test_to_many_clients_samples_go_in_several_turns_and_none_is_lost(tmp_path: Path) -> None:
@@ -239,12 +239,12 @@ def test_to_many_clients_samples_go_in_several_turns_and_none_is_lost(tmp_path: 
             peers = [await Peer.greeted(server) for _ in range(100)]
             for number, peer in enumerate(peers):
                 await peer.result("watch", **({"rate_hz": 1000.0} if number % 3 else {}))
-            step_ns = 400_000  # sending takes its time
+            step_ns = 400_000  # each read of the clock adds 0.4 ms
             for seq in range(1, 6):
                 server.publish(batch("imu0", seq))
                 waiting = sum(client.queue_samples > 0 for client in server.hub.clients())
             step_ns = 0
-            assert waiting == 34  # publishing takes 1 ms, with a look at the clock after 32 clients
+            assert waiting == 34  # `publish` ends after 1 ms; it reads the clock after 32 clients
             for peer in peers:
                 assert [message["params"]["seq"] for message in await peer.messages(5)] == list(range(1, 6))
             assert all(client.dropped == 0 for client in server.hub.clients())
@@ -254,7 +254,7 @@ def test_to_many_clients_samples_go_in_several_turns_and_none_is_lost(tmp_path: 
 
 @pytest.mark.parametrize("selection", ["one", "many"])
 @in_server(memory_mb=8)
-async def test_what_waits_for_all_clients_together_is_bounded(server: SocketServer, selection: str) -> None:
+async def test_the_queues_of_all_clients_together_are_bounded(server: SocketServer, selection: str) -> None:
     fields = ["sync", "gyro_rad_s", "accel_m_s2", "t_err_ns", "utc_ns", "t_dev_ns", "t_rx_ns", "temperature_c"]
     peers = [await Peer.greeted(server) for _ in range(20)]
     for number, peer in enumerate(peers):
@@ -315,7 +315,7 @@ async def test_out_of_descriptors_pauses_accepting_until_the_next_tick_and_is_lo
                 server.tick(0)
     for _ in range(20):
         await asyncio.sleep(0)
-    assert not server.hub.connections  # not before the tick
+    assert not server.hub.connections  # only after the tick
     server.tick(0)
     assert (await peer.message())["method"] == "hello"
     assert caplog.text.count("cannot accept a client: Too many open files") == 1
@@ -323,7 +323,7 @@ async def test_out_of_descriptors_pauses_accepting_until_the_next_tick_and_is_lo
 
 @pytest.mark.parametrize(("step_ns", "accepted"), [(0, [16, 32, 40]), (100_000, [2, 4, 6])])
 def test_accepting_takes_a_limited_part_of_a_turn(tmp_path: Path, step_ns: int, accepted: list[int]) -> None:
-    """At most 16 clients, and 0.3 ms."""
+    """At most 16 clients, and at most 0.3 ms."""
     now_ns, step = NOW_NS, 0
 
     def clock() -> int:
@@ -347,7 +347,7 @@ def test_accepting_takes_a_limited_part_of_a_turn(tmp_path: Path, step_ns: int, 
 
 
 @in_server()
-async def test_a_client_that_is_gone_when_it_is_accepted_leaves_nothing(
+async def test_a_client_that_left_before_accept_leaves_nothing(
     server: SocketServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def gone(_sock: socket.socket) -> None:
@@ -368,7 +368,7 @@ def broken(*_args: object, **_names: object) -> bytes:
     "place", ["Quota.admit", "ClientConnection.__init__", "hello", "peer_of"], ids=lambda place: place.split(".")[0]
 )
 @in_server()
-async def test_an_error_while_a_client_is_welcomed_ends_that_client_only(
+async def test_an_error_while_a_client_is_greeted_ends_only_this_client(
     server: SocketServer, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
     good = await Peer.greeted(server)
@@ -387,7 +387,7 @@ async def test_an_error_while_a_client_is_welcomed_ends_that_client_only(
 
 @pytest.mark.parametrize("what", ["wake", "tick", "event", "reply"])
 @in_server()
-async def test_an_error_in_one_client_s_part_ends_that_client_only(
+async def test_an_error_in_the_code_for_one_client_ends_only_this_client(
     server: SocketServer, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     done_late.clear()

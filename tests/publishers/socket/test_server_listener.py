@@ -1,4 +1,4 @@
-"""Life and death of the socket file: a dead daemon's is replaced, a live one's is left alone, ours is removed."""
+"""Socket file: imud replaces the file of a dead daemon, keeps the file of a live one, and removes its own."""
 
 import os
 import socket
@@ -22,7 +22,7 @@ async def test_a_stale_socket_is_replaced_and_a_live_one_left_alone(tmp_path: Pa
         with pytest.raises(ServerError, match="another daemon serves"):
             second.start()
         second.close()
-        await Peer.greeted(server)  # the first is unharmed
+        await Peer.greeted(server)  # the first server still works
 
 
 @alone()
@@ -42,7 +42,7 @@ async def test_close_leaves_a_socket_alone_that_is_another_daemon_s(tmp_path: Pa
 
 
 @alone()
-async def test_the_directory_is_made_or_the_error_says_what_to_do(tmp_path: Path) -> None:
+async def test_the_directory_is_made_or_the_error_names_the_next_step(tmp_path: Path) -> None:
     server = SocketServer(SocketOptions(path=str(tmp_path / "run" / "imud" / "s")), context())
     server.start()
     assert (tmp_path / "run" / "imud").stat().st_mode & 0o777 == 0o755
@@ -111,14 +111,14 @@ def around_rename(
 
 
 def as_process(monkeypatch: pytest.MonkeyPatch, pid: int, work: Callable[[], Listener]) -> Listener:
-    """`work` under another process number."""
+    """Run `work` with another process number."""
     with monkeypatch.context() as patch:
         patch.setattr(os, "getpid", lambda: pid)
         return work()
 
 
 @pytest.mark.parametrize("stale", [False, True])
-def test_the_file_appears_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stale: bool) -> None:
+def test_the_file_appears_with_its_final_rights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stale: bool) -> None:
     path = tmp_path / "imud.sock"
     if stale:
         leave_socket(path)
@@ -134,11 +134,11 @@ def test_the_file_appears_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     def after() -> None:
         assert path.stat().st_mode & 0o777 == SOCKET_MODE
         with socket.socket(socket.AF_UNIX) as client:
-            client.connect(str(path))  # nobody is refused from here on
+            client.connect(str(path))  # all connections succeed after this
 
     around_rename(monkeypatch, before, after)
     listener = Listener(path, GROUP)
-    assert inodes == [inodes[0]] * 2  # looked at, and the old one stood until the rename
+    assert inodes == [inodes[0]] * 2  # the old file exists until the rename
     assert [file.name for file in tmp_path.iterdir()] == ["imud.sock"]
     listener.close()
     assert not list(tmp_path.iterdir())
@@ -152,7 +152,7 @@ def test_a_path_of_the_greatest_length(tmp_path: Path, monkeypatch: pytest.Monke
         Listener(longer, GROUP)
 
 
-def test_another_starts_while_this_one_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_daemons_start_at_the_same_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "imud.sock"
     others: list[Listener] = []
     listen = socket.socket.listen
@@ -172,7 +172,7 @@ def test_another_starts_while_this_one_does(tmp_path: Path, monkeypatch: pytest.
     others[0].close()
 
 
-def test_another_replaces_the_file_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_daemon_replaces_the_file_just_after_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "imud.sock"
     other = tmp_path / "other"
 
@@ -183,7 +183,7 @@ def test_another_replaces_the_file_at_once(tmp_path: Path, monkeypatch: pytest.M
     around_rename(monkeypatch, lambda: None, replace)
     with pytest.raises(ServerError, match="has just taken"):
         Listener(path, GROUP)
-    assert [file.name for file in tmp_path.iterdir()] == ["imud.sock"]  # the other's
+    assert [file.name for file in tmp_path.iterdir()] == ["imud.sock"]  # the socket of the other daemon
 
 
 def test_leftovers_of_dead_daemons_go_and_nothing_else(tmp_path: Path) -> None:
@@ -195,7 +195,7 @@ def test_leftovers_of_dead_daemons_go_and_nothing_else(tmp_path: Path) -> None:
     (tmp_path / f"imud.sock.0{ended.pid}").touch()
     with (
         subprocess.Popen(["cat"], stdin=subprocess.PIPE) as other,
-        socket.socket(socket.AF_UNIX) as alive,  # of a container, whose processes are not seen from here
+        socket.socket(socket.AF_UNIX) as alive,  # of a container with invisible processes
     ):
         for number in (ended.pid, os.getpid(), other.pid):
             leave_socket(tmp_path / f"imud.sock.{number}")

@@ -1,4 +1,4 @@
-"""Subscriptions: what matches, and the rate of each client and device."""
+"""Subscriptions: matching devices, and the rate of each client and device."""
 
 import pytest
 
@@ -40,7 +40,7 @@ async def test_clients_with_one_rate_get_the_same_samples(server: SocketServer) 
     for peer, numbers in ((first, [1, 11, 21, 31]), (second, [11, 21, 31])):
         assert [(await peer.message())["params"]["seq"] for _ in numbers] == numbers
     first.close()
-    await second.result("watch", rate_hz=500)  # the rate before is forgotten with the last that wanted it
+    await second.result("watch", rate_hz=500)  # no client uses the previous rate any longer
     for seq in range(32, 37):
         server.publish(batch("imu0", seq))
     assert [(await second.message())["params"]["seq"] for _ in range(3)] == [32, 34, 36]
