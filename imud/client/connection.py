@@ -67,8 +67,7 @@ class ReceivedEvent(msgspec.Struct, frozen=True):
 
     t_ns: int
     device: str
-    kind: str
-    """Kind of the event. A daemon of another version may send an unknown kind."""
+    kind: str  # kind of the event. A daemon of another version may send an unknown kind.
     message: str
     detail: dict[str, Any] = {}  # msgspec copies a mutable default
 
@@ -82,10 +81,9 @@ class Watch:
     NAMES: Final = frozenset(("sample", "dropped", "device"))
 
     def __init__(self, client: "Client", devices: Mapping[str, int], timeout_s: float | None) -> None:
-        self.device_ids = dict(devices)
-        """Number of each device in slots."""
+        self.device_ids = dict(devices)  # number of each device in slots
+        # number of samples per device that the daemon dropped because this client read too slowly
         self.dropped: dict[str, int] = {}
-        """Number of samples per device that the daemon dropped because this client read too slowly."""
         self.on_dropped: Callable[[str, int], None] | None = None
         self._ended = False
         self._names = {number: name for name, number in self.device_ids.items()}
@@ -205,10 +203,8 @@ class Hello(msgspec.Struct, frozen=True):
 
     protocol: int
     version: str
-    epoch: int
-    """Random number of this start of the daemon."""
-    rights: tuple[str, ...]
-    """`read`, `control`."""
+    epoch: int  # random number of this start of the daemon
+    rights: tuple[str, ...]  # `read`, `control`
 
 
 class WatchAnswer(msgspec.Struct, frozen=True):
@@ -248,8 +244,7 @@ class Client:
         self.path = default_path() if path is None else os.fspath(path)
         self.timeout_s = timeout_s
         self._buffer = bytearray()
-        self.discarded = 0
-        """Number of messages above INBOX_MAX that the client discarded because no iterator read them."""
+        self.discarded = 0  # number of messages above INBOX_MAX that the client discarded because no iterator read them
         self._inbox: deque[Message] = deque()
         self._watch: Watch | None = None
         self._fds: list[int] = []

@@ -36,39 +36,28 @@ class Wish(NamedTuple):
 
     devices: tuple[str, ...] | None = None
     """Devices to watch; None for all. The feed ignores devices that the daemon does not know."""
-    rate_hz: float | None = None
-    """Maximum number of samples per second and device; None for every sample."""
-    news_s: float = 0.25
-    """Time between two `News`, s."""
-    newest: bool = False
-    """Whether to read the newest sample of every device, for any `devices`."""
-    newest_s: float = STATUS_S
-    """Time between two reads of the newest samples, s."""
+    rate_hz: float | None = None  # maximum number of samples per second and device; None for every sample
+    news_s: float = 0.25  # time between two `News`, s
+    newest: bool = False  # whether to read the newest sample of every device, for any `devices`
+    newest_s: float = STATUS_S  # time between two reads of the newest samples, s
 
 
 class News(NamedTuple):
     """Data received since the previous `News`."""
 
-    problem: str = ""
-    """Reason for the missing connection; empty if the feed is connected."""
+    problem: str = ""  # reason for the missing connection; empty if the feed is connected
     statuses: tuple[DeviceStatus, ...] | None = None
     """State of each device; None if the feed did not request it this time."""
-    clients: int = 0
-    """Number of clients of the daemon, if `statuses` is not None."""
-    now_ns: int = 0
-    """CLOCK_MONOTONIC of the daemon's host."""
-    ahead_ns: int = 0
-    """CLOCK_MONOTONIC of the daemon's host minus that clock of this host; 0 on the same host."""
+    clients: int = 0  # number of clients of the daemon, if `statuses` is not None
+    now_ns: int = 0  # CLOCK_MONOTONIC of the daemon's host
+    ahead_ns: int = 0  # CLOCK_MONOTONIC of the daemon's host minus that clock of this host; 0 on the same host
     samples: tuple[Sample, ...] = ()
     events: tuple[Event, ...] = ()
     newest: tuple[Sample, ...] | None = None
     """Newest sample of each device; None if the feed did not request it this time."""
-    newest_ns: int = 0
-    """Time of the request for `newest`, CLOCK_MONOTONIC of the daemon's host."""
-    hello: Hello | None = None
-    """Greeting of the daemon, in the first `News` of a connection."""
-    dropped: int = 0
-    """Number of samples that the daemon dropped because this feed read too slowly."""
+    newest_ns: int = 0  # time of the request for `newest`, CLOCK_MONOTONIC of the daemon's host
+    hello: Hello | None = None  # greeting of the daemon, in the first `News` of a connection
+    dropped: int = 0  # number of samples that the daemon dropped because this feed read too slowly
 
 
 class Feed:
@@ -153,8 +142,7 @@ class _Reading:
         self._watch: Watch | None = None
         self._dropped = 0
         self._ahead_ns = 0
-        self._first_event: Event | None = None
-        """Event that arrived while the feed watched no device."""
+        self._first_event: Event | None = None  # event that arrived while the feed watched no device
 
     def next(self, wanted: Wish) -> News:
         """Send due requests, then collect samples and events for `wanted.news_s`."""

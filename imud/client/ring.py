@@ -60,10 +60,8 @@ _SHOWN_MAX = 32
 class RingRead(NamedTuple):
     """Result of `read`."""
 
-    samples: list[Sample]
-    """New samples, oldest first."""
-    missed: int
-    """Number of samples overwritten before this `read`, since the previous `read`."""
+    samples: list[Sample]  # new samples, oldest first
+    missed: int  # number of samples overwritten before this `read`, since the previous `read`
 
 
 class Ring:
@@ -84,8 +82,7 @@ class Ring:
         """
         text = str(device_or_path)
         self.path = Path(text) if "/" in text else ring_path(directory or default_directory(text), text)
-        self.missed = 0
-        """Number of samples that `read` missed since opening."""
+        self.missed = 0  # number of samples that `read` missed since opening
         self._now_ns = now_ns
         self._owner_uid = owner_uid
         self._change_to(_RingFile.open(self.path, owner_uid))

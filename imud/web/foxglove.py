@@ -90,8 +90,7 @@ class Relay:
         self._rate_hz = rate_hz
         self._noise = noise or {}
         self._utc_offset_of = utc_offset_ns
-        self._utc_offset_ns = 0
-        """UTC minus CLOCK_MONOTONIC at the newest status."""
+        self._utc_offset_ns = 0  # UTC minus CLOCK_MONOTONIC at the newest status
         self._dialect = dialect
         self._events = dialect.events()
         self._diagnostics = dialect.diagnostics()

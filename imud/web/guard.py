@@ -31,8 +31,7 @@ class WebRights(NamedTuple):
 
     read: bool
     control: bool
-    by_cookie: bool = False
-    """Whether the permission is from the cookie, which a browser sends automatically."""
+    by_cookie: bool = False  # whether the permission is from the cookie, which a browser sends automatically
 
 
 class WebGuard:

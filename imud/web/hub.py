@@ -33,8 +33,7 @@ class Bucketing:
     def __init__(self, rate_hz: int) -> None:
         self._period_ns = NS_PER_S // rate_hz
         self._open: list[Sample] = []
-        self._number = -1
-        """Number of the interval of the open bucket."""
+        self._number = -1  # number of the interval of the open bucket
 
     def add(self, samples: Iterable[Sample], now_ns: int) -> list[Bucket]:
         """Add samples in order. Return the complete buckets."""
@@ -112,8 +111,7 @@ class Mailbox:
     """Queue of messages for one browser. Synchronization: one event loop."""
 
     def __init__(self) -> None:
-        self.dropped = 0
-        """Number of dropped messages."""
+        self.dropped = 0  # number of dropped messages
         self._newest: dict[str, str] = {}
         self._frames: deque[str] = deque()
         self._unacknowledged = 0
@@ -175,8 +173,7 @@ class Browser:
     def __init__(self) -> None:
         self.look = Look()
         self.mailbox = Mailbox()
-        self.reported = (0, 0)
-        """Numbers of dropped messages and samples that the page knows."""
+        self.reported = (0, 0)  # numbers of dropped messages and samples that the page knows
 
 
 class BrowserHub:
@@ -185,8 +182,7 @@ class BrowserHub:
     def __init__(self, call_soon: Callable[[Callable[[News], None], News], object]) -> None:
         """`call_soon` calls a function in the event loop, from any thread."""
         self.browsers: set[Browser] = set()
-        self.dropped_samples = 0
-        """Number of samples that the daemon dropped since start."""
+        self.dropped_samples = 0  # number of samples that the daemon dropped since start
         self._call_soon = call_soon
         self._room = BoundedSemaphore(WAITING_MAX)
         self._feed: Feed | None = None
@@ -196,8 +192,7 @@ class BrowserHub:
         self._events: deque[messages.NewEvent] = deque(maxlen=EVENTS_KEPT)
         self._buckets: dict[tuple[str, int], Bucketing] = {}
         self._newest: dict[str, Sample] = {}
-        self._watched: tuple[str, ...] = ()
-        """Devices with samples for a page."""
+        self._watched: tuple[str, ...] = ()  # devices with samples for a page
 
     def attach(self, feed: Feed) -> None:
         self._feed = feed

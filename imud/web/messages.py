@@ -24,21 +24,14 @@ Range = tuple[tuple[float, ...], tuple[float, ...]]
 class Bucket(msgspec.Struct, frozen=True, omit_defaults=True):
     """The samples of one device in one interval. A member is absent if no sample contains it."""
 
-    first_s: float
-    """Time of the first sample, CLOCK_MONOTONIC."""
-    last_s: float
-    """Time of the last sample, CLOCK_MONOTONIC."""
-    utc_s: float
-    """Time of the last sample since 1970-01-01 UTC."""
+    first_s: float  # time of the first sample, CLOCK_MONOTONIC
+    last_s: float  # time of the last sample, CLOCK_MONOTONIC
+    utc_s: float  # time of the last sample since 1970-01-01 UTC
     count: int
-    seq: int
-    """Sequence number of the last sample."""
-    sync: str
-    """Source of the time stamp of the last sample."""
-    t_err_s: float
-    """Maximum time stamp error, one sigma."""
-    latency_s: float
-    """Maximum time from the measurement to the arrival of the last byte."""
+    seq: int  # sequence number of the last sample
+    sync: str  # source of the time stamp of the last sample
+    t_err_s: float  # maximum time stamp error, one sigma
+    latency_s: float  # maximum time from the measurement to the arrival of the last byte
     accel_m_s2: Range | None = None
     gyro_rad_s: Range | None = None
     mag_t: Range | None = None
@@ -56,12 +49,9 @@ class ToPage(msgspec.Struct, frozen=True, tag_field="kind"):
 class StateMessage(ToPage, frozen=True, tag="state"):
     """State of the connection to the daemon."""
 
-    problem: str
-    """Reason for a missing connection; empty if connected."""
-    version: str
-    """Version of the daemon; empty while unknown."""
-    epoch: str
-    """Random number of the daemon's start as a string; empty while unknown."""
+    problem: str  # reason for a missing connection; empty if connected
+    version: str  # version of the daemon; empty while unknown
+    epoch: str  # random number of the daemon's start as a string; empty while unknown
 
 
 class DeviceRow(msgspec.Struct, frozen=True):
@@ -77,14 +67,11 @@ class DeviceRow(msgspec.Struct, frozen=True):
     rate_hz: float
     expected_rate_hz: float
     lost: int
-    closes: bool
-    """Whether its ledger balances."""
-    differs: bool
-    """Whether its settings differ from the declared ones."""
+    closes: bool  # whether its ledger balances
+    differs: bool  # whether its settings differ from the declared ones
     alarm: bool
     temperature_c: float | None
-    age_s: float | None
-    """Age of the newest sample; null before the first sample."""
+    age_s: float | None  # age of the newest sample; null before the first sample
     t_err_s: float | None
     sync: str
     euler_rad: tuple[float, ...] | None
@@ -95,8 +82,7 @@ class DeviceRow(msgspec.Struct, frozen=True):
 class OverviewMessage(ToPage, frozen=True, tag="overview"):
     """All devices."""
 
-    clients: int
-    """Number of clients of the daemon's socket."""
+    clients: int  # number of clients of the daemon's socket
     devices: tuple[DeviceRow, ...]
 
 
@@ -107,10 +93,8 @@ class StatusMessage(ToPage, frozen=True, tag="status"):
     now_s: float
     status: dict[str, Any] | None
     lost: int
-    bytes_open: int
-    """0 if the ledger balances."""
-    frames_open: int
-    """0 if the ledger balances."""
+    bytes_open: int  # 0 if the ledger balances
+    frames_open: int  # 0 if the ledger balances
     latency_bounds_s: tuple[float, ...]
 
 
@@ -130,8 +114,7 @@ class RawMessage(ToPage, frozen=True, tag="raw"):
     seq: tuple[int, ...]
     """Sequence numbers. A step above 1: samples that the page did not get. A step in `t_s` also shows lost samples."""
     t_s: tuple[float, ...]
-    axes: tuple[tuple[float, ...], ...]
-    """Values of x, y and z."""
+    axes: tuple[tuple[float, ...], ...]  # values of x, y and z
 
 
 class NewEvent(msgspec.Struct, frozen=True):
@@ -154,8 +137,7 @@ class DroppedMessage(ToPage, frozen=True, tag="dropped"):
     """Numbers of dropped messages and samples, because this browser or `imud web` was too slow."""
 
     messages: int
-    samples: int
-    """Number of samples that the daemon dropped, of the devices of all pages."""
+    samples: int  # number of samples that the daemon dropped, of the devices of all pages
 
 
 class ProblemMessage(ToPage, frozen=True, tag="problem"):

@@ -125,8 +125,7 @@ class WebServer:
         self._calls = Calls(path)
         self._path = path
         self._failures = 0
-        self.hub: BrowserHub | None = None
-        """The hub; None before the application runs."""
+        self.hub: BrowserHub | None = None  # the hub; None before the application runs
 
     def make_app(self) -> web.Application:
         """Return the application with all routes."""

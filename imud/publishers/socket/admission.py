@@ -79,8 +79,7 @@ class Peer:
 
     pid: int
     uid: int
-    groups: frozenset[int]
-    """Effective and supplementary group numbers."""
+    groups: frozenset[int]  # effective and supplementary group numbers
 
 
 class Place(NamedTuple):
@@ -156,13 +155,11 @@ class Quota:
         self._of_root = _share_of(self._reserved)
         self._reserved_per_user = _share_of(self._reserved - self._of_root)
         self._own_uid = own_uid
-        self._fd_end = fd_limit - min(RESERVED_FDS, fd_limit // 4)
-        """First descriptor that is not for clients."""
+        self._fd_end = fd_limit - min(RESERVED_FDS, fd_limit // 4)  # first descriptor that is not for clients
         self._reserved_fd_end = self._fd_end + self._reserved
         self._now_ns = now_ns
         self._connects: dict[int, TokenBucket] = {}
-        self._forms: dict[int, Counter[object]] = {}
-        """Number of clients in each form, for each user."""
+        self._forms: dict[int, Counter[object]] = {}  # number of clients in each form, for each user
 
     def admit(self, peer: Peer, rights: Rights, fd: int, places: Collection[Place]) -> Place:
         """Return the place of a new client that may at least read. `places` are the places of all other clients.

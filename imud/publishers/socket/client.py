@@ -149,13 +149,10 @@ class Clients(ABC):
 
     def __init__(self, pool: Pool, now_ns: Callable[[], int]) -> None:
         self.pool = pool
-        self.connections: dict[int, ClientConnection] = {}
-        """The clients by number."""
-        self.accepted = 0
-        """Connections accepted since start; the number of the newest."""
+        self.connections: dict[int, ClientConnection] = {}  # the clients by number
+        self.accepted = 0  # connections accepted since start; the number of the newest
         self.refused = 0
-        self.evicted = 0
-        """Clients disconnected because they exceeded a limit."""
+        self.evicted = 0  # clients disconnected because they exceeded a limit
         self._failed = 0
         self._failures = RateLimitedLog(now_ns)
 
@@ -189,17 +186,13 @@ class ClientConnection(Outbox, ScheduledClient):
         self.place = place
         self.wakers = ClientWakers()
         self.closed = False
-        self.text_numbers = False
-        """Whether imud sends integers that may exceed 2⁵³ as strings."""
-        self.framed = False
-        """Whether imud sends messages as frames; never reset."""
+        self.text_numbers = False  # whether imud sends integers that may exceed 2⁵³ as strings
+        self.framed = False  # whether imud sends messages as frames; never reset
         self._clients = clients
         self._scheduler = scheduler
         self._input = bytearray()
-        self._searched = 0
-        """Bytes of the input that contain no newline."""
-        self._work: Iterator[int] | None = None
-        """An unfinished answer."""
+        self._searched = 0  # bytes of the input that contain no newline
+        self._work: Iterator[int] | None = None  # an unfinished answer
         self._work_bytes = 0
         self._readable = self._writable = False
         self._linger_ticks: int | None = None

@@ -35,10 +35,8 @@ class ClientRecordings:
         self._context = context
         self._check_fds = check_fds
         self._ids: dict[str, int] = {}
-        self._running: dict[int, ClientRecording] = {}
-        """Recordings by client number."""
-        self._ending: list[ClientRecording] = []
-        """Stopped recordings that still send their queue."""
+        self._running: dict[int, ClientRecording] = {}  # recordings by client number
+        self._ending: list[ClientRecording] = []  # stopped recordings that still send their queue
 
     # --- requests of a client -----------------------------------------------------------------------------------------
 
@@ -171,26 +169,21 @@ class Hub(Clients):
         super().__init__(pool, context.clock.now_ns)
         self.path = path
         self.context = context
-        self.control_group = "the control group"
-        """Name of the group that may control, for error messages."""
-        self.devices: dict[str, int] = {}
-        """The `device_id` of each device."""
-        self.newest: dict[str, Batch] = {}
-        """The newest batch of each device."""
+        self.control_group = "the control group"  # name of the group that may control, for error messages
+        self.devices: dict[str, int] = {}  # the `device_id` of each device
+        self.newest: dict[str, Batch] = {}  # the newest batch of each device
         self.recordings = ClientRecordings(context, quota.check_fds)
         self._quota = quota
         self._time = time
         self._handle_line = handle_line
         self._subscriptions: dict[int, Subscription] = {}
+        # devices with events for a client, None for all. A client without events is absent.
         self._events: dict[int, Collection[str] | None] = {}
-        """Devices with events for a client, None for all. A client without events is absent."""
         self._plans: dict[str, DeliveryPlan] = {}
-        self._work: dict[int, asyncio.Future[None]] = {}
-        """Running request of a client, by client number."""
-        self._wanting_wake: dict[str, dict[ClientConnection, None]] = {}
-        """Clients with a waker, by device."""
+        self._work: dict[int, asyncio.Future[None]] = {}  # running request of a client, by client number
+        self._wanting_wake: dict[str, dict[ClientConnection, None]] = {}  # clients with a waker, by device
+        # clients that imud has not woken yet for the newest batch of a device
         self._to_wake: dict[str, list[ClientConnection]] = {}
-        """Clients that imud has not woken yet for the newest batch of a device."""
 
     # --- devices, samples, events -------------------------------------------------------------------------------------
 

@@ -19,10 +19,8 @@ from imud.publishers.socket.subscription import Form
 class BigNumbers(StrEnum):
     """Form of integers that may exceed 2⁵³ (`epoch`, members in ns). JavaScript and others round larger numbers."""
 
-    NUMBER = "number"
-    """JSON numbers."""
-    STRING = "string"
-    """Strings of decimal digits."""
+    NUMBER = "number"  # JSON numbers
+    STRING = "string"  # strings of decimal digits
 
 
 # --- parameters -----------------------------------------------------------------------------------------------------
@@ -46,8 +44,7 @@ class WatchParams(msgspec.Struct):
     rate_hz: float | None = None
     encoding: Form | None = None
     convention: Convention | None = None
-    latency_ms: float | None = None
-    """Maximum hold of a sample; default: a period of `rate_hz`, at most 20."""
+    latency_ms: float | None = None  # maximum hold of a sample; default: a period of `rate_hz`, at most 20
 
 
 class PollParams(msgspec.Struct):
@@ -67,8 +64,7 @@ class DeviceParams(msgspec.Struct):
 
 class NotifyParams(msgspec.Struct):
     device: str
-    latency_ms: float | None = None
-    """Maximum delay until the descriptor becomes readable; default 0."""
+    latency_ms: float | None = None  # maximum delay until the descriptor becomes readable; default 0
 
 
 class CommandParams(msgspec.Struct):
@@ -97,8 +93,7 @@ class SettingsChangeParams(msgspec.Struct):
 
 
 class RecordParams(msgspec.Struct):
-    devices: list[str] | None = None
-    """Default: all devices, also devices that imud adds later."""
+    devices: list[str] | None = None  # default: all devices, also devices that imud adds later
 
 
 # --- results --------------------------------------------------------------------------------------------------------
@@ -119,8 +114,7 @@ class DeviceSummary(msgspec.Struct):
     """A device in the result of `devices`."""
 
     name: str
-    device_id: int
-    """Number of the device, as in slots."""
+    device_id: int  # number of the device, as in slots
     driver: str
     link: str
     state: DeviceState
@@ -128,13 +122,11 @@ class DeviceSummary(msgspec.Struct):
     identity: dict[str, str]
     rate_hz: float
     sync: Sync
-    ring: str | None
-    """Path of the shared memory of the device; null without shared memory."""
+    ring: str | None  # path of the shared memory of the device; null without shared memory
 
 
 class StatusResult(msgspec.Struct):
-    now_ns: int
-    """CLOCK_MONOTONIC."""
+    now_ns: int  # CLOCK_MONOTONIC
     devices: list[DeviceStatus]
     socket: SocketStatus
 
@@ -145,8 +137,7 @@ class DeviceFrame(msgspec.Struct, omit_defaults=True):
     driver: str
     euler_convention: str
     navigation_frame: str
-    status_bits: dict[str, str]
-    """Name of each bit of `status`, by bit number."""
+    status_bits: dict[str, str]  # name of each bit of `status`, by bit number
     frame: str | msgspec.UnsetType = msgspec.UNSET
     convention: str | msgspec.UnsetType = msgspec.UNSET
     heading: Heading | msgspec.UnsetType = msgspec.UNSET
@@ -156,12 +147,9 @@ class DeviceFrame(msgspec.Struct, omit_defaults=True):
 
 class SlotMember(msgspec.Struct):
     name: str
-    struct: str
-    """Type of one number as in Python's `struct`: Q u64, q i64, I u32, H u16, B u8, d f64, s bytes."""
-    count: int
-    """Number of adjacent values."""
-    offset: int
-    """Offset of the first byte."""
+    struct: str  # type of one number as in Python's `struct`: Q u64, q i64, I u32, H u16, B u8, d f64, s bytes
+    count: int  # number of adjacent values
+    offset: int  # offset of the first byte
 
 
 class SlotSchema(msgspec.Struct):
@@ -169,10 +157,8 @@ class SlotSchema(msgspec.Struct):
     layout_version: int
     byte_order: str
     fields: list[SlotMember]
-    present_bits: dict[str, int]
-    """Bit of `present` for each optional field."""
-    sync_codes: dict[str, int]
-    """Number of each source of time stamps in `sync`."""
+    present_bits: dict[str, int]  # bit of `present` for each optional field
+    sync_codes: dict[str, int]  # number of each source of time stamps in `sync`
 
 
 class SchemaResult(msgspec.Struct):
@@ -180,26 +166,20 @@ class SchemaResult(msgspec.Struct):
     fields: list[FieldInfo]
     devices: dict[str, DeviceFrame]
     slot: SlotSchema
-    latency_bounds_ns: list[int]
-    """Upper bounds of `latency_buckets`, ns. The last bucket has no bound."""
-    states: list[DeviceState]
-    """Values of `state`."""
+    latency_bounds_ns: list[int]  # upper bounds of `latency_buckets`, ns. The last bucket has no bound.
+    states: list[DeviceState]  # values of `state`
 
 
 class WatchResult(msgspec.Struct, omit_defaults=True):
     encoding: Form
-    devices: dict[str, int]
-    """Number of each watched device, as in slots."""
+    devices: dict[str, int]  # number of each watched device, as in slots
     rate_hz: float
-    latency_ms: float
-    """Maximum hold of a sample for this client."""
-    convention: Convention | None = None
-    """The requested convention; absent without a request."""
+    latency_ms: float  # maximum hold of a sample for this client
+    convention: Convention | None = None  # the requested convention; absent without a request
 
 
 class PollResult(msgspec.Struct, omit_defaults=True):
-    now_ns: int
-    """CLOCK_MONOTONIC."""
+    now_ns: int  # CLOCK_MONOTONIC
     samples: Annotated[list[Any], msgspec.Meta(extra_json_schema={"items": {"$ref": "#/$defs/Sample"}})]
     """The newest sample of each device, with the requested members. Devices without a sample are absent."""
     convention: Convention | None = None
@@ -223,13 +203,11 @@ class StopResult(msgspec.Struct):
 class RecordResult(msgspec.Struct):
     """Result of `record.start`. The descriptor is part of the same message."""
 
-    devices: list[str] | None
-    """Recorded devices; null for all."""
+    devices: list[str] | None  # recorded devices; null for all
 
 
 class RecordStopResult(msgspec.Struct):
-    stopped: bool
-    """Whether a recording was running. imud still sends its queue, then end of file."""
+    stopped: bool  # whether a recording was running. imud still sends its queue, then end of file.
     records_dropped: int
     """Number of records that imud dropped because the client did not read. The recording marks each loss."""
 
@@ -237,8 +215,7 @@ class RecordStopResult(msgspec.Struct):
 class SnapshotResult(msgspec.Struct):
     """Result of `record.snapshot`. The descriptor is part of the same message."""
 
-    seconds: float
-    """Duration of the snapshot."""
+    seconds: float  # duration of the snapshot
 
 
 # --- notifications --------------------------------------------------------------------------------------------------
@@ -247,10 +224,8 @@ class SnapshotResult(msgspec.Struct):
 class Greeting(msgspec.Struct):
     protocol: int
     version: str
-    epoch: int
-    """Random number of this start of the daemon."""
-    rights: list[str]
-    """`read`, `control`."""
+    epoch: int  # random number of this start of the daemon
+    rights: list[str]  # `read`, `control`
 
 
 class DeviceNotice(msgspec.Struct):

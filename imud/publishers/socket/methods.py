@@ -97,12 +97,9 @@ class Answer:
     """The answer of a method."""
 
     result: object
-    fd: int = NO_FD
-    """Descriptor; imud sends a copy with the reply."""
-    framed_from_here: bool = False
-    """Whether imud sends frames after this reply."""
-    big_numbers: bool = True
-    """Whether `result` may contain integers above 2⁵³ that are not converted to strings yet."""
+    fd: int = NO_FD  # descriptor; imud sends a copy with the reply
+    framed_from_here: bool = False  # whether imud sends frames after this reply
+    big_numbers: bool = True  # whether `result` may contain integers above 2⁵³ that are not converted to strings yet
 
 
 Pieces = Generator[int, None, Answer]
@@ -118,12 +115,10 @@ class Method(Generic[P]):
 
     params: type[P]
     run: Callable[[Hub, ClientConnection, P], Answer | Pieces | Later]
-    right: Rights = Rights.READ
-    """The right that the client needs."""
+    right: Rights = Rights.READ  # the right that the client needs
     acts: bool = False
     """Whether the method has an effect other than its reply. Otherwise imud ignores a request without `id`."""
-    result: Any = Any
-    """Type of the result."""
+    result: Any = Any  # type of the result
 
 
 # --- requests and replies -------------------------------------------------------------------------------------------

@@ -37,8 +37,7 @@ _SLOT_HEADER: Final = FRAME_HEADER.pack(SLOT_BYTES)
 class Encoding(ABC):
     """Base class of the encodings of samples. A message contains one sample, so that a queue can drop one sample."""
 
-    message_bytes: int
-    """Size of the last message; an estimate before the first."""
+    message_bytes: int  # size of the last message; an estimate before the first
 
     def __init__(self, convention: Convention | None = None) -> None:
         """Convert samples to `convention` if it is not None."""
@@ -179,8 +178,8 @@ class Delivery:
         self._chosen = chosen
         self.count = len(batch.samples) if chosen is None else len(chosen)
         self._messages = messages
+        # memory of a sample with its message; with the size of the last message before encoding
         self.each_bytes = SAMPLE_BYTES + (encoding.message_bytes if messages is None else len(messages[0]))
-        """Memory of a sample with its message; with the size of the last message before encoding."""
 
     def messages(self) -> Sequence[bytes]:
         if self._messages is None:
@@ -212,8 +211,7 @@ class Pool:
         self._share_bytes = limit_bytes * 3 // 8
         self._half_bytes = limit_bytes // 2
         self._waiting: dict[Outbox, None] = {}
-        self._holding: dict[Outbox, None] = {}
-        """Clients with memory other than samples."""
+        self._holding: dict[Outbox, None] = {}  # clients with memory other than samples
         self._sample_bytes = 0
         self._other_bytes = 0
         self._order = 0
@@ -309,34 +307,26 @@ class Outbox(ABC):
 
     def __init__(self, sock: socket.socket, pool: Pool, uid: int) -> None:
         self.uid = uid
-        self.sent = 0
-        """Number of samples passed to the socket."""
-        self.dropped = 0
-        """Number of dropped samples."""
-        self.waiting = False
-        """Whether anything is queued; then imud appends new messages to the queue."""
-        self.reply_bytes = 0
-        """Size of the queued replies."""
-        self.held_bytes = 0
-        """Memory held for the client without samples, as counted in the pool."""
-        self.moved = 0
-        """Count of the pool at the last progress of this client."""
+        self.sent = 0  # number of samples passed to the socket
+        self.dropped = 0  # number of dropped samples
+        self.waiting = False  # whether anything is queued; then imud appends new messages to the queue
+        self.reply_bytes = 0  # size of the queued replies
+        self.held_bytes = 0  # memory held for the client without samples, as counted in the pool
+        self.moved = 0  # count of the pool at the last progress of this client
         self._owned_bytes = 0
         self._sock = sock
         self._send = sock.send
         self._limits = pool.limits
         self._pool = pool
         self._samples: deque[Delivery] = deque()
-        self._skip = 0
-        """Number of samples of the first delivery that are already sent or dropped."""
+        self._skip = 0  # number of samples of the first delivery that are already sent or dropped
         self._sample_count = 0
         self._sample_bytes = 0
         self._replies: deque[tuple[int, bytes, int]] = deque()
-        self._partial = b""
-        """Unsent rest of a message, or messages taken from the queues."""
+        self._partial = b""  # unsent rest of a message, or messages taken from the queues
         self._partial_fd = NO_FD
+        # number of dropped samples per device that no message has reported to the client yet
         self._unreported: dict[str, int] = {}
-        """Number of dropped samples per device that no message has reported to the client yet."""
 
     @abstractmethod
     def on_broken(self, reason: str) -> None:

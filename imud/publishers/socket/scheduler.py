@@ -66,8 +66,7 @@ class TokenBucket:
         self._rate = rate
         self._burst = burst
         self._at_ns = now_ns
-        self.level: float = burst if level is None else level
-        """Unused allowance; negative after a piece that used more."""
+        self.level: float = burst if level is None else level  # unused allowance; negative after a piece that used more
 
     def use(self, amount: int) -> None:
         """Subtract the used amount; the debt is at most `burst`."""
@@ -80,13 +79,10 @@ class TokenBucket:
 
 
 class _State(Enum):
-    IDLE = auto()
-    """The client has no work, or its socket is armed."""
+    IDLE = auto()  # the client has no work, or its socket is armed
     QUEUED = auto()
-    SERVED = auto()
-    """`serve` runs."""
-    PARKED = auto()
-    """The client has work and no allowance."""
+    SERVED = auto()  # `serve` runs
+    PARKED = auto()  # the client has work and no allowance
     GONE = auto()
 
 
@@ -99,10 +95,9 @@ class _User:
         self.uid = uid
         self.clients = 0
         self.run_ns = run_ns
-        self.served_ns = 0
-        """Run time of the client that was served last."""
+        self.served_ns = 0  # run time of the client that was served last
+        # heap of the queued clients: False for a light client, run time, number
         self.queue: list[tuple[bool, int, int, ScheduledClient]] = []
-        """Heap of the queued clients: False for a light client, run time, number."""
 
     def urgency(self) -> tuple[bool, int]:
         """Return the key of the queue: the user with the smallest key is next."""
@@ -179,21 +174,16 @@ class Scheduler:
         self.now_ns = now_ns
         self._cpu_ns = cpu_ns
         self.serving_time = time
-        self._served_all_ns = 0
-        """Time of the last turn that served every client."""
+        self._served_all_ns = 0  # time of the last turn that served every client
         self._loop = asyncio.get_running_loop()
         self._epoll = select.epoll()
         self._loop.add_reader(self._epoll.fileno(), self._on_events)
         self._next_turn: asyncio.Handle | None = None
-        self._pausing = False
-        """Whether the next turn begins after a pause."""
-        self._clients: dict[int, ScheduledClient] = {}
-        """All clients by descriptor."""
+        self._pausing = False  # whether the next turn begins after a pause
+        self._clients: dict[int, ScheduledClient] = {}  # all clients by descriptor
         self._users: dict[int, _User] = {}
-        self._queued: dict[_User, None] = {}
-        """Users with queued clients."""
-        self._served_ns = 0
-        """Run time of the user that was served last."""
+        self._queued: dict[_User, None] = {}  # users with queued clients
+        self._served_ns = 0  # run time of the user that was served last
         self._parked: dict[ScheduledClient, None] = {}
 
     def add(self, client: ScheduledClient, uid: int) -> _User:

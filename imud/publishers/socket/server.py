@@ -289,8 +289,7 @@ class SocketServer:
         self._scheduler: Scheduler | None = None
         self._listener: Listener | None = None
         self._guard = Guard(own_uid, None, None)
-        self._paused = False
-        """Whether imud accepts no client until the next tick."""
+        self._paused = False  # whether imud accepts no client until the next tick
         self._pauses = RateLimitedLog(context.clock.now_ns)
 
     def start(self) -> None:

@@ -26,10 +26,8 @@ ChosenSamples = Mapping[float, tuple[int, ...]]
 class Form(StrEnum):
     """Encoding of samples in the protocol."""
 
-    JSON = "json"
-    """One notification per sample."""
-    BINARY = "binary"
-    """One slot of shared memory per sample."""
+    JSON = "json"  # one notification per sample
+    BINARY = "binary"  # one slot of shared memory per sample
 
 
 FormKey = tuple[Form, tuple[str, ...] | None, bool, Convention | None, bool]
@@ -40,21 +38,15 @@ FormKey = tuple[Form, tuple[str, ...] | None, bool, Convention | None, bool]
 class Subscription:
     """The checked parameters of a `watch`."""
 
-    devices: Collection[str] | None
-    """Watched devices; None for all devices, also devices that imud adds later."""
-    fields: tuple[str, ...] | None
-    """Members of a JSON sample in addition to ALWAYS_FIELDS; None for all."""
-    rate_hz: float
-    """Maximum number of samples per second and device; 0 for all."""
+    devices: Collection[str] | None  # watched devices; None for all devices, also devices that imud adds later
+    fields: tuple[str, ...] | None  # members of a JSON sample in addition to ALWAYS_FIELDS; None for all
+    rate_hz: float  # maximum number of samples per second and device; 0 for all
     form: Form
-    framed: bool = False
-    """Whether imud sends messages as frames."""
+    framed: bool = False  # whether imud sends messages as frames
     convention: Convention | None = None
     """Axes and angles of samples; None for the convention in the configuration of the device."""
-    text_numbers: bool = False
-    """Whether integers of JSON samples that may exceed 2⁵³ are strings."""
-    latency_ns: int = 0
-    """Maximum hold of a sample, ns."""
+    text_numbers: bool = False  # whether integers of JSON samples that may exceed 2⁵³ are strings
+    latency_ns: int = 0  # maximum hold of a sample, ns
     key: FormKey = field(init=False)
 
     def __post_init__(self) -> None:
@@ -84,14 +76,10 @@ class DeliveryGroup:
     def __init__(self, encoding: Encoding, order: Callable[[], int]) -> None:
         self.encoding = encoding
         self._order = order
-        self._rates_hz: dict[Outbox, float] = {}
-        """Rate of each client; 0 for every sample."""
-        self._changed = False
-        """Whether the lists are out of date."""
-        self._direct: list[list[Outbox]] = []
-        """Clients with every sample, in lists of at most CLIENTS_PER_LOOK."""
-        self._thinned: dict[float, list[Outbox]] = {}
-        """Clients with a rate, by rate."""
+        self._rates_hz: dict[Outbox, float] = {}  # rate of each client; 0 for every sample
+        self._changed = False  # whether the lists are out of date
+        self._direct: list[list[Outbox]] = []  # clients with every sample, in lists of at most CLIENTS_PER_LOOK
+        self._thinned: dict[float, list[Outbox]] = {}  # clients with a rate, by rate
 
     def __contains__(self, outbox: Outbox) -> bool:
         return outbox in self._rates_hz
@@ -187,10 +175,8 @@ class DeliveryPlan:
         self._thinner = RateThinner()
         self._groups: dict[FormKey, DeliveryGroup] = {}
         self._order: tuple[DeliveryGroup, ...] = ()
-        self._only: DeliveryGroup | None = None
-        """The only group, if it is small; otherwise None."""
-        self._thins = False
-        """Whether a client has a rate."""
+        self._only: DeliveryGroup | None = None  # the only group, if it is small; otherwise None
+        self._thins = False  # whether a client has a rate
 
     def __len__(self) -> int:
         return len(self._groups)
