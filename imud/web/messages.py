@@ -67,7 +67,7 @@ class DeviceRow(msgspec.Struct, frozen=True):
     rate_hz: float
     expected_rate_hz: float
     lost: int
-    closes: bool  # whether its ledger balances
+    closes: bool  # whether the ledger balances
     differs: bool  # whether its settings differ from the declared ones
     alarm: bool
     temperature_c: float | None

@@ -33,11 +33,11 @@ class Waker:
     Synchronization: the event loop's thread.
     """
 
-    __slots__ = ("_send", "_sock", "_theirs")
+    __slots__ = ("_client_sock", "_send", "_sock")
 
     def __init__(self) -> None:
-        self._sock, self._theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._theirs.setblocking(False)  # only a default: the client may change it
+        self._sock, self._client_sock = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._client_sock.setblocking(False)  # only a default: the client may change it
         self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
         self._sock.shutdown(socket.SHUT_RD)  # the client cannot send bytes or descriptors, which nothing would read
         self._send = self._sock.send
@@ -45,15 +45,15 @@ class Waker:
     @property
     def client_end(self) -> int:
         """The descriptor for the client; NO_FD after `close_copy`."""
-        return self._theirs.fileno()
+        return self._client_sock.fileno()
 
     @property
     def fds(self) -> tuple[int, int]:
-        return self._sock.fileno(), self._theirs.fileno()
+        return self._sock.fileno(), self._client_sock.fileno()
 
     def close_copy(self) -> None:
         """Close the daemon's copy of the client's end. Without it, `wake` fails after the client closed its end."""
-        self._theirs.close()
+        self._client_sock.close()
 
     def wake(self) -> bool:
         """Make the client's end readable, without waiting. Return False if the client has closed it."""
@@ -68,7 +68,7 @@ class Waker:
     def close(self) -> None:
         """Close both ends. The client reads the pending bytes, then end of file. A second call does nothing."""
         self._sock.close()
-        self._theirs.close()
+        self._client_sock.close()
 
 
 class ClientWakers:
@@ -281,7 +281,7 @@ class ClientConnection(Outbox, ScheduledClient):
             else:
                 self._serve_line()
         if not self.closed:
-            self.count_owned(self.unread_bytes)
+            self.set_request_bytes(self.unread_bytes)
         return self._has_work()
 
     def wanted_events(self) -> int:

@@ -47,7 +47,7 @@ class ClientRecordings:
         count = len(self._running) + len(self._ending)
         if count >= RECORDINGS_MAX:
             raise RpcError(Code.UNAVAILABLE, f"record.start: {count} recordings are running, the maximum")
-        ours, fd = self._lend(connection, "record.start")
+        ours, fd = self._make_pair(connection, "record.start")
         try:
             made = ClientRecording(self._context, devices, ours)
         except RuntimeError as error:  # no thread can be started
@@ -76,7 +76,7 @@ class ClientRecordings:
                 "record.snapshot: the flight recorder is off; set `recorder: {flight: {enabled: true}}` in the "
                 "configuration",
             )
-        ours, fd = self._lend(connection, "record.snapshot")
+        ours, fd = self._make_pair(connection, "record.snapshot")
         try:
             return self._context.outputs.snapshots[0](ours), fd
         except ImudError as error:
@@ -90,7 +90,7 @@ class ClientRecordings:
             made.close()
             log.info("client %d stopped recording: its connection has ended", connection.number)
 
-    def _lend(self, connection: ClientConnection, method: str) -> tuple[socket.socket, int]:
+    def _make_pair(self, connection: ClientConnection, method: str) -> tuple[socket.socket, int]:
         """Make a pair of sockets. Return the daemon's socket and the client's descriptor. Raises RpcError."""
         try:
             ours, theirs = stream_pair()
@@ -147,7 +147,7 @@ class ClientRecordings:
 
 WAKE_NS: Final = 300_000
 """Maximum time to wake clients in one turn of the event loop, ns. imud wakes the other clients in the next turn."""
-CLIENTS_PER_LOOK: Final = 16
+CLIENTS_PER_CHECK: Final = 16
 """Number of clients that imud wakes between two reads of the clock."""
 
 
@@ -254,7 +254,7 @@ class Hub(Clients):
         now_ns, waiting = self.context.clock.now_ns, self._to_wake[device]
         end_ns = now_ns() + WAKE_NS
         while waiting:
-            for _ in range(min(CLIENTS_PER_LOOK, len(waiting))):
+            for _ in range(min(CLIENTS_PER_CHECK, len(waiting))):
                 self._wake(waiting.pop(), device)
             if waiting and now_ns() > end_ns:
                 asyncio.get_running_loop().call_soon(self._wake_some, device)
@@ -272,7 +272,7 @@ class Hub(Clients):
         if wanting is not None:
             if connection in wanting:
                 del wanting[connection]
-                self.context.latencies.release(_asker(connection, device))
+                self.context.latencies.release(_requester(connection, device))
             if not wanting:
                 del self._wanting_wake[device]
 
@@ -290,7 +290,7 @@ class Hub(Clients):
         self._quota.exchange_form(connection.uid, old and old.key, subscription.key)
         self._stop_sending(connection)
         self._subscriptions[connection.number] = subscription
-        self.context.latencies.ask(_asker(connection), subscription.latency_ns, subscription.devices)
+        self.context.latencies.ask(_requester(connection), subscription.latency_ns, subscription.devices)
         for device, plan in self._plans.items():
             if subscription.matches(device):
                 plan.add(subscription, connection)
@@ -300,7 +300,7 @@ class Hub(Clients):
         subscription = self._stop_sending(connection)
         if subscription is not None:
             self._quota.exchange_form(connection.uid, subscription.key, None)
-            self.context.latencies.release(_asker(connection))
+            self.context.latencies.release(_requester(connection))
 
     def _stop_sending(self, connection: ClientConnection) -> Subscription | None:
         """Remove and return the subscription of a client."""
@@ -327,7 +327,7 @@ class Hub(Clients):
         self._quota.check_waker(uid, sum(len(one.wakers) for one in self.connections.values() if one.uid == uid))
         fd = connection.wakers.make(device, self._quota.check_fds)
         self._wanting_wake.setdefault(device, {})[connection] = None
-        self.context.latencies.ask(_asker(connection, device), latency_ns, (device,))
+        self.context.latencies.ask(_requester(connection, device), latency_ns, (device,))
         return fd
 
     def wakes(self, device: str) -> bool:
@@ -397,6 +397,6 @@ def post_all(connections: Iterable[ClientConnection], body: bytes) -> None:
             connection.on_failure(error)
 
 
-def _asker(connection: ClientConnection, notified: str = "") -> str:
-    """Return the name of a client in latency requests: for its subscription, or for its waker of a device."""
+def _requester(connection: ClientConnection, notified: str = "") -> str:
+    """Return the name of a client in latency requests, for its subscription or for its waker of a device."""
     return f"client {connection.number}" + (f", notify {notified}" if notified else "")

@@ -215,17 +215,17 @@ class Pool:
         self._sample_bytes = 0
         self._other_bytes = 0
         self._order = 0
-        self._moves = 0
+        self._progress = 0
 
     def next_order(self) -> int:
         """Return the order number of the next queued message. The numbers of all clients ascend."""
         self._order += 1
         return self._order
 
-    def next_move(self) -> int:
+    def next_progress(self) -> int:
         """Count a progress event of a client."""
-        self._moves += 1
-        return self._moves
+        self._progress += 1
+        return self._progress
 
     @property
     def held_bytes(self) -> int:
@@ -283,10 +283,10 @@ class Pool:
         for outbox in self._holding:
             users[outbox.uid] += outbox.held_bytes
         uid = max(users, key=users.__getitem__)
-        moves = self._moves
+        progress = self._progress
         return max(
             (outbox for outbox in self._holding if outbox.uid == uid),
-            key=lambda outbox: outbox.held_bytes * (moves - outbox.moved + 1),
+            key=lambda outbox: outbox.held_bytes * (progress - outbox.progress + 1),
         )
 
 
@@ -299,12 +299,6 @@ class Outbox(ABC):
     Synchronization: the event loop's thread.
     """
 
-    __slots__ = (
-        "_limits", "_owned_bytes", "_partial", "_partial_fd", "_pool", "_replies", "_sample_bytes", "_sample_count",
-        "_samples", "_send", "_skip", "_sock", "_unreported", "dropped", "held_bytes", "moved", "reply_bytes", "sent",
-        "uid", "waiting",
-    )  # fmt: skip
-
     def __init__(self, sock: socket.socket, pool: Pool, uid: int) -> None:
         self.uid = uid
         self.sent = 0  # number of samples passed to the socket
@@ -312,8 +306,8 @@ class Outbox(ABC):
         self.waiting = False  # whether anything is queued; then imud appends new messages to the queue
         self.reply_bytes = 0  # size of the queued replies
         self.held_bytes = 0  # memory held for the client without samples, as counted in the pool
-        self.moved = 0  # count of the pool at the last progress of this client
-        self._owned_bytes = 0
+        self.progress = 0  # count of the pool at the last progress of this client
+        self._request_bytes = 0
         self._sock = sock
         self._send = sock.send
         self._limits = pool.limits
@@ -384,7 +378,7 @@ class Outbox(ABC):
                 outbox.sent += samples
             else:
                 delivery = delivery or Delivery(outbox._pool.next_order(), batch, encoding, messages, chosen)
-                outbox._keep_rest(count, delivery)
+                outbox._queue_rest(count, delivery)
 
     def defer(self, delivery: Delivery) -> None:
         """Queue samples because `publish` has no more time. The scheduler sends them."""
@@ -407,11 +401,11 @@ class Outbox(ABC):
         else:
             self._pool.evict()
 
-    def count_owned(self, size_bytes: int) -> None:
+    def set_request_bytes(self, size_bytes: int) -> None:
         """Set the memory of the client's input and of its unfinished answer."""
-        if size_bytes != self._owned_bytes:
-            self._owned_bytes = size_bytes
-            self.moved = self._pool.next_move()
+        if size_bytes != self._request_bytes:
+            self._request_bytes = size_bytes
+            self.progress = self._pool.next_progress()
             self._count_held()
             self._pool.evict()
 
@@ -439,7 +433,7 @@ class Outbox(ABC):
         self._samples.clear()
         self._replies.clear()
         self._partial = b""
-        self.reply_bytes = self._owned_bytes = 0
+        self.reply_bytes = self._request_bytes = 0
         self._pool.remove(self)
         self._pool.count_samples(-self._sample_bytes)
         self._sample_bytes = self._sample_count = 0
@@ -447,7 +441,7 @@ class Outbox(ABC):
 
     # --- queueing ---------------------------------------------------------------------------------------------------
 
-    def _keep_rest(self, count: int, delivery: Delivery) -> None:
+    def _queue_rest(self, count: int, delivery: Delivery) -> None:
         """Queue the rest of a delivery. The socket took its first `count` bytes."""
         messages = delivery.messages()
         whole = 0
@@ -483,11 +477,11 @@ class Outbox(ABC):
 
     def _count_held(self) -> None:
         """Update the memory without samples in the pool."""
-        held = self.reply_bytes + REPLY_BYTES * len(self._replies) + len(self._partial) + self._owned_bytes
+        held = self.reply_bytes + REPLY_BYTES * len(self._replies) + len(self._partial) + self._request_bytes
         change = held - self.held_bytes
         if change:
             if not self.held_bytes:
-                self.moved = self._pool.next_move()
+                self.progress = self._pool.next_progress()
             self.held_bytes = held
             self._pool.count_others(self, change)
 
@@ -522,7 +516,7 @@ class Outbox(ABC):
             return False
         self._partial = self._partial[count:]
         if self._partial or self._samples or self._replies:
-            self.moved = self._pool.next_move()
+            self.progress = self._pool.next_progress()
             self._keep(self.on_deferred)
             return self.waiting
         return self._emptied()

@@ -79,7 +79,7 @@ class Listener:
         self._inode = (0, 0)
         try:
             self._listen(group, control_group)
-            self._take_place()
+            self._rename_file()
         except OSError as error:
             self.close()
             raise ServerError(f"cannot serve at {path}: {_reason(error, self._file)}") from error
@@ -92,10 +92,10 @@ class Listener:
         self.sock.bind(os.fspath(self._file))
         self._inode = _inode_of(self._file)
         _set_access(self._file, self.path, group)
-        _admit(self._file, self.path, gid_of(control_group))
+        _set_acl(self._file, self.path, gid_of(control_group))
         self.sock.listen(BACKLOG)
 
-    def _take_place(self) -> None:
+    def _rename_file(self) -> None:
         """Rename the file to `path`. Raises ServerError if another daemon serves `path`, before or just after."""
         left_behind = _check_free(self.path)
         self._file.rename(self.path)
@@ -210,7 +210,7 @@ def _set_access(file: Path, path: Path, group: str) -> None:
         log.warning("cannot give %s to group %r: the daemon's user is not a member of it", path, group)
 
 
-def _admit(file: Path, path: Path, gid: int | None) -> None:
+def _set_acl(file: Path, path: Path, gid: int | None) -> None:
     """Let the members of another group connect, by an ACL (acl(5)). Do nothing if `gid` is None."""
     if gid is None:
         return
@@ -281,7 +281,7 @@ class SocketServer:
         limits = Limits(settings.queue_samples, settings.queue_bytes)
         pool = Pool(settings.memory_mb * MIB, limits)
         self.hub = Hub(settings.path, context, self._quota, self._time, pool, handle_line)
-        # without a method of this class: each would cost one more call per batch or event
+        # direct references: a method of this class would cost one more call per batch
         self.publish: Final = self.hub.publish
         self.event: Final = self.hub.event
         self.add_device: Final = self.hub.add_device
@@ -348,7 +348,7 @@ class SocketServer:
                 self._pause(error)
                 return
             sock.setblocking(False)
-            self._welcome(sock)
+            self._greet(sock)
 
     def _pause(self, error: OSError) -> None:
         """Accept no client until the next tick. Without a pause, a lack of descriptors would cause a busy loop."""
@@ -359,7 +359,7 @@ class SocketServer:
         asyncio.get_running_loop().remove_reader(self._listener.sock)
         self._paused = True
 
-    def _welcome(self, sock: socket.socket) -> None:
+    def _greet(self, sock: socket.socket) -> None:
         """Greet a client, or refuse it."""
         connection: ClientConnection | None = None
         try:

@@ -15,7 +15,7 @@ from imud.publishers.thinning import NOTHING, RateThinner
 PUBLISH_NS: Final = 1_000_000
 """Maximum time to send a batch, ns. The scheduler serves the remaining clients, in several turns."""
 NEVER_NS: Final = 1 << 63
-CLIENTS_PER_LOOK: Final = 32
+CLIENTS_PER_CHECK: Final = 32
 """Number of clients between two reads of the clock."""
 FORMS_AT_ONCE: Final = 16
 """Maximum number of forms that imud encodes in `publish`. It encodes other forms when it serves their clients."""
@@ -73,12 +73,12 @@ class DeliveryGroup:
     the time cost little.
     """
 
-    def __init__(self, encoding: Encoding, order: Callable[[], int]) -> None:
+    def __init__(self, encoding: Encoding, next_order: Callable[[], int]) -> None:
         self.encoding = encoding
-        self._order = order
+        self._next_order = next_order
         self._rates_hz: dict[Outbox, float] = {}  # rate of each client; 0 for every sample
         self._changed = False  # whether the lists are out of date
-        self._direct: list[list[Outbox]] = []  # clients with every sample, in lists of at most CLIENTS_PER_LOOK
+        self._direct: list[list[Outbox]] = []  # clients with every sample, in lists of at most CLIENTS_PER_CHECK
         self._thinned: dict[float, list[Outbox]] = {}  # clients with a rate, by rate
 
     def __contains__(self, outbox: Outbox) -> bool:
@@ -87,7 +87,7 @@ class DeliveryGroup:
     @property
     def is_small(self) -> bool:
         """Whether the group has so few clients that imud need not limit the time to send."""
-        return len(self._rates_hz) <= CLIENTS_PER_LOOK
+        return len(self._rates_hz) <= CLIENTS_PER_CHECK
 
     def add(self, outbox: Outbox, rate_hz: float) -> None:
         """Add a client. With the rate 0 it gets every sample."""
@@ -124,9 +124,9 @@ class DeliveryGroup:
         if self._changed:
             self._make_lists()
         for indices, outboxes in self._due(chosen):
-            _defer(outboxes, Delivery(self._order(), batch, self.encoding, None, indices))
+            _defer(outboxes, Delivery(self._next_order(), batch, self.encoding, None, indices))
         if self._direct:
-            _defer(chain(*self._direct), Delivery(self._order(), batch, self.encoding, None))
+            _defer(chain(*self._direct), Delivery(self._next_order(), batch, self.encoding, None))
 
     def _make_lists(self) -> None:
         self._changed = False
@@ -151,7 +151,7 @@ class DeliveryGroup:
             if delivery is None and now_ns() < end_ns:
                 Outbox.put_samples(outboxes, messages, batch, self.encoding, chosen)
                 continue
-            delivery = delivery or Delivery(self._order(), batch, self.encoding, messages, chosen)
+            delivery = delivery or Delivery(self._next_order(), batch, self.encoding, messages, chosen)
             _defer(outboxes, delivery)
 
 
@@ -161,20 +161,21 @@ def _defer(outboxes: Iterable[Outbox], delivery: Delivery) -> None:
 
 
 def _in_parts(outboxes: list[Outbox]) -> list[list[Outbox]]:
-    return [outboxes[first : first + CLIENTS_PER_LOOK] for first in range(0, len(outboxes), CLIENTS_PER_LOOK)]
+    return [outboxes[first : first + CLIENTS_PER_CHECK] for first in range(0, len(outboxes), CLIENTS_PER_CHECK)]
 
 
 class DeliveryPlan:
     """The clients that watch one device: a group for each form.
 
-    `order` returns the order number of the next queued message.
+    `next_order` returns the order number of the next queued message.
     """
 
-    def __init__(self, order: Callable[[], int]) -> None:
-        self._next_order = order
+    def __init__(self, next_order: Callable[[], int]) -> None:
+        self._next_order = next_order
         self._thinner = RateThinner()
         self._groups: dict[FormKey, DeliveryGroup] = {}
-        self._order: tuple[DeliveryGroup, ...] = ()
+        # a copy of `_groups`: a client may leave while `send` iterates over it
+        self._in_order: tuple[DeliveryGroup, ...] = ()
         self._only: DeliveryGroup | None = None  # the only group, if it is small; otherwise None
         self._thins = False  # whether a client has a rate
 
@@ -187,7 +188,7 @@ class DeliveryPlan:
         group = self._groups.get(key)
         if group is None:
             group = self._groups[key] = DeliveryGroup(wanted.encoding(), self._next_order)
-            self._order = tuple(self._groups.values())
+            self._in_order = tuple(self._groups.values())
         group.add(outbox, wanted.rate_hz)
         if wanted.rate_hz:
             self._thinner.add(wanted.rate_hz)
@@ -203,20 +204,20 @@ class DeliveryPlan:
             self._thinner.discard(wanted.rate_hz)
         if group.discard(outbox):
             del self._groups[key]
-            self._order = tuple(self._groups.values())
+            self._in_order = tuple(self._groups.values())
         self._note_groups()
 
     def _note_groups(self) -> None:
-        order = self._order
+        groups = self._in_order
         self._thins = bool(self._thinner)
-        self._only = order[0] if len(order) == 1 and order[0].is_small else None
+        self._only = groups[0] if len(groups) == 1 and groups[0].is_small else None
 
     def send(self, batch: Batch, now_ns: Callable[[], int], time: TokenBucket) -> None:
         """Send a batch to all clients: to a small group without a time limit, otherwise for PUBLISH_NS, then queue it.
 
         `time` is the allowance for serving. If it is used up, imud queues the batch for most of many clients.
         """
-        groups = self._order
+        groups = self._in_order
         if not groups:
             return
         chosen = self._thinner.choose(batch.samples) if self._thins else NOTHING

@@ -509,7 +509,7 @@ def test_exactly_the_limit_of_replies_may_wait(sizes: tuple[int, ...]) -> None:
     for size_bytes in sizes:
         outbox.put_reply(bytes(size_bytes))
     assert not outbox.gone
-    outbox.count_owned(50)
+    outbox.set_request_bytes(50)
     held_bytes = 1000 + sum(sizes) + REPLY_BYTES * len(sizes) + 50
     assert (outbox.held_bytes, pool.held_bytes) == (held_bytes, held_bytes)
     outbox.put_reply(bytes(1))
