@@ -182,7 +182,6 @@ LARGE_CONSTRUCTORS = {
     "imud.sampling.steering.Holdover",
     "imud.sim.can_module.PeriodicCanModule",
     "imud.sim.imu61x.registers.Imu61xRegisters",
-    "imud.web.foxglove.Relay",
 }
 """Constructors with more parameters, from before this rule. Add none."""
 

@@ -44,7 +44,7 @@ class Viewer(Protocol):
     """Receiver of messages: the server, or a recorder of a test."""
 
     @property
-    def is_looked_at(self) -> bool:
+    def is_subscribed(self) -> bool:
         """Whether a client has a subscription."""
         ...
 
@@ -77,11 +77,9 @@ class Relay:
         devices: Sequence[str] = (),
         rate_hz: float | None = None,
         noise: Mapping[str, Deviations] | None = None,
-        utc_offset_ns: Callable[[int], int] = lambda now_ns: utc_offset_ns(clock_ahead_ns(now_ns)),
     ) -> None:
         """Relay `devices` (empty: all) with at most `rate_hz` samples per second (None: every sample).
 
-        `utc_offset_ns` receives the present CLOCK_MONOTONIC of the daemon and returns UTC minus this time, ns.
         `noise` replaces the noise in the daemon's configuration, by device.
         """
         self._path = path
@@ -89,7 +87,6 @@ class Relay:
         self._wanted = list(devices)
         self._rate_hz = rate_hz
         self._noise = noise or {}
-        self._utc_offset_of = utc_offset_ns
         self._utc_offset_ns = 0  # UTC minus CLOCK_MONOTONIC at the newest status
         self._dialect = dialect
         self._events = dialect.events()
@@ -124,7 +121,7 @@ class Relay:
             if monotonic() >= due_s:
                 self._show_status(client)
                 due_s = monotonic() + STATUS_S
-            if not self._viewer.is_looked_at:
+            if not self._viewer.is_subscribed:
                 if watch is not None:
                     client.unwatch()
                     watch = None
@@ -160,7 +157,7 @@ class Relay:
     def _show_status(self, client: Client) -> None:
         answer = client.status()
         statuses = msgspec.convert(answer["devices"], list[DeviceStatus])
-        self._utc_offset_ns = self._utc_offset_of(answer["now_ns"])
+        self._utc_offset_ns = utc_offset_ns(clock_ahead_ns(answer["now_ns"]))
         utc_ns = answer["now_ns"] + self._utc_offset_ns
         self._viewer.problem("")
         shown = {status.name: status for status in statuses if not self._wanted or status.name in self._wanted}
@@ -439,7 +436,7 @@ class FoxgloveServer:
         self.url: Final = f"ws://{f'[{host}]' if ':' in host else host}:{self._gate.port}"
 
     @property
-    def is_looked_at(self) -> bool:
+    def is_subscribed(self) -> bool:
         return any(channel.has_sinks() for channel in self._channels.values())
 
     def open(self, channel: MessageChannel[Any]) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from queue import Queue
 from threading import Thread
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import msgspec
 import pytest
@@ -35,7 +36,7 @@ class Said(NamedTuple):
 
 class FakeViewer:
     def __init__(self) -> None:
-        self.is_looked_at = True
+        self.is_subscribed = True
         self.said: Queue[Said] = Queue()
 
     def open(self, channel: MessageChannel[Any]) -> None:
@@ -61,15 +62,16 @@ class FakeViewer:
 
 @contextmanager
 def relaying(path: str | Path, viewer: FakeViewer, dialect: Dialect | None = None, **options: Any) -> Iterator[Relay]:
-    relay = Relay(str(path), viewer, dialect or JsonDialect(), utc_offset_ns=lambda _now_ns: OFFSET_NS, **options)
+    relay = Relay(str(path), viewer, dialect or JsonDialect(), **options)
     thread = Thread(target=relay.run)
-    thread.start()
-    try:
-        yield relay
-    finally:
-        relay.stop()
-        thread.join(LIMIT_S)
-        assert not thread.is_alive()
+    with patch("imud.web.foxglove.utc_offset_ns", lambda _ahead_ns: OFFSET_NS):
+        thread.start()
+        try:
+            yield relay
+        finally:
+            relay.stop()
+            thread.join(LIMIT_S)
+            assert not thread.is_alive()
 
 
 def test_samples_events_and_status_come(tmp_path: Path) -> None:
@@ -97,7 +99,7 @@ def test_samples_events_and_status_come(tmp_path: Path) -> None:
 
 def test_without_a_subscription_events_arrive_and_samples_are_not_requested(tmp_path: Path) -> None:
     viewer = FakeViewer()
-    viewer.is_looked_at = False
+    viewer.is_subscribed = False
     with daemon(tmp_path) as served, relaying(served.path, viewer):
         viewer.wait_for("/imu1/status")
         served.do(lambda server: server.publish(batch("imu0", 1)))
@@ -106,7 +108,7 @@ def test_without_a_subscription_events_arrive_and_samples_are_not_requested(tmp_
         while missing:
             missing.discard(viewer.said.get(timeout=LIMIT_S).topic)
         assert not served.do(lambda server: any(client.encoding for client in server.hub.clients()))
-        viewer.is_looked_at = True
+        viewer.is_subscribed = True
         while not served.do(lambda server: any(client.encoding for client in server.hub.clients())):
             viewer.said.get(timeout=LIMIT_S)  # the relay subscribes with one of the next status messages
         served.do(lambda server: server.publish(batch("imu0", 2)))

@@ -38,14 +38,14 @@ def test_messages_reach_a_client_that_subscribed() -> None:
             server.open(channel)
         server.open(events)
         server.open(events)
-        assert not server.is_looked_at
+        assert not server.is_subscribed
         async with connected(server.url) as client:
             await client.subscribe("/bow/attitude")
             await client.subscribe("/events")
             imu = client.channels["/bow/imu/data"]
             assert (imu["encoding"], imu["schemaName"], imu["schemaEncoding"]) == ("json", "imud.Imu", "jsonschema")
             assert json.loads(imu["schema"])["title"] == "imud.Imu"
-            while not server.is_looked_at:
+            while not server.is_subscribed:
                 await asyncio.sleep(0)
             got: dict[str, Any] = {}
             while len(got) < 2:
