@@ -207,27 +207,27 @@ class Hello(msgspec.Struct, frozen=True):
     rights: tuple[str, ...]  # `read`, `control`
 
 
-class WatchAnswer(msgspec.Struct, frozen=True):
+class WatchReply(msgspec.Struct, frozen=True):
     """Reply to `watch`, without the members that the client does not use."""
 
     devices: dict[str, int]
     convention: str | None = None
 
 
-class PollAnswer(msgspec.Struct, frozen=True):
+class PollReply(msgspec.Struct, frozen=True):
     """Reply to `poll`."""
 
     samples: list[dict[str, Any]]
     convention: str | None = None
 
 
-class StopAnswer(msgspec.Struct, frozen=True):
+class StopReply(msgspec.Struct, frozen=True):
     """Reply to `record.stop`."""
 
     records_dropped: int
 
 
-class SnapshotAnswer(msgspec.Struct, frozen=True):
+class SnapshotReply(msgspec.Struct, frozen=True):
     """Reply to `record.snapshot`."""
 
     seconds: float
@@ -278,19 +278,19 @@ class Client:
 
     def devices(self) -> list[dict[str, Any]]:
         """Return the devices."""
-        return self._answer("devices", list[dict[str, Any]])
+        return self._request("devices", list[dict[str, Any]])
 
     def status(self) -> dict[str, Any]:
         """Return the complete status: `now_ns`, `devices`, `socket`."""
-        return self._answer("status", dict[str, Any])
+        return self._request("status", dict[str, Any])
 
     def schema(self) -> dict[str, Any]:
         """Return the descriptions of the members of samples: `fields`, `devices`, `slot`."""
-        return self._answer("schema", dict[str, Any])
+        return self._request("schema", dict[str, Any])
 
     def poll(self, devices: Iterable[str] | None = None, convention: str | None = None) -> list[Sample]:
         """Return the newest sample of each device, without devices that have no sample. `convention` as for `watch`."""
-        reply = self._answer("poll", PollAnswer, devices=_listed(devices), convention=convention)
+        reply = self._request("poll", PollReply, devices=_listed(devices), convention=convention)
         _check_convention(reply.convention, convention)
         return [sample_of(params) for params in reply.samples]
 
@@ -332,8 +332,8 @@ class Client:
         - `timeout_s`: the iterator raises TimeoutError if no sample arrives in this time.
         """
         wanted = None if fields is None else sorted({*fields, "t_err_ns", "sync", "t_rx_ns", "utc_ns"})
-        reply = self._answer(
-            "watch", WatchAnswer, devices=_listed(devices), fields=wanted, rate_hz=_finite(rate_hz), encoding=encoding,
+        reply = self._request(
+            "watch", WatchReply, devices=_listed(devices), fields=wanted, rate_hz=_finite(rate_hz), encoding=encoding,
             convention=convention, latency_ms=_finite(latency_ms),
         )  # fmt: skip
         if encoding == "binary":
@@ -377,14 +377,14 @@ class Client:
 
     def stop_recording(self) -> int:
         """Stop the recording. imud still sends its queue, then end of file. Return the number of dropped records."""
-        return self._answer("record.stop", StopAnswer).records_dropped
+        return self._request("record.stop", StopReply).records_dropped
 
     def snapshot(self) -> tuple[int, float]:
         """Return a descriptor to read the flight recorder's content from, as `record`, and its duration, s.
 
         Raises RpcError if the configuration has no flight recorder.
         """
-        seconds = self._answer("record.snapshot", SnapshotAnswer).seconds
+        seconds = self._request("record.snapshot", SnapshotReply).seconds
         return self._descriptor("record.snapshot"), seconds
 
     # --- messages ---------------------------------------------------------------------------------------------------
@@ -407,7 +407,7 @@ class Client:
             self._keep(message)
         return message
 
-    def _answer(self, method: str, kind: type[T], **params: object) -> T:
+    def _request(self, method: str, kind: type[T], **params: object) -> T:
         """Call a method and return its result as `kind`. Raises ServerError if the result has another form."""
         result = self.call(method, **params)
         try:

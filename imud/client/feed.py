@@ -158,12 +158,12 @@ class _Reading:
         news = News()
         now_s = monotonic()
         if now_s >= self._status_due_s:
-            answer = self._client.status()
-            self._ahead_ns = clock_ahead_ns(answer["now_ns"])
-            statuses = msgspec.convert(answer["devices"], tuple[DeviceStatus, ...])
+            reply = self._client.status()
+            self._ahead_ns = clock_ahead_ns(reply["now_ns"])
+            statuses = msgspec.convert(reply["devices"], tuple[DeviceStatus, ...])
             self._known = frozenset(status.name for status in statuses)
             self._status_due_s = now_s + _pause_s(STATUS_S, len(statuses))
-            news = News(statuses=statuses, clients=len(answer["socket"]["clients"]))
+            news = News(statuses=statuses, clients=len(reply["socket"]["clients"]))
         if wanted.newest and now_s >= self._newest_due_s:
             news = news._replace(newest=tuple(self._client.poll()), newest_ns=monotonic_ns() + self._ahead_ns)
             self._newest_due_s = now_s + _pause_s(wanted.newest_s, len(self._known))

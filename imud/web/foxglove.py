@@ -155,10 +155,10 @@ class Relay:
             self._viewer.send(self._diagnostics, diagnoses, diagnoses.utc_ns)
 
     def _show_status(self, client: Client) -> None:
-        answer = client.status()
-        statuses = msgspec.convert(answer["devices"], list[DeviceStatus])
-        self._utc_offset_ns = utc_offset_ns(clock_ahead_ns(answer["now_ns"]))
-        utc_ns = answer["now_ns"] + self._utc_offset_ns
+        reply = client.status()
+        statuses = msgspec.convert(reply["devices"], list[DeviceStatus])
+        self._utc_offset_ns = utc_offset_ns(clock_ahead_ns(reply["now_ns"]))
+        utc_ns = reply["now_ns"] + self._utc_offset_ns
         self._viewer.problem("")
         shown = {status.name: status for status in statuses if not self._wanted or status.name in self._wanted}
         for name in self._devices.keys() - shown.keys():

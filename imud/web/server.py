@@ -29,11 +29,11 @@ READING: Final = frozenset(("settings.get", "actions", "calibrations", "schema")
 """Methods that need the right to read."""
 CONTROLLING: Final = frozenset(("settings.plan", "settings.apply", "command", "calibrate", "stop_calibration"))
 """Methods that need the right to control, here and at the daemon."""
-ANSWER_S: Final = 10.0
-LONG_ANSWER_S: Final = 660.0
+REPLY_S: Final = 10.0
+LONG_REPLY_S: Final = 660.0
 """Time limit of long requests, s. The daemon ends a calibration after 600 s."""
 LONG: Final = frozenset(("command", "calibrate", "settings.apply"))
-ANSWER_BYTES_MAX: Final = 1 << 22
+REPLY_BYTES_MAX: Final = 1 << 22
 """Maximum size of a reply, bytes: ten times the reply to `schema` for 256 devices."""
 AT_A_TIME_MAX: Final = 16
 """Maximum number of concurrent requests. Each uses a connection to the daemon."""
@@ -59,7 +59,7 @@ class Calls:
             raise Busy(f"the limit of {AT_A_TIME_MAX} concurrent requests is reached; try again later")
         self._count += 1
         try:
-            async with asyncio.timeout(LONG_ANSWER_S if method in LONG else ANSWER_S):
+            async with asyncio.timeout(LONG_REPLY_S if method in LONG else REPLY_S):
                 return await self._request(method, params)
         except TimeoutError:
             raise TimeoutError(f"{self._path}: no reply of the daemon to {method} within the time limit") from None
@@ -68,7 +68,7 @@ class Calls:
 
     async def _request(self, method: str, params: Mapping[str, Any]) -> Any:
         try:
-            reader, writer = await asyncio.open_unix_connection(self._path, limit=ANSWER_BYTES_MAX)
+            reader, writer = await asyncio.open_unix_connection(self._path, limit=REPLY_BYTES_MAX)
         except PermissionError as error:
             raise LinkDenied(f"no permission for {self._path}: is the user of imud web in group imud?") from error
         except OSError as error:
@@ -81,21 +81,21 @@ class Calls:
                 raise ServerError(f"{self._path}: expected a daemon of protocol {PROTOCOL}")
             writer.write(line_of(encode_request(method, params, 1)))
             await writer.drain()
-            while (answer := await self._message(reader)).get("id", 0) not in (1, None):
+            while (reply := await self._message(reader)).get("id", 0) not in (1, None):
                 pass
         except OSError as error:
             raise LinkMissing(f"{self._path}: the connection to the daemon is lost: {reason_of(error)}") from error
         finally:
             writer.close()
-        if "error" in answer:
-            raise rpc_error(answer["error"])
-        return answer.get("result")
+        if "error" in reply:
+            raise rpc_error(reply["error"])
+        return reply.get("result")
 
     async def _message(self, reader: asyncio.StreamReader) -> dict[str, Any]:
         try:
             line = await reader.readline()
         except ValueError:
-            raise ServerError(f"{self._path}: expected a reply of at most {ANSWER_BYTES_MAX} bytes") from None
+            raise ServerError(f"{self._path}: expected a reply of at most {REPLY_BYTES_MAX} bytes") from None
         if not line.endswith(b"\n"):
             raise LinkMissing(f"{self._path}: the daemon closed the connection")
         return parse_object(line)
@@ -170,7 +170,7 @@ class WebServer:
 
     async def _session(self, request: web.Request) -> web.StreamResponse:
         rights = self._rights_of(request)
-        return _answer(
+        return _reply(
             {"read": rights.read, "control": rights.control, "has_token": self._guard.has_token, "version": __version__}
         )
 
@@ -183,7 +183,7 @@ class WebServer:
             return _refusal(403, "this server has no token, so no login is possible; start imud web with --token-file")
         if not self._guard.is_token(token):
             return await self._wrong_token()
-        response = _answer({"control": True})
+        response = _reply({"control": True})
         response.set_cookie(COOKIE, self._guard.new_session(), max_age=SESSION_S, httponly=True, samesite="Strict")
         return response
 
@@ -198,7 +198,7 @@ class WebServer:
         return _refusal(401, "wrong token")
 
     async def _logout(self, _request: web.Request) -> web.StreamResponse:
-        response = _answer({"control": False})
+        response = _reply({"control": False})
         response.del_cookie(COOKIE, httponly=True, samesite="Strict")
         return response
 
@@ -248,13 +248,13 @@ class WebServer:
         is_control = asked.method in CONTROLLING or asked.params.get("fresh") not in (None, False)
         if not (rights.control if is_control else rights.read):
             return _refusal(401, "no permission; log in with the token")
-        return await self._answered(asked)
+        return await self._forwarded(asked)
 
-    async def _answered(self, asked: messages.CallRequest) -> web.Response:
+    async def _forwarded(self, asked: messages.CallRequest) -> web.Response:
         try:
-            return _answer({"result": await self._calls.call(asked.method, asked.params)})
+            return _reply({"result": await self._calls.call(asked.method, asked.params)})
         except RpcError as error:
-            return _answer({"error": str(error), "code": error.code})
+            return _reply({"error": str(error), "code": error.code})
         except Busy as error:
             return _refusal(503, str(error))
         except (ImudError, TimeoutError) as error:
@@ -273,7 +273,7 @@ async def _add_headers(_request: web.Request, response: web.StreamResponse) -> N
     response.headers["Server"] = "imud"
 
 
-def _answer(value: object) -> web.Response:
+def _reply(value: object) -> web.Response:
     return web.Response(body=msgspec.json.encode(value), content_type="application/json")
 
 

@@ -37,7 +37,7 @@ def publish(served: Daemon, *batches: Batch) -> None:
     served.do(work)
 
 
-def test_questions(served: Daemon) -> None:
+def test_requests(served: Daemon) -> None:
     with Client(served.path) as client:
         assert (client.hello.protocol, client.hello.epoch) == (1, EPOCH)
         assert "read" in client.hello.rights

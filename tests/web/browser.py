@@ -20,7 +20,7 @@ from tests.support.files import hi91
 from tests.test_daemon import Cable, device
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-MISSING = "" if CHROMIUM and CHROMEDRIVER else "no chromium and chromedriver on this machine (make web-deps)"
+MISSING = "" if CHROMIUM and CHROMEDRIVER else "no chromium and chromedriver on this host (make web-deps)"
 LOOK_S: Final = 0.05
 PHONE: Final = (390, 844)
 PERIOD_MS: Final = 5

@@ -50,7 +50,7 @@ def test_the_plot_contains_every_sent_peak(page: Page, tmp_path: Path) -> None:
     lowest = {
         value for value, most in zip(np.round(least, 4), greatest, strict=True) if value < 15 or most > value + 1e-4
     }
-    assert lowest == {9.5}, "one of forty samples is a peak, alone in its bucket only where the machine was late"
+    assert lowest == {9.5}, "one of forty samples is a peak, alone in its bucket only if the host was late"
     known = np.array([peaks(number) for number in range(measured)])
     plotted = [value for value in greatest if value > 15]
     assert len(plotted) >= 10, "a peak each 0.2 s"

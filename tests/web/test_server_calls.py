@@ -12,14 +12,14 @@ from tests.support import socket_rig
 from tests.support.socket_rig import serving
 
 
-async def test_a_question_is_answered_or_refused_and_its_connection_ends(tmp_path: Path) -> None:
+async def test_a_request_uses_a_connection_that_ends_after_the_reply(tmp_path: Path) -> None:
     async with serving(tmp_path) as server:
         calls = Calls(server.hub.path)
         report = await calls.call("settings.get", {"device": "imu0"})
         assert report["settings"][0]["actual"] == "6-axis"
         arguments = {"message": "HI91", "rate_hz": 5}
-        order = {"device": "imu0", "name": "output", "arguments": arguments}
-        assert await calls.call("command", order) is None
+        request = {"device": "imu0", "name": "output", "arguments": arguments}
+        assert await calls.call("command", request) is None
         await socket_rig.until(lambda: not server.hub.connections)
         with pytest.raises(RpcError, match="no device named 'none'") as caught:
             await Calls(server.hub.path).call("actions", {"device": "none"})
@@ -30,11 +30,11 @@ async def test_long_orders_hold_up_no_others_and_are_bounded(tmp_path: Path) -> 
     socket_rig.done_late = asyncio.Event()
     async with serving(tmp_path) as server:
         calls = Calls(server.hub.path)
-        order = {"device": "imu0", "name": "wait", "arguments": {}}
-        waiting = [asyncio.create_task(calls.call("command", order)) for _ in range(AT_A_TIME_MAX - 1)]
+        request = {"device": "imu0", "name": "wait", "arguments": {}}
+        waiting = [asyncio.create_task(calls.call("command", request)) for _ in range(AT_A_TIME_MAX - 1)]
         assert await calls.call("actions", {"device": "imu1"})
         await socket_rig.until(lambda: len(server.hub.connections) == AT_A_TIME_MAX - 1)
-        waiting.append(asyncio.create_task(calls.call("command", order)))
+        waiting.append(asyncio.create_task(calls.call("command", request)))
         await socket_rig.until(lambda: len(server.hub.connections) == AT_A_TIME_MAX)
         with pytest.raises(Busy, match="try again"):
             await calls.call("actions", {"device": "imu1"})

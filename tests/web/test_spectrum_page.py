@@ -68,7 +68,7 @@ def test_lost_samples_are_counted_and_a_vibration_keeps_its_frequency_and_size(p
             )
             note = page.text("#spectrum .quiet")
         assert page.problems() == []
-    assert rate_hz == pytest.approx(RATE_HZ, rel=0.005), "the rate of the module, not of what is left"
+    assert rate_hz == pytest.approx(RATE_HZ, rel=0.005), "the rate of the device, not of the received samples"
     power = np.array(density, dtype=float) ** 2 * (frequencies[1] - frequencies[0])
     at = int(np.argmax(power))
     assert frequencies[at] == pytest.approx(WAVE_HZ, abs=RATE_HZ / 512)

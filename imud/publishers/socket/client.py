@@ -157,7 +157,7 @@ class Clients(ABC):
         self._failures = RateLimitedLog(now_ns)
 
     @abstractmethod
-    def answer(self, connection: "ClientConnection", line: bytes) -> None:
+    def handle_line(self, connection: "ClientConnection", line: bytes) -> None:
         """Carry out the request in `line`."""
 
     @abstractmethod
@@ -192,7 +192,7 @@ class ClientConnection(Outbox, ScheduledClient):
         self._scheduler = scheduler
         self._input = bytearray()
         self._searched = 0  # bytes of the input that contain no newline
-        self._work: Iterator[int] | None = None  # an unfinished answer
+        self._work: Iterator[int] | None = None  # an unfinished reply
         self._work_bytes = 0
         self._readable = self._writable = False
         self._linger_ticks: int | None = None
@@ -206,7 +206,7 @@ class ClientConnection(Outbox, ScheduledClient):
 
     @property
     def unread_bytes(self) -> int:
-        """Bytes of the requests that are not carried out yet, and of the unfinished answer."""
+        """Bytes of the requests that are not carried out yet, and of the unfinished reply."""
         return len(self._input) + self._work_bytes
 
     @property
@@ -229,9 +229,9 @@ class ClientConnection(Outbox, ScheduledClient):
         )
 
     def work_on(self, work: Iterator[int]) -> None:
-        """Make an answer in pieces: one now, the others in later turns. Read no request until it is complete.
+        """Make a reply in pieces: one now, the others in later turns. Read no request until it is complete.
 
-        Each piece yields the number of bytes that the answer occupies so far. The last piece posts the answer.
+        Each piece yields the number of bytes that the reply occupies so far. The last piece posts the reply.
         """
         self._work = work
         self._step()
@@ -335,7 +335,7 @@ class ClientConnection(Outbox, ScheduledClient):
             self._read()
             line = self._next_line()
         if line is not None:
-            self._clients.answer(self, line)
+            self._clients.handle_line(self, line)
 
     def _read(self) -> None:
         try:

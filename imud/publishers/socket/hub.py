@@ -278,7 +278,7 @@ class Hub(Clients):
 
     # --- requests of a client -----------------------------------------------------------------------------------------
 
-    def answer(self, connection: ClientConnection, line: bytes) -> None:
+    def handle_line(self, connection: ClientConnection, line: bytes) -> None:
         self._handle_line(self, connection, line)
 
     def subscribe(self, connection: ClientConnection, subscription: Subscription) -> None:

@@ -68,9 +68,9 @@ from imud.publishers.socket.outbox import NO_FD, selector
 from imud.publishers.socket.subscription import Form, Subscription
 
 DEVICES_PER_PIECE: Final = 8
-"""Number of devices in one piece of an answer: about 0.3 ms; 0.5 ms with big numbers as strings."""
+"""Number of devices in one piece of a reply: about 0.3 ms; 0.5 ms with big numbers as strings."""
 CLIENTS_PER_PIECE: Final = 64
-"""Number of clients in one piece of an answer: about 0.3 ms."""
+"""Number of clients in one piece of a reply: about 0.3 ms."""
 RATE_MIN_HZ: Final = 0.001
 """Minimum `rate_hz`. A lower rate is probably a wrong unit, and `poll` can replace it."""
 RATE_MAX_HZ: Final = 1_000_000
@@ -93,8 +93,8 @@ SLOT_SCHEMA: Final = SlotSchema(
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """The answer of a method."""
+class MethodReply:
+    """The reply of a method."""
 
     result: object
     fd: int = NO_FD  # descriptor; imud sends a copy with the reply
@@ -102,10 +102,10 @@ class Answer:
     big_numbers: bool = True  # whether `result` may contain integers above 2⁵³ that are not converted to strings yet
 
 
-Pieces = Generator[int, None, Answer]
-"""An answer in pieces. Each piece yields the number of bytes that the answer occupies so far."""
+Pieces = Generator[int, None, MethodReply]
+"""A reply in pieces. Each piece yields the number of bytes that the reply occupies so far."""
 Later = Coroutine[Any, Any, object]
-"""A result that takes time. imud answers other requests of the client before it. May raise ImudError."""
+"""A result that takes time. imud carries out other requests of the client before it. May raise ImudError."""
 P = TypeVar("P", bound=msgspec.Struct)
 
 
@@ -114,7 +114,7 @@ class Method(Generic[P]):
     """A row of METHODS."""
 
     params: type[P]
-    run: Callable[[Hub, ClientConnection, P], Answer | Pieces | Later]
+    run: Callable[[Hub, ClientConnection, P], MethodReply | Pieces | Later]
     right: Rights = Rights.READ  # the right that the client needs
     acts: bool = False
     """Whether the method has an effect other than its reply. Otherwise imud ignores a request without `id`."""
@@ -138,22 +138,22 @@ def handle_line(hub: Hub, connection: ClientConnection, line: bytes) -> None:
         connection.post(encode_error(error))
         return
     try:
-        answer = _call(hub, connection, request)
+        reply = _call(hub, connection, request)
     except RpcError as error:
         if request.wants_reply:
             connection.post(encode_error(RpcError(error.code, str(error), request.request_id)))
         return
-    if answer is None:
+    if reply is None:
         return
-    if isinstance(answer, Generator):
-        connection.work_on(_answer_in_pieces(connection, request, answer))
-    elif isinstance(answer, Answer):
-        _send(connection, request, answer)
+    if isinstance(reply, Generator):
+        connection.work_on(_reply_in_pieces(connection, request, reply))
+    elif isinstance(reply, MethodReply):
+        _send(connection, request, reply)
     else:
-        hub.do_later(connection, _answer_later(connection, request, answer))
+        hub.do_later(connection, _reply_later(connection, request, reply))
 
 
-def _call(hub: Hub, connection: ClientConnection, request: RpcRequest) -> Answer | Pieces | Later | None:
+def _call(hub: Hub, connection: ClientConnection, request: RpcRequest) -> MethodReply | Pieces | Later | None:
     """Check the request, and run its method. Raises RpcError."""
     method = METHODS.get(request.method)
     if method is None:
@@ -171,20 +171,20 @@ def _call(hub: Hub, connection: ClientConnection, request: RpcRequest) -> Answer
     return method.run(hub, connection, params)
 
 
-def _send(connection: ClientConnection, request: RpcRequest, answer: Answer) -> None:
+def _send(connection: ClientConnection, request: RpcRequest, reply: MethodReply) -> None:
     if request.wants_reply:
-        texts = connection.text_numbers and answer.big_numbers
-        connection.post(encode_result(request.request_id, answer.result, texts=texts), answer.fd)
-    if answer.framed_from_here:
+        texts = connection.text_numbers and reply.big_numbers
+        connection.post(encode_result(request.request_id, reply.result, texts=texts), reply.fd)
+    if reply.framed_from_here:
         connection.framed = True
 
 
-def _answer_in_pieces(connection: ClientConnection, request: RpcRequest, pieces: Pieces) -> Iterator[int]:
-    answer = yield from pieces
-    _send(connection, request, answer)
+def _reply_in_pieces(connection: ClientConnection, request: RpcRequest, pieces: Pieces) -> Iterator[int]:
+    reply = yield from pieces
+    _send(connection, request, reply)
 
 
-async def _answer_later(connection: ClientConnection, request: RpcRequest, later: Later) -> None:
+async def _reply_later(connection: ClientConnection, request: RpcRequest, later: Later) -> None:
     try:
         try:
             result = await later
@@ -210,7 +210,7 @@ def _devices(hub: Hub, connection: ClientConnection, _params: NoParams) -> Piece
         for one in hub.context.devices.each_status()
     )  # fmt: skip
     made = yield from _encoded(summaries, DEVICES_PER_PIECE, connection.text_numbers)
-    return Answer(made, big_numbers=False)
+    return MethodReply(made, big_numbers=False)
 
 
 def _status(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces:
@@ -220,7 +220,9 @@ def _status(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces
     clients = yield from _encoded(hub.each_client(), CLIENTS_PER_PIECE, texts, held_bytes)
     now_ns = hub.context.clock.now_ns()
     socket = msgspec.structs.asdict(hub.status(())) | {"clients": clients}
-    return Answer({"now_ns": str(now_ns) if texts else now_ns, "devices": made, "socket": socket}, big_numbers=False)
+    return MethodReply(
+        {"now_ns": str(now_ns) if texts else now_ns, "devices": made, "socket": socket}, big_numbers=False
+    )
 
 
 def _schema(hub: Hub, _connection: ClientConnection, _params: NoParams) -> Pieces:
@@ -235,13 +237,13 @@ def _schema(hub: Hub, _connection: ClientConnection, _params: NoParams) -> Piece
     bounds, states = list(LATENCY_BOUNDS_NS), list(DeviceState)
     result = SchemaResult(PROTOCOL, list(SAMPLE_SCHEMA), {}, SLOT_SCHEMA, bounds, states)
     of_devices = {"devices": dict(zip(names, made, strict=True))}
-    return Answer(msgspec.structs.asdict(result) | of_devices, big_numbers=False)
+    return MethodReply(msgspec.structs.asdict(result) | of_devices, big_numbers=False)
 
 
 def _encoded(
     values: Iterable[object], per_piece: int, texts: bool, held_bytes: int = 0
 ) -> Generator[int, None, list[msgspec.Raw]]:
-    """Encode `per_piece` values in each piece. `held_bytes` is the size of the earlier parts of the answer."""
+    """Encode `per_piece` values in each piece. `held_bytes` is the size of the earlier parts of the reply."""
     made: list[msgspec.Raw] = []
     for value in values:
         if made and not len(made) % per_piece:
@@ -262,18 +264,18 @@ def _frame_of(device: DeviceStatus) -> DeviceFrame:
     return known
 
 
-def _options(hub: Hub, connection: ClientConnection, params: OptionsParams) -> Answer:
+def _options(hub: Hub, connection: ClientConnection, params: OptionsParams) -> MethodReply:
     """Set the form of big numbers on this connection. A running `watch` does not change."""
     if params.big_numbers is not None:
         connection.text_numbers = params.big_numbers is BigNumbers.STRING
     form = BigNumbers.STRING if connection.text_numbers else BigNumbers.NUMBER
-    return Answer(OptionsResult(form, hub.context.epoch))
+    return MethodReply(OptionsResult(form, hub.context.epoch))
 
 
 # --- samples and events ---------------------------------------------------------------------------------------------
 
 
-def _watch(hub: Hub, connection: ClientConnection, params: WatchParams) -> Answer:
+def _watch(hub: Hub, connection: ClientConnection, params: WatchParams) -> MethodReply:
     devices = _known_devices(hub, params.devices)
     fields = _known_fields(params.fields)
     rate_hz = _rate(params.rate_hz)
@@ -287,21 +289,21 @@ def _watch(hub: Hub, connection: ClientConnection, params: WatchParams) -> Answe
     hub.subscribe(connection, wanted)
     numbers = hub.devices if devices is None else {name: hub.devices[name] for name in devices}
     result = WatchResult(form, dict(numbers), rate_hz, latency_ms, params.convention)
-    return Answer(result, framed_from_here=form is Form.BINARY)
+    return MethodReply(result, framed_from_here=form is Form.BINARY)
 
 
-def _unwatch(hub: Hub, connection: ClientConnection, _params: NoParams) -> Answer:
+def _unwatch(hub: Hub, connection: ClientConnection, _params: NoParams) -> MethodReply:
     """Stop sending samples. imud still sends the queued samples."""
     hub.unsubscribe(connection)
-    return Answer(NothingMore())
+    return MethodReply(NothingMore())
 
 
-def _poll(hub: Hub, _connection: ClientConnection, params: PollParams) -> Answer:
+def _poll(hub: Hub, _connection: ClientConnection, params: PollParams) -> MethodReply:
     names = _known_devices(hub, params.devices) or tuple(hub.devices)
     fields = _known_fields(params.fields)
     newest = [_newest_of(hub.newest[name], params.convention) for name in names if name in hub.newest]
     samples = newest if fields is None else list(map(selector(fields), newest))
-    return Answer(PollResult(hub.context.clock.now_ns(), samples, params.convention))
+    return MethodReply(PollResult(hub.context.clock.now_ns(), samples, params.convention))
 
 
 def _newest_of(batch: Batch, convention: Convention | None) -> Sample:
@@ -311,21 +313,21 @@ def _newest_of(batch: Batch, convention: Convention | None) -> Sample:
     return sample if rotation is None else rotation.sample(sample)
 
 
-def _events(hub: Hub, connection: ClientConnection, params: EventsParams) -> Answer:
+def _events(hub: Hub, connection: ClientConnection, params: EventsParams) -> MethodReply:
     devices = _known_devices(hub, params.devices)
     enable = params.enable is not False
     if enable:
         hub.subscribe_events(connection, devices)
     else:
         hub.unsubscribe_events(connection)
-    return Answer(EventsResult(enable))
+    return MethodReply(EventsResult(enable))
 
 
-def _notify(hub: Hub, connection: ClientConnection, params: NotifyParams) -> Answer:
+def _notify(hub: Hub, connection: ClientConnection, params: NotifyParams) -> MethodReply:
     _known_devices(hub, [params.device])
     latency_ms = _latency_ms(params.latency_ms, 0.0)
     fd = hub.make_waker(connection, params.device, round(latency_ms * NS_PER_MS))
-    return Answer(NotifyResult(params.device, latency_ms), fd)
+    return MethodReply(NotifyResult(params.device, latency_ms), fd)
 
 
 # --- commands, calibrations, settings -------------------------------------------------------------------------------
@@ -337,8 +339,8 @@ def _control(hub: Hub, device: str) -> DeviceControl:
     return hub.context.devices.control(device)
 
 
-def _actions(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> Answer:
-    return Answer(described(_control(hub, params.device).actions))
+def _actions(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> MethodReply:
+    return MethodReply(described(_control(hub, params.device).actions))
 
 
 def _command(hub: Hub, connection: ClientConnection, params: CommandParams) -> Later:
@@ -348,8 +350,8 @@ def _command(hub: Hub, connection: ClientConnection, params: CommandParams) -> L
     return control.act(params.name, params.arguments or {})
 
 
-def _calibrations(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> Answer:
-    return Answer(infos(_control(hub, params.device).calibrations))
+def _calibrations(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> MethodReply:
+    return MethodReply(infos(_control(hub, params.device).calibrations))
 
 
 def _calibrate(hub: Hub, connection: ClientConnection, params: CalibrateParams) -> Later:
@@ -359,9 +361,9 @@ def _calibrate(hub: Hub, connection: ClientConnection, params: CalibrateParams) 
     return control.calibrate(params.kind, save=bool(params.save))
 
 
-def _stop_calibration(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> Answer:
+def _stop_calibration(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> MethodReply:
     """Stop the running calibration of a device, also if another client started it."""
-    return Answer(StopResult(_control(hub, params.device).stop_calibration()))
+    return MethodReply(StopResult(_control(hub, params.device).stop_calibration()))
 
 
 def _settings(hub: Hub, connection: ClientConnection, params: SettingsParams) -> Later:
@@ -400,19 +402,19 @@ def _check_name(method: str, name: str) -> None:
 # --- recordings -----------------------------------------------------------------------------------------------------
 
 
-def _record_start(hub: Hub, connection: ClientConnection, params: RecordParams) -> Answer:
+def _record_start(hub: Hub, connection: ClientConnection, params: RecordParams) -> MethodReply:
     devices = _known_devices(hub, params.devices)
     fd = hub.recordings.start(connection, devices)
-    return Answer(RecordResult(None if devices is None else list(devices)), fd)
+    return MethodReply(RecordResult(None if devices is None else list(devices)), fd)
 
 
-def _record_stop(hub: Hub, connection: ClientConnection, _params: NoParams) -> Answer:
-    return Answer(RecordStopResult(*hub.recordings.stop(connection)))
+def _record_stop(hub: Hub, connection: ClientConnection, _params: NoParams) -> MethodReply:
+    return MethodReply(RecordStopResult(*hub.recordings.stop(connection)))
 
 
-def _record_snapshot(hub: Hub, connection: ClientConnection, _params: NoParams) -> Answer:
+def _record_snapshot(hub: Hub, connection: ClientConnection, _params: NoParams) -> MethodReply:
     seconds, fd = hub.recordings.snapshot(connection)
-    return Answer(SnapshotResult(seconds), fd)
+    return MethodReply(SnapshotResult(seconds), fd)
 
 
 METHODS: Final[Mapping[str, Method[Any]]] = {

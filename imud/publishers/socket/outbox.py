@@ -200,7 +200,7 @@ class Pool:
     client that begins to queue. If the queued samples reach half of the limit, all clients lose the samples above their
     share.
 
-    Everything else: replies, partly sent messages, requests that are not carried out yet, unfinished answers. Above
+    Everything else: replies, partly sent messages, requests that are not carried out yet, unfinished replies. Above
     half of the limit, imud evicts clients: of the user with the most memory, the client with the highest product of
     memory and time without progress. Thus a client that reads a large reply stays, and a client that does not read is
     evicted. The time is the number of progress events of all clients, so that no clock is necessary.
@@ -402,7 +402,7 @@ class Outbox(ABC):
             self._pool.evict()
 
     def set_request_bytes(self, size_bytes: int) -> None:
-        """Set the memory of the client's input and of its unfinished answer."""
+        """Set the memory of the client's input and of its unfinished reply."""
         if size_bytes != self._request_bytes:
             self._request_bytes = size_bytes
             self.progress = self._pool.next_progress()

@@ -254,7 +254,7 @@ class SocketOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     clients_per_user: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 128
     """Maximum number of clients of one user. It does not apply to root and the daemon's own user."""
     memory_mb: Annotated[int, msgspec.Meta(ge=8, le=4096)] = 64
-    """Maximum memory for all clients, MiB: queues, requests, and unfinished answers."""
+    """Maximum memory for all clients, MiB: queues, requests, and unfinished replies."""
     queue_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 4096
     """Maximum queue of a client that does not read, samples: 4096 are 4 s at 1 kHz. imud drops the oldest samples."""
     queue_bytes: Annotated[int, msgspec.Meta(ge=4096, le=1 << 30)] = 4 << 20

@@ -24,7 +24,7 @@ def request(number: int, name: str, **arguments: Any) -> bytes:
 
 
 @in_server()
-async def test_other_requests_are_answered_before_a_late_reply(server: SocketServer) -> None:
+async def test_other_requests_get_replies_before_a_late_reply(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     await peer.send(request(70, "wait"))
     assert len(await peer.result("devices")) == 2

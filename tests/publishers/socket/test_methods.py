@@ -112,7 +112,7 @@ def test_rights_and_effects_of_the_methods() -> None:
 
 
 @in_server()
-async def test_notifications_act_and_are_not_answered(server: SocketServer) -> None:
+async def test_notifications_act_without_a_reply(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     await peer.send(b'{"jsonrpc":"2.0","method":"status"}\n')
     await peer.send(b'{"jsonrpc":"2.0","method":"nonsense"}\n')
