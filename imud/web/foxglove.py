@@ -233,6 +233,12 @@ SCHEMES: Final = ("http", "https")
 class ViewerOrigins:
     """Accepted hosts and origins of one server."""
 
+    # Host: an IP address, `localhost` or a configured name. No other site can serve a page under these names, so a name
+    # that resolves to this host (DNS rebinding) is useless.
+    # Origin: the site of the page that opens the WebSocket. Browsers send it, and pages cannot change it. A program
+    # sends none, or `file://` if it consists of web pages (Electron). The gate refuses `null`, the origin of sandboxed
+    # pages of any site.
+
     def __init__(self, *, names: Iterable[str] = (), origins: Iterable[str] = ()) -> None:
         """Accept additional `names` of this host and additional `origins`. Raises BadArgument for an invalid origin."""
         self._names: Collection[str] = {"localhost", *(name.lower() for name in names)}
@@ -289,7 +295,13 @@ NOTES_MAX: Final = 20
 
 
 class ViewerGate:
-    """Checks connections and forwards them to a server, in a thread of its own. Call `close` in the creating thread."""
+    """Checks connections and forwards them to a server, in a thread of its own. Call `close` in the creating thread.
+
+    viewer ──▶ gate: Host, Origin ──▶ server of foxglove-sdk, on a random address of 127.0.0.0/8
+    """
+
+    # The server of foxglove-sdk accepts every connection, and any page in a browser of this host can open a WebSocket
+    # to it. The gate checks the head of the first request, and then forwards bytes without a check.
 
     def __init__(
         self, host: str, port: int, server: tuple[str, int], origins: ViewerOrigins, *, note: Callable[[str], None]

@@ -30,6 +30,8 @@ LATE_PERIODS: Final = 2
 class Bucketing:
     """Buckets of one device at one rate. Intervals begin at multiples of the period of CLOCK_MONOTONIC."""
 
+    # a bucket has the minimum and the maximum of each axis: a plot with few points per second shows every peak
+
     def __init__(self, rate_hz: int) -> None:
         self._period_ns = NS_PER_S // rate_hz
         self._open: list[Sample] = []
@@ -109,6 +111,9 @@ WINDOW_MAX: Final = 100
 
 class Mailbox:
     """Queue of messages for one browser. Synchronization: one event loop."""
+
+    # Without WINDOW_MAX, a slow connection (tunnel, phone) would keep megabytes of old samples in the buffers of the
+    # kernels.
 
     def __init__(self) -> None:
         self.dropped = 0  # number of dropped messages

@@ -46,6 +46,8 @@ class Busy(ServerError):
 class Calls:
     """Requests to the daemon at `path`. Synchronization: one event loop."""
 
+    # each request uses its own connection, so that a calibration of minutes delays no other request
+
     def __init__(self, path: str) -> None:
         self._path = path
         self._count = 0

@@ -91,7 +91,13 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Guard:
-    """The users and groups with rights; None for a group that does not exist."""
+    """Rights of users and groups. A group that does not exist is None.
+
+    | right   | users                                                      |
+    |---------|------------------------------------------------------------|
+    | read    | root, the user of the daemon, members of the read group    |
+    | control | root, members of the control group                         |
+    """
 
     own_uid: int
     read_gid: int | None

@@ -33,6 +33,13 @@ class Waker:
     Synchronization: the event loop's thread.
     """
 
+    # Nothing that the client does with its descriptor may block the daemon. Other descriptors cannot guarantee this:
+    # - eventfd: both sides share one open file description. A client that clears O_NONBLOCK and fills the counter
+    #   blocks the next write of the daemon.
+    # - pipe: a read holds the lock of the pipe while it copies to the memory of the reader. A write waits for this
+    #   lock, also with O_NONBLOCK. The client can delay the copy with a page fault (userfaultfd, FUSE).
+    # A UNIX socket has one description per end, MSG_DONTWAIT for each call, and no lock during the copy.
+
     __slots__ = ("_client_sock", "_send", "_sock")
 
     def __init__(self) -> None:

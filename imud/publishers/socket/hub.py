@@ -28,7 +28,8 @@ RECORDINGS_MAX: Final = 4
 class ClientRecordings:
     """The recordings of all clients. Synchronization: the event loop's thread.
 
-    `check_fds` raises RpcError if clients may not use these descriptors.
+    A client reads its recording from a descriptor. The recording ends with `record.stop`, with the connection, when the
+    client closes the descriptor, or when imud stops. `check_fds` raises RpcError if clients may not use descriptors.
     """
 
     def __init__(self, context: PublisherContext, check_fds: Callable[[Sequence[int]], None]) -> None:

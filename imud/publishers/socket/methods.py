@@ -198,6 +198,10 @@ async def _reply_later(connection: ClientConnection, request: RpcRequest, later:
 
 
 # --- devices, status, schema ----------------------------------------------------------------------------------------
+#
+# The state of 256 devices takes several ms, and 10 ms more with big numbers as strings. That is too long for one turn
+# of the event loop. imud encodes the state of a device when it reads it, a few devices in each turn. The states of two
+# devices may be some turns apart. A device that is removed in the meantime is absent.
 
 
 def _devices(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces:

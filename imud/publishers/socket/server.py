@@ -68,6 +68,13 @@ class Listener:
     attempt would cost the daemon 20 µs. Raises ServerError, and removes its file, if it cannot listen.
     """
 
+    # imud binds the file as imud.sock.PID and renames it at the end. With the final name, it would refuse clients
+    # before `listen`, and have a wrong mode and group for a moment.
+    #
+    # If two daemons start at the same time, the second sees the socket of the first. If both check before one of them
+    # renames, the first sees after its rename that its file was replaced. A window of two system calls remains: if the
+    # second renames after the last check of the first, the first serves a socket that no client finds.
+
     def __init__(self, path: Path, group: str, control_group: str = "") -> None:
         self.path = path
         _check_length(path)
