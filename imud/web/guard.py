@@ -67,7 +67,6 @@ class WebGuard:
         return "expected a request of a page of this server, got a request of another site"
 
     def rights(self, authorization: str | None, cookie: str | None) -> WebRights:
-        """Return the permissions of a request with these headers."""
         by_header = (authorization or "").startswith(BEARER) and self.is_token((authorization or "")[len(BEARER) :])
         by_cookie = not by_header and self.is_session(cookie or "")
         return WebRights(not self._reading_needs_token or by_header or by_cookie, by_header or by_cookie, by_cookie)

@@ -341,11 +341,6 @@ class BrowserHub:
                 browser.mailbox.put_newest("dropped", _text(messages.DroppedMessage(*dropped)))
 
 
-def hub_of(loop: asyncio.AbstractEventLoop) -> BrowserHub:
-    """Return a new hub for a running event loop."""
-    return BrowserHub(loop.call_soon_threadsafe)
-
-
 def status_message(name: str, status: DeviceStatus | None, now_ns: int) -> messages.StatusMessage:
     """Return the message with the complete status of a device; with null if the device is not configured."""
     bounds_s = tuple(bound / NS_PER_S for bound in LATENCY_BOUNDS_NS)
@@ -357,7 +352,6 @@ def status_message(name: str, status: DeviceStatus | None, now_ns: int) -> messa
 
 
 def row_of(status: DeviceStatus, newest: Sample | None, now_ns: int) -> messages.DeviceRow:
-    """Return the row of a device in the overview."""
     ledger = _counts(status)
     return messages.DeviceRow(
         name=status.name,

@@ -23,7 +23,7 @@ from imud.formats.jsonrpc import PROTOCOL, RpcError, encode_request, line_of, pa
 from imud.model.errors import ImudError, LinkDenied, LinkMissing, ServerError, reason_of
 from imud.web import messages
 from imud.web.guard import COOKIE, SESSION_S, WebGuard, WebRights, safety_headers
-from imud.web.hub import Browser, BrowserHub, hub_of
+from imud.web.hub import Browser, BrowserHub
 
 READING: Final = frozenset(("settings.get", "actions", "calibrations", "schema"))
 """Methods that need the right to read."""
@@ -130,7 +130,6 @@ class WebServer:
         self.hub: BrowserHub | None = None  # the hub; None before the application runs
 
     def make_app(self) -> web.Application:
-        """Return the application with all routes."""
         app = web.Application(middlewares=[self._guarded], client_max_size=BODY_BYTES_MAX)
         app.router.add_get("/", self._page)
         app.router.add_get("/api/session", self._session)
@@ -145,7 +144,7 @@ class WebServer:
 
     async def _reading(self, _app: web.Application) -> Any:
         """Run the feed while the application runs."""
-        self.hub = hub = hub_of(asyncio.get_running_loop())
+        self.hub = hub = BrowserHub(asyncio.get_running_loop().call_soon_threadsafe)
         feed = Feed(self._path, hub.take, None)
         hub.attach(feed)
         feed.start()

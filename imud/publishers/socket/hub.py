@@ -208,7 +208,6 @@ class Hub(Clients):
         self._plans.pop(name, None)
 
     def publish(self, batch: Batch) -> None:
-        """Send a batch to all clients that watch its device."""
         device = batch.device
         self.newest[device] = batch
         plan = self._plans.get(device)

@@ -311,7 +311,6 @@ def _poll(hub: Hub, _connection: ClientConnection, params: PollParams) -> Method
 
 
 def _newest_of(batch: Batch, convention: Convention | None) -> Sample:
-    """Return the last sample of a batch, in `convention` if it is not None."""
     rotation = None if convention is None else batch.frame.rotation_to(convention)
     sample = batch.samples[-1]
     return sample if rotation is None else rotation.sample(sample)

@@ -223,13 +223,11 @@ class Pool:
         return self._order
 
     def next_progress(self) -> int:
-        """Count a progress event of a client."""
         self._progress += 1
         return self._progress
 
     @property
     def held_bytes(self) -> int:
-        """Memory held for all clients."""
         return self._sample_bytes + self._other_bytes
 
     @property
@@ -349,7 +347,6 @@ class Outbox(ABC):
 
     @property
     def queue_bytes(self) -> int:
-        """Size of the queue."""
         return self._sample_bytes + self.reply_bytes + len(self._partial)
 
     @staticmethod

@@ -119,7 +119,6 @@ class ScheduledClient(ABC):
         self.run_ns = self.user.served_ns
 
     def count_bytes(self, count: int) -> None:
-        """Count bytes that the client sent."""
         self._data.use(count)
 
     def charge(self, cpu_ns: int) -> None:
@@ -130,7 +129,6 @@ class ScheduledClient(ABC):
 
     @property
     def is_over(self) -> bool:
-        """Whether the client has used up its allowance."""
         return self._cpu.level < 0 or self._data.level < 0
 
     @property
@@ -139,7 +137,6 @@ class ScheduledClient(ABC):
         return self._cpu.level >= CPU_LIGHT_NS and self._data.level >= 0
 
     def fill(self, now_ns: int) -> None:
-        """Add the allowance of the time since the last call."""
         self._cpu.fill(now_ns)
         self._data.fill(now_ns)
 

@@ -367,7 +367,6 @@ class SocketServer:
         self._paused = True
 
     def _greet(self, sock: socket.socket) -> None:
-        """Greet a client, or refuse it."""
         connection: ClientConnection | None = None
         try:
             connection = self._let_in(sock)

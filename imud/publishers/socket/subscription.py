@@ -56,7 +56,6 @@ class Subscription:
         )  # fmt: skip
 
     def encoding(self) -> Encoding:
-        """Return a new encoding of the samples."""
         if self.form is Form.BINARY:
             return BinaryEncoding(self.convention)
         return JsonEncoding(self.fields, self.framed, self.text_numbers, self.convention)
