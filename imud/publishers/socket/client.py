@@ -59,7 +59,7 @@ class Waker:
         return self._sock.fileno(), self._client_sock.fileno()
 
     def close_copy(self) -> None:
-        """Close the daemon's copy of the client's end. Without it, `wake` fails after the client closed its end."""
+        """Close the daemon's copy of the client's end, so that `wake` detects that the client closed its own."""
         self._client_sock.close()
 
     def wake(self) -> bool:
