@@ -326,7 +326,7 @@ class _RingFile(NamedTuple):
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             kind = stat.filemode(status.st_mode)[0]
-            raise ServerError(f"{path} is no ring of imud: expected a regular file (-), got another kind ({kind})")
+            raise ServerError(f"{path} is not a ring file: expected a regular file (-), got another kind ({kind})")
         _check_owner(path, status.st_uid, owner_uid)
         header = decode_header(os.pread(descriptor, HEADER_BYTES, 0), str(path))
         expected_bytes = HEADER_BYTES + header.slot_count * SLOT_BYTES

@@ -47,7 +47,7 @@ def test_no_such_ring_and_no_permission(board: Board, tmp_path: Path, monkeypatc
     (tmp_path / "imud.x").write_bytes(b"hello")
     with pytest.raises(ServerError, match="is not a ring of imud"):
         Ring("x", directory=str(tmp_path))
-    with pytest.raises(ServerError, match=r"no ring of imud: expected a regular file \(-\), got another kind \(d\)"):
+    with pytest.raises(ServerError, match=r"not a ring file: expected a regular file \(-\), got another kind \(d\)"):
         Ring(tmp_path)
     os.truncate(board.path, HEADER_BYTES + SLOTS * SLOT_BYTES - 1)
     with pytest.raises(ServerError, match="expected 20480 bytes, got 20479"):

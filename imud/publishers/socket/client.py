@@ -384,7 +384,7 @@ class ClientConnection(Outbox, ScheduledClient):
 
     def on_broken(self, reason: str) -> None:
         if not self.closed:
-            log.info("client %d (pid %d, uid %d) is gone: %s", self.number, self.peer.pid, self.peer.uid, reason)
+            log.info("client %d (pid %d, uid %d) disconnected: %s", self.number, self.peer.pid, self.peer.uid, reason)
             self.close()
 
     def on_full(self) -> None:

@@ -72,7 +72,7 @@ FRAMES = {
         published_frame(FrameOptions(axes=MountingAxes(x="y", y="x", z="-z")), None, None, RFU_ENU),
     ),
 }  # fmt: skip
-"""The same body, measured by devices with three configured conventions."""
+"""One body, measured by devices with three configured conventions."""
 
 
 @pytest.mark.parametrize("name", FRAMES)
