@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Coroutine
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, closing
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -170,7 +170,8 @@ def test_what_was_found_is_remembered(tmp_path: Path) -> None:
             assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 8]
 
         bus.play(story)
-        assert Remembered(tmp_path).get("mast") == RememberedDevice("fake-can", 0, 8)
+        with closing(Remembered(tmp_path)) as memory:
+            assert memory.get("mast") == RememberedDevice("fake-can", 0, 8)
 
 
 @played(Bus)
