@@ -12,7 +12,7 @@ import secrets
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -56,13 +56,12 @@ PAUSE_S: Final = 100e-6
 
 
 class Reloader:
-    """Reads `file` on request and applies it to `target`. Synchronization: the event loop's thread only."""
+    """Reads `file` on request and applies it to the daemon. Synchronization: the event loop's thread only."""
 
-    def __init__(self, file: Path, target: "Daemon", now_ns: Callable[[], int]) -> None:
-        """`now_ns` reads CLOCK_MONOTONIC."""
+    def __init__(self, file: Path, daemon: "Daemon", host: HostClock) -> None:
         self._file = file
-        self._target = target
-        self._now_ns = now_ns
+        self._daemon = daemon
+        self._host = host
         self._jobs: queue.SimpleQueue[asyncio.Future[Config] | None] = queue.SimpleQueue()
         self._again = False
         self._task: asyncio.Task[None] | None = None
@@ -87,13 +86,13 @@ class Reloader:
         again = True
         while again:
             self._again = False
-            notify(f"RELOADING=1\nMONOTONIC_USEC={self._now_ns() // 1000}")
+            notify(f"RELOADING=1\nMONOTONIC_USEC={self._host.now_ns() // 1000}")
             try:
                 new = await self._read()
             except ConfigError as error:
-                self._target.refuse(error)
+                self._daemon.refuse(error)
             else:
-                await self._target.change_to(new)
+                await self._daemon.change_to(new)
             notify("READY=1")
             again = self._again
 
@@ -165,11 +164,8 @@ class Daemon:
         self._file = file
         self._reloader: Reloader | None = None
         host = HostClock()
-        self._now_ns, self._follow_clocks = host.now_ns, host.utc_offset_ns
-        self._factory = DeviceFactory(
-            self._publish, self._send_event, host, state_dir=state_dir, lines=lines,
-            configured=lambda: self.config.devices,
-        )  # fmt: skip
+        self._host = host
+        self._factory = DeviceFactory(self, host, state_dir=state_dir, lines=lines)
         self._devices: dict[str, Device] = {}
         self._latencies = LatencyBudget()
         self.recording = RecordableDevices(self._devices, host)
@@ -186,7 +182,7 @@ class Daemon:
             outputs=OutputFacts(),
             latencies=self._latencies,
             watch_line=watching(lines, host.now_ns),
-            raise_event=self._send_event,
+            raise_event=self.send_event,
         )
         self._extra = dict(extra or {})
         self._until_finished = until_finished
@@ -213,7 +209,7 @@ class Daemon:
         loop.set_exception_handler(self._on_loop_error)
         loop.set_default_executor(_one_thread())
         if self._file is not None:
-            self._reloader = Reloader(self._file, self, self._now_ns)
+            self._reloader = Reloader(self._file, self, self._host)
         try:
             for name in self.config.publishers:
                 self._start_or_put_off(name)
@@ -264,8 +260,8 @@ class Daemon:
         """Log and send what is wrong with a new configuration."""
         for problem in str(error).splitlines():
             log.error("the configuration stays as it was: %s", problem)
-        self._send_event(
-            Event(self._now_ns(), "", EventKind.CONFIGURATION, f"the new configuration is refused: {error}")
+        self.send_event(
+            Event(self._host.now_ns(), "", EventKind.CONFIGURATION, f"the new configuration is refused: {error}")
         )
 
     async def change_to(self, new: Config) -> None:
@@ -286,7 +282,7 @@ class Daemon:
                 await asyncio.sleep(0)
         words = "; ".join([f"configuration read again: {change}", *filter(None, problems)])
         log.info("%s", words)
-        self._send_event(Event(self._now_ns(), "", EventKind.CONFIGURATION, words))
+        self.send_event(Event(self._host.now_ns(), "", EventKind.CONFIGURATION, words))
 
     def _restart_publisher(self, name: str, old: Config) -> str:
         """With its new settings, or with the old ones if those cannot be used; returns what is wrong, if anything."""
@@ -335,6 +331,10 @@ class Daemon:
         """Return the ledger of every device."""
         return [(name, device.driver_name, device.ledger.snapshot()) for name, device in self._devices.items()]
 
+    def configured_devices(self) -> Sequence[DeviceConfig]:
+        """Return all devices of the present configuration."""
+        return self.config.devices
+
     def _start_configured(self, name: str) -> None:
         settings = self.config.publishers[name]
         if PUBLISHERS[name].wanted(settings):
@@ -349,7 +349,7 @@ class Daemon:
             if PUBLISHERS[name].required:
                 raise
             pause_ns = RETRY_FIRST_NS if before is None else min(2 * before.pause_ns, RETRY_MOST_NS)
-            self._put_off[name] = _PutOff(self._now_ns() + pause_ns, pause_ns)
+            self._put_off[name] = _PutOff(self._host.now_ns() + pause_ns, pause_ns)
             if before is None:
                 log.error("%s: %s; imud goes on without it and tries again", name, error)
         else:
@@ -414,11 +414,13 @@ class Daemon:
         self._failure = error if isinstance(error, BaseException) else RuntimeError(str(context.get("message")))
         self._stop.set()
 
-    def _publish(self, batch: Batch) -> None:
+    def publish(self, batch: Batch) -> None:
+        """Pass samples of a device to the outputs."""
         for publish in self._outputs:
             publish(batch)
 
-    def _send_event(self, event: Event) -> None:
+    def send_event(self, event: Event) -> None:
+        """Pass an event to the outputs."""
         for publisher in self._publishers.values():
             publisher.event(event)
 
@@ -435,8 +437,8 @@ class Daemon:
 
     def _tick(self) -> None:
         """Call the ticks of all parts. An error here ends the process (`_on_loop_error`)."""
-        now_ns = self._now_ns()
-        self._follow_clocks()  # also where no device is read for long: between two readings a rate is a mean
+        now_ns = self._host.now_ns()
+        self._host.utc_offset_ns()  # also where no device is read for long: between two readings a rate is a mean
         for device in self._devices.values():
             device.tick(now_ns)
         for publisher in self._publishers.values():
@@ -460,7 +462,7 @@ class Daemon:
             self._end_part(name, device.close)
         self._end_part("devices", self._factory.close)
         for name, publisher in self._publishers.items():
-            self._end_part(name, lambda publisher=publisher: publisher.tick(self._now_ns()))  # type: ignore[misc]
+            self._end_part(name, lambda publisher=publisher: publisher.tick(self._host.now_ns()))  # type: ignore[misc]
             self._end_part(name, publisher.close)
 
     def _end_part(self, name: str, step: Callable[[], None]) -> None:

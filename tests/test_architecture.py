@@ -151,7 +151,6 @@ SMALL_LINES = 130
 LONG_MODULES = {
     "imud.cli.top": "the display of one command: table, details of a device, keys",
     "imud.device.polled_bus": "one state machine: the turns of the devices on a bus",
-    "imud.device.settings": "one state machine: device settings, compared, applied and saved",
     "imud.drivers.imu61x.uart.settings": "the table of settings with its scripts",
     "imud.links.socketcan": "one link: socket, bus state and reader",
     "imud.publishers.metrics.families": "one table: the metric families",
@@ -164,18 +163,10 @@ LONG_MODULES = {
 }
 LONG_CLASSES = {
     "SampleClock": "one state machine with a fast path",
-    "SettingsKeeper": "one state machine: device settings",
 }
 LARGE_CONSTRUCTORS = {
     "imud.cli.doctor.surroundings.Surroundings",
     "imud.cli.setup.steps.SetupSteps",
-    "imud.device.device.Device",
-    "imud.device.factory.DeviceFactory",
-    "imud.device.scripts.Exchange",
-    "imud.device.settings.SettingsKeeper",
-    "imud.device.stream_search.StreamRound",
-    "imud.device.transport.SearchLoop",
-    "imud.device.utc.UtcFeed",
     "imud.fleet.writer.SpoolWriter",
     "imud.lines.sync.SyncSignals",
     "imud.sampling.clock.SampleClock",

@@ -9,12 +9,13 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from imud.config.model import Config
 from imud.daemon import Daemon, Reloader
+from imud.host.clock import HostClock
 from imud.model.errors import ConfigError
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, running_daemon, wait_until, write_config
 from tests.support.event_loops import in_loop
@@ -105,7 +106,7 @@ async def test_requests_during_a_reload_are_one_more_of_the_file_as_it_is_then(
     told: list[str] = []
     monkeypatch.setattr("imud.daemon.notify", told.append)
     file, target, done = tmp_path / "imud.yaml", SlowTarget(), asyncio.Event()
-    reloader = Reloader(file, target, lambda: 5000)
+    reloader = Reloader(file, cast(Daemon, target), HostClock(lambda: 5000))
 
     def request(level: str) -> None:
         file.write_text(f"log_level: {level}\ndevices: {{}}")
@@ -136,7 +137,7 @@ async def test_requests_during_a_reload_are_one_more_of_the_file_as_it_is_then(
 async def test_a_reload_ends_with_an_error_of_its_own_and_with_the_daemon(tmp_path: Path) -> None:
     file, target = tmp_path / "imud.yaml", SlowTarget()
     file.write_text("devices: {}")
-    reloader = Reloader(file, target, lambda: 0)
+    reloader = Reloader(file, cast(Daemon, target), HostClock())
     tasks: list[asyncio.Task[None]] = []
     reloader.request(tasks.append)
     await asyncio.sleep(0)

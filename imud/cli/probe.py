@@ -8,7 +8,6 @@ import asyncio
 import contextlib
 from collections.abc import Sequence
 from contextlib import suppress
-from time import monotonic_ns
 
 import msgspec
 
@@ -18,12 +17,14 @@ from imud.config.model import DeviceConfig
 from imud.contracts.codec import message_of
 from imud.contracts.driver import CanDriver, Identity, of_kind
 from imud.contracts.link import CanLink, StreamLink
+from imud.contracts.script import Request
 from imud.device.can_search import EVERYTHING, CanDevice, CanRound, CanSearch
-from imud.device.scripts import Exchange
-from imud.device.settings import identity_words, printable_identity
+from imud.device.identity import identity_words, printable_identity
+from imud.device.scripts import RequestPort, ScriptRunner
 from imud.device.stream_search import StreamFound, StreamRound
 from imud.drivers import DRIVERS
 from imud.formats.can import CanFrame
+from imud.host.clock import HostClock
 from imud.links import LINKS
 from imud.links.netlink import can_details, can_interfaces
 from imud.links.serial_port import list_ports
@@ -62,6 +63,27 @@ def row(report: ProbeReport) -> tuple[object, ...]:
     )
 
 
+class LinkRequestPort(RequestPort):
+    """Link that sends the requests of a script."""
+
+    def __init__(self, link: StreamLink | CanLink) -> None:
+        self._link = link
+
+    def write(self, data: bytes) -> None:
+        self._link.write(data)
+
+
+class SerialRequestPort(LinkRequestPort):
+    """Serial port that follows a device to another baud rate."""
+
+    def __init__(self, link: StreamLink) -> None:
+        super().__init__(link)
+        self._serial_link = link
+
+    def change_rate(self, request: Request) -> None:
+        self._serial_link.set_baud(request.baud)
+
+
 async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
     """List one report per device heard on an interface, or one that gives the reason for none."""
     row = LINKS["socketcan"]
@@ -85,11 +107,11 @@ async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
 async def listen(link: CanLink) -> tuple[list[CanDevice], str]:
     """Run one round of detection: the devices heard, and the reason for none. Raises LinkError."""
     search = CanSearch(of_kind(DRIVERS.values(), CanDriver), link.title)
-    finder = CanRound(search, Ledger(), lambda found: None, monotonic_ns)
+    finder = CanRound(search, Ledger(), HostClock())
     ended = asyncio.get_running_loop().create_future()
     problems = [""]
     link.start(finder.on_frames, lambda news, problem: problems.append(problem), ended.set_result)
-    finder.start()
+    finder.start(lambda found: None)
     searching = asyncio.ensure_future(finder.finished())
     await asyncio.wait({searching, ended}, return_when=asyncio.FIRST_COMPLETED)
     if ended.done():
@@ -120,18 +142,18 @@ async def identity_of_node(device: CanDevice, link: CanLink) -> Identity:
     driver, settings = device.driver, device.driver.node_settings(device.node)
     ledger = Ledger()
     codec = driver.make_codec(ledger, settings)
-    exchange = Exchange(ledger, link.write, monotonic_ns)
+    runner = ScriptRunner(LinkRequestPort(link), ledger, HostClock())
 
     def on_frames(frames: Sequence[CanFrame]) -> None:
         for frame in frames:
             for event in codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns):
                 if (message := message_of(event)) is not None:
-                    exchange.on_message(message, frame.t_rx_ns)
+                    runner.on_message(message, frame.t_rx_ns)
 
     link.filters = driver.filters(settings)
     link.start(on_frames, lambda news, problem: None, lambda error: None)
     with suppress(CommandError):
-        return await exchange.run(driver.identify(settings))
+        return await runner.run(driver.identify(settings))
     return Identity()
 
 
@@ -188,10 +210,10 @@ async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
 async def find(config: DeviceConfig, link: StreamLink) -> StreamFound:
     """Run one round of detection. Raises NothingHeard and LinkError."""
     findings: list[StreamFound] = []
-    finder = StreamRound(config, link, Ledger(), None, findings.append, monotonic_ns, may_ask=config.identify)
+    finder = StreamRound(config, link, Ledger(), None, HostClock())
     ended = asyncio.get_running_loop().create_future()
     link.start(finder.on_data, ended.set_result)
-    finder.start()
+    finder.start(findings.append)
     searching = asyncio.ensure_future(finder.finished())
     await asyncio.wait({searching, ended}, return_when=asyncio.FIRST_COMPLETED)
     if not searching.done():
@@ -206,16 +228,16 @@ async def identity_of_device(found: StreamFound, link: StreamLink) -> Identity:
     """Ask a device for its identity; empty when it does not answer."""
     ledger = Ledger()
     codec = found.driver.make_codec(ledger, found.driver.settings())
-    exchange = Exchange(ledger, link.write, monotonic_ns, link.set_baud)
+    runner = ScriptRunner(SerialRequestPort(link), ledger, HostClock())
 
     def on_data(data: bytes, t_rx_ns: int) -> None:
         for event in codec.feed(data):
             if (message := message_of(event)) is not None:
-                exchange.on_message(message, t_rx_ns)
+                runner.on_message(message, t_rx_ns)
 
     link.start(on_data, lambda error: None)
     with contextlib.suppress(CommandError):
-        return await exchange.run(found.driver.identify())
+        return await runner.run(found.driver.identify())
     return Identity()
 
 

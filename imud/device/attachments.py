@@ -1,64 +1,69 @@
-"""Parts of a device next to its link: signals on GPIO lines, a reset line, a data-ready line, a source of UTC.
+"""Attachments of a device: GPIO lines, reset line and data-ready line, and the feed of UTC.
 
-All of them live by one small contract, so that the device goes through those that exist. They are made here.
+All attachments have the same methods, so that the device calls them in one loop.
 """
 
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol
+
+import msgspec
 
 from imud.config.model import DeviceConfig
 from imud.contracts.command import Action
+from imud.contracts.driver import Driver
 from imud.contracts.lines import AlarmRanges, LineFactory
 from imud.contracts.status import LinesStatus, UtcStatus
 from imud.device.health import DeviceEvents
-from imud.device.utc import DevicePort, UtcFeed, make_keeper
+from imud.device.utc import UtcFeed, make_utc_feed
 from imud.host.clock import HostClock
 from imud.lines.reset import ResetLine, make_reset
 from imud.lines.sync import LineActions, SyncSignals
+from imud.model.event import EventKind
 from imud.model.sample import Sample
 from imud.sampling.clock import SampleClock
+from imud.utc.rmc_feed import SentencePort
 
 
 class Attachment(Protocol):
     """A part of a device next to its link. Synchronization: the loop's thread only."""
 
     def start(self, clock: SampleClock) -> None:
-        """Begin delivery to this clock: the device was found."""
+        """Start the delivery to this clock: imud has found the device."""
         ...
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
-        """Do periodic work, ten times a second while the device's task runs: CLOCK_MONOTONIC and the newest sample."""
+        """Do periodic work, ten times per second. `now_ns` is CLOCK_MONOTONIC."""
         ...
 
     def stop(self) -> None:
-        """End delivery: the device's link ended; may be called twice."""
+        """Stop the delivery: the link of the device ended. A second call does nothing."""
         ...
 
     def close(self) -> None:
-        """Release everything; may be called twice."""
+        """Release all resources. A second call does nothing."""
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class AttachmentHooks:
-    """Callbacks from attachments to their device."""
+class DevicePort(SentencePort, Protocol):
+    """Transport of the device, for its attachments. `imud.device.transport` imports this module."""
 
-    port: DevicePort
-    """The device's port, as far as sentences with UTC need it."""
-    on_reset: Callable[[], None]
-    """Called right before the reset line is pulsed."""
+    def on_reset(self) -> None:
+        """Prepare for a reset of the device by its line."""
+        ...
 
 
 class Attachments:
     """Attachments of one device. Synchronization: the loop's thread only."""
 
     def __init__(
-        self, config: DeviceConfig, lines: LineFactory, hooks: AttachmentHooks, notices: DeviceEvents, host: HostClock
+        self, config: DeviceConfig, lines: LineFactory, port: DevicePort, notices: DeviceEvents, host: HostClock
     ) -> None:
-        """Make the attachments that `config` has; `lines` makes the GPIO lines."""
+        """Create the configured attachments. `lines` opens the GPIO lines, `port` is the transport of the device."""
+        self._config = config
+        self._notices = notices
+        self._host = host
         raise_event = notices.raise_event
-        self._utc: UtcFeed | None = make_keeper(config, hooks.port, host)
+        self._utc: UtcFeed | None = make_utc_feed(config, port, host)
         self._signals: SyncSignals | None = None
         if config.lines is not None:
             on_pulses = self._utc.on_pulses if self._utc is not None else None
@@ -67,88 +72,104 @@ class Attachments:
                 follow=host.utc_offset_ns,
             )  # fmt: skip
         self._reset: ResetLine | None = make_reset(
-            config.name, config.lines, lines, raise_event, host.now_ns, hooks.on_reset
+            config.name, config.lines, lines, raise_event, host.now_ns, port.on_reset
         )
         self._line_actions = LineActions(self._reset, self._signals)
-        made: tuple[Attachment | None, ...] = (
-            self._signals,
-            self._reset,
-            self._utc,
-        )
+        self._differences: Mapping[str, str] = {}
+        """Differences between the GPIO lines and the device settings, by the key of the line."""
+        made: tuple[Attachment | None, ...] = (self._signals, self._reset, self._utc)
         self._present = [one for one in made if one is not None]
         self.drain_edges: Callable[[], None] | None = self._signals.drain if self._signals is not None else None
-        """Gives the clock all edges that the kernel has; None without lines. To be called before bytes are decoded."""
+        """Passes all edges in the kernel's buffer to the clock. Call it before the codec decodes bytes. None if the
+        device has no GPIO lines."""
 
     def add(self, attachment: Attachment) -> None:
         """Add an attachment."""
         self._present.append(attachment)
 
-    # --- the contract, for all of them -------------------------------------------------------------------------------
+    # --- all attachments ---------------------------------------------------------------------------------------------
 
     def start(self, clock: SampleClock) -> None:
-        """Start all attachments: the device was found."""
+        """Start all attachments: imud has found the device."""
         for one in self._present:
             one.start(clock)
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
-        """Call `tick` of all attachments, ten times a second."""
+        """Call `tick` of all attachments, ten times per second."""
         for one in self._present:
             one.tick(now_ns, newest)
 
     def stop(self) -> None:
-        """Stop all attachments: the device's link ended; may be called twice."""
+        """Stop all attachments: the link of the device ended. A second call does nothing."""
         for one in self._present:
             one.stop()
 
     def close(self) -> None:
-        """Release everything; may be called twice."""
+        """Release all resources. A second call does nothing."""
         for one in self._present:
             one.close()
 
-    # --- signals -----------------------------------------------------------------------------------------------------
+    # --- GPIO lines --------------------------------------------------------------------------------------------------
 
     def set_alarm_ranges(self, ranges: AlarmRanges | None) -> None:
-        """Set what ALARM should indicate by the device's settings; None: not known, and not checked."""
+        """Set the ranges that the line ALARM indicates. With None imud does not check the line."""
         if self._signals is not None:
             self._signals.set_alarm_ranges(ranges)
 
+    def compare_settings(self, settings: Mapping[str, str], driver: Driver | None) -> None:
+        """Compare the GPIO lines with the device settings. Raise an event for each new difference."""
+        read_ranges = driver.alarm_ranges if driver is not None else None
+        self.set_alarm_ranges(read_ranges(settings) if read_ranges is not None else None)
+        lines = self._config.lines
+        found = driver.line_differences(settings, lines) if driver is not None and lines is not None else {}
+        for key, words in found.items():
+            if self._differences.get(key) != words:
+                message = f"line {key}: {words}"
+                self._notices.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message, line=key)
+        self._differences = found
+
     def lines_status(self) -> LinesStatus | None:
-        """Return the status of the lines; None for a device without lines."""
-        return self._signals.status(self._reset) if self._signals is not None else None
+        """Return the status of the GPIO lines; None for a device without lines."""
+        if self._signals is None:
+            return None
+        status = self._signals.status(self._reset)
+        if not self._differences:
+            return status
+        return msgspec.structs.replace(status, problems={**self._differences, **status.problems})
 
     def utc_status(self) -> UtcStatus | None:
-        """Return the status of UTC; None for a device without."""
+        """Return the status of the UTC feed; None for a device without UTC feed."""
         return self._utc.status() if self._utc is not None else None
 
     # --- the reset line ----------------------------------------------------------------------------------------------
 
     async def reset_settled(self) -> None:
-        """Return when no reset is going on and the device had the time it needs after one."""
+        """Return when no reset is in progress and the start-up time of the device has passed."""
         if self._reset is not None:
             await self._reset.settled()
 
     def device_found(self) -> None:
-        """Note that samples of the device come."""
+        """Note that samples of the device arrive."""
         if self._reset is not None:
             self._reset.found()
 
     async def device_not_found(self, now_ns: int) -> None:
-        """Note that a round of search ended without the device: reset it by its line, if due."""
+        """Note that a search round did not find the device. Reset the device by its line if this is due."""
         if self._reset is not None:
             await self._reset.not_found(now_ns)
 
     @property
     def can_reset(self) -> bool:
-        """Whether there is a reset line."""
+        """Whether the device has a reset line."""
         return self._reset is not None
 
     # --- actions -----------------------------------------------------------------------------------------------------
 
     @property
     def actions(self) -> Mapping[str, Action]:
-        """Actions by GPIO lines, which any device can have, by name."""
+        """Actions with GPIO lines by name. They do not depend on the driver."""
         return self._line_actions.rows
 
     def run_action(self, name: str, arguments: Mapping[str, Any]) -> Awaitable[object]:
-        """Run one of `actions`. Raises BadArgument, CommandError."""
+        """Run one of `actions`. Raises BadArgument or CommandError."""
         return self._line_actions.run(name, arguments)

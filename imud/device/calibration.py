@@ -9,7 +9,7 @@ It looks at the newest sample ten times a second. Progress goes out as events.
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from math import atan2, cos, dist, hypot, pi, sin, sqrt
@@ -23,10 +23,10 @@ from imud.contracts.command import (
     Handling,
     Kept,
     RestMeans,
-    Target,
     Verdict,
 )
 from imud.device.health import DeviceEvents
+from imud.device.transport import Transport
 from imud.model.errors import CommandError, ImudError
 from imud.model.event import EventKind
 from imud.model.sample import Pair, Sample, Vector3
@@ -305,15 +305,12 @@ ASK_NS: Final = 3 * NS_PER_S
 SETTLE_NS: Final = 2 * NS_PER_S
 """After the end, before the samples are looked at: the attitude filter of the device follows."""
 
-RunScript = Callable[[Callable[[Target], Any]], Awaitable[Any]]
-"""Runs a script that a function makes from the target. Raises CommandError, TransferError, DeviceRefused, LinkError."""
-
 
 class CalibrationRun:
     """Guide of one device's calibrations, one at a time; an attachment. Synchronization: the loop's thread only."""
 
-    def __init__(self, run_script: RunScript, notices: DeviceEvents) -> None:
-        self._run_script = run_script
+    def __init__(self, transport: Transport, notices: DeviceEvents) -> None:
+        self._transport = transport
         self._notices = notices
         self._running: asyncio.Task[CalibrationResult] | None = None
         self._look: asyncio.Future[tuple[int, Sample | None]] | None = None
@@ -364,7 +361,7 @@ class CalibrationRun:
         return self._running is not None and self._running.cancel()
 
     async def _run(self, kind: str, calibration: Calibration, save: bool) -> CalibrationResult:
-        if calibration.unready is not None and (words := await self._run_script(calibration.unready)):
+        if calibration.unready is not None and (words := await self._transport.run_script(calibration.unready)):
             raise CommandError(f"{kind}: {words}")
         self._report(kind, "begin", calibration.help)
         try:
@@ -383,7 +380,7 @@ class CalibrationRun:
         problem = problem or _failed(checks)
         saved = calibration.kept is Kept.BY_DEVICE and not problem
         if save and not problem and calibration.save is not None:
-            await self._run_script(calibration.save)
+            await self._transport.run_script(calibration.save)
             saved = True
         self._report(kind, "end", problem or "verified", verified=not problem, saved=saved)
         return CalibrationResult(kind, not problem, problem, device, checks, saved, calibration.kept)
@@ -392,7 +389,7 @@ class CalibrationRun:
         """Calibrate a device that must not move; return the device's words, the checks, and what is wrong."""
         await self._rest(kind)
         window = RestWindow()
-        script: asyncio.Future[Any] = asyncio.ensure_future(self._run_script(calibration.begin))
+        script: asyncio.Future[Any] = asyncio.ensure_future(self._transport.run_script(calibration.begin))
         try:
             while not script.done():
                 _, sample = await self._next(script)
@@ -411,8 +408,8 @@ class CalibrationRun:
     async def _turned(self, kind: str, calibration: Calibration) -> tuple[str, tuple[Check, ...], str]:
         """Calibrate a device that is turned; return the device's words, the checks, and what is wrong."""
         ask = calibration.verdict
-        before = verdict = await self._run_script(ask) if ask is not None else Verdict(done=False, words="")
-        await self._run_script(calibration.begin)
+        before = verdict = await self._transport.run_script(ask) if ask is not None else Verdict(done=False, words="")
+        await self._transport.run_script(calibration.begin)
         turning, begun_ns = Turning(), self._now_ns
         report_ns = ask_ns = begun_ns
         problem = "the device did not end the calibration"
@@ -425,7 +422,7 @@ class CalibrationRun:
                 self._report_turning(kind, turning, verdict)
             if ask is not None and now_ns >= ask_ns:
                 ask_ns = now_ns + ASK_NS
-                last, verdict = verdict, await self._run_script(ask)
+                last, verdict = verdict, await self._transport.run_script(ask)
                 if verdict.words != last.words:
                     turning.restart_field()
             if verdict.done and _turned_enough(turning) and (verdict.words != before.words or before.done):

@@ -20,6 +20,7 @@ from imud.contracts.codec import CodecEvent
 from imud.contracts.driver import CanDriver
 from imud.device.search import GaveUp, Listen, SearchRound
 from imud.formats.can import CanFilter, CanFrame
+from imud.host.clock import HostClock
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S
@@ -245,19 +246,17 @@ EVERYTHING: Final = (CanFilter(0, 0, False), CanFilter(0, 0, True))
 
 
 class CanRound(SearchRound[CanFound]):
-    """A round on a CAN bus."""
+    """Search round on a CAN bus."""
 
-    def __init__(
-        self, search: CanSearch, ledger: Ledger, on_found: Callable[[CanFound], None], now_ns: Callable[[], int]
-    ) -> None:
-        super().__init__(search, ledger, on_found, now_ns)
+    def __init__(self, search: CanSearch, ledger: Ledger, host: HostClock) -> None:
+        super().__init__(search, ledger, host)
         self._search = search
 
     def on_frames(self, frames: Sequence[CanFrame]) -> None:
-        """Pass on frames from the link, all of the bus; they count as skipped."""
+        """Process all frames of the bus. The ledger counts their bytes as skipped."""
         self._count(sum(len(frame.data) for frame in frames))
         if not self._done.done():
             self._follow(self._search.on_frames(frames))
 
     def _listen(self, step: Listen) -> None:
-        """Filters pass everything already."""
+        """Do nothing: the filters of the link pass all frames."""

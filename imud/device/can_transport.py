@@ -1,7 +1,7 @@
 """Transport of a device on a CAN bus: its driver is configured, or found by listening; filters select its frames."""
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from functools import partial
 from random import Random
 from typing import Any
 
@@ -9,13 +9,18 @@ from imud.contracts.codec import CanCodec
 from imud.contracts.command import Target
 from imud.contracts.driver import CanDriver, Identity, of_kind
 from imud.contracts.link import CanLink, CanUse, OnEnd
-from imud.contracts.script import ReplyFrame
-from imud.contracts.status import DeviceState, DeviceStatus
+from imud.contracts.script import ReplyFrame, Request
+from imud.contracts.status import DeviceState
 from imud.device.can_search import EVERYTHING, CanFound, CanRound, CanSearch
-from imud.device.scripts import Exchange
 from imud.device.search import Remembered, RememberedDevice
-from imud.device.settings import IDENTIFY_TRIES
-from imud.device.transport import SILENT_SEARCH_NS, UNHEARD_NS, DeviceContext, SearchLoop
+from imud.device.transport import (
+    IDENTIFY_TRIES,
+    SILENT_SEARCH_NS,
+    UNHEARD_NS,
+    DeviceContext,
+    Queries,
+    ReceivingTransport,
+)
 from imud.drivers import DRIVERS
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame, frame_bits
 from imud.model.errors import LinkError
@@ -82,39 +87,27 @@ class CanBuses:
         return ""
 
 
-class CanTransport:
-    """Transport of the frames of one device on a CAN bus. Synchronization: the event loop's thread only."""
+class CanTransport(ReceivingTransport):
+    """Transport of the frames of one device on a CAN bus. Synchronization: the loop's thread only."""
+
+    link: CanLink
+    driver: CanDriver | None
+    path: CanPath | None
 
     def __init__(self, context: DeviceContext, link: CanLink, buses: CanBuses, remembered: Remembered) -> None:
-        """`buses` is what the devices of a daemon share. Raises LinkError for a driver that is none for CAN."""
+        """All devices of the daemon share `buses`. Raises LinkError if the configured driver is not for CAN."""
+        super().__init__(context, remembered)
         self.link = link
-        self.driver: CanDriver | None = None
-        self.path: CanPath | None = None
-        self._config = context.config
-        self._context = context
-        self._health = context.health
-        self._now_ns = context.host.now_ns
+        self.driver = self.path = None
         self._buses = buses
-        self._remembered = remembered
-        self._exchange = Exchange(
-            context.ledger, link.write, self._now_ns, follow=self._follow, listen=self._listen, on_busy=self._on_busy
-        )
-        self._latency_ns = 0
         self._also: Sequence[CanFilter] = ()
-        """Frames that can answer the outstanding request although they are none of the device's replies."""
-        self._search = SearchLoop(
-            *(context.health, context.attachments, context.host),
-            begin=self._begin_search,
-            ask=self._ask,
-            ask_again=self._ask_once,
-            unanswered=lambda: self._may_ask and not context.identity.answered,
-        )
+        """Filters of frames from other senders that can answer the outstanding request."""
         self._round: CanRound | None = None
-        """The search that frames go to; None while they go to the path."""
+        """The search round that receives the frames; None while the path receives them."""
         self._options: Options | None = None
         self._codec: CanCodec | None = None
         self._node: int | None = None
-        """The device that was found, as its driver numbers them; None for a driver that is named."""
+        """Number of the device that the search found; None if the configuration names the driver."""
         self._joined = False
         if not self._searchable:
             driver = DRIVERS[self._config.driver]
@@ -122,42 +115,40 @@ class CanTransport:
                 raise LinkError(f"{self._config.name}: expected a driver for CAN, got {driver.name}")
             self._set_up(driver, self._config.options or driver.settings())
 
-    # --- the bus's life ----------------------------------------------------------------------------------------------
+    # --- the link ----------------------------------------------------------------------------------------------------
 
     async def wait_present(self) -> None:
-        """Return when the bus is up. Raises LinkError where another device sends the frames that this one needs."""
+        """Return when the bus is up. Raises LinkError if another device sends the frames of this device."""
         if not self._searchable and not self._joined:
             self._join()
         self._refuse_conflict()
         if reason := self.link.absence():
-            self._health.down(self._now_ns(), DeviceState.MISSING, reason)
+            self._health.down(self._host.now_ns(), DeviceState.MISSING, reason)
         await self.link.wait_present()
 
     def start(self, on_end: OnEnd) -> None:
-        """Deliver frames from now on, and begin the search."""
+        """Start the search and start reading the open link. `on_end` is called once if the link ends."""
         self._search.start()
         self.link.start(self._on_frames, self._on_news, on_end)
 
-    async def work(self) -> None:
-        """Find the device and ask for its identity, as often as needed; ends only with the link."""
-        await self._search.run()
-
     def stop(self) -> None:
-        """End the search and close the link; may be called twice."""
+        """Stop the search and close the link. A second call does nothing."""
         self._search.stop()
         if self._searchable:
             self._leave()
         self.link.close()
 
     def close(self) -> None:
-        """Stop, and leave the bus; may be called twice."""
+        """Stop, and leave the bus. A second call does nothing."""
         self.stop()
         self._leave()
 
     # --- the search --------------------------------------------------------------------------------------------------
 
-    def _begin_search(self) -> CanRound | None:
-        """Listen to the whole bus, until a single device that no other configuration has is heard."""
+    def begin_search(self) -> CanRound | None:
+        """Receive all frames of the bus to find a device that no other configuration uses.
+
+        Return None if the configuration names the driver, and set up the device instead."""
         if not self._searchable:
             self._begin()
             return None
@@ -165,7 +156,7 @@ class CanTransport:
         self._leave()
         if self.path is not None:
             self.path.reset()
-            self.path.begin(self._now_ns())
+            self.path.begin(self._host.now_ns())
         link.filters = EVERYTHING
         link.gather_ns = 0
         search = CanSearch(
@@ -174,12 +165,11 @@ class CanTransport:
             claimed=self._buses.claimed(name, link.bus),
             remembered=(last.driver, last.node) if last and last.node is not None else None,
         )
-        self._round = CanRound(search, self._context.ledger, self._on_found, self._now_ns)
-        self._round.start()
+        self._round = CanRound(search, self._context.ledger, self._host)
+        self._round.start(self._on_found)
         return self._round
 
     def _on_found(self, found: CanFound) -> None:
-        """Go on with the device that was found."""
         driver, node = found.device
         if driver is not self.driver or node != self._node:
             self._node = node
@@ -189,7 +179,7 @@ class CanTransport:
         self._begin()
 
     def _set_up(self, driver: CanDriver, options: Options) -> None:
-        """Make codec, clock and path for a device."""
+        """Create codec, clock and path for a device."""
         if self.path is not None:
             self.path.reset()
         context = self._context
@@ -197,11 +187,11 @@ class CanTransport:
         self.driver = driver
         self._options = options
         self._codec = driver.make_codec(context.ledger, options)
-        self.path = CanPath(self._codec, clock, context.path_context(driver, self.link, self._exchange.on_message))
+        self.path = CanPath(self._codec, clock, context.path_context(driver, self.link, self.scripts.on_message))
         context.tap.path_made(self.path, driver.name, options)
 
     def _begin(self) -> None:
-        """Give frames that come from now on to the device's codec."""
+        """Pass the frames to the codec of the device."""
         link, path, driver = self.link, self.path, self.driver
         assert driver is not None
         assert path is not None
@@ -213,8 +203,8 @@ class CanTransport:
         bits = frame_bits(first.extended, len(first.data))
         path.set_frame_time(bits * NS_PER_S // link.bitrate if link.bitrate else 0)
         path.link_opened()
-        path.begin(self._now_ns())
-        self._context.attachments.start(path.clock)
+        path.begin(self._host.now_ns())
+        self.attachments.start(path.clock)
 
     # --- other devices of the bus ------------------------------------------------------------------------------------
 
@@ -226,7 +216,7 @@ class CanTransport:
         self._joined = True
 
     def _bits_per_s(self) -> float:
-        """What the device's samples take of the bus now, without stuff bits."""
+        """Return the present bus load of the samples, bit/s without stuff bits."""
         if self.path is None or self.driver is None:
             return 0.0
         bits = sum(frame_bits(one.extended, len(one.data)) for one in self.driver.example_frames(Random(0)))
@@ -241,12 +231,12 @@ class CanTransport:
         if conflict := self._buses.conflict(self._config.name):
             raise LinkError(conflict)
 
-    # --- asking ------------------------------------------------------------------------------------------------------
+    # --- requests ----------------------------------------------------------------------------------------------------
 
-    async def _ask(self) -> None:
-        """Have the link send the cyclic frames, and ask for identity and settings where that is allowed.
+    async def ask(self) -> None:
+        """Send the cyclic frames, and query identity and settings, if the configuration allows it.
 
-        Raises LinkError where another device sends it already.
+        Raises LinkError if another device already sends the cyclic frames.
         """
         self._refuse_conflict()
         driver, options = self.driver, self._options
@@ -256,69 +246,56 @@ class CanTransport:
             self.link.send_cyclic(frames)
         await self._identify(IDENTIFY_TRIES)
 
-    async def _ask_once(self) -> None:
-        await self._identify(1)
-
-    async def read_back(self) -> None:
-        """Ask for identity and settings again."""
-        with suppress(LinkError):  # whoever waits for the link's end learns of it
-            await self._identify(1)
-
-    async def _identify(self, tries: int) -> None:
+    def _queries(self) -> Queries | None:
         driver, options = self.driver, self._options
-        if driver is not None and self._may_ask:
-            await self._context.identity.ask(
-                self._exchange,
-                lambda: driver.identify(options),
-                lambda: driver.read_settings(options),
-                self._apply,
-                tries,
-            )
+        if driver is None:
+            return None
+        return partial(driver.identify, options), partial(driver.read_settings, options)
 
     def _apply(self, identity: Identity) -> None:
         if self.driver is not None and self._codec is not None:
             self.driver.apply_identity(self._codec, identity)
             self._context.tap.codec_changed()
 
-    def _follow(self, options: Options) -> None:
-        """Follow a script that has given the device another number: filters, codec, and what other devices know."""
-        driver = self.driver
+    def follow(self, request: Request) -> None:
+        """Follow a script that has given the device another number: change the filters and create a new codec."""
+        driver, options = self.driver, request.settings
         if driver is None or options == self._options:
             return
         self._leave()
         self._set_up(driver, options)
         self._join()
-        self._node = None  # the next search tells it
+        self._node = None  # the next search sets it
         self._begin()
         if not self._searchable and options != (self._config.options or driver.settings()):
             message = f"the device is heard by other options now: change {_changed(self._config.options, options)}"
-            self._context.notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message)
+            self._context.notices.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message)
 
-    def _listen(self, filters: Sequence[CanFilter]) -> None:
-        """Receive further frames, as long as a request can be answered by them."""
+    def listen(self, request: Request, filters: Sequence[CanFilter]) -> None:
+        """Receive frames of other senders too, while they can answer the request."""
         self._also = filters
         if self.driver is not None and self._round is None:
             self.link.filters = (*self.driver.filters(self._options), *filters)
 
     async def run_script(self, make: Callable[[Target], Any]) -> Any:
-        """Run a request script on the device with its own node number; one that changes the number is followed."""
+        """Run a request script. Follow the device if the script changes its number."""
         others = self._buses.bits_per_s(self._config.name, self.link.bus)
-        return await self._exchange.run(make(Target(self._options, self.bit_rate, other_bits_per_s=others)))
+        return await self.scripts.run(make(Target(self._options, self.bit_rate, other_bits_per_s=others)))
 
-    # --- the flow ----------------------------------------------------------------------------------------------------
+    # --- the samples -------------------------------------------------------------------------------------------------
 
     def set_latency(self, latency_ns: int) -> None:
-        """Let frames gather for so long."""
+        """Set the maximum hold of a frame, ns; 0: no hold."""
         self._latency_ns = latency_ns
-        self._on_busy(self._exchange.busy)
+        self.on_busy(self.scripts.busy)
 
-    def _on_busy(self, busy: bool) -> None:
-        """Have frames gather, unless a request waits for a reply or the device is searched for."""
+    def on_busy(self, busy: bool) -> None:
+        """Hold no frames while a request waits for a reply, or during a search."""
         self.link.gather_ns = 0 if busy or self._round is not None else self._latency_ns
 
     @property
     def hold_ns(self) -> int:
-        """How long frames gather at present, ns."""
+        """Present hold of the frames, ns."""
         return self.link.gather_ns
 
     def _on_frames(self, frames: Sequence[CanFrame]) -> None:
@@ -332,17 +309,14 @@ class CanTransport:
     def _answer(self, frames: Sequence[CanFrame]) -> None:
         for frame in frames:
             if any(wanted.matches(frame.can_id, frame.extended) for wanted in self._also):
-                self._exchange.on_message(ReplyFrame(frame.can_id, frame.data), frame.t_rx_ns)
+                self.scripts.on_message(ReplyFrame(frame.can_id, frame.data), frame.t_rx_ns)
 
     def _on_news(self, news: str, problem: str) -> None:
-        """Show trouble of the bus, or its end."""
-        self._health.on_link_news(self._now_ns(), news, problem)
-
-    def tick(self, now_ns: int) -> None:
-        """No-op: frames come by themselves."""
+        """Report a change of the bus state."""
+        self._health.on_link_news(self._host.now_ns(), news, problem)
 
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
-        """Report the received frames instead, and search anew after a long silence."""
+        """Report the received frames, and search again after a long silence."""
         health, driver = self._health, self.driver
         since_ns = health.silent_since_ns if health.state is DeviceState.SILENT else path.begun_ns
         if self._searchable and now_ns - since_ns > SILENT_SEARCH_NS:
@@ -354,48 +328,31 @@ class CanTransport:
         else:
             health.report(f"nothing of {driver.name} is heard on {self.where}: is its identifier right?")
 
-    def on_reset(self) -> None:
-        """No-op: the device sends again by itself."""
-
     # --- state -------------------------------------------------------------------------------------------------------
 
     @property
     def where(self) -> str:
-        """The bus and its rate, for people."""
+        """Name of the bus and its bit rate."""
         return f"{self.link.title} at {self.link.bitrate // 1000} kbit/s" if self.link.bitrate else self.link.title
 
     @property
     def bit_rate(self) -> int:
-        """Rate of the bus in bit/s; 0 where it is not known."""
+        """Bit rate of the bus, bit/s; 0 if it is unknown."""
         return self.link.bitrate
 
     @property
     def receiving(self) -> bool:
-        """Whether frames go to the device's codec."""
+        """Whether frames go to the codec of the device; False during a search."""
         return self._round is None
 
     @property
     def hears_replies(self) -> bool:
-        """Whether a codec hears replies: that of a named driver does, so that a device that sends nothing can be set
-        to send."""
+        """Whether a codec exists. If the driver is configured, imud can thus start the output of a silent device."""
         return self.path is not None
-
-    @property
-    def busy(self) -> bool:
-        """Whether a request script is running."""
-        return self._exchange.busy
-
-    def add_status(self, status: DeviceStatus) -> DeviceStatus:
-        """Return the status as it is."""
-        return status
 
     @property
     def _searchable(self) -> bool:
         return self._config.driver == "auto"
-
-    @property
-    def _may_ask(self) -> bool:
-        return self._config.identify and self.link.writable
 
 
 def _changed(before: Options | None, after: Options) -> str:

@@ -11,31 +11,31 @@ A device is composed of a transport, which owns the link and the sample path, an
 import asyncio
 import logging
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
-import msgspec
-
+from imud.config.devices import owner_of
 from imud.config.model import DeviceConfig
 from imud.contracts.command import Action, Actions, CalibrationResult, Calibrations, Risk
 from imud.contracts.driver import status_words
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
-from imud.contracts.publisher import Batch, PutRecord
+from imud.contracts.publisher import PutRecord
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
-from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, LinesStatus
-from imud.device.attachments import AttachmentHooks, Attachments
+from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
+from imud.device.attachments import Attachments
 from imud.device.calibration import CalibrationRun
 from imud.device.flash import SettingsFiles
 from imud.device.health import DeviceEvents, Health
+from imud.device.identity import identity_words
 from imud.device.latency import Need
-from imud.device.settings import KnownIdentity, SettingsKeeper, identity_words
-from imud.device.transport import UNHEARD_NS, DeviceContext, Transport
-from imud.device.utc import DevicePort
+from imud.device.settings import SettingsKeeper
+from imud.device.transport import UNHEARD_NS, DeviceContext, DeviceOwner, Transport
 from imud.device.watches import AttitudeWatch, StatusWatch
 from imud.host.clock import HostClock
 from imud.host.log import printable, shown
+from imud.links import LINKS
 from imud.model.errors import BadArgument, CommandError, ImudError, LinkBusy, LinkError, LinkMissing
-from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.recording.observer import PathObserver
@@ -57,52 +57,44 @@ SILENCE_PERIODS = 5
 MakeTransport = Callable[[DeviceContext], Transport]
 
 
+@dataclass(frozen=True, slots=True)
+class SharedParts:
+    """Parts that all devices of a daemon share."""
+
+    owner: DeviceOwner
+    host: HostClock
+    lines: LineFactory
+    files: SettingsFiles
+
+
 class Device:
-    """A configured device. Synchronization: the event loop's thread only."""
+    """A configured device. Synchronization: the loop's thread only."""
 
     def __init__(
-        self,
-        config: DeviceConfig,
-        device_id: int,
-        make_transport: MakeTransport,
-        publish: Callable[[Batch], None],
-        send_event: Callable[[Event], None],
-        host: HostClock,
-        lines: LineFactory,
-        files: SettingsFiles,
-        port_owner: Callable[[], str],
+        self, config: DeviceConfig, device_id: int, shared: SharedParts, make_transport: MakeTransport
     ) -> None:
-        """`port_owner` names the device of this configuration that has the port, empty for none."""
-        self._port_owner = port_owner
         self.config = config
         self.device_id = device_id
         self.ledger = Ledger()
-        self._host = host
+        self._shared = shared
+        self._host = host = shared.host
         self._suspends = host.suspends
-        self._notices = DeviceEvents(config.name, self.ledger, send_event)
+        self._notices = DeviceEvents(config.name, self.ledger, shared.owner.send_event)
         self._health = Health(self._notices)
-        port = DevicePort(self._write, lambda: self._transport.bit_rate, self._is_busy)
-        hooks = AttachmentHooks(port, self._on_reset)
-        self._attachments = Attachments(config, lines, hooks, self._notices, host)
-        self._identity = KnownIdentity(self._notices, host.now_ns, self._on_settings, self._described)
         self._tap = PathObserver(config, device_id, self.ledger, host)
-        self._transport = make_transport(
-            DeviceContext(
-                config, device_id, host, self.ledger, self._notices, self._health, self._identity, self._attachments,
-                publish, self._tap,
-            )
-        )  # fmt: skip
-        self._guide = CalibrationRun(self._transport.run_script, self._notices)
-        self._attachments.add(self._guide)
-        transport = self._transport
-        self._settings = SettingsKeeper(
-            config, transport.run_script, lambda: transport.driver, self._identity, self._notices, host, files,
-            self._can_be_asked, transport.read_back,
-        )  # fmt: skip
+        context = DeviceContext(
+            config, device_id, shared.owner, host, shared.lines, self.ledger, self._notices, self._health, self._tap
+        )
+        self._transport = transport = make_transport(context)
+        self._identity = transport.identity
+        self._attachments = Attachments(config, shared.lines, transport, self._notices, host)
+        transport.serve(self._attachments)
+        self._calibration = CalibrationRun(transport, self._notices)
+        self._attachments.add(self._calibration)
+        self._settings = SettingsKeeper(context, transport, shared.files)
         self._attachments.add(self._settings)
-        self._frame = AttitudeWatch(config, self._notices)
+        self._attitude = AttitudeWatch(config, self._notices)
         self._status = StatusWatch(self._notices)
-        self._line_differences: Mapping[str, str] = {}
         self._rate = RateMeter()
         self._connects = 0
         self._need = Need(0, "")
@@ -162,7 +154,7 @@ class Device:
             path.flush(now_ns)
         if transport.receiving:
             self._watch_flow(path, now_ns)
-        self._frame.tick(now_ns, path)
+        self._attitude.tick(now_ns, path)
         self._status.tick(now_ns, transport.driver, path)
         self._notices.tick(now_ns, path.newest.sync if path.newest else None)
 
@@ -222,7 +214,9 @@ class Device:
 
     def _with_owner(self, error: LinkError) -> LinkError:
         """Name the device that has the port, where it is one of this configuration."""
-        owner = self._port_owner() if isinstance(error, LinkBusy) else ""
+        if not isinstance(error, LinkBusy):
+            return error
+        owner = owner_of(self.config, self._shared.owner.configured_devices(), LINKS)
         if not owner:
             return error
         return LinkBusy(f"{self._transport.link.title} is in use by {owner}, another device of this configuration")
@@ -232,48 +226,11 @@ class Device:
 
     # --- callbacks of its parts --------------------------------------------------------------------------------------
 
-    def _write(self, data: bytes) -> None:
-        self._transport.link.write(data)
-
-    def _is_busy(self) -> bool:
-        """Whether nothing may be sent in between: a script runs, or a search sets other rates."""
-        return self._transport.busy or not self._transport.receiving
-
     def record(self, put: PutRecord) -> None:
         """Describe the device as it is now, and pass on all that it delivers; `tap.end` ends it."""
         self._tap.begin(
             put, self._transport.where, identity_words(self._identity.identity), self._identity.shown_settings
         )
-
-    def _on_reset(self) -> None:
-        self._transport.on_reset()
-
-    def _on_settings(self, settings: Mapping[str, str]) -> None:
-        """Compare lines with the settings that were read back."""
-        identity = identity_words(self._identity.identity)
-        self._tap.described(self._transport.where, identity, self._identity.shown_settings)
-        driver = self._transport.driver
-        read = driver.alarm_ranges if driver is not None else None
-        self._attachments.set_alarm_ranges(read(settings) if read is not None else None)
-        lines = self.config.lines
-        found = driver.line_differences(settings, lines) if driver is not None and lines is not None else {}
-        for key, words in found.items():
-            if self._line_differences.get(key) != words:
-                self._notices.raise_event(
-                    self._host.now_ns(), EventKind.CONFIGURATION, f"line {key}: {words}", line=key
-                )
-        self._line_differences = found
-
-    def _described(self, settings: Mapping[str, str]) -> Mapping[str, str]:
-        driver = self._transport.driver
-        return driver.shown_settings(settings) if driver is not None else settings
-
-    def _lines_status(self) -> LinesStatus | None:
-        """Status of the lines, with what the device's settings contradict."""
-        lines = self._attachments.lines_status()
-        if lines is None or not self._line_differences:
-            return lines
-        return msgspec.structs.replace(lines, problems={**self._line_differences, **lines.problems})
 
     # --- actions -----------------------------------------------------------------------------------------------------
 
@@ -312,13 +269,13 @@ class Device:
             if save:
                 self._settings.spend_flash()
             try:
-                return await self._guide.run(kind, calibration, save=save)
+                return await self._calibration.run(kind, calibration, save=save)
             finally:
                 self._settings.commanded()
 
     def stop_calibration(self) -> bool:
         """End the calibration that runs; return whether there was one."""
-        return self._guide.cancel()
+        return self._calibration.cancel()
 
     async def _run_action(self, name: str, action: Action, arguments: Mapping[str, Any]) -> object:
         params = action.arguments(arguments)
@@ -362,18 +319,10 @@ class Device:
         self._attachments.set_alarm_ranges(None)  # what was read back need not hold any more
         return await self._settings.apply(given, save=save)
 
-    def _can_be_asked(self) -> bool:
-        """Whether a script can be run on the device now, and no other one is."""
-        transport = self._transport
-        searching = self._health.state is DeviceState.SEARCHING and transport.hears_replies
-        return transport.link.writable and (self._health.streaming or searching) and not transport.busy
-
     def _require_replies(self) -> None:
-        health = self._health
-        searching = health.state is DeviceState.SEARCHING and self._transport.hears_replies
-        if not health.streaming and not searching:
-            problem = health.problem or "it accepts no commands now"
-            raise CommandError(f"{self.config.name} is {health.state}: {problem}")
+        if not self._transport.accepts_scripts:
+            problem = self._health.problem or "it accepts no commands now"
+            raise CommandError(f"{self.config.name} is {self._health.state}: {problem}")
 
     def _known_actions(self) -> str:
         return ", ".join(self.actions) or "none" + " while no device is found" * (self._transport.driver is None)
@@ -408,7 +357,7 @@ class Device:
         path, driver = transport.path, transport.driver
         newest = path.newest if path is not None else None
         latency = path.latency if path is not None else LatencyMeter()
-        frame = self._frame.status(driver, path, self._identity.settings)
+        frame = self._attitude.status(driver, path, self._identity.settings)
         status = DeviceStatus(
             name=self.config.name,
             device_id=self.device_id,
@@ -437,7 +386,7 @@ class Device:
             status_words=status_words(driver.status_bits, newest.status) if driver and newest else (),
             status_bit_names={str(number): bit.name for number, bit in driver.status_bits.items()} if driver else {},
             connects=self._connects,
-            lines=self._lines_status(),
+            lines=self._attachments.lines_status(),
             utc=self._attachments.utc_status(),
             declared=self._settings.status(),
             noise=self.config.noise,

@@ -5,7 +5,7 @@ a configuration that contradicts it, must not use them up: imud by itself writes
 hours, which is a life of some seven years even so; people and programs may write it LIMIT_ASKED times.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any, Final
 import msgspec
 
 from imud.config.yaml import yaml_block, yaml_comment
+from imud.host.clock import HostClock
 from imud.host.files import StateFile, replace_file
 from imud.model.units import NS_PER_S
 
@@ -41,13 +42,13 @@ class ModuleRecord(msgspec.Struct):
 class FlashWrites:
     """Writes to the flash of all modules. Synchronization: the event loop's thread only."""
 
-    def __init__(self, folder: Path | None, utc_ns: Callable[[], int]) -> None:
-        """With None as `folder` they are known during this run only; `utc_ns` reads CLOCK_REALTIME."""
+    def __init__(self, folder: Path | None, host: HostClock) -> None:
+        """With `folder` None, imud keeps the counts in memory only."""
         self._file = StateFile(
             folder / FILE_NAME if folder else None, "settings", "writes to flash are counted from the beginning"
         )
         self._modules = self._file.read(dict[str, ModuleRecord])
-        self._utc_ns = utc_ns
+        self._host = host
 
     def writes(self, module: str) -> int:
         """Writes to the flash of a module in all runs."""
@@ -55,7 +56,7 @@ class FlashWrites:
 
     def writes_day(self, module: str) -> int:
         """Writes within the last 24 hours. Those that a wrong clock dated later than now count as of now."""
-        now_s, record = self._utc_ns() // NS_PER_S, self._record(module)
+        now_s, record = self._host.utc_ns() // NS_PER_S, self._record(module)
         record.times_s = [min(time_s, now_s) for time_s in record.times_s]
         return sum(time_s > now_s - DAY_S for time_s in record.times_s)
 
@@ -71,7 +72,7 @@ class FlashWrites:
         """Count a write that is about to be made."""
         record = self._modules.pop(module, None) or ModuleRecord()
         record.writes += 1
-        record.times_s = [*record.times_s, self._utc_ns() // NS_PER_S][-LIMIT_ASKED:]
+        record.times_s = [*record.times_s, self._host.utc_ns() // NS_PER_S][-LIMIT_ASKED:]
         self._keep(module, record)
 
     def unreadable(self, module: str) -> Mapping[str, Any]:
@@ -157,10 +158,8 @@ class BackupFolder:
 class SettingsFiles:
     """What imud keeps about settings of devices beyond a run, in the state directory; None keeps nothing."""
 
-    def __init__(self, state_dir: Path | None, utc_ns: Callable[[], int]) -> None:
-        """`utc_ns` reads CLOCK_REALTIME."""
-        self.utc_ns = utc_ns
-        self.flash = FlashWrites(state_dir, utc_ns)
+    def __init__(self, state_dir: Path | None, host: HostClock) -> None:
+        self.flash = FlashWrites(state_dir, host)
         self.backups = BackupFolder(state_dir)
 
     def close(self) -> None:

@@ -18,6 +18,7 @@ from typing import Any, Final, Protocol, TypeVar
 from imud.contracts.codec import Poll, Reading
 from imud.contracts.link import PolledLink
 from imud.contracts.script import Transfer, TransferScript
+from imud.host.clock import HostClock
 from imud.host.threads import BusThread, StartWatchingWorker
 from imud.model.errors import ImudError, LinkError, TransferError
 from imud.model.units import NS_PER_S
@@ -240,14 +241,14 @@ class BusMember:
     """A device on a bus, for its owner. Synchronization: the loop's thread only."""
 
     def __init__(self, bus: "PolledBus", link: PolledLink, deadlines: Deadlines, on_readings: OnReadings) -> None:
-        """`PolledBus.join` makes it; how its deadlines are kept is counted in `deadlines`."""
+        """`PolledBus.join` creates a member. `deadlines` counts the reads."""
+        self.link = link
+        self.deadlines = deadlines
         self._bus = bus
-        self._link = link
-        self._deadlines = deadlines
         self._on_readings = on_readings
         self._left = False
         self._latency_ns = 0
-        self._polling = _Polling(link, deadlines, bus.now_ns, self._deliver)
+        self._polling = _Polling(self, bus.now_ns)
         bus.command(lambda: bus.add(self._polling))
 
     async def run(self, script: TransferScript[T], target: int, on_target: Callable[[int], None] = ignore_target) -> T:
@@ -266,7 +267,7 @@ class BusMember:
 
     def claim(self, target: int) -> bool:
         """Claim a target of a shared bus for this device; return False if it is another's."""
-        return not self._link.shared or self._bus.claim(target, self)
+        return not self.link.shared or self._bus.claim(target, self)
 
     def release(self) -> None:
         """Release the claimed target; no-op without one."""
@@ -274,7 +275,7 @@ class BusMember:
 
     def start(self, polls: Sequence[Poll], timetable: Timetable | None = None) -> None:
         """Read from now on by the timetable; without one at deadlines, or in turns where the link has no rate."""
-        rate_hz, begin_ns, counts = self._link.rate_hz, self._bus.now_ns(), self._deadlines
+        rate_hz, begin_ns, counts = self.link.rate_hz, self._bus.now_ns(), self.deadlines
         schedule = timetable or (Schedule(rate_hz, begin_ns, counts) if rate_hz else RoundRobin(begin_ns, counts))
         self.command(lambda: self._polling.start(polls, schedule))
 
@@ -314,7 +315,8 @@ class BusMember:
             self.release()
             self.command(lambda: self._bus.remove(self._polling))
 
-    def _deliver(self, readings: Sequence[Reading], problem: LinkError | None) -> None:
+    def deliver(self, readings: Sequence[Reading], problem: LinkError | None) -> None:
+        """Pass readings to the owner, unless the member has left. Runs in the loop's thread."""
         if not self._left:
             self._on_readings(readings, problem)
 
@@ -322,18 +324,16 @@ class BusMember:
 class _Polling:
     """Polls of one device. Synchronization: the bus's thread only."""
 
-    def __init__(self, link: PolledLink, deadlines: Deadlines, now_ns: Callable[[], int], deliver: OnReadings) -> None:
-        """`deliver` is to be called in the loop's thread."""
-        self.link = link
+    def __init__(self, member: BusMember, now_ns: Callable[[], int]) -> None:
+        self.link = member.link
         self.scripts: deque[_ScriptRun] = deque()
         """Transfer scripts that wait for their transfers, the running one first."""
         self.schedule: Timetable | None = None
         """Timetable of its reads; None while it is not read."""
         self.held = False
         """Whether a script keeps it from being read until its next transfer."""
-        self._deadlines = deadlines
+        self._member = member
         self._now_ns = now_ns
-        self._deliver = deliver
         self._polls: Sequence[Poll] = ()
         self._due_ns: list[int] = []
         self._readings: list[Reading] = []
@@ -377,7 +377,7 @@ class _Polling:
     def delivery(self, next_ns: int) -> Callback | None:
         """Return what delivers all that has gathered, to be called in the loop's thread; None for nothing, or where it
         may wait until `next_ns`, when it is asked for again."""
-        readings, problem, deliver = self._readings, self._problem, self._deliver
+        readings, problem, deliver = self._readings, self._problem, self._member.deliver
         waits = not readings or next_ns <= readings[0].end_ns + self._latency_ns
         if waits and problem is None and not self._failed:
             return None
@@ -400,7 +400,7 @@ class _Polling:
         if len(self._readings) < READINGS_MAX:
             self._readings.append(Reading(number, data, error, start_ns, self._now_ns()))
         else:
-            self._deadlines.missed += 1
+            self._member.deadlines.missed += 1
 
 
 class _ScriptRun:
@@ -459,9 +459,9 @@ class PolledBus:
     """A bus and its devices."""
 
     def __init__(
-        self, name: str, loop: asyncio.AbstractEventLoop, now_ns: Callable[[], int], start_worker: StartWatchingWorker
+        self, name: str, loop: asyncio.AbstractEventLoop, host: HostClock, start_worker: StartWatchingWorker
     ) -> None:
-        self.now_ns = now_ns
+        self.now_ns = host.now_ns
         """CLOCK_MONOTONIC."""
         self._loop = loop
         self._polling: list[_Polling] = []
@@ -592,9 +592,9 @@ class PolledBus:
 class PolledBuses:
     """The buses in use, by name. Synchronization: the loop's thread."""
 
-    def __init__(self, now_ns: Callable[[], int], start_worker: StartWatchingWorker = BusThread) -> None:
-        """`now_ns` reads CLOCK_MONOTONIC; the buses are served by threads unless another worker is given."""
-        self.now_ns = now_ns
+    def __init__(self, host: HostClock, start_worker: StartWatchingWorker = BusThread) -> None:
+        """`start_worker` starts the thread of a bus."""
+        self._host = host
         self._start_worker = start_worker
         self._buses: dict[str, PolledBus] = {}
 
@@ -602,7 +602,7 @@ class PolledBuses:
         """Return the bus of that name; its thread starts with its first device."""
         bus = self._buses.get(name)
         if bus is None:
-            bus = self._buses[name] = PolledBus(name, asyncio.get_running_loop(), self.now_ns, self._start_worker)
+            bus = self._buses[name] = PolledBus(name, asyncio.get_running_loop(), self._host, self._start_worker)
         return bus
 
     def end(self) -> None:

@@ -1,15 +1,15 @@
-"""Transport of a polled device: it is identified and set up before it is read, and again whenever it vanished.
+"""Transport of a polled device: imud identifies the device and sets it up before it reads samples.
 
 MISSING ──bus appears──▶ SEARCHING ──identified, set up, samples──▶ RUNNING ──same bytes for a while──▶ SILENT
-   ▲                        ▲                                          │                                   │
-   └──────── bus gone ──────┴──── no answer, wrong id, bad frames ─────┴───────────────────────────────────┘
+   ▲                        │                                          │                                   │
+   └──────── bus missing ───┴──── no reply, wrong id, bad frames ──────┴───────────────────────────────────┘
 
-Readings are decoded only between an identification and the first sign that the device is not there any more.
+The path decodes readings only between an identification and the first sign that the device is missing.
 """
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,10 +22,12 @@ from imud.contracts.lines import Edge, LineFactory, ReadyOptions
 from imud.contracts.link import OnEnd, PolledLink
 from imud.contracts.script import Message
 from imud.contracts.status import DeviceState, DeviceStatus, LinesStatus, PollingStatus
+from imud.device.attachments import Attachments
 from imud.device.health import DeviceEvents
 from imud.device.polled_bus import BusMember, Deadlines, PolledBuses, ReadySchedule
-from imud.device.transport import UNHEARD_NS, DeviceContext
+from imud.device.transport import UNHEARD_NS, DeviceContext, Transport
 from imud.drivers import DRIVERS
+from imud.host.clock import HostClock
 from imud.lines.watched_line import WatchedLine
 from imud.links import LINKS
 from imud.model.errors import CommandError, DeviceRefused, ImudError, LinkError, TransferError, Trouble
@@ -36,41 +38,44 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import PolledPath, PollTiming, ReadyEdges, SamplePath
 
+log = logging.getLogger(__name__)
+
+RETRY_S = 0.5
+"""Pause between two search rounds, s."""
+TURNS_PERIOD_NS = 200 * NS_PER_MS
+"""Assumed period of a device that shares a bus by turns, ns: five missing readings make the device silent."""
+
 
 class DataReady:
-    """The data-ready line of one device, an attachment of it. Synchronization: the loop's thread only."""
+    """Data-ready line of one device: an attachment that starts a read at each edge. Synchronization: the loop's thread
+    only."""
 
     def __init__(
-        self,
-        device: str,
-        settings: ReadyOptions,
-        lines: LineFactory,
-        rate_hz: float,
-        notices: DeviceEvents,
-        now_ns: Callable[[], int],
-    ) -> None:
-        """`lines` makes the line; `rate_hz` is that of the reads while no edges come."""
+        self, device: str, settings: ReadyOptions, lines: LineFactory, rate_hz: float, notices: DeviceEvents,
+        host: HostClock,
+    ) -> None:  # fmt: skip
+        """`rate_hz` is the rate of the reads while no edge arrives."""
         self._rate_hz = rate_hz
         self._notices = notices
-        self._now_ns = now_ns
+        self._host = host
         line = lines.make_input(_rising(settings), f"{device} data_ready", True)
-        self._watched = WatchedLine(line, self._on_edges, self._on_level, self._report, now_ns)
+        self._watched = WatchedLine(line, self._on_edges, self._on_level, self._report, host.now_ns)
         self.edges = ReadyEdges(settings, round(NS_PER_S / rate_hz))
-        """The edges, for the path that dates reads by them."""
+        """Edges for the path, which time-stamps the readings with them."""
         self._member: BusMember | None = None
         self._schedule: ReadySchedule | None = None
         self._watched_fd = -1
-        """The line's descriptor while the bus's thread waits for it."""
+        """Descriptor of the line while the thread of the bus waits for it."""
         self._reported_by_edges = True
         self._closed = False
 
     # --- the attachment ----------------------------------------------------------------------------------------------
 
     def start(self, clock: SampleClock) -> None:
-        """No-op: `read` begins the reads."""
+        """Do nothing: `read` starts the reads."""
 
     def tick(self, now_ns: int, _newest: Sample | None) -> None:
-        """Open the line if it is due, and report when edges stopped or came back."""
+        """Open the line if this is due. Report if edges stop or return."""
         if not self._closed:
             self._watched.tick(now_ns)
         by_edges = self._schedule.by_edges if self._schedule is not None else self._reported_by_edges
@@ -80,12 +85,12 @@ class DataReady:
             self._raise_event(message, by_edges=by_edges)
 
     def stop(self) -> None:
-        """Edges cause no more reads; may be called twice."""
+        """Stop reads at edges. A second call does nothing."""
         self._unwatch()
         self._member = self._schedule = None
 
     def close(self) -> None:
-        """Release the line; may be called twice."""
+        """Release the line. A second call does nothing."""
         self.stop()
         self._closed = True
         self._watched.close()
@@ -93,7 +98,7 @@ class DataReady:
     # --- reads -------------------------------------------------------------------------------------------------------
 
     def read(self, member: BusMember, polls: Sequence[Poll], counts: Deadlines, now_ns: int) -> None:
-        """Read the device at its edges from now on; how that succeeds is counted in `counts`."""
+        """Start to read the device at its edges. `counts` counts the reads."""
         self._unwatch()
         self._watched.tick(now_ns)
         self.edges.restart()
@@ -103,19 +108,19 @@ class DataReady:
         member.start(polls, self._schedule)
 
     def drain(self) -> None:
-        """Process the edges that the kernel has."""
+        """Process the edges in the buffer of the kernel."""
         self._watched.drain()
 
     # --- state -------------------------------------------------------------------------------------------------------
 
     @property
     def expected_rate_hz(self) -> float:
-        """Reads per second as things are."""
+        """Present rate of the reads, Hz."""
         by_edges = self._schedule is not None and self._schedule.by_edges
         return NS_PER_S / self.edges.interval_ns if by_edges else self._rate_hz
 
     def add_status(self, lines: LinesStatus) -> LinesStatus:
-        """Return the status of the device's lines with this one."""
+        """Return the status of the lines with the status of this line."""
         watched = self._watched
         return msgspec.structs.replace(
             lines,
@@ -129,21 +134,22 @@ class DataReady:
         member, schedule = self._member, self._schedule
         if member is not None and schedule is not None:
             times_ns, interval_ns = [edge.t_ns for edge in edges], self.edges.interval_ns
-            tell = member.note if schedule.has_read(times_ns[-1]) else member.command
-            tell(lambda: schedule.on_edges(times_ns, interval_ns))
+            # an edge that a read already covers needs no wake-up of the thread
+            run = member.note if schedule.has_read(times_ns[-1]) else member.command
+            run(lambda: schedule.on_edges(times_ns, interval_ns))
 
     def _on_level(self, active: bool | None) -> None:
-        """Follow the line, which was opened, or closed (None); its level adds nothing to the edges."""
+        """Follow the line: imud has opened it, or closed it (None)."""
         if active is None:
             self._unwatch()
         else:
             self._watch()
 
     def _watch(self) -> None:
-        """Have the bus's thread wait for the line, if it is open and that is possible."""
+        """Let the thread of the bus wait for the line, if the line has a descriptor."""
         member, schedule, fd = self._member, self._schedule, self._watched.line.fileno()
         if member is not None and schedule is not None and self._watched_fd < 0:
-            now_ns = self._now_ns
+            now_ns = self._host.now_ns
             if member.watch(fd, lambda: schedule.noticed(now_ns())):
                 self._watched_fd = fd
 
@@ -157,72 +163,69 @@ class DataReady:
 
     def _raise_event(self, message: str, **detail: bool) -> None:
         words = f"line data_ready: {message}"
-        self._notices.raise_event(self._now_ns(), EventKind.LINK, words, line="data_ready", **detail)
+        self._notices.raise_event(self._host.now_ns(), EventKind.LINK, words, line="data_ready", **detail)
 
 
 def _rising(settings: ReadyOptions) -> ReadyOptions:
-    """Return settings whose rising edge is the wanted one: of that alone the kernel reports the direction reliably."""
+    """Return settings that wait for the rising edge: the kernel reports only its direction reliably."""
     if settings.edge == "rising":
         return settings
     return msgspec.structs.replace(settings, active_low=not settings.active_low, edge="rising")
 
 
-log = logging.getLogger(__name__)
-
-RETRY_S = 0.5
-"""Pause between two rounds of search."""
-TURNS_PERIOD_NS = 200 * NS_PER_MS
-"""Time between two reads of a device that is read in turns with others: five of them are no silence."""
-
-
 @dataclass(frozen=True, slots=True)
 class IdentifiedDevice:
-    """A device that answered on the bus."""
+    """A device that replied on the bus."""
 
     driver: PolledDriver
     options: Options
     target: int
+    """Address or chip select of the device."""
     identity: Identity
 
 
-class PolledTransport:
-    """Transport of one device on a polled bus. Synchronization: the event loop's thread only."""
+class PolledTransport(Transport):
+    """Transport of one device on a polled bus. Synchronization: the loop's thread only."""
 
-    def __init__(self, context: DeviceContext, link: PolledLink, buses: PolledBuses, ready: DataReady | None) -> None:
-        """`buses` is what the devices of a daemon share; `ready` is the device's data-ready line, if it has one."""
+    link: PolledLink
+    driver: PolledDriver | None
+    path: PolledPath | None
+
+    def __init__(self, context: DeviceContext, link: PolledLink, buses: PolledBuses) -> None:
+        """All devices of the daemon share `buses`."""
+        super().__init__(context)
         self.link = link
-        self.driver: PolledDriver | None = None
-        self.path: PolledPath | None = None
-        self._config = context.config
-        self._context = context
-        self._health = context.health
-        self._now_ns = context.host.now_ns
+        self.driver = self.path = None
         self._buses = buses
-        self._ready = ready
+        config, host, ready = context.config, context.host, None
+        if config.lines is not None and config.lines.data_ready is not None:
+            options = config.lines.data_ready
+            ready = DataReady(config.name, options, context.lines, link.rate_hz, context.notices, host)
+        self._ready: DataReady | None = ready
         self._member: BusMember | None = None
         self._deadlines = Deadlines()
         self._device: IdentifiedDevice | None = None
-        """The device that was read last."""
+        """The device that imud read last."""
         self._former: tuple[int, ...] = ()
-        """Target of the device before a script moved it: an unsaved address is lost when the device restarts."""
+        """Target of the device before a script changed it. The device loses an unsaved address at a restart."""
         self._identified = False
-        """Whether what is read is that of the identified device."""
+        """Whether the readings belong to the identified device."""
         self._gone: asyncio.Future[str] | None = None
-        """Completes with why the device must be identified again."""
+        """Completes with the reason for another identification."""
         self._on_end: OnEnd | None = None
         self._vanished = 0
         self._lost_counted = 0
-        self._latency_ns = 0
 
-    # --- the bus's life ----------------------------------------------------------------------------------------------
+    def serve(self, attachments: Attachments) -> None:
+        """Set the attachments of the device, and add the data-ready line."""
+        super().serve(attachments)
+        if self._ready is not None:
+            attachments.add(self._ready)
 
-    async def wait_present(self) -> None:
-        """Return when the bus is there."""
-        self._health.missing(self._now_ns(), self.link.absence())
-        await self.link.wait_present()
+    # --- the link ----------------------------------------------------------------------------------------------------
 
     def start(self, on_end: OnEnd) -> None:
-        """Join the bus."""
+        """Join the bus. `on_end` is called once if the link ends."""
         self._on_end = on_end
         self._health.searching()
         self._member = self._buses.get(self.link.bus).join(self.link, self._deadlines, self._on_readings)
@@ -230,32 +233,28 @@ class PolledTransport:
 
     async def work(self) -> None:
         """Find, set up and read the device, repeatedly. Ends only with the bus."""
-        member, attachments = self._member, self._context.attachments
+        member = self._member
         assert member is not None
         while True:
-            await attachments.reset_settled()
+            await self.attachments.reset_settled()
             device = await self._find(member)
             if device is not None and await self._set_up(member, device):
                 await self._read(member, device)
                 continue
             await asyncio.sleep(RETRY_S)
-            await attachments.device_not_found(self._now_ns())
+            await self.attachments.device_not_found(self._host.now_ns())
 
     def stop(self) -> None:
-        """Leave the bus, whose thread closes the link; may be called twice."""
+        """Leave the bus; its thread closes the link. A second call does nothing."""
         member, self._member = self._member, None
         self._identified = False
         if member is not None:
             member.leave()
 
-    def close(self) -> None:
-        """Stop; may be called twice."""
-        self.stop()
-
     # --- the search --------------------------------------------------------------------------------------------------
 
     async def _find(self, member: BusMember) -> IdentifiedDevice | None:
-        """Try all places once; return None when no device is there."""
+        """Probe all targets once; return None if no device replies."""
         problems: list[str] = []
         for driver in self._candidates():
             options = self._config.options or driver.settings()
@@ -270,27 +269,31 @@ class PolledTransport:
                     member.release()
                     problems.append(f"{place}: {error}")
                     if isinstance(error, TransferError) and error.trouble is Trouble.STUCK:
-                        break  # another try would hold up the other devices of the bus
+                        break  # another probe would delay the other devices of the bus
         self._health.report("; ".join(dict.fromkeys(problems)))
         return None
 
     async def _set_up(self, member: BusMember, device: IdentifiedDevice) -> bool:
-        """Set the device up as configured; return False when that failed."""
+        """Set up the device as configured; return whether this succeeded."""
         try:
             settings = await member.run(device.driver.set_up(device.options), device.target)
         except (TransferError, DeviceRefused) as error:
             member.release()
             self._health.report(f"{self.link.place(device.target)}: {error}")
             return False
-        self._context.identity.update(device.identity, settings)
+        self._update_identity(device, settings)
         return True
 
+    def _update_identity(self, device: IdentifiedDevice, settings: Mapping[str, str]) -> None:
+        self.identity.update_identity(device.identity)
+        self._update_settings(settings)
+
     async def _read(self, member: BusMember, device: IdentifiedDevice) -> None:
-        """Read until the device is gone. Raises LinkError when its bus is gone."""
+        """Read the device until it is missing. Raises LinkError if the bus is missing."""
         gone = self._gone = asyncio.get_running_loop().create_future()
         path, ready = self._begin(device), self._ready
         if ready is not None:
-            ready.read(member, path.codec.polls, self._deadlines, self._now_ns())
+            ready.read(member, path.codec.polls, self._deadlines, self._host.now_ns())
         else:
             member.start(path.codec.polls)
         try:
@@ -302,7 +305,7 @@ class PolledTransport:
             member.stop()
             member.release()
         self._vanished += 1
-        self._health.down(self._now_ns(), DeviceState.SEARCHING, why)
+        self._health.down(self._host.now_ns(), DeviceState.SEARCHING, why)
 
     def _begin(self, device: IdentifiedDevice) -> PolledPath:
         path = self.path
@@ -310,9 +313,9 @@ class PolledTransport:
             path = self._new_path(device)
         path.clock.restart()
         self._device = device
-        path.begin(self._now_ns())
+        path.begin(self._host.now_ns())
         self._identified = True
-        self._context.attachments.start(path.clock)
+        self.attachments.start(path.clock)
         return path
 
     def _new_path(self, device: IdentifiedDevice) -> PolledPath:
@@ -335,13 +338,15 @@ class PolledTransport:
         return [driver for driver in drivers if LINKS[self._config.link].fits(driver)]
 
     def _targets(self, driver: PolledDriver) -> Sequence[int]:
-        """Return where to look, beginning where the device was: a script may have moved it from the given place."""
+        """Return the targets to probe. The last target is first, because a script can have changed the address."""
         given = driver.targets if self.link.target is None else (self.link.target,)
         last = (self._device.target,) if self._device is not None else ()
         return tuple(dict.fromkeys((*last, *self._former, *given)))
 
+    # --- requests ----------------------------------------------------------------------------------------------------
+
     async def run_script(self, make: Callable[[Target], Any]) -> Any:
-        """Run a transfer script between two reads; one that changes the device's address is followed."""
+        """Run a transfer script between two reads. Follow the device if the script changes its address."""
         member, device = self._member, self._device
         if member is None or device is None:
             raise CommandError(f"{self._config.name} is not there")
@@ -354,9 +359,9 @@ class PolledTransport:
         return tuple(dict.fromkeys((device.target, *self._former, *given)))
 
     async def read_back(self) -> None:
-        """Set the device up again as configured, and keep the settings that it reads back.
+        """Set up the device again as configured, and store the settings that it reports.
 
-        One that does not answer is left as it is: it is set up when it returns."""
+        If the device does not reply, imud sets it up when it returns."""
         member, device = self._member, self._device
         if member is None or device is None or not self._identified:
             return
@@ -365,7 +370,7 @@ class PolledTransport:
         except ImudError as error:
             log.info("%s: settings not read back: %s", self._config.name, error)
             return
-        self._context.identity.update(device.identity, settings)
+        self._update_identity(device, settings)
 
     def _follow(self, target: int) -> None:
         """Follow a script that has given the device another address."""
@@ -378,24 +383,24 @@ class PolledTransport:
         if fixed is not None and target != fixed:
             place = self.link.place(target)
             message = f"the device has {place} now: change {self.link.place(fixed)} in the configuration"
-            self._context.notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message)
+            self._context.notices.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message)
         if not member.claim(target):
             place = self.link.place(target)
             message = f"the device has {place} now, which another device of this configuration has"
-            self._context.notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message)
+            self._context.notices.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message)
             self._identify_again(message)
 
-    # --- the flow ----------------------------------------------------------------------------------------------------
+    # --- the samples -------------------------------------------------------------------------------------------------
 
     def set_latency(self, latency_ns: int) -> None:
-        """Let readings wait so long; polls keep their deadlines."""
+        """Set the maximum hold of a reading, ns; 0: no hold. Reads keep their deadlines."""
         self._latency_ns = latency_ns
         if self._member is not None:
             self._member.set_latency(self.hold_ns)
 
     @property
     def hold_ns(self) -> int:
-        """How long readings wait, ns: not where fewer than two would, nor where each edge wakes the loop anyhow."""
+        """Present hold of the readings, ns; 0 if a hold contains one reading, or if each edge wakes the loop."""
         rate_hz = self.link.rate_hz
         waits = self._ready is None and rate_hz and self._latency_ns >= 2 * NS_PER_S / rate_hz
         return self._latency_ns if waits else 0
@@ -404,7 +409,7 @@ class PolledTransport:
         """Decode the readings of the bus's thread."""
         path, why = self.path, ""
         if self._ready is not None:
-            self._ready.drain()  # all edges before the end of a read are needed to say which of them it belongs to
+            self._ready.drain()  # the path needs all edges before the end of a read to assign the reading to an edge
         if path is not None and self._identified:
             why = path.on_readings(readings)
         elif path is not None:
@@ -418,55 +423,55 @@ class PolledTransport:
             self._identify_again(why)
 
     def _identify_again(self, why: str) -> None:
-        """Stop reading until the device is identified again."""
+        """Stop reading until imud has identified the device again."""
         self._identified = False
         if self._gone is not None and not self._gone.done():
             self._gone.set_result(why)
 
-    def tick(self, _now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Count deadlines and edges without a read as lost samples."""
         lost = self._missed
         self._context.ledger.lost_queue += lost - self._lost_counted
         self._lost_counted = lost
 
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
-        """Report that the device answers, where no sample came since the beginning."""
+        """Report that the device replies but has sent no new sample since its identification."""
         if self._health.state is DeviceState.SEARCHING and now_ns - path.begun_ns > UNHEARD_NS:
             self._health.report("the device answers, but no value of it is new: is it held in reset?")
 
     def on_reset(self) -> None:
-        """Identify the device again: its settings are lost."""
+        """Identify the device again: a reset loses its settings."""
         self._identify_again("reset by its line")
 
     # --- state -------------------------------------------------------------------------------------------------------
 
     @property
     def where(self) -> str:
-        """The bus and the place of the device on it, for people."""
+        """Name of the bus and address of the device."""
         return f"{self.link.title}, {self.link.place(self._device.target)}" if self._device else self.link.title
 
     @property
     def bit_rate(self) -> int:
-        """Rate of the line in bit/s, the same for all of its devices; 0 on a bus with a clock."""
+        """Bit rate of the bus, bit/s, which all of its devices share; 0 on a bus with a clock line."""
         return self.link.bit_rate
 
     @property
     def receiving(self) -> bool:
-        """Whether what is read is decoded."""
+        """Whether the path decodes the readings."""
         return self._identified
 
     @property
     def hears_replies(self) -> bool:
-        """Whether there is a device to talk to before the first sample: before it is identified, there is not."""
+        """False: imud can run scripts only after the identification, and samples follow immediately."""
         return False
 
     @property
     def busy(self) -> bool:
-        """False: scripts and reads take turns."""
+        """False: scripts and reads alternate."""
         return False
 
     def add_status(self, status: DeviceStatus) -> DeviceStatus:
-        """Return the status with how reading goes."""
+        """Return `status` with the state of the reads."""
         ready, lines = self._ready, status.lines
         return msgspec.structs.replace(
             status,
@@ -478,7 +483,7 @@ class PolledTransport:
 
     @property
     def _missed(self) -> int:
-        """Deadlines and data-ready edges for which nothing was read."""
+        """Number of deadlines and edges without a read."""
         return self._deadlines.missed + (self._ready.edges.missed if self._ready is not None else 0)
 
     def _polling_status(self) -> PollingStatus:
@@ -497,4 +502,4 @@ class PolledTransport:
 
 
 def _ignore_message(_message: Message, _t_rx_ns: int) -> None:
-    """Ignore messages: polled codecs make none, their devices answer to transfers."""
+    """Ignore a message. The codec of a polled device makes none, because the device replies to transfers."""

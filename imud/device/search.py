@@ -1,6 +1,6 @@
-"""A round of a search on an open link: passes received data on, sets rates, sends queries, keeps the deadlines.
+"""Execution of a search round on an open link: received data, rates, queries and deadlines.
 
-A search without I/O (`detection.stream`, `detection.can`) determines each step; here it is carried out.
+A search without I/O determines each step (`stream_search.Search`, `can_search.CanSearch`). A round executes the steps.
 """
 
 import asyncio
@@ -12,6 +12,7 @@ from typing import Final, Generic, Protocol, TypeVar
 
 import msgspec
 
+from imud.host.clock import HostClock
 from imud.host.files import StateFile
 from imud.model.errors import NothingHeard
 from imud.model.ledger import Ledger
@@ -21,109 +22,111 @@ FILE_NAME = "found.json"
 
 
 class RememberedDevice(msgspec.Struct, frozen=True):
-    """Driver and rate at which a device was last heard."""
+    """Driver and rate of a device at the last successful search."""
 
     driver: str
     baud: int
-    """0 on a CAN bus, whose rate is the system's."""
+    """Baud rate; 0 on a CAN bus."""
     node: int | None = None
-    """On a CAN bus: which device of the driver's kind."""
+    """Number of the device on a CAN bus."""
 
 
 class Remembered:
-    """The last good driver and baud rate by device name. Synchronization: the event loop's thread only.
+    """The results of successful searches by device name, in a file. Synchronization: the loop's thread only.
 
-    The file is written by a thread: a disk that is busy makes no sample wait. Only the newest content is written.
+    A thread writes the file, so that a slow disk delays no sample. The thread writes only the newest content.
     """
 
     def __init__(self, folder: Path | None) -> None:
-        """With None as `folder` nothing is read or written."""
+        """With `folder` None, imud neither reads nor writes a file."""
         without = "devices are searched for from the beginning"
         self._file = StateFile(folder / FILE_NAME if folder else None, "remembered", without)
         self._found = self._file.read(dict[str, RememberedDevice])
 
     def get(self, device: str) -> RememberedDevice | None:
-        """The remembered driver and rate of `device`."""
+        """Return the result for `device`; None if no search was successful."""
         return self._found.get(device)
 
     def put(self, device: str, found: RememberedDevice) -> None:
-        """Remember, and have the file written if that is news."""
+        """Store a result. Write the file if the result is new."""
         if self._found.get(device) != found:
             self._found[device] = found
             self._file.write(self._found)
 
     def close(self) -> None:
-        """Wait until the file is written, for a limited time; may be called twice."""
+        """Wait for the end of the last write, for a limited time. A second call does nothing."""
         self._file.close()
 
 
 @dataclass(frozen=True, slots=True)
 class Listen:
-    """Pass on received data, call `on_time` at `until_ns`. On a line of bytes first set the rate and send `send`."""
+    """Step: receive data until `until_ns`. On a serial port, first set the baud rate and send `send`."""
 
     until_ns: int
     baud: int = 0
-    """Rate in bit/s; 0 on a CAN bus, whose rate is the system's."""
+    """Baud rate; 0 on a CAN bus, because the kernel sets its bit rate."""
     send: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
 class GaveUp:
-    """End of a round that found no device, or several."""
+    """End of a round that found no device, or several devices."""
 
     summary: str
-    """Observations and advice, for people."""
+    """Observations and advice for the user."""
     wasted_bytes: int = 0
-    """Bytes heard on a line of bytes: the ledger's `bytes_skipped`."""
+    """Number of received bytes on a serial port: the ledger counts them as `bytes_skipped`."""
 
 
 EARLY_S: Final = 0.001
-"""Extra wait when the loop's timer fires a little early against CLOCK_MONOTONIC."""
+"""Additional wait if the timer of the loop fires before the deadline, s."""
 
 F = TypeVar("F")
 F_co = TypeVar("F_co", covariant=True)
 
 
 class TimedSearch(Protocol[F_co]):
-    """Timing of a search; all times are CLOCK_MONOTONIC in ns."""
+    """Search without I/O, on a serial port or a CAN bus. All times are CLOCK_MONOTONIC in ns."""
 
     def start(self, now_ns: int) -> Listen | F_co | GaveUp:
         """Return the first step."""
         ...
 
     def on_time(self, now_ns: int) -> Listen | F_co | GaveUp | None:
-        """Return the next step when the time of the last `Listen` has come; None when it has not."""
+        """Return the next step, or None before `until_ns` of the last `Listen`."""
         ...
 
 
 class SearchRound(ABC, Generic[F]):
     """Execution of the steps of one search. Synchronization: the loop's thread only."""
 
-    def __init__(
-        self, search: TimedSearch[F], ledger: Ledger, on_found: Callable[[F], None], now_ns: Callable[[], int]
-    ) -> None:
-        """`on_found` is called inside the callback that completed the round, so that what comes next already goes to
-        the device's own codec. `ledger` counts what is heard as skipped. Needs a running loop."""
+    def __init__(self, search: TimedSearch[F], ledger: Ledger, host: HostClock) -> None:
+        """`ledger` counts the received bytes as skipped. Needs a running loop."""
         self._steps = search
-        self._on_found = on_found
+        self._on_found: Callable[[F], None] = _ignore
         self._ledger = ledger
-        self._now_ns = now_ns
+        self._host = host
         self._timer: asyncio.TimerHandle | None = None
         self._done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
-    def start(self) -> None:
-        """Begin; data received from now on is to be given to the round."""
-        self._follow(self._steps.start(self._now_ns()))
+    def start(self, on_found: Callable[[F], None]) -> None:
+        """Start the round. From now on the owner passes received data to the round.
+
+        The round calls `on_found` in the callback of the last data, so that the codec of the device receives the data
+        that follow.
+        """
+        self._on_found = on_found
+        self._follow(self._steps.start(self._host.now_ns()))
 
     async def finished(self) -> None:
-        """Return when a device was found. Raises NothingHeard with what was heard instead, and LinkError."""
+        """Return when the round has found a device. Raises NothingHeard with a summary, or LinkError."""
         try:
             await self._done
         finally:
             self.cancel()
 
     def cancel(self) -> None:
-        """Stop searching; may be called twice."""
+        """Stop the search. A second call does nothing."""
         if self._timer is not None:
             self._timer.cancel()
         if not self._done.done():
@@ -133,7 +136,7 @@ class SearchRound(ABC, Generic[F]):
 
     @abstractmethod
     def _listen(self, step: Listen) -> Listen | F | GaveUp | None:
-        """Carry out `step`; return the next step if that failed."""
+        """Execute `step`. Return the next step if `step` failed."""
 
     def _found(self, found: F) -> None:
         self._on_found(found)
@@ -155,15 +158,14 @@ class SearchRound(ABC, Generic[F]):
             self._found(step)
 
     def _wait_until(self, until_ns: int) -> None:
-        """Call `_on_time` at that time; replaces an earlier request."""
         if self._timer is not None:
             self._timer.cancel()
-        self._call_later(max(0, until_ns - self._now_ns()) / NS_PER_S)
+        self._call_later(max(0, until_ns - self._host.now_ns()) / NS_PER_S)
 
     def _on_time(self) -> None:
         if self._done.done():
             return
-        step = self._steps.on_time(self._now_ns())
+        step = self._steps.on_time(self._host.now_ns())
         if step is None:
             self._call_later(EARLY_S)
         else:
@@ -171,3 +173,7 @@ class SearchRound(ABC, Generic[F]):
 
     def _call_later(self, delay_s: float) -> None:
         self._timer = asyncio.get_running_loop().call_later(delay_s, self._on_time)
+
+
+def _ignore(_found: object) -> None:
+    """Ignore the result: `start` sets the receiver."""

@@ -10,17 +10,14 @@ limited number of times per day (`flash.py`).
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
-from itertools import chain, islice, repeat
 from typing import Any, Final
 
 import msgspec
 
-from imud.config.model import DeviceConfig
 from imud.contracts.command import Target
-from imud.contracts.driver import Driver, Identity, PolledDriver
-from imud.contracts.script import RequestScript
+from imud.contracts.driver import PolledDriver
 from imud.contracts.setting import (
     AppliedSettings,
     OnDifference,
@@ -34,12 +31,10 @@ from imud.contracts.setting import (
     declared_values,
 )
 from imud.device.flash import ModuleFlash, SettingsFiles, backup_text
-from imud.device.health import DeviceEvents
-from imud.device.scripts import Exchange
+from imud.device.identity import identity_words
 from imud.device.settings_plan import (
     DEVICE_ERRORS,
     Applying,
-    RunScript,
     Values,
     advice,
     as_json,
@@ -50,8 +45,7 @@ from imud.device.settings_plan import (
     wanted_values,
     words,
 )
-from imud.host.clock import HostClock
-from imud.host.log import printable
+from imud.device.transport import DeviceContext, Transport
 from imud.model.errors import BadArgument, CommandError, reason_of
 from imud.model.event import EventKind
 from imud.model.options import shown
@@ -60,137 +54,6 @@ from imud.model.units import NS_PER_S
 from imud.sampling.clock import SampleClock
 
 log = logging.getLogger(__name__)
-
-IDENTIFY_TRIES = 3
-IDENTIFY_AGAIN_S = (5, 30, 120, 300)
-"""Pauses before a device that has not answered is asked again, the last of them for ever: right after a plug requests
-and replies can be lost, and a line that is wired later, or a host that is busy for minutes, must not cost the identity
-until the next plug. One whose RX is not wired gets one request in five minutes for nothing."""
-WORDS_MAX = 200
-"""Settings or details of one device; the HI14 has the most, some 60."""
-
-
-def pauses_s() -> Iterator[int]:
-    """Return the pauses before the further requests to a device that has not answered, without an end."""
-    return chain(IDENTIFY_AGAIN_S, repeat(IDENTIFY_AGAIN_S[-1]))
-
-
-def ignore_settings(_settings: Mapping[str, str]) -> None:
-    """Ignore the settings: the version for devices on which nothing depends on them."""
-
-
-class KnownIdentity:
-    """Identity and settings of one device as read back last. Synchronization: the loop's thread only."""
-
-    def __init__(
-        self,
-        notices: DeviceEvents,
-        now_ns: Callable[[], int],
-        on_settings: Callable[[Mapping[str, str]], None] = ignore_settings,
-        describe: Callable[[Mapping[str, str]], Mapping[str, str]] = dict,
-    ) -> None:
-        """`on_settings` is called with settings as they are read back, `describe` makes them readable for people."""
-        self.identity = Identity()
-        self.settings: Mapping[str, str] = {}
-        """By the device's own names."""
-        self.shown_settings: Mapping[str, str] = {}
-        """The same for people."""
-        self.answered = False
-        """Whether the device answered every question about it when it was asked last."""
-        self._notices = notices
-        self._now_ns = now_ns
-        self._on_settings = on_settings
-        self._describe = describe
-
-    async def ask(
-        self,
-        exchange: Exchange,
-        identify: Callable[[], RequestScript[Identity]],
-        read_settings: Callable[[], RequestScript[Mapping[str, str]]],
-        apply: Callable[[Identity], None],
-        tries: int = IDENTIFY_TRIES,
-    ) -> bool:
-        """Ask for identity and settings; `apply` gets the identity. Return whether the device answered both.
-
-        What is known of a device that does not answer is left as it is; one that tells its identity only has that.
-        """
-        self.answered = False
-        for attempt in range(1, tries + 1):
-            try:
-                identity = await exchange.run(identify())
-                apply(identity)
-                self._keep_identity(identity)
-                self._keep_settings(await exchange.run(read_settings()))
-                self.answered = True
-                return True
-            except CommandError as error:
-                log.info("%s: %s (try %d of %d)", self._notices.device, error, attempt, tries)
-        return False
-
-    def update(self, identity: Identity, settings: Mapping[str, str]) -> None:
-        """Keep what the device said; raise an event for what differs from before."""
-        self._keep_identity(identity)
-        self._keep_settings(settings)
-
-    def _keep_identity(self, identity: Identity) -> None:
-        """Keep who the device says it is; raise an event when it is another one than before."""
-        before = self.identity
-        self.identity = identity = completed(printable_identity(identity), before)
-        if before.serial_number and identity.serial_number != before.serial_number:
-            message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
-            serial_number = identity.serial_number
-            self._notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message, serial_number=serial_number)
-
-    def _keep_settings(self, settings: Mapping[str, str]) -> None:
-        """Keep the settings that the device said; raise an event for those that differ from before."""
-        settings, known = printable_words(settings), self.shown_settings
-        shown = printable_words(self._describe(settings))
-        changed = {name: value for name, value in shown.items() if known.get(name, value) != value}
-        if changed:
-            words = ", ".join(f"{name} is {value}, was {known[name]}" for name, value in changed.items())
-            message = f"settings of the device changed: {words}"
-            self._notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message, **changed)
-        self.settings, self.shown_settings = settings, shown
-        self._on_settings(settings)
-
-
-def completed(identity: Identity, before: Identity) -> Identity:
-    """Return an identity with what its answer lost taken from the one before, if both can be of the same device.
-
-    An adapter that was just plugged in can lose bytes of the first answers.
-    """
-    pairs = ((identity.product, before.product), (identity.serial_number, before.serial_number))
-    if any(new and old and new != old for new, old in pairs):
-        return identity
-    return Identity(
-        identity.product or before.product,
-        identity.serial_number or before.serial_number,
-        identity.firmware or before.firmware,
-        before.details if identity.details is None else identity.details,
-    )
-
-
-def printable_identity(identity: Identity) -> Identity:
-    """Return an identity as every output can have it: each text bounded, in printable characters."""
-    product, serial, firmware = map(printable, (identity.product, identity.serial_number, identity.firmware))
-    return Identity(product, serial, firmware, None if identity.details is None else printable_words(identity.details))
-
-
-def printable_words(words: Mapping[str, str]) -> dict[str, str]:
-    """Return names and texts of a device, WORDS_MAX at most, each bounded, in printable characters."""
-    return {printable(name): printable(text) for name, text in islice(words.items(), WORDS_MAX)}
-
-
-def identity_words(identity: Identity) -> dict[str, str]:
-    """Return an identity as the flat mapping of `DeviceStatus`, empty members left out."""
-    words = {
-        "product": identity.product,
-        "serial_number": identity.serial_number,
-        "firmware": identity.firmware,
-        **(identity.details or {}),
-    }
-    return {name: value for name, value in words.items() if value}
-
 
 BEGIN_NS: Final = NS_PER_S
 """From finding a device to the question: imud asks for its identity meanwhile, on which counting writes depends."""
@@ -216,30 +79,15 @@ PAUSES_FORGOTTEN_S: Final = 2 * 3600
 class SettingsKeeper:
     """Settings of one device. Synchronization: the event loop's thread only."""
 
-    def __init__(
-        self,
-        config: DeviceConfig,
-        run: RunScript,
-        driver: Callable[[], Driver | None],
-        identity: KnownIdentity,
-        notices: DeviceEvents,
-        host: HostClock,
-        files: SettingsFiles,
-        hears: Callable[[], bool],
-        read_back: Callable[[], Awaitable[None]],
-    ) -> None:
-        """`run` runs a script on the device; `driver` is the present one; `files` is shared by all devices; `hears`
-        says whether the device can be asked now; `read_back` asks for what the status shows of it."""
-        self._config = config
-        self._run = run
-        self._driver = driver
-        self._identity = identity
-        self._notices = notices
-        self._host = host
+    def __init__(self, context: DeviceContext, transport: Transport, files: SettingsFiles) -> None:
+        """All devices share `files`."""
+        self._config = context.config
+        self._transport = transport
+        self._identity = transport.identity
+        self._notices = context.notices
+        self._host = context.host
         self._files = files
         self._writes = files.flash
-        self._hears = hears
-        self._read_back = read_back
         self._clock: SampleClock | None = None
         self._own_until_ns = 0
         """Until when a new beginning of the device's clock is counted as caused by imud's own scripts."""
@@ -281,7 +129,7 @@ class SettingsKeeper:
             self._resets = resets
             if not self.busy and now_ns >= self._own_until_ns:
                 self._begin_anew(SETTLE_NS)
-        if self._due_ns is not None and now_ns >= self._due_ns and not self.busy and self._hears():
+        if self._due_ns is not None and now_ns >= self._due_ns and not self.busy and self._transport.can_be_asked:
             self._wanted.set()
 
     def commanded(self, *, saved: bool = False) -> None:
@@ -415,7 +263,7 @@ class SettingsKeeper:
             actual = await self._read(table)
             settable = [name for name, setting in table.table.items() if setting.write is not None and name in actual]
             values = {name: as_json(actual[name]) for name in settable}
-            device, utc_ns = self._config.name, self._files.utc_ns()
+            device, utc_ns = self._config.name, self._host.utc_ns()
             words = identity_words(self._identity.identity)
             text = backup_text(device, self._driver_name, words, values, utc_ns)
             writing = asyncio.to_thread(self._files.backups.write, device, text, utc_ns)
@@ -446,7 +294,7 @@ class SettingsKeeper:
         self._tries, self._problem = 0, ""
         found = self._differences(table)
         self._tell(found)
-        if isinstance(self._driver(), PolledDriver):
+        if isinstance(self._transport.driver, PolledDriver):
             self._due_ns = self._host.now_ns() + AGAIN_NS
         if self._config.on_difference is not OnDifference.REPORT:
             await self._repair(table, actual)
@@ -496,7 +344,7 @@ class SettingsKeeper:
             self._target = target
             return table.read(target)
 
-        actual: Values = await self._run(read)
+        actual: Values = await self._transport.run_script(read)
         self._actual, self._read_ns = actual, self._host.now_ns()
         return actual
 
@@ -505,7 +353,7 @@ class SettingsKeeper:
     ) -> AppliedSettings:
         plan = self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved)
         flash = ModuleFlash(self._writes, self._module, asked=asked)
-        applying = Applying(table, self._run, flash, wanted, actual)
+        applying = Applying(table, self._transport.run_script, flash, wanted, actual)
         try:
             done = await applying.carry_out(plan)
         finally:
@@ -521,7 +369,7 @@ class SettingsKeeper:
             log.info("%s: %s", self._config.name, _summary(done) or "settings are as wanted")
         self._tell(self._differences(table), quiet=True)
         if applying.changed:
-            await self._read_back()
+            await self._transport.read_back()
         return msgspec.structs.replace(done, advice=advice(self._config, done))
 
     def _make_plan(
@@ -586,7 +434,7 @@ class SettingsKeeper:
 
     @property
     def _driver_name(self) -> str:
-        driver = self._driver()
+        driver = self._transport.driver
         return driver.name if driver is not None else self._config.driver
 
     @property
@@ -601,7 +449,7 @@ class SettingsKeeper:
         return differences(table, self._declared, self._actual, self._all_written(table))
 
     def _known_table(self) -> SettingsTable | None:
-        driver = self._driver()
+        driver = self._transport.driver
         return driver.device_settings if driver is not None else None
 
     def _table(self) -> SettingsTable:

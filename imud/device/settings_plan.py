@@ -6,7 +6,7 @@ into force by a restart only is left out where nothing is to be saved: the resta
 
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import msgspec
 
@@ -25,6 +25,7 @@ from imud.contracts.setting import (
     StepOutcome,
     Written,
 )
+from imud.device.flash import ModuleFlash
 from imud.model.errors import BadArgument, CommandError, DeviceRefused, LinkError, TransferError
 from imud.model.options import expected, shown, unknown_name
 
@@ -196,25 +197,13 @@ RunScript = Callable[[Callable[[Target], Any]], Awaitable[Any]]
 """`run_script` of a transport."""
 
 
-class FlashBudget(Protocol):
-    """How often the flash of a device may be written."""
-
-    def refusal(self) -> str:
-        """Return why it may not be written now, one sentence; empty if it may."""
-        ...
-
-    def count(self) -> None:
-        """Count a write that is about to be made."""
-        ...
-
-
 @dataclass
 class Applying:
     """One plan under way. `wanted` has the values in the types of the table, `actual` what was read last."""
 
     table: SettingsTable
     run: RunScript
-    flash: FlashBudget
+    flash: ModuleFlash
     wanted: Values
     actual: Values
     written: dict[str, Any] = field(default_factory=dict)

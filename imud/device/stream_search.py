@@ -13,7 +13,7 @@ per byte, so two good frames in a visit of 1,000 bytes have a chance of (1000 ×
 with more bad frames than good ones SURE_FRAMES = 4 are enough: C(60, 4) × 2⁻⁶⁴ = 3 × 10⁻¹⁴.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -24,6 +24,7 @@ from imud.contracts.link import StreamLink
 from imud.contracts.script import Request
 from imud.device.search import GaveUp, Listen, RememberedDevice, SearchRound
 from imud.drivers import DRIVERS
+from imud.host.clock import HostClock
 from imud.model.errors import LinkError
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, uart_byte_ns
@@ -332,30 +333,23 @@ def _rates(drivers: Sequence[StreamDriver]) -> tuple[int, ...]:
 
 
 class StreamRound(SearchRound[StreamFound]):
-    """A round on a link of bytes."""
+    """Search round on a serial port."""
 
     def __init__(
-        self,
-        config: DeviceConfig,
-        link: StreamLink,
-        ledger: Ledger,
-        last: RememberedDevice | None,
-        on_found: Callable[[StreamFound], None],
-        now_ns: Callable[[], int],
-        *,
-        may_ask: bool,
+        self, config: DeviceConfig, link: StreamLink, ledger: Ledger, last: RememberedDevice | None, host: HostClock
     ) -> None:
-        """The bytes of what was found are taken out of the ledger again, for the device's own codec to count."""
+        """`last` is the result of the last successful search. The ledger counts the received bytes as skipped, but
+        not the bytes of the device: its own codec counts them."""
         named = config.driver != "auto"
         self._search = Search(
             of_kind([DRIVERS[config.driver]] if named else DRIVERS.values(), StreamDriver),
             bauds=() if link.auto_baud else (link.baud,),
             remembered=(last.driver, last.baud) if last else None,
-            may_ask=may_ask,
+            may_ask=config.identify and link.writable,
             hold_ns=link.hold_ns,
             options=config.options if named else None,
         )
-        super().__init__(self._search, ledger, on_found, now_ns)
+        super().__init__(self._search, ledger, host)
         self._link = link
 
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
@@ -373,7 +367,7 @@ class StreamRound(SearchRound[StreamFound]):
             try:
                 self._link.set_baud(step.baud)
             except LinkError as error:
-                return self._search.refused(str(error), self._now_ns())
+                return self._search.refused(str(error), self._host.now_ns())
         if step.send:
             try:
                 self._link.write(step.send)

@@ -1,70 +1,97 @@
-"""Contract of the transport that connects a device to its link.
+"""Transport of a device: the base class for the three kinds of link, and the search for the device.
 
-A transport is a stream of bytes, a CAN bus, or a bus that is polled. It owns the link, finds the device behind it, and
-feeds received data to the device's sample path.
+A transport owns the link, finds the device on the link, and passes received data to the sample path of the device.
+`StreamTransport` reads a serial port, `CanTransport` a CAN bus, and `PolledTransport` an SPI, I2C or RS-485 bus.
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain, repeat
 from typing import Any, Protocol
 
 from imud.attitude.published import published_frame
 from imud.config.model import DeviceConfig
 from imud.contracts.command import Target
-from imud.contracts.driver import Driver
+from imud.contracts.driver import Driver, Identity
+from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link, OnEnd
 from imud.contracts.publisher import Batch
-from imud.contracts.script import Message
-from imud.contracts.status import DeviceStatus
+from imud.contracts.script import Message, RequestScript
+from imud.contracts.status import DeviceState, DeviceStatus
 from imud.device.attachments import Attachments
 from imud.device.health import DeviceEvents, Health
-from imud.device.settings import KnownIdentity, pauses_s
+from imud.device.identity import KnownIdentity, identity_words
+from imud.device.scripts import RequestPort, ScriptRunner
+from imud.device.search import Remembered, SearchRound
 from imud.host.clock import HostClock
-from imud.model.errors import NothingHeard
+from imud.model.errors import CommandError, LinkError, NothingHeard
+from imud.model.event import Event
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_S
 from imud.recording.observer import PathObserver
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import PathContext, SamplePath, make_clock
 
+log = logging.getLogger(__name__)
+
 UNHEARD_NS = 2 * NS_PER_S
-"""Data without a single good sample for this long: the device has another rate now, or is another one."""
+"""Time with data but without a sample after which imud assumes another baud rate or another device, ns."""
 SILENT_SEARCH_NS = 15 * NS_PER_S
-"""A silent link is searched anew after this: the device may have been exchanged or set to another rate."""
+"""Time without data after which imud searches again, because the device may be replaced or reconfigured, ns."""
+IDENTIFY_TRIES = 3
+"""Number of identity queries after a search."""
+IDENTIFY_AGAIN_S = (5, 30, 120, 300)
+"""Pauses before further identity queries of a device that did not reply, s. The last pause repeats forever."""
+
+
+class DeviceOwner(Protocol):
+    """Owner of devices: the daemon, which imports this part, or a test."""
+
+    def publish(self, batch: Batch) -> None:
+        """Process samples of a device."""
+        ...
+
+    def send_event(self, event: Event) -> None:
+        """Process an event of a device."""
+        ...
+
+    def configured_devices(self) -> Sequence[DeviceConfig]:
+        """Return all devices of the present configuration."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceContext:
-    """The parts of a device that its transport works with."""
+    """The parts of a device that its transport uses."""
 
     config: DeviceConfig
     device_id: int
+    owner: DeviceOwner
     host: HostClock
+    lines: LineFactory
     ledger: Ledger
     notices: DeviceEvents
     health: Health
-    identity: KnownIdentity
-    attachments: Attachments
-    publish: Callable[[Batch], None]
     tap: PathObserver
-    """Where a recording hears what goes into the path; the transport says when it makes another one."""
 
-    def path_context(self, driver: Driver, link: Link, on_message: Callable[[Message, int], None]) -> PathContext:
-        """Return what the sample path of what `driver` decodes needs; messages of the device go to `on_message`."""
+    def path_context(self, driver: Driver, link: Link, on_message: Callable[[Message, int], object]) -> PathContext:
+        """Return the context of a sample path for `driver`. The path passes text lines and replies to `on_message`."""
         config = self.config
 
         def overruns() -> int:
             return link.kernel_counters().overrun
 
         return PathContext(
-            config.name, self.device_id, self.ledger, self.publish, on_message, self.notices.bad_frame, overruns,
+            config.name, self.device_id, self.ledger, self.owner.publish, on_message, self.notices.bad_frame, overruns,
             self.host, published_frame(config.frame, config.convention, config.declination_deg, driver.axes),
         )  # fmt: skip
 
     def new_clock(self, driver: Driver, path: SamplePath | None) -> SampleClock:
-        """Return a clock for what `driver` decodes, which continues that of the path before."""
+        """Return a clock for `driver` that continues the clock of `path`."""
         before = path.clock if path is not None else None
         name, lines = self.config.name, self.config.lines
         return make_clock(
@@ -72,205 +99,298 @@ class DeviceContext:
         )
 
 
-class Transport(Protocol):
-    """Transport of one device's data from its link to its sample path. Synchronization: the loop's thread only.
+class Transport(ABC):
+    """Transport of one device. Synchronization: the loop's thread only.
 
-    Order of calls: `wait_present`, `link.open`, `start`, then `work` until it or the link ends, `stop`; then again from
-    the beginning, and `close` at the end of all.
+    Order of calls: `serve` once; then `wait_present`, `link.open`, `start`, `work` until it or the link ends, `stop`,
+    and again from `wait_present`; `close` at the end.
     """
 
-    @property
-    def link(self) -> Link:
-        """The link it owns."""
-        ...
+    link: Link
+    driver: Driver | None
+    """Driver of the device; None before imud has found the device."""
+    path: SamplePath | None
+    """Sample path of the device; None before imud has found the device."""
+    attachments: Attachments
+
+    def __init__(self, context: DeviceContext) -> None:
+        self.identity = KnownIdentity(context.notices, context.host)
+        self._context = context
+        self._config = context.config
+        self._health = context.health
+        self._host = context.host
+        self._latency_ns = 0
+
+    def serve(self, attachments: Attachments) -> None:
+        """Set the attachments of the device, before the first use of the link."""
+        self.attachments = attachments
+
+    # --- the link ----------------------------------------------------------------------------------------------------
+
+    async def wait_present(self) -> None:
+        """Return when imud can open the link. Raises LinkError if imud must not open it."""
+        self._health.missing(self._host.now_ns(), self.link.absence())
+        await self.link.wait_present()
+
+    @abstractmethod
+    def start(self, on_end: OnEnd) -> None:
+        """Start reading the open link. `on_end` is called once if the link ends. Raises LinkError."""
+
+    @abstractmethod
+    async def work(self) -> None:
+        """Find the device and query its identity, repeatedly. Ends with the link, or by an error."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Stop all work and close the link. A second call does nothing."""
+
+    def close(self) -> None:
+        """Stop, and release all resources that devices share. A second call does nothing."""
+        self.stop()
+
+    # --- requests ----------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    async def run_script(self, make: Callable[[Target], Any]) -> Any:
+        """Run the script that `make` returns, and return its result.
+
+        Raises LinkError and the errors of the script and of `make`: CommandError, TransferError, DeviceRefused.
+        """
+
+    @abstractmethod
+    async def read_back(self) -> None:
+        """Query identity and settings again after a change. Keep the old values if the device does not reply."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes to the device. Raises LinkError."""
+        self.link.write(data)
+
+    def _update_settings(self, settings: Mapping[str, str]) -> None:
+        """Store the settings of the device, and compare the GPIO lines with them."""
+        identity = self.identity
+        identity.update_settings(settings, self.driver)
+        self._context.tap.described(self.where, identity_words(identity.identity), identity.shown_settings)
+        self.attachments.compare_settings(identity.settings, self.driver)
+
+    # --- the samples -------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def set_latency(self, latency_ns: int) -> None:
+        """Set the maximum hold of a sample, ns; 0: no hold."""
+
+    @abstractmethod
+    def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
+        """Report the received data, or search again. Called after UNHEARD_NS without a sample."""
+
+    def tick(self, now_ns: int) -> None:  # noqa: B027  # only a polled bus counts deadlines
+        """Do periodic work, ten times per second, before the device checks its samples."""
+
+    def on_reset(self) -> None:  # noqa: B027  # a stream or CAN device sends again without a request
+        """Prepare for a reset of the device by its line."""
+
+    # --- state -------------------------------------------------------------------------------------------------------
 
     @property
-    def driver(self) -> Driver | None:
-        """Driver of the device; None until it is known."""
-        ...
-
-    @property
-    def path(self) -> SamplePath | None:
-        """Sample path of the device; None until its driver is known."""
-        ...
-
-    @property
+    @abstractmethod
     def where(self) -> str:
-        """The link and its settings, for people."""
-        ...
+        """Name of the link with its rate or address."""
 
     @property
+    @abstractmethod
     def bit_rate(self) -> int:
-        """Rate of the link in bit/s; 0 where it has none."""
-        ...
+        """Bit rate of the link, bit/s; 0 if the link has no bit rate."""
 
     @property
+    @abstractmethod
     def receiving(self) -> bool:
-        """Whether received data goes to the sample path; False while the device is searched for."""
-        ...
+        """Whether received data goes to the sample path; False during a search."""
 
     @property
+    @abstractmethod
     def hears_replies(self) -> bool:
-        """Whether replies reach the device's codec even before its first sample."""
-        ...
+        """Whether the codec can receive replies before the first sample."""
+
+    @property
+    @abstractmethod
+    def busy(self) -> bool:
+        """Whether a request script is running."""
+
+    @property
+    @abstractmethod
+    def hold_ns(self) -> int:
+        """Present hold of the samples, ns."""
+
+    @property
+    def is_free(self) -> bool:
+        """Whether other parts may send bytes to the device: no script runs, and no search changes the rate."""
+        return self.receiving and not self.busy
+
+    @property
+    def accepts_scripts(self) -> bool:
+        """Whether the device can reply to a script: samples arrive, or the codec receives replies before them."""
+        health = self._health
+        return health.streaming or (health.state is DeviceState.SEARCHING and self.hears_replies)
+
+    @property
+    def can_be_asked(self) -> bool:
+        """Whether imud can run a script on the device now."""
+        return self.link.writable and self.accepts_scripts and not self.busy
+
+    def add_status(self, status: DeviceStatus) -> DeviceStatus:
+        """Return `status` with the fields of this kind of transport."""
+        return status
+
+
+Queries = tuple[Callable[[], RequestScript[Identity]], Callable[[], RequestScript[Mapping[str, str]]]]
+"""Scripts that query identity and settings."""
+
+
+class ReceivingTransport(Transport, RequestPort):
+    """Transport of a device that sends samples without a request, on a serial port or a CAN bus."""
+
+    def __init__(self, context: DeviceContext, remembered: Remembered) -> None:
+        super().__init__(context)
+        self.scripts = ScriptRunner(self, context.ledger, context.host)
+        self._search = SearchLoop(self, context)
+        self._remembered = remembered
+        self._asked_ns = 0
+        """CLOCK_MONOTONIC of the newest identity query; 0 before the first query."""
+
+    # --- parts of each kind ------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def begin_search(self) -> SearchRound[Any] | None:
+        """Start a search round. Return None if the configuration names the device, and set up the device instead."""
+
+    @abstractmethod
+    async def ask(self) -> None:
+        """Query identity and settings after a search, if the configuration allows it. Raises LinkError."""
+
+    async def still_answers(self) -> bool:
+        """Return whether the search that was requested is not needed, because the device replies."""
+        return False
+
+    @abstractmethod
+    def _queries(self) -> Queries | None:
+        """Return the scripts that query identity and settings; None before imud has found the device."""
+
+    @abstractmethod
+    def _apply(self, identity: Identity) -> None:
+        """Adapt the codec to the identity of the device."""
+
+    # --- common code -------------------------------------------------------------------------------------------------
+
+    async def work(self) -> None:
+        """Find the device and query its identity, repeatedly. Ends with the link, or by an error."""
+        await self._search.run()
+
+    def stop(self) -> None:
+        """Stop the search and close the link. A second call does nothing."""
+        self._search.stop()
+        self.link.close()
+
+    async def ask_once(self) -> None:
+        """Query identity and settings once."""
+        await self._identify(1)
+
+    async def read_back(self) -> None:
+        """Query identity and settings again after a change. Keep the old values if the device does not reply."""
+        with suppress(LinkError):  # the device receives the end of the link from `on_end`
+            await self._identify(1)
+
+    async def _identify(self, tries: int) -> bool:
+        """Query identity and settings; return whether the device replied to both queries."""
+        queries, identity = self._queries(), self.identity
+        if queries is None or not self._may_ask:
+            return False
+        self._asked_ns = self._host.now_ns()
+        identity.answered = False
+        identify, read_settings = queries
+        for attempt in range(1, tries + 1):
+            try:
+                found = await self.scripts.run(identify())
+                self._apply(found)
+                identity.update_identity(found)
+                self._update_settings(await self.scripts.run(read_settings()))
+                identity.answered = True
+                return True
+            except CommandError as error:
+                log.info("%s: %s (try %d of %d)", self._config.name, error, attempt, tries)
+        return False
+
+    @property
+    def unanswered(self) -> bool:
+        """Whether imud must query the identity again."""
+        return self._may_ask and not self.identity.answered
 
     @property
     def busy(self) -> bool:
         """Whether a request script is running."""
-        ...
+        return self.scripts.busy
 
     @property
-    def hold_ns(self) -> int:
-        """How long data of the device waits at present to be processed together, ns."""
-        ...
-
-    def set_latency(self, latency_ns: int) -> None:
-        """Let samples wait so long from now on, ns; 0: not at all."""
-        ...
-
-    async def wait_present(self) -> None:
-        """Return when the link can be opened. Raises LinkError where it must not be."""
-        ...
-
-    def start(self, on_end: OnEnd) -> None:
-        """Deliver from now on; the link is open. `on_end` is called once when it ends by itself. Raises LinkError."""
-        ...
-
-    async def work(self) -> None:
-        """Find the device and ask for its identity, as often as needed. Ends only with the link, or by an error."""
-        ...
-
-    def tick(self, now_ns: int) -> None:
-        """Ten times a second, before the flow of samples is looked at."""
-        ...
-
-    def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
-        """Report received data instead, and try what can help: no sample came for UNHEARD_NS."""
-        ...
-
-    def on_reset(self) -> None:
-        """Prepare for a reset of the device by its line."""
-        ...
-
-    async def run_script(self, make: Callable[[Target], Any]) -> Any:
-        """Run the script that `make` makes for the device, and return its result.
-
-        Raises what the script and its making raise: CommandError, TransferError, DeviceRefused, and LinkError.
-        """
-        ...
-
-    async def read_back(self) -> None:
-        """Ask for identity and settings again, after something was changed; a device that does not answer is left."""
-        ...
-
-    def add_status(self, status: DeviceStatus) -> DeviceStatus:
-        """Return the status with the fields of this kind of transport."""
-        ...
-
-    def stop(self) -> None:
-        """Stop all work and close the link; may be called twice."""
-        ...
-
-    def close(self) -> None:
-        """Stop, and release what is shared with other devices; may be called twice."""
-        ...
-
-
-class BegunRound(Protocol):
-    """A round in progress, on a stream or a CAN bus."""
-
-    async def finished(self) -> None:
-        """Return when a device was found. Raises NothingHeard with what was heard instead, and LinkError."""
-        ...
-
-    def cancel(self) -> None:
-        """Stop searching; may be called twice."""
-        ...
-
-
-async def never_answers() -> bool:
-    """Return False: the version for devices that cannot be asked before a search."""
-    return False
+    def _may_ask(self) -> bool:
+        return self._config.identify and self.link.writable
 
 
 class SearchLoop:
     """Loop of search rounds on one link. Synchronization: the loop's thread only."""
 
-    def __init__(
-        self,
-        health: Health,
-        attachments: Attachments,
-        host: HostClock,
-        begin: Callable[[], BegunRound | None],
-        ask: Callable[[], Awaitable[None]],
-        ask_again: Callable[[], Awaitable[None]],
-        unanswered: Callable[[], bool],
-        answers: Callable[[], Awaitable[bool]] = never_answers,
-    ) -> None:
-        """`begin` starts a round, or sets up the configured device and returns None; `ask` is called after each.
-
-        `ask_again` is called after ever longer pauses for as long as `unanswered`.
-        `answers` is called when another search was requested, and returns whether none is needed.
-        """
-        self._health = health
-        self._attachments = attachments
-        self._host = host
-        self._begin = begin
-        self._ask = ask
-        self._ask_again = ask_again
-        self._unanswered = unanswered
-        self._answers = answers
-        self._round: BegunRound | None = None
+    def __init__(self, transport: ReceivingTransport, context: DeviceContext) -> None:
+        self._transport = transport
+        self._health = context.health
+        self._host = context.host
+        self._round: SearchRound[Any] | None = None
         self._again = asyncio.Event()
 
     @property
     def requested(self) -> bool:
-        """Whether another search was requested and has not begun."""
+        """Whether another search was requested and has not started."""
         return self._again.is_set()
 
     def start(self) -> None:
-        """Begin a search, in place of one in progress."""
+        """Start a search. Cancel a search that is running."""
         self.stop()
         self._again.clear()
         self._health.searching()
-        self._round = self._begin()
+        self._round = self._transport.begin_search()
 
     def search_again(self) -> None:
         """Request another search."""
         self._again.set()
 
     def stop(self) -> None:
-        """Cancel the search; may be called twice."""
+        """Cancel the search. A second call does nothing."""
         if self._round is not None:
             self._round.cancel()
             self._round = None
 
     async def run(self) -> None:
-        """Search and ask, again and again; the first search has begun. Ends only by an error of the link."""
-        await self._attachments.reset_settled()
+        """Search and query, repeatedly; the first search has started. Ends only by an error of the link."""
+        await self._transport.attachments.reset_settled()
         while True:
             searched = self._round is not None
             await self._finish_search()
-            await self._ask()
+            await self._transport.ask()
             await self._needed()
             if not searched:
                 await self._report_absence()
             self.start()
 
     async def _needed(self) -> None:
-        """Return when another search is needed; until then ask a device again that has not answered."""
-        now_ns, pauses = self._host.now_ns, pauses_s()
+        """Return when another search is needed. Until then query a device again that has not replied."""
+        now_ns, pauses = self._host.now_ns, _pauses_s()
         due_ns = now_ns() + next(pauses) * NS_PER_S
         while True:
             with suppress(TimeoutError):
-                async with asyncio.timeout((due_ns - now_ns()) / NS_PER_S if self._unanswered() else None):
+                async with asyncio.timeout((due_ns - now_ns()) / NS_PER_S if self._transport.unanswered else None):
                     await self._again.wait()
             if self._again.is_set():
                 self._again.clear()
-                if not await self._answers():
+                if not await self._transport.still_answers():
                     return
             else:
-                await self._ask_again()
+                await self._transport.ask_once()
                 due_ns = now_ns() + next(pauses) * NS_PER_S
 
     async def _finish_search(self) -> None:
@@ -284,4 +404,13 @@ class SearchLoop:
                 self.start()
 
     async def _report_absence(self) -> None:
-        await self._attachments.device_not_found(self._host.now_ns())
+        await self._transport.attachments.device_not_found(self._host.now_ns())
+
+
+def _pauses_s() -> Iterator[int]:
+    """Return the pauses before further identity queries, without end.
+
+    Requests and replies can be lost right after a plug, on a busy host, or before a line is wired. A device without a
+    wired RX costs one useless request in five minutes.
+    """
+    return chain(IDENTIFY_AGAIN_S, repeat(IDENTIFY_AGAIN_S[-1]))

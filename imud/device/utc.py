@@ -1,12 +1,11 @@
-"""UTC of one device: sentences from a source to its port, and the host's UTC reference to its clock.
+"""UTC of one device: RMC sentences for its port, and the UTC reference of the host for its clock.
 
-source ──RMC──▶ feed ──▶ the device's port            (its time becomes UTC)
+source ──RMC──▶ RmcFeed ──▶ port of the device           (UTC becomes the device time)
           └───▶ PpsReference ◀── pulses of the line ──▶ chronyd
-                     └─ or the system clock, whichever has the smaller error ──▶ clock
+                     └─ or the system clock, if its error is smaller ──▶ clock
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import msgspec
 
@@ -14,7 +13,7 @@ from imud.config.model import DeviceConfig
 from imud.contracts.lines import Edge, UtcReference
 from imud.contracts.link import StreamLink
 from imud.contracts.status import UtcStatus
-from imud.host.clock import UNSTEERED, HostClock, SteadyTime
+from imud.host.clock import HostClock
 from imud.links import LINKS
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
@@ -22,63 +21,44 @@ from imud.sampling.clock import SampleClock
 from imud.utc import RMC_SOURCES
 from imud.utc.pps import ChronyFeed, PpsReference
 from imud.utc.receivers import RmcSource, SourceContext
-from imud.utc.rmc_feed import RmcFeed
+from imud.utc.rmc_feed import RmcFeed, SentencePort
 from imud.utc.system_clock import kernel_clock, system_reference
 
 ASK_NS = NS_PER_S
-"""Interval at which the reference is updated."""
-
-
-@dataclass(frozen=True, slots=True)
-class DevicePort:
-    """Port of the device, as far as sentences need it."""
-
-    write: Callable[[bytes], None]
-    baud: Callable[[], int]
-    busy: Callable[[], bool]
-    """Whether a request script is running on the device."""
+"""Interval between two updates of the reference, ns."""
 
 
 class UtcFeed:
-    """Feed of UTC to a device's port and clock. Synchronization: the loop's thread only."""
+    """Feed of UTC to the port and the clock of a device. Synchronization: the loop's thread only."""
 
     def __init__(
         self,
         source: RmcSource | None,
-        port: DevicePort | None,
+        feed: RmcFeed | None,
         system: Callable[[], UtcReference | None],
-        now_ns: Callable[[], int],
-        *,
-        rate_hz: int = 1,
+        host: HostClock,
         chrony: ChronyFeed | None = None,
-        steady: SteadyTime = UNSTEERED,
     ) -> None:
-        """`source` and `port` are None if the device is fed no sentences.
-
-        `system` returns the system clock as a reference; `rate_hz` is the greatest rate of sentences to the device.
-        Pulses are fitted in `steady`: a line through them in a time that is slewed would be none.
-        """
+        """`source` and `feed` are None if the device receives no sentences. `system` reads the system clock."""
         self._source = source
+        self._feed = feed
         self._chrony = chrony
         self._pps = PpsReference(self._on_second if chrony is not None else None)
         self._system = system
-        self._steady = steady
+        self._steady = host.steady  # pulses drift against a clock that NTP slews
         self._reference: UtcReference | None = None
         self._clock: SampleClock | None = None
         self._due_ns = 0
         self._begun = self._closed = False
-        self._feed: RmcFeed | None = None
-        if port is not None:
-            self._feed = RmcFeed(port.write, port.baud, port.busy, now_ns, rate_hz, lambda: self._reference)
 
     def start(self, clock: SampleClock) -> None:
-        """Deliver the reference to the clock of the device that was found."""
+        """Deliver the reference to the clock of the device."""
         self._clock = clock
         clock.set_utc_reference(self._reference)
         self._due_ns = 0
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
-        """Start the source the first time; update the reference if that is due. Call it at 10 Hz in the loop."""
+        """Start the source at the first call. Update the reference if this is due. Called at 10 Hz."""
         if self._closed:
             return
         if not self._begun:
@@ -89,11 +69,11 @@ class UtcFeed:
             self._update_reference(now_ns)
 
     def stop(self) -> None:
-        """Deliver no more references, at the end of the device's link; may be called twice. The source continues."""
+        """Stop the delivery to the clock. The source continues. A second call does nothing."""
         self._clock = None
 
     def close(self) -> None:
-        """Release source and chronyd's socket; may be called twice."""
+        """Release the source and the socket of chronyd. A second call does nothing."""
         self._closed = True
         self.stop()
         if self._source is not None:
@@ -102,7 +82,7 @@ class UtcFeed:
             self._chrony.close()
 
     def on_pulses(self, edges: Sequence[Edge]) -> None:
-        """Add edges of the pulse per second that the device's SIN receives."""
+        """Add edges of the pulse per second at the SIN input of the device."""
         for edge in edges:
             if edge.rising:
                 self._pps.on_pulse(self._steady.steady_ns(edge.t_ns))
@@ -110,7 +90,7 @@ class UtcFeed:
                     self._feed.on_pulse(edge.t_ns)
 
     def status(self) -> UtcStatus:
-        """Return problem and counters."""
+        """Return the problem and the counters."""
         source, feed, chrony = self._source, self._feed, self._chrony
         return UtcStatus(
             source=source.title if source is not None else "",
@@ -129,16 +109,18 @@ class UtcFeed:
         by_system, by_pulses = self._system(), self._pps.reference(self._steady.steady_ns(now_ns))
         if by_pulses is not None:
             by_pulses = UtcReference(by_pulses.offset_ns - self._steady.offset_ns, by_pulses.error_ns)
-        if by_system is not None:  # the clock of a device counts on in steady time from here, until the next time
+        if by_system is not None:
+            # the clock of the device uses this reference in steady time until the next update
             steered_ns = round(abs(self._steady.rate) * ASK_NS)
             by_system = UtcReference(by_system.offset_ns, by_system.error_ns + steered_ns)
         self._reference = _better(by_pulses, by_system)
+        if self._feed is not None:
+            self._feed.reference = self._reference
         if self._clock is not None:
             self._clock.set_utc_reference(self._reference)
 
     def _on_sentence(self, sentence: bytes, t_rx_ns: int) -> None:
-        """Use a sentence for the host first: its clock must know UTC before the device's time becomes UTC, or it takes
-        that for a jump."""
+        # the clock must know UTC before UTC becomes the device time: otherwise it assumes a jump of the device time
         self._pps.on_sentence(sentence, self._steady.steady_ns(t_rx_ns))
         if self._reference is None:
             self._update_reference(t_rx_ns)
@@ -151,30 +133,29 @@ class UtcFeed:
 
 
 def _better(one: UtcReference | None, other: UtcReference | None) -> UtcReference | None:
-    """Return the reference with the smaller error; the first if they are equal."""
+    """Return the reference with the smaller error; the first if the errors are equal."""
     if one is None or other is None:
         return one or other
     return one if one.error_ns <= other.error_ns else other
 
 
-def make_keeper(config: DeviceConfig, port: DevicePort, host: HostClock) -> UtcFeed | None:
-    """Make the keeper that a device's configuration needs; None if it has neither sentences nor a pulse per second."""
-    now_ns, utc_offset_ns, steady = host.now_ns, host.utc_offset_ns, host.steady
+def make_utc_feed(config: DeviceConfig, port: SentencePort, host: HostClock) -> UtcFeed | None:
+    """Return the feed of a device; None if neither sentences nor a pulse per second are configured."""
     rmc, pps = config.rmc, config.lines.pps if config.lines is not None else None
     if rmc is None and pps is None:
         return None
-    chrony = ChronyFeed(pps.chrony, utc_offset_ns) if pps is not None and pps.chrony else None
+    chrony = ChronyFeed(pps.chrony, host.utc_offset_ns) if pps is not None and pps.chrony else None
 
     def system() -> UtcReference | None:
-        return system_reference(kernel_clock(), utc_offset_ns())
+        return system_reference(kernel_clock(), host.utc_offset_ns())
 
     if rmc is None:
-        return UtcFeed(None, None, system, now_ns, chrony=chrony, steady=steady)
-    source = RMC_SOURCES[rmc.source](rmc, SourceContext(_serial_port, now_ns, utc_offset_ns))
-    return UtcFeed(source, port, system, now_ns, rate_hz=rmc.rate_hz, chrony=chrony, steady=steady)
+        return UtcFeed(None, None, system, host, chrony)
+    source = RMC_SOURCES[rmc.source](rmc, SourceContext(_serial_port, host.now_ns, host.utc_offset_ns))
+    return UtcFeed(source, RmcFeed(port, host.now_ns, rmc.rate_hz), system, host, chrony)
 
 
 def _serial_port(path: str, baud: int) -> StreamLink:
-    """Make the port of a GNSS receiver."""
+    """Return the port of a GNSS receiver."""
     row = LINKS["uart"]
     return row.make(msgspec.convert({"port": path, "baud": baud}, row.settings))

@@ -194,6 +194,10 @@ class HostClock:
             self._measure()
         return self._offset_ns
 
+    def utc_ns(self) -> int:
+        """Return CLOCK_REALTIME, ns."""
+        return self.now_ns() + self.utc_offset_ns()
+
     def kept(self) -> tuple[int, int]:
         """Return the kept value of CLOCK_REALTIME minus CLOCK_MONOTONIC, ns, and the number of suspends."""
         return self._offset_ns, self.suspends

@@ -121,7 +121,7 @@ class PathContext:
     device_id: int
     ledger: Ledger
     publish: Callable[[Batch], None]
-    on_message: Callable[[Message, int], None]
+    on_message: Callable[[Message, int], object]
     """Called with a text line or reply frame, and with CLOCK_MONOTONIC of its arrival, ns."""
     on_bad_frame: Callable[[BadFrame], None]
     overruns: Callable[[], int]  # returns the number of overruns that the kernel counted since the link was opened
@@ -291,7 +291,7 @@ class SampleListener(Protocol):
 
     wants_samples: bool  # whether the listener is active
 
-    def on_sample(self, sample: Measurement) -> None:
+    def on_sample(self, sample: Measurement) -> object:
         """Process one measurement."""
         ...
 

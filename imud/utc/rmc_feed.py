@@ -9,7 +9,7 @@ writes a sentence completely or not at all, and never while a script runs on the
 from collections import Counter
 from collections.abc import Callable
 from enum import StrEnum
-from typing import Final
+from typing import Final, Protocol
 
 from imud.contracts.lines import UtcReference
 from imud.formats.nmea0183 import Rmc, RmcFault, as_gprmc, parse
@@ -36,24 +36,35 @@ class Refusal(StrEnum):
     LINK = "link"  # the port did not accept the bytes
 
 
+class SentencePort(Protocol):
+    """Port of a device for sentences. `imud.device` implements it; this part cannot import `imud.device`."""
+
+    @property
+    def bit_rate(self) -> int:
+        """Baud rate of the port."""
+        ...
+
+    @property
+    def is_free(self) -> bool:
+        """Whether other parts may send bytes: no request script runs, and no search changes the rate."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send bytes. Raises LinkError."""
+        ...
+
+
 class RmcFeed:
     """Feed of sentences to the device's port. Synchronization: the event loop's thread only."""
 
-    def __init__(
-        self,
-        write: Callable[[bytes], None],
-        baud: Callable[[], int],
-        busy: Callable[[], bool],
-        now_ns: Callable[[], int],
-        rate_hz: int = 1,
-        reference: Callable[[], UtcReference | None] = lambda: None,
-    ) -> None:
-        """`write` and `baud` belong to the link. `busy` returns whether a script is running."""
+    def __init__(self, port: SentencePort, now_ns: Callable[[], int], rate_hz: int = 1) -> None:
+        """`rate_hz` is the maximum rate of sentences to the device."""
         self.sent = 0
         self.refused: Counter[str] = Counter()  # number of rejected sentences for each `Refusal`
-        self._write, self._baud, self._busy = write, baud, busy
+        self.reference: UtcReference | None = None  # UTC reference of the host; set by the owner
+        self._port = port
         self._rate_hz = rate_hz
-        self._reference, self._now_ns = reference, now_ns
+        self._now_ns = now_ns
         self._pulse_ns: int | None = None
         self._last_slot = -1
 
@@ -79,7 +90,7 @@ class RmcFeed:
         if slot == self._last_slot:
             return Refusal.TOO_MANY
         now_ns, data = self._now_ns(), as_gprmc(sentence)
-        refusal = self._timely(rmc, t_rx_ns, now_ns, now_ns + len(data) * uart_byte_ns(self._baud()))
+        refusal = self._timely(rmc, t_rx_ns, now_ns, now_ns + len(data) * uart_byte_ns(self._port.bit_rate))
         if refusal is None:
             refusal = self._send(data)
         if refusal is None:
@@ -97,7 +108,7 @@ class RmcFeed:
 
     def _second_ns(self, rmc: Rmc, t_rx_ns: int, now_ns: int) -> tuple[int | None, int]:
         """Return (CLOCK_MONOTONIC at the start of the sentence's second, its error), ns; None if unknown."""
-        reference, pulse_ns = self._reference(), self._pulse_ns
+        reference, pulse_ns = self.reference, self._pulse_ns
         if reference is not None and SIGMAS * reference.error_ns + AHEAD_NS <= DOUBT_MOST_NS:
             return rmc.unix_s * NS_PER_S - reference.offset_ns, SIGMAS * reference.error_ns + AHEAD_NS
         if pulse_ns is not None and now_ns - pulse_ns < PULSE_FRESH_NS:
@@ -107,10 +118,10 @@ class RmcFeed:
         return None, 0
 
     def _send(self, data: bytes) -> Refusal | None:
-        if self._busy():
+        if not self._port.is_free:
             return Refusal.BUSY
         try:
-            self._write(data)
+            self._port.write(data)
         except LinkError:
             return Refusal.LINK
         return None

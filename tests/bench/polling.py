@@ -18,7 +18,6 @@ import imud.links.spi as spi_link
 from imud.config.model import DeviceConfig
 from imud.contracts.lines import DeviceLines, LineFactory, ReadyOptions
 from imud.contracts.link import LinkType
-from imud.contracts.publisher import Batch
 from imud.device.factory import DeviceFactory
 from imud.drivers.imu61x import spi
 from imud.drivers.imu61x.spi import PIPELINE_BYTES
@@ -28,6 +27,7 @@ from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.pins import MemoryOutput
 from tests.bench.ready_line import PipeInput
 from tests.bench.rows import Row, at_most
+from tests.support.device_rig import DeviceOutput
 
 RATE_HZ = 1000.0
 BURST_BYTES = 32
@@ -70,23 +70,19 @@ class Stub:
 
 async def _measured(port: Path, seconds: float, busy_ms: float, *, by_edges: bool) -> Sequence[float]:
     """Mean and worst lateness µs, share late, missed, polls, CPU µs per sample, with `busy_ms` of work every 20 ms."""
-    samples = 0
-
-    def publish(batch: Batch) -> None:
-        nonlocal samples
-        samples += len(batch.samples)
-
+    output = DeviceOutput()
+    samples = output.samples
     settings = SpiOptions(port=str(port), rate_hz=RATE_HZ, speed_hz=2_000_000, mode=0)
     lines = DeviceLines(data_ready=ReadyOptions(line="Y")) if by_edges else None
     config = DeviceConfig("imu", "imu61x-spi", None, True, "spi", settings, lines=lines)
     maker = LineFactory(lambda *_: PipeInput(round(1e9 / RATE_HZ)), lambda *_: MemoryOutput())
-    factory = DeviceFactory(publish, lambda _event: None, HostClock(), lines=maker)
+    factory = DeviceFactory(output, HostClock(), lines=maker)
     runner = factory.make(config, 0)
     task = asyncio.create_task(runner.run())
-    while samples < RATE_HZ / 4:
+    while len(samples) < RATE_HZ / 4:
         await asyncio.sleep(0.01)
         assert not task.done(), task
-    before, begun, cpu_s, polling = runner.status().polling, samples, time.process_time(), None
+    before, begun, cpu_s, polling = runner.status().polling, len(samples), time.process_time(), None
     end_s = time.monotonic() + seconds
     used_s = 0.0
     while time.monotonic() < end_s:
@@ -101,7 +97,7 @@ async def _measured(port: Path, seconds: float, busy_ms: float, *, by_edges: boo
     polls = polling.polls - before.polls
     mean_ns = (polling.late_mean_ns * polling.polls - before.late_mean_ns * before.polls) / polls
     late, missed = polling.late - before.late, polling.missed - before.missed
-    return mean_ns / 1e3, polling.late_worst_ns / 1e3, late / polls, missed, polls, cpu_s * 1e6 / (samples - begun)
+    return mean_ns / 1e3, polling.late_worst_ns / 1e3, late / polls, missed, polls, cpu_s * 1e6 / (len(samples) - begun)
 
 
 def _busy(milliseconds: float) -> float:

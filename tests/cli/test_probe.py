@@ -68,7 +68,7 @@ def ports(monkeypatch: pytest.MonkeyPatch) -> Ports:
                 return runner.run(body)  # type: ignore[arg-type]
 
         monkeypatch.setattr(probe, "LINKS", {"uart": LinkType("uart", PortSettings, make=port.make)})
-        monkeypatch.setattr(probe, "monotonic_ns", port.clock.now_ns)
+        monkeypatch.setattr(probe, "HostClock", lambda: port.clock.host)
         monkeypatch.setattr("imud.cli.probe.asyncio.run", run)
         monkeypatch.setattr(probe, "list_ports", lambda: [type("Listed", (), {"path": PORT, "title": "FT232R"})])
         monkeypatch.setattr(probe, "can_interfaces", lambda **_: [])

@@ -18,10 +18,11 @@ from imud.contracts.script import (
     pause,
     with_undo,
 )
-from imud.device.scripts import LATE_WINDOW_NS, REPLY_MESSAGES_MAX, Session
+from imud.device.scripts import LATE_WINDOW_NS, REPLY_MESSAGES_MAX, ScriptRunner
 from imud.model.errors import CommandError
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
+from tests.support.script_runners import offline_runner
 
 TIMEOUT_NS = 100
 
@@ -46,54 +47,54 @@ def ledger() -> Ledger:
 
 
 @pytest.fixture
-def session(ledger: Ledger) -> Session:
-    return Session(ledger)
+def session(ledger: Ledger) -> ScriptRunner:
+    return offline_runner(ledger)
 
 
 def strays(ledger: Ledger) -> tuple[int, int]:
     return (ledger.replies_late, ledger.replies_unsolicited)
 
 
-def test_reply(session: Session, ledger: Ledger) -> None:
+def test_reply(session: ScriptRunner, ledger: Ledger) -> None:
     assert session.start(command("ask", "a"), 0) == b"ask"
-    assert session.busy
+    assert session.deadline_ns is not None
     assert session.deadline_ns == TIMEOUT_NS
     assert session.on_message("a=1", 5) is None
     assert session.on_message("OK", 6) == Reply(("a=1", "OK"))
-    assert not session.busy
+    assert session.deadline_ns is None
     assert session.deadline_ns is None
     assert session.on_time(1000) is None
     assert strays(ledger) == (0, 0)
 
 
-def test_refusal_needs_no_lines(session: Session) -> None:
+def test_refusal_needs_no_lines(session: ScriptRunner) -> None:
     session.start(command("ask", "a"), 0)
     assert session.on_message("ERR", 5) == Rejection(("ERR",))
 
 
-def test_silence_at_the_deadline_and_not_before(session: Session) -> None:
+def test_silence_at_the_deadline_and_not_before(session: ScriptRunner) -> None:
     session.start(command("ask", "a"), 0)
     session.on_message("a=1", 5)
     assert session.on_time(TIMEOUT_NS - 1) is None
     assert session.on_time(TIMEOUT_NS) == Silence(("a=1",))
     assert session.on_time(TIMEOUT_NS) is None
-    assert not session.busy
+    assert session.deadline_ns is None
 
 
-def test_one_request_at_a_time(session: Session) -> None:
+def test_one_request_at_a_time(session: ScriptRunner) -> None:
     session.start(command("first"), 0)
     with pytest.raises(CommandError, match="second: still waiting for the reply to first"):
         session.start(command("second"), 1)
     assert session.on_message("OK", 2) == Reply(("OK",))
 
 
-def test_silent_request_is_done_at_once(session: Session) -> None:
+def test_silent_request_is_done_at_once(session: ScriptRunner) -> None:
     assert session.start(command("reboot", silent=True), 0) == b"reboot"
-    assert not session.busy
+    assert session.deadline_ns is None
     assert session.deadline_ns is None
 
 
-def test_other_text_is_unsolicited_and_not_part_of_the_reply(session: Session, ledger: Ledger) -> None:
+def test_other_text_is_unsolicited_and_not_part_of_the_reply(session: ScriptRunner, ledger: Ledger) -> None:
     assert session.on_message("boot", 0) is None
     session.start(command("ask", "a"), 0)
     for line in ("noise", "a=1", "noise"):
@@ -124,7 +125,7 @@ Step = Request | str | ReplyFrame
     ],
 )
 def test_a_late_reply_does_not_answer_the_next_request(
-    session: Session, ledger: Ledger, first: list[str], wait_ns: int, steps: list[Step], outcomes: list[Outcome],
+    session: ScriptRunner, ledger: Ledger, first: list[str], wait_ns: int, steps: list[Step], outcomes: list[Outcome],
     late_and_unsolicited: tuple[int, int],
 ) -> None:  # fmt: skip
     """`first`: the part of the first request, and the lines that come in time; it then times out."""
@@ -142,11 +143,11 @@ def test_a_late_reply_does_not_answer_the_next_request(
     assert strays(ledger) == late_and_unsolicited
 
 
-def test_cancel_forgets_the_request(session: Session, ledger: Ledger) -> None:
+def test_cancel_forgets_the_request(session: ScriptRunner, ledger: Ledger) -> None:
     session.start(command("ask", "a"), 0)
     session.on_message("a=1", 1)
     session.cancel()
-    assert not session.busy
+    assert session.deadline_ns is None
     assert session.on_time(TIMEOUT_NS) is None
     session.on_message("OK", 2)
     assert strays(ledger) == (0, 1)
@@ -155,7 +156,7 @@ def test_cancel_forgets_the_request(session: Session, ledger: Ledger) -> None:
     assert session.on_message("OK", 4) == Reply(("a=2", "OK"))
 
 
-def test_endless_reply_is_bounded(session: Session) -> None:
+def test_endless_reply_is_bounded(session: ScriptRunner) -> None:
     session.start(command("ask", "a"), 0)
     for number in range(REPLY_MESSAGES_MAX + 50):
         session.on_message(f"a={number}", 1)
@@ -175,7 +176,7 @@ def frame_command(frame_id: int) -> Request:
     )
 
 
-def test_a_frame_answers_as_a_line_does(session: Session, ledger: Ledger) -> None:
+def test_a_frame_answers_as_a_line_does(session: ScriptRunner, ledger: Ledger) -> None:
     session.start(frame_command(6), 0)
     assert session.on_message("6", 1) is None
     assert session.on_message(ReplyFrame(7, b""), 2) is None
@@ -186,7 +187,7 @@ def test_a_frame_answers_as_a_line_does(session: Session, ledger: Ledger) -> Non
     assert strays(ledger) == (0, 2)
 
 
-def test_a_late_frame_is_told_from_the_next_reply(session: Session, ledger: Ledger) -> None:
+def test_a_late_frame_is_told_from_the_next_reply(session: ScriptRunner, ledger: Ledger) -> None:
     session.start(frame_command(6), 0)
     session.on_time(TIMEOUT_NS)
     session.start(frame_command(7), TIMEOUT_NS)
@@ -200,7 +201,7 @@ def test_text_predicates_hold_for_no_frame() -> None:
     assert not of_text(lambda line: True)(ReplyFrame(1, b""))
 
 
-def test_a_pause_sends_nothing_and_late_replies_stay_late(session: Session, ledger: Ledger) -> None:
+def test_a_pause_sends_nothing_and_late_replies_stay_late(session: ScriptRunner, ledger: Ledger) -> None:
     session.start(command("ask", "a"), 0)
     session.on_time(TIMEOUT_NS)
     assert session.start(pause(50), TIMEOUT_NS) == b""
@@ -235,9 +236,9 @@ def measured(tick: int) -> Measurement:
     return Measurement(54, 0, tick)
 
 
-def waiting(ledger: Ledger, tick: int) -> Session:
+def waiting(ledger: Ledger, tick: int) -> ScriptRunner:
     """A session whose request waits for the measurement at `tick`."""
-    session = Session(ledger)
+    session = offline_runner(ledger)
     session.start(replace(command("once"), is_sample=lambda sample: sample.dev_ticks == tick), 0)
     return session
 
@@ -255,8 +256,8 @@ def test_a_measurement_ends_a_request_that_waits_for_it(ledger: Ledger) -> None:
 def test_a_request_without_its_measurement_is_refused_or_silent_and_others_take_none(ledger: Ledger) -> None:
     assert waiting(ledger, 7).on_message("ERR", 1) == Rejection(("ERR",))
     assert waiting(ledger, 7).on_time(TIMEOUT_NS) == Silence(())
-    session = Session(ledger)
+    session = offline_runner(ledger)
     session.start(command("save"), 0)
     assert not session.wants_samples
     assert session.on_sample(measured(1)) is None
-    assert session.busy
+    assert session.deadline_ns is not None

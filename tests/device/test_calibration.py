@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from math import radians
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -12,6 +12,7 @@ from imud.contracts.command import GYRO_ZERO, Calibration, CalibrationResult, Ha
 from imud.contracts.lines import DeviceLines
 from imud.device.calibration import CalibrationRun
 from imud.device.health import DeviceEvents
+from imud.device.transport import Transport
 from imud.model.errors import BadArgument, CommandError, Rejected
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
@@ -34,14 +35,14 @@ class GuideRig:
         self.clock = VirtualClock()
         self.events: list[Event] = []
         self.ran: list[str] = []
-        self.guide = CalibrationRun(self._run, DeviceEvents("bow", Ledger(), self.events.append))
+        self.guide = CalibrationRun(cast(Transport, self), DeviceEvents("bow", Ledger(), self.events.append))
         self.motion: Callable[[float], Vector3] = lambda _t_s: (0.0, 0.0, 0.0)
         """Angular rate by the time since the beginning."""
         self.mag_t: Callable[[float], Vector3 | None] = lambda _t_s: None
         self.silent = False
         self._begin_ns = self.clock.now_ns()
 
-    async def _run(self, make: Callable[[Target], Any]) -> Any:
+    async def run_script(self, make: Callable[[Target], Any]) -> Any:
         made = make(Target(None, 115200))
         return await made if isinstance(made, Awaitable) else made
 

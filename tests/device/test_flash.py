@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from imud.device.flash import FILE_NAME, FlashWrites, ModuleFlash
+from imud.host.clock import HostClock
 from imud.model.units import NS_PER_S
 
 DAY_S = 86_400
@@ -22,13 +23,14 @@ class Days:
     def __init__(self) -> None:
         self.now_s = BEGIN_S
 
-    def utc_ns(self) -> int:
-        return self.now_s * NS_PER_S
+    @property
+    def host(self) -> HostClock:
+        return HostClock(lambda: 0, lambda: self.now_s * NS_PER_S, lambda: 0)
 
 
 def test_imud_itself_is_stopped_before_people_are() -> None:
     days = Days()
-    writes = FlashWrites(None, days.utc_ns)
+    writes = FlashWrites(None, days.host)
     itself, asked = ModuleFlash(writes, "A", asked=False), ModuleFlash(writes, "A", asked=True)
     for number in range(LIMIT_ASKED):
         assert bool(itself.refusal()) == (number >= LIMIT_ITSELF)
@@ -47,11 +49,11 @@ def test_imud_itself_is_stopped_before_people_are() -> None:
 
 def test_counts_survive_a_restart_of_imud(tmp_path: Path) -> None:
     days = Days()
-    with closing(FlashWrites(tmp_path, days.utc_ns)) as writes:
+    with closing(FlashWrites(tmp_path, days.host)) as writes:
         writes.count("A")
         writes.count("A")
         writes.keep_unreadable("A", {"secret": 5})
-    with closing(FlashWrites(tmp_path, days.utc_ns)) as writes:
+    with closing(FlashWrites(tmp_path, days.host)) as writes:
         assert (writes.writes("A"), writes.writes_day("A"), writes.unreadable("A")) == (2, 2, {"secret": 5})
         assert (writes.writes("B"), writes.unreadable("B")) == (0, {})
 
@@ -59,14 +61,14 @@ def test_counts_survive_a_restart_of_imud(tmp_path: Path) -> None:
 def test_a_wrong_clock_does_not_forbid_writes_and_the_modules_written_last_are_remembered() -> None:
     days = Days()
     days.now_s += 10 * 365 * DAY_S
-    writes = FlashWrites(None, days.utc_ns)
+    writes = FlashWrites(None, days.host)
     for _ in range(LIMIT_ITSELF):
         writes.count("A")
     days.now_s = BEGIN_S
     assert writes.writes_day("A") == LIMIT_ITSELF
     days.now_s += DAY_S
     assert writes.writes_day("A") == 0
-    writes = FlashWrites(None, Days().utc_ns)
+    writes = FlashWrites(None, Days().host)
     for number in range(MODULES_MAX):
         writes.count(str(number))
     writes.count("0")
@@ -77,9 +79,9 @@ def test_a_wrong_clock_does_not_forbid_writes_and_the_modules_written_last_are_r
 @pytest.mark.parametrize("content", [b"{", b'{"A": {"writes": "x"}}', b"[]"])
 def test_a_damaged_file_costs_the_count_only(tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / FILE_NAME).write_bytes(content)
-    with closing(FlashWrites(tmp_path, Days().utc_ns)) as writes:
+    with closing(FlashWrites(tmp_path, Days().host)) as writes:
         assert writes.writes("A") == 0
         writes.count("A")
     assert "counted from the beginning" in caplog.text
-    with closing(FlashWrites(tmp_path, Days().utc_ns)) as writes:
+    with closing(FlashWrites(tmp_path, Days().host)) as writes:
         assert writes.writes("A") == 1

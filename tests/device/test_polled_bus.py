@@ -15,6 +15,7 @@ from imud.contracts.codec import Poll, Reading
 from imud.contracts.script import Transfer, TransferScript
 from imud.contracts.status import KernelCounters
 from imud.device.polled_bus import BusMember, Deadlines, PolledBuses, ReadySchedule
+from imud.host.clock import HostClock
 from imud.model.errors import DeviceRefused, LinkError, TransferError, Trouble
 from imud.model.units import NS_PER_S
 from tests.support.event_loops import VirtualClock, in_loop, run_virtually, virtual_buses
@@ -321,7 +322,7 @@ async def test_a_script_can_keep_its_device_from_being_read(buses: PolledBuses) 
 async def test_an_edge_is_read_while_the_loop_is_busy() -> None:
     """The thread waits for the line: nothing is read from the descriptor here, and the loop does not run."""
     edges, device = os.pipe2(os.O_NONBLOCK)
-    buses, wire, read = PolledBuses(monotonic_ns), Wire(), threading.Event()
+    buses, wire, read = PolledBuses(HostClock()), Wire(), threading.Event()
     wire.takes_time = read.set
     member = joined(buses, wire, Sink())
     schedule = ReadySchedule(1.0, monotonic_ns(), Deadlines())
@@ -352,7 +353,7 @@ async def test_an_edge_is_read_while_the_loop_is_busy() -> None:
 @in_loop
 async def test_a_watched_line_does_not_keep_others_from_their_deadlines() -> None:
     edges, device = os.pipe2(os.O_NONBLOCK)
-    buses, wire, sink = PolledBuses(monotonic_ns), Wire(), Sink()
+    buses, wire, sink = PolledBuses(HostClock()), Wire(), Sink()
     member = joined(buses, wire, sink)
     assert member.watch(edges, lambda: None)
     try:

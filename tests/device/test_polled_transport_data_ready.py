@@ -17,6 +17,7 @@ from imud.contracts.lines import DeviceLines, LineFactory, OnEdges, OnLineEnd, R
 from imud.contracts.status import DeviceState
 from imud.device.polled_bus import Deadlines, ReadySchedule
 from imud.device.polled_transport import DataReady
+from imud.host.clock import HostClock
 from imud.model.errors import LinkMissing
 from imud.model.event import EventKind
 from imud.model.sample import Sample, Sync
@@ -304,7 +305,7 @@ async def test_the_thread_waits_for_a_line_with_a_descriptor_while_that_is_open_
     line, clock, member, told = DescriptorLine(), VirtualClock(), WatchingMember(), list[str]()
     notices: Any = SimpleNamespace(raise_event=lambda _t, _kind, message, **_detail: told.append(message))
     maker = LineFactory(lambda *_: line, lambda *_: MemoryOutput())
-    ready = DataReady("imu", ReadyOptions(line="Y"), maker, RATE_HZ, notices, clock.now_ns)
+    ready = DataReady("imu", ReadyOptions(line="Y"), maker, RATE_HZ, notices, HostClock(clock.now_ns))
     some: Any = member
     line.open_error = LinkMissing("not there")
     ready.read(some, (), Deadlines(), clock.now_ns())

@@ -1,20 +1,22 @@
 """Request scripts over a line that is also used by others: in order, one at a time, late and missing replies apart."""
 
 import asyncio
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from time import monotonic_ns
 from typing import Any
 
 import pytest
 
 from imud.contracts.driver import StreamDriver
 from imud.contracts.script import Outcome, Reply, ReplyFrame, Request, RequestScript, Silence, of_text, pause, with_undo
-from imud.device.scripts import Exchange
+from imud.device.scripts import RequestPort, ScriptRunner
 from imud.drivers import DRIVERS
+from imud.host.clock import HostClock
 from imud.model.errors import CommandError, LinkMissing, NoReply
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from tests.support.event_loops import VirtualClock, in_loop, run_virtually
+from tests.support.script_runners import ListPort, offline_runner
 
 
 def request(name: str, timeout_ns: int = 10**10, *, silent: bool = False) -> Request:
@@ -36,50 +38,75 @@ def ask(*requests: Request) -> RequestScript[list[Outcome]]:
     return outcomes
 
 
-def made() -> tuple[Exchange, list[bytes]]:
-    written: list[bytes] = []
-    return Exchange(Ledger(), written.append, monotonic_ns), written
+class CallingPort(RequestPort):
+    """A link that calls a function for each request, and notes what a script changes."""
+
+    def __init__(self, write: Callable[[bytes], None]) -> None:
+        self.changes: list[object] = []
+        self._write = write
+
+    def write(self, data: bytes) -> None:
+        self.changes.append(data)
+        self._write(data)
+
+    def change_rate(self, request: Request) -> None:
+        self.changes.append(request.baud)
+
+    def follow(self, request: Request) -> None:
+        self.changes.append(request.settings)
+
+    def listen(self, request: Request, filters: Sequence[Any]) -> None:
+        self.changes.append(filters)
+
+
+def made() -> tuple[ScriptRunner, list[bytes]]:
+    port = ListPort()
+    return ScriptRunner(port, Ledger(), HostClock()), port.written
+
+
+def runner_of(write: Callable[[bytes], None]) -> ScriptRunner:
+    return ScriptRunner(CallingPort(write), Ledger(), HostClock())
 
 
 @in_loop
 async def test_requests_and_scripts_go_out_one_after_the_other() -> None:
-    exchange, written = made()
-    task = asyncio.create_task(exchange.run(ask(request("A"), request("B"))))
+    runner, written = made()
+    task = asyncio.create_task(runner.run(ask(request("A"), request("B"))))
     await asyncio.sleep(0)
     assert written == [b"A\r\n"]
-    exchange.on_message("A=1", 0)
-    exchange.on_message("OK", 0)
+    runner.on_message("A=1", 0)
+    runner.on_message("OK", 0)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     assert written == [b"A\r\n", b"B\r\n"]
-    exchange.on_message("ERR", 0)
+    runner.on_message("ERR", 0)
     outcomes = await task
     assert outcomes[0] == Reply(("A=1", "OK"))
     assert outcomes[1].lines == ("ERR",)
-    exchange, written = made()
-    first = asyncio.create_task(exchange.run(ask(request("A"))))
-    second = asyncio.create_task(exchange.run(ask(request("B"))))
+    runner, written = made()
+    first = asyncio.create_task(runner.run(ask(request("A"))))
+    second = asyncio.create_task(runner.run(ask(request("B"))))
     for _ in range(5):
         await asyncio.sleep(0)
     assert written == [b"A\r\n"]
-    exchange.on_message("OK", 0)
+    runner.on_message("OK", 0)
     await first
     for _ in range(5):
         await asyncio.sleep(0)
     assert written == [b"A\r\n", b"B\r\n"]
-    exchange.on_message("OK", 0)
+    runner.on_message("OK", 0)
     await second
 
 
 @in_loop
 async def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
     ledger = Ledger()
-    exchange = Exchange(ledger, lambda data: None, monotonic_ns)
-    assert await exchange.run(ask(request("A", timeout_ns=1))) == [Silence(())]
-    exchange.on_message("A=1", 0)
-    exchange.on_message("OK", 0)
+    runner = offline_runner(ledger)
+    assert await runner.run(ask(request("A", timeout_ns=1))) == [Silence(())]
+    runner.on_message("A=1", 0)
+    runner.on_message("OK", 0)
     assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
-    exchange.on_message("OK", 0)
+    runner.on_message("OK", 0)
     assert ledger.replies_unsolicited == 1
 
 
@@ -91,17 +118,17 @@ async def test_a_script_that_is_cancelled_or_whose_link_is_gone_leaves_the_line_
         if gone:
             raise LinkMissing("pulled out")
 
-    exchange = Exchange(Ledger(), write, monotonic_ns)
+    runner = runner_of(write)
     with pytest.raises(LinkMissing):
-        await exchange.run(ask(request("A")))
+        await runner.run(ask(request("A")))
     gone = False
-    assert await exchange.run(ask(request("B", silent=True))) == [Reply(())]
-    exchange, _ = made()
-    task = asyncio.create_task(exchange.run(ask(request("A"))))
+    assert await runner.run(ask(request("B", silent=True))) == [Reply(())]
+    runner, _ = made()
+    task = asyncio.create_task(runner.run(ask(request("A"))))
     await asyncio.sleep(0)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-    assert await exchange.run(ask(request("B", silent=True))) == [Reply(())]
+    assert await runner.run(ask(request("B", silent=True))) == [Reply(())]
 
 
 def test_device_that_never_answers_is_no_reply() -> None:
@@ -111,31 +138,31 @@ def test_device_that_never_answers_is_no_reply() -> None:
 
     async def body() -> None:
         with pytest.raises(NoReply, match="LOG VERSION"):
-            await Exchange(Ledger(), lambda _data: None, clock.now_ns).run(script)
+            await ScriptRunner(ListPort(), Ledger(), HostClock(clock.now_ns)).run(script)
 
     run_virtually(clock, body())
 
 
 @in_loop
 async def test_a_script_gets_the_reply_frame_or_measurement_that_it_waits_for_and_pauses_write_nothing() -> None:
-    exchange, _ = made()
+    runner, _ = made()
     wanted = ReplyFrame(5, b"x")
     asking = replace(request("A"), is_end=lambda message: message == wanted)
-    task = asyncio.create_task(exchange.run(ask(asking)))
+    task = asyncio.create_task(runner.run(ask(asking)))
     await asyncio.sleep(0)
-    exchange.on_message(wanted, 0)
+    runner.on_message(wanted, 0)
     assert await task == [Reply((wanted,))]
-    exchange, _ = made()
-    assert not exchange.wants_samples
-    task = asyncio.create_task(exchange.run(ask(replace(request("A"), is_sample=lambda sample: True))))
+    runner, _ = made()
+    assert not runner.wants_samples
+    task = asyncio.create_task(runner.run(ask(replace(request("A"), is_sample=lambda sample: True))))
     await asyncio.sleep(0)
-    assert exchange.wants_samples
-    exchange.on_sample(Measurement(54, 0, 3))
-    exchange.on_sample(Measurement(54, 0, 4))
+    assert runner.wants_samples
+    runner.on_sample(Measurement(54, 0, 3))
+    runner.on_sample(Measurement(54, 0, 4))
     assert await task == [Reply((), Measurement(54, 0, 3))]
-    assert not exchange.wants_samples
-    exchange, written = made()
-    assert await exchange.run(ask(pause(1_000_000))) == [Silence(())]
+    assert not runner.wants_samples
+    runner, written = made()
+    assert await runner.run(ask(pause(1_000_000))) == [Silence(())]
     assert written == []
 
 
@@ -149,8 +176,8 @@ async def test_a_script_given_up_is_undone_if_the_link_is_there(is_there: bool) 
             raise LinkMissing("gone")
         written.append(data)
 
-    exchange = Exchange(Ledger(), write, monotonic_ns)
-    task = asyncio.create_task(exchange.run(with_undo(ask(request("A"), request("B")), b"UNDO")))
+    runner = runner_of(write)
+    task = asyncio.create_task(runner.run(with_undo(ask(request("A"), request("B")), b"UNDO")))
     await asyncio.sleep(0)
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
@@ -166,10 +193,10 @@ async def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
         yield request("A", timeout_ns=1)
         raise NoReply("no")
 
-    exchange, written = made()
-    assert await exchange.run(with_undo(ask(request("A", timeout_ns=1)), b"UNDO")) == [Silence(())]
+    runner, written = made()
+    assert await runner.run(with_undo(ask(request("A", timeout_ns=1)), b"UNDO")) == [Silence(())]
     with pytest.raises(NoReply):
-        await exchange.run(with_undo(failing(), b"UNDO"))
+        await runner.run(with_undo(failing(), b"UNDO"))
     assert written == [b"A\r\n"] * 2
 
 
@@ -181,14 +208,13 @@ async def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
 @in_loop
 async def test_a_request_can_change_how_the_device_is_heard(change: dict[str, Any], words: str) -> None:
     """The change is made before the request is written. A link without the setting is an error."""
-    happened: list[object] = []
-    note = happened.append
-    exchange = Exchange(Ledger(), note, monotonic_ns, set_baud=note, follow=note, listen=note)
+    port = CallingPort(lambda _data: None)
+    runner = ScriptRunner(port, Ledger(), HostClock())
     silent = request("B", silent=True)
-    assert await exchange.run(ask(request("A", silent=True), replace(silent, **change))) == [Reply(())] * 2
+    assert await runner.run(ask(request("A", silent=True), replace(silent, **change))) == [Reply(())] * 2
     after = [()] if "also" in change else []
-    assert happened == [b"A\r\n", *change.values(), b"B\r\n", *after]
-    exchange, written = made()
+    assert port.changes == [b"A\r\n", *change.values(), b"B\r\n", *after]
+    runner, written = made()
     with pytest.raises(CommandError, match=words):
-        await exchange.run(ask(replace(silent, **change)))
+        await runner.run(ask(replace(silent, **change)))
     assert written == []

@@ -8,7 +8,9 @@ import pytest
 
 from imud.contracts.command import Target
 from imud.contracts.setting import AppliedSettings, Effect, Setting, SettingsTable, StepOutcome, Written
+from imud.device.flash import FlashWrites, ModuleFlash
 from imud.device.settings_plan import Applying, make_plan
+from imud.host.clock import HostClock
 from imud.model.errors import LinkMissing, NoReply
 
 TARGET = Target(None, 0)
@@ -48,30 +50,29 @@ class TableOfOne:
         self.active = dict(self.actual) if self.active else {}
 
 
-class Unlimited:
-    """Flash that may be written."""
+class CountedFlash(ModuleFlash):
+    """Flash that may be written, and the number of writes."""
 
     def __init__(self) -> None:
-        self.counted = 0
+        self._counts = FlashWrites(None, HostClock())
+        super().__init__(self._counts, "module", asked=True)
 
-    def refusal(self) -> str:
-        return ""
-
-    def count(self) -> None:
-        self.counted += 1
+    @property
+    def counted(self) -> int:
+        return self._counts.writes("module")
 
 
-def applied(device: TableOfOne, *, save: bool = True, flash: Unlimited | None = None) -> AppliedSettings:
+def applied(device: TableOfOne, *, save: bool = True, flash: CountedFlash | None = None) -> AppliedSettings:
     async def run(make: Callable[[Target], Any]) -> Any:
         return make(TARGET)
 
     plan = make_plan(device.table, TARGET, {"x": 2}, device.active, {}, save=save, unsaved=False)
-    applying = Applying(device.table, run, flash or Unlimited(), {"x": 2}, device.active)
+    applying = Applying(device.table, run, flash or CountedFlash(), {"x": 2}, device.active)
     return asyncio.run(applying.carry_out(plan))
 
 
 def test_values_are_written_read_back_saved_and_judged_after_a_restart() -> None:
-    device, flash = TableOfOne(None), Unlimited()
+    device, flash = TableOfOne(None), CountedFlash()
     found = applied(device, flash=flash)
     assert device.done == ["x=2", "read", "save"]
     assert (found.steps[0].outcome, found.saved, found.restarted, found.differences) == (
@@ -106,7 +107,7 @@ def test_a_device_that_ignores_reads_has_taken_the_value_and_one_that_tells_anot
 
 
 def test_a_setting_that_saves_itself_is_saved_once() -> None:
-    device, flash = TableOfOne(Written.VERIFIED, saves=True, connection=True), Unlimited()
+    device, flash = TableOfOne(Written.VERIFIED, saves=True, connection=True), CountedFlash()
     found = applied(device, flash=flash)
     assert device.done == ["x=2", "read"]
     assert (found.saved, flash.counted) == (True, 1)

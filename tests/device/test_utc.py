@@ -6,8 +6,8 @@ import pytest
 
 from imud.config.model import DeviceConfig
 from imud.contracts.lines import DeviceLines, Edge, PpsOptions, UtcReference
-from imud.device import utc as utc_keeper
-from imud.device.utc import DevicePort, UtcFeed, make_keeper
+from imud.device import utc as utc_module
+from imud.device.utc import UtcFeed, make_utc_feed
 from imud.formats.nmea0183 import build
 from imud.host.clock import HostClock
 from imud.links.memory import MemoryOptions
@@ -15,12 +15,23 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
 from imud.utc.pps import ChronyFeed
 from imud.utc.receivers import RmcOptions
+from imud.utc.rmc_feed import RmcFeed
 from imud.utc.system_clock import KernelClock
 from tests.support.rmc_sources import FakeSource
 
 UTC_S = 1_795_000_000
 BEGIN_NS = 1000 * NS_PER_S
 OFFSET_NS = UTC_S * NS_PER_S - BEGIN_NS
+
+
+class FakePort:
+    def __init__(self, bit_rate: int = 115_200) -> None:
+        self.written: list[bytes] = []
+        self.bit_rate = bit_rate
+        self.is_free = True
+
+    def write(self, data: bytes) -> None:
+        self.written.append(data)
 
 
 class FakeChrony:
@@ -44,19 +55,18 @@ class FakeChrony:
 
 class KeeperBench:
     def __init__(self, *, source: bool = True, system: UtcReference | None = None) -> None:
-        self.written: list[bytes] = []
-        self.busy = False
+        self.now_ns = BEGIN_NS - NS_PER_S
         self.system = system
         self.source, self.chrony = FakeSource(), FakeChrony()
-        port = DevicePort(self.written.append, lambda: 115_200, lambda: self.busy)
+        host, port = HostClock(lambda: self.now_ns, lambda: self.now_ns, lambda: self.now_ns), FakePort()
+        self.port, self.written = port, port.written
         self.keeper = UtcFeed(
             self.source if source else None,
-            port if source else None,
+            RmcFeed(port, host.now_ns) if source else None,
             lambda: self.system,
-            lambda: self.now_ns,
-            chrony=cast(ChronyFeed, self.chrony),
+            host,
+            cast(ChronyFeed, self.chrony),
         )
-        self.now_ns = BEGIN_NS - NS_PER_S
         self.clock = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
         self.keeper.tick(self.now_ns, None)
         self.keeper.start(self.clock)
@@ -94,9 +104,9 @@ def test_sentences_go_to_the_device_and_make_pulses_utc(bench: KeeperBench) -> N
 def test_a_sentence_for_a_busy_or_wrong_second_is_refused_and_counted(bench: KeeperBench) -> None:
     for number in range(4):
         bench.second(number)
-    bench.busy = True
+    bench.port.is_free = False
     bench.second(4)
-    bench.busy = False
+    bench.port.is_free = True
     bench.second(5, sentence=False)
     bench.source.give(build((UTC_S + 7) * NS_PER_S), bench.now_ns)
     assert bench.keeper.status().refused == {"busy": 1, "ahead": 1}
@@ -155,9 +165,9 @@ def test_close_releases_source_and_socket_and_nothing_starts_again_or_at_all() -
     bench.source.started = 0
     bench.keeper.tick(BEGIN_NS, None)
     assert bench.source.started == 0
-    UtcFeed(None, None, lambda: None, lambda: 0).close()
+    UtcFeed(None, None, lambda: None, HostClock()).close()
     source = FakeSource()
-    keeper = UtcFeed(source, None, lambda: None, lambda: 0)
+    keeper = UtcFeed(source, None, lambda: None, HostClock())
     keeper.close()
     keeper.tick(BEGIN_NS, None)
     assert source.started == 0
@@ -177,16 +187,15 @@ def test_problems_show_and_a_sentence_that_is_too_late_for_its_pulse_is_refused(
 
 def test_the_system_clock_counts_only_while_something_keeps_it(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
-    port = DevicePort(lambda _data: None, lambda: 9600, lambda: False)
     offset_ns, now_ns = [OFFSET_NS], lambda: BEGIN_NS
     host = HostClock(now_ns, lambda: BEGIN_NS + offset_ns[0], now_ns)
-    keeper = make_keeper(configured(None, PpsOptions(line="A")), port, host)
+    keeper = make_utc_feed(configured(None, PpsOptions(line="A")), FakePort(9600), host)
     assert keeper is not None
     keeper.start(clock)
-    monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 100, 100))
+    monkeypatch.setattr(utc_module, "kernel_clock", lambda: KernelClock(False, 100, 100))
     keeper.tick(BEGIN_NS, None)
     assert clock.utc_reference is None
-    monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(True, 100, 0))
+    monkeypatch.setattr(utc_module, "kernel_clock", lambda: KernelClock(True, 100, 0))
     offset_ns[0] += 37 * NS_PER_S
     keeper.tick(BEGIN_NS + NS_PER_S, None)
     assert clock.utc_reference == UtcReference(OFFSET_NS + 37 * NS_PER_S, 100_000)
@@ -204,12 +213,11 @@ def configured(rmc: RmcOptions | None, pps: PpsOptions | None) -> DeviceConfig:
 def test_a_device_gets_what_it_is_configured_for(
     monkeypatch: pytest.MonkeyPatch, rmc: RmcOptions | None, pps: PpsOptions | None
 ) -> None:
-    now_ns, written, source = [BEGIN_NS], list[bytes](), FakeSource()
+    now_ns, port, source = [BEGIN_NS], FakePort(9600), FakeSource()
 
     def make() -> UtcFeed | None:
-        port = DevicePort(written.append, lambda: 9600, lambda: False)
         host = HostClock(lambda: now_ns[0], lambda: now_ns[0] + OFFSET_NS, lambda: now_ns[0])
-        return make_keeper(configured(rmc, pps), port, host)
+        return make_utc_feed(configured(rmc, pps), port, host)
 
     real = make()
     assert (real is None) == (rmc is None and pps is None)
@@ -218,7 +226,7 @@ def test_a_device_gets_what_it_is_configured_for(
     assert real.status().source.startswith("gpsd" if rmc else "")
     assert bool(real.status().source) == (rmc is not None)
     real.close()
-    monkeypatch.setattr(utc_keeper, "RMC_SOURCES", {"gpsd": lambda _settings, _context: source})
+    monkeypatch.setattr(utc_module, "RMC_SOURCES", {"gpsd": lambda _settings, _context: source})
     keeper = make()
     assert keeper is not None
     keeper.tick(BEGIN_NS, None)
@@ -227,7 +235,7 @@ def test_a_device_gets_what_it_is_configured_for(
         keeper.on_pulses([Edge(BEGIN_NS + second * NS_PER_S, True, second)])
         now_ns[0] = BEGIN_NS + second * NS_PER_S + NS_PER_S // 5
         source.give(build((UTC_S + second) * NS_PER_S), now_ns[0])
-    assert len(written) == (6 if rmc is not None else 0)
+    assert len(port.written) == (6 if rmc is not None else 0)
     to_chrony = pps is not None and pps.chrony and rmc is not None  # the second of a pulse must be known
     assert bool(keeper.status().chrony_refused) == bool(to_chrony)
     keeper.close()

@@ -12,12 +12,13 @@ from imud.contracts.codec import CodecEvent, message_of
 from imud.contracts.command import Target as ActionTarget
 from imud.contracts.driver import CanDriver, Driver, StreamDriver
 from imud.contracts.script import Message, Outcome, Reply, Request, RequestScript
-from imud.device.scripts import Session
+from imud.device.scripts import ScriptRunner
 from imud.model.errors import BadArgument, CommandError, DeviceRefused
 from imud.model.ledger import Ledger
 from tests.fuzz import can, streams
 from tests.fuzz.drivers import mender, names_of, row
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target
+from tests.support.script_runners import offline_runner
 
 REQUESTS_MAX = 500
 """Maximum number of requests of a script, for any replies."""
@@ -96,7 +97,7 @@ def _messages(events: Sequence[CodecEvent]) -> Iterator[Message]:
 
 
 def _answer(begin: Script, messages: Iterator[Message]) -> None:
-    session = Session(Ledger())
+    session = offline_runner(Ledger())
     now_ns = 0
     try:
         script = begin()
@@ -111,7 +112,7 @@ def _answer(begin: Script, messages: Iterator[Message]) -> None:
     raise AssertionError(f"more than {REQUESTS_MAX} requests")
 
 
-def _outcome(session: Session, request: Request, messages: Iterator[Message], now_ns: int) -> tuple[Outcome, int]:
+def _outcome(session: ScriptRunner, request: Request, messages: Iterator[Message], now_ns: int) -> tuple[Outcome, int]:
     session.start(request, now_ns)
     if request.silent:
         return Reply(()), now_ns

@@ -14,6 +14,7 @@ from imud.device import flash
 from imud.device import search as remembered
 from imud.device.flash import LIMIT_ASKED, MODULES_MAX, FlashWrites
 from imud.device.search import Remembered, RememberedDevice
+from imud.host.clock import HostClock
 from imud.model.units import NS_PER_S
 from tests.fuzz.target import Target
 
@@ -48,7 +49,7 @@ def run(data: bytes) -> None:
     again = msgspec.json.decode((folder / remembered.FILE_NAME).read_bytes(), type=dict[str, RememberedDevice])
     assert again["new"] == devices.get("new")
     (folder / flash.FILE_NAME).write_bytes(data)
-    writes = FlashWrites(folder, lambda: UTC_NS)
+    writes = FlashWrites(folder, HostClock(lambda: 0, lambda: UTC_NS, lambda: 0))
     before = writes.writes(MODULE)
     assert bool(writes.refusal(MODULE, asked=True)) == (writes.writes_day(MODULE) >= LIMIT_ASKED)
     writes.count(MODULE)

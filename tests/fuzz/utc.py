@@ -51,10 +51,17 @@ def run_rmc(data: bytes) -> None:
         assert feed.sent + sum(feed.refused.values()) == 2
 
 
+class FreePort:
+    bit_rate = 115200
+    is_free = True
+
+    def write(self, data: bytes) -> None: ...
+
+
 def _feed(reference: UtcReference | None) -> RmcFeed:
-    return RmcFeed(
-        lambda _data: None, lambda: 115200, lambda: False, lambda: NOW_NS, reference=lambda: reference,
-    )  # fmt: skip
+    feed = RmcFeed(FreePort(), lambda: NOW_NS)
+    feed.reference = reference
+    return feed
 
 
 def run_sentences(data: bytes) -> None:

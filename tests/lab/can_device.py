@@ -12,11 +12,10 @@ from imud.device.device import Device
 from imud.device.factory import DeviceFactory
 from imud.host.clock import HostClock
 from imud.links.socketcan import SocketCanOptions
-from imud.model.event import Event
 from imud.model.options import Options
-from imud.model.sample import Sample
 from imud.sim.can_module import CanModule, CanModules
 from imud.sim.ports.can_port import CanPort
+from tests.support.device_rig import DeviceOutput
 
 LIMIT_S = 60.0
 
@@ -26,10 +25,10 @@ class BusRig:
 
     def __init__(self, interface: str, driver: str, options: Options, *modules: CanModule) -> None:
         self.port = CanPort(CanModules(modules), interface) if modules else None
-        self.samples: list[Sample] = []
-        self.events: list[Event] = []
+        self.output = DeviceOutput()
+        self.samples, self.events = self.output.samples, self.output.events
         config = DeviceConfig("bow", driver, options, True, "socketcan", SocketCanOptions(interface=interface))
-        self.factory = DeviceFactory(lambda batch: self.samples.extend(batch.samples), self.events.append, HostClock())
+        self.factory = DeviceFactory(self.output, HostClock())
         self.device: Device = self.factory.make(config, 1)
 
     async def until(self, condition: Callable[[], object], what: str) -> None:

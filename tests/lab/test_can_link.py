@@ -21,6 +21,7 @@ from imud.sim.can_module import CanModules
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
 from imud.sim.ports.can_port import CanPort
 from tests.lab.can_interface import CanInterface
+from tests.support.device_rig import DeviceOutput
 
 LIMIT_S = 30.0
 MS = 1_000_000
@@ -134,7 +135,7 @@ def test_filters_hold_from_the_moment_they_are_set(vcan: CanInterface) -> None:
 
 def test_a_device_is_found_by_listening_and_again_after_the_bus_was_down(vcan: CanInterface) -> None:
     config = DeviceConfig("mast", "auto", None, True, "socketcan", SocketCanOptions(interface=vcan.name))
-    runner = DeviceFactory(lambda batch: None, lambda event: None, HostClock()).make(config, 1)
+    runner = DeviceFactory(DeviceOutput(), HostClock()).make(config, 1)
 
     async def story() -> None:
         now_ns = monotonic_ns()

@@ -16,12 +16,12 @@ from imud.drivers.imu61x.can import Imu61xCanOptions, encode_set
 from imud.formats.can import pack_frame
 from imud.host.clock import HostClock
 from imud.links.socketcan import SocketCanOptions
-from imud.model.event import Event, EventKind
-from imud.model.sample import Sample
+from imud.model.event import EventKind
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
 from imud.sim.ports.can_port import CanPort
 from tests.lab.can_interface import CanInterface
 from tests.lab.tool import tool
+from tests.support.device_rig import DeviceOutput
 
 LIMIT_S = 20.0
 BUS_OFF, CONTROLLER = 0x2000_0040, 0x2000_0004
@@ -31,11 +31,9 @@ class Rig:
     def __init__(self, near: str, far: str, *, base_id: int = 101, **link: Any) -> None:
         settings = SocketCanOptions(interface=near, **link)
         config = DeviceConfig("mast", "imu61x-can", Imu61xCanOptions(base_id=base_id), True, "socketcan", settings)
-        self.samples: list[Sample] = []
-        self.events: list[Event] = []
-        self.runner = DeviceFactory(
-            lambda batch: self.samples.extend(batch.samples), self.events.append, HostClock()
-        ).make(config, 1)
+        output = DeviceOutput()
+        self.samples, self.events = output.samples, output.events
+        self.runner = DeviceFactory(output, HostClock()).make(config, 1)
         self.far = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         self.far.bind((far,))
 

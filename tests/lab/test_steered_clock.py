@@ -18,10 +18,10 @@ from imud.device.factory import DeviceFactory
 from imud.drivers.hipnuc.uart.codec import HipnucOptions, encode_hi91
 from imud.host.clock import HostClock
 from imud.links.uart import UartOptions
-from imud.model.sample import Sample
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 from imud.utc.system_clock import Timex
 from tests.lab.serial_port import PseudoTerminal
+from tests.support.device_rig import DeviceOutput
 
 ADJ_FREQUENCY, ADJ_TICK = 0x2, 0x4000
 PERIOD_NS = 20 * NS_PER_MS
@@ -98,9 +98,8 @@ class Device:
 
 @pytest.mark.thorough
 def test_stamps_stay_right_while_the_kernel_steers(pty: PseudoTerminal) -> None:
-    samples: list[Sample] = []
-    host = HostClock()
-    factory = DeviceFactory(lambda batch: samples.extend(batch.samples), lambda _event: None, host)
+    output, host = DeviceOutput(), HostClock()
+    samples, factory = output.samples, DeviceFactory(output, host)
     settings = UartOptions(port=str(pty.path), baud=115_200)
     runner = factory.make(DeviceConfig("bow", "hipnuc-uart", HipnucOptions(), False, "uart", settings), 1)
     module = Device(pty)

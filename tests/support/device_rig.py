@@ -119,6 +119,23 @@ class DeviceRig:
         )
 
 
+class DeviceOutput:
+    """Owner of devices that keeps their samples and events."""
+
+    def __init__(self) -> None:
+        self.samples: list[Sample] = []
+        self.events: list[Event] = []
+
+    def publish(self, batch: Batch) -> None:
+        self.samples += batch.samples
+
+    def send_event(self, event: Event) -> None:
+        self.events.append(event)
+
+    def configured_devices(self) -> Sequence[DeviceConfig]:
+        return ()
+
+
 class DeviceRigs:
     """Makes devices that share time, buses and lines, and keeps apart what comes out of them."""
 
@@ -141,16 +158,9 @@ class DeviceRigs:
         """Time, lines and workers are the real ones unless given; `configured` are all devices of the file."""
         self.host = host or HostClock()
         self._host_tap = ClockObserver(self.host)
+        self._configured = configured
         self.rigs: dict[str, DeviceRig] = {}
-        self.factory = DeviceFactory(
-            self._publish,
-            self._send_event,
-            self.host,
-            state_dir=state_dir,
-            lines=lines,
-            start_worker=start_worker,
-            configured=lambda: configured,
-        )
+        self.factory = DeviceFactory(self, self.host, state_dir=state_dir, lines=lines, start_worker=start_worker)
 
     def add(self, config: DeviceConfig, link: MemoryLink | MemoryCanLink | None = None) -> DeviceRig:
         rig = self.rigs[config.name] = DeviceRig(self.host.now_ns)
@@ -192,14 +202,17 @@ class DeviceRigs:
             for rig in filter(is_replayed, rigs):
                 check_replay(rig)
 
-    def _publish(self, batch: Batch) -> None:
+    def configured_devices(self) -> Sequence[DeviceConfig]:
+        return self._configured
+
+    def publish(self, batch: Batch) -> None:
         rig = self.rigs[batch.device]
         assert batch.device_id == rig.device.device_id
         rig.batches += 1
         rig.published.append((self.host.now_ns(), list(batch.samples)))
         rig.samples += batch.samples
 
-    def _send_event(self, event: Event) -> None:
+    def send_event(self, event: Event) -> None:
         assert isinstance(event.kind, EventKind)
         assert isinstance(event.t_ns, int)
         self.rigs[event.device].events.append(event)

@@ -131,7 +131,7 @@ class LoopWorker:
 
 
 def virtual_buses(clock: VirtualClock) -> PolledBuses:
-    return PolledBuses(clock.now_ns, LoopWorker)
+    return PolledBuses(HostClock(clock.now_ns), LoopWorker)
 
 
 def run_virtually(clock: VirtualClock, body: Coroutine[Any, Any, None]) -> None:

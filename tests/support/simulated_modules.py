@@ -17,7 +17,6 @@ from imud.contracts.command import Target
 from imud.contracts.driver import CanDriver
 from imud.contracts.script import Outcome, Reply, ReplyFrame, Request, RequestScript, Transfer
 from imud.contracts.setting import Written
-from imud.device.scripts import Session
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.canopen.driver import DRIVER as CANOPEN_DRIVER
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
@@ -39,6 +38,7 @@ from imud.sim.imu61x.uart import VARIANTS, Imu61xBehaviour, Imu61xHardware, Imu6
 from imud.sim.physics import Still
 from imud.sim.ports.uart_wire import heard
 from imud.sim.sensor import Burst
+from tests.support.script_runners import offline_runner
 
 T = TypeVar("T")
 
@@ -78,7 +78,7 @@ class SerialLine(Generic[M]):
         """Whether the host's transmit line reaches the module."""
         self.ledger = ledger
         self.codec = codec
-        self.session = Session(ledger)
+        self.session = offline_runner(ledger)
         self.asked: list[str] = []
 
     def wait(self, duration_ms: float) -> list[CodecEvent]:
@@ -213,7 +213,7 @@ class CanBench:
         self.settings = settings
         """Settings of the driver, which scripts change when they follow the module."""
         self.codec: CanCodec = driver.make_codec(Ledger(), settings)
-        self.session = Session(self.codec.ledger)
+        self.session = offline_runner(self.codec.ledger)
         self.sent: list[tuple[int, bytes]] = []
         self.heard: list[tuple[int, bytes]] = []
         self.measured: list[Measurement] = []

@@ -27,14 +27,13 @@ class FeedBench:
     def __init__(self, rate_hz: int = 1, reference: UtcReference | None = GOOD, baud: int = 115_200) -> None:
         self.now_ns = BEGIN_NS
         self.sent: list[bytes] = []
-        self.busy = False
+        self.is_free = True
         self.broken = False
-        self.reference = reference
-        self.feed = RmcFeed(
-            self._write, lambda: baud, lambda: self.busy, lambda: self.now_ns, rate_hz, lambda: self.reference
-        )
+        self.bit_rate = baud
+        self.feed = RmcFeed(self, lambda: self.now_ns, rate_hz)
+        self.feed.reference = reference
 
-    def _write(self, data: bytes) -> None:
+    def write(self, data: bytes) -> None:
         if self.broken:
             raise LinkError("the port is gone")
         self.sent.append(data)
@@ -132,9 +131,9 @@ def test_sentences_above_the_rate_are_rejected() -> None:
     assert [n for n, refusal in enumerate(refusals) if not refusal] == [0, 5, 10, 15, 20, 25]
     assert set(refusals) == {"", Refusal.TOO_MANY}
     bench = FeedBench()
-    bench.busy = True
+    bench.is_free = False
     assert bench.give(0, 0.1) == Refusal.BUSY
-    bench.busy, bench.broken = False, True
+    bench.is_free = bench.broken = True
     assert bench.give(0, 0.2) == Refusal.LINK
     bench.broken = False
     assert bench.give(0, 0.3) == ""

@@ -7,7 +7,6 @@ from typing import TypeVar
 import pytest
 
 from imud.contracts.script import Outcome, Request, RequestScript, TextLine
-from imud.device.scripts import Session
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -17,6 +16,7 @@ from imud.sim.hipnuc.uart import HipnucModule, make
 from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.physics import Noise, Still, swing
 from imud.sim.sensor import SimulatorOptions
+from tests.support.script_runners import offline_runner
 from tests.support.simulated_modules import BEGIN_NS, FAST, HIPNUC_STILL, HipnucUartBench, run_script, unpack_hi91
 
 T = TypeVar("T")
@@ -152,7 +152,7 @@ def test_main_status_noise_the_end_of_32_bits_and_pulses() -> None:
 
 def converse(bench: HipnucUartBench, script: RequestScript[T]) -> T:
     ledger = Ledger()
-    codec, session = DRIVER.make_codec(ledger, DRIVER.settings()), Session(ledger)
+    codec, session = DRIVER.make_codec(ledger, DRIVER.settings()), offline_runner(ledger)
 
     def ask(request: Request) -> Outcome:
         bench.module.receive(session.start(request, bench.now_ns), bench.now_ns)

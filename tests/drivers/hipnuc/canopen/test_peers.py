@@ -15,7 +15,6 @@ from canopen.objectdictionary import ODRecord, ODVariable, datatypes
 
 from imud.contracts.codec import CodecEvent, message_of
 from imud.contracts.script import Outcome, Reply, ReplyFrame, Request
-from imud.device.scripts import Session
 from imud.drivers.hipnuc.canopen import cia301
 from imud.drivers.hipnuc.canopen import commands as session
 from imud.drivers.hipnuc.canopen.cia301 import NmtCommand
@@ -26,6 +25,7 @@ from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
 from tests.support.daemon_process import LIMIT_S, wait_until
+from tests.support.script_runners import offline_runner
 from tests.support.simulated_modules import run_script, unpack
 
 pytestmark = pytest.mark.live
@@ -180,7 +180,7 @@ class Host:
     def __init__(self, channel: str) -> None:
         self.bus = can.Bus(channel, interface="virtual")
         self.codec = HipnucCanopenCodec(Ledger(), HipnucCanopenOptions(node=NODE))
-        self.session = Session(self.codec.ledger)
+        self.session = offline_runner(self.codec.ledger)
         self.periods = 0
         self.limit_s = LIMIT_S
         """Real time limit of a request: their node runs in a thread."""

@@ -6,7 +6,6 @@ import pytest
 
 from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
 from imud.contracts.setting import Written
-from imud.device.scripts import Session
 from imud.drivers.hipnuc.j1939 import commands as session
 from imud.drivers.hipnuc.j1939.codec import HOST_ADDRESS, J1939Node
 from imud.drivers.hipnuc.j1939.commands import X_SIGN, Y_SIGN, Zero
@@ -15,6 +14,7 @@ from imud.formats.can import EXTENDED_FLAG, RAW_FRAME
 from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.ledger import Ledger
 from imud.sim.hipnuc.j1939 import J1939_VARIANTS, J1939Settings, J1939Variant
+from tests.support.script_runners import offline_runner
 from tests.support.simulated_modules import J1939Bench, run_script
 
 PEER = J1939Node(8)
@@ -153,7 +153,7 @@ def test_which_frames_answer_a_request() -> None:
         assert bench.act("send_once", pgn="FF43") is None
         assert [can_id for can_id, _ in bench.heard].count(0x0CFF4308) == 1
 
-    talk = Session(ledger := Ledger())
+    talk = offline_runner(ledger := Ledger())
     talk.start(next(session.read(PEER, X_SIGN)), 0)
     assert talk.on_message(ReplyFrame(0x0CEF5508, bytes.fromhex("9F00030001000000")), 1) is None
     outcome = talk.on_message(ReplyFrame(0x0CEF5508, bytes.fromhex("9E00030001000000")), 2)

@@ -6,7 +6,6 @@ from typing import TypeVar
 import pytest
 
 from imud.contracts.script import Outcome, Rejection, Reply, Request, RequestScript, Silence
-from imud.device.scripts import Session
 from imud.drivers.hipnuc.uart.commands import (
     OutputMessage,
     Query,
@@ -20,6 +19,7 @@ from imud.drivers.hipnuc.uart.commands import (
 from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.ledger import Ledger
 from imud.sim.hipnuc.uart_settings import VARIANTS, Behaviour, ModuleSettings, Output, RateChange
+from tests.support.script_runners import offline_runner
 from tests.support.simulated_modules import HipnucLine, hardware_of, run_script
 
 T = TypeVar("T")
@@ -83,7 +83,7 @@ def test_no_reply_and_one_that_lost_its_product(outcome: Outcome, words: str) ->
 def test_a_late_version_is_not_taken_for_the_settings() -> None:
     """LOG VERSION times out, imud sends LOG USRCONFIG, and then the late reply to LOG VERSION arrives with its OK."""
     ledger = Ledger()
-    session = Session(ledger)
+    session = offline_runner(ledger)
     session.start(ask(Query.VERSION), 0)
     assert isinstance(session.on_time(10**9), Silence)
     session.start(ask(Query.USRCONFIG), 10**9)
@@ -92,7 +92,7 @@ def test_a_late_version_is_not_taken_for_the_settings() -> None:
     assert session.on_message("ATT_MODE: 0", 10**9 + 2) is None
     assert session.on_message("OK", 10**9 + 2) == Reply(("ATT_MODE: 0", "OK"))
     ledger = Ledger()
-    session = Session(ledger)
+    session = offline_runner(ledger)
     session.start(log_ontime(OutputMessage.HI91, 100), 0)
     session.on_time(10**9)
     session.start(ask(Query.VERSION), 10**9)

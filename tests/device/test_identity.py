@@ -1,56 +1,66 @@
 """What is known of a device, and what is reported when it differs from before."""
 
+from collections.abc import Mapping
+
 import msgspec
 
 from imud.contracts.driver import Identity
 from imud.device.health import DeviceEvents
-from imud.device.settings import KnownIdentity, identity_words
+from imud.device.identity import KnownIdentity, identity_words
+from imud.host.clock import HostClock
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
+
+
+def update(known: KnownIdentity, identity: Identity, settings: Mapping[str, str]) -> None:
+    known.update_identity(identity)
+    known.update_settings(settings, None)
 
 
 def test_only_differences_to_a_known_device_are_reported() -> None:
     events: list[Event] = []
     times_ns = iter((3, 4))  # one for each event
-    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), lambda: next(times_ns))
-    known.update(Identity("HI14", "A1"), {"ATT_MODE": "0", "BAUD": "115200"})
-    known.update(Identity("HI14", "A1"), {"ATT_MODE": "0", "BAUD": "115200", "NEW": "1"})
+    host = HostClock(lambda: 5)
+    host.now_ns = lambda: next(times_ns)
+    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), host)
+    update(known, Identity("HI14", "A1"), {"ATT_MODE": "0", "BAUD": "115200"})
+    update(known, Identity("HI14", "A1"), {"ATT_MODE": "0", "BAUD": "115200", "NEW": "1"})
     assert not events
-    known.update(Identity("HI14", "A1"), {"ATT_MODE": "1"})
-    known.update(Identity("HI14", "B2"), {"ATT_MODE": "1"})
+    update(known, Identity("HI14", "A1"), {"ATT_MODE": "1"})
+    update(known, Identity("HI14", "B2"), {"ATT_MODE": "1"})
     assert [(event.t_ns, event.kind, event.message) for event in events] == [
         (3, EventKind.CONFIGURATION, "settings of the device changed: ATT_MODE is 1, was 0"),
         (4, EventKind.CONFIGURATION, "another device: serial number B2, was A1"),
     ]
     assert (known.identity.serial_number, known.settings) == ("B2", {"ATT_MODE": "1"})
     events = []
-    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), lambda: 5)
-    known.update(Identity("HI14"), {})
-    known.update(Identity("HI14", "B2"), {})
+    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), HostClock(lambda: 5))
+    update(known, Identity("HI14"), {})
+    update(known, Identity("HI14", "B2"), {})
     assert not events
 
 
 def test_what_an_answer_lost_is_known_from_before_of_the_same_device() -> None:
     """An adapter that was just plugged in: the first answers have lost bytes."""
     events: list[Event] = []
-    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), lambda: 5)
+    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), HostClock(lambda: 5))
     whole = Identity("HI14", "A1", "1.5.6", {"BUILD": "x"})
-    known.update(whole, {})
+    update(known, whole, {})
     for damaged in (Identity("HI14"), Identity("", "A1", "1.5.6"), Identity()):
-        known.update(damaged, {})
+        update(known, damaged, {})
         assert known.identity == whole
     assert not events
-    known.update(Identity("HI14", "A1", "1.6.9", {"BUILD": "y"}), {})
+    update(known, Identity("HI14", "A1", "1.6.9", {"BUILD": "y"}), {})
     assert known.identity == Identity("HI14", "A1", "1.6.9", {"BUILD": "y"})
     events = []
-    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), lambda: 5)
-    known.update(Identity("HI14", "A1", "1.5.6"), {})
-    known.update(Identity("", "B2"), {})
+    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), HostClock(lambda: 5))
+    update(known, Identity("HI14", "A1", "1.5.6"), {})
+    update(known, Identity("", "B2"), {})
     assert known.identity == Identity("", "B2")
     assert [event.message for event in events] == ["another device: serial number B2, was A1"]
-    known.update(Identity("CH0"), {})
+    update(known, Identity("CH0"), {})
     assert known.identity == Identity("CH0", "B2")
-    known.update(Identity("HI14"), {})
+    update(known, Identity("HI14"), {})
     assert known.identity == Identity("HI14")
 
 
@@ -64,12 +74,12 @@ HOSTILE = "\x1b[2J\n\udc80\ud800\u202e" + "x" * 10_000
 def test_what_a_device_says_fits_every_output() -> None:
     """Long, unprintable, not UTF-8, and named as the arguments of our own functions."""
     events: list[Event] = []
-    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), lambda: 5)
+    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), HostClock(lambda: 5))
     names = ("message", "kind", "now_ns", "self", "device", HOSTILE)
     many = {f"n{number}": HOSTILE for number in range(10_000)}
-    known.update(Identity(HOSTILE, HOSTILE, HOSTILE, many), dict.fromkeys(names, "old"))
-    known.update(Identity("HI14", "B2"), dict.fromkeys(names, HOSTILE))
-    known.update(Identity(HOSTILE, HOSTILE, HOSTILE, many), {})
+    update(known, Identity(HOSTILE, HOSTILE, HOSTILE, many), dict.fromkeys(names, "old"))
+    update(known, Identity("HI14", "B2"), dict.fromkeys(names, HOSTILE))
+    update(known, Identity(HOSTILE, HOSTILE, HOSTILE, many), {})
     assert len(events) == 3
     assert set(names[:-1]) <= set(events[1].detail)
     shown = [known.identity, known.settings, identity_words(known.identity), *events]
