@@ -1,4 +1,4 @@
-"""The daemon: one event loop that owns every configured device and every output.
+"""The daemon: one event loop with all configured devices and outputs.
 
 Device ──Batch──▶ Publisher ×n              (publish: a plain loop)
 tick, 10 Hz ──▶ devices, publishers         SIGHUP ──▶ reload        SIGTERM, SIGINT ──▶ stop
@@ -52,11 +52,11 @@ from imud.utc.system_clock import kernel_clock, system_reference
 log = logging.getLogger(__name__)
 
 PAUSE_S: Final = 100e-6
-"""Long enough for the kernel to wake the loop's thread, which takes some ten microseconds."""
+"""Pause of the thread that reads the configuration, s. The kernel needs about 10 us to wake the loop's thread."""
 
 
 class Reloader:
-    """Reads `file` on request and applies it to the daemon. Synchronization: the event loop's thread only."""
+    """Reader of the configuration file for reloads. Synchronization: the loop's thread only."""
 
     def __init__(self, file: Path, daemon: "Daemon", host: HostClock) -> None:
         self._file = file
@@ -68,7 +68,7 @@ class Reloader:
         threading.Thread(target=self._serve, name="configuration", daemon=True).start()
 
     def request(self, done: Callable[[asyncio.Task[None]], None]) -> None:
-        """Reload now, or once more after the reload that is under way. `done` is called with the task at its end."""
+        """Reload now, or again after the running reload. Call `done` with the task at its end."""
         if self._task is not None and not self._task.done():
             self._again = True
             return
@@ -76,7 +76,7 @@ class Reloader:
         self._task.add_done_callback(done)
 
     async def close(self) -> None:
-        """End the thread and a reload that is under way; may be called twice."""
+        """Stop the thread and the running reload. A second call does nothing."""
         self._jobs.put(None)
         if self._task is not None:
             self._task.cancel()
@@ -97,16 +97,16 @@ class Reloader:
             again = self._again
 
     async def _read(self) -> Config:
-        """Have the thread read the file. Raises ConfigError."""
+        """Read the file in the thread. Raises ConfigError."""
         answer: asyncio.Future[Config] = asyncio.get_running_loop().create_future()
         self._jobs.put(answer)
         return await answer
 
     def _serve(self) -> None:
-        """Read the file for each future of the queue. Runs in the thread."""
+        """Read the file for each future in the queue. Runs in the thread."""
         while (answer := self._jobs.get()) is not None:
             config, error = self._load()
-            with suppress(RuntimeError):  # the loop has ended meanwhile
+            with suppress(RuntimeError):  # the loop has ended
                 answer.get_loop().call_soon_threadsafe(_give, answer, config, error)
 
     def _load(self) -> tuple[Config | None, ConfigError | None]:
@@ -114,7 +114,7 @@ class Reloader:
             return configuration.load(self._file, pause=lambda: time.sleep(PAUSE_S)), None
         except ConfigError as error:
             return None, error
-        except Exception as error:  # an internal error in reading a new configuration does not end what runs
+        except Exception as error:  # an internal error must not stop the running devices
             log.exception("the configuration cannot be read because of an internal error")
             return None, ConfigError(f"{self._file}: {type(error).__name__}: {printable(str(error))}")
 
@@ -129,25 +129,26 @@ def _give(answer: "asyncio.Future[Config]", config: Config | None, error: Config
 
 
 TICK_S = 0.1
+"""Interval of ticks, s."""
 RETRY_FIRST_NS = NS_PER_S
-"""Pause before an output that could not start is tried again; it doubles up to RETRY_MOST_NS."""
+"""First pause before imud starts a failed output again, ns. The pause doubles up to RETRY_MOST_NS."""
 RETRY_MOST_NS = 60 * NS_PER_S
+"""Maximum pause before imud starts a failed output again, ns."""
 
 
 class _PutOff(NamedTuple):
-    """An output that is to be tried again."""
+    """Next start of a failed output."""
 
     due_ns: int
-    """CLOCK_MONOTONIC."""
+    """CLOCK_MONOTONIC of the next start."""
     pause_ns: int
 
 
 class Daemon:
-    """Runtime of one configuration. Synchronization: all in the event loop's thread.
+    """Devices and outputs of one configuration. Synchronization: the loop's thread only.
 
-    `file` is read again on SIGHUP; `state_dir` is where found devices are remembered (None remembers nothing);
-    `extra` are publishers in addition to the configured ones; `until_finished` ends the run with the last replay;
-    `lines` makes the devices' GPIO lines.
+    A reload reads `file`. `state_dir` contains the state files (None: no files). `extra` contains outputs in addition
+    to the configured outputs. With `until_finished`, `run` ends with the last replay. `lines` opens the GPIO lines.
     """
 
     def __init__(
@@ -187,23 +188,21 @@ class Daemon:
         self._extra = dict(extra or {})
         self._until_finished = until_finished
         self._publishers: dict[str, Publisher] = {}
-        self._outputs: tuple[Callable[[Batch], None], ...] = ()
-        """Where samples go: `publish` of all publishers that have one."""
+        self._outputs: tuple[Callable[[Batch], None], ...] = ()  # `publish` of all outputs that process samples
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._ids: dict[str, int] = {}
         self._stop = asyncio.Event()
         self._timer: asyncio.TimerHandle | None = None
         self._failure: BaseException | None = None
         self._manager = ServiceManager()
-        self._put_off: dict[str, _PutOff] = {}
-        """Outputs that could not start at the beginning, to be tried again."""
+        self._put_off: dict[str, _PutOff] = {}  # outputs that imud must start again
 
     # --- life ------------------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Run until stopped.
+        """Run until `stop`.
 
-        Raises ServerError when an output that is required cannot start, and the error that ended a device's task.
+        Raises ServerError if a required output cannot start, and the error that ended the task of a device.
         """
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._on_loop_error)
@@ -219,7 +218,7 @@ class Daemon:
             for device in self.config.devices:
                 self._start_device(device)
             gc.collect()
-            gc.freeze()  # what is there now stays: collections in service need not look at it
+            gc.freeze()  # later collections skip the present objects, which live until the end
             self._manager.ready()
             log.info("imud %s has started: %s", __version__, self._summary())
             await self._tick_until_stopped()
@@ -231,7 +230,7 @@ class Daemon:
             raise self._failure
 
     def stop(self) -> None:
-        """Ask `run` to end; it closes everything first."""
+        """Close all devices and outputs, then end `run`."""
         self._stop.set()
 
     def install_signals(self) -> None:
@@ -243,21 +242,18 @@ class Daemon:
 
     @property
     def finished(self) -> bool:
-        """Whether every device is a replay that came to its end."""
+        """Whether each device is a finished replay."""
         return all(device.state is DeviceState.FINISHED for device in self._devices.values())
 
     # --- reload ----------------------------------------------------------------------------------------------------
 
     def reload(self) -> None:
-        """Read the configuration file again and change what differs; a bad file leaves everything as it is.
-
-        Returns at once; a device at a time is changed in turns of the event loop.
-        """
+        """Start a reload: read the configuration file again and apply the changes. An invalid file changes nothing."""
         if self._reloader is not None:
             self._reloader.request(self._on_reloaded)
 
     def refuse(self, error: ConfigError) -> None:
-        """Log and send what is wrong with a new configuration."""
+        """Report the errors of a new configuration."""
         for problem in str(error).splitlines():
             log.error("the configuration stays as it was: %s", problem)
         self.send_event(
@@ -265,7 +261,7 @@ class Daemon:
         )
 
     async def change_to(self, new: Config) -> None:
-        """Start, stop and restart what differs in `new`; other work has its turn after each."""
+        """Stop, restart and start the changed devices and outputs. Run the event loop after each change."""
         change = configuration.differences(self.config, new)
         old, self.config = self.config, new
         logging.getLogger().setLevel(new.log_level.upper())
@@ -285,7 +281,7 @@ class Daemon:
         self.send_event(Event(self._host.now_ns(), "", EventKind.CONFIGURATION, words))
 
     def _restart_publisher(self, name: str, old: Config) -> str:
-        """With its new settings, or with the old ones if those cannot be used; returns what is wrong, if anything."""
+        """Restart an output with its new options, or with the old options if it fails. Return the problem, or empty."""
         self._put_off.pop(name, None)
         if name in self._publishers:
             self._publishers.pop(name).close()
@@ -317,18 +313,18 @@ class Daemon:
         return device
 
     def status(self) -> list[DeviceStatus]:
-        """Return the state of every device."""
+        """Return the status of all devices."""
         return list(self.each_status())
 
     def each_status(self) -> Iterator[DeviceStatus]:
-        """Return the state of each device when its turn comes; one that is removed in between is left out."""
+        """Yield the status of each device. Skip a device that a reload removes in the meantime."""
         for name in list(self._devices):
             device = self._devices.get(name)
             if device is not None:
                 yield device.status()
 
     def ledgers(self) -> list[DeviceLedger]:
-        """Return the ledger of every device."""
+        """Return the ledgers of all devices."""
         return [(name, device.driver_name, device.ledger.snapshot()) for name, device in self._devices.items()]
 
     def configured_devices(self) -> Sequence[DeviceConfig]:
@@ -341,7 +337,7 @@ class Daemon:
             self._start_publisher(name, PUBLISHERS[name].make(settings, self._context))
 
     def _start_or_put_off(self, name: str) -> None:
-        """Start an output; one that is not required is tried again later where that fails. Raises ServerError."""
+        """Start an output. Start a failed optional output again later. Raises ServerError for a required output."""
         before = self._put_off.pop(name, None)
         try:
             self._start_configured(name)
@@ -357,7 +353,7 @@ class Daemon:
                 log.info("%s: started after all", name)
 
     def _summary(self) -> str:
-        """Configuration, devices and outputs, for the log."""
+        """Return file, devices and outputs for the log."""
         outputs = ", ".join(self._publishers) or "none"
         missing = f" (not yet: {', '.join(self._put_off)})" if self._put_off else ""
         file = f"configuration {self._file}; " if self._file is not None else ""
@@ -394,7 +390,7 @@ class Daemon:
             publisher.remove_device(name)
 
     def _on_done(self, task: asyncio.Task[None]) -> None:
-        """End the process with the error that ended a device's task; the service manager restarts it."""
+        """Stop after an error in the task of a device. The service manager restarts imud."""
         if not task.cancelled() and task.exception() is not None:
             self._failure = task.exception()
             self._stop.set()
@@ -402,13 +398,13 @@ class Daemon:
             self._stop.set()
 
     def _on_reloaded(self, task: asyncio.Task[None]) -> None:
-        """A reload that dies of an error ends the process, as a device's task does."""
+        """Stop after an internal error in a reload."""
         if not task.cancelled() and task.exception() is not None:
             self._failure = task.exception()
             self._stop.set()
 
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
-        """End the process after an exception in a callback, which is an internal error."""
+        """Stop after an exception in a callback, which is an internal error."""
         error = context.get("exception")
         log.error("%s", context.get("message"), exc_info=error if isinstance(error, BaseException) else None)
         self._failure = error if isinstance(error, BaseException) else RuntimeError(str(context.get("message")))
@@ -427,7 +423,7 @@ class Daemon:
     # --- time -------------------------------------------------------------------------------------------------------
 
     async def _tick_until_stopped(self) -> None:
-        """Tick at once, and by a timer from then on: a wait with a time limit turns the loop four more times."""
+        # A wait with a timeout would add four iterations of the event loop per tick.
         self._tick()
         try:
             await self._stop.wait()
@@ -436,9 +432,9 @@ class Daemon:
                 self._timer.cancel()
 
     def _tick(self) -> None:
-        """Call the ticks of all parts. An error here ends the process (`_on_loop_error`)."""
+        """Call `tick` of all devices and outputs. An error stops the daemon (`_on_loop_error`)."""
         now_ns = self._host.now_ns()
-        self._host.utc_offset_ns()  # also where no device is read for long: between two readings a rate is a mean
+        self._host.utc_offset_ns()  # without samples too: the rate of the clock is a mean between two reads
         for device in self._devices.values():
             device.tick(now_ns)
         for publisher in self._publishers.values():
@@ -466,7 +462,7 @@ class Daemon:
             self._end_part(name, publisher.close)
 
     def _end_part(self, name: str, step: Callable[[], None]) -> None:
-        """Do a step of the end; an error is the reason of the end, unless there is one, and the next steps follow."""
+        """Close a part. Log an error and continue; the first error is the result of `run`."""
         try:
             step()
         except Exception as error:
@@ -475,7 +471,7 @@ class Daemon:
 
 
 def _one_thread() -> ThreadPoolExecutor:
-    """Return an executor with one thread that runs already: unplugging a device must not need to start one."""
+    """Return an executor with one running thread, so that a missing device does not start a thread."""
     executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="imud close")
     executor.submit(int)
     return executor

@@ -75,8 +75,8 @@ class Attachments:
             config.name, config.lines, lines, raise_event, host.now_ns, port.on_reset
         )
         self._line_actions = LineActions(self._reset, self._signals)
+        # differences between the GPIO lines and the device settings, by the key of the line
         self._differences: Mapping[str, str] = {}
-        """Differences between the GPIO lines and the device settings, by the key of the line."""
         made: tuple[Attachment | None, ...] = (self._signals, self._reset, self._utc)
         self._present = [one for one in made if one is not None]
         self.drain_edges: Callable[[], None] | None = self._signals.drain if self._signals is not None else None
@@ -84,28 +84,23 @@ class Attachments:
         device has no GPIO lines."""
 
     def add(self, attachment: Attachment) -> None:
-        """Add an attachment."""
         self._present.append(attachment)
 
     # --- all attachments ---------------------------------------------------------------------------------------------
 
     def start(self, clock: SampleClock) -> None:
-        """Start all attachments: imud has found the device."""
         for one in self._present:
             one.start(clock)
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
-        """Call `tick` of all attachments, ten times per second."""
         for one in self._present:
             one.tick(now_ns, newest)
 
     def stop(self) -> None:
-        """Stop all attachments: the link of the device ended. A second call does nothing."""
         for one in self._present:
             one.stop()
 
     def close(self) -> None:
-        """Release all resources. A second call does nothing."""
         for one in self._present:
             one.close()
 

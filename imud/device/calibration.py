@@ -1,9 +1,9 @@
-"""The guide of a calibration: checks rest, starts it on the device, watches the samples, and verifies the result.
+"""Guide of a calibration: check the rest, start the calibration on the device, check the samples, verify the result.
 
-    ready? ──▶ rest? ──▶ begin ──▶ rest? ──▶ samples as expected? ──▶ save        the device must not move
-    ready? ──▶ begin ──▶ turning, until the device says that it is done ──▶ field as expected?      it is turned
+    ready? ──▶ rest? ──▶ begin ──▶ rest? ──▶ samples as expected? ──▶ save        for a device at rest
+    ready? ──▶ begin ──▶ turn the device until it reports the end ──▶ field as expected?   for a turned device
 
-It looks at the newest sample ten times a second. Progress goes out as events.
+The guide checks the newest sample ten times per second. Events report the progress.
 """
 
 import asyncio
@@ -34,19 +34,20 @@ from imud.model.units import NS_PER_S, RAD_PER_DEG
 from imud.sampling.clock import SampleClock
 
 WINDOW_SAMPLES: Final = 20
-"""At ten looks per second, two seconds."""
+"""Number of samples of a rest: 2 s at ten samples per second."""
 RATE_BAND_RAD_S: Final = 1.0 * RAD_PER_DEG
-"""About the mean: ten times the noise of these sensors; a hand that holds the device moves it more."""
+"""Maximum deviation from the mean at rest, rad/s: ten times the noise. A hand moves the device more."""
 RATE_MEAN_RAD_S: Final = 5.0 * RAD_PER_DEG
-"""The bias of an uncalibrated gyroscope is below; a slow steady turn is above."""
+"""Maximum mean at rest, rad/s: above the bias of an uncalibrated gyroscope, below a slow turn."""
 ACCEL_BAND_M_S2: Final = 0.5
+"""Maximum deviation from the mean at rest, m/s²."""
 STANDARD_GRAVITY_M_S2: Final = 9.80665
 GRAVITY_TOLERANCE: Final = 0.05
-"""Of the mean's length: scale errors and local gravity are below one percent."""
+"""Maximum relative difference to standard gravity. Scale errors and local gravity are below 1 %."""
 
 
 class RestWindow:
-    """The newest samples of a device. Memory is bounded by WINDOW_SAMPLES."""
+    """Newest WINDOW_SAMPLES samples of a device."""
 
     def __init__(self) -> None:
         self._accel: deque[Vector3] = deque(maxlen=WINDOW_SAMPLES)
@@ -54,10 +55,9 @@ class RestWindow:
         self._euler: deque[Vector3] = deque(maxlen=WINDOW_SAMPLES)
         self._incli: deque[Pair] = deque(maxlen=WINDOW_SAMPLES)
         self.samples = 0
-        """Samples seen since the last `clear`."""
+        """Number of samples since the last `clear`."""
 
     def add(self, sample: Sample) -> None:
-        """Add a sample."""
         self.samples += 1
         if sample.accel_m_s2 is not None:
             self._accel.append(sample.accel_m_s2)
@@ -69,7 +69,6 @@ class RestWindow:
             self._incli.append(sample.incli_rad)
 
     def clear(self) -> None:
-        """Forget all samples."""
         self._accel.clear()
         self._gyro.clear()
         self._euler.clear()
@@ -78,11 +77,11 @@ class RestWindow:
 
     @property
     def full(self) -> bool:
-        """Whether there are enough samples to judge."""
+        """Whether the window contains enough samples for a decision."""
         return self.samples >= WINDOW_SAMPLES
 
     def motion(self) -> str:
-        """What moves, one clause with its figure and limit; empty at rest. Judges what samples there are."""
+        """Return the motion of the present samples with value and limit, one clause; empty at rest."""
         if self._gyro:
             mean = _mean(self._gyro)
             if (band := _band(self._gyro, mean)) > RATE_BAND_RAD_S:
@@ -100,7 +99,7 @@ class RestWindow:
         return ""
 
     def means(self) -> RestMeans:
-        """Means of the samples; angles as circular means."""
+        """Return the means of the samples; circular means for angles."""
         roll_pitch_yaw, incli = _circular_mean(self._euler), _circular_mean(self._incli)
         return RestMeans(
             _mean(self._accel) if self._accel else None,
@@ -121,37 +120,40 @@ def _mean(vectors: deque[Vector3]) -> Vector3:
 
 
 def _band(vectors: deque[Vector3], mean: Vector3) -> float:
-    """Length of the largest deviation from the mean."""
+    """Return the length of the largest deviation from the mean."""
     a, b, c = mean
     return max(hypot(x - a, y - b, z - c) for x, y, z in vectors)
 
 
 def _circular_mean(angles: Iterable[tuple[float, ...]]) -> tuple[float, ...]:
-    """Means of several angles; empty for none."""
+    """Return the circular mean of each angle; empty without samples."""
     axes = zip(*angles, strict=True)
     return tuple(atan2(sum(sin(one) for one in axis), sum(cos(one) for one in axis)) for axis in axes)
 
 
 _ORDERS: Final = tuple(permutations(range(3)))
-"""Axes by falling absolute value."""
+"""Possible orders of the axes by absolute value."""
 CELLS: Final = 8 * len(_ORDERS)
+"""Number of cells of the sphere: 48."""
 POINTS_MAX: Final = 1024
-"""Points for the coverage; later ones are not kept. A slow turning of five minutes has some 700."""
+"""Maximum number of points for the coverage. A slow calibration of five minutes has about 700."""
 POINT_DISTANCE_T: Final = 5e-6
-"""An eighth of a cell in Earth's field."""
+"""Minimum distance of two points, T: an eighth of a cell in Earth's field."""
 FIT_POINTS_MIN: Final = 12
+"""Minimum number of points for a fit."""
 T_PER_UT: Final = 1e-6
 STEP_MAX_NS: Final = NS_PER_S
-"""A longer pause between two samples is not integrated."""
+"""Maximum time between two samples in the integral of the angular rate, ns."""
 TURNS_WANTED_RAD: Final = 2 * pi
-"""Manual B, section 8.1.1: each axis at least once through 360°."""
+"""Minimum angle about each axis, rad (manual B, section 8.1.1)."""
 COVERAGE_WANTED: Final = 0.6
-"""Share of the cells: a hand reaches more than 40 of 48; with fewer than 29 the fit depends on noise."""
+"""Minimum share of cells. A hand reaches 40 of 48 cells. With fewer than 29 cells the fit depends on noise."""
 FIELD_MIN_T: Final = 22e-6
+"""Minimum of Earth's field at the surface, T (IGRF)."""
 FIELD_MAX_T: Final = 67e-6
-"""Earth's field at the surface, 22 to 67 µT (IGRF)."""
+"""Maximum of Earth's field at the surface, T (IGRF)."""
 RESIDUAL_MAX: Final = 0.05
-"""RMS distance from the sphere over its radius: 5 % of the horizontal field turn the heading by about 3°."""
+"""Maximum RMS distance from the sphere, as a share of its radius. 5 % change the heading by about 3°."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,14 +163,14 @@ class Sphere:
     centre_t: Vector3
     radius_t: float
     residual: float
-    """RMS distance of the points from it, as a share of the radius."""
+    """RMS distance of the points from the sphere, as a share of the radius."""
 
 
 class Turning:
-    """Samples of a device that is being turned.
+    """Samples of a device that a user turns.
 
-    The fit uses sums over all samples. For the coverage POINTS_MAX points are kept, none nearer to the one before than
-    POINT_DISTANCE_T. So memory, and the time of one question, are bounded.
+    The fit uses sums over all samples. The coverage uses at most POINTS_MAX points with a distance of at least
+    POINT_DISTANCE_T. Thus memory and computing time have a limit.
     """
 
     def __init__(self) -> None:
@@ -178,7 +180,6 @@ class Turning:
         self._t_ns: int | None = None
 
     def add(self, sample: Sample) -> None:
-        """Add a sample."""
         if sample.mag_t is not None:
             self._add_field(sample.mag_t)
         before, self._t_ns = self._t_ns, sample.t_ns
@@ -194,23 +195,23 @@ class Turning:
             self._points.append(field_t)
 
     def restart_field(self) -> None:
-        """Forget the field so far: the device corrects it in another way from now on."""
+        """Remove the field samples: the device now corrects the field in another way."""
         self._points.clear()
         self._fit = _SphereFit()
 
     @property
     def turned_rad(self) -> Vector3:
-        """Angle turned about each axis of the sensor, whatever the direction."""
+        """Angle about each axis of the sensor, rad, summed over both directions."""
         x, y, z = self._turned
         return (x, y, z)
 
     @property
     def has_field(self) -> bool:
-        """Whether any sample had a magnetic field."""
+        """Whether a sample contained a magnetic field."""
         return bool(self._points)
 
     def cells(self, sphere: Sphere | None) -> int:
-        """The covered cells as a bit mask, seen from the centre of the sphere."""
+        """Return the covered cells as a bit mask, seen from the centre of the sphere."""
         a, b, c = sphere.centre_t if sphere is not None else (0.0, 0.0, 0.0)
         mask = 0
         for x, y, z in self._points:
@@ -218,20 +219,19 @@ class Turning:
         return mask
 
     def fit(self) -> Sphere | None:
-        """Fit the sphere; None while the points are too few or lie in a plane."""
+        """Return the fitted sphere; None if there are too few points or if they lie in a plane."""
         return self._fit.sphere()
 
 
 class _SphereFit:
-    """Linear least squares for the sphere, from sums; in µT, so that they are well scaled."""
+    """Linear least-squares fit of a sphere from sums, in µT for numerical accuracy."""
 
     def __init__(self) -> None:
         self._count = 0
+        # products of (2x, 2y, 2z, 1, |m|²): the normal equations with the right side and its square
         self._sums = [[0.0] * 5 for _ in range(5)]
-        """Products of (2x, 2y, 2z, 1, |m|²) with each other: normal equations, their right side, its square."""
 
     def add(self, field_t: Vector3) -> None:
-        """Add a point."""
         x, y, z = (value / T_PER_UT for value in field_t)
         row = (2 * x, 2 * y, 2 * z, 1.0, x * x + y * y + z * z)
         self._count += 1
@@ -240,7 +240,6 @@ class _SphereFit:
                 sums[column] += left * right
 
     def sphere(self) -> Sphere | None:
-        """The sphere; None while the points are too few or lie in a plane."""
         if self._count < FIT_POINTS_MIN:
             return None
         solved = _solve([list(row) for row in self._sums[:4]])
@@ -251,28 +250,28 @@ class _SphereFit:
         if squared <= 0:
             return None
         right_side = [row[4] for row in self._sums]
-        # A point at distance e from the sphere misses its equation by about 2 r e.
+        # a point at distance e from the sphere has a residual of about 2 r e in its equation
         missed = right_side[4] - sum(value * right for value, right in zip(solved, right_side[:4], strict=True))
         residual = sqrt(max(missed, 0.0) / self._count) / (2 * squared)
         return Sphere((a * T_PER_UT, b * T_PER_UT, c * T_PER_UT), sqrt(squared) * T_PER_UT, residual)
 
 
 def cell_of(direction: Vector3) -> int:
-    """The cell, 0 … 47, in which a direction lies: octant by signs, then the order of the absolute values."""
+    """Return the cell of a direction, 0 … 47: its octant, then the order of the absolute values."""
     octant = sum((value < 0) << axis for axis, value in enumerate(direction))
     order = tuple(sorted(range(3), key=lambda axis: -abs(direction[axis])))
     return octant * len(_ORDERS) + _ORDERS.index(order)
 
 
 def coverage(mask: int) -> float:
-    """Share of the cells that are in the mask."""
+    """Return the share of the cells in the mask."""
     return mask.bit_count() / CELLS
 
 
 def _solve(matrix: Sequence[list[float]]) -> list[float] | None:
-    """Solve four linear equations with their right sides in the fifth column; None for a singular system.
+    """Solve four linear equations with the right sides in the fifth column; None if they are singular.
 
-    Gaussian elimination with partial pivoting; `matrix` is changed.
+    Gaussian elimination with partial pivoting. Changes `matrix`.
     """
     scale = max(abs(value) for row in matrix for value in row[:4])
     for i in range(4):
@@ -296,51 +295,51 @@ def _solve(matrix: Sequence[list[float]]) -> list[float] | None:
 log = logging.getLogger(__name__)
 
 REST_LIMIT_NS: Final = 20 * NS_PER_S
-"""For the device to come to rest, and for its samples to be enough to see it."""
+"""Maximum wait for the rest of the device, ns."""
 TURN_LIMIT_NS: Final = 300 * NS_PER_S
-"""The manual names one to two minutes."""
+"""Maximum time for the turns, ns. The manual specifies one to two minutes."""
 REPORT_NS: Final = NS_PER_S // 2
+"""Interval of progress events, ns."""
 ASK_NS: Final = 3 * NS_PER_S
-"""Between two questions to the device while it is turned; each may cost it some samples."""
+"""Interval of queries during the turns, ns. Each query can cost some samples."""
 SETTLE_NS: Final = 2 * NS_PER_S
-"""After the end, before the samples are looked at: the attitude filter of the device follows."""
+"""Time between the end and the verification, ns: the attitude filter of the device needs it."""
 
 
 class CalibrationRun:
-    """Guide of one device's calibrations, one at a time; an attachment. Synchronization: the loop's thread only."""
+    """Guide of one calibration at a time; an attachment. Synchronization: the loop's thread only."""
 
     def __init__(self, transport: Transport, notices: DeviceEvents) -> None:
         self._transport = transport
         self._notices = notices
         self._running: asyncio.Task[CalibrationResult] | None = None
-        self._look: asyncio.Future[tuple[int, Sample | None]] | None = None
+        self._tick_future: asyncio.Future[tuple[int, Sample | None]] | None = None
         self._now_ns = 0
         self._seen_seq = 0
 
-    # --- the contract of attachments ---------------------------------------------------------------------------------
+    # --- the attachment ----------------------------------------------------------------------------------------------
 
     def start(self, _clock: SampleClock) -> None:
-        """No-op: nothing runs by itself."""
+        """Do nothing. A calibration starts only on request."""
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
-        """Pass on the newest sample, ten times a second."""
+        """Pass the newest sample to the calibration, ten times per second."""
         self._now_ns = now_ns
-        if self._look is not None and not self._look.done():
-            self._look.set_result((now_ns, newest))
+        if self._tick_future is not None and not self._tick_future.done():
+            self._tick_future.set_result((now_ns, newest))
 
     def stop(self) -> None:
-        """End the calibration that runs: the device's link ended; may be called twice."""
-        if self._look is not None and not self._look.done():
-            self._look.set_exception(CommandError("the device's link ended during the calibration"))
+        """Stop the calibration: the link of the device ended. A second call does nothing."""
+        if self._tick_future is not None and not self._tick_future.done():
+            self._tick_future.set_exception(CommandError("the device's link ended during the calibration"))
 
     def close(self) -> None:
-        """End what runs; may be called twice."""
         self.cancel()
 
     # --- a calibration -----------------------------------------------------------------------------------------------
 
     async def run(self, kind: str, calibration: Calibration, *, save: bool) -> CalibrationResult:
-        """Run a calibration to its end. Raises CommandError where it cannot begin, was cancelled, or was disturbed."""
+        """Run a calibration to its end. Raises CommandError if it cannot start, was cancelled, or failed."""
         if self._running is not None:
             raise CommandError("another calibration of this device is running")
         if save and calibration.kept is not Kept.BY_SAVE:
@@ -357,7 +356,6 @@ class CalibrationRun:
             self._running = None
 
     def cancel(self) -> bool:
-        """End the calibration that runs; return whether there was one."""
         return self._running is not None and self._running.cancel()
 
     async def _run(self, kind: str, calibration: Calibration, save: bool) -> CalibrationResult:
@@ -372,7 +370,7 @@ class CalibrationRun:
             raise
 
     async def _begun(self, kind: str, calibration: Calibration, save: bool) -> CalibrationResult:
-        """Run a calibration whose begin was reported, and report its end; errors are left to the caller."""
+        """Run a calibration after its first event, and report its end. The caller reports errors."""
         if calibration.handling is Handling.REST:
             device, checks, problem = await self._at_rest(kind, calibration)
         else:
@@ -386,7 +384,7 @@ class CalibrationRun:
         return CalibrationResult(kind, not problem, problem, device, checks, saved, calibration.kept)
 
     async def _at_rest(self, kind: str, calibration: Calibration) -> tuple[str, tuple[Check, ...], str]:
-        """Calibrate a device that must not move; return the device's words, the checks, and what is wrong."""
+        """Calibrate a device at rest. Return the reply of the device, the checks, and the problem."""
         await self._rest(kind)
         window = RestWindow()
         script: asyncio.Future[Any] = asyncio.ensure_future(self._transport.run_script(calibration.begin))
@@ -406,7 +404,7 @@ class CalibrationRun:
         return _words(answer), tuple(_check(one, means) for one in calibration.expected), ""
 
     async def _turned(self, kind: str, calibration: Calibration) -> tuple[str, tuple[Check, ...], str]:
-        """Calibrate a device that is turned; return the device's words, the checks, and what is wrong."""
+        """Calibrate a turned device. Return the reply of the device, the checks, and the problem."""
         ask = calibration.verdict
         before = verdict = await self._transport.run_script(ask) if ask is not None else Verdict(done=False, words="")
         await self._transport.run_script(calibration.begin)
@@ -434,10 +432,10 @@ class CalibrationRun:
             problem = f"{problem} within {TURN_LIMIT_NS // NS_PER_S} s; {_advice(turning, checks)}"
         return verdict.words, checks, problem
 
-    # --- looking -----------------------------------------------------------------------------------------------------
+    # --- samples -----------------------------------------------------------------------------------------------------
 
     async def _rest(self, kind: str) -> RestMeans:
-        """Wait until the device rests and return the means of its samples. Raises CommandError."""
+        """Wait for the rest of the device and return the means of its samples. Raises CommandError."""
         window, begun_ns, first, moved = RestWindow(), self._now_ns, True, ""
         while self._now_ns - begun_ns < REST_LIMIT_NS:
             now_ns, sample = await self._next()
@@ -464,11 +462,11 @@ class CalibrationRun:
             await self._next()
 
     async def _next(self, until: asyncio.Future[Any] | None = None) -> tuple[int, Sample | None]:
-        """Return the next look: the time, and the newest sample if it is a new one.
+        """Return the time of the next tick, and the newest sample if it is new.
 
-        With `until`, returns early without a sample when that is done.
+        Return without a sample if `until` is done before the tick.
         """
-        look = self._look = asyncio.get_running_loop().create_future()
+        look = self._tick_future = asyncio.get_running_loop().create_future()
         try:
             if until is not None:
                 await asyncio.wait({look, until}, return_when=asyncio.FIRST_COMPLETED)
@@ -476,13 +474,13 @@ class CalibrationRun:
                     return self._now_ns, None
             now_ns, newest = await look
         finally:
-            self._look = None
+            self._tick_future = None
         if newest is None or newest.seq == self._seen_seq:
             return now_ns, None
         self._seen_seq = newest.seq
         return now_ns, newest
 
-    # --- reports -----------------------------------------------------------------------------------------------------
+    # --- events ------------------------------------------------------------------------------------------------------
 
     def _report(self, kind: str, phase: str, words: str, **detail: str | int | float | bool | None) -> None:
         message = f"calibration {kind}: {words}"
@@ -529,7 +527,7 @@ def _field_checks(turning: Turning) -> tuple[Check, ...]:
 
 
 def _failed(checks: tuple[Check, ...]) -> str:
-    """The first check that is not passed, as a sentence; empty for none."""
+    """Return the first failed check as a sentence; empty if all checks passed."""
     for check in checks:
         if check.value is None:
             return f"{check.name}: the samples do not tell it"
@@ -540,7 +538,7 @@ def _failed(checks: tuple[Check, ...]) -> str:
 
 
 def _advice(turning: Turning, checks: tuple[Check, ...]) -> str:
-    """What to do about a turning that did not end, one clause."""
+    """Return advice about a calibration that did not end, one clause."""
     if not turning.has_field:
         return "its samples have no magnetic field: has it a magnetometer, and does its output carry it?"
     share = coverage(turning.cells(turning.fit()))
@@ -555,7 +553,7 @@ def _advice(turning: Turning, checks: tuple[Check, ...]) -> str:
 
 
 def _words(answer: object) -> str:
-    """The device's answer for people."""
+    """Return the reply of the device as text."""
     if answer is None or answer is True:
         return ""
     if isinstance(answer, tuple | list):

@@ -1,15 +1,15 @@
-"""Detection of the devices on a CAN bus: listens and sends nothing, without I/O or clock of its own.
+"""Detection of the devices on a CAN bus, without I/O and without reads of the clock. The detection sends no frame.
 
-Strategy. `node_of` of every driver returns the possible sender of a frame. Each such (driver, node) gets a trial codec
-with `node_settings(node)`, which is fed with all frames that pass its filters. A device is accepted after LOCK_SAMPLES
-measurements, more than it had damaged frames. A round lasts LISTEN_NS, so that all devices of the bus have been heard
-before one is chosen; while there are candidates in doubt it goes on, PATIENCE_NS at most: a device at 1 Hz whose sample
-is made of several frames needs some of its periods.
+`node_of` of each driver returns the possible sender of a frame. Each (driver, node) gets a trial codec with
+`node_settings(node)`, which decodes all frames that pass its filters. The search accepts a device after LOCK_SAMPLES
+measurements, and only if it has fewer damaged frames. A round lasts LISTEN_NS, so that it receives all devices of the
+bus. With doubtful candidates it lasts up to PATIENCE_NS: a device at 1 Hz with several frames per sample needs some
+periods.
 
-One device is found when it is the only one that no other configured device of the bus has. A device that was found
-before is chosen as soon as it is accepted, whatever other devices send.
+The search is successful if exactly one accepted device is not used by another configured device. It chooses the device
+of the last successful search immediately.
 
-A device that sends only when it is asked (CANopen TPDOs by SYNC, J1939 on request) is not heard; it must be named.
+The search cannot find a device that only sends on request (CANopen TPDOs by SYNC, J1939). The user must configure it.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,19 +26,22 @@ from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 LOCK_SAMPLES: Final = 2
+"""Minimum number of measurements of an accepted device."""
 LISTEN_NS: Final = 1500 * NS_PER_MS
-"""1 Hz, the slowest rate that the manuals name for a single frame, is heard once."""
+"""Minimum duration of a round, ns: one frame at 1 Hz, the lowest rate in the manuals."""
 PATIENCE_NS: Final = 6 * NS_PER_S
+"""Maximum duration of a round with doubtful candidates, ns."""
 DEVICES_MAX: Final = 128
-"""Candidates on trial; a bus that names more carries noise or another protocol."""
+"""Maximum number of candidates. More candidates are noise or another protocol."""
 IDENTIFIERS_MAX: Final = 4096
-"""Identifiers kept; more on one bus are a test."""
+"""Maximum number of stored identifiers."""
 SHOWN_MAX: Final = 8
+"""Maximum number of identifiers in a message."""
 
 Identifier = tuple[int, bool]
-"""Of a frame, and whether it has 29 bits."""
+"""Identifier of a frame, and whether it has 29 bits."""
 Claimed = Callable[[int, bool], bool]
-"""Whether a configured device has frames with this identifier (and 29 bits or not) already."""
+"""Test of an identifier: whether a configured device uses it."""
 
 
 def none_claimed(_can_id: int, _extended: bool) -> bool:
@@ -47,20 +50,20 @@ def none_claimed(_can_id: int, _extended: bool) -> bool:
 
 
 class CanDevice(NamedTuple):
-    """A device of a bus, by the number that its driver uses."""
+    """A device on a bus with the number that its driver uses."""
 
     driver: CanDriver
     node: int
 
     @property
     def title(self) -> str:
-        """Title for people, for example `imu61x-can base_id 101`."""
+        """Title, for example `imu61x-can base_id 101`."""
         return f"{self.driver.name} {self.driver.node_title(self.node)}"
 
 
 @dataclass(frozen=True, slots=True)
 class CanFound:
-    """The only device found."""
+    """Result of a search: the device."""
 
     device: CanDevice
 
@@ -69,16 +72,16 @@ CanStep = Listen | CanFound | GaveUp
 
 
 class CanSurvey:
-    """The devices heard on a bus. Synchronization: one thread."""
+    """Devices that send on a bus. Synchronization: one thread."""
 
     def __init__(self, drivers: Sequence[CanDriver]) -> None:
         self._drivers = tuple(drivers)
         self._trials: dict[tuple[str, int], _Trial] = {}
+        # Candidates that receive a frame, by identifier. Each received identifier is a key.
         self._listeners: dict[Identifier, tuple[_Trial, ...]] = {}
-        """Candidates whose filters pass a frame, by identifier; every received identifier is a key."""
 
     def on_frames(self, frames: Sequence[CanFrame]) -> None:
-        """Process frames in the order they came."""
+        """Process frames in the order of arrival."""
         for frame in frames:
             if frame.after_loss:
                 for trial in self._trials.values():
@@ -88,16 +91,16 @@ class CanSurvey:
                 trial.count(trial.codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns))
 
     def flush(self) -> None:
-        """Process frames that wait: the bus is idle, or the round ends."""
+        """Process pending frames at the end of a round."""
         for trial in self._trials.values():
             trial.count(trial.codec.flush())
 
     def devices(self, claimed: Claimed = none_claimed) -> list[CanDevice]:
-        """Return devices that yield measurements and are not claimed, in the order they were heard."""
+        """Return the accepted devices that no configured device uses, in the order of their first frames."""
         return [trial.device for trial in self._trials.values() if trial.accepted and not trial.has_any(claimed)]
 
     def doubtful(self, claimed: Claimed = none_claimed) -> list[CanDevice]:
-        """Return candidates without measurements (yet) whose frames are not those of a device that has some."""
+        """Return candidates that are not accepted and have a frame that no accepted device sends."""
         known = {i for trial in self._trials.values() if trial.accepted for i in trial.identifiers}
         return [
             trial.device
@@ -106,7 +109,7 @@ class CanSurvey:
         ]
 
     def others(self, claimed: Claimed = none_claimed) -> list[str]:
-        """Return identifiers, for people, that belong to no candidate and are not claimed: three or eight digits."""
+        """Return the identifiers without candidate and without configured device, as three or eight digits."""
         free = (i for i, trials in self._listeners.items() if not trials and not claimed(*i))
         return [f"0x{can_id:08X}" if extended else f"0x{can_id:03X}" for can_id, extended in sorted(free)]
 
@@ -140,7 +143,7 @@ class CanSurvey:
 
 
 class CanSearch:
-    """A round of detection on one bus. Synchronization: one thread. All times are CLOCK_MONOTONIC in ns."""
+    """Search on one bus. Synchronization: one thread. All times are CLOCK_MONOTONIC in ns."""
 
     def __init__(
         self,
@@ -150,9 +153,9 @@ class CanSearch:
         claimed: Claimed = none_claimed,
         remembered: tuple[str, int] | None = None,
     ) -> None:
-        """`where` is the bus for people; `remembered` is (driver name, node) of the last success.
+        """`where` is the name of the bus. `remembered` is (driver name, node) of the last successful search.
 
-        `claimed` is asked when something is to be decided, so that it may change meanwhile.
+        The search calls `claimed` at each decision, because its result can change.
         """
         self.survey = CanSurvey(drivers)
         self._where = where
@@ -161,12 +164,11 @@ class CanSearch:
         self._begun_ns = self._until_ns = 0
 
     def start(self, now_ns: int) -> Listen:
-        """Return the first step."""
         self._begun_ns = now_ns
         return self._listen(now_ns)
 
     def on_frames(self, frames: Sequence[CanFrame]) -> CanFound | None:
-        """Process frames as they come; return None to go on."""
+        """Process frames. Return None to continue."""
         self.survey.on_frames(frames)
         if self._remembered is None:
             return None
@@ -176,7 +178,6 @@ class CanSearch:
         return None
 
     def on_time(self, now_ns: int) -> CanStep | None:
-        """End the present step if `until_ns` of the last Listen has come; return None when it has not."""
         if now_ns < self._until_ns:
             return None
         self.survey.flush()
@@ -186,7 +187,7 @@ class CanSearch:
         return CanFound(devices[0]) if len(devices) == 1 else GaveUp(self.summary())
 
     def summary(self) -> str:
-        """Explain why no device was chosen."""
+        """Return the reason for no result."""
         survey, where = self.survey, self._where
         if devices := survey.devices(self._claimed):
             return f"{len(devices)} devices are heard on {where}, {_listed(devices)}: name driver and options"
@@ -206,7 +207,7 @@ class CanSearch:
 
 
 class _Trial:
-    """A candidate and its codec."""
+    """Candidate with its codec."""
 
     def __init__(self, device: CanDevice) -> None:
         settings = device.driver.node_settings(device.node)
@@ -214,26 +215,26 @@ class _Trial:
         self.ledger = Ledger()
         self.codec = device.driver.make_codec(self.ledger, settings)
         self.identifiers: set[Identifier] = set()
-        """Of frames that named the device."""
+        """Identifiers of the frames that name the device."""
         self._filters = device.driver.filters(settings)
         self._samples = 0
 
     @property
     def accepted(self) -> bool:
-        """Whether it is a device."""
+        """Whether the candidate is a device."""
         return self._samples >= LOCK_SAMPLES and self._samples > self.ledger.frames_bad()
 
     def count(self, events: Sequence[CodecEvent]) -> None:
-        """Events of its codec."""
+        """Count the measurements of the codec."""
         for event in events:
             self._samples += isinstance(event, Measurement)
 
     def hears(self, identifier: Identifier) -> bool:
-        """Whether its codec needs such frames."""
+        """Return whether the codec receives such frames."""
         return any(wanted.matches(*identifier) for wanted in self._filters)
 
     def has_any(self, claimed: Claimed) -> bool:
-        """Whether another device is configured for frames of it."""
+        """Return whether a configured device uses a frame of the candidate."""
         return any(claimed(*identifier) for identifier in self.identifiers)
 
 

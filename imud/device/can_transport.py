@@ -1,4 +1,4 @@
-"""Transport of a device on a CAN bus: its driver is configured, or found by listening; filters select its frames."""
+"""Transport of a device on a CAN bus: the configuration names the driver, or a search finds the device."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -31,7 +31,7 @@ from imud.sampling.path import CanPath, SamplePath
 
 
 class CanBuses:
-    """Members of all buses by the name of the device. Synchronization: one thread."""
+    """Devices of all CAN buses by name. Synchronization: one thread."""
 
     def __init__(self) -> None:
         self._members: dict[str, CanUse] = {}
@@ -45,22 +45,22 @@ class CanBuses:
         cyclic: Sequence[CyclicFrame],
         bits_per_s: Callable[[], float] = lambda: 0.0,
     ) -> None:
-        """Add a device to a bus: the frames it receives, those that it needs to be sent, and how much it sends now."""
+        """Add a device with its received frames, the cyclic frames that it needs, and its bus load."""
         self._members[name] = CanUse(bus, filters, cyclic)
         self._loads[name] = bits_per_s
 
     def leave(self, name: str) -> None:
-        """Remove the device; no-op if absent."""
+        """Remove a device. Do nothing for an unknown device."""
         self._members.pop(name, None)
         self._loads.pop(name, None)
 
     def bits_per_s(self, name: str, bus: str) -> float:
-        """Return what the other devices of a bus send, in bit/s without stuff bits."""
+        """Return the bus load of the other devices, bit/s without stuff bits."""
         others = [other for other, member in self._members.items() if other != name and member.bus == bus]
         return sum(self._loads[other]() for other in others)
 
     def claimed(self, name: str, bus: str) -> Callable[[int, bool], bool]:
-        """Return a test of an identifier (and 29 bits or not): whether another device of the bus receives it."""
+        """Return a test whether another device of the bus receives an identifier."""
 
         def is_claimed(can_id: int, extended: bool) -> bool:
             return any(
@@ -71,10 +71,10 @@ class CanBuses:
         return is_claimed
 
     def conflict(self, name: str) -> str:
-        """Return which other device takes the frames of this one, or has a frame sent that it needs, one sentence.
+        """Return the conflict with a device that joined before, one sentence; empty if there is none.
 
-        Empty if there is none. Of two, the one that joined first may go on: one that was found by listening is not
-        stopped by a device that a reload adds.
+        Two devices conflict if they receive the same frames or need the same cyclic frame. The first device continues,
+        so that a reload with another device does not stop it.
         """
         mine = self._members.get(name)
         for other, member in self._members.items():
@@ -100,14 +100,14 @@ class CanTransport(ReceivingTransport):
         self.link = link
         self.driver = self.path = None
         self._buses = buses
+        # filters of frames from other senders that can answer the outstanding request
         self._also: Sequence[CanFilter] = ()
-        """Filters of frames from other senders that can answer the outstanding request."""
+        # the search round that receives the frames; None while the path receives them
         self._round: CanRound | None = None
-        """The search round that receives the frames; None while the path receives them."""
         self._options: Options | None = None
         self._codec: CanCodec | None = None
+        # number of the device that the search found; None if the configuration names the driver
         self._node: int | None = None
-        """Number of the device that the search found; None if the configuration names the driver."""
         self._joined = False
         if not self._searchable:
             driver = DRIVERS[self._config.driver]
@@ -127,12 +127,10 @@ class CanTransport(ReceivingTransport):
         await self.link.wait_present()
 
     def start(self, on_end: OnEnd) -> None:
-        """Start the search and start reading the open link. `on_end` is called once if the link ends."""
         self._search.start()
         self.link.start(self._on_frames, self._on_news, on_end)
 
     def stop(self) -> None:
-        """Stop the search and close the link. A second call does nothing."""
         self._search.stop()
         if self._searchable:
             self._leave()
@@ -146,9 +144,10 @@ class CanTransport(ReceivingTransport):
     # --- the search --------------------------------------------------------------------------------------------------
 
     def begin_search(self) -> CanRound | None:
-        """Receive all frames of the bus to find a device that no other configuration uses.
+        """Start a search round on all frames of the bus.
 
-        Return None if the configuration names the driver, and set up the device instead."""
+        Return None if the configuration names the driver, and set up the device instead.
+        """
         if not self._searchable:
             self._begin()
             return None
@@ -285,7 +284,6 @@ class CanTransport(ReceivingTransport):
     # --- the samples -------------------------------------------------------------------------------------------------
 
     def set_latency(self, latency_ns: int) -> None:
-        """Set the maximum hold of a frame, ns; 0: no hold."""
         self._latency_ns = latency_ns
         self.on_busy(self.scripts.busy)
 
@@ -295,7 +293,6 @@ class CanTransport(ReceivingTransport):
 
     @property
     def hold_ns(self) -> int:
-        """Present hold of the frames, ns."""
         return self.link.gather_ns
 
     def _on_frames(self, frames: Sequence[CanFrame]) -> None:
@@ -342,7 +339,6 @@ class CanTransport(ReceivingTransport):
 
     @property
     def receiving(self) -> bool:
-        """Whether frames go to the codec of the device; False during a search."""
         return self._round is None
 
     @property
@@ -356,7 +352,7 @@ class CanTransport(ReceivingTransport):
 
 
 def _changed(before: Options | None, after: Options) -> str:
-    """Options that differ, for people, for example `options.node to 9`."""
+    """Return the changed options, for example `options.node to 9 in the configuration`."""
     given = before if before is not None else type(after)()
     names = [name for name in type(after).__struct_fields__ if getattr(given, name) != getattr(after, name)]
     return ", ".join(f"options.{name} to {shown(getattr(after, name))}" for name in names) + " in the configuration"

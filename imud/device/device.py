@@ -1,11 +1,11 @@
-"""The life of one device, whatever its link: open, stream, detect silence and loss of the link, and recover.
+"""One device with any link: open the link, receive samples, detect silence and a missing link, and recover.
 
 MISSING ──port appears──▶ SEARCHING ──samples──▶ RUNNING ──none for a while──▶ SILENT
    ▲                        │    ▲                  │                            │
    └──────── unplugged ─────┴────┼──────────────────┴────────────────────────────┤
                                  └── bytes without frames, or long silence ──────┘
 
-A device is composed of a transport, which owns the link and the sample path, and of attachments next to the link.
+A device has a transport, which owns the link and the sample path, and attachments such as GPIO lines.
 """
 
 import asyncio
@@ -44,15 +44,16 @@ from imud.sampling.path import LatencyMeter, RateMeter, SamplePath
 log = logging.getLogger(__name__)
 
 RETRY_S = 0.5
-"""Pause before a port that refused is opened again: short enough to be back within a second of its coming back."""
+"""Pause before imud opens a failed port again, s. A device thus returns within 1 s."""
 GONE_S = 0.02
-"""The same after a port has gone; its coming back is waited for without polling, so this only keeps a node that is
-there and cannot be opened from being tried without end."""
+"""Pause after a port became missing, s. imud waits for the port without polling. The pause limits the number of tries
+if the device node exists but imud cannot open it."""
 IDLE_FLUSH_NS = 50 * NS_PER_MS
-"""A line idle for longer than any adapter's latency timer (16 ms) sends no more of the frame that is pending."""
+"""Idle time of the link after which the codec discards a pending frame, ns. Latency timers take up to 16 ms."""
 SILENCE_NS = 1 * NS_PER_S
-"""Without samples for this long, and for five periods, a device counts as silent."""
+"""Minimum time without a sample that makes a device silent, ns."""
 SILENCE_PERIODS = 5
+"""Minimum number of sample periods without a sample that makes a device silent."""
 
 MakeTransport = Callable[[DeviceContext], Transport]
 
@@ -102,33 +103,30 @@ class Device:
 
     @property
     def state(self) -> DeviceState:
-        """State now."""
         return self._health.state
 
     @property
     def tap(self) -> PathObserver:
-        """Where a recording hears the device; it begins by `record`."""
+        """Observer that records the device; `record` starts it."""
         return self._tap
 
     @property
     def driver_name(self) -> str:
-        """Name of the driver in use; while none is known, what the configuration has."""
+        """Name of the driver; the configured name before imud has found the device."""
         driver = self._transport.driver
         return driver.name if driver else self.config.driver
 
     @property
     def link(self) -> Link:
-        """Link of the device."""
         return self._transport.link
 
     def set_need(self, need: Need) -> None:
-        """Let samples wait for as long as their consumers allow; with lines, on which edges, triggers or an alarm
-        belong to samples, they never do."""
+        """Set the maximum hold of samples. With GPIO lines there is no hold, because edges belong to samples."""
         self._need = need if self._attachments.drain_edges is None else Need(0, "its lines")
         self._transport.set_latency(self._need.latency_ns)
 
     async def run(self) -> None:
-        """Keep the device alive until cancelled, or until a replay ends."""
+        """Run the device until cancelled, or until the end of a replay."""
         try:
             self._attachments.tick(self._host.now_ns(), None)
             await self._serve_until_finished()
@@ -138,7 +136,7 @@ class Device:
             self._transport.close()
 
     def tick(self, now_ns: int) -> None:
-        """Update states, detect an idle line, send gathered events; ten times a second."""
+        """Update the state, detect an idle link, and send collected events. Called ten times per second."""
         transport = self._transport
         self._rate.mark(now_ns, self.ledger.samples)
         path = transport.path
@@ -148,7 +146,7 @@ class Device:
             return
         if self._suspends != self._host.suspends:
             self._suspends = self._host.suspends
-            if path.fresh:  # what it measured meanwhile is lost, and CLOCK_MONOTONIC does not show that time passed
+            if path.fresh:  # CLOCK_MONOTONIC does not count the suspend, during which samples were lost
                 self.ledger.add_unknown_gap()
         if now_ns - path.last_data_ns > IDLE_FLUSH_NS + transport.hold_ns:
             path.flush(now_ns)
@@ -159,13 +157,13 @@ class Device:
         self._notices.tick(now_ns, path.newest.sync if path.newest else None)
 
     def close(self) -> None:
-        """Release the link; may be called twice."""
+        """Release the link. A second call does nothing."""
         self._transport.close()
 
-    # --- the link's life ---------------------------------------------------------------------------------------------
+    # --- the link ----------------------------------------------------------------------------------------------------
 
     async def _serve_until_finished(self) -> None:
-        """Serve the link whenever it is there; return at the regular end of a replay."""
+        """Serve the link while it exists; return at the end of a replay."""
         while True:
             try:
                 await self._transport.wait_present()
@@ -179,7 +177,7 @@ class Device:
                 await asyncio.sleep(RETRY_S)
 
     async def _serve(self) -> None:
-        """Serve the link from open to its end; return at the regular end of a replay. Raises LinkError."""
+        """Open and serve the link until it ends; return at the end of a replay. Raises LinkError."""
         transport = self._transport
         transport.link.open()
         self._connects += 1
@@ -196,7 +194,7 @@ class Device:
             if not ended.done():
                 for task in tasks:
                     if task.done():
-                        await task  # it ends before its link only by an error
+                        await task  # a task that ends before the link has an error
             elif error := ended.result():
                 raise error
         finally:
@@ -213,7 +211,7 @@ class Device:
             self._ended.set_result(error)
 
     def _with_owner(self, error: LinkError) -> LinkError:
-        """Name the device that has the port, where it is one of this configuration."""
+        """Return the error with the name of the other configured device that uses the port."""
         if not isinstance(error, LinkBusy):
             return error
         owner = owner_of(self.config, self._shared.owner.configured_devices(), LINKS)
@@ -224,10 +222,10 @@ class Device:
     def _down(self, state: DeviceState, error: LinkError) -> None:
         self._health.down(self._host.now_ns(), state, str(error))
 
-    # --- callbacks of its parts --------------------------------------------------------------------------------------
+    # --- recording ---------------------------------------------------------------------------------------------------
 
     def record(self, put: PutRecord) -> None:
-        """Describe the device as it is now, and pass on all that it delivers; `tap.end` ends it."""
+        """Start a recording: write the description of the device, then its data. `tap.end` stops the recording."""
         self._tap.begin(
             put, self._transport.where, identity_words(self._identity.identity), self._identity.shown_settings
         )
@@ -236,12 +234,12 @@ class Device:
 
     @property
     def actions(self) -> Actions:
-        """Actions of the device by name; while its driver is not known, those of its lines only."""
+        """Actions by name. Before imud has found the device: only the actions of its GPIO lines."""
         driver = self._transport.driver
         return {**(driver.actions if driver is not None else {}), **self._attachments.actions}
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
-        """Run an action and return its answer. Raises CommandError, TransferError, DeviceRefused, LinkError."""
+        """Run an action and return its result. Raises CommandError, TransferError, DeviceRefused, LinkError."""
         log.info("%s: run %s%s", self.config.name, printable(name), f" {shown(arguments)}" if arguments else "")
         action = self.actions.get(name)
         if action is None:
@@ -253,12 +251,12 @@ class Device:
 
     @property
     def calibrations(self) -> Calibrations:
-        """Calibrations of the device by kind; none while its driver is not known."""
+        """Calibrations by kind; empty before imud has found the device."""
         driver = self._transport.driver
         return driver.calibrations if driver is not None else {}
 
     async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:
-        """Run a guided calibration. Raises CommandError, TransferError, DeviceRefused, LinkError."""
+        """Guide a calibration. Raises CommandError, TransferError, DeviceRefused, LinkError."""
         calibration = self.calibrations.get(kind)
         if calibration is None:
             known = ", ".join(self.calibrations) or "none"
@@ -274,7 +272,7 @@ class Device:
                 self._settings.commanded()
 
     def stop_calibration(self) -> bool:
-        """End the calibration that runs; return whether there was one."""
+        """Stop the running calibration; return whether one was running."""
         return self._calibration.cancel()
 
     async def _run_action(self, name: str, action: Action, arguments: Mapping[str, Any]) -> object:
@@ -284,7 +282,7 @@ class Device:
                 self._settings.spend_flash()
             if action.risk is Risk.RESET:
                 await self._settings.back_up(name)
-            self._attachments.set_alarm_ranges(None)  # what was read back need not hold any more
+            self._attachments.set_alarm_ranges(None)  # the action can change the ranges
             saved = False
             try:
                 answer = await self._transport.run_script(lambda target: action.script(target, params))
@@ -300,7 +298,7 @@ class Device:
     # --- settings -----------------------------------------------------------------------------------------------------
 
     async def settings_report(self, *, fresh: bool) -> SettingsReport:
-        """Return the device's settings: asked for now if `fresh`, otherwise as reported last.
+        """Return the device settings: read now if `fresh`, otherwise the last values.
 
         Raises CommandError, TransferError, DeviceRefused, LinkError.
         """
@@ -309,14 +307,14 @@ class Device:
         return await self._settings.report(fresh=fresh)
 
     async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
-        """Plan to make the device as `given` (None: as declared). Raises what `settings_report` does."""
+        """Return the plan to set the values `given` (None: the declared settings). Raises as `settings_report`."""
         self._require_replies()
         return await self._settings.plan(given, save=save)
 
     async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
-        """Make the device as `given` (None: as declared). Raises what `settings_report` does, with nothing written."""
+        """Set the values `given` (None: the declared settings). Raises as `settings_report`, before the first write."""
         self._require_replies()
-        self._attachments.set_alarm_ranges(None)  # what was read back need not hold any more
+        self._attachments.set_alarm_ranges(None)  # the new settings can change the ranges
         return await self._settings.apply(given, save=save)
 
     def _require_replies(self) -> None:
@@ -327,7 +325,7 @@ class Device:
     def _known_actions(self) -> str:
         return ", ".join(self.actions) or "none" + " while no device is found" * (self._transport.driver is None)
 
-    # --- the flow ----------------------------------------------------------------------------------------------------
+    # --- the samples -------------------------------------------------------------------------------------------------
 
     def _watch_flow(self, path: SamplePath, now_ns: int) -> None:
         state, quiet_ns = self._health.state, now_ns - max(path.last_sample_ns, path.begun_ns)
@@ -352,7 +350,7 @@ class Device:
     # --- state -------------------------------------------------------------------------------------------------------
 
     def status(self) -> DeviceStatus:
-        """Return the full status of the device."""
+        """Return the status of the device."""
         transport, health = self._transport, self._health
         path, driver = transport.path, transport.driver
         newest = path.newest if path is not None else None

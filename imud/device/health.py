@@ -1,7 +1,6 @@
-"""State and present problem of a device: shown in its status, logged, raised as events UP and DOWN.
+"""State, problem and events of a device. The status shows the state and the problem.
 
-Trouble of a link that goes on (a CAN bus that is error-passive) stays shown while samples flow, and explains why none
-come.
+A lasting problem of the link (for example an error-passive CAN bus) stays in the status while samples arrive.
 """
 
 import logging
@@ -18,12 +17,13 @@ from imud.model.units import NS_PER_S
 log = logging.getLogger(__name__)
 
 INTERVAL_NS = NS_PER_S
-"""At most one loss and one bad-frame event a second and device."""
+"""Minimum interval of loss events and of bad-frame events, ns."""
 RAW_SHOWN_BYTES = 32
+"""Maximum number of bytes of a bad frame in an event."""
 
 
 class DeviceEvents:
-    """Events of one device: `raise_event` sends one at once, `tick` those of counters."""
+    """Events of one device: `raise_event` sends an event immediately, `tick` sends the events of counters."""
 
     def __init__(self, device: str, ledger: Ledger, send: Callable[[Event], None]) -> None:
         self.device = device
@@ -39,19 +39,19 @@ class DeviceEvents:
     def raise_event(
         self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
     ) -> None:
-        """Send one event, and log it; texts that came from the device may hold anything, and are made printable."""
+        """Log and send an event. Replace unprintable characters, because a device can send any text."""
         message = printable(message, MESSAGE_CHARACTERS_MAX)
         detail = {name: printable(one) if isinstance(one, str) else one for name, one in detail.items()}
-        alike = same_as(kind if kind is EventKind.BAD_FRAME else message)  # the bytes of a damaged frame always differ
+        alike = same_as(kind if kind is EventKind.BAD_FRAME else message)  # the bytes of each damaged frame differ
         log.log(LEVELS.get(kind, logging.WARNING), "%s: %s", self.device, message, extra=alike)
         self._send(Event(now_ns, self.device, kind, message, detail))
 
     def bad_frame(self, frame: BadFrame) -> None:
-        """Note a damaged frame; the newest one is shown in the next event."""
+        """Note a damaged frame. The next event shows the newest frame."""
         self._last_bad = frame
 
     def tick(self, now_ns: int, sync: Sync | None) -> None:
-        """Send the events gathered since the last interval."""
+        """Send the events of the counters since the previous interval."""
         if sync is not None and sync is not self._sync:
             self._report_sync(now_ns, sync)
         if now_ns < self._due_ns:
@@ -95,48 +95,48 @@ def _counted(number: int, what: str) -> str:
 
 
 SEARCH_BEGUN = "no sample has come yet: wait until the search has listened for a while"
-"""The problem of a device whose link was opened just now."""
+"""Problem of a device right after imud has opened its link."""
 STREAMING = (DeviceState.RUNNING, DeviceState.SILENT)
 
 
 class Health:
-    """State and problem of one device; all times are CLOCK_MONOTONIC in ns. Synchronization: the loop's thread only."""
+    """State and problem of one device. All times are CLOCK_MONOTONIC in ns. Synchronization: the loop's thread only."""
 
     def __init__(self, notices: DeviceEvents) -> None:
         self.state = DeviceState.MISSING
         self.problem = ""
-        """Present fault, one sentence; empty for none."""
+        """Present problem, one sentence; empty if there is none."""
         self.silent_since_ns = 0
-        """CLOCK_MONOTONIC when the state became SILENT."""
+        """CLOCK_MONOTONIC of the last change to SILENT, ns."""
         self.link_problem = ""
-        """Present fault of a link that still works; empty for none."""
+        """Present problem of a link that still works; empty if there is none."""
         self._notices = notices
 
     @property
     def streaming(self) -> bool:
-        """Whether the device was found and its link is there."""
+        """Whether imud has found the device and its link is open."""
         return self.state in STREAMING
 
     def link_opened(self) -> None:
-        """Clear the problem: the link is open."""
+        """Clear the problem after the link was opened."""
         self.problem = self.link_problem = ""
 
     def searching(self) -> None:
-        """Enter SEARCHING; the problem stays shown until a device is found."""
+        """Enter SEARCHING. The problem stays in the status until imud finds the device."""
         self.state = DeviceState.SEARCHING
         self.problem = self.problem or SEARCH_BEGUN
 
     def finished(self) -> None:
-        """Enter FINISHED: a replay came to its end."""
+        """Enter FINISHED after the end of a replay."""
         self.state, self.problem = DeviceState.FINISHED, ""
 
     def up(self, now_ns: int, driver: str, where: str, bit_rate: int) -> None:
-        """Enter RUNNING: samples of `driver` come on the link `where`."""
+        """Enter RUNNING: samples of `driver` arrive on the link `where`."""
         self.state, self.problem = DeviceState.RUNNING, self.link_problem
         self._notices.raise_event(now_ns, EventKind.UP, f"{driver} on {where}", driver=driver, baud=bit_rate)
 
     def down(self, now_ns: int, state: DeviceState, problem: str) -> None:
-        """Enter a state in which no samples come, for the reason `problem`."""
+        """Enter a state without samples, because of `problem`."""
         problem = printable(problem, MESSAGE_CHARACTERS_MAX)
         if state is DeviceState.SILENT:
             problem = self.link_problem or problem
@@ -149,18 +149,18 @@ class Health:
             log.warning("%s: %s", self._notices.device, problem, extra=same_as(problem))
 
     def missing(self, now_ns: int, reason: str) -> None:
-        """Enter MISSING for `reason`, empty for a link that is there; how a link went stays shown until it is back."""
+        """Enter MISSING if `reason` is not empty. The first problem stays in the status until the link returns."""
         if reason and not (self.state is DeviceState.MISSING and self.problem):
             self.down(now_ns, DeviceState.MISSING, reason)
 
     def report(self, problem: str) -> None:
-        """Show what is wrong while the state stays; trouble of the link takes precedence."""
+        """Set the problem without a change of state. A problem of the link has priority."""
         problem = self.link_problem or printable(problem, MESSAGE_CHARACTERS_MAX)
         if problem != self.problem:
             log.warning("%s: %s", self._notices.device, problem, extra=same_as(problem))
         self.problem = problem
 
     def on_link_news(self, now_ns: int, news: str, problem: str) -> None:
-        """Raise an event: the state of the link changed, and `problem` is what is wrong with it from now on."""
+        """Raise an event about a change of the link. `problem` is the problem after the change."""
         self.link_problem = self.problem = printable(problem, MESSAGE_CHARACTERS_MAX)
         self._notices.raise_event(now_ns, EventKind.LINK, news, problem=problem)

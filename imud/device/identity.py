@@ -21,7 +21,7 @@ class KnownIdentity:
         self.settings: Mapping[str, str] = {}
         """Settings by the names that the device uses."""
         self.shown_settings: Mapping[str, str] = {}
-        """The same settings with readable values."""
+        """Settings with readable values."""
         self.answered = False
         """Whether the device replied to all requests of the newest query."""
         self._notices = notices

@@ -1,11 +1,11 @@
-"""The latency that consumers of samples ask for: for each device, the strictest of them decides.
+"""Latency of each device: the smallest latency that a client or output requests.
 
     shared memory 5 ms ─┐
-    client 3     10 ms ─┼─▶ least per device ──changed──▶ the device, which lets samples wait so long
+    client 3     10 ms ─┼─▶ minimum per device ──changed──▶ the device, which holds samples up to this time
     client 4      0 ms ─┘
 
-A consumer asks once for all devices, those that appear later included, or for some by name, and releases what it has
-asked for when it leaves. Where nobody asks, MOST_NS holds: nobody is there to see it.
+A request is for all devices, also future devices, or for named devices. It ends when the client leaves. Without a
+request the latency is MOST_NS.
 """
 
 from bisect import bisect_left, insort
@@ -15,71 +15,70 @@ from typing import Final, NamedTuple
 from imud.model.units import NS_PER_MS
 
 MOST_NS: Final = 50 * NS_PER_MS
-"""No device lets samples wait for longer, whatever is asked for: more would save nothing that can be measured."""
+"""Maximum hold of a sample, ns, for any requested latency. A longer hold saves no measurable CPU time."""
 
 
 class Need(NamedTuple):
-    """What holds for a device."""
+    """Latency of a device."""
 
     latency_ns: int
-    """How long a sample may wait before it is published; 0: not at all."""
+    """Maximum hold of a sample, ns; 0: no hold."""
     who: str
-    """Who asks for it; empty for nobody."""
+    """Name of the client or output; empty without a request."""
 
 
 NOBODY: Final = Need(MOST_NS, "")
 
 OnNeed = Callable[[Need], None]
-"""Called with what holds for a device from now on."""
+"""Called with the new latency of a device."""
 
 
 class _Request(NamedTuple):
-    """What one consumer asks for."""
+    """Request of one client or output."""
 
     need: Need
     devices: frozenset[str] | None
-    """None for all."""
+    """Names of the devices; None: all devices."""
 
 
 class LatencyBudget:
-    """The consumers' requests, and what they come to. Synchronization: the event loop's thread only.
+    """Latency requests and their minimum per device. Synchronization: the loop's thread only.
 
-    Requests are kept in order, for each device that is named and for all: hundreds of clients may come and go at once.
+    The requests are sorted per device, because hundreds of clients can connect and disconnect at the same time.
     """
 
     def __init__(self) -> None:
         self._requests: dict[str, _Request] = {}
-        self._common: list[Need] = []
-        """Requests that concern all devices, the strictest first."""
+        self._common: list[Need] = []  # requests for all devices, in ascending order of latency
+        # requests by the name of the device, in ascending order of latency; also for unknown devices
         self._named: dict[str, list[Need]] = {}
-        """Those that name a device, by its name, the strictest first; also of devices that are not there."""
         self._devices: dict[str, tuple[Need, OnNeed]] = {}
 
     def add_device(self, name: str, on_need: OnNeed) -> None:
-        """Add a device; `on_need` is called at once, and whenever that changes."""
+        """Add a device. Call `on_need` now and after each change of its latency."""
         need = self._strictest(name)
         self._devices[name] = (need, on_need)
         on_need(need)
 
     def remove_device(self, name: str) -> None:
-        """Remove a device; no-op if absent. Requests that name it stay, for it may be added again."""
+        """Remove a device. Its requests stay, because the device can return. Do nothing for an unknown device."""
         self._devices.pop(name, None)
 
     def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
-        """Ask for a latency of `devices` (None: of all) in place of what `who` asked for before."""
+        """Request a latency for `devices` (None: all). Replace the previous request of `who`."""
         need = Need(min(max(latency_ns, 0), MOST_NS), who)
         self._replace(who, _Request(need, None if devices is None else frozenset(devices)))
 
     def release(self, who: str) -> None:
-        """Ask for nothing any more; no-op for one that does not ask."""
+        """Withdraw the request of `who`. Do nothing if `who` did not make a request."""
         self._replace(who, None)
 
     def need(self, device: str) -> Need:
-        """Return what holds for a device."""
+        """Return the latency of a device."""
         return self._devices[device][0]
 
     def _replace(self, who: str, request: _Request | None) -> None:
-        """Put a request in the place of the one of `who` before; tell the devices for which that changes something."""
+        """Replace the request of `who`. Notify each device whose latency changes."""
         before, common = self._requests.pop(who, None), self._common[:1]
         named = set[str]()
         if before is not None:
@@ -94,22 +93,22 @@ class LatencyBudget:
         for device in named:
             if not self._named[device]:
                 del self._named[device]
-        self._tell(named if self._common[:1] == common else list(self._devices))
+        self._notify(named if self._common[:1] == common else list(self._devices))
 
     def _lists(self, request: _Request) -> Iterator[list[Need]]:
-        """Where a request is kept."""
+        """Return the lists that contain a request."""
         if request.devices is None:
             yield self._common
         else:
             yield from (self._named.setdefault(device, []) for device in request.devices)
 
     def _strictest(self, device: str) -> Need:
-        """Find what holds for a device."""
+        """Return the smallest request for a device."""
         needs: list[Need] = [NOBODY, *self._common[:1], *self._named.get(device, [])[:1]]
         return min(needs)
 
-    def _tell(self, devices: Collection[str]) -> None:
-        """Tell those of some devices whose latency or asker changed."""
+    def _notify(self, devices: Collection[str]) -> None:
+        """Notify the devices whose latency or requester has changed."""
         for device in devices:
             if device in self._devices:
                 before, on_need = self._devices[device]

@@ -1,12 +1,11 @@
 """Transfers of all devices of a bus in one thread, at absolute deadlines.
 
     loop ──commands──▶ thread: due poll? ─▶ transfer ─▶ readings ─┐
-      ▲                        │ no: one transfer of a script      │ before it sleeps: one wake-up for all of it
+      ▲                        │ no: one transfer of a script      │ before a sleep: one wake-up of the loop
       └────────────────────────┴───────────────────────────────────┘
 
-The thread owns the links while they are open. It blocks in transfers and between rounds, nowhere else. A device that
-fails costs the others the time of that transfer. What is done in a round, and when, is here; the thread that goes from
-one to the next is a `Worker`, and time is `now_ns`: a test puts its own in the place of both.
+The thread owns the open links. It blocks only in transfers and between rounds. A failing device delays the other
+devices by the time of its transfer. This module contains the rounds; a `Worker` contains the thread.
 """
 
 import asyncio
@@ -25,31 +24,32 @@ from imud.model.units import NS_PER_S
 from imud.sampling.path import QUIET_NS
 
 LATE_SHARE: Final = 4
-"""A read that begins later than a quarter of its period counts as late."""
+"""A read counts as late if its delay exceeds the period divided by this number."""
 QUIET_INTERVALS: Final = 3
+"""Number of missing edges after which imud reads at deadlines."""
 UNMATCHED_MOST: Final = 64
-"""Reads whose edges are not known yet; the oldest are forgotten, and not counted."""
+"""Maximum number of reads without a known edge. imud does not count older reads."""
 
 
 class Deadlines:
-    """Counters of kept and missed deadlines, over all schedules of a device."""
+    """Counters of the deadlines of a device, over all of its schedules."""
 
     __slots__ = ("late", "missed", "polls", "sum_late_ns", "worst_ns")
 
     def __init__(self) -> None:
         self.polls = 0
-        """Deadlines that were served, late or not."""
+        """Number of deadlines with a read."""
         self.late = 0
-        """Of these, those served more than a quarter of a period late."""
+        """Number of late reads."""
         self.missed = 0
-        """Deadlines that passed before the one before them was done: nothing was read for them."""
+        """Number of deadlines without a read, because the previous read lasted too long."""
         self.sum_late_ns = 0
-        """Time from deadline to read, summed over `polls`."""
+        """Sum of the delays of all reads, ns."""
         self.worst_ns = 0
-        """Longest time from deadline to read."""
+        """Maximum delay of a read, ns."""
 
     def served(self, late_ns: int, limit_ns: int) -> None:
-        """Count a read by its delay after its deadline; longer than `limit_ns` is late."""
+        """Count a read. It is late if its delay exceeds `limit_ns`."""
         self.polls += 1
         self.sum_late_ns += late_ns
         self.late += late_ns > limit_ns
@@ -57,17 +57,17 @@ class Deadlines:
 
 
 class Timetable(Protocol):
-    """Timetable of a device's reads."""
+    """Times of the reads of a device."""
 
     due_ns: int
-    """CLOCK_MONOTONIC; the lowest on a bus comes first."""
+    """CLOCK_MONOTONIC of the next read. The bus serves the device with the lowest value first."""
 
     def begun(self, start_ns: int, /) -> None:
-        """Count the read that begins."""
+        """Count a read that starts."""
         ...
 
     def done(self, now_ns: int, /) -> None:
-        """Set `due_ns` to that of the next read: one is over."""
+        """Set `due_ns` to the next read after the end of a read."""
         ...
 
 
@@ -81,16 +81,15 @@ class Schedule:
         self._late_ns = self.period_ns // LATE_SHARE
         self.counts = counts
         self.due_ns = begin_ns
-        """The next deadline (CLOCK_MONOTONIC)."""
+        """CLOCK_MONOTONIC of the next deadline."""
 
     def begun(self, start_ns: int) -> None:
-        """Count the read for the present deadline."""
         self.counts.served(start_ns - self.due_ns, self._late_ns)
 
     def done(self, now_ns: int) -> None:
-        """Go to the next deadline that can still be kept, and count those passed over."""
+        """Set the next deadline. Count the deadlines that have passed without a read."""
         due_ns, period_ns = self.due_ns + self.period_ns, self.period_ns
-        if due_ns + period_ns <= now_ns:  # less late than a period, the next is still worth reading
+        if due_ns + period_ns <= now_ns:  # a read that is late by less than a period is still useful
             passed = (now_ns - due_ns) // period_ns
             self.counts.missed += passed
             due_ns += passed * period_ns
@@ -98,32 +97,30 @@ class Schedule:
 
 
 class RoundRobin:
-    """Turns instead of deadlines: every device is due at once, the one that waited longest comes first. Nothing is late
-    or missed. Synchronization: the bus's thread."""
+    """Turns in place of deadlines: every device is always due, and the device with the longest wait is first.
+    Synchronization: the bus's thread."""
 
     __slots__ = ("counts", "due_ns", "period_ns")
 
     def __init__(self, begin_ns: int, counts: Deadlines) -> None:
         self.period_ns = 0
-        """No-op: there are no deadlines."""
         self.counts = counts
         self.due_ns = begin_ns
-        """End of the device's last turn (CLOCK_MONOTONIC): the lowest of all members is next."""
+        """CLOCK_MONOTONIC at the end of the device's last turn."""
 
     def begun(self, _start_ns: int) -> None:
-        """Count the turn that begins."""
         self.counts.polls += 1
 
     def done(self, now_ns: int) -> None:
-        """Queue behind all other devices: the turn is over."""
+        """Move the device behind all other devices after its turn."""
         self.due_ns = now_ns
 
 
 class ReadySchedule:
-    """Edges instead of deadlines. The first read is at once: a line that stays active until it is read makes no edge
-    before that. Synchronization: the bus's thread; `by_edges` is read by any thread.
+    """Edges in place of deadlines. Synchronization: the bus's thread; any thread may read `by_edges`.
 
-    An edge may be noticed (`noticed`) before its stamp is known (`on_edges`): one of both causes the read.
+    The first read is immediate, because a line that stays active until a read makes no edge before the first read.
+    The thread can notice an edge (`noticed`) before the loop has its time (`on_edges`). Either call causes the read.
     """
 
     __slots__ = (
@@ -132,45 +129,40 @@ class ReadySchedule:
     )  # fmt: skip
 
     def __init__(self, rate_hz: float, begin_ns: int, counts: Deadlines) -> None:
-        """`rate_hz` is that of the deadlines."""
+        """`rate_hz` is the rate of the deadlines if there are no edges."""
         self._deadlines = Schedule(rate_hz, begin_ns, counts)
         self._interval_ns = self._deadlines.period_ns
-        self._edge_ns = begin_ns
-        """The newest edge, or the beginning."""
-        self._start_ns = 0
-        """Begin of the newest read."""
-        self._pending = True
-        """Whether the newest edge was not read yet."""
-        self._unstamped = False
-        """Whether the stamp of the edge that is to be read is not known yet."""
-        self._starts: deque[int] = deque(maxlen=UNMATCHED_MOST)
-        """Begins of reads of such edges, oldest first."""
+        self._edge_ns = begin_ns  # CLOCK_MONOTONIC of the newest edge, or of the start
+        self._start_ns = 0  # CLOCK_MONOTONIC of the start of the newest read
+        self._pending = True  # whether the newest edge still needs a read
+        self._unstamped = False  # whether the time of the pending edge is unknown
+        self._starts: deque[int] = deque(maxlen=UNMATCHED_MOST)  # starts of the reads of such edges, oldest first
         self.counts = counts
         self.by_edges = True
-        """False while deadlines take the place of edges."""
+        """Whether edges cause the reads; False: deadlines."""
         self.due_ns = begin_ns
-        """The edge that is to be read, or the deadline (CLOCK_MONOTONIC)."""
+        """CLOCK_MONOTONIC of the pending edge or of the deadline."""
 
     @property
     def period_ns(self) -> int:
-        """Time between two reads, as it is now."""
+        """Present time between two reads, ns."""
         return self._interval_ns if self.by_edges else self._deadlines.period_ns
 
     def noticed(self, now_ns: int) -> None:
-        """Read at once: an edge came, whose stamp is not known yet."""
+        """Read immediately: an edge has arrived, and its time is unknown."""
         if self.by_edges:
             self._pending = self._unstamped = True
             self.due_ns = self._edge_ns = now_ns
 
     def has_read(self, t_ns: int) -> bool:
-        """Whether a read began after this edge. From any thread."""
+        """Return whether a read started after this edge. Any thread may call it."""
         return t_ns <= self._start_ns
 
     def on_edges(self, times_ns: Sequence[int], interval_ns: int) -> None:
-        """Note edges, oldest first, and the time between the two newest."""
+        """Process edges, oldest first. `interval_ns` is the time between the two newest edges."""
         t_ns = times_ns[-1]
         self._count_reads(times_ns, interval_ns)
-        if not self.by_edges and t_ns - self._edge_ns > QUIET_NS:  # one alone may be a disturbance
+        if not self.by_edges and t_ns - self._edge_ns > QUIET_NS:  # a single edge can be a disturbance
             self._edge_ns = t_ns
             return
         self.by_edges = True
@@ -181,7 +173,7 @@ class ReadySchedule:
             self._wait()
 
     def begun(self, start_ns: int) -> None:
-        """Count a read that begins: of the newest edge, or since there is none."""
+        """Count a read that starts. Without a pending edge, change to deadlines."""
         self._start_ns = start_ns
         if self.by_edges and not self._pending:
             self.by_edges = False
@@ -196,7 +188,6 @@ class ReadySchedule:
             self.counts.served(start_ns - self.due_ns, self._interval_ns // LATE_SHARE)
 
     def done(self, now_ns: int) -> None:
-        """Wait for the next edge or deadline."""
         if self.by_edges:
             self._wait()
         else:
@@ -204,13 +195,13 @@ class ReadySchedule:
             self.due_ns = self._deadlines.due_ns
 
     def _count_reads(self, times_ns: Sequence[int], interval_ns: int) -> None:
-        """Count reads of edges that were noticed, by their stamps: each is of the newest edge before it."""
+        """Count the reads of noticed edges. Each read belongs to the newest edge before its start."""
         starts, at = self._starts, 0
         while starts and at < len(times_ns):
             start_ns, edge_ns = starts.popleft(), 0
             while at < len(times_ns) and times_ns[at] <= start_ns:
                 edge_ns, at = times_ns[at], at + 1
-            if edge_ns:  # else it is of none
+            if edge_ns:  # a read without an edge is not counted
                 self.counts.served(start_ns - edge_ns, interval_ns // LATE_SHARE)
 
     def _wait(self) -> None:
@@ -221,24 +212,25 @@ class ReadySchedule:
 T = TypeVar("T")
 
 IDLE_NS = 60 * NS_PER_S
+"""Maximum sleep of a thread without a due read, ns."""
 FAR_NS = 1 << 63
-"""Nothing is to be done before anything that may wait for it."""
+"""Time of the next read if there is none: after all other times."""
 POLLS_IN_ROW = 8
-"""Number of polls after which a script has its turn on a bus that is never idle."""
+"""Number of reads before a script gets one transfer on a bus that is never idle."""
 READINGS_MAX = 10_000
-"""Readings that wait for a loop that does not run; more are dropped and count as missed deadlines."""
+"""Maximum number of readings that wait for a blocked loop. imud drops further readings and counts missed deadlines."""
 
 OnReadings = Callable[[Sequence[Reading], LinkError | None], None]
-"""Called in the loop's thread with what was read, oldest first, and the error that ended the bus, if any."""
+"""Called in the loop's thread with the readings, oldest first, and the error that ended the bus, or None."""
 Callback = Callable[[], None]
 
 
 def ignore_target(_target: int) -> None:
-    """Ignore the target of a script: the version for scripts that move no device."""
+    """Ignore the target of a script that does not change the address."""
 
 
 class BusMember:
-    """A device on a bus, for its owner. Synchronization: the loop's thread only."""
+    """Membership of a device on a bus. Synchronization: the loop's thread only."""
 
     def __init__(self, bus: "PolledBus", link: PolledLink, deadlines: Deadlines, on_readings: OnReadings) -> None:
         """`PolledBus.join` creates a member. `deadlines` counts the reads."""
@@ -252,9 +244,9 @@ class BusMember:
         bus.command(lambda: bus.add(self._polling))
 
     async def run(self, script: TransferScript[T], target: int, on_target: Callable[[int], None] = ignore_target) -> T:
-        """Run a transfer script with one target. Raises what it raises, TransferError and LinkError.
+        """Run a transfer script on one target. Raises the errors of the script, TransferError and LinkError.
 
-        `on_target` gets the target with which the script has ended, by an error as well.
+        `on_target` receives the target at the end of the script, also after an error.
         """
         future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
         running = _ScriptRun(script, target, future)
@@ -266,50 +258,45 @@ class BusMember:
                 on_target(running.target)
 
     def claim(self, target: int) -> bool:
-        """Claim a target of a shared bus for this device; return False if it is another's."""
         return not self.link.shared or self._bus.claim(target, self)
 
     def release(self) -> None:
-        """Release the claimed target; no-op without one."""
         self._bus.release(self)
 
     def start(self, polls: Sequence[Poll], timetable: Timetable | None = None) -> None:
-        """Read from now on by the timetable; without one at deadlines, or in turns where the link has no rate."""
+        """Start reads at the times of `timetable`. Without it: at deadlines, or in turns if the link has no rate."""
         rate_hz, begin_ns, counts = self.link.rate_hz, self._bus.now_ns(), self.deadlines
         schedule = timetable or (Schedule(rate_hz, begin_ns, counts) if rate_hz else RoundRobin(begin_ns, counts))
         self.command(lambda: self._polling.start(polls, schedule))
 
     def set_latency(self, latency_ns: int) -> None:
-        """Let readings wait so long before they are delivered together, ns; 0: not at all."""
+        """Set the maximum hold of a reading, ns; 0: no hold."""
         if latency_ns != self._latency_ns:
             self._latency_ns = latency_ns
             self.command(lambda: self._polling.set_latency(latency_ns))
 
     def command(self, command: Callback) -> None:
-        """Have the bus's thread run a function between two transfers, at once if it sleeps."""
         self._bus.command(command)
 
     def watch(self, fd: int, callback: Callback) -> bool:
-        """Have the bus's thread call a function when something comes on a descriptor; return whether that is possible.
+        """Call a function in the bus's thread if a descriptor becomes readable. Return False for an invalid descriptor.
 
-        It reads nothing of it, and goes on with what is due then.
+        The thread does not read the descriptor.
         """
         return fd >= 0 and self._bus.watch(fd, callback)
 
     def unwatch(self, fd: int) -> None:
-        """Call nothing for a descriptor any more; it may be closed already."""
         self._bus.unwatch(fd)
 
     def note(self, command: Callback) -> None:
-        """Have the bus's thread run a function before what it does next, whenever that is."""
         self._bus.note(command)
 
     def stop(self) -> None:
-        """Read no more until `start`; what was read before is still delivered."""
+        """Stop reads. The bus still delivers previous readings."""
         self.command(self._polling.stop)
 
     def leave(self) -> None:
-        """Leave the bus; the link is closed by its thread. Nothing is delivered any more. May be called twice."""
+        """Leave the bus. Its thread closes the link and delivers no more readings. A second call does nothing."""
         if not self._left:
             self._left = True
             self.release()
@@ -322,16 +309,16 @@ class BusMember:
 
 
 class _Polling:
-    """Polls of one device. Synchronization: the bus's thread only."""
+    """Reads and scripts of one device. Synchronization: the bus's thread only."""
 
     def __init__(self, member: BusMember, now_ns: Callable[[], int]) -> None:
         self.link = member.link
         self.scripts: deque[_ScriptRun] = deque()
-        """Transfer scripts that wait for their transfers, the running one first."""
+        """Waiting transfer scripts; the first script is running."""
         self.schedule: Timetable | None = None
-        """Timetable of its reads; None while it is not read."""
+        """Times of the reads; None while imud does not read the device."""
         self.held = False
-        """Whether a script keeps it from being read until its next transfer."""
+        """Whether a script forbids reads until its next transfer."""
         self._member = member
         self._now_ns = now_ns
         self._polls: Sequence[Poll] = ()
@@ -339,24 +326,21 @@ class _Polling:
         self._readings: list[Reading] = []
         self._problem: LinkError | None = None
         self._latency_ns = 0
+        # whether a reading failed: imud must deliver it immediately, because the device can be missing
         self._failed = False
-        """Whether one of the readings failed: the device may be gone, and is to be looked for at once."""
 
     def set_latency(self, latency_ns: int) -> None:
-        """Let readings wait so long."""
         self._latency_ns = latency_ns
 
     def start(self, polls: Sequence[Poll], schedule: Timetable) -> None:
-        """Read from now on."""
         self._polls, self._due_ns = polls, [0] * len(polls)
         self.schedule = schedule
 
     def stop(self) -> None:
-        """Read no more."""
         self.schedule = None
 
     def poll(self, schedule: Timetable) -> None:
-        """Read all that is due at the present deadline."""
+        """Execute the polls that are due at the present deadline."""
         start_ns = self._now_ns()
         schedule.begun(start_ns)
         due_ns = self._due_ns
@@ -367,7 +351,7 @@ class _Polling:
         schedule.done(self._now_ns())
 
     def step_script(self) -> Callback | None:
-        """Make one transfer of the running script; at its end return what settles it in the loop's thread."""
+        """Execute one transfer of the running script. At its end return a function that completes it in the loop."""
         settle = self.scripts[0].step(self.link)
         self.held = settle is None and self.scripts[0].holds
         if settle is not None:
@@ -375,8 +359,8 @@ class _Polling:
         return settle
 
     def delivery(self, next_ns: int) -> Callback | None:
-        """Return what delivers all that has gathered, to be called in the loop's thread; None for nothing, or where it
-        may wait until `next_ns`, when it is asked for again."""
+        """Return a function that delivers all readings in the loop's thread. Return None without readings, or if they
+        can wait until the next call at `next_ns`."""
         readings, problem, deliver = self._readings, self._problem, self._member.deliver
         waits = not readings or next_ns <= readings[0].end_ns + self._latency_ns
         if waits and problem is None and not self._failed:
@@ -404,7 +388,7 @@ class _Polling:
 
 
 class _ScriptRun:
-    """A transfer script that is running, one transfer at a time."""
+    """A running transfer script."""
 
     __slots__ = ("error", "future", "holds", "script", "send", "target")
 
@@ -417,14 +401,14 @@ class _ScriptRun:
         self.holds = False
 
     def step(self, link: PolledLink) -> Callback | None:
-        """Make one transfer. At the end of the script return what settles it in the loop's thread."""
+        """Execute one transfer. At the end of the script return a function that completes it in the loop's thread."""
         try:
             wanted = self.script.throw(self.error) if self.error else self.script.send(self.send)  # type: ignore[arg-type]  # None begins a generator
             self.error, self.send = None, self._transfer(link, wanted)
         except StopIteration as end:
             return _settle(self.future, end.value, None)
         except TransferError as error:
-            if self.error is error:  # the script let it out
+            if self.error is error:  # the script did not handle the error
                 return _settle(self.future, None, error)
             self.error = error
         except ImudError as error:
@@ -440,7 +424,7 @@ class _ScriptRun:
             if wanted.then_at is not None:
                 self.target = wanted.then_at
             if wanted.at is not None or wanted.then_at is not None:
-                link.select(self.target)  # reads have their turn between two transfers of a script
+                link.select(self.target)  # the next transfer can be a read of the device
 
 
 def _settle(future: asyncio.Future[Any], value: object, error: Exception | None) -> Callback:
@@ -456,7 +440,10 @@ def _settle(future: asyncio.Future[Any], value: object, error: Exception | None)
 
 
 class PolledBus:
-    """A bus and its devices."""
+    """A bus and its devices.
+
+    The loop's thread calls `join` … `end`, the bus's thread calls `add`, `remove` and the rounds.
+    """
 
     def __init__(
         self, name: str, loop: asyncio.AbstractEventLoop, host: HostClock, start_worker: StartWatchingWorker
@@ -464,50 +451,49 @@ class PolledBus:
         self.now_ns = host.now_ns
         """CLOCK_MONOTONIC."""
         self._loop = loop
+        # Members of the bus. Only the bus's thread uses this list.
         self._polling: list[_Polling] = []
-        """Polls of the members. The bus's thread."""
         self._commands: deque[Callback] = deque()
-        self._callbacks: list[Callback] = []
-        """For the loop's thread, at the next wake-up."""
-        self._in_row = 0
+        self._callbacks: list[Callback] = []  # functions that the loop's thread runs at the next wake-up
+        self._in_row = 0  # number of reads since the last transfer of a script
+        # Claimed targets of a shared bus. Only the loop's thread uses them.
         self._owners: dict[int, BusMember] = {}
-        """Claimed targets of a shared bus. The loop's thread."""
         self._failure: BaseException | None = None
         self._worker = start_worker(name, self._round, self._failed)
 
     # --- the loop's side ---------------------------------------------------------------------------------------------
 
     def join(self, link: PolledLink, deadlines: Deadlines, on_readings: OnReadings) -> BusMember:
-        """Add a device whose link is open; how its deadlines are kept is counted in `deadlines`."""
+        """Add a device with an open link. `deadlines` counts the reads."""
         return BusMember(self, link, deadlines, on_readings)
 
     def claim(self, target: int, member: BusMember) -> bool:
-        """Claim a target for a member; return False if it is another's."""
+        """Claim a target for a member. Return False if another member has claimed it."""
         return self._owners.setdefault(target, member) is member
 
     def release(self, member: BusMember) -> None:
-        """Release what a member has claimed; no-op without."""
+        """Release the claims of a member."""
         self._owners = {target: owner for target, owner in self._owners.items() if owner is not member}
 
     def command(self, command: Callback) -> None:
-        """Have something done by the thread between two transfers."""
+        """Run a function in the thread between two transfers. Wake the thread."""
         self.note(command)
         self._worker.ring()
 
     def note(self, command: Callback) -> None:
-        """Have something done by the thread before what it does next."""
+        """Run a function in the thread before its next work."""
         self._commands.append(command)
 
     def watch(self, fd: int, callback: Callback) -> bool:
-        """Have the thread call a function when something comes on a descriptor."""
+        """Call a function in the thread if a descriptor becomes readable."""
         return self._worker.watch(fd, callback)
 
     def unwatch(self, fd: int) -> None:
-        """Call nothing for a descriptor any more."""
+        """Stop to watch a descriptor."""
         self._worker.unwatch(fd)
 
     def end(self) -> None:
-        """Stop the thread after the present transfer and close what is open; may be called twice."""
+        """Stop the thread after its transfer, and close all links. A second call does nothing."""
         self._worker.end()
         for polling in self._polling:
             polling.link.close()
@@ -516,16 +502,14 @@ class PolledBus:
     # --- the thread's side -------------------------------------------------------------------------------------------
 
     def add(self, polling: "_Polling") -> None:
-        """Serve one more device."""
         self._polling.append(polling)
 
     def remove(self, polling: "_Polling") -> None:
-        """Serve a device no more, and close its link."""
         self._polling.remove(polling)
         polling.link.close()
 
     def _round(self) -> int:
-        """Run commands, then due polls or one step of a script; return the time until the next work, ns."""
+        """Run the commands, then due reads or one transfer of a script. Return the time until the next work, ns."""
         commands = self._commands
         while commands:
             commands.popleft()()
@@ -534,7 +518,7 @@ class PolledBus:
             assert polling is not None
             self._in_row += 1
             polling.poll(schedule)
-            if not polling.link.rate_hz:  # something is always due here: no idle moment comes to hand over in
+            if not polling.link.rate_hz:  # a read is always due: the thread is never idle
                 self._hand_over(FAR_NS)
             return 0
         stepped, self._in_row = self._step_script(), 0
@@ -546,7 +530,7 @@ class PolledBus:
         return max(0, schedule.due_ns - self.now_ns()) if schedule is not None else IDLE_NS
 
     def _next(self) -> tuple[_Polling | None, Timetable | None]:
-        """Return who is to be read next, and its timetable."""
+        """Return the device with the next read, and its timetable."""
         first, earliest = None, None
         for polling in self._polling:
             schedule = polling.schedule
@@ -555,7 +539,7 @@ class PolledBus:
         return first, earliest
 
     def _step_script(self) -> bool:
-        """Make one transfer of one script, if there is any."""
+        """Execute one transfer of a waiting script; return whether a script was waiting."""
         for polling in self._polling:
             if polling.scripts:
                 settle = polling.step_script()
@@ -565,7 +549,7 @@ class PolledBus:
         return False
 
     def _hand_over(self, next_ns: int) -> None:
-        """Deliver all gathered results that may not wait until `next_ns` to the loop, with one wake-up."""
+        """Deliver all results that cannot wait until `next_ns`, with one wake-up of the loop."""
         callbacks = self._callbacks
         for polling in self._polling:
             delivery = polling.delivery(next_ns)
@@ -576,11 +560,11 @@ class PolledBus:
             self._call_loop(lambda: [callback() for callback in callbacks])
 
     def _call_loop(self, callback: Callable[[], object]) -> None:
-        with suppress(RuntimeError):  # the loop is closed
+        with suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(callback)
 
     def _failed(self, error: BaseException) -> None:
-        """Raise the exception of a round in the loop's thread."""
+        """Raise an exception of a round again in the loop's thread."""
         self._failure = error
         self._call_loop(self._raise)
 
@@ -590,7 +574,7 @@ class PolledBus:
 
 
 class PolledBuses:
-    """The buses in use, by name. Synchronization: the loop's thread."""
+    """Buses by name. Synchronization: the loop's thread."""
 
     def __init__(self, host: HostClock, start_worker: StartWatchingWorker = BusThread) -> None:
         """`start_worker` starts the thread of a bus."""
@@ -599,14 +583,14 @@ class PolledBuses:
         self._buses: dict[str, PolledBus] = {}
 
     def get(self, name: str) -> PolledBus:
-        """Return the bus of that name; its thread starts with its first device."""
+        """Return a bus. Start its thread at the first call."""
         bus = self._buses.get(name)
         if bus is None:
             bus = self._buses[name] = PolledBus(name, asyncio.get_running_loop(), self._host, self._start_worker)
         return bus
 
     def end(self) -> None:
-        """Stop all threads; may be called twice."""
+        """Stop all threads. A second call does nothing."""
         for bus in self._buses.values():
             bus.end()
         self._buses.clear()

@@ -64,8 +64,7 @@ class DataReady:
         """Edges for the path, which time-stamps the readings with them."""
         self._member: BusMember | None = None
         self._schedule: ReadySchedule | None = None
-        self._watched_fd = -1
-        """Descriptor of the line while the thread of the bus waits for it."""
+        self._watched_fd = -1  # descriptor of the line while the thread of the bus waits for it
         self._reported_by_edges = True
         self._closed = False
 
@@ -85,12 +84,10 @@ class DataReady:
             self._raise_event(message, by_edges=by_edges)
 
     def stop(self) -> None:
-        """Stop reads at edges. A second call does nothing."""
         self._unwatch()
         self._member = self._schedule = None
 
     def close(self) -> None:
-        """Release the line. A second call does nothing."""
         self.stop()
         self._closed = True
         self._watched.close()
@@ -204,14 +201,11 @@ class PolledTransport(Transport):
         self._ready: DataReady | None = ready
         self._member: BusMember | None = None
         self._deadlines = Deadlines()
-        self._device: IdentifiedDevice | None = None
-        """The device that imud read last."""
+        self._device: IdentifiedDevice | None = None  # the device that imud read last
+        # Target of the device before a script changed it. The device loses an unsaved address at a restart.
         self._former: tuple[int, ...] = ()
-        """Target of the device before a script changed it. The device loses an unsaved address at a restart."""
-        self._identified = False
-        """Whether the readings belong to the identified device."""
-        self._gone: asyncio.Future[str] | None = None
-        """Completes with the reason for another identification."""
+        self._identified = False  # whether the readings belong to the identified device
+        self._gone: asyncio.Future[str] | None = None  # completes with the reason for another identification
         self._on_end: OnEnd | None = None
         self._vanished = 0
         self._lost_counted = 0
@@ -225,14 +219,12 @@ class PolledTransport(Transport):
     # --- the link ----------------------------------------------------------------------------------------------------
 
     def start(self, on_end: OnEnd) -> None:
-        """Join the bus. `on_end` is called once if the link ends."""
         self._on_end = on_end
         self._health.searching()
         self._member = self._buses.get(self.link.bus).join(self.link, self._deadlines, self._on_readings)
         self._member.set_latency(self.hold_ns)
 
     async def work(self) -> None:
-        """Find, set up and read the device, repeatedly. Ends only with the bus."""
         member = self._member
         assert member is not None
         while True:
@@ -393,7 +385,6 @@ class PolledTransport(Transport):
     # --- the samples -------------------------------------------------------------------------------------------------
 
     def set_latency(self, latency_ns: int) -> None:
-        """Set the maximum hold of a reading, ns; 0: no hold. Reads keep their deadlines."""
         self._latency_ns = latency_ns
         if self._member is not None:
             self._member.set_latency(self.hold_ns)
@@ -457,7 +448,6 @@ class PolledTransport(Transport):
 
     @property
     def receiving(self) -> bool:
-        """Whether the path decodes the readings."""
         return self._identified
 
     @property

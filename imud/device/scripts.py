@@ -39,7 +39,7 @@ class RequestPort(ABC):
         raise CommandError(f"{request.name}: expected a bus on which the device has a number, got another link")
 
     def listen(self, request: Request, filters: Sequence[CanFilter]) -> None:
-        """Receive these CAN frames too; empty: only those of the device. Raises CommandError if there is no CAN bus."""
+        """Receive further CAN frames; empty: only frames of the device. Raises CommandError if there is no CAN bus."""
         raise CommandError(f"{request.name}: expected a CAN bus, to receive other devices, got another link")
 
     def on_busy(self, busy: bool) -> None:  # noqa: B027  # most links have nothing to do
@@ -67,8 +67,7 @@ class ScriptRunner:
         self._messages: deque[Message] = deque(maxlen=REPLY_MESSAGES_MAX)
         self._timed_out: Request | None = None
         self._timed_out_ns = 0
-        self._late_messages = 0
-        """Number of messages of the late reply that is arriving."""
+        self._late_messages = 0  # number of messages of the late reply that is arriving
         self.deadline_ns: int | None = None
         """CLOCK_MONOTONIC of the deadline of the outstanding request; None without a request."""
         self.answered_ns = 0

@@ -38,7 +38,7 @@ class Remembered:
     """
 
     def __init__(self, folder: Path | None) -> None:
-        """With `folder` None, imud neither reads nor writes a file."""
+        """`folder` contains the file; None: imud keeps the results in memory."""
         without = "devices are searched for from the beginning"
         self._file = StateFile(folder / FILE_NAME if folder else None, "remembered", without)
         self._found = self._file.read(dict[str, RememberedDevice])

@@ -1,11 +1,11 @@
-"""The settings of one device: compared with what the configuration declares, and kept so where it says so.
+"""Settings of one device: comparison with the declared settings, and repair if `on_difference` requests it.
 
-    link opened, identified again, clock of the device began anew, a command ─▶ read ─▶ compare ─▶ event, status
-                                                                                          │ on_difference
-                                                                                          └─▶ plan ─▶ apply ─▶ event
+    link opened, device identified, device restarted, command executed ─▶ read ─▶ compare ─▶ event, status
+                                                                                    │ on_difference
+                                                                                    └─▶ plan ─▶ apply ─▶ event
 
-A device that does not keep its settings gets them again after growing pauses (PAUSES_S), and its flash is written a
-limited number of times per day (`flash.py`).
+If a device loses its settings repeatedly, imud waits longer before each repair (PAUSES_S). imud writes the flash of a
+device a limited number of times per day (`flash.py`).
 """
 
 import asyncio
@@ -56,28 +56,30 @@ from imud.sampling.clock import SampleClock
 log = logging.getLogger(__name__)
 
 BEGIN_NS: Final = NS_PER_S
-"""From finding a device to the question: imud asks for its identity meanwhile, on which counting writes depends."""
+"""Time from the search to the first comparison, ns. imud queries the identity first, which identifies the flash."""
 SETTLE_NS: Final = NS_PER_S // 2
-"""From the first sample after a restart to the question: a module that has just started need not answer at once."""
+"""Time from the first sample after a restart to the comparison, ns. A device may ignore requests at its start."""
 AGAIN_NS: Final = 60 * NS_PER_S
-"""From one comparison to the next of a device that is polled: it has no clock by which its restart shows."""
+"""Interval of comparisons of a polled device, ns. It has no counter that shows a restart."""
 OWN_NS: Final = 2 * NS_PER_S
-"""After a script a device that paused its samples for it, or that it restarted, may begin its clock anew so late: what
-it has then is compared at the end of the script, and not once more, which would pause its samples again."""
+"""Time after a script in which a restart of the device counter is a result of the script, ns. imud compares the
+settings at the end of the script. A second comparison would pause the samples again."""
 WAIT_S: Final = 10.0
-"""How long a command waits for another one."""
+"""Maximum wait of a command for another command, s."""
 BACKUP_LIMIT_S: Final = 5.0
-"""How long a command waits for a disk that does not answer."""
+"""Maximum wait of a command for the disk, s."""
 READ_AGAIN_NS: Final = 5 * NS_PER_S
+"""Pause before imud reads the settings again after an error, ns."""
 READ_TRIES: Final = 3
-"""A device that does not tell its settings is asked so often; then at the next restart, replug or command."""
+"""Number of reads before imud waits for the next restart, replug or command."""
 PAUSES_S: Final = (0, 10, 60, 600, 3600)
-"""From one repair to the next within PAUSES_FORGOTTEN_S, by their number; the last for all further ones."""
+"""Pauses before the first, second, … repair within PAUSES_FORGOTTEN_S, s. The last pause repeats."""
 PAUSES_FORGOTTEN_S: Final = 2 * 3600
+"""Time after which a repair no longer counts, s."""
 
 
 class SettingsKeeper:
-    """Settings of one device. Synchronization: the event loop's thread only."""
+    """Settings of one device; an attachment. Synchronization: the loop's thread only."""
 
     def __init__(self, context: DeviceContext, transport: Transport, files: SettingsFiles) -> None:
         """All devices share `files`."""
@@ -89,80 +91,75 @@ class SettingsKeeper:
         self._files = files
         self._writes = files.flash
         self._clock: SampleClock | None = None
+        # CLOCK_MONOTONIC until which a restart of the device counter is a result of a script of imud
         self._own_until_ns = 0
-        """Until when a new beginning of the device's clock is counted as caused by imud's own scripts."""
         self._resets = 0
         self._lock = asyncio.Lock()
         self._wanted = asyncio.Event()
-        self._due_ns: int | None = None
-        """When to compare; None for not before something happens."""
+        self._due_ns: int | None = None  # CLOCK_MONOTONIC of the next comparison; None: after the next event
         self._tries = 0
         self._actual: Values | None = None
         self._target: Target | None = None
+        # values that imud wrote since the last restart, of settings that the device does not report
         self._written: dict[str, Any] = {}
-        """Values written since the device's last restart, of settings that it does not tell."""
-        self._unsaved = False
-        """Whether something was written since then that flash does not have, as far as imud knows."""
-        self._saved: Values | None = None
-        """While `_unsaved`: what the device had before, None where that is not known."""
+        self._unsaved = False  # whether a write since the last restart may be missing in flash
+        self._saved: Values | None = None  # while `_unsaved`: the values before the write; None if they are unknown
         self._reported: Mapping[str, SettingDifference] = {}
         self._problem = ""
         self._read_ns: int | None = None
         self._repairs = 0
-        self._repaired_ns: list[int] = []
-        self._repaired_module = ""
-        """When imud set the device by itself, of the last PAUSES_FORGOTTEN_S."""
+        self._repaired_ns: list[int] = []  # CLOCK_MONOTONIC of the repairs within PAUSES_FORGOTTEN_S
+        self._repaired_module = ""  # the device of these repairs, as in `_module`
 
-    # --- when ---------------------------------------------------------------------------------------------------------
+    # --- the attachment -----------------------------------------------------------------------------------------------
 
     def start(self, clock: SampleClock) -> None:
-        """Note that a device was found: its link was opened, or it is back. It may be another one."""
+        """Note that imud has found the device after its link was opened. It can be another device."""
         self._clock, self._resets = clock, clock.status().resets
         self._actual = None
-        self._begin_anew(BEGIN_NS)
+        self._after_start(BEGIN_NS)
 
     def tick(self, now_ns: int, _newest: Sample | None) -> None:
-        """Wake `run` when it is time and the device can be asked; note a restart of the device by its clock."""
+        """Wake `run` if a comparison is due and the device can reply. Detect a restart of the device counter."""
         if not self._declared:
             return
         if self._clock is not None and (resets := self._clock.status().resets) != self._resets:
             self._resets = resets
             if not self.busy and now_ns >= self._own_until_ns:
-                self._begin_anew(SETTLE_NS)
+                self._after_start(SETTLE_NS)
         if self._due_ns is not None and now_ns >= self._due_ns and not self.busy and self._transport.can_be_asked:
             self._wanted.set()
 
     def commanded(self, *, saved: bool = False) -> None:
-        """Note that a command was carried out, which may have changed anything, or `saved` everything."""
+        """Note that a command was executed. It may have changed any setting, or `saved` all settings."""
         if not self._unsaved:
             self._saved = self._actual
         self._unsaved, self._tries = not saved, 0
         self._due_ns = self._host.now_ns()
 
     def stop(self) -> None:
-        """Note that the link ended: nothing is known of the device; may be called twice."""
+        """Forget the settings: the link ended. A second call does nothing."""
         self._actual = self._due_ns = None
         self._wanted.clear()
 
     def close(self) -> None:
-        """End, without a restart; may be called twice."""
         self.stop()
 
-    def _begin_anew(self, after_ns: int) -> None:
-        """Note that the device has what its flash has, and compare after a time."""
+    def _after_start(self, after_ns: int) -> None:
+        """Note that the device has the settings of its flash, and compare them after `after_ns`."""
         self._reported, self._written, self._unsaved, self._tries = {}, {}, False, 0
         self._due_ns = self._host.now_ns() + after_ns
 
     @property
     def busy(self) -> bool:
-        """Whether settings are being read or written, or a command is carried out."""
+        """Whether imud reads or writes settings, or executes a command."""
         return self._lock.locked()
 
     @asynccontextmanager
     async def exclusive(self) -> AsyncIterator[None]:
-        """Keep settings alone while a command is carried out, or they are read or written.
+        """Lock the settings for a command.
 
-        Raises CommandError where another one does not end in time, for example a calibration.
+        Raises CommandError if another command, for example a calibration, does not end within WAIT_S.
         """
         try:
             async with asyncio.timeout(WAIT_S):
@@ -177,29 +174,29 @@ class SettingsKeeper:
 
     @property
     def flash(self) -> ModuleFlash:
-        """The flash of the present module, as written for people and programs."""
+        """Flash of the present device, for writes that a user or program requested."""
         return ModuleFlash(self._writes, self._module, asked=True)
 
     def spend_flash(self) -> None:
-        """Count a write to flash that a command is about to make. Raises CommandError where it may not be made."""
+        """Count a write to flash before a command makes it. Raises CommandError if the limit is reached."""
         if refusal := self.flash.refusal():
             raise CommandError(f"{self._config.name}: {refusal}")
         self.flash.count()
 
     async def run(self) -> None:
-        """Compare whenever it is time. Ends only by an error of imud."""
+        """Compare the settings when a comparison is due. Ends only by an internal error."""
         while True:
             await self._wanted.wait()
             self._wanted.clear()
-            with suppress(CommandError):  # a command is under way, after which it is compared anyway
+            with suppress(CommandError):  # another command is running: imud compares after it
                 async with self.exclusive():
                     self._due_ns = None
                     await self._keep()
 
-    # --- questions ----------------------------------------------------------------------------------------------------
+    # --- requests -----------------------------------------------------------------------------------------------------
 
     def status(self) -> SettingsStatus | None:
-        """Return the newest comparison; None for a driver that does not know its device's settings."""
+        """Return the newest comparison; None if the driver has no table of settings."""
         table = self._known_table()
         if table is None:
             return None
@@ -219,7 +216,7 @@ class SettingsKeeper:
         )
 
     async def report(self, *, fresh: bool) -> SettingsReport:
-        """Return all settings: asked for now if `fresh`, otherwise as reported last.
+        """Return all settings: read now if `fresh`, otherwise the last values.
 
         Raises CommandError, TransferError, DeviceRefused, LinkError.
         """
@@ -238,23 +235,23 @@ class SettingsKeeper:
         )
 
     async def plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
-        """Plan to make the device as `given` (None: as declared), without changing it. Raises what `report` does."""
+        """Return the plan to set the values `given` (None: the declared settings). Raises as `report`."""
         table = self._table()
         wanted = self._wanted_values(table, given)
         async with self.exclusive():
             return self._make_plan(table, wanted, await self._read(table), save=save, unsaved=self._unsaved)
 
     async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
-        """Make the device as `given` (None: as declared). Raises what `report` does, before anything is written."""
+        """Set the values `given` (None: the declared settings). Raises as `report`, before the first write."""
         table = self._table()
         wanted = self._wanted_values(table, given)
         async with self.exclusive():
             return await self._apply(table, wanted, await self._read(table), save=save, asked=True)
 
     async def back_up(self, action: str) -> None:
-        """Write a backup before an action that loses all settings, and tell where it is; the caller has `exclusive`.
+        """Write a backup before an action that resets all settings, and report its file. The caller holds `exclusive`.
 
-        An action is not kept from a device that does not tell its settings: it may be what helps. An event says so.
+        If the backup fails, imud raises an event and runs the action anyway: the action may repair the device.
         """
         table = self._known_table()
         if table is None:
@@ -282,7 +279,7 @@ class SettingsKeeper:
     # --- comparison ---------------------------------------------------------------------------------------------------
 
     async def _keep(self) -> None:
-        """Read, compare, tell, and set what differs where the configuration says so."""
+        """Read the settings, report differences, and repair them if `on_difference` requests it."""
         table = self._known_table()
         if table is None:
             return
@@ -293,14 +290,14 @@ class SettingsKeeper:
             return
         self._tries, self._problem = 0, ""
         found = self._differences(table)
-        self._tell(found)
+        self._report_differences(found)
         if isinstance(self._transport.driver, PolledDriver):
             self._due_ns = self._host.now_ns() + AGAIN_NS
         if self._config.on_difference is not OnDifference.REPORT:
             await self._repair(table, actual)
 
     async def _repair(self, table: SettingsTable, actual: Values) -> None:
-        """Set what differs, or note when it may be set again."""
+        """Apply the declared settings, or set the time of the next repair."""
         save = self._config.on_difference is OnDifference.APPLY_AND_SAVE
         try:
             unsaved = self._unsaved and not self._is_saved(actual)
@@ -323,13 +320,13 @@ class SettingsKeeper:
         self._announce(applied)
 
     def _is_saved(self, actual: Values) -> bool:
-        """Whether flash has what is declared, after commands that changed nothing."""
+        """Return whether flash contains the declared settings, because commands changed no value."""
         return actual == self._saved and all(name in actual for name in self._declared)
 
     def _pause_ns(self, now_ns: int) -> int:
-        """Time to wait before the device may be set by imud itself again, by how often that was needed of late.
+        """Return the pause before the next repair, ns. It depends on the number of repairs within PAUSES_FORGOTTEN_S.
 
-        A module that takes the place of another one begins without pauses.
+        The first repair of another device has no pause.
         """
         if self._module != self._repaired_module:
             self._repaired_module = self._module
@@ -365,9 +362,9 @@ class SettingsKeeper:
                 self._unsaved = False
                 unreadable = {name: as_json(value) for name, value in self._all_written(table).items()}
                 self._writes.keep_unreadable(self._module, unreadable)
-        if asked:  # the rest is an event, which is in the log
+        if asked:  # a repair raises an event, which the log contains
             log.info("%s: %s", self._config.name, _summary(done) or "settings are as wanted")
-        self._tell(self._differences(table), quiet=True)
+        self._report_differences(self._differences(table), quiet=True)
         if applying.changed:
             await self._transport.read_back()
         return msgspec.structs.replace(done, advice=advice(self._config, done))
@@ -379,7 +376,7 @@ class SettingsKeeper:
         return make_plan(table, self._target, wanted, actual, self._all_written(table), save=save, unsaved=unsaved)
 
     def _all_written(self, table: SettingsTable) -> dict[str, Any]:
-        """Values of settings that the device does not report, as written to it since its restart or before a save."""
+        """Return the written values of settings that the device does not report: saved, or since its restart."""
         found: dict[str, Any] = {}
         for name, value in self._writes.unreadable(self._module).items():
             try:
@@ -388,10 +385,10 @@ class SettingsKeeper:
                 log.debug("%s: %s of an earlier version is not used", self._config.name, name)
         return found | self._written
 
-    # --- what is reported ---------------------------------------------------------------------------------------------
+    # --- events -------------------------------------------------------------------------------------------------------
 
-    def _tell(self, found: Mapping[str, SettingDifference], *, quiet: bool = False) -> None:
-        """Raise an event for differences that are news; `quiet` for those that an answer or another event tells."""
+    def _report_differences(self, found: Mapping[str, SettingDifference], *, quiet: bool = False) -> None:
+        """Raise an event for new differences. With `quiet` a reply or another event already reports them."""
         if found and found != self._reported and not quiet:
             detail = {name: shown(one.actual) for name, one in found.items()}
             self._raise(f"settings are not as declared: {words(found)}", **detail)
@@ -400,7 +397,7 @@ class SettingsKeeper:
         self._reported = found
 
     def _announce(self, applied: AppliedSettings) -> None:
-        """Raise an event for what imud did by itself."""
+        """Raise an event for a repair."""
         if applied.problem:
             self._problem = applied.problem
             now_ns = self._host.now_ns()
@@ -409,7 +406,7 @@ class SettingsKeeper:
         self._raise(_summary(applied), saved=applied.saved, **detail)
 
     def _not_read(self, error: Exception) -> None:
-        """Ask again later, a limited number of times."""
+        """Set the time of the next read; after READ_TRIES report the error."""
         self._tries += 1
         self._actual = None
         if self._tries < READ_TRIES:
@@ -439,7 +436,7 @@ class SettingsKeeper:
 
     @property
     def _module(self) -> str:
-        """The module whose flash is written: by its serial number, without one by the name of the device."""
+        """Key of the device in the counts of flash writes: serial number; without one the name of the device."""
         serial_number = self._identity.identity.serial_number
         return f"{self._driver_name} {serial_number}" if serial_number else f"device {self._config.name}"
 
@@ -468,7 +465,7 @@ class SettingsKeeper:
 
 
 def _summary(applied: AppliedSettings) -> str:
-    """Describe what was done, for example `settings: mode set to "6-axis" (was "9-axis"); saved to flash`."""
+    """Describe the steps, for example `settings: mode set to "6-axis" (was "9-axis"); saved to flash`."""
     parts = []
     for step in applied.steps:
         if step.outcome is StepOutcome.NOT_DONE:

@@ -1,7 +1,7 @@
-"""Plan of what is written to a device to make it as wanted, and in which order.
+"""Plan and execution of a change of device settings.
 
-Settings are written in the order of the driver's table, those that change how the device is reached last. What comes
-into force by a restart only is left out where nothing is to be saved: the restart would lose it.
+imud writes settings in the order of the driver's table. The settings that change the connection (baud rate, address)
+are last. Without a save, imud leaves out the settings that need a restart, because the restart loses unsaved values.
 """
 
 from collections.abc import Awaitable, Callable, Mapping
@@ -30,11 +30,11 @@ from imud.model.errors import BadArgument, CommandError, DeviceRefused, LinkErro
 from imud.model.options import expected, shown, unknown_name
 
 Values = Mapping[str, Any]
-"""Values of settings by name, in the types of the driver's table."""
+"""Values of settings by name, in the types of the table."""
 
 
 def has(table: SettingsTable, name: str, wanted: Values, actual: Values, unreadable: Values) -> bool:
-    """Whether a device has a wanted value: as it reports, or as was written to it where it does not."""
+    """Return whether the device has the wanted value. `unreadable` contains written values that it does not report."""
     setting = table.table[name]
     known = actual if name in actual else unreadable
     return name in known and setting.agrees(wanted[name], known[name])
@@ -43,9 +43,9 @@ def has(table: SettingsTable, name: str, wanted: Values, actual: Values, unreada
 def differences(
     table: SettingsTable, wanted: Values, actual: Values, unreadable: Values
 ) -> dict[str, SettingDifference]:
-    """List the settings that can be read and are not as wanted, in the order of the table.
+    """Return the readable settings that differ from `wanted`, in the order of the table.
 
-    `unreadable` are values as they were written, which count where the device does not say what it has.
+    `unreadable` contains written values. They count for settings that the device does not report.
     """
     return {
         name: SettingDifference(as_json(wanted[name]), as_json(actual.get(name)))
@@ -55,7 +55,7 @@ def differences(
 
 
 def unverified(table: SettingsTable, wanted: Values, actual: Values) -> tuple[str, ...]:
-    """List the wanted settings that the device does not tell, in the order of the table."""
+    """Return the wanted settings that the device does not report, in the order of the table."""
     return tuple(name for name in table.table if name in wanted and name not in actual)
 
 
@@ -68,14 +68,14 @@ def words(found: Mapping[str, SettingDifference]) -> str:
 
 
 def as_json(value: Any) -> Any:
-    """Return a value of a setting as JSON has it."""
+    """Return the JSON value of a setting."""
     return msgspec.to_builtins(value)
 
 
 def wanted_values(table: SettingsTable, given: Mapping[str, Any]) -> dict[str, Any]:
     """Convert values of JSON or YAML to the types of the table, in its order.
 
-    Raises BadArgument for a setting that is not known or cannot be set, and for a value that is not accepted.
+    Raises BadArgument if a setting is unknown or read-only, or if a value is invalid.
     """
     settable = [name for name, setting in table.table.items() if setting.write is not None]
     for name in given:
@@ -86,7 +86,7 @@ def wanted_values(table: SettingsTable, given: Mapping[str, Any]) -> dict[str, A
 
 
 def described_settings(table: SettingsTable, declared: Values, actual: Values | None) -> tuple[SettingInfo, ...]:
-    """Describe all settings of a table; `actual` is None where they were not read."""
+    """Describe all settings of a table. `actual` is None if imud has not read them."""
     found = differences(table, declared, actual, {}) if actual is not None else {}
     return tuple(
         SettingInfo(
@@ -105,7 +105,7 @@ def described_settings(table: SettingsTable, declared: Values, actual: Values | 
 
 
 def description_of(value_type: Any) -> tuple[str, str, str, str]:
-    """Return accepted values, description, unit and section of the manual, from the type of a setting."""
+    """Return accepted values, description, unit and manual section of a setting, from its type."""
     info = msgspec.inspect.type_info(value_type)
     schema: Mapping[str, Any] = {}
     extra: Mapping[str, Any] = {}
@@ -137,10 +137,10 @@ def make_plan(
     save: bool,
     unsaved: bool,
 ) -> SettingsPlan:
-    """Plan to make a device that has `actual` as `wanted`.
+    """Return the plan that changes the settings of a device from `actual` to `wanted`.
 
-    `unreadable` are values of settings that cannot be read back, as they were written to this device, `unsaved` whether
-    something was written that flash does not have. Raises BadArgument for values that do not go together.
+    `unreadable` contains written values of settings that the device does not report. `unsaved` means that flash does
+    not contain the last write. Raises BadArgument if the values contradict each other.
     """
     differing = [name for name in table.table if name in wanted and not has(table, name, wanted, actual, unreadable)]
     left_out = {name: why for name in differing if (why := _why_left_out(table, table.table[name], save))}
@@ -161,7 +161,7 @@ def make_plan(
 
 
 def merged(actual: Values, wanted: Values) -> dict[str, Any]:
-    """Return all values as they will be: of a setting with several keys those that are wanted on top of the others."""
+    """Return all values after the change. In a setting with several keys, `wanted` replaces only its own keys."""
     values = dict(actual)
     for name, value in wanted.items():
         present = values.get(name)
@@ -186,10 +186,10 @@ def _step(name: str, setting: Setting, wanted: Values, actual: Values) -> Planne
 
 
 DEVICE_ERRORS: Final = (CommandError, DeviceRefused, LinkError, TransferError)
-"""Raised where a device does not answer, does not take a value, or is gone."""
+"""Errors of a device that does not reply, rejects a value, or is missing."""
 
 PLACES: Final = ("baud", "address", "node")
-"""Settings by whose names link or options say where the device is found."""
+"""Settings that the link or the options repeat to find the device."""
 UNVERIFIED: Final = (Written.UNVERIFIED, Written.UNVERIFIED_PENDING)
 PENDING: Final = (Written.PENDING, Written.UNVERIFIED_PENDING)
 
@@ -199,7 +199,7 @@ RunScript = Callable[[Callable[[Target], Any]], Awaitable[Any]]
 
 @dataclass
 class Applying:
-    """One plan under way. `wanted` has the values in the types of the table, `actual` what was read last."""
+    """Execution of one plan. `wanted` has the types of the table, `actual` contains the values of the last read."""
 
     table: SettingsTable
     run: RunScript
@@ -207,19 +207,19 @@ class Applying:
     wanted: Values
     actual: Values
     written: dict[str, Any] = field(default_factory=dict)
-    """Values written of settings that cannot be read back."""
+    """Written values of settings that the device does not report."""
     saved: bool = False
     restarted: bool = False
     changed: bool = False
-    """Whether anything was written."""
+    """Whether imud has written a setting."""
     pending: bool = False
-    """Whether a script said that what it wrote comes into force by a restart, whatever the table says."""
+    """Whether a script has reported that its value needs a restart, although the table does not require it."""
     heard: bool = True
-    """Whether the device answered to the newest question."""
+    """Whether the device has replied to the newest read."""
     problem: str = ""
 
     async def carry_out(self, plan: SettingsPlan) -> AppliedSettings:
-        """Do everything, up to the first failure. Raises nothing that a device or its link can cause."""
+        """Execute the plan up to the first failure. Raises no error of the device or its link."""
         done: list[AppliedStep] = []
         for step in plan.steps:
             done.append(await self._do(step) if not self.problem else _applied(step, StepOutcome.NOT_DONE))
@@ -258,7 +258,7 @@ class Applying:
         return self._judged(step, setting)
 
     def _judged(self, step: PlannedStep, setting: Setting) -> AppliedStep:
-        """Compare what was read back after a write."""
+        """Compare the written value with the value that imud read back."""
         if step.effect is Effect.AFTER_RESTART and not step.saves:
             return _applied(step, StepOutcome.WRITTEN)
         if message := self._mismatch(step.name, setting):
@@ -290,7 +290,7 @@ class Applying:
             self.problem = f"not saved: {error}"
 
     async def _restart(self, done: list[AppliedStep]) -> list[AppliedStep]:
-        """Restart the device, and judge the settings that come into force by that."""
+        """Restart the device, and compare the settings that needed the restart."""
         restart = self.table.restart
         assert restart is not None
         try:
@@ -310,7 +310,7 @@ class Applying:
         return self._judged(step, self.table.table[done.name])
 
     async def _read_again(self) -> bool:
-        """Read all settings; return False where the device does not answer, and its values are not known then."""
+        """Read all settings; return whether the device replied. Without a reply the values are unknown."""
         try:
             self.actual = await self.run(self.table.read)
             self.heard = True
@@ -319,7 +319,7 @@ class Applying:
         return self.heard
 
     def _present(self) -> str:
-        """How the device is after a failure, for the end of its message."""
+        """Describe the state of the device after a failure, for the end of the message."""
         if not self.problem:
             return ""
         if not self.heard:
@@ -330,7 +330,7 @@ class Applying:
 
 
 def advice(config: DeviceConfig, done: AppliedSettings) -> str:
-    """Say what to change in a configuration that looks for the device where it was; empty for nothing."""
+    """Return the necessary change of the configuration if the device has a new address or baud rate; empty if none."""
     found = []
     for step in done.steps:
         if step.outcome not in (StepOutcome.DONE, StepOutcome.WRITTEN):

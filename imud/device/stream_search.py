@@ -1,16 +1,15 @@
-"""Detection of the device and the baud rate on a port: a search without I/O or clock of its own.
+"""Detection of device and baud rate on a serial port, without I/O and without reads of the clock.
 
-Strategy. Listen at one rate after the other, decode with a fresh codec of every driver, and count frames whose check
-value holds. Passes get slower: QUICK finds a 100 Hz device, MIDDLE 5 Hz, SLOW 1 Hz; the slow ones run only when
-something is heard. One good frame prolongs the visit until a second can come, so a dwell needs to hold one frame only.
-The remembered rate comes first. Only after a whole pass and QUIET_NS without a single byte, and only if allowed, each
-driver's query is sent at each rate; from the first byte heard on, nothing is sent any more.
+The search visits one baud rate after the other. A new codec of each driver decodes the bytes of the visit and counts
+frames with a correct check value. QUICK visits find a device at 100 Hz, MIDDLE visits at 5 Hz, SLOW visits at 1 Hz.
+MIDDLE and SLOW visits need received bytes. One good frame extends the visit for a second frame. The baud rate of the
+last successful search is first. If no byte has arrived in one pass and within QUIET_NS, and if the configuration
+allows it, the search sends the query of each driver at each rate. After the first received byte it sends no query.
 
-False locks. LOCK_FRAMES = 2 good frames, more than there were bad ones. With a 16-bit check a wrong rate must pass it
-twice among the first three things that look like frames: 3 × 2⁻³² = 7 × 10⁻¹⁰ per visit, even if every frame of the
-device turns into a sync word with a plausible length. On random bytes a sync word and length of HiPNUC come at 2⁻²³
-per byte, so two good frames in a visit of 1,000 bytes have a chance of (1000 × 2⁻³⁹)² / 2 = 2 × 10⁻¹⁸. On a noisy line
-with more bad frames than good ones SURE_FRAMES = 4 are enough: C(60, 4) × 2⁻⁶⁴ = 3 × 10⁻¹⁴.
+False results. LOCK_FRAMES = 2 good frames are enough if there are fewer bad frames. With a 16-bit check value, the
+probability at a wrong rate is 3 × 2⁻³² = 7 × 10⁻¹⁰ per visit, if each frame looks like a sync word with a valid length.
+Random bytes contain a sync word and a length of HiPNUC with 2⁻²³ per byte: (1000 × 2⁻³⁹)² / 2 = 2 × 10⁻¹⁸ in a visit
+of 1,000 bytes. With more bad frames, SURE_FRAMES = 4 good frames are enough: C(60, 4) × 2⁻⁶⁴ = 3 × 10⁻¹⁴.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,47 +29,52 @@ from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, uart_byte_ns
 
 LOCK_FRAMES: Final = 2
+"""Number of good frames that is enough if there are fewer bad frames."""
 SURE_FRAMES: Final = 4
+"""Number of good frames that is enough with any number of bad frames."""
 
 SETTLE_NS: Final = 10 * NS_PER_MS
-"""Setting a rate: up to some ms of control transfers on a USB adapter."""
+"""Time to set a baud rate, ns: control transfers of a USB adapter take some ms."""
 QUICK_NS: Final = 45 * NS_PER_MS
-"""A 100 Hz device: the rest of a frame, up to 10 ms, one whole frame of 8 ms at 115200; the same at 50 Hz."""
+"""QUICK visit, ns. A device at 50 or 100 Hz sends one complete frame."""
 MIDDLE_NS: Final = 250 * NS_PER_MS
+"""MIDDLE visit, ns. A device at 5 Hz sends one complete frame."""
 SLOW_NS: Final = 1150 * NS_PER_MS
-"""1 Hz, the slowest rate that the manuals name, and 15 % for a slow crystal and the frame itself."""
+"""SLOW visit, ns: 1 Hz, the lowest rate in the manuals, and 15 % for the crystal and the frame."""
 WHOLE_FRAME_BYTES: Final = 300
-"""On a line that is full, one frame is whole within twice its length: two of 150 bytes (HI91 and HI92 in one frame are
-130). It decides at 9600 baud only."""
+"""Minimum length of a visit, bytes: two frames of 150 bytes, so that one frame is complete. HI91 and HI92 in one frame
+have 130 bytes. This limit is only relevant at 9600 baud."""
 QUIET_NS: Final = 1200 * NS_PER_MS
-"""Silence required before a query: a device at 1 Hz is received within it at any rate, if only as garbage."""
+"""Silence before the first query, ns. A device at 1 Hz sends within this time."""
 ASK_NS: Final = 120 * NS_PER_MS
+"""Wait for the reply to a query, ns."""
 QUERY_BYTES: Final = 32
+"""Maximum length of a query, bytes."""
 REPLY_GAP_NS: Final = 200 * NS_PER_MS
-"""Longest pause within a reply."""
+"""Maximum pause within a reply, ns."""
 VISIT_BYTES_MAX: Final = 256 * 1024
-"""Bytes kept of one visit; a visit that receives more without a lock ends."""
+"""Maximum number of bytes in a visit. A visit with more bytes ends."""
 ASK_TRIES: Final = 2
-"""Bytes sent at wrong rates may stand in the device's line buffer and spoil the first query at the right one."""
+"""Number of queries per rate. Bytes of wrong rates in the buffer of the device can damage the first query."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamFound:
-    """The device found, and the bytes to feed to its own codec so that every byte gets into its ledger."""
+    """Result of a search: the device, and its bytes for its own codec, so that its ledger counts them."""
 
     driver: StreamDriver
     baud: int
     chunks: tuple[tuple[bytes, int], ...] = ()
-    """Bytes of the last visit at that rate, with the time of each read."""
+    """Bytes of the last visit, with the time of each read."""
     wasted_bytes: int = 0
-    """Bytes heard before, in visits that found nothing: the ledger's `bytes_skipped`."""
+    """Number of bytes of the previous visits: the ledger counts them as `bytes_skipped`."""
 
 
 Step = Listen | StreamFound | GaveUp
 
 
 class Search:
-    """A round of detection on one port. Synchronization: one thread. All times are CLOCK_MONOTONIC in ns."""
+    """Search on one port. Synchronization: one thread. All times are CLOCK_MONOTONIC in ns."""
 
     def __init__(
         self,
@@ -82,10 +86,10 @@ class Search:
         hold_ns: int = 0,
         options: Any = None,
     ) -> None:
-        """`bauds` restricts the rates (a fixed one, say); empty means all that the drivers know, most likely first.
+        """`bauds` contains the allowed baud rates; empty: all rates of the drivers, most likely first.
 
-        `remembered` is (driver name, rate) of the last success; `options` go to the codec in place of the driver's
-        default settings, which is for a single driver only. Raises ValueError without any driver or rate.
+        `remembered` is (driver name, rate) of the last successful search. `options` are the options of the driver, if
+        there is only one driver. Raises ValueError without a driver or a rate.
         """
         self._options = options
         self._hold_ns = hold_ns
@@ -105,12 +109,11 @@ class Search:
         self._visit = _Visit(self._bauds[0], 0)
 
     def start(self, now_ns: int) -> Step:
-        """Return the first step."""
         self._started_ns = now_ns
         return self._next(now_ns)
 
     def on_data(self, data: bytes, t_rx_ns: int) -> Step | None:
-        """Process bytes read at the present rate; return None to go on."""
+        """Process bytes of the present visit. Return None to continue."""
         visit = self._visit
         self._heard_bytes += len(data)
         before = visit.good_frames()
@@ -129,7 +132,6 @@ class Search:
         return self._listen_until(until_ns)
 
     def on_time(self, now_ns: int) -> Step | None:
-        """End the present step if `until_ns` of the last Listen has come; return None when it has not."""
         visit = self._visit
         if now_ns < visit.until_ns:
             return None
@@ -142,11 +144,11 @@ class Search:
         return self._next(now_ns)
 
     def refused(self, why: str, now_ns: int) -> Step:
-        """Go on without the rate of the last Listen: the port does not support it."""
+        """Continue without the rate of the last Listen, because the port does not support it."""
         self._tallies[self._visit.baud].refusal = why
         return self._next(now_ns)
 
-    # --- the order of visits -------------------------------------------------------------------------------------
+    # --- the order of visits -----------------------------------------------------------------------------------------
 
     def _visits(self) -> Iterator["_Visit"]:
         if self._first is not None:
@@ -200,7 +202,7 @@ class Search:
         return [_Trial(driver, self._options) for driver in fitting or self._drivers]
 
     def _dwell_ns(self, flow_ns: int) -> int:
-        """Duration of a visit that waits `flow_ns` for bytes to flow."""
+        """Return the duration of a visit that waits `flow_ns` for bytes."""
         return self._hold_ns + SETTLE_NS + max(flow_ns, WHOLE_FRAME_BYTES * uart_byte_ns(self._visit.baud))
 
     def _listen_until(self, until_ns: int) -> Listen | None:
@@ -209,7 +211,7 @@ class Search:
         self._visit.until_ns = until_ns
         return Listen(until_ns, self._visit.baud)
 
-    # --- results -------------------------------------------------------------------------------------------------
+    # --- results -----------------------------------------------------------------------------------------------------
 
     def _found(self) -> StreamFound | None:
         visit = self._visit
@@ -260,7 +262,7 @@ class _Trial:
         self.codec: StreamCodec = driver.make_codec(self.ledger, driver.settings() if options is None else options)
 
     def good_frames(self) -> int:
-        """Binary frames whose check value holds; text lines have none and prove nothing."""
+        """Return the number of binary frames with a correct check value. Text lines have no check value."""
         return self.ledger.frames_good - self.ledger.frames_in_replies
 
     def locked(self) -> bool:
@@ -275,7 +277,7 @@ class _Visit:
     baud: int
     dwell_ns: int
     only_until_heard: bool = False
-    """A long wait for silence; the first byte shortens it."""
+    """Whether the first byte shortens the visit."""
     question: Request | None = None
     asked: StreamDriver | None = None
     answered: bool = False
@@ -303,7 +305,7 @@ class _Visit:
         return max((trial.good_frames() for trial in self.trials), default=0)
 
     def _look_for_reply(self, trial: _Trial, events: Sequence[CodecEvent]) -> None:
-        """Look for a reply with as many messages as the query wants: the end alone (`OK`) is common to many devices."""
+        """Detect a complete reply. The end alone (`OK`) is not enough, because many devices send it."""
         question = self.question
         if question is None or trial.driver is not self.asked:
             return
@@ -318,7 +320,7 @@ class _Visit:
 
 
 def _usable(remembered: tuple[str, int] | None, drivers: Sequence[StreamDriver], bauds: Sequence[int]) -> int | None:
-    """The remembered rate, unless the configuration has changed since."""
+    """Return the remembered rate; None if the configuration has changed."""
     if remembered is None:
         return None
     name, baud = remembered
@@ -327,7 +329,7 @@ def _usable(remembered: tuple[str, int] | None, drivers: Sequence[StreamDriver],
 
 
 def _rates(drivers: Sequence[StreamDriver]) -> tuple[int, ...]:
-    """List all rates of all drivers once, the most likely ones of each first."""
+    """Return all rates of all drivers, most likely first."""
     ranked = [(rank, baud) for driver in drivers for rank, baud in enumerate(driver.baud_rates)]
     return tuple(dict.fromkeys(baud for _, baud in sorted(ranked, key=lambda pair: pair[0])))
 
@@ -353,7 +355,7 @@ class StreamRound(SearchRound[StreamFound]):
         self._link = link
 
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
-        """Pass on bytes from the link; they count as skipped until a device is found in them."""
+        """Process bytes of the link. The ledger counts them as skipped."""
         self._count(len(data))
         if not self._done.done():
             self._follow(self._search.on_data(data, t_rx_ns))

@@ -63,12 +63,10 @@ class StreamHold:
         self._host = host
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
-        self._paused_ns = 0
-        """CLOCK_MONOTONIC of the start of the hold."""
-        self._watch_ns = 0
-        """CLOCK_MONOTONIC of the next frame that is read on arrival."""
+        self._paused_ns = 0  # CLOCK_MONOTONIC of the start of the hold
+        self._watch_ns = 0  # CLOCK_MONOTONIC of the next frame that is read on arrival
+        # maximum hold in which the bytes fit into the kernel buffer, from the number of bytes of the last hold, ns
         self._most_ns = FIRST_NS
-        """Maximum hold in which the bytes fit into the kernel buffer, from the number of bytes of the last hold, ns."""
 
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
         """Process bytes that the link read on arrival."""
@@ -147,22 +145,18 @@ class StreamTransport(ReceivingTransport):
         self._ledger = context.ledger
         self._discard = _Discard(context.ledger)
         self._receiver: DataReceiver = self._discard
-        self._hold: StreamHold | None = None
-        """Holds the samples; None if the path receives each read on arrival."""
+        self._hold: StreamHold | None = None  # holds the samples; None if the path receives each read on arrival
         self._fixed_baud = 0 if link.auto_baud else link.baud
-        self._samples_before = 0
-        """Number of samples before the link was opened."""
+        self._samples_before = 0  # number of samples before the link was opened
 
     # --- the link ----------------------------------------------------------------------------------------------------
 
     def start(self, on_end: OnEnd) -> None:
-        """Start reading the open link and start the search. `on_end` is called once if the link ends."""
         self._samples_before = self._ledger.samples
         self.link.start(self._on_data, on_end)
         self._search.start()
 
     def stop(self) -> None:
-        """Stop the search and close the link. A second call does nothing."""
         self._search.stop()
         self._release()
         self.link.close()
@@ -310,7 +304,6 @@ class StreamTransport(ReceivingTransport):
     # --- the samples -------------------------------------------------------------------------------------------------
 
     def set_latency(self, latency_ns: int) -> None:
-        """Set the maximum hold of a sample, ns; 0: no hold."""
         latency_ns = latency_ns if self.link.waiting_bytes else 0
         if latency_ns == self._latency_ns:
             return  # another client requested the same latency
@@ -320,7 +313,6 @@ class StreamTransport(ReceivingTransport):
 
     @property
     def hold_ns(self) -> int:
-        """Present hold of the samples, ns."""
         return self._hold.hold_ns if self._hold is not None else 0
 
     def _receive(self) -> None:
@@ -404,12 +396,10 @@ class StreamTransport(ReceivingTransport):
 
     @property
     def bit_rate(self) -> int:
-        """Baud rate of the port; 0 if the link has none."""
         return self.link.baud
 
     @property
     def receiving(self) -> bool:
-        """Whether bytes go to the codec of the device; False during a search."""
         return self._receiver is self.path or self._receiver is self._hold
 
     @property

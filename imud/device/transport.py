@@ -253,8 +253,7 @@ class ReceivingTransport(Transport, RequestPort):
         self.scripts = ScriptRunner(self, context.ledger, context.host)
         self._search = SearchLoop(self, context)
         self._remembered = remembered
-        self._asked_ns = 0
-        """CLOCK_MONOTONIC of the newest identity query; 0 before the first query."""
+        self._asked_ns = 0  # CLOCK_MONOTONIC of the newest identity query; 0 before the first query
 
     # --- parts of each kind ------------------------------------------------------------------------------------------
 
@@ -281,11 +280,9 @@ class ReceivingTransport(Transport, RequestPort):
     # --- common code -------------------------------------------------------------------------------------------------
 
     async def work(self) -> None:
-        """Find the device and query its identity, repeatedly. Ends with the link, or by an error."""
         await self._search.run()
 
     def stop(self) -> None:
-        """Stop the search and close the link. A second call does nothing."""
         self._search.stop()
         self.link.close()
 
@@ -294,7 +291,6 @@ class ReceivingTransport(Transport, RequestPort):
         await self._identify(1)
 
     async def read_back(self) -> None:
-        """Query identity and settings again after a change. Keep the old values if the device does not reply."""
         with suppress(LinkError):  # the device receives the end of the link from `on_end`
             await self._identify(1)
 
@@ -325,7 +321,6 @@ class ReceivingTransport(Transport, RequestPort):
 
     @property
     def busy(self) -> bool:
-        """Whether a request script is running."""
         return self.scripts.busy
 
     @property

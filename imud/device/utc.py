@@ -69,11 +69,9 @@ class UtcFeed:
             self._update_reference(now_ns)
 
     def stop(self) -> None:
-        """Stop the delivery to the clock. The source continues. A second call does nothing."""
         self._clock = None
 
     def close(self) -> None:
-        """Release the source and the socket of chronyd. A second call does nothing."""
         self._closed = True
         self.stop()
         if self._source is not None:
@@ -90,7 +88,6 @@ class UtcFeed:
                     self._feed.on_pulse(edge.t_ns)
 
     def status(self) -> UtcStatus:
-        """Return the problem and the counters."""
         source, feed, chrony = self._source, self._feed, self._chrony
         return UtcStatus(
             source=source.title if source is not None else "",

@@ -1,7 +1,7 @@
-"""Axes and angles of one device in its status, and the check of its attitude against gravity at rest.
+"""Checks of the samples of one device: the attitude against gravity at rest, and the status bits.
 
-Ten times a second the newest sample is given to the check, not each one. A contradiction raises one event of its kind
-while the device stays the same; as long as the last rest has shown one, it is in the status.
+The checks use the newest sample ten times per second. Each kind of contradiction between attitude and gravity raises
+one event per path. The status shows the contradiction until a later rest without contradiction.
 """
 
 from collections.abc import Mapping
@@ -18,11 +18,11 @@ from imud.model.units import NS_PER_S
 from imud.sampling.path import SamplePath
 
 AS_DEVICE = "device"
-"""Name of the convention where the configuration has none."""
+"""Name of the convention if none is configured."""
 
 
 class AttitudeWatch:
-    """Watches what is published of one device. Synchronization: the event loop's thread only."""
+    """Check of the published attitude of one device. Synchronization: the loop's thread only."""
 
     def __init__(self, config: DeviceConfig, notices: DeviceEvents) -> None:
         self._config = config
@@ -32,7 +32,7 @@ class AttitudeWatch:
         self._raised: set[Contradiction] = set()
 
     def tick(self, now_ns: int, path: SamplePath) -> None:
-        """Give the newest sample to the check; raise an event when it contradicts for the first time."""
+        """Check the newest sample. Raise an event for the first contradiction of each kind."""
         if path is not self._path:
             self._path, self._check = path, self._new_check(path)
             self._raised.clear()
@@ -53,7 +53,7 @@ class AttitudeWatch:
     def status(
         self, driver: Driver | None, path: SamplePath | None, read_back: Mapping[str, str]
     ) -> FrameStatus | None:
-        """Describe what is published; None while the driver is not known."""
+        """Return axes and angles of the published samples; None before imud has found the device."""
         if driver is None or path is None:
             return None
         frame, config = path.frame, self._config
@@ -71,9 +71,9 @@ class AttitudeWatch:
         )
 
     def _new_check(self, path: SamplePath) -> GravityCheck:
-        frame, given = path.frame, self._config.frame
-        stands_level = given is not None and given.level_at_rest
-        return GravityCheck(frame.device, frame.mounting if stands_level else None)
+        frame, configured = path.frame, self._config.frame
+        is_level = configured is not None and configured.level_at_rest
+        return GravityCheck(frame.device, frame.mounting if is_level else None)
 
     def _problem(self, heading: Heading) -> str:
         finding = self._check.finding if self._check is not None else None
@@ -86,24 +86,24 @@ class AttitudeWatch:
 
 
 CLEAR_NS: Final = NS_PER_S
+"""Time without a status bit after which the bit is cleared, ns."""
 INTERVAL_NS: Final = NS_PER_S
+"""Minimum interval of events, ns."""
 
 
 class StatusWatch:
-    """State of the notable status bits of one device. Synchronization: the loop's thread only."""
+    """Check of the notable status bits of one device. Synchronization: the loop's thread only."""
 
     def __init__(self, notices: DeviceEvents) -> None:
         self._notices = notices
         self._path: SamplePath | None = None
         self._bits: Mapping[int, StatusBit] = {}
-        self._set = 0
-        """Bits that are reported as set."""
-        self._seen_ns: dict[int, int] = {}
-        """CLOCK_MONOTONIC of the newest sample with a bit."""
+        self._set = 0  # bits that imud has reported as set, as a mask
+        self._seen_ns: dict[int, int] = {}  # CLOCK_MONOTONIC of the newest sample with each bit
         self._due_ns = 0
 
     def tick(self, now_ns: int, driver: Driver | None, path: SamplePath | None) -> None:
-        """Look at the samples since the last call, and raise an event for what changed. Call it at 10 Hz."""
+        """Check the samples since the last call. Raise an event for changed bits. Called at 10 Hz."""
         if driver is None or path is None:
             return
         if path is not self._path:
@@ -118,7 +118,7 @@ class StatusWatch:
             self._report(now_ns, is_silent=now_ns - path.last_sample_ns > CLEAR_NS)
 
     def _begin(self, driver: Driver, path: SamplePath) -> None:
-        """Watch another path: that of another driver."""
+        """Watch the status bits of a new path."""
         self._path = path
         self._bits = {number: bit for number, bit in driver.status_bits.items() if bit.notable}
         path.watch_status(sum(1 << number for number in self._bits))
@@ -126,7 +126,7 @@ class StatusWatch:
         self._seen_ns.clear()
 
     def _report(self, now_ns: int, *, is_silent: bool) -> None:
-        """Raise one event for all bits that changed; while no samples come, nothing changes."""
+        """Raise one event for all changed bits. Without samples the bits keep their state."""
         risen = [n for n in self._bits if not self._set >> n & 1 and n in self._seen_ns]
         fallen = [n for n in self._bits if self._set >> n & 1 and now_ns - self._seen_ns[n] > CLEAR_NS]
         if is_silent or not (risen or fallen):
