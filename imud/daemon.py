@@ -255,9 +255,9 @@ class Daemon:
     def refuse(self, error: ConfigError) -> None:
         """Report the errors of a new configuration."""
         for problem in str(error).splitlines():
-            log.error("the configuration stays as it was: %s", problem)
+            log.error("the old configuration stays active: %s", problem)
         self.send_event(
-            Event(self._host.now_ns(), "", EventKind.CONFIGURATION, f"the new configuration is refused: {error}")
+            Event(self._host.now_ns(), "", EventKind.CONFIGURATION, f"the new configuration is invalid: {error}")
         )
 
     async def change_to(self, new: Config) -> None:
@@ -268,7 +268,7 @@ class Daemon:
         for name in (*change.devices_removed, *change.devices_changed):
             self._stop_device(name)
             await asyncio.sleep(0)
-        problems = ["state_dir counts from the next start"] if "state_dir" in change.keys_changed else []
+        problems = ["a new state_dir needs a restart of imud"] if "state_dir" in change.keys_changed else []
         for name in change.publishers_changed:
             problems.append(self._restart_publisher(name, old))
             await asyncio.sleep(0)
@@ -289,10 +289,10 @@ class Daemon:
         try:
             self._start_configured(name)
         except ServerError as error:
-            log.error("%s keeps its old settings: %s", name, error)
+            log.error("%s keeps its old options: %s", name, error)
             self.config = replace(self.config, publishers={**self.config.publishers, name: old.publishers[name]})
             self._start_or_put_off(name)
-            return f"{name} keeps its old settings: {error}"
+            return f"{name} keeps its old options: {error}"
         return ""
 
     def _try_device(self, device: DeviceConfig) -> str:
@@ -347,10 +347,10 @@ class Daemon:
             pause_ns = RETRY_FIRST_NS if before is None else min(2 * before.pause_ns, RETRY_MOST_NS)
             self._put_off[name] = _PutOff(self._host.now_ns() + pause_ns, pause_ns)
             if before is None:
-                log.error("%s: %s; imud goes on without it and tries again", name, error)
+                log.error("%s: %s; imud continues without this output and tries again", name, error)
         else:
             if before is not None:
-                log.info("%s: started after all", name)
+                log.info("%s: started", name)
 
     def _summary(self) -> str:
         """Return file, devices and outputs for the log."""

@@ -211,7 +211,7 @@ def test_a_reload_that_changes_little_or_cannot_be_used_is_an_event(tmp_path: Pa
             events = client.events(timeout_s=LIMIT_S)
             reload(daemon, {"bow": device(port.name)}, state_dir=str(tmp_path / "other"))
             assert next(events).message == (
-                "configuration read again: keys changed: state_dir; state_dir counts from the next start"
+                "configuration read again: keys changed: state_dir; a new state_dir needs a restart of imud"
             )
             file = tmp_path / "imud.yaml"
             file.write_text("devices:\n  bow:\n    baudd: 9600\n")
@@ -269,10 +269,10 @@ def test_metrics_and_socket_and_shared_memory_show_the_same_ledger(tmp_path: Pat
         with running_daemon(tmp_path, {"bow": device(port.name)}, metrics={"port": number}) as daemon:
             wait_until(lambda: "has started" in log.read_text(), "the devices are searched for")
             assert f"port {number}: Address already in use" in log.read_text()
-            assert "imud goes on without it and tries again" in log.read_text()
+            assert "imud continues without this output and tries again" in log.read_text()
             assert "outputs: socket, shm (not yet: metrics)" in log.read_text()
             holder.close()
-            wait_until(lambda: "metrics: started after all" in log.read_text(), "the port is taken")
+            wait_until(lambda: "metrics: started" in log.read_text(), "the port is taken")
             daemon.wait_for("bow", "searching")
             port.send(4)
             os.write(port.master, b"\x00garbage\xff" + hi91(1)[:50])

@@ -343,13 +343,13 @@ class CalibrationRun:
         if self._running is not None:
             raise CommandError("another calibration of this device is running")
         if save and calibration.kept is not Kept.BY_SAVE:
-            raise CommandError(f"{kind}: expected no `save`, for its result lasts {calibration.kept}")
+            raise CommandError(f"{kind}: cannot save: the result lasts {calibration.kept}")
         task = self._running = asyncio.ensure_future(self._run(kind, calibration, save))
         try:
             return await task
         except asyncio.CancelledError:
             if task.cancelled():
-                raise CommandError("the calibration was cancelled; the device may have finished it by itself") from None
+                raise CommandError("the calibration was cancelled; the device can still finish it") from None
             task.cancel()
             raise
         finally:
@@ -398,7 +398,11 @@ class CalibrationRun:
             script.cancel()
         moved = window.motion()
         if moved:
-            return _words(answer), (), f"the device moved while it was calibrated: {moved}; hold it still and repeat"
+            return (
+                _words(answer),
+                (),
+                f"the device moved during the calibration: {moved}; keep it still and repeat the calibration",
+            )
         await self._pause(SETTLE_NS)
         means = await self._rest(kind)
         return _words(answer), tuple(_check(one, means) for one in calibration.expected), ""
@@ -410,7 +414,7 @@ class CalibrationRun:
         await self._transport.run_script(calibration.begin)
         turning, begun_ns = Turning(), self._now_ns
         report_ns = ask_ns = begun_ns
-        problem = "the device did not end the calibration"
+        problem = "the device did not finish the calibration"
         while self._now_ns - begun_ns < TURN_LIMIT_NS:
             now_ns, sample = await self._next()
             if sample is not None:
@@ -453,8 +457,10 @@ class CalibrationRun:
             window.clear()
         if moved or window.samples:
             words = moved or window.motion() or f"only {window.samples} samples came"
-            raise CommandError(f"{kind}: expected the device at rest, got: {words}; put it down, away from vibration")
-        raise CommandError(f"{kind}: expected samples of the device, got none for {REST_LIMIT_NS // NS_PER_S} s")
+            raise CommandError(
+                f"{kind}: expected the device at rest, got: {words}; put the device on a surface without vibration"
+            )
+        raise CommandError(f"{kind}: expected samples of the device, got no sample for {REST_LIMIT_NS // NS_PER_S} s")
 
     async def _pause(self, duration_ns: int) -> None:
         end_ns = self._now_ns + duration_ns
@@ -530,7 +536,7 @@ def _failed(checks: tuple[Check, ...]) -> str:
     """Return the first failed check as a sentence; empty if all checks passed."""
     for check in checks:
         if check.value is None:
-            return f"{check.name}: the samples do not tell it"
+            return f"{check.name}: the samples do not contain this value"
         if not check.passed:
             unit = f" {check.unit}" if check.unit else ""
             return f"{check.name}: expected at most {check.limit:.3g}{unit}, got {check.value:.3g}{unit}"
@@ -540,16 +546,21 @@ def _failed(checks: tuple[Check, ...]) -> str:
 def _advice(turning: Turning, checks: tuple[Check, ...]) -> str:
     """Return advice about a calibration that did not end, one clause."""
     if not turning.has_field:
-        return "its samples have no magnetic field: has it a magnetometer, and does its output carry it?"
+        return (
+            "its samples contain no magnetic field; "
+            "check that the device has a magnetometer, and that its output contains the field"
+        )
     share = coverage(turning.cells(turning.fit()))
     if share < COVERAGE_WANTED:
-        return f"it was turned into {share:.0%} of the directions, {COVERAGE_WANTED:.0%} are needed: turn it over, too"
+        return (
+            f"it was turned to {share:.0%} of the directions, expected {COVERAGE_WANTED:.0%}: also turn it upside down"
+        )
     least = min(turning.turned_rad)
     if least < TURNS_WANTED_RAD:
-        return "about one axis it was turned by less than 360°: turn it about each of its axes"
+        return "it was turned by less than 360° about one axis: turn it about each of its axes"
     if any(not check.passed for check in checks):
         return "the field is disturbed: go outdoors, or at least 30 cm from iron, motors, computers and telephones"
-    return "the field is good: repeat it more slowly, for one to two minutes"
+    return "the field is good: repeat the calibration more slowly, for one to two minutes"
 
 
 def _words(answer: object) -> str:

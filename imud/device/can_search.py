@@ -190,16 +190,17 @@ class CanSearch:
         """Return the reason for no result."""
         survey, where = self.survey, self._where
         if devices := survey.devices(self._claimed):
-            return f"{len(devices)} devices are heard on {where}, {_listed(devices)}: name driver and options"
+            return f"{len(devices)} devices send on {where}: {_listed(devices)}; configure driver and options"
         if doubtful := survey.doubtful(self._claimed):
-            return f"frames as of {_listed(doubtful)} come on {where}, but no whole sample: name driver and options"
+            found = _listed(doubtful)
+            return f"frames of {found} arrive on {where}, but no complete sample; configure driver and options"
         if others := survey.others(self._claimed):
             more = f" and {len(others) - SHOWN_MAX} more" if len(others) > SHOWN_MAX else ""
             names = ", ".join(others[:SHOWN_MAX])
-            return f"frames come on {where} that no driver knows ({names}{more}): name driver and options"
+            return f"unknown frames arrive on {where} ({names}{more}); configure driver and options"
         if survey.others() or survey.devices() or survey.doubtful():
-            return f"only frames of other configured devices come on {where}: is the device powered?"
-        return f"nothing is heard on {where}: is the bit rate right, is the bus terminated, is the device powered?"
+            return f"only frames of other configured devices arrive on {where}; check the power supply of the device"
+        return f"no frame arrives on {where}; check the bit rate, the termination and the power supply of the device"
 
     def _listen(self, now_ns: int) -> Listen:
         self._until_ns = now_ns + LISTEN_NS

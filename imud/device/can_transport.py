@@ -81,9 +81,12 @@ class CanBuses:
             if other == name or mine is None:
                 break
             if both := mine.both_send(member):
-                return f"{other} and {name} would both send {both} on {mine.bus}: let one of them do it"
+                return f"{other} and {name} would both send {both} on {mine.bus}; configure only one of them to send it"
             if both := mine.both_receive(member):
-                return f"{other} and {name} would be the same device on {mine.bus}, the one that sends {both}"
+                return (
+                    f"{other} and {name} would receive the same device on {mine.bus}, which sends {both}; "
+                    "change the options of one of them"
+                )
         return ""
 
 
@@ -267,7 +270,7 @@ class CanTransport(ReceivingTransport):
         self._node = None  # the next search sets it
         self._begin()
         if not self._searchable and options != (self._config.options or driver.settings()):
-            message = f"the device is heard by other options now: change {_changed(self._config.options, options)}"
+            message = f"the device has a new number: change {_changed(self._config.options, options)}"
             self._context.notices.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message)
 
     def listen(self, request: Request, filters: Sequence[CanFilter]) -> None:
@@ -321,9 +324,9 @@ class CanTransport(ReceivingTransport):
         if health.state is not DeviceState.SEARCHING or driver is None or now_ns - path.begun_ns <= UNHEARD_NS:
             return
         if path.last_data_ns > path.begun_ns:
-            health.report(f"frames of {driver.name} come on {self.where}, but no whole sample")
+            health.report(f"frames of {driver.name} arrive on {self.where}, but no complete sample")
         else:
-            health.report(f"nothing of {driver.name} is heard on {self.where}: is its identifier right?")
+            health.report(f"no frame of {driver.name} arrives on {self.where}; check its identifier")
 
     # --- state -------------------------------------------------------------------------------------------------------
 

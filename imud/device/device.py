@@ -243,7 +243,7 @@ class Device:
         log.info("%s: run %s%s", self.config.name, printable(name), f" {shown(arguments)}" if arguments else "")
         action = self.actions.get(name)
         if action is None:
-            raise BadArgument(f"{self.config.name}: no action {name[:64]!r}; there are: {self._known_actions()}")
+            raise BadArgument(f"{self.config.name}: unknown action {name[:64]!r}; expected: {self._known_actions()}")
         if name in self._attachments.actions:
             return await self._attachments.run_action(name, arguments)
         self._require_replies()
@@ -260,7 +260,7 @@ class Device:
         calibration = self.calibrations.get(kind)
         if calibration is None:
             known = ", ".join(self.calibrations) or "none"
-            raise BadArgument(f"{self.config.name}: no calibration {kind[:64]!r}; there are: {known}")
+            raise BadArgument(f"{self.config.name}: unknown calibration {kind[:64]!r}; expected: {known}")
         log.info("%s: calibrate %s%s", self.config.name, kind, ", save" if save else "")
         self._require_replies()
         async with self._settings.exclusive():
@@ -319,7 +319,7 @@ class Device:
 
     def _require_replies(self) -> None:
         if not self._transport.accepts_scripts:
-            problem = self._health.problem or "it accepts no commands now"
+            problem = self._health.problem or "it cannot reply to commands now"
             raise CommandError(f"{self.config.name} is {self._health.state}: {problem}")
 
     def _known_actions(self) -> str:
@@ -334,8 +334,9 @@ class Device:
         ):
             self._up(now_ns)
         elif state is DeviceState.RUNNING and quiet_ns > max(SILENCE_NS, SILENCE_PERIODS * path.period_ns):
+            seconds = f"{quiet_ns / NS_PER_S:.1f} s"
             words = (
-                f"no sample for {quiet_ns / NS_PER_S:.1f} s, though the link is there: is it powered, was it stopped?"
+                f"no sample for {seconds}, but the link is open; check the power supply of the device and its output"
             )
             self._health.down(now_ns, DeviceState.SILENT, words)
         elif quiet_ns > UNHEARD_NS:

@@ -44,7 +44,7 @@ class FlashWrites:
     def __init__(self, folder: Path | None, host: HostClock) -> None:
         """`folder` contains the file; None: imud keeps the counts in memory."""
         self._file = StateFile(
-            folder / FILE_NAME if folder else None, "settings", "writes to flash are counted from the beginning"
+            folder / FILE_NAME if folder else None, "settings", "imud counts the writes to flash from 0"
         )
         self._modules = self._file.read(dict[str, ModuleRecord])
         self._host = host
@@ -64,8 +64,8 @@ class FlashWrites:
         limit, written = LIMIT_ASKED if asked else LIMIT_ITSELF, self.writes_day(module)
         if written < limit:
             return ""
-        who = "" if asked else " by imud itself"
-        return f"its flash was written {written} times within 24 hours, and {limit} are allowed{who}: it wears out"
+        who = "" if asked else " of imud itself"
+        return f"its flash was written {written} times in 24 hours, the limit{who} is {limit}: flash wears out"
 
     def count(self, module: str) -> None:
         """Count a write, before imud makes it."""

@@ -94,7 +94,7 @@ def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
 
 
-SEARCH_BEGUN = "no sample has come yet: wait until the search has listened for a while"
+SEARCH_BEGUN = "no sample has arrived yet; wait for the search"
 """Problem of a device right after imud has opened its link."""
 STREAMING = (DeviceState.RUNNING, DeviceState.SILENT)
 

@@ -80,7 +80,11 @@ class DataReady:
         by_edges = self._schedule.by_edges if self._schedule is not None else self._reported_by_edges
         if by_edges is not self._reported_by_edges:
             self._reported_by_edges = by_edges
-            message = "edges are back: read at them" if by_edges else f"no edges: read at {self._rate_hz:g} Hz instead"
+            message = (
+                "edges have returned: imud reads at each edge"
+                if by_edges
+                else f"no edges: imud reads at {self._rate_hz:g} Hz"
+            )
             self._raise_event(message, by_edges=by_edges)
 
     def stop(self) -> None:
@@ -341,7 +345,7 @@ class PolledTransport(Transport):
         """Run a transfer script between two reads. Follow the device if the script changes its address."""
         member, device = self._member, self._device
         if member is None or device is None:
-            raise CommandError(f"{self._config.name} is not there")
+            raise CommandError(f"{self._config.name}: the device is missing")
         options = self._config.options or device.driver.settings()
         script = make(Target(options, self.bit_rate, places=self._places(device)))
         return await member.run(script, device.target, self._follow)
@@ -428,7 +432,7 @@ class PolledTransport(Transport):
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
         """Report that the device replies but has sent no new sample since its identification."""
         if self._health.state is DeviceState.SEARCHING and now_ns - path.begun_ns > UNHEARD_NS:
-            self._health.report("the device answers, but no value of it is new: is it held in reset?")
+            self._health.report("the device replies, but its values do not change; check its reset line")
 
     def on_reset(self) -> None:
         """Identify the device again: a reset loses its settings."""

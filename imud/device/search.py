@@ -39,7 +39,7 @@ class Remembered:
 
     def __init__(self, folder: Path | None) -> None:
         """`folder` contains the file; None: imud keeps the results in memory."""
-        without = "devices are searched for from the beginning"
+        without = "imud searches for all devices again"
         self._file = StateFile(folder / FILE_NAME if folder else None, "remembered", without)
         self._found = self._file.read(dict[str, RememberedDevice])
 

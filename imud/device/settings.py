@@ -165,7 +165,9 @@ class SettingsKeeper:
             async with asyncio.timeout(WAIT_S):
                 await self._lock.acquire()
         except TimeoutError:
-            raise CommandError(f"{self._config.name}: another command or a calibration is still under way") from None
+            raise CommandError(
+                f"{self._config.name}: another command or a calibration is still running; try again later"
+            ) from None
         try:
             yield
         finally:
@@ -266,7 +268,7 @@ class SettingsKeeper:
             writing = asyncio.to_thread(self._files.backups.write, device, text, utc_ns)
             file = await asyncio.wait_for(writing, BACKUP_LIMIT_S)
         except TimeoutError:
-            self._raise(f"no backup of the settings before {action}: the disk does not answer")
+            self._raise(f"no backup of the settings before {action}: the disk does not respond")
             return
         except (*DEVICE_ERRORS, OSError) as error:
             self._raise(f"no backup of the settings before {action}: {reason_of(error)}")
@@ -312,7 +314,7 @@ class SettingsKeeper:
         wait_ns = self._pause_ns(now_ns)
         if wait_ns > 0:
             self._due_ns = now_ns + wait_ns
-            self._problem = f"the device does not keep its settings; set again in {wait_ns / NS_PER_S:.0f} s"
+            self._problem = f"the device loses its settings; imud sets them again in {wait_ns / NS_PER_S:.0f} s"
             return
         self._repaired_ns.append(now_ns)
         self._repairs += 1
@@ -363,7 +365,7 @@ class SettingsKeeper:
                 unreadable = {name: as_json(value) for name, value in self._all_written(table).items()}
                 self._writes.keep_unreadable(self._module, unreadable)
         if asked:  # a repair raises an event, which the log contains
-            log.info("%s: %s", self._config.name, _summary(done) or "settings are as wanted")
+            log.info("%s: %s", self._config.name, _summary(done) or "all settings already have these values")
         self._report_differences(self._differences(table), quiet=True)
         if applying.changed:
             await self._transport.read_back()
@@ -391,9 +393,9 @@ class SettingsKeeper:
         """Raise an event for new differences. With `quiet` a reply or another event already reports them."""
         if found and found != self._reported and not quiet:
             detail = {name: shown(one.actual) for name, one in found.items()}
-            self._raise(f"settings are not as declared: {words(found)}", **detail)
+            self._raise(f"settings differ from the declared settings: {words(found)}", **detail)
         elif not found and self._reported:
-            self._raise("settings are as declared again")
+            self._raise("settings agree with the declared settings again")
         self._reported = found
 
     def _announce(self, applied: AppliedSettings) -> None:
@@ -410,10 +412,10 @@ class SettingsKeeper:
         self._tries += 1
         self._actual = None
         if self._tries < READ_TRIES:
-            self._problem = f"settings could not be read: {error}"
+            self._problem = f"cannot read the settings: {error}"
             self._due_ns = self._host.now_ns() + READ_AGAIN_NS
         else:
-            self._complain(f"settings could not be read, asked {self._tries} times: {error}")
+            self._complain(f"cannot read the settings after {self._tries} tries: {error}")
 
     def _complain(self, problem: str) -> None:
         if problem != self._problem:
@@ -453,7 +455,7 @@ class SettingsKeeper:
         table = self._known_table()
         if table is None:
             name = self._driver_name
-            raise CommandError(f"{self._config.name}: driver {name} does not know the settings of its device")
+            raise CommandError(f"{self._config.name}: driver {name} cannot read or write device settings")
         return table
 
     def _wanted_values(self, table: SettingsTable, given: Mapping[str, Any] | None) -> Values:

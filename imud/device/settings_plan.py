@@ -80,7 +80,7 @@ def wanted_values(table: SettingsTable, given: Mapping[str, Any]) -> dict[str, A
     settable = [name for name, setting in table.table.items() if setting.write is not None]
     for name in given:
         if name not in settable:
-            only_read = f"{name}: it can only be read" if name in table.table else ""
+            only_read = f"{name}: it is read-only" if name in table.table else ""
             raise BadArgument(only_read or unknown_name("a setting", name, settable))
     return {name: _converted(name, given[name], table.table[name].type) for name in settable if name in given}
 
@@ -122,9 +122,9 @@ def _converted(name: str, value: Any, value_type: Any) -> Any:
         raise BadArgument(f"{name}: expected {expected(value_type)}, got {shown(value)[:60]}") from None
 
 
-NEEDS_SAVE: Final = "comes into force by save and restart only, and nothing is to be saved"
-SAVES_ITSELF: Final = "saves to flash and restarts the device, and nothing is to be saved"
-CANNOT_SAVE: Final = "comes into force by save and restart only, and this driver cannot save"
+NEEDS_SAVE: Final = "needs a save and a restart, and no save was requested"
+SAVES_ITSELF: Final = "saves to flash and restarts the device, and no save was requested"
+CANNOT_SAVE: Final = "needs a save and a restart, and this driver cannot save"
 
 
 def make_plan(
@@ -248,7 +248,7 @@ class Applying:
         self.changed = True
         self.saved |= step.saves
         if not await self._read_again():
-            return self._failed(step, "written, and the device does not tell its settings since")
+            return self._failed(step, "written, but the device has not reported its settings after the write")
         if not setting.readable or (result in UNVERIFIED and step.name not in self.actual):
             self.written[step.name] = value
             return _applied(step, StepOutcome.NOT_VERIFIED)
@@ -267,7 +267,7 @@ class Applying:
 
     def _mismatch(self, name: str, setting: Setting) -> str:
         if name not in self.actual:
-            return "written, and the device does not tell it"
+            return "written, but the device does not report this setting"
         if setting.agrees(self.wanted[name], self.actual[name]):
             return ""
         return f"wrote {shown(as_json(self.wanted[name]))}, read back {shown(as_json(self.actual[name]))}"
@@ -299,7 +299,7 @@ class Applying:
         except DEVICE_ERRORS as error:
             self.problem = f"restart: {error}"
         if not await self._read_again():
-            self.problem = self.problem or "the device does not tell its settings after its restart"
+            self.problem = self.problem or "the device does not report its settings after its restart"
             return done
         return [self._after_restart(one) for one in done]
 
@@ -323,10 +323,10 @@ class Applying:
         if not self.problem:
             return ""
         if not self.heard:
-            return "; what it has now is not known"
+            return "; its present settings are unknown"
         if not self.changed:
-            return "; nothing else was written"
-        return "" if self.saved else "; what was written before holds until the device restarts"
+            return "; no other setting was written"
+        return "" if self.saved else "; the previous writes last until the device restarts"
 
 
 def advice(config: DeviceConfig, done: AppliedSettings) -> str:
@@ -339,7 +339,7 @@ def advice(config: DeviceConfig, done: AppliedSettings) -> str:
             place = getattr(part, step.name, None)
             if place not in (None, "auto", step.value) and type(place) is type(step.value) and step.name in PLACES:
                 found.append(f"change `{key}.{step.name}: {place}` in the configuration to {step.value}")
-    return "; ".join(found) + (": imud looks for the device there at its next start" if found else "")
+    return "; ".join(found) + (": imud uses this value at its next start" if found else "")
 
 
 def _applied(step: PlannedStep, outcome: StepOutcome, message: str = "") -> AppliedStep:

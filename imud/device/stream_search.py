@@ -224,13 +224,13 @@ class Search:
         names = " or ".join(driver.name for driver in self._drivers)
         rates = ", ".join(str(baud) for baud, tally in self._tallies.items() if not tally.refusal)
         if rates and not self._heard_bytes:
-            asked = " and no answer to a query" if self._asked else ""
+            asked = " and no reply to a query" if self._asked else ""
             return (
-                f"expected {names}, heard nothing at {rates} baud{asked}: "
-                "is the device powered, and do its TX and ground reach this port's RX and ground?"
+                f"expected {names}, got no byte at {rates} baud{asked}; "
+                "check the power supply of the device, and the wires from its TX to RX and between the grounds"
             )
         found = "; ".join(f"{baud}: {tally.text()}" for baud, tally in self._tallies.items())
-        return f"expected {names}, heard no two valid frames at any baud rate ({found}): is it another kind of device?"
+        return f"expected {names}, got too few valid frames at all baud rates ({found}); check the device type"
 
 
 @dataclass(slots=True)

@@ -262,7 +262,7 @@ class StreamTransport(ReceivingTransport):
                 return
             if not reported:
                 reported = True
-                message = "it answered and sent no samples: commanded to stream, which is not saved"
+                message = "it replied but sent no samples: imud started its output and did not save this"
                 self._context.notices.raise_event(
                     self._host.now_ns(), EventKind.CONFIGURATION, message, acknowledged=acknowledged
                 )
@@ -279,7 +279,9 @@ class StreamTransport(ReceivingTransport):
 
     def _require_device(self) -> None:
         if not self.receiving:
-            raise CommandError(f"{self._config.name} is searched for at all baud rates now: try again in some seconds")
+            raise CommandError(
+                f"{self._config.name}: cannot run a command during the search; try again in some seconds"
+            )
 
     def change_rate(self, request: Request) -> None:
         """Follow a script that has changed the baud rate of the device."""
@@ -337,12 +339,14 @@ class StreamTransport(ReceivingTransport):
         health = self._health
         unheard = self._is_unheard(path)
         if unheard:
-            problem = f"bytes come on {self.where}, but no valid frame: wrong baud rate or device?"
+            problem = f"bytes arrive on {self.where}, but no valid frame; check the baud rate and the driver"
             self._report_silence(problem, now_ns, ended=health.state is DeviceState.RUNNING)
         elif self._has_answered(path):
             self._report_silence(self._words_of_silence(), now_ns, ended=health.state is DeviceState.SEARCHING)
         elif health.state is DeviceState.SEARCHING:
-            health.report(f"nothing is heard on {self.where}: is it powered, are TX and RX swapped?")
+            health.report(
+                f"no byte arrives on {self.where}; check the power supply of the device and the wires TX and RX"
+            )
             if self.attachments.can_reset and path.last_data_ns <= path.begun_ns:
                 self._search.search_again()
         if not self.busy and ((unheard and self._searchable) or self._is_overdue(path, now_ns)):
@@ -384,8 +388,8 @@ class StreamTransport(ReceivingTransport):
         firmware = f"firmware {known.identity.firmware}" if known.identity.firmware else ""
         names = ", ".join(filter(None, (known.identity.product, firmware)))
         why = driver.why_silent(known.settings)
-        hint = "; the action wake makes it send" if "wake" in driver.actions else ""
-        return f"it answers{f' ({names})' if names else ''} and sends no samples: {why}{hint}"
+        hint = "; the action wake starts its output" if "wake" in driver.actions else ""
+        return f"it replies{f' ({names})' if names else ''} but sends no samples: {why}{hint}"
 
     # --- state -------------------------------------------------------------------------------------------------------
 

@@ -81,7 +81,7 @@ class AttitudeWatch:
             return finding.message
         if self._config.declination_deg is not None and heading in (Heading.RELATIVE, Heading.TRUE):
             why = "counts from power-on" if heading is Heading.RELATIVE else "is true already"
-            return f"declination_deg is given, but the device's heading {why}"
+            return f"declination_deg is configured, but the heading of the device {why}"
         return ""
 
 

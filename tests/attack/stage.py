@@ -50,9 +50,9 @@ LOST_SETTLE_S = 1.0
 QUIET_LIMIT_S = 10.0
 """Time until closed connections are gone, s, with the connections that wait for acceptance at 64 per second and
 user."""
-LOG_SPOILT = b"the configuration stays as it was"
+LOG_SPOILT = b"the old configuration stays active"
 LOG_FILLER = b"-" * 63
-LOG_EXPECTED = (b"nothing is heard on", LOG_SPOILT, LOG_FILLER, b" is gone (hung up)")
+LOG_EXPECTED = (b"no byte arrives on", LOG_SPOILT, LOG_FILLER, b" is gone (hung up)")
 PROBLEMS = 20
 
 

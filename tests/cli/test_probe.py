@@ -110,7 +110,7 @@ def test_a_silent_port_a_port_that_ends_and_one_that_cannot_be_opened(ports: Por
     silent.module_is_on = False
     report = printed(cli, status=1)
     assert (report.driver, report.title, silent.written) == ("", "FT232R", [])
-    assert "heard nothing at 115200, " in report.problem
+    assert "got no byte at 115200, " in report.problem
     assert printed(cli, "--active", PORT, status=1).driver == ""
     assert silent.written, "a silent module may be asked for samples"
     for error, problem in ((LinkError("it was pulled out"), "it was pulled out"), (None, f"{PORT} ended")):

@@ -79,7 +79,7 @@ def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, words: tupl
     cli(*words, "--set", "sout_divisor=4", 'output={"hi91": 20}')
     assert (actual(daemon)["sout_divisor"], actual(daemon)["output"]["hi91"]) == (4, 20)
     out = cli(*words, "--set", "mounting=x_up", status=1).out
-    assert "left out: mounting comes into force by save and restart only" in out
+    assert "left out: mounting needs a save and a restart" in out
 
 
 def test_another_rate_is_asked_for_and_followed(
@@ -102,7 +102,7 @@ def test_mistakes_are_explained(words: tuple[object, ...], cli: Cli, tmp_path: P
         "mode": "expected NAME=VALUE, got 'mode'",
         "mod=9": 'expected a setting that imud knows, got "mod"; did you mean mode?',
         "mode=7": 'mode: expected one of "6-axis", "9-axis", got 7',
-        "magnetometer_bias=1": "magnetometer_bias: it can only be read",
+        "magnetometer_bias=1": "magnetometer_bias: it is read-only",
     }.items():
         cli.refuses(problem, *words, "--set", value)
     file = tmp_path / "bow.yaml"

@@ -141,13 +141,15 @@ async def test_a_bias_that_stays_is_told_and_not_saved(rig: GuideRig) -> None:
 async def test_what_samples_do_not_tell_is_not_verified(rig: GuideRig) -> None:
     expectation = replace(GYRO_ZERO, value=lambda _means: None)
     result = await rig.guide.run("gyro", gyro(rig, expected=(expectation,)), save=False)
-    assert result.problem == "mean angular rate: the samples do not tell it"
+    assert result.problem == "mean angular rate: the samples do not contain this value"
 
 
 @played(GuideRig)
 async def test_motion_refuses_before_anything_is_sent(rig: GuideRig) -> None:
     rig.motion = lambda _t_s: (0.0, 0.0, 0.5)
-    with pytest.raises(CommandError, match=r"expected the device at rest, got: it turns at 28\.6 °/s .* put it down"):
+    with pytest.raises(
+        CommandError, match=r"expected the device at rest, got: it turns at 28\.6 °/s .* put the device on a surface"
+    ):
         await rig.guide.run("gyro", gyro(rig), save=False)
     assert rig.ran == []
     assert rig.phases()[-2:] == ["rest", "end"]
@@ -191,7 +193,7 @@ async def test_rest_is_waited_for(rig: GuideRig) -> None:
 async def test_motion_while_it_runs_spoils_it(rig: GuideRig) -> None:
     rig.motion = lambda t_s: (0.0, 0.0, 0.5 if 4 < t_s < 4.5 else 0.0)
     result = await rig.guide.run("gyro", gyro(rig), save=True)
-    assert result.problem.startswith("the device moved while it was calibrated: the angular rate changes by 2")
+    assert result.problem.startswith("the device moved during the calibration: the angular rate changes by 2")
     assert not result.saved
     assert rig.ran == ["begin"]
 
@@ -199,7 +201,7 @@ async def test_motion_while_it_runs_spoils_it(rig: GuideRig) -> None:
 @played(GuideRig)
 async def test_no_samples(rig: GuideRig) -> None:
     rig.silent = True
-    with pytest.raises(CommandError, match="gyro: expected samples of the device, got none for 20 s"):
+    with pytest.raises(CommandError, match="gyro: expected samples of the device, got no sample for 20 s"):
         await rig.guide.run("gyro", gyro(rig), save=False)
     assert rig.clock.now_ns() >= 1020 * NS_PER_S
 
@@ -209,7 +211,7 @@ async def test_refusals(rig: GuideRig) -> None:
     async def refuse() -> None:
         raise Rejected("no")
 
-    with pytest.raises(CommandError, match="heading: expected no `save`, for its result lasts until power-off"):
+    with pytest.raises(CommandError, match="heading: cannot save: the result lasts until power-off"):
         await rig.guide.run("heading", gyro(rig, kept=Kept.NEVER), save=True)
     with pytest.raises(CommandError, match="gyro: set the mode first"):
         await rig.guide.run("gyro", gyro(rig, unready=rig.does("ready?", "set the mode first")), save=False)
@@ -301,10 +303,10 @@ async def test_a_device_that_was_calibrated_before_needs_the_turning_only(rig: G
 @pytest.mark.parametrize(
     ("prepare", "words"),
     [
-        (lambda _rig: None, "its samples have no magnetic field"),
-        (lambda rig: setattr(rig, "mag_t", lambda _t_s: (3e-5, 0.0, 0.0)), "turned into 2% of the directions"),
+        (lambda _rig: None, "its samples contain no magnetic field"),
+        (lambda rig: setattr(rig, "mag_t", lambda _t_s: (3e-5, 0.0, 0.0)), "turned to 2% of the directions"),
         (lambda rig: setattr(rig, "mag_t", lambda t_s: tumble().at(t_s).mag_t), "turned by less than 360°"),
-        (turned_by_hand, "the field is good: repeat it more slowly"),
+        (turned_by_hand, "the field is good: repeat the calibration more slowly"),
         (turned_where_it_is_disturbed, "the field is disturbed: go outdoors"),
     ],
     ids=["no field", "at rest", "gyroscope at rest", "not accepted", "disturbed"],
@@ -323,7 +325,7 @@ async def test_advice(rig: GuideRig, prepare: Callable[[GuideRig], object], word
     assert 98 <= len(asked) <= 101  # every 3 s
     assert not result.verified
     assert not result.saved
-    assert result.problem.startswith("the device did not end the calibration within 300 s; ")
+    assert result.problem.startswith("the device did not finish the calibration within 300 s; ")
     assert words in result.problem
 
 
@@ -358,7 +360,7 @@ async def test_six_axes_have_no_use_for_the_magnetometer(it: WiredDevice) -> Non
     await it.wait(2)
     with pytest.raises(CommandError, match=r"magnetometer: expected 9-axis mode, .* action mode, axes=9"):
         await it.device.calibrate("magnetometer", save=False)
-    with pytest.raises(BadArgument, match=r"no calibration 'gyro'; there are: magnetometer, .*, heading"):
+    with pytest.raises(BadArgument, match=r"unknown calibration 'gyro'; expected: magnetometer, .*, heading"):
         await it.device.calibrate("gyro", save=False)
 
 

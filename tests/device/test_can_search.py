@@ -74,7 +74,7 @@ def test_one_device_is_found_beside_strangers_and_several_are_named() -> None:
     assert Round().hear(*strangers, fake_can_frame(8), *strangers, fake_can_frame(8, 1)).found() == "fake-can node 8"
     frames = [f for n in (1, 2) for f in (fake_can_frame(8, n), fake_can_frame(9, n), *imu61x(n))]
     assert Round().hear(*frames).complaint() == (
-        "3 devices are heard on can0, fake-can node 8, fake-can node 9, imu61x-can base_id 101: name driver and options"
+        "3 devices send on can0: fake-can node 8, fake-can node 9, imu61x-can base_id 101; configure driver and options"
     )
 
 
@@ -87,7 +87,7 @@ def test_samples_that_are_not_whole_are_waited_for_and_told() -> None:
     assert heard.found() == "imu61x-can base_id 101"
     heard = Round().hear(*imu61x(1)[:3], *imu61x(2)[:3])
     assert heard.complaint() == (
-        "frames as of imu61x-can base_id 101 come on can0, but no whole sample: name driver and options"
+        "frames of imu61x-can base_id 101 arrive on can0, but no complete sample; configure driver and options"
     )
     assert 6 * NS_PER_S <= heard.until_ns < 6 * NS_PER_S + 2 * LISTEN_NS
 
@@ -95,11 +95,11 @@ def test_samples_that_are_not_whole_are_waited_for_and_told() -> None:
 def test_unknown_frames_are_shown_by_their_identifiers_and_silence_as_such() -> None:
     frames = [CanFrame(0x18FEE9AA, True, bytes(8), 0), CanFrame(0x65, True, bytes(8), 0), CanFrame(0x7, False, b"", 0)]
     assert Round().hear(*frames).complaint() == (
-        "frames come on can0 that no driver knows (0x007, 0x00000065, 0x18FEE9AA): name driver and options"
+        "unknown frames arrive on can0 (0x007, 0x00000065, 0x18FEE9AA); configure driver and options"
     )
     many = [CanFrame(number, False, b"", 0) for number in range(12)]
     assert "0x007 and 4 more" in Round().hear(*many).complaint()
-    assert "nothing is heard on can0" in Round().complaint()
+    assert "no frame arrives on can0" in Round().complaint()
 
 
 def test_devices_of_others_are_left_to_them() -> None:

@@ -37,8 +37,8 @@ def test_imud_itself_is_stopped_before_people_are() -> None:
         assert not asked.refusal()
         asked.count()
         days.now_s += 1
-    assert "written 40 times within 24 hours, and 40 are allowed" in asked.refusal()
-    assert "allowed by imud itself" in itself.refusal()
+    assert "written 40 times in 24 hours, the limit is 40" in asked.refusal()
+    assert "the limit of imud itself" in itself.refusal()
     assert not ModuleFlash(writes, "B", asked=False).refusal()
     days.now_s = BEGIN_S + DAY_S + LIMIT_ASKED - LIMIT_ITSELF - 1
     assert itself.refusal()

@@ -71,12 +71,12 @@ def test_an_event_is_logged_at_once_after_another_kind_of_trouble(caplog: pytest
         ledger.frames_bad_crc += 1
         notices.bad_frame(BadFrame(BadReason.CRC, bytes((0x5A, 0xA5, t))))
         notices.tick(t * S, None)
-    notices.raise_event(2 * S, EventKind.CONFIGURATION, "settings are not as declared")
+    notices.raise_event(2 * S, EventKind.CONFIGURATION, "settings differ from the declared settings")
     for record in caplog.records:
         record.created = 1000.0
     told = [record.getMessage() for record in caplog.records if repeats.filter(record)]
     assert told == [
         "bow: 2 samples lost",
         "bow: 1 bad frame, the last by crc: 5a a5 00",
-        "bow: settings are not as declared",
+        "bow: settings differ from the declared settings",
     ]

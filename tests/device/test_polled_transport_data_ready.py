@@ -216,7 +216,7 @@ async def test_no_edges_any_more_and_edges_again(bench: PolledBusBench) -> None:
     async with scene(bench) as it:
         await it.rig.until_samples(20)
         it.signal.quiet = True
-        await it.rig.until(it.told("no edges: read at 100 Hz instead"), "told")
+        await it.rig.until(it.told("no edges: imud reads at 100 Hz"), "told")
         count = len(it.rig.samples)
         await it.rig.until_samples(50)
         assert it.rig.device.status().expected_rate_hz == RATE_HZ
@@ -226,7 +226,7 @@ async def test_no_edges_any_more_and_edges_again(bench: PolledBusBench) -> None:
         steps = [b.t_ns - a.t_ns for a, b in pairwise(by_deadlines)]
         assert sum(steps) / len(steps) == pytest.approx(10 * MS, rel=0.01)
         it.signal.quiet = False
-        await it.rig.until(it.told("edges are back"), "told")
+        await it.rig.until(it.told("edges have returned"), "told")
         count = len(it.rig.samples)
         await it.rig.until_samples(50)
         numbers = [it.dated(sample) for sample in it.rig.samples[count:]]
@@ -249,7 +249,7 @@ async def test_without_the_line_deadlines_serve_until_it_comes(bench: PolledBusB
         assert status.lines is not None
         assert status.lines.problems == {"data_ready": "no such line"}
         it.signal.line.open_error = None
-        await it.rig.until(it.told("edges are back"), "told")
+        await it.rig.until(it.told("edges have returned"), "told")
         await it.rig.until_samples(20)
         it.dated(it.rig.samples[-1])
 

@@ -137,8 +137,8 @@ async def test_commands_go_to_the_device_that_is_configured(bus: Bus) -> None:
 @played(Bus)
 async def test_several_are_named_and_the_search_goes_on(bus: Bus) -> None:
     bench = bus.add()
-    await bench.until(lambda: "2 devices are heard" in bench.rig.problem, 8, 9)
-    assert "fake-can node 8, fake-can node 9: name driver and options" in bench.rig.problem
+    await bench.until(lambda: "2 devices send on can0" in bench.rig.problem, 8, 9)
+    assert "fake-can node 8, fake-can node 9; configure driver and options" in bench.rig.problem
     assert bench.device.state is DeviceState.SEARCHING
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 9)  # the other one was taken away
 
@@ -212,7 +212,7 @@ async def test_the_bus_goes_down_while_searching_and_comes_back(bus: Bus) -> Non
 @played(Bus)
 async def test_trouble_of_the_bus_explains_why_nothing_is_found(bus: Bus) -> None:
     bench = bus.add()
-    await bench.until(lambda: "nothing is heard on can0" in bench.rig.problem)
+    await bench.until(lambda: "no frame arrives on can0" in bench.rig.problem)
     bench.link.news("can0 is bus-off: x", "can0 is bus-off: x")
     await bench.until(lambda: bench.rig.problem == "can0 is bus-off: x")
 
@@ -251,4 +251,4 @@ async def test_a_second_sender_of_the_same_frame_is_refused(bus: Bus) -> None:
     assert "bow and mast would both send 0x080 on can0" in second.rig.problem
     assert not second.link.cyclic
     assert second.device.status().connects == 0  # it is not even opened
-    assert first.rig.problem.startswith("no sample has come yet")
+    assert first.rig.problem.startswith("no sample has arrived yet")

@@ -156,7 +156,8 @@ async def test_what_agrees_is_said_to(bench: ModuleBench) -> None:
 async def test_a_difference_is_told_once_and_nothing_is_written(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.is_in(SettingsState.DIFFER))
     await bench.pass_s(100)
-    message = 'settings are not as declared: mode is "6-axis", declared "9-axis", offset_deg is 0.0, declared 1.5'
+    found = 'mode is "6-axis", declared "9-axis", offset_deg is 0.0, declared 1.5'
+    message = f"settings differ from the declared settings: {found}"
     assert bench.messages == [message]
     assert bench.told[0].detail == {"mode": '"6-axis"', "offset_deg": "0.0"}
     assert bench.status.differences["mode"].declared == "9-axis"
@@ -189,8 +190,8 @@ async def test_compared_again_after_a_replug_a_restart_and_a_command(bench: Modu
     asked = bench.module.commands.count("GET")
     bench.module.restart()
     await bench.until(lambda: bench.module.commands.count("GET") > asked, limit_s=3)
-    differ = 'settings are not as declared: mode is "9-axis", declared "6-axis"'
-    assert bench.messages == [differ, differ, "settings are as declared again"]
+    differ = 'settings differ from the declared settings: mode is "9-axis", declared "6-axis"'
+    assert bench.messages == [differ, differ, "settings agree with the declared settings again"]
 
 
 @played(lambda: ModuleBench(declared={"mode": "6-axis"}, pauses_clock=True))
@@ -207,13 +208,13 @@ async def test_a_device_whose_clock_begins_anew_by_the_question_is_asked_once(be
 @played(lambda: ModuleBench(declared={"mode": "6-axis"}, silent={"GET"}))
 async def test_a_device_that_does_not_tell_its_settings_is_asked_ever_more_seldom(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.messages)
-    assert bench.messages == ["settings could not be read, asked 3 times: GET: expected OK, got nothing"]
+    assert bench.messages == ["cannot read the settings after 3 tries: GET: expected OK, got nothing"]
     await bench.pass_s(sum(IDENTIFY_AGAIN_S) + 10)  # the identity is asked for with them, four times more
     asked = bench.module.commands.count("GET")
     await bench.pass_s(2 * IDENTIFY_AGAIN_S[-1])
     assert asked + 1 <= bench.module.commands.count("GET") <= asked + 2
     assert bench.is_in(SettingsState.UNKNOWN)
-    assert "could not be read" in bench.status.problem
+    assert "cannot read the settings" in bench.status.problem
     bench.module.silent = set()
     bench.module.restart()
     await bench.until(lambda: bench.is_in(SettingsState.AGREE))
@@ -231,7 +232,7 @@ async def test_apply_sets_what_is_in_force_at_once_and_leaves_flash_alone(bench:
     assert bench.written() == ['SET mode="9-axis"', "SET secret=5"]
     assert bench.module.flash == FACTORY
     assert bench.status.flash_writes == 0
-    assert "mounting comes into force by save and restart only" in bench.status.problem
+    assert "mounting needs a save and a restart" in bench.status.problem
     last = bench.told[-1]
     assert last.message == ('settings: mode set to "9-axis" (was "6-axis"), secret set to 5: written, not verified')
     assert last.detail == {"saved": False, "mode": "done", "secret": "written, not verified"}
@@ -344,7 +345,7 @@ async def test_each_module_that_takes_the_place_of_another_is_set_at_once(bench:
 async def test_a_device_that_forgets_is_set_again_after_growing_pauses(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.status.repairs == 1)
     assert bench.messages[-1].endswith(
-        'mode: wrote "9-axis", read back "6-axis"; what was written before holds until the device restarts'
+        'mode: wrote "9-axis", read back "6-axis"; the previous writes last until the device restarts'
     )
     times_s, reads, asked = [], [], bench.module.commands.count("GET")
     for number in range(2, 5):
@@ -359,7 +360,7 @@ async def test_a_device_that_forgets_is_set_again_after_growing_pauses(bench: Mo
     await bench.pass_s(3)
     bench.module.restart()
     await bench.pass_s(20)
-    assert "does not keep its settings" in bench.status.problem
+    assert "the device loses its settings" in bench.status.problem
     assert bench.is_in(SettingsState.DIFFER)
     asked = bench.module.commands.count("GET")
     await bench.pass_s(3500)
@@ -375,7 +376,7 @@ async def test_flash_is_written_a_few_times_a_day_by_itself_and_still_for_people
         bench.module.flash = dict(FACTORY)
         bench.module.restart()
     await bench.until(lambda: "not saved" in bench.messages[-1], limit_s=4000)
-    assert "allowed by imud itself" in bench.status.problem
+    assert "the limit of imud itself" in bench.status.problem
     assert bench.module.saves == LIMIT_ITSELF
     assert bench.module.set["mode"] == "9-axis"  # it is set all the same
     applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
@@ -479,7 +480,7 @@ def test_a_step_that_fails_ends_the_plan_and_nothing_is_saved() -> None:
         "offset_deg": StepOutcome.NOT_DONE,
     }  # fmt: skip
     assert applied.problem == (
-        'output: SET output={"a":10}: the module refused; what was written before holds until the device restarts'
+        'output: SET output={"a":10}: the module refused; the previous writes last until the device restarts'
     )
     assert not applied.saved
     assert not applied.restarted
@@ -487,7 +488,7 @@ def test_a_step_that_fails_ends_the_plan_and_nothing_is_saved() -> None:
     assert bench.module.flash == FACTORY
     assert bench.module.set == {**FACTORY, "mode": "9-axis"}
     bench, applied = applied_with(WANTED, lambda module: module.refuses.add("mode"))
-    assert applied.problem == 'mode: SET mode="9-axis": the module refused; nothing else was written'
+    assert applied.problem == 'mode: SET mode="9-axis": the module refused; no other setting was written'
     assert bench.module.set == FACTORY
     _bench, applied = applied_with(WANTED, lambda module: module.forgets.add("offset_deg"))
     assert outcomes(applied)["offset_deg"] is StepOutcome.FAILED
@@ -510,7 +511,7 @@ def test_a_device_that_falls_silent_in_the_middle() -> None:
 
     _bench, applied = applied_with(WANTED, prepare)
     assert outcomes(applied)["output"] is StepOutcome.FAILED
-    assert applied.problem == 'output: SET output={"a":10}: expected OK, got nothing; what it has now is not known'
+    assert applied.problem == 'output: SET output={"a":10}: expected OK, got nothing; its present settings are unknown'
 
 
 def test_a_restart_or_a_save_that_fails_says_what_is_set() -> None:
@@ -523,7 +524,7 @@ def test_a_restart_or_a_save_that_fails_says_what_is_set() -> None:
     _bench, applied = applied_with({"mode": "9-axis"}, lambda module: module.silent.add("SAVE"))
     assert outcomes(applied) == {"mode": StepOutcome.DONE}
     assert applied.problem == (
-        "not saved: SAVE: expected OK, got nothing; what was written before holds until the device restarts"
+        "not saved: SAVE: expected OK, got nothing; the previous writes last until the device restarts"
     )
     bench, applied = applied_with({"baud": 921600, "mounting": "x_up", "mode": "9-axis"}, lambda _: None, save=False)
     assert list(applied.left_out) == ["baud", "mounting"]
@@ -537,7 +538,7 @@ def test_another_rate_is_followed_unless_the_device_is_not_heard_at_it() -> None
     assert (bench.module.baud, bench.module.set["baud"], bench.module.saves) == (921600, 921600, 1)
     assert (applied.problem, applied.saved) == ("", True)
     assert applied.advice == (
-        "change `memory.baud: 115200` in the configuration to 921600: imud looks for the device there at its next start"
+        "change `memory.baud: 115200` in the configuration to 921600: imud uses this value at its next start"
     )
     assert bench.status.flash_writes == 1
     assert bench.rig.kinds.count(EventKind.UP) == 1
@@ -561,7 +562,7 @@ async def test_commands_that_save_count_and_are_limited(bench: ModuleBench) -> N
     assert bench.status.flash_writes_day == bench.module.saves == LIMIT_ASKED
     sent = bench.module.commands.count("ZERO")
     for saving in (bench.device.act("save", {}), bench.device.calibrate("zero", save=True)):
-        with pytest.raises(CommandError, match="bow: its flash was written 40 times within 24 hours"):
+        with pytest.raises(CommandError, match="bow: its flash was written 40 times in 24 hours"):
             await bench.doing(saving)
     applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
     assert "not saved: its flash was written 40 times" in applied.problem
@@ -578,7 +579,7 @@ async def test_a_command_does_not_wait_for_another_one_for_ever(bench: ModuleBen
     await bench.pass_s(2)
     waiting = asyncio.ensure_future(bench.device.act("wait", {}))
     await bench.pass_s(1)
-    with pytest.raises(CommandError, match="another command or a calibration is still under way"):
+    with pytest.raises(CommandError, match="another command or a calibration is still running"):
         await bench.doing(bench.device.settings_report(fresh=True))
     waiting.cancel()
     await bench.pass_s(1)

@@ -118,5 +118,5 @@ def test_errors_of_device_and_link_are_an_answer(error: Exception) -> None:
     device = TableOfOne(error)
     device.result = error
     found = applied(device)
-    assert found.problem == f"x: {error}; nothing else was written"
+    assert found.problem == f"x: {error}; no other setting was written"
     assert device.done == ["x=2", "read"]

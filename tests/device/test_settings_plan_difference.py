@@ -46,7 +46,7 @@ def test_words_name_both_values_and_given_values_get_the_types_of_the_table() ->
     ("given", "message"),
     [
         ({"mod": 1}, 'expected a setting that imud knows, got "mod"; did you mean mode?'),
-        ({"hours": 1}, "hours: it can only be read"),
+        ({"hours": 1}, "hours: it is read-only"),
         ({"mode": 7}, 'mode: expected one of "6-axis", "9-axis", got 7'),
         ({"offset_deg": 181}, "offset_deg: expected a number from -180 to 180, got 181"),
         ({"secret": None}, "secret: expected a whole number from 0 to 9, got null"),

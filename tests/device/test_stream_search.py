@@ -86,7 +86,7 @@ def test_nothing_is_sent_without_leave_or_to_another_kind_of_device() -> None:
     assert isinstance(result, GaveUp)
     assert far.sent_to == []
     assert {listen.baud for listen in listens} == set(BAUD_RATES)
-    assert "heard nothing at 115200" in result.summary
+    assert "got no byte at 115200" in result.summary
     assert "query" not in result.summary
     far = replace(device(115200, 10), noise=b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
     result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far)

@@ -89,7 +89,7 @@ def test_every_driver_is_asked_as_often_at_the_rates() -> None:
     far = device(HIPNUC, 57600, 0)
     result, _, _ = run_search(Search(FAMILIES, may_ask=True), far)
     assert isinstance(result, GaveUp)
-    assert "no answer to a query" in result.summary
+    assert "no reply to a query" in result.summary
     bauds = {baud for driver in FAMILIES for baud in driver.baud_rates}
     for query, _ in ANSWERS.values():
         asked = [baud for baud, sent in far.sent_to if sent == query]

@@ -234,9 +234,9 @@ async def test_detection_locks_counts_every_byte_and_is_remembered(rig: DeviceRi
 @told(play)
 async def test_a_device_without_samples_is_given_time_and_then_says_what_to_look_at(rig: DeviceRig) -> None:
     rig.tick()
-    assert rig.problem == "no sample has come yet: wait until the search has listened for a while"
+    assert rig.problem == "no sample has arrived yet; wait for the search"
     rig.tick(ahead_ns=3000 * MS)
-    assert rig.problem.startswith("nothing is heard on memory at 115200 baud")
+    assert rig.problem.startswith("no byte arrives on memory at 115200 baud")
     rig.tick()
     feed(rig, hi91(10))
     rig.tick()
@@ -356,7 +356,7 @@ def test_a_device_that_refuses_to_stream_is_told_again_and_of_once(monkeypatch: 
         await module.pass_s(20)
         assert len(told) >= 5
         assert min(after - before for before, after in pairwise(told)) >= 2e9
-        assert sum("commanded to stream" in event.message for event in module.rig.events) == 1
+        assert sum("started its output" in event.message for event in module.rig.events) == 1
 
     module.play(story)
 
@@ -475,7 +475,7 @@ async def test_bytes_without_frames_say_so(rig: DeviceRig) -> None:
     later_ns = rig.now_ns() + 2500 * MS
     rig.link.feed(b"\x00" * 100, later_ns)
     rig.device.tick(later_ns + 100 * MS)
-    assert rig.problem.startswith("bytes come on memory at 115200 baud, but no valid frame")
+    assert rig.problem.startswith("bytes arrive on memory at 115200 baud, but no valid frame")
 
 
 @told(play)

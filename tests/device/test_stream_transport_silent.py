@@ -53,7 +53,7 @@ async def test_a_module_that_is_silent_by_its_settings_is_known_and_left_so(
     await device.wait(35)
     assert device.rig.is_in(DeviceState.SILENT)
     assert device.problem == (
-        f"it answers (HI14R3, firmware 1.5.6) and sends no samples: {why}; the action wake makes it send"
+        f"it replies (HI14R3, firmware 1.5.6) but sends no samples: {why}; the action wake starts its output"
     )
     assert device.device.status().identity["serial_number"] == "043995698D6E1708"
     assert device.module.settings == settings
@@ -84,7 +84,7 @@ async def test_commands_are_accepted_as_soon_as_it_has_answered(device: LinkedDe
 async def test_output_that_is_only_switched_off_is_switched_on(device: LinkedDevice, link: dict[str, Any]) -> None:
     device.module.receive(b"LOG DISABLE\r\n", device.clock.now_ns())
     await device.until(lambda: len(device.samples) > 20)
-    assert "it answered and sent no samples: commanded to stream, which is not saved" in device.messages
+    assert "it replied but sent no samples: imud started its output and did not save this" in device.messages
     assert device.module.settings == device.module.flash == ModuleSettings()
     assert turns(device) == [EventKind.UP]
 
@@ -143,7 +143,7 @@ async def test_a_script_under_way_ends_when_a_search_begins_under_it(
     acting = [asyncio.ensure_future(device.device.act("restart", {})) for _ in range(3)]
     await device.until(lambda: all(one.done() for one in acting), limit_s=90)
     assert all(isinstance(one.exception(), CommandError) for one in acting)
-    assert any("is searched for at all baud rates now" in str(one.exception()) for one in acting)
+    assert any("cannot run a command during the search" in str(one.exception()) for one in acting)
     reboots = [baud for baud, data in device.link.sent_at if data.startswith(b"REBOOT")]
     assert set(reboots) == {115200}
 

@@ -19,7 +19,7 @@ from tests.support.wired_device import Imu61xLine, play_on_line
 
 QUIET = Imu61xSettings(mode=OutputMode.COMMAND)
 STREAMING = Imu61xSettings()
-WOKEN = "it answered and sent no samples: commanded to stream, which is not saved"
+WOKEN = "it replied but sent no samples: imud started its output and did not save this"
 
 
 class WakeBench:
@@ -38,7 +38,7 @@ class WakeBench:
 
     @property
     def woken(self) -> list[str]:
-        return [event.message for event in self.events if "commanded to stream" in event.message]
+        return [event.message for event in self.events if "started its output" in event.message]
 
     async def until(self, condition: Callable[[], object], limit_s: float = 30.0) -> None:
         await self.rig.until(condition, str(self.line.written), limit_s, step_s=0.01)
@@ -60,7 +60,7 @@ async def test_device_saved_in_command_mode_is_made_to_stream(bench: WakeBench, 
     assert bench.woken == [WOKEN]
     assert bench.device.status().identity["serial_number"] == "003200473133510D33383736"
     assert bench.module.flash.mode is OutputMode.COMMAND
-    assert [e.kind for e in bench.events if "commanded to stream" in e.message] == [EventKind.CONFIGURATION]
+    assert [e.kind for e in bench.events if "started its output" in e.message] == [EventKind.CONFIGURATION]
 
 
 @pytest.mark.parametrize(

@@ -173,7 +173,9 @@ def test_a_declination_and_what_the_heading_counts_from() -> None:
     assert true.euler_deg[:2] == pytest.approx(plain.euler_deg[:2], abs=1e-4)
     relative = played("imu61x-uart", motion, 2.0, declination_deg=7.0)
     assert relative.status.heading is Heading.RELATIVE
-    assert relative.status.problem == "declination_deg is given, but the device's heading counts from power-on"
+    assert (
+        relative.status.problem == "declination_deg is configured, but the heading of the device counts from power-on"
+    )
 
 
 # --- the event --------------------------------------------------------------------------------------------------------
