@@ -1,4 +1,4 @@
-"""Fixtures of these tests."""
+"""Fixtures of tests/device."""
 
 from tests.support.leaks import _no_open_descriptor
 

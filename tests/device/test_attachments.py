@@ -1,4 +1,4 @@
-"""Devices with a reset line: reset when they are not found by other means, and when told to."""
+"""Devices with a reset line: imud resets a device that it cannot find, or on request."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
@@ -30,7 +30,7 @@ from tests.support.stories import in_bench, played
 
 LINES = DeviceLines(reset=ResetOptions(line="R"))
 BOOT_S = 2.9
-"""A little less than the manual says."""
+"""Start-up time of the device, a little shorter than in the manual."""
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PolledBusBench:
 
 
 def reset_line(lines: MemoryLines, now_ns: Callable[[], int], boot: Callable[[], None]) -> MemoryOutput:
-    """The line of a device that boots after each pulse."""
+    """Reset line of a device that boots after each pulse."""
 
     def changed(_t_ns: int, active: bool) -> None:
         if not active:
@@ -50,7 +50,7 @@ def reset_line(lines: MemoryLines, now_ns: Callable[[], int], boot: Callable[[],
 
 
 class Scene:
-    """A polled device that hangs, and the line that helps."""
+    """A polled device that hangs, and its reset line."""
 
     rig: DeviceRig
 
@@ -58,15 +58,13 @@ class Scene:
         self.line = reset_line(bench.lines, bench.clock.now_ns, self.boot)
         self.device = bench.registers()
         self.dead = False
-        """Whether it does not even boot."""
+        """Whether the device ignores the reset."""
         bench.spi.device = self.device.spi
 
     def hang(self) -> None:
-        """It answers no more."""
         self.device.faults.line = 0xFF
 
     def boot(self) -> None:
-        """It works again, its settings forgotten."""
         if self.dead:
             return
         self.device.restart()
@@ -121,7 +119,7 @@ async def test_nothing_is_asked_while_the_line_is_active_and_for_3_s(bench: Poll
         samples = len(it.rig.samples)
         await it.rig.until(lambda: not it.line.active, "released")
         await it.rig.until(task.done, "over")
-        assert it.device.transactions - asked <= 1  # the transfer that was under way
+        assert it.device.transactions - asked <= 1  # the transfer in progress
         assert await task is None
         assert bench.clock.now_ns() - begin_ns == pytest.approx(3.5e9, abs=10e6)
         await it.rig.until_samples(5)
@@ -137,7 +135,7 @@ async def test_reset_is_offered_with_a_line_only_and_also_while_no_device_is_fou
         with pytest.raises(BadArgument, match="unknown action 'reset'"):
             await rig.device.act("reset", {})
     async with polled(bench) as it:
-        assert "trigger" not in it.rig.device.actions  # it has lines, and no SIN
+        assert "trigger" not in it.rig.device.actions  # it has lines, but no SIN line
         it.hang()
         await it.rig.until(lambda: "received only 0xFF" in it.rig.device.status().problem, "searching")
         with pytest.raises(BadArgument, match="hard"):
@@ -169,7 +167,7 @@ def frame(timer_us: int) -> bytes:
 
 
 class Uart:
-    """A line whose device sends nothing until it is reset."""
+    """Reset line of a device that sends nothing before a reset."""
 
     def __init__(self, lines: DeviceLines, **link: Any) -> None:
         clock = self.clock = VirtualClock()
@@ -241,12 +239,12 @@ def test_where_the_measurement_is_reaches_the_clock() -> None:
     by_sout, by_sin = (make_clock("imu", lines, DRIVER, None) for _ in range(2))
     for i in range(200):
         at_ns = NS_PER_S + i * 10 * NS_PER_MS
-        by_sout.add_edges("sout", [Edge(at_ns + 90_000, False, 2 * i + 2)])  # the rising edge is counted back
+        by_sout.add_edges("sout", [Edge(at_ns + 90_000, False, 2 * i + 2)])  # imud computes the rising edge
         by_sin.add_triggers([TriggerStamp(at_ns, 0, i + 1)])
         m, t_rx_ns = Measurement(82, 0, 10_000 * i), at_ns + NS_PER_MS
         sample, answer = by_sout.sample(m, t_rx_ns, 0), by_sin.sample(m, t_rx_ns, 0)
     assert (sample.sync, sample.t_ns - at_ns) == (Sync.EDGE, -7_000)
-    assert sample.t_err_ns < 10_000  # 26 µs and more with the default of bias_us
+    assert sample.t_err_ns < 10_000  # at least 26 us with the default of bias_us
     assert (answer.sync, answer.t_ns - at_ns) == (Sync.EDGE, 9_000)
 
 
@@ -271,5 +269,5 @@ async def test_at_the_start_a_device_on_a_bus_is_reset_before_it_is_asked(bench:
 async def test_at_the_start_a_device_on_a_uart_is_reset(it: Uart) -> None:
     begin_ns = it.clock.now_ns()
     await it.until(lambda: len(it.rig.samples) > 10)
-    assert it.clock.now_ns() - begin_ns < 5e9  # without it: after a search of more than 4 s
+    assert it.clock.now_ns() - begin_ns < 5e9  # without at_start: after a search of more than 4 s
     assert [e.message for e in it.events if e.detail.get("line") == "reset"] == ["reset by its line at the start"]

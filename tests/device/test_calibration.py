@@ -1,4 +1,4 @@
-"""The guide with a device made of functions, and with a simulated module, in virtual time."""
+"""Guided calibrations of a fake device and of a simulated module, in virtual time."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
@@ -29,7 +29,7 @@ HARD_IRON_T: Vector3 = (14.14e-6, -2.08e-6, -8.75e-6)
 
 
 class GuideRig:
-    """A guide, the samples it sees, and what it runs on the device."""
+    """A guide with a fake transport and generated samples."""
 
     def __init__(self) -> None:
         self.clock = VirtualClock()
@@ -37,7 +37,7 @@ class GuideRig:
         self.ran: list[str] = []
         self.guide = CalibrationRun(cast(Transport, self), DeviceEvents("bow", Ledger(), self.events.append))
         self.motion: Callable[[float], Vector3] = lambda _t_s: (0.0, 0.0, 0.0)
-        """Angular rate by the time since the beginning."""
+        """Angular rate as a function of the time since the start."""
         self.mag_t: Callable[[float], Vector3 | None] = lambda _t_s: None
         self.silent = False
         self._begin_ns = self.clock.now_ns()
@@ -47,7 +47,7 @@ class GuideRig:
         return await made if isinstance(made, Awaitable) else made
 
     def does(self, name: str, answer: object = None, seconds: float = 0.0) -> Callable[[Target], Any]:
-        """A script that is noted, takes so long, and gives that answer."""
+        """Return a script that notes its name, lasts for `seconds`, and returns `answer`."""
 
         async def run() -> object:
             self.ran.append(name)
@@ -186,7 +186,7 @@ async def test_rest_is_waited_for(rig: GuideRig) -> None:
     rig.motion = lambda t_s: (0.0, 0.0, 0.5 if t_s < 5 else 0.0)
     assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified
     assert rig.phases()[:2] == ["begin", "rest"]
-    assert rig.phases().count("rest") == 3  # once for each window of 2 s
+    assert rig.phases().count("rest") == 3  # one event per window of 2 s
 
 
 @played(GuideRig)
@@ -239,7 +239,7 @@ async def test_it_can_be_ended(rig: GuideRig, end: str) -> None:
         else "calibration gyro: it was cancelled"
     )
     assert not rig.guide.cancel()
-    assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified  # and begun anew
+    assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified  # and the next calibration can start
 
 
 # --- turned -----------------------------------------------------------------------------------------------------------
@@ -256,7 +256,7 @@ def turned_by_hand(rig: GuideRig, hard_iron_t: Vector3 = (0.0, 0.0, 0.0)) -> Non
 
 
 def turned_where_it_is_disturbed(rig: GuideRig) -> None:
-    """A field that depends on the place: stronger where the module points to one side."""
+    """Return a field that is stronger in one direction."""
     turned_by_hand(rig)
 
     def mag_t(t_s: float) -> Vector3:
@@ -285,7 +285,7 @@ async def test_turning_ends_when_the_device_says_so(rig: GuideRig) -> None:
     assert field.value == pytest.approx(45.1e-6, rel=1e-3)
     assert rig.clock.now_ns() > 1060 * NS_PER_S
     turning = [event.detail for event in rig.events if event.detail["phase"] == "turn"]
-    assert len(turning) <= 2 * (rig.clock.now_ns() // NS_PER_S - 1000) + 2  # the first and the last one
+    assert len(turning) <= 2 * (rig.clock.now_ns() // NS_PER_S - 1000) + 2  # the first and the last query
     progress = [float(detail["progress"] or 0) for detail in turning]
     assert (progress[-1], max(progress)) == (1.0, 1.0)
     assert progress[0] < 0.1
@@ -319,10 +319,10 @@ async def test_advice(rig: GuideRig, prepare: Callable[[GuideRig], object], word
 
     def verdict() -> Verdict:
         asked.append(rig.clock.now_ns())
-        return Verdict(rig.clock.now_ns() > 1290 * NS_PER_S, "bias 0, 0, 0 µT")  # done, with the result of before
+        return Verdict(rig.clock.now_ns() > 1290 * NS_PER_S, "bias 0, 0, 0 µT")  # done, with the previous result
 
     result = await rig.guide.run("magnetometer", magnetometer(rig, verdict), save=False)
-    assert 98 <= len(asked) <= 101  # every 3 s
+    assert 98 <= len(asked) <= 101  # one query every 3 s
     assert not result.verified
     assert not result.saved
     assert result.problem.startswith("the device did not finish the calibration within 300 s; ")
@@ -378,8 +378,8 @@ async def test_level_and_heading_of_a_module(it: WiredDevice) -> None:
     await it.wait(5)
     newest = it.samples[-1].euler_rad
     assert newest is not None
-    assert abs(newest[0]) < 0.01  # the level was saved
-    assert abs(newest[2]) > 0.3  # the heading cannot be
+    assert abs(newest[0]) < 0.01  # the module has saved the level
+    assert abs(newest[2]) > 0.3  # the module cannot save the heading
 
 
 @pytest.mark.manual("B 2.2.4 rest")

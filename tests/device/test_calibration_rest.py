@@ -1,4 +1,4 @@
-"""Whether a device rests, by samples computed by hand."""
+"""Detection of rest, with samples computed by hand."""
 
 from math import pi, radians
 
@@ -33,7 +33,7 @@ def window(*samples: Sample) -> RestWindow:
 
 def test_rest() -> None:
     assert window(*[sample()] * WINDOW_SAMPLES).motion() == ""
-    assert window(sample(gyro=(radians(2), 0.0, 0.0))).motion() == ""  # a bias is no motion
+    assert window(sample(gyro=(radians(2), 0.0, 0.0))).motion() == ""  # a constant bias is not a motion
     assert window(sample(accel=None, gyro=None)).motion() == ""
 
 
@@ -71,7 +71,7 @@ def test_the_newest_samples_count_and_have_means() -> None:
     ).means()
     assert means.accel_m_s2 == (2.0, 0.0, 9.5)
     assert means.gyro_rad_s == (0.2, 0.0, 0.0)
-    assert means.euler_rad == pytest.approx((0.2, 0.0, -pi + 0.1))  # across ±180°
+    assert means.euler_rad == pytest.approx((0.2, 0.0, -pi + 0.1))  # angles on both sides of ±180°
     assert means.incli_rad is not None
     assert means.incli_rad[0] == pytest.approx(0.3)
     assert abs(means.incli_rad[1]) == pytest.approx(pi)

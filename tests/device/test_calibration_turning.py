@@ -1,4 +1,4 @@
-"""Coverage, turns and the fitted sphere, on points whose answer is known."""
+"""Coverage, turns and the fitted sphere for points with known results."""
 
 from itertools import permutations, product
 from math import pi
@@ -20,7 +20,7 @@ def sample(t_ns: int, mag: Vector3 | None = None, gyro: Vector3 | None = None) -
 
 
 def of(points: list[Vector3]) -> Turning:
-    """Those field vectors, a tenth of a second apart."""
+    """Return the result for these field vectors, 0.1 s apart."""
     turning = Turning()
     for number, point in enumerate(points):
         turning.add(sample(number * 100 * NS_PER_MS, point))
@@ -54,7 +54,7 @@ def test_sphere_of_six_points_and_its_residual() -> None:
     assert sphere.residual < 1e-9
     flattened = of(axes(40e-6)).fit()
     assert flattened is not None
-    # The mean of |m - c|² is (40² + 2·45²)/3 = 1883.3 = r², missed by -283.3, 141.7, 141.7: 200.3 / (2 r²) = 0.0532
+    # mean of |m - c|² = (40² + 2·45²)/3 = 1883.3 = r², residuals -283.3, 141.7, 141.7: 200.3 / (2 r²) = 0.0532
     assert flattened.radius_t == pytest.approx(43.4e-6, abs=1e-8)
     assert flattened.residual == pytest.approx(0.0532, abs=1e-4)
 
@@ -74,7 +74,7 @@ def test_no_sphere(points: list[Vector3]) -> None:
 
 
 def test_coverage_is_seen_from_the_centre() -> None:
-    """A field of 45 µT about a bias of 60 µT: seen from the origin, half of the directions are never reached."""
+    """A field of 45 µT with a bias of 60 µT covers half of the directions, seen from the origin."""
     truth = [tumble().at(second / 10).mag_t for second in range(1000)]
     turning = of([(x + 60e-6, y, z) for x, y, z in truth])
     sphere = turning.fit()
@@ -91,13 +91,13 @@ def test_turns_and_bounded_memory() -> None:
     for number in range(11):
         turning.add(sample(number * 100 * NS_PER_MS, None, (pi, -pi / 2, 0.0)))
     assert turning.turned_rad == pytest.approx((pi, pi / 2, 0.0))
-    turning.add(sample(5 * NS_PER_S, None, (pi, pi, pi)))  # four seconds without samples are not integrated
+    turning.add(sample(5 * NS_PER_S, None, (pi, pi, pi)))  # a gap of 4 s is not part of the angle
     assert turning.turned_rad == pytest.approx((pi, pi / 2, 0.0))
     assert not turning.has_field
-    # Two opposite directions are one after the other as often as points are kept; a third comes too late
+    # two alternating directions use all points, and a third direction arrives too late
     turning = of([(4e-5, 2e-5, 1e-5), (-4e-5, -2e-5, -1e-5)] * (POINTS_MAX // 2))
     turning.add(sample(10**12, (1e-5, 2e-5, 4e-5)))
     assert turning.cells(None).bit_count() == 2
     near = of([(4e-5, 2e-5, 1e-5 + number * 1e-9) for number in range(POINTS_MAX)])
     near.add(sample(10**12, (1e-5, 2e-5, 4e-5)))
-    assert near.cells(None).bit_count() == 2  # points that are the same take no place
+    assert near.cells(None).bit_count() == 2  # equal points use one place

@@ -1,4 +1,4 @@
-"""Who talks on a CAN bus: one device, several, none, strangers, claimed and remembered ones."""
+"""Detection on a CAN bus: one, several or no devices, unknown, claimed and remembered devices."""
 
 from random import Random
 
@@ -107,7 +107,7 @@ def test_devices_of_others_are_left_to_them() -> None:
     heard = Round(claimed=lambda can_id, extended: can_id in claimed and not extended)
     heard.hear(*(fake_can_frame(node, n) for n in (1, 2) for node in (8, 9)))
     assert heard.found() == "fake-can node 9"
-    claimed.add(BASE + 9)  # another device found it meanwhile
+    claimed.add(BASE + 9)  # another search has found it in the meantime
     assert "only frames of other configured devices" in heard.complaint()
 
 
@@ -129,7 +129,7 @@ def test_a_device_is_found_by_frames_whose_identifier_came_before_it_was_named()
 
 
 def test_only_protocols_that_yield_samples_are_named() -> None:
-    """A second driver names the same frames as those of its own device, and gets no samples out of them."""
+    """A second driver recognizes the same frames, but decodes no sample."""
     search = CanSearch([fake_can_driver("wrong", BASE - 1), FAKE], "can0")
     search.start(0)
     search.on_frames([fake_can_frame(8, 1), fake_can_frame(8, 2)])

@@ -1,4 +1,4 @@
-"""The life of a device on a CAN bus inside the process: streams, loses frames by cause, bus down and up."""
+"""A device on a CAN bus in memory: samples, lost frames by cause, bus down and up."""
 
 import asyncio
 from collections.abc import Callable, Coroutine, Sequence
@@ -37,7 +37,7 @@ def configured(
 
 
 class Frames:
-    """Samples of a module, whose frames are 1 ms apart."""
+    """Frames of a module, 1 ms apart."""
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
         self._clock, self._now_ns = now_ns, now_ns()
@@ -68,7 +68,7 @@ class CanDeviceBench:
 
 
 def play(story: Callable[[CanDeviceBench], Coroutine[Any, Any, None]], config: DeviceConfig | None = None) -> DeviceRig:
-    """Run the device while the story is told; at the end the ledger closes and the link is released."""
+    """Run the device during the story. At the end the ledger balances and the link is closed."""
     clock = VirtualClock()
     rigs = DeviceRigs(clock.host)
     rig = rigs.add(config or configured())
@@ -90,7 +90,7 @@ async def test_samples_of_one_read_are_one_batch_with_their_own_times(bench: Can
     assert rig.is_in(DeviceState.RUNNING)
     assert rig.batches == 1
     assert [s.seq for s in rig.samples] == [1, 2, 3]
-    # measured before its first frame was complete (111 bits at 500 kbit/s), known when the fifth was
+    # measured before the end of its first frame (111 bits at 500 kbit/s), complete after the fifth frame
     assert all(4 * MS + 222_000 <= s.t_rx_ns - s.t_ns < 4 * MS + 500_000 for s in rig.samples)
     assert [b.t_rx_ns - a.t_rx_ns for a, b in zip(rig.samples, rig.samples[1:], strict=False)] == [5 * MS] * 2
     assert rig.device.status().link == "can0 at 500 kbit/s"
@@ -99,7 +99,7 @@ async def test_samples_of_one_read_are_one_batch_with_their_own_times(bench: Can
 
 
 def delay_ns(name: str, settings: Options, bitrate: int) -> int:
-    """From the time of a sample to its arrival; four frames, 0.3 ms apart, every 10 ms."""
+    """Return the time from the measurement to the arrival; four frames, 0.3 ms apart, every 10 ms."""
     driver = DRIVERS[name]
     assert isinstance(driver, CanDriver)
     burst = driver.example_frames(Random(1))
@@ -135,11 +135,11 @@ async def test_only_own_identifiers_pass(bench: CanDeviceBench) -> None:
 @told(play)
 async def test_losses_by_cause(bench: CanDeviceBench) -> None:
     bench.feed(1, 2)
-    bench.link.feed(bench.frames(3, lost=[2]))  # nobody says why
+    bench.link.feed(bench.frames(3, lost=[2]))  # no reason is known
     bench.feed(4)
     bench.link.counters = KernelCounters(overrun=7)
     after = bench.frames(6)
-    bench.link.feed([after[0]._replace(after_loss=True), *after[1:]])  # 5 is the kernel's
+    bench.link.feed([after[0]._replace(after_loss=True), *after[1:]])  # the kernel counts 5
     damaged = bench.frames(7)
     bench.link.feed([*damaged[:4], damaged[4]._replace(data=b"\0" * 7)])
     bench.feed(8)
@@ -160,7 +160,7 @@ async def test_frames_from_before_a_loss_are_not_mixed_with_those_after(bench: C
 
 
 def test_a_device_that_has_not_answered_is_asked_on() -> None:
-    """Nobody answers: after the first minutes one try in five, as on a serial line."""
+    """No device replies: after the first minutes one query in five minutes."""
     clock = VirtualClock()
     rigs = DeviceRigs(clock.host)
     rig = rigs.add(configured("hipnuc-canopen", HipnucCanopenOptions(node=8)))
@@ -172,7 +172,7 @@ def test_a_device_that_has_not_answered_is_asked_on() -> None:
             end_ns = clock.now_ns() + int(pass_s * 1e9)
             await rig.until(lambda end_ns=end_ns: clock.now_ns() > end_ns, limit_s=pass_s + 1, step_s=0.1)  # type: ignore[misc]
             counts.append(len(rig.can_link.written))
-        assert counts == [3, 6, 7, 8, 9]  # a try is one request
+        assert counts == [3, 6, 7, 8, 9]  # a query is one request
 
     play_rigs(rigs, story, clock)
 
@@ -264,7 +264,7 @@ async def test_trouble_of_the_bus_is_shown_while_it_lasts(bench: CanDeviceBench)
     assert [e.message for e in rig.events if e.kind is EventKind.LINK][-1] == "can0 is error-active again"
 
 
-@pytest.mark.parametrize(("lost", "words"), [([], "nothing of imu61x-can is heard"), ([4], "no whole sample")])
+@pytest.mark.parametrize(("lost", "words"), [([], "no frame of imu61x-can arrives"), ([4], "no complete sample")])
 @told(play)
 async def test_silence_says_what_is_heard(bench: CanDeviceBench, lost: list[int], words: str) -> None:
     if lost:

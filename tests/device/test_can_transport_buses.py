@@ -1,4 +1,4 @@
-"""What devices of one CAN bus know of each other."""
+"""Claims, conflicts and bus load of the devices of one CAN bus."""
 
 from imud.device.can_transport import CanBuses
 from imud.formats.can import CanFilter, CyclicFrame

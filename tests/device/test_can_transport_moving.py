@@ -1,4 +1,4 @@
-"""Simulated modules of every kind made as they are declared, by a device on a CAN bus inside the process."""
+"""Declared settings of simulated modules of every kind, on a CAN bus in memory."""
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping
@@ -29,7 +29,7 @@ BIT_RATE = 500_000
 
 
 class BusInProcess:
-    """Modules, and a device of the daemon that is the first of them, in virtual time."""
+    """Simulated modules in virtual time; the first module is the device."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class BusInProcess:
         identify: bool = True,
         **declared: object,
     ) -> None:
-        """`declared` are settings that the daemon applies and saves by itself."""
+        """imud applies and saves the settings in `declared`."""
         self.clock = clock
         self.modules = CanModules(modules)
         self.rigs = DeviceRigs(HostClock(clock.now_ns, clock.realtime_ns, clock.now_ns))
@@ -56,7 +56,7 @@ class BusInProcess:
         self._passed_on = 0
 
     def step(self) -> None:
-        """Pass frames on, both ways."""
+        """Deliver the frames of both sides."""
         link, now_ns = self.rig.can_link, self.clock.now_ns()
         for payload in link.written[self._passed_on :]:
             can_id, size, data = RAW_FRAME.unpack(payload)
@@ -68,7 +68,7 @@ class BusInProcess:
         await self.rig.until(condition, what, 120.0, step=self.step)
 
     async def done(self, work: Coroutine[Any, Any, Any]) -> Any:
-        """What comes of something that the device does, while the modules go on."""
+        """Return the result of `work`, while the modules run."""
         task = asyncio.create_task(work)
         await self.until(task.done, "its end")
         return task.result()
@@ -82,7 +82,7 @@ class BusInProcess:
 
 
 async def made_so(bus: BusInProcess, wanted: Mapping[str, object], *, verified: bool) -> None:
-    """Apply settings with saving, and judge what is said of each."""
+    """Apply and save settings, and check the result of each setting."""
     applied = await bus.done(bus.rig.device.settings_apply(wanted, save=True))
     assert applied.problem == "", applied
     assert {step.name for step in applied.steps} == set(wanted)
@@ -136,7 +136,7 @@ def test_a_j1939_module_is_made_as_declared(variant: str) -> None:
 
 
 def test_a_node_that_was_found_by_listening_is_told_what_it_is_commanded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is not asked for its identity."""
+    """The configuration forbids queries of the identity."""
     monkeypatch.setattr("imud.device.can_search.LISTEN_NS", 100_000_000)
     clock = VirtualClock()
     module = HipnucCanopenModule(clock.now_ns(), HipnucCanopenHardware(factory=NodeSettings(node=9), boot_ms=0))

@@ -1,4 +1,4 @@
-"""Writes to flash: counted over all runs, limited per day, whatever the wall clock does."""
+"""Flash writes: counted over all runs, limited per day, with any wall clock."""
 
 from contextlib import closing
 from pathlib import Path
@@ -18,7 +18,7 @@ BEGIN_S = 1_800_000_000
 
 
 class Days:
-    """A wall clock that is set."""
+    """A wall clock that the test sets."""
 
     def __init__(self) -> None:
         self.now_s = BEGIN_S
@@ -82,6 +82,6 @@ def test_a_damaged_file_costs_the_count_only(tmp_path: Path, content: bytes, cap
     with closing(FlashWrites(tmp_path, Days().host)) as writes:
         assert writes.writes("A") == 0
         writes.count("A")
-    assert "counted from the beginning" in caplog.text
+    assert "counts the writes to flash from 0" in caplog.text
     with closing(FlashWrites(tmp_path, Days().host)) as writes:
         assert writes.writes("A") == 1

@@ -1,4 +1,4 @@
-"""Backups: read back by a person's program, dated, bounded in number, and never lost half-written."""
+"""Backups: readable YAML files with a date, limited in number, never half-written."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Events come at a bounded rate and say what is behind them."""
+"""Events have a limited rate and contain their causes."""
 
 import msgspec
 import pytest

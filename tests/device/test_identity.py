@@ -1,4 +1,4 @@
-"""What is known of a device, and what is reported when it differs from before."""
+"""Identity and settings of a device, and events about changes."""
 
 from collections.abc import Mapping
 
@@ -19,7 +19,7 @@ def update(known: KnownIdentity, identity: Identity, settings: Mapping[str, str]
 
 def test_only_differences_to_a_known_device_are_reported() -> None:
     events: list[Event] = []
-    times_ns = iter((3, 4))  # one for each event
+    times_ns = iter((3, 4))  # one time for each event
     host = HostClock(lambda: 5)
     host.now_ns = lambda: next(times_ns)
     known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), host)
@@ -41,7 +41,7 @@ def test_only_differences_to_a_known_device_are_reported() -> None:
 
 
 def test_what_an_answer_lost_is_known_from_before_of_the_same_device() -> None:
-    """An adapter that was just plugged in: the first answers have lost bytes."""
+    """A new adapter can lose bytes of the first replies."""
     events: list[Event] = []
     known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), HostClock(lambda: 5))
     whole = Identity("HI14", "A1", "1.5.6", {"BUILD": "x"})
@@ -72,7 +72,7 @@ HOSTILE = "\x1b[2J\n\udc80\ud800\u202e" + "x" * 10_000
 
 
 def test_what_a_device_says_fits_every_output() -> None:
-    """Long, unprintable, not UTF-8, and named as the arguments of our own functions."""
+    """Long, unprintable, not UTF-8, and with the names of parameters of imud."""
     events: list[Event] = []
     known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), HostClock(lambda: 5))
     names = ("message", "kind", "now_ns", "self", "device", HOSTILE)

@@ -1,4 +1,4 @@
-"""Whose latency holds for which device."""
+"""Latency of each device from all requests."""
 
 from random import Random
 
@@ -15,7 +15,7 @@ class Told:
 
     @property
     def now(self) -> tuple[float, str]:
-        """Latency in ms, and who asks for it."""
+        """Return the latency in ms, and its client."""
         return self.needs[-1].latency_ns / NS_PER_MS, self.needs[-1].who
 
 

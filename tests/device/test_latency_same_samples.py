@@ -1,4 +1,4 @@
-"""Whatever waits and however it is cut: the same samples but for their times, and the same ledger, for each driver."""
+"""With any hold and any division of the data: the same samples except for their times, and the same ledger."""
 
 from collections.abc import Callable, Sequence
 from random import Random
@@ -25,7 +25,7 @@ FRAMES = 60
 BYTE_NS = 10_850
 
 TIMES = ("t_ns", "t_err_ns", "t_rx_ns", "utc_ns", "sync", "t_dev_ns")
-"""Of frames with random times of the device, even how often its counter turned depends on their arrival."""
+"""Members that depend on the arrival if the device times are random."""
 
 
 class Came(msgspec.Struct):
@@ -34,7 +34,7 @@ class Came(msgspec.Struct):
     ledger: dict[str, int]
 
     def without_times(self) -> tuple[list[dict[str, Any]], list[object], dict[str, int]]:
-        """All that must not depend on when it was read."""
+        """Results that must not depend on the time of the read."""
         plain = [
             {name: value for name, value in msgspec.structs.asdict(sample).items() if name not in TIMES}
             for sample in self.samples
@@ -83,7 +83,7 @@ def damaged(frame: bytes, random: Random) -> bytes:
 
 
 def stream_of(driver: StreamDriver, random: Random) -> bytes:
-    """Frames, lines between them, a tenth of the frames damaged."""
+    """Return frames and text lines; a tenth of the frames is damaged."""
     parts = []
     for _ in range(FRAMES):
         frame = driver.example_frame(random)
@@ -130,7 +130,7 @@ def can_path(driver: CanDriver) -> Path:
 
 
 def frames_of(driver: CanDriver, random: Random) -> list[CanFrame]:
-    """Frames of samples 10 ms apart, some of them lost."""
+    """Return frames of samples, 10 ms apart, without some frames."""
     found = []
     for number in range(FRAMES):
         at_ns = 1000 * NS_PER_S + number * 10 * NS_PER_MS

@@ -1,4 +1,4 @@
-"""The thread of a bus: scripts get their turn, devices come and go, nothing is left behind."""
+"""The thread of a bus: turns of scripts, devices that join and leave, no remaining resources."""
 
 import asyncio
 import os
@@ -25,7 +25,7 @@ ASK = Transfer((b"\x01",), 1)
 
 
 class Wire:
-    """A link whose answers are the number of the transfer."""
+    """A link that replies with the number of the transfer."""
 
     title, writable, bus, shared, rate_hz, bit_rate = "wire", True, "wire", True, 2000.0, 0
 
@@ -143,7 +143,7 @@ async def test_a_script_takes_its_device_to_another_target_and_looks_at_others(b
     wire.fail = TransferError(Trouble.ABSENT, "no")
     with pytest.raises(TransferError):
         await member.run(moving(), 5)
-    assert (wire.targets[-1], wire.selected) == (7, 5)  # what is read next goes to the device
+    assert (wire.targets[-1], wire.selected) == (7, 5)  # the next read is on the device
 
 
 @told(run)
@@ -163,7 +163,7 @@ async def test_scripts_return_raise_and_catch(buses: PolledBuses) -> None:
 
 
 def test_readings_come_in_order_with_their_times() -> None:
-    """In virtual time: at 2 kHz, each 30 µs long, and every sixth time two of them."""
+    """Virtual time: reads at 2 kHz, 30 µs each; every sixth deadline has two reads."""
     clock = VirtualClock()
     buses = virtual_buses(clock)
 
@@ -187,7 +187,7 @@ def test_readings_come_in_order_with_their_times() -> None:
 
 @pytest.mark.parametrize(("latency_ns", "together"), [(0, 1), (460_000, 1), (5_000_000, 11), (5_100_000, 11)])
 def test_readings_wait_and_their_polls_do_not(latency_ns: int, together: int) -> None:
-    """At 2 kHz in virtual time: the oldest reading is delivered before its latency would be over."""
+    """Virtual time, 2 kHz: imud delivers the oldest reading before the end of its latency."""
     clock = VirtualClock()
     buses = virtual_buses(clock)
     delivered: list[tuple[int, list[Reading]]] = []
@@ -203,7 +203,7 @@ def test_readings_wait_and_their_polls_do_not(latency_ns: int, together: int) ->
         member.set_latency(0)
         count = len(delivered)
         await asyncio.sleep(0.002)
-        assert len(delivered) >= count + 4  # what waited, then each at once
+        assert len(delivered) >= count + 4  # the held readings, then each reading immediately
         buses.end()
 
     run_virtually(clock, body())
@@ -246,7 +246,7 @@ async def test_end_of_the_bus_is_told_once_and_reading_stops(buses: PolledBuses)
     await sink.enough.wait()
     wire.fail = None
     count = wire.count
-    assert await member.run(three(), 1) == 3 * count + 6  # nothing else was transferred meanwhile
+    assert await member.run(three(), 1) == 3 * count + 6  # no other transfer in the meantime
     assert str(sink.problem) == "gone"
     assert sink.calls == 1
 
@@ -277,7 +277,7 @@ async def test_a_script_that_is_given_up_ends_without_a_result(buses: PolledBuse
         running.cancel()
         with pytest.raises(asyncio.CancelledError):
             await running
-    assert await member.run(three(), 1) == 5 + 6 + 7  # after their transfers
+    assert await member.run(three(), 1) == 5 + 6 + 7  # after the transfers
     assert failed == []
 
 
@@ -304,13 +304,13 @@ def holding(log: list[int], wire: Wire) -> TransferScript[None]:
 @told(run)
 async def test_a_script_can_keep_its_device_from_being_read(buses: PolledBuses) -> None:
     wire, log = Wire(), list[int]()
-    wire.rate_hz = 0.0  # a read is due at any time
+    wire.rate_hz = 0.0  # a read is always due
     member = joined(buses, wire, Sink())
     member.start([Poll(ASK)])
     while wire.count < 20:
         await asyncio.sleep(0)
     await member.run(holding(log, wire), 5)
-    assert log == [1]  # the script's own
+    assert log == [1]  # the error of the script
     read = wire.count
     while wire.count < read + 20:
         await asyncio.sleep(0)
@@ -320,7 +320,7 @@ async def test_a_script_can_keep_its_device_from_being_read(buses: PolledBuses) 
 @pytest.mark.live
 @in_loop
 async def test_an_edge_is_read_while_the_loop_is_busy() -> None:
-    """The thread waits for the line: nothing is read from the descriptor here, and the loop does not run."""
+    """The thread waits for the line. It does not read the descriptor, and the loop is blocked."""
     edges, device = os.pipe2(os.O_NONBLOCK)
     buses, wire, read = PolledBuses(HostClock()), Wire(), threading.Event()
     wire.takes_time = read.set
@@ -331,7 +331,7 @@ async def test_an_edge_is_read_while_the_loop_is_busy() -> None:
     try:
         member.start((Poll(ASK),), schedule)
         for number in range(1, 51):
-            assert read.wait(60)  # in the loop's thread
+            assert read.wait(60)  # runs in the loop's thread
             assert wire.count == number
             read.clear()
             os.write(device, b"x")
@@ -339,7 +339,7 @@ async def test_an_edge_is_read_while_the_loop_is_busy() -> None:
         member.unwatch(edges)
         member.unwatch(edges)
         os.write(device, b"x")
-        await member.run(three(), 1)  # in the next turns of the thread, which would read for the edge first
+        await member.run(three(), 1)  # in the next rounds of the thread, after a read for the edge
     finally:
         buses.end()
         os.close(edges)

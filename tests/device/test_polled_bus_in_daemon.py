@@ -1,4 +1,4 @@
-"""The daemon with a polled device: its bus has a thread and real time here."""
+"""The daemon with a polled device, a thread and real time."""
 
 import asyncio
 import sys
@@ -64,7 +64,7 @@ def _raise(error: BaseException) -> NoReturn:
 
 @pytest.mark.parametrize(("before_s", "after_s"), [(0.005, SWITCH_INTERVAL_S), (0.0001, 0.0001)])
 def test_a_bus_thread_need_not_wait_5_ms_for_the_interpreter(before_s: float, after_s: float) -> None:
-    """A reader at 1 kHz beside a loop that computes; an interval that is shorter already stays."""
+    """Reads at 1 kHz next to a busy loop. A shorter switch interval stays."""
     kept = sys.getswitchinterval()
     try:
         sys.setswitchinterval(before_s)

@@ -1,4 +1,4 @@
-"""When a device is read: deadlines without drift, turns on a line that is never idle, edges of a data-ready line."""
+"""Times of reads: deadlines without drift, turns on a busy bus, edges of a data-ready line."""
 
 from imud.contracts.codec import Poll
 from imud.device.polled_bus import Deadlines, ReadySchedule, RoundRobin, Schedule
@@ -40,7 +40,7 @@ def test_late_and_missed_deadlines_are_counted_and_the_rest_stays_in_step() -> N
     assert one.counts.late == 2
     one = schedule()
     one.begun(5 * MS)
-    one.done(5 * MS + 3_400_000)  # 6 and 7 passed and their whole periods with them; 8 is 0.4 ms late
+    one.done(5 * MS + 3_400_000)  # deadlines 6 and 7 have passed with their periods; 8 is 0.4 ms late
     assert one.counts.missed == 2
     assert one.due_ns == 8 * MS
     one.begun(8 * MS + 400_000)
@@ -63,7 +63,7 @@ def test_all_take_turns_also_with_one_that_comes_back() -> None:
     now_ns, order = 100, []
     for number in range(30):
         first = min(turns, key=lambda turn: turn.due_ns)
-        assert first.due_ns <= now_ns  # always due
+        assert first.due_ns <= now_ns  # a turn is always due
         order.append(turns.index(first))
         first.begun(now_ns)
         now_ns += 1000 if number % 7 else 500_000
@@ -79,7 +79,7 @@ def test_all_take_turns_also_with_one_that_comes_back() -> None:
 
 
 def test_on_a_bus_every_reading_is_handed_over_at_once() -> None:
-    """Something is always due there, so that no idle moment comes to do it in."""
+    """A read is always due, so that the thread is never idle."""
     clock = VirtualClock()
 
     async def body() -> None:
@@ -100,7 +100,7 @@ def test_on_a_bus_every_reading_is_handed_over_at_once() -> None:
 
 
 def by_edges(rate_hz: float = 100.0) -> ReadySchedule:
-    """One whose first read, which waits for nothing, is over at once."""
+    """Return a schedule after its first, immediate read."""
     made = ReadySchedule(rate_hz, BEGIN, Deadlines())
     assert made.due_ns == BEGIN
     read(made, BEGIN, 0)
@@ -132,7 +132,7 @@ def test_an_edge_is_due_at_once_and_late_after_a_quarter_of_the_interval() -> No
 
 
 def test_edges_that_were_read_are_counted_by_their_stamps_and_not_read_again() -> None:
-    """It was told late: a read that began after it had its values."""
+    """The loop reports the edge late: a read after the edge already has its values."""
     made = by_edges()
     made.on_edges([BEGIN + MS], MS)
     read(made, BEGIN + 2 * MS + 100_000)
@@ -145,7 +145,7 @@ def test_edges_that_were_read_are_counted_by_their_stamps_and_not_read_again() -
         t_ns = BEGIN + number * MS
         made.noticed(t_ns + 30_000)
         assert made.due_ns == t_ns + 30_000
-        told_first = number % 3 == 0  # the loop knows the stamp before the read begins
+        told_first = number % 3 == 0  # the loop knows the time before the read starts
         if told_first:
             made.on_edges([t_ns], MS)
             assert made.due_ns == t_ns
@@ -155,7 +155,7 @@ def test_edges_that_were_read_are_counted_by_their_stamps_and_not_read_again() -
         assert made.due_ns == t_ns + (0 if told_first else 30_000) + QUIET_NS
         if not told_first:
             made.on_edges([t_ns], MS)
-            assert made.due_ns == t_ns + QUIET_NS  # not read again
+            assert made.due_ns == t_ns + QUIET_NS  # no second read
     made.on_edges([BEGIN + 100 * MS], MS)
     assert (made.counts.polls, made.counts.late, made.counts.missed) == (100, 0, 0)
     assert made.counts.sum_late_ns == 99 * 100_000
@@ -167,7 +167,7 @@ def test_edges_that_were_read_are_counted_by_their_stamps_and_not_read_again() -
     assert made.counts.polls == 1
     made.on_edges([BEGIN + number * MS for number in range(1, 7)], MS)
     assert (made.counts.polls, made.counts.late, made.counts.worst_ns) == (6, 1, 300_000)
-    made.noticed(BEGIN + 8 * MS + 10_000)  # 6 and 7 were not read
+    made.noticed(BEGIN + 8 * MS + 10_000)  # no read for 6 and 7
     read(made, BEGIN + 8 * MS + 20_000)
     made.on_edges([BEGIN + 7 * MS, BEGIN + 8 * MS], MS)
     assert (made.counts.polls, made.counts.sum_late_ns) == (7, 4 * 20_000 + 300_000 + 20_000)
@@ -179,7 +179,7 @@ def test_edges_end_and_come_back_by_two_of_them() -> None:
     read(made, BEGIN + MS)
     read(made, made.due_ns)
     assert not made.by_edges
-    made.noticed(BEGIN + 600 * MS)  # one alone may be a disturbance: it is not read
+    made.noticed(BEGIN + 600 * MS)  # a single edge can be a disturbance: no read
     assert made.due_ns < BEGIN + 600 * MS
     made.on_edges([BEGIN + 600 * MS], 600 * MS)
     assert not made.by_edges

@@ -1,4 +1,4 @@
-"""Modules on an RS-485 line in the daemon's own path, in virtual time, and once from the port to samples."""
+"""Modules on an RS-485 bus, in virtual time, and once from the port to samples."""
 
 from collections.abc import AsyncIterator, Coroutine, Sequence
 from contextlib import asynccontextmanager, suppress
@@ -31,7 +31,7 @@ from tests.support.stories import in_bench
 
 
 class VirtualLine:
-    """An `Rs485Line` without a port: the transfers of its modules take virtual time."""
+    """An `Rs485Line` without a port. Transfers take virtual time."""
 
     def __init__(self, clock: VirtualClock, *slaves: Slave) -> None:
         self.bench = ModbusBench(*slaves)
@@ -66,7 +66,7 @@ class VirtualLine:
 
 
 class LineBench:
-    """A line with modules, and devices of the daemon on it, in virtual time."""
+    """Modules on an RS-485 bus and their devices, in virtual time."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.clock = VirtualClock(BEGIN_NS)
@@ -78,7 +78,7 @@ class LineBench:
     async def running(
         self, *modules: Slave, at: Sequence[int | str] = (), **link: Any
     ) -> AsyncIterator[list[DeviceRig]]:
-        """Run a device for each module, or for each of the addresses `at`."""
+        """Run a device for each module, or for each address of `at`."""
         self.line = VirtualLine(self.clock, *modules)
         ports: Any = self.line
         row = LinkType("rs485", Rs485Options, make_polled=lambda settings: Rs485Link(settings, ports=ports))
@@ -108,7 +108,7 @@ def told(rig: DeviceRig) -> str:
 
 @in_bench
 async def test_several_modules_take_turns(bench: LineBench) -> None:
-    """Old and new firmware side by side; every one is the module it should be, and turns are fair."""
+    """Old and new firmware on one bus: each device is correct, and turns are fair."""
     modules = [modbus_slave(1), modbus_slave(2, firmware=152), modbus_slave(3, inclinometer="dual")]
     async with bench.running(*modules) as rigs:
         for rig in rigs:
@@ -130,7 +130,7 @@ async def test_several_modules_take_turns(bench: LineBench) -> None:
                 instants = range(sample.t_ns - BEGIN_NS, sample.t_rx_ns - BEGIN_NS, 500_000)
                 truths = [module.motion.at(instant / 1e9).accel_m_s2 for instant in instants]
                 assert min(dist(sample.accel_m_s2, truth) for truth in truths) < 0.02
-        assert rigs[1].device.ledger.frames_in_replies >= 1  # the exception that told of old firmware
+        assert rigs[1].device.ledger.frames_in_replies >= 1  # the exception of old firmware
         assert [rig.samples[-1].incli_rad is None for rig in rigs] == [True, True, False]
         assert [rig.kinds.count(EventKind.UP) for rig in rigs] == [1, 1, 1]
 
@@ -145,7 +145,7 @@ async def test_a_dead_module_does_not_stall_the_others(bench: LineBench) -> None
         await rigs[1].until(lambda: rigs[1].is_in(DeviceState.SEARCHING), "given up")
         assert rigs[1].device.status().problem.startswith("no reply from address 2")
         assert rigs[1].device.ledger.lost_gap_device == 3
-        line = rigs[0].device.status().serial_line  # of all its devices, also those that answer
+        line = rigs[0].device.status().serial_line  # of all devices, also of devices that reply
         assert line is not None
         assert line.timeouts >= 3
         await rigs[0].until_samples(30)
@@ -181,9 +181,9 @@ async def test_module_is_told_something_while_it_is_read(bench: LineBench) -> No
     async with bench.running(module, other) as rigs:
         for rig in rigs:
             await rig.until_samples(5)
-        assert rigs[0].device.status().status_words == ("time not UTC",)  # 0x0800 of the simulated module
+        assert rigs[0].device.status().status_words == ("time not UTC",)  # register 0x0800 of the simulated module
         await rigs[0].device.act("attitude_mode", {"axes": 9})
-        assert rigs[0].device.status().settings["heading_mode"] == "nine axes"  # read again by itself
+        assert rigs[0].device.status().settings["heading_mode"] == "nine axes"  # imud reads again without a request
         assert await rigs[0].device.act("read", {"register": "HEADING_MODE"}) == (1,)
         assert (module.settings.heading_mode, other.settings.heading_mode) == (1, 0)
         await rigs[0].until_samples(5)
@@ -209,7 +209,7 @@ async def test_module_that_is_given_another_address_is_followed(
         assert rigs[0].device.status().link == f"{bench.path}, address 2"
         await rigs[0].until_samples(5)
         assert EventKind.DOWN not in rigs[0].kinds
-        module.dead = True  # and found again at the new address, although the configuration has the old one
+        module.dead = True  # found at the new address, although the configuration contains the old address
         await rigs[0].until(lambda: rigs[0].is_in(DeviceState.SEARCHING), "given up")
         module.dead = False
         await rigs[0].until_samples(5)
@@ -261,7 +261,7 @@ async def test_a_module_is_followed_to_another_address_and_back(bench: LineBench
         assert module.address == module.flash.slave == 9
         assert "change address 1 in the configuration" in told(rig)
         await rig.device.act("address", {"address": 1})
-        await rig.device.act("restart", {})  # not saved: it is at 9 again
+        await rig.device.act("restart", {})  # not saved: address 9 after the restart
         await rig.until_samples(10)
         assert rig.device.status().link == f"{bench.path}, address 9"
         assert beside.kinds.count(EventKind.DOWN) == 0

@@ -1,4 +1,4 @@
-"""A polled device from its bus to the publishers: identified before it is believed, in time, back when it vanished."""
+"""A polled device from its bus to the outputs: identification, deadlines, return after an absence."""
 
 import asyncio
 import errno
@@ -37,14 +37,16 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PolledBusBench:
 async def test_spi_samples_are_the_truth_of_the_latched_instant(
     bench: PolledBusBench, burst: str, resolution_m_s2: float, temperature: float
 ) -> None:
-    """The resolution of a burst count is 0.2 / 65536 g = 3e-5 m/s², of a register's a thousandth, of f32 1e-6."""
-    device = bench.registers(modes=frozenset({3}), update_ns=970_000)  # not in step with the deadlines
+    """Resolution of a burst: 0.2 / 65536 g = 3e-5 m/s²; of a register: a thousandth; of f32: 1e-6."""
+    device = bench.registers(modes=frozenset({3}), update_ns=970_000)  # not synchronous with the deadlines
     latched: list[int] = []
 
     def answer(selections: Any, mode: int) -> list[bytes]:
         miso = device.spi(selections, mode)
         is_reading = selections[0][0] in (0x80, 0x0E) and len(selections) != 4
-        if is_reading and latched[-1:] != [device.latched_ns]:  # read twice, it is stale and makes no sample
+        if is_reading and latched[-1:] != [
+            device.latched_ns
+        ]:  # a second read of the same values is stale and makes no sample
             latched.append(device.latched_ns)
         return miso
 
@@ -85,7 +87,7 @@ async def test_without_a_known_update_rate_the_error_is_the_time_since_the_last_
         await rig.until_samples(20)
     bursts = [mosi for mosi, _, _ in bench.spi.messages if mosi[0][:1] == b"\x80"]
     assert len(bursts) >= 20
-    assert {tuple(map(len, mosi)) for mosi in bursts} == {(32,)}  # each is one ioctl in one selection
+    assert {tuple(map(len, mosi)) for mosi in bursts} == {(32,)}  # each transfer is one ioctl with one selection
     for before, sample in zip(rig.samples[5:], rig.samples[6:], strict=False):
         asked_ns = sample.t_rx_ns - sample.t_ns
         assert sample.t_err_ns == int(1 / sqrt(3) * (sample.t_ns - before.t_ns + asked_ns)) + 1
@@ -115,7 +117,7 @@ async def test_vanished_device_is_not_believed_before_it_is_identified(
         await rig.until(lambda: EventKind.DOWN in rig.kinds, "reported")
         down = next(event for event in rig.events if event.kind is EventKind.DOWN)
         assert why in down.message
-        # another device takes its place, whose bursts look right
+        # another device with valid bursts replaces the first device
         device.faults = type(device.faults)(product_id=b"\x00\x00ICM206")
         count, asked = len(rig.samples), device.transactions
         await rig.until(lambda: device.transactions > asked + 1, "asked again")
@@ -129,7 +131,7 @@ async def test_vanished_device_is_not_believed_before_it_is_identified(
 
 @in_bench
 async def test_readings_on_their_way_when_it_vanished_are_not_decoded(bench: PolledBusBench) -> None:
-    """On a bus that is never idle the thread has read more before it hears that the device is gone."""
+    """The thread of a busy bus makes further readings before the loop detects the missing device."""
     device = bench.registers()
     armed, gone_ns, good_after = False, 0, 0
 
@@ -170,7 +172,7 @@ async def test_single_damage_costs_its_sample_and_nothing_else(bench: PolledBusB
         assert rig.device.ledger.lost_crc == 2
         assert EventKind.DOWN not in rig.kinds
         assert EventKind.BAD_FRAME in rig.kinds
-        device.faults.flips = 3  # three damaged frames in a row: imud identifies the device again
+        device.faults.flips = 3  # three damaged frames: imud identifies the device again
         await rig.until(lambda: EventKind.DOWN in rig.kinds, "gone")
         await rig.until_samples(5)
         assert (rig.ledger.lost_crc, rig.ledger.lost(), rig.ledger.lost_unknown) == (5, 5, 0)
@@ -180,7 +182,7 @@ async def test_single_damage_costs_its_sample_and_nothing_else(bench: PolledBusB
 
 @in_bench
 async def test_time_in_which_it_was_looked_for_is_a_gap_of_unknown_size(bench: PolledBusBench) -> None:
-    """One gap, however often the device was found and gone again before its next sample."""
+    """One gap, even if the device was found and lost several times before its next sample."""
     device = bench.registers()
     is_absent = False
 
@@ -202,7 +204,7 @@ async def test_time_in_which_it_was_looked_for_is_a_gap_of_unknown_size(bench: P
 
 @in_bench
 async def test_restarted_device_is_set_up_again(bench: PolledBusBench) -> None:
-    """Its filter is read every ten seconds."""
+    """imud reads the filter setting every ten seconds."""
     device = bench.registers()
     bench.i2c.devices[0x1A] = device
     config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 1, "rate_hz": RATE_HZ}, gyro_filter=2)
@@ -266,7 +268,7 @@ async def test_a_stuck_bus_is_tried_once_in_a_round(bench: PolledBusBench) -> No
     for device in devices:
         device.faults.error = errno.ETIMEDOUT
     async with bench.running(on_i2c()) as (rig,):
-        await asyncio.sleep(2.2)  # a round every 0.5 s
+        await asyncio.sleep(2.2)  # one round per 0.5 s
         assert rig.is_in(DeviceState.SEARCHING)
         assert sum(device.transactions for device in devices) == 5
 
@@ -275,7 +277,7 @@ async def test_a_stuck_bus_is_tried_once_in_a_round(bench: PolledBusBench) -> No
 async def test_readings_are_held_if_two_of_them_fit(bench: PolledBusBench) -> None:
     bench.spi.device = bench.registers().spi
     async with bench.running(bench.on_spi()) as (rig,):
-        for latency_ns, hold_ns in ((8_000_000, 8_000_000), (7_999_999, 0)):  # a period is 4 ms
+        for latency_ns, hold_ns in ((8_000_000, 8_000_000), (7_999_999, 0)):  # the period is 4 ms
             rig.device.set_need(Need(latency_ns, "client"))
             before, batches = len(rig.samples), rig.batches
             await rig.until_samples(20)
@@ -375,11 +377,11 @@ async def test_slow_transfers_miss_deadlines_which_are_lost_samples(
         await rig.until(lambda: EventKind.LOSS in rig.kinds, "told")
         polling = rig.device.status().polling
         assert polling is not None
-        # a transfer takes 5.16 ms, the first read has three: as many deadlines as ms pass, kept or missed
+        # a transfer takes 5.16 ms, the first read has three; each ms is one deadline, kept or missed
         assert polling.polls + polling.missed == pytest.approx(5.16 * (polling.polls + 2), abs=1.5)
         assert polling.late > 0.5 * polling.polls
         assert polling.late_sum_ns // polling.polls == polling.late_mean_ns > 0
-        assert "no value of it is new" not in caplog.text  # it was not asked for long enough to say so
+        assert "no value of it is new" not in caplog.text  # too few reads for this message
         assert rig.device.ledger.lost_queue == polling.missed >= 30
 
 
@@ -412,7 +414,7 @@ async def test_settings_are_applied_and_read_again_after_an_action(bench: Polled
 async def test_a_kind_of_burst_is_found_and_kept_in_every_variant(
     bench: PolledBusBench, variant: str, burst: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Over readings of identity and settings, ten per second here, and after a restart that loses them."""
+    """During reads of identity and settings, ten per second, and after a restart that loses the settings."""
     polls = {kind: (first, Poll(READ_STATE, 10**8)) for kind, (first, *_) in codec.POLLS.items()}
     monkeypatch.setattr(codec, "POLLS", polls)
     device = bench.registers(behaviour=REGISTER_VARIANTS[variant])

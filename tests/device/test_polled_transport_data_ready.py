@@ -1,4 +1,4 @@
-"""A polled device with a data-ready line: read at its edges, dated by them, and by deadlines while there are none."""
+"""A polled device with a data-ready line: reads and time stamps at its edges, at deadlines without edges."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -31,16 +31,16 @@ from tests.support.stories import in_bench
 
 MS = 1_000_000
 EVERY_NS = 2 * MS
-"""500 Hz, while `rate_hz` says 100."""
+"""Period of the device, ns: 500 Hz; `rate_hz` is 100."""
 RATE_HZ = 100.0
 
 
 class Signal:
-    """The device's side of the line: an edge whenever its registers are renewed."""
+    """The line of the device: an edge at each update of its registers."""
 
     def __init__(self, bench: PolledBusBench, device: Imu61xRegisters) -> None:
         self.stamps: list[int] = []
-        """Of the edges since the line was opened."""
+        """Number of edges since the line was opened."""
         self.quiet = False
         self._stage, self._device = bench, device
 
@@ -50,12 +50,12 @@ class Signal:
 
     @property
     def newest_ns(self) -> int:
-        """When the registers were renewed last."""
+        """Time of the last update of the registers."""
         epoch_ns = self._device.epoch_ns
         return epoch_ns + (self._stage.clock.now_ns() - epoch_ns) // EVERY_NS * EVERY_NS
 
     def at_once(self, t_ns: int, *, heard: bool = True) -> None:
-        """An edge with that stamp, which the kernel has; the loop hears of it now, or only who drains the line."""
+        """Add an edge to the buffer of the kernel. With `heard` the loop processes the edge."""
         self.line.edge(t_ns, True)
         if heard:
             asyncio.get_running_loop().call_soon(self.line.drain)
@@ -85,7 +85,7 @@ class Scene:
         return polling.missed
 
     def dated(self, sample: Sample) -> int:
-        """Index of the edge that a sample has, which has the right stamp and values."""
+        """Check time stamp and values of a sample. Return the index of its edge."""
         assert sample.edge_seq is not None
         assert sample.sync is Sync.EDGE
         stamp_ns = self.signal.stamps[sample.edge_seq - 1]
@@ -131,7 +131,7 @@ async def test_every_edge_is_a_sample_of_its_own_instant(bench: PolledBusBench) 
         assert status.lines.edges_lost == {"data_ready": 0}
         numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
         assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-        assert all(sample.t_err_ns < 62_000 for sample in it.rig.samples[1:])  # 100 µs / √3 and 3 µs
+        assert all(sample.t_err_ns < 62_000 for sample in it.rig.samples[1:])  # 100 us / √3 and 3 us
         assert it.missed == it.rig.device.ledger.lost_queue == 0
         assert EventKind.LINK not in it.rig.kinds
     it.rig.device.tick(bench.clock.now_ns())
@@ -156,7 +156,7 @@ async def test_falling_edges_of_an_inverted_line_are_those_of_the_line_as_it_is(
 
 @in_bench
 async def test_the_edges_of_a_loop_that_stalls_are_missed(bench: PolledBusBench) -> None:
-    """The kernel has ten more edges when the loop comes back: one read, of the newest."""
+    """After a blocked loop the kernel has ten more edges: one read, for the newest edge."""
     async with scene(bench) as it:
         await it.rig.until_samples(20)
         newest = len(it.signal.stamps)
@@ -174,7 +174,7 @@ async def test_the_edges_of_a_loop_that_stalls_are_missed(bench: PolledBusBench)
 
 
 class Unheard(MemoryInput):
-    """A line whose edges the loop is not woken for."""
+    """A line with edges that do not wake the loop."""
 
     def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
         super().start(on_edges, on_end, watch=False)
@@ -182,7 +182,7 @@ class Unheard(MemoryInput):
 
 @in_bench
 async def test_an_edge_that_the_loop_did_not_hear_of_dates_the_read_all_the_same(bench: PolledBusBench) -> None:
-    """It is in the kernel when the read for the edge before begins; it is not read a second time."""
+    """The edge is in the kernel before the read for the previous edge starts: no second read."""
 
     def make(_settings: Any, purpose: str, rising_only: bool = False) -> MemoryInput:
         return bench.lines.inputs.setdefault(purpose, Unheard(purpose, rising_only))
@@ -324,7 +324,7 @@ async def test_the_thread_waits_for_a_line_with_a_descriptor_while_that_is_open_
     clock.advance(1000)
     member.schedule.begun(clock.now_ns())
     ready.drain()
-    assert (member.noted, member.commands) == (1, 0)  # it was read already
+    assert (member.noted, member.commands) == (1, 0)  # a read already covers it
     line.edge(clock.now_ns() + 1, True)
     ready.drain()
     assert (member.noted, member.commands) == (1, 1)

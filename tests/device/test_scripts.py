@@ -1,4 +1,4 @@
-"""Request scripts over a line that is also used by others: in order, one at a time, late and missing replies apart."""
+"""Request scripts on a shared link: one at a time, in order, with late and missing replies."""
 
 import asyncio
 from collections.abc import Callable, Sequence
@@ -187,7 +187,7 @@ async def test_a_script_given_up_is_undone_if_the_link_is_there(is_there: bool) 
 
 @in_loop
 async def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
-    """Whether it returns or raises: it had its turn to leave the device in order."""
+    """The script returns or raises: it has left the device in a defined state."""
 
     def failing() -> RequestScript[None]:
         yield request("A", timeout_ns=1)
@@ -207,7 +207,7 @@ async def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
 )
 @in_loop
 async def test_a_request_can_change_how_the_device_is_heard(change: dict[str, Any], words: str) -> None:
-    """The change is made before the request is written. A link without the setting is an error."""
+    """The change precedes the request. A link without the property is an error."""
     port = CallingPort(lambda _data: None)
     runner = ScriptRunner(port, Ledger(), HostClock())
     silent = request("B", silent=True)

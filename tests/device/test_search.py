@@ -1,4 +1,4 @@
-"""`driver: auto` on a CAN bus: found, several, exchanged, remembered; and frames that imud sends cyclically."""
+"""`driver: auto` on a CAN bus: one, several, exchanged and remembered devices; and cyclic frames."""
 
 import asyncio
 from collections.abc import Callable, Coroutine
@@ -31,14 +31,14 @@ SILENT_SEARCH_NS = 15 * 10**9
 
 @pytest.fixture(autouse=True)
 def fake_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The fake driver beside the real ones, and rounds of no length."""
+    """Add the fake driver, and make the rounds short."""
     table: dict[str, Driver] = {**dict(DRIVERS), "fake-can": fake_can_driver()}
     monkeypatch.setattr(can_transport, "DRIVERS", table)
     monkeypatch.setattr(detection, "LISTEN_NS", 20 * NS_PER_MS)
 
 
 class Bus:
-    """Devices on the bus `can0`, in virtual time. They start when the test waits for the first time."""
+    """Devices on the bus `can0` in virtual time. They start at the first wait of the test."""
 
     def __init__(self, state_dir: Path | None = None) -> None:
         self.clock = VirtualClock()
@@ -54,7 +54,7 @@ class Bus:
         return OnBus(self, self.rigs.add(config, MemoryCanLink(settings)))
 
     async def start(self) -> None:
-        """Start the devices; may be called again."""
+        """Start the devices. A second call does nothing."""
         if not self._started:
             self._started = True
             await self._at_work.enter_async_context(self.rigs.at_work())
@@ -100,7 +100,7 @@ async def test_the_only_device_is_found_nothing_was_sent_and_commands_go_to_it(b
     status = bench.device.status()
     assert (status.driver, status.state, status.problem) == ("fake-can", DeviceState.RUNNING, "")
     assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 8]
-    assert bench.device.ledger.bytes_skipped > 0  # what was heard while searching
+    assert bench.device.ledger.bytes_skipped > 0  # the frames of the search
     assert bench.link.written == []
     assert await bench.device.act("node", {}) == 8
 
@@ -113,7 +113,7 @@ async def test_a_device_that_is_given_another_number_is_followed(bus: Bus, drive
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 8)
     path = bench.device._transport.path
     await bench.device.act("renumber", {"node": 8})
-    assert bench.device._transport.path is path  # it has this number already
+    assert bench.device._transport.path is path  # the device already has this number
     await bench.device.act("renumber", {"node": 9})
     assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 9]
     words = "change options.node to 9 in the configuration"
@@ -121,7 +121,7 @@ async def test_a_device_that_is_given_another_number_is_followed(bus: Bus, drive
     heard = len(bench.samples)
     await bench.until(lambda: len(bench.samples) > heard, 9)
     assert await bench.device.act("node", {}) == 9
-    await other.until(lambda: other.samples, 8)  # the former number is free
+    await other.until(lambda: other.samples, 8)  # the previous number is free
     assert [wanted.can_id for wanted in other.link.filters] == [BASE + 8]
     assert bench.device.state is DeviceState.RUNNING
     assert [sample.seq for sample in bench.samples] == list(range(1, len(bench.samples) + 1))
@@ -140,7 +140,7 @@ async def test_several_are_named_and_the_search_goes_on(bus: Bus) -> None:
     await bench.until(lambda: "2 devices send on can0" in bench.rig.problem, 8, 9)
     assert "fake-can node 8, fake-can node 9; configure driver and options" in bench.rig.problem
     assert bench.device.state is DeviceState.SEARCHING
-    await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 9)  # the other one was taken away
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 9)  # the other device was removed
 
 
 @played(Bus)
@@ -161,7 +161,7 @@ async def test_two_that_search_do_not_both_take_the_same_device(bus: Bus) -> Non
 
 
 def test_what_was_found_is_remembered(tmp_path: Path) -> None:
-    for nodes in ((8,), (8, 9)):  # although two are heard the second time
+    for nodes in ((8,), (8, 9)):  # although two devices send at the second search
         bus = Bus(tmp_path)
         bench = bus.add()
 
@@ -206,7 +206,7 @@ async def test_the_bus_goes_down_while_searching_and_comes_back(bus: Bus) -> Non
     await bench.until(lambda: bench.rig.is_in(DeviceState.MISSING))
     bench.link.appear()
     await bench.until(lambda: bench.rig.is_in(DeviceState.RUNNING), 8)
-    assert bench.device._transport.path is path  # it is the same device
+    assert bench.device._transport.path is path  # the same device
 
 
 @played(Bus)
@@ -250,5 +250,5 @@ async def test_a_second_sender_of_the_same_frame_is_refused(bus: Bus) -> None:
     await second.until(lambda: second.device.state is DeviceState.FAILED)
     assert "bow and mast would both send 0x080 on can0" in second.rig.problem
     assert not second.link.cyclic
-    assert second.device.status().connects == 0  # it is not even opened
+    assert second.device.status().connects == 0  # imud does not open the bus
     assert first.rig.problem.startswith("no sample has arrived yet")

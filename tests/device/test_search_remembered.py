@@ -1,4 +1,4 @@
-"""What was found is there after a restart; a bad file costs nothing but the memory."""
+"""Results of searches after a restart. An invalid file only loses the results."""
 
 import os
 import threading
@@ -15,7 +15,7 @@ FOUND = RememberedDevice("hipnuc-uart", 9600)
 
 
 def remember(folder: Path, **found: RememberedDevice) -> None:
-    """Remember devices as one daemon does from its start to its end."""
+    """Store results as one daemon from its start to its end."""
     before = set(threading.enumerate())
     with closing(Remembered(folder)) as memory:
         for name, one in found.items():
@@ -24,7 +24,7 @@ def remember(folder: Path, **found: RememberedDevice) -> None:
 
 
 def recalled(folder: Path, device: str) -> RememberedDevice | None:
-    """What the next daemon knows."""
+    """Return the result that the next daemon reads."""
     with closing(Remembered(folder)) as memory:
         return memory.get(device)
 
@@ -103,7 +103,7 @@ def test_directory_of_its_name_stops_nothing(tmp_path: Path, caplog: pytest.LogC
 @pytest.mark.parametrize("make", [fifo, endless, half])
 @pytest.mark.timeout(5)
 def test_what_a_killed_daemon_left_is_replaced(tmp_path: Path, make: Callable[[Path], None]) -> None:
-    """The temporary file, whatever it is now: removed, and not followed."""
+    """imud removes the temporary file of any type and does not follow a link."""
     make(tmp_path / (FILE_NAME + ".new"))
     remember(tmp_path, bow=FOUND)
     assert recalled(tmp_path, "bow") == FOUND

@@ -1,4 +1,4 @@
-"""The settings of a module behind a line, in virtual time: compared at start, replug and restart, applied and kept."""
+"""Settings of a module in virtual time: comparison at start, replug and restart, apply, repair."""
 
 import asyncio
 from collections.abc import Callable, Coroutine
@@ -32,17 +32,17 @@ LIMIT_ASKED = 40
 LIMIT_ITSELF = 4
 
 STEP_S, LONG_STEP_S = 0.05, 0.5
-"""Time from one sample to the next, and while long times pass."""
+"""Period of the samples, s; during long waits the second value."""
 
 
 @pytest.fixture(autouse=True)
 def fake_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The fake driver beside the real ones."""
+    """Add the fake driver."""
     monkeypatch.setattr(stream_transport, "DRIVERS", {**dict(DRIVERS), "fake-module": FAKE_MODULE_DRIVER})
 
 
 class AtOnce(ThreadPoolExecutor):
-    """What would be done by a thread is done at once: virtual time does not wait for threads."""
+    """Run the function of a thread immediately: virtual time does not wait for threads."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         done: Future[Any] = Future()
@@ -54,7 +54,7 @@ class AtOnce(ThreadPoolExecutor):
 
 
 class ModuleBench:
-    """One module with what is declared for it, and all that is told of it."""
+    """One module with declared settings and its events."""
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class ModuleBench:
         state_dir: Path | None = None,
         **module: Any,
     ) -> None:
-        """`module` are attributes of the module from its start on."""
+        """`module` contains attributes of the module."""
         self.clock = VirtualClock()
         self.module = FakeModule(self.clock.now_ns)
         for name, value in module.items():
@@ -86,7 +86,7 @@ class ModuleBench:
         play_rigs(self.rigs, told, self.clock)
 
     async def until(self, holds: Callable[[], object], what: str = "the condition", limit_s: float = 30.0) -> None:
-        """Let time pass, with a sample in every step."""
+        """Let time pass with a sample in each step."""
         step_s = STEP_S if limit_s < 100 else LONG_STEP_S
         await self.rig.until(holds, what, limit_s, step=self.module.sample, step_s=step_s)
 
@@ -95,14 +95,13 @@ class ModuleBench:
         await self.until(lambda: self.clock.now_ns() >= end_ns, limit_s=duration_s + 10)
 
     async def doing(self, work: Coroutine[Any, Any, Any]) -> Any:
-        """The result of something that takes its time, with samples all the while."""
+        """Return the result of `work`, with samples in the meantime."""
         task = asyncio.ensure_future(work)
         await self.until(task.done)
         return task.result()
 
     @property
     def status(self) -> SettingsStatus:
-        """How declared and actual settings compare."""
         found = self.device.status().declared
         assert found is not None
         return found
@@ -112,23 +111,22 @@ class ModuleBench:
 
     @property
     def told(self) -> list[Event]:
-        """Events about settings."""
         return [e for e in self.rig.events if e.kind is EventKind.CONFIGURATION and "settings" in e.message]
 
     @property
     def messages(self) -> list[str]:
-        """What they say, without what the daemon has always said of changed settings."""
+        """Texts of these events, without events about changed settings."""
         return [e.message for e in self.told if not e.message.startswith("settings of the device changed")]
 
     def repaired(self, times: int) -> bool:
-        """Whether imud has set the settings so often."""
+        """Return whether imud has made this number of repairs."""
         return self.status.repairs == times
 
     def saved(self, times: int) -> bool:
         return self.module.saves == times
 
     def written(self) -> list[str]:
-        """Commands that set or save something."""
+        """Commands that set or save a value."""
         return [one for one in self.module.commands if one.startswith(("SET", "SAVE", "RESTART"))]
 
 
@@ -139,7 +137,7 @@ class ModuleBench:
 async def test_without_a_declaration_nothing_is_asked_and_nothing_told(bench: ModuleBench) -> None:
     await bench.pass_s(5)
     assert bench.is_in(SettingsState.UNDECLARED)
-    assert bench.module.commands == ["WHO", "GET"]  # identity, and settings as text
+    assert bench.module.commands == ["WHO", "GET"]  # identity and settings as text
     assert bench.messages == []
 
 
@@ -164,9 +162,9 @@ async def test_a_difference_is_told_once_and_nothing_is_written(bench: ModuleBen
     assert bench.written() == []
     asked = bench.module.commands.count("GET")
     await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
-    await bench.until(lambda: bench.module.commands.count("GET") >= asked + 2)  # as text, and to compare
+    await bench.until(lambda: bench.module.commands.count("GET") >= asked + 2)  # as text, and for the comparison
     await bench.pass_s(2)
-    assert bench.messages == [message]  # it is as before
+    assert bench.messages == [message]  # the value is as before
 
 
 @played(lambda: ModuleBench(declared={"mode": "6-axis"}))
@@ -180,13 +178,13 @@ async def test_compared_again_after_a_replug_a_restart_and_a_command(bench: Modu
     bench.module.appear()
     await bench.until(lambda: bench.is_in(SettingsState.DIFFER), "after a replug")
     await bench.pass_s(20)
-    bench.module.restart()  # by itself: flash has what is declared
+    bench.module.restart()  # without a request: flash contains the declared settings
     await bench.until(lambda: bench.is_in(SettingsState.AGREE), "after a restart")
     await bench.doing(bench.device.act("set_mode", {"mode": "9-axis"}))
     await bench.until(lambda: bench.is_in(SettingsState.DIFFER), "after a command")
     await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
     await bench.until(lambda: bench.is_in(SettingsState.AGREE), "after another one")
-    await bench.pass_s(2.2)  # a restart by imud's own script would have shown by now
+    await bench.pass_s(2.2)  # time in which a restart by a script of imud would be visible
     asked = bench.module.commands.count("GET")
     bench.module.restart()
     await bench.until(lambda: bench.module.commands.count("GET") > asked, limit_s=3)
@@ -201,7 +199,7 @@ async def test_a_device_whose_clock_begins_anew_by_the_question_is_asked_once(be
     await bench.pass_s(50)
     assert bench.module.commands.count("GET") == asked
     bench.module.set["mode"] = "9-axis"
-    bench.module.restart()  # and by itself it is noticed
+    bench.module.restart()  # imud detects the restart
     await bench.until(lambda: bench.module.commands.count("GET") == asked + 1)
 
 
@@ -209,7 +207,7 @@ async def test_a_device_whose_clock_begins_anew_by_the_question_is_asked_once(be
 async def test_a_device_that_does_not_tell_its_settings_is_asked_ever_more_seldom(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.messages)
     assert bench.messages == ["cannot read the settings after 3 tries: GET: expected OK, got nothing"]
-    await bench.pass_s(sum(IDENTIFY_AGAIN_S) + 10)  # the identity is asked for with them, four times more
+    await bench.pass_s(sum(IDENTIFY_AGAIN_S) + 10)  # with four more queries of the identity
     asked = bench.module.commands.count("GET")
     await bench.pass_s(2 * IDENTIFY_AGAIN_S[-1])
     assert asked + 1 <= bench.module.commands.count("GET") <= asked + 2
@@ -326,7 +324,7 @@ async def test_another_module_is_brought_to_the_same_settings(bench: ModuleBench
     await bench.until(lambda: bench.module.saves == 2)
     await bench.until(lambda: bench.is_in(SettingsState.AGREE))
     assert (bench.module.flash["mode"], bench.module.flash["secret"]) == ("9-axis", 5)
-    assert bench.status.flash_writes == 1  # of this module
+    assert bench.status.flash_writes == 1  # writes of this module
 
 
 @played(lambda: ModuleBench("apply", {"mode": "9-axis"}))
@@ -355,7 +353,7 @@ async def test_a_device_that_forgets_is_set_again_after_growing_pauses(bench: Mo
         asked, before = bench.module.commands.count("GET"), asked
         reads.append(asked - before)
     assert [round(time_s, -1) for time_s in times_s] == [10, 60, 600]
-    assert reads == [3, 3, 3]  # before and after the write, and as text: the device is not read in the pause
+    assert reads == [3, 3, 3]  # before and after the write, and as text: no read in the pause
     bench.module.forgets = set()
     await bench.pass_s(3)
     bench.module.restart()
@@ -378,7 +376,7 @@ async def test_flash_is_written_a_few_times_a_day_by_itself_and_still_for_people
     await bench.until(lambda: "not saved" in bench.messages[-1], limit_s=4000)
     assert "the limit of imud itself" in bench.status.problem
     assert bench.module.saves == LIMIT_ITSELF
-    assert bench.module.set["mode"] == "9-axis"  # it is set all the same
+    assert bench.module.set["mode"] == "9-axis"  # imud sets it anyway
     applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
     assert applied.saved
     assert bench.status.flash_writes_day == LIMIT_ITSELF + 1
@@ -397,7 +395,7 @@ async def test_plan_and_apply_of_given_values(bench: ModuleBench) -> None:
     assert [(one.name, one.before, one.outcome) for one in applied.steps] == [("mode", "6-axis", StepOutcome.DONE)]
     assert (applied.problem, applied.saved, applied.differences) == ("", False, {})
     saved = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
-    assert (saved.steps, saved.saved) == ((), True)  # what was set before is saved
+    assert (saved.steps, saved.saved) == ((), True)  # the previous value is saved
     again = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
     assert (again.steps, again.saved, bench.module.saves) == ((), False, 1)
 
@@ -453,7 +451,7 @@ Outcomes = dict[str, StepOutcome]
 def applied_with(
     given: dict[str, Any], prepare: Callable[[FakeModule], object], *, save: bool = True
 ) -> tuple[ModuleBench, AppliedSettings]:
-    """Values applied to a module that `prepare` has changed."""
+    """Apply values to a module that `prepare` has changed."""
     bench, answers = ModuleBench(), list[AppliedSettings]()
 
     async def story() -> None:
@@ -484,7 +482,7 @@ def test_a_step_that_fails_ends_the_plan_and_nothing_is_saved() -> None:
     )
     assert not applied.saved
     assert not applied.restarted
-    assert list(applied.differences) == ["output", "mounting", "offset_deg"]  # how it is now
+    assert list(applied.differences) == ["output", "mounting", "offset_deg"]  # the present values
     assert bench.module.flash == FACTORY
     assert bench.module.set == {**FACTORY, "mode": "9-axis"}
     bench, applied = applied_with(WANTED, lambda module: module.refuses.add("mode"))
@@ -498,7 +496,7 @@ def test_a_step_that_fails_ends_the_plan_and_nothing_is_saved() -> None:
 
 def test_a_device_that_falls_silent_in_the_middle() -> None:
     class Dying(set[str]):
-        """Commands not answered: none until the second setting."""
+        """Commands without a reply: all commands after the write of `output`."""
 
         def __contains__(self, command: object) -> bool:
             return any(one.startswith("SET output") for one in bench_of[0].commands)
@@ -546,8 +544,8 @@ def test_another_rate_is_followed_unless_the_device_is_not_heard_at_it() -> None
     assert outcomes(applied) == {"mode": StepOutcome.DONE, "baud": StepOutcome.FAILED}
     assert "does not reply at 921600 baud; the bus has 115200 baud again" in applied.problem
     assert bench.module.baud == 115200
-    assert list(applied.differences) == ["baud"]  # it was asked after it, and told
-    assert bench.status.flash_writes == 1  # the attempt counts
+    assert list(applied.differences) == ["baud"]  # imud queried it after the write, and reported it
+    assert bench.status.flash_writes == 1  # the failed write counts
 
 
 @played(ModuleBench)
@@ -566,7 +564,9 @@ async def test_commands_that_save_count_and_are_limited(bench: ModuleBench) -> N
             await bench.doing(saving)
     applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
     assert "not saved: its flash was written 40 times" in applied.problem
-    applied = await bench.doing(bench.device.settings_apply({"baud": 921600}, save=True))  # its step saves by itself
+    applied = await bench.doing(
+        bench.device.settings_apply({"baud": 921600}, save=True)
+    )  # the step of this setting saves
     assert applied.problem.startswith("baud: its flash was written 40 times")
     assert (bench.module.saves, bench.module.commands.count("ZERO"), bench.module.baud) == (LIMIT_ASKED, sent, 115200)
     assert (await bench.doing(bench.device.calibrate("zero", save=False))).verified
@@ -599,7 +599,7 @@ async def test_a_backup_is_made_before_a_factory_reset(bench: ModuleBench, tmp_p
     assert 'mode: "9-axis"' in file.read_text()
     assert 'serial_number: "A1"' in file.read_text()
     assert bench.told[-1].message == f"settings before factory_reset are in {file}"
-    assert bench.module.commands[-4:] == ["GET", "RESTART", "WHO", "GET"]  # then it is asked what it has now
+    assert bench.module.commands[-4:] == ["GET", "RESTART", "WHO", "GET"]  # then imud reads the settings again
 
 
 @pytest.mark.parametrize("silent", [True, False])
@@ -618,7 +618,7 @@ async def test_a_reset_without_a_backup_says_so(bench: ModuleBench, silent: bool
 
 
 def declaring(config: DeviceConfig, on_difference: OnDifference, **declared: Any) -> DeviceConfig:
-    """The same device with settings that it should have."""
+    """Return the configuration with declared settings."""
     table = DRIVERS[config.driver].device_settings
     assert table is not None
     return replace(config, declared=msgspec.convert(declared, table.declarable), on_difference=on_difference)

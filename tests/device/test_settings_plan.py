@@ -1,4 +1,4 @@
-"""What is written, in which order, and what is left out because nothing is to be saved."""
+"""The plan: written settings, their order, and settings that need a save."""
 
 from dataclasses import replace
 from typing import Any
@@ -29,7 +29,7 @@ def test_only_what_differs_or_cannot_be_read_back_is_written_and_flash_only_then
     plan = planned({"mode": "9-axis", "output": {"a": 100}})
     assert plan == SettingsPlan((PlannedStep("mode", "9-axis", "6-axis"),), save=True)
     assert not planned({"mode": "9-axis"}, save=False).save
-    assert planned({"mode": "6-axis"}, unsaved=True).save  # written before and not saved
+    assert planned({"mode": "6-axis"}, unsaved=True).save  # a previous write is not saved
     assert not planned({"mode": "6-axis"}, save=False, unsaved=True).save
     assert names(planned({"secret": 5})) == ["secret"]
     assert names(planned({"secret": 5}, secret=5)) == []
@@ -40,7 +40,7 @@ def test_the_order_is_that_of_the_table_and_what_changes_the_connection_comes_la
     plan = planned({"baud": 921600, "offset_deg": 1.0, "mounting": "x_up", "mode": "9-axis"})
     assert names(plan) == ["mode", "mounting", "offset_deg", "baud"]
     assert plan.risk is Risk.CONNECTION
-    assert (plan.save, plan.restart) == (False, False)  # the step for the rate does both
+    assert (plan.save, plan.restart) == (False, False)  # the step of the rate saves and restarts
     assert planned({"mode": "9-axis"}).risk is Risk.NONE
     baud = replace(FAKE_SETTINGS.table["baud"], saves=False)
     table = replace(FAKE_SETTINGS, table={**FAKE_SETTINGS.table, "baud": baud})
@@ -66,11 +66,11 @@ def test_what_needs_a_restart_is_left_out_where_nothing_is_or_can_be_saved() -> 
 
 
 def test_values_are_checked_together_with_the_present_ones() -> None:
-    assert names(planned({"output": {"b": 1000}})) == ["output"]  # with 100 Hz of `a` it is 1100 of 1152
+    assert names(planned({"output": {"b": 1000}})) == ["output"]  # with `a` at 100 Hz the load is 1100 of 1152
     with pytest.raises(BadArgument, match="at most 96 Hz in all at 9600 baud, got 100 Hz"):
         planned({"baud": 9600})
     planned({"baud": 9600, "output": {"a": 90}})
-    planned({"baud": 9600}, save=False)  # it is left out
+    planned({"baud": 9600}, save=False)  # the plan leaves it out
 
 
 def test_values_of_several_keys_are_merged() -> None:

@@ -1,4 +1,4 @@
-"""What scripts say of how far a value is known, and the order of save and restart; failures are in test_keeper.py."""
+"""Results of writes, and the order of save and restart. test_settings.py tests failures."""
 
 import asyncio
 from collections.abc import Callable
@@ -17,7 +17,7 @@ TARGET = Target(None, 0)
 
 
 class TableOfOne:
-    """A device with the setting `x`: its scripts are done as soon as they are made."""
+    """A device with the setting `x`. Its scripts run when they are created."""
 
     def __init__(self, result: object, *, readable: bool = True, effect: Effect = Effect.AT_ONCE, **more: Any) -> None:
         self.actual: dict[str, Any] = {"x": 1}

@@ -1,4 +1,4 @@
-"""What is declared against what a device has: the table decides what agrees, and every value is described."""
+"""Comparison of declared and actual settings, and the description of each setting."""
 
 from typing import Any
 
@@ -27,7 +27,9 @@ def test_the_table_says_what_agrees_and_what_cannot_be_read_differs_unless_it_wa
     assert found == {"mode": SettingDifference("6-axis", None)}
     assert words(found) == 'mode is not reported, declared "6-axis"'
     assert differing({"mode": "6-axis"}, {}, {"mode": "6-axis"}) == []
-    assert differing({"mode": "6-axis"}, {"mode": "9-axis"}, {"mode": "6-axis"}) == ["mode"]  # what it says counts
+    assert differing({"mode": "6-axis"}, {"mode": "9-axis"}, {"mode": "6-axis"}) == [
+        "mode"
+    ]  # the reported value counts
     assert differing({"secret": 5}) == []
     assert unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, ACTUAL) == ("secret",)
     assert unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, {}) == ("mode", "secret")

@@ -1,4 +1,4 @@
-"""Detection in virtual time, against a model of the line that shows what a wrong rate makes of the bits."""
+"""Detection in virtual time, with a model of the bits at a wrong baud rate."""
 
 from dataclasses import replace
 from random import Random
@@ -23,9 +23,9 @@ def device(baud: int, rate_hz: float, phase_ns: int = 0, poll_ns: int = NS_PER_M
 def test_the_line_model_gives_the_bytes_at_the_right_rate_and_others_at_wrong_ones() -> None:
     data = bytes(range(256))
     assert bytes(value for _, value in received(data, 115200, 115200)) == data
-    # 0x00 at 9600 is one low of nine bits = 108 bits at 115200: one start edge only, sampled all low
+    # 0x00 at 9600 baud: low for nine bits = 108 bits at 115200 baud, with one start edge
     assert [value for _, value in received(b"\x00", 9600, 115200)] == [0]
-    # 0x55 at half the rate: start low 2 bits, then pairs 11 00 11 00: sampled 0 11 00 11 0
+    # 0x55 at half the rate: start bit low for 2 bits, then 11 00 11 00, sampled 0 11 00 11 0
     assert received(b"\x55", 115200, 230400)[0][1] == 0b01100110
 
 
@@ -36,7 +36,7 @@ def test_a_remembered_rate_that_is_wrong_costs_little_and_one_that_no_longer_exi
     assert found.baud == 921600
     assert listens[0].baud == 9600
     assert found.wasted_bytes > 0
-    assert took_ns < 0.8 * NS_PER_S  # garbage ends the long wait for silence
+    assert took_ns < 0.8 * NS_PER_S  # invalid bytes end the long wait
     assert first_baud(Search([FAKE_DRIVER], remembered=("gone-uart", 9600))) == BAUD_RATES[0]
     assert first_baud(Search([FAKE_DRIVER], remembered=("fake-uart", 57600))) == BAUD_RATES[0]
     assert first_baud(Search([FAKE_DRIVER], bauds=(9600,), remembered=("fake-uart", 115200))) == 9600
@@ -123,7 +123,7 @@ def test_two_valid_frames_are_a_lock_if_few_are_damaged() -> None:
     search = Search([FAKE_DRIVER], bauds=(115200,))
     search.start(0)
     step = search.on_data(fake_frame(b"x" * 76), 1)
-    assert isinstance(step, Listen)  # a longer stay
+    assert isinstance(step, Listen)  # a longer visit
     assert step.until_ns > NS_PER_S
     assert isinstance(search.on_data(fake_frame(b"y" * 76), 2), StreamFound)
     bad = fake_frame(b"x" * 76)[:-1] + b"y"
@@ -143,7 +143,7 @@ def test_a_noisy_line_still_locks_also_on_frames_inside_a_false_long_one() -> No
     search = Search([FAKE_DRIVER], bauds=(115200,))
     step = search.start(0)
     assert isinstance(step, Listen)
-    lie = b"\x5a\xa5\x00\x02\x00\x00"  # claims 512 bytes
+    lie = b"\x5a\xa5\x00\x02\x00\x00"  # its length field is 512
     assert search.on_data(lie + fake_frame(b"a" * 76) + fake_frame(b"b" * 76), 1) is None
     assert isinstance(search.on_time(step.until_ns), StreamFound)
 
@@ -226,8 +226,7 @@ class DeafCodec:
     def flush(self) -> list[CodecEvent]:
         return []
 
-    def reset(self) -> None:
-        """Has nothing to forget."""
+    def reset(self) -> None: ...
 
 
 def test_cut_frames_and_random_bytes_are_no_device() -> None:
@@ -250,7 +249,7 @@ def test_a_reply_behind_other_frames_and_frames_of_several_visits_count() -> Non
     while isinstance(step, Listen) and not step.send:
         step = search.on_time(step.until_ns)
     assert isinstance(step, Listen)
-    found = search.on_data(fake_frame(b"x" * 76) + REPLY, step.until_ns - 1)  # one frame does not suffice
+    found = search.on_data(fake_frame(b"x" * 76) + REPLY, step.until_ns - 1)  # one frame is not enough
     assert isinstance(found, StreamFound)
     deaf = replace(FAKE_DRIVER, name="other-uart", make_codec=lambda ledger, options: DeafCodec(ledger))
     search = Search([deaf, FAKE_DRIVER], bauds=(115200, 9600))

@@ -1,4 +1,4 @@
-"""Several families of devices on one port, neither driver nor rate known: each is found, and told from the others."""
+"""Detection of driver and baud rate for several device families on one port."""
 
 from dataclasses import replace
 from random import Random
@@ -50,7 +50,7 @@ def test_a_streaming_device_is_found_cold_among_all(driver: StreamDriver, baud: 
         assert far.sent_to == []
         ledger = Ledger()
         codec = driver.make_codec(ledger, driver.settings())
-        for data, _ in found.chunks:  # the device's own codec gets whole frames
+        for data, _ in found.chunks:  # the codec of the device receives complete frames
             codec.feed(data)
         assert ledger.frames_in_samples >= 2
 
@@ -68,7 +68,7 @@ def test_a_remembered_device_is_found_at_once(driver: StreamDriver, baud: int) -
 
 @pytest.mark.parametrize(("before", "now"), [(HIPNUC, IMU61X), (IMU61X, HIPNUC)])
 def test_a_device_of_the_other_family_in_its_place_is_found(before: StreamDriver, now: StreamDriver) -> None:
-    """Exchanged at the same rate: the remembered rate is heard first, with both codecs."""
+    """Another device at the same rate: the search starts at the remembered rate with both codecs."""
     search = Search(FAMILIES, remembered=(before.name, 115200))
     found, took_ns, _ = run_search(search, device(now, 115200, 100, 4_000_000), start_ns=NS_PER_S)
     assert isinstance(found, StreamFound)

@@ -1,4 +1,4 @@
-"""The life of a device on a link inside the process: found, asked, lost, back, silent, never crashing."""
+"""A device on a link in memory: search, query, unplug, replug, silence."""
 
 import asyncio
 from collections.abc import Callable, Coroutine
@@ -44,7 +44,7 @@ def feed(rig: DeviceRig, data: bytes) -> None:
 
 
 def play(story: Story, config: DeviceConfig | None = None, link: MemoryLink | None = None) -> None:
-    """Run the device while the story is told; at the end the ledger closes and the link is released."""
+    """Run the device during the story. At the end the ledger balances and the link is closed."""
     clock = VirtualClock()
     rigs = DeviceRigs(clock.host)
     rigs.add(config or configured(), link)
@@ -76,7 +76,7 @@ async def test_samples_flow_and_the_device_is_up(rig: DeviceRig) -> None:
 async def test_unplugged_and_back_the_count_goes_on_and_time_rises(rig: DeviceRig) -> None:
     for i in range(5):
         feed(rig, hi91(5000 + 10 * i))
-    feed(rig, hi91(5050)[:40])  # the cable goes in the middle of a frame
+    feed(rig, hi91(5050)[:40])  # unplugged within a frame
     rig.tick()
     rig.link.disappear()
     await rig.turn(lambda: rig.state is DeviceState.MISSING)
@@ -86,7 +86,7 @@ async def test_unplugged_and_back_the_count_goes_on_and_time_rises(rig: DeviceRi
     rig.link.appear()
     await rig.turn(lambda: rig.state is not DeviceState.MISSING)
     for i in range(3):
-        feed(rig, hi91(10 * i))  # the device was without power: its clock starts again
+        feed(rig, hi91(10 * i))  # power-on: the device counter starts again
     rig.tick()
     assert rig.is_in(DeviceState.RUNNING)
     assert [s.seq for s in rig.samples] == list(range(1, 9))
@@ -188,7 +188,7 @@ async def test_missing_samples_are_put_to_their_cause(rig: DeviceRig) -> None:
     feed(rig, hi91(210))
     assert rig.ledger.lost_crc == 1
     rig.link.counters = KernelCounters(overrun=1)
-    feed(rig, hi91(240))  # 220 and 230 are missing
+    feed(rig, hi91(240))  # 220 and 230 are lost
     assert rig.ledger.lost_overrun == 2
     feed(rig, hi91(260))
     assert rig.ledger.lost_gap_device == 1
@@ -201,7 +201,7 @@ async def test_missing_samples_are_put_to_their_cause(rig: DeviceRig) -> None:
 async def test_frame_held_by_a_lying_length_is_delivered_when_the_line_is_idle(rig: DeviceRig) -> None:
     feed(rig, b"\x5a\xa5\xff\x01" + hi91(10))
     rig.tick(ahead_ns=50 * MS)
-    assert rig.samples == []  # the rest of the long frame may still come
+    assert rig.samples == []  # the rest of the long frame can still arrive
     rig.tick(ahead_ns=51 * MS)
     assert len(rig.samples) == 1
 
@@ -244,21 +244,21 @@ async def test_a_device_without_samples_is_given_time_and_then_says_what_to_look
 
 
 class DeafModule:
-    """A module that streams, and answers from a request for its version on; in virtual time."""
+    """A module that ignores the first `deaf_to` requests for its version; in virtual time."""
 
     def __init__(self, deaf_to: int, deaf_to_settings: int = 0) -> None:
         self.clock = VirtualClock()
         self.rigs = DeviceRigs(self.clock.host)
         self.rig = self.rigs.add(configured(identify=True))
         self.asked_ns: list[int] = []
-        """When it was asked for its version."""
+        """Times of the version requests."""
         self.paused = False
-        """It sends nothing, and hears."""
+        """Whether the module sends no samples, but receives requests."""
         self._deaf_to, self._deaf_to_settings = deaf_to, deaf_to_settings
         self._ms = self._seen = 0
 
     def step(self) -> None:
-        """A frame every 0.25 s, and the replies."""
+        """Send a frame every 0.25 s, and the replies."""
         self._ms += 250
         if not self.paused:
             assert self.rig.link.feed(hi91(self._ms), self.clock.now_ns())
@@ -279,7 +279,7 @@ class DeafModule:
         return self.rig.device.status().identity.get("product")
 
     def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Run the device while the story is told."""
+        """Run the device during the story."""
 
         async def told(_made: list[DeviceRig]) -> None:
             await self.rig.until(lambda: self.rig.link.listening)
@@ -293,7 +293,7 @@ class DeafModule:
 async def test_a_device_that_streams_and_did_not_answer_is_asked_until_it_does(
     module: DeafModule, deaf_to: int
 ) -> None:
-    """Three tries, then one after 5, 30 and 120 s, then every five minutes."""
+    """Three queries, further queries after 5, 30 and 120 s, then a query per five minutes."""
     await module.rig.until(lambda: module.product, limit_s=2000, step=module.step, step_s=0.25)
     await module.pass_s(310)
     assert len(module.asked_ns) == deaf_to + 1
@@ -309,20 +309,20 @@ async def test_a_device_that_never_answers_gets_a_request_in_five_minutes(module
     assert len(pauses_s[5:]) == 4
     assert all(300 <= pause_s < 303 for pause_s in pauses_s[5:])
     assert module.product is None
-    assert module.rig.is_in(DeviceState.RUNNING)  # it streams all the same
+    assert module.rig.is_in(DeviceState.RUNNING)  # samples arrive anyway
     assert len(module.rig.samples) > 5000
 
 
 @played(lambda: DeafModule(5))
 async def test_a_device_that_is_silent_for_a_moment_before_it_has_answered_is_asked_on(module: DeafModule) -> None:
-    """The request at its silence is lost, too, and its samples come back meanwhile: no search, and no last request."""
+    """The request in the silence is lost too, and samples return in the meantime: no search, no further request."""
     await module.pass_s(12)
-    assert len(module.asked_ns) == 4  # the next pause is of 30 s
+    assert len(module.asked_ns) == 4  # the next pause is 30 s
     module.paused = True
     await module.rig.until(lambda: len(module.asked_ns) == 5, step=module.step, step_s=0.25)
     assert module.rig.is_in(DeviceState.SILENT)
     module.paused = False
-    module.step()  # within the time of that request
+    module.step()  # within the timeout of this request
     await module.pass_s(2)
     assert module.rig.is_in(DeviceState.RUNNING)
     assert module.product is None
@@ -401,7 +401,7 @@ def test_bytes_that_come_before_the_search_begins_are_counted() -> None:
 
 @pytest.mark.parametrize("baud", [115200, "auto"])
 def test_the_time_unplugged_is_no_silence(baud: Any) -> None:
-    """A device that was away for 6 s and needs another 3 s to start again is up once, and was never silent."""
+    """A device that was unplugged for 6 s and boots for 3 s: one UP event, and no silence."""
     clock = VirtualClock()
     rigs = DeviceRigs(clock.host)
     rig = rigs.add(configured(baud=baud))
@@ -517,7 +517,7 @@ def test_an_action_that_changes_the_rate_takes_port_and_memory_along(monkeypatch
 
 @told(play, configured(baud="auto"))
 async def test_a_device_that_is_back_counts_as_found_by_its_new_samples_only(rig: DeviceRig) -> None:
-    """While a line is searched, samples of before do not make it run."""
+    """During a search, earlier samples do not change the state to RUNNING."""
     for ms in range(0, 400, 10):
         feed(rig, hi91(ms))
     rig.tick()

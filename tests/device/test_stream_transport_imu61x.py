@@ -1,4 +1,4 @@
-"""A simulated IMU61x in every variant, from the line to actions and settings: in virtual time, and on a real pty."""
+"""Every variant of a simulated IMU61x, with actions and settings, in virtual time and on a pty."""
 
 import asyncio
 import time
@@ -27,7 +27,7 @@ SLOW = Imu61xSettings(rate_hz=50)
 
 
 class VariantBench:
-    """One device at work in virtual time."""
+    """One device in virtual time."""
 
     def __init__(self, behaviour: Imu61xBehaviour, settings: Imu61xSettings | None = None) -> None:
         self.clock = VirtualClock()
@@ -41,7 +41,7 @@ class VariantBench:
         self.device = self.rig.device
 
     def play(self, story: Callable[[], Awaitable[None]]) -> None:
-        """Run the device during the story, which begins with samples and identity."""
+        """Run the device. The story starts after the first samples and the identity."""
 
         async def whole() -> None:
             await self.rig.until(
@@ -52,7 +52,7 @@ class VariantBench:
         play_on_line(self.line, self.rigs, whole)
 
     async def samples(self) -> None:
-        """Some more samples come, at the latest when the device has been quiet for a while."""
+        """Wait for more samples."""
         count = len(self.rig.samples) + 20
         await self.rig.until(lambda: len(self.rig.samples) >= count, "more samples", 10, step_s=0.01)
         assert self.device.state is DeviceState.RUNNING
@@ -117,7 +117,7 @@ async def test_a_device_that_refuses_all_orders_is_left_as_it_was(bench: Variant
 
 @pytest.mark.live
 def test_on_a_real_port(tmp_path: Path) -> None:
-    """The line's rate follows the terminal's: what is sent at another one is garbage at the far end."""
+    """The baud rate of the pty has an effect: another rate damages the bytes."""
     hardware = imu61x_hardware(uptime_us=UPTIME_US, boot_ms=200)
     module = Imu61xModule(time.monotonic_ns(), None, hardware)
 

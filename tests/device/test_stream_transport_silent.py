@@ -1,4 +1,4 @@
-"""A simulated HiPNUC module on a line in virtual time: silent and told things, changed, read back, never lost."""
+"""A simulated HiPNUC module in virtual time: silence, commands, changed settings, read-back."""
 
 import asyncio
 import time
@@ -33,7 +33,6 @@ every_link = pytest.mark.parametrize("link", LINKS, ids=str)
 
 
 def turns(device: LinkedDevice) -> list[EventKind]:
-    """The events up and down so far."""
     return [event.kind for event in device.events if event.kind in UP_AND_DOWN]
 
 
@@ -104,7 +103,7 @@ async def test_a_module_that_was_silenced_stays_so_and_is_asked_at_its_own_rate(
     assert turns(device) == [EventKind.UP, EventKind.DOWN]
     asked = device.link.sent_at[sent:]
     assert {baud for baud, _ in asked} == {115200}
-    assert 2 <= sum(data.startswith(b"LOG VERSION") for _, data in asked) <= 4  # once in 15 s
+    assert 2 <= sum(data.startswith(b"LOG VERSION") for _, data in asked) <= 4  # one search per 15 s
     await device.act("output", message="HI91", rate_hz=100)
     await device.until(lambda: len(device.samples) > count + 20)
     assert turns(device) == [EventKind.UP, EventKind.DOWN, EventKind.UP]
@@ -112,7 +111,7 @@ async def test_a_module_that_was_silenced_stays_so_and_is_asked_at_its_own_rate(
 
 @played(lambda: LinkedDevice(baud="auto"))
 async def test_while_a_lost_module_is_searched_for_no_command_goes_out(device: LinkedDevice) -> None:
-    """It is switched off: the search asks at all rates, and nothing else does."""
+    """The module is off: only the search sends requests at all rates."""
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
     device.module.receive(b"UNLOGALL\r\n", device.clock.now_ns())
     await device.wait(0.1)
@@ -136,7 +135,7 @@ async def test_while_a_lost_module_is_searched_for_no_command_goes_out(device: L
 async def test_a_script_under_way_ends_when_a_search_begins_under_it(
     device: LinkedDevice, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Even if the search did not wait for it, it would send nothing at the rates of the search."""
+    """A running script does not send at the rates of the search, even if the search does not wait for the script."""
     monkeypatch.setattr(StreamTransport, "busy", property(lambda _transport: False))
     await device.until(lambda: len(device.samples) > 20)
     device.link.module_is_on = False
@@ -190,7 +189,7 @@ async def test_settings_are_read_again_after_each_action(device: LinkedDevice) -
 @played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(refuses=("CONFIG ATT RST",)))))
 async def test_after_an_action_that_fails_the_settings_are_what_the_module_has(device: LinkedDevice) -> None:
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
-    device.module.receive(b"CONFIG ATT MODE 1\r\n", device.clock.now_ns())  # by somebody else
+    device.module.receive(b"CONFIG ATT MODE 1\r\n", device.clock.now_ns())  # by another program
     await device.wait(0.1)
     with pytest.raises(CommandError, match="the device rejected the request"):
         await device.act("level", level="automatic")
@@ -199,7 +198,7 @@ async def test_after_an_action_that_fails_the_settings_are_what_the_module_has(d
 
 @played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(), firmware=169)))
 async def test_status_bits_and_settings_are_shown_by_name(device: LinkedDevice) -> None:
-    """Firmware 1.6.9 and newer sends MAIN_STATUS; the simulated module converges within 5 s."""
+    """Firmware from 1.6.9 sends MAIN_STATUS; the simulated module converges within 5 s."""
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
     status = device.device.status()
     assert status.status_words == (
@@ -238,7 +237,7 @@ async def test_output_that_is_declared_to_be_off_is_not_switched_on(device: Link
 @pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARIANTS)
 @played(lambda behaviour: LinkedDevice(hardware=hardware_of(behaviour), baud="auto"))
 async def test_declared_settings_reach_every_variant(device: LinkedDevice, behaviour: Behaviour) -> None:
-    """More output than the old rate carries, with the rate that carries it."""
+    """An output that needs the new baud rate, together with this rate."""
     wanted = {"mode": "9-axis", "mounting": "y_up", "sout_divisor": 3, "output": {"hi91": 500}, "baud": 921600}
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
     applying = asyncio.ensure_future(device.device.settings_apply(wanted, save=True))
@@ -246,7 +245,7 @@ async def test_declared_settings_reach_every_variant(device: LinkedDevice, behav
     applied = applying.result()
     assert applied.problem == ""
     outcomes = {step.name: step.outcome for step in applied.steps}
-    assert outcomes.pop("mounting") in (StepOutcome.DONE, StepOutcome.WRITTEN)  # in force by the restart for baud
+    assert outcomes.pop("mounting") in (StepOutcome.DONE, StepOutcome.WRITTEN)  # active after the restart for baud
     assert set(outcomes.values()) == {StepOutcome.DONE}
     assert applied.steps[-1].name == "baud"
     flash = ModuleSettings(
@@ -260,7 +259,7 @@ async def test_declared_settings_reach_every_variant(device: LinkedDevice, behav
 
 @pytest.mark.live
 def test_on_a_real_port(tmp_path: Path) -> None:
-    """The line's rate follows the terminal's: what is sent at another one is garbage at the far end."""
+    """The baud rate of the pty has an effect: another rate damages the bytes."""
     hardware = hardware_of(Behaviour(), boot_ms=200)
     module = HipnucModule(time.monotonic_ns(), NO_RATE, hardware)
 

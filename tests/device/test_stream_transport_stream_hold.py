@@ -1,6 +1,6 @@
-"""Samples of a stream that wait: what is read when, what is published together, and when nothing waits.
+"""Held samples of a stream: times of reads, size of batches, and cases without a hold.
 
-The module sends every ms; its fit of arrivals is in use after 100 ms. All of it in virtual time.
+The module sends a frame every ms. imud uses its fit after 100 ms. All tests use virtual time.
 """
 
 import asyncio
@@ -22,19 +22,19 @@ from tests.support.stories import played
 MOST_NS = 50 * 10**6
 
 WIRE_NS = 890 * NS_PER_US
-"""82 bytes at 921600 baud."""
+"""Duration of a frame, ns: 82 bytes at 921600 baud."""
 FIT_MS = 400
-"""After this the fit is used, and rounds are as long as they may be."""
+"""Time after which imud uses the fit and the maximum hold, ns."""
 
 
 class Takes(MemoryLink):
-    """A link that notes its reads of what waited: when, and how many bytes."""
+    """A link that notes time and size of each read after a hold."""
 
     def __init__(self, settings: MemoryOptions, clock: VirtualClock) -> None:
         super().__init__(settings)
         self.taken: list[tuple[int, int]] = []
         self.resumed: list[int] = []
-        """When it was to be read as it comes again."""
+        """Times of `resume`."""
         self._clock = clock
 
     def take(self) -> bytes:
@@ -48,12 +48,12 @@ class Takes(MemoryLink):
 
 
 class HoldBench:
-    """A module at 1 kHz and the device that reads it."""
+    """A module at 1 kHz and its device."""
 
     def __init__(
         self, latency_ms: float, *, period_ms: int = 1, waiting_bytes: int = 2048, hold_ns: int = 0, anew: bool = False
     ) -> None:
-        """`anew`: the module's time begins anew in the story, or part of it is left out."""
+        """`anew`: the story restarts the device time, or leaves out samples."""
         self.clock = VirtualClock()
         settings = MemoryOptions(baud=921_600, waiting_bytes=waiting_bytes, hold_ns=hold_ns)
         self.link = Takes(settings, self.clock)
@@ -69,7 +69,7 @@ class HoldBench:
         return hi91(1000 + number * self._period_ms)
 
     async def send(self, count: int, make: Callable[[int], bytes] | None = None) -> None:
-        """Frames as they come; the device ticks as in the daemon."""
+        """Send frames, and tick the device as the daemon does."""
         for _ in range(count):
             self.sent += 1
             await asyncio.sleep(self._period_ms / 1000)
@@ -78,19 +78,18 @@ class HoldBench:
                 self.rig.tick()
 
     def want(self, latency_ms: float, who: str = "client 1") -> None:
-        """From now on samples may wait so long."""
         self.device.set_need(Need(round(latency_ms * NS_PER_MS), who))
 
     def sizes(self, since: int) -> list[int]:
-        """Samples of each batch from that number on."""
+        """Return the samples of each batch from a sequence number."""
         return [len(samples) for _, samples in self.rig.published[since:]]
 
     def waits_ns(self, since: int) -> list[int]:
-        """Of each batch from that number on, from the arrival of its oldest sample to its publication."""
+        """Return the hold of each batch from a sequence number: arrival of its oldest sample to publication."""
         return [at_ns - samples[0].t_rx_ns for at_ns, samples in self.rig.published[since:]]
 
     def play(self, story: Callable[[], Awaitable[None]]) -> None:
-        """Run the device until its fit is used, then the story; no sample may be missing at the end."""
+        """Run the device until imud uses the fit, then the story. At the end no sample is lost."""
 
         async def whole() -> None:
             async with self.rigs.at_work():
@@ -131,7 +130,7 @@ async def test_behind_a_latency_timer_one_message_of_each_round_is_read_as_it_co
 @played(lambda: HoldBench(10))
 async def test_a_latency_that_ends_while_samples_are_published_ends_the_wait(bench: HoldBench, before: int) -> None:
     class Leaving(list[tuple[int, list[Sample]]]):
-        """The client that lets samples wait leaves as it gets some."""
+        """The client with the latency request disconnects when it receives samples."""
 
         def append(self, item: tuple[int, list[Sample]]) -> None:
             super().append(item)
@@ -180,7 +179,7 @@ async def test_nothing_waits_before_the_fit_is_used_nor_again_after_a_restart_of
     assert single == [1] * 100
     assert bench.rig.samples[99].sync is Sync.ARRIVAL
     since, begun = len(bench.rig.samples), bench.sent
-    await bench.send(1000, lambda number: bench.frame(number - begun))  # its time begins anew
+    await bench.send(1000, lambda number: bench.frame(number - begun))  # the device time restarts
     anew = [s for s in bench.rig.samples[since:] if s.sync is Sync.ARRIVAL]
     assert len(anew) > 50
     late = [s.t_rx_ns - s.t_ns - 2 * s.t_err_ns for s in anew]
@@ -225,7 +224,7 @@ async def test_no_more_gathers_than_may_wait(bench: HoldBench) -> None:
     assert max(size for _, size in bench.link.taken[since:]) <= 820 + 82
     assert bench.device.status().hold_ns <= 11 * NS_PER_MS
     begun = bench.sent
-    await bench.send(300, lambda number: bench.frame(number) + bytes(200))  # far more is sent now
+    await bench.send(300, lambda number: bench.frame(number) + bytes(200))  # the data rate is much higher now
     assert max(size for _, size in bench.link.taken[-10:]) <= 820 + 282
     assert begun + 300 == bench.sent
 
@@ -255,7 +254,7 @@ async def test_the_first_sample_after_silence_waits_no_longer_than_the_others(be
 
 @played(lambda: HoldBench(MOST_NS / NS_PER_MS))
 async def test_an_incomplete_frame_that_waits_is_not_given_up(bench: HoldBench) -> None:
-    """The daemon's tick finds the last read long ago: the rest of the frame waits in the kernel."""
+    """At the tick the last read is long ago, but the rest of the frame is in the kernel."""
     for _ in range(40):
         bench.sent += 2
         first, second = bench.frame(bench.sent - 1), bench.frame(bench.sent)
@@ -265,7 +264,7 @@ async def test_an_incomplete_frame_that_waits_is_not_given_up(bench: HoldBench) 
         bench.link.feed(second[40:], bench.clock.now_ns())
         bench.rig.tick()
     await asyncio.sleep(0.1)
-    for _ in range(5):  # now a part of a frame is all that comes
+    for _ in range(5):  # only a part of a frame arrives
         bench.sent += 1
         frame = bench.frame(bench.sent)
         bench.link.feed(frame[:40], bench.clock.now_ns())
@@ -277,7 +276,7 @@ async def test_an_incomplete_frame_that_waits_is_not_given_up(bench: HoldBench) 
 
 @played(lambda: HoldBench(50))
 async def test_a_request_is_not_slowed(bench: HoldBench) -> None:
-    """What waits is processed when it begins, and its reply as it comes; then samples wait again."""
+    """imud processes held samples at the start of a script, receives the reply without a hold, then holds again."""
 
     def asking() -> RequestScript[int]:
         asked = Request(b"WHO\r\n", "who", of_text("OK".__eq__), never, never, 1_000 * NS_PER_MS)
@@ -313,4 +312,4 @@ async def test_at_the_end_what_was_kept_is_published(bench: HoldBench, how: str)
         await asyncio.sleep(0)
         await asyncio.sleep(0)
     else:
-        await bench.send(7)  # these wait in the kernel
+        await bench.send(7)  # these samples are in the kernel

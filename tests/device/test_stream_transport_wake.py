@@ -1,4 +1,4 @@
-"""A simulated IMU61x on a line in virtual time: made to stream when it is silent, and never left silent."""
+"""A simulated IMU61x in virtual time: imud starts the output of a silent device."""
 
 from collections.abc import Callable, Coroutine
 from typing import Any
@@ -68,7 +68,7 @@ async def test_device_saved_in_command_mode_is_made_to_stream(bench: WakeBench, 
     [
         ({"identify": False}, 8, [], range(1)),
         ({"boot_ms": 10**6}, 20, [], range(11, 10**6)),
-        ({"boot_ms": 0, "changes_mode": False}, 10, [WOKEN], range(1, 10**6)),  # it acknowledges and stays silent
+        ({"boot_ms": 0, "changes_mode": False}, 10, [WOKEN], range(1, 10**6)),  # it acknowledges, but sends no samples
     ],
     ids=["may not be asked", "never answers", "does not stream"],
 )
@@ -94,7 +94,7 @@ async def test_device_that_streams_is_not_told_to_and_one_that_was_silenced_is_l
 
 @played(lambda: WakeBench(boot_ms=20_000, acknowledges=False))
 async def test_device_that_comes_later_is_woken_and_told_of_once(bench: WakeBench) -> None:
-    """It boots for 20 s, and does not say that it obeys."""
+    """The module boots for 20 s and does not acknowledge."""
     await bench.until(lambda: bench.woken and len(bench.samples) > 500, 60)
     assert bench.woken == [WOKEN]
     assert [e.detail["acknowledged"] for e in bench.events if "acknowledged" in e.detail] == [False]
@@ -102,7 +102,7 @@ async def test_device_that_comes_later_is_woken_and_told_of_once(bench: WakeBenc
 
 @pytest.mark.parametrize("cut_at", range(1, 25, 3))
 def test_identification_cut_off_anywhere_leaves_it_streaming(cut_at: int) -> None:
-    """The daemon stops in the middle of the questions; the device answers in command mode only."""
+    """The daemon stops during the queries. The device only replies in command mode."""
     bench = WakeBench(STREAMING, answers_while_streaming=False)
     bench.play(lambda: bench.until(lambda: len(bench.line.written) >= cut_at))
     assert bench.module.settings.mode is OutputMode.STREAM
@@ -116,5 +116,5 @@ async def test_a_link_that_is_gone_needs_nothing(bench: WakeBench) -> None:
     count = len(bench.line.written)
     bench.line.appear()
     await bench.until(lambda: len(bench.line.written) > count)
-    await bench.until(lambda: len(bench.samples) > 20)  # asked again, which begins with what it is in
+    await bench.until(lambda: len(bench.samples) > 20)  # the next query starts with the present mode
     assert bench.rig.is_in(DeviceState.RUNNING)

@@ -1,4 +1,4 @@
-"""UTC of one device: sentences to its port, a reference for its clock, pulses to chronyd."""
+"""UTC of one device: sentences for its port, a reference for its clock, pulses for chronyd."""
 
 from typing import cast
 
@@ -180,7 +180,7 @@ def test_problems_show_and_a_sentence_that_is_too_late_for_its_pulse_is_refused(
     bench.source.problem = "no gpsd"
     assert bench.keeper.status().problem == "no gpsd"
     bench.second(0, sentence=False)
-    bench.now_ns = BEGIN_NS + NS_PER_S - 25 * NS_PER_MS  # 6 ms on the wire, and 20 ms before the next second at least
+    bench.now_ns = BEGIN_NS + NS_PER_S - 25 * NS_PER_MS  # 6 ms transmission, and at least 20 ms before the next second
     bench.source.give(build(UTC_S * NS_PER_S), bench.now_ns)
     assert bench.keeper.status().refused == {"stale": 1}
 
@@ -236,6 +236,6 @@ def test_a_device_gets_what_it_is_configured_for(
         now_ns[0] = BEGIN_NS + second * NS_PER_S + NS_PER_S // 5
         source.give(build((UTC_S + second) * NS_PER_S), now_ns[0])
     assert len(port.written) == (6 if rmc is not None else 0)
-    to_chrony = pps is not None and pps.chrony and rmc is not None  # the second of a pulse must be known
+    to_chrony = pps is not None and pps.chrony and rmc is not None  # imud must know the second of a pulse
     assert bool(keeper.status().chrony_refused) == bool(to_chrony)
     keeper.close()

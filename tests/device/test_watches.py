@@ -1,4 +1,4 @@
-"""Simulated modules of known attitude in a body: what is published of them, and when an event says that it is wrong."""
+"""Simulated modules with known attitude: published samples, and events about contradictions."""
 
 import asyncio
 from math import degrees, radians
@@ -39,12 +39,12 @@ from tests.support.device_rig import DeviceRig, DeviceRigs, play
 from tests.support.event_loops import VirtualClock
 
 BODY_DEG = (5.0, -10.0, 30.0)
-"""Roll, pitch, yaw of the body in enu-flu: left side up by 5°, nose up by 10°, its front 30° to the left of east."""
+"""Roll, pitch, yaw of the body in enu-flu: left side up 5°, nose up 10°, front 30° left of east."""
 STEP_S = 0.01
 
 
 def in_body(frame: FrameOptions, euler_deg: Vector3 = BODY_DEG, device: Any = RFU_ENU) -> Still:
-    """The sensor at rest in a body of this attitude, as it is mounted; `Still` takes its angles in the order 312."""
+    """Return the motion of a mounted sensor in a body at rest. `Still` uses the order 312."""
     roll, pitch, yaw = euler_deg
     body = matrix_from_quat(quat_from_euler_zyx((radians(roll), radians(pitch), radians(yaw))))
     sensor = quat_from_matrix(matrix_product(body, mounting_of(frame, device)))
@@ -52,7 +52,7 @@ def in_body(frame: FrameOptions, euler_deg: Vector3 = BODY_DEG, device: Any = RF
 
 
 class ZDown:
-    """The same motion of a sensor whose own axes are x forward, y right, z down, in a level frame with z down."""
+    """Return the motion of a sensor with x forward, y right, z down, in a level system with z down."""
 
     def __init__(self, motion: Motion) -> None:
         self._motion = motion
@@ -83,7 +83,7 @@ class Played:
 
 
 def played(driver: str, motion: Motion, seconds: float = 12.0, identify: bool = False, **keys: Any) -> Played:
-    """Run the module of a driver on a link in memory in virtual time, with these keys of the configuration."""
+    """Run a module on a link in memory in virtual time, with these keys of the configuration."""
     clock = VirtualClock()
     module: StreamModule
     if driver == "hipnuc-uart":
@@ -121,7 +121,7 @@ MOUNTINGS = {
     "as the manual draws it": FrameOptions(),
     "on its side": axes("y", "z", "x"),
     "upside down": axes("y", "x", "-z"),
-    "turned 90° in yaw": axes("x", "y", "z"),  # of a module with x right, y forward
+    "turned 90° in yaw": axes("x", "y", "z"),  # a module with x right, y forward
     "by angles": FrameOptions(euler=MountingAngles(roll_deg=90, pitch_deg=20, yaw_deg=-70)),
     "by a quaternion": FrameOptions(quat_wxyz=[0.5, -0.5, 0.5, -0.5]),
 }
@@ -148,7 +148,7 @@ def test_the_same_body_in_ned_frd_and_without_the_keys() -> None:
     assert made.euler_deg == pytest.approx((5.0, 10.0, 60.0), abs=1e-3), "nose up, and 60° clockwise from north"
     assert (made.status.convention, made.status.navigation_frame) == ("ned-frd", "NED")
     assert "z down" in made.status.frame
-    # Bit for bit: the published samples are those that the path without any rotation makes
+    # bit-identical to the samples of a path without rotation
     motion = in_body(FrameOptions())
     made = played("hipnuc-uart", motion, 2.0)
     truth = motion.at(0.0)
@@ -162,7 +162,7 @@ def test_the_same_body_in_ned_frd_and_without_the_keys() -> None:
 
 
 def test_a_declination_and_what_the_heading_counts_from() -> None:
-    """The mode is read back from the module: nine axes, so its heading is magnetic."""
+    """imud reads the mode of the module: nine axes, so that the heading is magnetic."""
     motion = in_body(FrameOptions())
     plain = played("hipnuc-uart", motion, 2.0, identify=True)
     assert plain.status.heading is Heading.MAGNETIC
@@ -182,7 +182,7 @@ def test_a_declination_and_what_the_heading_counts_from() -> None:
 
 
 def test_z_down_is_found_and_cured_either_way() -> None:
-    """The axes of an IMU61x are not settled: with z down the event says what to set, and setting it is right."""
+    """The axes of an IMU61x are uncertain: with z down the event names the right option."""
     motion = ZDown(in_body(FrameOptions(), device=FLU_LEVEL))
     wrong = played("imu61x-uart", motion, 20.0)
     (event,) = wrong.events
@@ -230,7 +230,7 @@ def test_a_wrong_mounting_is_found(is_so: str, said: FrameOptions) -> None:
 
 
 def test_another_device_is_checked_anew() -> None:
-    """The driver of a device that replaces another one makes another path: its contradictions are events again."""
+    """A replaced device with another driver has a new path: its contradictions raise events again."""
     events: list[Event] = []
     config = DeviceConfig("bow", "auto", None, False, "memory", MemoryOptions(), frame=FrameOptions())
     watch = AttitudeWatch(config, DeviceEvents("bow", Ledger(), events.append))
@@ -261,14 +261,14 @@ def test_another_device_is_checked_anew() -> None:
 
 
 def test_in_motion_nothing_is_said() -> None:
-    """A module that is mounted wrongly and swings without a rest."""
+    """A wrongly mounted module that swings and never rests."""
     swing = Swing(roll=(Sine(0.3, 0.5), Sine(3.1, 0.0, 1.57)), pitch=(Sine(0.3, 0.4),), yaw=(Sine(0.5, 0.3),))
     made = played("hipnuc-uart", swing, 20.0, frame=FrameOptions())
     assert made.events == []
 
 
 def test_every_sample_is_turned_once_and_the_newest_of_the_path_not_at_all() -> None:
-    """That one stays in the sensor's axes: the ALARM line is compared with it."""
+    """The acceleration in sensor axes stays available for the ALARM line."""
     frame = published_frame(MOUNTINGS["upside down"], None, None, RFU_ENU)
     clock, ledger, batches = VirtualClock(), Ledger(), list[Batch]()
     context = PathContext(

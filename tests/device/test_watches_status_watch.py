@@ -1,4 +1,4 @@
-"""Status bits that mean trouble are events when they are set and cleared, few of them, and none is missed."""
+"""Events about notable status bits: set and cleared, with a limited rate."""
 
 from itertools import pairwise
 from typing import Any
@@ -19,7 +19,7 @@ OVER_RANGE, DISTURBED, AT_REST = 1 << 5, 1 << 4, 1 << 9
 
 
 class FakePath:
-    """A path whose samples have the status that the test says."""
+    """A path with the status bits of the test."""
 
     def __init__(self) -> None:
         self.mask = self.status = 0
@@ -40,7 +40,7 @@ class WatchBench:
         self.now_ns = 1000 * NS_PER_S
 
     def step(self, status: int | None, count: int = 1) -> list[str]:
-        """Let samples with a status come, None for no samples; return the messages of the events."""
+        """Process samples with a status (None: no samples). Return the messages of the events."""
         before = len(self.events)
         for _ in range(count):
             self.now_ns += TICK_NS
@@ -85,7 +85,7 @@ def test_the_bits_of_another_device_are_events_again() -> None:
     bench = WatchBench()
     assert bench.step(DISTURBED | OVER_RANGE, 20)
     bench.path = FakePath()
-    assert bench.step(AT_REST, 20) == []  # nothing of the former device is cleared
+    assert bench.step(AT_REST, 20) == []  # no bit of the previous device is cleared
     assert bench.step(DISTURBED) == ["status: magnetic disturbance"]
     assert bench.step(0, 20) == ["status: cleared: magnetic disturbance"]
 
