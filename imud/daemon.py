@@ -128,19 +128,16 @@ def _give(answer: "asyncio.Future[Config]", config: Config | None, error: Config
         answer.set_exception(error or ConfigError("not read"))
 
 
-TICK_S = 0.1
-"""Interval of ticks, s."""
+TICK_S = 0.1  # interval of ticks, s
 RETRY_FIRST_NS = NS_PER_S
 """First pause before imud starts a failed output again, ns. The pause doubles up to RETRY_MOST_NS."""
-RETRY_MOST_NS = 60 * NS_PER_S
-"""Maximum pause before imud starts a failed output again, ns."""
+RETRY_MOST_NS = 60 * NS_PER_S  # maximum pause before imud starts a failed output again, ns
 
 
 class _PutOff(NamedTuple):
     """Next start of a failed output."""
 
-    due_ns: int
-    """CLOCK_MONOTONIC of the next start."""
+    due_ns: int  # CLOCK_MONOTONIC of the next start
     pause_ns: int
 
 

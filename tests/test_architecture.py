@@ -150,7 +150,6 @@ SMALL_LINES = 130
 
 LONG_MODULES = {
     "imud.cli.top": "the display of one command: table, details of a device, keys",
-    "imud.device.polled_bus": "one state machine: the turns of the devices on a bus",
     "imud.drivers.imu61x.uart.settings": "the table of settings with its scripts",
     "imud.links.socketcan": "one link: socket, bus state and reader",
     "imud.publishers.metrics.families": "one table: the metric families",

@@ -33,14 +33,12 @@ from imud.model.sample import Pair, Sample, Vector3
 from imud.model.units import NS_PER_S, RAD_PER_DEG
 from imud.sampling.clock import SampleClock
 
-WINDOW_SAMPLES: Final = 20
-"""Number of samples of a rest: 2 s at ten samples per second."""
+WINDOW_SAMPLES: Final = 20  # number of samples of a rest: 2 s at ten samples per second
 RATE_BAND_RAD_S: Final = 1.0 * RAD_PER_DEG
 """Maximum deviation from the mean at rest, rad/s: ten times the noise. A hand moves the device more."""
 RATE_MEAN_RAD_S: Final = 5.0 * RAD_PER_DEG
 """Maximum mean at rest, rad/s: above the bias of an uncalibrated gyroscope, below a slow turn."""
-ACCEL_BAND_M_S2: Final = 0.5
-"""Maximum deviation from the mean at rest, m/s²."""
+ACCEL_BAND_M_S2: Final = 0.5  # maximum deviation from the mean at rest, m/s²
 STANDARD_GRAVITY_M_S2: Final = 9.80665
 GRAVITY_TOLERANCE: Final = 0.05
 """Maximum relative difference to standard gravity. Scale errors and local gravity are below 1 %."""
@@ -54,8 +52,7 @@ class RestWindow:
         self._gyro: deque[Vector3] = deque(maxlen=WINDOW_SAMPLES)
         self._euler: deque[Vector3] = deque(maxlen=WINDOW_SAMPLES)
         self._incli: deque[Pair] = deque(maxlen=WINDOW_SAMPLES)
-        self.samples = 0
-        """Number of samples since the last `clear`."""
+        self.samples = 0  # number of samples since the last `clear`
 
     def add(self, sample: Sample) -> None:
         self.samples += 1
@@ -131,27 +128,19 @@ def _circular_mean(angles: Iterable[tuple[float, ...]]) -> tuple[float, ...]:
     return tuple(atan2(sum(sin(one) for one in axis), sum(cos(one) for one in axis)) for axis in axes)
 
 
-_ORDERS: Final = tuple(permutations(range(3)))
-"""Possible orders of the axes by absolute value."""
-CELLS: Final = 8 * len(_ORDERS)
-"""Number of cells of the sphere: 48."""
+_ORDERS: Final = tuple(permutations(range(3)))  # possible orders of the axes by absolute value
+CELLS: Final = 8 * len(_ORDERS)  # number of cells of the sphere: 48
 POINTS_MAX: Final = 1024
 """Maximum number of points for the coverage. A slow calibration of five minutes has about 700."""
-POINT_DISTANCE_T: Final = 5e-6
-"""Minimum distance of two points, T: an eighth of a cell in Earth's field."""
-FIT_POINTS_MIN: Final = 12
-"""Minimum number of points for a fit."""
+POINT_DISTANCE_T: Final = 5e-6  # minimum distance of two points, T: an eighth of a cell in Earth's field
+FIT_POINTS_MIN: Final = 12  # minimum number of points for a fit
 T_PER_UT: Final = 1e-6
-STEP_MAX_NS: Final = NS_PER_S
-"""Maximum time between two samples in the integral of the angular rate, ns."""
-TURNS_WANTED_RAD: Final = 2 * pi
-"""Minimum angle about each axis, rad (manual B, section 8.1.1)."""
+STEP_MAX_NS: Final = NS_PER_S  # maximum time between two samples in the integral of the angular rate, ns
+TURNS_WANTED_RAD: Final = 2 * pi  # minimum angle about each axis, rad (manual B, section 8.1.1)
 COVERAGE_WANTED: Final = 0.6
 """Minimum share of cells. A hand reaches 40 of 48 cells. With fewer than 29 cells the fit depends on noise."""
-FIELD_MIN_T: Final = 22e-6
-"""Minimum of Earth's field at the surface, T (IGRF)."""
-FIELD_MAX_T: Final = 67e-6
-"""Maximum of Earth's field at the surface, T (IGRF)."""
+FIELD_MIN_T: Final = 22e-6  # minimum of Earth's field at the surface, T (IGRF)
+FIELD_MAX_T: Final = 67e-6  # maximum of Earth's field at the surface, T (IGRF)
 RESIDUAL_MAX: Final = 0.05
 """Maximum RMS distance from the sphere, as a share of its radius. 5 % change the heading by about 3°."""
 
@@ -162,8 +151,7 @@ class Sphere:
 
     centre_t: Vector3
     radius_t: float
-    residual: float
-    """RMS distance of the points from the sphere, as a share of the radius."""
+    residual: float  # RMS distance of the points from the sphere, as a share of the radius
 
 
 class Turning:
@@ -294,14 +282,10 @@ def _solve(matrix: Sequence[list[float]]) -> list[float] | None:
 
 log = logging.getLogger(__name__)
 
-REST_LIMIT_NS: Final = 20 * NS_PER_S
-"""Maximum wait for the rest of the device, ns."""
-TURN_LIMIT_NS: Final = 300 * NS_PER_S
-"""Maximum time for the turns, ns. The manual specifies one to two minutes."""
-REPORT_NS: Final = NS_PER_S // 2
-"""Interval of progress events, ns."""
-ASK_NS: Final = 3 * NS_PER_S
-"""Interval of queries during the turns, ns. Each query can cost some samples."""
+REST_LIMIT_NS: Final = 20 * NS_PER_S  # maximum wait for the rest of the device, ns
+TURN_LIMIT_NS: Final = 300 * NS_PER_S  # maximum time for the turns, ns. The manual specifies one to two minutes.
+REPORT_NS: Final = NS_PER_S // 2  # interval of progress events, ns
+ASK_NS: Final = 3 * NS_PER_S  # interval of queries during the turns, ns. Each query can cost some samples.
 SETTLE_NS: Final = 2 * NS_PER_S
 """Time between the end and the verification, ns: the attitude filter of the device needs it."""
 

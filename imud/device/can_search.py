@@ -25,23 +25,16 @@ from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S
 
-LOCK_SAMPLES: Final = 2
-"""Minimum number of measurements of an accepted device."""
+LOCK_SAMPLES: Final = 2  # minimum number of measurements of an accepted device
 LISTEN_NS: Final = 1500 * NS_PER_MS
 """Minimum duration of a round, ns: one frame at 1 Hz, the lowest rate in the manuals."""
-PATIENCE_NS: Final = 6 * NS_PER_S
-"""Maximum duration of a round with doubtful candidates, ns."""
-DEVICES_MAX: Final = 128
-"""Maximum number of candidates. More candidates are noise or another protocol."""
-IDENTIFIERS_MAX: Final = 4096
-"""Maximum number of stored identifiers."""
-SHOWN_MAX: Final = 8
-"""Maximum number of identifiers in a message."""
+PATIENCE_NS: Final = 6 * NS_PER_S  # maximum duration of a round with doubtful candidates, ns
+DEVICES_MAX: Final = 128  # maximum number of candidates. More candidates are noise or another protocol.
+IDENTIFIERS_MAX: Final = 4096  # maximum number of stored identifiers
+SHOWN_MAX: Final = 8  # maximum number of identifiers in a message
 
-Identifier = tuple[int, bool]
-"""Identifier of a frame, and whether it has 29 bits."""
-Claimed = Callable[[int, bool], bool]
-"""Test of an identifier: whether a configured device uses it."""
+Identifier = tuple[int, bool]  # identifier of a frame, and whether it has 29 bits
+Claimed = Callable[[int, bool], bool]  # test of an identifier: whether a configured device uses it
 
 
 def none_claimed(_can_id: int, _extended: bool) -> bool:
@@ -215,8 +208,7 @@ class _Trial:
         self.device = device
         self.ledger = Ledger()
         self.codec = device.driver.make_codec(self.ledger, settings)
-        self.identifiers: set[Identifier] = set()
-        """Identifiers of the frames that name the device."""
+        self.identifiers: set[Identifier] = set()  # identifiers of the frames that name the device
         self._filters = device.driver.filters(settings)
         self._samples = 0
 
@@ -243,8 +235,7 @@ def _listed(devices: Sequence[CanDevice]) -> str:
     return ", ".join(device.title for device in devices)
 
 
-EVERYTHING: Final = (CanFilter(0, 0, False), CanFilter(0, 0, True))
-"""Filters that pass every data frame."""
+EVERYTHING: Final = (CanFilter(0, 0, False), CanFilter(0, 0, True))  # filters that pass every data frame
 
 
 class CanRound(SearchRound[CanFound]):

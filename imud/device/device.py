@@ -43,17 +43,14 @@ from imud.sampling.path import LatencyMeter, RateMeter, SamplePath
 
 log = logging.getLogger(__name__)
 
-RETRY_S = 0.5
-"""Pause before imud opens a failed port again, s. A device thus returns within 1 s."""
+RETRY_S = 0.5  # pause before imud opens a failed port again, s. A device thus returns within 1 s.
 GONE_S = 0.02
 """Pause after a port became missing, s. imud waits for the port without polling. The pause limits the number of tries
 if the device node exists but imud cannot open it."""
 IDLE_FLUSH_NS = 50 * NS_PER_MS
 """Idle time of the link after which the codec discards a pending frame, ns. Latency timers take up to 16 ms."""
-SILENCE_NS = 1 * NS_PER_S
-"""Minimum time without a sample that makes a device silent, ns."""
-SILENCE_PERIODS = 5
-"""Minimum number of sample periods without a sample that makes a device silent."""
+SILENCE_NS = 1 * NS_PER_S  # minimum time without a sample that makes a device silent, ns
+SILENCE_PERIODS = 5  # minimum number of sample periods without a sample that makes a device silent
 
 MakeTransport = Callable[[DeviceContext], Transport]
 

@@ -19,10 +19,8 @@ from imud.model.units import NS_PER_S
 
 FILE_NAME: Final = "settings.json"
 DAY_S: Final = 24 * 3600
-LIMIT_ITSELF: Final = 4
-"""Maximum number of writes in 24 hours before imud stops its own writes. All writes count."""
-LIMIT_ASKED: Final = 40
-"""Maximum number of writes in 24 hours, also on request."""
+LIMIT_ITSELF: Final = 4  # maximum number of writes in 24 hours before imud stops its own writes. All writes count.
+LIMIT_ASKED: Final = 40  # maximum number of writes in 24 hours, also on request
 MODULES_MAX: Final = 1024
 """Maximum number of records: the devices that imud wrote last. A daemon has at most 256 devices."""
 
@@ -30,8 +28,7 @@ MODULES_MAX: Final = 1024
 class ModuleRecord(msgspec.Struct):
     """Flash writes of one device."""
 
-    writes: int = 0
-    """Number of writes by imud."""
+    writes: int = 0  # number of writes by imud
     times_s: list[int] = []  # msgspec copies a mutable default
     """UTC of the newest LIMIT_ASKED writes, s, oldest first."""
     unreadable: dict[str, Any] = msgspec.field(name="told", default_factory=dict)
@@ -116,8 +113,7 @@ class ModuleFlash:
 
 
 FOLDER: Final = "backups"
-BACKUPS_MAX: Final = 10
-"""Maximum number of backups of one device."""
+BACKUPS_MAX: Final = 10  # maximum number of backups of one device
 
 
 def backup_text(device: str, driver: str, identity: Mapping[str, str], settings: Mapping[str, Any], utc_ns: int) -> str:

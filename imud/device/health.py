@@ -16,18 +16,15 @@ from imud.model.units import NS_PER_S
 
 log = logging.getLogger(__name__)
 
-INTERVAL_NS = NS_PER_S
-"""Minimum interval of loss events and of bad-frame events, ns."""
-RAW_SHOWN_BYTES = 32
-"""Maximum number of bytes of a bad frame in an event."""
+INTERVAL_NS = NS_PER_S  # minimum interval of loss events and of bad-frame events, ns
+RAW_SHOWN_BYTES = 32  # maximum number of bytes of a bad frame in an event
 
 
 class DeviceEvents:
     """Events of one device: `raise_event` sends an event immediately, `tick` sends the events of counters."""
 
     def __init__(self, device: str, ledger: Ledger, send: Callable[[Event], None]) -> None:
-        self.device = device
-        """Name in the configuration."""
+        self.device = device  # name in the configuration
         self._ledger = ledger
         self._send = send
         self._due_ns = 0
@@ -104,12 +101,9 @@ class Health:
 
     def __init__(self, notices: DeviceEvents) -> None:
         self.state = DeviceState.MISSING
-        self.problem = ""
-        """Present problem, one sentence; empty if there is none."""
-        self.silent_since_ns = 0
-        """CLOCK_MONOTONIC of the last change to SILENT, ns."""
-        self.link_problem = ""
-        """Present problem of a link that still works; empty if there is none."""
+        self.problem = ""  # present problem, one sentence; empty if there is none
+        self.silent_since_ns = 0  # CLOCK_MONOTONIC of the last change to SILENT, ns
+        self.link_problem = ""  # present problem of a link that still works; empty if there is none
         self._notices = notices
 
     @property

@@ -9,8 +9,7 @@ from imud.host.clock import HostClock
 from imud.host.log import printable
 from imud.model.event import EventKind
 
-WORDS_MAX = 200
-"""Maximum number of settings or details of one device. The HI14 has the most, about 60."""
+WORDS_MAX = 200  # maximum number of settings or details of one device. The HI14 has the most, about 60.
 
 
 class KnownIdentity:
@@ -18,12 +17,9 @@ class KnownIdentity:
 
     def __init__(self, notices: DeviceEvents, host: HostClock) -> None:
         self.identity = Identity()
-        self.settings: Mapping[str, str] = {}
-        """Settings by the names that the device uses."""
-        self.shown_settings: Mapping[str, str] = {}
-        """Settings with readable values."""
-        self.answered = False
-        """Whether the device replied to all requests of the newest query."""
+        self.settings: Mapping[str, str] = {}  # settings by the names that the device uses
+        self.shown_settings: Mapping[str, str] = {}  # settings with readable values
+        self.answered = False  # whether the device replied to all requests of the newest query
         self._notices = notices
         self._host = host
 

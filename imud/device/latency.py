@@ -21,24 +21,20 @@ MOST_NS: Final = 50 * NS_PER_MS
 class Need(NamedTuple):
     """Latency of a device."""
 
-    latency_ns: int
-    """Maximum hold of a sample, ns; 0: no hold."""
-    who: str
-    """Name of the client or output; empty without a request."""
+    latency_ns: int  # maximum hold of a sample, ns; 0: no hold
+    who: str  # name of the client or output; empty without a request
 
 
 NOBODY: Final = Need(MOST_NS, "")
 
-OnNeed = Callable[[Need], None]
-"""Called with the new latency of a device."""
+OnNeed = Callable[[Need], None]  # called with the new latency of a device
 
 
 class _Request(NamedTuple):
     """Request of one client or output."""
 
     need: Need
-    devices: frozenset[str] | None
-    """Names of the devices; None: all devices."""
+    devices: frozenset[str] | None  # names of the devices; None: all devices
 
 
 class LatencyBudget:

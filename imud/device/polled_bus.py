@@ -23,12 +23,9 @@ from imud.model.errors import ImudError, LinkError, TransferError
 from imud.model.units import NS_PER_S
 from imud.sampling.path import QUIET_NS
 
-LATE_SHARE: Final = 4
-"""A read counts as late if its delay exceeds the period divided by this number."""
-QUIET_INTERVALS: Final = 3
-"""Number of missing edges after which imud reads at deadlines."""
-UNMATCHED_MOST: Final = 64
-"""Maximum number of reads without a known edge. imud does not count older reads."""
+LATE_SHARE: Final = 4  # a read counts as late if its delay exceeds the period divided by this number
+QUIET_INTERVALS: Final = 3  # number of missing edges after which imud reads at deadlines
+UNMATCHED_MOST: Final = 64  # maximum number of reads without a known edge. imud does not count older reads.
 
 
 class Deadlines:
@@ -37,16 +34,11 @@ class Deadlines:
     __slots__ = ("late", "missed", "polls", "sum_late_ns", "worst_ns")
 
     def __init__(self) -> None:
-        self.polls = 0
-        """Number of deadlines with a read."""
-        self.late = 0
-        """Number of late reads."""
-        self.missed = 0
-        """Number of deadlines without a read, because the previous read lasted too long."""
-        self.sum_late_ns = 0
-        """Sum of the delays of all reads, ns."""
-        self.worst_ns = 0
-        """Maximum delay of a read, ns."""
+        self.polls = 0  # number of deadlines with a read
+        self.late = 0  # number of late reads
+        self.missed = 0  # number of deadlines without a read, because the previous read lasted too long
+        self.sum_late_ns = 0  # sum of the delays of all reads, ns
+        self.worst_ns = 0  # maximum delay of a read, ns
 
     def served(self, late_ns: int, limit_ns: int) -> None:
         """Count a read. It is late if its delay exceeds `limit_ns`."""
@@ -59,8 +51,7 @@ class Deadlines:
 class Timetable(Protocol):
     """Times of the reads of a device."""
 
-    due_ns: int
-    """CLOCK_MONOTONIC of the next read. The bus serves the device with the lowest value first."""
+    due_ns: int  # CLOCK_MONOTONIC of the next read. The bus serves the device with the lowest value first.
 
     def begun(self, start_ns: int, /) -> None:
         """Count a read that starts."""
@@ -80,8 +71,7 @@ class Schedule:
         self.period_ns = round(NS_PER_S / rate_hz)
         self._late_ns = self.period_ns // LATE_SHARE
         self.counts = counts
-        self.due_ns = begin_ns
-        """CLOCK_MONOTONIC of the next deadline."""
+        self.due_ns = begin_ns  # CLOCK_MONOTONIC of the next deadline
 
     def begun(self, start_ns: int) -> None:
         self.counts.served(start_ns - self.due_ns, self._late_ns)
@@ -105,8 +95,7 @@ class RoundRobin:
     def __init__(self, begin_ns: int, counts: Deadlines) -> None:
         self.period_ns = 0
         self.counts = counts
-        self.due_ns = begin_ns
-        """CLOCK_MONOTONIC at the end of the device's last turn."""
+        self.due_ns = begin_ns  # CLOCK_MONOTONIC at the end of the device's last turn
 
     def begun(self, _start_ns: int) -> None:
         self.counts.polls += 1
@@ -138,10 +127,8 @@ class ReadySchedule:
         self._unstamped = False  # whether the time of the pending edge is unknown
         self._starts: deque[int] = deque(maxlen=UNMATCHED_MOST)  # starts of the reads of such edges, oldest first
         self.counts = counts
-        self.by_edges = True
-        """Whether edges cause the reads; False: deadlines."""
-        self.due_ns = begin_ns
-        """CLOCK_MONOTONIC of the pending edge or of the deadline."""
+        self.by_edges = True  # whether edges cause the reads; False: deadlines
+        self.due_ns = begin_ns  # CLOCK_MONOTONIC of the pending edge or of the deadline
 
     @property
     def period_ns(self) -> int:
@@ -211,12 +198,9 @@ class ReadySchedule:
 
 T = TypeVar("T")
 
-IDLE_NS = 60 * NS_PER_S
-"""Maximum sleep of a thread without a due read, ns."""
-FAR_NS = 1 << 63
-"""Time of the next read if there is none: after all other times."""
-POLLS_IN_ROW = 8
-"""Number of reads before a script gets one transfer on a bus that is never idle."""
+IDLE_NS = 60 * NS_PER_S  # maximum sleep of a thread without a due read, ns
+FAR_NS = 1 << 63  # time of the next read if there is none: after all other times
+POLLS_IN_ROW = 8  # number of reads before a script gets one transfer on a bus that is never idle
 READINGS_MAX = 10_000
 """Maximum number of readings that wait for a blocked loop. imud drops further readings and counts missed deadlines."""
 
@@ -313,12 +297,9 @@ class _Polling:
 
     def __init__(self, member: BusMember, now_ns: Callable[[], int]) -> None:
         self.link = member.link
-        self.scripts: deque[_ScriptRun] = deque()
-        """Waiting transfer scripts; the first script is running."""
-        self.schedule: Timetable | None = None
-        """Times of the reads; None while imud does not read the device."""
-        self.held = False
-        """Whether a script forbids reads until its next transfer."""
+        self.scripts: deque[_ScriptRun] = deque()  # waiting transfer scripts; the first script is running
+        self.schedule: Timetable | None = None  # times of the reads; None while imud does not read the device
+        self.held = False  # whether a script forbids reads until its next transfer
         self._member = member
         self._now_ns = now_ns
         self._polls: Sequence[Poll] = ()
@@ -448,8 +429,7 @@ class PolledBus:
     def __init__(
         self, name: str, loop: asyncio.AbstractEventLoop, host: HostClock, start_worker: StartWatchingWorker
     ) -> None:
-        self.now_ns = host.now_ns
-        """CLOCK_MONOTONIC."""
+        self.now_ns = host.now_ns  # CLOCK_MONOTONIC
         self._loop = loop
         # Members of the bus. Only the bus's thread uses this list.
         self._polling: list[_Polling] = []

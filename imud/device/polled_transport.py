@@ -40,8 +40,7 @@ from imud.sampling.path import PolledPath, PollTiming, ReadyEdges, SamplePath
 
 log = logging.getLogger(__name__)
 
-RETRY_S = 0.5
-"""Pause between two search rounds, s."""
+RETRY_S = 0.5  # pause between two search rounds, s
 TURNS_PERIOD_NS = 200 * NS_PER_MS
 """Assumed period of a device that shares a bus by turns, ns: five missing readings make the device silent."""
 
@@ -180,8 +179,7 @@ class IdentifiedDevice:
 
     driver: PolledDriver
     options: Options
-    target: int
-    """Address or chip select of the device."""
+    target: int  # address or chip select of the device
     identity: Identity
 
 

@@ -15,10 +15,8 @@ from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_S
 
-REPLY_MESSAGES_MAX = 256
-"""Maximum number of messages in a reply. The longest reply of any manual has some dozens."""
-LATE_WINDOW_NS = 5 * NS_PER_S
-"""Time after a timeout in which a matching message counts as part of the late reply, ns."""
+REPLY_MESSAGES_MAX = 256  # maximum number of messages in a reply. The longest reply of any manual has some dozens.
+LATE_WINDOW_NS = 5 * NS_PER_S  # time after a timeout in which a matching message counts as part of the late reply, ns
 
 T = TypeVar("T")
 
@@ -70,8 +68,7 @@ class ScriptRunner:
         self._late_messages = 0  # number of messages of the late reply that is arriving
         self.deadline_ns: int | None = None
         """CLOCK_MONOTONIC of the deadline of the outstanding request; None without a request."""
-        self.answered_ns = 0
-        """CLOCK_MONOTONIC of the newest complete reply; 0 before the first reply."""
+        self.answered_ns = 0  # CLOCK_MONOTONIC of the newest complete reply; 0 before the first reply
         self.wants_samples = False
         """Whether a request waits for a measurement. An attribute, because the path reads it for each batch."""
 

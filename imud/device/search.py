@@ -25,10 +25,8 @@ class RememberedDevice(msgspec.Struct, frozen=True):
     """Driver and rate of a device at the last successful search."""
 
     driver: str
-    baud: int
-    """Baud rate; 0 on a CAN bus."""
-    node: int | None = None
-    """Number of the device on a CAN bus."""
+    baud: int  # baud rate; 0 on a CAN bus
+    node: int | None = None  # number of the device on a CAN bus
 
 
 class Remembered:
@@ -63,8 +61,7 @@ class Listen:
     """Step: receive data until `until_ns`. On a serial port, first set the baud rate and send `send`."""
 
     until_ns: int
-    baud: int = 0
-    """Baud rate; 0 on a CAN bus, because the kernel sets its bit rate."""
+    baud: int = 0  # baud rate; 0 on a CAN bus, because the kernel sets its bit rate
     send: bytes = b""
 
 
@@ -72,14 +69,11 @@ class Listen:
 class GaveUp:
     """End of a round that found no device, or several devices."""
 
-    summary: str
-    """Observations and advice for the user."""
-    wasted_bytes: int = 0
-    """Number of received bytes on a serial port: the ledger counts them as `bytes_skipped`."""
+    summary: str  # observations and advice for the user
+    wasted_bytes: int = 0  # number of received bytes on a serial port: the ledger counts them as `bytes_skipped`
 
 
-EARLY_S: Final = 0.001
-"""Additional wait if the timer of the loop fires before the deadline, s."""
+EARLY_S: Final = 0.001  # additional wait if the timer of the loop fires before the deadline, s
 
 F = TypeVar("F")
 F_co = TypeVar("F_co", covariant=True)

@@ -64,18 +64,13 @@ AGAIN_NS: Final = 60 * NS_PER_S
 OWN_NS: Final = 2 * NS_PER_S
 """Time after a script in which a restart of the device counter is a result of the script, ns. imud compares the
 settings at the end of the script. A second comparison would pause the samples again."""
-WAIT_S: Final = 10.0
-"""Maximum wait of a command for another command, s."""
-BACKUP_LIMIT_S: Final = 5.0
-"""Maximum wait of a command for the disk, s."""
-READ_AGAIN_NS: Final = 5 * NS_PER_S
-"""Pause before imud reads the settings again after an error, ns."""
-READ_TRIES: Final = 3
-"""Number of reads before imud waits for the next restart, replug or command."""
+WAIT_S: Final = 10.0  # maximum wait of a command for another command, s
+BACKUP_LIMIT_S: Final = 5.0  # maximum wait of a command for the disk, s
+READ_AGAIN_NS: Final = 5 * NS_PER_S  # pause before imud reads the settings again after an error, ns
+READ_TRIES: Final = 3  # number of reads before imud waits for the next restart, replug or command
 PAUSES_S: Final = (0, 10, 60, 600, 3600)
 """Pauses before the first, second, … repair within PAUSES_FORGOTTEN_S, s. The last pause repeats."""
-PAUSES_FORGOTTEN_S: Final = 2 * 3600
-"""Time after which a repair no longer counts, s."""
+PAUSES_FORGOTTEN_S: Final = 2 * 3600  # time after which a repair no longer counts, s
 
 
 class SettingsKeeper:

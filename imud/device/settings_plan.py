@@ -29,8 +29,7 @@ from imud.device.flash import ModuleFlash
 from imud.model.errors import BadArgument, CommandError, DeviceRefused, LinkError, TransferError
 from imud.model.options import expected, shown, unknown_name
 
-Values = Mapping[str, Any]
-"""Values of settings by name, in the types of the table."""
+Values = Mapping[str, Any]  # values of settings by name, in the types of the table
 
 
 def has(table: SettingsTable, name: str, wanted: Values, actual: Values, unreadable: Values) -> bool:
@@ -188,13 +187,11 @@ def _step(name: str, setting: Setting, wanted: Values, actual: Values) -> Planne
 DEVICE_ERRORS: Final = (CommandError, DeviceRefused, LinkError, TransferError)
 """Errors of a device that does not reply, rejects a value, or is missing."""
 
-PLACES: Final = ("baud", "address", "node")
-"""Settings that the link or the options repeat to find the device."""
+PLACES: Final = ("baud", "address", "node")  # settings that the link or the options repeat to find the device
 UNVERIFIED: Final = (Written.UNVERIFIED, Written.UNVERIFIED_PENDING)
 PENDING: Final = (Written.PENDING, Written.UNVERIFIED_PENDING)
 
-RunScript = Callable[[Callable[[Target], Any]], Awaitable[Any]]
-"""`run_script` of a transport."""
+RunScript = Callable[[Callable[[Target], Any]], Awaitable[Any]]  # `run_script` of a transport
 
 
 @dataclass
@@ -210,12 +207,10 @@ class Applying:
     """Written values of settings that the device does not report."""
     saved: bool = False
     restarted: bool = False
-    changed: bool = False
-    """Whether imud has written a setting."""
+    changed: bool = False  # whether imud has written a setting
     pending: bool = False
     """Whether a script has reported that its value needs a restart, although the table does not require it."""
-    heard: bool = True
-    """Whether the device has replied to the newest read."""
+    heard: bool = True  # whether the device has replied to the newest read
     problem: str = ""
 
     async def carry_out(self, plan: SettingsPlan) -> AppliedSettings:

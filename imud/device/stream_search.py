@@ -28,32 +28,22 @@ from imud.model.errors import LinkError
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, uart_byte_ns
 
-LOCK_FRAMES: Final = 2
-"""Number of good frames that is enough if there are fewer bad frames."""
-SURE_FRAMES: Final = 4
-"""Number of good frames that is enough with any number of bad frames."""
+LOCK_FRAMES: Final = 2  # number of good frames that is enough if there are fewer bad frames
+SURE_FRAMES: Final = 4  # number of good frames that is enough with any number of bad frames
 
-SETTLE_NS: Final = 10 * NS_PER_MS
-"""Time to set a baud rate, ns: control transfers of a USB adapter take some ms."""
-QUICK_NS: Final = 45 * NS_PER_MS
-"""QUICK visit, ns. A device at 50 or 100 Hz sends one complete frame."""
-MIDDLE_NS: Final = 250 * NS_PER_MS
-"""MIDDLE visit, ns. A device at 5 Hz sends one complete frame."""
+SETTLE_NS: Final = 10 * NS_PER_MS  # time to set a baud rate, ns: control transfers of a USB adapter take some ms
+QUICK_NS: Final = 45 * NS_PER_MS  # QUICK visit, ns. A device at 50 or 100 Hz sends one complete frame.
+MIDDLE_NS: Final = 250 * NS_PER_MS  # MIDDLE visit, ns. A device at 5 Hz sends one complete frame.
 SLOW_NS: Final = 1150 * NS_PER_MS
 """SLOW visit, ns: 1 Hz, the lowest rate in the manuals, and 15 % for the crystal and the frame."""
 WHOLE_FRAME_BYTES: Final = 300
 """Minimum length of a visit, bytes: two frames of 150 bytes, so that one frame is complete. HI91 and HI92 in one frame
 have 130 bytes. This limit is only relevant at 9600 baud."""
-QUIET_NS: Final = 1200 * NS_PER_MS
-"""Silence before the first query, ns. A device at 1 Hz sends within this time."""
-ASK_NS: Final = 120 * NS_PER_MS
-"""Wait for the reply to a query, ns."""
-QUERY_BYTES: Final = 32
-"""Maximum length of a query, bytes."""
-REPLY_GAP_NS: Final = 200 * NS_PER_MS
-"""Maximum pause within a reply, ns."""
-VISIT_BYTES_MAX: Final = 256 * 1024
-"""Maximum number of bytes in a visit. A visit with more bytes ends."""
+QUIET_NS: Final = 1200 * NS_PER_MS  # silence before the first query, ns. A device at 1 Hz sends within this time.
+ASK_NS: Final = 120 * NS_PER_MS  # wait for the reply to a query, ns
+QUERY_BYTES: Final = 32  # maximum length of a query, bytes
+REPLY_GAP_NS: Final = 200 * NS_PER_MS  # maximum pause within a reply, ns
+VISIT_BYTES_MAX: Final = 256 * 1024  # maximum number of bytes in a visit. A visit with more bytes ends.
 ASK_TRIES: Final = 2
 """Number of queries per rate. Bytes of wrong rates in the buffer of the device can damage the first query."""
 
@@ -64,10 +54,8 @@ class StreamFound:
 
     driver: StreamDriver
     baud: int
-    chunks: tuple[tuple[bytes, int], ...] = ()
-    """Bytes of the last visit, with the time of each read."""
-    wasted_bytes: int = 0
-    """Number of bytes of the previous visits: the ledger counts them as `bytes_skipped`."""
+    chunks: tuple[tuple[bytes, int], ...] = ()  # bytes of the last visit, with the time of each read
+    wasted_bytes: int = 0  # number of bytes of the previous visits: the ledger counts them as `bytes_skipped`
 
 
 Step = Listen | StreamFound | GaveUp
@@ -276,8 +264,7 @@ class _Visit:
 
     baud: int
     dwell_ns: int
-    only_until_heard: bool = False
-    """Whether the first byte shortens the visit."""
+    only_until_heard: bool = False  # whether the first byte shortens the visit
     question: Request | None = None
     asked: StreamDriver | None = None
     answered: bool = False

@@ -34,16 +34,14 @@ from imud.sampling.path import SamplePath, StreamPath
 
 log = logging.getLogger(__name__)
 
-GRID_NS: Final = NS_PER_MS
-"""Grid of the end of a hold, ns. One iteration of the loop then serves many devices."""
+GRID_NS: Final = NS_PER_MS  # grid of the end of a hold, ns. One iteration of the loop then serves many devices.
 FIRST_NS: Final = 5 * NS_PER_MS
 """Maximum first hold, ns. imud does not know the data rate yet. Each hold is at most twice as long as the last."""
 WATCH_NS: Final = MOST_NS
 """Time between two frames that imud reads on arrival, ns: the longest latency. Each such read is another wake-up.
 Behind an adapter with a latency timer, imud reads one frame per hold on arrival, because the time stamp error would
 grow by half otherwise."""
-PERIODS_LEAST: Final = 2
-"""Minimum number of samples in a hold. With fewer samples a hold saves no wake-up."""
+PERIODS_LEAST: Final = 2  # minimum number of samples in a hold. With fewer samples a hold saves no wake-up.
 
 
 class StreamHold:
@@ -53,10 +51,8 @@ class StreamHold:
     """
 
     def __init__(self, link: StreamLink, path: StreamPath, scripts: ScriptRunner, host: HostClock) -> None:
-        self.latency_ns = 0
-        """Maximum hold, ns; set by the transport."""
-        self.hold_ns = 0
-        """Present hold, ns."""
+        self.latency_ns = 0  # maximum hold, ns; set by the transport
+        self.hold_ns = 0  # present hold, ns
         self._link = link
         self._path = path
         self._scripts = scripts

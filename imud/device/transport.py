@@ -42,8 +42,7 @@ UNHEARD_NS = 2 * NS_PER_S
 """Time with data but without a sample after which imud assumes another baud rate or another device, ns."""
 SILENT_SEARCH_NS = 15 * NS_PER_S
 """Time without data after which imud searches again, because the device may be replaced or reconfigured, ns."""
-IDENTIFY_TRIES = 3
-"""Number of identity queries after a search."""
+IDENTIFY_TRIES = 3  # number of identity queries after a search
 IDENTIFY_AGAIN_S = (5, 30, 120, 300)
 """Pauses before further identity queries of a device that did not reply, s. The last pause repeats forever."""
 
@@ -107,10 +106,8 @@ class Transport(ABC):
     """
 
     link: Link
-    driver: Driver | None
-    """Driver of the device; None before imud has found the device."""
-    path: SamplePath | None
-    """Sample path of the device; None before imud has found the device."""
+    driver: Driver | None  # driver of the device; None before imud has found the device
+    path: SamplePath | None  # sample path of the device; None before imud has found the device
     attachments: Attachments
 
     def __init__(self, context: DeviceContext) -> None:

@@ -24,8 +24,7 @@ from imud.utc.receivers import RmcSource, SourceContext
 from imud.utc.rmc_feed import RmcFeed, SentencePort
 from imud.utc.system_clock import kernel_clock, system_reference
 
-ASK_NS = NS_PER_S
-"""Interval between two updates of the reference, ns."""
+ASK_NS = NS_PER_S  # interval between two updates of the reference, ns
 
 
 class UtcFeed:

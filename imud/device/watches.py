@@ -17,8 +17,7 @@ from imud.model.event import EventKind
 from imud.model.units import NS_PER_S
 from imud.sampling.path import SamplePath
 
-AS_DEVICE = "device"
-"""Name of the convention if none is configured."""
+AS_DEVICE = "device"  # name of the convention if none is configured
 
 
 class AttitudeWatch:
@@ -85,10 +84,8 @@ class AttitudeWatch:
         return ""
 
 
-CLEAR_NS: Final = NS_PER_S
-"""Time without a status bit after which the bit is cleared, ns."""
-INTERVAL_NS: Final = NS_PER_S
-"""Minimum interval of events, ns."""
+CLEAR_NS: Final = NS_PER_S  # time without a status bit after which the bit is cleared, ns
+INTERVAL_NS: Final = NS_PER_S  # minimum interval of events, ns
 
 
 class StatusWatch:
