@@ -56,13 +56,13 @@ class Attachments:
     """Attachments of one device. Synchronization: the loop's thread only."""
 
     def __init__(
-        self, config: DeviceConfig, lines: LineFactory, port: DevicePort, notices: DeviceEvents, host: HostClock
+        self, config: DeviceConfig, lines: LineFactory, port: DevicePort, events: DeviceEvents, host: HostClock
     ) -> None:
         """Create the configured attachments. `lines` opens the GPIO lines, `port` is the transport of the device."""
         self._config = config
-        self._notices = notices
+        self._events = events
         self._host = host
-        raise_event = notices.raise_event
+        raise_event = events.raise_event
         self._utc: UtcFeed | None = make_utc_feed(config, port, host)
         self._signals: SyncSignals | None = None
         if config.lines is not None:
@@ -120,7 +120,7 @@ class Attachments:
         for key, words in found.items():
             if self._differences.get(key) != words:
                 message = f"line {key}: {words}"
-                self._notices.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message, line=key)
+                self._events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message, line=key)
         self._differences = found
 
     def lines_status(self) -> LinesStatus | None:

@@ -293,9 +293,9 @@ SETTLE_NS: Final = 2 * NS_PER_S
 class CalibrationRun:
     """Guide of one calibration at a time; an attachment. Synchronization: the loop's thread only."""
 
-    def __init__(self, transport: Transport, notices: DeviceEvents) -> None:
+    def __init__(self, transport: Transport, events: DeviceEvents) -> None:
         self._transport = transport
-        self._notices = notices
+        self._events = events
         self._running: asyncio.Task[CalibrationResult] | None = None
         self._tick_future: asyncio.Future[tuple[int, Sample | None]] | None = None
         self._now_ns = 0
@@ -474,7 +474,7 @@ class CalibrationRun:
 
     def _report(self, kind: str, phase: str, words: str, **detail: str | int | float | bool | None) -> None:
         message = f"calibration {kind}: {words}"
-        self._notices.raise_event(self._now_ns, EventKind.CALIBRATION, message, kind=kind, phase=phase, **detail)
+        self._events.raise_event(self._now_ns, EventKind.CALIBRATION, message, kind=kind, phase=phase, **detail)
 
     def _report_turning(self, kind: str, turning: Turning, verdict: Verdict) -> None:
         sphere = turning.fit()

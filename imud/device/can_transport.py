@@ -271,7 +271,7 @@ class CanTransport(ReceivingTransport):
         self._begin()
         if not self._searchable and options != (self._config.options or driver.settings()):
             message = f"the device has a new number: change {_changed(self._config.options, options)}"
-            self._context.notices.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message)
+            self._context.events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message)
 
     def listen(self, request: Request, filters: Sequence[CanFilter]) -> None:
         """Receive frames of other senders too, while they can answer the request."""

@@ -77,22 +77,22 @@ class Device:
         self._shared = shared
         self._host = host = shared.host
         self._suspends = host.suspends
-        self._notices = DeviceEvents(config.name, self.ledger, shared.owner.send_event)
-        self._health = Health(self._notices)
+        self._events = DeviceEvents(config.name, self.ledger, shared.owner.send_event)
+        self._health = Health(self._events)
         self._tap = PathObserver(config, device_id, self.ledger, host)
         context = DeviceContext(
-            config, device_id, shared.owner, host, shared.lines, self.ledger, self._notices, self._health, self._tap
+            config, device_id, shared.owner, host, shared.lines, self.ledger, self._events, self._health, self._tap
         )
         self._transport = transport = make_transport(context)
         self._identity = transport.identity
-        self._attachments = Attachments(config, shared.lines, transport, self._notices, host)
+        self._attachments = Attachments(config, shared.lines, transport, self._events, host)
         transport.serve(self._attachments)
-        self._calibration = CalibrationRun(transport, self._notices)
+        self._calibration = CalibrationRun(transport, self._events)
         self._attachments.add(self._calibration)
         self._settings = SettingsKeeper(context, transport, shared.files)
         self._attachments.add(self._settings)
-        self._attitude = AttitudeWatch(config, self._notices)
-        self._status = StatusWatch(self._notices)
+        self._attitude = AttitudeWatch(config, self._events)
+        self._status = StatusWatch(self._events)
         self._rate = RateMeter()
         self._connects = 0
         self._need = Need(0, "")
@@ -151,7 +151,7 @@ class Device:
             self._watch_flow(path, now_ns)
         self._attitude.tick(now_ns, path)
         self._status.tick(now_ns, transport.driver, path)
-        self._notices.tick(now_ns, path.newest.sync if path.newest else None)
+        self._events.tick(now_ns, path.newest.sync if path.newest else None)
 
     def close(self) -> None:
         """Release the link. A second call does nothing."""

@@ -1,7 +1,7 @@
 """Flash writes of each device, counted over all runs of imud and limited per day, and backups of the settings.
 
-The flash of such devices endures about 10,000 writes. imud by itself makes at most LIMIT_ITSELF writes in 24 hours:
-even a device that loses its settings every day lasts about seven years. Users and programs may make LIMIT_ASKED writes.
+The flash of such devices endures about 10,000 writes. imud by itself makes at most LIMIT_ITSELF writes in 24 hours: at
+this rate the flash lasts about seven years. Users and programs may make LIMIT_ASKED writes in 24 hours.
 """
 
 from collections.abc import Mapping

@@ -99,12 +99,12 @@ STREAMING = (DeviceState.RUNNING, DeviceState.SILENT)
 class Health:
     """State and problem of one device. All times are CLOCK_MONOTONIC in ns. Synchronization: the loop's thread only."""
 
-    def __init__(self, notices: DeviceEvents) -> None:
+    def __init__(self, events: DeviceEvents) -> None:
         self.state = DeviceState.MISSING
         self.problem = ""  # present problem, one sentence; empty if there is none
         self.silent_since_ns = 0  # CLOCK_MONOTONIC of the last change to SILENT, ns
         self.link_problem = ""  # present problem of a link that still works; empty if there is none
-        self._notices = notices
+        self._events = events
 
     @property
     def streaming(self) -> bool:
@@ -127,7 +127,7 @@ class Health:
     def up(self, now_ns: int, driver: str, where: str, bit_rate: int) -> None:
         """Enter RUNNING: samples of `driver` arrive on the link `where`."""
         self.state, self.problem = DeviceState.RUNNING, self.link_problem
-        self._notices.raise_event(now_ns, EventKind.UP, f"{driver} on {where}", driver=driver, baud=bit_rate)
+        self._events.raise_event(now_ns, EventKind.UP, f"{driver} on {where}", driver=driver, baud=bit_rate)
 
     def down(self, now_ns: int, state: DeviceState, problem: str) -> None:
         """Enter a state without samples, because of `problem`."""
@@ -138,9 +138,9 @@ class Health:
         was_up, changed = self.streaming, state is not self.state or problem != self.problem
         self.state, self.problem = state, problem
         if was_up:
-            self._notices.raise_event(now_ns, EventKind.DOWN, problem, state=str(state))
+            self._events.raise_event(now_ns, EventKind.DOWN, problem, state=str(state))
         elif changed:
-            log.warning("%s: %s", self._notices.device, problem, extra=same_as(problem))
+            log.warning("%s: %s", self._events.device, problem, extra=same_as(problem))
 
     def missing(self, now_ns: int, reason: str) -> None:
         """Enter MISSING if `reason` is not empty. The first problem stays in the status until the link returns."""
@@ -151,10 +151,10 @@ class Health:
         """Set the problem without a change of state. A problem of the link has priority."""
         problem = self.link_problem or printable(problem, MESSAGE_CHARACTERS_MAX)
         if problem != self.problem:
-            log.warning("%s: %s", self._notices.device, problem, extra=same_as(problem))
+            log.warning("%s: %s", self._events.device, problem, extra=same_as(problem))
         self.problem = problem
 
     def on_link_news(self, now_ns: int, news: str, problem: str) -> None:
         """Raise an event about a change of the link. `problem` is the problem after the change."""
         self.link_problem = self.problem = printable(problem, MESSAGE_CHARACTERS_MAX)
-        self._notices.raise_event(now_ns, EventKind.LINK, news, problem=problem)
+        self._events.raise_event(now_ns, EventKind.LINK, news, problem=problem)

@@ -15,12 +15,12 @@ WORDS_MAX = 200  # maximum number of settings or details of one device. The HI14
 class KnownIdentity:
     """Identity and settings of one device. Synchronization: the loop's thread only."""
 
-    def __init__(self, notices: DeviceEvents, host: HostClock) -> None:
+    def __init__(self, events: DeviceEvents, host: HostClock) -> None:
         self.identity = Identity()
         self.settings: Mapping[str, str] = {}  # settings by the names that the device uses
         self.shown_settings: Mapping[str, str] = {}  # settings with readable values
         self.answered = False  # whether the device replied to all requests of the newest query
-        self._notices = notices
+        self._events = events
         self._host = host
 
     def update_identity(self, identity: Identity) -> None:
@@ -30,9 +30,7 @@ class KnownIdentity:
         if before.serial_number and identity.serial_number != before.serial_number:
             message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
             serial_number = identity.serial_number
-            self._notices.raise_event(
-                self._host.now_ns(), EventKind.CONFIGURATION, message, serial_number=serial_number
-            )
+            self._events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message, serial_number=serial_number)
 
     def update_settings(self, settings: Mapping[str, str], driver: Driver | None) -> None:
         """Store new settings, made readable by `driver`. Raise an event if a known setting has another value."""
@@ -42,7 +40,7 @@ class KnownIdentity:
         if changed:
             words = ", ".join(f"{name} is {value}, was {known[name]}" for name, value in changed.items())
             message = f"settings of the device changed: {words}"
-            self._notices.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message, **changed)
+            self._events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message, **changed)
         self.settings, self.shown_settings = settings, shown
 
 

@@ -50,12 +50,12 @@ class DataReady:
     only."""
 
     def __init__(
-        self, device: str, settings: ReadyOptions, lines: LineFactory, rate_hz: float, notices: DeviceEvents,
+        self, device: str, settings: ReadyOptions, lines: LineFactory, rate_hz: float, events: DeviceEvents,
         host: HostClock,
     ) -> None:  # fmt: skip
         """`rate_hz` is the rate of the reads while no edge arrives."""
         self._rate_hz = rate_hz
-        self._notices = notices
+        self._events = events
         self._host = host
         line = lines.make_input(_rising(settings), f"{device} data_ready", True)
         self._watched = WatchedLine(line, self._on_edges, self._on_level, self._report, host.now_ns)
@@ -163,7 +163,7 @@ class DataReady:
 
     def _raise_event(self, message: str, **detail: bool) -> None:
         words = f"line data_ready: {message}"
-        self._notices.raise_event(self._host.now_ns(), EventKind.LINK, words, line="data_ready", **detail)
+        self._events.raise_event(self._host.now_ns(), EventKind.LINK, words, line="data_ready", **detail)
 
 
 def _rising(settings: ReadyOptions) -> ReadyOptions:
@@ -199,7 +199,7 @@ class PolledTransport(Transport):
         config, host, ready = context.config, context.host, None
         if config.lines is not None and config.lines.data_ready is not None:
             options = config.lines.data_ready
-            ready = DataReady(config.name, options, context.lines, link.rate_hz, context.notices, host)
+            ready = DataReady(config.name, options, context.lines, link.rate_hz, context.events, host)
         self._ready: DataReady | None = ready
         self._member: BusMember | None = None
         self._deadlines = Deadlines()
@@ -377,11 +377,11 @@ class PolledTransport(Transport):
         if fixed is not None and target != fixed:
             place = self.link.place(target)
             message = f"the device has {place} now: change {self.link.place(fixed)} in the configuration"
-            self._context.notices.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message)
+            self._context.events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message)
         if not member.claim(target):
             place = self.link.place(target)
             message = f"the device has {place} now, which another device of this configuration has"
-            self._context.notices.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message)
+            self._context.events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message)
             self._identify_again(message)
 
     # --- the samples -------------------------------------------------------------------------------------------------

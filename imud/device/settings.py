@@ -81,7 +81,7 @@ class SettingsKeeper:
         self._config = context.config
         self._transport = transport
         self._identity = transport.identity
-        self._notices = context.notices
+        self._events = context.events
         self._host = context.host
         self._files = files
         self._writes = files.flash
@@ -109,7 +109,7 @@ class SettingsKeeper:
     # --- the attachment -----------------------------------------------------------------------------------------------
 
     def start(self, clock: SampleClock) -> None:
-        """Note that imud has found the device after its link was opened. It can be another device."""
+        """Forget the settings: imud has found the device again, or another device."""
         self._clock, self._resets = clock, clock.status().resets
         self._actual = None
         self._after_start(BEGIN_NS)
@@ -300,7 +300,7 @@ class SettingsKeeper:
             unsaved = self._unsaved and not self._is_saved(actual)
             plan = self._make_plan(table, self._declared, actual, save=save, unsaved=unsaved)
         except BadArgument as error:
-            self._complain(f"settings cannot be set: {error}")
+            self._complain(f"cannot set the settings: {error}")
             return
         self._problem = "; ".join(f"{name} {why}" for name, why in plan.left_out.items())
         if plan.empty:
@@ -418,7 +418,7 @@ class SettingsKeeper:
         self._problem = problem
 
     def _raise(self, message: str, **detail: str | bool) -> None:
-        self._notices.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message, **detail)
+        self._events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message, **detail)
 
     # --- parts --------------------------------------------------------------------------------------------------------
 

@@ -259,7 +259,7 @@ class StreamTransport(ReceivingTransport):
             if not reported:
                 reported = True
                 message = "it replied but sent no samples: imud started its output and did not save this"
-                self._context.notices.raise_event(
+                self._context.events.raise_event(
                     self._host.now_ns(), EventKind.CONFIGURATION, message, acknowledged=acknowledged
                 )
 

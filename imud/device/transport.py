@@ -73,7 +73,7 @@ class DeviceContext:
     host: HostClock
     lines: LineFactory
     ledger: Ledger
-    notices: DeviceEvents
+    events: DeviceEvents
     health: Health
     tap: PathObserver
 
@@ -85,7 +85,7 @@ class DeviceContext:
             return link.kernel_counters().overrun
 
         return PathContext(
-            config.name, self.device_id, self.ledger, self.owner.publish, on_message, self.notices.bad_frame, overruns,
+            config.name, self.device_id, self.ledger, self.owner.publish, on_message, self.events.bad_frame, overruns,
             self.host, published_frame(config.frame, config.convention, config.declination_deg, driver.axes),
         )  # fmt: skip
 
@@ -111,7 +111,7 @@ class Transport(ABC):
     attachments: Attachments
 
     def __init__(self, context: DeviceContext) -> None:
-        self.identity = KnownIdentity(context.notices, context.host)
+        self.identity = KnownIdentity(context.events, context.host)
         self._context = context
         self._config = context.config
         self._health = context.health

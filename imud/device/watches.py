@@ -23,9 +23,9 @@ AS_DEVICE = "device"  # name of the convention if none is configured
 class AttitudeWatch:
     """Check of the published attitude of one device. Synchronization: the loop's thread only."""
 
-    def __init__(self, config: DeviceConfig, notices: DeviceEvents) -> None:
+    def __init__(self, config: DeviceConfig, events: DeviceEvents) -> None:
         self._config = config
-        self._notices = notices
+        self._events = events
         self._path: SamplePath | None = None
         self._check: GravityCheck | None = None
         self._raised: set[Contradiction] = set()
@@ -41,7 +41,7 @@ class AttitudeWatch:
         finding = check.finding
         if finding.kind not in self._raised:
             self._raised.add(finding.kind)
-            self._notices.raise_event(
+            self._events.raise_event(
                 now_ns,
                 EventKind.ATTITUDE,
                 finding.message,
@@ -91,8 +91,8 @@ INTERVAL_NS: Final = NS_PER_S  # minimum interval of events, ns
 class StatusWatch:
     """Check of the notable status bits of one device. Synchronization: the loop's thread only."""
 
-    def __init__(self, notices: DeviceEvents) -> None:
-        self._notices = notices
+    def __init__(self, events: DeviceEvents) -> None:
+        self._events = events
         self._path: SamplePath | None = None
         self._bits: Mapping[int, StatusBit] = {}
         self._set = 0  # bits that imud has reported as set, as a mask
@@ -134,4 +134,4 @@ class StatusWatch:
         self._due_ns = now_ns + INTERVAL_NS
         words = [self._bits[n].name for n in risen] + [f"cleared: {self._bits[n].name}" for n in fallen]
         detail = {self._bits[n].name: n in risen for n in (*risen, *fallen)}
-        self._notices.raise_event(now_ns, EventKind.ALARM, f"status: {', '.join(words)}", **detail)
+        self._events.raise_event(now_ns, EventKind.ALARM, f"status: {', '.join(words)}", **detail)

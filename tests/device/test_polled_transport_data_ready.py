@@ -303,9 +303,9 @@ class WatchingMember:
 @in_loop
 async def test_the_thread_waits_for_a_line_with_a_descriptor_while_that_is_open_and_read() -> None:
     line, clock, member, told = DescriptorLine(), VirtualClock(), WatchingMember(), list[str]()
-    notices: Any = SimpleNamespace(raise_event=lambda _t, _kind, message, **_detail: told.append(message))
+    device_events: Any = SimpleNamespace(raise_event=lambda _t, _kind, message, **_detail: told.append(message))
     maker = LineFactory(lambda *_: line, lambda *_: MemoryOutput())
-    ready = DataReady("imu", ReadyOptions(line="Y"), maker, RATE_HZ, notices, HostClock(clock.now_ns))
+    ready = DataReady("imu", ReadyOptions(line="Y"), maker, RATE_HZ, device_events, HostClock(clock.now_ns))
     some: Any = member
     line.open_error = LinkMissing("not there")
     ready.read(some, (), Deadlines(), clock.now_ns())

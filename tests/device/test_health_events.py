@@ -20,40 +20,40 @@ def make() -> tuple[DeviceEvents, Ledger, list[Event]]:
 
 
 def test_only_a_change_of_sync_is_told() -> None:
-    notices, _, events = make()
+    device_events, _, events = make()
     for t in range(5):
-        notices.tick(t * S, Sync.ARRIVAL)
+        device_events.tick(t * S, Sync.ARRIVAL)
     assert events == []
-    notices, _, events = make()
-    notices.tick(0, Sync.ARRIVAL)
-    notices.tick(1, Sync.ARRIVAL)
-    notices.tick(2, Sync.REGRESSION)
+    device_events, _, events = make()
+    device_events.tick(0, Sync.ARRIVAL)
+    device_events.tick(1, Sync.ARRIVAL)
+    device_events.tick(2, Sync.REGRESSION)
     assert [(e.kind, e.detail) for e in events] == [(EventKind.SYNC, {"sync": "regression", "before": "arrival"})]
 
 
 def test_losses_are_told_once_a_second_with_causes_and_bad_frames_with_the_last() -> None:
-    notices, ledger, events = make()
+    device_events, ledger, events = make()
     ledger.lost_crc = 2
-    notices.tick(10 * S, None)
+    device_events.tick(10 * S, None)
     ledger.lost_gap_device = 5
-    notices.tick(10 * S + S // 2, None)
+    device_events.tick(10 * S + S // 2, None)
     assert [e.message for e in events] == ["2 samples lost"]
-    notices.tick(11 * S, None)
+    device_events.tick(11 * S, None)
     assert [e.message for e in events] == ["2 samples lost", "5 samples lost"]
     assert events[1].kind is EventKind.LOSS
     assert events[1].detail == {"gap_device": 5, "crc": 2, "overrun": 0, "queue": 0}
-    notices, ledger, events = make()
+    device_events, ledger, events = make()
     ledger.frames_bad_crc = 3
-    notices.bad_frame(BadFrame(BadReason.CRC, b"\x5a\xa5\x01"))
-    notices.tick(S, None)
+    device_events.bad_frame(BadFrame(BadReason.CRC, b"\x5a\xa5\x01"))
+    device_events.tick(S, None)
     assert events[0].kind is EventKind.BAD_FRAME
     assert events[0].message == "3 bad frames, the last by crc: 5a a5 01"
 
 
 def test_texts_of_an_event_are_printable_and_bounded() -> None:
-    notices, _, events = make()
+    device_events, _, events = make()
     hostile = "a\n\x1b[31m\udc80" + "x" * 10_000
-    notices.raise_event(S, EventKind.LINK, hostile, message=hostile, kind=hostile, number=1)
+    device_events.raise_event(S, EventKind.LINK, hostile, message=hostile, kind=hostile, number=1)
     assert events[0].message.isprintable()
     assert len(events[0].message) <= 2000
     assert events[0].message.startswith(r"a\n\x1b[31m\udc80")
@@ -64,14 +64,14 @@ def test_texts_of_an_event_are_printable_and_bounded() -> None:
 
 
 def test_an_event_is_logged_at_once_after_another_kind_of_trouble(caplog: pytest.LogCaptureFixture) -> None:
-    notices, ledger, _ = make()
+    device_events, ledger, _ = make()
     repeats = RepeatFilter()
     for t, lost in enumerate((2, 3)):
         ledger.lost_crc += lost
         ledger.frames_bad_crc += 1
-        notices.bad_frame(BadFrame(BadReason.CRC, bytes((0x5A, 0xA5, t))))
-        notices.tick(t * S, None)
-    notices.raise_event(2 * S, EventKind.CONFIGURATION, "settings differ from the declared settings")
+        device_events.bad_frame(BadFrame(BadReason.CRC, bytes((0x5A, 0xA5, t))))
+        device_events.tick(t * S, None)
+    device_events.raise_event(2 * S, EventKind.CONFIGURATION, "settings differ from the declared settings")
     for record in caplog.records:
         record.created = 1000.0
     told = [record.getMessage() for record in caplog.records if repeats.filter(record)]
