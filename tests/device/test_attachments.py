@@ -108,7 +108,7 @@ async def test_a_device_that_hangs_is_reset_and_set_up_again(bench: PolledBusBen
 
 
 @in_bench
-async def test_nothing_is_asked_while_the_line_is_active_and_for_3_s(bench: PolledBusBench) -> None:
+async def test_no_request_during_a_reset_and_for_3_s(bench: PolledBusBench) -> None:
     async with polled(bench, hold_ms=500) as it:
         await it.rig.until_samples(5)
         begin_ns = bench.clock.now_ns()
@@ -129,7 +129,7 @@ async def test_nothing_is_asked_while_the_line_is_active_and_for_3_s(bench: Poll
 
 
 @in_bench
-async def test_reset_is_offered_with_a_line_only_and_also_while_no_device_is_found(bench: PolledBusBench) -> None:
+async def test_reset_needs_a_line_but_no_device(bench: PolledBusBench) -> None:
     async with bench.running(bench.on_spi()) as (rig,):
         assert "reset" not in rig.device.actions
         with pytest.raises(BadArgument, match="unknown action 'reset'"):
@@ -148,7 +148,7 @@ async def test_reset_is_offered_with_a_line_only_and_also_while_no_device_is_fou
 
 
 @in_bench
-async def test_the_line_is_held_from_the_beginning_to_the_end_and_its_trouble_shown(bench: PolledBusBench) -> None:
+async def test_the_reset_line_stays_open_and_the_status_shows_its_problem(bench: PolledBusBench) -> None:
     async with polled(bench) as it:
         await it.rig.until_samples(1)
         assert it.line.is_open
@@ -199,7 +199,7 @@ class Uart:
 
 @pytest.mark.parametrize("baud", [115200, "auto"])
 @played(lambda baud: Uart(LINES, baud=baud))
-async def test_a_uart_on_which_nothing_is_heard_has_its_device_reset(it: Uart, baud: Any) -> None:
+async def test_a_device_without_bytes_on_a_uart_is_reset(it: Uart, baud: Any) -> None:
     await it.until(lambda: it.device.state is DeviceState.RUNNING and it.clock.now_ns() > 1015e9)
     assert [active for _, active in it.wires.outputs["imu reset"].history] == [True, False]
     assert sum(e.message.endswith("reset by its line") for e in it.events) == 1
@@ -211,7 +211,7 @@ async def test_a_uart_on_which_nothing_is_heard_has_its_device_reset(it: Uart, b
 
 
 @played(lambda: Uart(LINES, baud=115200))
-async def test_a_uart_on_which_something_is_heard_is_left_alone(it: Uart) -> None:
+async def test_a_device_with_bytes_on_a_uart_is_not_reset(it: Uart) -> None:
     for _ in range(60):
         next_ns = it.clock.now_ns() + 1_000_000_000
         await it.until(partial(lambda until_ns: it.clock.now_ns() > until_ns, next_ns))
@@ -220,7 +220,7 @@ async def test_a_uart_on_which_something_is_heard_is_left_alone(it: Uart) -> Non
 
 
 @in_loop
-async def test_a_trigger_is_offered_where_imud_drives_sin(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_trigger_action_needs_a_sin_line(monkeypatch: pytest.MonkeyPatch) -> None:
     it = Uart(DeviceLines(sin=TriggerOptions(line="S")), baud=115200)
     assert list(it.device.actions) == ["trigger"]
     once: list[str] = []
@@ -232,7 +232,7 @@ async def test_a_trigger_is_offered_where_imud_drives_sin(monkeypatch: pytest.Mo
         await it.device.act("trigger", {})
 
 
-def test_where_the_measurement_is_reaches_the_clock() -> None:
+def test_the_clock_gets_the_position_of_the_measurement_in_the_pulse() -> None:
     lines = DeviceLines(
         sout=SoutOptions(line="O", offset_us=-7, bias_us=2, width_us=90), sin=TriggerOptions(line="I", offset_us=9)
     )
@@ -249,7 +249,7 @@ def test_where_the_measurement_is_reaches_the_clock() -> None:
 
 
 @in_bench
-async def test_at_the_start_a_device_on_a_bus_is_reset_before_it_is_asked(bench: PolledBusBench) -> None:
+async def test_at_start_a_device_on_a_bus_is_reset_before_the_first_request(bench: PolledBusBench) -> None:
     async with polled(bench, at_start=True) as it:
         await it.rig.until(lambda: it.pulses == 1, "the pulse")
         assert it.device.transactions == 0
@@ -266,7 +266,7 @@ async def test_at_the_start_a_device_on_a_bus_is_reset_before_it_is_asked(bench:
 
 
 @played(lambda: Uart(DeviceLines(reset=ResetOptions(line="R", at_start=True)), baud=115200))
-async def test_at_the_start_a_device_on_a_uart_is_reset(it: Uart) -> None:
+async def test_at_start_a_device_on_a_uart_is_reset(it: Uart) -> None:
     begin_ns = it.clock.now_ns()
     await it.until(lambda: len(it.rig.samples) > 10)
     assert it.clock.now_ns() - begin_ns < 5e9  # without at_start: after a search of more than 4 s

@@ -108,7 +108,7 @@ def magnetometer(rig: GuideRig, verdicts: Callable[[], Verdict], **changes: Any)
 
 
 @played(GuideRig)
-async def test_rest_calibrated_verified_and_saved(rig: GuideRig) -> None:
+async def test_calibration_at_rest_is_verified_and_saved(rig: GuideRig) -> None:
     result = await rig.guide.run("gyro", gyro(rig), save=True)
     (check,) = result.checks
     assert check.name == "mean angular rate"
@@ -120,7 +120,7 @@ async def test_rest_calibrated_verified_and_saved(rig: GuideRig) -> None:
 
 
 @played(GuideRig)
-async def test_it_is_not_saved_unless_it_is_asked_for(rig: GuideRig) -> None:
+async def test_a_result_is_saved_only_on_request(rig: GuideRig) -> None:
     result = await rig.guide.run("gyro", gyro(rig), save=False)
     assert result.verified
     assert not result.saved
@@ -128,7 +128,7 @@ async def test_it_is_not_saved_unless_it_is_asked_for(rig: GuideRig) -> None:
 
 
 @played(GuideRig)
-async def test_a_bias_that_stays_is_told_and_not_saved(rig: GuideRig) -> None:
+async def test_a_remaining_bias_is_reported_and_not_saved(rig: GuideRig) -> None:
     rig.motion = lambda _t_s: (0.0, radians(0.3), 0.0)
     result = await rig.guide.run("gyro", gyro(rig), save=True)
     assert not result.verified
@@ -138,14 +138,14 @@ async def test_a_bias_that_stays_is_told_and_not_saved(rig: GuideRig) -> None:
 
 
 @played(GuideRig)
-async def test_what_samples_do_not_tell_is_not_verified(rig: GuideRig) -> None:
+async def test_a_value_that_samples_do_not_contain_is_not_verified(rig: GuideRig) -> None:
     expectation = replace(GYRO_ZERO, value=lambda _means: None)
     result = await rig.guide.run("gyro", gyro(rig, expected=(expectation,)), save=False)
     assert result.problem == "mean angular rate: the samples do not contain this value"
 
 
 @played(GuideRig)
-async def test_motion_refuses_before_anything_is_sent(rig: GuideRig) -> None:
+async def test_motion_prevents_the_start(rig: GuideRig) -> None:
     rig.motion = lambda _t_s: (0.0, 0.0, 0.5)
     with pytest.raises(
         CommandError, match=r"expected the device at rest, got: it turns at 28\.6 °/s .* put the device on a surface"
@@ -159,7 +159,7 @@ async def test_motion_refuses_before_anything_is_sent(rig: GuideRig) -> None:
 
 @pytest.mark.parametrize("until_s", [19.7, 20.05])
 @played(GuideRig)
-async def test_motion_is_told_also_when_no_sample_came_since_it_was_seen(rig: GuideRig, until_s: float) -> None:
+async def test_motion_is_reported_even_if_no_sample_follows(rig: GuideRig, until_s: float) -> None:
     rig.motion = lambda _t_s: (0.0, 0.0, 0.5)
     running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
     await asyncio.sleep(until_s - 18)
@@ -172,7 +172,7 @@ async def test_motion_is_told_also_when_no_sample_came_since_it_was_seen(rig: Gu
     ("rate_rad_s", "words"), [(0.5, "it turns at 28.6 °/s"), (0.0, "only 11 samples came")], ids=["moved", "at rest"]
 )
 @played(GuideRig)
-async def test_too_few_samples_say_what_they_show(rig: GuideRig, rate_rad_s: float, words: str) -> None:
+async def test_too_few_samples_are_reported(rig: GuideRig, rate_rad_s: float, words: str) -> None:
     rig.motion, rig.silent = lambda _t_s: (0.0, 0.0, rate_rad_s), True
     running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
     await asyncio.sleep(19.05)
@@ -182,7 +182,7 @@ async def test_too_few_samples_say_what_they_show(rig: GuideRig, rate_rad_s: flo
 
 
 @played(GuideRig)
-async def test_rest_is_waited_for(rig: GuideRig) -> None:
+async def test_the_guide_waits_for_rest(rig: GuideRig) -> None:
     rig.motion = lambda t_s: (0.0, 0.0, 0.5 if t_s < 5 else 0.0)
     assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified
     assert rig.phases()[:2] == ["begin", "rest"]
@@ -190,7 +190,7 @@ async def test_rest_is_waited_for(rig: GuideRig) -> None:
 
 
 @played(GuideRig)
-async def test_motion_while_it_runs_spoils_it(rig: GuideRig) -> None:
+async def test_motion_during_the_calibration_is_an_error(rig: GuideRig) -> None:
     rig.motion = lambda t_s: (0.0, 0.0, 0.5 if 4 < t_s < 4.5 else 0.0)
     result = await rig.guide.run("gyro", gyro(rig), save=True)
     assert result.problem.startswith("the device moved during the calibration: the angular rate changes by 2")
@@ -226,7 +226,7 @@ async def test_refusals(rig: GuideRig) -> None:
 
 @pytest.mark.parametrize("end", ["stop", "cancel", "close"])
 @played(GuideRig)
-async def test_it_can_be_ended(rig: GuideRig, end: str) -> None:
+async def test_a_calibration_can_be_cancelled(rig: GuideRig, end: str) -> None:
     running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
     await asyncio.sleep(1)
     getattr(rig.guide, end)()
@@ -269,7 +269,7 @@ def turned_where_it_is_disturbed(rig: GuideRig) -> None:
 
 @pytest.mark.manual("B 8.1.1 procedure")
 @played(GuideRig)
-async def test_turning_ends_when_the_device_says_so(rig: GuideRig) -> None:
+async def test_the_turns_end_when_the_device_reports_the_end(rig: GuideRig) -> None:
     turned_by_hand(rig, HARD_IRON_T)
 
     def verdict() -> Verdict:
@@ -293,7 +293,7 @@ async def test_turning_ends_when_the_device_says_so(rig: GuideRig) -> None:
 
 
 @played(GuideRig)
-async def test_a_device_that_was_calibrated_before_needs_the_turning_only(rig: GuideRig) -> None:
+async def test_a_calibrated_device_only_needs_the_turns(rig: GuideRig) -> None:
     turned_by_hand(rig)
     result = await rig.guide.run("magnetometer", magnetometer(rig, lambda: Verdict(True, "x")), save=False)
     assert result.verified
@@ -356,7 +356,7 @@ async def test_magnetometer_of_a_module(it: WiredDevice) -> None:
 
 
 @played(lambda: module(tumble(), 0))
-async def test_six_axes_have_no_use_for_the_magnetometer(it: WiredDevice) -> None:
+async def test_six_axis_mode_refuses_the_magnetometer_calibration(it: WiredDevice) -> None:
     await it.wait(2)
     with pytest.raises(CommandError, match=r"magnetometer: expected 9-axis mode, .* action mode, axes=9"):
         await it.device.calibrate("magnetometer", save=False)

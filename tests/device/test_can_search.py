@@ -62,7 +62,7 @@ class Round:
         return step.summary
 
 
-def test_one_device_is_found_beside_strangers_and_several_are_named() -> None:
+def test_one_device_is_found_and_several_are_listed() -> None:
     heard = Round().hear(fake_can_frame(8), fake_can_frame(8, 1))
     assert heard.early is None
     assert heard.search.on_time(LISTEN_NS - 1) is None
@@ -78,7 +78,7 @@ def test_one_device_is_found_beside_strangers_and_several_are_named() -> None:
     )
 
 
-def test_samples_that_are_not_whole_are_waited_for_and_told() -> None:
+def test_incomplete_samples_extend_the_round_and_are_reported() -> None:
     heard = Round().hear(*imu61x(1))
     step = heard.search.on_time(heard.until_ns)
     assert isinstance(step, Listen)
@@ -92,7 +92,7 @@ def test_samples_that_are_not_whole_are_waited_for_and_told() -> None:
     assert 6 * NS_PER_S <= heard.until_ns < 6 * NS_PER_S + 2 * LISTEN_NS
 
 
-def test_unknown_frames_are_shown_by_their_identifiers_and_silence_as_such() -> None:
+def test_unknown_frames_and_silence_are_reported() -> None:
     frames = [CanFrame(0x18FEE9AA, True, bytes(8), 0), CanFrame(0x65, True, bytes(8), 0), CanFrame(0x7, False, b"", 0)]
     assert Round().hear(*frames).complaint() == (
         "unknown frames arrive on can0 (0x007, 0x00000065, 0x18FEE9AA); configure driver and options"
@@ -102,7 +102,7 @@ def test_unknown_frames_are_shown_by_their_identifiers_and_silence_as_such() -> 
     assert "no frame arrives on can0" in Round().complaint()
 
 
-def test_devices_of_others_are_left_to_them() -> None:
+def test_claimed_devices_are_not_found() -> None:
     claimed = {BASE + 8}
     heard = Round(claimed=lambda can_id, extended: can_id in claimed and not extended)
     heard.hear(*(fake_can_frame(node, n) for n in (1, 2) for node in (8, 9)))
@@ -111,7 +111,7 @@ def test_devices_of_others_are_left_to_them() -> None:
     assert "only frames of other configured devices" in heard.complaint()
 
 
-def test_the_remembered_device_is_taken_at_once_if_it_is_free() -> None:
+def test_the_remembered_device_is_found_immediately_if_it_is_free() -> None:
     heard = Round(remembered=("fake-can", 9))
     heard.hear(fake_can_frame(8, 1), fake_can_frame(9, 1), fake_can_frame(8, 2))
     assert heard.early is None
@@ -123,12 +123,12 @@ def test_the_remembered_device_is_taken_at_once_if_it_is_free() -> None:
     assert heard.early is None
 
 
-def test_a_device_is_found_by_frames_whose_identifier_came_before_it_was_named() -> None:
+def test_frames_before_the_naming_frame_do_not_prevent_the_search() -> None:
     unnamed = fake_can_frame(8)._replace(data=b"7 bytes")
     assert Round().hear(unnamed, fake_can_frame(8), fake_can_frame(8, 1)).found() == "fake-can node 8"
 
 
-def test_only_protocols_that_yield_samples_are_named() -> None:
+def test_only_drivers_with_samples_are_listed() -> None:
     """A second driver recognizes the same frames, but decodes no sample."""
     search = CanSearch([fake_can_driver("wrong", BASE - 1), FAKE], "can0")
     search.start(0)
@@ -151,7 +151,7 @@ def test_frames_after_a_loss_are_not_joined_with_those_before() -> None:
 
 
 @pytest.mark.parametrize("extended", [False, True])
-def test_a_bus_full_of_noise_costs_bounded_memory(extended: bool) -> None:
+def test_noise_on_the_bus_uses_limited_memory(extended: bool) -> None:
     survey, random = CanSurvey([fake_can_driver(base=0), FAKE]), Random(3)
     most = 0x1FFF_FFFF if extended else 0x7FF
     for _ in range(IDENTIFIERS_MAX + 500):

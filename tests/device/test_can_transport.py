@@ -119,7 +119,7 @@ def delay_ns(name: str, settings: Options, bitrate: int) -> int:
     ("name", "settings", "bits"),
     [("hipnuc-canopen", HipnucCanopenOptions(), 95), ("hipnuc-j1939", HipnucJ1939Options(), 131)],
 )
-def test_the_length_of_the_first_frame_is_taken_off(name: str, settings: Options, bits: int) -> None:
+def test_the_time_stamp_precedes_the_first_frame_by_its_length(name: str, settings: Options, bits: int) -> None:
     """TPDO1 has six bytes; a 29-bit identifier makes a frame 20 bits longer."""
     taken_ns = delay_ns(name, settings, 500_000) - delay_ns(name, settings, 0)
     assert taken_ns == pytest.approx(bits * 2000, abs=2000)
@@ -133,7 +133,7 @@ async def test_only_own_identifiers_pass(bench: CanDeviceBench) -> None:
 
 
 @told(play)
-async def test_losses_by_cause(bench: CanDeviceBench) -> None:
+async def test_lost_samples_are_counted_by_cause(bench: CanDeviceBench) -> None:
     bench.feed(1, 2)
     bench.link.feed(bench.frames(3, lost=[2]))  # no reason is known
     bench.feed(4)
@@ -159,7 +159,7 @@ async def test_frames_from_before_a_loss_are_not_mixed_with_those_after(bench: C
     assert bench.rig.samples == []
 
 
-def test_a_device_that_has_not_answered_is_asked_on() -> None:
+def test_a_device_without_reply_is_queried_again() -> None:
     """No device replies: after the first minutes one query in five minutes."""
     clock = VirtualClock()
     rigs = DeviceRigs(clock.host)
@@ -177,7 +177,7 @@ def test_a_device_that_has_not_answered_is_asked_on() -> None:
     play_rigs(rigs, story, clock)
 
 
-def test_what_a_device_measured_while_the_host_was_suspended_is_a_gap_of_unknown_size() -> None:
+def test_a_suspend_of_the_host_is_a_gap_of_unknown_size() -> None:
     clock, asleep_ns, index = VirtualClock(), 0, count()
     now_ns = clock.now_ns
     host = HostClock(now_ns, clock.realtime_ns, now_ns, lambda: now_ns() + asleep_ns)
@@ -206,7 +206,7 @@ def test_what_a_device_measured_while_the_host_was_suspended_is_a_gap_of_unknown
 
 
 @pytest.mark.parametrize("end", ["run ends", "closed"])
-def test_a_device_that_ends_leaves_its_bus(end: str) -> None:
+def test_a_closed_device_leaves_its_bus(end: str) -> None:
     clock = VirtualClock()
     rigs = DeviceRigs(clock.host)
     rig = rigs.add(configured())
@@ -248,7 +248,7 @@ async def test_bus_down_and_up(bench: CanDeviceBench) -> None:
 
 
 @told(play)
-async def test_trouble_of_the_bus_is_shown_while_it_lasts(bench: CanDeviceBench) -> None:
+async def test_the_status_shows_a_problem_of_the_bus_while_it_lasts(bench: CanDeviceBench) -> None:
     rig = bench.rig
     bench.link.news("can0 is error-passive: x", "can0 is error-passive: x")
     bench.feed(1)
@@ -266,7 +266,7 @@ async def test_trouble_of_the_bus_is_shown_while_it_lasts(bench: CanDeviceBench)
 
 @pytest.mark.parametrize(("lost", "words"), [([], "no frame of imu61x-can arrives"), ([4], "no complete sample")])
 @told(play)
-async def test_silence_says_what_is_heard(bench: CanDeviceBench, lost: list[int], words: str) -> None:
+async def test_a_silent_device_reports_the_received_frames(bench: CanDeviceBench, lost: list[int], words: str) -> None:
     if lost:
         bench.link.feed(bench.frames(1, lost=lost))
     bench.rig.tick(ahead_ns=3000 * MS)

@@ -24,7 +24,7 @@ def test_frames_of_others_on_the_same_bus_are_claimed() -> None:
     assert not claimed(0x181, False)
 
 
-def test_of_two_that_want_the_same_frames_the_second_is_refused_with_both_names() -> None:
+def test_the_second_of_two_devices_with_equal_frames_is_refused() -> None:
     buses = CanBuses()
     buses.join("front", "can0", (), [SYNC])
     buses.join("rear", "can0", (), [CyclicFrame(0x80, False, b"", 20_000_000)])

@@ -94,7 +94,7 @@ async def made_so(bus: BusInProcess, wanted: Mapping[str, object], *, verified: 
 
 
 @pytest.mark.parametrize("variant", NODE_VARIANTS)
-def test_a_canopen_node_is_made_as_declared(variant: str) -> None:
+def test_declared_settings_are_applied_to_a_canopen_node(variant: str) -> None:
     clock, kind = VirtualClock(), NODE_VARIANTS[variant]
     module = HipnucCanopenModule(clock.now_ns(), HipnucCanopenHardware(boot_ms=200, variant=kind))
     other = NodeSettings(node=12)
@@ -116,7 +116,7 @@ def test_a_canopen_node_is_made_as_declared(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", J1939_VARIANTS)
-def test_a_j1939_module_is_made_as_declared(variant: str) -> None:
+def test_declared_settings_are_applied_to_a_j1939_module(variant: str) -> None:
     clock, kind = VirtualClock(), J1939_VARIANTS[variant]
     module = HipnucJ1939Module(clock.now_ns(), J1939Settings(), J1939Hardware(boot_ms=200, variant=kind))
     beside = HipnucJ1939Module(clock.now_ns(), J1939Settings(address=12), J1939Hardware(boot_ms=0))
@@ -135,7 +135,7 @@ def test_a_j1939_module_is_made_as_declared(variant: str) -> None:
     assert beside.settings == J1939Settings(address=12)
 
 
-def test_a_node_that_was_found_by_listening_is_told_what_it_is_commanded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_found_node_with_another_number_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The configuration forbids queries of the identity."""
     monkeypatch.setattr("imud.device.can_search.LISTEN_NS", 100_000_000)
     clock = VirtualClock()
@@ -150,7 +150,7 @@ def test_a_node_that_was_found_by_listening_is_told_what_it_is_commanded(monkeyp
     bus.play(story)
 
 
-def test_a_node_is_set_as_declared_and_followed() -> None:
+def test_a_node_with_a_declared_number_is_followed() -> None:
     clock = VirtualClock()
     module = HipnucCanopenModule(clock.now_ns(), HipnucCanopenHardware(boot_ms=0))
     bus = BusInProcess(

@@ -28,7 +28,7 @@ class Days:
         return HostClock(lambda: 0, lambda: self.now_s * NS_PER_S, lambda: 0)
 
 
-def test_imud_itself_is_stopped_before_people_are() -> None:
+def test_the_limit_of_imud_itself_is_lower_than_the_limit_of_users() -> None:
     days = Days()
     writes = FlashWrites(None, days.host)
     itself, asked = ModuleFlash(writes, "A", asked=False), ModuleFlash(writes, "A", asked=True)
@@ -77,7 +77,9 @@ def test_a_wrong_clock_does_not_forbid_writes_and_the_modules_written_last_are_r
 
 
 @pytest.mark.parametrize("content", [b"{", b'{"A": {"writes": "x"}}', b"[]"])
-def test_a_damaged_file_costs_the_count_only(tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_invalid_file_only_loses_the_counts(
+    tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / FILE_NAME).write_bytes(content)
     with closing(FlashWrites(tmp_path, Days().host)) as writes:
         assert writes.writes("A") == 0

@@ -19,7 +19,7 @@ def make() -> tuple[DeviceEvents, Ledger, list[Event]]:
     return DeviceEvents("bow", ledger, events.append), ledger, events
 
 
-def test_only_a_change_of_sync_is_told() -> None:
+def test_only_a_change_of_sync_raises_an_event() -> None:
     device_events, _, events = make()
     for t in range(5):
         device_events.tick(t * S, Sync.ARRIVAL)
@@ -31,7 +31,7 @@ def test_only_a_change_of_sync_is_told() -> None:
     assert [(e.kind, e.detail) for e in events] == [(EventKind.SYNC, {"sync": "regression", "before": "arrival"})]
 
 
-def test_losses_are_told_once_a_second_with_causes_and_bad_frames_with_the_last() -> None:
+def test_losses_and_bad_frames_raise_one_event_per_second() -> None:
     device_events, ledger, events = make()
     ledger.lost_crc = 2
     device_events.tick(10 * S, None)
@@ -63,7 +63,7 @@ def test_texts_of_an_event_are_printable_and_bounded() -> None:
     msgspec.json.encode(events[0])
 
 
-def test_an_event_is_logged_at_once_after_another_kind_of_trouble(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_event_of_another_kind_is_logged_immediately(caplog: pytest.LogCaptureFixture) -> None:
     device_events, ledger, _ = make()
     repeats = RepeatFilter()
     for t, lost in enumerate((2, 3)):

@@ -40,7 +40,7 @@ def test_only_differences_to_a_known_device_are_reported() -> None:
     assert not events
 
 
-def test_what_an_answer_lost_is_known_from_before_of_the_same_device() -> None:
+def test_lost_members_of_an_identity_are_kept() -> None:
     """A new adapter can lose bytes of the first replies."""
     events: list[Event] = []
     known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), HostClock(lambda: 5))
@@ -64,14 +64,14 @@ def test_what_an_answer_lost_is_known_from_before_of_the_same_device() -> None:
     assert known.identity == Identity("HI14")
 
 
-def test_words_leave_out_what_is_empty() -> None:
+def test_identity_words_contain_no_empty_member() -> None:
     assert identity_words(Identity("HI14", details={"BUILD": "x", "EMPTY": ""})) == {"product": "HI14", "BUILD": "x"}
 
 
 HOSTILE = "\x1b[2J\n\udc80\ud800\u202e" + "x" * 10_000
 
 
-def test_what_a_device_says_fits_every_output() -> None:
+def test_texts_of_a_device_have_limited_printable_characters() -> None:
     """Long, unprintable, not UTF-8, and with the names of parameters of imud."""
     events: list[Event] = []
     known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), HostClock(lambda: 5))

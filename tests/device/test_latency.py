@@ -19,7 +19,7 @@ class Told:
         return self.needs[-1].latency_ns / NS_PER_MS, self.needs[-1].who
 
 
-def test_the_strictest_request_for_a_device_decides_whenever_it_appears() -> None:
+def test_the_smallest_latency_counts_for_a_device() -> None:
     budget = LatencyBudget()
     bow, stern = Told(budget, "bow"), Told(budget, "stern")
     assert bow.needs == [NOBODY]
@@ -46,7 +46,7 @@ def test_the_strictest_request_for_a_device_decides_whenever_it_appears() -> Non
     assert Told(budget, "bow").now == (3, "named")
 
 
-def test_a_device_is_told_changes_within_the_limits_only() -> None:
+def test_a_device_is_notified_of_changes_within_the_limits() -> None:
     budget = LatencyBudget()
     bow = Told(budget, "bow")
     budget.ask("client 1", 5 * NS_PER_MS)
@@ -66,7 +66,7 @@ def test_a_device_is_told_changes_within_the_limits_only() -> None:
     assert bow.now == (0, "hasty")
 
 
-def test_any_order_of_requests_comes_to_the_strictest_of_those_that_stand() -> None:
+def test_the_order_of_requests_does_not_matter() -> None:
     random, budget = Random(1), LatencyBudget()
     names = ["bow", "stern", "mast", "gone"]
     devices = {name: Told(budget, name) for name in names[:3]}
@@ -86,7 +86,7 @@ def test_any_order_of_requests_comes_to_the_strictest_of_those_that_stand() -> N
             assert device.needs[-1] == budget.need(name) == min([*needs, NOBODY])
 
 
-def test_a_client_that_goes_costs_no_look_at_the_others() -> None:
+def test_a_withdrawn_request_does_not_visit_other_requests() -> None:
     budget, compared = LatencyBudget(), 0
 
     class Counted(str):

@@ -95,7 +95,7 @@ def stream_of(driver: StreamDriver, random: Random) -> bytes:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("driver", STREAM, ids=lambda driver: driver.name)
-def test_bytes_that_waited_give_the_same_samples_and_ledger(driver: StreamDriver, seed: int) -> None:
+def test_held_bytes_give_the_same_samples_and_ledger(driver: StreamDriver, seed: int) -> None:
     random = Random(f"{driver.name} {seed}")
     stream = stream_of(driver, random)
     plain, held = stream_path(driver), stream_path(driver)
@@ -142,7 +142,7 @@ def frames_of(driver: CanDriver, random: Random) -> list[CanFrame]:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("driver", CAN, ids=lambda driver: driver.name)
-def test_frames_that_gathered_give_the_same_samples_even_in_time(driver: CanDriver, seed: int) -> None:
+def test_held_frames_give_the_same_samples_and_times(driver: CanDriver, seed: int) -> None:
     random = Random(f"{driver.name} {seed}")
     frames = frames_of(driver, random)
     plain, held = can_path(driver), can_path(driver)

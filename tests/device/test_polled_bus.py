@@ -132,7 +132,7 @@ def moving() -> TransferScript[None]:
 
 
 @told(run)
-async def test_a_script_takes_its_device_to_another_target_and_looks_at_others(buses: PolledBuses) -> None:
+async def test_a_script_changes_the_target_and_reads_other_targets(buses: PolledBuses) -> None:
     wire, ended_at = Wire(), list[int]()
     member = joined(buses, wire, Sink())
     with pytest.raises(DeviceRefused):
@@ -162,7 +162,7 @@ async def test_scripts_return_raise_and_catch(buses: PolledBuses) -> None:
         await member.run(stubborn(), 1)
 
 
-def test_readings_come_in_order_with_their_times() -> None:
+def test_readings_are_delivered_in_order_with_their_times() -> None:
     """Virtual time: reads at 2 kHz, 30 µs each; every sixth deadline has two reads."""
     clock = VirtualClock()
     buses = virtual_buses(clock)
@@ -186,7 +186,7 @@ def test_readings_come_in_order_with_their_times() -> None:
 
 
 @pytest.mark.parametrize(("latency_ns", "together"), [(0, 1), (460_000, 1), (5_000_000, 11), (5_100_000, 11)])
-def test_readings_wait_and_their_polls_do_not(latency_ns: int, together: int) -> None:
+def test_a_hold_does_not_delay_reads(latency_ns: int, together: int) -> None:
     """Virtual time, 2 kHz: imud delivers the oldest reading before the end of its latency."""
     clock = VirtualClock()
     buses = virtual_buses(clock)
@@ -214,7 +214,7 @@ def test_readings_wait_and_their_polls_do_not(latency_ns: int, together: int) ->
 
 
 @told(run)
-async def test_a_failed_reading_and_those_before_it_do_not_wait(buses: PolledBuses) -> None:
+async def test_a_failed_reading_ends_the_hold(buses: PolledBuses) -> None:
     wire, delivered = Wire(), list[list[Reading]]()
     member = buses.get(wire.bus).join(wire, Deadlines(), lambda some, _problem: delivered.append(list(some)))
     member.set_latency(40_000_000)
@@ -228,7 +228,7 @@ async def test_a_failed_reading_and_those_before_it_do_not_wait(buses: PolledBus
 
 
 @told(run)
-async def test_script_has_its_turn_on_a_bus_that_is_never_idle(buses: PolledBuses) -> None:
+async def test_a_script_gets_a_turn_on_a_busy_bus(buses: PolledBuses) -> None:
     wire, sink = Wire(), Sink()
     wire.rate_hz = 1e6
     member = joined(buses, wire, sink)
@@ -238,7 +238,7 @@ async def test_script_has_its_turn_on_a_bus_that_is_never_idle(buses: PolledBuse
 
 
 @told(run)
-async def test_end_of_the_bus_is_told_once_and_reading_stops(buses: PolledBuses) -> None:
+async def test_the_end_of_the_bus_is_reported_once_and_stops_reads(buses: PolledBuses) -> None:
     wire, sink = Wire(), Sink()
     member = joined(buses, wire, sink)
     wire.fail = LinkError("gone")
@@ -252,7 +252,7 @@ async def test_end_of_the_bus_is_told_once_and_reading_stops(buses: PolledBuses)
 
 
 @told(run)
-async def test_device_that_left_hears_nothing_and_its_link_is_closed_by_the_thread(buses: PolledBuses) -> None:
+async def test_the_thread_closes_the_link_of_a_device_that_has_left(buses: PolledBuses) -> None:
     wire, sink, other = Wire(), Sink(), Wire()
     member, stays = joined(buses, wire, sink), joined(buses, other, Sink())
     member.start((Poll(ASK),))
@@ -267,7 +267,7 @@ async def test_device_that_left_hears_nothing_and_its_link_is_closed_by_the_thre
 
 
 @told(run)
-async def test_a_script_that_is_given_up_ends_without_a_result(buses: PolledBuses) -> None:
+async def test_a_cancelled_script_has_no_result(buses: PolledBuses) -> None:
     failed, wire = list[object](), Wire()
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: failed.append(context))
     member = joined(buses, wire, Sink())
@@ -282,7 +282,7 @@ async def test_a_script_that_is_given_up_ends_without_a_result(buses: PolledBuse
 
 
 @told(run)
-async def test_targets_are_taken_once(buses: PolledBuses) -> None:
+async def test_a_target_is_claimed_once(buses: PolledBuses) -> None:
     a, b = joined(buses, Wire(), Sink()), joined(buses, Wire(), Sink())
     assert a.claim(0x18)
     assert a.claim(0x18)
@@ -302,7 +302,7 @@ def holding(log: list[int], wire: Wire) -> TransferScript[None]:
 
 
 @told(run)
-async def test_a_script_can_keep_its_device_from_being_read(buses: PolledBuses) -> None:
+async def test_a_script_can_prevent_reads_of_its_device(buses: PolledBuses) -> None:
     wire, log = Wire(), list[int]()
     wire.rate_hz = 0.0  # a read is always due
     member = joined(buses, wire, Sink())
@@ -319,7 +319,7 @@ async def test_a_script_can_keep_its_device_from_being_read(buses: PolledBuses) 
 
 @pytest.mark.live
 @in_loop
-async def test_an_edge_is_read_while_the_loop_is_busy() -> None:
+async def test_a_blocked_loop_does_not_delay_the_read_of_an_edge() -> None:
     """The thread waits for the line. It does not read the descriptor, and the loop is blocked."""
     edges, device = os.pipe2(os.O_NONBLOCK)
     buses, wire, read = PolledBuses(HostClock()), Wire(), threading.Event()
@@ -351,7 +351,7 @@ async def test_an_edge_is_read_while_the_loop_is_busy() -> None:
 
 @pytest.mark.live
 @in_loop
-async def test_a_watched_line_does_not_keep_others_from_their_deadlines() -> None:
+async def test_a_watched_line_does_not_delay_other_devices() -> None:
     edges, device = os.pipe2(os.O_NONBLOCK)
     buses, wire, sink = PolledBuses(HostClock()), Wire(), Sink()
     member = joined(buses, wire, sink)

@@ -45,7 +45,7 @@ async def test_daemon_serves_a_polled_device(bench: PolledBusBench) -> None:
     assert not bench.spi.opened
 
 
-def test_mistake_in_the_bus_thread_ends_the_daemon(bench: PolledBusBench) -> None:
+def test_an_internal_error_in_the_bus_thread_ends_the_daemon(bench: PolledBusBench) -> None:
     def mistake(_selections: Any, _mode: int) -> list[bytes]:
         raise ZeroDivisionError("a mistake")
 
@@ -63,7 +63,7 @@ def _raise(error: BaseException) -> NoReturn:
 
 
 @pytest.mark.parametrize(("before_s", "after_s"), [(0.005, SWITCH_INTERVAL_S), (0.0001, 0.0001)])
-def test_a_bus_thread_need_not_wait_5_ms_for_the_interpreter(before_s: float, after_s: float) -> None:
+def test_the_daemon_shortens_the_switch_interval_for_a_bus_thread(before_s: float, after_s: float) -> None:
     """Reads at 1 kHz next to a busy loop. A shorter switch interval stays."""
     kept = sys.getswitchinterval()
     try:

@@ -15,7 +15,7 @@ def schedule(rate_hz: float = 1000.0, begin_ns: int = 5 * MS) -> Schedule:
     return Schedule(rate_hz, begin_ns, Deadlines())
 
 
-def test_deadlines_do_not_drift_and_their_counts_go_on_over_schedules() -> None:
+def test_deadlines_do_not_drift_and_counters_continue() -> None:
     one = schedule()
     for number in range(1000):
         assert one.due_ns == 5 * MS + number * MS
@@ -32,7 +32,7 @@ def test_deadlines_do_not_drift_and_their_counts_go_on_over_schedules() -> None:
     assert counts.polls == 2
 
 
-def test_late_and_missed_deadlines_are_counted_and_the_rest_stays_in_step() -> None:
+def test_late_and_missed_deadlines_are_counted() -> None:
     one = schedule()
     for late_ns in (250_000, 250_001, 999_999):
         one.begun(one.due_ns + late_ns)
@@ -57,7 +57,7 @@ def test_late_and_missed_deadlines_are_counted_and_the_rest_stays_in_step() -> N
 # --- turns ------------------------------------------------------------------------------------------------------------
 
 
-def test_all_take_turns_also_with_one_that_comes_back() -> None:
+def test_devices_alternate_even_after_a_return() -> None:
     counts = [Deadlines() for _ in range(3)]
     turns = [RoundRobin(100, one) for one in counts]
     now_ns, order = 100, []
@@ -78,7 +78,7 @@ def test_all_take_turns_also_with_one_that_comes_back() -> None:
     assert back.due_ns < busy.due_ns
 
 
-def test_on_a_bus_every_reading_is_handed_over_at_once() -> None:
+def test_a_busy_bus_delivers_each_reading_immediately() -> None:
     """A read is always due, so that the thread is never idle."""
     clock = VirtualClock()
 
@@ -112,7 +112,7 @@ def read(made: ReadySchedule, start_ns: int, takes_ns: int = MS // 5) -> None:
     made.done(start_ns + takes_ns)
 
 
-def test_an_edge_is_due_at_once_and_late_after_a_quarter_of_the_interval() -> None:
+def test_a_read_is_late_after_a_quarter_of_the_interval() -> None:
     made = by_edges()
     assert made.due_ns == BEGIN + QUIET_NS
     for number in range(1, 100):
@@ -131,7 +131,7 @@ def test_an_edge_is_due_at_once_and_late_after_a_quarter_of_the_interval() -> No
     assert made.counts.late == 2
 
 
-def test_edges_that_were_read_are_counted_by_their_stamps_and_not_read_again() -> None:
+def test_an_edge_is_read_once_and_counted_by_its_time() -> None:
     """The loop reports the edge late: a read after the edge already has its values."""
     made = by_edges()
     made.on_edges([BEGIN + MS], MS)
@@ -173,7 +173,7 @@ def test_edges_that_were_read_are_counted_by_their_stamps_and_not_read_again() -
     assert (made.counts.polls, made.counts.sum_late_ns) == (7, 4 * 20_000 + 300_000 + 20_000)
 
 
-def test_edges_end_and_come_back_by_two_of_them() -> None:
+def test_two_edges_end_the_use_of_deadlines() -> None:
     made = by_edges()
     made.noticed(BEGIN + MS)
     read(made, BEGIN + MS)
@@ -199,7 +199,7 @@ def test_edges_end_and_come_back_by_two_of_them() -> None:
     assert (made.by_edges, made.due_ns) == (True, t_ns + QUIET_NS + MS)
 
 
-def test_without_edges_deadlines_come_again_after_a_time_by_their_interval() -> None:
+def test_missing_edges_start_the_use_of_deadlines() -> None:
     made = by_edges(100.0)
     at_ns = made.due_ns + 7
     read(made, at_ns)

@@ -107,7 +107,7 @@ def told(rig: DeviceRig) -> str:
 
 
 @in_bench
-async def test_several_modules_take_turns(bench: LineBench) -> None:
+async def test_several_modules_alternate(bench: LineBench) -> None:
     """Old and new firmware on one bus: each device is correct, and turns are fair."""
     modules = [modbus_slave(1), modbus_slave(2, firmware=152), modbus_slave(3, inclinometer="dual")]
     async with bench.running(*modules) as rigs:
@@ -136,7 +136,7 @@ async def test_several_modules_take_turns(bench: LineBench) -> None:
 
 
 @in_bench
-async def test_a_dead_module_does_not_stall_the_others(bench: LineBench) -> None:
+async def test_a_dead_module_does_not_delay_other_modules(bench: LineBench) -> None:
     gone = modbus_slave(2)
     async with bench.running(modbus_slave(1), gone, modbus_slave(3)) as rigs:
         for rig in rigs:
@@ -157,7 +157,7 @@ async def test_a_dead_module_does_not_stall_the_others(bench: LineBench) -> None
 
 
 @in_bench
-async def test_noise_costs_one_sample_and_no_more(bench: LineBench) -> None:
+async def test_noise_loses_one_sample(bench: LineBench) -> None:
     module = modbus_slave(1)
     async with bench.running(module) as (rig,):
         await rig.until_samples(10)
@@ -176,7 +176,7 @@ async def test_noise_costs_one_sample_and_no_more(bench: LineBench) -> None:
 
 
 @in_bench
-async def test_module_is_told_something_while_it_is_read(bench: LineBench) -> None:
+async def test_a_command_runs_between_reads(bench: LineBench) -> None:
     module, other = modbus_slave(1), modbus_slave(2)
     async with bench.running(module, other) as rigs:
         for rig in rigs:
@@ -191,9 +191,7 @@ async def test_module_is_told_something_while_it_is_read(bench: LineBench) -> No
 
 
 @in_bench
-async def test_module_that_is_given_another_address_is_followed(
-    bench: LineBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_module_with_a_new_address_is_followed(bench: LineBench, monkeypatch: pytest.MonkeyPatch) -> None:
     def moving(_target: Target, *, address: int) -> TransferScript[None]:
         with suppress(TransferError):
             yield replace(next(session.set_id(address)), then_at=address)
@@ -220,7 +218,7 @@ async def test_module_that_is_given_another_address_is_followed(
 
 
 @in_bench
-async def test_module_exchanged_for_another_at_the_same_address(
+async def test_a_replaced_module_at_the_same_address_is_reported(
     bench: LineBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("imud.drivers.hipnuc.modbus.codec.CHECK_NS", 20 * NS_PER_MS)
@@ -269,7 +267,7 @@ async def test_a_module_is_followed_to_another_address_and_back(bench: LineBench
 
 @pytest.mark.parametrize("variant", SLAVE_VARIANTS)
 @in_bench
-async def test_modules_of_every_kind_are_read_and_made_as_declared(bench: LineBench, variant: str) -> None:
+async def test_declared_settings_are_applied_to_every_kind_of_module(bench: LineBench, variant: str) -> None:
     module, other = modbus_slave(1, variant=SLAVE_VARIANTS[variant]), modbus_slave(2)
     async with bench.running(module, other) as (rig, beside):
         await rig.until_samples(10)

@@ -34,7 +34,7 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PolledBusBench:
     [("standard", 4e-5, 2e-3), ("extended", 2e-6, 2e-3), ("registers", 4e-8, 1e-3)],
 )
 @in_bench
-async def test_spi_samples_are_the_truth_of_the_latched_instant(
+async def test_spi_samples_have_the_values_of_their_time_stamp(
     bench: PolledBusBench, burst: str, resolution_m_s2: float, temperature: float
 ) -> None:
     """Resolution of a burst: 0.2 / 65536 g = 3e-5 m/s²; of a register: a thousandth; of f32: 1e-6."""
@@ -105,7 +105,7 @@ SPI_FAULTS: list[tuple[dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("fault", "why"), SPI_FAULTS, ids=[why for _, why in SPI_FAULTS])
 @in_bench
-async def test_vanished_device_is_not_believed_before_it_is_identified(
+async def test_readings_after_an_absence_need_an_identification(
     bench: PolledBusBench, fault: dict[str, Any], why: str
 ) -> None:
     device = bench.registers()
@@ -130,7 +130,7 @@ async def test_vanished_device_is_not_believed_before_it_is_identified(
 
 
 @in_bench
-async def test_readings_on_their_way_when_it_vanished_are_not_decoded(bench: PolledBusBench) -> None:
+async def test_pending_readings_of_a_missing_device_are_not_decoded(bench: PolledBusBench) -> None:
     """The thread of a busy bus makes further readings before the loop detects the missing device."""
     device = bench.registers()
     armed, gone_ns, good_after = False, 0, 0
@@ -160,7 +160,7 @@ async def test_readings_on_their_way_when_it_vanished_are_not_decoded(bench: Pol
 
 
 @in_bench
-async def test_single_damage_costs_its_sample_and_nothing_else(bench: PolledBusBench) -> None:
+async def test_one_damaged_reading_loses_one_sample(bench: PolledBusBench) -> None:
     device = bench.registers()
     bench.spi.device = device.spi
     async with bench.running(bench.on_spi()) as (rig,):
@@ -181,7 +181,7 @@ async def test_single_damage_costs_its_sample_and_nothing_else(bench: PolledBusB
 
 
 @in_bench
-async def test_time_in_which_it_was_looked_for_is_a_gap_of_unknown_size(bench: PolledBusBench) -> None:
+async def test_the_time_of_a_search_is_a_gap_of_unknown_size(bench: PolledBusBench) -> None:
     """One gap, even if the device was found and lost several times before its next sample."""
     device = bench.registers()
     is_absent = False
@@ -219,7 +219,7 @@ async def test_restarted_device_is_set_up_again(bench: PolledBusBench) -> None:
 
 
 @in_bench
-async def test_setting_that_does_not_take_keeps_it_from_running(bench: PolledBusBench) -> None:
+async def test_a_device_with_a_rejected_setting_does_not_run(bench: PolledBusBench) -> None:
     device = bench.registers()
     bench.i2c.devices[0x18] = device
     device.faults.ignores_writes = True
@@ -231,7 +231,7 @@ async def test_setting_that_does_not_take_keeps_it_from_running(bench: PolledBus
 
 
 @in_bench
-async def test_auto_finds_driver_and_address_and_does_not_take_one_twice(bench: PolledBusBench) -> None:
+async def test_auto_finds_driver_and_address_of_unclaimed_devices(bench: PolledBusBench) -> None:
     bench.i2c.devices.update({0x19: bench.registers(product="IMU612"), 0x1B: bench.registers(product="IMU618")})
     async with bench.running(on_i2c("a", "auto"), on_i2c("b"), on_i2c("c")) as rigs:
 
@@ -251,7 +251,7 @@ async def test_auto_finds_driver_and_address_and_does_not_take_one_twice(bench: 
 
 
 @in_bench
-async def test_a_failed_read_of_settings_costs_no_sample(bench: PolledBusBench) -> None:
+async def test_a_failed_read_of_settings_loses_no_sample(bench: PolledBusBench) -> None:
     bench.spi.device = bench.registers().spi
     async with bench.running(bench.on_spi()) as (rig,):
         await rig.until_samples(3)
@@ -274,7 +274,7 @@ async def test_a_stuck_bus_is_tried_once_in_a_round(bench: PolledBusBench) -> No
 
 
 @in_bench
-async def test_readings_are_held_if_two_of_them_fit(bench: PolledBusBench) -> None:
+async def test_readings_are_held_if_the_hold_contains_two(bench: PolledBusBench) -> None:
     bench.spi.device = bench.registers().spi
     async with bench.running(bench.on_spi()) as (rig,):
         for latency_ns, hold_ns in ((8_000_000, 8_000_000), (7_999_999, 0)):  # the period is 4 ms
@@ -286,7 +286,7 @@ async def test_readings_are_held_if_two_of_them_fit(bench: PolledBusBench) -> No
 
 
 @in_bench
-async def test_vanished_device_does_not_hold_up_the_others(bench: PolledBusBench) -> None:
+async def test_a_missing_device_does_not_delay_other_devices(bench: PolledBusBench) -> None:
     there, gone = bench.registers(), bench.registers()
     bench.i2c.devices.update({0x18: there, 0x19: gone})
     gone.faults.error = errno.ENXIO
@@ -302,7 +302,7 @@ async def test_vanished_device_does_not_hold_up_the_others(bench: PolledBusBench
 
 
 @in_bench
-async def test_repeated_values_are_stale_and_then_silence(bench: PolledBusBench) -> None:
+async def test_repeated_values_are_stale_and_make_the_device_silent(bench: PolledBusBench) -> None:
     device = bench.registers()
     bench.i2c.devices[0x18] = device
     async with bench.running(on_i2c()) as (rig,):
@@ -333,7 +333,7 @@ async def test_device_slower_than_its_polls_gives_each_value_once(bench: PolledB
 
 
 @in_bench
-async def test_missing_bus_is_waited_for_and_one_that_may_not_be_opened_is_tried_again(bench: PolledBusBench) -> None:
+async def test_imud_waits_for_a_missing_bus_and_retries_a_denied_bus(bench: PolledBusBench) -> None:
     bench.spi.device = bench.registers().spi
     plug, unplug = bench.node.touch, bench.node.unlink
     unplug()
@@ -411,7 +411,7 @@ async def test_settings_are_applied_and_read_again_after_an_action(bench: Polled
 @pytest.mark.parametrize("variant", REGISTER_VARIANTS)
 @pytest.mark.parametrize("burst", ["standard", "extended"])
 @in_bench
-async def test_a_kind_of_burst_is_found_and_kept_in_every_variant(
+async def test_the_kind_of_burst_is_detected_in_every_variant(
     bench: PolledBusBench, variant: str, burst: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """During reads of identity and settings, ten per second, and after a restart that loses the settings."""

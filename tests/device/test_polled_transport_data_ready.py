@@ -120,7 +120,7 @@ async def scene(bench: PolledBusBench, **more: Any) -> AsyncIterator[Scene]:
 
 
 @in_bench
-async def test_every_edge_is_a_sample_of_its_own_instant(bench: PolledBusBench) -> None:
+async def test_each_edge_is_a_sample_with_its_time(bench: PolledBusBench) -> None:
     async with scene(bench) as it:
         await it.rig.until_samples(200)
         status = it.rig.device.status()
@@ -139,7 +139,7 @@ async def test_every_edge_is_a_sample_of_its_own_instant(bench: PolledBusBench) 
 
 
 @in_bench
-async def test_falling_edges_of_an_inverted_line_are_those_of_the_line_as_it_is(bench: PolledBusBench) -> None:
+async def test_an_inverted_line_has_the_same_edges(bench: PolledBusBench) -> None:
     asked: list[Any] = []
     make = bench.lines.input
 
@@ -155,7 +155,7 @@ async def test_falling_edges_of_an_inverted_line_are_those_of_the_line_as_it_is(
 
 
 @in_bench
-async def test_the_edges_of_a_loop_that_stalls_are_missed(bench: PolledBusBench) -> None:
+async def test_a_stalled_loop_misses_edges(bench: PolledBusBench) -> None:
     """After a blocked loop the kernel has ten more edges: one read, for the newest edge."""
     async with scene(bench) as it:
         await it.rig.until_samples(20)
@@ -181,7 +181,7 @@ class Unheard(MemoryInput):
 
 
 @in_bench
-async def test_an_edge_that_the_loop_did_not_hear_of_dates_the_read_all_the_same(bench: PolledBusBench) -> None:
+async def test_an_edge_in_the_kernel_time_stamps_its_read(bench: PolledBusBench) -> None:
     """The edge is in the kernel before the read for the previous edge starts: no second read."""
 
     def make(_settings: Any, purpose: str, rising_only: bool = False) -> MemoryInput:
@@ -212,7 +212,7 @@ async def test_an_edge_that_the_loop_did_not_hear_of_dates_the_read_all_the_same
 
 
 @in_bench
-async def test_no_edges_any_more_and_edges_again(bench: PolledBusBench) -> None:
+async def test_edges_stop_and_return(bench: PolledBusBench) -> None:
     async with scene(bench) as it:
         await it.rig.until_samples(20)
         it.signal.quiet = True
@@ -239,7 +239,7 @@ async def test_no_edges_any_more_and_edges_again(bench: PolledBusBench) -> None:
 
 
 @in_bench
-async def test_without_the_line_deadlines_serve_until_it_comes(bench: PolledBusBench) -> None:
+async def test_a_missing_line_causes_reads_at_deadlines(bench: PolledBusBench) -> None:
     bench.lines.input(ReadyOptions(line="Y"), "imu data_ready", True).open_error = LinkMissing("no such line")
     async with scene(bench) as it:
         await it.rig.until(it.told("line data_ready: no such line"), "told")
@@ -255,7 +255,7 @@ async def test_without_the_line_deadlines_serve_until_it_comes(bench: PolledBusB
 
 
 @in_bench
-async def test_what_came_while_the_device_was_not_believed_is_not_missed(bench: PolledBusBench) -> None:
+async def test_edges_before_the_identification_are_not_missed(bench: PolledBusBench) -> None:
     async with scene(bench) as it:
         await it.rig.until_samples(20)
         it.device.faults.line = 0xFF
@@ -301,7 +301,7 @@ class WatchingMember:
 
 
 @in_loop
-async def test_the_thread_waits_for_a_line_with_a_descriptor_while_that_is_open_and_read() -> None:
+async def test_the_thread_watches_an_open_line_during_reads() -> None:
     line, clock, member, told = DescriptorLine(), VirtualClock(), WatchingMember(), list[str]()
     device_events: Any = SimpleNamespace(raise_event=lambda _t, _kind, message, **_detail: told.append(message))
     maker = LineFactory(lambda *_: line, lambda *_: MemoryOutput())

@@ -69,7 +69,7 @@ def runner_of(write: Callable[[bytes], None]) -> ScriptRunner:
 
 
 @in_loop
-async def test_requests_and_scripts_go_out_one_after_the_other() -> None:
+async def test_requests_and_scripts_run_one_at_a_time() -> None:
     runner, written = made()
     task = asyncio.create_task(runner.run(ask(request("A"), request("B"))))
     await asyncio.sleep(0)
@@ -99,7 +99,7 @@ async def test_requests_and_scripts_go_out_one_after_the_other() -> None:
 
 
 @in_loop
-async def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
+async def test_a_timeout_ends_a_request_and_a_late_reply_is_counted() -> None:
     ledger = Ledger()
     runner = offline_runner(ledger)
     assert await runner.run(ask(request("A", timeout_ns=1))) == [Silence(())]
@@ -111,7 +111,7 @@ async def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
 
 
 @in_loop
-async def test_a_script_that_is_cancelled_or_whose_link_is_gone_leaves_the_line_free() -> None:
+async def test_a_cancelled_or_failed_script_allows_the_next_script() -> None:
     gone = True
 
     def write(data: bytes) -> None:
@@ -131,7 +131,7 @@ async def test_a_script_that_is_cancelled_or_whose_link_is_gone_leaves_the_line_
     assert await runner.run(ask(request("B", silent=True))) == [Reply(())]
 
 
-def test_device_that_never_answers_is_no_reply() -> None:
+def test_a_device_without_reply_raises_no_reply() -> None:
     clock, driver = VirtualClock(), DRIVERS["hipnuc-uart"]
     assert isinstance(driver, StreamDriver)
     script = driver.identify()
@@ -144,7 +144,7 @@ def test_device_that_never_answers_is_no_reply() -> None:
 
 
 @in_loop
-async def test_a_script_gets_the_reply_frame_or_measurement_that_it_waits_for_and_pauses_write_nothing() -> None:
+async def test_a_script_receives_its_reply_frame_or_measurement() -> None:
     runner, _ = made()
     wanted = ReplyFrame(5, b"x")
     asking = replace(request("A"), is_end=lambda message: message == wanted)
@@ -168,7 +168,7 @@ async def test_a_script_gets_the_reply_frame_or_measurement_that_it_waits_for_an
 
 @pytest.mark.parametrize("is_there", [True, False])
 @in_loop
-async def test_a_script_given_up_is_undone_if_the_link_is_there(is_there: bool) -> None:
+async def test_a_cancelled_script_is_undone_if_the_link_exists(is_there: bool) -> None:
     written: list[bytes] = []
 
     def write(data: bytes) -> None:
@@ -186,7 +186,7 @@ async def test_a_script_given_up_is_undone_if_the_link_is_there(is_there: bool) 
 
 
 @in_loop
-async def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
+async def test_a_finished_script_is_not_undone() -> None:
     """The script returns or raises: it has left the device in a defined state."""
 
     def failing() -> RequestScript[None]:
@@ -206,7 +206,7 @@ async def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
     ids=["rate", "number", "other frames"],
 )
 @in_loop
-async def test_a_request_can_change_how_the_device_is_heard(change: dict[str, Any], words: str) -> None:
+async def test_a_request_can_change_rate_number_or_filters(change: dict[str, Any], words: str) -> None:
     """The change precedes the request. A link without the property is an error."""
     port = CallingPort(lambda _data: None)
     runner = ScriptRunner(port, Ledger(), HostClock())

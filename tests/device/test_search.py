@@ -92,7 +92,7 @@ class OnBus:
 
 
 @played(Bus)
-async def test_the_only_device_is_found_nothing_was_sent_and_commands_go_to_it(bus: Bus) -> None:
+async def test_the_only_device_is_found_without_a_sent_frame(bus: Bus) -> None:
     bench = bus.add()
     assert bench.device.actions == {}
     await bench.until(lambda: bench.link.listening)
@@ -107,7 +107,7 @@ async def test_the_only_device_is_found_nothing_was_sent_and_commands_go_to_it(b
 
 @pytest.mark.parametrize("driver", ["auto", "fake-can"])
 @played(Bus)
-async def test_a_device_that_is_given_another_number_is_followed(bus: Bus, driver: str) -> None:
+async def test_a_device_with_a_new_number_is_followed(bus: Bus, driver: str) -> None:
     bench = bus.add(driver=driver, options=FakeCanSettings(node=8, sync_ms=10) if driver != "auto" else None)
     other = bus.add("bow")
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 8)
@@ -128,14 +128,14 @@ async def test_a_device_that_is_given_another_number_is_followed(bus: Bus, drive
 
 
 @played(Bus)
-async def test_commands_go_to_the_device_that_is_configured(bus: Bus) -> None:
+async def test_commands_use_the_configured_number(bus: Bus) -> None:
     bench = bus.add(driver="fake-can", options=FakeCanSettings(node=5))
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 5)
     assert await bench.device.act("node", {}) == 5
 
 
 @played(Bus)
-async def test_several_are_named_and_the_search_goes_on(bus: Bus) -> None:
+async def test_several_devices_are_listed_and_the_search_continues(bus: Bus) -> None:
     bench = bus.add()
     await bench.until(lambda: "2 devices send on can0" in bench.rig.problem, 8, 9)
     assert "fake-can node 8, fake-can node 9; configure driver and options" in bench.rig.problem
@@ -144,7 +144,7 @@ async def test_several_are_named_and_the_search_goes_on(bus: Bus) -> None:
 
 
 @played(Bus)
-async def test_a_device_that_another_one_is_configured_for_is_left_alone(bus: Bus) -> None:
+async def test_a_device_of_another_configuration_is_not_used(bus: Bus) -> None:
     auto = bus.add()
     bus.add("bow", "fake-can", FakeCanSettings(node=8))
     await auto.until(lambda: auto.samples, 8, 9)
@@ -152,7 +152,7 @@ async def test_a_device_that_another_one_is_configured_for_is_left_alone(bus: Bu
 
 
 @played(Bus)
-async def test_two_that_search_do_not_both_take_the_same_device(bus: Bus) -> None:
+async def test_two_searches_do_not_find_the_same_device(bus: Bus) -> None:
     first, second = bus.add("bow"), bus.add("mast")
     await first.until(lambda: first.samples, 8)
     await second.until(lambda: "only frames of other" in second.rig.problem, 8)
@@ -160,7 +160,7 @@ async def test_two_that_search_do_not_both_take_the_same_device(bus: Bus) -> Non
     assert [wanted.can_id for wanted in second.link.filters] == [BASE + 9]
 
 
-def test_what_was_found_is_remembered(tmp_path: Path) -> None:
+def test_the_result_of_a_search_is_stored(tmp_path: Path) -> None:
     for nodes in ((8,), (8, 9)):  # although two devices send at the second search
         bus = Bus(tmp_path)
         bench = bus.add()
@@ -193,7 +193,7 @@ async def test_after_long_silence_another_device_is_found(bus: Bus) -> None:
 
 
 @played(Bus)
-async def test_the_bus_goes_down_while_searching_and_comes_back(bus: Bus) -> None:
+async def test_the_search_continues_after_the_bus_was_down(bus: Bus) -> None:
     bench = bus.add()
     await bench.until(lambda: bench.link.listening)
     bench.hear(8)
@@ -210,7 +210,7 @@ async def test_the_bus_goes_down_while_searching_and_comes_back(bus: Bus) -> Non
 
 
 @played(Bus)
-async def test_trouble_of_the_bus_explains_why_nothing_is_found(bus: Bus) -> None:
+async def test_a_problem_of_the_bus_is_the_reason_for_no_result(bus: Bus) -> None:
     bench = bus.add()
     await bench.until(lambda: "no frame arrives on can0" in bench.rig.problem)
     bench.link.news("can0 is bus-off: x", "can0 is bus-off: x")
@@ -237,7 +237,7 @@ async def test_cyclic_frames_are_sent_while_the_link_is_open(bus: Bus) -> None:
 
 
 @played(Bus)
-async def test_a_link_that_may_not_send_sends_nothing(bus: Bus) -> None:
+async def test_a_read_only_link_sends_no_frame(bus: Bus) -> None:
     bench = syncing(bus, "mast", 8, writable=False)
     await bench.until(lambda: bench.samples, 8)
     assert not bench.link.cyclic

@@ -29,7 +29,7 @@ def recalled(folder: Path, device: str) -> RememberedDevice | None:
         return memory.get(device)
 
 
-def test_the_newest_findings_survive_a_restart_and_are_written_once(tmp_path: Path) -> None:
+def test_results_survive_a_restart_and_are_written_once(tmp_path: Path) -> None:
     remember(tmp_path, bow=RememberedDevice("hipnuc-uart", 921600))
     assert recalled(tmp_path, "bow") == RememberedDevice("hipnuc-uart", 921600)
     assert recalled(tmp_path, "stern") is None
@@ -78,7 +78,7 @@ DAMAGED = [b"", b"{", b"[1]", b'{"bow": {"driver": 1, "baud": "x"}}', b"\xff\xfe
 
 @pytest.mark.parametrize("make", [fifo, endless, terminal, loop, *map(holding, DAMAGED)])
 @pytest.mark.timeout(5)
-def test_what_is_damaged_or_no_file_is_reported_and_replaced(
+def test_an_invalid_file_is_reported_and_replaced(
     tmp_path: Path, make: Callable[[Path], object], caplog: pytest.LogCaptureFixture
 ) -> None:
     make(tmp_path / FILE_NAME)
@@ -87,12 +87,12 @@ def test_what_is_damaged_or_no_file_is_reported_and_replaced(
     assert recalled(tmp_path, "bow") == FOUND
 
 
-def test_a_state_directory_that_is_missing_is_made(tmp_path: Path) -> None:
+def test_a_missing_state_directory_is_created(tmp_path: Path) -> None:
     remember(tmp_path / "var" / "imud", bow=FOUND)
     assert recalled(tmp_path / "var" / "imud", "bow") == FOUND
 
 
-def test_directory_of_its_name_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_directory_in_place_of_the_file_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / FILE_NAME).mkdir()
     remember(tmp_path, bow=FOUND)
     assert "cannot be used" in caplog.text
@@ -102,7 +102,7 @@ def test_directory_of_its_name_stops_nothing(tmp_path: Path, caplog: pytest.LogC
 
 @pytest.mark.parametrize("make", [fifo, endless, half])
 @pytest.mark.timeout(5)
-def test_what_a_killed_daemon_left_is_replaced(tmp_path: Path, make: Callable[[Path], None]) -> None:
+def test_the_temporary_file_of_a_killed_daemon_is_replaced(tmp_path: Path, make: Callable[[Path], None]) -> None:
     """imud removes the temporary file of any type and does not follow a link."""
     make(tmp_path / (FILE_NAME + ".new"))
     remember(tmp_path, bow=FOUND)
@@ -123,9 +123,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_without_a_folder_or_the_right_to_write_it_the_memory_lasts_for_the_run(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_a_folder_results_stay_in_memory(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with closing(Remembered(None)) as memory:
         memory.put("bow", FOUND)
         assert memory.get("bow") == FOUND

@@ -134,7 +134,7 @@ class ModuleBench:
 
 
 @played(ModuleBench)
-async def test_without_a_declaration_nothing_is_asked_and_nothing_told(bench: ModuleBench) -> None:
+async def test_without_declared_settings_imud_reads_no_settings(bench: ModuleBench) -> None:
     await bench.pass_s(5)
     assert bench.is_in(SettingsState.UNDECLARED)
     assert bench.module.commands == ["WHO", "GET"]  # identity and settings as text
@@ -142,7 +142,7 @@ async def test_without_a_declaration_nothing_is_asked_and_nothing_told(bench: Mo
 
 
 @played(lambda: ModuleBench(declared={"mode": "6-axis", "output": {"a": 100}, "secret": 5}))
-async def test_what_agrees_is_said_to(bench: ModuleBench) -> None:
+async def test_equal_settings_are_reported_as_agreeing(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
     assert bench.is_in(SettingsState.UNKNOWN)
     await bench.until(lambda: bench.is_in(SettingsState.AGREE))
@@ -151,7 +151,7 @@ async def test_what_agrees_is_said_to(bench: ModuleBench) -> None:
 
 
 @played(lambda: ModuleBench(declared={"mode": "9-axis", "offset_deg": 1.5}))
-async def test_a_difference_is_told_once_and_nothing_is_written(bench: ModuleBench) -> None:
+async def test_a_difference_raises_one_event_and_no_write(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.is_in(SettingsState.DIFFER))
     await bench.pass_s(100)
     found = 'mode is "6-axis", declared "9-axis", offset_deg is 0.0, declared 1.5'
@@ -168,7 +168,7 @@ async def test_a_difference_is_told_once_and_nothing_is_written(bench: ModuleBen
 
 
 @played(lambda: ModuleBench(declared={"mode": "6-axis"}))
-async def test_compared_again_after_a_replug_a_restart_and_a_command(bench: ModuleBench) -> None:
+async def test_settings_are_compared_after_replug_restart_and_command(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.is_in(SettingsState.AGREE))
     await bench.pass_s(20)
     bench.module.disappear()
@@ -193,7 +193,7 @@ async def test_compared_again_after_a_replug_a_restart_and_a_command(bench: Modu
 
 
 @played(lambda: ModuleBench(declared={"mode": "6-axis"}, pauses_clock=True))
-async def test_a_device_whose_clock_begins_anew_by_the_question_is_asked_once(bench: ModuleBench) -> None:
+async def test_a_counter_restart_by_a_read_causes_no_second_read(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.is_in(SettingsState.AGREE))
     asked = bench.module.commands.count("GET")
     await bench.pass_s(50)
@@ -204,7 +204,7 @@ async def test_a_device_whose_clock_begins_anew_by_the_question_is_asked_once(be
 
 
 @played(lambda: ModuleBench(declared={"mode": "6-axis"}, silent={"GET"}))
-async def test_a_device_that_does_not_tell_its_settings_is_asked_ever_more_seldom(bench: ModuleBench) -> None:
+async def test_failed_reads_of_settings_are_repeated_a_few_times(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.messages)
     assert bench.messages == ["cannot read the settings after 3 tries: GET: expected OK, got nothing"]
     await bench.pass_s(sum(IDENTIFY_AGAIN_S) + 10)  # with four more queries of the identity
@@ -223,7 +223,7 @@ async def test_a_device_that_does_not_tell_its_settings_is_asked_ever_more_seldo
 
 
 @played(lambda: ModuleBench("apply", {"mode": "9-axis", "mounting": "x_up", "secret": 5}))
-async def test_apply_sets_what_is_in_force_at_once_and_leaves_flash_alone(bench: ModuleBench) -> None:
+async def test_apply_does_not_write_flash(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.status.repairs)
     await bench.until(lambda: list(bench.status.differences) == ["mounting"])
     await bench.pass_s(50)
@@ -243,7 +243,7 @@ EVERYTHING = {"mode": "9-axis", "mounting": "x_up", "output": {"b": 50}, "secret
 
 
 @played(lambda: ModuleBench("apply_and_save", EVERYTHING))
-async def test_apply_and_save_does_everything_once(bench: ModuleBench) -> None:
+async def test_apply_and_save_writes_flash_once(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.status.repairs)
     await bench.until(lambda: bench.is_in(SettingsState.AGREE))
     assert bench.written() == [
@@ -259,7 +259,7 @@ async def test_apply_and_save_does_everything_once(bench: ModuleBench) -> None:
 
 
 @played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis"}))
-async def test_flash_is_not_written_after_commands_that_change_nothing_or_save_themselves(bench: ModuleBench) -> None:
+async def test_commands_without_unsaved_changes_cause_no_flash_write(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.status.repairs == 1 and bench.is_in(SettingsState.AGREE))
     await bench.doing(bench.device.act("save", {}))
     await bench.pass_s(300)
@@ -274,7 +274,7 @@ async def test_flash_is_not_written_after_commands_that_change_nothing_or_save_t
 
 
 @played(lambda: ModuleBench("apply_and_save", {"output": {"b": 50}}))
-async def test_flash_is_not_written_again_after_a_change_that_a_command_has_saved(bench: ModuleBench) -> None:
+async def test_a_change_that_a_command_saved_is_not_written_again(bench: ModuleBench) -> None:
     async def change_and_save() -> None:
         await asyncio.gather(bench.device.act("set_mode", {"mode": "9-axis"}), bench.device.act("save", {}))
 
@@ -285,7 +285,7 @@ async def test_flash_is_not_written_again_after_a_change_that_a_command_has_save
     assert (bench.module.flash["mode"], bench.module.saves) == ("9-axis", 2)
 
 
-def test_what_is_saved_and_not_told_is_not_written_again_in_the_next_run(tmp_path: Path) -> None:
+def test_a_saved_unreadable_value_is_not_written_in_the_next_run(tmp_path: Path) -> None:
     modules = []
     for _run in range(2):
         bench = ModuleBench("apply_and_save", {"secret": 5}, tmp_path)
@@ -301,7 +301,7 @@ def test_what_is_saved_and_not_told_is_not_written_again_in_the_next_run(tmp_pat
 
 
 @played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis"}))
-async def test_what_a_command_could_not_save_is_saved_later(bench: ModuleBench) -> None:
+async def test_a_failed_save_of_a_command_is_repeated(bench: ModuleBench) -> None:
     bench.module.silent = {"SAVE"}
     await bench.until(lambda: "not saved" in bench.status.problem)
     with pytest.raises(CommandError, match="SAVE: expected OK, got nothing"):
@@ -314,7 +314,7 @@ async def test_what_a_command_could_not_save_is_saved_later(bench: ModuleBench) 
 
 
 @played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis", "secret": 5}))
-async def test_another_module_is_brought_to_the_same_settings(bench: ModuleBench) -> None:
+async def test_a_replaced_module_gets_the_declared_settings(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.module.saves == 1)
     bench.module.disappear()
     await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
@@ -328,7 +328,7 @@ async def test_another_module_is_brought_to_the_same_settings(bench: ModuleBench
 
 
 @played(lambda: ModuleBench("apply", {"mode": "9-axis"}))
-async def test_each_module_that_takes_the_place_of_another_is_set_at_once(bench: ModuleBench) -> None:
+async def test_each_replaced_module_is_repaired_without_pause(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.status.repairs == 1)
     for number, serial in enumerate(("B2", "C3", "D4"), start=2):
         bench.module.disappear()
@@ -340,7 +340,7 @@ async def test_each_module_that_takes_the_place_of_another_is_set_at_once(bench:
 
 
 @played(lambda: ModuleBench("apply", {"mode": "9-axis"}, forgets={"mode"}))
-async def test_a_device_that_forgets_is_set_again_after_growing_pauses(bench: ModuleBench) -> None:
+async def test_repeated_repairs_have_growing_pauses(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.status.repairs == 1)
     assert bench.messages[-1].endswith(
         'mode: wrote "9-axis", read back "6-axis"; the previous writes last until the device restarts'
@@ -367,7 +367,7 @@ async def test_a_device_that_forgets_is_set_again_after_growing_pauses(bench: Mo
 
 
 @played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis"}))
-async def test_flash_is_written_a_few_times_a_day_by_itself_and_still_for_people(bench: ModuleBench) -> None:
+async def test_flash_writes_of_imud_have_a_lower_limit_than_requests(bench: ModuleBench) -> None:
     for number in range(1, LIMIT_ITSELF + 1):
         await bench.until(partial(bench.saved, number), limit_s=4000)
         await bench.pass_s(3)
@@ -401,7 +401,7 @@ async def test_plan_and_apply_of_given_values(bench: ModuleBench) -> None:
 
 
 @played(lambda: ModuleBench(declared={"mode": "9-axis"}))
-async def test_a_report_has_what_was_told_last_or_asks_now(bench: ModuleBench) -> None:
+async def test_a_report_contains_the_last_or_new_values(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
     known = await bench.device.settings_report(fresh=False)
     assert {one.actual for one in known.settings} == {None}
@@ -422,7 +422,7 @@ async def test_a_report_has_what_was_told_last_or_asks_now(bench: ModuleBench) -
     ],
 )
 @played(ModuleBench)
-async def test_what_cannot_be_is_refused_before_anything_is_written(
+async def test_invalid_values_are_refused_before_the_first_write(
     bench: ModuleBench, given: Any, error: type[Exception], message: str
 ) -> None:
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
@@ -432,7 +432,7 @@ async def test_what_cannot_be_is_refused_before_anything_is_written(
 
 
 @played(ModuleBench)
-async def test_a_device_that_is_not_there_is_not_asked(bench: ModuleBench) -> None:
+async def test_a_missing_device_is_not_read(bench: ModuleBench) -> None:
     bench.module.disappear()
     await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
     for work in (
@@ -471,7 +471,7 @@ def outcomes(applied: AppliedSettings) -> Outcomes:
 WANTED = {"mode": "9-axis", "output": {"a": 10}, "mounting": "x_up", "offset_deg": 1.5}
 
 
-def test_a_step_that_fails_ends_the_plan_and_nothing_is_saved() -> None:
+def test_a_failed_step_ends_the_plan_without_save() -> None:
     bench, applied = applied_with(WANTED, lambda module: module.refuses.add("output"))
     assert outcomes(applied) == {
         "mode": StepOutcome.DONE, "output": StepOutcome.FAILED, "mounting": StepOutcome.NOT_DONE,
@@ -494,7 +494,7 @@ def test_a_step_that_fails_ends_the_plan_and_nothing_is_saved() -> None:
     assert not applied.saved
 
 
-def test_a_device_that_falls_silent_in_the_middle() -> None:
+def test_a_device_without_reply_during_the_plan() -> None:
     class Dying(set[str]):
         """Commands without a reply: all commands after the write of `output`."""
 
@@ -512,7 +512,7 @@ def test_a_device_that_falls_silent_in_the_middle() -> None:
     assert applied.problem == 'output: SET output={"a":10}: expected OK, got nothing; its present settings are unknown'
 
 
-def test_a_restart_or_a_save_that_fails_says_what_is_set() -> None:
+def test_a_failed_restart_or_save_reports_the_written_settings() -> None:
     _bench, applied = applied_with(
         {"mounting": "x_up", "mode": "9-axis"}, lambda module: module.forgets.add("mounting")
     )
@@ -530,7 +530,7 @@ def test_a_restart_or_a_save_that_fails_says_what_is_set() -> None:
     assert bench.module.flash == FACTORY
 
 
-def test_another_rate_is_followed_unless_the_device_is_not_heard_at_it() -> None:
+def test_a_new_rate_is_followed_if_the_device_replies() -> None:
     bench, applied = applied_with({"baud": 921600, "mode": "9-axis"}, lambda _module: None)
     assert outcomes(applied) == {"mode": StepOutcome.DONE, "baud": StepOutcome.DONE}
     assert (bench.module.baud, bench.module.set["baud"], bench.module.saves) == (921600, 921600, 1)
@@ -574,7 +574,7 @@ async def test_commands_that_save_count_and_are_limited(bench: ModuleBench) -> N
 
 
 @played(ModuleBench)
-async def test_a_command_does_not_wait_for_another_one_for_ever(bench: ModuleBench) -> None:
+async def test_a_command_waits_for_another_command_for_a_limited_time(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
     await bench.pass_s(2)
     waiting = asyncio.ensure_future(bench.device.act("wait", {}))
@@ -604,7 +604,7 @@ async def test_a_backup_is_made_before_a_factory_reset(bench: ModuleBench, tmp_p
 
 @pytest.mark.parametrize("silent", [True, False])
 @played(ModuleBench)
-async def test_a_reset_without_a_backup_says_so(bench: ModuleBench, silent: bool) -> None:
+async def test_a_reset_without_backup_raises_an_event(bench: ModuleBench, silent: bool) -> None:
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
     await bench.pass_s(1)
     bench.module.silent = {"GET"} if silent else set()
@@ -624,9 +624,7 @@ def declaring(config: DeviceConfig, on_difference: OnDifference, **declared: Any
     return replace(config, declared=msgspec.convert(declared, table.declarable), on_difference=on_difference)
 
 
-def test_a_device_that_is_polled_is_set_between_its_reads_and_again_after_a_restart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_polled_device_is_repaired_after_a_restart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.device.settings.AGAIN_NS", NS_PER_S)
     bench = PolledBusBench(tmp_path, monkeypatch, VirtualClock())
     device = bench.registers()

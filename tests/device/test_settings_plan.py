@@ -23,7 +23,7 @@ def names(plan: SettingsPlan) -> list[str]:
     return [step.name for step in plan.steps]
 
 
-def test_only_what_differs_or_cannot_be_read_back_is_written_and_flash_only_then() -> None:
+def test_only_different_or_unreadable_settings_are_written() -> None:
     assert planned({"mode": "6-axis", "output": {"a": 100}}) == SettingsPlan()
     assert planned({"mode": "6-axis"}).empty
     plan = planned({"mode": "9-axis", "output": {"a": 100}})
@@ -36,7 +36,7 @@ def test_only_what_differs_or_cannot_be_read_back_is_written_and_flash_only_then
     assert names(planned({"secret": 5}, secret=4)) == ["secret"]
 
 
-def test_the_order_is_that_of_the_table_and_what_changes_the_connection_comes_last() -> None:
+def test_settings_of_the_connection_are_last() -> None:
     plan = planned({"baud": 921600, "offset_deg": 1.0, "mounting": "x_up", "mode": "9-axis"})
     assert names(plan) == ["mode", "mounting", "offset_deg", "baud"]
     assert plan.risk is Risk.CONNECTION
@@ -49,7 +49,7 @@ def test_the_order_is_that_of_the_table_and_what_changes_the_connection_comes_la
     assert (names(plan), plan.save) == (["mode", "baud"], True)
 
 
-def test_what_needs_a_restart_is_left_out_where_nothing_is_or_can_be_saved() -> None:
+def test_settings_that_need_a_restart_need_a_save() -> None:
     wanted = {"mounting": "x_up", "mode": "9-axis", "baud": 921600}
     plan = planned(wanted, save=False)
     assert names(plan) == ["mode"]

@@ -71,7 +71,7 @@ def applied(device: TableOfOne, *, save: bool = True, flash: CountedFlash | None
     return asyncio.run(applying.carry_out(plan))
 
 
-def test_values_are_written_read_back_saved_and_judged_after_a_restart() -> None:
+def test_values_are_written_read_back_saved_and_compared() -> None:
     device, flash = TableOfOne(None), CountedFlash()
     found = applied(device, flash=flash)
     assert device.done == ["x=2", "read", "save"]
@@ -98,7 +98,7 @@ def test_values_are_written_read_back_saved_and_judged_after_a_restart() -> None
 
 
 @pytest.mark.parametrize("result", [Written.UNVERIFIED, Written.UNVERIFIED_PENDING])
-def test_a_device_that_ignores_reads_has_taken_the_value_and_one_that_tells_another_has_not(result: Written) -> None:
+def test_an_unreadable_value_is_not_verified_and_another_value_is_a_failure(result: Written) -> None:
     found = applied(TableOfOne(result, readable=False))
     assert found.steps[0].outcome is StepOutcome.NOT_VERIFIED
     assert (found.saved, found.problem, found.differences) == (True, "", {})
@@ -114,7 +114,7 @@ def test_a_setting_that_saves_itself_is_saved_once() -> None:
 
 
 @pytest.mark.parametrize("error", [NoReply("no answer"), LinkMissing("pulled out")])
-def test_errors_of_device_and_link_are_an_answer(error: Exception) -> None:
+def test_errors_of_device_and_link_are_part_of_the_result(error: Exception) -> None:
     device = TableOfOne(error)
     device.result = error
     found = applied(device)

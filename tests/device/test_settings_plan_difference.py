@@ -18,7 +18,7 @@ def differing(
     return list(differences(FAKE_SETTINGS, wanted, actual, unreadable or {}))
 
 
-def test_the_table_says_what_agrees_and_what_cannot_be_read_differs_unless_it_was_written() -> None:
+def test_the_table_compares_values_and_unreadable_values_differ_unless_written() -> None:
     assert differing({"mode": "6-axis", "output": {"a": 100}, "offset_deg": 0.009}) == []
     assert differing({"offset_deg": 0.02, "output": {"a": 100, "b": 1}, "mode": "9-axis"}) == [
         "mode", "output", "offset_deg",
@@ -35,7 +35,7 @@ def test_the_table_says_what_agrees_and_what_cannot_be_read_differs_unless_it_wa
     assert unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, {}) == ("mode", "secret")
 
 
-def test_words_name_both_values_and_given_values_get_the_types_of_the_table() -> None:
+def test_words_contain_both_values() -> None:
     assert words({"mode": SettingDifference("6-axis", "9-axis"), "n": SettingDifference(1, 2)}) == (
         'mode is "9-axis", declared "6-axis", n is 2, declared 1'
     )
@@ -54,7 +54,7 @@ def test_words_name_both_values_and_given_values_get_the_types_of_the_table() ->
         ({"secret": None}, "secret: expected a whole number from 0 to 9, got null"),
     ],
 )
-def test_bad_values_are_named_with_what_is_expected(given: dict[str, Any], message: str) -> None:
+def test_errors_contain_the_expected_values(given: dict[str, Any], message: str) -> None:
     with pytest.raises(BadArgument) as caught:
         wanted_values(FAKE_SETTINGS, given)
     assert message in str(caught.value)

@@ -20,7 +20,7 @@ def device(baud: int, rate_hz: float, phase_ns: int = 0, poll_ns: int = NS_PER_M
     return FakeDevice(FAKE_DRIVER, baud, rate_hz, phase_ns, poll_ns, REPLY, QUERY, random=Random(baud + phase_ns))
 
 
-def test_the_line_model_gives_the_bytes_at_the_right_rate_and_others_at_wrong_ones() -> None:
+def test_the_line_model_changes_bytes_at_a_wrong_rate() -> None:
     data = bytes(range(256))
     assert bytes(value for _, value in received(data, 115200, 115200)) == data
     # 0x00 at 9600 baud: low for nine bits = 108 bits at 115200 baud, with one start edge
@@ -29,7 +29,7 @@ def test_the_line_model_gives_the_bytes_at_the_right_rate_and_others_at_wrong_on
     assert received(b"\x55", 115200, 230400)[0][1] == 0b01100110
 
 
-def test_a_remembered_rate_that_is_wrong_costs_little_and_one_that_no_longer_exists_nothing() -> None:
+def test_a_wrong_remembered_rate_costs_little_time() -> None:
     search = Search([FAKE_DRIVER], remembered=("fake-uart", 9600))
     found, took_ns, listens = run_search(search, device(921600, 100, 777), start_ns=NS_PER_S)
     assert isinstance(found, StreamFound)
@@ -42,7 +42,7 @@ def test_a_remembered_rate_that_is_wrong_costs_little_and_one_that_no_longer_exi
     assert first_baud(Search([FAKE_DRIVER], bauds=(9600,), remembered=("fake-uart", 115200))) == 9600
 
 
-def test_an_adapter_that_holds_bytes_back_gets_as_much_more_time() -> None:
+def test_a_latency_timer_extends_the_visits() -> None:
     until_ns = []
     for hold_ns in (0, 16 * NS_PER_MS):
         step = Search([FAKE_DRIVER], hold_ns=hold_ns).start(0)
@@ -69,7 +69,7 @@ def test_a_slow_device_is_found_in_a_later_pass(baud: int, rate_hz: float) -> No
 
 
 @pytest.mark.parametrize("baud", BAUD_RATES)
-def test_a_silent_device_is_asked_after_the_quiet_time_only(baud: int) -> None:
+def test_a_silent_device_is_queried_only_after_the_quiet_time(baud: int) -> None:
     far = device(baud, 0)
     found, took_ns, listens = run_search(Search([FAKE_DRIVER], may_ask=True), far, start_ns=NS_PER_S)
     assert isinstance(found, StreamFound)
@@ -80,7 +80,7 @@ def test_a_silent_device_is_asked_after_the_quiet_time_only(baud: int) -> None:
     assert b"".join(data for data, _ in found.chunks) == REPLY
 
 
-def test_nothing_is_sent_without_leave_or_to_another_kind_of_device() -> None:
+def test_no_query_without_permission_or_to_another_device() -> None:
     far = device(115200, 0)
     result, _, listens = run_search(Search([FAKE_DRIVER]), far)
     assert isinstance(result, GaveUp)
@@ -100,7 +100,7 @@ def test_nothing_is_sent_without_leave_or_to_another_kind_of_device() -> None:
     assert isinstance(result, GaveUp)
 
 
-def test_noise_stops_the_questions() -> None:
+def test_noise_stops_the_queries() -> None:
     search = Search([FAKE_DRIVER], may_ask=True)
     step: Step | None = search.start(0)
     now_ns = 0
@@ -119,7 +119,7 @@ def test_noise_stops_the_questions() -> None:
     assert sent == 0
 
 
-def test_two_valid_frames_are_a_lock_if_few_are_damaged() -> None:
+def test_two_good_frames_are_enough_with_few_bad_frames() -> None:
     search = Search([FAKE_DRIVER], bauds=(115200,))
     search.start(0)
     step = search.on_data(fake_frame(b"x" * 76), 1)
@@ -135,7 +135,7 @@ def test_two_valid_frames_are_a_lock_if_few_are_damaged() -> None:
     assert isinstance(search.on_data(good, 9), StreamFound)
 
 
-def test_a_noisy_line_still_locks_also_on_frames_inside_a_false_long_one() -> None:
+def test_a_device_on_a_noisy_line_is_found() -> None:
     far = replace(device(460800, 100, 4_000_000), damage=0.4)
     found, took_ns, _ = run_search(Search([FAKE_DRIVER]), far, start_ns=NS_PER_S)
     assert isinstance(found, StreamFound)
@@ -148,7 +148,7 @@ def test_a_noisy_line_still_locks_also_on_frames_inside_a_false_long_one() -> No
     assert isinstance(search.on_time(step.until_ns), StreamFound)
 
 
-def test_every_byte_is_in_the_chunks_or_wasted() -> None:
+def test_each_byte_is_in_the_result_or_counted_as_wasted() -> None:
     far = device(9600, 100, 5_000_000)
     search = Search([FAKE_DRIVER])
     heard = 0
@@ -166,7 +166,7 @@ def test_every_byte_is_in_the_chunks_or_wasted() -> None:
     assert sum(len(data) for data, _ in found.chunks) + found.wasted_bytes == heard
 
 
-def test_a_rate_that_the_port_cannot_do_is_left_out_and_named() -> None:
+def test_an_unsupported_rate_is_skipped_and_reported() -> None:
     search = Search([FAKE_DRIVER], bauds=(921600, 9600))
     step: Step | None = search.start(0)
     now_ns = 0
@@ -191,7 +191,7 @@ def test_a_rate_that_the_port_cannot_do_is_left_out_and_named() -> None:
     assert "9600: not to be had" in step.summary
 
 
-def test_a_visit_ends_at_its_time_or_by_a_flood() -> None:
+def test_a_visit_ends_at_its_deadline_or_byte_limit() -> None:
     search = Search([FAKE_DRIVER])
     step = search.start(0)
     assert isinstance(step, Listen)
@@ -208,7 +208,7 @@ def test_a_visit_ends_at_its_time_or_by_a_flood() -> None:
     assert change.baud != step.baud
 
 
-def test_the_driver_is_told_apart_by_its_frames() -> None:
+def test_the_frames_determine_the_driver() -> None:
     other = replace(FAKE_DRIVER, name="other-uart", make_codec=lambda ledger, options: DeafCodec(ledger))
     for drivers in ([other, FAKE_DRIVER], [FAKE_DRIVER, other]):
         found, _, _ = run_search(Search(drivers), device(115200, 100), start_ns=NS_PER_S)
@@ -229,7 +229,7 @@ class DeafCodec:
     def reset(self) -> None: ...
 
 
-def test_cut_frames_and_random_bytes_are_no_device() -> None:
+def test_cut_frames_and_random_bytes_are_not_a_device() -> None:
     random = Random(7)
     for noise in (fake_frame(b"x" * 76)[:60], fake_frame(b"x" * 76)[:60] + SYNC, random.randbytes(82), SYNC * 40):
         far = replace(device(115200, 100, 3_000_000), noise=noise)

@@ -38,7 +38,9 @@ def device(driver: StreamDriver, baud: int, rate_hz: float, phase_ns: int = 0) -
 @every_rate
 @pytest.mark.parametrize("order", [1, -1])
 @pytest.mark.parametrize("hold_ms", [0, 16])
-def test_a_streaming_device_is_found_cold_among_all(driver: StreamDriver, baud: int, order: int, hold_ms: int) -> None:
+def test_a_streaming_device_is_found_without_a_remembered_rate(
+    driver: StreamDriver, baud: int, order: int, hold_ms: int
+) -> None:
     random = Random(f"{driver.name} {baud}")
     for _ in range(3):
         far = replace(device(driver, baud, 100, random.randrange(NS_PER_S)), poll_ns=max(hold_ms, 1) * NS_PER_MS)
@@ -56,7 +58,7 @@ def test_a_streaming_device_is_found_cold_among_all(driver: StreamDriver, baud: 
 
 
 @every_rate
-def test_a_remembered_device_is_found_at_once(driver: StreamDriver, baud: int) -> None:
+def test_a_remembered_device_is_found_immediately(driver: StreamDriver, baud: int) -> None:
     search = Search(FAMILIES, remembered=(driver.name, baud))
     found, took_ns, listens = run_search(search, device(driver, baud, 100, 1_234_567), start_ns=NS_PER_S)
     assert isinstance(found, StreamFound)
@@ -67,7 +69,7 @@ def test_a_remembered_device_is_found_at_once(driver: StreamDriver, baud: int) -
 
 
 @pytest.mark.parametrize(("before", "now"), [(HIPNUC, IMU61X), (IMU61X, HIPNUC)])
-def test_a_device_of_the_other_family_in_its_place_is_found(before: StreamDriver, now: StreamDriver) -> None:
+def test_a_replaced_device_of_another_family_is_found(before: StreamDriver, now: StreamDriver) -> None:
     """Another device at the same rate: the search starts at the remembered rate with both codecs."""
     search = Search(FAMILIES, remembered=(before.name, 115200))
     found, took_ns, _ = run_search(search, device(now, 115200, 100, 4_000_000), start_ns=NS_PER_S)
@@ -77,7 +79,7 @@ def test_a_device_of_the_other_family_in_its_place_is_found(before: StreamDriver
 
 
 @every_rate
-def test_a_silent_device_is_found_by_its_answer(driver: StreamDriver, baud: int) -> None:
+def test_a_silent_device_is_found_by_its_reply(driver: StreamDriver, baud: int) -> None:
     far = device(driver, baud, 0)
     found, took_ns, _ = run_search(Search(FAMILIES, may_ask=True), far, start_ns=NS_PER_S)
     assert isinstance(found, StreamFound)
@@ -85,7 +87,7 @@ def test_a_silent_device_is_found_by_its_answer(driver: StreamDriver, baud: int)
     assert took_ns < 8 * NS_PER_S
 
 
-def test_every_driver_is_asked_as_often_at_the_rates() -> None:
+def test_each_driver_is_queried_equally_often() -> None:
     far = device(HIPNUC, 57600, 0)
     result, _, _ = run_search(Search(FAMILIES, may_ask=True), far)
     assert isinstance(result, GaveUp)
@@ -97,7 +99,7 @@ def test_every_driver_is_asked_as_often_at_the_rates() -> None:
         assert len(asked) == len(bauds) * ASK_TRIES
 
 
-def test_an_acknowledgement_alone_is_no_answer() -> None:
+def test_an_acknowledgement_is_not_a_reply() -> None:
     far = replace(device(IMU61X, 115200, 0), reply=encode_acknowledgement(1))
     result, _, _ = run_search(Search(FAMILIES, may_ask=True), far, start_ns=NS_PER_S)
     assert isinstance(result, GaveUp)

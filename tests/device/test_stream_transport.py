@@ -57,7 +57,7 @@ def play(story: Story, config: DeviceConfig | None = None, link: MemoryLink | No
 
 
 @told(play)
-async def test_samples_flow_and_the_device_is_up(rig: DeviceRig) -> None:
+async def test_samples_make_the_device_run(rig: DeviceRig) -> None:
     assert rig.is_in(DeviceState.SEARCHING)
     for i in range(5):
         feed(rig, hi91(1000 + 10 * i))
@@ -73,7 +73,7 @@ async def test_samples_flow_and_the_device_is_up(rig: DeviceRig) -> None:
 
 
 @told(play)
-async def test_unplugged_and_back_the_count_goes_on_and_time_rises(rig: DeviceRig) -> None:
+async def test_after_a_replug_sequence_numbers_and_times_increase(rig: DeviceRig) -> None:
     for i in range(5):
         feed(rig, hi91(5000 + 10 * i))
     feed(rig, hi91(5050)[:40])  # unplugged within a frame
@@ -97,7 +97,7 @@ async def test_unplugged_and_back_the_count_goes_on_and_time_rises(rig: DeviceRi
     assert rig.ledger.lost() == 0
 
 
-def test_identity_is_asked_and_a_changed_setting_is_told_after_a_replug() -> None:
+def test_a_changed_setting_is_reported_after_a_replug() -> None:
     async def answer(rig: DeviceRig, mode: bytes, uuid: bytes = b"043995698D6E1708") -> None:
         done = 0
         while done < 4:
@@ -133,7 +133,7 @@ def test_identity_is_asked_and_a_changed_setting_is_told_after_a_replug() -> Non
 
 
 @told(play)
-async def test_device_that_falls_silent_is_told_once_and_comes_up_again(rig: DeviceRig) -> None:
+async def test_a_silent_device_raises_one_event_and_returns(rig: DeviceRig) -> None:
     for i in range(3):
         feed(rig, hi91(10 * i))
     rig.tick()
@@ -147,7 +147,7 @@ async def test_device_that_falls_silent_is_told_once_and_comes_up_again(rig: Dev
     assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
 
 
-def test_port_that_is_busy_is_tried_again_and_says_why() -> None:
+def test_a_busy_port_is_reported_and_tried_again() -> None:
     class Busy(MemoryLink):
         def open(self) -> None:
             if len(self.bauds) < 3:
@@ -167,7 +167,7 @@ def test_port_that_is_busy_is_tried_again_and_says_why() -> None:
 
 
 @in_loop
-async def test_end_of_a_replay_finishes_the_runner() -> None:
+async def test_the_end_of_a_replay_finishes_the_device() -> None:
     rig = DeviceRigs().add(configured(writable=False))
     task = asyncio.create_task(rig.device.run())
     await rig.turn(lambda: rig.link.listening)
@@ -179,7 +179,7 @@ async def test_end_of_a_replay_finishes_the_runner() -> None:
 
 
 @told(play)
-async def test_missing_samples_are_put_to_their_cause(rig: DeviceRig) -> None:
+async def test_lost_samples_are_assigned_to_their_causes(rig: DeviceRig) -> None:
     for i in range(20):
         feed(rig, hi91(10 * i))
     damaged = bytearray(hi91(200))
@@ -198,7 +198,7 @@ async def test_missing_samples_are_put_to_their_cause(rig: DeviceRig) -> None:
 
 
 @told(play)
-async def test_frame_held_by_a_lying_length_is_delivered_when_the_line_is_idle(rig: DeviceRig) -> None:
+async def test_a_frame_behind_a_wrong_length_is_delivered_when_the_link_is_idle(rig: DeviceRig) -> None:
     feed(rig, b"\x5a\xa5\xff\x01" + hi91(10))
     rig.tick(ahead_ns=50 * MS)
     assert rig.samples == []  # the rest of the long frame can still arrive
@@ -207,7 +207,7 @@ async def test_frame_held_by_a_lying_length_is_delivered_when_the_line_is_idle(r
 
 
 @told(play, configured(baud="auto", driver="auto"))
-async def test_detection_locks_counts_every_byte_and_is_remembered(rig: DeviceRig) -> None:
+async def test_detection_counts_each_byte_and_is_stored(rig: DeviceRig) -> None:
     noise = bytes(range(200, 250))
     feed(rig, noise)
     first = rig.link.baud
@@ -232,7 +232,7 @@ async def test_detection_locks_counts_every_byte_and_is_remembered(rig: DeviceRi
 
 
 @told(play)
-async def test_a_device_without_samples_is_given_time_and_then_says_what_to_look_at(rig: DeviceRig) -> None:
+async def test_a_device_without_samples_reports_what_to_check(rig: DeviceRig) -> None:
     rig.tick()
     assert rig.problem == "no sample has arrived yet; wait for the search"
     rig.tick(ahead_ns=3000 * MS)
@@ -290,9 +290,7 @@ class DeafModule:
 
 @pytest.mark.parametrize("deaf_to", [3, 5, 9])
 @played(DeafModule)
-async def test_a_device_that_streams_and_did_not_answer_is_asked_until_it_does(
-    module: DeafModule, deaf_to: int
-) -> None:
+async def test_a_streaming_device_is_queried_until_it_replies(module: DeafModule, deaf_to: int) -> None:
     """Three queries, further queries after 5, 30 and 120 s, then a query per five minutes."""
     await module.rig.until(lambda: module.product, limit_s=2000, step=module.step, step_s=0.25)
     await module.pass_s(310)
@@ -301,7 +299,7 @@ async def test_a_device_that_streams_and_did_not_answer_is_asked_until_it_does(
 
 
 @played(lambda: DeafModule(1_000_000))
-async def test_a_device_that_never_answers_gets_a_request_in_five_minutes(module: DeafModule) -> None:
+async def test_a_device_without_reply_gets_a_query_per_five_minutes(module: DeafModule) -> None:
     await module.pass_s(1500)
     pauses_s = [(after - before) / 1e9 for before, after in pairwise(module.asked_ns)]
     for pause_s, wanted_s in zip(pauses_s[2:5], (5, 30, 120), strict=True):
@@ -314,7 +312,7 @@ async def test_a_device_that_never_answers_gets_a_request_in_five_minutes(module
 
 
 @played(lambda: DeafModule(5))
-async def test_a_device_that_is_silent_for_a_moment_before_it_has_answered_is_asked_on(module: DeafModule) -> None:
+async def test_a_short_silence_does_not_stop_the_queries(module: DeafModule) -> None:
     """The request in the silence is lost too, and samples return in the meantime: no search, no further request."""
     await module.pass_s(12)
     assert len(module.asked_ns) == 4  # the next pause is 30 s
@@ -331,7 +329,7 @@ async def test_a_device_that_is_silent_for_a_moment_before_it_has_answered_is_as
 
 
 @played(lambda: DeafModule(0, deaf_to_settings=4))
-async def test_a_device_whose_settings_are_lost_has_told_its_product_already(module: DeafModule) -> None:
+async def test_the_identity_is_known_if_the_reply_with_settings_is_lost(module: DeafModule) -> None:
     await module.pass_s(4)
     assert module.product == "HI14R3"
     assert not module.rig.device.status().settings
@@ -339,7 +337,7 @@ async def test_a_device_whose_settings_are_lost_has_told_its_product_already(mod
     assert module.rig.device.status().settings
 
 
-def test_a_device_that_refuses_to_stream_is_told_again_and_of_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_wake_is_repeated_and_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
     module, told = DeafModule(0), list[int]()
     module.paused = True
 
@@ -400,7 +398,7 @@ def test_bytes_that_come_before_the_search_begins_are_counted() -> None:
 
 
 @pytest.mark.parametrize("baud", [115200, "auto"])
-def test_the_time_unplugged_is_no_silence(baud: Any) -> None:
+def test_the_time_unplugged_is_not_silence(baud: Any) -> None:
     """A device that was unplugged for 6 s and boots for 3 s: one UP event, and no silence."""
     clock = VirtualClock()
     rigs = DeviceRigs(clock.host)
@@ -433,7 +431,7 @@ def test_the_time_unplugged_is_no_silence(baud: Any) -> None:
     play_rigs(rigs, story, clock)
 
 
-def test_a_port_that_is_not_there_says_so_and_what_to_look_at(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_missing_port_reports_what_to_check(caplog: pytest.LogCaptureFixture) -> None:
     clock = VirtualClock()
     rigs = DeviceRigs(clock.host)
     rig = rigs.add(configured())
@@ -451,7 +449,7 @@ def test_a_port_that_is_not_there_says_so_and_what_to_look_at(caplog: pytest.Log
     assert caplog.text.count("is not there") == 1
 
 
-def test_a_port_that_another_device_of_the_configuration_has_names_it() -> None:
+def test_a_port_of_another_configured_device_reports_its_name() -> None:
     class Busy(MemoryLink):
         def open(self) -> None:
             raise LinkBusy("memory is in use by this imud (pid 4711): stop that first")
@@ -471,7 +469,7 @@ def test_a_port_that_another_device_of_the_configuration_has_names_it() -> None:
 
 
 @told(play)
-async def test_bytes_without_frames_say_so(rig: DeviceRig) -> None:
+async def test_bytes_without_frames_are_reported(rig: DeviceRig) -> None:
     later_ns = rig.now_ns() + 2500 * MS
     rig.link.feed(b"\x00" * 100, later_ns)
     rig.device.tick(later_ns + 100 * MS)
@@ -479,7 +477,7 @@ async def test_bytes_without_frames_say_so(rig: DeviceRig) -> None:
 
 
 @told(play)
-async def test_error_of_the_link_is_a_failed_device_and_tried_again(rig: DeviceRig) -> None:
+async def test_an_error_of_the_link_is_a_failed_device(rig: DeviceRig) -> None:
     rig.link.end(LinkError("input/output error: the adapter stopped answering"))
     await rig.turn(lambda: rig.device.status().connects == 2)
     feed(rig, hi91(10))
@@ -487,7 +485,7 @@ async def test_error_of_the_link_is_a_failed_device_and_tried_again(rig: DeviceR
     assert rig.is_in(DeviceState.RUNNING)
 
 
-def test_an_action_that_changes_the_rate_takes_port_and_memory_along(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_action_that_changes_the_rate_changes_port_and_stored_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     def at_921600(_target: object) -> RequestScript[None]:
         yield Request(b"?", "?", never, never, never, silent=True, baud=921600)
 
@@ -516,7 +514,7 @@ def test_an_action_that_changes_the_rate_takes_port_and_memory_along(monkeypatch
 
 
 @told(play, configured(baud="auto"))
-async def test_a_device_that_is_back_counts_as_found_by_its_new_samples_only(rig: DeviceRig) -> None:
+async def test_a_returned_device_needs_new_samples(rig: DeviceRig) -> None:
     """During a search, earlier samples do not change the state to RUNNING."""
     for ms in range(0, 400, 10):
         feed(rig, hi91(ms))

@@ -60,9 +60,7 @@ class VariantBench:
 
 @every_variant
 @played(lambda variant: VariantBench(VARIANTS[variant]))
-async def test_actions_are_followed_and_settings_applied_in_an_order_that_keeps_the_device(
-    bench: VariantBench, variant: str
-) -> None:
+async def test_settings_are_applied_in_an_order_that_keeps_the_connection(bench: VariantBench, variant: str) -> None:
     device = bench.device
     assert device.status().identity["model_number"] == "614"
     await device.act("rate", {"rate_hz": 200})
@@ -101,7 +99,7 @@ async def test_actions_are_followed_and_settings_applied_in_an_order_that_keeps_
 
 
 @played(lambda: VariantBench(REFUSING, SLOW))
-async def test_a_device_that_refuses_all_orders_is_left_as_it_was(bench: VariantBench) -> None:
+async def test_a_device_that_refuses_all_commands_keeps_its_settings(bench: VariantBench) -> None:
     for name in ("save", "restart", "factory_reset", "stop_streaming"):
         with pytest.raises(CommandError):
             await bench.device.act(name, {})

@@ -46,7 +46,7 @@ def turns(device: LinkedDevice) -> list[EventKind]:
 )
 @pytest.mark.manual("B 2.2.5 LOG DISABLE")
 @played(lambda settings, link: LinkedDevice(settings, **link))
-async def test_a_module_that_is_silent_by_its_settings_is_known_and_left_so(
+async def test_a_module_with_its_output_off_is_known_and_stays_silent(
     device: LinkedDevice, settings: ModuleSettings, why: str, link: dict[str, Any]
 ) -> None:
     await device.wait(35)
@@ -68,7 +68,7 @@ async def test_a_module_that_is_silent_by_its_settings_is_known_and_left_so(
 
 
 @played(lambda: LinkedDevice(NO_RATE))
-async def test_commands_are_accepted_as_soon_as_it_has_answered(device: LinkedDevice) -> None:
+async def test_commands_are_accepted_after_the_first_reply(device: LinkedDevice) -> None:
     await device.until(lambda: device.device.actions, limit_s=0.1)
     with pytest.raises(CommandError, match="bow is searching"):
         await device.device.act("wake", {})
@@ -80,7 +80,7 @@ async def test_commands_are_accepted_as_soon_as_it_has_answered(device: LinkedDe
 
 @every_link
 @played(lambda link: LinkedDevice(hardware=hardware_of(Behaviour(), boot_ms=0), **link))
-async def test_output_that_is_only_switched_off_is_switched_on(device: LinkedDevice, link: dict[str, Any]) -> None:
+async def test_a_disabled_output_is_enabled(device: LinkedDevice, link: dict[str, Any]) -> None:
     device.module.receive(b"LOG DISABLE\r\n", device.clock.now_ns())
     await device.until(lambda: len(device.samples) > 20)
     assert "it replied but sent no samples: imud started its output and did not save this" in device.messages
@@ -90,7 +90,7 @@ async def test_output_that_is_only_switched_off_is_switched_on(device: LinkedDev
 
 @every_link
 @played(lambda link: LinkedDevice(**link))
-async def test_a_module_that_was_silenced_stays_so_and_is_asked_at_its_own_rate(
+async def test_a_silenced_module_stays_silent_and_is_queried_at_its_rate(
     device: LinkedDevice, link: dict[str, Any]
 ) -> None:
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
@@ -110,7 +110,7 @@ async def test_a_module_that_was_silenced_stays_so_and_is_asked_at_its_own_rate(
 
 
 @played(lambda: LinkedDevice(baud="auto"))
-async def test_while_a_lost_module_is_searched_for_no_command_goes_out(device: LinkedDevice) -> None:
+async def test_no_command_is_sent_during_a_search(device: LinkedDevice) -> None:
     """The module is off: only the search sends requests at all rates."""
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
     device.module.receive(b"UNLOGALL\r\n", device.clock.now_ns())
@@ -132,9 +132,7 @@ async def test_while_a_lost_module_is_searched_for_no_command_goes_out(device: L
 
 
 @played(lambda: LinkedDevice(baud="auto", identify=False))
-async def test_a_script_under_way_ends_when_a_search_begins_under_it(
-    device: LinkedDevice, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_search_ends_a_running_script(device: LinkedDevice, monkeypatch: pytest.MonkeyPatch) -> None:
     """A running script does not send at the rates of the search, even if the search does not wait for the script."""
     monkeypatch.setattr(StreamTransport, "busy", property(lambda _transport: False))
     await device.until(lambda: len(device.samples) > 20)
@@ -187,7 +185,7 @@ async def test_settings_are_read_again_after_each_action(device: LinkedDevice) -
 
 
 @played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(refuses=("CONFIG ATT RST",)))))
-async def test_after_an_action_that_fails_the_settings_are_what_the_module_has(device: LinkedDevice) -> None:
+async def test_settings_are_read_again_after_a_failed_action(device: LinkedDevice) -> None:
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
     device.module.receive(b"CONFIG ATT MODE 1\r\n", device.clock.now_ns())  # by another program
     await device.wait(0.1)
@@ -215,7 +213,7 @@ async def test_status_bits_and_settings_are_shown_by_name(device: LinkedDevice) 
 
 
 @played(lambda: LinkedDevice(lines=DeviceLines(sout_div=DividedOptions(line="A", divisor=4))))
-async def test_lines_that_the_module_contradicts_are_events_and_shown(device: LinkedDevice) -> None:
+async def test_differences_between_lines_and_settings_are_reported(device: LinkedDevice) -> None:
     words = "expected divisor 4 from the configuration, got 8 from the device"
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
     assert device.messages.count(f"line sout_div: {words}") == 1
@@ -227,7 +225,7 @@ async def test_lines_that_the_module_contradicts_are_events_and_shown(device: Li
 
 
 @played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(), boot_ms=0), declared=OUTPUT_OFF))
-async def test_output_that_is_declared_to_be_off_is_not_switched_on(device: LinkedDevice) -> None:
+async def test_an_output_declared_off_is_not_enabled(device: LinkedDevice) -> None:
     device.module.receive(b"LOG DISABLE\r\n", device.clock.now_ns())
     await device.wait(20)
     assert device.samples == []

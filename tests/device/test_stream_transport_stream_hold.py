@@ -109,7 +109,7 @@ class HoldBench:
 
 @pytest.mark.parametrize(("latency_ms", "rounds"), [(5, 10), (10, 5), (20, 2), (30, 1), (50, 1)])
 @played(lambda latency_ms: HoldBench(latency_ms, waiting_bytes=1 << 16))
-async def test_one_message_in_50_ms_is_read_as_it_comes(bench: HoldBench, latency_ms: int, rounds: int) -> None:
+async def test_one_frame_per_50_ms_is_read_on_arrival(bench: HoldBench, latency_ms: int, rounds: int) -> None:
     await bench.send(200)
     resumed, taken = len(bench.link.resumed), len(bench.link.taken)
     await bench.send(rounds * latency_ms * 10 + 10)
@@ -119,7 +119,7 @@ async def test_one_message_in_50_ms_is_read_as_it_comes(bench: HoldBench, latenc
 
 
 @played(lambda: HoldBench(10, hold_ns=NS_PER_MS))
-async def test_behind_a_latency_timer_one_message_of_each_round_is_read_as_it_comes(bench: HoldBench) -> None:
+async def test_behind_a_latency_timer_one_frame_per_hold_is_read_on_arrival(bench: HoldBench) -> None:
     await bench.send(200)
     resumed, taken = len(bench.link.resumed), len(bench.link.taken)
     await bench.send(210)
@@ -128,7 +128,7 @@ async def test_behind_a_latency_timer_one_message_of_each_round_is_read_as_it_co
 
 @pytest.mark.parametrize("before", [80, 90, 100, 110, 120])
 @played(lambda: HoldBench(10))
-async def test_a_latency_that_ends_while_samples_are_published_ends_the_wait(bench: HoldBench, before: int) -> None:
+async def test_a_request_withdrawn_during_publishing_ends_the_hold(bench: HoldBench, before: int) -> None:
     class Leaving(list[tuple[int, list[Sample]]]):
         """The client with the latency request disconnects when it receives samples."""
 
@@ -145,7 +145,7 @@ async def test_a_latency_that_ends_while_samples_are_published_ends_the_wait(ben
 
 
 @played(lambda: HoldBench(10))
-async def test_samples_of_a_latency_are_read_and_published_together(bench: HoldBench) -> None:
+async def test_the_samples_of_a_hold_are_published_together(bench: HoldBench) -> None:
     since, taken = len(bench.rig.published), len(bench.link.taken)
     await bench.send(220)
     sizes = bench.sizes(since)
@@ -157,7 +157,7 @@ async def test_samples_of_a_latency_are_read_and_published_together(bench: HoldB
 
 
 @pytest.mark.parametrize("latency_ms", [5, 10, 20])
-def test_stamps_are_as_good_as_without(latency_ms: float) -> None:
+def test_a_hold_does_not_change_the_time_stamps(latency_ms: float) -> None:
     def stamps(latency_ms: float) -> list[Sample]:
         bench = HoldBench(latency_ms)
         bench.play(lambda: bench.send(1000))
@@ -174,7 +174,7 @@ def test_stamps_are_as_good_as_without(latency_ms: float) -> None:
 
 
 @played(lambda: HoldBench(10, anew=True))
-async def test_nothing_waits_before_the_fit_is_used_nor_again_after_a_restart_of_the_module(bench: HoldBench) -> None:
+async def test_no_hold_before_the_fit_and_after_a_restart(bench: HoldBench) -> None:
     single = [len(samples) for _, samples in bench.rig.published[:100]]
     assert single == [1] * 100
     assert bench.rig.samples[99].sync is Sync.ARRIVAL
@@ -189,7 +189,7 @@ async def test_nothing_waits_before_the_fit_is_used_nor_again_after_a_restart_of
 
 
 @played(lambda: HoldBench(10, period_ms=6))
-async def test_at_a_rate_at_which_fewer_than_two_would_wait_none_does(bench: HoldBench) -> None:
+async def test_no_hold_with_fewer_than_two_samples(bench: HoldBench) -> None:
     since = len(bench.rig.published)
     await bench.send(50)
     assert bench.sizes(since) == [1] * 50
@@ -199,7 +199,7 @@ async def test_at_a_rate_at_which_fewer_than_two_would_wait_none_does(bench: Hol
 
 
 @played(lambda: HoldBench(20))
-async def test_who_wants_each_sample_at_once_gets_what_waits_now(bench: HoldBench) -> None:
+async def test_a_latency_of_0_releases_held_samples(bench: HoldBench) -> None:
     await bench.send(5)
     count = len(bench.rig.samples)
     assert bench.link.paused
@@ -218,7 +218,7 @@ async def test_who_wants_each_sample_at_once_gets_what_waits_now(bench: HoldBenc
 
 
 @played(lambda: HoldBench(50, waiting_bytes=820))
-async def test_no_more_gathers_than_may_wait(bench: HoldBench) -> None:
+async def test_a_hold_does_not_exceed_the_buffer(bench: HoldBench) -> None:
     since = len(bench.link.taken)
     await bench.send(300)
     assert max(size for _, size in bench.link.taken[since:]) <= 820 + 82
@@ -230,14 +230,14 @@ async def test_no_more_gathers_than_may_wait(bench: HoldBench) -> None:
 
 
 @played(lambda: HoldBench(50, waiting_bytes=0))
-async def test_a_link_that_cannot_be_paused_is_not(bench: HoldBench) -> None:
+async def test_a_link_without_pause_has_no_hold(bench: HoldBench) -> None:
     await bench.send(100)
     assert bench.link.taken == []
     assert len(bench.rig.published) == bench.sent
 
 
 @played(lambda: HoldBench(20, anew=True))
-async def test_the_first_sample_after_silence_waits_no_longer_than_the_others(bench: HoldBench) -> None:
+async def test_the_first_sample_after_a_silence_has_the_normal_hold(bench: HoldBench) -> None:
     await bench.send(30)
     await asyncio.sleep(0.5)
     bench.rig.tick()
@@ -253,7 +253,7 @@ async def test_the_first_sample_after_silence_waits_no_longer_than_the_others(be
 
 
 @played(lambda: HoldBench(MOST_NS / NS_PER_MS))
-async def test_an_incomplete_frame_that_waits_is_not_given_up(bench: HoldBench) -> None:
+async def test_a_held_incomplete_frame_is_not_discarded(bench: HoldBench) -> None:
     """At the tick the last read is long ago, but the rest of the frame is in the kernel."""
     for _ in range(40):
         bench.sent += 2
@@ -275,7 +275,7 @@ async def test_an_incomplete_frame_that_waits_is_not_given_up(bench: HoldBench) 
 
 
 @played(lambda: HoldBench(50))
-async def test_a_request_is_not_slowed(bench: HoldBench) -> None:
+async def test_a_hold_does_not_delay_a_reply(bench: HoldBench) -> None:
     """imud processes held samples at the start of a script, receives the reply without a hold, then holds again."""
 
     def asking() -> RequestScript[int]:
@@ -302,7 +302,7 @@ async def test_a_request_is_not_slowed(bench: HoldBench) -> None:
 
 @pytest.mark.parametrize("how", ["closed", "unplugged"])
 @played(lambda: HoldBench(50))
-async def test_at_the_end_what_was_kept_is_published(bench: HoldBench, how: str) -> None:
+async def test_held_samples_are_published_at_the_end(bench: HoldBench, how: str) -> None:
     await asyncio.sleep(0.1)
     assert not bench.link.paused
     await bench.send(1)

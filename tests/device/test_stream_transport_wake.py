@@ -54,7 +54,7 @@ class WakeBench:
 @pytest.mark.parametrize("link", [{}, {"baud": "auto"}, {"baud": "auto", "driver": "auto"}], ids=str)
 @pytest.mark.manual("A 1 mode at power-on")
 @played(lambda link: WakeBench(boot_ms=0, **link))
-async def test_device_saved_in_command_mode_is_made_to_stream(bench: WakeBench, link: dict[str, Any]) -> None:
+async def test_the_output_of_a_device_in_command_mode_is_started(bench: WakeBench, link: dict[str, Any]) -> None:
     await bench.until(lambda: bench.woken and len(bench.samples) > 20)
     assert bench.device.state is DeviceState.RUNNING
     assert bench.woken == [WOKEN]
@@ -73,7 +73,7 @@ async def test_device_saved_in_command_mode_is_made_to_stream(bench: WakeBench, 
     ids=["may not be asked", "never answers", "does not stream"],
 )
 @played(lambda hardware: WakeBench(**hardware))
-async def test_what_is_told_of_a_device_that_stays_silent(
+async def test_events_of_a_device_that_stays_silent(
     bench: WakeBench, hardware: dict[str, Any], wait_s: float, woken: list[str], writes: range
 ) -> None:
     await bench.wait(wait_s)
@@ -82,7 +82,7 @@ async def test_what_is_told_of_a_device_that_stays_silent(
 
 
 @played(lambda: WakeBench(STREAMING))
-async def test_device_that_streams_is_not_told_to_and_one_that_was_silenced_is_left_so(bench: WakeBench) -> None:
+async def test_a_streaming_or_silenced_device_is_not_woken(bench: WakeBench) -> None:
     await bench.until(lambda: len(bench.samples) > 500 and bench.device.status().settings)
     await bench.device.act("stop_streaming", {})
     count = len(bench.samples)
@@ -93,7 +93,7 @@ async def test_device_that_streams_is_not_told_to_and_one_that_was_silenced_is_l
 
 
 @played(lambda: WakeBench(boot_ms=20_000, acknowledges=False))
-async def test_device_that_comes_later_is_woken_and_told_of_once(bench: WakeBench) -> None:
+async def test_a_late_device_is_woken_and_reported_once(bench: WakeBench) -> None:
     """The module boots for 20 s and does not acknowledge."""
     await bench.until(lambda: bench.woken and len(bench.samples) > 500, 60)
     assert bench.woken == [WOKEN]
@@ -101,7 +101,7 @@ async def test_device_that_comes_later_is_woken_and_told_of_once(bench: WakeBenc
 
 
 @pytest.mark.parametrize("cut_at", range(1, 25, 3))
-def test_identification_cut_off_anywhere_leaves_it_streaming(cut_at: int) -> None:
+def test_an_interrupted_identification_leaves_the_output_on(cut_at: int) -> None:
     """The daemon stops during the queries. The device only replies in command mode."""
     bench = WakeBench(STREAMING, answers_while_streaming=False)
     bench.play(lambda: bench.until(lambda: len(bench.line.written) >= cut_at))
@@ -109,7 +109,7 @@ def test_identification_cut_off_anywhere_leaves_it_streaming(cut_at: int) -> Non
 
 
 @played(lambda: WakeBench(STREAMING, answers_while_streaming=False))
-async def test_a_link_that_is_gone_needs_nothing(bench: WakeBench) -> None:
+async def test_a_missing_link_needs_no_undo(bench: WakeBench) -> None:
     await bench.until(lambda: bench.module.settings.mode is OutputMode.COMMAND)
     bench.line.disappear()
     await bench.until(lambda: bench.rig.is_in(DeviceState.MISSING))

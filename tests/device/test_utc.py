@@ -86,7 +86,7 @@ def bench() -> KeeperBench:
     return KeeperBench()
 
 
-def test_sentences_go_to_the_device_and_make_pulses_utc(bench: KeeperBench) -> None:
+def test_sentences_are_sent_and_give_pulses_utc(bench: KeeperBench) -> None:
     for number in range(6):
         bench.second(number)
     assert len(bench.written) == 6
@@ -156,7 +156,7 @@ def test_a_clock_has_the_reference_of_each_second_from_its_start_to_the_end_of_t
     assert other.utc_reference == UtcReference(6, 6)
 
 
-def test_close_releases_source_and_socket_and_nothing_starts_again_or_at_all() -> None:
+def test_close_releases_source_and_socket() -> None:
     bench = KeeperBench()
     bench.keeper.close()
     bench.keeper.close()
@@ -173,7 +173,7 @@ def test_close_releases_source_and_socket_and_nothing_starts_again_or_at_all() -
     assert source.started == 0
 
 
-def test_problems_show_and_a_sentence_that_is_too_late_for_its_pulse_is_refused(bench: KeeperBench) -> None:
+def test_problems_are_in_the_status_and_a_late_sentence_is_refused(bench: KeeperBench) -> None:
     assert bench.keeper.status().problem == ""
     bench.chrony.problem = "no chronyd"
     assert bench.keeper.status().problem == "no chronyd"
@@ -185,7 +185,7 @@ def test_problems_show_and_a_sentence_that_is_too_late_for_its_pulse_is_refused(
     assert bench.keeper.status().refused == {"stale": 1}
 
 
-def test_the_system_clock_counts_only_while_something_keeps_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_system_clock_is_used_only_while_it_is_synchronized(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
     offset_ns, now_ns = [OFFSET_NS], lambda: BEGIN_NS
     host = HostClock(now_ns, lambda: BEGIN_NS + offset_ns[0], now_ns)
@@ -210,7 +210,7 @@ def configured(rmc: RmcOptions | None, pps: PpsOptions | None) -> DeviceConfig:
 
 @pytest.mark.parametrize("rmc", [None, RmcOptions(source="gpsd", rate_hz=5)])
 @pytest.mark.parametrize("pps", [None, PpsOptions(line="A"), PpsOptions(line="A", chrony="/nowhere/imud.sock")])
-def test_a_device_gets_what_it_is_configured_for(
+def test_the_feed_follows_the_configuration(
     monkeypatch: pytest.MonkeyPatch, rmc: RmcOptions | None, pps: PpsOptions | None
 ) -> None:
     now_ns, port, source = [BEGIN_NS], FakePort(9600), FakeSource()

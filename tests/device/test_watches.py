@@ -161,7 +161,7 @@ def test_the_same_body_in_ned_frd_and_without_the_keys() -> None:
     assert set(made.status.conventions) == {"enu-flu", "ned-frd"}
 
 
-def test_a_declination_and_what_the_heading_counts_from() -> None:
+def test_declination_and_heading_reference() -> None:
     """imud reads the mode of the module: nine axes, so that the heading is magnetic."""
     motion = in_body(FrameOptions())
     plain = played("hipnuc-uart", motion, 2.0, identify=True)
@@ -181,7 +181,7 @@ def test_a_declination_and_what_the_heading_counts_from() -> None:
 # --- the event --------------------------------------------------------------------------------------------------------
 
 
-def test_z_down_is_found_and_cured_either_way() -> None:
+def test_z_down_is_detected_and_corrected() -> None:
     """The axes of an IMU61x are uncertain: with z down the event names the right option."""
     motion = ZDown(in_body(FrameOptions(), device=FLU_LEVEL))
     wrong = played("imu61x-uart", motion, 20.0)
@@ -198,7 +198,7 @@ def test_z_down_is_found_and_cured_either_way() -> None:
     assert "remove z_down from frame" in event.message
 
 
-def test_a_wrong_order_of_angles_is_found() -> None:
+def test_a_wrong_order_of_angles_is_detected() -> None:
     motion = in_body(FrameOptions(), (20.0, -15.0, 30.0), FLU_LEVEL)
     assert played("imu61x-uart", motion).events == []
     made = played("imu61x-uart", motion, frame=FrameOptions(euler_order=EulerOrder.ZXY))
@@ -219,7 +219,7 @@ def test_a_wrong_order_of_angles_is_found() -> None:
         ("as the manual draws it", FrameOptions(quat_wxyz=[0.5, -0.5, 0.5, -0.5])),
     ],
 )
-def test_a_wrong_mounting_is_found(is_so: str, said: FrameOptions) -> None:
+def test_a_wrong_mounting_is_detected(is_so: str, said: FrameOptions) -> None:
     motion = in_body(MOUNTINGS[is_so])
     made = played("hipnuc-uart", motion, frame=said)
     (event,) = made.events
@@ -229,7 +229,7 @@ def test_a_wrong_mounting_is_found(is_so: str, said: FrameOptions) -> None:
     assert arm.events == [], "a body that need not stand level"
 
 
-def test_another_device_is_checked_anew() -> None:
+def test_a_replaced_device_is_checked_again() -> None:
     """A replaced device with another driver has a new path: its contradictions raise events again."""
     events: list[Event] = []
     config = DeviceConfig("bow", "auto", None, False, "memory", MemoryOptions(), frame=FrameOptions())
@@ -260,14 +260,14 @@ def test_another_device_is_checked_anew() -> None:
         assert len(events) == number
 
 
-def test_in_motion_nothing_is_said() -> None:
+def test_a_moving_device_raises_no_event() -> None:
     """A wrongly mounted module that swings and never rests."""
     swing = Swing(roll=(Sine(0.3, 0.5), Sine(3.1, 0.0, 1.57)), pitch=(Sine(0.3, 0.4),), yaw=(Sine(0.5, 0.3),))
     made = played("hipnuc-uart", swing, 20.0, frame=FrameOptions())
     assert made.events == []
 
 
-def test_every_sample_is_turned_once_and_the_newest_of_the_path_not_at_all() -> None:
+def test_each_published_sample_is_rotated_once() -> None:
     """The acceleration in sensor axes stays available for the ALARM line."""
     frame = published_frame(MOUNTINGS["upside down"], None, None, RFU_ENU)
     clock, ledger, batches = VirtualClock(), Ledger(), list[Batch]()

@@ -51,7 +51,7 @@ class WatchBench:
         return [event.message for event in self.events[before:]]
 
 
-def test_bits_are_events_when_they_are_set_and_cleared_but_not_by_silence() -> None:
+def test_set_and_cleared_bits_raise_events() -> None:
     bench = WatchBench()
     assert bench.step(AT_REST, 20) == []
     assert bench.step(OVER_RANGE) == ["status: accelerometer over range"]
@@ -67,7 +67,7 @@ def test_bits_are_events_when_they_are_set_and_cleared_but_not_by_silence() -> N
     assert bench.step(0, 12) == ["status: cleared: magnetic disturbance"]
 
 
-def test_events_are_one_a_second_with_all_that_changed() -> None:
+def test_one_event_per_second_contains_all_changes() -> None:
     bench = WatchBench()
     messages = [message for i in range(600) for message in bench.step(OVER_RANGE if i // 14 % 2 else DISTURBED)]
     times = [event.t_ns for event in bench.events]
@@ -81,7 +81,7 @@ def test_events_are_one_a_second_with_all_that_changed() -> None:
     assert other.step(0, 9) == ["status: accelerometer over range, cleared: magnetic disturbance"]
 
 
-def test_the_bits_of_another_device_are_events_again() -> None:
+def test_the_bits_of_a_replaced_device_raise_events_again() -> None:
     bench = WatchBench()
     assert bench.step(DISTURBED | OVER_RANGE, 20)
     bench.path = FakePath()
@@ -90,7 +90,7 @@ def test_the_bits_of_another_device_are_events_again() -> None:
     assert bench.step(0, 20) == ["status: cleared: magnetic disturbance"]
 
 
-def test_a_driver_without_bits_is_not_watched() -> None:
+def test_a_driver_without_notable_bits_is_not_watched() -> None:
     bench = WatchBench()
     bench.path.status = ~0
     bench.watch.tick(bench.now_ns, DRIVERS["imu61x-can"], bench.path)

@@ -51,11 +51,11 @@ def bench(tmp_path: Path, recorded: pytest.MonkeyPatch) -> PolledBusBench:
         lambda: signals.test_every_sample_has_its_edge(settings=None),
         signals.test_frames_answer_the_triggers_on_sin,
         signals.test_an_alarm_is_an_event_and_shown_in_the_samples,
-        waiting.test_a_link_that_cannot_be_paused_is_not,
-        can.test_losses_by_cause,
+        waiting.test_a_link_without_pause_has_no_hold,
+        can.test_lost_samples_are_counted_by_cause,
         can.test_frames_from_before_a_loss_are_not_mixed_with_those_after,
         can.test_bus_down_and_up,
-        can.test_what_a_device_measured_while_the_host_was_suspended_is_a_gap_of_unknown_size,
+        can.test_a_suspend_of_the_host_is_a_gap_of_unknown_size,
     ],
     ids=[
         "edges",
@@ -75,9 +75,9 @@ def test_a_run_on_a_line_or_can_bus_is_replayed(run: Callable[[], None]) -> None
 @pytest.mark.parametrize(
     "run",
     [
-        data_ready.test_every_edge_is_a_sample_of_its_own_instant,
-        polled.test_single_damage_costs_its_sample_and_nothing_else,
-        lambda bench: polled.test_vanished_device_is_not_believed_before_it_is_identified(
+        data_ready.test_each_edge_is_a_sample_with_its_time,
+        polled.test_one_damaged_reading_loses_one_sample,
+        lambda bench: polled.test_readings_after_an_absence_need_an_identification(
             bench=bench, fault={"error": errno.EIO}, why="transfer failed"
         ),
     ],
