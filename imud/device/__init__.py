@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""One configured device: its link, samples, scripts, settings, calibrations and state."""

@@ -279,10 +279,6 @@ class ReceivingTransport(Transport, RequestPort):
     async def work(self) -> None:
         await self._search.run()
 
-    def stop(self) -> None:
-        self._search.stop()
-        self.link.close()
-
     async def ask_once(self) -> None:
         """Query identity and settings once."""
         await self._identify(1)
