@@ -103,7 +103,7 @@ def test_declared_settings_are_applied_to_a_canopen_node(variant: str) -> None:
 
     async def story() -> None:
         taken = await bus.done(bus.rig.device.settings_apply({"node": 12}, save=True))
-        assert "node 12 is taken" in taken.problem
+        assert "node 12 is in use" in taken.problem
         assert module.objects.writes_to_flash == 0
         wanted = {"tpdo2_interval_ms": 100, "incli_x_reversed": True, "node": 9}
         await made_so(bus, wanted, verified=kind.reads == "answered")
@@ -124,7 +124,7 @@ def test_declared_settings_are_applied_to_a_j1939_module(variant: str) -> None:
 
     async def story() -> None:
         taken = await bus.done(bus.rig.device.settings_apply({"address": 12}, save=True))
-        assert "address 12 is taken" in taken.problem
+        assert "address 12 is in use" in taken.problem
         assert module.writes_to_flash == 0
         wanted = {"ff37_interval_ms": 50, "y_reversed": True, "address": 9}
         await made_so(bus, wanted, verified=kind.reads != "ignored")

@@ -249,7 +249,7 @@ async def test_a_module_is_followed_to_another_address_and_back(bench: LineBench
     async with bench.running(module, other) as (rig, beside):
         await rig.until_samples(5)
         await beside.until_samples(5)
-        with pytest.raises(BadArgument, match="address 2 is taken"):
+        with pytest.raises(BadArgument, match="address 2 is in use"):
             await rig.device.act("address", {"address": 2})
         await rig.device.act("address", {"address": 9})
         await rig.device.act("save", {})
@@ -274,7 +274,7 @@ async def test_declared_settings_are_applied_to_every_kind_of_module(bench: Line
         assert rig.kinds.count(EventKind.UP) == 1
         assert rig.ledger.lost_gap_device == (2 if module.variant.long_block == "silent" else 0)
         taken = await rig.device.settings_apply({"address": 2}, save=True)
-        assert "address 2 is taken" in taken.problem
+        assert "address 2 is in use" in taken.problem
         applied = await rig.device.settings_apply({"mode": "9-axis", "mounting": "x_up", "address": 9}, save=True)
         assert applied.problem == "", applied
         assert {step.name: str(step.outcome) for step in applied.steps}["mounting"] == "written, not verified"
