@@ -55,6 +55,8 @@ class Action:
     risk: Risk = Risk.NONE
     # Whether the action writes the flash of the device. imud counts these writes and limits them per day.
     saves: bool = False
+    # Whether the action can change the identity or a setting. imud reads both again after such an action.
+    changes: bool = True
 
     @property
     def parameters(self) -> type[Options]:

@@ -279,17 +279,22 @@ class Device:
                 self._settings.spend_flash()
             if action.risk is Risk.RESET:
                 await self._settings.back_up(name)
-            self._attachments.set_alarm_ranges(None)  # the action can change the ranges
-            saved = False
+            if action.changes:
+                self._attachments.set_alarm_ranges(None)  # the action can change the ranges
+            done = False
             try:
                 answer = await self._transport.run_script(lambda target: action.script(target, params))
-                saved = action.saves
-            except ImudError:
+                done = True
+            except ImudError:  # the state of the device is unknown
                 await self._transport.read_back()
                 raise
             finally:
-                self._settings.commanded(saved=saved)
-            await self._transport.read_back()
+                if action.changes or not done:
+                    self._settings.commanded(saved=done and action.saves)
+                elif action.saves:
+                    self._settings.saved()
+            if action.changes:
+                await self._transport.read_back()
             return answer
 
     # --- settings -----------------------------------------------------------------------------------------------------

@@ -132,6 +132,10 @@ class SettingsKeeper:
         self._unsaved, self._tries = not saved, 0
         self._due_ns = self._host.now_ns()
 
+    def saved(self) -> None:
+        """Note that the flash contains the present settings: a command saved them and changed no value."""
+        self._unsaved = False
+
     def stop(self) -> None:
         """Forget the settings: the link ended. A second call does nothing."""
         self._actual = self._due_ns = None

@@ -133,6 +133,16 @@ class ModuleBench:
 # --- report -----------------------------------------------------------------------------------------------------------
 
 
+@played(lambda: ModuleBench(declared={"mode": "6-axis"}))
+async def test_a_save_makes_one_request(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    before = len(bench.module.commands)
+    await bench.doing(bench.device.act("save", {}))
+    await bench.pass_s(5)
+    assert bench.module.commands[before:] == ["SAVE"]
+    assert bench.is_in(SettingsState.AGREE)
+
+
 @played(ModuleBench)
 async def test_without_declared_settings_imud_reads_no_settings(bench: ModuleBench) -> None:
     await bench.pass_s(5)

@@ -478,7 +478,7 @@ FAKE_MODULE_DRIVER: Final = replace(
     actions={
         "set_mode": Action("set it", _set_mode),
         "wait": Action("take an hour", lambda _target: (pause(3600 * 1_000_000_000) for _ in range(1))),
-        "save": Action("save all", _save_all, saves=True),
+        "save": Action("save all", _save_all, saves=True, changes=False),
         "factory_reset": Action("forget all", _restart, Risk.RESET),
     },
 )

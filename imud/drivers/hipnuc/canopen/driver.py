@@ -296,7 +296,7 @@ def _nmt(
 
 
 ACTIONS: Final[Actions] = {
-    "save": replace(_simple("write all settings to flash", commands.save), saves=True),
+    "save": replace(_simple("write all settings to flash", commands.save), saves=True, changes=False),
     "restart": Action(
         "restart the device and wait for its frames, also from a new node number; unsaved settings are lost",
         lambda target: commands.restart(target.settings, target.baud),

@@ -215,7 +215,7 @@ def _direction(
 
 
 ACTIONS: Final[Actions] = {
-    "save": replace(_simple("write all settings to flash", commands.save), saves=True),
+    "save": replace(_simple("write all settings to flash", commands.save), saves=True, changes=False),
     "restart": Action(
         "restart the device and wait for its frames, also from a new address; unsaved settings are lost",
         lambda target: commands.restart(target.settings, target.baud),
@@ -227,7 +227,7 @@ ACTIONS: Final[Actions] = {
         Risk.RESET,
     ),
     "interval": Action("set the interval of a message; imud rejects more than the bus can carry", _interval),
-    "send_once": Action("send a message once immediately and wait for it", _send_once),
+    "send_once": Action("send a message once immediately and wait for it", _send_once, changes=False),
     "bitrate": Action(
         "set the bit rate, effective after `save` and `restart`: then the device disturbs the bus until the "
         "interface and all other devices use the same bit rate",

@@ -105,7 +105,7 @@ def _read(
 
 
 ACTIONS: Final[Actions] = {
-    "save": replace(_simple("write all settings to flash", commands.save), saves=True),
+    "save": replace(_simple("write all settings to flash", commands.save), saves=True, changes=False),
     "restart": Action("restart the device and wait until it replies; unsaved settings are lost", _restart),
     "factory_reset": Action(
         "restore the factory settings and restart: imud follows the device to address 80 if no other device uses it "
@@ -127,7 +127,7 @@ ACTIONS: Final[Actions] = {
     "attitude_mode": Action("set 6-axis mode, or 9-axis mode with the magnetometer", _attitude_mode),
     "level": Action("make the present attitude level, or cancel it; the device must be at rest", _level),
     "mounting": Action("set the mounting of the device", _mounting),
-    "read": Action("read a register as words of 16 bits", _read),
+    "read": Action("read a register as words of 16 bits", _read, changes=False),
 }
 
 DONE_PERCENT: Final = 100

@@ -206,7 +206,7 @@ def _sout_divider(
 
 
 ACTIONS: Final[Actions] = {
-    "save": replace(_simple("write all settings to flash", commands.save_config), saves=True),
+    "save": replace(_simple("write all settings to flash", commands.save_config), saves=True, changes=False),
     "restart": Action("restart the device and wait until it replies; unsaved settings are lost", _restart),
     "factory_reset": Action(
         "restore the factory settings with 115200 baud, restart the device and follow it",
@@ -221,7 +221,7 @@ ACTIONS: Final[Actions] = {
     ),
     "output": Action("set the output rate of a message; 0: off", _output),
     "output_on_mark": Action("send a message for each pulse on SIN", _output_on_mark),
-    "output_once": Action("send a message once, as after a pulse on SIN", _output_once),
+    "output_once": Action("send a message once, as after a pulse on SIN", _output_once, changes=False),
     "output_none": _simple("set the output rate of all messages to 0", commands.unlog_all),
     "output_enabled": Action("enable or disable the frames of all rates", _output_enabled),
     "mode": Action("set 6-axis mode, or 9-axis mode with the magnetometer", _mode),

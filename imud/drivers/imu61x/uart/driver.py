@@ -239,11 +239,16 @@ ACTIONS: Final[Actions] = {
     "status": Action(
         "read versions, model and state; names that end in _raw have no documented unit",
         lambda _target: settings.device_status(),
+        changes=False,
     ),
     "settings": Action(
-        "read all settings from the device, with units in their names", lambda _target: settings.read_settings()
+        "read all settings from the device, with units in their names",
+        lambda _target: settings.read_settings(),
+        changes=False,
     ),
-    "sample_once": Action("read and publish one sample, also in command mode", lambda _target: settings.sample_once()),
+    "sample_once": Action(
+        "read and publish one sample, also in command mode", lambda _target: settings.sample_once(), changes=False
+    ),
     "start_streaming": Action(
         "start sending samples and wait for the first sample",
         lambda target: settings.start_streaming(done=_done(target)),
@@ -252,7 +257,9 @@ ACTIONS: Final[Actions] = {
         "enter command mode: send only replies until `start_streaming`; no program receives samples",
         _stop,
     ),
-    "save": Action("write all parameters to flash", lambda target: settings.save(done=_done(target)), saves=True),
+    "save": Action(
+        "write all parameters to flash", lambda target: settings.save(done=_done(target)), saves=True, changes=False
+    ),
     "restart": Action(
         "restart the device, wait until it replies and check that its timer restarted; unsaved settings are lost",
         lambda target: settings.restart(done=_done(target)),
@@ -289,7 +296,9 @@ ACTIONS: Final[Actions] = {
         "measure the mounting error and wait for the end; returns the angles in °", _installation
     ),
     "installation_status": Action(
-        "read the state of the installation calibration, as sent", lambda _target: installation_status()
+        "read the state of the installation calibration, as sent",
+        lambda _target: installation_status(),
+        changes=False,
     ),
 }
 
