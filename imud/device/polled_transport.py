@@ -352,10 +352,11 @@ class PolledTransport(Transport):
         given = () if self.link.target is None else (self.link.target,)
         return tuple(dict.fromkeys((device.target, *self._former, *given)))
 
-    async def read_back(self) -> None:
+    async def read_back(self, *, identity: bool = True) -> None:
         """Set up the device again as configured, and store the settings that it reports.
 
-        If the device does not reply, imud sets it up when it returns."""
+        If the device does not reply, imud sets it up when it returns.
+        """
         member, device = self._member, self._device
         if member is None or device is None or not self._identified:
             return

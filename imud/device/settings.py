@@ -65,6 +65,7 @@ OWN_NS: Final = 2 * NS_PER_S
 """Time after a script in which a restart of the device counter is a result of the script, ns. imud compares the
 settings at the end of the script. A second comparison would pause the samples again."""
 WAIT_S: Final = 10.0  # maximum wait of a command for another command, s
+PLAN_NS: Final = 10 * NS_PER_S  # maximum age of the values of a plan that `apply` uses without a new read, ns
 BACKUP_LIMIT_S: Final = 5.0  # maximum wait of a command for the disk, s
 READ_AGAIN_NS: Final = 5 * NS_PER_S  # pause before imud reads the settings again after an error, ns
 READ_TRIES: Final = 3  # number of reads before imud waits for the next restart, replug or command
@@ -102,6 +103,8 @@ class SettingsKeeper:
         self._reported: Mapping[str, SettingDifference] = {}
         self._problem = ""
         self._read_ns: int | None = None
+        # resets of the device counter at a plan that no other script has followed; None without such a plan
+        self._planned_resets: int | None = None
         self._repairs = 0
         self._repaired_ns: list[int] = []  # CLOCK_MONOTONIC of the repairs within PAUSES_FORGOTTEN_S
         self._repaired_module = ""  # the device of these repairs, as in `_module`
@@ -111,7 +114,7 @@ class SettingsKeeper:
     def start(self, clock: SampleClock) -> None:
         """Forget the settings: imud has found the device again, or another device."""
         self._clock, self._resets = clock, clock.status().resets
-        self._actual = None
+        self._actual = self._planned_resets = None
         self._after_start(BEGIN_NS)
 
     def tick(self, now_ns: int, _newest: Sample | None) -> None:
@@ -138,7 +141,7 @@ class SettingsKeeper:
 
     def stop(self) -> None:
         """Forget the settings: the link ended. A second call does nothing."""
-        self._actual = self._due_ns = None
+        self._actual = self._due_ns = self._planned_resets = None
         self._wanted.clear()
 
     def close(self) -> None:
@@ -156,7 +159,7 @@ class SettingsKeeper:
 
     @asynccontextmanager
     async def exclusive(self) -> AsyncIterator[None]:
-        """Lock the settings for a command.
+        """Lock the settings for a command. The values of an earlier plan are then out of date.
 
         Raises CommandError if another command, for example a calibration, does not end within WAIT_S.
         """
@@ -167,6 +170,7 @@ class SettingsKeeper:
             raise CommandError(
                 f"{self._config.name}: another command or a calibration is still running; try again later"
             ) from None
+        self._planned_resets = None
         try:
             yield
         finally:
@@ -240,14 +244,31 @@ class SettingsKeeper:
         table = self._table()
         wanted = self._wanted_values(table, given)
         async with self.exclusive():
-            return self._make_plan(table, wanted, await self._read(table), save=save, unsaved=self._unsaved)
+            plan = self._make_plan(table, wanted, await self._read(table), save=save, unsaved=self._unsaved)
+            self._planned_resets = self._counter_resets
+            return plan
 
     async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
-        """Set the values `given` (None: the declared settings). Raises as `report`, before the first write."""
+        """Set the values `given` (None: the declared settings). Raises as `report`, before the first write.
+
+        imud uses the values of a plan if they are younger than PLAN_NS and no other script or restart followed.
+        """
         table = self._table()
         wanted = self._wanted_values(table, given)
+        planned = self._planned_values()
         async with self.exclusive():
-            return await self._apply(table, wanted, await self._read(table), save=save, asked=True)
+            actual = planned if planned is not None else await self._read(table)
+            return await self._apply(table, wanted, actual, save=save, asked=True)
+
+    def _planned_values(self) -> Values | None:
+        """Return the values of a plan that are still valid; None if there are none."""
+        if self.busy or self._read_ns is None or self._planned_resets != self._counter_resets:
+            return None
+        return self._actual if self._host.now_ns() - self._read_ns <= PLAN_NS else None
+
+    @property
+    def _counter_resets(self) -> int:
+        return self._clock.status().resets if self._clock is not None else 0
 
     async def back_up(self, action: str) -> None:
         """Write a backup before an action that resets all settings, and report its file. The caller holds `exclusive`.
@@ -367,7 +388,7 @@ class SettingsKeeper:
             log.info("%s: %s", self._config.name, _summary(done) or "all settings already have these values")
         self._report_differences(self._differences(table), quiet=True)
         if applying.changed:
-            await self._transport.read_back()
+            await self._transport.read_back(identity=done.restarted)
         return msgspec.structs.replace(done, advice=advice(self._config, done))
 
     def _make_plan(

@@ -155,8 +155,11 @@ class Transport(ABC):
         """
 
     @abstractmethod
-    async def read_back(self) -> None:
-        """Query identity and settings again after a change. Keep the old values if the device does not reply."""
+    async def read_back(self, *, identity: bool = True) -> None:
+        """Query the settings and, if `identity`, the identity again after a change.
+
+        Keep the old values if the device does not reply.
+        """
 
     def write(self, data: bytes) -> None:
         """Send bytes to the device. Raises LinkError."""
@@ -283,12 +286,12 @@ class ReceivingTransport(Transport, RequestPort):
         """Query identity and settings once."""
         await self._identify(1)
 
-    async def read_back(self) -> None:
+    async def read_back(self, *, identity: bool = True) -> None:
         with suppress(LinkError):  # the device receives the end of the link from `on_end`
-            await self._identify(1)
+            await self._identify(1, is_new=identity)
 
-    async def _identify(self, tries: int) -> bool:
-        """Query identity and settings; return whether the device replied to both queries."""
+    async def _identify(self, tries: int, *, is_new: bool = True) -> bool:
+        """Query the settings and, if it `is_new`, the identity. Return whether the device replied to all queries."""
         queries, identity = self._queries(), self.identity
         if queries is None or not self._may_ask:
             return False
@@ -297,9 +300,10 @@ class ReceivingTransport(Transport, RequestPort):
         identify, read_settings = queries
         for attempt in range(1, tries + 1):
             try:
-                found = await self.scripts.run(identify())
-                self._apply(found)
-                identity.update_identity(found)
+                if is_new:
+                    found = await self.scripts.run(identify())
+                    self._apply(found)
+                    identity.update_identity(found)
                 self._update_settings(await self.scripts.run(read_settings()))
                 identity.answered = True
                 return True

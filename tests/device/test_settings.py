@@ -133,6 +133,29 @@ class ModuleBench:
 # --- report -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("between", "reads_again"),
+    [
+        (lambda _bench: asyncio.sleep(0), False),
+        (lambda bench: bench.pass_s(11), True),
+        (lambda bench: bench.doing(bench.device.act("save", {})), True),
+        (lambda bench: bench.doing(bench.device.settings_report(fresh=True)), True),
+    ],
+    ids=["immediately", "late", "after a command", "after a read"],
+)
+@played(ModuleBench)
+async def test_apply_uses_the_values_of_a_recent_plan(
+    bench: ModuleBench, between: Callable[[ModuleBench], Coroutine[Any, Any, Any]], reads_again: bool
+) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    await bench.doing(bench.device.settings_plan({"mode": "9-axis"}, save=False))
+    await between(bench)
+    before = len(bench.module.commands)
+    applied = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+    assert outcomes(applied) == {"mode": StepOutcome.DONE}
+    assert (bench.module.commands[before] == "GET") is reads_again
+
+
 @played(lambda: ModuleBench(declared={"mode": "6-axis"}))
 async def test_a_save_makes_one_request(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.is_in(SettingsState.AGREE))
