@@ -234,14 +234,17 @@ def actions_table(actions: Actions, lists: LongLists) -> Iterator[str]:
         yield f"| `{name}` | {arguments_of(action, lists)} | {cell(action.help.rstrip('.'))} |"
 
 
-def actions_part(driver: Driver, lists: LongLists) -> list[str]:
-    lines = list(actions_table(driver.actions, lists)) if driver.actions else ["No actions."]
-    return [f"### `{driver.name}`: {driver.title}", "", *lines, ""]
+def actions_part(driver: Driver, lists: LongLists, first_of: dict[str, str]) -> list[str]:
+    """Return title and table of the actions of a driver; a table that an earlier driver has becomes a reference."""
+    table = "\n".join(actions_table(driver.actions, lists)) if driver.actions else "No actions."
+    first = first_of.setdefault(table, driver.name)
+    same = bool(driver.actions) and first != driver.name
+    return [f"### `{driver.name}`: {driver.title}", "", f"As `{first}`." if same else table, ""]
 
 
 def actions_tables() -> str:
-    lists = LongLists()
-    lines = [line for driver in DRIVERS.values() for line in actions_part(driver, lists)]
+    lists, first_of = LongLists(), dict[str, str]()
+    lines = [line for driver in DRIVERS.values() for line in actions_part(driver, lists, first_of)]
     by_lines = [
         "### Any device with the line `reset` or `sin`",
         "",

@@ -108,16 +108,15 @@ FilterName = Literal[
 ]  # fmt: skip
 FILTERS: Final[tuple[FilterName, ...]] = get_args(FilterName)  # low-pass filters by code 0 … 15
 FILTER_DEFAULT: Final = 0xBB  # 47 Hz for both sensors, the factory setting
-# Table 21 in one line, for help texts and documents
-FILTER_CODES: Final = ", ".join(f"{code} = {name}" for code, name in enumerate(FILTERS))
+
 FilterCode = Annotated[int, Meta(ge=0, le=len(FILTERS) - 1)]  # an index of FILTERS
 FilterChoice = FilterName | FilterCode  # a filter by name, or by its code in table 21
 ACCEL_FILTER: Final = Meta(
-    description="low-pass filter of the accelerometer, by name or by its code in the order of the names",
+    description="low-pass filter of the accelerometer, by name or by code in the order of the names",
     extra={"section": "2.4.2, table 21"},
 )
 GYRO_FILTER: Final = Meta(
-    description="low-pass filter of the gyroscope, by name or by its code in the order of the names",
+    description="low-pass filter of the gyroscope, as for the accelerometer",
     extra={"section": "2.4.2, table 21"},
 )
 

@@ -19,7 +19,6 @@ from imud.contracts.setting import Setting, SettingsTable
 from imud.drivers.imu61x.common import (
     ACCEL_FILTER,
     EULER_CONVENTION,
-    FILTER_CODES,
     FILTERS,
     GYRO_FILTER,
     M_S2_PER_G,
@@ -48,7 +47,7 @@ class RegisterOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=
     """Options of an IMU61x on a polled bus."""
 
     accel_filter: FilterChoice | None = None
-    """Low-pass filter of the accelerometer, by name or by its code in the order of the names (11: 47 Hz); null:
+    """Low-pass filter of the accelerometer, by name or by code in the order of the names (11: 47 Hz); null:
     unchanged."""
     gyro_filter: FilterChoice | None = None
     """Low-pass filter of the gyroscope, as for the accelerometer."""
@@ -167,8 +166,8 @@ def _filter_action(set_up: SetUp[S]) -> Action:
         return set_up(msgspec.structs.replace(settings, **wanted))
 
     return Action(
-        "set the low-pass filters until the device restarts, null: unchanged; returns the filters; "
-        f"imud sets the filters in `options` at every start; by name or code: {FILTER_CODES}",
+        "set the low-pass filters until the device restarts, by name or by code in the order of the names, null: "
+        "unchanged; returns the filters; imud sets the filters in `options` at every start",
         set_filter,
     )
 

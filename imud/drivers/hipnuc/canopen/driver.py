@@ -144,7 +144,7 @@ def _interval_setting(tpdo: TpdoNumber) -> Setting:
 
 
 def _transmission_setting(tpdo: TpdoNumber) -> Setting:
-    words = f"trigger of the message with the {CONTENT[tpdo]}: its interval, or SYNC (`options.sync_hz`)"
+    words = f"trigger of the message with the {CONTENT[tpdo]}, interval or SYNC (`options.sync_hz`)"
     return Setting(
         type=Annotated[By, Meta(description=words, extra={"section": "5.4.2"})],
         write=lambda target, by: commands.set_tpdo_type(target.settings.node, tpdo, TRANSMISSIONS[by]),

@@ -23,7 +23,6 @@ from imud.contracts.driver import StreamDriver
 from imud.contracts.script import RequestScript, pause
 from imud.drivers.imu61x.common import (
     EULER_CONVENTION,
-    FILTER_CODES,
     FILTERS,
     NAVIGATION_FRAME,
     SHEET,
@@ -278,7 +277,7 @@ ACTIONS: Final[Actions] = {
         saves=True,
     ),
     "rate": Action("set the output rate; the baud rate limits it", _rate),
-    "filter": Action(f"set the low-pass filters, by name or code: {FILTER_CODES}", _filter),
+    "filter": Action("set the low-pass filters, by name or by code in the order of the names", _filter),
     "i2c_address": Action(
         "set the I2C address; a host that uses the old address loses the device until you change its `i2c.address`",
         _i2c_address,
