@@ -30,8 +30,8 @@ class General(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """Lowest level of log messages."""
     state_dir: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud"
-    """Folder of the state: found baud rates, writes to flash, backups of device settings. imud creates the folder. A
-    change needs a restart. STATE_DIRECTORY of systemd overrides this key."""
+    """Directory of the state: found devices, flash writes, backups of device settings. imud creates it. A change needs
+    a restart. STATE_DIRECTORY of systemd overrides this key."""
 
 
 class DeviceGeneral(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -42,16 +42,16 @@ class DeviceGeneral(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     enabled: bool = True
     """False: imud ignores the device, but checks its keys."""
     identify: bool = True
-    """True: imud can send queries to learn product, serial number and firmware. Queries do not change the device. imud
-    repeats a query without a reply after 5, 30 and 120 s, then every five minutes."""
+    """Whether imud may request product, serial number and firmware. The requests do not change the device."""
     on_difference: OnDifference = OnDifference.REPORT
-    """Reaction if the device differs from `settings`: report the difference, apply the settings, or apply the settings
-    and save them to the flash of the device."""
+    """Reaction if the device differs from `settings`: report the difference, apply the settings, or apply and save
+    them."""
     convention: Convention | None = None
     """Axes and angles of the published samples; null: the convention of the device, or enu-flu if `frame` is set
     (docs/frames.md)."""
     declination_deg: Annotated[float, msgspec.Meta(ge=-180, le=180)] | None = None
-    """True north relative to magnetic north, east positive. imud adds it to a magnetic heading; null: no change."""
+    """Direction of magnetic north from true north, east positive. imud adds it to a magnetic heading; null: no
+    change."""
 
 
 Row = Driver | LinkType[Any] | PublisherType

@@ -101,9 +101,10 @@ class LineOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
     line: Annotated[int, Meta(ge=0, le=1023)] | Annotated[str, Meta(min_length=1, max_length=31)]
     """Number of the line on its chip, or its name, for example `GPIO17`."""
     chip: Annotated[str, Meta(max_length=64)] = ""
-    """`/dev/gpiochip0`, `gpiochip0`, or a chip's label; empty to search all chips for the name of the line."""
+    """`/dev/gpiochip0`, `gpiochip0`, or the label of the chip; empty: imud searches all chips for the
+    name of the line."""
     active_low: bool = False
-    """Whether a low level means active (line behind an inverting level shifter)."""
+    """Whether a low level means active, for example behind an inverting level shifter."""
 
     def __post_init__(self) -> None:
         if isinstance(self.line, int) and not self.chip:
@@ -114,7 +115,7 @@ class InputOptions(LineOptions, frozen=True, kw_only=True, forbid_unknown_fields
     """Input: a line that the device drives."""
 
     bias: Literal["as-is", "pull-up", "pull-down", "disabled"] = "as-is"
-    """Bias resistor in the GPIO chip. A line without a driver or resistor floats and causes false edges."""
+    """Bias resistor in the GPIO chip. An open line without a resistor causes false edges."""
 
 
 class SoutOptions(InputOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -144,8 +145,8 @@ class PpsOptions(InputOptions, frozen=True, kw_only=True, forbid_unknown_fields=
     """Options of the pulse per second."""
 
     chrony: str = ""
-    """Path of the socket of chronyd's SOCK reference clock, which receives the pulses, for example
-    `/run/chrony.imud.sock`; empty: imud does not send them. Requires `rmc`, which gives the second of each pulse."""
+    """Socket of chronyd that receives the pulses, for example `/run/chrony.imud.sock`; empty: none. Without `rmc`,
+    chronyd needs another source for the second."""
 
 
 class ReadyOptions(InputOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -156,8 +157,7 @@ class ReadyOptions(InputOptions, frozen=True, kw_only=True, forbid_unknown_field
     offset_us: Offset = 0.0
     """Instant of measurement minus edge, µs; negative if the device measures before the edge."""
     bias_us: Bias = 100.0
-    """Maximum error of `offset_us`, µs; 0 if it was calibrated. The default 100 is an assumption; no manual states
-    it."""
+    """Maximum error of `offset_us`, µs; 0 if it was calibrated. The default is an assumption."""
 
 
 class OutputOptions(LineOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -173,8 +173,7 @@ class TriggerOptions(OutputOptions, frozen=True, kw_only=True, forbid_unknown_fi
     rate_hz: Annotated[float, Meta(ge=0, le=1000)] = 100.0
     """Rising edges per second; 0: edges only on request."""
     pulse_ms: Annotated[float, Meta(ge=0.01, le=500)] = 1.0
-    """Width of a pulse, ms, at most half a period. No HiPNUC manual states a width. 1 ms passes any level shifter; a
-    slow optocoupler needs more."""
+    """Width of a pulse, ms, at most half a period. A slow optocoupler needs more than 1 ms."""
     offset_us: Offset = 0.0
     """Instant of measurement minus trigger, µs."""
     bias_us: Bias = SIN_DELAY_US

@@ -29,22 +29,21 @@ class DeviceSending(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Messages that imud sends for a device."""
 
     rate_hz: Annotated[float, msgspec.Meta(ge=0.01, le=100)] | None = 1.0
-    """Number of statistics intervals per second; each interval uses all of its samples. null: no statistics."""
+    """Statistics intervals per second; null: no statistics."""
     values: Annotated[list[Measure], msgspec.Meta(min_length=1)] = msgspec.field(
         default_factory=lambda: list[Measure](("mean", "min", "max", "rms"))
     )
     """Statistics of each interval: `mean`, `min`, `max`, `rms` (root mean square)."""
     whole: Whole = Whole.NONE
-    """Format of complete samples: `json`, compressed `slots`, or `none` to send statistics only."""
+    """Format of all samples: `json`, compressed `slots`, or `none` for statistics only."""
     batch_s: Annotated[float, msgspec.Meta(ge=0.1, le=60)] = 1.0
     """Time that one message covers, s."""
     events: bool = True
     """Send the events of the device."""
     status: bool = True
-    """Send the state of the device as a retained message, after each change and every `status_s`."""
+    """Send the status of the device (retained), after each change and every `status_s`."""
     settings: bool = True
-    """Send the device settings and their differences from the declared settings, as a retained message after each
-    change."""
+    """Send the device settings and their differences from the declared settings (retained), after each change."""
 
     @property
     def batch_ns(self) -> int:
@@ -55,13 +54,11 @@ class CommandOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Options of the command channel."""
 
     enabled: bool = False
-    """Accept commands for devices over the broker. The access rights of the broker decide who may write to
-    `imud/SITE/GATEWAY/DEVICE/command`."""
+    """Accept commands for devices over the broker. The rights on the broker decide who can send commands."""
     actions: Annotated[list[str], msgspec.Meta(max_length=256)] = msgspec.field(default_factory=list[str])
-    """Allowed commands: `COMMAND` for all devices or `DEVICE/COMMAND` for one device. `imud command DEVICE` lists the
-    names. imud rejects all other commands."""
+    """Allowed actions: `ACTION` for all devices, `DEVICE/ACTION` for one device. imud rejects all other actions."""
     max_age_s: Annotated[float, msgspec.Meta(ge=1, le=600)] = 30.0
-    """Maximum age of a request by its `issued_utc_ns`, and maximum time ahead of the gateway's clock, s."""
+    """Maximum difference between `issued_utc_ns` of a request and the clock of the gateway, s."""
     per_minute: Annotated[int, msgspec.Meta(ge=1, le=600)] = 30
     """Maximum number of requests per minute."""
 
@@ -127,20 +124,20 @@ class MqttOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
         default_factory=lambda: ["mqtt://127.0.0.1:1883"]
     )
     """Brokers of one cluster, in the order of the attempts: `mqtt://HOST:PORT`, `mqtts` (TLS), `ws` or `wss`
-    (WebSocket). imud does not send a message to a second broker after an acknowledgement."""
+    (WebSocket)."""
     version: Literal["5", "3.1.1"] = "5"
-    """Version of MQTT. A broker with 3.1.1 cannot report rejected messages, so they are lost."""
+    """Version of MQTT. With 3.1.1, messages that the broker rejects are lost."""
     site: Name = "default"
-    """Name of the place, second level of all topics."""
+    """Name of the site, second level of all topics."""
     gateway: Name = ""
-    """Name of this gateway, third level of all topics. It must be unique on the broker. Empty: the host name up to the
+    """Name of this gateway, third level of all topics, unique on the broker; empty: the host name up to the
     first dot."""
     user: str = ""
-    """User name for the broker; empty: no user name."""
+    """User name for the broker; empty: none."""
     password_file: str | None = None
-    """File with the password in its first line; null: no password. imud reads it at each connection."""
+    """File with the password in its first line, read at each connection; null: no password."""
     ca_file: str | None = None
-    """CA certificates (PEM) for the certificate of the broker; null: the certificates that the system trusts."""
+    """CA certificates (PEM) for the broker; null: the certificates that the system trusts."""
     cert_file: str | None = None
     """Client certificate (PEM) of this gateway; null: no certificate."""
     key_file: str | None = None
@@ -150,27 +147,25 @@ class MqttOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
     retry_max_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 60.0
     """Maximum pause between two connection attempts, s. Pauses are random and grow from 4 s."""
     messages_per_s: Annotated[float, msgspec.Meta(ge=0.1, le=100_000)] | None = None
-    """Maximum number of stream messages per second; null: no limit. A limit prevents that a gateway fills the network
-    link after a long interruption. It must be higher than the rate of new messages."""
+    """Maximum number of stream messages per second, above the rate of new messages; null: no limit."""
     newest_first: bool = False
-    """Send new messages before messages that waited for a connection. Streams are then not in order."""
+    """Send new messages before older messages. Streams are then not in order."""
     spool_directory: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud/mqtt"
-    """Folder of the spool. imud creates it."""
+    """Directory of the spool. imud creates it."""
     spool_mb: Annotated[float, msgspec.Meta(ge=1, le=1_000_000)] = 256.0
-    """Maximum size of the spool, MB (10⁶ bytes). If the spool is full, imud replaces the oldest complete samples by
-    statistics, and then drops the oldest messages."""
+    """Maximum size of the spool, MB (10⁶ bytes). If it is full, imud first replaces the oldest samples by statistics,
+    then drops the oldest messages."""
     spool_hours: Annotated[float, msgspec.Meta(ge=0.01, le=8760)] = 168.0
-    """Maximum age of a message in the spool, hours. imud drops older messages."""
+    """Maximum age of a message in the spool, hours."""
     status_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 60.0
-    """Interval of the state messages of devices and gateway, s."""
+    """Interval of the status messages of devices and gateway, s."""
     commands: CommandOptions = CommandOptions()
     """Options of the command channel."""
     home_assistant: bool = False
-    """Announce devices with `status` to Home Assistant in retained messages below `homeassistant/device/`. The broker
-    must allow the gateway to write there."""
+    """Announce devices with `status` to Home Assistant. The gateway must be allowed to write below
+    `homeassistant/device/`."""
     devices: dict[str, DeviceSending] = msgspec.field(default_factory=lambda: {EVERY: DeviceSending()})
-    """Messages by device name; `*` is for all other devices. The table `mqtt.devices.NAME` contains the keys of an
-    entry."""
+    """Messages by device name; `*`: all other devices."""
 
     def __post_init__(self) -> None:
         """Raise ValueError if a URL, a device name, or a combination of keys is invalid."""

@@ -428,14 +428,11 @@ class ShmOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
     enabled: bool = True
     """Write rings."""
     directory: str = DIRECTORY
-    """Directory of the ring files. If the daemon cannot use the default, it uses $XDG_RUNTIME_DIR/imud/shm. Readers
-    search both; IMUD_SHM in their environment names another directory."""
+    """Directory of the ring files. If the default is not usable, imud uses $XDG_RUNTIME_DIR/imud/shm."""
     slots: Annotated[int, msgspec.Meta(ge=SLOTS_MIN, le=SLOTS_MAX)] = 4096
-    """Number of samples in a ring, a power of two. A sample needs 256 bytes: 4096 samples are four seconds at 1 kHz and
-    1 MB per device."""
+    """Number of samples in a ring, a power of two: 4096 are four seconds at 1 kHz and 1 MB per device."""
     latency_ms: Annotated[float, msgspec.Meta(ge=0, le=50)] = 5.0
-    """Maximum hold of samples before imud writes them, ms; 0: write each sample immediately. A longer hold costs less
-    CPU time. A client of the socket with a lower latency reduces the hold for all readers."""
+    """Maximum hold of samples, ms; 0: imud writes each sample immediately (docs/latency.md)."""
     group: str = "imud"
     """Group with read access, if it exists and imud may use it."""
     mode: Annotated[int, msgspec.Meta(ge=0, le=0o777)] = 0o640

@@ -43,10 +43,9 @@ class RmcOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
     port: str = ""
     """Path of the receiver's serial port, for `nmea`."""
     baud: Annotated[int, Meta(ge=4800, le=921_600)] = 9600
-    """Bit rate of this port."""
+    """Baud rate of this port, bit/s."""
     error_ms: Annotated[float, Meta(gt=0, le=60)] = 50.0
-    """Maximum one-sigma error of the system clock. A sentence only contains the second and is sent 200 ms after its
-    start. Such an error therefore has no effect."""
+    """Maximum one-sigma error of the system clock for the source `system`, ms."""
 
     def __post_init__(self) -> None:
         if not is_host(self.host):

@@ -117,15 +117,14 @@ class FlightOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     memory_mb: Annotated[float, msgspec.Meta(ge=1, le=100_000)] = 64.0
     """Maximum size of the kept data, MB (10⁶ bytes). imud keeps fewer minutes if they need more."""
     directory: str = ""
-    """Directory of the kept data, for example on a tmpfs; empty: main memory. imud creates the directory. After a kill,
-    imud saves the data in this directory at the next start."""
+    """Directory of the kept data, for example on a tmpfs; empty: main memory. After a kill, imud saves the data of this
+    directory at the next start."""
     acceleration_m_s2: Annotated[float, msgspec.Meta(gt=0, le=1_000_000)] | None = None
     """Acceleration that causes an alert, m/s², including gravity; null: no alert."""
     device_lost: bool = True
     """Cause an alert if a running device becomes missing or silent."""
     line: InputOptions | None = None
-    """GPIO line that causes an alert when it becomes active, with the keys `line`, `chip`, `active_low` and `bias` as
-    for a device; null: no line."""
+    """GPIO line that causes an alert when it becomes active; null: no line."""
     per_hour: Annotated[int, msgspec.Meta(ge=1, le=3600)] = 6
     """Maximum number of snapshots by alerts per hour."""
 
@@ -142,7 +141,7 @@ class RecorderOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=
     keep_gb: Annotated[float, msgspec.Meta(gt=0, le=1_000_000)] = 10.0
     """Maximum size of all files, including snapshots, GB (10⁹ bytes). imud removes the oldest files."""
     file_mb: Annotated[float, msgspec.Meta(ge=1, le=100_000)] = 100.0
-    """Size of a file after which imud starts a new file, MB (10⁶ bytes)."""
+    """Size at which imud starts a new file, MB (10⁶ bytes)."""
     file_minutes: Annotated[float, msgspec.Meta(ge=1, le=10_080)] = 60.0
     """Time after which imud starts a new file, min."""
     flight: FlightOptions = FlightOptions()

@@ -261,7 +261,7 @@ class HipnucOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     hi91_word: Literal["auto", "pps", "status"] = "auto"
     """Meaning of bytes 1-2 of HI91: time since the last PPS edge (firmware before 1.6.9) or status bits (newer
-    firmware). `auto` decides by the firmware version that the device reports, and uses `pps` before."""
+    firmware). `auto` selects `pps` until the device reports its firmware version."""
 
 
 class HipnucCodec:
