@@ -1,7 +1,7 @@
-"""`make bench`: every measurement in one run, side by side, and in build/bench.json.
+"""`make bench`: run all measurements, print one table, and write the same rows to build/bench.json.
 
-`make bench ARGS="clock socket"` runs some parts. `make bench ARGS=--short` runs all of them with fewer and shorter
-rounds, in SHORT_LIMIT_S at most on a machine that does nothing else; what may boot the lab's kernel is left out there.
+`make bench ARGS="clock socket"` runs only these parts. `make bench ARGS=--short` runs all parts with fewer and shorter
+rounds. The short form takes at most SHORT_LIMIT_S on an idle host. It omits the parts that may boot the lab's kernel.
 """
 
 import argparse
@@ -23,7 +23,7 @@ PARTS = (
 )  # fmt: skip
 SHORT_LIMIT_S: Final = 300.0
 LAB_PARTS: Final = ("can",)
-"""Parts that may boot the lab's kernel; the short form runs them only where they are named."""
+"""Parts that may boot the lab's kernel. The short form runs them only if the command line names them."""
 OUTPUT = Path("build/bench.json")
 
 
@@ -31,6 +31,7 @@ def measure(parts: Iterable[str], quick: bool) -> list[Row]:
     rows: list[Row] = []
     for part in parts:
         print(f"# {part}", flush=True)
+        # the time includes the import of the part
         begun_s = monotonic()
         for row in import_module(f"tests.bench.{part}").rows(quick=quick):
             print(row, flush=True)
@@ -45,19 +46,22 @@ def parts_of(*, short: bool) -> tuple[str, ...]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make bench")
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}")
-    parser.add_argument("--short", "--quick", action="store_true", help="shorter runs, rougher figures")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"one of {', '.join(PARTS)}")
+    parser.add_argument(
+        "--short", "--quick", action="store_true", help="use shorter runs; the figures are less precise"
+    )
     args = parser.parse_args()
     begun_s = monotonic()
     parts = args.parts or parts_of(short=args.short)
     rows = measure(parts, args.short)
     took_s = monotonic() - begun_s
     OUTPUT.parent.mkdir(exist_ok=True)
+    # compare.py reads this file and matches rows by name
     OUTPUT.write_bytes(msgspec.json.format(msgspec.json.encode([row._asdict() for row in rows])))
     missed = sum(row.reached is False for row in rows)
-    print(f"# {len(rows)} figures in {OUTPUT}, {missed} short of what was aimed at; {took_s:.0f} s")
+    print(f"# {len(rows)} figures in {OUTPUT}, {missed} goals not reached; {took_s:.0f} s")
     if args.short and took_s > SHORT_LIMIT_S:
-        print(f"# the short form is to take {SHORT_LIMIT_S:.0f} s at most: does the machine do something else?")
+        print(f"# expected at most {SHORT_LIMIT_S:.0f} s for the short form; is the host busy with other programs?")
     return 0
 
 

@@ -1,9 +1,10 @@
-"""What a clock meets: devices, links and hosts with a fault each, simulated with the truth known (for `clock_table`).
+"""Simulated devices, links and hosts with one fault each, and the true time of each sample (for `clock_table`).
 
-The way of a message is that of `ArrivalModel`; here its parts misbehave. What no arrival can show, the constant part of
-a link's delay, differs from machine to machine: each seed is another machine (`machine_of`), within what imud allows
-for (`LinkDelay`), with another crystal, FIFO and timer. A stated error can be judged over several machines only: on one
-of them the constant part is whatever it is.
+A frame takes the same path as in `ArrivalModel`. Here, parts of the path misbehave. Arrival times cannot show the
+constant part of a link's delay. This part is different in each installation. Each seed is therefore another
+installation (`machine_of`) with its own crystals, FIFO, adapter timer and constant delay. The delay is within the
+bounds that imud assumes (`LinkDelay`). Judge the time stamp error only over several installations: in a single
+installation, the constant delay is one random value.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -19,28 +20,29 @@ from imud.sim.ports.arrival import Arrival, ArrivalModel, ArrivalProfile
 
 SECONDS: Final = 120
 WakeLaw = Callable[[Random, float], float]
-"""Wake-up of a read at a host time, ns, above the machine's shortest."""
+"""Function from a generator and the host time, ns, to the wake-up time of a read above the host's minimum, ns."""
 STAMP_MODULUS: Final = 8192
 
 
 # --- machines -------------------------------------------------------------------------------------------------------
 
 WAKE_LEAST_NS: Final = 5 * NS_PER_US
-"""An interrupt and a switch to a process that waits: no host is faster."""
+"""Minimum wake-up time of all hosts, ns: one interrupt and one switch to the waiting process."""
 WAKE_MOST_NS: Final = 90 * NS_PER_US
-"""Shortest wake-up of a machine, above that, at most: what imud takes as the bound (`LinkDelay`)."""
+"""Maximum of a host's minimum wake-up time above WAKE_LEAST_NS, ns: the bound that imud assumes (`LinkDelay`)."""
 POLL_NS: Final = 60 * NS_PER_US
-"""Wait for a USB poll that differs from read to read; as much again at most is the machine's own. Both together are a
-microframe of USB 2.0, 125 µs."""
+"""Maximum random wait for a USB poll, ns. Each host adds a constant wait of at most the same length. The sum of both is
+a microframe of USB 2.0, 125 µs."""
 FIFO_MOST_BYTES: Final = 4.0
-"""A 16550 reports what is below its trigger level after four characters; one without a FIFO at once."""
+"""Maximum number of byte times until a FIFO reports its bytes. A 16550 reports bytes below its trigger level after four
+byte times. A port without a FIFO reports each byte immediately."""
 CRYSTAL_PPM: Final = 50.0
-"""Tolerance of a usual crystal, of a device and of an adapter's timer. More makes it easier to see through a timer: it
-beats with the samples sooner. Crystals that are 5 % off are in the table of `clock`."""
+"""Tolerance of the crystals of devices and adapters, ppm. With a larger error, the adapter timer beats faster with the
+samples, and imud can see the timer more easily. The table of `clock` contains crystals with an error of 5 %."""
 
 
 class Machine(NamedTuple):
-    """What one installation has and another has otherwise. The shares are of the bounds above, from 0 to 1."""
+    """Properties of an installation. `wake`, `poll` and `fifo` are shares of the bounds above, 0 to 1."""
 
     wake: float
     poll: float
@@ -52,6 +54,7 @@ class Machine(NamedTuple):
         poll = POLL_NS if link.timer_ns else 0
         return ArrivalProfile(
             name, timer_ns=link.timer_ns, timer_ppm=self.timer_ppm, packet_bytes=link.packet_bytes, poll_ns=poll,
+            # adapters with a latency timer have no UART FIFO delay: the timer is longer
             fifo_bytes=0 if link.timer_ns else FIFO_MOST_BYTES * self.fifo,
             floor_ns=WAKE_LEAST_NS + int(self.wake * WAKE_MOST_NS + self.poll * poll),
         )  # fmt: skip
@@ -63,13 +66,15 @@ NAMED: Final = tuple(
         ((-30.0, 12.0), (14.0, -43.0), (3.0, 50.0), (-11.0, -7.0), (40.0, 28.0), (0.0, 0.0))
     )
 )
-"""Machines of seeds 0 to 5: spread evenly, and one in lockstep. The figures of `clock_table.json` are of these."""
+"""Installations of the seeds 0 to 5: evenly distributed shares, and one adapter timer in lockstep with the device. The
+figures in `clock_table.json` are from these six."""
 
 
 def machine_of(seed: int) -> Machine:
-    """Return the machine of a seed: one of `NAMED`, or drawn evenly from all that a machine can be."""
+    """Return the installation of a seed: one of `NAMED`, or random values with an even distribution."""
     if seed < len(NAMED):
         return NAMED[seed]
+    # a seed always returns the same installation, also in another process
     random = Random(f"machine {seed}")
     tolerance = partial(random.uniform, -CRYSTAL_PPM, CRYSTAL_PPM)
     return Machine(random.random(), random.random(), random.random(), tolerance(), tolerance())
@@ -82,11 +87,11 @@ def machine_of(seed: int) -> Machine:
 class Link:
     name: str
     baud: int = 115_200
-    """0: a CAN bus, where the kernel stamps the first frame."""
+    """Baud rate, bit/s; 0 for a link without a wire time. On a CAN bus, the kernel time-stamps the first frame."""
     timer_ns: int = 0
     packet_bytes: int = 0
     told_hold_ns: int | None = None
-    """What the system says of the timer; None: the truth."""
+    """Latency timer that the operating system reports, ns; None if it reports the true timer."""
 
     @property
     def hold_ns(self) -> int:
@@ -98,7 +103,7 @@ USB_1: Final = Link("usb-1ms", timer_ns=NS_PER_MS)
 USB_16: Final = Link("usb-16ms", timer_ns=16 * NS_PER_MS)
 FT232: Final = Link("ft232-16ms", timer_ns=16 * NS_PER_MS, packet_bytes=62)
 FRAMES: Final = Link("usb-frames", 0, timer_ns=NS_PER_MS)
-"""A device that is USB itself: the host asks in frames of 1 ms, and there is no wire."""
+"""A device with a USB interface of its own. The host polls it in USB frames of 1 ms, and no serial wire exists."""
 CAN: Final = Link("can", 0)
 LINKS: Final = (UART, USB_1, USB_16, FT232, FRAMES)
 
@@ -112,13 +117,17 @@ def _exponential(random: Random, _t_ns: float, mean_ns: float, stall_share: floa
 
 
 def _pareto(random: Random, _t_ns: float) -> float:
-    """Most within 50 µs, one in a thousand over 5 ms, and no mean worth the name."""
+    """Return a wait with a heavy tail: usually less than 50 µs, more than 5 ms in one of 1,000 reads."""
+    # the exponent 1.3 has no finite variance; the maximum is 0.5 s
     return min(25 * NS_PER_US * (random.paretovariate(1.3) - 1), 0.5 * NS_PER_S)
 
 
 def _log_normal(random: Random, t_ns: float) -> float:
-    """Idle states and frequencies of a processor: half of the reads wake it from sleep; every 7 s it is busy for 2."""
-    wait = random.lognormvariate(10.0, 0.9)  # 22 µs
+    """Return a wait on a host with idle states and frequency scaling.
+
+    Half of the reads wake the processor from an idle state. The host is busy for 2 s of every 7 s.
+    """
+    wait = random.lognormvariate(10.0, 0.9)  # median 22 µs
     if random.random() < 0.5:
         wait += random.uniform(20, 180) * NS_PER_US
     if t_ns % (7 * NS_PER_S) < 2 * NS_PER_S and random.random() < 0.3:
@@ -147,22 +156,24 @@ class Stalls:
 class HostClocks:
     name: str
     slews: tuple[tuple[float, float], ...] = ()
-    """(from then on, CLOCK_MONOTONIC runs so many ppm fast)."""
+    """Pairs of (start in s, rate error of CLOCK_MONOTONIC in ppm)."""
     steps: tuple[tuple[float, float], ...] = ()
-    """(then, CLOCK_REALTIME is set forward by so many seconds)."""
+    """Pairs of (time in s, forward step of CLOCK_REALTIME in s)."""
     suspend_s: tuple[float, float] | None = None
-    """(then, for so long): CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW stand still, the device runs on unheard."""
+    """(start in s, duration in s) of a suspend. CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW stop. The device continues, and
+    the host does not receive its frames."""
     stop_s: tuple[float, float] | None = None
-    """(then, for so long): the virtual machine does not run, and its clocks go on. What comes beyond WAITING_BYTES in
-    that time is lost."""
+    """(start in s, duration in s) of a stop of the virtual machine. The clocks of the host continue. Frames that do not
+    fit into WAITING_BYTES during the stop are lost."""
 
     def stepped_ns(self, since_ns: int) -> int:
+        # a suspend also moves CLOCK_REALTIME ahead of the stopped CLOCK_MONOTONIC
         steps = (*self.steps, self.suspend_s) if self.suspend_s else self.steps
         return sum(int(step_s * NS_PER_S) for at_s, step_s in steps if since_ns >= at_s * NS_PER_S)
 
 
 WAITING_BYTES: Final = 256
-"""Receive buffer of an FT232."""
+"""Size of the receive buffer of an FT232, bytes."""
 
 
 # --- devices --------------------------------------------------------------------------------------------------------
@@ -171,25 +182,26 @@ WAITING_BYTES: Final = 256
 @dataclass(frozen=True, slots=True)
 class Device:
     says: str = "time"
-    """`time`: ms (HI91); `stamp`: ms modulo 8192 (HI92); `number`: of the sample, 8 bits; `trigger`: that there was
-    one (HI92 on mark); `nothing`."""
+    """Time information in a frame. `time`: device time in ms (HI91). `stamp`: device time in ms modulo 8192 (HI92).
+    `number`: 8-bit sample counter. `trigger`: only the information that a trigger occurred (HI92 in the mode MARK).
+    `nothing`: no time."""
     rates_hz: Sequence[tuple[float, float]] = ((0.0, 100.0),)
-    """(from this second on, rate); a change moves the sampling within the tick too."""
+    """Pairs of (start in s, rate in Hz). A change of the rate also shifts the sampling instant within the tick."""
     swing_ppm: float = 0.0
-    """Temperature: the crystal swings by this much in `swing_s`."""
+    """Amplitude of the rate error due to temperature, ppm, with the period `swing_s`."""
     swing_s: float = 200.0
     restarts_s: Sequence[float] = ()
-    """It is silent for two seconds then, and its counter begins anew."""
+    """Times of the device's restarts, s. After each, the device is silent for two seconds and its counter restarts."""
     ticks_before_wrap: int | None = None
     loss: float = 0.0
-    """Share of messages that are lost one by one."""
+    """Share of frames that are lost individually."""
     loss_burst_s: tuple[float, float] | None = None
-    """(every, for): all are lost."""
+    """(period in s, duration in s) of bursts in which all frames are lost."""
     size_bytes: int = 82
 
 
 class Message(NamedTuple):
-    """What `SampleClock.sample` gets, and the truth."""
+    """A frame: the arguments of `SampleClock.sample`, and the true time of the measurement."""
 
     truth_ns: int
     measurement: Measurement
@@ -205,7 +217,7 @@ class Cell:
     wake: WakeLaw = QUIET
     stalls: Stalls | None = None
     host: HostClocks | None = None
-    """None: its clocks are left alone."""
+    """Changes of the host clocks; None for unchanged clocks."""
 
     @property
     def name(self) -> str:
@@ -217,7 +229,7 @@ class Cell:
 
 @dataclass(slots=True)
 class _AdverseModel(ArrivalModel):
-    """Arrivals of a cell; the device's time is in whole ms from `_truth` on."""
+    """Arrivals of a cell. `_truth` yields device time in whole ms."""
 
     cell: Cell = field(default_factory=lambda: Cell("", UART))
     skew_ppm: float = 0.0
@@ -225,6 +237,7 @@ class _AdverseModel(ArrivalModel):
     def _truth(self, count: int, random: Random) -> Iterator[tuple[float, float]]:
         device, begin_ns = self.cell.device, self.begin_ns + random.random() * 50 * NS_PER_MS
         t_ns, dev_ns = begin_ns, 5e12 + random.random() * NS_PER_MS
+        # start the counter shortly before the 32-bit counter of ms wraps
         if device.ticks_before_wrap is not None:
             dev_ns += ((1 << 32) - device.ticks_before_wrap) * NS_PER_MS - 5e12
         rates, restarts, rate = list(device.rates_hz), list(device.restarts_s), 1.0
@@ -234,13 +247,16 @@ class _AdverseModel(ArrivalModel):
             if rates and since_s >= rates[0][0]:
                 rate = rates.pop(0)[1]
                 if since_s:
-                    skipped_ns = random.uniform(20, 60) * NS_PER_MS  # the command is carried out
+                    # the device executes the rate command: 20 to 60 ms without samples
+                    skipped_ns = random.uniform(20, 60) * NS_PER_MS
                     t_ns, dev_ns = t_ns + skipped_ns, dev_ns + skipped_ns
             if restarts and since_s >= restarts[0]:
                 restarts.pop(0)
+                # restart: 2 s of silence, device time continues near 0.4 s
                 t_ns, dev_ns = t_ns + 2 * NS_PER_S, 4e8 + random.random() * NS_PER_MS
             if suspend and since_s >= suspend[0]:
                 unheard_ns, suspend = suspend[1] * NS_PER_S, None
+                # the device samples during the suspend; CLOCK_MONOTONIC does not advance
                 samples = ceil(unheard_ns * rate / NS_PER_S)
                 dev_ns += samples * NS_PER_S / rate
                 t_ns += samples * NS_PER_S / rate / (1 + self.skew_ppm * 1e-6) - unheard_ns
@@ -264,6 +280,7 @@ class _AdverseModel(ArrivalModel):
         while first < count:
             t_rx_ns = int(handed[first] + floor_ns + poll_ns * random.random() + wake(random, handed[first]))
             last = first
+            # one read returns all frames that the adapter delivered before the wake-up
             while last + 1 < count and handed[last + 1] <= t_rx_ns:
                 last += 1
             rest = self._begun_bytes(begins, last + 1, self._newest_hand_over(handed[last], t_rx_ns))
@@ -281,6 +298,7 @@ def messages(cell: Cell, seed: int, seconds: int = SECONDS) -> Iterator[Message]
     )  # fmt: skip
     ends = [at for at, _ in device.rates_hz[1:]] + [float(seconds)]
     count = int(sum(rate * (end - at) for (at, rate), end in zip(device.rates_hz, ends, strict=True) if end > at))
+    # `_heard` applies the stop of a virtual machine before the losses
     for number, a in _heard(enumerate(model.run(count)), cell, model.begin_ns):
         if device.loss and random.random() < device.loss:
             continue
@@ -298,12 +316,14 @@ def _heard(arrivals: Iterator[tuple[int, Arrival]], cell: Cell, begin_ns: int) -
     at_s, for_s = cell.host.stop_s
     stop_ns = begin_ns + int(at_s * NS_PER_S)
     end_ns = stop_ns + int(for_s * NS_PER_S)
+    # frames that fit into the receive buffer of the adapter
     room = WAITING_BYTES // cell.device.size_bytes
     for number, a in arrivals:
         if not stop_ns <= a.t_rx_ns < end_ns:
             yield number, a
         elif room:
             room -= 1
+            # the host reads these frames together when the virtual machine continues
             yield number, replace(a, t_rx_ns=end_ns, trailing_bytes=room * a.size_bytes if cell.link.baud else 0)
 
 

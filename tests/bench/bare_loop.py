@@ -1,7 +1,7 @@
-"""The least a Python process can do: epoll, read, find/crc/unpack, pack, send. What imud is measured against.
+"""Minimal Python server, the reference for the cost of imud: epoll, read, find, CRC, unpack, pack, send.
 
-No clock, no ledger, no shared memory, no slow-client care. It prints `ready` and serves each client that connects until
-SIGTERM: `python -m tests.bench.bare_loop SOCKET ENCODING HOLD_MS PTY…`.
+The server has no clock, no ledger, no shared memory and no protection against slow clients. It prints `ready`. Then it
+serves each connected client until SIGTERM: `python -m tests.bench.bare_loop SOCKET ENCODING HOLD_MS PTY…`.
 """
 
 import binascii
@@ -15,7 +15,7 @@ import tty
 
 import msgspec
 
-from imud.drivers.hipnuc.uart.codec import encode_hi91  # noqa: F401 - the same start-up cost on both sides
+from imud.drivers.hipnuc.uart.codec import encode_hi91  # noqa: F401 - same start-up cost as imud
 
 HEAD = struct.Struct("<2sHH")
 BODY = struct.Struct("<BHbfI16f")
@@ -40,6 +40,7 @@ def serve(path: str, encoding: str, hold_s: float, ports: list[str]) -> None:
     listener.listen(256)
     poll = select.epoll()
     poll.register(listener.fileno(), select.EPOLLIN)
+    # incomplete frame at the end of each port's data
     tails: dict[int, bytes] = {}
     seqs: dict[int, int] = {}
     for port in ports:
@@ -52,6 +53,7 @@ def serve(path: str, encoding: str, hold_s: float, ports: list[str]) -> None:
     crc = binascii.crc_hqx
     while True:
         ready = poll.poll()
+        # the reference for `latency_ms`: let the samples of several reads collect in the pty
         if hold_s:
             time.sleep(hold_s)
         for fd, _ in ready:
@@ -60,6 +62,7 @@ def serve(path: str, encoding: str, hold_s: float, ports: list[str]) -> None:
                 continue
             data = tails[fd] + os.read(fd, 65536)
             out = []
+            # sync bytes of HiPNUC; 82 bytes are an HI91 frame: 6 bytes of header, 76 of payload
             at = data.find(b"\x5a\xa5")
             while at >= 0 and len(data) - at >= 82:
                 _, length, check = HEAD.unpack_from(data, at)

@@ -1,16 +1,17 @@
-"""Wire to client at 1 kHz on a busy machine: what the scheduling settings of a service bring, in turns.
+"""Latency from the port to a client at 1 kHz on a busy host, for different scheduling settings of the service.
 
     writer, SCHED_FIFO ──pty──▶ kernel worker ──▶ imud, the setting under test ──▶ reader, SCHED_FIFO
 
-On every core a program computes without end, another writes to disk without end, and each is a session of its own, as
-the services of systemd are. A pty's bytes pass through a kernel worker, which competes with the programs as an ordinary
-task; those of a UART do not, so that the workers run at SCHED_FIFO while this measures, as do writer and reader: the
-figures are to be imud's. What is left is the kernel's own, and is measured first: how late a program at SCHED_FIFO runs
-that only waits for a timer of 1 kHz (in the preemption mode `none` a write to disk goes on for milliseconds); the mode
-is printed, as far as it can be known.
+A computing program runs on each core. Another program writes to the disk. Each program has a session of its own, like a
+service of systemd. A kernel worker moves the bytes of a pty. It competes with these programs as a normal task. The
+bytes of a UART need no such worker. To measure only imud, the workers, the writer and the reader run with SCHED_FIFO.
 
-It needs root. `python -m tests.bench.busy [ROUNDS]` prints a line for each setting and round. `--short` plays 2 s of
-each.
+The first line shows the remaining delay of the kernel: a program with SCHED_FIFO that only waits for a timer of 1 kHz.
+With the preemption mode `none`, a write to the disk can block this program for milliseconds. The output contains the
+preemption mode if the kernel reports it.
+
+`python -m tests.bench.busy [ROUNDS]` needs root. It prints one line for each setting and round. `--short` runs each
+setting for 2 s.
 """
 
 import argparse
@@ -59,11 +60,11 @@ class Setting:
     policy: int = os.SCHED_OTHER
     priority: int = 0
     core: bool = False
-    """CPUAffinity= with one core, which the others have too."""
+    """CPUAffinity= with one core. The other programs use the same core."""
     lock: bool = False
-    """mlockall, which no directive does."""
+    """Lock the memory with mlockall. systemd has no directive for this."""
     weight: bool = False
-    """CPUWeight=: a share of the processors that counts among services, here by the session's own nice value."""
+    """CPUWeight=: share of the processors relative to other services; simulated with the nice value of the session."""
 
 
 SETTINGS = (
@@ -89,9 +90,9 @@ class Seen:
 
 @contextmanager
 def busy(folder: Path) -> Iterator[None]:
-    """Every core has a program that computes, and one more writes to `folder`."""
+    """Run a computing program on each core and a program that writes to `folder`."""
     programs = [[sys.executable, "-c", HOG] for _ in CORES] + [[sys.executable, "-c", DISK, str(folder / "file")]]
-    lived = ["setpriv", "--pdeathsig", "KILL"]  # none outlives this process
+    lived = ["setpriv", "--pdeathsig", "KILL"]  # the kernel kills the programs if this process ends
     running = [subprocess.Popen([*lived, *argv], start_new_session=True) for argv in programs]
     try:
         yield
@@ -102,7 +103,7 @@ def busy(folder: Path) -> Iterator[None]:
 
 
 def timer(seconds: float) -> Seen:
-    """How late a program that waits for a timer of 1 kHz runs, at the policy of writer and reader."""
+    """Measure the delay of a program that waits for a timer of 1 kHz, with the policy of writer and reader."""
     argv = ["chrt", "--fifo", str(FIFO_OF_OTHERS), sys.executable, "-c", TIMER, str(int(seconds * 1000))]
     printed = subprocess.run(argv, stdout=subprocess.PIPE, text=True, check=True).stdout
     p50_us, p99_us, max_us = map(float, printed.split())
@@ -122,6 +123,7 @@ def run(setting: Setting, load: Load) -> Seen:
         reader = start_readers(stack, folder, load, set(CORES))
         for other in (writer, reader):
             os.sched_setscheduler(other.popen.pid, os.SCHED_FIFO, os.sched_param(FIFO_OF_OTHERS))
+        # apply the setting now: the threads of the daemon exist
         apply(setting, server.popen.pid)
         stack.enter_context(workers_first())
         writer.say("go")
@@ -133,19 +135,20 @@ def run(setting: Setting, load: Load) -> Seen:
 
 
 def apply(setting: Setting, pid: int) -> None:
-    """Set all threads of the daemon as systemd would have set its process before the start."""
+    """Apply the setting to all threads of the daemon, as systemd does for the process before its start."""
     for task in map(int, os.listdir(f"/proc/{pid}/task")):
         os.setpriority(os.PRIO_PROCESS, task, setting.nice)
         os.sched_setscheduler(task, setting.policy, os.sched_param(setting.priority))
         os.sched_setaffinity(task, {CORES[-1]} if setting.core else set(CORES))
     autogroup = Path(f"/proc/{pid}/autogroup")
     if setting.weight and autogroup.exists():
+        # autogroup is the nice value of a session, -19 the largest weight
         autogroup.write_text("-19")
 
 
 @contextmanager
 def workers_first() -> Iterator[None]:
-    """The kernel's unbound workers, which pass a pty's bytes on, run before the programs, as an interrupt would."""
+    """Run the kernel's unbound workers, which move the bytes of a pty, before all programs, like an interrupt."""
     workers = unbound_workers()
     _schedule(workers, os.SCHED_FIFO, FIFO_OF_OTHERS + 1)
     try:
@@ -155,10 +158,11 @@ def workers_first() -> Iterator[None]:
 
 
 def unbound_workers() -> list[int]:
-    """Process numbers of the kernel's unbound workers with ordinary priority."""
+    """Return the process ids of the kernel's unbound workers with normal priority."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
+            # kernel threads have an empty command line; kworker/uN… is not bound to a core
             if (folder / "comm").read_text().startswith("kworker/u") and not (folder / "cmdline").read_text():
                 found.append(int(folder.name))
     return found
@@ -166,12 +170,12 @@ def unbound_workers() -> list[int]:
 
 def _schedule(pids: Sequence[int], policy: int, priority: int) -> None:
     for pid in pids:
-        with suppress(OSError):  # it has ended
+        with suppress(OSError):  # the worker has ended
             os.sched_setscheduler(pid, policy, os.sched_param(priority))
 
 
 def preemption() -> str:
-    """What can be known of the kernel's preemption: the mode in force, or what it was built with."""
+    """Describe the preemption of the kernel: the active mode, or the version text with the build options."""
     with suppress(OSError):
         return f"preemption: {Path('/sys/kernel/debug/sched/preempt').read_text().strip()}"
     return f"preemption: mode not readable (debugfs), uname -v: {os.uname().version}"
@@ -187,6 +191,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir="/var/tmp", prefix="imud-busy-") as name, busy(Path(name)):
         print(f"{'a timer alone, fifo':32} {timer(seconds)}", flush=True)
         for number in range(args.rounds):
+            # reverse the order in each second round, so that a drift of the load does not favor a setting
             for setting in SETTINGS if number % 2 == 0 else reversed(SETTINGS):
                 print(f"{setting.name:32} {run(setting, Load(seconds=seconds))}", flush=True)
 

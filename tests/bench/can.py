@@ -1,7 +1,7 @@
-"""CPU per received CAN frame, our receive path against python-can's own `recv`, on the same bus in one run.
+"""CPU time per received CAN frame: the receive path of imud and `recv` of python-can, on the same bus in one run.
 
-It needs a virtual CAN bus and the right to make one. Where this kernel has none, the lab's measures (`make lab-deps`);
-there the CPU is emulated and the ratio alone means something.
+The part needs a virtual CAN bus and the permission to create one. If this kernel has no virtual CAN bus, the kernel of
+the lab measures (`make lab-deps`). The lab emulates the CPU, so only the ratio of both times is meaningful.
 """
 
 import shlex
@@ -40,6 +40,7 @@ def measure(interface: str, waiting: int, frames: int) -> tuple[float, float]:
         sent = [pack_frame(0x100 + number, False, bytes(8)) for number in range(waiting)]
         taken_ns = [0, 0]
         rounds = max(frames // waiting, 1)
+        # the kernel queues each frame for both sockets
         for _ in range(rounds):
             for frame in sent:
                 far.send(frame)
@@ -56,7 +57,7 @@ def measure(interface: str, waiting: int, frames: int) -> tuple[float, float]:
 
 @contextmanager
 def virtual_bus() -> Iterator[str]:
-    """A virtual CAN interface of our own. Raises CalledProcessError where none can be made."""
+    """Create a virtual CAN interface. Raises CalledProcessError if the kernel or the permissions forbid it."""
     _ip("link", "add", "dev", BUS, "type", "vcan")
     try:
         _ip("link", "set", BUS, "up")
@@ -85,13 +86,13 @@ def here(*, quick: bool) -> list[Row]:
 
 
 def in_lab(why: str, *, quick: bool) -> list[Row]:
-    """The figures of the lab's kernel; none, with a reason, where there is no lab."""
+    """Return the rows that the lab's kernel measures. Without a lab, print the reason and return no rows."""
     command = shlex.join([".venv/bin/python", "-m", "tests.bench.can", *(["--quick"] if quick else [])])
-    print(f"# no virtual CAN bus here ({why}): measured in the lab, on an emulated CPU", flush=True)
+    print(f"# cannot create a virtual CAN bus ({why}); the lab measures on an emulated CPU", flush=True)
     lab = [str(ROOT / "tests/lab/run"), "--steady", "--exec", command]
     done = subprocess.run(lab, cwd=ROOT, text=True, capture_output=True, timeout=LAB_LIMIT_S, check=False)
     if done.returncode:
-        print(f"# the lab does not measure either: {done.stderr.strip().splitlines()[-1:]}")
+        print(f"# cannot measure in the lab: {done.stderr.strip().splitlines()[-1:]}")
         return []
     line = next(line for line in done.stdout.splitlines() if line.startswith("["))
     return [row._replace(name=f"{row.name} (lab)") for row in msgspec.json.decode(line, type=list[Row])]

@@ -1,7 +1,8 @@
-"""CPU per sample of nine devices on one CAN bus, from the read to the published sample, and what of a CPU they need.
+"""CPU time of nine devices on one CAN bus, from the read to the published sample, and their total share of a CPU.
 
-Four CANopen nodes with six TPDOs, four J1939 nodes with four PGNs, one IMU61x, with the codecs, clocks and paths of the
-daemon; each has a socket of the loop device in place of the bus, and the system call that reads one reads those, too.
+The devices are four CANopen nodes with six TPDOs, four J1939 nodes with four PGNs, and one IMU61x. They use the codecs,
+clocks and paths of the daemon. A datagram socket on the loopback interface replaces the bus of each device. The read
+uses the same system call as on a CAN bus.
 """
 
 import socket
@@ -24,7 +25,7 @@ from tests.lab.can_traffic import Module, fleet
 
 RATE_HZ = 100.0
 PERIOD_NS = round(1e9 / RATE_HZ)
-WAITING = {"read one by one": 1, "gathered for 50 ms": 5}
+WAITING = {"read one by one": 1, "held for 50 ms": 5}
 LEARNING = 40
 CPU_SHARE_MOST = 0.5
 
@@ -39,6 +40,7 @@ class Device:
         receiver = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         receiver.bind(("127.0.0.1", 0))
         receiver.setblocking(False)
+        # the buffer must hold all frames of one turn
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         self.sender.connect(receiver.getsockname())
         self.reader = FrameReader(receiver, lambda _classes, _data: False)
@@ -51,10 +53,11 @@ class Device:
         self.path = CanPath(codec, clock, context)
 
     def read_and_decode(self, times_ns: list[int]) -> int:
-        """Read and decode what was sent, as if it had come at these times; return the CPU time, ns."""
+        """Read and decode the sent frames with these arrival times, ns. Return the CPU time, ns."""
         begin_ns = process_time_ns()
         frames = self.reader.read()
         read_ns = process_time_ns()
+        # replace the receive times: the frames of all turns are sent without a pause
         frames = [frame._replace(t_rx_ns=t_ns) for frame, t_ns in zip(frames, times_ns, strict=True)]
         taken_ns = process_time_ns()
         self.path.on_frames(frames)
@@ -77,6 +80,7 @@ def measure(waiting: int, samples: int) -> float:
         devices = [Device(module, stack) for module in modules]
         share = [
             [
+                # each device receives only the frames that pass its CAN filters
                 [raw for at in range(0, len(burst.frames), RAW_FRAME.size)
                  if device.wants(raw := bytes(burst.frames[at : at + RAW_FRAME.size]))]
                 for device in devices
@@ -96,6 +100,7 @@ def measure(waiting: int, samples: int) -> float:
                     [begun_ns + n * PERIOD_NS for n, some in zip(turn, each, strict=True) for _ in some]
                 )
             if begin < LEARNING:
+                # do not count the first samples: the clocks still learn the rate
                 taken_ns = 0
             else:
                 made += sum(device.ledger.samples for device in devices) - before
@@ -109,5 +114,5 @@ def rows(*, quick: bool = False) -> list[Row]:
         each_us = measure(waiting, 200 if quick else 1000)
         share = each_us * 1e-6 * RATE_HZ * len(fleet())
         found.append(Row(f"nine CAN devices, {words}: CPU per sample", each_us, "us"))
-        found.append(at_most(f"nine CAN devices at {RATE_HZ:g} Hz, {words}: of a CPU", share, "", CPU_SHARE_MOST))
+        found.append(at_most(f"nine CAN devices at {RATE_HZ:g} Hz, {words}: share of a CPU", share, "", CPU_SHARE_MOST))
     return found

@@ -1,4 +1,4 @@
-"""Captures of simulated modules that move, and a daemon that plays a capture and records it."""
+"""Captures of simulated devices in motion, and a daemon that replays and records a capture."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -29,7 +29,7 @@ def hi91_module(rate_hz: int) -> HipnucModule:
 
 
 def write_capture(source: Source, seconds: int, path: Path) -> None:
-    """Write what the module sends through a port that hands bytes over up to 0.25 ms late."""
+    """Write a capture of the simulated device. The simulated port delivers each burst up to 0.25 ms late."""
     random, module = Random(1), source.make()
     with path.open("wb") as out:
         writer = CaptureWriter(out, driver=source.driver, baud=BAUD)
@@ -40,9 +40,9 @@ def write_capture(source: Source, seconds: int, path: Path) -> None:
 
 
 def record(source: Source, seconds: int, folder: Path, **more: Any) -> Path:
-    """Let a daemon record a module for this time of its time stamps. Return the recording.
+    """Record a simulated device with a daemon for `seconds` of device time. Return the path of the recording.
 
-    `more` are further arguments of the daemon.
+    `more` contains further arguments of the daemon.
     """
     capture, recordings = folder / "capture", folder / f"{source.driver}-recordings"
     write_capture(source, seconds, capture)
@@ -54,6 +54,7 @@ metrics: {{enabled: false}}
 devices:
   bow: {{driver: {source.driver}, replay: {{path: {capture}, speed: maximum}}}}
 """
+    # speed `maximum`: the daemon reads the capture without pauses
     event_loop.run(Daemon(config.parse(text, "imud.yaml"), until_finished=True, **more).run())
     capture.unlink()
     (made,) = recordings.iterdir()

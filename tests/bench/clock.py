@@ -1,8 +1,8 @@
-"""How right and how fast the clock is: `python -m tests.bench.clock` prints the table, truth known from simulation.
+"""Accuracy and speed of the clock in a simulation: `python -m tests.bench.clock` prints the table.
 
-A row is one profile of arrival, rate and crystal; figures are of all its seeds, after the fit has settled for 70 s.
-The second table, of lines and UTC, is `clock_lines`. `--quick` takes one seed and fewer rows; `--keep` keeps them for
-docs/measurements.md.
+The simulation knows the true time of each sample. A row is a combination of an arrival profile, a rate and a crystal.
+Its figures are from all seeds, after the fit has settled for 70 s. `clock_lines` prints the second table, for lines and
+UTC. `--quick` uses one seed and fewer rows. `--keep` stores the figures for docs/measurements.md.
 """
 
 import sys
@@ -32,7 +32,7 @@ CRYSTALS = {
     "-5 %": Crystal(-50_000.0),
     "drift": Crystal(20.0, 0.1),
 }
-"""`drift`: 20 ppm and 0.1 ppm/s up and down by 10 ppm."""
+"""Crystals by name. `drift`: 20 ppm, then a change of 0.1 ppm/s between -10 and +10 ppm around it."""
 
 
 class Point(NamedTuple):
@@ -45,9 +45,9 @@ class Point(NamedTuple):
 @dataclass(frozen=True, slots=True)
 class Accuracy:
     rms_ns: float
-    """About the truth: a constant bias is in it."""
+    """Root mean square of the errors relative to the true time, ns. A constant error is included."""
     sigma_ns: float
-    """About their own mean: what is left when the bias is calibrated away."""
+    """Standard deviation of the errors around their mean, ns: the error after a calibration of the constant part."""
     p999_ns: float
     mean_t_err_ns: float
     share: float
@@ -106,7 +106,7 @@ def over_seeds(profile: ArrivalProfile, rate_hz: int, crystal: Crystal, seeds: S
 
 
 def speed_ns(profile: ArrivalProfile, rate_hz: int = 1000, count: int = 20_000) -> float:
-    """Mean time of one `sample()` call with a full measurement, the fit settled; the best of three."""
+    """Return the mean time of a `sample()` call with a full measurement, ns, best of three runs. The fit is settled."""
     v = (1.0, 2.0, 3.0)
     model = ArrivalModel(profile, rate_hz, 1, baud=BAUD_OF_RATE[rate_hz])
     calls = [
@@ -116,6 +116,7 @@ def speed_ns(profile: ArrivalProfile, rate_hz: int = 1000, count: int = 20_000) 
     best = float("inf")
     for _ in range(3):
         clock = clock_for(model)
+        # the first half settles the fit
         for m, t_rx_ns in calls[: count // 2]:
             clock.sample(m, t_rx_ns, 0)
         begin = perf_counter_ns()
@@ -145,11 +146,12 @@ def _spread_us(values: Sequence[float]) -> Spread:
 
 
 def table(seeds: Sequence[int], rates: Sequence[int]) -> Iterator[ArrivalFigures]:
-    """The rows of the table of docs/measurements.md: each from the best to the worst of all crystals."""
+    """Yield the rows of the table in docs/measurements.md. Each value is a range from the best to the worst crystal."""
     for profile in PROFILES:
         for rate_hz in rates:
             all_of = [over_seeds(profile, rate_hz, crystal, seeds) for crystal in CRYSTALS.values()]
             sigma, rms, p999, t_err = (_spread_us([getattr(a, figure) for a in all_of]) for figure in FIGURES)
+            # a share is from the worst crystal
             share, settling = min(a.share for a in all_of), min(a.share_settling for a in all_of)
             yield ArrivalFigures(profile.name, rate_hz, sigma, rms, p999, t_err, round(share, 3), round(settling, 3))
 

@@ -1,7 +1,7 @@
 """Measured figures of docs/measurements.md, stored in `clock_figures.json`: two tables and two plots.
 
-`python -m tests.bench.clock --keep` and `python -m tests.bench.clock_lines --keep` measure and keep them;
-`python -m tests.support.references` makes the tables of them, `python -m tests.bench.clock_pictures` the plots.
+`python -m tests.bench.clock --keep` and `python -m tests.bench.clock_lines --keep` measure and store the figures.
+`python -m tests.support.references` creates the tables, and `python -m tests.bench.clock_pictures` the plots.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -30,7 +30,7 @@ SAME_WITH_SOUT: Final = {
 """Rows that docs/measurements.md omits: SOUT has the same error on each link."""
 
 Spread = tuple[float, float]
-"""The best and the worst of all crystals."""
+"""Minimum and maximum over all crystals, µs."""
 
 
 class ArrivalFigures(msgspec.Struct, frozen=True):
@@ -41,7 +41,7 @@ class ArrivalFigures(msgspec.Struct, frozen=True):
     p999_us: Spread
     mean_t_err_us: Spread
     share: float
-    """Within twice the stated error, settled; of the worst crystal."""
+    """Share of samples within 2 × t_err_ns after settling, for the worst crystal."""
     settling: float
 
     def row(self) -> str:
@@ -77,6 +77,7 @@ def kept() -> ClockFigures:
 
 
 def keep(*, arrivals: Sequence[ArrivalFigures] | None = None, lines: Sequence[LineFigures] | None = None) -> None:
+    # keep the other table if only one was measured
     old = kept() if FILE.exists() else ClockFigures()
     new = ClockFigures(
         old.arrivals if arrivals is None else tuple(arrivals), old.lines if lines is None else tuple(lines)
@@ -85,7 +86,7 @@ def keep(*, arrivals: Sequence[ArrivalFigures] | None = None, lines: Sequence[Li
 
 
 def spread(values: Spread) -> str:
-    """Least and greatest of some figures in whole µs."""
+    """Return the smallest and the largest value in whole µs, or one value if both are equal."""
     low, high = (f"{one:.0f}" for one in values)
     return low if low == high else f"{low}–{high}"
 

@@ -1,12 +1,12 @@
 """Measures the time stamp errors of held samples: `python -m tests.bench.clock_hold` (docs/measurements.md).
 
-Three ways to read 1,000 samples a second a latency apart, from the same simulated arrivals:
+The same simulated arrivals are read in three ways, at intervals of the latency:
 
-- at once: each message is read as it comes;
-- one in time: after a message that was read as it came, all that gathered is read a latency apart, which the clock is
-  told; every 50 ms, or at once behind a latency timer, the next message is read as it comes
-  (`imud.device.stream_transport`);
-- by timer: all that gathered, a latency apart, and the clock takes that for an adapter's latency timer.
+- at once: each frame is read on arrival.
+- one in time: imud reads one frame on arrival, then all held frames at intervals of the latency. The clock receives the
+  hold. Every 50 ms, imud reads the next frame on arrival again. Behind a latency timer, it does so after each interval
+  (`imud.device.stream_transport`).
+- by timer: all frames are held. The clock interprets the hold as the latency timer of an adapter.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -40,6 +40,7 @@ def one_in_time(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int, watch_n
     at = 0
     while at < len(arrivals):
         begun_ns = arrivals[at].t_rx_ns
+        # this frame, and frames of the same read
         while at < len(arrivals) and arrivals[at].t_rx_ns == begun_ns:
             yield TimedRead(arrivals[at], begun_ns, arrivals[at].trailing_bytes, 0)
             at += 1
@@ -50,6 +51,7 @@ def one_in_time(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int, watch_n
                 end += 1
             yield from _together(arrivals, at, end, end_ns, byte_ns, hold_ns)
             if end == at:
+                # no frame arrived during the interval: the next frame is read on arrival
                 break
             at, end_ns = end, end_ns + hold_ns
 
@@ -67,7 +69,7 @@ def by_timer(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int, _watch_ns:
 def _together(
     arrivals: Sequence[Arrival], at: int, end: int, t_rx_ns: int, byte_ns: int, waited_ns: int
 ) -> Iterator[TimedRead]:
-    """Messages of one read; what has come of the next one trails."""
+    """Yield the frames of one read. The received bytes of the next, incomplete frame are trailing bytes."""
     rest = 0
     if end < len(arrivals) and byte_ns:
         after = arrivals[end]
@@ -89,8 +91,9 @@ def run(way: str, model: ArrivalModel, seconds: int, hold_ns: int) -> list[Point
     watch_ns = 0 if model.profile.hold_ns else WATCH_NS
     points = []
     first = {True: at_once, False: WAYS[way]}
+    # 5 s until the clock uses the fit
     settle = next(i for i, a in enumerate(arrivals) if a.t_ns - arrivals[0].t_ns > 5_000 * NS_PER_MS)
-    begin = settle if way == "one in time" else 0  # nothing waits before the fit is used
+    begin = settle if way == "one in time" else 0  # nothing is held before the clock uses the fit
     for early, part in ((True, arrivals[:begin]), (False, arrivals[begin:])):
         for a, t_rx_ns, trailing_bytes, waited_ns in first[early](part, hold_ns, model.byte_ns, watch_ns):
             m = Measurement(a.size_bytes, trailing_bytes, a.dev_ns // TICK_NS % TICK_MODULUS)
@@ -110,7 +113,7 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
         plain, held = (
             measure(way, profile, 1000, CRYSTALS["+50 ppm"], 10).sigma_ns for way in ("at once", "one in time")
         )
-        yield at_most(f"clock: sigma when samples wait 10 ms, against none, {profile.name}", held / plain, "x", 1.5)
+        yield at_most(f"clock: sigma with a hold of 10 ms / without a hold, {profile.name}", held / plain, "x", 1.5)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Measures the time stamp errors with GPIO lines and UTC (docs/measurements.md), and the speed with SOUT."""
+"""Measures the time stamp errors with GPIO lines and UTC for docs/measurements.md, and the time that SOUT adds."""
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -43,7 +43,7 @@ FAULTS = {
     "10 % of pulses and of frames lost, loaded": LineFaults(pulse_loss=0.1, frame_loss=0.1, loaded=True),
 }
 Case = tuple[str, str, int, Callable[[], list[DatedSample]]]
-"""Source, what is special, rate, and how to run it."""
+"""Source of the time, condition, rate in Hz, and the function that runs the case."""
 
 
 def model(profile: ArrivalProfile, rate_hz: int, crystal: Crystal, seed: int = 1) -> ArrivalModel:
@@ -64,6 +64,7 @@ def sout_cases(rate_hz: int) -> Iterator[Case]:
     for name, faults in FAULTS.items():
         if name:
             yield "SOUT", f"usb-16ms, {name}", rate_hz, case(USB_16MS, plain, faults)
+    # the device restarts in the middle of the run, with 1 s of silence
     m = model(USB_16MS, rate_hz, plain)
     yield (
         "SOUT", "usb-16ms, device restarts", rate_hz,
@@ -85,6 +86,7 @@ def other_cases() -> Iterator[Case]:
             def utc(
                 profile: ArrivalProfile = profile, rate_hz: int = rate_hz, crystal: Crystal = crystal
             ) -> list[DatedSample]:
+                # 2^32 ms: the counter of UTC does not wrap in the run
                 return run_utc(model(profile, rate_hz, crystal), 120, turn_ms=1 << 32)[0]
 
             yield "PPS", at, rate_hz, pps
@@ -113,6 +115,7 @@ def table() -> Iterator[LineFigures]:
             sigma_ns(offs), sum(offs) / len(offs), sorted(map(abs, offs))[int(len(offs) * 0.999)],
             sum(t.sample.t_err_ns for t in settled) / len(settled),
         )  # fmt: skip
+        # share of samples that used the source of this case
         mine = sum(t.sample.sync.value not in ("arrival", "regression") for t in settled) / len(settled)
         shares = (share_honest(settled), share_honest(settling), mine)
         yield LineFigures(
@@ -131,7 +134,7 @@ def main() -> None:
 
 
 def speed_ns(*, edges: bool, count: int = 20_000) -> float:
-    """Mean time of one sample at 1 kHz, with or without its pulse's two edges; the best of many stretches."""
+    """Return the mean time of one sample, ns, with or without the two edges of its pulse; best of all chunks."""
     v = (1.0, 2.0, 3.0)
     m = model(BARE_UART, 1000, CRYSTALS["+50 ppm"])
     clock = clock_for(m)
@@ -153,6 +156,7 @@ def speed_ns(*, edges: bool, count: int = 20_000) -> float:
             clock.sample(message, t_rx_ns, 0)
         spent += perf_counter_ns() - begin
         done += len(messages)
+        # a chunk of 500 samples is short enough to miss interrupts of other programs
         if done >= CHUNK:
             best, done = min(best, spent / done), 0
     return best
@@ -161,7 +165,7 @@ def speed_ns(*, edges: bool, count: int = 20_000) -> float:
 def rows(*, quick: bool = False) -> Iterator[Row]:
     seconds = 10 if quick else 30
     plain, with_edges = speed_ns(edges=False), speed_ns(edges=True)
-    yield at_most("clock: what SOUT adds to one sample at 1 kHz", with_edges - plain, "ns", 4000)
+    yield at_most("clock: time that SOUT adds to one sample at 1 kHz", with_edges - plain, "ns", 4000)
     for profile, rate_hz in ((USB_16MS, 100), (LOADED, 1000)):
         dated = run_sout(
             model(profile, rate_hz, CRYSTALS["+50 ppm"]), seconds, LineFaults(edge_loss=0.01), SoutTiming(bias_us=0.0)

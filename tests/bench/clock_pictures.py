@@ -16,9 +16,9 @@ FOLDER: Final = ROOT / "docs/pictures"
 RATE_COLOURS: Final = {1: "#8e44ad", 100: "#1f5fa8", 200: "#2e8b57", 400: "#d68910", 1000: "#c0392b"}
 SOURCE_COLOURS: Final = {"SOUT": "#1f5fa8", "PPS": "#2e8b57", "UTC": "#d68910", "SIN trigger": "#c0392b"}
 STEP: Final = 0.15
-"""Distance of two rates of one arrival."""
+"""Distance between two rates of one arrival profile on the x axis."""
 LEAST_US: Final = 0.1
-"""What is smaller stands here: a scale of powers has no zero."""
+"""Smallest drawn value, µs. Smaller values are drawn here, because a logarithmic scale has no zero."""
 ROW_INCHES: Final = 0.19
 
 
@@ -35,7 +35,7 @@ def arrivals_figure(found: Sequence[ArrivalFigures]) -> Figure:
     axes.set_xticks(range(len(names)), names)
     axes.set(yscale="log", ylabel="µs", title="Error of time stamps without lines, from the best to the worst crystal")
     keys = [Line2D([], [], color=RATE_COLOURS[hz], linewidth=5, label=f"rms, {hz} Hz") for hz in rates]
-    keys.append(Line2D([], [], color="#222", linewidth=1.2, marker="_", label="stated: mean t_err"))
+    keys.append(Line2D([], [], color="#222", linewidth=1.2, marker="_", label="reported: mean t_err"))
     axes.legend(handles=keys, fontsize=8, ncols=2, loc="upper left")
     _finish(axes)
     axes.grid(visible=False, axis="x")
@@ -59,7 +59,7 @@ def lines_figure(found: Sequence[LineFigures]) -> Figure:
         handles=[
             Line2D([], [], color="#555", marker="o", linestyle="", label="σ"),
             Line2D([], [], color="#555", marker="o", markerfacecolor="none", linestyle="", label="mean, either sign"),
-            Line2D([], [], color="#222", marker="|", markersize=9, linestyle="", label="stated: mean t_err"),
+            Line2D([], [], color="#222", marker="|", markersize=9, linestyle="", label="reported: mean t_err"),
         ],
         fontsize=8, loc="upper right",
     )  # fmt: skip

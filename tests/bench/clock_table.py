@@ -1,24 +1,24 @@
-"""Whether the stated error is honest: every adversity on every link, `python -m tests.bench.clock_table` (3 minutes).
+"""Compare `t_err_ns` with the real error in difficult conditions: `python -m tests.bench.clock_table` (3 minutes).
 
-A cell is one adversity on one kind of link, over several machines (`adversity`). Its figures, beside those of the
-commit in `clock_table.json`:
+A cell is one condition on one link, simulated in several installations (`adversity`). The table shows the figures of
+each cell next to the figures of the commit in `clock_table.json`:
 
-    σ           root mean square of `t_ns` - truth, in µs, settled and settling together
+    σ           root mean square of `t_ns` - truth, µs, over the whole run
     settling    share of samples within 2 × t_err_ns in the first 30 s
-    settled     the same afterwards
-    t_err/rms   median of t_err_ns over σ, settled: an error stated far too large is as useless as one far too small
-    rms/rms     root mean square of t_err_ns over σ, settled
+    settled     the same share after 30 s
+    t_err/rms   median of t_err_ns divided by σ, settled; a value far above 1 is as useless as a value far below 1
+    rms/rms     root mean square of t_err_ns divided by σ, settled
 
-The median is of what is usual, and σ mostly of the few samples that are off by far: where a cell has both, t_err/rms is
-low even if each sample states its own error exactly, and rms/rms is 1 then. rms/rms in turn is high where few samples
-state far too much. What is aimed at is of the first: settling ≥ 0.95, settled ≥ 0.97, t_err/rms from 0.8 to 3, σ no
-worse than the base's.
+The median describes normal samples. A few samples with a large error dominate σ. If a cell has both, t_err/rms is low
+even if each t_err_ns is exact. rms/rms is 1 in this case. If a few samples have a much too large t_err_ns, rms/rms is
+high. The goals are: settling ≥ 0.95, settled ≥ 0.97, t_err/rms from 0.8 to 3, σ not larger than at the base commit.
 
-On hosts whose clocks are steered, stepped or stopped the truth is CLOCK_MONOTONIC as it ran, and a sample is off by the
-larger of the errors of `t_ns` and `utc_ns`.
+On hosts with steered, stepped or stopped clocks, the truth is CLOCK_MONOTONIC as it ran. The error of a sample is the
+larger error of `t_ns` and `utc_ns`.
 
-`--quick`: two machines instead of six. `--only TEXT`: cells whose name contains it. `--seeds FIRST`: other machines.
-`--base COMMIT`: compare with that commit, computed now. `--keep COMMIT`: the same, and keep its figures in the tree.
+`--quick`: two installations instead of six. `--only TEXT`: cells whose name contains TEXT. `--seeds FIRST`: other
+installations. `--base COMMIT`: run this commit now and compare with it. `--keep COMMIT`: also store the
+figures.
 """
 
 import argparse
@@ -61,20 +61,20 @@ from tests.bench.adversity import (
 from tests.bench.compare import ROOT, checked_out
 from tests.bench.rows import Row, at_least
 
-if TYPE_CHECKING:  # a base may have none
+if TYPE_CHECKING:  # older base commits do not have this module
     from imud.host.clock import SteadyTime
 
 FILE: Final = Path(__file__).with_suffix(".json")
 SETTLING_NS: Final = 30 * NS_PER_S
 MACHINES: Final = 6
 QUICK: Final = (1, 4)
-"""Machines of the short form: their shortest wake-ups are a quarter and three quarters of the most."""
+"""Installations of the short form: their minimum wake-up times are 1/4 and 3/4 of the maximum."""
 SETTLED_LEAST: Final = 0.97
 SETTLING_LEAST: Final = 0.95
 RATIO_LEAST: Final = 0.8
 RATIO_MOST: Final = 3.0
 WORSE_MOST: Final = 1.02
-"""σ may be so much of the base's: two runs of a changed clock are two draws."""
+"""Maximum ratio of σ to the base. 2 % allow for the random values of two runs."""
 
 
 class CellFigures(msgspec.Struct, frozen=True):
@@ -83,7 +83,7 @@ class CellFigures(msgspec.Struct, frozen=True):
     settled: float
     ratio: float
     rms_ratio: float | None = None
-    """None in figures that were kept before there was one."""
+    """None in figures that an older version stored."""
 
     def short_of(self, base: "CellFigures | None") -> list[str]:
         missed = []
@@ -128,6 +128,7 @@ def cells() -> Iterator[Cell]:
         fast = replace(link, baud=921_600 if link.baud else 0)
         yield Cell("100 Hz to 400 to 50", fast, Device(rates_hz=((0.0, 100.0), (40.0, 400.0), (80.0, 50.0))))
     for link in (USB_1, FT232):
+        # the adapter has a timer of 16 ms, the operating system reports 1 ms
         untold = replace(link, name=f"{link.name}, told 1 ms", timer_ns=16 * NS_PER_MS, told_hold_ns=NS_PER_MS)
         yield Cell("wrong timer", untold)
         yield Cell("wrong timer, loaded host", untold, wake=LOADED)
@@ -179,7 +180,7 @@ HOST_CLOCKS: Final = (
 
 def _host_clocks() -> Iterator[Cell]:
     if "host" not in signature(SampleClock).parameters:
-        return  # a base that knows no such host
+        return  # the base commit has no `host` argument
     for host in HOST_CLOCKS:
         for link in LINKS:
             yield Cell(host.name, link, host=host)
@@ -211,6 +212,7 @@ def dated(cell: Cell, seed: int, seconds: int = SECONDS) -> Iterator[Dated]:
 
 
 def _dated_on(clocks: HostClocks, cell: Cell, seed: int, seconds: int) -> Iterator[Dated]:
+    # import here: older base commits do not have host_clocks.py
     from tests.bench.host_clocks import BEGIN_NS, DECODE_NS, UTC_AHEAD_NS, SteeredHost, Steering
 
     host = SteeredHost(Steering(clocks.name, clocks.slews))
@@ -224,6 +226,7 @@ def _dated_on(clocks: HostClocks, cell: Cell, seed: int, seconds: int) -> Iterat
         begin_ns = None if message.t_begin_ns is None else to(message.t_begin_ns)
         sample = clock.sample(message.measurement, to(message.t_rx_ns), offset_ns, begin_ns)
         truth_ns = to(message.truth_ns)
+        # the larger error of both clocks counts
         off_ns = max(sample.t_ns - truth_ns, sample.utc_ns - host.ahead_ns - truth_ns, key=abs)
         yield Dated(off_ns, sample.t_err_ns, message.truth_ns < settled_ns)
 
@@ -266,6 +269,7 @@ def kept_base() -> Base:
 
 def base_of(commit: str, arguments: Sequence[str]) -> Base:
     program = [sys.executable, "-P", "-m", "tests.bench.clock_table", "--json", *arguments]
+    # imud of the base commit, tests of this tree
     with checked_out(commit) as tree, tempfile.TemporaryDirectory(prefix="imud-clock-table-") as folder:
         (Path(folder) / "imud").symlink_to(tree / "imud")
         (Path(folder) / "tests").symlink_to(ROOT / "tests")
@@ -286,7 +290,7 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
 
 def show(found: Iterable[tuple[str, CellFigures]], base: Figures) -> int:
     columns = "σ, µs | settling | settled | t_err/rms | rms/rms"
-    print(f"| cell | {columns} | before: {columns} | missed |")
+    print(f"| cell | {columns} | base: {columns} | missed |")
     print(f"|{12 * '---|'}")
     short = 0
     for name, got in found:
@@ -323,9 +327,10 @@ def main() -> int:
         if args.keep:
             FILE.write_bytes(msgspec.json.format(msgspec.json.encode(base)) + b"\n")
     else:
+        # the stored figures are from six installations from seed 0 on
         base = kept_base() if not args.quick and not args.seeds and FILE.exists() else Base("", {})
     short = show(found, base.cells)
-    print(f"\n{short} cells miss something")
+    print(f"\n{short} cells miss a goal")
     return 0
 
 

@@ -1,9 +1,9 @@
-"""`make bench-compare BASE=COMMIT`: parts of `make bench` in two checkouts, in turns, and the ratio of each figure.
+"""`make bench-compare BASE=COMMIT`: run parts of `make bench` in two checkouts and print the ratio of each figure.
 
     make bench-compare BASE=v0.1.0 ARGS="clock socket --rounds 5"
 
-Both run on this Python with these dependencies; BASE is checked out beside, and removed at the end. What else the
-machine does meets both alike, and the medians of the rounds are compared.
+Both checkouts use this Python and the same dependencies. The checkout of BASE is temporary. The rounds alternate, so
+that other load on the host affects both checkouts equally. The table compares the medians of the rounds.
 """
 
 import argparse
@@ -44,13 +44,14 @@ class Compared(NamedTuple):
 
 
 def compare(base: Sequence[Figures], here: Sequence[Figures]) -> list[Compared]:
+    # compare only the rows that all rounds of both checkouts contain
     names = [name for name in here[0] if all(name in figures for figures in (*base, *here))]
     return [Compared(name, median(f[name] for f in base), median(f[name] for f in here)) for name in names]
 
 
 @contextmanager
 def checked_out(commit: str) -> Iterator[Path]:
-    """A checkout of a commit in a directory of its own. Raises CalledProcessError for one that is not known."""
+    """Check out a commit in a temporary directory. Raises CalledProcessError if git does not know the commit."""
     with tempfile.TemporaryDirectory(prefix="imud-compare-") as directory:
         tree = Path(directory) / "base"
         subprocess.run(["git", "worktree", "add", "--quiet", "--detach", str(tree), commit], cwd=ROOT, check=True)
@@ -69,13 +70,14 @@ def measure(tree: Path, parts: Sequence[str]) -> Figures:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make bench-compare")
-    parser.add_argument("parts", nargs="+", metavar="PART", help=f"of {', '.join(PARTS)}")
+    parser.add_argument("parts", nargs="+", metavar="PART", help=f"one of {', '.join(PARTS)}")
     parser.add_argument("--base", required=True, metavar="COMMIT")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     args = parser.parse_args()
     measured: dict[Path, list[Figures]] = {}
     with checked_out(args.base) as base:
         for number in range(args.rounds):
+            # alternate the order: the second run of a round may find a warmer processor
             for tree in (base, ROOT) if number % 2 else (ROOT, base):
                 print(f"# round {number + 1}: {'here' if tree == ROOT else args.base}", flush=True)
                 measured.setdefault(tree, []).append(measure(tree, args.parts))
