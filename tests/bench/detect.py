@@ -1,8 +1,8 @@
-"""Duration of detection in virtual time, at every baud rate and at random phases.
+"""Duration of detection in simulated time, at every baud rate and at random phases.
 
-Neither driver nor rate is given: every search tries all families. The device sends at 100 Hz (at 9600 baud as often as
-the line carries); the line is modelled bit by bit, so that wrong rates deliver the garbage that they would. `quick`
-draws fewer phases.
+The search knows neither the driver nor the baud rate, so it tries all families. The device sends at 100 Hz, or at the
+maximum rate of the serial port at 9600 baud. The simulation models each bit, so a wrong baud rate delivers realistic
+garbage. `quick` uses fewer phases.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,6 +23,7 @@ from tests.support.uart_wire import FakeDevice, run_search
 
 COLD_S = 2.0
 REMEMBERED_S = 0.3
+# latency timers of the adapters: without an adapter, and an FT232 by default
 HOLDS_MS = (0, 16)
 
 
@@ -44,7 +45,7 @@ def random_hi91(random: Random) -> bytes:
 
 @dataclass(frozen=True)
 class Family:
-    """A driver, what its devices send as delivered, and how they answer when asked who they are."""
+    """A driver, the stream of its devices with factory settings, and their reply to the identity request."""
 
     driver: StreamDriver
     make_frame: Callable[[Random], bytes]
@@ -65,13 +66,15 @@ DRIVERS = [family.driver for family in FAMILIES]
 
 
 def measure(family: Family, baud: int, hold_ms: int, phases: int, *, remembered: bool) -> tuple[list[float], int]:
-    """Times to lock in s, and how many searches found something false or nothing."""
+    """Return the times until detection, s, and the number of searches with a wrong result or without a result."""
     driver = family.driver
     random = Random(f"{baud} {hold_ms} {remembered}")
+    # an adapter without a timer is polled every 1 ms
     poll_ns = max(hold_ms, 1) * NS_PER_MS
     far = FakeDevice(driver, baud, 100, poll_ns=poll_ns, random=random, make_frame=family.make_frame)
     times_s, wrong = [], 0
     for _ in range(phases):
+        # the start of the search relative to the device's frames is random
         far.phase_ns = random.randrange(NS_PER_S)
         memory = (driver.name, baud) if remembered else None
         search = Search(DRIVERS, remembered=memory, may_ask=True, hold_ns=hold_ms * NS_PER_MS)
@@ -82,7 +85,10 @@ def measure(family: Family, baud: int, hold_ms: int, phases: int, *, remembered:
 
 
 def measure_rare(family: Family, rate_hz: float, phases: int) -> tuple[list[float], int]:
-    """Times in s to find a device at `rate_hz` (0: it only answers a query) at random baud rates, and failures."""
+    """Return the detection times at `rate_hz` and random baud rates, s, and the number of failures.
+
+    If `rate_hz` is 0, the device only replies to requests.
+    """
     driver, random = family.driver, Random(f"{rate_hz}")
     times_s, wrong = [], 0
     for _ in range(phases):
@@ -113,9 +119,9 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
                 yield Row(f"detect {how}, all rates, p50", quantiles(everything, n=2)[0], "s")
                 yield at_most(f"detect {how}, all rates, p95", quantiles(everything, n=20)[-1], "s", limit_s)
                 yield at_most(f"detect {how}, all rates, max", max(everything), "s", limit_s)
-        for name, rate_hz in (("10 Hz", 10), ("1 Hz", 1), ("silent, asked", 0)):
+        for name, rate_hz in (("10 Hz", 10), ("1 Hz", 1), ("silent, on request", 0)):
             times_s, wrong = measure_rare(family, rate_hz, phases // 5)
             failed += wrong
             yield Row(f"detect {family.driver.name} cold, {name}, p50", quantiles(times_s, n=2)[0], "s")
             yield Row(f"detect {family.driver.name} cold, {name}, p95", quantiles(times_s, n=20)[-1], "s")
-    yield at_most("detect: searches without or with a false result", failed, "", 0)
+    yield at_most("detect: searches without a result or with a wrong result", failed, "", 0)

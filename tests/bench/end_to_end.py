@@ -1,4 +1,4 @@
-"""End to end against the bare loop: pty → decode → clock → shared memory → socket client's receive, in one run."""
+"""CPU time and latency of imud and the bare loop: pty → decode → clock → shared memory → socket client, in one run."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -22,6 +22,7 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
 
 def compare(load: Load, rounds: int) -> Iterator[Row]:
     pairs = [(run(load), run(replace(load, bare=True))) for _ in range(rounds)]
+    # the best of the rounds: other programs on the host only increase CPU time and latency
     imud = min((a for a, _ in pairs), key=lambda o: o.cpu_us_per_sample)
     bare = min((b for _, b in pairs), key=lambda o: o.cpu_us_per_sample)
     name = f"1 kHz, {load.clients} {load.encoding} clients"
@@ -44,7 +45,7 @@ def many(devices: int, seconds: float) -> tuple[Outcome, Outcome]:
 
 
 def growth(seconds: float, sizes: Sequence[int]) -> Iterator[Row]:
-    """Cost by the number of devices, and how many go on one core without loss."""
+    """Yield the CPU time by number of devices, and the largest number of devices on one core without lost samples."""
     most = 0
     for devices in sizes:
         imud, bare = many(devices, seconds)

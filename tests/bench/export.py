@@ -1,12 +1,12 @@
-"""Time of `imud export` for an hour at 400 Hz, in each format.
+"""Duration of `imud export` for one hour of samples at 400 Hz, in each format.
 
-`python -m tests.bench.export [--quick] [--keep FOLDER]`; `--quick` exports two minutes, and judges nothing.
+`python -m tests.bench.export [--quick] [--keep FOLDER]`; `--quick` exports two minutes and checks no goal.
 
-A simulated IMU61X at 400 Hz sends to a daemon that plays and records as fast as it can, with time stamps of the hour;
-a simulated HI91 module, whose samples have more fields, does so at 500 Hz for the same number of samples. Each export
-is the command itself, in its own processes. CPU is that of all of them, user and system, which other programs on the
-machine disturb less than the time that passes; with both cores free the time is what counts. `--keep` leaves the
-recordings in a folder, and takes them from there if they are there already.
+The recordings are from a simulated IMU61x at 400 Hz and a simulated HI91 device at 500 Hz. Both have the same number of
+samples; HI91 samples have more fields. A daemon replays and records them as fast as possible, with the time stamps of
+one hour. The part runs the command itself. CPU is the sum of the user and system time of all its processes. Other
+programs on the host affect this sum less than the duration. If both cores are idle, the duration is the relevant
+figure. `--keep` stores the recordings in FOLDER and uses existing recordings there.
 """
 
 import os
@@ -62,11 +62,14 @@ def export_rows(name: str, recording: Path, samples: int, folder: Path, limit_s:
         process = subprocess.Popen(argv, stderr=subprocess.PIPE, text=True)
         assert process.stderr is not None
         said = process.stderr.read()
+        # wait4 includes the CPU time of the worker processes of the export
         _, status, used = os.wait4(process.pid, 0)
         spent_s = monotonic() - begin_s
         process.returncode = os.waitstatus_to_exitcode(status)
         process.stderr.close()
+        # the last paragraph of the progress output starts with the number of samples
         exported = int(said.rsplit("\n\n", 1)[-1].split()[0])
+        # a recording may contain up to 1 % fewer samples
         if process.returncode or abs(exported - samples) > samples // 100:
             raise SystemExit(f"{name}, {words}: expected {samples} samples, status {process.returncode}:\n{said}")
         what = f"{name}, {words}: time for {exported} samples"

@@ -1,11 +1,13 @@
-"""`make fleet-cluster`: three NATS servers with JetStream and MQTT, of which one is killed while gateways send.
+"""`make fleet-cluster`: three NATS servers with JetStream and MQTT; one server is killed while gateways publish.
 
-`python -m tests.bench.fleet_cluster [--gateways 200] [--seconds 30]`. The servers are Debian's
-nats-server, which speaks MQTT 3.1.1; sessions and messages are on three of them. Gateways are simulated, but for a few
-more that are the output `mqtt` itself, each in a process of its own, with a device at 1 kHz, every sample as a slot.
-The collector is that of the package; with --postgres it writes rows. A third of the way through the server that it is
-connected to is killed with SIGKILL. Gateways and collector go to the next server of their lists, and gateways send
-again what was not acknowledged. It ends with 1 where a number is missing at the end.
+`python -m tests.bench.fleet_cluster [--gateways 200] [--seconds 30] [--postgres]`. The servers are Debian's nats-server
+with MQTT 3.1.1. Each session and each message is on three servers. `--gateways` gateways are simulated. OUTPUTS further
+gateways are the output `mqtt` in processes of their own, each with a device at 1 kHz that sends every sample as a slot.
+The collector is `FleetCollector`. With `--postgres` it writes rows.
+
+After a third of the time, SIGKILL ends the server that the collector uses. Gateways and collector connect to the next
+server of their lists. Gateways send all messages without an acknowledgment again. The exit status is 1 if a sequence
+number is missing at the end.
 """
 
 import argparse
@@ -31,7 +33,7 @@ from tests.support.surroundings import free_port
 PROGRAM: Final = shutil.which("nats-server") or shutil.which("nats-server", path="/usr/sbin:/sbin")
 SERVERS: Final = 3
 OUTPUTS: Final = 3
-"""Gateways that are the output `mqtt` itself."""
+"""Number of gateways that run the output `mqtt`."""
 LIMIT_S: Final = 60.0
 ACCOUNT_WORDS: Final = ("p50_ms", "p99_ms", "max_ms", "duplicates", "missing", "open")
 
@@ -51,7 +53,7 @@ class Cluster:
         end_s = time.monotonic() + LIMIT_S
         while not all(map(is_healthy, self.monitors)):
             if time.monotonic() > end_s:
-                raise TimeoutError(f"no cluster within {LIMIT_S:g} s; see {folder}")
+                raise TimeoutError(f"expected a NATS cluster within {LIMIT_S:g} s; see the logs in {folder}")
             time.sleep(0.2)
 
     def kill(self, at: int) -> None:
@@ -77,7 +79,7 @@ mqtt {{ listen: "127.0.0.1:{port}" }}
 
 
 def is_healthy(monitor: int) -> bool:
-    """Whether a server has joined, with JetStream."""
+    """Return whether a server has joined the cluster and JetStream is ready."""
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{monitor}/healthz", timeout=2) as answer:
             return bool(answer.status == 200)
@@ -89,9 +91,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="make fleet-cluster")
     parser.add_argument("--gateways", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--postgres", action="store_true", help="the collector writes into a PostgreSQL")
+    parser.add_argument("--postgres", action="store_true", help="let the collector write rows into PostgreSQL")
     args = parser.parse_args()
-    missing = "" if PROGRAM else "nats-server is not installed (apt-get install nats-server)"
+    missing = "" if PROGRAM else "cannot find nats-server; try apt-get install nats-server"
     if missing := missing or (NO_POSTGRES if args.postgres else ""):
         print(missing)
         return 1
@@ -116,19 +118,23 @@ class Output:
         self.gateway = KilledGateway(ports, spool, 1, name=name, version="3.1.1")
 
     def end(self) -> int:
-        """Have it send what it has; return how many numbers it gave. Raises TimeoutError where something is left."""
+        """Send the rest of the spool and end the gateway. Return the number of used sequence numbers.
+
+        Raises TimeoutError if messages remain in the spool.
+        """
         drained = self.gateway.drain(LIMIT_S)
         self.gateway.kill()
         rows, positions = in_spool(self._spool)
         if not drained or rows:
-            raise TimeoutError(f"{len(rows)} messages still wait after {LIMIT_S:g} s")
+            raise TimeoutError(f"expected an empty spool within {LIMIT_S:g} s, got {len(rows)} messages")
         return sum(one.last - one.begin + 1 for one in positions)
 
 
 def play(
     cluster: Cluster, collector: CollectorProcess, fleet: GatewayFleet, outputs: Sequence[Output], seconds: float
 ) -> int:
-    """Send for so long, kill a server meanwhile, and print the account; 1 where it does not close."""
+    """Publish for `seconds`, kill a server, and print the result. Return 1 if samples are missing, otherwise 0."""
+    # 8 s until all gateways are connected
     fleet.run(8.0)
     killed = False
 
@@ -136,20 +142,19 @@ def play(
         nonlocal killed
         if not killed and at_s > seconds / 3:
             killed = True
+            # the collector connects to the first server of the list
             cluster.kill(0)
 
     acknowledged = acknowledged_by(fleet)
     fleet.run(seconds, tick)
     print(f"  acknowledged {(acknowledged_by(fleet) - acknowledged) / seconds:.0f} messages/s")
-    print(
-        f"  waiting when gateways stop: {fleet.waiting} messages; acknowledged after {fleet.drain():.1f} s", flush=True
-    )
+    print(f"  waiting at the end: {fleet.waiting} messages; all acknowledged after {fleet.drain():.1f} s", flush=True)
     own = sum(one.end() for one in outputs)
     numbered = fleet.numbered + own
     account = collector.end(numbered)
     fleet.clients.close()
     print(
-        f"  numbered {numbered}, {own} of them by outputs; came {account['came']}, "
+        f"  numbered {numbered}, {own} of them by outputs; received {account['came']}, "
         f"connections of the collector {account['connects']}"
     )
     print("  " + ", ".join(f"{word} {account[word]:.0f}" for word in ACCOUNT_WORDS))

@@ -1,9 +1,9 @@
-"""The collector of the package, measured: a process with `FleetCollector`, with rows into PostgreSQL or without.
+"""The collector in a process of its own, for measurements: `FleetCollector`, with or without rows in PostgreSQL.
 
     python -m tests.bench.fleet_collector --version 3.1.1 --to postgresql://… URL …
 
-It prints `ready` when it is connected, reads from standard input how many samples were numbered, waits until all of
-them have come, and prints its account as JSON.
+The process prints `ready` after it has connected. It reads the number of published samples from standard input, waits
+until all these samples have arrived, and prints its counters as JSON.
 """
 
 import argparse
@@ -57,14 +57,14 @@ class CollectorProcess:
         assert self.popen.stdout.readline().strip() == "ready"
 
     def end(self, numbered: int) -> dict[str, Any]:
-        """Have it wait for all numbers; return its account."""
+        """Wait until the collector has received `numbered` samples. Return its counters."""
         said, _ = self.popen.communicate(f"{numbered}\n", timeout=2 * END_S)
         found: dict[str, Any] = json.loads(said)
         return found
 
 
 async def collect(urls: Sequence[str], version: str, to: str) -> dict[str, Any]:
-    """Collect until everything has come that standard input says; return the account."""
+    """Collect until the number of samples from standard input has arrived. Return the counters."""
     fleet = Fleet(*urls, name="load", version=version, from_begin=True, retry_max_s=1.0)
     store = MeasuredStore(PostgresStore(to) if to else None)
     collector = FleetCollector(fleet, store)
@@ -74,6 +74,7 @@ async def collect(urls: Sequence[str], version: str, to: str) -> dict[str, Any]:
     print("ready", flush=True)
     due = int(await asyncio.to_thread(sys.stdin.readline))
     end_s = monotonic() + END_S
+    # after END_S, return the counters although samples are missing: the caller reports the difference
     while store.came < due and monotonic() < end_s and not running.done():
         await asyncio.sleep(LOOK_S)
     collector.stop()

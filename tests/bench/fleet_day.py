@@ -1,10 +1,13 @@
-"""`make fleet-day`: a spool with what a day without a network makes, and how long the broker then takes to get it.
+"""`make fleet-day`: fill a spool with the messages of a day without a network, and measure the time of its replay.
 
 `python -m tests.bench.fleet_day [--hours 24] [--devices 2] [--messages-per-s 200] [--newest-first] [--live-hz 100]`.
-Each device has statistics of 1 Hz in messages of 1 s, as by default. The spool is filled as fast as the disk takes it,
-by the output's own parts; then the output, mosquitto and a collector start, and the time is measured until the whole
-day has come. With --live-hz a further device has samples meanwhile, whole ones in messages of 1 s, and the time from
-the newest of a message to its arrival is printed. It ends with 1 where a number is missing, or came out of its order.
+Each device has statistics of 1 Hz in messages of 1 s, like the default. The classes of the output fill the spool as
+fast as the disk allows. Then the output, mosquitto and a collector start. The program measures the time until the
+collector has received the whole day.
+
+With `--live-hz`, a further device publishes whole samples in messages of 1 s at the same time. The program prints the
+delay from the newest sample of a message to its arrival. The exit status is 1 if a sequence number is missing or if the
+order is wrong.
 """
 
 import argparse
@@ -27,7 +30,7 @@ from tests.fleet.gateways import LiveGateway
 from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, running_broker
 
 RATE_HZ: Final = 4
-"""Samples a second: a message of statistics has the same size for any rate."""
+"""Sample rate, Hz. A message of statistics has the same size at each rate."""
 TOGETHER_S: Final = 60
 LIMIT_S: Final = 1800.0
 SPOOL_BYTES: Final = 4 << 30
@@ -44,6 +47,7 @@ def fill(folder: Path, hours: float, devices: int) -> tuple[int, int]:
     begin_utc_ns = time_ns() - seconds * NS_PER_S
     for begin_s in range(0, seconds, TOGETHER_S):
         end_s = min(begin_s + TOGETHER_S, seconds)
+        # commit 60 s in one transaction, so that the disk is not the limit
         rows = [row for number, one in enumerate(streams) for row in one.add(list(samples(number, begin_s, end_s)))]
         spool.commit(rows, (), begin_s * NS_PER_S, begin_utc_ns + begin_s * NS_PER_S)
     spool.commit([row for one in streams for row in one.flush()], (), seconds * NS_PER_S, time_ns())
@@ -65,7 +69,8 @@ def samples(device: int, begin_s: int, end_s: int) -> Iterator[Sample]:
 class LiveData:
     def __init__(self, rate_hz: float) -> None:
         self.delays_s: list[float] = []
-        """From the newest sample of a message to its arrival, in the order of arrivals, within the 20 ms of a look."""
+        """Delays from the newest sample of a message to its arrival, s, in order of arrival. The resolution is 20 ms,
+        the time between two calls of `look`."""
         self._looked = 0
         self._rate_hz, self._begin_s, self._seq = rate_hz, monotonic(), 0
 
@@ -79,7 +84,7 @@ class LiveData:
             gateway.output.publish(Batch(LIVE, 0, made))
 
     def look(self, collector: Collector) -> None:
-        """Note messages that came since the last call; `utc_ns` of these samples is CLOCK_MONOTONIC."""
+        """Store the delays of new messages. `utc_ns` of these samples contains CLOCK_MONOTONIC."""
         fresh, now_s = collector.fresh, monotonic()
         end = len(fresh)
         found = [one.utc_ns / NS_PER_S for one in fresh[self._looked : end] if one.device == LIVE]
@@ -101,6 +106,7 @@ def replay(args: argparse.Namespace, spool: Path, port: int, messages: int) -> i
     live = LiveGateway(spool, port, spool_mb=SPOOL_BYTES / 1e6, devices=devices, **settings)
     pause = threading.Event()
     took_s = 0.0
+    # without live data, stop after the replay; with live data, also wait for a first delay
     while monotonic() - begin_s < LIMIT_S and not (took_s and (data.delays_s or not args.live_hz)):
         if not took_s and has_all(collector, args.devices, last):
             took_s = monotonic() - begin_s
@@ -129,7 +135,7 @@ def report(args: argparse.Namespace, collector: Collector, data: LiveData, messa
     if delays_s := sorted(data.delays_s):
         p50_s, p99_s = delays_s[len(delays_s) // 2], delays_s[len(delays_s) * 99 // 100]
         late = f"delay median {p50_s:.1f} s, p99 {p99_s:.1f} s, largest {delays_s[-1]:.1f} s"
-        print(f"  live meanwhile: {len(delays_s)} messages, {late}")
+        print(f"  live device: {len(delays_s)} messages, {late}")
     return int(bool(missing or out_of_order) or len(days) != args.devices)
 
 
@@ -137,9 +143,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="make fleet-day")
     parser.add_argument("--hours", type=float, default=24.0)
     parser.add_argument("--devices", type=int, default=2)
-    parser.add_argument("--messages-per-s", type=float, help="bound of the replay, as mqtt.messages_per_s")
-    parser.add_argument("--newest-first", action="store_true", help="as mqtt.newest_first: live data before the day's")
-    parser.add_argument("--live-hz", type=float, default=0.0, help="samples of a further device meanwhile; 0: none")
+    parser.add_argument("--messages-per-s", type=float, help="limit of the replay, like mqtt.messages_per_s")
+    parser.add_argument(
+        "--newest-first", action="store_true", help="send live data before the replayed day, like mqtt.newest_first"
+    )
+    parser.add_argument("--live-hz", type=float, default=0.0, help="rate of a further live device; 0 for no device")
     args = parser.parse_args()
     if NO_MOSQUITTO:
         print(NO_MOSQUITTO)

@@ -1,13 +1,14 @@
-"""`make fleet-faults`: a gateway, a broker and everything that can happen between them, as a table.
+"""`make fleet-faults`: a gateway, a broker and all faults between them, as a table.
 
 `python -m tests.bench.fleet_faults [--seconds 20] [--tls] [--postgres] [FAULT …]`. A gateway is the output `mqtt` in a
-process of its own, with one device at 1 kHz, every sample as a slot and statistics of 10 Hz. Each fault begins once
-samples arrive, and lasts `--seconds`; catching up is from its end until nothing waits that is older than three seconds.
-At the end the gateway is killed with SIGKILL, and the ledger has to close: what its spool's file has given numbers to
-is what came, or what still waits. It ends with 1 where a number is missing, or the ledger does not close.
+process of its own, with one device at 1 kHz that sends every sample as a slot, and statistics of 10 Hz. Each fault
+starts when samples arrive and lasts `--seconds`. The catch-up time is the time from the end of the fault until no
+message older than three seconds is in the spool. Then SIGKILL ends the gateway. The ledger balances if each sequence
+number in the spool's file has arrived or is still in the spool. The exit status is 1 if a sequence number is missing or
+a ledger does not balance.
 
-With --tls the gateway speaks TLS, with certificates of both sides. With --postgres `imud fleet collect` writes rows
-meanwhile, of which there have to be as many as whole samples that came.
+With `--tls`, gateway and broker use TLS with certificates on both sides. With `--postgres`, `imud fleet collect` also
+writes rows. The number of rows must be equal to the number of received whole samples.
 """
 
 import argparse
@@ -31,10 +32,10 @@ from tests.fleet.proxy import Proxy
 from tests.support.surroundings import free_port
 
 CAUGHT_UP: Final = 30
-"""Messages in the spool of a gateway that is up to date: those of three transactions, ten in each."""
+"""Maximum number of messages in the spool of an up-to-date gateway: three transactions of ten messages."""
 LIMIT_S: Final = 300.0
 UP_S: Final = 3.0
-"""Between two restarts: a mosquitto that is ended while it starts does not end."""
+"""Time between two restarts, s. mosquitto ignores SIGTERM during its start."""
 SMALL_MB: Final = 1.0
 
 
@@ -67,6 +68,7 @@ class Scene:
     def _prepare(self, client: Any) -> None:
         take = client.on_message
 
+        # 0.2 s per message: 5 messages/s
         def slowly(*args: object) -> None:
             if self.held.is_set():
                 threading.Event().wait(0.2)
@@ -92,7 +94,9 @@ class Scene:
     def catch_up(self) -> float:
         took = self.watch(LIMIT_S, lambda waiting: waiting <= CAUGHT_UP)
         if took >= LIMIT_S:
-            raise TimeoutError(f"still not up to date after {LIMIT_S:g} s")
+            raise TimeoutError(
+                f"expected an up-to-date gateway within {LIMIT_S:g} s after the fault; older messages are in the spool"
+            )
         return took
 
     def close(self) -> None:
@@ -173,12 +177,13 @@ def kill_gateway(scene: Scene, seconds: float) -> None:
 
 def kill_full(scene: Scene, seconds: float) -> None:
     scene.proxy.cut()
+    # 95 % of the size limit, because the spool stays below the limit
     full = round(SMALL_MB * 950_000)
     end = monotonic() + LIMIT_S
     while scene.high_water < full:
         scene.watch(1.0)
         if monotonic() > end:
-            raise TimeoutError(f"the spool has {scene.high_water} bytes after {LIMIT_S:g} s")
+            raise TimeoutError(f"expected {full} bytes in the spool within {LIMIT_S:g} s, got {scene.high_water}")
     for _ in range(3):
         scene.watch(seconds / 3)
         scene.gateway.kill()
@@ -196,19 +201,20 @@ def kill_collector(scene: Scene, seconds: float) -> None:
             scene.rows.start()
 
 
+# by name: function and description in the table
 FAULTS: Final[Mapping[str, tuple[Fault, str]]] = {
     "none": (nothing, "none"),
-    "restart": (restart, "the broker is ended and comes back"),
-    "restarts": (kill_broker, "the same three times"),
+    "restart": (restart, "the broker restarts"),
+    "restarts": (kill_broker, "the broker restarts three times"),
     "freeze": (freeze, "the broker's process is stopped (SIGSTOP)"),
-    "refuse": (refuse, "the broker refuses what the gateway sends"),
-    "half-open": (half_open, "nothing passes, and no end learns of it"),
+    "refuse": (refuse, "the broker rejects the messages of the gateway"),
+    "half-open": (half_open, "the network drops all data, and the connection stays open"),
     "cut": (cut, "the network is cut"),
-    "slow-network": (slow_network, "20 kB/s pass"),
-    "slow-collector": (slow_collector, "the collector takes 5 messages a second"),
-    "kill": (kill_gateway, "SIGKILL three times while the network is cut"),
-    "kill-full": (kill_full, "the same with a spool of 1 MB that is full"),
-    "kill-collector": (kill_collector, "SIGKILL three times of the collector that writes rows"),
+    "slow-network": (slow_network, "the network is limited to 20 kB/s"),
+    "slow-collector": (slow_collector, "the collector reads 5 messages per second"),
+    "kill": (kill_gateway, "SIGKILL of the gateway, three times, while the network is cut"),
+    "kill-full": (kill_full, "SIGKILL of the gateway, three times, with a full spool of 1 MB"),
+    "kill-collector": (kill_collector, "SIGKILL of the collector with rows, three times"),
 }
 
 
@@ -223,7 +229,7 @@ class Result(NamedTuple):
     high_water: int
     catch_up_s: float
     rows: int | None
-    """In the database; None without one."""
+    """Number of rows in the database; None without a database."""
 
     @property
     def closes(self) -> bool:
@@ -235,7 +241,7 @@ def play(name: str, folder: Path, seconds: float, *, tls: bool, database: str) -
     fault, _ = FAULTS[name]
     rights = folder / "rights"
     rights.write_text("topic readwrite #\n")
-    # with rights, mosquitto 2.0.11 keeps nothing for readers that are away since its restart (docs/fleet.md)
+    # with an ACL, mosquitto 2.0.11 stores no messages for readers that are offline since its restart (docs/fleet.md)
     lines = ("allow_anonymous true", *((f"acl_file {rights}",) if name == "refuse" else ()))
     spool_mb = SMALL_MB if name == "kill-full" else 256.0
     scene = Scene(folder, *lines, spool_mb=spool_mb, tls=tls, database=database)
@@ -243,12 +249,13 @@ def play(name: str, folder: Path, seconds: float, *, tls: bool, database: str) -
         scene.collector.wait_for(lambda: len(scene.collector.fresh) > 5, 60.0)
         fault(scene, seconds)
         catch_up_s = scene.catch_up()
+        # 2 s for the last messages that are on their way to the collector
         scene.watch(2.0)
         scene.gateway.kill()
         counts = [one for (_, stream), one in closes(scene.collector, scene.spool).items() if stream == Stream.SAMPLES]
         rows = None if scene.rows is None else scene.rows.rows_after(sum(one.whole for one in counts))
         if scene.rows is not None and (missing := scene.rows.missing()):
-            raise AssertionError(f"the ledger in the database misses {missing}")
+            raise AssertionError(f"expected no missing samples in the ledger of the database, got {missing}")
     finally:
         scene.close()
     numbered = last_numbers(scene.spool)
@@ -261,7 +268,7 @@ def play(name: str, folder: Path, seconds: float, *, tls: bool, database: str) -
 
 
 def last_numbers(spool: Path) -> int:
-    """Samples that the spool of a gateway that has ended gave numbers to, in all its boots."""
+    """Return the number of samples that the spool of an ended gateway has numbered, over all its boots."""
     _, positions = in_spool(spool)
     return sum(one.last - one.begin + 1 for one in positions if one.stream == Stream.SAMPLES)
 
@@ -269,9 +276,9 @@ def last_numbers(spool: Path) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make fleet-faults")
     parser.add_argument("faults", nargs="*", choices=[[], *FAULTS], metavar="FAULT", help=", ".join(FAULTS))
-    parser.add_argument("--seconds", type=float, default=20.0, help="how long each fault lasts (default: %(default)g)")
-    parser.add_argument("--tls", action="store_true", help="between gateway and broker")
-    parser.add_argument("--postgres", action="store_true", help="count the rows that `imud fleet collect` writes")
+    parser.add_argument("--seconds", type=float, default=20.0, help="duration of each fault, s (default: %(default)g)")
+    parser.add_argument("--tls", action="store_true", help="use TLS between gateway and broker")
+    parser.add_argument("--postgres", action="store_true", help="also count the rows of `imud fleet collect`")
     args = parser.parse_args()
     if missing := NO_MOSQUITTO or (NO_POSTGRES if args.postgres else ""):
         print(missing)

@@ -1,10 +1,10 @@
-"""`make fleet-load`: gateways that are simulated, one broker and one collector: how many are held, and what it takes.
+"""`make fleet-load`: CPU time, memory and delays with many simulated gateways, one broker and one collector.
 
-`python -m tests.bench.fleet_load [--gateways 1000] [--seconds 30] [--postgres]`. Every gateway sends what the output
-`mqtt` sends of two devices with `rate_hz: 10` and `batch_s: 1`: a message a second and device, with ten intervals of
-acceleration, rate of turn and angles. The collector is that of the package in a process of its own; with --postgres it
-writes rows. At the end the gateways stop, everything they have numbered has to arrive, and the program ends with 1
-where anything is missing.
+`python -m tests.bench.fleet_load [--gateways 1000] [--seconds 30] [--postgres]`. Each simulated gateway sends the
+messages of the output `mqtt` for two devices with `rate_hz: 10` and `batch_s: 1`: one message per second and device,
+with ten intervals of acceleration, rotation rate and angles. The collector is `FleetCollector` in a process of its own.
+With `--postgres` it writes rows. At the end, the gateways stop, and all numbered samples must arrive. The exit status
+is 1 if a sample is missing.
 """
 
 import argparse
@@ -56,8 +56,10 @@ def intervals_of(first: int) -> list[Interval]:
     found = _MADE.get(first)
     if found is None:
         size = SAMPLES // INTERVALS
+        # all gateways of a second share the intervals: encoding must not limit the load
         found = [_interval(begin, begin + size - 1) for begin in range(first, first + SAMPLES, size)]
         _MADE[first] = found
+        # forget intervals of 100 s ago
         _MADE.pop(first - 100 * SAMPLES, None)
     return found
 
@@ -76,6 +78,7 @@ def _interval(first: int, last: int) -> Interval:
 
 class GatewayFleet:
     def __init__(self, number: int, ports: Sequence[int]) -> None:
+        # 5 s for the connections; the gateways send at different moments of a second
         begin_s = monotonic() + 5.0
         self.gateways = [SimulatedGateway(one, ports, begin_s + one / number) for one in range(number)]
         self.clients = Clients([one.client for one in self.gateways])
@@ -116,6 +119,7 @@ def measure(number: int, seconds: float, *, to: str = "") -> Iterator[tuple[str,
     ) as broker:  # fmt: skip
         collector = CollectorProcess([broker.port], version="5", to=to)
         fleet = GatewayFleet(number, [broker.port])
+        # 6 s until all gateways are connected and send
         fleet.run(6.0)
         pids = {"broker": broker.pid, "collector": collector.popen.pid, "gateways": os.getpid()}
         before, acknowledged = {name: cpu_ns(pid) for name, pid in pids.items()}, acknowledged_by(fleet)
@@ -126,8 +130,8 @@ def measure(number: int, seconds: float, *, to: str = "") -> Iterator[tuple[str,
         memory = {name: rss_mb(pid) for name, pid in pids.items()}
         yield "messages acknowledged", (acknowledged_by(fleet) - acknowledged) / elapsed_s, "1/s"
         yield "messages waiting at the end", float(fleet.waiting), ""
-        yield "gateways late at most", fleet.late_s, "s"
-        yield "everything acknowledged after", fleet.drain(), "s"
+        yield "maximum delay of a gateway", fleet.late_s, "s"
+        yield "time until all acknowledged", fleet.drain(), "s"
         account = collector.end(fleet.numbered)
         fleet.clients.close()
     for name in pids:
@@ -148,7 +152,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="make fleet-load")
     parser.add_argument("--gateways", type=int, default=1000)
     parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--postgres", action="store_true", help="the collector writes into a PostgreSQL")
+    parser.add_argument("--postgres", action="store_true", help="let the collector write rows into PostgreSQL")
     args = parser.parse_args()
     if missing := NO_MOSQUITTO or (NO_POSTGRES if args.postgres else ""):
         print(missing)

@@ -1,4 +1,4 @@
-"""`imud fleet collect --to postgresql://…` as a process beside faults, which is ended and killed, and its tables."""
+"""`imud fleet collect --to postgresql://…` as a process that tests end and kill, and queries of its tables."""
 
 import signal
 import subprocess
@@ -13,10 +13,10 @@ LIMIT_S = 120.0
 
 
 class RowCollector:
-    """The process. Synchronization: one thread."""
+    """The process of the collector. Synchronization: one thread."""
 
     def __init__(self, broker: str, database: str, log: Path, options: Sequence[str] = ()) -> None:
-        """`options` are further ones of the command line."""
+        """`options` contains further options of the command line."""
         words = [sys.executable, "-m", "imud", "fleet", "collect", broker, "--to", database, "--from-begin", *options]
         self._words, self._database, self._log = words, database, log
         self._process: subprocess.Popen[bytes] | None = None

@@ -1,10 +1,12 @@
-"""A process that plays many modules of several drivers into as many ptys, each at a rate of its own, and keeps count.
+"""Process that simulates devices of several drivers on one pty each, each at its own rate, and counts the frames.
 
     python -m tests.bench.fleet_writer --seconds S DRIVER:HZ …
 
-Prints one line with the slave paths, waits for a line on standard input, plays, and prints as JSON for each device how
-many frames its pty took, and how many it refused before the last one that it took: later ones leave no gap.
-What is due is sent, however late: device time goes on while this process is not run.
+The process prints one line with the paths of the slaves, waits for a line on standard input, and sends the frames. Then
+it prints JSON: for each device, the number of frames that its pty accepted, and the number of frames that its pty
+rejected before the last accepted frame. Later rejected frames cause no gap.
+
+The process sends each frame, also if it is late: device time continues while the process does not run.
 """
 
 import argparse
@@ -28,12 +30,13 @@ from tests.bench.writer import open_ptys, template
 BEGIN_NS: Final = 10_000_000
 SEED: Final = 25
 VALUES: Final = 997
-"""Different values that follow one another again and again: a recording cannot compress them away."""
+"""Number of different values before they repeat. A recording cannot compress this many values well."""
+# bytes of acceleration and rotation rate in an HI91 frame
 ACCEL_AND_GYRO: Final = slice(18, 42)
 
 
 def noisy_values() -> list[tuple[Vector3, Vector3]]:
-    """Acceleration and rotation rate of a module at rest, with its noise; the same in every run."""
+    """Return acceleration, m/s², and rotation rate, rad/s, of a device at rest with noise, equal in all runs."""
     random = Random(SEED)
     return [
         (
@@ -95,12 +98,13 @@ class Player:
             whole = False
         if whole:
             self.taken += 1
+            # rejected frames cause a gap only if a later frame arrives
             self.refused += self._refused_since
         self._refused_since = 0 if whole else self._refused_since + 1
 
 
 def play(players: list[Player], seconds: float) -> None:
-    """Send every frame when it is due; the devices begin at different moments."""
+    """Send each frame at its due time. The devices start at different times."""
     start_ns = time.monotonic_ns() + BEGIN_NS
     end_ns = start_ns + int(seconds * 1e9)
     due = [(start_ns + int(p.period_ns * n / len(players)), n) for n, p in enumerate(players)]
@@ -114,6 +118,7 @@ def play(players: list[Player], seconds: float) -> None:
             time.sleep(wait_ns / 1e9)
         players[number].send()
         counts[number] += 1
+        # compute the due time from the start: rounding errors do not add up
         heapq.heapreplace(due, (first_ns[number] + int(counts[number] * players[number].period_ns), number))
 
 

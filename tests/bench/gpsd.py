@@ -1,10 +1,10 @@
-"""The daemon against gpsd: one device at 1 kHz, ten clients that get all of it as JSON, in turns in one run.
+"""CPU time of imud and gpsd: one device at 1 kHz, ten clients that receive all samples as JSON, alternating in one run.
 
-gpsd is given attitude sentences ($OHPR) of about the size of an HI91 frame, which it reports as ATT objects over TCP;
-imud HI91 frames, over its UNIX socket. Each client gets each sample at once; a third measurement lets imud gather
-samples for 10 ms, which gpsd cannot. The sentences come in UDP datagrams: on a pseudo-terminal gpsd 3.22 stands still
-after the first read without bytes, until another descriptor wakes it. Needs gpsd (`make bench-deps`); without it there
-are no rows.
+gpsd receives attitude sentences ($OHPR) of about the size of an HI91 frame and sends ATT objects over TCP. imud
+receives HI91 frames and uses its UNIX socket. Each client receives each sample immediately. In a third measurement,
+imud holds samples for 10 ms; gpsd has no such function. The sentences are UDP datagrams: on a pseudo-terminal, gpsd
+3.22 stops after the first read without bytes until another descriptor wakes it. The part needs gpsd (`make
+bench-deps`). Without gpsd, it returns no rows.
 """
 
 import json
@@ -25,15 +25,16 @@ from tests.support.surroundings import free_port
 
 LOAD = Load(clients=10, encoding="json", warm_s=1.5)
 ROUNDS = 3
-GATHERED_MS = 10.0
+HELD_MS = 10.0
 RATIO_MOST = 0.8
-GATHERED_RATIO_MOST = 0.4
+HELD_RATIO_MOST = 0.4
 LOST_MOST = 0.01
-"""gpsd drops what a client does not take at once; more than this, and it did less work than asked for."""
+"""Maximum share of samples that gpsd may drop for slow clients. With more drops, gpsd did less work than imud."""
 
 
 def start_gpsd(stack: ExitStack, program: str, port: int, input_port: int) -> int:
-    """Start gpsd alone on one core, reading datagrams; return its process id. Raises TimeoutError."""
+    """Start gpsd alone on one core with UDP input. Return its process id. Raises TimeoutError if it does not start."""
+    # -N: no background process, -n: read the input without clients
     command = [program, "-N", "-n", "-S", str(port), f"udp://127.0.0.1:{input_port}"]
     gpsd = subprocess.Popen(["taskset", "-c", str(*SERVER_CORE), *command], stderr=subprocess.DEVNULL)
     stack.callback(gpsd.wait)
@@ -46,11 +47,11 @@ def start_gpsd(stack: ExitStack, program: str, port: int, input_port: int) -> in
             sleep(0.05)
         else:
             return gpsd.pid
-    raise TimeoutError(f"gpsd did not listen within {START_LIMIT_S} s")
+    raise TimeoutError(f"cannot start gpsd: expected an open port {port} within {START_LIMIT_S} s")
 
 
 def gpsd_us(program: str, load: Load) -> float:
-    """CPU time of gpsd per sample, µs. Raises RuntimeError where the first client did not get the samples."""
+    """Return the CPU time of gpsd per sample, µs. Raises RuntimeError if the first client missed samples."""
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as name, ExitStack() as stack:
         port, input_port = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_DGRAM)
         pid = start_gpsd(stack, program, port, input_port)
@@ -63,31 +64,33 @@ def gpsd_us(program: str, load: Load) -> float:
         readers.say("end")
         got = json.loads(readers.line())["samples"]
     if used.refused or got < load.frames * (1 - LOST_MOST):
-        raise RuntimeError(f"gpsd: {got} of {load.frames} samples came, {used.refused} were not sent")
+        raise RuntimeError(
+            f"cannot measure gpsd: expected {load.frames} samples, got {got}; {used.refused} were not sent"
+        )
     return used.cpu_ns / 1e3 / (used.elapsed_s * load.rate_hz)
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
     program = shutil.which("gpsd", path="/usr/sbin:/usr/local/sbin:/usr/bin")
     if program is None:
-        print("# gpsd is not installed: `make bench-deps` installs it, as root", flush=True)
+        print("# cannot find gpsd; try `make bench-deps` as root", flush=True)
         return
     load = replace(LOAD, seconds=2.0 if quick else 6.0)
     figures = [
         (
             gpsd_us(program, load),
-            *(run(replace(load, latency_ms=held)).cpu_us_per_sample for held in (0.0, GATHERED_MS)),
+            *(run(replace(load, latency_ms=held)).cpu_us_per_sample for held in (0.0, HELD_MS)),
         )
         for _ in range(1 if quick else ROUNDS)
     ]
-    theirs, at_once, gathered = zip(*figures, strict=True)
+    theirs, at_once, held_cpu = zip(*figures, strict=True)
     name = f"1 kHz, {load.clients} json clients"
     yield Row(f"{name}: CPU per sample, gpsd", median(theirs), "us")
-    yield Row(f"{name}: CPU per sample, imud beside gpsd", median(at_once), "us")
-    yield Row(f"{name}: CPU per sample, imud, {GATHERED_MS:g} ms gathered", median(gathered), "us")
+    yield Row(f"{name}: CPU per sample, imud in the same run", median(at_once), "us")
+    yield Row(f"{name}: CPU per sample, imud, {HELD_MS:g} ms hold", median(held_cpu), "us")
     for words, ours, most in (
         ("", at_once, RATIO_MOST),
-        (f", {GATHERED_MS:g} ms gathered", gathered, GATHERED_RATIO_MOST),
+        (f", {HELD_MS:g} ms hold", held_cpu, HELD_RATIO_MOST),
     ):
         ratio = median(a / b for a, b in zip(ours, theirs, strict=True))
         yield at_most(f"{name}: imud / gpsd{words}", ratio, "x", most)

@@ -1,7 +1,7 @@
-"""The clock on hosts whose CLOCK_MONOTONIC is slewed: `python -m tests.bench.host_clocks` prints the table.
+"""Accuracy of the clock on hosts with a slewed CLOCK_MONOTONIC: `python -m tests.bench.host_clocks` prints the table.
 
-The models of arrival run in steady time, which is the truth; CLOCK_MONOTONIC is made of it by rates that change, and
-read by a real `HostClock` at each read of the device. `--unseen` shows what comes out where the steering is not seen.
+The arrival models use steady time, which is the truth. CLOCK_MONOTONIC follows from steady time and changing rates. A
+real `HostClock` reads it at each read of the device. With `--unseen`, the clock does not know the steering of the host.
 """
 
 import sys
@@ -28,7 +28,7 @@ class Steering:
     changes: tuple[tuple[float, float], ...] = ()
 
     def monotonic_ns(self, steady_ns: int) -> int:
-        """CLOCK_MONOTONIC at a steady time; both are the same before the first change."""
+        """Return CLOCK_MONOTONIC at a steady time, ns. Both are equal before the first change."""
         moved_ns = 0
         ends = [BEGIN_NS + int(s * NS_PER_S) for s, _ in self.changes[1:]] + [1 << 62]
         for (begin_s, ppm), end_ns in zip(self.changes, ends, strict=False):
@@ -41,16 +41,16 @@ class Steering:
 
 STEERINGS: Final = (
     Steering("not steered"),
-    Steering("20 ppm all the time", ((-1000, 20),)),
+    Steering("20 ppm, constant", ((-1000, 20),)),
     Steering("500 ppm for 40 s, twice", ((30, 500), (70, -500), (110, 0))),
     Steering("83,333 ppm for 5 s after start", ((2, 83_333), (7, 0))),
-    Steering("83,333 ppm back for 5 s", ((80, -83_333), (85, 0))),
-    Steering("400 ppm to and fro each second", tuple((s, 400 * (-1) ** s) for s in range(1, 120))),
+    Steering("-83,333 ppm for 5 s", ((80, -83_333), (85, 0))),
+    Steering("400 ppm, alternating each second", tuple((s, 400 * (-1) ** s) for s in range(1, 120))),
 )
 
 
 class SteeredHost:
-    """A host whose clocks are read. `at` sets what time it is."""
+    """Simulated host with a real `HostClock`. `at` sets the present time."""
 
     def __init__(self, steering: Steering) -> None:
         self.steering = steering
@@ -62,7 +62,7 @@ class SteeredHost:
         return self.steering.monotonic_ns(self.now_ns)
 
     def at(self, steady_ns: int) -> int:
-        """Set the time; returns CLOCK_REALTIME minus CLOCK_MONOTONIC as the daemon reads it then."""
+        """Set the present time. Return CLOCK_REALTIME minus CLOCK_MONOTONIC, ns, as the daemon reads it then."""
         self.now_ns = steady_ns
         return self.clock.utc_offset_ns()
 
@@ -84,6 +84,7 @@ def clock_on(host: SteeredHost, model: ArrivalModel, *, unseen: bool = False) ->
 
 
 def date(clock: SampleClock, host: SteeredHost, a: Arrival) -> DatedArrival:
+    # the daemon reads the clocks 20 us after the arrival, when it decodes the frame
     offset_ns = host.at(a.t_rx_ns + DECODE_NS)
     monotonic_ns = host.steering.monotonic_ns
     m = Measurement(a.size_bytes, a.trailing_bytes, a.dev_ns // TICK_NS % TICK_MODULUS)
@@ -98,6 +99,7 @@ def run(model: ArrivalModel, steering: Steering, count: int, *, unseen: bool = F
 
 
 def rises(dated: Sequence[DatedArrival]) -> bool:
+    # time stamps increase, and no time stamp is later than its arrival
     return all(a.sample.t_ns < b.sample.t_ns for a, b in pairwise(dated)) and all(
         d.sample.t_ns <= d.sample.t_rx_ns for d in dated
     )
