@@ -1,8 +1,8 @@
-"""What it saves that samples may wait: the daemon against the bare loop, which reads and sends each at once, in turns.
+"""CPU time that a hold saves: imud and the bare loop, which reads and sends each sample immediately, alternating.
 
-`make bench ARGS=latency`. Every round runs each load once, so that all of them see the same machine; the median of the
-rounds' ratios is shown. Shared memory has its own default of 5 ms where nothing else is asked for. The bare loop that
-waits before it reads is the least that a Python process with samples in batches can do: no clock, no ledger, no ring.
+`make bench ARGS=latency`. Every round runs each load once, so that all loads have the same conditions. The rows show
+the median of the ratios of all rounds. Shared memory uses its default of 5 ms unless a load requests a latency. The
+bare loop with a wait before each read is the minimum for a Python process with batches, without clock, ledger and ring.
 """
 
 from collections.abc import Iterator
@@ -18,8 +18,8 @@ LATENCY_MS = 10.0
 JUDGED = ("latency 10 ms", "at 100 Hz", "at 10 Hz, latency 20 ms")
 FLEETS = (48, 64, 80, 96, 112)
 APART_FRAMES = 50
-"""Modules begin one after another: a clock that begins costs more than one that has begun, and on a gateway that is
-started modules are found one after another, too."""
+"""Number of frames between the starts of two devices. A clock needs more CPU time until its fit has settled. On a real
+gateway, imud also detects the devices one after another."""
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
@@ -43,6 +43,7 @@ def compare(encoding: str, seconds: float, rounds: int) -> Iterator[Row]:
     for _ in range(rounds):
         for name, load in loads.items():
             found[name].append(run(load))
+    # the bare loop of the same round is the reference
     bare = found.pop("bare loop")
     yield Row(f"10 {encoding} clients, bare loop: CPU per sample", median(o.cpu_us_per_sample for o in bare), "us")
     for name, outcomes in found.items():
@@ -69,6 +70,7 @@ def fleets(seconds: float) -> Iterator[Row]:
         yield Row(f"{devices} devices, latency 10 ms: CPU per sample", outcome.cpu_us_per_sample, "us")
         yield Row(f"{devices} devices, latency 10 ms: samples lost", float(outcome.lost), "samples")
         yield Row(f"{devices} devices, latency 10 ms: share of one core", outcome.cpu_share, "")
+        # stop at the first lost sample: more devices would only increase the loss
         if outcome.lost:
             break
         most = devices

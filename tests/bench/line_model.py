@@ -1,7 +1,7 @@
-"""A device with lines, simulated with the truth known: SOUT pulses, lost and extra edges, and messages that get lost.
+"""A simulated device with GPIO lines and known true times: SOUT pulses, lost and extra edges, and lost frames.
 
-The instant of measurement is the rising edge; the pulse takes 80 µs, then the message of `ArrivalModel` begins. The
-kernel stamps an edge late by some microseconds, on a loaded system now and then by some hundred.
+The measurement is at the rising edge. The pulse takes 80 µs. Then the frame of `ArrivalModel` starts. The kernel
+time-stamps an edge some microseconds late. On a busy host, some edges are late by some hundred microseconds.
 """
 
 from bisect import bisect_right
@@ -21,7 +21,8 @@ LATENCY_NS = 3 * NS_PER_US
 JITTER_NS = 4 * NS_PER_US
 STALL_SHARE = 0.01
 STALL_NS = 200 * NS_PER_US
-"""The kernel's interrupt thread: floor and mean of an exponential law, and how often it waits for another one."""
+"""Delay of the kernel's interrupt thread: minimum LATENCY_NS plus an exponential part with the mean JITTER_NS.
+STALL_SHARE of the edges on a busy host wait for another thread, with the mean STALL_NS."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +31,7 @@ class LineFaults:
     edge_loss: float = 0.0
     frame_loss: float = 0.0
     extra: float = 0.0
-    """Pulses that are no pulses, per true one, at any time."""
+    """Number of false pulses per true pulse, at random times."""
     loaded: bool = False
 
 
@@ -42,7 +43,7 @@ class LineRead(NamedTuple):
 
 
 def measured_ns(arrival: Arrival) -> int:
-    """The truth of a message: the rising edge of its pulse."""
+    """Return the true time of a measurement, ns: the rising edge of its pulse."""
     return arrival.t_ns - PULSE_NS
 
 
@@ -65,7 +66,7 @@ def simulate_reads(arrivals: Iterable[Arrival], seed: int, faults: LineFaults) -
 
 
 def late_ns(random: Random, *, loaded: bool) -> int:
-    """How late the kernel stamps an edge."""
+    """Return a random delay of the kernel's time stamp, ns."""
     late = LATENCY_NS + random.expovariate(1 / JITTER_NS)
     if loaded and random.random() < STALL_SHARE:
         late += random.expovariate(1 / STALL_NS)
@@ -75,9 +76,10 @@ def late_ns(random: Random, *, loaded: bool) -> int:
 def _edges(
     pulses: Sequence[tuple[int, int]], random: Random, faults: LineFaults
 ) -> tuple[list[Edge], list[int], list[int]]:
-    both: list[tuple[int, int, int | None]] = []  # stamp of the rising edge, of the falling edge, pulse
+    both: list[tuple[int, int, int | None]] = []  # time stamps of rising and falling edge, number of the pulse
     for t_ns, i in pulses:
         rise = t_ns + late_ns(random, loaded=faults.loaded)
+        # the falling edge has a later time stamp than the rising edge
         both.append((rise, max(t_ns + PULSE_NS + late_ns(random, loaded=faults.loaded), rise + 1000), i))
     both += [extra for extra in _extra(pulses, random, faults) if _is_free(extra, both)]
     both.sort()
@@ -106,11 +108,12 @@ def _extra(
 
 def _is_free(extra: tuple[int, int, int | None], pulses: Sequence[tuple[int, int, int | None]]) -> bool:
     at = bisect_right(pulses, extra)
+    # skip extra pulses that would overlap another pulse
     return (at == 0 or pulses[at - 1][1] < extra[0]) and (at == len(pulses) or extra[1] < pulses[at][0])
 
 
 def restarted(model: ArrivalModel, count: int, silent_ns: int) -> Iterator[Arrival]:
-    """A run of a device that restarts in the middle: its counter begins at 3 s, `silent_ns` later."""
+    """Yield the arrivals of a device that restarts halfway after `silent_ns`, with a counter that starts at 3 s."""
     last = None
     for last in model.run(count // 2):
         yield last
@@ -125,7 +128,7 @@ def restarted(model: ArrivalModel, count: int, silent_ns: int) -> Iterator[Arriv
 
 
 def pulses_per_second(arrivals: Sequence[Arrival], seed: int) -> list[Edge]:
-    """A pulse for every whole second of the host from one before the first message on, as the kernel stamps them."""
+    """Return a pulse for every whole second of the host, from before the first frame on, with late time stamps."""
     random = Random(f"pps {seed}")
     first, last = arrivals[0].t_ns // NS_PER_S, arrivals[-1].t_ns // NS_PER_S
     return [
@@ -135,14 +138,14 @@ def pulses_per_second(arrivals: Sequence[Arrival], seed: int) -> list[Edge]:
 
 
 def pps_age_ms(arrival: Arrival, skew_ppm: float) -> int:
-    """What the device says: its time since the newest whole second of the host, cut off to ms."""
+    """Return the value that the device sends: time since the last whole second of the host, rounded down to ms."""
     return int(arrival.t_ns % NS_PER_S * (1 + skew_ppm * 1e-6)) // NS_PER_MS
 
 
 def triggered(model: ArrivalModel, count: int, answered: float) -> Iterator[tuple[TriggerStamp, Arrival | None]]:
-    """Triggers of the host at even times of its own, and the answers 125 µs (± 20 µs) later; a share is not answered.
+    """Yield triggers at regular host times with the replies 125 µs (± 20 µs) later. `answered` is the share of replies.
 
-    The device stamps its time of the trigger in ms, cut off.
+    The reply contains the device time of the trigger, rounded down to ms.
     """
     random = Random(f"trigger {model.seed}")
     skew = 1 + model.crystal.skew_ppm * 1e-6

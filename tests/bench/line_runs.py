@@ -1,4 +1,4 @@
-"""Simulated devices with lines through a clock: what came out beside the truth."""
+"""Runs of a clock with simulated devices with GPIO lines. A run returns samples with their true times."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -29,7 +29,7 @@ class DatedSample(NamedTuple):
     truth_ns: int
     number: int
     begun_ns: int = 0
-    """Latest time that its message can have begun, by its arrival."""
+    """Latest possible start of the frame according to its arrival, ns."""
 
     @property
     def off_ns(self) -> int:
@@ -70,7 +70,7 @@ def run_sout(
 
 
 def run_pps(model: ArrivalModel, seconds: int, *, silent_s: range = range(0)) -> list[DatedSample]:
-    """A device that says how long ago the pulse per second was; none comes in some seconds of the run."""
+    """Run a device that sends its time since the last pulse per second. No pulse arrives in the seconds `silent_s`."""
     clock, dated = clock_for(model), []
     arrivals = list(model.run(int(model.rate_hz) * seconds))
     first_s = arrivals[0].t_ns // NS_PER_S
@@ -80,7 +80,7 @@ def run_pps(model: ArrivalModel, seconds: int, *, silent_s: range = range(0)) ->
         due: list[Edge] = [p for p in pulses[given : given + 3] if p.t_ns <= a.t_rx_ns]
         given += len(due)
         clock.add_edges("pps", due)
-        # without a pulse the age goes on
+        # without a new pulse, the time since the last pulse continues to rise
         newest = max((p.t_ns // NS_PER_S for p in pulses[:given] if p.t_ns <= a.t_ns), default=a.t_ns // NS_PER_S)
         age = pps_age_ms(a, model.crystal.skew_ppm) + 1000 * (a.t_ns // NS_PER_S - newest)
         dated.append(
@@ -93,7 +93,7 @@ def run_utc(
     model: ArrivalModel, seconds: int, *, turn_ms: int, ahead_ns: int = 0, reference: UtcReference = REFERENCE,
     turn_at: float = 0.25, back_at: float = 1.0,
 ) -> tuple[list[DatedSample], SampleClock]:  # fmt: skip
-    """A device whose counter turns into UTC ms modulo `turn_ms` at a share of the run, and back at another."""
+    """Run a device with UTC in ms modulo `turn_ms` in its counter, from the share `turn_at` to `back_at` of the run."""
     clock, dated = clock_for(model), []
     clock.set_utc_reference(reference)
     count = int(model.rate_hz) * seconds
@@ -105,7 +105,7 @@ def run_utc(
 
 
 def run_triggers(model: ArrivalModel, seconds: int, answered: float) -> tuple[list[DatedSample], SampleClock, int]:
-    """A device that answers most triggers; also how many it did not answer."""
+    """Run a device that answers most triggers. Also return the number of triggers without a reply."""
     clock, dated, missed = clock_for(model), [], 0
     for stamp, a in triggered(model, int(model.rate_hz) * seconds, answered):
         clock.add_triggers([stamp])
@@ -125,7 +125,7 @@ def share_honest(dated: Sequence[DatedSample]) -> float:
 
 
 def steepest(dated: Sequence[DatedSample]) -> float:
-    """Largest error of a step between samples, per length of the step; but no stamp is later than its message."""
+    """Return the largest error of a time step divided by the step. Skip samples limited by the start of their frame."""
     return max(
         abs(b.off_ns - a.off_ns) / (b.truth_ns - a.truth_ns) for a, b in pairwise(dated) if b.sample.t_ns != b.begun_ns
     )

@@ -1,4 +1,4 @@
-"""Lines: what an edge costs to read, how a trigger keeps its deadlines, and why its ioctl keeps the GIL."""
+"""GPIO lines: CPU time per edge, delay of triggers, and the reason why the ioctl of a trigger keeps the GIL."""
 
 import asyncio
 import ctypes
@@ -17,7 +17,7 @@ from imud.model.units import NS_PER_S, NS_PER_US
 from tests.bench.rows import Row
 
 FIONREAD = 0x541B
-"""An ioctl that a pipe answers at once, as a GPIO chip in the processor does."""
+"""An ioctl that a pipe answers immediately, like a GPIO controller in the processor."""
 
 
 class PipeLine:
@@ -40,7 +40,7 @@ class PipeLine:
 
 
 def _per_edge_us(read: Callable[[], object], edges: int, times: int) -> float:
-    """Best of five, in µs."""
+    """Return the CPU time per edge, µs, best of five runs."""
     best = float("inf")
     for _ in range(5):
         begin_ns = time.thread_time_ns()
@@ -55,6 +55,7 @@ def _reading(quick: bool) -> list[Row]:
     events, times = LineEventDecoder(), 200 if quick else 2000
     found = []
     for count in (2, READ_EVENTS):
+        # two edges of a pulse, and the maximum number of edges in one read
         data = b"".join(EVENT.pack(n, 1, 0, n, n) for n in range(1, count + 1))
 
         def read(data: bytes = data) -> None:
@@ -62,10 +63,10 @@ def _reading(quick: bool) -> list[Row]:
             events.decode(os.read(near, READ_EVENTS * EVENT.size))
 
         found.append(
-            Row(f"edges read {count} at a time, CPU per edge (with the write)", _per_edge_us(read, count, times), "us")
+            Row(f"{count} edges per read, CPU per edge (includes the write)", _per_edge_us(read, count, times), "us")
         )
     found.append(
-        Row("gpiod's own object for an edge, CPU", _per_edge_us(lambda: EdgeEvent(1, 1, 0, 1, 1), 1, times), "us")
+        Row("object of gpiod for an edge, CPU", _per_edge_us(lambda: EdgeEvent(1, 1, 0, 1, 1), 1, times), "us")
     )
     os.close(near)
     os.close(far)
@@ -107,12 +108,13 @@ def rows(*, quick: bool = False) -> list[Row]:
         found += [
             Row(f"{title}: from deadline to edge, mean", counts.mean_late_ns / NS_PER_US, "us"),
             Row(f"{title}: worst", counts.worst_late_ns / NS_PER_US, "us"),
-            Row(f"{title}: error of the stamp, mean", mean(stamp.err_ns for stamp in stamps) / NS_PER_US, "us"),
+            Row(f"{title}: error of the time stamp, mean", mean(stamp.err_ns for stamp in stamps) / NS_PER_US, "us"),
             Row(f"{title}: deadlines missed", 100 * counts.missed / (counts.missed + counts.edges), "%"),
             Row(f"{title}: CPU per edge", used_s / counts.edges * NS_PER_S / NS_PER_US, "us"),
         ]
-    for name, library in (("GIL kept", ctypes.PyDLL), ("GIL given away", ctypes.CDLL)):
+    # PyDLL keeps the GIL during the ioctl, CDLL releases it
+    for name, library in (("GIL kept", ctypes.PyDLL), ("GIL released", ctypes.CDLL)):
         _, stamps, _ = asyncio.run(_trigger(40.0, seconds, library, True))
         error_us = mean(stamp.err_ns for stamp in stamps) / NS_PER_US
-        found.append(Row(f"SIN beside a computing thread, {name}: error of the stamp", error_us, "us"))
+        found.append(Row(f"SIN beside a computing thread, {name}: error of the time stamp", error_us, "us"))
     return found

@@ -1,7 +1,7 @@
-"""Cost of one scrape: CPU of rendering, and how long it keeps a busy event loop from its next turn.
+"""Cost of one scrape: CPU time, and the longest delay of a busy event loop.
 
-The stall is measured where it hurts: a loop in the main thread turns without a break while another thread renders,
-and the longest time between two turns is noted.
+A loop in the main thread runs without a pause while another thread renders the page. The delay is the longest time
+between two turns of this loop.
 """
 
 import asyncio
@@ -20,18 +20,18 @@ from tests.bench.rows import Row, at_most
 from tests.support.metrics import client, equipped
 
 STALL_MS_MAX = 1.0
-"""A sample every millisecond: a stall below this delays one wake-up and loses nothing."""
+"""Maximum delay of the loop, ms. At 1 kHz, a shorter delay affects one wake-up and causes no loss."""
 
 
 def snapshot(devices: int) -> Snapshot:
-    """Devices with every part that a device can have, and ten clients."""
+    """Return a status with `devices` devices with all optional parts, and ten clients."""
     return Snapshot(
         tuple(equipped(f"imu{n}", n) for n in range(devices)), tuple(client(n, sent=5) for n in range(10)), (), 1
     )
 
 
 def render_ms(devices: int, repeats: int) -> tuple[float, int]:
-    """CPU ms of one rendering without pauses (best of `repeats`), and bytes of it."""
+    """Return the CPU time of one rendering without pauses, ms, best of `repeats`, and the size in bytes."""
     renderer, shown = Renderer(pause=lambda: None), snapshot(devices)
     best_ns, size = 1 << 62, 0
     for _ in range(repeats):
@@ -44,6 +44,7 @@ def render_ms(devices: int, repeats: int) -> tuple[float, int]:
 async def stalls_ms(work: Callable[[], object], repeats: int) -> list[float]:
     longest = []
     for _ in range(repeats):
+        # the thread waits for `go`, so that its start is not part of the delay
         go = Event()
         thread = Thread(target=lambda go=go: (go.wait(), work()))
         thread.start()
@@ -73,7 +74,7 @@ def motion_slots() -> bytes:
 
 
 def motion_ms(slots: bytes, repeats: int) -> float:
-    """CPU ms of the motion of one device, best of `repeats`."""
+    """Return the CPU time of the motion of one device, ms, best of `repeats`."""
     best_ns = 1 << 62
     for _ in range(repeats):
         begin_ns = time.thread_time_ns()

@@ -1,8 +1,8 @@
-"""Eight Modbus modules on one RS-485 line at 115200 baud, read in turns by the daemon: how near to what a wire can.
+"""Sample rate of eight Modbus devices on one RS-485 bus at 115200 baud, compared with the limit of the bus.
 
-The limit is arithmetic: a request of 8 bytes and a reply of 57 (26 registers), 10 bits each, and a silence of 1.75 ms
-before each of the two, is 5.642 ms + 3.5 ms = 9.142 ms a sample, for modules that need no time to think; those of the
-simulator take 0.3 ms. The line is a process that hands over every byte when it is through, the daemon another.
+A request has 8 bytes, a reply has 57 bytes (26 registers), and a byte has 10 bits. A silence of 1.75 ms precedes each
+of them. The limit is 5.642 ms + 3.5 ms = 9.142 ms per sample if the devices reply immediately. The simulated devices
+need 0.3 ms for a reply. A process simulates the bus and delivers each byte at the end of its wire time.
 """
 
 import tempfile
@@ -52,6 +52,7 @@ def measured(seconds: float, alive: int, configured: int) -> Outcome:
             if monotonic() > end:
                 raise TimeoutError(f"expected {alive} running devices within {START_LIMIT_S:g} s")
             sleep(0.05)
+        # 1 s until the rates are stable
         sleep(1.0)
         before, begun, cpu = ask(folder / "s"), monotonic(), cpu_ns(daemon.popen.pid)
         sleep(seconds)

@@ -1,6 +1,6 @@
-"""A simulated RS-485 line whose every byte comes when it is through, as a process: `… BAUD ADDRESS …`.
+"""Process that simulates an RS-485 bus and delivers each byte at the end of its wire time: `… BAUD ADDRESS …`.
 
-The first line it prints is the port. It ends with its stdin.
+The first printed line is the port. The process ends when its standard input closes.
 """
 
 import sys
@@ -18,6 +18,7 @@ from imud.sim.sensor import SimulatorOptions
 def main() -> None:
     baud, *addresses = map(int, sys.argv[1:])
     now_ns = time.monotonic_ns()
+    # one byte per chunk: the simulator delivers each byte separately
     line = ModbusLine(now_ns, slaves_at(addresses, SimulatorOptions(baud=baud)), chunk_bytes=1)
     sharpen_timers()
     with TemporaryDirectory(prefix="imud-bench-") as folder:

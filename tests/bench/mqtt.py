@@ -1,13 +1,13 @@
-"""Cost of the output `mqtt`: CPU of the daemon at 1 kHz with and without it, whatever the broker does, and its wear.
+"""CPU time of the daemon and bytes on the disk with the output `mqtt` at 1 kHz, for different states of the broker.
 
-Brokers: Debian's mosquitto; nobody at the port; mosquitto that refuses the user; a peer that accepts, and reads 1 kB a
-second; mosquitto that is stopped with SIGSTOP. Each round runs the load without the output right before and after each
-load with it; the ratio is to the mean of both, and the median of the rounds counts. All samples are sent as slots, and
-statistics of 1 Hz.
+The brokers are: Debian's mosquitto; no server at the port; mosquitto that rejects the user; a server that accepts the
+connection and reads 1 kB per second; mosquitto stopped with SIGSTOP. A run without the output precedes and follows each
+run with the output. The ratio is relative to the mean of both, and the rows show the median of all rounds. The output
+sends all samples as slots, and statistics of 1 Hz.
 
-The event loop's thread is what samples wait for; the whole daemon has the two threads of the output as well, which run
-beside it where there is a second core. Bytes written are `write_bytes` of /proc/PID/io, on the file system of the
-working directory.
+Samples wait only for the thread of the event loop. The CPU time of the daemon also includes the two threads of the
+output. These threads use a second core if one exists. The written bytes are `write_bytes` of /proc/PID/io, on the file
+system of the working directory.
 """
 
 import socket
@@ -26,7 +26,7 @@ from tests.fleet.mosquitto import NO_MOSQUITTO, running_broker
 from tests.support.surroundings import free_port
 
 LOOP_RATIO_LIMIT: Final = 1.05
-"""Of the event loop's thread: with the output it puts each batch into a queue."""
+"""Maximum CPU ratio of the event loop's thread. With the output, the thread also puts each batch into a queue."""
 SAMPLES: Final[Mapping[str, object]] = {"whole": "slots", "rate_hz": 1}
 READ_BYTES: Final = 1000
 QUICK: Final = ("present", "gone", "stopped")
@@ -60,6 +60,7 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
         for name, place in brokers.items():
             outcome = run_with(place, Load(seconds=seconds), SAMPLES)
             plain.append(run(Load(seconds=seconds)))
+            # the run without the output before and after this run
             pairs[name].append(Pair(outcome, plain[-2], plain[-1]))
     yield Row("1 kHz, no output mqtt: CPU of the event loop per sample", middle(plain, "loop_us_per_sample"), "us")
     yield Row("1 kHz, no output mqtt: latency of samples, p99", middle(plain, "p99_us"), "us")
@@ -84,7 +85,7 @@ def wear_rows(seconds: float, brokers: Sequence[str]) -> Iterator[Row]:
     ):
         for name in brokers:
             outcome = run_with(BROKERS[name], Load(seconds=seconds, rate_hz=rate_hz), sending)
-            yield Row(f"{words}, broker {name}: written in an hour", outcome.written_bytes_s * HOUR_S / 1e6, "MB")
+            yield Row(f"{words}, broker {name}: written per hour", outcome.written_bytes_s * HOUR_S / 1e6, "MB")
 
 
 def run_with(place: Place, load: Load, sending: Mapping[str, object]) -> Outcome:
@@ -109,14 +110,14 @@ def gone(_folder: Path) -> Iterator[int]:
 
 @contextmanager
 def refusing(folder: Path) -> Iterator[int]:
-    """A broker that does not know the user."""
+    """Run a broker that rejects the user."""
     with running_broker(folder, "allow_anonymous false") as broker:
         yield broker.port
 
 
 @contextmanager
 def stopped(folder: Path) -> Iterator[int]:
-    """A broker that answers nothing; the kernel still accepts connections for it."""
+    """Run a broker that does not reply. The kernel still accepts connections for it."""
     with running_broker(folder) as broker:
         broker.freeze()
         yield broker.port
@@ -124,7 +125,7 @@ def stopped(folder: Path) -> Iterator[int]:
 
 @contextmanager
 def slow(_folder: Path) -> Iterator[int]:
-    """A peer that accepts every connection, and reads READ_BYTES a second of it."""
+    """Run a server that accepts each connection and reads READ_BYTES per second."""
     ended = threading.Event()
     with socket.create_server(("127.0.0.1", 0)) as listener:
         listener.settimeout(0.2)
@@ -140,6 +141,7 @@ def slow(_folder: Path) -> Iterator[int]:
 def _serve_slowly(listener: socket.socket, ended: threading.Event) -> None:
     while not ended.is_set():
         with suppress(TimeoutError), listener.accept()[0] as peer:
+            # a small receive buffer, so that the kernel does not accept much more than the server reads
             peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             peer.recv(4096)
             peer.sendall(bytes.fromhex("2003000000"))  # CONNACK: accepted, no properties

@@ -1,8 +1,8 @@
-"""Many clients of MQTT 3.1.1 that send, in one thread, cheap enough that broker and collector are what is loaded.
+"""Many publishing MQTT 3.1.1 clients in one thread, cheap enough that only the broker and the collector are the limit.
 
-Packets are those of the standard (OASIS MQTT 3.1.1, sections 2 and 3): CONNECT, PUBLISH with QoS 1, PINGREQ and their
-answers. What is to be sent waits, as in the spool, until the broker has acknowledged it; after a
-loss a client goes to the next broker of its list and sends everything again, oldest first.
+The packets follow the standard (OASIS MQTT 3.1.1, sections 2 and 3): CONNECT, PUBLISH with QoS 1, PINGREQ and their
+replies. A message stays in the queue until the broker acknowledges it, like in the spool. After a lost connection, a
+client connects to the next broker of its list and sends all remaining messages again, the oldest first.
 """
 
 import selectors
@@ -19,13 +19,13 @@ CONNACK, PUBACK = 2, 4
 WINDOW: Final = 20
 KEEP_ALIVE_S: Final = 30
 ANSWER_S: Final = 15.0
-"""A broker that answers nothing for so long while it owes something is left."""
+"""Maximum time without a reply from the broker, s. Then the client closes the connection."""
 RETRY_S: Final = 2.0
 READ_BYTES: Final = 262_144
 
 
 class MqttClient:
-    """One client. Synchronization: the thread of its `Clients`."""
+    """A client. Synchronization: the thread of its `Clients`."""
 
     def __init__(self, name: str, ports: Sequence[int], *, first: int = 0) -> None:
         self.name, self.ports = name, tuple(ports)
@@ -33,7 +33,7 @@ class MqttClient:
         self.socket: socket.socket | None = None
         self.is_ready = False
         self.waiting: deque[tuple[str, bytes]] = deque()
-        """Messages that the broker has not acknowledged, those that were sent first."""
+        """Messages without an acknowledgment, in the order of sending."""
         self.sent = 0
         self.acknowledged = self.connects = 0
         self.retry_s = 0.0
@@ -41,7 +41,7 @@ class MqttClient:
         self.out = bytearray()
         self.read = bytearray()
         self.number = 0
-        """Packet identifier of the newest message; those of a connection follow on each other."""
+        """Packet identifier of the newest message. Identifiers of a connection are consecutive."""
 
     def give(self, topic: str, payload: bytes) -> None:
         self.waiting.append((topic, payload))
@@ -59,7 +59,7 @@ class Clients:
             client.retry_s = monotonic() + self._random.random() * RETRY_S
 
     def round(self, seconds: float) -> None:
-        """Read and write what is there, for so long at most, and connect what is to be connected."""
+        """Read and write pending data for at most `seconds`, and open missing connections."""
         for key, mask in self._selector.select(seconds):
             client: MqttClient = key.data
             try:
@@ -83,6 +83,7 @@ class Clients:
     def _write(self, client: MqttClient) -> None:
         if client.socket is None:
             return
+        # at most WINDOW messages without an acknowledgment
         while client.is_ready and client.sent < min(WINDOW, len(client.waiting)):
             topic, payload = client.waiting[client.sent]
             client.number = client.number % 0xFFFF + 1
@@ -100,6 +101,7 @@ class Clients:
         for client in self.clients:
             if client.socket is not None:
                 with suppress(OSError):
+                    # DISCONNECT (section 3.14)
                     client.socket.send(b"\xe0\x00")
                 self._lose(client)
         self._selector.close()
@@ -114,6 +116,7 @@ class Clients:
             self._lose(client)
         elif client.is_ready:
             if now_s - client.wrote_s > KEEP_ALIVE_S / 2:
+                # PINGREQ (section 3.12)
                 client.out += b"\xc0\x00"
             self.write(client)
 
@@ -122,10 +125,11 @@ class Clients:
         made.setblocking(False)
         made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         made.connect_ex(("127.0.0.1", client.ports[client.at]))
+        # send all remaining messages again over the new connection
         client.socket, client.is_ready, client.sent = made, False, 0
         client.heard_s = client.wrote_s = now_s
         client.read.clear()
-        head = text("MQTT") + bytes((4, 2)) + struct.pack(">H", KEEP_ALIVE_S)  # a clean session
+        head = text("MQTT") + bytes((4, 2)) + struct.pack(">H", KEEP_ALIVE_S)  # protocol level 4, clean session
         client.out[:] = packet(0x10, head + text(client.name))
         self._selector.register(made, selectors.EVENT_READ | selectors.EVENT_WRITE, client)
 
@@ -161,20 +165,20 @@ class Clients:
                 raise ConnectionRefusedError
             client.connects += 1
             client.is_ready, client.number = True, 0
-        elif kind == PUBACK:  # brokers acknowledge in the order of the messages (section 4.6)
+        elif kind == PUBACK:  # brokers acknowledge messages in order (section 4.6)
             client.waiting.popleft()
             client.sent -= 1
             client.acknowledged += 1
 
 
 def text(value: str) -> bytes:
-    """A string with its length (section 1.5.3)."""
+    """Return a string with its length (section 1.5.3)."""
     data = value.encode()
     return struct.pack(">H", len(data)) + data
 
 
 def packet(first: int, body: bytes) -> bytes:
-    """A packet with its length (section 2.2.3)."""
+    """Return a packet with its remaining length (section 2.2.3)."""
     size, head = len(body), bytearray((first,))
     while True:
         size, low = divmod(size, 128)
@@ -184,7 +188,7 @@ def packet(first: int, body: bytes) -> bytes:
 
 
 def split(data: bytearray) -> tuple[int, int, int] | None:
-    """First byte, begin and end of the body of the first packet; None while it is not whole."""
+    """Return the first byte, the start and the end of the first packet's body; None if the packet is incomplete."""
     size = 0
     for at in range(1, min(5, len(data))):
         size |= (data[at] & 127) << 7 * (at - 1)

@@ -1,9 +1,9 @@
-"""1 kHz SPI burst polling in the daemon's own path, the ioctl stubbed out: jitter, missed deadlines, CPU per sample.
+"""SPI burst reads at 1 kHz through the path of the daemon: jitter, missed deadlines, CPU time per sample.
 
-The whole path is real (bus thread, link, codec, clock, batch) except for the ioctl, which copies a burst from memory
-and, like the kernel's, lets other threads run meanwhile: `time.sleep` for as long as the bus takes at 2 MHz.
-With a data-ready line the edges come out of a pipe: from the stamp to the read, so the way through the kernel and the
-loop to the bus's thread counts.
+Bus thread, link, codec, clock and batch are real; only the ioctl is simulated. The simulated ioctl copies a burst from
+memory. It uses `time.sleep` for the duration of the transfer at 2 MHz, and other threads run in this time, like during
+the real ioctl. With a data-ready line, the edges arrive through a pipe. The delay then includes the path through the
+kernel and the event loop to the bus thread.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ from tests.support.device_rig import DeviceOutput
 RATE_HZ = 1000.0
 BURST_BYTES = 32
 WIRE_S = BURST_BYTES * 8 / 2e6
-"""A standard burst at 2 MHz."""
+"""Duration of a standard burst at 2 MHz, s."""
 PREPARED = 512
 
 
@@ -50,11 +50,13 @@ class Stub:
     def ioctl(self, _fd: int, request: int, argument: bytes) -> int:
         if request == spi_link.WR_BITS_PER_WORD and argument[0] > 8:
             raise OSError(errno.EINVAL, "8-bit words only, as on a Raspberry Pi")
+        # a WR_… request: nothing to transfer
         if len(argument) < spi_link.ROW.size:
             return 0
         rows = list(spi_link.ROW.iter_unpack(argument))
         if self._wire_s:
             time.sleep(self._wire_s)
+        # a burst: copy the next prepared burst without simulating the registers
         if rows[0][2] == BURST_BYTES:
             self._next = (self._next + 1) % PREPARED
             ctypes.memmove(rows[0][1], self._bursts[self._next], BURST_BYTES)
@@ -69,7 +71,10 @@ class Stub:
 
 
 async def _measured(port: Path, seconds: float, busy_ms: float, *, by_edges: bool) -> Sequence[float]:
-    """Mean and worst lateness µs, share late, missed, polls, CPU µs per sample, with `busy_ms` of work every 20 ms."""
+    """Measure with `busy_ms` of work in the event loop every 20 ms.
+
+    Return mean and maximum delay (µs), share of late reads, missed deadlines, polls, and CPU time per sample (µs).
+    """
     output = DeviceOutput()
     samples = output.samples
     settings = SpiOptions(port=str(port), rate_hz=RATE_HZ, speed_hz=2_000_000, mode=0)
@@ -79,6 +84,7 @@ async def _measured(port: Path, seconds: float, busy_ms: float, *, by_edges: boo
     factory = DeviceFactory(output, HostClock(), lines=maker)
     runner = factory.make(config, 0)
     task = asyncio.create_task(runner.run())
+    # a quarter of a second until the clock and the thread run
     while len(samples) < RATE_HZ / 4:
         await asyncio.sleep(0.01)
         assert not task.done(), task
@@ -112,7 +118,7 @@ def rows(*, quick: bool = False) -> list[Row]:
     found: list[Row] = []
     for name, wire_s, busy_ms, by_edges in (
         ("", WIRE_S, 0.0, False),
-        (", ioctl at once", 0.0, 0.0, False),
+        (", ioctl without duration", 0.0, 0.0, False),
         (", loop busy 10 %", WIRE_S, 2.0, False),
         (", data-ready edges", WIRE_S, 0.0, True),
         (", data-ready edges, loop busy 10 %", WIRE_S, 2.0, True),
@@ -132,9 +138,9 @@ def rows(*, quick: bool = False) -> list[Row]:
         found += [
             Row(f"{title}: from {'edge' if by_edges else 'deadline'} to read, mean", mean_us, "us"),
             Row(f"{title}: worst", worst_us, "us"),
-            Row(f"{title}: reads a quarter of a period late", late * 100, "%"),
+            Row(f"{title}: reads later than 1/4 of a period", late * 100, "%"),
             Row(f"{title}: edges without a read, of {polls:.0f}", missed, "")
-            if busy_ms and by_edges  # two edges come within 2 ms of work: one read
+            if busy_ms and by_edges  # the work takes 2 ms: one read handles two edges
             else at_most(f"{title}: deadlines missed of {polls:.0f}", missed, "", 0.001 * polls),
             Row(f"{title}: CPU per sample", cpu_us, "us"),
         ]

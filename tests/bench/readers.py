@@ -1,8 +1,8 @@
-"""A process with N socket clients, which prints `ready`, reads until the server or standard input closes, then figures.
+"""Process with N socket clients. It prints `ready`, reads until the server or standard input closes, and prints JSON.
 
-The first client checks every sample and measures its latency; the others only receive. With `--stuck` one more client
-subscribes and never reads. With `--devices` every client checks its samples, watches each fifth device, and every other
-client gets JSON. The figures are a line of JSON.
+The first client checks each sample and measures its latency. The other clients only receive. With `--stuck`, a further
+client subscribes and never reads. With `--devices`, every client checks its samples, each client watches every fifth
+device, and every second client uses JSON. The result is one line of JSON.
 """
 
 import argparse
@@ -24,14 +24,14 @@ from tests.bench.writer import FIRST_PA
 
 LENGTH = struct.Struct("<I")
 SEQ_DEVICE_AND_PRESSURE = struct.Struct("<Q52xH138xd")
-"""Members of a slot."""
+"""Members of a slot: sequence number, device id and pressure."""
 CHUNK = 1 << 18
 PARTS = 5
 """Number of devices per watched device, with `--devices`."""
 
 
 class Seen:
-    """Samples of a client, gaps in `seq`, and times from the write into the pty to the receive."""
+    """Counters of a client: samples, gaps in `seq`, and latencies from the write into the pty to the receive, ns."""
 
     def __init__(self, times: mmap.mmap | None = None, skip: int = 0) -> None:
         self.times = times
@@ -42,7 +42,7 @@ class Seen:
         self.newest: dict[object, int] = {}
 
     def add(self, device: object, seq: int, pressure_pa: float, now_ns: int) -> None:
-        """Count one sample; its pressure has the writer's number of the frame."""
+        """Count one sample. Its pressure contains the number of the frame in the writer."""
         self.samples += 1
         self.gaps += seq - self.newest.get(device, seq - 1) - 1
         self.newest[device] = seq
@@ -51,18 +51,17 @@ class Seen:
 
 
 Take = Callable[[bytearray, Seen, int], None]
-"""Removes whole messages from the front of a buffer and counts their samples."""
+"""Function that removes complete messages from the start of a buffer and counts their samples."""
 
 
 def take_binary(buffer: bytearray, seen: Seen, now_ns: int) -> None:
-    """Take length-prefixed messages."""
     at = 0
     while len(buffer) - at >= LENGTH.size:
         (length,) = LENGTH.unpack_from(buffer, at)
         body = at + LENGTH.size
         if len(buffer) - body < length:
             break
-        if length % SLOT_BYTES == 0:  # anything else is a notification
+        if length % SLOT_BYTES == 0:  # a message of another size is a notification
             for slot in range(body, body + length, SLOT_BYTES):
                 seq, device, pressure_pa = SEQ_DEVICE_AND_PRESSURE.unpack_from(buffer, slot)
                 seen.add(device, seq, pressure_pa, now_ns)
@@ -71,7 +70,6 @@ def take_binary(buffer: bytearray, seen: Seen, now_ns: int) -> None:
 
 
 def take_json(buffer: bytearray, seen: Seen, now_ns: int) -> None:
-    """Take lines."""
     end = buffer.rfind(b"\n") + 1
     for line in bytes(buffer[:end]).splitlines():
         params = msgspec.json.decode(line).get("params", {})
@@ -81,7 +79,6 @@ def take_json(buffer: bytearray, seen: Seen, now_ns: int) -> None:
 
 
 def take_attitudes(buffer: bytearray, seen: Seen, now_ns: int) -> None:
-    """Take lines of gpsd."""
     end = buffer.rfind(b"\n") + 1
     for _ in range(buffer.count(b'"class":"ATT"', 0, end)):
         seen.add("gpsd", seen.samples, 0.0, now_ns)
@@ -92,15 +89,15 @@ TAKES: dict[str, Take] = {"binary": take_binary, "json": take_json}
 
 
 class Client(NamedTuple):
-    """A connection that is subscribed."""
+    """A client with a subscription."""
 
     socket: socket.socket
     buffer: bytearray
-    """Received bytes that were not taken yet."""
+    """Received bytes that were not processed yet."""
 
 
 def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -> Client:
-    """Connect and ask for samples, as `wanted`."""
+    """Connect and subscribe with the parameters `wanted`."""
     sock = socket.socket(socket.AF_UNIX)
     sock.connect(path)
     if bare:
@@ -108,7 +105,7 @@ def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -
     request = {"jsonrpc": "2.0", "id": 1, "method": "watch", "params": {"encoding": encoding, **wanted}}
     sock.sendall(json.dumps(request).encode() + b"\n")
     got = b""
-    while got.count(b"\n") < 2:  # hello, then the reply
+    while got.count(b"\n") < 2:  # wait for hello and the reply
         got += sock.recv(CHUNK)
     _, reply, rest = got.split(b"\n", 2)
     assert b'"error"' not in reply, reply
@@ -116,7 +113,7 @@ def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -
 
 
 def subscribe_to_gpsd(port: int) -> Client:
-    """Connect to gpsd and ask for all its reports."""
+    """Connect to gpsd and subscribe to all reports."""
     sock = socket.create_connection(("127.0.0.1", port))
     sock.sendall(b'?WATCH={"enable":true,"json":true};\n')
     got = b""
@@ -126,7 +123,7 @@ def subscribe_to_gpsd(port: int) -> Client:
 
 
 def receive(clients: list[Client], takes: list[tuple[Take, Seen]], seconds: float) -> None:
-    """Receive for `seconds`, or until a socket or standard input ends; the first clients count with `takes`."""
+    """Receive for `seconds`, or until a socket or standard input closes. The first clients count with `takes`."""
     poll = select.epoll()
     by_fd = {client.socket.fileno(): (client, number) for number, client in enumerate(clients)}
     for fd, (client, _) in by_fd.items():
@@ -138,6 +135,7 @@ def receive(clients: list[Client], takes: list[tuple[Take, Seen]], seconds: floa
     until_ns = now_ns() + int(seconds * 1e9)
     while now_ns() < until_ns:
         for fd, _ in poll.poll(1.0):
+            # standard input: the parent process ends the measurement
             if fd not in by_fd:
                 return
             client, number = by_fd[fd]
@@ -152,12 +150,12 @@ def receive(clients: list[Client], takes: list[tuple[Take, Seen]], seconds: floa
 
 
 def percentile(ordered: list[int], share: float) -> float:
-    """The value below which `share` of the values lie; NaN of none."""
+    """Return the value below which `share` of the values are; NaN without values."""
     return float(ordered[min(len(ordered) - 1, int(share * len(ordered)))]) if ordered else float("nan")
 
 
 def figures(seen: list[Seen]) -> dict[str, float]:
-    """Return the figures of the clients that counted, and the latencies of the first."""
+    """Return the counters of all checking clients, and the latencies of the first client."""
     ordered = sorted(seen[0].latencies_ns)
     shares = {"p50_us": 0.5, "p99_us": 0.99}
     found = {name: percentile(ordered, share) / 1e3 for name, share in shares.items()}
@@ -166,18 +164,17 @@ def figures(seen: list[Seen]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Run as `python -m tests.bench.readers`."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--socket", default="")
-    parser.add_argument("--gpsd", type=int, metavar="PORT", help="clients of gpsd instead")
+    parser.add_argument("--gpsd", type=int, metavar="PORT", help="connect the clients to gpsd")
     parser.add_argument("--clients", type=int, default=1)
     parser.add_argument("--encoding", choices=list(TAKES), default="binary")
     parser.add_argument("--bare", action="store_true")
     parser.add_argument("--stuck", action="store_true")
-    parser.add_argument("--watch", type=json.loads, default={}, help="more parameters of `watch`, as JSON")
+    parser.add_argument("--watch", type=json.loads, default={}, help="further parameters of `watch`, JSON")
     parser.add_argument("--times")
     parser.add_argument("--frames", type=int, default=0)
-    parser.add_argument("--skip", type=int, default=0, help="frames at the beginning whose latency does not count")
+    parser.add_argument("--skip", type=int, default=0, help="number of first frames without a latency measurement")
     parser.add_argument("--seconds", type=float, default=3600.0)
     parser.add_argument("--devices", nargs="+", default=[])
     args = parser.parse_args()

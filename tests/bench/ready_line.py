@@ -1,4 +1,4 @@
-"""A data-ready line whose edges come from another process through a pipe, as a kernel's come through its descriptor."""
+"""A data-ready line. Another process sends its edges through a pipe, like the kernel through a descriptor."""
 
 import asyncio
 import os
@@ -21,7 +21,7 @@ while True:
 
 
 class PipeInput:
-    """An `InputLine`. Synchronization: the loop's thread only."""
+    """An `InputLine`. Synchronization: only the thread of the event loop."""
 
     title = "pipe"
     edges_lost = 0
@@ -66,7 +66,7 @@ class PipeInput:
         return False
 
     def close(self) -> None:
-        """End the other process; may be called twice."""
+        """End the other process. A second call does nothing."""
         process, self._process, self._on_edges = self._process, None, None
         if process is not None:
             asyncio.get_running_loop().remove_reader(self._fd)

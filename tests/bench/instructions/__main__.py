@@ -1,10 +1,12 @@
-"""`make bench-instructions`: instructions per sample and stage, counted by callgrind, beside those kept in the tree.
+"""`make bench-instructions`: instructions per sample and stage, counted by callgrind, next to the stored figures.
 
-The count does not depend on what else the machine does: two runs agree within 0.5 %. It has the instructions of the
-process, not those of the kernel, and says nothing about caches. It fails when a stage takes 5 % more than its figure in
-`figures.json`; a commit that lowers one writes them anew: ARGS=--update. Words choose stages: ARGS="clock slot".
+The count does not depend on other load on the host: two runs agree within 0.5 %. It contains the instructions of the
+process, not of the kernel, and it does not include the effect of caches. The program fails if a stage takes 5 % more
+instructions than its figure in `figures.json`. A commit that lowers a figure updates the file with ARGS=--update.
+Arguments select stages: ARGS="clock slot".
 
-Figures hold for one build of Python on one architecture; for others it prints what it counted, and judges nothing.
+The figures are valid for one build of Python on one architecture. With another build, the program prints
+the counts without a comparison.
 """
 
 import argparse
@@ -25,30 +27,31 @@ from tests.bench.instructions.measured import MARK, MARKS
 LIMIT_S: Final = 900.0
 ROOT: Final = Path(__file__).parents[3]
 PASSED_ON: Final = ("PATH", "PYTHONPATH", "TMPDIR")
-"""All else of the environment is left out: its size moves the stack."""
+"""Environment variables for the measured program. imud removes all others, because their size moves the stack."""
 
 
 class MeasurementError(Exception):
-    """The program that is measured failed, or left other dumps than it should."""
+    """The measured program failed, or callgrind wrote an unexpected set of dumps."""
 
 
 def total(dump: str) -> int:
     found = re.search(r"^totals: (\d+)$", dump, re.MULTILINE)
     if found is None:
-        raise MeasurementError("a dump of callgrind without totals; was it interrupted?")
+        raise MeasurementError("expected totals in the dump of callgrind, got none; was callgrind interrupted?")
     return int(found[1])
 
 
 def per_operation(count: int, totals: Sequence[int]) -> int:
-    """Instructions of an operation. `totals` are those of the dumps: before n, n and 2 n operations."""
+    """Return the instructions per operation from the totals of the dumps before, after n, and after 2 n operations."""
     if len(totals) != MARKS:
-        raise MeasurementError(f"{len(totals)} dumps of a stage, expected {MARKS}")
+        raise MeasurementError(f"expected {MARKS} dumps of a stage, got {len(totals)}")
     _, once, twice = totals
     return round((twice - once) / count)
 
 
 def measure(words: Sequence[str]) -> dict[str, int]:
     environment = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
+    # a fixed hash seed, because the order of sets changes the number of instructions
     environment |= {"PYTHONHASHSEED": "0", "LC_ALL": "C.UTF-8"}
     with ExitStack() as stack:
         dumps, files = (
@@ -74,16 +77,16 @@ def measure(words: Sequence[str]) -> dict[str, int]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make bench-instructions")
-    parser.add_argument("words", nargs="*", metavar="WORD", help="stages with a WORD in their names; all without any")
-    parser.add_argument("--update", action="store_true", help="keep what is counted as the figures of this Python")
+    parser.add_argument("words", nargs="*", metavar="WORD", help="count only stages with WORD in their names")
+    parser.add_argument("--update", action="store_true", help="store the counts as the figures of this Python")
     args = parser.parse_args()
     if shutil.which("valgrind") is None:
-        print("valgrind is not installed: `make bench-deps` installs it, as root", file=sys.stderr)
+        print("cannot find valgrind; try `make bench-deps` as root", file=sys.stderr)
         return 2
     try:
         measured = measure([*args.words, figures.INTERPRETER] if args.words else [])
     except MeasurementError as error:
-        print(f"nothing was counted: {error}", file=sys.stderr)
+        print(f"cannot count instructions: {error}", file=sys.stderr)
         return 1
     build = figures.python_build()
     kept = figures.load().get(build)
@@ -94,16 +97,16 @@ def main() -> int:
         print(line if known else f"{line.stage:58} {line.now:8}")
     if args.update:
         figures.keep(build, measured)
-        print(f"# kept in {figures.FILE.relative_to(ROOT)}")
+        print(f"# stored in {figures.FILE.relative_to(ROOT)}")
         return 0
     if not known:
-        print("# no figures for this Python, or it is built with other options: nothing is judged")
+        print("# no comparison: figures.json has no figures for this build of Python; try ARGS=--update")
         return 0
     bad = [line.stage for line in lines if not line.is_good]
     if any(line.growth < -figures.LESS_NOTED for line in lines):
-        print('# some are lower than kept: keep them with ARGS="--update"')
+        print('# some counts are lower than the stored figures; store them with ARGS="--update"')
     if bad:
-        print(f"# {len(bad)} stages take more than {figures.GROWTH_MOST:.0%} above their figure, or have none")
+        print(f"# {len(bad)} stages take more than {figures.GROWTH_MOST:.0%} above their figure or have no figure")
     return 1 if bad else 0
 
 

@@ -1,7 +1,7 @@
-"""The real daemon on a pseudo-terminal, in virtual time: each wake-up of its event loop finds one read of the port.
+"""The real daemon on a pseudo-terminal in simulated time. Each wake-up of its event loop finds one read of the port.
 
-The module and the clients' reads have their turn where the loop would sleep (`_Feeder.poll`), so the turns of the
-loop, its ticks included, are those of a daemon in service.
+`_Feeder.poll` runs in place of the sleep of the event loop. It writes the device's bytes and reads the sockets of the
+clients. The turns of the loop, including the ticks, are therefore the same as in normal operation.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ from tests.bench.instructions import virtual_time
 from tests.bench.instructions.module import BAUD, SETTLE_READS, Module, Read
 
 DRAIN_EVERY: Final = 16
-"""Wake-ups between two reads of the clients: no socket is full by then."""
+"""Number of wake-ups between two reads of the clients. The socket buffers do not fill up in this time."""
 START_MS: Final = 1000
 CONNECT_MS: Final = 10
 BUFFER: Final = bytearray(1 << 20)
@@ -42,6 +42,7 @@ class _Feeder:
         self.wakes = 0
 
     def poll(self, timeout: float | None, maxevents: int) -> list[tuple[int, int]]:
+        # the loop would sleep now: deliver the next read
         if timeout is None or timeout > 0:
             read = next(self.reads, None)
             if read is None:
@@ -54,7 +55,7 @@ class _Feeder:
     def _feed(self, read: Read) -> None:
         virtual_time.set_now(read.t_rx_ns)
         os.write(self._master, read.data)
-        self._readable.poll()  # a kernel thread carries the bytes over
+        self._readable.poll()  # wait until a kernel thread has moved the bytes to the slave
         self.wakes += 1
         if not self.wakes % DRAIN_EVERY:
             self.drain()
@@ -100,6 +101,7 @@ class VirtualDaemon:
     def _run(self, reads: Iterator[Read]) -> None:
         self._feeder.reads = reads
         self._loop.run_forever()
+        # the daemon ended: raise its exception
         if self._running.done():
             self._running.result()
 
@@ -123,5 +125,5 @@ def _settings(directory: str, port: str) -> config.Config:
 
 
 def own_group() -> str:
-    """A group that files may be given to without any right."""
+    """Return a group to which this process may assign files without root."""
     return grp.getgrgid(os.getegid()).gr_name

@@ -1,4 +1,4 @@
-"""The figures that are kept in the tree, by build of Python, and what a new measurement is beside them."""
+"""The stored figures by build of Python, and the comparison with a new measurement."""
 
 import platform
 from collections.abc import Mapping
@@ -9,12 +9,12 @@ import msgspec
 
 FILE: Final = Path(__file__).with_name("figures.json")
 GROWTH_MOST: Final = 0.05
-"""Two runs of the same code agree within 0.5 %."""
+"""Maximum growth of a stage, as a share. Two runs of the same code agree within 0.5 %."""
 LESS_NOTED: Final = 0.005
 BUILD_MOST: Final = 0.01
-"""The same Python without imud: with a larger difference it is built with other options."""
+"""Maximum difference of the stage `interpreter`, as a share. A larger difference means another build of Python."""
 INTERPRETER: Final = "interpreter: a loop without imud"
-"""The stage that shows how Python itself was built."""
+"""The stage that does not use imud. It shows differences between two builds of Python."""
 
 Figures = dict[str, int]
 
@@ -26,7 +26,7 @@ class Line(NamedTuple):
 
     @property
     def growth(self) -> float:
-        """Share by which it has grown."""
+        """Return the growth since the stored figure, as a share."""
         return self.now / self.kept - 1 if self.kept else 0.0
 
     @property
@@ -50,14 +50,14 @@ def load() -> dict[str, Figures]:
 
 
 def keep(build: str, measured: Mapping[str, int]) -> None:
-    """Write the figures of one build; those of stages that were not measured stay."""
+    """Store the figures of one build. Keep the figures of stages that were not measured."""
     kept = load()
     kept[build] = {**kept.get(build, {}), **measured}
     FILE.write_bytes(msgspec.json.format(msgspec.json.encode(kept), indent=1) + b"\n")
 
 
 def is_same_build(kept: Figures | None, measured: Mapping[str, int]) -> bool:
-    """Whether the figures are those of this Python: it takes the same instructions for the same loop."""
+    """Return whether the figures are from this build of Python: the same loop takes the same number of instructions."""
     if kept is None or INTERPRETER not in kept:
         return False
     return abs(measured[INTERPRETER] / kept[INTERPRETER] - 1) <= BUILD_MOST

@@ -1,9 +1,9 @@
-"""The program that runs under callgrind: `python -m tests.bench.instructions.measured DIRECTORY [WORD …]`.
+"""The program under callgrind: `python -m tests.bench.instructions.measured DIRECTORY [WORD …]`.
 
-Each stage has a process of its own, forked after all imports: what ran before would change how the interpreter has
-specialised its instructions. `mark` is a system call that nothing else here makes; callgrind begins a new dump of the
-process before each (`--dump-before`). A stage has three: before n operations, before 2 n, and after them. Process, n
-and name of each stage go to standard output, in order.
+Each stage runs in a process of its own, forked after all imports. Otherwise, an earlier stage would change the
+specialized instructions of the interpreter. `mark` is a system call that no other code here uses. Before each such
+call, callgrind starts a new dump of the process (`--dump-before`). A stage has three dumps: before n operations, before
+2 n operations, and after them. The program prints the process id, n and the name of each stage in order.
 """
 
 import gc
@@ -48,7 +48,7 @@ def run(stage: Any, directory: str) -> None:
         operate = stage.make(stage.total, directory)
         operate(stage.warm)
         gc.collect()
-        gc.freeze()  # as the daemon does: collections need not look at what is there
+        gc.freeze()  # like the daemon: collections skip the existing objects
         mark()
         operate(stage.count)
         mark()
@@ -58,7 +58,7 @@ def run(stage: Any, directory: str) -> None:
     finally:
         if status:
             traceback.print_exc()
-        os._exit(status)  # callgrind would count the end for seconds
+        os._exit(status)  # a normal exit would take seconds under callgrind
 
 
 if __name__ == "__main__":

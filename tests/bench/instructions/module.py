@@ -1,8 +1,7 @@
-"""The device of the measurements: an HI91 module at 1 kHz.
+"""The device of the measurements: an HI91 device at 1 kHz.
 
-Its first minute passes quickly: most of its frames are lost, so that the fit of arrivals becomes old at little cost.
-
-Frames, their times of arrival and the small delays in them are the same in every run.
+The first minute is cheap: most frames are lost, so the fit gets old with few frames. Frames, arrival times and their
+small delays are the same in every run.
 """
 
 import struct
@@ -14,16 +13,16 @@ from tests.bench.instructions.virtual_time import BEGIN_NS
 
 BAUD: Final = 921600
 PAIRS: Final = 350
-"""Frames that come while most are lost, two by two, so that 1 ms remains the period that the clock learns."""
+"""Number of pairs of frames in the first minute. Two adjacent frames let the clock keep the period of 1 ms."""
 PAIR_STEP_MS: Final = 200
-"""The bins of the fit are 1 s wide after 64 s, and a new fit is rare from then on."""
+"""Time between two pairs, ms. After 64 s, the bins of the fit are 1 s wide, and the clock rarely computes a new fit."""
 SETTLE_READS: Final = 300
-"""After a gap the clock watches the next 256 samples closely."""
+"""Number of reads after a gap, more than the 256 samples that the clock checks closely after a gap."""
 PPM: Final = 40
 DELAY_NS: Final = (20_000, 90_000, 35_000, 150_000, 60_000, 25_000, 110_000)
 HEADER_BYTES: Final = 6
 TIME_AT: Final = 8
-"""Where an HI91 payload has its time, u32 in ms."""
+"""Offset of the device time in an HI91 payload (u32, ms)."""
 HI91: Final = encode_hi91(
     system_time_ms=0, accel_m_s2=(0.1226, -0.4903, 9.787), gyro_rad_s=(0.00175, -0.0035, 0.0052),
     mag_t=(2.13e-5, -3.4e-6, -4.27e-5), euler_rad=(0.0123, -0.0235, 0.7854),
@@ -52,7 +51,7 @@ class Module:
         self._time_ms = 1000
 
     def first_minute(self) -> list[Read]:
-        """Reads until the fit is old and nothing is watched any more."""
+        """Return reads until the fit is old and the clock has finished its checks after the gaps."""
         found = self.reads(SETTLE_READS)
         for _ in range(PAIRS):
             self.skip(PAIR_STEP_MS)
@@ -63,7 +62,7 @@ class Module:
         self._time_ms += duration_ms
 
     def reads(self, count: int, frames: int = 1) -> list[Read]:
-        """`count` reads of so many frames each, at 1 kHz."""
+        """Return `count` reads with `frames` frames each, at 1 kHz."""
         found = []
         for number in range(count):
             times = range(self._time_ms + 1, self._time_ms + frames + 1)

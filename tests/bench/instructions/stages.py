@@ -1,7 +1,7 @@
-"""What is counted: stages of the way of a sample, each on fixed input, and the whole daemon.
+"""The counted stages: parts of the path of a sample with fixed input, and the whole daemon.
 
-A stage makes `run`, which carries out its first so many operations that are still to be done; the instructions of 2 n
-less those of n are n operations without all that surrounds them.
+A stage creates the function `run`. `run(n)` executes the next n operations. The difference between the counts of 2 n
+and n operations is the count of n operations without the overhead of the measurement.
 """
 
 import asyncio
@@ -49,7 +49,7 @@ WARM_LEAST: Final = 20
 class CountedStage:
     name: str
     make: Callable[[int, str], Run]
-    """Makes `run` for so many operations in all; its files go into the directory."""
+    """Function that creates `run` for a total number of operations. It stores files in the directory."""
     count: int
     per: int = 1
 
@@ -59,7 +59,7 @@ class CountedStage:
 
     @property
     def warm(self) -> int:
-        """Operations before the first that is counted: the interpreter specialises its instructions."""
+        """Return the number of operations before the count. The interpreter specializes its instructions in this time."""
         return max(WARM // self.per, WARM_LEAST)
 
 
@@ -99,7 +99,7 @@ def _hi91_single(total: int, _directory: str) -> Run:
 
 
 HI91_BLOCK: Final = 50
-"""Frames in 4100 bytes: reads of that size have a cut frame at each end, as those of 4096 have."""
+"""Number of HI91 frames in 4100 bytes. Such reads have an incomplete frame at each end, like reads of 4096 bytes."""
 
 
 def _hi91_bulk(total: int, _directory: str) -> Run:
@@ -109,6 +109,7 @@ def _hi91_bulk(total: int, _directory: str) -> Run:
 
 
 def _cut(stream: bytes, size: int) -> list[bytes]:
+    # 30 bytes more in the first read: each following read starts inside a frame
     return [stream[: size + 30], *(stream[at : at + size] for at in range(size + 30, len(stream), size))]
 
 
@@ -169,13 +170,14 @@ def _canopen(total: int, _directory: str) -> Run:
 
 
 def _can_read(frames: int, total: int, _directory: str) -> Run:
-    """Reads of so many frames; datagrams of the loop device take the place of the bus's."""
+    """Return a function that reads `frames` CAN frames. Datagrams on the loopback interface replace the CAN bus."""
     sender, receiver = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     receiver.bind(("127.0.0.1", 0))
     receiver.setblocking(False)
     sender.connect(receiver.getsockname())
     reader, raw = FrameReader(receiver, lambda _classes, _data: False), pack_frame(BASE_ID, False, bytes(8))
 
+    # the default argument keeps the receiver open
     def read(_kept_open: socket.socket = receiver) -> None:
         for _ in range(frames):
             sender.send(raw)
@@ -205,7 +207,7 @@ def _clock(total: int, _directory: str) -> Run:
 
 
 def _samples(count: int) -> list[Sample]:
-    """Samples one ms apart, with the values of a whole HI91 message."""
+    """Return samples at intervals of 1 ms with the values of a complete HI91 measurement."""
     module, clock = Module(), _clock_of_module()
     reads = module.reads(SETTLE_READS + count)
     return [clock.sample(m, t_rx_ns, virtual_time.UTC_AHEAD_NS) for m, t_rx_ns in _measured(reads)][-count:]
@@ -234,6 +236,7 @@ def _ring(frames: int, total: int, directory: str) -> Run:
     publisher = _ring_publisher(directory)
     samples = _samples(total * frames)
     batches = [Batch("d0", 0, samples[at : at + frames]) for at in range(0, len(samples), frames)]
+    # encode the slots before the count: the outputs share the encoded slots of a batch
     for batch in batches:
         batch.slots()
     return _taking([partial(publisher.publish, batch) for batch in batches])
@@ -243,7 +246,7 @@ def _ring(frames: int, total: int, directory: str) -> Run:
 
 
 async def _serve(directory: str, clients: int, encoding: str) -> tuple[SocketServer, list[socket.socket]]:
-    """A server whose clients watch `d0`, over real sockets."""
+    """Start a server with clients that watch `d0` over real sockets."""
     path = f"{directory}/s"
     server = SocketServer(SocketOptions(path=path, group=own_group()), _context())
     server.start()
@@ -290,7 +293,7 @@ def _socket(clients: int, encoding: str, frames: int, total: int, directory: str
 
 
 def _mqtt_queue(total: int, _directory: str) -> Run:
-    """What the event loop does for the output `mqtt`: the rest is done by threads beside it."""
+    """Queue a batch for the output `mqtt`, the only work in the event loop. Threads of the output do the rest."""
     queue = WriterQueue()
     return _taking([partial(queue.put_batch, Batch("d0", 0, [sample])) for sample in _samples(total)])
 
@@ -299,7 +302,7 @@ def _mqtt_queue(total: int, _directory: str) -> Run:
 
 
 def _path(frames: int, total: int, directory: str) -> Run:
-    """From the bytes of a read to shared memory and one binary client, without the event loop."""
+    """Process the bytes of a read up to shared memory and one binary client, without the event loop."""
     server, (sock,) = asyncio.new_event_loop().run_until_complete(_serve(directory, 1, "binary"))
     publishers = (_ring_publisher(directory), server)
 
@@ -319,13 +322,13 @@ def _path(frames: int, total: int, directory: str) -> Run:
                 sock.recv_into(BUFFER)
 
     first = module.first_minute()
+    # the first counted read must be the first after a drain
     process([*first, *module.reads(-len(first) % DRAIN_EVERY)])
     reads = iter(module.reads(total, frames))
     return lambda count: process(list(islice(reads, count)))
 
 
-def _ignore(*_arguments: object) -> None:
-    """Of what the stream has beside samples: nothing."""
+def _ignore(*_arguments: object) -> None: ...
 
 
 def _daemon(clients: int, encoding: str, frames: int, total: int, directory: str) -> Run:

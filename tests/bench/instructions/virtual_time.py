@@ -1,7 +1,7 @@
-"""Clocks that stand still until they are set, in place of the machine's, for a program whose instructions are counted.
+"""Clocks with a settable time in place of the host's clocks, for a program under callgrind.
 
-Under valgrind a program runs fifty times as long, and never twice the same: ticks and time-outs would come at other
-samples in each run. `install` is called before anything of imud is imported, because modules bind the clocks by name.
+Under valgrind, a program needs fifty times as long, and each run has another duration. Ticks and time-outs would occur
+at different samples in each run. Call `install` before any import of imud, because its modules bind the clocks by name.
 """
 
 import time
@@ -19,7 +19,7 @@ _s = [BEGIN_NS / NS_PER_S]
 
 
 def install() -> None:
-    """Replace the clocks of `time`; they are C functions as before, so that reading one costs about the same."""
+    """Replace the clocks of `time` with C functions, so that reading a clock costs about the same as before."""
     time.monotonic_ns = time.thread_time_ns = partial(_ns.__getitem__, 0)
     time.time_ns = partial(_ns.__getitem__, 1)
     time.monotonic = partial(_s.__getitem__, 0)
