@@ -1,12 +1,12 @@
-"""Kills of what records, at random moments: every block that was written is whole, and replays as it ran.
+"""Kills recorders at random moments. All written blocks must be complete, and their replay must be equal to the run.
 
-`python -m tests.bench.recorder_kills [WRITERS [DAEMONS]]`, 100 and 10 unless given, with SIGKILL:
+`python -m tests.bench.recorder_kills [WRITERS [DAEMONS]]`, default 100 and 10. All kills use SIGKILL:
 
-- writers: the recorder's thread in a process that gives it records as fast as it takes them, so that most kills are in
-  the middle of a write; the records that are left are the first ones, each whole, without a gap;
-- daemons: 0.2 to 3 s after their file has begun; of each file no byte is damaged and no block is missing, at most one
-  is cut short at the end, and the replay has the stamps, errors and ledgers of the run at every check. Printed is how
-  much of the time before the kill is missing.
+- Writers: a process with the recorder's thread, which receives records as fast as it accepts them. Most kills occur
+  during a write. The records in the file must be the first records, complete and without a gap.
+- Daemons: the kill is 0.2 to 3 s after the start of the file. No byte of a file may be damaged and no block may be
+  missing. One block at the end may be incomplete. The replay must have the time stamps, time stamp errors and ledgers
+  of the run at every check. The output contains the time between the last recorded sample and the kill.
 """
 
 import os
@@ -59,9 +59,9 @@ def new_files(folder: Path, before: set[Path], least_bytes: int) -> list[Path]:
 
 
 def run_and_kill(folder: Path, after_s: float, least_bytes: int = 1) -> tuple[Path, int]:
-    """Run a daemon and kill it so long after its file has that size.
+    """Start a daemon and kill it `after_s` after its file has reached `least_bytes`.
 
-    Returns the file, and CLOCK_MONOTONIC of the kill.
+    Return the file, and the time of the kill, CLOCK_MONOTONIC, ns.
     """
     before = set((folder / "recordings").glob("*"))
     daemon = subprocess.Popen(
@@ -70,8 +70,8 @@ def run_and_kill(folder: Path, after_s: float, least_bytes: int = 1) -> tuple[Pa
     try:
         end_s = time.monotonic() + 60
         while not (new := new_files(folder, before, least_bytes)):
-            assert daemon.poll() is None, f"the daemon ended with {daemon.returncode}"
-            assert time.monotonic() < end_s, "no file begins"
+            assert daemon.poll() is None, f"expected a running daemon, got exit status {daemon.returncode}"
+            assert time.monotonic() < end_s, "expected a recording within 60 s, got no file"
             time.sleep(0.01)
         time.sleep(after_s)
         daemon.send_signal(signal.SIGKILL)
@@ -104,13 +104,14 @@ def write_for_ever(file: Path) -> None:
     queue.mark(file)
     for number in count():
         queue.put(records.encode_data(0, number.to_bytes(8, "little") * 10, number, -1))
+        # do not fill the queue, because a full queue drops records
         while not queue.is_easy:
             time.sleep(0.001)
         assert not writer.problem, writer.problem
 
 
 def kill_writer(file: Path, after_s: float) -> tuple[int, bool]:
-    """Kill a writer so long after its start; returns the records that are left, and whether a block was cut."""
+    """Kill a writer `after_s` after its start. Return the number of records, and whether a block is incomplete."""
     child = os.fork()
     if not child:
         try:
@@ -127,8 +128,9 @@ def kill_writer(file: Path, after_s: float) -> tuple[int, bool]:
         reader = RecordingReader(opened, file.name)
         try:
             numbers = [records.decode_data(record.body).t_rx_ns for record in reader]
-        except ImudError:  # the first block was cut
+        except ImudError:  # the first block is incomplete
             numbers = []
+    # the time stamp of each record is its number
     assert numbers == list(range(len(numbers)))
     assert (reader.blocks.bytes_bad, reader.records_unreadable) == (0, 0)
     assert reader.stored_bytes + reader.blocks.bytes_cut == file.stat().st_size
@@ -143,9 +145,7 @@ def kill_writers(kills: int) -> None:
         for number in range(kills):
             found, was_cut = kill_writer(Path(name) / str(number), random.uniform(0.0, 1.0))
             left, cut = left + found, cut + was_cut
-    print(
-        f"{kills} writers killed, {cut} of them in the middle of a block: {left} records left, whole and without a gap"
-    )
+    print(f"{kills} writers killed, {cut} of them during a block: {left} records remain, complete and without a gap")
 
 
 def main() -> int:
@@ -166,8 +166,8 @@ def kill_daemons(kills: int) -> None:
             samples += found
             missing += [missing_s] if found else []
     print(
-        f"{kills} daemons killed, {samples} samples in the files, all the same in the replay; missing before the kill: "
-        f"{sum(missing) / len(missing):.2f} s on average, {max(missing):.2f} s at most"
+        f"{kills} daemons killed, {samples} samples in the files, equal in the replay; last sample before the kill: "
+        f"mean {sum(missing) / len(missing):.2f} s, maximum {max(missing):.2f} s"
     )
 
 

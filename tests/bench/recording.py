@@ -1,11 +1,12 @@
-"""Cost of recording: CPU of the daemon with and without, and what a sample takes on the disk; and that it is right.
+"""Cost of a recording: CPU time of the daemon with and without it, and bytes per sample. Also checks the replay.
 
-`python -m tests.bench.recording [--quick] [size] [cpu] [replay]`; without a name all of them.
+`python -m tests.bench.recording [--quick] [size] [cpu] [replay]`; without a name, all three run.
 
-`cpu`: the same load in turns, the best round of each: other programs share the machine, which must be quiet otherwise.
-Threads of the recorder are part of the daemon's CPU. `size` records simulated modules that move, because a module at
-rest is compressed better. `replay` has a daemon play ten minutes of such a module at 1 kHz as fast as it can, and
-record it; a replay of the recording must have every member of every sample equal. With the others it is half a minute.
+`cpu` alternates between the load with and without a recording. The rows show the best round. Other programs must be
+idle. The CPU time of the daemon includes the threads of the recorder. `size` records simulated devices in motion,
+because a recording of a device at rest compresses better. `replay` records ten minutes of such a device at 1 kHz as
+fast as possible. All members of all samples must be equal in the replay. Together with the other parts, `replay`
+records half a minute.
 """
 
 import hashlib
@@ -55,7 +56,7 @@ def chosen_rows(words: list[str]) -> Iterator[Row]:
 
 
 def size_rows() -> Iterator[Row]:
-    """Bytes per sample of a module that moves, at the rates that the daemon's blocks have: one a second."""
+    """Yield the bytes per sample of a device in motion. The daemon writes one block per second."""
     for rate_hz in (100, 1000):
         random, module = Random(1), hi91_module(rate_hz)
         gatherer, stored, plain, samples, spent_ns = BlockGatherer(), 0, 0, 0, 0
@@ -66,6 +67,7 @@ def size_rows() -> Iterator[Row]:
                     late_ns = random.randrange(NS_PER_MS // 4)
                     made.append(records.encode_data(0, burst.data, BEGIN_NS + len(made) * NS_PER_MS + late_ns, -1))
             begin_ns = thread_time_ns()
+            # finish the block after each second, like the daemon
             stored += sum(len(gatherer.add(one)) for one in made) + len(gatherer.finish())
             spent_ns += thread_time_ns() - begin_ns
             plain += sum(map(len, made))
@@ -81,7 +83,7 @@ def cpu_rows(rounds: int, seconds: float) -> Iterator[Row]:
         pairs = [(run(without), run(replace(without, record_to=str(Path(folder))))) for _ in range(rounds)]
     plain = min((a for a, _ in pairs), key=lambda outcome: outcome.cpu_us_per_sample)
     recorded = min((b for _, b in pairs), key=lambda outcome: outcome.cpu_us_per_sample)
-    yield Row("1 kHz, 1 client: CPU per sample, nothing recorded", plain.cpu_us_per_sample, "us")
+    yield Row("1 kHz, 1 client: CPU per sample, not recorded", plain.cpu_us_per_sample, "us")
     yield Row("1 kHz, 1 client: CPU per sample, recorded", recorded.cpu_us_per_sample, "us")
     ratio = recorded.cpu_us_per_sample / plain.cpu_us_per_sample
     yield at_most("1 kHz, 1 client: CPU ratio", ratio, "x", RATIO_LIMIT)
@@ -89,7 +91,7 @@ def cpu_rows(rounds: int, seconds: float) -> Iterator[Row]:
 
 
 class Digest:
-    """A publisher that keeps the number of samples and a digest of all their members."""
+    """Publisher that counts the samples and computes a digest of all their members."""
 
     def __init__(self) -> None:
         self.count = 0

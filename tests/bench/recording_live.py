@@ -1,11 +1,10 @@
-"""A recording of a live device against what a client got: every member of every sample, and the ledger.
+"""A recording of a live device compared with the samples of a client: all members of all samples, and the ledger.
 
-`python -m tests.bench.recording_live [SECONDS]`, 30 unless given.
+`python -m tests.bench.recording_live [SECONDS]`, default 30.
 
-The real daemon records a simulated module that moves, in real time at 1 kHz on a pseudo-terminal, while a client
-receives every sample over the socket. It subscribes before the module is there, so it has them from the first to the
-last. Then the recording is replayed: there must be as many samples, and the slot of each (all members, f64) must be the
-very bytes that the client received.
+The daemon records a simulated device in motion in real time at 1 kHz on a pseudo-terminal. A client on the socket
+receives every sample. The client subscribes before the device exists, so it receives the first and the last sample. The
+replay must have the same number of samples. The client must have received the same slots (all members, f64).
 """
 
 import subprocess
@@ -33,9 +32,9 @@ STILL_S = 1.0
 
 
 class Receiver:
-    """A client that writes the slots of all samples to a file as they come.
+    """A client that writes the slots of all samples to a file.
 
-    Synchronization: a thread of its own; the attributes are read after its end.
+    Synchronization: a thread of its own. Read the attributes only after its end.
     """
 
     def __init__(self, path: Path, out: Path) -> None:
@@ -49,7 +48,7 @@ class Receiver:
         self._thread.start()
 
     def close(self) -> None:
-        """End it, once nothing comes any more."""
+        """Wait until no more samples arrive, then close the client."""
         self._end.set()
         self._thread.join()
         self._client.close()
@@ -76,14 +75,14 @@ def module(port: Path) -> Iterator[None]:
     with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
-            assert process.stdout.readline(), "the module has no port"
+            assert process.stdout.readline(), "cannot start the simulated device: expected its port on standard output"
             yield
         finally:
             process.communicate(timeout=START_S)
 
 
 def live_run(folder: Path, seconds: float) -> tuple[Receiver, dict[str, int]]:
-    """Run daemon, module and client; returns the client, and the ledger after the module's end."""
+    """Run daemon, device and client. Return the client, and the ledger after the end of the device."""
     device = {"driver": "hipnuc-uart", "uart": {"port": str(folder / "port"), "baud": 921_600}}
     recorder = {"enabled": True, "directory": str(folder / "recordings"), "file_mb": 1000}
     more = {"log_level": "info", "metrics": {"enabled": False}, "recorder": recorder}
@@ -111,6 +110,7 @@ def differing(file: Path, slots: Path) -> tuple[Player, int]:
             player.play([record])
             wrong += sum(slot != received.read(SLOT_BYTES) for slot in again)
             again.clear()
+        # also count samples that only the client received
         wrong += sum(1 for _ in iter(lambda: received.read(SLOT_BYTES), b""))
     return player, wrong
 
@@ -124,7 +124,7 @@ def live_rows(seconds: float = SECONDS) -> Iterator[Row]:
         player, wrong = differing(file, folder / "slots")
         (device,) = player.devices.values()
         other = sum(device.ledger.snapshot()[key] != value for key, value in ledger.items())
-        least = RATE_HZ * seconds / 2  # a busy machine may lose some on their way to the daemon
+        least = RATE_HZ * seconds / 2  # a busy host may lose frames before the daemon reads them
         yield at_least(f"{name}: samples", float(receiver.count), "samples", least)
         yield Row(f"{name}: samples lost before imud", float(lost(ledger)), "samples")
         yield at_most(f"{name}: samples dropped for the client", float(receiver.dropped), "samples", 0)

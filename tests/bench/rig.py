@@ -1,4 +1,4 @@
-"""Starts writer, server and readers as processes, the server alone on one core, and reads what the server cost."""
+"""Starts writer, server and readers as processes, the server alone on one core, and measures the cost of the server."""
 
 import json
 import os
@@ -23,8 +23,8 @@ SERVER_CORE = {CORES[-1]}
 REST_CORES = set(CORES[:-1]) or SERVER_CORE
 START_LIMIT_S = 120.0
 END_S = 0.2
-"""The measurement of CPU time ends this long before the last frame: the writer keeps its deadlines, this process may
-wake late."""
+"""Time between the end of the CPU measurement and the last frame, s. The writer has to keep its deadlines, and this
+process may wake up late."""
 
 
 @dataclass(frozen=True)
@@ -35,22 +35,22 @@ class Load:
     rate_hz: float = 1000.0
     seconds: float = 5.0
     warm_s: float = 3.0
-    """Time before it that does not: the clock's first fits, and caches."""
+    """Time before the measurement, s: the clock computes its first fits, and the caches fill."""
     bare: bool = False
     latency_ms: float | None = None
-    """What clients and shared memory ask for; None: what they get without asking."""
+    """Latency that clients and shared memory request, ms; None for their defaults."""
     client_hz: float | None = None
-    """Samples a second that a client asks for; None: all."""
+    """Sample rate that a client requests, Hz; None for all samples."""
     stuck: bool = False
     phases: int = 1
     apart: int = 0
-    """Frames after which the next device begins: 0 lets all begin at once."""
+    """Number of frames between the starts of two devices; 0 starts all devices at the same time."""
     shm: bool = True
     sout: bool = False
     record_to: str = ""
-    """Directory that the daemon records to; empty for no recording."""
+    """Directory of the recording; empty for no recording."""
     mqtt: Mapping[str, object] = field(default_factory=dict)
-    """Settings of the output `mqtt`; empty for none."""
+    """Configuration of the output `mqtt`; empty for no output."""
 
     @property
     def frames(self) -> int:
@@ -74,7 +74,7 @@ class Outcome:
 
     @property
     def lost(self) -> int:
-        """Samples that did not reach the first client, or that the daemon says are lost."""
+        """Return the number of samples that the first client did not receive or that the daemon reports as lost."""
         return (
             self.gaps
             + self.refused
@@ -97,7 +97,7 @@ class Process:
         assert self.popen.stdout is not None
         text = self.popen.stdout.readline()
         if not text:
-            raise RuntimeError(f"{self.popen.args!r} ended with {self.popen.wait()}")
+            raise RuntimeError(f"expected a line from {self.popen.args!r}, got exit status {self.popen.wait()}")
         return text.strip()
 
     def say(self, text: str) -> None:
@@ -115,6 +115,7 @@ class Process:
 
 def cpu_ns(pid: int) -> int:
     total = 0
+    # the CPU time of all threads, ns; more precise than the ticks of /proc/PID/stat
     for task in Path(f"/proc/{pid}/task").iterdir():
         total += int((task / "schedstat").read_text().split()[0])
     return total
@@ -125,7 +126,7 @@ def loop_ns(pid: int) -> int:
 
 
 def written_bytes(pid: int) -> int:
-    """Bytes that a process gave the disk so far (proc(5), /proc/PID/io)."""
+    """Return the number of bytes that a process has written to the disk (proc(5), /proc/PID/io)."""
     lines = Path(f"/proc/{pid}/io").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("write_bytes:"))
 
@@ -144,6 +145,7 @@ def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
         for i, port in enumerate(ports)
     }
     if load.sout:
+        # the name of a line has at most 31 bytes
         devices["d0"]["lines"] = {"sout": {"line": str(folder / "edges")[-31:]}}
     tree = {
         "log_level": "error",
@@ -157,7 +159,7 @@ def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
         "devices": devices,
     }
     file = folder / "imud.yaml"
-    file.write_bytes(msgspec.json.encode(tree))  # JSON is YAML
+    file.write_bytes(msgspec.json.encode(tree))  # each JSON text is a YAML text
     return file
 
 
@@ -165,7 +167,7 @@ def wait_for(path: Path) -> None:
     end = monotonic() + START_LIMIT_S
     while not path.exists():
         if monotonic() > end:
-            raise TimeoutError(f"{path} did not appear within {START_LIMIT_S} s")
+            raise TimeoutError(f"expected {path} within {START_LIMIT_S} s")
         sleep(0.01)
 
 
@@ -184,7 +186,7 @@ def start_server(stack: ExitStack, folder: Path, ports: Sequence[str], load: Loa
     with Client(str(path)) as client:
         while any(status.state != "searching" for status in statuses(client)):
             if monotonic() > end:
-                raise TimeoutError("the daemon did not open all ports")
+                raise TimeoutError(f"expected all devices in the state searching within {START_LIMIT_S} s")
             sleep(0.05)
     return server
 
@@ -217,7 +219,7 @@ class Used(NamedTuple):
 
 
 def measure_cpu(load: Load, writer: Process, pid: int) -> Used:
-    """Let the writer go; return what process `pid` used while it was measured."""
+    """Start the writer. Return the cost of process `pid` during the measurement."""
     writer.say("go")
     sleep(load.warm_s)
     before_ns, before_loop_ns, before_bytes, begun = cpu_ns(pid), loop_ns(pid), written_bytes(pid), monotonic()
@@ -225,7 +227,7 @@ def measure_cpu(load: Load, writer: Process, pid: int) -> Used:
     used_ns, used_loop_ns, elapsed = cpu_ns(pid) - before_ns, loop_ns(pid) - before_loop_ns, monotonic() - begun
     used_bytes = written_bytes(pid) - before_bytes
     refused = int(writer.line())
-    sleep(0.05)  # what is on its way arrives
+    sleep(0.05)  # wait for the last samples
     return Used(used_ns, used_loop_ns, used_bytes, elapsed, refused)
 
 
@@ -244,6 +246,7 @@ def run(load: Load) -> Outcome:
         statuses = () if load.bare else tuple(ask(folder / "s"))
         readers.say("end")
         figures = json.loads(readers.line())
+    # device n starts n * apart frames later and sends fewer frames
     total = load.frames * load.devices - load.apart * sum(range(load.devices))
     counted = used.elapsed_s * load.rate_hz * load.devices
     return Outcome(
@@ -255,6 +258,7 @@ def run(load: Load) -> Outcome:
         p99_us=figures["p99_us"],
         max_us=figures["max_us"],
         received=figures["samples"],
+        # a client with `rate_hz` receives only a part of the samples
         gaps=figures["gaps"] + total - figures["samples"] if load.clients and load.client_hz is None else 0,
         refused=used.refused,
         rss_mb=memory_mb,

@@ -1,10 +1,10 @@
-"""A measurement as it is printed and written to build/bench.json."""
+"""A figure as `make bench` prints it and writes it to build/bench.json."""
 
 from typing import NamedTuple
 
 
 class Row(NamedTuple):
-    """One figure. `reach` is what was aimed at in words, `reached` whether it was; both empty for a plain figure."""
+    """A figure. `reach` is its goal as text, `reached` the result; both are empty for a figure without a goal."""
 
     name: str
     value: float

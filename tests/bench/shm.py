@@ -1,4 +1,4 @@
-"""Time per sample of the Python and the C reader of shared memory. `make bench-instructions` measures the writer."""
+"""Time per sample of the Python and C readers of shared memory. `make bench-instructions` measures the writer."""
 
 import shutil
 import subprocess
@@ -49,7 +49,7 @@ def samples() -> Iterator[Sample]:
 
 
 def rows(quick: bool = False) -> Iterable[Row]:
-    """The figures; the best of ROUNDS, because the rest of the machine only ever adds."""
+    """Yield the best of ROUNDS: other programs on the host only increase the time."""
     rounds = 2 if quick else ROUNDS
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as folder:
         context = publisher_context(list, 1, time.monotonic_ns)
@@ -64,7 +64,7 @@ def rows(quick: bool = False) -> Iterable[Row]:
 
 
 def _read_ns(publisher: ShmPublisher, folder: str, given: list[Sample]) -> float:
-    publisher.add_device("bench", 0)  # an empty ring
+    publisher.add_device("bench", 0)  # replace the ring by an empty ring
     with Ring("bench", directory=folder) as ring:
         publisher.publish(Batch("bench", 0, given))
         start = time.perf_counter_ns()

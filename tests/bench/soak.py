@@ -1,13 +1,19 @@
-"""`make soak`: 100 devices at 1 … 400 Hz, 20 clients, scrapes, all recorded: memory flat, every loss in the ledger.
+"""`make soak`: 100 devices at 1 … 400 Hz, 20 clients, scrapes, all recorded. Memory must not grow, and ledgers balance.
 
-Passed means: anonymous memory rises by less than SLOPE_LIMIT after the first ten minutes; each device's samples are the
-frames that its pty took, and its losses those that it refused (±1); what a line of Modbus modules answered came as good
-frames; every ledger closes; a client misses only samples that the daemon says it dropped; descriptors and threads stay
-what they were; the recorder's account closes, and its files are whole and replay as the run was (`soak_recordings`).
-Nothing is drawn by chance: frames are made by number, noise has a seed. A run that is too short for a slope is held to
-a growth in its second half instead. In the first minutes the clients do not read for a while, until samples are
-dropped: what the queues need then is part of the memory that must not rise. The rings' shared memory is shown apart:
-its pages become resident when a device first writes them, which takes more than an hour at 1 Hz.
+The run passes if all of these conditions are true:
+
+- Anonymous memory grows by less than SLOPE_LIMIT_MB_PER_H after the first ten minutes. A shorter run limits the growth
+  in its second half.
+- The samples of each device are the frames that its pty accepted. The lost samples are the frames that its pty rejected
+  (±1).
+- imud received at most as many good frames as the Modbus devices sent, and each deadline is a sample or a loss.
+- Every ledger balances. Clients only miss samples that the daemon reports as dropped.
+- The numbers of descriptors and threads do not grow.
+- The files of the recorder are complete and agree with its counters and the run (`soak_recordings`).
+
+The frames and the noise are the same in each run. In the first minutes, the clients do not read for BEHIND_S, so that
+imud drops samples. The memory of the full queues is thus included before the memory must not grow. The shared memory of
+the rings is a separate figure: its pages become resident at the first write, which takes more than an hour at 1 Hz.
 """
 
 import argparse
@@ -38,14 +44,14 @@ from tests.support.files import CaptureWriter
 from tests.support.surroundings import free_port
 
 RATES: Final = ((1.0, 34), (10.0, 22), (20.0, 14), (50.0, 8), (100.0, 3), (400.0, 1))
-"""Rate in Hz and how many ptys have it; every other one is an IMU61x."""
+"""Pairs of (rate in Hz, number of ptys). Every second device is an IMU61x."""
 MODULES: Final = 8
-"""Modbus modules on one line behind a pty of its own, which imud asks at MODULE_HZ each."""
+"""Number of Modbus devices on one bus behind a pty. imud polls each at MODULE_HZ."""
 MODULE_HZ: Final = 5.0
 MODULE_BAUD: Final = 115200
 LINE_SEED: Final = 25
 DEADLINE_TOLERANCE: Final = 2
-"""Deadlines between the moment for which a status stands and those before and after it was asked for."""
+"""Tolerance in deadlines. The status may describe a moment shortly before or after the request."""
 REPLAYS: Final = 10
 REPLAY_HZ: Final = 10.0
 CLIENTS: Final = 20
@@ -53,15 +59,15 @@ SCRAPE_S: Final = 5.0
 MINUTE_S: Final = 60.0
 SETTLE_S: Final = 600.0
 SLOPE_MIN_S: Final = 600.0
-"""A slope over less is that of the noise."""
+"""Minimum duration for a slope, s. The slope of a shorter run is mainly noise."""
 SLOPE_LIMIT_MB_PER_H: Final = 1.0
 GROWTH_LIMIT_MB: Final = 1.0
 BEHIND_AT_S: Final = 60.0
 BEHIND_S: Final = 10.0
-"""Clients do not read for so long, until more waits for some than may."""
+"""Time in which the clients do not read, s. The queues of some clients overflow in this time."""
 TAIL_S: Final = 1.0
 END_LIMIT_S: Final = 20.0
-"""Until the daemon has written what waits and ended."""
+"""Maximum time until the daemon has written its data and ended, s."""
 LOST_TOLERANCE: Final = 1
 
 
@@ -117,10 +123,10 @@ def write_configuration(folder: Path, ports: list[str], line: str, port: int) ->
 class Watched:
     def __init__(self, pid: int, socket: Path, metrics_port: int) -> None:
         self.points: list[tuple[float, float]] = []
-        """Seconds, and resident anonymous memory in MB, at every scrape."""
+        """Pairs of (time, s; resident anonymous memory, MB), one for each scrape."""
         self.usage: list[tuple[int, int]] = []
         self.unanswered = 0
-        """Scrapes without a page, where a starved daemon says 503, and questions without an answer in time."""
+        """Number of failed scrapes and late replies to status requests. A starved daemon replies 503."""
         self._pid, self._socket, self._port = pid, socket, metrics_port
         self._scrape_ms = self._scrape_kb = self._shared_mb = 0.0
         self._cpu_ns, self._samples = cpu_ns(pid), 0
@@ -132,7 +138,7 @@ class Watched:
         try:
             with urlopen(f"http://127.0.0.1:{self._port}/metrics", timeout=SCRAPE_S) as answer:
                 self._scrape_kb = len(answer.read()) / 1e3
-        except OSError:  # 503 from a daemon that is not run for seconds, or no answer
+        except OSError:  # 503 from a starved daemon, or no reply
             self.unanswered += 1
         self._scrape_ms = max(self._scrape_ms, (monotonic() - begin) * 1e3)
         anonymous_mb, self._shared_mb = resident_mb(self._pid)
@@ -141,9 +147,9 @@ class Watched:
     def minute(self, elapsed_s: float, over_s: float) -> None:
         try:
             statuses, dropped = ask_all(self._socket)
-        except TimeoutError:  # what counts is asked at the end, however busy the machine was meanwhile
+        except TimeoutError:  # the checks use the status at the end, so a busy host may skip this one
             self.unanswered += 1
-            print(f"{elapsed_s:5.0f} s  no status within {START_LIMIT_S:g} s", flush=True)
+            print(f"{elapsed_s:5.0f} s  no reply to the status request within {START_LIMIT_S:g} s", flush=True)
             return
         samples = sum(status.ledger["samples"] for status in statuses.values())
         missing = sum(count for status in statuses.values() for name, count in status.ledger.items() if "lost_" in name)
@@ -160,7 +166,7 @@ class Watched:
 
 
 def resident_mb(pid: int) -> tuple[float, float]:
-    """Anonymous and shared resident memory in MB (10⁶ bytes)."""
+    """Return anonymous and shared resident memory, MB (10⁶ bytes)."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     kb = {name: value.split()[0] for name, _, value in (line.partition(":") for line in lines) if "Rss" in name}
     return int(kb["RssAnon"]) * 1024 / 1e6, int(kb["RssShmem"]) * 1024 / 1e6
@@ -181,16 +187,18 @@ def judge(
         ledger = statuses[name].ledger
         missing = sum(count for key, count in ledger.items() if key.startswith("lost_"))
         if ledger["samples"] != taken:
-            found.append(f"{name}: {ledger['samples']} samples of {taken} frames that its pty took")
+            found.append(f"{name}: expected {taken} samples, the frames that its pty accepted, got {ledger['samples']}")
         if abs(missing - refused) > LOST_TOLERANCE * (refused > 0):
-            found.append(f"{name}: the ledger says {missing} lost, its pty refused {refused}")
+            found.append(f"{name}: expected {refused} lost samples, the frames that its pty rejected, got {missing}")
     for name, status in statuses.items():
         if bytes_open(status.ledger) or frames_open(status.ledger):
-            found.append(f"{name}: the ledger does not close: {status.ledger}")
+            found.append(f"{name}: the ledger does not balance: {status.ledger}")
         if name.startswith("replay") and any(count for key, count in status.ledger.items() if key.startswith("lost_")):
-            found.append(f"{name}: losses in a replay: {status.ledger}")
+            found.append(f"{name}: expected no lost samples in a replay, got {status.ledger}")
     if gaps > dropped:
-        found.append(f"clients miss {gaps} samples, the daemon says it dropped {dropped}")
+        found.append(
+            f"clients: expected at most {dropped} missing samples, the dropped samples of the daemon, got {gaps}"
+        )
     return found
 
 
@@ -206,9 +214,9 @@ class LineState:
     answered_s: float
     ledgers: Mapping[str, Mapping[str, int]]
     failed: Mapping[str, int]
-    """Polls without a sample, by module: a loss after one of them is known within one."""
+    """Polls without a sample, by device. A status may not yet count the loss of a failed poll."""
     replies: int
-    """Replies that the modules had sent, asked after imud was."""
+    """Replies that the devices had sent. Read after the status of imud."""
 
 
 def ask_line(path: Path, line: Process) -> LineState:
@@ -221,9 +229,9 @@ def ask_line(path: Path, line: Process) -> LineState:
 
 
 def judge_line(begin: LineState, end: LineState) -> list[str]:
-    """What is wrong with the line: each deadline is a sample or a loss, and no module said more than it did.
+    """Return the errors of the bus: each deadline must be a sample or a loss, and each good frame must be a sent reply.
 
-    A gap of which the ledger knows no size, after a module was searched for, leaves the sum of that module open.
+    After a detection, the ledger may contain a gap of unknown size. The sum of this device is then not checked.
     """
     found = []
     for name, before in begin.ledgers.items():
@@ -232,15 +240,15 @@ def judge_line(begin: LineState, end: LineState) -> list[str]:
         due_min = MODULE_HZ * (end.asked_s - begin.answered_s) - failed - DEADLINE_TOLERANCE
         due_max = MODULE_HZ * (end.answered_s - begin.asked_s) + failed + DEADLINE_TOLERANCE
         if counted > due_max or (counted < due_min and after["lost_unknown"] == before["lost_unknown"]):
-            found.append(f"{name}: {counted} samples and losses, expected {due_min:.0f} to {due_max:.0f}")
+            found.append(f"{name}: expected {due_min:.0f} to {due_max:.0f} samples and losses, got {counted}")
     good = sum(ledger["frames_good"] for ledger in end.ledgers.values())
     if good > end.replies:
-        found.append(f"modbus: {good} good frames of {end.replies} that the modules sent")
+        found.append(f"modbus: expected at most {end.replies} good frames, the replies of the devices, got {good}")
     return found
 
 
 def judge_memory(points: list[tuple[float, float]], seconds: float) -> tuple[str, bool]:
-    """The figure of memory in words, and whether it is within its limit."""
+    """Return the memory growth as text, and whether it is within its limit."""
     settled = [(t, mb) for t, mb in points if t > SETTLE_S]
     if seconds >= SETTLE_S + SLOPE_MIN_S:
         slope = slope_mb_per_h(settled)
@@ -255,13 +263,14 @@ def judge_memory(points: list[tuple[float, float]], seconds: float) -> tuple[str
 
 
 def watch_for(watched: Watched, recordings: Recordings, readers: Process, seconds: float) -> None:
-    """Scrape, read recordings and print until the time is over."""
+    """Scrape, check the recordings and print until `seconds` have passed."""
     begin = monotonic()
     next_scrape, minute = 0.0, 0.0
     behind_s = min(BEHIND_AT_S, seconds / 4)
     signals = [(behind_s, SIGSTOP), (behind_s + BEHIND_S, SIGCONT)]
     while (elapsed := monotonic() - begin) < seconds:
         while signals and elapsed >= signals[0][0]:
+            # SIGSTOP and SIGCONT: the clients do not read in between
             readers.popen.send_signal(signals.pop(0)[1])
         if elapsed >= next_scrape:
             watched.scrape(elapsed)
@@ -271,7 +280,7 @@ def watch_for(watched: Watched, recordings: Recordings, readers: Process, second
             watched.minute(elapsed, elapsed - minute)
             minute = elapsed
         sleep(max(min(next_scrape, seconds) - (monotonic() - begin), 0.01))
-    readers.popen.send_signal(SIGCONT)  # a short run ends before its time
+    readers.popen.send_signal(SIGCONT)  # a short run ends before the signal
     watched.scrape(elapsed)
     watched.minute(elapsed, elapsed - minute)
 
@@ -279,13 +288,14 @@ def watch_for(watched: Watched, recordings: Recordings, readers: Process, second
 def run_fleet(seconds: float, metrics_port: int) -> int:
     written = written_devices()
     print(
-        f"soak: {len(written)} devices behind ptys, {MODULES} Modbus modules on a line and {REPLAYS} replays, "
+        f"soak: {len(written)} devices behind ptys, {MODULES} Modbus devices on a bus and {REPLAYS} replays, "
         f"{sum(r * n for r, n in RATES):g} + {MODULES * MODULE_HZ:g} + {REPLAYS * REPLAY_HZ:g} samples/s, "
         f"{CLIENTS} clients, a scrape every {SCRAPE_S:g} s, all recorded, {seconds:g} s"
     )
-    print("soak: CAN, I2C and SPI left out: they need a kernel's buses, which `make chaos` has in the lab")
+    print("soak: without CAN, I2C and SPI, because they need buses of the kernel; see `make chaos` in the lab")
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-soak-") as name, ExitStack() as stack:
         folder = Path(name)
+        # longer than the run, so that no replay ends
         write_capture(folder / "capture", seconds + START_LIMIT_S)
         writer = stack.enter_context(
             Process(REST_CORES, "-m", "tests.bench.fleet_writer", "--seconds", str(seconds), *written)
@@ -304,6 +314,7 @@ def run_fleet(seconds: float, metrics_port: int) -> int:
         writer.say("go")
         watch_for(watched, recordings, readers, seconds)
         counts = [tuple(pair) for pair in json.loads(writer.line())]
+        # wait until the last samples have arrived
         sleep(TAIL_S)
         statuses, dropped = ask_all(folder / "s")
         found = judge_line(begin, ask_line(folder / "s", line))
@@ -318,11 +329,11 @@ def run_fleet(seconds: float, metrics_port: int) -> int:
     if not flat:
         found.append(words)
     if any(a > b for a, b in zip(watched.usage[-1], watched.usage[0], strict=True)):
-        found.append(f"descriptors and threads {watched.usage[-1]}, in the beginning {watched.usage[0]}")
+        found.append(f"descriptors and threads {watched.usage[-1]}, at the start {watched.usage[0]}")
     taken, refused = (sum(column) for column in zip(*counts, strict=True))
     seen = f"clients {figures['samples']} samples, {figures['gaps']} missing, dropped {dropped}"
-    scrapes = f"scrapes {len(watched.points)}, unanswered {watched.unanswered}"
-    print(f"frames taken by ptys {taken}, refused {refused}; {seen}; {scrapes}; {recorded}; {words}")
+    scrapes = f"scrapes {len(watched.points)}, failed requests {watched.unanswered}"
+    print(f"frames accepted by ptys {taken}, rejected {refused}; {seen}; {scrapes}; {recorded}; {words}")
     print("\n".join(found or ["passed"]))
     return 1 if found else 0
 
@@ -335,14 +346,14 @@ def wait_open(path: Path, fleet: Fleet) -> None:
         if all(states[name] == "searching" for name in fleet.written) and set(modules) == {"running"}:
             return
         if monotonic() > end:
-            raise TimeoutError("the daemon did not open all ports")
+            raise TimeoutError(f"expected all ports open and all Modbus devices running within {START_LIMIT_S:g} s")
         sleep(0.2)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make soak")
-    parser.add_argument("--seconds", type=float, help="how long (3600; with --single 600)")
-    parser.add_argument("--single", action="store_true", help="one device at 1 kHz, ten clients")
+    parser.add_argument("--seconds", type=float, help="duration, s (default: 3600; with --single 600)")
+    parser.add_argument("--single", action="store_true", help="use one device at 1 kHz with ten clients")
     args = parser.parse_args()
     if args.single:
         return run_single(args.seconds or 600.0)

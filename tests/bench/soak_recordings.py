@@ -1,8 +1,8 @@
-"""What `make soak` looks at in the recorder: every file that it made, before it is removed, against its own counters.
+"""The checks of `make soak` for the recorder: each file before its removal, and the counters of the recorder.
 
-Files are read whole when the next one has begun, thus all of them, while the budget lets only the newest stand. The
-recorder's account closes when the files have as many records, lost records and bytes as its metrics say, and when as
-many files are gone as it says it removed. The files that are left are replayed and compared with the run.
+A file is read completely when the next file exists. The size limit removes all files except the newest ones, so each
+file is read soon. The numbers of records, lost records, bytes and removed files must agree with the metrics of the
+recorder. The remaining files are replayed and compared with the run.
 """
 
 from collections.abc import Mapping
@@ -22,10 +22,10 @@ from imud.recording.player import Player
 
 FILE_MB: Final = 1.0
 KEEP_MB: Final = 3.0
-"""One file and what is written meanwhile: a file is there for long enough to be read, and is removed soon after."""
+"""Size limit of all files, MB: one file, and the data that the recorder writes until the file is read."""
 SCRAPE_LIMIT_S: Final = 5.0
 CLOSE_LIMIT_S: Final = 20.0
-"""A block is made in milliseconds, once a second: after some looks one of them is between two blocks."""
+"""Maximum time for a consistent reading of files and counters, s. The recorder writes a block once per second."""
 
 
 def settings(directory: Path) -> dict[str, object]:
@@ -46,22 +46,23 @@ class Recordings:
     read: dict[str, Count] = field(default_factory=dict)
 
     def look(self) -> None:
-        """Read the files that ended since; called more often than files begin."""
+        """Read the finished files. Call more often than new files start."""
         for file in self._files()[:-1]:
             if file.name not in self.read:
                 self._read(file)
 
     def close_account(self, metrics_port: int) -> list[str]:
-        """Compare with the recorder's counters while the daemon runs and writes; return what does not agree.
+        """Compare the files with the counters of the recorder while the daemon writes. Return the differences.
 
-        What is in the files lies between the counters of before and after they were read. A counter may be ahead of
-        the file for the moment in which a block is made: then it is looked at again.
+        The values of the files must be between the counters before and after the read. While the recorder writes a
+        block, a counter may be ahead of the file. The comparison is then repeated.
         """
-        end, found = monotonic() + CLOSE_LIMIT_S, ["the recorder's account was not looked at"]
+        end, found = monotonic() + CLOSE_LIMIT_S, ["the recorder: no comparison of files and counters"]
         while found and monotonic() < end:
             self.look()
             before = recorder_metrics(metrics_port)
             files = self._files()
+            # the newest file grows: read it between two reads of the counters
             left, newest = len(files), files[-1].read_bytes()
             sizes = len(newest) + sum(file.stat().st_size for file in files[:-1] if file.exists())
             after = recorder_metrics(metrics_port)
@@ -69,21 +70,24 @@ class Recordings:
             counts.append(count_of(BytesIO(newest), files[-1].name)[0])
             found = _compare(counts, before, after, left)
             if sizes > KEEP_MB * 1e6:
-                found.append(f"recordings take {sizes} bytes of {KEEP_MB:g} MB")
+                found.append(f"recordings: expected at most {KEEP_MB:g} MB, got {sizes} bytes")
         return found
 
     def finish(self) -> str:
-        """After the end of the daemon: read and replay what is left. Returns what there was, in words."""
+        """Read and replay the remaining files after the end of the daemon. Return a summary as text."""
         left, samples, checks = self._files(), 0, 0
         for file in left:
             self._read(file)
             file_samples, file_checks = self._replay(file)
             samples, checks = samples + file_samples, checks + file_checks
+        # files have consecutive numbers; a missing number is a file that was removed unread
         numbers = sorted(int(name.split("-")[2].removesuffix(".imudrec")) for name in self.read)
         if numbers != list(range(len(numbers))):
-            self.problems.append(f"files were removed before they could be read: there are {numbers}")
+            self.problems.append(
+                f"recordings: expected consecutive file numbers, got {numbers}; files were removed before the check"
+            )
         if len(left) == len(self.read) and sum(count.bytes for count in self.read.values()) > KEEP_MB * 1e6:
-            self.problems.append(f"no file of {len(left)} was removed, and they take more than {KEEP_MB:g} MB")
+            self.problems.append(f"recordings: expected removed files above {KEEP_MB:g} MB, got all {len(left)} files")
         total = sum(count.records for count in self.read.values())
         lost = sum(count.lost for count in self.read.values())
         return (
@@ -103,7 +107,7 @@ class Recordings:
         self.problems += [f"{file.name}: {problem}" for problem in problems]
 
     def _replay(self, file: Path) -> tuple[int, int]:
-        """Replay a file; returns samples and places where it was compared with the run."""
+        """Replay a file. Return the number of samples and the number of comparisons with the run."""
         samples = 0
 
         def publish(batch: Batch) -> None:
@@ -124,7 +128,7 @@ class Recordings:
 
 
 def _compare(counts: list[Count], before: Mapping[str, int], after: Mapping[str, int], files_left: int) -> list[str]:
-    """What of the files is not between the counters of before and after."""
+    """Return the values of the files that are not between the counters before and after."""
     pairs = {
         "records": sum(count.records for count in counts),
         "records_dropped": sum(count.lost for count in counts),
@@ -132,7 +136,7 @@ def _compare(counts: list[Count], before: Mapping[str, int], after: Mapping[str,
         "files_removed": len(counts) - files_left,
     }
     return [
-        f"recorder: {name} {before[name]} to {after[name]}, in the files {value}"
+        f"recorder: expected {name} from {before[name]} to {after[name]}, got {value} in the files"
         for name, value in pairs.items()
         if not before[name] <= value <= after[name]
     ]

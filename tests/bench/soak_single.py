@@ -1,4 +1,4 @@
-"""`make soak ARGS=--single`: one device at 1 kHz, ten clients and one that never reads: nothing lost, memory flat."""
+"""`make soak ARGS=--single`: one device at 1 kHz, ten clients, one stuck client. No loss, and memory must not grow."""
 
 import tempfile
 from contextlib import ExitStack
@@ -12,7 +12,7 @@ SETTLE_S = 20.0
 
 
 def slope_mb_per_h(points: list[tuple[float, float]]) -> float:
-    """Least-squares slope of resident memory over time."""
+    """Return the least-squares slope of resident memory, MB/h."""
     n = len(points)
     mean_t = sum(t for t, _ in points) / n
     mean_m = sum(m for _, m in points) / n
@@ -42,7 +42,7 @@ def run_single(seconds: float) -> int:
     lost = sum(v for k, v in status.ledger.items() if k.startswith("lost_"))
     slope = slope_mb_per_h(points) if len(points) > 1 else 0.0
     print(
-        f"frames written {load.frames}, refused by the pty {refused}, samples {status.ledger['samples']}, lost {lost}"
+        f"frames written {load.frames}, rejected by the pty {refused}, samples {status.ledger['samples']}, lost {lost}"
     )
     print(f"first client: {figures}")
     if points:

@@ -1,7 +1,8 @@
-"""What `publish` to socket clients costs, against the bare `send` calls it cannot do without.
+"""Cost of `publish` for socket clients, compared with the same number of plain `send` calls.
 
-Real UNIX sockets, in one process: publish ten batches of one sample (timed), then empty the clients' sockets (not
-timed), so that the figures hold the daemon's own work and the kernel's part of `send`, and no waking of readers.
+All sockets are UNIX sockets in one process. A round publishes ten batches of one sample (measured), then reads the
+sockets of the clients (not measured). The figures contain the work of the daemon and the kernel's part of `send`, but
+not the wake-up of readers.
 """
 
 import asyncio
@@ -24,9 +25,9 @@ from tests.support.publisher_context import publisher_context
 
 CLIENTS = (1, 10, 100)
 SAMPLES_PER_ROUND = 10
-"""Few, so that what waits in 100 sockets fits the processor's cache, as it does at 1 kHz."""
+"""Number of samples per round. Ten samples in 100 sockets fit into the processor cache, as at 1 kHz."""
 OWN_LIMIT_NS = 300.0
-"""What publishing may add to each `send`, which costs about 3 µs where it wakes a reader."""
+"""Maximum time that publishing may add to each `send`, ns. A `send` that wakes a reader takes about 3 µs."""
 
 
 def make_batch(seq: int) -> Batch:
@@ -45,7 +46,7 @@ def make_batch(seq: int) -> Batch:
 
 
 def connect(path: str, request: bytes) -> socket.socket:
-    """A client that has sent its request; the answers are still to be read."""
+    """Connect a client and send its request. The replies are not read."""
     sock = socket.socket(socket.AF_UNIX)
     sock.connect(path)
     sock.sendall(request)
@@ -54,7 +55,7 @@ def connect(path: str, request: bytes) -> socket.socket:
 
 
 def empty(socks: list[socket.socket]) -> int:
-    """Read all that is there; bytes of the last socket."""
+    """Read all pending data. Return the number of bytes of the last socket."""
     count = 0
     for sock in socks:
         count = 0
@@ -67,7 +68,7 @@ def empty(socks: list[socket.socket]) -> int:
 
 
 def per_sample_ns(kinds: Sequence[Callable[[], None]], after: Callable[[], object], rounds: int) -> list[float]:
-    """For each kind of round the median of the time of one sample, ns; taken in turns, so that noise hits all alike."""
+    """Return the median time of one sample for each kind of round, ns. The kinds alternate against noise."""
     times: list[list[float]] = [[] for _ in kinds]
     for _ in range(rounds):
         for kind, taken in zip(kinds, times, strict=True):
@@ -79,8 +80,9 @@ def per_sample_ns(kinds: Sequence[Callable[[], None]], after: Callable[[], objec
 
 
 async def measure(directory: str, clients: int, encoding: str, rate_hz: float, rounds: int) -> tuple[float, float]:
-    """Cost of publish, and of the bare sends of the same bytes to as many sockets, ns per sample."""
-    context = publisher_context(list, 1, lambda: 0)  # with a clock that moves, so many clients would be put off
+    """Return the cost of `publish` and of plain sends of the same bytes to the same sockets, ns per sample."""
+    # a stopped clock: otherwise the server postpones some of the clients
+    context = publisher_context(list, 1, lambda: 0)
     own_group = grp.getgrgid(os.getegid()).gr_name
     server = SocketServer(SocketOptions(path=str(Path(directory) / "s"), group=own_group), context)
     server.start()
@@ -92,6 +94,7 @@ async def measure(directory: str, clients: int, encoding: str, rate_hz: float, r
     empty(socks)
     batches = iter([make_batch(seq) for seq in range(1, 2 + SAMPLES_PER_ROUND * rounds)])
     server.publish(next(batches))
+    # 700 bytes if the subscription has a lower rate and no sample arrived
     message = b"x" * (empty(socks) or 700)
     sends = [connection._send for connection in server.hub.connections.values()]
 
@@ -123,11 +126,11 @@ def rows(quick: bool = False) -> list[Row]:
                 cost_ns, bare_ns = asyncio.run(measure(directory, clients, encoding, 0, rounds))
                 name = f"socket: publish, {encoding}, {clients} clients"
                 found.append(Row(name, cost_ns, "ns/sample"))
-                found.append(Row(f"{name}: the bare sends of it", bare_ns, "ns/sample"))
+                found.append(Row(f"{name}: only the sends", bare_ns, "ns/sample"))
                 own_ns[clients] = cost_ns - bare_ns
             each_ns = (own_ns[100] - own_ns[1]) / 99
             found.append(
-                at_most(f"socket: {encoding}, own work per further client", each_ns, "ns/sample", OWN_LIMIT_NS)
+                at_most(f"socket: {encoding}, work per further client without send", each_ns, "ns/sample", OWN_LIMIT_NS)
             )
         cost_ns, _ = asyncio.run(measure(directory, 100, "json", 10.0, 50))
         found.append(Row("socket: publish, json, 100 clients at 10 Hz each", cost_ns, "ns/sample"))

@@ -1,6 +1,6 @@
-"""The daemon with its lines on FIFOs: `python -m tests.bench.sout_daemon CONFIG`. The FIFO `edges` is beside the file.
+"""The daemon with FIFOs as GPIO lines: `python -m tests.bench.sout_daemon CONFIG`. The FIFO `edges` is next to CONFIG.
 
-What a GPIO chip gives by its descriptor a FIFO gives here: the same bytes for the same system calls.
+A FIFO delivers the same bytes through the same system calls as the descriptor of a GPIO chip.
 """
 
 import os
@@ -24,7 +24,7 @@ class FifoInput(GpioInput):
         super().__init__(settings, purpose, rising_only)
 
     def _open(self, _config: Callable[[Any], Any], _events: int | None) -> None:
-        self._fd = os.open(self.path, os.O_RDWR)  # its own writer too, so that it never ends
+        self._fd = os.open(self.path, os.O_RDWR)  # also open for writing, so that the FIFO does not end
 
     def level(self) -> bool:
         return False

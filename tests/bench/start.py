@@ -1,8 +1,8 @@
-"""How long a command takes from its start to its end: `imud --help`, `imud status`, and the import of the package.
+"""Duration of a command from start to end: `imud --help`, `imud status`, and the import of the package.
 
-What waits is a person or a script in a loop, so that it is the time that passes, a new process each, the median of ten.
-The CPU time of the same starts is beside it, which other programs disturb less, and the interpreter alone: nothing in
-Python is faster.
+A user or a script waits for these commands. The figure is therefore the elapsed time of a new process, median of ten.
+The CPU time of the same processes is also a row, because other programs affect it less. The interpreter alone is the
+minimum for every Python program.
 """
 
 import os
@@ -30,9 +30,9 @@ NOT_STREAMING: Final = 1
 
 
 def start_rows(name: str, *arguments: str, status: int = 0) -> Iterator[Row]:
-    """Median time and CPU time of runs of Python with these arguments, after one that fills the caches.
+    """Yield median time and CPU time of Python with these arguments, after one run that fills the caches.
 
-    Raises RuntimeError where it does not end as expected: an error would be quick.
+    Raises RuntimeError if the exit status is not `status`, because a failed command is fast.
     """
     took_ms, cpu_ms = [], []
     for number in range(STARTS + 1):
@@ -44,7 +44,7 @@ def start_rows(name: str, *arguments: str, status: int = 0) -> Iterator[Row]:
             took_ms.append((time.monotonic_ns() - begin_ns) / 1e6)
             cpu_ms.append(_children_cpu_ms() - begin_cpu_ms)
         if done.returncode != status:
-            raise RuntimeError(f"{arguments} ended with {done.returncode}, expected {status}: {done.stderr!r}")
+            raise RuntimeError(f"{arguments}: expected exit status {status}, got {done.returncode}: {done.stderr!r}")
     yield at_most(f"start: {name}", median(took_ms), "ms", LIMIT_MS)
     yield Row(f"start: {name}, CPU", median(cpu_ms), "ms")
 

@@ -1,4 +1,4 @@
-"""The figures of docs/measurements.md: rows by hand, kept and read back, and plots that show every one of them."""
+"""The figures of docs/measurements.md: rows by hand, stored and read back, and plots with every row."""
 
 from tests.bench.clock_figures import ArrivalFigures, LineFigures, kept, microseconds, spread
 from tests.bench.clock_pictures import LEAST_US, arrivals_figure, lines_figure

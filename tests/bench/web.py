@@ -1,8 +1,8 @@
-"""CPU time of `imud web` and of the daemon with no browser, 1 and 20, on a module at 1 kHz.
+"""CPU time of `imud web` and of the daemon with 0, 1 and 20 browsers, on a device at 1 kHz.
 
-Twenty browsers are twenty WebSockets that look at the page of the device at 20 Hz and acknowledge as the page does;
-they draw nothing. What drawing costs is the browser's. The figure of the daemon without browsers is that without any
-client of its socket. The three are measured in turns, and the median of the rounds is shown: other load comes and goes.
+A browser is a WebSocket that displays the page of the device at 20 Hz and acknowledges messages like the page. It does
+not draw: drawing costs CPU time only in a browser. The figure of the daemon without browsers is also without any client
+on its socket. The three loads alternate, and the rows show the median of the rounds, because other load changes.
 """
 
 import asyncio
@@ -33,7 +33,7 @@ ROUNDS, QUICK_ROUNDS = 5, 1
 
 
 async def browse(socket: ClientWebSocketResponse, end_s: float) -> int:
-    """Take messages as a page does; returns the samples in the buckets that came."""
+    """Receive messages like a page. Return the number of samples in the received buckets."""
     look = {"look": "device", "device": "bow", "rate_hz": LOOK_HZ}
     samples = handled = 0
     due_s = monotonic()
@@ -52,7 +52,7 @@ async def browse(socket: ClientWebSocketResponse, end_s: float) -> int:
 
 
 async def share(url: str, browsers: int, pids: Sequence[int], seconds: float) -> tuple[list[float], list[int]]:
-    """CPU time per time of each process while so many look, after a time to warm up; and the samples each got."""
+    """Return the CPU time of each process per elapsed time, and the samples of each browser, after a warm-up."""
     async with ClientSession() as session:
         sockets = [await session.ws_connect(f"{url}api/stream", headers={"Origin": url[:-1]}) for _ in range(browsers)]
         await asyncio.gather(asyncio.sleep(WARM_S), *(browse(socket, monotonic() + WARM_S) for socket in sockets))
@@ -110,9 +110,9 @@ def rows(*, quick: bool) -> Iterator[Row]:
             yield Row(f"daemon, {browsers} browsers at {LOOK_HZ} Hz", 100 * of_daemon[browsers], "% of a core")
             yield Row(f"imud web, {browsers} browsers at {LOOK_HZ} Hz", 100 * of_web[browsers], "% of a core")
         for browsers, hz in least_hz.items():
-            yield Row(f"samples a second in each of {browsers} browsers, the least", hz, "Hz")
-        yield Row("daemon, 1 browser against none", of_daemon[1] / of_daemon[0], "times")
-        yield at_most("daemon, 20 browsers against 1", of_daemon[20] / of_daemon[1], "times", 1.1)
-        yield Row("imud web, 20 browsers against 1", of_web[20] / of_web[1], "times")
+            yield Row(f"samples a second in each of {browsers} browsers, minimum", hz, "Hz")
+        yield Row("daemon, 1 browser / 0 browsers", of_daemon[1] / of_daemon[0], "times")
+        yield at_most("daemon, 20 browsers / 1 browser", of_daemon[20] / of_daemon[1], "times", 1.1)
+        yield Row("imud web, 20 browsers / 1 browser", of_web[20] / of_web[1], "times")
         yield Row("memory of imud web", rss_mb(web), "MB")
-        yield Row("load of the machine, one minute", os.getloadavg()[0], "processes")
+        yield Row("load of the host, one minute", os.getloadavg()[0], "processes")

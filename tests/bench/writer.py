@@ -1,10 +1,10 @@
-"""A process that plays N HiPNUC modules into N ptys at a fixed rate, as cheaply as Python can.
+"""Process that simulates N HiPNUC devices on N ptys at a fixed rate, with as little CPU time as Python allows.
 
-Prints one line with the slave paths, waits for a line on standard input, writes, prints how many frames each pty took.
-Frame i carries FIRST_PA + i in its pressure field, and the time of its write stands in an array of i64 in the file
-`--times`, so that a reader knows each sample's true moment without any cost on the measured side; `--refused` names a
-file of one i64 that has the number of frames so far that a pty did not take whole. With `--udp PORT` attitude sentences
-of NMEA 0183 go to that port instead, for gpsd.
+The process prints one line with the paths of the slaves, waits for a line on standard input, writes the frames, and
+prints the number of frames that the ptys rejected. The pressure of frame i is FIRST_PA + i. The file `--times` is an
+array of i64 with the time of each write, ns. A reader thus knows the true time of each sample, and the measured process
+has no extra work. The file `--refused` is one i64, the number of frames so far that a pty did not accept completely.
+With `--udp PORT`, the process sends attitude sentences of NMEA 0183 to this port, for gpsd.
 """
 
 import argparse
@@ -26,15 +26,15 @@ from imud.lines.gpio import EVENT, RISING
 from imud.model.units import uart_byte_ns
 
 LATE_LIMIT_NS = 50_000_000
-"""A writer this late has lost its deadlines: it counts them and starts anew."""
+"""Maximum delay of the writer, ns. With a larger delay, the writer has lost its deadlines and shifts all later ones."""
 
 MakeFrame = Callable[[int], bytes | bytearray]
 
 FIRST_PA = 2000
-"""Of frame 0: imud takes what is below 1000 Pa or above 120 kPa for no pressure."""
+"""Pressure of frame 0, Pa. imud ignores a pressure below 1000 Pa or above 120 kPa."""
 
 PULSE_NS = 82 * uart_byte_ns(921_600) + 80_000
-"""From the rising edge of SOUT to the last byte of a frame: a pty has no wire, so the edge is set back by it."""
+"""Time from the rising edge of SOUT to the last byte of a frame, ns. The edge is set back by it: a pty has no wire."""
 
 
 def open_ptys(count: int) -> list[tuple[int, int]]:
@@ -48,7 +48,7 @@ def open_ptys(count: int) -> list[tuple[int, int]]:
 
 
 def template() -> bytearray:
-    """A HI91 frame to patch: pressure at 10, system time at 14, CRC at 4 (offsets in the frame)."""
+    """Return an HI91 frame with pressure at offset 10, device time at 14 and CRC at 4."""
     frame = encode_hi91(
         system_time_ms=0,
         accel_m_s2=(0.1, 0.2, 9.8),
@@ -77,7 +77,7 @@ def hi91_frames(rate_hz: float) -> MakeFrame:
 
 
 def sentence(i: int) -> bytes:
-    """$OHPR of a digital compass: heading, pitch, roll, temperature, depth, magnetic field, acceleration, turn."""
+    """Return an $OHPR sentence: heading, pitch, roll, temperature, depth, magnetic field, acceleration, rotation."""
     angle = i % 3600 / 10
     body = f"OHPR,{angle:.1f},-2.5,1.3,30.1,0.0,48.2,20.1,-3.4,-43.6,9.81,0.12,-0.05,9.79,0.0,0.1,0.2,0.3,0.0"
     check = reduce(xor, body.encode())
@@ -88,12 +88,11 @@ def play(
     masters: list[int], rate_hz: float, frames: int, phases: int, times: mmap.mmap, make: MakeFrame, edges: int = -1,
     count: mmap.mmap | None = None, apart: int = 0,
 ) -> int:  # fmt: skip
-    """Write `frames` frames to every master, in `phases` groups over each period; return how many were refused.
+    """Write `frames` frames to every master, in `phases` groups over each period. Return the number of rejected frames.
 
-    A frame that is taken in part is refused. The number so far is in `count`. Each master but the first leaves out the
-    first `apart` frames of the one before it as well.
-
-    With a descriptor for `edges`, the event of a pulse on SOUT goes there right before each frame.
+    A pty rejects a frame if it accepts only a part of it. `count` contains the number of rejected frames so far. Each
+    master skips `apart` more first frames than the previous master. If `edges` is a descriptor, the event of a SOUT
+    pulse is written to it before each frame.
     """
     pack = struct.pack_into
     period_ns = int(1e9 / rate_hz)
@@ -140,11 +139,13 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=1000.0)
     parser.add_argument("--frames", type=int, required=True)
     parser.add_argument("--phases", type=int, default=1)
-    parser.add_argument("--apart", type=int, default=0, metavar="FRAMES", help="each begins so much later than another")
+    parser.add_argument(
+        "--apart", type=int, default=0, metavar="FRAMES", help="frames between the starts of two devices"
+    )
     parser.add_argument("--times", required=True)
     parser.add_argument("--refused", metavar="FILE")
     parser.add_argument("--udp", type=int, metavar="PORT")
-    parser.add_argument("--edges", help="FIFO that gets the events of SOUT")
+    parser.add_argument("--edges", help="FIFO for the events of SOUT")
     args = parser.parse_args()
     times, count = mapped(args.times, 8 * args.frames), mapped(args.refused, 8) if args.refused else None
     if args.udp:

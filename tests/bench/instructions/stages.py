@@ -59,7 +59,7 @@ class CountedStage:
 
     @property
     def warm(self) -> int:
-        """Return the number of operations before the count. The interpreter specializes its instructions in this time."""
+        """Return the number of operations before the count, in which the interpreter specializes its instructions."""
         return max(WARM // self.per, WARM_LEAST)
 
 
