@@ -40,7 +40,7 @@ def watching(stage: AttackedDaemon) -> Iterator[Peak]:
             try:
                 peak.rss_mb = max(peak.rss_mb, stage.rss_mb)
                 peak.fds = max(peak.fds, stage.fds)
-            except OSError:  # it is gone
+            except OSError:  # the daemon has ended
                 return
 
     thread = threading.Thread(target=look)
@@ -106,24 +106,22 @@ def attack(
 
 def describe(stage: AttackedDaemon, idle_mb: float, *, delays: bool) -> str:
     if stage.scheduling is Scheduling.UNIT:
-        how = "default policy at nice 0 on any core, as the unit has it; hostile clients the same"
+        how = "default policy at nice 0 on any core, like the unit; hostile clients with the same settings"
     else:
         how = f"SCHED_RR {PRIORITY} on a core of its own; hostile clients at nice 10 on the others"
-    measuring = (
-        f"SCHED_RR {PRIORITY}" if stage.undisturbed else "no real-time priority could be had: delays are theirs too"
-    )
+    measuring = f"SCHED_RR {PRIORITY}" if stage.undisturbed else "no real-time priority, so they add to the delays"
     users = (
         f"good client uid {GOOD_UID}, hostile clients uids {HOSTILE_UIDS[0]} and {HOSTILE_UIDS[1]}"
         if os.geteuid() == 0
-        else "all of one user: only root can start others"
+        else "all clients with one user, because other users need root"
     )
-    judged = f"p99 of answers and of samples {P99_LIMIT_MS:g} ms, " if delays else "no delay (short form), "
+    judged = f"p99 of replies and of samples {P99_LIMIT_MS:g} ms, " if delays else "no limit of delays (short form), "
     return (
         f"scheduling {stage.scheduling.value}: daemon {how}; device and good client: {measuring}\n"
         f"users: {users}\n"
-        f"judged: no sample lost but by stops, ledger = port ± 1, {judged}"
+        f"limits: no lost sample except during stops, ledger = port ± 1, {judged}"
         f"{RSS_LIMIT_MB:.0f} MB and {FDS_LIMIT} descriptors above idle, {FDS_LEFT_LIMIT} descriptors left\n"
-        f"daemon idle: {idle_mb:.1f} MB, {stage.fds} descriptors; load of the machine {os.getloadavg()[0]:.1f}"
+        f"daemon idle: {idle_mb:.1f} MB, {stage.fds} descriptors; load of the host {os.getloadavg()[0]:.1f}"
     )
 
 
@@ -135,7 +133,7 @@ def run(chosen: dict[str, Attack], seconds: float, scheduling: Scheduling, *, sh
         for name, entry in chosen.items():
             found = attack(name, entry, stage, seconds, idle_mb, delays=not short)
             if found and short and stage.alive:
-                print(f"{name}: {'; '.join(found)}; once more, a stall of the machine does not come twice", flush=True)
+                print(f"{name}: {'; '.join(found)}; repeating, because the host may have stalled", flush=True)
                 found = attack(name, entry, stage, seconds, idle_mb, delays=not short)
             problems += [f"{name}: {problem}" for problem in found]
             if not stage.alive:
@@ -145,24 +143,24 @@ def run(chosen: dict[str, Attack], seconds: float, scheduling: Scheduling, *, sh
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make attack")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"one of {', '.join(ATTACKS)}; all when left out")
-    parser.add_argument("--short", action="store_true", help="at most 75 s in all, delays not judged, for CI")
-    parser.add_argument("--seconds", type=float, help="of each attack")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"one of {', '.join(ATTACKS)}; default: all")
+    parser.add_argument("--short", action="store_true", help="run for at most 75 s, without limits of delays, for CI")
+    parser.add_argument("--seconds", type=float, help="duration of each attack, s")
     parser.add_argument(
         "--scheduling", type=Scheduling, choices=list(Scheduling), default=Scheduling.REAL_TIME,
         metavar="unit|real-time",
-        help="of the daemon: as the unit has it, or real-time on a core of its own (default)",
+        help="scheduling of the daemon: like the unit, or real-time on a core of its own (default)",
     )  # fmt: skip
     args = parser.parse_args()
     unknown = [name for name in args.names if name not in ATTACKS]
     if unknown:
-        parser.error(f"no attack named {unknown[0]!r}; there are: {', '.join(ATTACKS)}")
+        parser.error(f"unknown attack {unknown[0]!r}; expected one of: {', '.join(ATTACKS)}")
     chosen = {name: entry for name, entry in ATTACKS.items() if name in args.names or not args.names}
     if args.short and not args.names:
         chosen = {name: entry for name, entry in chosen.items() if entry.short}
     seconds = args.seconds or (SHORT_S if args.short else LONG_S)
     problems = run(chosen, seconds, args.scheduling, short=args.short)
-    print(*(problems or ["every bound kept"]), sep="\n")
+    print(*(problems or ["no limit exceeded"]), sep="\n")
     return 1 if problems else 0
 
 

@@ -1,4 +1,4 @@
-"""Table: the attacks. Another one is a function that is given the stage and is a row of ATTACKS."""
+"""Table of the attacks. An attack is a function with the stage as argument and a row of ATTACKS."""
 
 import json
 import os
@@ -18,13 +18,13 @@ from tests.attack.stage import HOSTILE_UIDS, PIPE_BYTES, READ_GID, AttackedDaemo
 SHORT = (
     "nested", "empty-lines", "field-orders", "rates", "statuses", "watch-unread", "connects", "event-storm", "scrapes",
 )  # fmt: skip
-"""Kinds of hostile clients in the short form, one of each sort."""
+"""Kinds of hostile clients in the short form, one kind for each part of the daemon."""
 MANY_DEVICES = 100
 HANG_UPS_S = 0.005
 STARVE_S, STARVE_SEED = 4.0, 5
-"""The second stop of this seed is of 2 s: more than a port holds."""
+"""Duration of the attack, s, and seed of the stops. The second stop takes 2 s, more than a port can buffer."""
 LINE_BYTES = 512
-"""A message of the log is shorter: a pipe with less room than that takes no other."""
+"""Maximum length of a log message, bytes. A pipe with less room accepts no further message."""
 
 
 @dataclass
@@ -55,7 +55,7 @@ def end(children: list[subprocess.Popen[str]], seconds: float) -> Done:
     for child in children:
         out, _ = child.communicate(timeout=seconds + 30)
         if child.returncode:
-            done.problems.append(f"hostile process ended with {child.returncode}")
+            done.problems.append(f"a hostile process failed with exit status {child.returncode}")
         else:
             done.deeds += Deeds(**json.loads(out))
     if not done.deeds.connections:
@@ -68,13 +68,13 @@ def hostile(stage: AttackedDaemon, seconds: float, kind: str) -> Done:
 
 
 def replug(stage: AttackedDaemon, seconds: float) -> Done:
-    """All descriptors that clients can get, then a device is unplugged and plugged in again."""
+    """Let clients use all descriptors that they can get. Then unplug a device and plug it in again."""
     children = start(stage, seconds, "wakers")
     sleep(seconds / 2)
     plugged = stage.replug()
     done = end(children, seconds)
     if not plugged:
-        done.problems.append("the device that was plugged in again was not opened")
+        done.problems.append("the daemon did not open the reconnected device")
     return done
 
 
@@ -92,7 +92,7 @@ def reloads(stage: AttackedDaemon, seconds: float) -> Done:
 
 
 def event_flood(stage: AttackedDaemon, seconds: float) -> Done:
-    """Each reload is an event for all hostile clients."""
+    """Reload continuously. Each reload is an event for all hostile clients."""
     children = start(stage, seconds, "event-watch")
     count = hang_ups(stage, seconds)
     done = end(children, seconds)
@@ -109,15 +109,15 @@ def unread_log(stage: AttackedDaemon, seconds: float) -> Done:
     stage.log.read_on()
     stage.change()
     if waiting_bytes < PIPE_BYTES - LINE_BYTES:
-        done.problems.append(f"the log was not full: {waiting_bytes} bytes of {PIPE_BYTES}")
+        done.problems.append(f"expected a full log, got {waiting_bytes} bytes of {PIPE_BYTES}")
     if stage.log.spoilt == seen:
-        done.problems.append("the daemon had nothing to write into the log")
+        done.problems.append("expected log messages of the daemon, got none")
     return done
 
 
 def shared_memory(stage: AttackedDaemon, seconds: float, sticky: bool) -> Done:
     if os.geteuid():
-        print("shared memory: left out, only root can act as another user", flush=True)
+        print("shared memory: skipped, because only root can become another user", flush=True)
         sleep(seconds)
         return Done()
     problems, acts = rings.attack(stage, HOSTILE_UIDS[0], seconds, sticky)
@@ -127,7 +127,11 @@ def shared_memory(stage: AttackedDaemon, seconds: float, sticky: bool) -> Done:
 def starved(stage: AttackedDaemon, seconds: float) -> Done:
     before = stage.port_refused
     stops = starvation.attack(stage.pid, max(seconds, STARVE_S), STARVE_SEED)
-    problems = [] if stops and stage.port_refused > before else ["the daemon was never stopped for long enough"]
+    problems = (
+        []
+        if stops and stage.port_refused > before
+        else ["expected frames that the port rejected, got none: no stop was long enough"]
+    )
     return Done(problems, Deeds(requests=stops), stops)
 
 

@@ -38,7 +38,7 @@ class Figures:
 
 
 def quantile(values: list[float], share: float) -> float:
-    """The value that `share` of them do not exceed; infinity without any, as nothing was answered."""
+    """Return the quantile `share` of the values; infinity without values, because no reply arrived."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else float("inf")
 

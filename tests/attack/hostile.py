@@ -34,9 +34,9 @@ class Kind:
     """Function that returns the next data of a client; empty for no more data."""
     reading: Reading = Reading.ALL
     once: bool = False
-    """Whether it sends only once per connection."""
+    """Whether the client sends only once per connection."""
     leaves: bool = False
-    """Whether it disconnects as soon as it has sent."""
+    """Whether the client disconnects immediately after it has sent its data."""
     scrapes: bool = False
 
 
@@ -45,7 +45,7 @@ class Deeds:
     clients: int = 0
     connections: int = 0
     requests: int = 0
-    """Lines that were sent to the socket, scrapes, signals, acts on files."""
+    """Number of lines sent to the socket, scrapes, signals, and file operations."""
     sent_bytes: int = 0
 
     def __add__(self, other: "Deeds") -> "Deeds":
@@ -125,7 +125,7 @@ class Hostile:
         sock.setblocking(False)
         try:
             sock.connect((LOOPBACK, self._port) if self._kind.scrapes else self._path)
-        except BlockingIOError:  # TCP; a full queue of a UNIX socket
+        except BlockingIOError:  # TCP, or a full queue of a UNIX socket
             if not self._kind.scrapes:
                 sock.close()
                 return None
@@ -183,7 +183,7 @@ def attack(kinds: list[Kind], path: str, metrics_port: int, clients: int, second
     selector = selectors.DefaultSelector()
     deeds = Deeds(clients)
     everyone = [Hostile(path, metrics_port, kinds[number % len(kinds)], rng, deeds) for number in range(clients)]
-    idle = list(everyone)  # a client that waits for nothing is in no other list, and its connection has to last
+    idle = list(everyone)  # keep the connections of clients that wait for nothing: no other list contains them
     allowed = float(clients)
     last_s = time.monotonic()
     slow = any(kind.reading is Reading.SLOWLY for kind in kinds)

@@ -24,7 +24,7 @@ READ_S: Final = 0.02
 SETTLE_S: Final = 0.3
 """Time until new rings contain samples and a heartbeat, s."""
 REMADE_MISSED_MAX: Final = 500
-"""Maximum number of samples that a reader may miss while the daemon makes all rings twice, 1 kHz: half a second."""
+"""Maximum number of missed samples while the daemon creates all rings twice: half a second at 1 kHz."""
 HOSTILE: Final = """
 import sys, time
 from pathlib import Path
@@ -41,7 +41,7 @@ class Witness:
     missed: int = 0
     newest: int = 0
     refused: int = 0
-    """Files that were not believed."""
+    """Number of forged files that the reader rejected."""
     problems: list[str] = field(default_factory=list)
     over: Event = field(default_factory=Event)
 
@@ -50,7 +50,7 @@ class Witness:
             with Ring(self.stage.rings / "imud.d0") as ring:
                 self._follow(ring)
         except ServerError as error:
-            self.problems.append(f"a reader was stopped: {error}")
+            self.problems.append(f"the reader failed: {error}")
 
     def _follow(self, ring: Ring) -> None:
         epoch, self.newest = ring.epoch, ring.newest_seq
@@ -60,24 +60,24 @@ class Witness:
             self.missed += missed
             for sample in samples:
                 if sample.seq <= self.newest:
-                    self.problems.append(f"a reader got sample {sample.seq} after {self.newest}")
+                    self.problems.append(f"the reader received sample {sample.seq} after {self.newest}")
                 self.newest = sample.seq
             self._open_foreign(epoch)
         if ring.epoch != epoch or not ring.alive(monotonic_ns()):
-            self.problems.append("a reader has no living ring of the daemon at the end")
+            self.problems.append("expected a ring with a current heartbeat at the end, got none")
 
     def _open_foreign(self, epoch: int) -> None:
         for name in DEVICES:
             try:
                 with closing(Ring(self.stage.rings / f"imud.{name}")) as ring:
                     if ring.epoch != epoch:
-                        self.problems.append(f"a reader believed a forged ring of {name}")
+                        self.problems.append(f"the reader accepted a forged ring of {name}")
             except ServerError as error:
                 self.refused += "no such ring" not in str(error)
 
 
 def attack(stage: AttackedDaemon, uid: int, seconds: float, sticky: bool) -> tuple[list[str], int]:
-    """Let user `uid` act in the directory of the rings. Return the faults and the number of his operations."""
+    """Let user `uid` attack the directory of the rings. Return the problems and the number of operations."""
     stage.rings.chmod(STICKY_MODE if sticky else PRIVATE_MODE)
     witness = Witness(stage)
     reading = Thread(target=witness.run)
@@ -95,17 +95,21 @@ def attack(stage: AttackedDaemon, uid: int, seconds: float, sticky: bool) -> tup
     witness.over.set()
     reading.join()
     stage.rings.chmod(PRIVATE_MODE)
-    problems = [] if child.returncode == 0 and int(out) else [f"hostile process ended with {child.returncode}"]
+    problems = (
+        []
+        if child.returncode == 0 and int(out)
+        else [f"the hostile process failed with exit status {child.returncode}"]
+    )
     return problems + witness.problems + _judged(witness, sticky), int(out or 0)
 
 
 def _judged(witness: Witness, sticky: bool) -> list[str]:
     problems = []
     if not witness.samples:
-        problems.append("a reader got no samples")
+        problems.append("the reader received no samples")
     limit = REMADE_MISSED_MAX if sticky else 0
     if witness.missed > limit:
-        problems.append(f"a reader missed {witness.missed} samples, expected at most {limit}")
+        problems.append(f"the reader missed {witness.missed} samples, expected at most {limit}")
     if sticky and not witness.refused:
-        problems.append("no hostile file was ever there for a reader to refuse: this attack tried nothing")
+        problems.append("expected forged files that the reader rejects, got none: the attack had no effect")
     return problems

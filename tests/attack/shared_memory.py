@@ -23,13 +23,13 @@ DEVICES: Final = ("a", "bow", "demo", "imu", "imu0", "stern")
 """Names of possible devices. The attack also uses the names of the existing rings."""
 SLOTS: Final = 64
 HELD_MAX: Final = 64
-"""Descriptors that he keeps open, with their locks."""
+"""Maximum number of descriptors that the attacker keeps open, with their locks."""
 FILLER_BYTES: Final = 1 << 20
 FILLERS: Final = 8
 
 
 class Attacker:
-    """A user with at most the right to read. It counts its operations and expects errors."""
+    """A user with at most read permission. It counts its operations and expects errors."""
 
     def __init__(self, directory: Path, seed: int = 1) -> None:
         self.acts = 0
@@ -132,9 +132,10 @@ class Attacker:
 
 
 def attack(directory: Path, uid: int, stop: Callable[[], bool]) -> int:
-    """Become `uid` without groups, act until `stop()`, clean up; return the number of hostile acts.
+    """Become `uid` without groups, attack until `stop()`, clean up. Return the number of hostile operations.
 
-    To be called in a child process: there is no way back. Raises PermissionError where this user may not become `uid`.
+    Call this function only in a child process, because the change of the user is permanent. Raises PermissionError if
+    this user may not become `uid`.
     """
     if os.geteuid() != uid:
         os.setgroups([])

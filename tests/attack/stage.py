@@ -29,11 +29,11 @@ from tests.support.surroundings import free_port
 
 HOSTILE_UIDS = (65_534, 65_533)
 GOOD_UID = 65_532
-"""An ordinary reader: neither root, nor the daemon's user, nor one of the hostile ones."""
+"""User id of a normal reader. It is not root, not the user of the daemon, and not a hostile user."""
 READ_GID, CONTROL_GID = 65_534, 1
 RATE_HZ = 1000
 PRIORITY = 10
-"""Real-time; above that of programs that ask for the least, with which it would take turns of 100 ms."""
+"""Real-time priority, above programs with the lowest priority. With an equal priority, turns would take 100 ms."""
 SETTLE_S = 3.0
 IDLE_DEVICES = 3
 REPLUG_LIMIT_S = 5.0
@@ -41,12 +41,12 @@ CLIENTS_MAX = 320
 """Maximum number of clients: 256 hostile clients and the reserved places."""
 FDS_MAX = 16_384
 PIPE_BYTES = 4096
-"""The least that a pipe has room for, so that it is full soon."""
+"""Minimum size of a pipe, bytes. The log is full soon."""
 FILL_S = 0.2
 SLOTS = 1024
-"""256 KiB of memory for a ring: there are a hundred devices in some attacks."""
+"""Slots of a ring, 256 KiB of memory: some attacks use a hundred devices."""
 LOST_SETTLE_S = 1.0
-"""A loss is known with the sample after it."""
+"""Time until the next sample shows a loss, s."""
 QUIET_LIMIT_S = 10.0
 """Time until closed connections are gone, s, with the connections that wait for acceptance at 64 per second and
 user."""
@@ -57,12 +57,12 @@ PROBLEMS = 20
 
 
 class Scheduling(Enum):
-    """Scheduling of the daemon. Device and good client, which measure, are real-time in both cases."""
+    """Scheduling of the daemon. Device and good client, which measure, have real-time priority in both cases."""
 
     UNIT = "unit"
-    """As in the unit: the default policy, nice 0, any core. The same for hostile clients."""
+    """Settings of the unit: default policy, nice 0, any core. Hostile clients have the same settings."""
     REAL_TIME = "real-time"
-    """Real-time on its own core, with hostile clients at nice 10 on the other cores: the load of the daemon itself."""
+    """Real-time priority on its own core, hostile clients at nice 10 on the other cores: measures only the daemon."""
 
     @property
     def daemon_cores(self) -> set[int]:
@@ -88,7 +88,7 @@ def before_others(pid: int) -> bool:
 
 
 class IdlePort:
-    """A port that a device has and that can be unplugged: a link to a pseudo-terminal."""
+    """A port with a device that can be unplugged: a link to a pseudo-terminal."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -107,7 +107,7 @@ class IdlePort:
 
 
 class LogPipe:
-    """The daemon's standard error: a pipe that is read, or not, as an attack wants it."""
+    """The standard error of the daemon: a pipe. An attack decides whether it is read."""
 
     def __init__(self) -> None:
         self._reader, self.writer = os.pipe()
@@ -116,7 +116,7 @@ class LogPipe:
         self._reads.set()
         self._thread = threading.Thread(target=self._pass_on, daemon=True)
         self.spoilt = 0
-        """Lines that say that a configuration was refused."""
+        """Number of lines that report a rejected configuration."""
 
     @property
     def waiting_bytes(self) -> int:
@@ -126,7 +126,9 @@ class LogPipe:
     def stop_reading(self) -> None:
         """Stop reading and fill the socket, so that no later data fits into it."""
         self._reads.clear()
-        writer = os.open(f"/proc/self/fd/{self.writer}", os.O_WRONLY | os.O_NONBLOCK)  # the daemon's blocks
+        writer = os.open(
+            f"/proc/self/fd/{self.writer}", os.O_WRONLY | os.O_NONBLOCK
+        )  # the daemon's descriptor is blocking
         try:
             end_s = monotonic() + FILL_S  # the reader processes its last data in one turn
             while monotonic() < end_s:
@@ -178,7 +180,7 @@ class AttackedDaemon:
         self._stack = ExitStack()
         self.scheduling = scheduling
         self.undisturbed = True
-        """Whether device and good client, and a real-time daemon, could be made to run before other programs."""
+        """Whether device, good client and a real-time daemon have priority over other programs."""
         self.metrics_port = free_port()
         self.log = LogPipe()
 
@@ -186,7 +188,7 @@ class AttackedDaemon:
         raise_descriptors()
         try:
             self._start(self._stack)
-        except BaseException:  # what was started does not stay behind
+        except BaseException:  # end all started processes
             self._stack.close()
             raise
         return self
@@ -249,7 +251,7 @@ class AttackedDaemon:
         return int.from_bytes((self.folder / "refused").read_bytes(), sys.byteorder)
 
     def losses(self) -> tuple[int, int]:
-        """Lost samples of the 1 kHz device in the daemon's ledger, and gaps of unknown size."""
+        """Return the lost samples of the 1 kHz device in the ledger, and the number of gaps of unknown size."""
         with Client(str(self.socket)) as client:
             ledger = next(found for found in statuses(client) if found.name == "d0").ledger
         return lost(ledger), ledger["lost_unknown"]
@@ -265,7 +267,7 @@ class AttackedDaemon:
         os.kill(self.pid, number)
 
     def spoil_configuration(self) -> None:
-        """Leave a configuration that a reload refuses for many reasons; `change` mends it."""
+        """Write a configuration that a reload rejects for many reasons. `change` repairs it."""
         self._file.write_bytes(msgspec.json.encode({f"no-such-key-{number}": 1 for number in range(PROBLEMS)}))
 
     def change(self, *, devices: int = 0, slots: int = SLOTS) -> None:
@@ -281,7 +283,7 @@ class AttackedDaemon:
                 if len(statuses(client)) == 1 + IDLE_DEVICES + devices:
                     return
             sleep(0.05)
-        raise TimeoutError(f"the daemon did not change to {devices} more devices within {REPLUG_LIMIT_S:g} s")
+        raise TimeoutError(f"expected {devices} more devices within {REPLUG_LIMIT_S:g} s after the reload")
 
     def status(self) -> dict[str, Any]:
         with Client(str(self.socket)) as client:
@@ -333,7 +335,7 @@ class AttackedDaemon:
             "devices": devices,
         }
         new = self._file.with_suffix(".new")
-        new.write_bytes(msgspec.json.encode(tree))  # JSON is YAML
+        new.write_bytes(msgspec.json.encode(tree))  # each JSON text is a YAML text
         new.replace(self._file)
 
 

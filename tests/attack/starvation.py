@@ -1,4 +1,4 @@
-"""Starve a process: stop it by signals, and leave it little of the processor. Linux."""
+"""Starve a process: stop it with signals, and limit its CPU time. Linux only."""
 
 import os
 import signal
@@ -10,7 +10,8 @@ from time import monotonic, sleep
 from typing import Final
 
 STOPS_S: Final = (0.05, 0.2, 0.7, 2.0)
-"""Shorter and longer than a terminal's buffer lasts at 1 kHz (50 ms), and than a message may be late (500 ms)."""
+"""Durations of the stops, s: shorter and longer than the buffer of a terminal lasts at 1 kHz (50 ms) and than the
+maximum delay of a frame (500 ms)."""
 BETWEEN_S: Final = (0.02, 0.3, 1.0)
 HOG: Final = "while True: pass"
 

@@ -1,4 +1,4 @@
-"""Each bound of `make attack` is seen when it is exceeded."""
+"""`make attack` reports each exceeded limit."""
 
 from dataclasses import replace
 
@@ -25,17 +25,17 @@ def test_kept() -> None:
     ("seen", "problem"),
     [
         (replace(GOOD, lost=1, dropped=1), "1 samples lost, 1 of them dropped"),
-        (replace(GOOD, port_refused=1), "1 refused by the port"),
+        (replace(GOOD, port_refused=1), "1 rejected by the port"),
         (replace(GOOD, samples=0), "no samples"),
-        (replace(GOOD, reply_p99_ms=5.1), "answers 5.1 ms, expected at most 5 ms"),
+        (replace(GOOD, reply_p99_ms=5.1), "replies 5.1 ms, expected at most 5 ms"),
         (replace(GOOD, sample_p99_ms=5.1), "samples 5.1 ms, expected at most 5 ms"),
         (replace(GOOD, above_mb=RSS_LIMIT_MB + 1), "memory above idle"),
         (replace(GOOD, fds=FDS_LIMIT + 1), "descriptors above idle 1345, expected at most 1344"),
         (replace(GOOD, fds_left=FDS_LEFT_LIMIT + 1), "descriptors left over"),
         (replace(GOOD, failed=1), "errors in the daemon"),
-        (replace(GOOD, ledger_lost=2), "the ledger has 2 lost samples, the port refused 0"),
+        (replace(GOOD, ledger_lost=2), "the ledger has 2 lost samples, the port rejected 0"),
         (replace(GOOD, ledger_unknown=1), "1 gaps of unknown size"),
-        (replace(STARVED, ledger_lost=398), "the ledger has 398 lost samples, the port refused 400"),
+        (replace(STARVED, ledger_lost=398), "the ledger has 398 lost samples, the port rejected 400"),
         (replace(STARVED, ledger_lost=402), "expected a difference of at most 1"),
         (replace(STARVED, lost=402), "the good client missed 402 samples"),
     ],
