@@ -1,11 +1,11 @@
-"""`make fuzz`: every target for some seconds, two at a time, and a table; exit status 1 if something was found.
+"""`make fuzz`: run each target for some seconds, two at a time, and print a table. A finding causes exit status 1.
 
-make fuzz                                            60 s each with atheris, else with hypothesis
+make fuzz                                            60 s each with atheris, or with hypothesis without atheris
 make fuzz ARGS="--seconds 4 --seed 25"               the short form: all targets in at most 100 s on two idle cores
-make fuzz ARGS="--seconds 3600 --target stream/"     an hour for each target whose name has this in it
-make fuzz ARGS="--seed 7"                            the same inputs in the same order, as far as the time goes
+make fuzz ARGS="--seconds 3600 --target stream/"     an hour for each target with this text in its name
+make fuzz ARGS="--seed 7"                            the same inputs in the same order, up to the time limit
 make fuzz ARGS="--replay FILE --target shm/ring"     one input, with its traceback
-make fuzz ARGS="--corpus"                            writes tests/fuzz/corpus anew from the targets' seeds
+make fuzz ARGS="--corpus"                            create tests/fuzz/corpus again from the seeds of the targets
 """
 
 import argparse
@@ -96,7 +96,7 @@ def _run(command: Sequence[str], log: int, seconds: float) -> int:
 
 
 def environment() -> dict[str, str]:
-    """Of a target's process: the order of sets is the same in each."""
+    """Return the environment of a target's process. The order of sets is the same in each process."""
     return {**c_header.environment(), "PYTHONHASHSEED": "0"}
 
 
@@ -113,20 +113,22 @@ def _log(target: str) -> Path:
 
 
 def plan(wanted: Sequence[str], engine: str) -> list[tuple[str, str]]:
-    """Return the targets with their engines. Print the skipped targets with the reason. Raises SystemExit if no target
-    may be skipped."""
+    """Return the targets with their engines. Print the skipped targets with the reason.
+
+    Raises SystemExit if a required target cannot be built.
+    """
     chosen = [name for name in all_names() if not wanted or any(part in name for part in wanted)]
     if engine == "auto":
         engine = "atheris" if importlib.util.find_spec("atheris") else "hypothesis"
         if engine == "hypothesis":
-            print("atheris cannot be imported: hypothesis fuzzes in its place, not guided by coverage")
+            print("cannot import atheris; using hypothesis, without coverage")
     found = [(name, engine) for name in chosen]
     if not wanted or any(part in c_header.TARGET for part in wanted):
         problem = c_header.build(BUILD)
         if problem and c_header.is_needed():
-            raise SystemExit(f"{c_header.TARGET} cannot be left out where CI=true and root has apt-get: {problem}")
+            raise SystemExit(f"cannot build {c_header.TARGET}: {problem}; try make fuzz-deps, CI requires it")
         if problem:
-            print(f"{c_header.TARGET} is left out: {problem}")
+            print(f"skipping {c_header.TARGET}: {problem}")
         else:
             found.append((c_header.TARGET, "clang"))
     return found
@@ -142,13 +144,17 @@ def replay(path: Path, wanted: Sequence[str]) -> int:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make fuzz")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="for each target (default %(default)s)")
-    parser.add_argument("--target", action="append", default=[], help="part of a target's name; may be given again")
-    parser.add_argument("--seed", type=int, default=0, help="of what is tried; 0, the default: by the clock")
-    parser.add_argument("--jobs", type=int, default=JOBS, help="targets at a time (default %(default)s)")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="time for each target, s (default %(default)s)")
+    parser.add_argument(
+        "--target", action="append", default=[], help="part of a target's name; repeat it for more targets"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the inputs; 0 uses the clock (default)")
+    parser.add_argument(
+        "--jobs", type=int, default=JOBS, help="number of targets that run at the same time (default %(default)s)"
+    )
     parser.add_argument("--engine", choices=("auto", "atheris", "hypothesis"), default="auto")
     parser.add_argument("--replay", type=Path, metavar="FILE", help="run one input through --target")
-    parser.add_argument("--corpus", action="store_true", help="write the corpus in the tree anew")
+    parser.add_argument("--corpus", action="store_true", help="create the corpus in the tree again")
     parser.add_argument("--list", action="store_true", help="print the targets")
     args = parser.parse_args()
     if args.list:

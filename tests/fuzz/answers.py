@@ -1,5 +1,4 @@
-"""Data from a daemon, or from a program in its place, to its clients: replies, notifications, frames, or any other
-bytes."""
+"""Data from a daemon, or from another program, to a client: replies, notifications, frames, or any other bytes."""
 
 import asyncio
 import atexit
@@ -106,7 +105,7 @@ def _daemon() -> _Daemon:
 
 
 def run(data: bytes) -> None:
-    """The first byte selects the request of the client and whether the greeting is valid; the rest is the data."""
+    """The first byte selects the client's request and whether the hello is valid. The other bytes are the data."""
     head, rest = data[0] if data else 0, data[1:]
     daemon = _daemon()
     use = head % (CALLS + 1)

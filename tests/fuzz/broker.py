@@ -11,7 +11,7 @@ from imud.fleet.settings import MqttOptions, broker_of
 from tests.fuzz.target import Target, check_printable
 
 WAITS: Final = 8
-"""More than the packets that fit into an input of `BYTES_MAX` need."""
+"""Number of `wait` calls, more than the packets of an input of `BYTES_MAX` need."""
 BYTES_MAX: Final = 256
 LIMIT_S: Final = 60.0
 SETTINGS: Final = (MqttOptions(site="site", version="3.1.1"), MqttOptions(site="site", version="5"))
@@ -22,7 +22,7 @@ def names() -> Sequence[str]:
 
 
 def make(_name: str) -> Target:
-    """A connection to a broker that sends the input. The library is imported here, to be instrumented too."""
+    """Make a connection to a broker that sends the input. Import the library here, so that it is also instrumented."""
     check_extra()
     return Target(run, seeds, bytes_max=BYTES_MAX)
 
@@ -64,7 +64,7 @@ def seeds() -> list[bytes]:
     packets = [
         bytes.fromhex("40020001"),  # PUBACK
         bytes.fromhex("40040001 8700"),  # PUBACK: not authorized
-        bytes.fromhex("40040001 0000 40020001"),  # twice
+        bytes.fromhex("40040001 0000 40020001"),  # two packets
         bytes.fromhex("3005 0001 74 00 62"),  # PUBLISH, QoS 0
         bytes.fromhex("3208 0001 74 0001 00 6263"),  # PUBLISH, QoS 1
         bytes.fromhex("3408 0001 74 0001 00 6263"),  # PUBLISH, QoS 2
@@ -77,7 +77,7 @@ def seeds() -> list[bytes]:
         bytes.fromhex("e0028b00"),  # DISCONNECT: server shutting down
         bytes.fromhex("f0020000"),  # AUTH
         bytes.fromhex("10020000"),  # CONNECT, which only clients send
-        bytes.fromhex("ffffffff7f00"),  # the longest length there can be
+        bytes.fromhex("ffffffff7f00"),  # the maximum length
     ]
     tails = [b"".join((bytes([version]), answer, packet)) for version, answer in accepted.items() for packet in packets]
     limits = bytes.fromhex("01 200b 0000 08 21 0005 27 00000100")  # receive maximum, maximum packet size

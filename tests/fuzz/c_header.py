@@ -21,21 +21,21 @@ _BASE: Final = "ring.base"
 
 
 def build(folder: Path) -> str:
-    """Compile the fuzzer into `folder`; returns why it cannot be, empty if it was."""
+    """Compile the fuzzer into `folder`. Return the error message; empty if the build succeeded."""
     clang = shutil.which("clang")
     if clang is None:
-        return "there is no clang (apt-get install clang libclang-rt-14-dev)"
+        return "cannot find clang; try apt-get install clang libclang-rt-14-dev"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / _BASE).write_bytes(base())
     options = ["-std=c99", "-g", "-O1", "-Wall", "-Wextra", "-Werror", f"-I{INCLUDE}"]
     sanitizers = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
     command = [clang, *options, *sanitizers, str(SOURCE), "-o", str(folder / _PROGRAM)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return f"it does not compile: {done.stderr.strip()}" if done.returncode else ""
+    return f"clang failed: {done.stderr.strip()}" if done.returncode else ""
 
 
 def is_needed() -> bool:
-    """Whether it is an error that it cannot be built: in a gate, where `make fuzz-deps` can install what it takes."""
+    """Return whether a failed build is an error. In CI with root and apt-get, `make fuzz-deps` can install clang."""
     return os.environ.get("CI") == "true" and os.geteuid() == 0 and shutil.which("apt-get") is not None
 
 
@@ -47,7 +47,7 @@ def command(seconds: float, seed: int, folder: Path, grown: Path, inputs: Sequen
 
 
 def run_once(folder: Path, inputs: list[Path]) -> subprocess.CompletedProcess[str]:
-    """Run inputs through the fuzzer that `build` put into `folder`, once each."""
+    """Run each input once through the fuzzer in `folder`."""
     return subprocess.run(
         [str(folder / _PROGRAM), *map(str, inputs)], capture_output=True, text=True, check=False,
         env=environment(folder),
@@ -55,5 +55,5 @@ def run_once(folder: Path, inputs: list[Path]) -> subprocess.CompletedProcess[st
 
 
 def environment(folder: Path = Path("build/fuzz")) -> dict[str, str]:
-    """Return the environment of the fuzzer: the ring that programs change."""
+    """Return the environment of the fuzzer, with the path of the initial ring."""
     return {**os.environ, "IMUD_FUZZ_RING": str(folder / _BASE)}

@@ -1,7 +1,8 @@
-"""Every CAN codec: frames of any content and order, own and of others, never raise and close the ledger.
+"""All CAN codecs: for any frames of any device, a codec raises no exception and its ledger balances.
 
-An input is a row of frames: which identifier (below OWN one of the device's own, else four bytes follow, bit 31 for 29
-bits), the time since the frame before in steps of STEP_NS, the number of data bytes, and the data.
+An input is a list of frames. A frame is: its identifier, the time since the previous frame in steps of STEP_NS, the
+number of data bytes, and the data. An identifier below OWN selects one of the device's identifiers. Otherwise, four
+bytes follow, with bit 31 for 29 bits.
 """
 
 from collections.abc import Iterable, Sequence

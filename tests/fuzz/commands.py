@@ -1,4 +1,4 @@
-"""The command channel over MQTT: for any messages, an executed request is permitted, fresh, and executed once."""
+"""The command channel over MQTT: for any messages, imud executes only permitted and fresh requests, each one once."""
 
 import asyncio
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,7 @@ def make(_name: str) -> Target:
 
 
 class _Control(FakeControl):
-    """A device that notes its requests after the check of their arguments."""
+    """A device that records its requests after the check of their arguments."""
 
     def __init__(self, device: str, asked: list[tuple[str, str]]) -> None:
         super().__init__(device)

@@ -1,4 +1,4 @@
-"""The configuration: any bytes as a file give a configuration, or one ConfigError whose text is safe to log."""
+"""The configuration: for any bytes, the result is a configuration or one ConfigError with a printable text."""
 
 import re
 from collections.abc import Sequence

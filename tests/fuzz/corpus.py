@@ -1,6 +1,6 @@
-"""The corpus in the tree: for each target the seeds that its encoders make, and inputs that were findings once.
+"""The corpus in the tree: for each target the seeds of its encoders, and inputs of earlier findings.
 
-A seed's file is named by its hash, an input that was added by hand begins with `finding-`.
+The name of a seed's file is its hash. The name of a manually added input begins with `finding-`.
 """
 
 from hashlib import sha1
@@ -34,5 +34,5 @@ def write_all() -> int:
         size = sum(path.stat().st_size for path in inputs_of(target))
         total += size
         print(f"{target:24} {len(inputs_of(target)):4} files {size:8} bytes")
-    print(f"{total} bytes in all")
+    print(f"total: {total} bytes")
     return 0

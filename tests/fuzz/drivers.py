@@ -1,4 +1,4 @@
-"""Common parts of the targets of stream, CAN and polled codecs: rows of one kind, variants of options, check values."""
+"""Common parts of the targets of stream, CAN and polled codecs: lists of drivers, option combinations, checksums."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -39,7 +39,7 @@ def mender(name: str) -> Mend:
 
 
 def spliced(data: bytes, random: Random, example: bytes) -> bytes:
-    """`data` with an example put in anywhere."""
+    """Insert an example into `data` at a random place."""
     at = random.randint(0, len(data))
     return data[:at] + example + data[at:]
 
@@ -60,7 +60,7 @@ def _mend_frames(
     data: bytes, sync: bytes, length_at: int, overhead: int, crc_at: int | None, crc_bytes: int,
     crc: Callable[[bytes], int],
 ) -> bytes:  # fmt: skip
-    """Make the check value of each frame right that is whole by its length field (two bytes, little-endian)."""
+    """Correct the checksum of each complete frame. The length field has two bytes, little-endian."""
     mended = bytearray(data)
     at = 0
     for found in re.finditer(re.escape(sync), data):
@@ -75,7 +75,7 @@ def _mend_frames(
 
 
 def mend_reading(name: str, data: bytes) -> bytes:
-    """The bytes of one transfer with a right check value."""
+    """Return the bytes of one transfer with a correct checksum."""
     from imud.drivers.imu61x.common import crc32
     from imud.formats.modbus import crc16_modbus
 

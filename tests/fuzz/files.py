@@ -1,5 +1,4 @@
-"""Files of captures: raw captures, captures with time stamps, and logs of candump. The readers return only data of the
-file."""
+"""Capture files: raw captures, captures with time stamps, and candump logs. Readers return only data of the file."""
 
 import io
 import zlib
@@ -57,7 +56,7 @@ def make(name: str) -> Target:
 
 
 def run_capture(data: bytes) -> None:
-    """The chunks are bytes of the file in its order, the same from a pipe; times do not run back."""
+    """The chunks are the bytes of the file in order, also from a pipe. The time stamps do not decrease."""
     whole = _chunks(io.BytesIO(data))
     piped = _chunks(ShortReads(data, Random(zlib.crc32(data))))
     if whole is None or piped is None:
@@ -89,7 +88,7 @@ def _chunks(file: io.BytesIO | io.RawIOBase) -> list[Chunk] | None:
 
 
 def run_candump(data: bytes) -> None:
-    """Frames are valid CAN frames, their times do not run back, and each line is counted at most once."""
+    """The frames are valid CAN frames, their time stamps do not decrease, and each line is counted at most once."""
     reader = CandumpReader(io.BytesIO(data))
     newest_ns, count = 0, 0
     for frame in reader:
@@ -104,10 +103,10 @@ def run_candump(data: bytes) -> None:
 
 
 def run_recording(data: bytes) -> None:
-    """Blocks of a file and records of a block are read or refused, and every byte of the file is accounted for."""
+    """A reader accepts or rejects the blocks of a file and the records of a block. It counts every byte."""
     reader = RecordingReader(
         io.BytesIO(data), "a"
-    )  # its blocks have a CRC that no fuzzer finds: records go by themselves
+    )  # a fuzzer cannot find the CRC of a block, so records are tested separately
     for source in (reader, _records(data)):
         try:
             Player(lambda _batch: None).play(source)

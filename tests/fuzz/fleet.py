@@ -1,4 +1,4 @@
-"""Messages of gateways that come through a broker: any payload is a message or an error, and the ledger closes."""
+"""Messages of gateways from a broker: each payload is a message or an error, and the ledger balances."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -34,7 +34,7 @@ PACKED: Final = b"\1"
 """First byte of an input whose rest is header and slots. The target compresses them, because a mutation of compressed
 data fails early."""
 SEVERAL: Final = b"\2"
-"""The rest is payloads as JSON, one in a line, which the ledger takes one after another."""
+"""First byte of an input with several payloads as JSON, one per line. The ledger processes them in order."""
 
 
 def names() -> Sequence[str]:
@@ -48,7 +48,7 @@ def make(name: str) -> Target:
 
 
 def run_message(data: bytes) -> None:
-    """Decode and account; the accounts of all streams close after each."""
+    """Decode and count the payloads. The accounts of all streams balance after each payload."""
     kind, rest = data[:1], data[1:]
     if kind == PACKED:
         header, _, slots = rest.partition(b"\n")
@@ -65,7 +65,7 @@ def run_message(data: bytes) -> None:
         assert len(message.samples) <= max(SLOTS_MAX, len(payload))
         fresh = ledger.take(message, Stream.SAMPLES)
         if fresh is not None:
-            with suppress(ValueError):  # a sample with a name that cannot be encoded, which JSON can carry
+            with suppress(ValueError):  # the device name cannot be encoded in UTF-8, but JSON can contain it
                 assert decode_message(encode_message(fresh)).last == fresh.last
         for counts in ledger.counts.values():
             assert counts.balance == 0

@@ -1,4 +1,4 @@
-"""Table: the groups of fuzz targets. A target's name is `group/name`; drivers come from their rows in DRIVERS."""
+"""Table of the groups of fuzz targets. The name of a target is `group/name`. DRIVERS contains the drivers."""
 
 from importlib import import_module
 from typing import Final, cast
@@ -22,7 +22,7 @@ GROUPS: Final = {
     "state": "tests.fuzz.state",
     "client": "tests.fuzz.answers",
 }
-"""Module of each group; imported when one of its targets is used, so that only its code is instrumented."""
+"""Module of each group. It is imported with its first target, so that only the code of this target is instrumented."""
 
 
 def group(name: str) -> TargetGroup:

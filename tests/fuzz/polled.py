@@ -1,7 +1,7 @@
-"""Every polled codec and its conversations: any bytes of any length never raise, and conversations end.
+"""All polled codecs and their scripts: for any bytes, a codec raises no exception and each script ends.
 
-The first byte of an input chooses the variant of settings; with bit 7 the rest answers the transfers of `probe` and
-`set_up`, else it is a row of readings: which poll, its length, its bytes.
+The first byte of an input selects the combination of options. With bit 7, the other bytes are the replies to `probe`
+and `set_up`. Without bit 7, they are a list of readings: number of the poll, length, and bytes.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The UNIX socket: one line through `parse_request`, and all that a client sends through a server with two devices."""
+"""The UNIX socket: one line through `parse_request`, and all data of a client through a server with two devices."""
 
 import asyncio
 import atexit
@@ -27,7 +27,7 @@ T = TypeVar("T")
 ANSWER_S: Final = 5.0
 REPLIES_PER_LINE_MAX: Final = 1
 BLANK: Final = b" \t\r"
-"""What JSON takes for white space within a line (RFC 8259, section 2); `bytes.strip` knows more, as vertical tabs."""
+"""White space of JSON within a line (RFC 8259, section 2). `bytes.strip` also removes vertical tabs, for example."""
 ERROR_CHARACTERS_MAX: Final = 1024
 METHODS: Final = (
     "devices", "status", "schema", "watch", "unwatch", "poll", "events", "notify", "actions", "command",
@@ -45,7 +45,7 @@ def make(name: str) -> Target:
 
 
 def run_line(data: bytes) -> None:
-    """A request that can be answered, or an error that can be sent."""
+    """The result is a request with a reply, or an error that the server can send."""
     try:
         request = parse_request(data)
     except RpcError as error:
@@ -55,7 +55,7 @@ def run_line(data: bytes) -> None:
 
 
 def run_connection(data: bytes) -> None:
-    """A client sends this and ends its side: each line is answered at most once, and the server stays."""
+    """A client sends the data and closes its side. The server sends at most one reply per line and continues to run."""
     rig = _rig()
     rig.do(rig.serve(data))
 
@@ -70,7 +70,7 @@ def _check_error(error: RpcError) -> None:
 
 
 class _Rig:
-    """A server, whose loop runs while a client is served."""
+    """A server with an event loop. The loop runs while a client is connected."""
 
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()
@@ -127,7 +127,7 @@ class _Rig:
                 peer.shutdown(socket.SHUT_WR)
                 while part := await loop.sock_recv(peer, 1 << 16):
                     received += part
-            except ConnectionError:  # ended by the server before all was read
+            except ConnectionError:  # the server closed the connection before it had read all data
                 return b""
         return bytes(received)
 
@@ -138,7 +138,7 @@ def _rig() -> _Rig:
 
 
 class _Control(FakeControl):
-    """A device with the actions of a real driver, whose arguments are checked as the daemon does; nothing is done."""
+    """A device with the actions of a real driver. It checks the arguments like the daemon and executes nothing."""
 
     actions = ACTIONS
 
@@ -150,8 +150,8 @@ class _Control(FakeControl):
 
 
 def _check_received(received: bytes, data: bytes) -> None:
-    """Every message up to the first frame is one JSON object, and there are no more replies than lines."""
-    if b"binary" in data:  # frames may follow
+    """Check that all messages before the first frame are JSON objects, at most one reply for each line."""
+    if b"binary" in data:  # the data may contain frames
         return
     replies = 0
     for line in received.split(b"\n"):

@@ -1,5 +1,8 @@
-"""Requests over HTTP: each head of a scrape gives a reply in a format of Prometheus, or none. `imud web` permits no
-control without the token, and refuses requests that a page cannot have sent."""
+"""HTTP requests to the metrics and to `imud web`.
+
+The reply to a scrape uses a format of Prometheus, or there is no reply. Without the token, `imud web` permits no
+control. It rejects requests that its page cannot send.
+"""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -24,7 +27,7 @@ def names() -> Sequence[str]:
 
 
 def make(_name: str) -> Target:
-    """`parse_request` and the choice of the format by its Accept header; rules and bodies of `imud web`."""
+    """Make a target: `parse_request` and the choice of the format by the Accept header, or the rules of `imud web`."""
     return Target(run, seeds, words=words, bytes_max=REQUEST_BYTES_MAX)
 
 

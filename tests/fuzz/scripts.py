@@ -109,7 +109,7 @@ def _answer(begin: Script, messages: Iterator[Message]) -> None:
         return
     except (CommandError, DeviceRefused):
         return
-    raise AssertionError(f"more than {REQUESTS_MAX} requests")
+    raise AssertionError(f"expected the end of the script after at most {REQUESTS_MAX} requests")
 
 
 def _outcome(session: ScriptRunner, request: Request, messages: Iterator[Message], now_ns: int) -> tuple[Outcome, int]:

@@ -1,13 +1,13 @@
-"""Readers of shared memory: one slot, and a ring whose file changes while it is read.
+"""Readers of shared memory: one slot, and a ring with a file that changes during the read.
 
 An input for a ring is a program. Byte 0: number of steps before the reader opens the file. Byte 1: number of missing
-CUT_BYTES at the end of the file. A step is a byte, of which the low three bits count:
+CUT_BYTES at the end of the file. Each further byte is a step. Its three low bits select the operation:
 
-    0 read  1 latest  2 ledger  3 health  7 the file is replaced by a copy, and reopened
-    4 write: offset u16, modulo the size; length u8, modulo 32; bytes    5 slot's CRC-32 made right: number u8
-    6 ledger's CRC-32 made right
+    0 read  1 latest  2 ledger  3 health  7 replace the file by a copy, and open it again
+    4 write: offset u16, modulo the size; length u8, modulo 32; bytes    5 correct the CRC-32 of a slot: number u8
+    6 correct the CRC-32 of the ledger
 
-`ring.c` runs the same programs on imud.h.
+`ring.c` runs the same programs with imud.h.
 """
 
 import atexit
@@ -64,7 +64,7 @@ def make(name: str) -> Target:
 
 
 def run_slot(data: bytes) -> None:
-    """ValueError, or a sample that gives the same sample when it is encoded again."""
+    """The result is a ValueError, or a sample that is equal after it was encoded and decoded again."""
     try:
         sample = decode_slot(data, DEVICE)
     except ValueError:
@@ -74,7 +74,7 @@ def run_slot(data: bytes) -> None:
 
 
 def _comparable(sample: Sample) -> str:
-    """A sample in words: NaN is equal to itself there. A zero may lose its sign."""
+    """Return a sample as text, because NaN is then equal to itself. Remove the sign of zero."""
     return re.sub(r"-0\.0\b", "0.0", repr(sample))
 
 
@@ -95,7 +95,7 @@ def slot_seeds() -> list[bytes]:
 
 @cache
 def base() -> bytes:
-    """A ring in the middle of its work: eight slots, twenty samples."""
+    """Return a ring in use: eight slots, twenty samples."""
     header = encode_header(RingHeader(77, PID, 1, DEVICE, 3, SLOTS, NEWEST, 1, START_NS))
     image = bytearray(header + bytes(SLOTS * SLOT_BYTES))
     block = encode_ledger_block(5, "hipnuc-uart", dict.fromkeys(LEDGER_FIELDS, 7))
@@ -142,7 +142,7 @@ class RingFile:
 
 
 def run_ring(data: bytes) -> None:
-    """Run a program: only ServerError, samples in order, never more of them than slots."""
+    """Run a program. It may raise only ServerError. Samples are in order, at most as many as slots."""
     if len(data) < 2:
         return
     file = RingFile(_folder() / f"imud.{DEVICE}", max(BYTES - data[1] * CUT_BYTES, 0))

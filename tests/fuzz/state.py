@@ -1,5 +1,4 @@
-"""Files of the state directory: for any content of `found.json` and `settings.json`, the daemon starts and
-continues."""
+"""Files of the state directory: the daemon starts and continues for any content of the files."""
 
 import atexit
 import tempfile

@@ -1,4 +1,4 @@
-"""Every stream codec: any bytes in any split give the same events, close the ledger, and end a pause or a reset."""
+"""All stream codecs: the same events for all chunk sizes, a balanced ledger, and no effect after a pause or a reset."""
 
 import zlib
 from collections.abc import Sequence

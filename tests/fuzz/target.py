@@ -6,7 +6,7 @@ from random import Random
 from typing import Final, Protocol
 
 INPUT_BYTES_MAX: Final = 4096
-"""Longest input where a target names no other length: several frames or requests, and short enough to be fast."""
+"""Default maximum length of an input, bytes: several frames or requests, and short enough to be fast."""
 
 
 def as_it_is(data: bytes, _random: Random) -> bytes:
@@ -21,7 +21,7 @@ class Target:
     run: Callable[[bytes], None]
     """Function that raises an exception for an input that violates an invariant. Each exception is a finding."""
     seeds: Callable[[], Sequence[bytes]]
-    """Valid inputs to begin with, made by encoders; a few dozen, the same at each call."""
+    """Function that returns valid inputs as a start, made by encoders: a few dozen, the same for each call."""
     mend: Callable[[bytes, Random], bytes] = as_it_is
     """Function that corrects check values after a mutation, so that the fuzzer reaches the code behind them."""
     words: Callable[[], Sequence[bytes]] = tuple
@@ -29,7 +29,7 @@ class Target:
 
 
 def check_printable(text: str) -> None:
-    """Fail for text that could forge a line of a log or steer a terminal."""
+    """Raise an exception if the text could forge a log line or control a terminal."""
     assert text.isprintable(), ascii(text)
 
 
@@ -37,5 +37,5 @@ class TargetGroup(Protocol):
     def names(self) -> Sequence[str]: ...
 
     def make(self, name: str) -> Target:
-        """Make the target of that name. Imports what it tests no earlier than here."""
+        """Make the target with this name. Import the tested code only here."""
         ...

@@ -1,4 +1,4 @@
-"""Every input of the corpus, once through its target; no fuzzing engine is needed."""
+"""Run every input of the corpus once through its target, without a fuzzing engine."""
 
 from pathlib import Path
 from random import Random
@@ -18,8 +18,8 @@ CORPUS_BYTES_MAX = 2_000_000
 def test_corpus(name: str) -> None:
     target = load(name)
     inputs = corpus.inputs_of(name)
-    assert inputs, f"{name} has no corpus: make fuzz ARGS=--corpus"
-    for data in {*(path.read_bytes() for path in inputs), *target.seeds()}:  # seeds as the encoders make them now
+    assert inputs, f"expected inputs of {name}, got none; try make fuzz ARGS=--corpus"
+    for data in {*(path.read_bytes() for path in inputs), *target.seeds()}:  # also the present seeds of the encoders
         target.run(data)
         target.run(target.mend(data, Random(1)))
 

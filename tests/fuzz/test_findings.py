@@ -1,4 +1,4 @@
-"""Findings of the fuzzers, one test each."""
+"""Findings of the fuzzers, one test for each. The docstring of a test names the target and the former fault."""
 
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,8 @@ SENTENCE = b"$GPRMC,083559.00,A,4717.11437,N,00833.91522,E,0.004,77.52,091202,,,
 
 
 @pytest.mark.parametrize("size", [100, LINE_BYTES_MAX, 3 * LINE_BYTES_MAX])
-def test_a_line_that_is_too_long_is_skipped_in_any_split(size: int) -> None:
-    """utc/sentences: read at once it was searched for a sentence, read in parts it was not."""
+def test_splitter_skips_too_long_line_in_any_chunks(size: int) -> None:
+    """utc/sentences: the splitter found a sentence in the long line only if it received the line in one chunk."""
     stream = b"x" * LINE_BYTES_MAX + SENTENCE + SENTENCE
     splitter = SentenceSplitter()
     parts = [stream[at : at + size] for at in range(0, len(stream), size)]
@@ -29,9 +29,8 @@ def test_a_line_that_is_too_long_is_skipped_in_any_split(size: int) -> None:
 
 
 @pytest.mark.parametrize("version", ["x", "1.x", "", "1.0.0"])
-def test_a_scrape_with_any_version_is_answered(version: str) -> None:
-    """http/request: prometheus_client raised TypeError for a version that is not a number, and the server sent no
-    reply."""
+def test_server_replies_to_scrape_with_any_version(version: str) -> None:
+    """http/request: prometheus_client raised TypeError for a version that is not a number; no reply was sent."""
     _, content_type = encoder_for(f"application/openmetrics-text; version={version}")
     assert content_type.startswith(("text/plain", "application/openmetrics-text"))
 
@@ -46,8 +45,8 @@ def test_a_scrape_with_any_version_is_answered(version: str) -> None:
         'state_dir: "/var/\\Lx"\ndevices: {}',
     ],
 )
-def test_text_with_control_characters_is_refused(text: str) -> None:
-    """config/yaml: an escape in quotes gave a path with NUL, whose opening ended the daemon with a ValueError."""
+def test_config_rejects_control_characters(text: str) -> None:
+    """config/yaml: an escape in quotes produced a path with NUL. The daemon ended with a ValueError."""
     with pytest.raises(ConfigError, match="expected text without control characters, got") as refused:
         config.parse(text, "imud.yaml")
     assert str(refused.value).isprintable()
@@ -60,8 +59,8 @@ def test_text_with_control_characters_is_refused(text: str) -> None:
         "devices: {a: {driver: imu61x-i2c, options: {nothing: 1}, i2c: {bus: 1, rate_hz: 500}}}",
     ],
 )
-def test_bad_options_of_a_polled_driver_are_refused(text: str) -> None:
-    """config/yaml: the load of a bus was computed from options that could not be read, an AttributeError."""
+def test_config_rejects_invalid_options_of_polled_driver(text: str) -> None:
+    """config/yaml: imud computed the load of a bus from invalid options and raised an AttributeError."""
     with pytest.raises(ConfigError, match=r"imud\.yaml:1:.*options"):
         config.parse(text, "imud.yaml")
 
@@ -70,25 +69,25 @@ def test_bad_options_of_a_polled_driver_are_refused(text: str) -> None:
 @pytest.mark.parametrize(
     "body", [b'{"params":{"a":' + b"[" * 30_000, b'{"token":"\xff","method":"\xff","device":"\xff"}']
 )
-def test_a_body_that_is_no_text_or_too_deep_is_refused_in_one_way(kind: type, body: bytes) -> None:
-    """http/request: a POST to `imud web` with either was answered with 500, and a traceback in the log."""
+def test_decode_body_raises_value_error_for_invalid_body(kind: type, body: bytes) -> None:
+    """http/request: a POST to `imud web` with such a body received status 500, and the log contained a traceback."""
     with pytest.raises(ValueError, match=r"nested too deeply|can't decode byte|unknown field|malformed"):
         decode_body(body, kind)
 
 
 @pytest.mark.parametrize("method", ["{}", "[]", "5", "null"])
-def test_a_method_that_is_no_text_is_a_server_error(method: str) -> None:
+def test_non_string_method_raises_server_error(method: str) -> None:
     """client/answers: the iterators raised TypeError, because an object cannot be a key of a mapping."""
     watched = line_of(encode_result(1, {"devices": {"bow": 0}}))
-    for use in (1, 2):  # events, samples
+    for use in (1, 2):  # 1: events, 2: samples
         answers.run(bytes([use]) + watched + b'{"jsonrpc":"2.0","method":%s}\n' % method.encode())
 
 
 @pytest.mark.parametrize("result", [None, 5, [], {}, "x"])
-def test_an_answer_of_another_form_is_a_server_error(result: object) -> None:
-    """client/answers: TypeError, KeyError and msgspec's ValidationError came out of the client's methods."""
+def test_invalid_result_raises_server_error(result: object) -> None:
+    """client/answers: the methods of the client raised TypeError, KeyError or ValidationError of msgspec."""
     answer = line_of(encode_result(1, result))
-    for use in (0, 2, 4):  # questions, samples, the end of a recording
+    for use in (0, 2, 4):  # 0: requests, 2: samples, 4: end of a recording
         answers.run(bytes([use]) + answer)
 
 
@@ -101,7 +100,7 @@ def test_an_answer_of_another_form_is_a_server_error(result: object) -> None:
         ("device", {"device": "bow", "device_id": []}),
     ],
 )
-def test_a_notification_of_another_form_is_a_server_error(name: str, params: object) -> None:
+def test_invalid_notification_raises_server_error(name: str, params: object) -> None:
     """client/answers: a TypeError or KeyError ended the iterator."""
     message = {"method": name, "params": params}
     with pytest.raises(ServerError, match="cannot decode"):
@@ -109,7 +108,7 @@ def test_a_notification_of_another_form_is_a_server_error(name: str, params: obj
 
 
 @pytest.mark.parametrize("params", [[], {"t_ns": "x", "device": "bow", "kind": "up", "message": ""}])
-def test_an_event_of_another_form_is_a_server_error(params: object) -> None:
+def test_invalid_event_raises_server_error(params: object) -> None:
     """client/answers: the client returned the event unchanged or raised TypeError."""
     message = {"method": "event", "params": params}
     with pytest.raises(ServerError, match="cannot decode"):
@@ -129,7 +128,7 @@ class _Once:
         return self._message
 
 
-def test_heartbeat_at_the_end_of_its_range_is_no_undefined_behaviour(tmp_path: Path) -> None:
+def test_maximum_heartbeat_causes_no_undefined_behavior(tmp_path: Path) -> None:
     """c-header: `now_ns - heartbeat_ns` overflowed in imud_health."""
     if problem := c_header.build(tmp_path):
         pytest.skip(problem)

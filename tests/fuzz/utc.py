@@ -1,6 +1,6 @@
-"""Sources of UTC: an RMC sentence, the stream of gpsd or of a receiver, and the feed that passes sentences on.
+"""Sources of UTC: an RMC sentence, the stream of gpsd or of a receiver, and the feed that passes sentences to chronyd.
 
-chronyd answers nothing: imud only sends to its socket.
+chronyd sends no replies: imud only writes to its socket.
 """
 
 import zlib
@@ -33,7 +33,7 @@ def make(name: str) -> Target:
 
 
 def run_rmc(data: bytes) -> None:
-    """A fault, or a time that reads the same when the sentence is passed on; the feed counts it once."""
+    """The result is an error, or a time that is equal after the sentence was encoded again. The feed counts it once."""
     found = parse(data)
     if isinstance(found, Rmc):
         assert 0 <= found.fraction_ns < 1_000_000_000
@@ -68,14 +68,14 @@ def run_sentences(data: bytes) -> None:
     whole = SentenceSplitter().feed(data)
     splitter = SentenceSplitter()
     random = Random(zlib.crc32(data))
-    long, end = data[:-FINE_BYTES], data[-FINE_BYTES:]  # single bytes of a long line would take its length squared
+    long, end = data[:-FINE_BYTES], data[-FINE_BYTES:]  # feeding a long line in single bytes takes quadratic time
     parts = [*(long[at : at + 997] for at in range(0, len(long), 997)), *cut(end, random)]
     assert [sentence for part in parts for sentence in splitter.feed(part)] == whole
     assert all(len(sentence) <= RMC_BYTES_MAX and sentence[:-2] in data for sentence in whole)
 
 
 def mend(data: bytes, _random: Random) -> bytes:
-    """Make the checksum of each sentence right."""
+    """Correct the checksum of each sentence."""
     lines = data.split(b"\n")
     for number, line in enumerate(lines):
         begin, star = line.rfind(b"$"), line.rfind(b"*")

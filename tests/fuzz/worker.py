@@ -1,7 +1,7 @@
 """Fuzzes one target in this process: `python -m tests.fuzz.worker ENGINE TARGET SECONDS SEED FOLDER GROWN INPUT...`.
 
-Started by `tests.fuzz.__main__` for each target, because atheris instruments a module when it is imported, and ends
-the process at a finding. The last lines say what was done, in the words of libFuzzer for both engines.
+`tests.fuzz.__main__` starts this process for each target, because atheris instruments a module at its import and ends
+the process at a finding. The last printed lines are a summary in the format of libFuzzer, for both engines.
 """
 
 import importlib
@@ -26,7 +26,7 @@ MEND_SHARE: Final = 0.5
 
 class Atheris(Protocol):
     def instrument_imports(self, include: Sequence[str]) -> AbstractContextManager[None]:
-        """Count coverage of the packages that are imported inside."""
+        """Count the coverage of the packages that the context imports."""
         ...
 
     def Setup(
@@ -41,7 +41,7 @@ class Atheris(Protocol):
 
 
 def fuzz_with_atheris(name: str, seconds: float, seed: int, folder: Path, grown: Path, inputs: Sequence[str]) -> None:
-    """Fuzz, guided by the coverage of the package `imud`."""
+    """Fuzz with atheris, guided by the coverage of the package `imud`."""
     atheris = cast(Atheris, importlib.import_module("atheris"))
     with atheris.instrument_imports(include=["imud", "prometheus_client", "paho"]):
         target = load(name)
@@ -75,7 +75,7 @@ def libfuzzer_options(seconds: float, seed: int, folder: Path, inputs: Sequence[
 
 
 def _dictionary(target: Target, folder: Path) -> list[str]:
-    """The option that names a file of the target's words; none for a target without words."""
+    """Return the option for a dictionary file with the words of the target; empty for a target without words."""
     words = target.words()
     file = folder / "words.dict"
     file.write_text("".join(f'"{escaped(word)}"\n' for word in words))
@@ -83,7 +83,7 @@ def _dictionary(target: Target, folder: Path) -> list[str]:
 
 
 def fuzz_with_hypothesis(name: str, seconds: float, seed: int, folder: Path, paths: Sequence[Path]) -> int:
-    """Fuzz with mutations of the corpus, not guided by coverage. Returns the status of the process."""
+    """Fuzz with mutations of the corpus, without coverage. Return the exit status of the process."""
     from hypothesis import HealthCheck, find, settings
     from hypothesis import strategies as st
     from hypothesis.errors import NoSuchExample
@@ -134,7 +134,7 @@ def _changed(target: Target, data: bytes, at: int, cut: int, put: bytes, seed: i
 
 
 def escaped(word: bytes) -> str:
-    """Format a word for a dictionary of libFuzzer, which has ASCII only."""
+    """Format a word in ASCII for a dictionary of libFuzzer."""
     return "".join(chr(byte) if bytes([byte]).isalnum() else f"\\x{byte:02X}" for byte in word)
 
 
