@@ -1,9 +1,9 @@
-"""Simulated I2C and SPI devices, served in a thread to the kernel's bus drivers.
+"""Simulated I2C and SPI devices. A thread connects them to the kernel's bus drivers.
 
-A device is a function from the transfer to the bytes the host reads; it may raise Refuse (wire.py).
-The transfers come from any thread or process: i2c-tools, the code under test, the test itself.
-In the same process beware of fcntl.ioctl with more than 1024 bytes (33 SPI transfers or more): it keeps the
-GIL, so the thread cannot answer, and the transfer fails with ETIMEDOUT after the module's timeout_ms.
+A device is a function from the transfer to the bytes that the host reads. It may raise Refuse (wire.py). The transfers
+are from any thread or process: i2c-tools, the code under test, or the test itself. In the same process, do not use
+fcntl.ioctl with more than 1024 bytes (33 or more SPI transfers). It keeps the GIL, so the thread cannot reply, and the
+transfer fails with ETIMEDOUT after `timeout_ms` of the kernel module.
 """
 
 import errno
@@ -28,7 +28,7 @@ class Bus(Generic[OneTransfer]):
     """
 
     def __init__(self, path: Path, select_of: Callable[[OneTransfer], int]) -> None:
-        """`path` is the module's device; `select_of` tells the address (I2C) or chip select (SPI) of a transfer."""
+        """`path` is the kernel module's node. `select_of` returns the address or chip select of a transfer."""
         self._file = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
         self._stop = os.eventfd(0, os.EFD_CLOEXEC)
         self._select_of: Callable[[OneTransfer], int] = select_of
@@ -62,7 +62,7 @@ class Bus(Generic[OneTransfer]):
             os.close(self._file)
             os.close(self._stop)
         self._file = -1
-        assert not stuck, "a simulated device did not return"
+        assert not stuck, "expected the end of the serving thread; a simulated device did not return"
         if self._failure is not None:
             raise self._failure
 
@@ -80,7 +80,7 @@ class Bus(Generic[OneTransfer]):
             try:
                 request = os.read(self._file, wire.MAX_BYTES)
             except BlockingIOError:
-                continue  # the host gave up between poll and read
+                continue  # the host cancelled the transfer between poll and read
             transfer = cast(OneTransfer, wire.parse(request))
             self._write(self._answer(transfer))
 
@@ -117,5 +117,5 @@ def i2c_bus(number: int = 0) -> Bus[wire.I2cTransfer]:
 
 
 def spi_bus(number: int) -> Bus[wire.SpiTransfer]:
-    """The devices behind /dev/spidev<number>.*, by chip select. Bus 0 has 8-bit words only, bus 1 also 16."""
+    """The devices behind /dev/spidev<number>.*, by chip select. Bus 0 has only 8-bit words, bus 1 also 16-bit words."""
     return Bus(Path(f"/dev/imud-lab-spi{number}"), lambda transfer: transfer.chip_select)

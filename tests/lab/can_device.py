@@ -56,7 +56,7 @@ class BusRig:
         async def both() -> None:
             task = asyncio.create_task(self.device.run())
             try:
-                await self.until(is_ready, "samples, or an open bus")
+                await self.until(is_ready, "samples or an open bus")
                 await story()
             finally:
                 task.cancel()

@@ -1,4 +1,4 @@
-"""CAN interfaces of the guest: virtual ones, and QEMU's two SJA1000 controllers on one bus."""
+"""CAN interfaces of the guest: virtual interfaces, and two SJA1000 controllers of QEMU on one bus."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,7 +11,7 @@ BITRATE = 500_000
 FAULT = Path("/sys/module/imud_lab/parameters/can_fault")
 COUNTERS = Path("/sys/module/imud_lab/parameters/can_counters")
 MODE_RESET = b"\x01"
-"""Mode register, the first of an SJA1000, with bit RM alone."""
+"""Value of the mode register, the first register of an SJA1000: only bit RM is set."""
 
 
 @dataclass(frozen=True)
@@ -22,14 +22,14 @@ class CanInterface:
         tool("ip", "link", "set", self.name, "up")
 
     def down(self) -> None:
-        """Takes it out of operation: sockets on it get ENETDOWN."""
+        """Set the interface down. Sockets on it receive ENETDOWN."""
         tool("ip", "link", "set", self.name, "down")
 
     def enter(self, state: str) -> None:
-        """Lets the controller's driver see an error state: `error-passive`, `bus-off`, `error-active`.
+        """Report an error state to the driver of the controller: `error-passive`, `bus-off` or `error-active`.
 
-        A controller that is bus-off takes no part in the bus until it is restarted, so it is put into reset mode, as
-        an SJA1000 puts itself (data sheet, 6.4.4: bit RM of the mode register is set).
+        A controller in the state bus-off neither sends nor receives until its restart. The function therefore sets the
+        emulated chip to reset mode, like an SJA1000 does itself (data sheet, 6.4.4: bit RM of the mode register).
         """
         if state == "bus-off":
             with open(f"/sys/class/net/{self.name}/device/resource1", "r+b", buffering=0) as registers:
@@ -38,7 +38,7 @@ class CanInterface:
 
     @contextmanager
     def error_counters(self, tx: int, rx: int) -> Iterator[None]:
-        """Has its driver report these error counters for as long as the block; the emulated chip's stay 0."""
+        """Let the driver report these error counters during the block. The emulated chip always has 0."""
         COUNTERS.write_text(f"{self.name} {tx} {rx}", encoding="ascii")
         try:
             yield
@@ -46,7 +46,7 @@ class CanInterface:
             COUNTERS.write_text(f"{self.name} 0 0", encoding="ascii")
 
     def restart(self) -> None:
-        """Restarts a controller that is bus-off, as an administrator does."""
+        """Restart a controller in the state bus-off, like an administrator."""
         tool("ip", "link", "set", self.name, "type", "can", "restart")
 
     def restart_by_itself(self, after_ms: int) -> None:
@@ -55,13 +55,13 @@ class CanInterface:
         self.up()
 
     def statistic(self, name: str) -> int:
-        """A kernel counter, such as rx_packets or tx_packets."""
+        """Return a counter of the kernel, such as rx_packets or tx_packets."""
         return int(Path(f"/sys/class/net/{self.name}/statistics/{name}").read_text(encoding="ascii"))
 
 
 @contextmanager
 def virtual_can(name: str) -> Iterator[CanInterface]:
-    """A vcan interface of this name, up; it is deleted at the end."""
+    """Create a vcan interface with this name and set it up. Delete it at the end."""
     tool("ip", "link", "add", "dev", name, "type", "vcan")
     interface = CanInterface(name)
     try:
@@ -73,7 +73,7 @@ def virtual_can(name: str) -> Iterator[CanInterface]:
 
 @contextmanager
 def controller_pair(bitrate: int = BITRATE) -> Iterator[tuple[CanInterface, CanInterface]]:
-    """can0 and can1, emulated SJA1000 controllers on one bus: real drivers, with bit timing and states."""
+    """Return can0 and can1, emulated SJA1000 controllers on one bus, with real drivers, bit timing and error states."""
     pair = (CanInterface("can0"), CanInterface("can1"))
     try:
         for interface in pair:

@@ -1,13 +1,13 @@
-"""The motions that the modules on a bus are played with: the same one, each at another time of it, over and over."""
+"""Motions of the devices on a bus. All devices repeat the same motion with different start times."""
 
 from typing import Final
 
 from imud.sim.physics import GRAVITY_M_S2, MOTIONS, Truth
 
 LOOP_S: Final = 4.0
-"""Played again and again; making it takes the guest longer than playing it."""
+"""Duration of the repeated motion, s. The guest needs longer to compute the motion than to play it."""
 PHASE_S: Final = 7.3
-"""Between the motions of one module and the next: the same frame of two modules is never alike."""
+"""Time offset between the motions of two devices, s. Frames of two devices are thus never equal."""
 
 
 class Phased:
@@ -16,5 +16,5 @@ class Phased:
         self._phase_s = PHASE_S * number
 
     def at(self, t_s: float) -> Truth:
-        """The truth `t_s` seconds after the module's own zero."""
+        """Return the true attitude `t_s` seconds after the start of the device's motion."""
         return self._motion.at(t_s + self._phase_s)

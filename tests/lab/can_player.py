@@ -1,10 +1,12 @@
-"""Plays simulated modules from memory: python -m tests.lab.can_player INTERFACE RATE SECONDS NAME:NODE …
+"""Plays simulated devices from memory: python -m tests.lab.can_player INTERFACE RATE SECONDS NAME:NODE …
 
-The guest's one emulated CPU cannot simulate nine modules while a daemon serves them. So the frames of LOOP_S seconds
-are made first, in virtual time, each module with a motion of its own (`Phased`); then they are played again and again,
-each burst in one system call, INDEX of an IMU61x counting on. Prints `ready`, begins at the first line on stdin and
-prints the instant of the first sample (CLOCK_MONOTONIC, ns), ends after SECONDS or with stdin, and prints how many
-frames were refused.
+The guest has one emulated CPU, which cannot simulate nine devices while a daemon serves them. The player first computes
+the frames of LOOP_S in simulated time, with a motion of its own for each device (`Phased`). Then it repeats these
+frames. It sends each burst with one system call and continues the INDEX of an IMU61x.
+
+The program prints `ready`. At the first line of standard input, it starts and prints the time of the first sample
+(CLOCK_MONOTONIC, ns). It ends after SECONDS or when standard input closes, and prints the number of frames that the
+kernel rejected.
 """
 
 import ctypes
@@ -34,12 +36,12 @@ BEGIN_NS = 1_000_000_000
 LOOP_NS = round(LOOP_S * 1e9)
 INDEX = struct.Struct("<H")
 INDEX_AT = 8 + 6
-"""Where the frame that closes a set has INDEX: in the last two of its data, which begin at 8."""
+"""Offset of INDEX in the last frame of a set: the last two data bytes. The data starts at offset 8."""
 
 
 @dataclass
 class Played:
-    """Frames that leave together."""
+    """Frames that are sent together."""
 
     offset_ns: int
     frames: bytearray
@@ -79,7 +81,7 @@ class Sender:
     def __init__(self, interface: str) -> None:
         self.refused = 0
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
-        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # receives no frames
+        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # this socket only sends
         self._socket.bind((interface,))
         self._frames = bytearray(FRAMES_MAX * RAW_FRAME.size)
         frames = ctypes.addressof(ctypes.c_char.from_buffer(self._frames))

@@ -1,4 +1,4 @@
-"""Simulated modules on one CAN bus in a process of their own, and the truth to hold samples against."""
+"""Simulated devices on one CAN bus in a process of their own, and the comparison of samples with the true motion."""
 
 import subprocess
 import sys
@@ -20,7 +20,7 @@ from tests.lab.can_phase import LOOP_S, Phased
 GYRO_RAD_S: Final = 0.004
 ACCEL_M_S2: Final = 0.02
 ANGLE_RAD: Final = 0.002
-"""Some counts of the coarsest protocol, and less than the motion `swing` changes between two samples at 100 Hz."""
+"""Tolerance of angles, rad: some counts of the coarsest protocol, less than the motion in 10 ms."""
 BEGIN_S: Final = 1.0
 LATE_SAMPLES: Final = 12
 """Maximum delay of the first sample after a stall of the guest, samples."""
@@ -94,7 +94,7 @@ def traffic(interface: str, modules: Sequence[Module], rate_hz: float, seconds: 
 
 
 class Against:
-    """Holds the samples of one device against the truth of its motion, each at its own instant."""
+    """Comparison of the samples of one device with its true motion, each sample at its own time."""
 
     def __init__(self, number: int, first: Sample, rate_hz: float, begin_ns: int) -> None:
         """Find the time of the first sample, at or before its time stamp, with the smallest deviation from the truth.
@@ -108,11 +108,11 @@ class Against:
         )
 
     def is_true(self, sample: Sample) -> bool:
-        """Return whether every value of the sample belongs to the instant of its number."""
+        """Return whether every value of the sample matches the time of its sequence number."""
         return self._worst(sample, self._instant_s(self._first + sample.seq - self._seq)) <= 1
 
     def _instant_s(self, number: int) -> float:
-        """The instant of a sample since the play began, in the module's own time."""
+        """Return the time of a sample since the start of the motion, in device time, s."""
         return BEGIN_S + number / self._rate_hz % LOOP_S
 
     def _worst(self, sample: Sample, t_s: float) -> float:
@@ -132,7 +132,7 @@ def _distance(a: Vector3 | None, b: Vector3) -> float:
 
 
 def _turn(sample: Sample, truth: Truth) -> float:
-    """Angle between two attitudes, rad."""
+    """Return the angle between two attitudes, rad."""
     assert sample.quat_wxyz is not None
     near, far = (
         sqrt(sum((x - sign * y) ** 2 for x, y in zip(sample.quat_wxyz, truth.quat_wxyz, strict=True)))

@@ -21,9 +21,9 @@ collect_ignore_glob = [] if SHARE else ["*"]
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Says why nothing was collected here."""
+    """Print the reason why pytest collected no tests here."""
     if not SHARE:
-        terminalreporter.write_line("tests/lab left out: it runs in the lab's kernel (make lab)")
+        terminalreporter.write_line("tests/lab skipped: it needs the lab's kernel; try make lab")
 
 
 def pytest_runtest_logstart() -> None:
@@ -35,11 +35,11 @@ def pytest_runtest_logstart() -> None:
 
 @pytest.fixture(autouse=True)
 def nothing_left_behind() -> Iterator[None]:
-    """Each test closes its descriptors and ends its threads."""
+    """Check that each test closes its descriptors and ends its threads."""
     before = _open_descriptors()
     yield
-    assert _open_descriptors() == before, "descriptors left open"
-    assert threading.enumerate() == [threading.main_thread()], "threads left running"
+    assert _open_descriptors() == before, "open descriptors"
+    assert threading.enumerate() == [threading.main_thread()], "running threads"
 
 
 def _open_descriptors() -> dict[str, str]:
@@ -48,7 +48,7 @@ def _open_descriptors() -> dict[str, str]:
         try:
             found[name] = os.readlink(f"/proc/self/fd/{name}")
         except FileNotFoundError:
-            continue  # the descriptor of the listing itself
+            continue  # the descriptor of this listing
     return found
 
 
@@ -66,7 +66,7 @@ def can_pair() -> Iterator[tuple[CanInterface, CanInterface]]:
 
 @pytest.fixture
 def gpio_chip() -> Iterator[GpioChip]:
-    """A chip with the lines SOUT, SIN, PPS, ALARM, a line without a name, and RESET."""
+    """Create a chip with the lines SOUT, SIN, PPS, ALARM, a line without a name, and RESET."""
     with simulated_chip(GPIO_LINES) as chip:
         yield chip
 
@@ -79,7 +79,7 @@ def i2c() -> Iterator[Bus[I2cTransfer]]:
 
 @pytest.fixture
 def spi8() -> Iterator[Bus[SpiTransfer]]:
-    """The far end of /dev/spidev0.*, a controller with 8-bit words only: attach devices by chip select."""
+    """Create the far end of /dev/spidev0.*, a controller with only 8-bit words. Attach devices by chip select."""
     with spi_bus(0) as bus:
         yield bus
 

@@ -1,4 +1,4 @@
-"""`imud demo` to its end, with the patience that an emulated processor needs."""
+"""Runs `imud demo` to its end with time limits for an emulated processor."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""`imud doctor --json` as a process: its findings, and an exit status that follows from them."""
+"""`imud doctor --json` as a process: its findings, and the matching exit status."""
 
 import subprocess
 import sys
@@ -9,7 +9,7 @@ import msgspec
 
 LIMIT_S: Final = 150.0
 STATUS: Final = {"error": 2, "warning": 1}
-"""Exit status by severity (docs/doctor.md); 0 for the others."""
+"""Exit status by severity (docs/doctor.md); 0 for all other severities."""
 ORDINARY_USER: Final = (
     "setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--inh-caps=+dac_read_search",
     "--ambient-caps=+dac_read_search",
@@ -35,7 +35,7 @@ class Diagnosis(msgspec.Struct, frozen=True):
     checks: list[CheckOutcome]
 
     def of(self, severity: str) -> list[tuple[str, str]]:
-        """Check and text of every finding of a severity."""
+        """Return check and text of every finding of a severity."""
         return [
             (check.name, found.seen) for check in self.checks for found in check.findings if found.severity == severity
         ]
@@ -43,7 +43,7 @@ class Diagnosis(msgspec.Struct, frozen=True):
     def advice(self, check: str, severity: str, seen: str, advice: str = "") -> str:
         found = [one for each in self.checks if each.name == check for one in each.findings]
         fitting = [one for one in found if one.severity == severity and seen in one.seen and advice in one.advice]
-        assert fitting, f"{check}: no {severity} with {seen!r} and the step {advice!r} among {found}"
+        assert fitting, f"{check}: expected {severity} with {seen!r} and the step {advice!r}, got {found}"
         return fitting[0].advice
 
     def has(self, check: str, severity: str, seen: str, advice: str = "") -> None:

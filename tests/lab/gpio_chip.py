@@ -1,6 +1,6 @@
-"""GPIO chips of the kernel's gpio-sim: levels from outside, outputs seen from outside.
+"""GPIO chips of the kernel's gpio-sim. Tests set the levels of inputs and read the levels of outputs.
 
-Interface: Documentation/admin-guide/gpio/gpio-sim.rst (configfs makes a chip, sysfs sets pulls and shows values).
+Interface: Documentation/admin-guide/gpio/gpio-sim.rst (configfs creates a chip, sysfs sets pulls and shows values).
 """
 
 import itertools

@@ -1,4 +1,4 @@
-"""A simulated module as a process: behind a pty, its pins on the lines of a gpio-sim chip."""
+"""A simulated device as a process behind a pty. Its pins are lines of a gpio-sim chip."""
 
 import csv
 import os
@@ -14,12 +14,12 @@ from tests.lab.gpio_chip import GpioChip
 
 LIMIT_S = 150.0
 SETTLE_MS = 12.0
-"""The lab's kernel tells of simulated edges at its timer ticks, 4 ms apart."""
+"""Time for an edge, ms. The lab's kernel reports simulated edges at its timer ticks, every 4 ms."""
 
 
 class Pulse(NamedTuple):
     sample_ns: int
-    """Instant of measurement of its sample."""
+    """Time of the measurement, ns."""
     late_ns: int
     """Delay of the process of the device, ns."""
 

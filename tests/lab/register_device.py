@@ -1,4 +1,4 @@
-"""A simulated I2C device that most sensors resemble: byte registers behind a pointer."""
+"""A simulated I2C device that is similar to most sensors: byte registers and a register pointer."""
 
 from tests.lab import wire
 

@@ -12,7 +12,7 @@ from pathlib import Path
 class PseudoTerminal:
     path: Path
     far_fd: int
-    """The controlling end, blocking."""
+    """Descriptor of the controlling end, blocking."""
 
     def write(self, data: bytes) -> None:
         while data:

@@ -30,7 +30,7 @@ QUIET_S = 0.5
 TIOCGICOUNT = 0x545D
 COUNTERS = struct.Struct("=11i9i")
 COUNTERS_USED = {"rx": 4, "tx": 5, "frame": 6, "overrun": 7}
-"""Places of counters in `struct serial_icounter_struct`."""
+"""Offsets of counters in `struct serial_icounter_struct`."""
 
 
 def test_the_guest_runs_the_built_kernel_on_a_read_only_root() -> None:
@@ -71,7 +71,7 @@ def test_spi_of_8_bit_words_keeps_the_order_of_memory(spi8: Bus[SpiTransfer]) ->
 
 @pytest.mark.usefixtures("word_of_16_bits")
 def test_spi_of_16_bit_words_has_the_high_byte_first(spi16: Bus[SpiTransfer]) -> None:
-    """The host has words in its own byte order."""
+    """The host stores words in its own byte order."""
     spi16.attach(0, lambda transfer: b"\xca\xfe\xba\xbe"[: transfer.whole])
     words = struct.pack("=HH", 0x1234, 0xABCD)
     read = tool("spi-pipe", "-d", "/dev/spidev1.0", "-b", "4", "-n", "1", data=words)
@@ -104,7 +104,7 @@ def counters(port: serial.Serial) -> dict[str, int]:
 
 
 def exchanged(first: serial.Serial, second: serial.Serial) -> dict[str, int]:
-    """Send every byte there and back. Return the growth of the counters of `second`."""
+    """Send every byte in both directions. Return the increase of the counters of `second`."""
     for port in (first, second):
         port.timeout = QUIET_S
         while port.read(4096):
@@ -123,7 +123,7 @@ def test_uarts_are_wired_to_each_other(uarts: tuple[Path, Path]) -> None:
         first.set_low_latency_mode(True)
         try:
             counted = exchanged(first, second)
-        except AssertionError as error:  # the emulated UART lost 54 bytes once, on a busy host
+        except AssertionError as error:  # on a busy host, the emulated UART lost 54 bytes once
             print(f"once more, after {error}")
             counted = exchanged(first, second)
     assert counted == {"rx": 256, "tx": 256, "frame": 0, "overrun": 0}

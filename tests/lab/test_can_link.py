@@ -1,4 +1,4 @@
-"""The CAN link on the kernel's own: frames sent cyclically, filters that change, a device found by listening."""
+"""The CAN link on a bus of the kernel: cyclic sending, changing filters, and detection of a device by listening."""
 
 import asyncio
 import socket
@@ -48,7 +48,7 @@ def test_the_kernel_sends_cyclically_and_stops_with_the_link(vcan: CanInterface)
             link.send_cyclic([SYNC, CyclicFrame(0x18FEE9AA, True, b"\1\2", 50 * MS)])
             end = monotonic() + 3
             while monotonic() < end:
-                await asyncio.sleep(0.1)  # the kernel does it, whatever we do
+                await asyncio.sleep(0.1)  # the kernel sends the frames without the event loop
                 heard.extend(reader.read())
             link.send_cyclic([CyclicFrame(0x81, False, b"", 10 * MS)])
             heard.extend(reader.read())
@@ -66,7 +66,7 @@ def test_the_kernel_sends_cyclically_and_stops_with_the_link(vcan: CanInterface)
     mean_ns = (times[-1] - times[0]) / (len(times) - 1)
     words = f"mean {mean_ns / 1e6:.4f} ms, shortest {gaps[0] / 1e6:.2f} ms, longest {gaps[-1] / 1e6:.2f} ms"
     print(f"\nSYNC every 10 ms by the kernel: {len(times)} sent, {words}")
-    assert mean_ns >= 10 * MS - 1  # longer by the latency of the timer's interrupt, and by the stalls of a busy host
+    assert mean_ns >= 10 * MS - 1  # longer due to the latency of the timer interrupt and stalls of a busy host
     assert gaps[len(gaps) // 2] < 11 * MS
     assert len(others) == pytest.approx(len(times) / 5, abs=6)
     assert others[0][:3] == (0x18FEE9AA, True, b"\1\2")

@@ -1,4 +1,4 @@
-"""Nine devices on one virtual bus and one daemon: nothing is lost, nothing mixed; the bus goes down and up again."""
+"""Nine devices on one virtual bus and one daemon: no lost or mixed samples, also after an interface was down."""
 
 import os
 from pathlib import Path
@@ -21,7 +21,7 @@ LATENCY_MS = float(os.environ.get("IMUD_LAB_LATENCY_MS", "50"))
 LIMIT_S = 60.0
 ASK_S = 0.5
 EDGE_S = 0.5
-"""By so much may the time of reading begin or end late; none of the samples in it may be missing."""
+"""Tolerance of start and end of the reading time, s. No sample between them may be missing."""
 SPARE_S = 120.0
 ID_AT = next(field.offset for field in SLOT_FIELDS if field.name == "device_id")
 LOSSES = ("lost_gap_device", "lost_crc", "lost_overrun", "lost_queue")
@@ -34,7 +34,7 @@ def collect(client: Client, seconds: float) -> dict[str, list[Sample]]:
     end = monotonic() + seconds
     while monotonic() < end:
         message = client.next_message(Watch.NAMES, LIMIT_S)
-        assert isinstance(message, bytes), message  # nothing was dropped
+        assert isinstance(message, bytes), message  # no sample was dropped
         taken.append(message)
     client.unwatch()
     found: dict[str, list[Sample]] = {name: [] for name in names.values()}
@@ -114,7 +114,7 @@ def test_nine_devices_on_one_bus(vcan: CanInterface, tmp_path: Path) -> None:
         for number, module in enumerate(modules):
             against = Against(number, again[module.name][0], RATE_HZ, begin_ns)
             assert all(against.is_true(s) for s in again[module.name])
-        assert bus.end() > 0  # refused while the bus was down
+        assert bus.end() > 0  # frames rejected while the bus was down
 
 
 def show(

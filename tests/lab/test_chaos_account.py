@@ -69,4 +69,4 @@ def test_faults_of_the_sequence() -> None:
     assert sequence_faults(good, 4) == []
     assert sequence_faults(good, 3) == ["sample 4 follows 2"]
     assert sequence_faults([good[0], good[2]], 4) == ["sample 6 follows 4"]
-    assert "a stamp does not rise" in sequence_faults(received([9, 9]), 1)
+    assert "a time stamp does not increase" in sequence_faults(received([9, 9]), 1)

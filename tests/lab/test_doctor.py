@@ -142,7 +142,12 @@ def test_healthy_devices_then_a_newer_file_then_no_daemon(
         wait_running(made, *devices)
         found = doctor(made)
         assert found.of("error") == []
-        allowed = {"clock", "processor", "kernel log", "CAN state"}  # an emulated machine after other tests
+        allowed = {
+            "clock",
+            "processor",
+            "kernel log",
+            "CAN state",
+        }  # possible findings of an emulated system after other tests
         assert {check for check, _ in found.of("warning")} <= allowed
         found.has("clock", "warning", "synchronised", "chrony")
         found.has("service", "not checked", "no systemd runs here")
@@ -171,7 +176,7 @@ def test_healthy_devices_then_a_newer_file_then_no_daemon(
 
 @pytest.mark.thorough
 def test_mistakes_and_a_port_that_is_the_console(tmp_path: Path) -> None:
-    """No daemon runs: none is to open that port."""
+    """No daemon runs, because no process may open that port."""
     config = write_config(tmp_path, {"bow": uart("/dev/ttyS0")})
     found = diagnose(config, tmp_path / "imud.sock")
     found.has("ports taken", "error", "/dev/ttyS0 is a console of the kernel", "remove `console=ttyS0`")
@@ -184,7 +189,7 @@ def test_mistakes_and_a_port_that_is_the_console(tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 def test_serial_ports(uarts: tuple[Path, Path], tmp_path: Path) -> None:
-    """On one daemon: silence, noise, a wrong rate, a held port, wires of one direction, RS-485 without its module."""
+    """Check with one daemon: silence, noise, wrong baud rate, used port, one-way wires, and RS-485 without a device."""
     near, far = uarts
     with ExitStack() as stack:
         quiet, bits, held, line, loop = (stack.enter_context(pseudo_terminal()) for _ in range(5))
@@ -223,7 +228,7 @@ def test_serial_ports(uarts: tuple[Path, Path], tmp_path: Path) -> None:
 
 
 def check_rights(made: RunningDaemon, port: Path) -> None:
-    """A port that an ordinary user may not open: it belongs to root, then to a group, then to everyone."""
+    """Check a port that a normal user may not open. It belongs to root, then to a group, then to all users."""
     before = port.stat()
     try:
         os.chmod(port, 0o600)
@@ -246,7 +251,7 @@ def check_rights(made: RunningDaemon, port: Path) -> None:
 
 @contextmanager
 def port_held(path: Path) -> Iterator["subprocess.Popen[str]"]:
-    """Another program that has the port for itself, as terminal programs do."""
+    """Run a program with exclusive access to the port, like terminal programs."""
     code = f"import serial, time\nport = serial.Serial({str(path)!r}, exclusive=True)\nprint(1, flush=True)\n"
     with running(sys.executable, "-c", code + "time.sleep(3600)") as process:
         assert process.stdout is not None
@@ -285,7 +290,7 @@ def test_can(can_pair: tuple[CanInterface, CanInterface], tmp_path: Path) -> Non
 
 
 def check_states(made: RunningDaemon, near: CanInterface) -> None:
-    """A controller that becomes error-passive, leaves its bus, and returns after the advised commands."""
+    """Check a controller that becomes error-passive and bus-off, and recovers after the advised commands."""
     near.enter("error-passive")
     doctor(made).has("CAN state", "warning", f"{near.name} is ERROR-PASSIVE", "120 Ω at both ends")
     near.enter("error-active")
@@ -304,7 +309,7 @@ def check_states(made: RunningDaemon, near: CanInterface) -> None:
 
 @pytest.mark.thorough
 def test_i2c_and_spi(i2c: Bus[I2cTransfer], spi8: Bus[SpiTransfer], spi16: Bus[SpiTransfer], tmp_path: Path) -> None:
-    """Silent addresses and chip selects, failing and damaged transfers, exchanged bytes, a wrong mode, absent nodes."""
+    """Check silent addresses and chip selects, failed or damaged transfers, swapped bytes, missing nodes."""
     damaged = registers()
     i2c.attach(0x19, refusing(on_i2c(registers()), 10))
     i2c.attach(0x1A, on_i2c(damaged))
@@ -366,12 +371,12 @@ def exchanged(answer: Callable[[SpiTransfer], bytes]) -> Callable[[SpiTransfer],
 
 @pytest.mark.thorough
 def test_lines_and_restarts(gpio_chip: GpioChip, tmp_path: Path) -> None:
-    """SOUT, PPS and ALARM are not wired; the module restarts by itself."""
+    """SOUT, PPS and ALARM are not connected. The device restarts by itself."""
     lines = {"sout": {"line": "SOUT"}, "pps": {"line": "PPS"}, "alarm": {"line": "ALARM"}}
     devices: dict[str, object] = {"bow": {**uart(tty(tmp_path)), "lines": lines}}
     with ExitStack() as stack:
         imu = stack.enter_context(running_imu(tmp_path, gpio_chip, {}, "--rate", "20"))
-        tell(tmp_path, "CONFIG PMUX5 Y,-89,89,0,1")  # a range that it does not leave
+        tell(tmp_path, "CONFIG PMUX5 Y,-89,89,0,1")  # the device never leaves this range
         made = stack.enter_context(daemon(tmp_path, devices))
         wait_for(made, "bow", lambda one: one.ledger["samples"] > 250, "enough samples")
         found = doctor(made)

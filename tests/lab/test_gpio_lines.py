@@ -89,7 +89,7 @@ async def test_drain_comes_before_the_loop(gpio_chip: GpioChip) -> None:
 
 @in_loop
 async def test_overflow_is_counted(gpio_chip: GpioChip) -> None:
-    """Without a reader, the kernel keeps the newest edges. It can join two edges that are close together."""
+    """The kernel keeps only the newest edges if no program reads them. It can join two close edges."""
     watcher = Watcher(InputOptions(line="SOUT"))
     watcher.start()
     for level in islice(cycle((True, False)), 3 * KERNEL_EVENTS):
@@ -198,7 +198,7 @@ async def test_a_chip_that_is_pulled_out_and_comes_back(gpio_chip: GpioChip) -> 
 
 
 def test_outputs_are_inactive_before_and_after(gpio_chip: GpioChip) -> None:
-    """A released line of gpio-sim has the level of its pull: here that of the resistor which a board has there."""
+    """A released line of gpio-sim has the level of its pull. The pull replaces the resistor of a board."""
     gpio_chip.drive("RESET", True)
     for settings, name, inactive in (
         (OutputOptions(line="SIN"), "SIN", False),
@@ -250,7 +250,7 @@ class WiredOutput(GpioOutput):
 
 @in_loop
 async def test_sin_has_its_period_and_its_stamps_are_true(gpio_chip: GpioChip) -> None:
-    """gpiomon, which is not ours, reads the wire; its stamps are the kernel's, and lie within the errors of ours."""
+    """gpiomon reads the same line. Its kernel time stamps must be within the errors of imud's time stamps."""
     line, stamps, enough = WiredOutput(gpio_chip, OutputOptions(line="SIN")), list[TriggerStamp](), asyncio.Event()
 
     def on_stamps(found: Sequence[TriggerStamp]) -> None:
@@ -283,7 +283,7 @@ async def test_sin_has_its_period_and_its_stamps_are_true(gpio_chip: GpioChip) -
 
 @contextmanager
 def rising_edges(chip: str, offset: int) -> Iterator[Iterator[int]]:
-    """Kernel stamps of rising edges as gpiomon prints them."""
+    """Return the kernel's time stamps of rising edges in the output of gpiomon."""
     command = ("gpiomon", "--line-buffered", "--rising-edge", "--format=%s %n", chip, str(offset))
     with running(*command) as monitor:
         assert monitor.stdout is not None

@@ -101,7 +101,7 @@ def test_stream_of_the_simulator_with_its_truth(vcan: CanInterface) -> None:
         await rig.until(lambda: len(rig.samples) >= 99, "99 samples")
         port.close()
         for number, sample in enumerate(rig.samples):
-            instant_ns = module.epoch_ns + round(number * 20e6 / 1.00002)  # its clock is 20 ppm fast
+            instant_ns = module.epoch_ns + round(number * 20e6 / 1.00002)  # the device clock is 20 ppm fast
             truth = hardware.motion.at((instant_ns - module.epoch_ns) / 1e9)
             assert sample.gyro_rad_s == pytest.approx(truth.gyro_rad_s, abs=1e-6)
             assert instant_ns - 3 * sample.t_err_ns <= sample.t_ns <= sample.t_rx_ns
@@ -186,7 +186,7 @@ def test_interface_down_and_up_again(vcan: CanInterface) -> None:
         rig.back()
         rig.send(500, 501)
         await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running again")
-        await rig.until(lambda: len(rig.samples) == 4, "both")  # the kernel may hand over the second one later
+        await rig.until(lambda: len(rig.samples) == 4, "both")  # the kernel may deliver the second sample later
 
     rig.play(story)
     assert len(rig.samples) == 4
@@ -231,7 +231,7 @@ def test_error_states_are_counted_and_shown(vcan: CanInterface) -> None:
         await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running again")
         assert rig.runner.status().problem == ""
         rig.send(3)
-        rig.send_error(CONTROLLER, 0x01)  # the controller's own buffer ran over
+        rig.send_error(CONTROLLER, 0x01)  # overflow of the controller's receive buffer
         rig.send(5)
         await rig.until(lambda: len(rig.samples) == 4, "four samples")
 
@@ -263,7 +263,7 @@ def test_real_controllers_carry_the_stream(can_pair: tuple[CanInterface, CanInte
         await rig.until(lambda: rig.runner.state is DeviceState.MISSING, "missing")
         near.up()
         await rig.until(lambda: rig.runner.state is DeviceState.SEARCHING, "open again")
-        rig.send(90, 91)  # the far controller stayed up
+        rig.send(90, 91)  # the interface at the far end is still up
         await rig.until(lambda: len(rig.samples) == 22, "two more")
 
     rig.play(story)
@@ -325,7 +325,7 @@ def test_bus_off_of_a_real_controller_and_its_restart(
     ledger = rig.runner.ledger
     assert rig.runner.status().kernel.bus_off == 1
     assert rig.runner.status().connects == 1
-    assert ledger.lost() == 3  # 3 was cut off, 4 and 5 were never received
+    assert ledger.lost() == 3  # frame 3 was incomplete, frames 4 and 5 were not received
     assert ledger.frames_ignored == 3
     news = [event.message.partition(":")[0] for event in rig.events if event.kind is EventKind.LINK]
     assert news == ["can0 is bus-off", "can0 is error-active again"]

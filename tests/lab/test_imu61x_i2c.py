@@ -1,4 +1,4 @@
-"""The IMU61x on the kernel's i2c-dev: found by its id, set up, streams, faults, recovery."""
+"""The IMU61x on i2c-dev of the kernel: detection by id, setup, stream, faults, recovery."""
 
 import asyncio
 import errno
@@ -23,7 +23,7 @@ ADDRESS = 0x1A
 
 @pytest.mark.manual("A 3.1 rate")
 def test_found_by_its_id_and_streams_the_truth(i2c: Bus[I2cTransfer]) -> None:
-    """Another sensor answers at the first address; the device is at the third."""
+    """Another sensor replies at the first address. The device is at the third address."""
     other = RegisterDevice({0x6A: 0x12})
     device = registers(product="IMU6132B")
     i2c.attach(0x18, other)
@@ -64,7 +64,7 @@ def test_vanishes_and_is_identified_before_it_is_believed(
     i2c: Bus[I2cTransfer], fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     polls = (Poll(device_i2c.READ_BURST), Poll(READ_ID, 10**8))
-    if fault == "wrong id":  # otherwise its reading tells of other faults as well, and sooner
+    if fault == "wrong id":  # with the other faults, the readings also show the fault, and earlier
         monkeypatch.setattr(device_i2c.Imu61xI2cCodec, "polls", polls)
     device = registers()
     i2c.attach(ADDRESS, on_i2c(device))

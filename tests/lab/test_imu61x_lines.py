@@ -1,5 +1,4 @@
-"""GPIO lines of the IMU61x on gpio-sim next to its buses: reset as seen by an independent reader, and each data-ready
-edge."""
+"""GPIO lines of the IMU61x on gpio-sim: the reset seen by an independent reader, and each data-ready edge."""
 
 import asyncio
 import threading
@@ -199,7 +198,10 @@ def test_edges_that_come_faster_than_reads_are_missed_and_counted(stepped: tuple
             rig.device.tick(monotonic_ns())
             polling = rig.device.status().polling
             assert polling is not None
-            lost, stale = rig.device.ledger.lost_queue, polling.stale  # an early read makes the value stale at its edge
+            lost, stale = (
+                rig.device.ledger.lost_queue,
+                polling.stale,
+            )  # a read before the edge makes the value stale at its edge
             assert 0 < lost <= missed <= lost + stale
             assert numbers[-1] <= len(it.stamps_ns) <= numbers[-1] + stale
 

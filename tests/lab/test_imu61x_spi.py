@@ -1,4 +1,4 @@
-"""The IMU61x on the kernel's spidev: identify, set up, stream, faults, recovery; 8-bit words only, and 16."""
+"""The IMU61x on spidev of the kernel: identify, setup, stream, faults, recovery, with 8-bit words and 16-bit words."""
 
 import asyncio
 import errno
@@ -55,7 +55,7 @@ def test_streams_the_truth(bus: tuple[Bus[SpiTransfer], str], burst: str) -> Non
     assert len(bursts) >= 20
     bits = 8 if port == PORTS["spi8"] else 16
     assert {(s.bits_per_word, s.speed_hz) for t in bursts for s in t.segments} == {(bits, 500_000)}
-    if burst != "registers":  # one ioctl, one selection
+    if burst != "registers":  # one ioctl, one activation of chip select
         assert {len(t.segments) for t in bursts} == {1}
         assert not any(t.stays_selected for t in bursts)
 

@@ -1,4 +1,4 @@
-"""The J1939 driver and its simulator against the kernel's own J1939 sockets, both ways, on a virtual bus."""
+"""The J1939 driver and its simulator with the J1939 sockets of the kernel, in both directions, on a virtual bus."""
 
 import asyncio
 import math
@@ -31,7 +31,7 @@ RAD_PER_COUNT = math.pi / 180_000
 
 @contextmanager
 def node(interface: str, address: int) -> Iterator[socket.socket]:
-    """A node of this address, run by the kernel."""
+    """Create a node with this address. The kernel runs the node."""
     with socket.socket(socket.AF_CAN, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK, socket.CAN_J1939) as end:
         end.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         end.setsockopt(LEVEL, socket.SO_J1939_SEND_PRIO, 3)
@@ -66,7 +66,7 @@ def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
             return
         requests.append((source, data))
         register, command, _, value = commands.LAYOUT.unpack(data)
-        if register in intervals:  # it has no other
+        if register in intervals:  # the node has no other register
             intervals[register] = value if command == commands.WRITE else intervals[register]
             reply = commands.LAYOUT.pack(register, command, 0, intervals[register])
             say(end, vcan.name, codec.CONFIGURE, reply, 0x55)
@@ -104,8 +104,8 @@ def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
 
 
 def test_our_simulator_heard_and_set_by_a_node_of_the_kernel(vcan: CanInterface) -> None:
-    """Without a claim of its address: Linux 6.12 keeps a reference to the interface for each claim that a J1939 socket
-    heard, and the interface could never be deleted ("waiting for vcan0 to become free")."""
+    """The node does not claim its address. Linux 6.12 keeps a reference to the interface for each claim that a J1939
+    socket received. The kernel could then never delete the interface ("waiting for vcan0 to become free")."""
     hardware = J1939Hardware(bitrate=0, boot_ms=0, variant=J1939_VARIANTS["claims no address"])
     module = HipnucJ1939Module(monotonic_ns(), J1939Settings(), hardware)
     port = CanPort(module, vcan.name)
@@ -136,11 +136,11 @@ def test_our_simulator_heard_and_set_by_a_node_of_the_kernel(vcan: CanInterface)
         say(end, vcan.name, codec.CONFIGURE, bytes.fromhex("3701030000000000"), 8)
         run_until(end, lambda: heard[-1][2] == bytes.fromhex("3701030032000000"))
     accel = struct.unpack("<3hH", next(data for pgn, _, data in heard if pgn == 0xFF34))
-    assert 1700 < sum(counts * counts for counts in accel[:3]) ** 0.5 < 2400  # 1 G and the swing
+    assert 1700 < sum(counts * counts for counts in accel[:3]) ** 0.5 < 2400  # 1 G and the motion
 
 
 def test_driver_and_simulator_with_every_message_and_all_actions(vcan: CanInterface) -> None:
-    """Two modules on the bus; one is set while both send, restarted, and sends as it was saved."""
+    """Two devices on the bus. The test changes settings of one device while both send, and restarts it."""
     fast = dict.fromkeys(codec.PGNS, 100)
     quiet = J1939Hardware(bitrate=0, boot_ms=0)
     module = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast), quiet)

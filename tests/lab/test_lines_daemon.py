@@ -125,7 +125,7 @@ def instant(truth: Mapping[int, int], sample: Sample) -> int:
 
 @pytest.mark.thorough
 def test_the_alarm_is_seen(gpio_chip: GpioChip, tmp_path: Path) -> None:
-    """The module turns by 25° to either side; its alarm is set to 5°."""
+    """The device turns by 25° in both directions. The limit of its alarm is 5°."""
     with running_imu(tmp_path, gpio_chip, {"alarm": "ALARM"}, "--rate", "20", "--no-noise"):
         tell(tmp_path, "CONFIG PMUX5 Y,-5,5,0,1")
         with daemon(tmp_path, {"alarm": {"line": "ALARM"}}) as made:
@@ -145,7 +145,7 @@ def test_the_alarm_is_seen(gpio_chip: GpioChip, tmp_path: Path) -> None:
     outside = [abs(degrees(sample.euler_rad[0])) > 5 for sample in samples if sample.euler_rad is not None]
     assert len(outside) == len(samples)
     for i in range(FOLLOWS, len(samples)):
-        if len(set(outside[i - FOLLOWS : i + 1])) == 1:  # long enough for the line to be seen
+        if len(set(outside[i - FOLLOWS : i + 1])) == 1:  # long enough for the level to be in the samples
             assert bool((samples[i].status or 0) & ALARM_STATUS) == outside[i]
 
 

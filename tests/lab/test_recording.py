@@ -45,9 +45,9 @@ SLOW_S = 150.0
 RUN_S = 12.0
 REQUEST_S = 5
 LEAST = 30
-"""Samples of each device in RUN_S: at 5 Hz, the slowest, twice as many come."""
+"""Minimum number of samples of each device in RUN_S. The slowest device, at 5 Hz, sends twice this number."""
 BEFORE_MOST = 5
-"""A device is recorded from the recorder's first look at it on, by when it may have had samples."""
+"""Maximum number of samples of a device before its recording starts."""
 DISK = "2m"
 EDGES = 10
 
@@ -68,7 +68,7 @@ def test_every_link_is_replayed_as_it_ran(tmp_path: Path) -> None:
             life.wait_running()
             record(life, asked_for)
             sleep(RUN_S)
-        at_end = at_rest(life)  # all devices are removed: the ledgers do not change any more
+        at_end = at_rest(life)  # all devices are removed: the ledgers no longer change
         life.terminate()
     live = received(life)
     assert life.recorder.dropped == []
@@ -156,7 +156,7 @@ def differing(found: list[Sample], live: list[Sample]) -> str:
 
 
 def test_samples_of_a_data_ready_line_are_replayed(i2c: Bus[I2cTransfer], gpio_chip: GpioChip) -> None:
-    """Each edge by itself, then so many at once that reads miss some; the rigs compare at the end."""
+    """First single edges, then many edges together, so that reads miss some. The rigs compare at the end."""
     it = Stepped(gpio_chip)
     i2c.attach(0x18, on_i2c(it.device))
     config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 0, "rate_hz": FALLBACK_HZ})

@@ -1,7 +1,7 @@
-"""Settings of modules on CAN made as they are declared, by a device of the daemon on the kernel's virtual bus.
+"""Declared settings of devices on CAN, applied by a device of the daemon on the kernel's virtual bus.
 
-Over every kind of module that the simulators have: each setting is written, read back, saved, the module restarted and
-followed to its new number.
+The test runs with every kind of simulated device. It writes each setting, reads it back and saves it. Then the device
+restarts, and imud continues at its new node number.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ async def made_so(rig: BusRig, wanted: Mapping[str, object], *, verified: bool) 
     count = len(rig.samples)
     await rig.until(lambda: len(rig.samples) > count + 5, "samples afterwards")
     messages = " ".join(event.message for event in rig.events)
-    assert "in the configuration" in messages  # which number to change there
+    assert "in the configuration" in messages  # the message names the node number to change in the configuration
 
 
 @pytest.mark.timeout(300)

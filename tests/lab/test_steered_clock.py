@@ -26,7 +26,7 @@ from tests.support.device_rig import DeviceOutput
 ADJ_FREQUENCY, ADJ_TICK = 0x2, 0x4000
 PERIOD_NS = 20 * NS_PER_MS
 WIRE_NS = 82 * uart_byte_ns(115_200)
-"""A pseudo terminal takes no time for the bytes."""
+"""Wire time of a frame, ns. A pseudo-terminal has no wire time."""
 STEPS = (
     (6.0, 0, 10_000),
     (5.0, 500, 10_000),
@@ -35,7 +35,7 @@ STEPS = (
     (3.0, 0, 9_000),
     (4.0, 0, 10_000),
 )
-"""Seconds, ppm, length of a tick in µs: the last is 10 % more and 10 % less than the kernel's own."""
+"""Steps of (time in s, rate error in ppm, length of a tick in µs). The last steps change the tick by ±10 %."""
 
 
 def steer(ppm: float, tick_us: int) -> None:
@@ -46,7 +46,7 @@ def steer(ppm: float, tick_us: int) -> None:
 
 @contextmanager
 def steering() -> Iterator[None]:
-    """Leave the clock as it was."""
+    """Restore the clock at the end."""
     try:
         yield
     finally:
@@ -58,7 +58,7 @@ def raw_ns() -> int:
 
 
 def tight_pair() -> tuple[int, int]:
-    """CLOCK_MONOTONIC_RAW and CLOCK_MONOTONIC at one instant: the tightest of some readings."""
+    """Return CLOCK_MONOTONIC_RAW and CLOCK_MONOTONIC at one instant: the closest pair of some readings."""
     best = None
     for _ in range(5):
         before_ns, raw, after_ns = monotonic_ns(), raw_ns(), monotonic_ns()
@@ -79,7 +79,7 @@ class Device:
         number = (raw_ns() - self._begin_ns - WIRE_NS) // PERIOD_NS
         if number <= self._number:
             return
-        self._number = number  # a host that was too busy for the previous reading loses it
+        self._number = number  # a busy host may miss a reading
         self.pairs.append(tight_pair())
         frame = encode_hi91(
             system_time_ms=self._number * PERIOD_NS // NS_PER_MS, accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0),
@@ -88,7 +88,7 @@ class Device:
         self._pty.write(frame)
 
     def truth_ns(self, t_dev_ns: int) -> int:
-        """CLOCK_MONOTONIC at the measurement with this device time."""
+        """Return CLOCK_MONOTONIC at the measurement with this device time, ns."""
         raw = self._begin_ns + t_dev_ns
         for (raw_0, monotonic_0), (raw_1, monotonic_1) in pairwise(self.pairs):
             if raw_0 <= raw < raw_1:
@@ -133,7 +133,7 @@ def test_stamps_stay_right_while_the_kernel_steers(pty: PseudoTerminal) -> None:
         offs = sorted(s.t_ns - truth_ns for s, truth_ns in dated if begin_ns + NS_PER_S < truth_ns < end_ns)
         medians.append(offs[len(offs) // 2])
     print(f"medians {medians} ns, rates {[round(rate * 1e6, 1) for rate in rates]} ppm")
-    assert max(medians) - min(medians) < 500_000, medians  # by the steered clock alone 500 ppm are 2.5 ms in 5 s
+    assert max(medians) - min(medians) < 500_000, medians  # with the steered clock alone, 500 ppm cause 2.5 ms in 5 s
     assert all(a.t_ns < b.t_ns for a, b in pairwise(samples))
     assert all(s.t_ns <= s.t_rx_ns for s in samples)
     utc = [s.utc_ns - s.t_ns for s in samples]

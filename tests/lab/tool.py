@@ -9,7 +9,7 @@ LIMIT_S = 30.0
 
 
 class ToolError(Exception):
-    """A program ended with a status other than 0; the text is its standard error."""
+    """A program ended with an exit status other than 0. The text is its standard error."""
 
 
 def tool(*command: str, data: bytes | None = None) -> str:

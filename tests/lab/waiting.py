@@ -1,4 +1,4 @@
-"""Waiting for a state of the kernel or of another program that announces itself in no other way."""
+"""Wait for a state of the kernel or of another program that has no event."""
 
 import time
 from collections.abc import Callable

@@ -1,7 +1,7 @@
-"""The module's messages (kmod/protocol.h): requests as records, answers as bytes. Pure.
+"""The messages of the kernel module (kmod/protocol.h): requests as records, replies as bytes. No I/O.
 
-SPI data is shown here as it is on the wire, most significant byte of each word first; the module has words
-of more than 8 bits in the host's byte order, which `SpiTransfer.answer` and the parser convert.
+SPI data is in wire order here, most significant byte of each word first. The kernel module uses the byte order of the
+host for words of more than 8 bits. `SpiTransfer.answer` and the parser convert.
 """
 
 import struct
@@ -21,7 +21,7 @@ MAX_BYTES = 64 * 1024
 
 
 class Refuse(Exception):
-    """Raised by a simulated device: the host's call fails with this errno."""
+    """Exception of a simulated device. The call of the host then fails with this errno."""
 
     def __init__(self, number: int) -> None:
         """`number` is an errno: ENXIO for a NAK, ETIMEDOUT for a stuck bus, EAGAIN for a lost arbitration."""
@@ -31,7 +31,7 @@ class Refuse(Exception):
 
 @dataclass(frozen=True, slots=True)
 class I2cSegment:
-    """One I2C message; between two of a transfer is a repeated start."""
+    """One I2C message. A repeated start separates two messages of a transfer."""
 
     address: int
     flags: int
@@ -40,13 +40,13 @@ class I2cSegment:
 
     @property
     def reads(self) -> bool:
-        """Whether the host reads."""
+        """Return whether the host reads this segment."""
         return bool(self.flags & I2C_M_RD)
 
 
 @dataclass(frozen=True, slots=True)
 class I2cTransfer:
-    """Everything between start and stop."""
+    """All segments between start and stop."""
 
     id: int
     segments: tuple[I2cSegment, ...]
@@ -57,7 +57,7 @@ class I2cTransfer:
 
     @property
     def whole(self) -> int:
-        """`done` of a full transfer."""
+        """Return `done` of a complete transfer."""
         return len(self.segments)
 
     def payload(self, data: bytes) -> bytes:
@@ -77,7 +77,7 @@ class SpiSegment:
 
 @dataclass(frozen=True, slots=True)
 class SpiTransfer:
-    """One SPI_IOC_MESSAGE: all its transfers."""
+    """One SPI_IOC_MESSAGE with all its transfers."""
 
     id: int
     mode: int
@@ -95,17 +95,17 @@ class SpiTransfer:
 
     @property
     def stays_selected(self) -> bool:
-        """cs_change of the last segment: the chip stays selected after the message."""
+        """Return whether the chip stays selected after the message: cs_change of the last segment."""
         return bool(self.segments) and self.segments[-1].cs_change
 
     @property
     def read_length(self) -> int:
-        """Bytes that a full answer to the module has."""
+        """Return the number of bytes in a complete reply to the kernel module."""
         return sum(len(segment.mosi) for segment in self.segments if segment.reads)
 
     @property
     def whole(self) -> int:
-        """`done` of a full transfer."""
+        """Return `done` of a complete transfer."""
         return sum(len(segment.mosi) for segment in self.segments)
 
     def payload(self, miso: bytes) -> bytes:
@@ -122,14 +122,14 @@ Transfer = I2cTransfer | SpiTransfer
 
 
 def swapped(data: bytes, bits_per_word: int) -> bytes:
-    """Words of 9 to 16 bits from host byte order to wire order, or back; the same for 8-bit words."""
+    """Convert words of 9 to 16 bits between host byte order and wire order. Return 8-bit words unchanged."""
     if bits_per_word <= 8 or sys.byteorder == "big":
         return data
     return b"".join(data[i : i + 2][::-1] for i in range(0, len(data), 2))
 
 
 def parse(request: bytes) -> Transfer:
-    """One read() of the module's device."""
+    """Parse the result of one read() of the kernel module's device."""
     identifier, size, kind, count, mode, chip_select = REQUEST.unpack_from(request)
     assert size == len(request), f"request says {size} bytes, has {len(request)}"
     assert kind in (KIND_I2C, KIND_SPI), f"unknown kind {kind}"
@@ -161,12 +161,12 @@ def _spi_segments(request: bytes, count: int) -> tuple[SpiSegment, ...]:
 
 
 def answer(transfer: Transfer, data: bytes) -> bytes:
-    """The answer of a transfer that went through; `data` is for the segments the host reads, SPI for all."""
+    """Return the reply to a successful transfer. `data` contains the read bytes, for SPI the bytes of all segments."""
     payload = transfer.payload(data)
     assert len(payload) == transfer.read_length, f"device gave {len(payload)} bytes, host reads {transfer.read_length}"
     return ANSWER.pack(transfer.id, 0, transfer.whole, len(payload)) + payload
 
 
 def refusal(transfer: Transfer, number: int) -> bytes:
-    """The answer that makes the host's call fail with an errno."""
+    """Return the reply that makes the call of the host fail with an errno."""
     return ANSWER.pack(transfer.id, -number, 0, 0)

@@ -1,12 +1,12 @@
-"""`make chaos`: random faults of all kinds on a real daemon in the lab's kernel, from a seed, then the account.
+"""`make chaos`: random faults of all kinds on a real daemon in the lab's kernel, from a seed, then the check.
 
     python -m tests.lab.chaos --seed N --seconds S      in the guest, as root
-    python -m tests.lab.chaos --seed N --short          two rounds with every kind of fault once each
+    python -m tests.lab.chaos --seed N --short          two rounds with each kind of fault once
 
-Faults come in rounds of ROUND_S. After each round every device must run again, each ledger close, the losses be the
-true ones (tests/lab/chaos/account.py has the rule), and descriptors and threads be no more than in the beginning. A
-daemon that is killed is audited right before. Prints the faults made, the account per device, and a verdict; the exit
-status is 0 only without any violation.
+Faults are in rounds of ROUND_S. After each round, every device must run again, each ledger must balance, and the losses
+must be the true losses (the rule is in tests/lab/chaos/account.py). The numbers of descriptors and threads must not be
+larger than at the start. The check also runs before each kill of the daemon. The program prints the faults, the counts
+of each device, and a result. The exit status is 0 only without a violation.
 """
 
 import argparse
@@ -111,13 +111,13 @@ class Chaos:
             else:
                 self._audit_polled(name, samples, before, now, what)
         if self.life.recorder.dropped:
-            self._violated(what, f"the recorder was too slow: {self.life.recorder.dropped}")
+            self._violated(what, f"the recorder was too slow: the daemon dropped {self.life.recorder.dropped} samples")
         self._outages = {name: [i for i in times if i.end_ns == NEVER_NS] for name, times in self._outages.items()}
 
     def _audit_sender(self, name: str, samples: list[Sample], before: Snapshot, now: Snapshot, what: str) -> None:
         is_learning = name in self.far.noise
         was = before.devices[name].ledger
-        if is_learning:  # a gap from before the rate is known is counted when it is: all are held from the first sample
+        if is_learning:  # imud counts a gap only after it knows the rate
             before_them = self.life.recorder.before[name]
             samples = [*before_them, *(sample for sample in samples if sample.seq > len(before_them))]
             was = dict.fromkeys(was, 0)
@@ -130,7 +130,7 @@ class Chaos:
         self._book(name, samples, holes, was, now, what)
 
     def _audit_polled(self, name: str, samples: list[Sample], before: Snapshot, now: Snapshot, what: str) -> None:
-        """Hold the deadlines of a device that is polled against its samples, and its answers against the causes."""
+        """Compare the deadlines of a polled device with its samples, and its replies with the causes in the ledger."""
         log, was, is_now = self.far.polls[name], before.devices[name], now.devices[name]
         self._refuse_strange(name, log.strange(samples), what)
         troubles = [*self._outages[name], *log.troubles(before.at_ns, now.at_ns)]
@@ -150,11 +150,14 @@ class Chaos:
         for answer, cause in ((Answer.DAMAGED, "lost_crc"), (Answer.REFUSED, "lost_gap_device")):
             true, counted = sum(a.answer is answer for a in asked), is_now.ledger[cause] - was.ledger[cause]
             if not 0 <= true - counted <= gone and name in self.far.registers:
-                self._violated(what, f"{name}: {true} reads {answer.value}, {cause} {counted}, {gone - 1} times gone")
+                self._violated(
+                    what,
+                    f"{name}: expected {true} {answer.value} reads as {cause}, got {counted}; missing {gone - 1} times",
+                )
 
     def _refuse_strange(self, name: str, seqs: Sequence[int], what: str) -> None:
         if seqs:
-            self._violated(what, f"{name}: {len(seqs)} samples that the device never took, the first is {seqs[0]}")
+            self._violated(what, f"{name}: {len(seqs)} samples that the device did not measure, the first is {seqs[0]}")
 
     def _book(
         self, name: str, samples: list[Sample], holes: list[Hole], was: Mapping[str, int], now: Snapshot, what: str
@@ -180,7 +183,7 @@ class Chaos:
                     print("    transfers:", self.far.polls[name].shown(sample.t_ns, after.t_rx_ns))
 
     def _counted_snapshot(self, what: str) -> Snapshot:
-        """The state at a moment at which missed deadlines are in the ledger: it counts them ten times a second."""
+        """Return the state when the ledger contains the missed deadlines. imud adds them ten times per second."""
         found: list[Snapshot] = []
 
         def counted() -> bool:
@@ -210,7 +213,7 @@ class Chaos:
             )
 
         try:
-            wait_until(complete, "the samples that the ledger has", CATCH_UP_S)
+            wait_until(complete, "all samples of the ledger", CATCH_UP_S)
         except AssertionError as error:
             self._violated(what, str(error))
         return chosen()
@@ -220,7 +223,9 @@ class Chaos:
         try:
             wait_until(lambda: all(a <= b for a, b in zip(self.life.usage(), allowed, strict=True)), "", CATCH_UP_S)
         except AssertionError:
-            self._violated(what, f"descriptors and threads {self.life.usage()}, in the beginning {allowed}")
+            self._violated(
+                what, f"expected at most {allowed} descriptors and threads, as at the start, got {self.life.usage()}"
+            )
 
     def _violated(self, what: str, words: str) -> None:
         self.violations.append(f"{what}: {words}")
@@ -245,7 +250,7 @@ def show(chaos: Chaos, made: Counter[str], faults: list[Fault]) -> None:
     print("\nfault                             times")
     for fault in faults:
         print(f"  {fault.name:32}{made[fault.name]:5}")
-    print(f"  {'in all':32}{made.total():5}, lives of the daemon {chaos.lives}")
+    print(f"  {'total':32}{made.total():5}, lives of the daemon {chaos.lives}")
     print("\ndevice    samples   true holes   lost by ledger   by the rule   gaps unknown   by the rule   outages")
     for name, sum_ in chaos.accounts.items():
         bounds = f"{sum_.least}" if sum_.least == sum_.most else f"{sum_.least} to {sum_.most}"
@@ -257,17 +262,22 @@ def show(chaos: Chaos, made: Counter[str], faults: list[Fault]) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="make chaos", description=__doc__.partition("\n")[0] if __doc__ else None)
-    parser.add_argument("--seed", type=int, default=time.time_ns() % 1_000_000, help="of the plan (by the clock)")
     parser.add_argument(
-        "--seconds", type=float, default=CI_SECONDS, help="of faults, in the guest's time (%(default)g)"
+        "--seed", type=int, default=time.time_ns() % 1_000_000, help="seed of the plan (default: from the clock)"
     )
-    parser.add_argument("--short", action="store_true", help="two rounds with every kind of fault once each")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=CI_SECONDS,
+        help="duration of the faults in the guest's time, s (default: %(default)g)",
+    )
+    parser.add_argument("--short", action="store_true", help="run two rounds with each kind of fault once")
     options = parser.parse_args(arguments)
     how = "--short" if options.short else f"--seconds {options.seconds:g}"
     print(f'chaos: repeat with ARGS="--seed {options.seed} {how}"', flush=True)
     with_memory = memory_control()
     if not with_memory:
-        print("chaos: no memory controller in this kernel: 'out of memory' is left out")
+        print("chaos: this kernel has no memory controller; skipping 'out of memory'")
     faults = all_faults(with_memory=with_memory)
     rounds = plan_short(options.seed, faults) if options.short else plan(options.seed, options.seconds, faults)
     made: Counter[str] = Counter()
@@ -295,7 +305,7 @@ def main(arguments: list[str] | None = None) -> int:
     if "Traceback" in log or chaos.violations:
         print("\n".join(["", "the daemon's log:", *log.splitlines()]))
     if "Traceback" in log:
-        chaos.violations.append("a traceback in the daemon's log")
+        chaos.violations.append("the daemon's log contains a traceback")
     show(chaos, made, faults)
     print("\n" + "\n".join(chaos.violations or ["passed"]))
     return 1 if chaos.violations else 0

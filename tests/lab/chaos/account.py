@@ -1,21 +1,23 @@
-"""The account of one device over one life of the daemon: samples and losses against the truth.
+"""Check of one device over one life of the daemon: samples and losses compared with the truth.
 
 Rule. A hole is the number of true samples between two received samples. The ledger counts each hole exactly if the
-daemon can know its size: from the counter of a device that kept running, also while the link was away, and from the
-deadlines of the reads of a polled device. The daemon cannot know the size
+daemon can know its size. The size follows from the counter of a device that kept running, also while the link was
+missing, and from the deadlines of a polled device. The daemon cannot know the size
 
 - if the device restarted: its counter contains nothing about the time before;
-- before it knows the rate of a device that sends time but no numbers, or the values that it needs to recognise a
-  counter after a missing link (`KNOWN`);
-- if a polled device was away: imud does not read it then, and the device has no counter.
+- before it knows the rate of a device that sends time but no sequence numbers, or the values that it needs to recognise
+  a counter after a missing link (`KNOWN`);
+- if a polled device was missing: imud does not read it then, and the device has no counter.
 
-Such a hole is uncertain. It counts as one of the ledger's gaps of unknown size, and its part in `lost` is between
-nothing and all, or it is counted within one sample. Therefore, with the ledger's number of unknown gaps U,
+Such a hole is uncertain. It counts as one of the ledger's gaps of unknown size, and its part in `lost` is between 0 and
+its size, or the ledger counts it with an error of at most one sample. Therefore, with the ledger's number of unknown
+gaps U,
 
-    holes - (the U largest uncertain ones) - (one for each of the rest) <= lost <= holes + (one for each uncertain one)
+    holes - (the U largest uncertain holes) - (one for each other uncertain hole) <= lost
+    lost <= holes + (one for each uncertain hole)
 
 and U is at most the number of uncertain holes. Without an uncertain hole, `lost` is exactly the truth. A polled device
-whose first reads failed has such a gap before its first sample. The time after the newest sample belongs to no gap.
+with failed first reads has such a gap before its first sample. The time after the newest sample belongs to no gap.
 """
 
 from collections.abc import Sequence
@@ -50,7 +52,7 @@ class Interval(NamedTuple):
 class Hole(NamedTuple):
     missing: int
     is_certain: bool
-    """Whether the daemon can know how many."""
+    """Whether the daemon can know the size of the hole."""
     unknown_most: int = 1
     """Maximum number of unknown gaps for the hole."""
     is_open: bool = False
@@ -64,7 +66,7 @@ class Account(NamedTuple):
     holes: int = 0
     least: int = 0
     most: int = 0
-    """Bounds of `lost` by the rule."""
+    """Bounds of `lost` according to the rule."""
     unknown: int = 0
     unknown_most: int = 0
     """Maximum number of unknown gaps by the rule."""
@@ -88,24 +90,24 @@ def sequence_faults(samples: Sequence[Sample], first_seq: int) -> list[str]:
         broken = next((a, b) for a, b in pairwise([first_seq - 1, *numbers]) if b != a + 1)
         found.append(f"sample {broken[1]} follows {broken[0]}")
     if any(b.t_ns <= a.t_ns for a, b in pairwise(samples)):
-        found.append("a stamp does not rise")
+        found.append("a time stamp does not increase")
     if any(sample.t_ns > sample.t_rx_ns for sample in samples):
-        found.append("a stamp is after the arrival")
+        found.append("a time stamp is later than the arrival")
     return found
 
 
 def open_ledger(status: DeviceStatus) -> str:
     """Return the difference by which the ledger does not balance; empty if it balances."""
     byte, frame = bytes_open(status.ledger), frames_open(status.ledger)
-    return f"{byte} bytes and {frame} frames unaccounted for" if byte or frame else ""
+    return f"the ledger does not balance: {byte} bytes and {frame} frames are not counted" if byte or frame else ""
 
 
 def find_holes(
     samples: Sequence[Sample], numbers: Sequence[int], outages: Sequence[Interval], *, learns: bool = False
 ) -> list[Hole]:
-    """Return what is between samples whose true numbers are given.
+    """Return the holes between samples with the given true numbers.
 
-    `learns`: the device gives time and no numbers.
+    `learns` means that the device sends time but no sequence numbers.
     """
     found: list[Hole] = []
     heard, even = 1, 0

@@ -1,4 +1,4 @@
-"""The daemon under test: started, killed, starved, and looked at from outside; one `Life` from start to death."""
+"""The daemon under test. The test starts, kills, stops and observes it. A `Life` is one process from start to end."""
 
 import os
 import signal
@@ -23,7 +23,7 @@ from tests.lab.waiting import wait_until
 
 START_LIMIT_S: Final = 60.0
 BACK_LIMIT_S: Final = 120.0
-"""For all devices to run again after the last fault; the slowest search takes 15 s of silence."""
+"""Maximum time until all devices run again after the last fault, s. The slowest detection waits for 15 s of silence."""
 ANSWER_LIMIT_S: Final = 30.0
 CGROUP: Final = Path("/sys/fs/cgroup/imud-chaos")
 TOO_LITTLE: Final = "4M"
@@ -47,7 +47,7 @@ class Recorder:
         self._watch = self._client.watch(encoding="binary")
         self._newest = self._client.poll()
         self.begin = _snapshot(self._client)
-        """The state at a moment from which on every sample is received."""
+        """The state at the start. The recorder receives every later sample."""
         self.before: Final = {name: _first_samples(rings, name, d.newest_seq) for name, d in self.begin.devices.items()}
         self._slots: list[bytes] = []
         self._others: list[object] = []
@@ -75,11 +75,11 @@ class Recorder:
 
     def close(self) -> None:
         self._thread.join(ANSWER_LIMIT_S)
-        assert not self._thread.is_alive(), "the recorder's connection did not end"
+        assert not self._thread.is_alive(), "expected the end of the recorder's connection"
         self._client.close()
 
     def _run(self) -> None:
-        with suppress(ImudError):  # the daemon is gone
+        with suppress(ImudError):  # the daemon has ended
             while True:
                 message = self._client.next_message(Watch.NAMES, None)
                 if isinstance(message, bytes):
@@ -89,10 +89,12 @@ class Recorder:
 
 
 def _first_samples(rings: Path, name: str, newest_seq: int) -> list[Sample]:
-    """Samples 1 to `newest_seq` of a daemon that has just started, out of its ring."""
+    """Return the samples 1 to `newest_seq` of a newly started daemon from its ring."""
     with Ring(name, directory=str(rings), from_oldest=True) as ring:
         found = [sample for sample in ring.read().samples if sample.seq <= newest_seq]
-    assert [sample.seq for sample in found] == list(range(1, newest_seq + 1)), f"{name}: its ring has not {newest_seq}"
+    assert [sample.seq for sample in found] == list(range(1, newest_seq + 1)), (
+        f"{name}: expected the samples 1 to {newest_seq} in its ring"
+    )
     return found
 
 
@@ -102,17 +104,17 @@ class Life:
         self.socket.unlink(missing_ok=True)
         self._log = (folder / "log").open("a")
         argv = [sys.executable, "-m", "imud", "run", "--config", str(config)]
-        if memory_control():  # memory counts for the group that a process is in when it asks for it
+        if memory_control():  # the kernel charges memory to the group of the process at the time of the allocation
             CGROUP.mkdir(exist_ok=True)
             argv = ["sh", "-c", f'echo $$ >{CGROUP}/cgroup.procs && exec "$@"', "sh", *argv]
         self.process = subprocess.Popen(argv, stderr=self._log, stdin=subprocess.DEVNULL)
         wait_until(lambda: self.socket.exists() or self.process.poll() is not None, "the socket", START_LIMIT_S)
-        assert self.process.poll() is None, "the daemon ended at its start"
+        assert self.process.poll() is None, "cannot start the daemon: it ended before it opened its socket"
         self.recorder = Recorder(self.socket, folder)
         self.descriptors = self.threads = 0
 
     def snapshot(self) -> Snapshot:
-        """The state of every device now. Raises ImudError, TimeoutError."""
+        """Return the present state of every device. Raises ImudError or TimeoutError."""
         with Client(self.socket, timeout_s=ANSWER_LIMIT_S) as client:
             return _snapshot(client)
 
@@ -126,7 +128,7 @@ class Life:
             }
             if not away:
                 return found
-            assert monotonic() < end, f"not back within {BACK_LIMIT_S:g} s: {away}"
+            assert monotonic() < end, f"expected all devices to run within {BACK_LIMIT_S:g} s, got: {away}"
             sleep(0.5)
 
     def usage(self) -> tuple[int, int]:
@@ -144,7 +146,7 @@ class Life:
         self._gone(-signal.SIGKILL)
 
     def run_out_of_memory(self) -> None:
-        """Take its memory away by its cgroup until the kernel kills it."""
+        """Reduce the memory limit of the daemon's cgroup until the kernel kills the daemon."""
         with suppress(OSError):  # EBUSY and similar errors: only the end of the process matters
             (CGROUP / "memory.max").write_text(TOO_LITTLE)
         try:
@@ -155,7 +157,7 @@ class Life:
     def terminate(self) -> None:
         self.process.terminate()
         self._gone(0)
-        assert not self.socket.exists(), "the socket was left behind"
+        assert not self.socket.exists(), "expected the daemon to remove its socket"
 
     def destroy(self) -> None:
         self.process.kill()
@@ -167,11 +169,11 @@ class Life:
         status = self.process.wait(START_LIMIT_S)
         self.recorder.close()
         self._log.close()
-        assert status == expected, f"the daemon ended with {status}, expected {expected}"
+        assert status == expected, f"expected exit status {expected} of the daemon, got {status}"
 
 
 def memory_control() -> bool:
-    """Whether processes can be put under a limit of memory here; switches it on."""
+    """Return whether this system supports memory limits for processes. Switch the support on."""
     root = CGROUP.parent
     if "memory" not in (root / "cgroup.controllers").read_text().split():
         return False

@@ -1,13 +1,13 @@
-"""The far ends of all links in one process: ports that send in one thread, buses that are polled in others.
+"""The far ends of all links in one process. One thread serves sending ports, other threads serve polled buses.
 
-device   link                                        driver           what its truth is
+device   link                                        driver           truth
 serial   pseudo-terminal, SOUT on gpio-sim           hipnuc-uart      every sample by device time
 uart     16550A pair                                 imu61x-uart      every sample by device time
 vcan     virtual CAN                                 imu61x-can       every sample by a number in its values
 can      SJA1000 pair                                imu61x-can       every sample by a number in its values
-modbus   pseudo-terminal                             hipnuc-modbus    its deadlines, and what it answered
-i2c      i2c-dev                                     imu61x-i2c       the same, and what was damaged or refused
-spi      spidev, 8-bit words                         imu61x-spi       the same
+modbus   pseudo-terminal                             hipnuc-modbus    the deadlines, and the replies
+i2c      i2c-dev                                     imu61x-i2c       also damaged and rejected transfers
+spi      spidev, 8-bit words                         imu61x-spi       the same as i2c
 """
 
 import errno
@@ -51,7 +51,7 @@ Port = SimulatedPort | CanPort
 
 
 class UartNode(PtyNode):
-    """The far UART of the pair in the place of a pseudo-terminal. It cannot be unplugged."""
+    """The far UART of the pair in place of a pseudo-terminal. It cannot be unplugged."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -94,7 +94,7 @@ class UartNode(PtyNode):
 
 
 class PortThread:
-    """Moves what the sending devices send. Synchronization: `changing` is held while anything of a port is touched."""
+    """Moves the bytes of the sending devices. Synchronization: hold `changing` during each access to a port."""
 
     def __init__(self) -> None:
         self.changing = threading.Lock()
@@ -248,7 +248,7 @@ class FarSide:
             self.streams[name].node.plug(self.modules[name].baud)
 
     def reboot(self, name: str) -> None:
-        """Restart a module while its port stays."""
+        """Restart a device. Its port continues to exist."""
         module = self.modules.get(name) or self.cans[name].module
         with self.thread.changing:
             module.reboot(monotonic_ns())
@@ -267,7 +267,7 @@ class FarSide:
 
 
 STUCK: Final = {"error": errno.ETIMEDOUT}
-"""SDA or a data line is held: every transfer times out."""
+"""SDA or a data line has a constant level: every transfer times out."""
 
 
 def _is_i2c_burst(transfer: I2cTransfer) -> bool:

@@ -1,5 +1,4 @@
-"""The faults: effect, resources and duration of each fault; and the plan of a run, which follows from its seed
-alone."""
+"""The faults with effect, resources and duration, and the plan of a run, which only depends on its seed."""
 
 import ctypes
 import struct
@@ -34,11 +33,11 @@ class Scene(Protocol):
 
     @property
     def state(self) -> Path:
-        """Folder on a small file system, where the daemon keeps its state."""
+        """Folder on a small file system, with the state of the daemon."""
         ...
 
     def write_config(self, variant: int) -> None:
-        """Write the configuration: a good one by number, a bad one for -1."""
+        """Write the configuration: a valid one by number, an invalid one for -1."""
         ...
 
     def next_life(self, end: Callable[[Life], None]) -> None: ...
@@ -50,7 +49,7 @@ class Fault:
     resources: frozenset[str]
     """Resources of the fault. Two faults with a common resource are never active at the same time."""
     begin: Callable[[Scene, float], None]
-    """Gets the time that it will last, s."""
+    """Function that starts the fault. Its second argument is the duration, s."""
     end: Callable[[Scene], None] = lambda scene: None
     shortest_s: float = 0.2
     longest_s: float = 2.5
@@ -146,12 +145,12 @@ STEP_MOST_S: Final = 3600.0
 ADJ_FREQUENCY: Final = 0x2
 TIMEX_BYTES: Final = 208
 FREQUENCY_AT: Final = 16
-"""Place of `freq` in struct timex (64 bits), in units of 2^-16 ppm."""
+"""Offset of `freq` in struct timex (64 bits). The unit is 2^-16 ppm."""
 SLEW_PPM: Final = 400
 
 
 def slew(ppm: float) -> None:
-    """Let the system clock run so much faster. CLOCK_MONOTONIC runs with it. Raises OSError."""
+    """Let the system clock run faster by `ppm`. CLOCK_MONOTONIC also runs faster. Raises OSError."""
     timex = ctypes.create_string_buffer(TIMEX_BYTES)
     struct.pack_into("=I", timex, 0, ADJ_FREQUENCY)
     struct.pack_into("=q", timex, FREQUENCY_AT, round(ppm * 65536))
@@ -223,18 +222,18 @@ def _good_again(scene: Scene) -> None:
 
 
 def all_faults(*, with_memory: bool) -> list[Fault]:
-    """Every kind; without control of memory not the one that needs it."""
+    """Return every kind of fault. Without memory control, omit the fault that needs it."""
     clock = _Clock()
     one = frozenset
     bad_wire = FaultRates(flip=0.15, drop=0.1, insert=0.1, cut=0.1)
     faults = [
         Fault("pty unplugged", one({"serial"}), lambda s, t: s.far.unplug("serial", t), **_restart("serial")),
-        Fault("pty unplugged, module has power", one({"serial"}), lambda s, t: s.far.pull_data("serial"),
+        Fault("pty unplugged, device has power", one({"serial"}), lambda s, t: s.far.pull_data("serial"),
               lambda s: s.far.plug_data("serial"), outage=("serial",)),
         Fault("RS-485 pty unplugged", one({"modbus"}), lambda s, t: s.far.unplug("modbus", t), **_restart("modbus")),
-        Fault("module restarts (pty)", one({"serial"}), lambda s, t: s.far.reboot("serial"), **_reboot("serial")),
-        Fault("module restarts (UART)", one({"uart"}), lambda s, t: s.far.reboot("uart"), **_reboot("uart")),
-        Fault("module restarts (vcan)", one({"vcan"}), lambda s, t: s.far.reboot("vcan"), **_reboot("vcan")),
+        Fault("device restarts (pty)", one({"serial"}), lambda s, t: s.far.reboot("serial"), **_reboot("serial")),
+        Fault("device restarts (UART)", one({"uart"}), lambda s, t: s.far.reboot("uart"), **_reboot("uart")),
+        Fault("device restarts (vcan)", one({"vcan"}), lambda s, t: s.far.reboot("vcan"), **_reboot("vcan")),
         Fault("noise on the pty", one({"serial"}), **_noise("serial", bad_wire)),
         Fault("noise on the UART", one({"uart"}), **_noise("uart", bad_wire)),
         Fault("pty silent", one({"serial"}), **_noise("serial", FaultRates(lose=1.0))),

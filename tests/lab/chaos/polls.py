@@ -32,7 +32,7 @@ class Answer(Enum):
     DAMAGED = "damaged"
     REFUSED = "refused"
     ABSENT = "absent"
-    """The level of a line that no device drives."""
+    """The level of a line without a driving device."""
 
 
 class Asked(NamedTuple):
@@ -42,7 +42,7 @@ class Asked(NamedTuple):
     is_sample: bool
     """True if the transfer requested a sample, False for identity and settings."""
     measured_ns: int
-    """When the device renewed the values that it answered."""
+    """Time at which the device updated the values of the reply, ns."""
 
 
 class PollLog:
@@ -95,7 +95,7 @@ class PollLog:
         return numbers[: len(samples)]
 
     def _steps(self, before: Sample, after: Sample, apart_ns: int = 0) -> int:
-        """Return how many deadlines after one sample the other is; reads less than `apart_ns` apart share one."""
+        """Return the number of deadlines between two samples. Reads less than `apart_ns` apart share a deadline."""
         asked = self.between(before.t_ns - 1, after.t_rx_ns)
         good = [a for a in asked if a.is_sample and a.answer is Answer.GOOD]
         stale = sum(a.measured_ns == b.measured_ns and b.t_ns - a.t_ns >= apart_ns for a, b in pairwise(good))
@@ -131,11 +131,11 @@ class LoggedRegisters:
 
 
 def block_replies(log: PollLog) -> Callable[[Burst, int], None]:
-    """Return what logs the replies of a module on RS-485 that have a sample."""
+    """Return a function that logs the replies with a sample of a device on RS-485."""
 
     def add(reply: Burst, _power_ns: int) -> None:
         if reply.sample_ns is not None and len(reply.data) == BLOCK_REPLY_BYTES:
-            log.add(Asked(monotonic_ns(), Answer.GOOD, True, reply.sample_ns))  # the module's time may be a step old
+            log.add(Asked(monotonic_ns(), Answer.GOOD, True, reply.sample_ns))  # the device time can be one step old
 
     return add
 

@@ -17,19 +17,19 @@ from imud.sim.physics import Truth
 from imud.sim.sensor import Burst, SensorHardware, StreamModule
 
 BASE: Final = 512
-"""Of the number that an acceleration carries: x has the lower part, y the upper one."""
+"""Base of the number in an acceleration: x contains the lower part, y the upper part."""
 STEP_M_S2: Final = 0.01
 
 
 class Measured(NamedTuple):
     sample_ns: int
-    """CLOCK_MONOTONIC of the instant."""
+    """Time of the measurement, CLOCK_MONOTONIC, ns."""
     key: int
-    """Device time in ns since power-on, or number of the sample (modulo BASE²)."""
+    """Device time since power-on, ns, or number of the sample (modulo BASE²)."""
 
 
 class TruthLog:
-    """All samples that a device took, by number from 0. Synchronization: one thread adds, another one reads."""
+    """All samples that a device measured, by number from 0. Synchronization: one thread adds, another thread reads."""
 
     def __init__(self, key_of: Callable[[Sample], int], tolerance: int) -> None:
         self._measured: list[Measured] = []
@@ -86,7 +86,7 @@ def decoded(sample: Sample) -> int:
 
 
 class LoggedModule:
-    """A device on a byte stream (`StreamModule`) whose bursts are logged as they leave it."""
+    """A device on a byte stream (`StreamModule`). The log contains its bursts in the order of sending."""
 
     def __init__(self, module: StreamModule, log: Callable[[Burst, int], None], now_ns: int) -> None:
         self._module, self._log, self._power_ns, self._is_on = module, log, now_ns, True
@@ -148,7 +148,7 @@ def by_device_time(log: TruthLog, period_ns: int) -> Callable[[Burst, int], None
 
 
 def numbered_can(clock_ns: Callable[[], int], rate_hz: float, base_id: int, log: TruthLog) -> PeriodicCanModule:
-    """Return an IMU61x on CAN whose accelerations say which sample they are of; `clock_ns` is CLOCK_MONOTONIC."""
+    """Return an IMU61x on CAN with the sample number in its accelerations. `clock_ns` is CLOCK_MONOTONIC."""
 
     def encode(index: int, reading: Truth) -> Sequence[tuple[int, bytes]]:
         number = len(log)

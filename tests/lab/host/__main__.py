@@ -23,27 +23,30 @@ MIN_MEMORY_MB = 256
 DEFAULT_MEMORY_MB = 1024
 MAX_PROCESSORS = 2  # the kernel's CONFIG_NR_CPUS
 DEFAULT_PROCESSORS = 1
-"""On a busy two-core host the guest with two took twice as long: 27 and 36 s against 14 and 16 s for boot and
-collection (tests/lab/run --processors N --exec '.venv/bin/python -m pytest --collect-only')."""
+"""Default number of processors of the guest. On a busy two-core host, two processors took twice as long: 27 and 36 s
+for boot and collection, with one processor 14 and 16 s (tests/lab/run --processors N --exec '.venv/bin/python -m pytest
+--collect-only')."""
 
 
 class Parser(argparse.ArgumentParser):
-    """Bad options are a LabError: one line, like every other failure."""
+    """Parser that raises LabError with one line for invalid options."""
 
     def error(self, message: str) -> NoReturn:
         raise LabError(f"{message} (tests/lab/run --help)")
 
 
 def parser() -> Parser:
-    options = Parser(prog="tests/lab/run", allow_abbrev=False, description="Runs tests/lab in a kernel under QEMU.")
-    options.add_argument("--ci", action="store_true", help="without QEMU say so and succeed")
+    options = Parser(prog="tests/lab/run", allow_abbrev=False, description="Run tests/lab in a kernel under QEMU.")
+    options.add_argument("--ci", action="store_true", help="exit with 0 and a message if QEMU is not installed")
     options.add_argument("--build-only", action="store_true", help="build the kernel and the module, do not boot")
     options.add_argument("--exec", metavar="COMMAND", help="run this shell command in the guest instead of pytest")
     options.add_argument("--venv", type=Path, default=environment.ROOT / ".venv", help="default: .venv")
     options.add_argument("--output", type=Path, default=environment.ROOT / "build" / "lab", help="default: build/lab")
     options.add_argument("--memory", type=int, default=DEFAULT_MEMORY_MB, metavar="MB", help="default: %(default)s")
     options.add_argument("--processors", type=int, default=DEFAULT_PROCESSORS, metavar="N", help="default: %(default)s")
-    options.add_argument("--steady", action="store_true", help="the guest's clock counts instructions, 1 ns each")
+    options.add_argument(
+        "--steady", action="store_true", help="use a clock that counts the guest's instructions, 1 ns each"
+    )
     options.add_argument("--limit", type=float, default=guest.Limits.total_s, metavar="S", help="default: %(default)s")
     options.add_argument("arguments", nargs="*", metavar="-- PYTEST_ARGUMENT", help="such as: -- -k can -v")
     return options
@@ -88,22 +91,24 @@ def timing(folder: Path, start_s: float) -> str:
 
 def check(options: argparse.Namespace) -> None:
     if platform.machine() != "x86_64":
-        raise LabError(f"the guest shares the host's programs, which must be x86_64, not {platform.machine()}")
+        raise LabError(f"expected an x86_64 host, because the guest runs the host's programs; got {platform.machine()}")
     if options.memory < MIN_MEMORY_MB:
-        raise LabError(f"--memory {options.memory}: the guest needs at least {MIN_MEMORY_MB} MB")
+        raise LabError(f"--memory: expected at least {MIN_MEMORY_MB} MB, got {options.memory}")
     if not 1 <= options.processors <= MAX_PROCESSORS:
-        raise LabError(f"--processors {options.processors}: give 1 to {MAX_PROCESSORS}")
+        raise LabError(f"--processors: expected 1 to {MAX_PROCESSORS}, got {options.processors}")
     if not options.limit > 0:
-        raise LabError(f"--limit {options.limit}: give seconds above 0")
+        raise LabError(f"--limit: expected seconds above 0, got {options.limit}")
     if any(character in str(environment.ROOT) for character in '"\n'):
-        raise LabError(f"repository folder {str(environment.ROOT)!r}: the kernel cannot take its name")
+        raise LabError(
+            f"cannot use the repository folder {str(environment.ROOT)!r}: the kernel does not support its name"
+        )
     packages.require_all()
 
 
 def lab(arguments: list[str]) -> int:
     options = parser().parse_args(arguments)
     if options.ci and shutil.which(QEMU) is None:
-        say(f"left out: {QEMU} is not installed (make lab-deps installs it)")
+        say(f"skipped: cannot find {QEMU}; try make lab-deps")
         return 0
     check(options)
     python = environment.find_python(options.venv)
@@ -114,12 +119,12 @@ def lab(arguments: list[str]) -> int:
     try:
         return boot(options, python, built)
     except HungGuest as error:
-        say(f"{error}; booting once more")
+        say(f"{error}; booting again")
         return boot(options, python, built)
 
 
 def terminate(number: int, _frame: object) -> NoReturn:
-    """SIGTERM ends the run in order, with QEMU."""
+    """Exit with status 143 on SIGTERM, so that QEMU also ends."""
     raise SystemExit(128 + number)
 
 

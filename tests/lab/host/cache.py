@@ -1,13 +1,13 @@
-"""The cache of built kernels: one folder per hash of everything that shapes the result.
+"""The cache of built kernels: one folder per hash of all inputs of the build.
 
-Layout under `${XDG_CACHE_HOME:-~/.cache}/imud-lab` (or IMUD_LAB_CACHE):
+Layout of `${XDG_CACHE_HOME:-~/.cache}/imud-lab` (or IMUD_LAB_CACHE):
 
-    lock              held (flock) by the one process that builds
-    failed-build.log  the log of the last build that failed
-    new-*             a build in progress; a leftover of a killed one goes with the next build
-    <name>-<key>/     finished; appears by rename, so it is whole or absent
+    lock              held (flock) by the process that builds
+    failed-build.log  log of the last failed build
+    new-*             build in progress; the next build removes the leftover of a killed build
+    <name>-<key>/     finished build; created by rename, so it is complete
 
-Finished folders not used for MAX_AGE_S go when the next one is built.
+A new build removes finished folders that were not used for MAX_AGE_S.
 """
 
 import contextlib
@@ -23,24 +23,26 @@ from pathlib import Path
 from tests.lab.host.errors import LabError
 
 MAX_AGE_S = 14 * 86400
-LOCK_WAIT_S = 45 * 60  # a cold build takes 5 minutes on two idle cores; a shared machine is slower
+LOCK_WAIT_S = 45 * 60  # a cold build takes 5 minutes on two idle cores; a busy host is slower
 LOCK_POLL_S = 0.2
 
 
 def cache_root(suffix: str = "") -> Path:
     """Return the cache folder. With a suffix, return a folder next to it with its own lock.
 
-    LabError if its path contains characters that make does not support.
+    Raises LabError if its path contains characters that make does not support.
     """
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     root = Path(f"{os.environ.get('IMUD_LAB_CACHE') or Path(base) / 'imud-lab'}{suffix}").absolute()
     if any(character.isspace() or character in ":#$," for character in str(root)):
-        raise LabError(f"cache folder {str(root)!r}: make needs a path without spaces and :#$, (set IMUD_LAB_CACHE)")
+        raise LabError(
+            f"cannot use the cache folder {str(root)!r}: expected no spaces and :#$, in its path; set IMUD_LAB_CACHE"
+        )
     return root
 
 
 def key_of(*parts: bytes) -> str:
-    """16 hex digits of the SHA-256 over the parts, each with its length so that no two splits agree."""
+    """Return 16 hex digits of the SHA-256 of the parts and their lengths, so that different splits never match."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(len(part).to_bytes(8, "little") + part)
@@ -48,7 +50,7 @@ def key_of(*parts: bytes) -> str:
 
 
 def require_space(folder: Path, needed_bytes: int) -> None:
-    """Raises LabError unless the file system of `folder` has `needed_bytes` free."""
+    """Raise LabError if the file system of `folder` has less than `needed_bytes` free."""
     free_bytes = shutil.disk_usage(folder).free
     if free_bytes < needed_bytes:
         raise LabError(
@@ -69,16 +71,18 @@ def locked(root: Path, say: Callable[[str], None], wait_s: float = LOCK_WAIT_S) 
                 break
             except BlockingIOError as error:
                 if time.monotonic() >= give_up_s:
-                    raise LabError(f"another build has held {root / 'lock'} for {wait_s:.0f} s") from error
+                    raise LabError(
+                        f"cannot lock {root / 'lock'}: another build has held it for {wait_s:.0f} s"
+                    ) from error
             if not told:
-                say("another build is under way; waiting for it")
+                say("waiting for another build")
                 told = True
             time.sleep(LOCK_POLL_S)
         yield
 
 
 def find(name: str, root: Path | None = None) -> Path | None:
-    """The finished folder `name` of `root` (cache_root()), marked as used now; None if it is not in the cache."""
+    """Return the finished folder `name` of `root` (default cache_root()) and mark it as used; None if missing."""
     folder = (root or cache_root()) / name
     try:
         os.utime(folder)
@@ -131,7 +135,7 @@ def _keep_log(root: Path, fresh: Path) -> str:
 
 
 def _remove_old(root: Path) -> None:
-    """Under the lock every `new-*` is a leftover: no other build runs."""
+    """Remove old folders and leftovers. With the lock, every `new-*` is a leftover, because no other build runs."""
     oldest_s = time.time() - MAX_AGE_S
     for folder in root.iterdir():
         if folder.is_dir() and (folder.name.startswith("new-") or folder.stat().st_mtime < oldest_s):

@@ -1,4 +1,4 @@
-"""Why a guest ended without a result: its console log read for the known causes."""
+"""Search the console log of a guest without a result for known causes."""
 
 import re
 
@@ -26,16 +26,16 @@ def cause(console: str) -> str | None:
 
 
 def out_of_memory(console: str) -> bool:
-    """Whether the guest's kernel killed a process for want of memory."""
+    """Return whether the guest's kernel killed a process because memory was full."""
     return KILLED.search(console) is not None
 
 
 def last_line(console: str) -> str:
     lines = [line for line in console.splitlines() if line.strip()]
-    return _bare(lines[-1]) if lines else "nothing on the console"
+    return _bare(lines[-1]) if lines else "no output on the console"
 
 
 def _bare(line: str) -> str:
-    """A console line without its time stamp and control characters, cut to 160 characters."""
+    """Return a console line without time stamp and control characters, at most 160 characters."""
     plain = re.sub(r"^\[ *[\d.]+\](\[[^]]*\])? *", "", line.strip())
     return "".join(character for character in plain if character.isprintable())[:160]

@@ -17,7 +17,7 @@ from pathlib import Path
 from tests.lab.host.errors import LabError
 
 ROOT = Path(__file__).resolve().parents[3]
-TEST_LIMIT_S = 120  # per test: twice the ordinary limit, for a guest several times slower than the host
+TEST_LIMIT_S = 120  # per test: twice the normal limit, because the guest is several times slower than the host
 PROBE_LIMIT_S = 300
 COMPILED = ("imud", "tests/conftest.py", "tests/lab", "tests/support")
 
@@ -29,15 +29,15 @@ class Python:
 
 
 def find_python(venv: Path) -> Python:
-    """Checks that `venv` has a Python with pytest and pytest-timeout; LabError if not."""
+    """Return the Python of `venv`. Raises LabError if it has no pytest or pytest-timeout."""
     interpreter = venv / "bin" / "python"
     if not os.access(interpreter, os.X_OK):
-        raise LabError(f"no Python at {interpreter} (make the virtual environment first, or give --venv)")
+        raise LabError(f"cannot find Python at {interpreter}; create the virtual environment first, or use --venv")
     probe = [str(interpreter), "-c", "import sys, pytest, pytest_timeout; print(sys.base_prefix)"]
     try:
         result = subprocess.run(probe, capture_output=True, text=True, timeout=PROBE_LIMIT_S, check=False)
     except subprocess.TimeoutExpired as error:
-        raise LabError(f"{interpreter} did not start within {PROBE_LIMIT_S} s") from error
+        raise LabError(f"cannot start {interpreter} within {PROBE_LIMIT_S} s") from error
     if result.returncode:
         why = (result.stderr.strip().splitlines() or ["no output"])[-1]
         raise LabError(f"{interpreter} cannot run pytest: {why}")
@@ -47,7 +47,7 @@ def find_python(venv: Path) -> Python:
 def precompile(python: Python) -> None:
     """Compile COMPILED to bytecode, which the guest can read but not write.
 
-    A failure (a read-only tree, a file with a syntax error) is not reported: it costs the guest time, or shows there.
+    Ignore failures, such as a read-only tree or a syntax error. The guest then needs more time or reports the error.
     """
     files = [str(ROOT / name) for name in COMPILED]
     command = [str(python.venv / "bin" / "python"), "-m", "compileall", "-q", *files]
@@ -56,7 +56,7 @@ def precompile(python: Python) -> None:
 
 
 def pytest_command(python: Python, arguments: list[str]) -> list[str]:
-    """pytest on tests/lab, or on what `arguments` name; they come last and so win."""
+    """Return the pytest command for tests/lab, or for `arguments`. The arguments are last and override the defaults."""
     return [
         *(str(python.venv / "bin" / "python"), "-m", "pytest", "-o", "testpaths=tests/lab"),
         *("-p", "no:cacheprovider", "-p", "no:hypothesispytest"),
@@ -67,7 +67,7 @@ def pytest_command(python: Python, arguments: list[str]) -> list[str]:
 
 
 def script(python: Python, command: list[str]) -> str:
-    """The shell script that runs `command` from the repository's root in a clean environment."""
+    """Return the shell script that runs `command` from the repository's root in a clean environment."""
     variables = {
         "PATH": f"{python.venv}/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
         "HOME": "/tmp",

@@ -1,7 +1,8 @@
-"""Runs one guest to its end: starts QEMU, passes its output on, and watches that it lives.
+"""Runs one guest to its end: starts QEMU, forwards its output, and checks its signs of life.
 
-A guest ends in one of four ways: it wrote its status; QEMU ended without one (a panic, a lack of memory, a
-bad command line); it gave no sign of life for too long; or its time is up. All but the first are LabError.
+A guest ends in one of four ways: it wrote its exit status; QEMU ended without a status (a panic, a lack of memory, an
+invalid command line); it sent no sign of life for too long; or the time limit has passed. All ways except the first
+raise LabError.
 """
 
 import os
@@ -19,11 +20,11 @@ from tests.lab.host.errors import HungGuest, LabError
 from tests.lab.host.monitor import examine, stop_and_continue
 
 TICK_S = 0.5
-GOODBYE_S = 5.0  # from the status to the end of QEMU; it is about 0.1 s
+GOODBYE_S = 5.0  # time from the exit status to the end of QEMU; about 0.1 s
 CHUNK_BYTES = 65536
 MACHINE_LOG = "machine.log"
 STEADY_SILENCE_S = 300.0
-"""Between two signs of life of a guest whose clock counts instructions: on a busy host its 5 s took more than 60."""
+"""Maximum time between two signs of life with `--steady`, s. The guest's 5 s took more than 60 s on a busy host."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Limits:
     silence_s: float = 60.0
     """Maximum time between two signs of life, s. The guest sends one every 5 s."""
     restart_s: float = 30.0
-    """Silence after which QEMU is told to stop the guest and to continue it, and again after each such time."""
+    """Silence after which QEMU stops and continues the guest, s. Repeated after each such time."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +63,10 @@ def run(
     limits: Limits,
     write: Callable[[bytes], object],
 ) -> int:
-    """Runs the command that `make_command(uart_fds, monitor_fd)` gives and returns the guest's exit status.
+    """Run the command of `make_command(uart_fds, monitor_fd)`. Return the guest's exit status.
 
-    `write` receives the guest's output as it comes. LabError: the guest gave no status. QEMU never outlives
-    this call, and dies with this process (`setpriv --pdeathsig`).
+    `write` receives the guest's output immediately. Raises LabError if the guest has no exit status. QEMU ends with
+    this call or with this process (`setpriv --pdeathsig`).
     """
     ends = socket.socketpair()
     monitor, far_monitor = socket.socketpair()
@@ -78,7 +79,7 @@ def run(
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 pass_fds=(*fds, monitor_fd),
-                start_new_session=True,  # Ctrl-C reaches the runner, which ends QEMU in its own order
+                start_new_session=True,  # Ctrl-C only reaches the runner, which then ends QEMU
             )
     finally:
         for end in (*ends, far_monitor):
@@ -90,7 +91,7 @@ def run(
         examine(monitor, folder.path / MACHINE_LOG)
         raise
     except subprocess.TimeoutExpired:
-        pass  # the status decides
+        pass  # the exit status of the guest decides
     finally:
         process.kill()
         process.wait()
@@ -107,7 +108,7 @@ def _watch(
     write: Callable[[bytes], object],
     monitor: socket.socket,
 ) -> None:
-    """Returns when QEMU closed its output, or did not although the status is there; LabError on a limit."""
+    """Return when QEMU has closed its output, or when the exit status exists. Raises LabError after a time limit."""
     assert process.stdout is not None
     start_s = restarted_s = time.monotonic()
     with selectors.DefaultSelector() as selector:
@@ -129,10 +130,10 @@ def _watch(
 
 def _check_limits(folder: Folder, limits: Limits, elapsed_s: float) -> None:
     if elapsed_s > limits.total_s:
-        raise LabError(f"time is up: the guest still ran after {limits.total_s:.0f} s{_hint(folder)}")
+        raise LabError(f"expected the end of the guest within {limits.total_s:.0f} s{_hint(folder)}")
     silence_s = folder.age_s("alive")
     if silence_s is None and elapsed_s > limits.boot_s:
-        raise LabError(f"hung guest: not booted after {limits.boot_s:.0f} s{_hint(folder)}")
+        raise LabError(f"hung guest: expected its start within {limits.boot_s:.0f} s{_hint(folder)}")
     if silence_s is not None and silence_s > limits.silence_s:
         raise HungGuest(f"hung guest: no sign of life for {silence_s:.0f} s{_hint(folder)}")
 
@@ -143,7 +144,7 @@ def _hint(folder: Folder) -> str:
 
 
 def _status(folder: Folder, qemu_status: int) -> int:
-    """The guest's exit status, or LabError saying why there is none."""
+    """Return the guest's exit status. Raises LabError with the cause if there is no status."""
     console = folder.read("console.log")
     problem = folder.read("problem").strip()
     if problem:
@@ -156,7 +157,7 @@ def _status(folder: Folder, qemu_status: int) -> int:
     qemu = folder.read("qemu.log").strip().splitlines()
     if qemu_status != 0 and qemu:
         raise LabError(f"QEMU failed: {qemu[-1]}")
-    raise LabError(cause(console) or f"guest ended without a result; last console line: {last_line(console)}")
+    raise LabError(cause(console) or f"the guest ended without a result; last console line: {last_line(console)}")
 
 
 def to_terminal(data: bytes) -> None:

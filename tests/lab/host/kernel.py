@@ -1,8 +1,8 @@
 """Builds the lab's kernel and its module from Debian's source package, once per change of their inputs.
 
-Two folders in the cache: `kernel-<key>` has the image and the part of the tree that modules are built
-against (key: configuration, package version, this recipe); `lab-<key>` has image and module (key: the
-same and the module's source), so that a change of the module costs seconds, not minutes.
+The cache contains two folders. `kernel-<key>` contains the image and the files for building modules (key:
+configuration, package version, this recipe). `lab-<key>` contains image and module (key: also the module's source). A
+change of the module therefore takes seconds, not minutes.
 """
 
 import os
@@ -21,9 +21,9 @@ MODULE_SOURCE = LAB / "kmod"
 MODULE = "imud_lab.ko"
 IMAGE = "bzImage"
 ARCHIVE = Path("/usr/src") / f"{KERNEL_SOURCE}.tar.xz"
-KERNEL_BUILD_BYTES = 3_000_000_000  # 1.9 GB were used (du -s of a built tree, 6.12.117)
+KERNEL_BUILD_BYTES = 3_000_000_000  # 1.9 GB used (du -s of a built tree, 6.12.117)
 MODULE_BUILD_BYTES = 50_000_000
-STEP_LIMIT_S = 4 * 3600  # 5 minutes on two idle cores; a starved host took 40
+STEP_LIMIT_S = 4 * 3600  # 5 minutes on two idle cores, 40 minutes on a busy host
 FROM_OUTER_MAKE = {"MAKEFLAGS", "MFLAGS", "MAKELEVEL", "MAKEOVERRIDES", "ARCH", "CROSS_COMPILE"}
 KEEP_FOR_MODULES = ("Makefile", "Module.symvers", ".config", "arch", "include", "scripts", "tools", IMAGE)
 
@@ -49,7 +49,7 @@ def built(say: Callable[[str], None]) -> Path:
 
 
 def build_kernel(folder: Path) -> None:
-    """Unpacks, configures, compiles and trims the kernel; `folder` becomes the tree that remains."""
+    """Unpack, configure, compile and trim the kernel. `folder` then contains the remaining tree."""
     log = folder / "build.log"
     step(["tar", "--extract", "--file", str(ARCHIVE), "--strip-components=1"], folder, log)
     step(["make", "tinyconfig"], folder, log)
@@ -84,18 +84,18 @@ def jobs() -> int:
 
 
 def require_config(wanted: str, got: str) -> None:
-    """LabError if an option of the fragment did not survive (a dependency is missing, or it was renamed)."""
+    """Raise LabError if an option of the fragment is not in the configuration (missing dependency or new name)."""
     taken = set(got.splitlines())
     options = [line for line in wanted.splitlines() if line.startswith("CONFIG_")]
     unset = [line.split()[1] for line in wanted.splitlines() if line.endswith(" is not set")]
     lost = [line for line in options if line not in taken]
     lost += [f"{name} off" for name in unset if any(line.startswith(f"{name}=") for line in taken)]
     if lost:
-        raise LabError(f"{CONFIG.name}: the kernel did not take {', '.join(lost)}")
+        raise LabError(f"{CONFIG.name}: expected {', '.join(lost)} in the configuration of the kernel")
 
 
 def trim(folder: Path) -> None:
-    """Removes what modules are not built from: 1.9 GB become 135 MB."""
+    """Remove all files that a build of modules does not need: 1.9 GB become 135 MB."""
     _remove_all_but(folder, {*KEEP_FOR_MODULES, "build.log"})
     _remove_all_but(folder / "arch", {"x86"})
     _remove_all_but(folder / "tools", {"objtool"})
@@ -112,7 +112,7 @@ def _remove_all_but(folder: Path, kept: set[str]) -> None:
 
 
 def step(command: list[str], folder: Path, log: Path) -> None:
-    """Runs one step at low priority with its output in `log`; LabError quotes the log's first error line."""
+    """Run one step at low priority with its output in `log`. LabError quotes the first error line of the log."""
     environment = {name: value for name, value in os.environ.items() if name not in FROM_OUTER_MAKE}
     environment |= {"LC_ALL": "C", "KBUILD_BUILD_TIMESTAMP": "@0"}
     with open(log, "ab") as output:
@@ -134,7 +134,7 @@ def step(command: list[str], folder: Path, log: Path) -> None:
 
 
 def why(log: Path) -> str:
-    """The first line of a build log that names an error, else its last line."""
+    """Return the first line of a build log with an error, or the last line."""
     lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     errors = [line for line in lines if "error:" in line.lower() or "No space left" in line or "not found" in line]
     return next(iter(errors), lines[-1] if lines else "no output")

@@ -14,24 +14,24 @@ QUESTIONS = ("info status", "info registers", "info lapic", "info pic")
 PROMPT = b"(qemu) "
 ANSWER_S = 10.0
 PANIC_S = 60.0
-"""A panic that prints a hundred tasks takes a few seconds."""
+"""Maximum time of a panic, s. A panic that prints a hundred tasks takes a few seconds."""
 
 
 def stop_and_continue(monitor: socket.socket) -> None:
-    """Stop the guest and continue it, which wakes QEMU's processor thread; `examine` skips the answers."""
-    print("lab: a silent guest: QEMU is told to stop and to continue it", file=sys.stderr, flush=True)
-    with suppress(OSError):  # QEMU has ended, or reads nothing
+    """Stop the guest and continue it, which wakes QEMU's processor thread. `examine` skips the replies."""
+    print("lab: the guest is silent; QEMU stops and continues it", file=sys.stderr, flush=True)
+    with suppress(OSError):  # QEMU has ended or does not read
         monitor.sendall(b"stop\ncont\n", socket.MSG_DONTWAIT)
 
 
 def examine(monitor: socket.socket, log: Path) -> None:
-    """Ask everything; return when QEMU ended, or when it does not answer."""
-    with log.open("wb") as file, suppress(OSError):  # a timeout is one too
+    """Send all commands. Return when QEMU has ended or does not reply."""
+    with log.open("wb") as file, suppress(OSError):  # TimeoutError is an OSError
         monitor.settimeout(ANSWER_S)
         file.write(_answer(monitor))  # the banner
         for question in (*QUESTIONS, "nmi"):
             monitor.sendall(question.encode() + b"\n")
-            _echo, _, answer = _answer(monitor).partition(b"\n")  # the echo has a line for each key that is pressed
+            _echo, _, answer = _answer(monitor).partition(b"\n")  # the echo has one line for each typed character
             file.write(question.encode() + b"\n" + answer)
             file.flush()
         monitor.settimeout(PANIC_S)
@@ -40,7 +40,7 @@ def examine(monitor: socket.socket, log: Path) -> None:
 
 
 def _answer(monitor: socket.socket) -> bytes:
-    """All up to the next prompt. Raises TimeoutError."""
+    """Return all bytes up to the next prompt. Raises TimeoutError."""
     found = b""
     while not found.endswith(PROMPT):
         part = monitor.recv(65536)

@@ -1,6 +1,6 @@
-"""The Debian packages the lab needs: which are missing, and their installation on request.
+"""The Debian packages that the lab needs: list the missing packages, and install them on request.
 
-As a program (`tests/lab/deps`) it installs what is missing; with `--check` it only names it.
+As a program (`tests/lab/deps`), it installs the missing packages. With `--check`, it only lists them.
 """
 
 import os
@@ -38,7 +38,7 @@ PACKAGES = {
 def installed_versions(names: list[str]) -> dict[str, str]:
     """Return the versions of the installed packages in `names`. Raises LabError without dpkg."""
     if shutil.which("dpkg-query") is None:
-        raise LabError("dpkg-query is not there: the lab knows Debian 12 and its relatives only")
+        raise LabError("cannot find dpkg-query: the lab needs Debian 12 or a derived system")
     query = ["dpkg-query", "--show", "--showformat=${Package} ${db:Status-Status} ${Version}\n", *names]
     listing = subprocess.run(query, capture_output=True, text=True, check=False).stdout
     rows = [line.split() for line in listing.splitlines()]
@@ -46,20 +46,20 @@ def installed_versions(names: list[str]) -> dict[str, str]:
 
 
 def missing() -> list[str]:
-    """Names of the packages that are not installed, in the table's order."""
+    """Return the names of the missing packages in the order of the table."""
     present = installed_versions(list(PACKAGES))
     return [name for name in PACKAGES if name not in present]
 
 
 def require_all() -> None:
-    """Raises LabError naming the missing packages and how to install them."""
+    """Raise LabError with the missing packages and the command that installs them."""
     absent = missing()
     if absent:
-        raise LabError(f"missing Debian packages: {' '.join(absent)} (make lab-deps installs them)")
+        raise LabError(f"missing Debian packages: {' '.join(absent)}; try make lab-deps")
 
 
 def kernel_source_version() -> str:
-    """The installed version of the kernel's source package, such as 6.12.117-1~deb12u1."""
+    """Return the installed version of the kernel's source package, such as 6.12.117-1~deb12u1."""
     return installed_versions([KERNEL_SOURCE])[KERNEL_SOURCE]
 
 
@@ -73,10 +73,10 @@ def without_candidate(names: list[str]) -> list[str]:
 
 
 def install(names: list[str]) -> None:
-    """Installs packages with apt-get, through sudo unless root. LabError if apt-get refuses."""
+    """Install packages with apt-get, with sudo for other users than root. Raises LabError if apt-get fails."""
     prefix = [] if os.geteuid() == 0 else ["sudo"]
     if prefix and shutil.which("sudo") is None:
-        raise LabError(f"neither root nor sudo: run as root: apt-get install {' '.join(names)}")
+        raise LabError(f"cannot install packages without root or sudo; run as root: apt-get install {' '.join(names)}")
     if subprocess.run([*prefix, "apt-get", "update"], check=False).returncode:
         raise LabError("apt-get update failed")
     unknown = without_candidate(names)
@@ -90,7 +90,7 @@ def install(names: list[str]) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """`deps` or `deps --check`: 0 if everything is there in the end, 1 with one line if not."""
+    """Run `deps` or `deps --check`. Return 0 if all packages are installed at the end, otherwise 1 with one line."""
     try:
         if arguments not in ([], ["--check"]):
             raise LabError(f"usage: tests/lab/deps [--check], got: {' '.join(arguments)}")

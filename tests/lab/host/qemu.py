@@ -1,4 +1,4 @@
-"""The guest's machine: the QEMU command line."""
+"""The virtual machine of the guest: the QEMU command line."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ PANIC_BY_NMI = "unknown_nmi_panic panic_print=0x5"
 """Kernel options: a panic prints the wait state of every task and the active timers. `examine` causes a panic in a hung
 guest."""
 STEADY = ("-icount", "shift=0")
-"""An instruction takes 2^0 ns; a guest that waits, waits as long by the host's clock."""
+"""Options for a clock that counts instructions: an instruction takes 2^0 ns. Waiting uses the clock of the host."""
 
 
 @dataclass(frozen=True)
@@ -22,14 +22,14 @@ class Machine:
 
     image: Path
     share: Path
-    """Folder the guest may write, its /run/lab."""
+    """Folder that the guest may write, its /run/lab."""
     console: Path
     memory_mb: int
     processors: int
     uart_fds: tuple[int, int]
-    """The two ends of a socket pair: the guest's extra UARTs, wired to each other."""
+    """Both ends of a socket pair: the extra UARTs of the guest, connected to each other."""
     monitor_fd: int
-    """A socket on which QEMU answers questions about the machine."""
+    """Socket of QEMU's monitor."""
     steady: bool = False
     """True: an instruction of the guest takes 1 ns. False: the guest uses the time of the host."""
 

@@ -31,7 +31,7 @@ def run_folder(output: Path) -> Iterator[Path]:
 
 
 def keep(folder: Path, output: Path, failed: bool) -> list[Path]:
-    """Moves the report, and after a failure the logs, to `output`; older ones go. Returns the logs kept."""
+    """Move the report, and after a failure the logs, to `output`. Remove older files. Return the kept logs."""
     _move(folder / REPORT, output / REPORT)
     if failed:
         return [output / name for name in LOGS if _move(folder / name, output / name)]
@@ -41,7 +41,7 @@ def keep(folder: Path, output: Path, failed: bool) -> list[Path]:
 
 
 def _move(source: Path, target: Path) -> bool:
-    """Moves a file over the old one; the old one goes even if there is no new one or it is empty."""
+    """Replace the target by the source. Remove the target if the source is missing or empty."""
     target.unlink(missing_ok=True)
     if not source.exists() or source.stat().st_size == 0:
         return False
@@ -50,7 +50,7 @@ def _move(source: Path, target: Path) -> bool:
 
 
 def _remove_leftovers(output: Path) -> None:
-    """Folders of runs that were killed; a day old, so that no run still uses them."""
+    """Remove folders of killed runs. They are one day old, so that no active run uses them."""
     for folder in output.glob("run-*"):
         if folder.stat().st_mtime < time.time() - LEFTOVER_S:
             shutil.rmtree(folder, ignore_errors=True)
