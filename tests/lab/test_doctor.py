@@ -142,12 +142,8 @@ def test_healthy_devices_then_a_newer_file_then_no_daemon(
         wait_running(made, *devices)
         found = doctor(made)
         assert found.of("error") == []
-        allowed = {
-            "clock",
-            "processor",
-            "kernel log",
-            "CAN state",
-        }  # possible findings of an emulated system after other tests
+        # possible findings of an emulated system after other tests
+        allowed = {"clock", "processor", "kernel log", "CAN state"}
         assert {check for check, _ in found.of("warning")} <= allowed
         found.has("clock", "warning", "synchronised", "chrony")
         found.has("service", "not checked", "no systemd runs here")
@@ -391,7 +387,7 @@ def test_lines_and_restarts(gpio_chip: GpioChip, tmp_path: Path) -> None:
             wait_for(made, "bow", lambda one, least=seen + 20: one.ledger["samples"] >= least, "samples")  # type: ignore[misc]  # a lambda's default
             imu.process.stdin.write("reboot\n")
             imu.process.stdin.flush()
-            wait_for(made, "bow", lambda one, least=number: one.clock.resets >= least, "its restart is seen")  # type: ignore[misc]  # a lambda's default
+            wait_for(made, "bow", lambda one, least=number: one.clock.resets >= least, "the restart in the status")  # type: ignore[misc]  # a lambda's default
         doctor(made).has("restarts", "warning", "bow began its clock anew 3 times", "brown-out?")
 
 

@@ -191,7 +191,7 @@ async def test_a_chip_that_is_pulled_out_and_comes_back(gpio_chip: GpioChip) -> 
         watcher.line.open()
     gpio_chip.plug_in()
     watcher.ends.clear()
-    wait_until(lambda: any(Path("/dev").glob("gpiochip*")), "the chip is back")
+    wait_until(lambda: any(Path("/dev").glob("gpiochip*")), "the node of the chip")
     watcher.start()
     assert not watcher.line.level()
     watcher.line.close()

@@ -180,7 +180,7 @@ def test_interface_down_and_up_again(vcan: CanInterface) -> None:
         await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
         vcan.down()
         await rig.until(lambda: rig.runner.state is DeviceState.MISSING, "missing")
-        await rig.until(lambda: "is down" in rig.runner.status().problem, "the problem is told")
+        await rig.until(lambda: "is down" in rig.runner.status().problem, "the problem in the status")
         vcan.up()
         await rig.until(lambda: rig.runner.state is DeviceState.SEARCHING, "open again")
         rig.back()
@@ -202,7 +202,7 @@ def test_interface_that_is_missing_is_waited_for() -> None:
     tool("ip", "link", "delete", "vcan7")
 
     async def story(rig: Rig) -> None:
-        await rig.until(lambda: "not there" in rig.runner.status().problem, "the problem is told")
+        await rig.until(lambda: "not there" in rig.runner.status().problem, "the problem in the status")
         tool("ip", "link", "add", "dev", config.interface, "type", "vcan")
         tool("ip", "link", "set", config.interface, "up")
         await rig.until(lambda: rig.runner.state is DeviceState.SEARCHING, "open")

@@ -126,7 +126,7 @@ def test_damaged_bytes_cost_their_sample_only(spi8: Bus[SpiTransfer]) -> None:
 
     async def damage(rig: DeviceRig) -> None:
         device.faults.flips = 1
-        await rig.until(lambda: rig.device.ledger.frames_bad_crc >= 1, "the damage is seen", LIMIT_S)
+        await rig.until(lambda: rig.device.ledger.frames_bad_crc >= 1, "the damage in the status", LIMIT_S)
 
     async def body() -> None:
         async with running(config) as (rig,):
