@@ -1,6 +1,6 @@
-"""The guest's program: `python3 -m tests.lab_debian.guest [--short] ARCHITECTURE [GROUP...]` runs checks, or groups.
+"""The program in the guest: `python3 -m tests.lab_debian.guest [--short] ARCHITECTURE [GROUP...]` runs checks.
 
-Exit status: 0 all passed, 1 some failed.
+Exit status: 0 if all checks passed, 1 if a check failed.
 """
 
 import argparse
@@ -40,7 +40,7 @@ GROUPS: dict[str, Group] = {
     "streaming": service.check_streaming,
     "removal": removal.check,
 }
-"""In the order in which they run: the first leaves the package installed and the second the service running."""
+"""Groups in the order of execution. The first installs the package, the second leaves the service running."""
 RUNS = {
     "amd64": (
         *("service", "rights", "sandbox", "outputs", "views", "buses", "replug", "doctor", "complaints", "setup"),
@@ -65,7 +65,7 @@ def main(arguments: list[str]) -> int:
         try:
             GROUPS[name](checks, host)
         except Exception:
-            with checks("everything between the checks"):
+            with checks("the code between the checks runs without an exception"):
                 raise
     print(f"{checks.summary()}, {uptime_s():.0f} s after the kernel's start", flush=True)
     return 1 if checks.failed else 0

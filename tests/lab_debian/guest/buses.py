@@ -44,7 +44,7 @@ CHRONY = Path("/etc/systemd/system/chrony.service")
 CHRONY_FILES = {
     "/etc/chrony/conf.d/imud.conf": f"refclock SOCK {CHRONY_SOCKET} refid IMUD poll 3\n",
     "/etc/systemd/system/chrony.service.d/imud.conf": f"[Service]\nExecStartPost=+/bin/chown imud {CHRONY_SOCKET}\n",
-    "/etc/default/chrony": 'DAEMON_OPTS="-F 1 -x"\n',  # -x: the guest's clock stays as it is
+    "/etc/default/chrony": 'DAEMON_OPTS="-F 1 -x"\n',  # -x: do not change the guest's clock
 }
 PULSES = 12
 FEED = f"""
@@ -60,7 +60,7 @@ print(feed.sent, feed.refused, feed.problem)
 
 
 def make_nodes() -> None:
-    """Make a node of each kind of bus that Debian's kernel has a driver for on QEMU's machine (machine.py)."""
+    """Create a node for each kind of bus for which Debian's kernel has a driver of QEMU's machine (machine.py)."""
     must("modprobe", "i2c-dev")
     run("modprobe", "i2c-stub", "chip_addr=0x18")
     for module in ("pcengines-apuv2", "parport_pc", "spi-butterfly"):
@@ -73,14 +73,14 @@ def make_nodes() -> None:
 
 
 def is_there(checks: Checks, pattern: str, what: str) -> bool:
-    """Whether there is such a node. A check that fails where the rig promises one, else a line that it is left out."""
+    """Return whether a matching node exists. Fail a check if README.md promises the node; otherwise print a note."""
     if any(Path("/dev").glob(pattern)):
         return True
     if pattern in NODES[platform.machine()]:
         with checks(what):
-            raise Failed(f"there is no /dev/{pattern}, which the rig promises")
+            raise Failed(f"expected a node /dev/{pattern} (README.md), got none")
     else:
-        checks.skip(what, "this machine has none")
+        checks.skip(what, "this system has no such node")
     return False
 
 
@@ -94,7 +94,7 @@ def check(checks: Checks, _host: Host) -> None:
 
 @contextmanager
 def further_device(text: str) -> Iterator[str]:
-    """Add a device to the configuration, for as long as the block; the problem that the daemon has with it."""
+    """Add a device to the configuration during the block. Yield the problem that the daemon reports for it."""
     before = CONFIG.read_text()
     since = mark()
     configure(before + text)
@@ -112,23 +112,23 @@ def further_device(text: str) -> Iterator[str]:
 
 
 def check_i2c(checks: Checks) -> None:
-    """A bus on which nothing answers."""
+    """Check a bus without a device."""
     if not is_there(checks, "i2c-0", "the daemon opens an I2C bus"):
         return
     with (
-        checks("the daemon opens an I2C bus and finds nothing there, which is not a right that is missing"),
+        checks("the daemon opens an I2C bus and reports a missing device, not a missing permission"),
         further_device("  keel:\n    driver: imu61x-i2c\n    i2c: {bus: 0, address: 24, rate_hz: 1}\n") as problem,
     ):
         checks.note(problem)
 
 
 def check_gpio(checks: Checks) -> None:
-    """A line that the daemon drives, of a chip whose lines make no interrupts."""
+    """Check an output line of a chip without interrupts."""
     if not is_there(checks, CHIP.name, "the daemon drives a GPIO line"):
         return
     with checks("a GPIO chip belongs to its group"):
         expect("group and mode", (CHIP.group(), CHIP.stat().st_mode & 0o777), ("gpio", 0o660))
-    with checks("the daemon drives a GPIO line, and says which one makes no interrupts"):
+    with checks("the daemon drives a GPIO line, and names the line without interrupts"):
         line = int(must(PYTHON, "-c", FREE_LINE))
         lines = f"lines: {{reset: {{line: {line}, chip: gpiochip0}}}}"
         with further_device(f"  keel:\n    driver: imu61x-uart\n    uart: {{port: /dev/ttyS7}}\n    {lines}\n"):
@@ -147,24 +147,24 @@ def check_spi(checks: Checks) -> None:
         expect("group and mode", (nodes[0].group(), nodes[0].stat().st_mode & 0o777), ("spi", 0o660))
     text = f"  keel:\n    driver: imu61x-spi\n    spi: {{port: {nodes[0]}, mode: 0, rate_hz: 1}}\n"
     with (
-        checks("the daemon transfers on an SPI bus and finds nothing there, which is not a right that is missing"),
+        checks("the daemon transfers on an SPI bus and reports a missing device, not a missing permission"),
         further_device(text) as problem,
     ):
         checks.note(problem)
 
 
 def check_chrony(checks: Checks) -> None:
-    """Debian's chronyd with its own unit takes what the confined user sends."""
-    with checks("chronyd takes pulses that a program sends which is confined as the unit is"), configured_chronyd():
+    """Check that Debian's chronyd, with its own unit, accepts the samples of the confined user."""
+    with checks("chronyd accepts pulses of a program that is confined like the unit"), configured_chronyd():
         code = FEED.format(path=must(PYTHON, "-c", "import imud, os; print(os.path.dirname(imud.__path__[0]))").strip())
         expect("sent, refused", confined(code, *confinement()).strip(), f"{PULSES} 0")
-        wait_until(lambda: "IMUD" in reached(), f"pulses at chronyd: {run('chronyc', 'sources').stdout}")
+        wait_until(lambda: "IMUD" in reached(), f"expected pulses at chronyd, got {run('chronyc', 'sources').stdout}")
 
 
 @contextmanager
 def configured_chronyd() -> Iterator[None]:
     """Run chronyd with the configuration of docs/time.md during the block, then remove it."""
-    CHRONY.unlink(missing_ok=True)  # masked by the rig
+    CHRONY.unlink(missing_ok=True)  # the lab masks this unit
     for name, text in CHRONY_FILES.items():
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_text(text)
@@ -174,14 +174,14 @@ def configured_chronyd() -> Iterator[None]:
         yield
     finally:
         run("systemctl", "stop", "chrony.service")
-        Path(CHRONY_SOCKET).unlink(missing_ok=True)  # chronyd 4.3 leaves it
+        Path(CHRONY_SOCKET).unlink(missing_ok=True)  # chronyd 4.3 does not remove its socket
         for name in CHRONY_FILES:
             Path(name).unlink()
-        Path(CHRONY_SOCKET).unlink(missing_ok=True)  # chronyd is no longer root when it ends
+        Path(CHRONY_SOCKET).unlink(missing_ok=True)  # chronyd has dropped root and cannot remove its socket
         must("systemctl", "daemon-reload")
 
 
 def reached() -> list[str]:
-    """Sources of chronyd that something came from: their reach is not zero."""
+    """Return the sources of chronyd with received samples: their reach is not zero."""
     rows = [row.split(",") for row in run("chronyc", "-c", "sources").stdout.splitlines()]
     return [row[2] for row in rows if len(row) > 5 and int(row[5], 8)]

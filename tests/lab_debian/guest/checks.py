@@ -2,7 +2,7 @@
 
 with checks("the service is READY after its start"):
     ...                                              each exception is a failure; the run continues
-checks.figure("start to READY", 8.1, "s")            measured, printed with the results
+checks.figure("start to READY", 8.1, "s")            a measured value, printed with the results
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 LIMIT_S = 180.0
-"""For anything that must happen: an emulated guest on a busy host is tens of times slower than a real machine."""
+"""Default time limit, s. An emulated guest on a busy host is tens of times slower than a real system."""
 POLL_S = 0.1
 LINES_SHOWN = 12
 
@@ -77,11 +77,11 @@ class Checks:
 
 
 def wait_until(found: Callable[[], T | None], what: str, limit_s: float = LIMIT_S) -> T:
-    """Return what `found()` gives as soon as that is true. Failed with `what` after `limit_s`."""
+    """Return the first true result of `found()`. Raise Failed with `what` after `limit_s`."""
     give_up_s = time.monotonic() + limit_s
     while not (value := found()):
         if time.monotonic() >= give_up_s:
-            raise Failed(f"not within {limit_s:.0f} s: {what} (last: {value!r})")
+            raise Failed(f"expected within {limit_s:.0f} s: {what}; last value: {value!r}")
         time.sleep(POLL_S)
     return value
 
@@ -93,6 +93,6 @@ def expect(what: str, got: object, wanted: object) -> None:
 
 
 def expect_in(part: str, whole: str, what: str) -> None:
-    """Failed unless `part` is in `whole`."""
+    """Raise Failed unless `part` is in `whole`."""
     if part not in whole:
         raise Failed(f"{what}: expected {part!r} in: {whole.strip()[-1500:]}")

@@ -50,17 +50,17 @@ class AdapterNow(NamedTuple):
     latency_ms: int
     """Latency timer, ms (`latency_timer` of ftdi_sio)."""
     ignored: bool
-    """Whether ModemManager leaves it alone (`ID_MM_DEVICE_IGNORE`)."""
+    """Whether ModemManager ignores the adapter (`ID_MM_DEVICE_IGNORE`)."""
 
 
 def check_doctor(checks: Checks, host: Host) -> None:
-    """Daemon up, adapter pulled, daemon down."""
+    """Check with a running daemon, with an unplugged adapter, and without a daemon."""
     ensure_running(USB + CAN)
     wait_streaming("can")
-    with checks("imud doctor finds no error while everything runs"):
+    with checks("imud doctor reports no error in normal operation"):
         # on a busy host, a simulator can stop for a second, which is an error during this time
         wait_until(lambda: not errors(), "no error of imud doctor")
-    with checks("imud doctor tells that the adapter is gone"):
+    with checks("imud doctor reports a missing adapter"):
         host.unplug()
         wait_until(lambda: (device("usb") or {}).get("state") == "missing", "the device is missing")
         result = run("imud", "doctor")
@@ -68,7 +68,7 @@ def check_doctor(checks: Checks, host: Host) -> None:
         expect_in("/dev/ttyUSB0", result.stdout, "doctor")
         host.plug()
         wait_streaming("usb")
-    with checks("imud doctor tells that the service does not run"):
+    with checks("imud doctor reports that the service does not run"):
         must("systemctl", "stop", UNIT)
         result = run("imud", "doctor")
         expect("exit status", result.returncode, ERROR)
@@ -79,7 +79,7 @@ def check_doctor(checks: Checks, host: Host) -> None:
 
 def check_complaints(checks: Checks, _host: Host) -> None:
     ensure_running(USB + CAN)
-    with checks("imud doctor names the program that has the port, and the daemon gets it afterwards"):
+    with checks("imud doctor names the program that uses the port, and the daemon uses the port afterwards"):
         must("systemctl", "stop", UNIT)
         background(HOLDER, PYTHON, "-c", HOLD_PORT)
         wait_until(lambda: f"{NODE}" in open_files(), "another program has the port")
@@ -88,7 +88,7 @@ def check_complaints(checks: Checks, _host: Host) -> None:
         expect_finding("ports taken", "error", f"{NODE} is open in ", "stop that program")
         must("systemctl", "stop", HOLDER)
         wait_streaming("usb")
-    with checks("imud doctor tells of a user without the port's group, and its advice gives access"):
+    with checks("imud doctor reports a user without the port's group, and its advice gives access"):
         must("gpasswd", "--delete", "imud", "dialout")
         start_service()
         wait_until(lambda: "may not be opened" in (device("usb") or {}).get("problem", ""), "the port is refused")
@@ -97,7 +97,7 @@ def check_complaints(checks: Checks, _host: Host) -> None:
         must(*command.split())
         start_service()
         wait_streaming("usb")
-    with checks("imud doctor tells of a unit that does not allow the port, and its advice gives access"), drop_in():
+    with checks("imud doctor reports a unit that does not allow the port, and its advice gives access"), drop_in():
         allow("char-pts rw")
         wait_until(lambda: "EPERM" in (device("usb") or {}).get("problem", ""), "the port is refused")
         entry = "char-ttyUSB rw"
@@ -115,14 +115,14 @@ def check_complaints(checks: Checks, _host: Host) -> None:
 def open_files() -> list[str]:
     holder = int(shown("MainPID", HOLDER))
     found: list[str] = []
-    with suppress(FileNotFoundError):  # a descriptor was closed, or its process ended
+    with suppress(FileNotFoundError):  # the descriptor was closed, or its process ended
         found.extend(os.readlink(one) for one in Path(f"/proc/{holder}/fd").iterdir())
     return found
 
 
 @contextmanager
 def drop_in() -> Iterator[None]:
-    """Settings of the unit may be added (`allow`) until the end of the block; its next start is without them."""
+    """Allow additional settings of the unit (`allow`) during the block. The next start is without them."""
     try:
         yield
     finally:
@@ -131,7 +131,7 @@ def drop_in() -> Iterator[None]:
 
 
 def allow(*entries: str) -> None:
-    """Restart the service with these DeviceAllow= alone."""
+    """Restart the service with only these DeviceAllow= entries."""
     DROP_IN.parent.mkdir(parents=True, exist_ok=True)
     DROP_IN.write_text("[Service]\nDeviceAllow=\n" + "".join(f"DeviceAllow={entry}\n" for entry in entries))
     must("systemctl", "daemon-reload")
@@ -139,7 +139,7 @@ def allow(*entries: str) -> None:
 
 
 def expect_finding(check: str, severity: str, seen: str, advice: str) -> None:
-    """Failed unless `imud doctor` has this finding of the check, and an exit status for it."""
+    """Raise Failed unless `imud doctor` reports this finding with the matching exit status."""
     result = run("imud", "doctor", "--json")
     examined = json.loads(result.stdout)
     found = [one for each in examined["checks"] if each["name"] == check for one in each["findings"]]
@@ -159,13 +159,13 @@ def errors() -> list[dict[str, str]]:
 
 
 def check_setup(checks: Checks, host: Host) -> None:
-    """`imud setup --yes` from the package's example to samples, and `--undo`; on a machine with ModemManager."""
+    """Check `imud setup --yes` up to the first samples, and `--undo`, on a system with ModemManager."""
     must("systemctl", "disable", "--now", UNIT)
     CONFIG.write_bytes(EXAMPLE.read_bytes())
     add_user(OPERATOR)
     with modem_manager():
         before = replugged(host)
-        with checks("imud setup --yes ends with a service that is enabled and has samples of what is attached"):
+        with checks("imud setup --yes ends with an enabled service and samples of the connected device"):
             said = must(*SETUP, "--yes", limit_s=900)
             expect("enabled", run("systemctl", "is-enabled", UNIT).stdout.strip(), "enabled")
             expect("active", shown("ActiveState"), "active")
@@ -173,14 +173,14 @@ def check_setup(checks: Checks, host: Host) -> None:
             for found in ask("status")["devices"]:
                 wait_streaming(found["name"])
         check_made(checks, host, before)
-        with checks("imud setup --undo takes back configuration, service, rules, group and journal"):
+        with checks("imud setup --undo removes configuration, service, rules, group and journal"):
             must(*SETUP, "--undo", "--yes", limit_s=900)
             expect("enabled", run("systemctl", "is-enabled", UNIT).stdout.strip(), "disabled")
-            assert CONFIG.read_bytes() == EXAMPLE.read_bytes(), "the configuration is not the one before"
+            assert CONFIG.read_bytes() == EXAMPLE.read_bytes(), "expected the configuration before imud setup"
             left = [path for path in (RULES, JOURNAL, *CONFIG.parent.glob(f"{CONFIG.name}.*")) if path.exists()]
-            expect("left of what it made", left, [])
+            expect("remaining files of imud setup", left, [])
             expect("groups of the user that runs sudo", groups(), {OPERATOR})
-            expect("the adapter, when it is plugged in again", replugged(host), before)
+            expect("the adapter after it was plugged in again", replugged(host), before)
     configure(USB + CAN)
     must("systemctl", "enable", UNIT)
     start_service()
@@ -192,7 +192,7 @@ def check_made(checks: Checks, host: Host, before: AdapterNow) -> None:
     rules."""
     with checks("the user that runs sudo may read samples after imud setup"):
         expect("groups", groups(), {OPERATOR, "imud"})
-    with checks("after imud setup udev keeps ModemManager from the adapter, and has its bytes sent at once"):
+    with checks("after imud setup, udev hides the adapter from ModemManager and sets its latency timer"):
         expect("ignored without the rules", before.ignored, False)
         assert before.latency_ms != LATENCY_MS, f"the latency timer is {LATENCY_MS} ms without the rules"
         expect("as it is", adapter().ignored, True)
@@ -203,13 +203,13 @@ def check_made(checks: Checks, host: Host, before: AdapterNow) -> None:
             expect("plugged in again", replugged(host), AdapterNow(LATENCY_MS, ignored=True))
         finally:
             start_service()
-    with checks("the journal of imud setup is there, for root only"):
+    with checks("the journal of imud setup exists, only for root"):
         expect("mode", JOURNAL.stat().st_mode & 0o777, 0o600)
 
 
 @contextmanager
 def modem_manager() -> Iterator[None]:
-    """Run a service with this name during the block: Debian in the rig does not contain it."""
+    """Run a service with this name during the block: Debian in the guest does not contain it."""
     MODEM_MANAGER.write_text("[Service]\nExecStart=/bin/sleep infinity\n")
     must("systemctl", "daemon-reload")
     must("systemctl", "start", MODEM_MANAGER.name)
@@ -226,19 +226,19 @@ def replugged(host: Host) -> AdapterNow:
     wait_until(lambda: not NODE.exists(), f"{NODE} is gone")
     host.plug()
     wait_until(NODE.exists, f"{NODE} is there")
-    must("udevadm", "wait", "--timeout=60", str(NODE))  # its own event, after that of the driver
+    must("udevadm", "wait", "--timeout=60", str(NODE))  # the event of the port, after the event of the driver
     must("udevadm", "settle")
     return adapter()
 
 
 def adapter() -> AdapterNow:
-    """Latency timer and ModemManager's property of the adapter, from the kernel and from udev's database."""
+    """Return latency timer and ModemManager's property of the adapter, from the kernel and from udev's database."""
     latency = Path(f"/sys/bus/usb-serial/devices/{NODE.name}/latency_timer").read_text()
     return AdapterNow(int(latency), "ID_MM_DEVICE_IGNORE=1" in properties(must("udevadm", "info", str(NODE))))
 
 
 def properties(text: str) -> list[str]:
-    """Properties of a device in what `udevadm info` prints."""
+    """Return the properties of a device in the output of `udevadm info`."""
     return [line.removeprefix("E: ") for line in text.splitlines() if line.startswith("E: ")]
 
 

@@ -7,32 +7,32 @@ from tests.lab_debian.guest.checks import Checks, Failed, expect
 from tests.lab_debian.guest.system import CONFIG, EXAMPLE, NODE, SHARE, Host, must, run, shown, uptime_s
 
 LEFT_OUT = re.compile(r"^missing +/usr/share/(doc|man)\b")
-"""Files that dpkg of the rig does not unpack (image.py)."""
+"""Files that dpkg of the guest does not unpack (image.py)."""
 
 
 def check(checks: Checks, _host: Host) -> None:
-    with checks("the system is up, with no failed unit"):
+    with checks("the system runs without a failed unit"):
         state = run("systemctl", "is-system-running", "--wait").stdout.strip()
         if state != "running":
             raise Failed(f"{state}: {run('systemctl', '--failed', '--no-legend', '--plain').stdout.strip()}")
-    checks.figure("kernel's start to a system that is up", uptime_s(), "s")
+    checks.figure("start of the kernel to a running system", uptime_s(), "s")
     with checks("apt installs the package"):
         start_s = time.monotonic()
         must("apt-get", "--quiet", "--yes", "install", "/run/lab/imud.deb", limit_s=900)
         checks.figure("installation", time.monotonic() - start_s, "s")
         EXAMPLE.write_bytes(CONFIG.read_bytes())
-    with checks("the package is as it was made, and its modules are compiled"):
+    with checks("the installed files match the package, and its modules are compiled"):
         changed = run("dpkg", "--verify", "imud-daemon").stdout.splitlines()
         expect("dpkg --verify", [line for line in changed if not LEFT_OUT.search(line)], [])
         must("sh", "-c", "find /usr/lib/imud/lib -name '*.pyc' | grep --quiet .")
-    with checks("nothing is started, nothing is enabled"):
+    with checks("no service is started or enabled"):
         expect("active", run("systemctl", "is-active", "imud").stdout.strip(), "inactive")
         expect("enabled", run("systemctl", "is-enabled", "imud").stdout.strip(), "disabled")
         expect("load state", shown("LoadState"), "loaded")
-    with checks("systemd has no complaint about the unit"):
+    with checks("systemd accepts the unit without a warning"):
         said = run("systemd-analyze", "verify", "imud.service").stdout
         expect("systemd-analyze verify", [line for line in said.splitlines() if "imud" in line], [])
-    with checks("the command and its manual are there"):
+    with checks("the command and its manual page exist"):
         must("imud", "--version")
         must("test", "-s", "/usr/share/bash-completion/completions/imud")
         must("imud", "check", "/etc/imud.yaml")
@@ -41,4 +41,4 @@ def check(checks: Checks, _host: Host) -> None:
         expect("group", NODE.group(), "dialout")
         must("sh", "-c", "ls /dev/serial/by-id/usb-*")
     if not (SHARE / "imud.deb").exists():
-        raise SystemExit("the package is not in the run's folder")
+        raise SystemExit("expected the package in the run's folder")

@@ -35,15 +35,15 @@ def check(checks: Checks, _host: Host) -> None:
     with checks("metrics are not served to a public address"):
         assert not metrics(f"http://{PUBLIC}:{METRICS_PORT}"), "they are"
     with checks("the daemon reaches a real gpsd over TCP"):
-        # without a receiver; with neither that nor a control socket bookworm's gpsd ends
+        # without a receiver; bookworm's gpsd ends if it has neither a receiver nor a control socket
         background("labgpsd", "/usr/sbin/gpsd", "-N", "-n", "-S", str(GPSD_PORT), "-F", "/run/labgpsd.sock")
         configure(USB.replace("115200}", "115200}\n    rmc: {source: gpsd}") + CAN)
         start_service()
         wait_streaming("usb")
-        wait_until(lambda: NOTHING_YET in str((device("usb") or {}).get("utc")), "gpsd, which has no receiver")
+        wait_until(lambda: NOTHING_YET in str((device("usb") or {}).get("utc")), "gpsd without a receiver")
         must("systemctl", "stop", "labgpsd")
         wait_until(lambda: NOTHING_YET not in str((device("usb") or {}).get("utc")), "the loss of gpsd")
-    with checks("real-time scheduling by a drop-in, as docs/operate.md has it"):
+    with checks("real-time scheduling with the drop-in of docs/operate.md"):
         folder = Path("/etc/systemd/system/imud.service.d")
         folder.mkdir()
         (folder / "realtime.conf").write_text(REALTIME)

@@ -1,4 +1,4 @@
-"""Who may read, who may change, who may nothing."""
+"""Permissions: users who may read, users who may change settings, and users without permissions."""
 
 from tests.lab_debian.guest.checks import Checks, expect, expect_in
 from tests.lab_debian.guest.system import PYTHON, RINGS, SOCKET, Host, add_user, must, run, wait_streaming
@@ -11,7 +11,7 @@ WRITE_RING = f"open('{RINGS}/imud.usb', 'r+b')"
 
 
 def check(checks: Checks, _host: Host) -> None:
-    """Members of imud, members of imud-control, the daemon's user, and strangers."""
+    """Check members of imud, members of imud-control, the daemon's user, and other users."""
     add_user("reader", "imud")
     add_user("chief", "imud", "imud-control")
     add_user("stranger")
@@ -19,12 +19,12 @@ def check(checks: Checks, _host: Host) -> None:
     with checks("a member of imud reads the socket and the ring"):
         must("runuser", "-u", "reader", "--", "imud", "devices")
         expect("ring", run(PYTHON, "-c", READ_RING, user="reader").stdout.strip(), "True")
-    with checks("a member of imud changes nothing"):
+    with checks("a member of imud cannot change settings"):
         refused = run("imud", "command", "usb", "output", "message=HI91", f"rate_hz={RATE_HZ}", user="reader")
-        assert refused.returncode, "the command was carried out"
+        assert refused.returncode, "expected an error for the command"
         expect_in("imud-control", refused.stdout, "refusal")
         expect_in("Permission denied", run(PYTHON, "-c", WRITE_RING, user="reader").stdout, "writing to a ring")
-    with checks("a member of imud-control changes a module"):
+    with checks("a member of imud-control changes a device"):
         must(
             "runuser",
             "-u",
@@ -38,14 +38,14 @@ def check(checks: Checks, _host: Host) -> None:
             "message=HI91",
             f"rate_hz={RATE_HZ}",
         )
-    with checks("a stranger reads neither socket nor ring, and is told why"):
+    with checks("another user can read neither socket nor ring, and receives the reason"):
         refused = run("imud", "devices", user="stranger")
-        assert refused.returncode, "the stranger may read"
+        assert refused.returncode, "expected an error for another user"
         expect_in("imud", refused.stdout, "refusal")
-        assert run(PYTHON, "-c", READ_RING, user="stranger").returncode, "the stranger reads the ring"
-    with checks("only imud makes names beside socket and rings"):
+        assert run(PYTHON, "-c", READ_RING, user="stranger").returncode, "another user reads the ring"
+    with checks("only imud creates files next to socket and rings"):
         for user in ("reader", "chief", "stranger"):
             for folder in (SOCKET.rpartition("/")[0], str(RINGS), "/var/lib/imud"):
-                assert run("touch", f"{folder}/mine", user=user).returncode, f"{user} makes a file in {folder}"
+                assert run("touch", f"{folder}/mine", user=user).returncode, f"{user} creates a file in {folder}"
     with checks("the daemon may not become another user or root"):
         expect_in("NoNewPrivs:\t1", must("sh", "-c", "cat /proc/$(systemctl show -P MainPID imud)/status"), "status")

@@ -21,9 +21,9 @@ from tests.lab_debian.guest.system import (
 )
 
 SCORE_MAX = 2.0
-"""Maximum score. 0.4 of it belong to adjtimex, which reports whether the clock is synchronised (docs/operate.md)."""
+"""Maximum score. 0.4 of it is due to adjtimex, which reports whether the clock is synchronised (docs/operate.md)."""
 PUBLIC, PRIVATE = "192.0.2.1", "10.9.8.7"
-"""Addresses that the guest gives itself; the first is of TEST-NET-1 (RFC 5737), outside of every private network."""
+"""Additional addresses of the guest. The first is from TEST-NET-1 (RFC 5737), outside of every private network."""
 INIT_MODULE = {"x86_64": 175, "aarch64": 105}[platform.machine()]
 FORBIDDEN = {
     "write to /usr": "open('/usr/probe', 'w')",
@@ -43,7 +43,7 @@ FORBIDDEN = {
     "open a packet socket": "import socket; socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)",
     "load a module": (
         "import ctypes, errno; l = ctypes.CDLL(None, use_errno=True); "
-        f"l.syscall({INIT_MODULE}, 0, 0, 0); assert ctypes.get_errno() != errno.EPERM"  # who may gets ENOEXEC
+        f"l.syscall({INIT_MODULE}, 0, 0, 0); assert ctypes.get_errno() != errno.EPERM"  # if permitted: ENOEXEC
     ),
     "make a node": "import os, stat; os.mknod('/dev/shm/n', stat.S_IFCHR | 0o600, os.makedev(1, 3))",
     "make a set-uid file": "import os; open('/dev/shm/s', 'w'); os.chmod('/dev/shm/s', 0o4755)",
@@ -52,9 +52,9 @@ FORBIDDEN = {
 operation."""
 LEFT = ("/usr/probe", "/etc/probe", "/dev/shm/n", "/dev/shm/s")
 FREE_FOR_ROOT = {"see other users' processes"}
-"""hidepid= of /proc, by which ProtectProc= works, leaves members of group root alone (proc(5), `gid=`)."""
+"""Operations that ProtectProc= does not forbid for root: hidepid= of /proc exempts the group root (proc(5), `gid=`)."""
 NOT_FOR_ROOT = "StateDirectory"
-"""Begin of settings by which systemd would give the daemon's state to root."""
+"""Prefix of the settings with which systemd would give the daemon's state to root."""
 NEEDED = {
     "ask the kernel for the clock's state": (
         "import ctypes; b = ctypes.create_string_buffer(512); assert ctypes.CDLL(None).adjtimex(b) >= 0"
@@ -63,7 +63,7 @@ NEEDED = {
         "import os; f = '/var/lib/imud/probe'; open(f, 'w').close(); os.chown(f, -1, os.getgid()); os.unlink(f)"
     ),
     "send a packet to a private network": f"import socket; socket.socket(2, 2).sendto(b'', ('{PRIVATE}', 9))",
-    "read when the machine was started, for the metrics of the process": "open('/proc/stat').read()",
+    "read the start time of the host, for the metrics of the process": "open('/proc/stat').read()",
 }
 """Necessary operations of imud except for opening devices. A setting that breaks one of them would show late or
 never."""
@@ -123,26 +123,26 @@ def check(checks: Checks, _host: Host) -> None:
     of_root = tried(FORBIDDEN, [one for one in settings if not one.startswith(NOT_FOR_ROOT)], user="root")
     judge(checks, able, results, of_root)
     for name in NEEDED:
-        with checks(f"confined as the unit is, a program may {name}"):
+        with checks(f"with the settings of the unit, a program may {name}"):
             expect("result", results[name], "")
     for node in nodes:
-        with checks(f"{node} opens under the unit's settings"):
+        with checks(f"with the settings of the unit, {node} can be opened"):
             expect("result", results[node], "")
 
 
 def judge(checks: Checks, able: dict[str, str], results: dict[str, str], of_root: dict[str, str]) -> None:
-    """A check for each of FORBIDDEN, by what was raised: for root without the settings, the user and root with them."""
+    """Add a check for each row of FORBIDDEN, from the exceptions without settings, of the user, and of root."""
     for name in FORBIDDEN:
-        with checks(f"confined as the unit is, a program may not {name}, which root may without the unit"):
+        with checks(f"with the settings of the unit, a program may not {name}; root may without them"):
             expect("result of root without the unit's settings", able[name], "")
             refused("the service's user", results[name])
             if name not in FREE_FOR_ROOT:
-                refused("root under the unit's settings", of_root[name])
+                refused("root with the unit's settings", of_root[name])
 
 
 def refused(who: str, result: str) -> None:
     if "Error" not in result:
-        raise Failed(f"{who}: {result or 'could'}")
+        raise Failed(f"{who}: expected an error, got {result or 'success'}")
 
 
 def present_nodes(checks: Checks) -> list[str]:
@@ -151,8 +151,8 @@ def present_nodes(checks: Checks) -> list[str]:
     for pattern in buses.NODES[platform.machine()]:
         nodes = sorted(str(path) for path in Path("/dev").glob(pattern))
         if not nodes:
-            with checks(f"/dev/{pattern} is there"):
-                raise Failed("the rig has none: was its driver loaded (README.md, What the guest has)?")
+            with checks(f"/dev/{pattern} exists"):
+                raise Failed("expected such a node; is its driver loaded (README.md, What the guest has)?")
         found += nodes[:1]
     return found
 
@@ -171,4 +171,4 @@ def tried(snippets: dict[str, str], settings: list[str], user: str = "imud") -> 
         if line.startswith("{"):
             found: dict[str, str] = json.loads(line)
             return found
-    raise Failed(said or "the confined program said nothing")
+    raise Failed(said or "expected a result of the confined program, got none")

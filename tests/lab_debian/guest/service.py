@@ -1,4 +1,4 @@
-"""The life of the service: start, watchdog, reload, kill, a configuration that cannot be used."""
+"""The service: start, watchdog, reload, kill, and a configuration that cannot be used."""
 
 import os
 import signal
@@ -40,7 +40,7 @@ CAN = """\
 """
 CAN_RATE_HZ = 20
 NOTIFY_RELOAD_SINCE = 253
-"""Version of systemd; trixie has 257, bookworm 252."""
+"""Version of systemd with Type=notify-reload. trixie has 257, bookworm 252."""
 START_LIMIT_S = 400
 """Time limit, s, above TimeoutStartSec=, so that the limit of systemd acts first."""
 
@@ -54,32 +54,32 @@ def check(checks: Checks, host: Host) -> None:
 
 def check_reload(checks: Checks) -> None:
     """Check `systemctl reload` with a valid file and with an invalid file."""
-    with checks("a reload is waited for where systemd can"):
+    with checks("systemctl waits for a reload if systemd supports it"):
         waits = int(must("systemctl", "--version").split()[1]) >= NOTIFY_RELOAD_SINCE
         expect("type", shown("Type"), "notify-reload" if waits else "notify")
         if waits:
             configure(USB)
             must("systemctl", "reload", UNIT)
-            expect("the device that is not in the file any more, right after", device("can"), None)
+            expect("the removed device, immediately after the reload", device("can"), None)
             configure(USB + CAN)
             must("systemctl", "reload", UNIT)
-            assert device("can"), "the device that came back is not there right after"
+            assert device("can"), "expected the added device immediately after the reload"
             wait_streaming("can")
-    with checks("reload of a changed file keeps the process and the devices that did not change"):
+    with checks("a reload keeps the process and the unchanged devices"):
         before, seq = pid(), newest("usb")
         configure(USB)
         must("systemctl", "reload", UNIT)
-        wait_until(lambda: device("can") is None, "the device that is not in the file any more is gone")
+        wait_until(lambda: device("can") is None, "the removal of the device")
         expect("process", pid(), before)
-        assert newest("usb") >= seq, "the device that did not change began anew"
+        assert newest("usb") >= seq, "expected no restart of the unchanged device"
         configure(USB + CAN)
         must("systemctl", "reload", UNIT)
         wait_streaming("can")
-    with checks("reload of a file with a mistake changes nothing and is in the log"):
+    with checks("a reload of an invalid file changes nothing and is in the log"):
         before, since = pid(), mark()
         configure(USB.replace("baud:", "bauds:") + CAN)
         run("systemctl", "reload", UNIT)
-        wait_until(lambda: "bauds" in journal(since), "the mistake in the log")
+        wait_until(lambda: "bauds" in journal(since), "the error in the log")
         expect("process", pid(), before)
         expect("active", shown("ActiveState"), "active")
         wait_streaming("usb")
@@ -88,7 +88,7 @@ def check_reload(checks: Checks) -> None:
 
 
 def check_ends(checks: Checks) -> None:
-    with checks("a daemon that hangs is killed by the watchdog and started again"):
+    with checks("the watchdog kills a hung daemon, and systemd restarts it"):
         before, restarts, said = pid(), int(shown("NRestarts")), len(console())
         os.kill(before, signal.SIGSTOP)
         start_s = time.monotonic()
@@ -98,7 +98,7 @@ def check_ends(checks: Checks) -> None:
         wait_until(lambda: "Failed with result 'watchdog'" in console()[said:], "the watchdog as the reason")
         wait_streaming("usb")
         wait_streaming("can")
-    with checks("a daemon that is killed is started again, with its rings"):
+    with checks("systemd restarts a killed daemon, with its rings"):
         before = pid()
         run("systemctl", "kill", "--signal", "SIGKILL", UNIT)
         start_s = time.monotonic()
@@ -106,29 +106,29 @@ def check_ends(checks: Checks) -> None:
         wait_streaming("usb")
         checks.figure("SIGKILL to samples again", time.monotonic() - start_s, "s")
         expect("rings", sorted(path.name for path in RINGS.iterdir()), ["imud.can", "imud.usb"])
-    with checks("a stop is clean and leaves no ring and no socket"):
+    with checks("a stop removes rings and socket"):
         must("systemctl", "stop", UNIT)
         expect("result", shown("Result"), "success")
-        assert not Path("/run/imud").exists(), "the runtime directory is left"
+        assert not Path("/run/imud").exists(), "expected no runtime directory"
 
 
 def check_refused_starts(checks: Checks) -> None:
     """Starts that must fail once, and starts that must not fail."""
-    with checks("a configuration that cannot be used is not tried again"):
+    with checks("an invalid configuration causes no restart"):
         configure("devices: {}: {}\n")
         assert run("systemctl", "start", UNIT, limit_s=START_LIMIT_S).returncode, "it started"
-        time.sleep(2 * 2.5)  # RestartSec= is 2 s
+        time.sleep(2 * 2.5)  # more than RestartSec=, 2 s
         expect("state", shown("ActiveState"), "failed")
         expect("exit status", shown("ExecMainStatus"), "78")
         expect("restarts", shown("NRestarts"), "0")
-    with checks("a metrics port that is taken does not end the service"):
+    with checks("a used metrics port does not end the service"):
         background("busyport", "/usr/bin/python3", "-c", BUSY_PORT)
         wait_until(lambda: "9321" in run("ss", "--listening", "--tcp", "--numeric").stdout, "a listener on the port")
         configure(USB + CAN)
         start_service()
         wait_streaming("usb")
         must("systemctl", "stop", "busyport")
-        wait_until(metrics, "metrics once the port is free")
+        wait_until(metrics, "metrics after the port is free")
 
 
 BUSY_PORT = """
@@ -139,8 +139,8 @@ signal.pause()
 
 
 def check_streaming(checks: Checks, _host: Host) -> None:
-    """A start with a sensor on USB and one on CAN, up to samples in every output."""
-    with checks("a virtual CAN bus with a simulated module"):
+    """Check a start with a sensor on USB and a sensor on CAN, until every output contains samples."""
+    with checks("a virtual CAN bus with a simulated device"):
         must("modprobe", "vcan")
         if run("ip", "link", "show", "vcan0").returncode:
             must("ip", "link", "add", "dev", "vcan0", "type", "vcan")
@@ -160,14 +160,14 @@ def check_streaming(checks: Checks, _host: Host) -> None:
         usb = wait_streaming("usb")
         checks.figure("READY to samples", time.monotonic() - start_s, "s")
         wait_streaming("can")
-        wait_until(lambda: (device("usb") or usb)["identity"].get("product"), "the product of the module on USB")
-    with checks("systemctl status says how many run"):
+        wait_until(lambda: (device("usb") or usb)["identity"].get("product"), "the product of the device on USB")
+    with checks("systemctl status shows the number of running devices"):
         wait_until(lambda: shown("StatusText") == "2 of 2 devices running.", f"two: {shown('StatusText')}")
-    with checks("rings, socket and metrics have the samples"):
+    with checks("rings, socket and metrics contain the samples"):
         must(PYTHON, "-c", "from imud.client import Ring\nwith Ring('usb') as ring: assert ring.latest() is not None")
         must("sh", "-c", "imud devices | grep --quiet 'usb.*running'")
         wait_until(metrics, "metrics")
-    with checks("the log has priorities and begins with the version"):
+    with checks("the log has priorities and starts with the version"):
         said = must("journalctl", "--no-pager", "--output", "cat", "--unit", UNIT, "--priority", "info..info")
         expect_in("has started", said, "log")
         expect("lines with a priority in their text", [line for line in journal().splitlines() if line[:1] == "<"], [])

@@ -1,4 +1,4 @@
-"""The guest's system as the checks see and change it: programs, units, users, the daemon's socket, the USB adapter."""
+"""The guest's system for the checks: programs, units, users, the daemon's socket, the USB adapter."""
 
 import json
 import re
@@ -16,7 +16,7 @@ EXAMPLE = Path("/run/example.yaml")
 SOCKET = "/run/imud/imud.sock"
 RINGS = Path("/run/imud/shm")
 PYTHON = "/usr/lib/imud/bin/python3"
-"""The package's own interpreter: it has imud, clients and simulators."""
+"""The interpreter of the package, with imud, clients and simulators."""
 UNIT = "imud.service"
 NODE = Path("/dev/ttyUSB0")
 REQUESTS = "/dev/virtio-ports/requests"
@@ -51,7 +51,7 @@ def configure(text: str) -> None:
 
 
 def journal(since: str = "") -> str:
-    """Messages of the service since a mark (`mark()`)."""
+    """Return the messages of the service since a mark (`mark()`)."""
     must("journalctl", "--sync")
     after = ["--after-cursor", since] if since else []
     return must("journalctl", "--no-pager", "--output", "cat", "--unit", UNIT, *after)
@@ -63,7 +63,7 @@ def console() -> str:
 
 
 def mark() -> str:
-    """The journal's end, for `journal`."""
+    """Return the end of the journal, for `journal`."""
     must("journalctl", "--sync")
     last = must("journalctl", "--no-pager", "--lines", "1", "--output", "json", "--output-fields", "MESSAGE").strip()
     return str(json.loads(last)["__CURSOR"])
@@ -93,7 +93,7 @@ def device(name: str) -> dict[str, Any] | None:
 
 
 def streams(name: str) -> dict[str, Any] | None:
-    """Status of the device when it runs and its newest sample is less than a second old; None otherwise."""
+    """Return the status of the device if it runs and its newest sample is less than a second old; otherwise None."""
     found = device(name)
     if found is None or found["state"] != "running":
         return None
@@ -124,7 +124,7 @@ def ensure_running(text: str) -> None:
 
 
 class Host:
-    """The program on the host that has the adapter's cable in its hand."""
+    """The program on the host that plugs and unplugs the adapter."""
 
     def __init__(self) -> None:
         self._port: IO[bytes] = open(REQUESTS, "r+b", buffering=0)  # noqa: SIM115 - open as long as the run
@@ -135,25 +135,25 @@ class Host:
         while not reply.endswith(b"\n"):
             reply += self._port.read(1)
         if reply != b"ok\n":
-            raise Failed(f"{word}: the rig answered {reply.decode()!r}")
+            raise Failed(f"{word}: expected ok from the lab, got {reply.decode()!r}")
 
     def unplug(self) -> None:
         self.ask("unplug")
         wait_until(lambda: not NODE.exists(), f"{NODE} gone")
 
     def plug(self) -> float:
-        """Plug the adapter in; return CLOCK_MONOTONIC in seconds when its node was there, within 5 ms."""
+        """Plug the adapter in. Return CLOCK_MONOTONIC when its node existed, s, within 5 ms."""
         self.ask("plug")
         give_up_s = time.monotonic() + LIMIT_S
         while not NODE.exists():
             if time.monotonic() > give_up_s:
-                raise Failed(f"{NODE} did not come back")
+                raise Failed(f"expected {NODE} after the adapter was plugged in")
             time.sleep(0.005)
         return time.monotonic()
 
 
 def background(unit: str, *command: str, properties: tuple[str, ...] = ()) -> None:
-    """Start a program as a transient service that later checks can stop by name."""
+    """Start a program as a transient service, so that later checks can stop it by name."""
     options = [word for text in properties for word in ("--property", text)]
     must("systemd-run", "--quiet", "--collect", f"--unit={unit}", *options, *command)
 
@@ -162,24 +162,24 @@ NOT_CONFINING = (
     *("Type", "Exec", "Restart", "Watchdog", "Notify", "User", "Group", "Timeout", "Runtime", "Success"),
     *("After", "Wants", "Before", "Condition", "StartLimit", "Description", "Documentation", "WantedBy"),
 )
-"""Begins of names of the unit's settings that a transient unit does not take, or gets otherwise."""
+"""Prefixes of unit settings that a transient unit does not support or receives in another way."""
 
 
 def confinement() -> list[str]:
-    """The settings of the unit's [Service] section that confine, for a transient unit."""
+    """Return the settings of the unit's [Service] section that confine the service, for a transient unit."""
     lines = must("systemctl", "cat", UNIT).splitlines()
     settings = [line for line in lines if re.match(r"[A-Z]\w+=", line) and not line.startswith(NOT_CONFINING)]
     return [one for line in settings for one in _single_networks(line)]
 
 
 def _single_networks(setting: str) -> list[str]:
-    """A list of networks as one setting for each: systemd-run reads a word such as `localhost` only alone."""
+    """Return one setting for each network of a list: systemd-run accepts a word such as `localhost` only alone."""
     name, _, value = setting.partition("=")
     return [f"{name}={word}" for word in value.split()] if name.startswith("IPAddress") else [setting]
 
 
 def confined(code: str, *properties: str, user: str = "imud") -> str:
-    """Output of a piece of Python that runs as the service's user and groups, with further properties of a unit."""
+    """Run Python code as the service's user and groups with further unit settings. Return its output."""
     options = [f"User={user}", f"Group={user}", *properties]
     words = [word for text in options for word in ("--property", text)]
     return run("systemd-run", "--quiet", "--wait", "--pipe", "--collect", *words, "/usr/bin/python3", "-c", code).stdout

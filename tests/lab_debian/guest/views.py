@@ -1,4 +1,4 @@
-"""The page in the browser as a service of its own, and a daemon whose MQTT broker is not there."""
+"""The page in the browser as a service of its own, and a daemon without its MQTT broker."""
 
 import json
 import re
@@ -82,20 +82,20 @@ def check(checks: Checks, _host: Host) -> None:
 
 
 def check_page(checks: Checks) -> None:
-    with checks("imud-web starts, and its page answers on this machine"):
+    with checks("imud-web starts and serves its page on this host"):
         must("systemctl", "start", UNIT)
         wait_until(lambda: fetch("/")[0] == 200, "the page")
         expect_in("<!doctype html>", fetch("/")[1].lower(), "page")
-    with checks("imud-web listens on this machine only, as a user of its own"):
+    with checks("imud-web listens only on this host, as a user of its own"):
         listening = must("ss", "--listening", "--tcp", "--numeric", "--no-header", f"sport = :{PORT}")
         expect("addresses", [line.split()[3] for line in listening.splitlines()], [f"127.0.0.1:{PORT}"])
         must("ip", "address", "replace", f"{PRIVATE}/32", "dev", "lo")
         expect("status on another address", fetch("/", PRIVATE)[0], 0)
         process = Path(f"/proc/{shown('MainPID', UNIT)}/status").read_text()
-        assert not re.search(r"^Uid:\t0\t", process, re.MULTILINE), "it runs as root"
+        assert not re.search(r"^Uid:\t0\t", process, re.MULTILINE), "expected another user than root"
         expect_in("CapEff:\t0000000000000000", process, "status")
         expect_in("Seccomp:\t2", process, "status")
-    with checks("without a token nobody changes anything by imud-web"):
+    with checks("imud-web permits no change without a token"):
         expect("who looks", fetch("/api/call", body=LOOK)[0], 200)
         expect("who changes", fetch("/api/call", body=CHANGE)[0], 401)
 
@@ -108,7 +108,7 @@ def check_confinement(checks: Checks) -> None:
             raise Failed(said)
         checks.figure("exposure of imud-web (systemd-analyze security)", float(found[1]), "of 10")
         assert float(found[1]) <= SCORE_MAX, f"score {found[1]}"
-    with checks("imud-web stays when the daemon is restarted"):
+    with checks("imud-web continues when the daemon restarts"):
         before = shown("MainPID", UNIT)
         start_service()
         wait_streaming("usb")
@@ -121,7 +121,7 @@ def check_confinement(checks: Checks) -> None:
 
 
 def check_token(checks: Checks) -> None:
-    with checks("on all addresses imud-web needs its token, and with it a module is asked"):
+    with checks("imud-web on all addresses needs its token, and sends requests to a device with it"):
         TOKEN_FILE.write_text(f"{TOKEN}\n")
         TOKEN_FILE.chmod(0o600)
         DROP_IN.parent.mkdir(exist_ok=True)
@@ -129,12 +129,12 @@ def check_token(checks: Checks) -> None:
         must("systemctl", "daemon-reload")
         try:
             must("systemctl", "start", UNIT)
-            wait_until(lambda: fetch("/", PRIVATE)[0], "an answer on another address")
+            wait_until(lambda: fetch("/", PRIVATE)[0], "a reply on another address")
             for token in ("", TOKEN[:-1] + "x"):
-                expect("a stranger who looks", fetch("/api/call", PRIVATE, token, LOOK)[0], 401)
-                expect("a stranger who changes", fetch("/api/call", PRIVATE, token, CHANGE)[0], 401)
+                expect("a read without the token", fetch("/api/call", PRIVATE, token, LOOK)[0], 401)
+                expect("a change without the token", fetch("/api/call", PRIVATE, token, CHANGE)[0], 401)
             expect_in("output", fetch("/api/call", PRIVATE, TOKEN, LOOK)[1], "actions")
-            expect_in('"result"', fetch("/api/call", PRIVATE, TOKEN, CHANGE)[1], "answer to a change")
+            expect_in('"result"', fetch("/api/call", PRIVATE, TOKEN, CHANGE)[1], "reply to a change")
         finally:
             run("systemctl", "stop", UNIT)
             DROP_IN.unlink()
@@ -145,17 +145,18 @@ def check_token(checks: Checks) -> None:
 
 def check_no_broker(checks: Checks) -> None:
     """Check the enabled output without a broker."""
-    with checks("a daemon whose MQTT broker is not there streams on, keeps its messages, and is not restarted"):
+    with checks("a daemon without its MQTT broker continues, keeps its messages, and does not restart"):
         since = mark()
         configure(NO_BROKER + USB + CAN)
         start_service()
         before = pid()
         wait_streaming("usb")
-        wait_until(lambda: "127.0.0.1:1" in journal(since), "what is wrong, in the log")
+        wait_until(lambda: "127.0.0.1:1" in journal(since), "the problem in the log")
         wait_until(lambda: any(Path("/var/lib/imud/mqtt").rglob("*")), "the spool")
         began = (device("usb") or {})["newest_seq"]
         wait_until(
-            lambda: (device("usb") or {})["newest_seq"] > began + STAYS_S * RATE_HZ, f"samples of {STAYS_S} s more"
+            lambda: (device("usb") or {})["newest_seq"] > began + STAYS_S * RATE_HZ,
+            f"samples of {STAYS_S} more seconds",
         )
         expect("process", pid(), before)
         expect("restarts", shown("NRestarts"), "0")

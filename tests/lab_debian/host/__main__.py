@@ -1,7 +1,7 @@
 """`tests/lab_debian/run`: boots Debian releases under QEMU, installs the package of imud, and runs the guest's checks.
 
-Exit status: 0 all checks passed, 1 some failed, 10 if the rig itself failed, with one line on standard error that says
-why; 130 and 143 after SIGINT and SIGTERM.
+Exit status: 0 if all checks passed; 1 if a check failed; 10 if the lab itself failed, with the cause on standard error;
+130 and 143 after SIGINT and SIGTERM.
 """
 
 import argparse
@@ -28,17 +28,17 @@ LIMITS = guest.Limits(total_s=3600.0, boot_s=1800.0, silence_s=300.0)
 SIMULATOR_LIMIT_S = 60.0
 POLL_S = 0.05
 SIMULATED_RATE_HZ = 20
-"""QEMU's adapter buffers 384 bytes: four frames, 200 ms of a host that stalls."""
+"""Rate of the simulated sensor, Hz. QEMU's adapter buffers 384 bytes: four frames, 200 ms at this rate."""
 BYTECODE = "__pycache__"
 
 
 def parser() -> argparse.ArgumentParser:
-    options = Parser(prog="tests/lab_debian/run", allow_abbrev=False, description="Checks the package on Debian.")
-    options.add_argument("--ci", action="store_true", help="where it cannot run say so and succeed")
-    options.add_argument("--arm64", action="store_true", help="arm64, with unit tests, instead of amd64")
-    options.add_argument("--suite", choices=[release.suite for release in AMD64], help="only this release")
-    options.add_argument("--build-only", action="store_true", help="make images and packages, do not boot")
-    options.add_argument("--short", action="store_true", help="the adapter is plugged in again twice, not ten times")
+    options = Parser(prog="tests/lab_debian/run", allow_abbrev=False, description="Check the package on Debian.")
+    options.add_argument("--ci", action="store_true", help="exit with 0 and a message if the lab cannot run")
+    options.add_argument("--arm64", action="store_true", help="use arm64, with unit tests, instead of amd64")
+    options.add_argument("--suite", choices=[release.suite for release in AMD64], help="run only this release")
+    options.add_argument("--build-only", action="store_true", help="build images and packages, do not boot")
+    options.add_argument("--short", action="store_true", help="plug the adapter in twice, not ten times")
     options.add_argument("--package", type=Path, metavar="DEB", help="install this package instead of building one")
     options.add_argument("--exec", metavar="COMMAND", help="run this shell command in the guest instead of the checks")
     options.add_argument("--venv", type=Path, default=ROOT / ".venv", help="default: .venv")
@@ -54,9 +54,9 @@ def say(line: str) -> None:
 def chosen(options: argparse.Namespace) -> list[Release]:
     found = [release for release in (ARM64 if options.arm64 else AMD64) if options.suite in (None, release.suite)]
     if unit_tests.NAME in options.only and not options.arm64:
-        raise LabError(f"{unit_tests.NAME} are for an architecture that the host has not: --arm64")
+        raise LabError(f"cannot run {unit_tests.NAME} for the architecture of the host; try --arm64")
     if not found:
-        raise LabError(f"there is no {options.suite} for arm64, only {', '.join(r.suite for r in ARM64)}")
+        raise LabError(f"--suite: expected {', '.join(r.suite for r in ARM64)} for arm64, got {options.suite}")
     return found
 
 
@@ -69,7 +69,7 @@ def program(options: argparse.Namespace, release: Release, groups: list[str]) ->
 
 @contextlib.contextmanager
 def simulator(python: Path, node: Path) -> Iterator[int]:
-    """Process number of a simulated sensor behind the pseudo-terminal `node`. LabError if it does not start."""
+    """Simulate a sensor behind the pseudo-terminal `node`. Yield its process id. Raises LabError if it fails."""
     command = [str(python), "-m", "imud.sim", "--path", str(node), "--rate", str(SIMULATED_RATE_HZ)]
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT
@@ -78,7 +78,7 @@ def simulator(python: Path, node: Path) -> Iterator[int]:
         give_up_s = time.monotonic() + SIMULATOR_LIMIT_S
         while not node.exists():
             if process.poll() is not None or time.monotonic() >= give_up_s:
-                raise LabError(f"the simulated sensor did not start: {' '.join(command)}")
+                raise LabError(f"cannot start the simulated sensor: {' '.join(command)}")
             time.sleep(POLL_S)
         yield process.pid
     finally:
@@ -122,7 +122,7 @@ def boot(options: argparse.Namespace, release: Release, groups: list[str], made:
 
 
 def keep(folder: Path, output: Path, failed: bool) -> str:
-    """Keep the guest's journal and results, and after a failure the logs of kernel and QEMU; what was kept for that."""
+    """Keep the guest's journal and results, and after a failure the logs of kernel and QEMU. Return their paths."""
     for name in ("journal.log", "results.json"):
         (output / name).unlink(missing_ok=True)
         if (folder / name).exists():
@@ -139,7 +139,7 @@ def lab(arguments: Sequence[str]) -> int:
         if why := packages.obstacle(release):
             if not options.ci:
                 raise LabError(why)
-            say(f"left out: {why}")
+            say(f"skipped: {why}")
             return 0
     return max(run_release(options, release) for release in releases)
 
@@ -154,7 +154,7 @@ def run_release(options: argparse.Namespace, release: Release) -> int:
     except LabError as error:
         if not options.ci:
             raise
-        say(f"left out: {error}")  # Debian's packages cannot be had
+        say(f"skipped: {error}")  # Debian's packages are not available
         return 0
     package = options.package or packages.build(release, python)
     say(f"{release.name}: image and package after {time.monotonic() - start_s:.0f} s")
@@ -168,7 +168,7 @@ def run_release(options: argparse.Namespace, release: Release) -> int:
     try:
         return max(worst, boot(options, release, checked, made, package))
     except HungGuest as error:
-        say(f"{error}; booting once more")
+        say(f"{error}; booting again")
         return max(worst, boot(options, release, checked, made, package))
 
 

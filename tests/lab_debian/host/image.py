@@ -1,9 +1,9 @@
-"""Makes the image for QEMU once per change of its inputs: a disk with Debian, its kernel, an initramfs.
+"""Creates the image for QEMU once per change of its inputs: a disk with Debian, its kernel, an initramfs.
 
 Packages come from the archives of apt on the host. Only the maintainer scripts of Debian run in a chroot. With
 qemu-user, maintainer scripts of another architecture took more than 40 minutes. Therefore the system is set up for the
 architecture of the host, and then programs, libraries and the records of dpkg are exchanged. The kernel package is only
-unpacked. This module makes the initramfs, because initramfs-tools takes minutes in emulation. Needs root.
+unpacked. This module creates the initramfs, because initramfs-tools takes minutes in emulation. Needs root.
 """
 
 import gzip
@@ -28,12 +28,12 @@ DISK_BYTES = 2 << 30
 NEEDED_BYTES = 3 << 30
 STEP_LIMIT_S = 40 * 60
 CLEAN = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root", "LC_ALL": "C"}
-"""The environment of every step: the host's own settings (of pip, of apt) stay out of the guest."""
+"""Environment of every step, without the host's settings of pip and apt."""
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 HOST = "amd64"
 TRIPLETS = {"amd64": "x86_64-linux-gnu", "arm64": "aarch64-linux-gnu"}
 FOREIGN = {"arm64": "qemu-aarch64"}
-"""Architectures that the host has not, and the names under which its kernel knows their emulation."""
+"""Foreign architectures, with the names of their emulation in the host's kernel."""
 
 MASKED = (
     *("serial-getty@.service", "getty@.service", "getty-static.service", "console-getty.service"),
@@ -47,7 +47,7 @@ MASKED = (
         "systemd-networkd-wait-online.service",
     ),
 )
-"""Units that cost an emulated machine time or disturb the checks, which start their own gpsd and chronyd."""
+"""Units that slow down an emulated system or disturb the checks. The checks start their own gpsd and chronyd."""
 
 INIT = """\
 #!/bin/busybox sh
@@ -71,7 +71,7 @@ class Image:
 
 def built(release: Release, say: Callable[[str], None]) -> Image:
     def make(folder: Path) -> None:
-        say(f"{release.name}: making the image (some minutes, once)")
+        say(f"{release.name}: building the image (some minutes, once)")
         make_image(release, folder)
 
     folder = cache.get(f"debian-{release.name}-{key(release)}", make, NEEDED_BYTES, say, cache.cache_root("-debian"))
@@ -93,7 +93,7 @@ def make_image(release: Release, folder: Path) -> None:
             exchange(release, root, folder / "exchanged", log)
         bootstrap(release, tree, log, "extract", (f"linux-image-{release.architecture}", "busybox-static"))
         if not (tree / "lib").exists():
-            (tree / "lib").symlink_to("usr/lib")  # where trixie's kernel package has its modules
+            (tree / "lib").symlink_to("usr/lib")  # trixie's kernel package has its modules there
         kernel = next((tree / "boot").glob("vmlinuz-*"))
         version = kernel.name.removeprefix("vmlinuz-")
         step(["depmod", "--basedir", str(tree), version], log)
@@ -108,7 +108,7 @@ def make_image(release: Release, folder: Path) -> None:
 
 
 def exchange(release: Release, root: Path, other: Path, log: Path) -> None:
-    """Put the programs of the release's architecture into a root file system that is set up for the host.
+    """Copy the programs of the release's architecture into a root file system that is set up for the host.
 
     The results of maintainer scripts (users, links, enabled units, bytecode) are the same on both.
     """
@@ -119,7 +119,7 @@ def exchange(release: Release, root: Path, other: Path, log: Path) -> None:
     for folder in (root / f"usr/lib/{ours}", root / "usr/lib64", root / "var/cache/ldconfig"):
         shutil.rmtree(folder, ignore_errors=True)
     for name in ("var", "run", "dev"):
-        shutil.rmtree(other / name, ignore_errors=True)  # folders that the first has, some of them as links
+        shutil.rmtree(other / name, ignore_errors=True)  # the target contains these folders, some of them as links
     for name in ("lib64", "etc/ld.so.cache", f"etc/ld.so.conf.d/{ours}.conf"):
         (root / name).unlink(missing_ok=True)
     step(["cp", "--archive", "--remove-destination", f"{other}/.", str(root)], log)
@@ -139,7 +139,7 @@ def enable_emulation(architecture: str) -> None:
     for command in (*mount, ["update-binfmts", "--enable", name]):
         result = subprocess.run(command, capture_output=True, text=True, check=False, env=CLEAN)
         if result.returncode:
-            raise LabError(f"programs for {architecture} do not run here: {command[0]}: {result.stderr.strip()}")
+            raise LabError(f"cannot run programs for {architecture}: {command[0]}: {result.stderr.strip()}")
 
 
 def bootstrap(release: Release, folder: Path, log: Path, variant: str, packages: tuple[str, ...]) -> None:
@@ -151,7 +151,7 @@ def bootstrap(release: Release, folder: Path, log: Path, variant: str, packages:
         *("mmdebstrap", "--verbose", "--mode=root", f"--variant={variant}", f"--architectures={release.architecture}"),
         *(f"--include={','.join(packages)}", '--aptopt=Acquire::Languages "none"'),
         *('--aptopt=APT::Install-Recommends "false"', '--aptopt=Acquire::Check-Valid-Until "false"'),
-        "--dpkgopt=force-unsafe-io",  # an interrupted image is deleted
+        "--dpkgopt=force-unsafe-io",  # safe: an interrupted image is deleted
         *(f"--dpkgopt=path-exclude=/usr/share/{part}/*" for part in ("man", "doc", "locale")),
         *(release.suite, str(folder), "-"),
     ]
@@ -167,7 +167,9 @@ def archives() -> tuple[str, str]:
     main = next((uri for name, uri in uris.items() if "-" not in name), "")
     security = next((uri for name, uri in uris.items() if name.endswith("-security")), "")
     if not main or not security:
-        raise LabError("apt knows no Debian archive, or none with security updates (apt-get update)")
+        raise LabError(
+            "cannot find Debian's archive and its security updates in the configuration of apt; try apt-get update"
+        )
     return main, security
 
 
@@ -200,7 +202,7 @@ def files_of(tree: Path, version: str, modules: tuple[str, ...]) -> list[Path]:
 
 
 def unpacked(module: Path) -> bytes:
-    """A module's bytes; trixie packs them."""
+    """Return a module's bytes, uncompressed. trixie compresses modules."""
     return lzma.decompress(module.read_bytes()) if module.suffix == ".xz" else module.read_bytes()
 
 
@@ -218,7 +220,7 @@ def copy_modules(tree: Path, version: str, root: Path, log: Path) -> None:
 
 
 def prepare_root(root: Path) -> None:
-    """Make the root file system start the rig's program and nothing that it has no use for."""
+    """Let the root file system start the lab's program, and no unnecessary units."""
     shutil.copytree(ROOT_FILES, root, dirs_exist_ok=True, symlinks=True)
     (root / "etc/hostname").write_text("lab\n", encoding="ascii")
     (root / "etc/fstab").write_text("", encoding="ascii")
@@ -250,7 +252,7 @@ def step(command: list[str], log: Path, text: str = "", folder: Path | None = No
                 input=text.encode(), stdout=out, stderr=out, env=CLEAN, cwd=folder, timeout=STEP_LIMIT_S, check=False
             ).returncode  # fmt: skip
         except subprocess.TimeoutExpired as error:
-            raise LabError(f"{command[0]} did not end within {STEP_LIMIT_S} s") from error
+            raise LabError(f"expected the end of {command[0]} within {STEP_LIMIT_S} s") from error
     if status:
         lines = [line for line in log.read_text("utf-8", "replace").splitlines() if line.strip()]
         raise LabError(f"{command[0]} failed: {lines[-1]}")

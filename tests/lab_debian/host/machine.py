@@ -1,4 +1,4 @@
-"""The guest's machine: QEMU's command line, and its control by QMP."""
+"""The virtual machine of the guest: QEMU's command line, and its control with QMP."""
 
 import json
 import socket
@@ -15,11 +15,11 @@ PLATFORMS = {
     "amd64": ("q35", "max", "ttyS0"),
     "arm64": ("virt,gic-version=3", "cortex-a72", "ttyAMA0"),
 }
-"""Machine, processor and console by architecture. Processors are always emulated: results must not depend on KVM."""
+"""Machine, processor and console by architecture. Processors are always emulated: results do not depend on KVM."""
 
 ADAPTER = {"driver": "usb-serial", "chardev": "imu", "id": "imu", "bus": "xhci.0", "serial": "LAB0001"}
-"""An FTDI adapter to the guest: ftdi_sio, /dev/ttyUSB0, /dev/serial/by-id/usb-QEMU_…; without a serial number of its
-own it gets that of the USB port, which is another when it is plugged in again."""
+"""Adapter of the guest, an FTDI: ftdi_sio, /dev/ttyUSB0, /dev/serial/by-id/usb-QEMU_…. The serial number is explicit,
+because QEMU would otherwise derive it from the USB port, which changes."""
 BUSES = {
     "amd64": (
         *("-smbios", "type=1,manufacturer=PC Engines", "-smbios", "type=2,product=apu2"),
@@ -27,12 +27,12 @@ BUSES = {
     ),
     "arm64": (),
 }
-"""Debian's kernel for amd64 has no gpio-sim, and no SPI controller that QEMU has. By these names pcengines-apuv2 takes
-the machine for a board whose GPIO registers are at an address where QEMU has nothing: lines without effect.
-spi-butterfly makes an SPI bus of a parallel port: one on which nothing answers. On arm64 `-M virt` has a PL061, and no
+"""Options for buses. Debian's kernel for amd64 has neither gpio-sim nor a driver for an SPI controller of QEMU. Due to
+these names, pcengines-apuv2 assumes a board with GPIO registers at an address that QEMU does not use: the lines have no
+effect. spi-butterfly creates an SPI bus on a parallel port, without devices. On arm64, `-M virt` has a PL061 and no
 SPI."""
 REQUESTS = "requests"
-"""Name of the socket for requests of the guest to the rig, one line each."""
+"""Name of the socket for requests of the guest to the host, one line each."""
 QMP = "qmp"
 SENSOR = "sensor"
 CONSOLE_OPTIONS = "systemd.show_status=yes systemd.log_target=console"
@@ -48,12 +48,12 @@ class DebianMachine:
     share: Path
     """Folder that the guest may write, its /run/lab."""
     sockets: Path
-    """Folder of REQUESTS, QMP and SENSOR: with a short name, since the path of a socket has 107 bytes at most."""
+    """Folder of REQUESTS, QMP and SENSOR. Its name is short, because the path of a socket has at most 107 bytes."""
     memory_mb: int = 1024
     processors: int = 2
 
     def command(self, monitor_fd: int) -> list[str]:
-        """QEMU's argument vector. The guest's live output is QEMU's standard output; `monitor_fd` is a socket."""
+        """Return QEMU's arguments. Standard output receives the guest's output. `monitor_fd` is a socket."""
         machine, processor, console = PLATFORMS[self.release.architecture]
         return [
             *(self.release.qemu, "-nodefaults", "-no-user-config", "-no-reboot", "-display", "none"),
@@ -91,10 +91,10 @@ class Qmp:
     """QEMU's control socket. Synchronization: one thread."""
 
     def __init__(self, path: Path, limit_s: float = CONNECT_LIMIT_S) -> None:
-        """LabError if QEMU does not open the socket within `limit_s`."""
+        """Connect to QEMU. Raises LabError if QEMU does not open the socket within `limit_s`."""
         self._socket = connected(path, limit_s)
         self._lines: IO[str] = self._socket.makefile("r", encoding="utf-8")
-        self._read()  # the greeting
+        self._read()  # greeting
         self.ask({"execute": "qmp_capabilities"})
 
     def __enter__(self) -> Self:
@@ -105,11 +105,11 @@ class Qmp:
         self._socket.close()
 
     def plug(self) -> None:
-        """Plug the USB adapter in. LabError if QEMU refuses."""
+        """Plug the USB adapter in. Raises LabError if QEMU reports an error."""
         self.ask({"execute": "device_add", "arguments": ADAPTER})
 
     def unplug(self) -> None:
-        """Pull the USB adapter; return when it is gone. LabError if QEMU refuses."""
+        """Unplug the USB adapter. Return after QEMU has removed it. Raises LabError if QEMU reports an error."""
         self.ask({"execute": "device_del", "arguments": {"id": ADAPTER["id"]}}, event="DEVICE_DELETED")
 
     def ask(self, command: dict[str, object], event: str = "") -> None:
@@ -127,9 +127,9 @@ class Qmp:
         try:
             line = self._lines.readline()
         except OSError as error:
-            raise LabError(f"QEMU gave no answer: {error}") from error
+            raise LabError(f"cannot read the reply of QEMU: {error}") from error
         if not line:
-            raise LabError("QEMU closed its control socket")
+            raise LabError("expected a reply of QEMU; it closed its control socket")
         message: dict[str, object] = json.loads(line)
         return message
 
@@ -144,7 +144,7 @@ def connected(path: Path, limit_s: float) -> socket.socket:
         except OSError as error:
             sock.close()
             if time.monotonic() >= give_up_s:
-                raise LabError(f"no program listens at {path} after {limit_s:.0f} s") from error
+                raise LabError(f"cannot connect to {path} within {limit_s:.0f} s") from error
             time.sleep(POLL_S)
         else:
             sock.settimeout(ANSWER_LIMIT_S)
@@ -152,5 +152,5 @@ def connected(path: Path, limit_s: float) -> socket.socket:
 
 
 def _escaped(path: Path) -> str:
-    """QEMU's option syntax doubles commas inside values."""
+    """Escape a value: QEMU's option syntax needs double commas."""
     return str(path).replace(",", ",,")

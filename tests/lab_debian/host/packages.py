@@ -1,4 +1,4 @@
-"""The Debian packages that the rig needs on the host, and the packages of imud that a run installs."""
+"""The Debian packages that the lab needs on the host, and the packages of imud that a run installs."""
 
 import os
 import platform
@@ -18,7 +18,7 @@ EMULATORS = {
     "amd64": ("qemu-system-x86",),
     "arm64": ("qemu-system-arm", "qemu-user-static", "binfmt-support", "arch-test"),
 }
-"""Names of the machine, and of the emulator of maintainer scripts for an architecture that the host does not have."""
+"""QEMU's package for the virtual machine and for emulated maintainer scripts, by foreign architecture."""
 BUILD = ROOT / "packaging" / "debian" / "build"
 BUILT = ROOT / "build" / "deb"
 BUILD_LIMIT_S = 30 * 60
@@ -26,7 +26,7 @@ NEXT = "+lab1"
 
 
 def missing(release: Release) -> list[str]:
-    """Names of Debian packages that a run of `release` needs and that are not installed."""
+    """Return the names of the Debian packages that a run of `release` needs and that are not installed."""
     names = [*NEEDED, *EMULATORS[release.architecture]]
     present = installed_versions(names)
     return [name for name in names if name not in present]
@@ -35,23 +35,23 @@ def missing(release: Release) -> list[str]:
 def obstacle(release: Release) -> str:
     """Return why this host cannot run `release`, one line; empty if it can."""
     if platform.machine() != "x86_64":
-        return f"the rig is for x86_64, not {platform.machine()}"
+        return f"expected an x86_64 host, got {platform.machine()}"
     if os.geteuid() != 0:
-        return "root is needed to make the root file systems"
+        return "cannot build root file systems without root; run as root"
     if shutil.which("apt-get") is None:
-        return "apt-get is not there: the rig takes Debian from where the host's apt takes it"
+        return "cannot find apt-get: the lab installs Debian from the archives of the host's apt"
     if absent := missing(release):
-        return f"missing Debian packages: {' '.join(absent)} (make {deps_target(release)} installs them)"
+        return f"missing Debian packages: {' '.join(absent)}; try make {deps_target(release)}"
     return ""
 
 
 def deps_target(release: Release) -> str:
-    """Make's target that installs what is missing."""
+    """Return the target of make that installs the missing packages."""
     return "lab-debian-deps" if release.architecture == "amd64" else "lab-arm64-deps"
 
 
 def build(release: Release, python: Path) -> Path:
-    """Make the package of imud for `release` as `make deb` does, and return it. LabError with its last line."""
+    """Build the package of imud for `release` like `make deb`, and return it. Raises LabError with its last line."""
     command = [str(BUILD), release.suite, release.architecture]
     environment = {**os.environ, "PYTHON": str(python)}
     try:
@@ -59,15 +59,15 @@ def build(release: Release, python: Path) -> Path:
             command, capture_output=True, text=True, timeout=BUILD_LIMIT_S, check=False, env=environment, cwd=ROOT
         )
     except subprocess.TimeoutExpired as error:
-        raise LabError(f"the package was not made within {BUILD_LIMIT_S} s") from error
+        raise LabError(f"cannot build the package within {BUILD_LIMIT_S} s") from error
     lines = [line for line in (result.stdout + result.stderr).splitlines() if line.strip()]
     if result.returncode:
-        raise LabError(f"the package cannot be made: {lines[-1] if lines else 'no output'}")
+        raise LabError(f"cannot build the package: {lines[-1] if lines else 'no output'}")
     return Path(result.stdout.splitlines()[-1])
 
 
 def next_version(package: Path, folder: Path) -> Path:
-    """Make the same package with a later version in `folder`, for an upgrade, and return it."""
+    """Build the same package with a later version in `folder`, for an upgrade, and return it."""
     tree = folder / "tree"
     try:
         subprocess.run(["dpkg-deb", "--raw-extract", str(package), str(tree)], check=True, timeout=BUILD_LIMIT_S)
@@ -77,7 +77,7 @@ def next_version(package: Path, folder: Path) -> Path:
         pack = ["dpkg-deb", "--root-owner-group", "-Zgzip", "-z1", "--build", str(tree), str(result)]
         subprocess.run(pack, check=True, timeout=BUILD_LIMIT_S, stdout=subprocess.DEVNULL)
     except (subprocess.SubprocessError, OSError) as error:
-        raise LabError(f"the package for the upgrade cannot be made: {error}") from error
+        raise LabError(f"cannot build the package for the upgrade: {error}") from error
     finally:
         shutil.rmtree(tree, ignore_errors=True)
     return result
@@ -87,12 +87,12 @@ def later(control: str) -> str:
     """Return a control file with a later version. Raises LabError if the file has no version."""
     changed, count = re.subn(r"^(Version: .*)$", rf"\1{NEXT}", control, flags=re.MULTILINE)
     if count != 1:
-        raise LabError(f"the package has {count} versions, expected one")
+        raise LabError(f"expected one version in the control file, got {count}")
     return changed
 
 
 def main(arguments: list[str]) -> int:
-    """`deps amd64` or `deps arm64`: installs what is missing; 0 if everything is there in the end."""
+    """Run `deps amd64` or `deps arm64`: install the missing packages. Return 0 if all packages are installed."""
     try:
         if len(arguments) != 1 or arguments[0] not in EMULATORS:
             raise LabError(f"usage: tests/lab_debian/deps {{amd64|arm64}}, got: {' '.join(arguments)}")

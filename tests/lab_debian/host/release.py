@@ -1,4 +1,4 @@
-"""Table of the systems of the rig: release, architecture, packages and kernel modules."""
+"""Table of the systems of the lab: release, architecture, packages and kernel modules."""
 
 from dataclasses import dataclass
 
@@ -11,14 +11,14 @@ SYSTEM = (
 """Debian packages of the guest: the system, its installation, and the programs that imud uses."""
 
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "crc32c_generic", "ext4", "virtio_console", "9pnet_virtio", "9p", "autofs4")
-"""Loaded by the initramfs, in this order; some are built into some kernels."""
+"""Modules that the initramfs loads, in this order. Some kernels contain some of them."""
 
 MODULES = (
     *("vcan", "can-raw", "can-j1939", "i2c-dev", "i2c-stub", "spidev", "pps-ldisc", "pps-gpio", "usbserial"),
     *("ftdi_sio", "cdc-acm", "xhci-pci", "virtio-rng", "8250_pci", "rng-core", "gpio-pl061"),
     *("pcengines-apuv2", "parport_pc", "spi-butterfly"),
 )
-"""Modules for udev and the checks. Modules that a kernel does not have are skipped. The last row makes GPIO lines and
+"""Modules for udev and the checks. Modules that a kernel does not have are skipped. The last row creates GPIO lines and
 an SPI bus on amd64 (machine.py)."""
 
 

@@ -20,7 +20,7 @@ DRAIN_S = 0.5
 
 @contextlib.contextmanager
 def answered(sockets: Path, sensor_pid: int) -> Iterator[None]:
-    """Answer the guest's requests from a thread, until the end of the block or of QEMU.
+    """Process the guest's requests in a thread until the end of the block or of QEMU.
 
     `sensor_pid` is the process of the simulated sensor.
     """
@@ -43,7 +43,7 @@ def _serve_machine(sockets: Path, sensor_pid: int) -> None:
 
 
 def unplug_quietly(unplug: Callable[[], None], sensor_pid: int) -> None:
-    """Pull the adapter while no byte comes: QEMU 7.2 ends by a segmentation fault when one comes in between."""
+    """Unplug the adapter while the sensor is stopped, because a byte would crash QEMU 7.2 in this time."""
     os.kill(sensor_pid, signal.SIGSTOP)
     try:
         time.sleep(DRAIN_S)
@@ -53,7 +53,7 @@ def unplug_quietly(unplug: Callable[[], None], sensor_pid: int) -> None:
 
 
 def serve(guest: socket.socket, actions: Mapping[str, Callable[[], None]]) -> None:
-    """Answer each line of `guest` by `ok` or by one line that says why not, until it closes."""
+    """Reply to each line of `guest` with `ok` or one line with the error, until `guest` closes."""
     with contextlib.suppress(OSError), guest.makefile("rb") as lines:
         while line := lines.readline(LINE_BYTES):
             guest.sendall(f"{answer(line.decode('utf-8', 'replace').strip(), actions)}\n".encode())

@@ -1,6 +1,6 @@
-"""The unit tests of codecs, clock, ring and C header on the Python of an architecture that the host has not.
+"""The unit tests of codecs, clock, ring and C header with the Python of a foreign architecture.
 
-They need no booted system and run under qemu-user, which emulates neither memory nor devices of a machine, on the
+They need no booted system. They run under qemu-user, which emulates neither memory nor devices of a machine, with the
 libraries of imud's package for that architecture.
 """
 
@@ -41,7 +41,7 @@ PARTS = {
 """Folders and files of tests by subject, without tests of scripts, settings and simulators, which contain no layout of
 bytes."""
 TEST_LIMIT_S = 600
-"""Per test: ten times the ordinary limit."""
+"""Time limit per test, s: ten times the normal limit."""
 LIMIT_S = 3600.0
 REPORT = "unit-tests.xml"
 LINES_SHOWN = 12
@@ -56,12 +56,15 @@ class Tally:
 
     @property
     def good(self) -> bool:
-        """Whether tests ran, and none failed."""
+        """Return whether tests ran and none failed."""
         return self.passed > 0 and not self.failures
 
 
 def run(release: Release, package: Path, python: Path, output: Path, say: Callable[[str], None]) -> int:
-    """Run all parts; 0 if all passed, 1 if not. `package` is imud's, `python` has pip. LabError if they cannot run."""
+    """Run all parts. Return 0 if all tests passed, otherwise 1. Raises LabError if the tests cannot run.
+
+    `package` is imud's package, `python` has pip.
+    """
     made = user_mode.built(release, python, say)
     start_s = time.monotonic()
     with results.run_folder(output) as work:
@@ -69,7 +72,7 @@ def run(release: Release, package: Path, python: Path, output: Path, say: Callab
         report = work / REPORT
         if not report.exists():
             lines = result.stdout.strip().splitlines() or ["no output"]
-            raise LabError(f"the unit tests on {release.name} ended with {result.returncode}: {lines[-1]}")
+            raise LabError(f"the unit tests on {release.name} failed with exit status {result.returncode}: {lines[-1]}")
         text = report.read_text(encoding="utf-8")
         shutil.copy(report, output / REPORT)
     good = shown(counted(text))
@@ -78,7 +81,7 @@ def run(release: Release, package: Path, python: Path, output: Path, say: Callab
 
 
 def pytest(made: Path, work: Path, site: str) -> subprocess.CompletedProcess[str]:
-    """Run the tests with the libraries at `site`; the report is in `work`. LabError if they do not end."""
+    """Run the tests with the libraries at `site`. The report is in `work`. Raises LabError after a time limit."""
     words = ["/usr/bin/env", "--chdir=/mnt/tree", "/usr/bin/python3", "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     words += [
         f"--timeout={TEST_LIMIT_S}",
@@ -91,31 +94,31 @@ def pytest(made: Path, work: Path, site: str) -> subprocess.CompletedProcess[str
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=LIMIT_S, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired as error:
-        raise LabError(f"the unit tests did not end within {LIMIT_S:.0f} s") from error
+        raise LabError(f"expected the end of the unit tests within {LIMIT_S:.0f} s") from error
 
 
 def unpack(package: Path, work: Path, release: Release) -> str:
-    """Unpack imud's package into the run's folder; the path of its libraries as the program sees it."""
+    """Unpack imud's package into the run's folder. Return the path of its libraries in the emulated system."""
     try:
         subprocess.run(["dpkg-deb", "--extract", str(package), str(work / "package")], check=True, timeout=600)
     except (subprocess.SubprocessError, OSError) as error:
-        raise LabError(f"the package {package} cannot be unpacked: {error}") from error
+        raise LabError(f"cannot unpack the package {package}: {error}") from error
     site = f"package/usr/lib/imud/lib/python{PYTHONS[release.suite]}/site-packages"
     if not (work / site).is_dir():
-        raise LabError(f"the package {package} has no {site.removeprefix('package/')}: is it one for {release.name}?")
-    shutil.rmtree(work / site / "imud")  # the tests have that of the repository, which is the same
+        raise LabError(f"cannot find {site.removeprefix('package/')} in {package}; is it a package for {release.name}?")
+    shutil.rmtree(work / site / "imud")  # the tests use the same package from the repository
     return f"/mnt/{site}"
 
 
 def counted(report: str) -> dict[str, Tally]:
-    """Results by part, of pytest's report (JUnit XML)."""
+    """Return the results of each part, from pytest's report (JUnit XML)."""
     tallies = {name: Tally() for name in PARTS}
     for case in ElementTree.fromstring(report).iter("testcase"):
         # pytest gives an unreadable file no class, and its name is the name of the file
         place = (case.get("classname") or str(case.get("name"))).replace(".", "/")
         part = next((name for name, paths in PARTS.items() if place.startswith(stems(paths))), "")
         if not part:
-            raise LabError(f"a test outside of what was asked for: {place}")
+            raise LabError(f"expected only tests of PARTS in the report, got {place}")
         tally = tallies[part]
         tally.seconds += float(case.get("time", "0"))
         bad = [element for element in case if element.tag in ("failure", "error")]
@@ -129,12 +132,12 @@ def counted(report: str) -> dict[str, Tally]:
 
 
 def stems(paths: tuple[str, ...]) -> tuple[str, ...]:
-    """Folders and files as the report's class names begin."""
+    """Return the prefixes of class names in the report for these folders and files."""
     return tuple(path.removesuffix(".py") for path in paths)
 
 
 def shown(tallies: dict[str, Tally]) -> bool:
-    """Print a line for each part, and failures; whether all are good."""
+    """Print a line for each part, and the failures. Return whether all parts are good."""
     for name, tally in tallies.items():
         word = "PASS" if tally.good else "FAIL"
         counts = f"{tally.passed} passed, {tally.skipped} skipped, {len(tally.failures)} failed"

@@ -1,5 +1,4 @@
-"""Programs of an architecture that the host does not have: the kernel of the host runs them with qemu-user
-(binfmt_misc).
+"""Programs of a foreign architecture. The kernel of the host runs them with qemu-user (binfmt_misc).
 
 `built` makes their root file system once per change of its inputs: Python and compiler of the release, only unpacked,
 so that no maintainer script needs emulation, and pytest. `command` runs a program there. It can change only the folder
@@ -25,7 +24,7 @@ TAGS = ("manylinux_2_17", "manylinux2014", "manylinux_2_28")
 ROOT_NAME = "root"
 SITE = "/opt/site"
 PYCACHE = "pycache"
-"""Bytecode of later runs: compiling takes longer than the tests."""
+"""Folder of bytecode for later runs: compiling takes longer than the tests."""
 NEEDED_BYTES = 2 << 30
 PIP_LIMIT_S = 600
 
@@ -47,11 +46,11 @@ mount -o remount,bind,ro "$root/mnt/tree"
 mount --bind "$made/pycache" "$root/mnt/pycache"
 exec chroot "$root" "$@"
 """
-"""In a mount namespace, so that nothing stays mounted. /mnt is the run's folder, and tree in it the repository."""
+"""Script in a mount namespace, so that no mount remains. /mnt is the run's folder, and /mnt/tree is the repository."""
 
 
 def built(release: Release, python: Path, say: Callable[[str], None]) -> Path:
-    """The folder of `release`, made if it is not in the cache; `python` has pip. LabError if it cannot be made."""
+    """Return the folder of `release`; build it if it is not in the cache. `python` has pip. Raises LabError."""
 
     def make(folder: Path) -> None:
         say(f"{release.name}: unpacking Python, compiler and pytest (a minute, once)")
@@ -70,7 +69,7 @@ def make_root(release: Release, python: Path, folder: Path) -> None:
     bootstrap(release, root, folder / "build.log", "extract", PACKAGES)
     for name in ("passwd", "group"):
         shutil.copy(root / f"usr/share/base-passwd/{name}.master", root / "etc" / name)
-    for name, target in (("cc", "gcc"), ("c++", "g++")):  # made by scripts that do not run
+    for name, target in (("cc", "gcc"), ("c++", "g++")):  # normally created by maintainer scripts
         (root / "usr/bin" / name).symlink_to(target)
     for name in ("proc", "dev/shm", "tmp", "mnt"):
         (root / name).mkdir(parents=True, exist_ok=True)
@@ -79,7 +78,7 @@ def make_root(release: Release, python: Path, folder: Path) -> None:
 
 
 def install_wheels(release: Release, python: Path, site: Path) -> None:
-    """Unpack WHEELS for the release's Python and architecture, by the host's pip. LabError with its last line."""
+    """Unpack WHEELS for the release's Python and architecture with the host's pip. Raises LabError if pip fails."""
     machine = MACHINES[release.architecture]
     fits = ["--only-binary=:all:", "--implementation", "cp", "--python-version", PYTHONS[release.suite]]
     fits += [word for tag in TAGS for word in ("--platform", f"{tag}_{machine}")]
@@ -87,14 +86,14 @@ def install_wheels(release: Release, python: Path, site: Path) -> None:
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=PIP_LIMIT_S, check=False)
     except subprocess.TimeoutExpired as error:
-        raise LabError(f"pip did not end within {PIP_LIMIT_S} s") from error
+        raise LabError(f"expected the end of pip within {PIP_LIMIT_S} s") from error
     if result.returncode:
         lines = [line for line in (result.stdout + result.stderr).splitlines() if line.strip()]
         raise LabError(f"wheels for {release.name}: {lines[-1] if lines else 'pip failed'}")
 
 
 def command(made: Path, work: Path, tree: Path, words: list[str]) -> list[str]:
-    """The command that runs `words` in `made`, with `work` as its /mnt and `tree` as /mnt/tree, at low priority."""
+    """Return the command that runs `words` in `made` at low priority, with `work` as /mnt and `tree` as /mnt/tree."""
     enter = ["unshare", "--mount", "sh", "-c", ENTER, "sh"]
     return ["nice", "-n", "5", *enter, str(made), str(work), str(tree), *words]
 
