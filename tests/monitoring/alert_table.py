@@ -1,4 +1,4 @@
-"""Table: the alerts of docs/monitoring.md, made from the rules themselves (`python -m tests.support.references`)."""
+"""Table of the alerts in docs/monitoring.md, created from the rules (`python -m tests.support.references`)."""
 
 import re
 from typing import Final
@@ -10,7 +10,7 @@ PARTS: Final = ("description", "cause", "next_step")
 
 
 def alert_table() -> str:
-    """A row for every alert."""
+    """Return the table with one row per alert."""
     rows = ["| alert | severity, after | meaning | likely causes | next step |", "|---|---|---|---|---|"]
     for alert in alerts_of(RULES.read_text()):
         name, wait = alert["alert"], alert.get("for", "")
@@ -21,6 +21,6 @@ def alert_table() -> str:
 
 
 def _cell(text: str) -> str:
-    """The text in one cell; pages of docs/ as links."""
+    """Return the text for one cell, with links to pages of docs/."""
     linked = re.sub(r"docs/(\w+\.md)", r"[\1](\1)", " ".join(text.split()))
     return linked.replace("|", "\\|")

@@ -1,7 +1,8 @@
 """The dashboard for Grafana, from one description: `python -m tests.monitoring.dashboard` writes etc/grafana/imud.json.
 
-A row is a title and its panels; a panel is a title, a unit of Grafana, and queries with their legends. Places and the
-rest of Grafana's JSON follow from that. `QUERIES` has every query as Grafana would send it, for the test.
+A row has a title and panels. A panel has a title, a unit of Grafana, and queries with their legends. The module
+computes the places and the other parts of Grafana's JSON. `QUERIES` contains every query as Grafana sends it, for the
+test.
 """
 
 import json
@@ -31,7 +32,7 @@ class Query:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A panel; `kind`, `unit` and `options` in the words of Grafana."""
+    """A panel. `kind`, `unit` and `options` use the names of Grafana."""
 
     title: str
     unit: str
@@ -44,7 +45,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A row; with `repeat` one for every device that is chosen."""
+    """A row. With `repeat`, Grafana draws one row for every selected device."""
 
     title: str
     panels: Sequence[Panel]
@@ -57,7 +58,7 @@ def device(metric: str, legend: str, wrap: str = "{}", labels: str = "") -> Quer
 
 
 def rate(metric: str, legend: str, labels: str = "") -> Query:
-    """The rate of a counter of the chosen device."""
+    """Return the rate of a counter of the selected device."""
     return device(metric, legend, f"rate({{}}{RATE})", labels)
 
 
@@ -66,15 +67,15 @@ FLEET: Final = Row("Fleet", [
     Panel("Devices", "none", [
         Query(f"sum(imud_device_up{DAEMON})", "running"), Query(f"count(imud_device_up{DAEMON})", "configured"),
     ], "stat", 5, 4),
-    Panel("Alerts that fire", "none", [
+    Panel("Active alerts", "none", [
         Query('count(ALERTS{alertname=~"Imud.+", alertstate="firing"}) or vector(0)', "alerts"),
     ], "stat", 4, 4),
     Panel("Samples", "cps", [Query(f"sum(rate(imud_samples_total{DAEMON}{RATE}))", "per second")], "stat", 6, 4),
     Panel("Lost samples", "cps", [Query(f"sum(rate(imud_samples_lost_total{DAEMON}{RATE}))", "per second")], "stat",
           6, 4),
     Panel("State", "none", [Query(f"imud_device_state{DAEMON} == 1", "{{instance}} {{device}}: {{state}}")],
-          "timeseries", 12, 8, "The state that each device is in."),
-    Panel("What they are", "none", [Query(f"imud_device_info{DAEMON}")], "table", 12, 8),
+          "timeseries", 12, 8, "State of each device."),
+    Panel("Device information", "none", [Query(f"imud_device_info{DAEMON}")], "table", 12, 8),
 ])  # fmt: skip
 
 OF_DEVICE: Final = Row("$device", [
@@ -83,16 +84,16 @@ OF_DEVICE: Final = Row("$device", [
     ]),
     Panel("Lost samples by cause", "cps", [rate("imud_samples_lost_total", "{{cause}}")]),
     Panel("Damaged frames by reason", "cps", [rate("imud_frames_bad_total", "{{reason}}")]),
-    Panel("Error of the time stamps", "s", [
+    Panel("Time stamp error", "s", [
         device("imud_clock_error_seconds", "error, one sigma"), device("imud_clock_residual_seconds", "spread"),
     ]),
-    Panel("Source of the time stamps", "none", [device("imud_clock_sync", "{{sync}}")]),
-    Panel("Clock of the device against the host's", "ppm", [
+    Panel("Time stamp source", "none", [device("imud_clock_sync", "{{sync}}")]),
+    Panel("Rate error of the device clock", "ppm", [
         device("imud_clock_skew_ratio", "gains", "1e6 * {}"),
     ]),
     Panel("Latency", "s", [
         Query(f"sum by (le) (increase({LATENCY}{RATE}))", "{{le}}"),
-    ], "heatmap", help="From the measurement to its publication."),
+    ], "heatmap", help="Time from the measurement to the publication."),
     Panel("Latency, 50 % and 99 %", "s", [
         Query(f"histogram_quantile(0.5, sum by (le) (rate({LATENCY}{RATE})))", "50 %"),
         Query(f"histogram_quantile(0.99, sum by (le) (rate({LATENCY}{RATE})))", "99 %"),
@@ -103,9 +104,9 @@ OF_DEVICE: Final = Row("$device", [
           help="Deviation of the acceleration from its mean of each second."),
     Panel("Vibration, peak", "accMS2", [device("imud_vibration_peak_meters_per_second_squared", "{{axis}}")]),
     Panel("Acceleration", "accMS2", [device("imud_acceleration_norm_meters_per_second_squared", "mean of a second")]),
-    Panel("Edges on lines", "cps", [rate("imud_line_edges_total", "{{line}}"),
+    Panel("Edges on GPIO lines", "cps", [rate("imud_line_edges_total", "{{line}}"),
                                     rate("imud_line_edges_lost_total", "{{line}} lost")]),
-    Panel("Lines with a problem, and ALARM", "none", [
+    Panel("Problems of GPIO lines, and ALARM", "none", [
         device("imud_line_problem", "{{line}}"), device("imud_alarm_active", "ALARM active"),
     ]),
     Panel("Bus errors", "cps", [
@@ -116,16 +117,16 @@ OF_DEVICE: Final = Row("$device", [
         rate("imud_polls_total", "made"), rate("imud_polls_late_total", "late"),
         rate("imud_polls_missed_total", "missed"),
     ]),
-    Panel("Shared memory is written", "none", [device("imud_ring_written", "written")]),
+    Panel("Ring of shared memory written", "none", [device("imud_ring_written", "written")]),
 ], repeat=True)  # fmt: skip
 
 CLIENTS: Final = Row("Clients and daemon", [
     Panel("Clients", "none", [Query(f"imud_clients{DAEMON}", "{{instance}} {{encoding}}")]),
-    Panel("Samples given to clients, and dropped", "cps", [
+    Panel("Samples sent to clients, and dropped", "cps", [
         Query(f"rate(imud_client_samples_sent_total{DAEMON}{RATE})", "{{instance}} sent"),
         Query(f"rate(imud_client_samples_dropped_total{DAEMON}{RATE})", "{{instance}} dropped"),
     ]),
-    Panel("Samples that wait for the slowest client", "none", [
+    Panel("Queued samples of the slowest client", "none", [
         Query(f"imud_client_queue_samples_max{DAEMON}", "{{instance}}"),
     ]),
     Panel("CPU", "percentunit", [
@@ -134,14 +135,14 @@ CLIENTS: Final = Row("Clients and daemon", [
     Panel("Memory", "bytes", [
         Query('process_resident_memory_bytes{job="imud", instance=~"$instance"}', "{{instance}}"),
     ]),
-    Panel("Event loop late by", "s", [Query(f"imud_heartbeat_age_seconds{DAEMON}", "{{instance}}")]),
+    Panel("Delay of the event loop", "s", [Query(f"imud_heartbeat_age_seconds{DAEMON}", "{{instance}}")]),
 ])  # fmt: skip
 
 ROWS: Final = (FLEET, OF_DEVICE, CLIENTS)
 
 
 def queries() -> Iterator[tuple[str, str]]:
-    """Title of the panel, and the expression, of every query."""
+    """Yield the title of the panel and the expression of every query."""
     for row in ROWS:
         for panel in row.panels:
             for query in panel.queries:
@@ -149,15 +150,15 @@ def queries() -> Iterator[tuple[str, str]]:
 
 
 def filled_in(expression: str, *, instance: str = ".+", device: str = ".+", window: str = "30s") -> str:
-    """The expression as Grafana sends it, with its variables replaced."""
+    """Return the expression as Grafana sends it, with values for its variables."""
     return expression.replace("$instance", instance).replace("$device", device).replace("$__rate_interval", window)
 
 
-# --- in Grafana's words -----------------------------------------------------------------------------------------------
+# --- the JSON of Grafana ----------------------------------------------------------------------------------------------
 
 
 def dashboard() -> dict[str, Any]:
-    """The whole dashboard."""
+    """Return the whole dashboard."""
     panels, y = [], 0
     for row in ROWS:
         made, height = _row(row, y)
@@ -186,7 +187,7 @@ def _variable(name: str, query: str) -> dict[str, Any]:
 
 
 def _row(row: Row, y: int) -> tuple[list[dict[str, Any]], int]:
-    """The row and its panels, from left to right and on; and how high all that is."""
+    """Return a row with its panels from left to right, line by line, and its height."""
     head: dict[str, Any] = {
         "type": "row", "title": row.title, "collapsed": False, "panels": [],
         "gridPos": {"x": 0, "y": y, "w": COLUMNS, "h": 1},

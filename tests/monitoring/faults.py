@@ -1,10 +1,10 @@
-"""A daemon on simulated devices, each with a fault of its own that can be switched on and off.
+"""A daemon on simulated devices. Each device has a fault that can be switched on and off.
 
     Feeder ──frames, 20 Hz──▶ Wire (pty) ──▶ Daemon in a thread ──▶ metrics
-    a simulated module, a module on RS-485, lines and PPS in memory ──▶ the same daemon ──▶ mosquitto, a recording
+    a simulated device, a device on RS-485, lines and PPS in memory ──▶ the same daemon ──▶ mosquitto, a recording
 
-The faults of ImudGapsUnknown, ImudBusErrors, ImudBusOff and ImudLedgerOpen need hardware, or are bugs of imud that do
-not exist: the state that the daemon shows is altered instead. Everything else really happens.
+ImudGapsUnknown, ImudBusErrors, ImudBusOff and ImudLedgerOpen need hardware or a bug of imud. For these alerts, the test
+changes the status that the daemon shows. All other faults really happen.
 """
 
 import asyncio
@@ -50,7 +50,7 @@ WIRE_FAULTS: Final = ("silent", "lose_every", "flip_every", "temperature_c", "ho
 FLAP_S: Final = 0.8
 PutRecord = Callable[[RecordQueue[object], bytes], None]
 DISK_BYTES: Final = 16_384
-"""A file of this process that is longer cannot be written further: as on a full disk."""
+"""Maximum size of a file of this process, bytes. Further writes fail, like on a full disk."""
 
 
 class Wire(Cable):
@@ -102,7 +102,7 @@ class Wire(Cable):
         )  # fmt: skip
 
     def swap(self) -> None:
-        """Pull the plug, or put it in."""
+        """Unplug the device, or plug it in."""
         if self.plugged:
             self.plugged = False
             self.unplug()
@@ -112,7 +112,7 @@ class Wire(Cable):
 
 
 def unpaid(status: DeviceStatus) -> DeviceStatus:
-    """A ledger that does not close."""
+    """Return the status with a ledger that does not balance."""
     return msgspec.structs.replace(status, ledger={**status.ledger, "bytes_in": status.ledger["bytes_in"] + 1})
 
 
@@ -129,7 +129,7 @@ def gaps_of_unknown_size() -> Callable[[DeviceStatus], DeviceStatus]:
 
 
 class AlteredDaemon(Daemon):
-    """A daemon whose shown state of some devices is altered. Synchronization: as Daemon; `altered` by one store."""
+    """A daemon with changed statuses of some devices. Synchronization: like Daemon; one assignment sets `altered`."""
 
     def __init__(self, settings: Config, **more: Any) -> None:
         self.altered: Mapping[str, Callable[[DeviceStatus], DeviceStatus]] = {}
@@ -148,18 +148,18 @@ class Site:
         self.folder = folder
         self.port = port
         self._beside = beside
-        """Wires of another daemon, which are fed as well."""
+        """Wires of another daemon, which this site also feeds."""
         self.memory = MemoryLines(time.monotonic_ns)
         self.faulty = False
         self.queue_is_full = False
-        """Whether the recorder's queue has no room, as with a disk that has been too slow for minutes."""
+        """Whether the queue of the recorder is full, as with a disk that was too slow for minutes."""
         self._stack = ExitStack()
         self._clients: list[Client] = []
         self._pps = True
         self._looping: asyncio.AbstractEventLoop | None = None
 
     def start(self) -> None:
-        """Start everything; nothing is wrong."""
+        """Start all parts without a fault."""
         stack, folder = self._stack, self.folder
         (folder / "shm").mkdir()
         self.wires = {}
@@ -191,13 +191,13 @@ class Site:
         self._log = stack.enter_context(_log_without_reader())
 
     def close(self) -> None:
-        """Stop everything; the report of a test that failed between the faults can be written again."""
+        """Stop all parts. The log of a failed test can then be written again."""
         resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         self._stack.close()
 
     def scrape_s(self) -> float:
         """Return the longest of three scrape times while all devices run, s."""
-        wait_until(lambda: self._running() == len(WIRES) + 2, "all devices run", LIMIT_S)
+        wait_until(lambda: self._running() == len(WIRES) + 2, "all devices in the state running", LIMIT_S)
 
         def once() -> float:
             begin = time.monotonic()
@@ -230,7 +230,7 @@ class Site:
         for number in range(100):
             self._log.emit(logging.makeLogRecord({"msg": f"message {number}", "levelno": logging.INFO}))
         client = Client(self.folder / "imud.sock")
-        client.watch(encoding="json")  # and never read
+        client.watch(encoding="json")  # a client that never reads
         self._clients.append(client)
         shutil.move(self.folder / "shm", self.folder / "away")
         self._broker.stop()
@@ -275,11 +275,11 @@ class Site:
         return put_or_drop
 
     def block_loop(self, seconds: float) -> None:
-        """Let nothing else run in the daemon's loop."""
+        """Block the event loop of the daemon."""
         self.in_loop(lambda: time.sleep(seconds))
 
     def in_loop(self, call: Callable[[], object]) -> None:
-        """Run something in the daemon's loop."""
+        """Run a function in the event loop of the daemon."""
         assert self._looping is not None
         self._looping.call_soon_threadsafe(call)
 
@@ -361,7 +361,7 @@ class Site:
 
 @contextmanager
 def _log_without_reader() -> Iterator[LogWriter]:
-    """A log whose reader does not read: a pipe that is full."""
+    """Yield a log with a full pipe that no program reads."""
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     with suppress(BlockingIOError):

@@ -28,12 +28,12 @@ from tests.support.surroundings import free_port
 FILE: Final = ROOT / "docs/pictures/dashboard.svg"
 SECONDS, SILENT_S, STEP_S = 220.0, 15.0, 2.0
 CHOSEN: Final = "bow"
-"""The device that the middle row shows."""
+"""Device of the middle row."""
 SENSORS: Final = {
     "bow": ("--device", "hipnuc-uart", "--rate", "100", "--faults", "flip=0.01,drop=0.005", "--seed", "7"),
     "mast": ("--device", "imu61x-uart", "--rate", "50", "--adapter", "usb-16ms"),
 }
-"""Name in the configuration, and words for `python -m imud.sim`."""
+"""Arguments of `python -m imud.sim`, by name in the configuration."""
 CELL_X, CELL_Y, MARGIN = 50, 30, 6
 """Size of a unit of Grafana's grid, and distance between panels, px."""
 COLOURS: Final = ("#73bf69", "#f2cc0c", "#5794f2", "#ff780a", "#f2495c", "#b877d9", "#8ab8ff", "#c4162a")
@@ -42,7 +42,7 @@ UNITS: Final = {
     "percentunit": ((0.01, "%"),), "cps": ((1, "/s"),), "hertz": ((1, "Hz"),), "ppm": ((1, "ppm"),),
     "celsius": ((1, "°C"),), "degree": ((1, "°"),), "accMS2": ((1, "m/s²"),), "none": ((1, ""),),
 }  # fmt: skip
-"""Of Grafana's units: factors and signs, the largest first."""
+"""Factors and symbols of Grafana's units, the largest factor first."""
 
 
 class Series(NamedTuple):
@@ -53,7 +53,7 @@ class Series(NamedTuple):
 
 
 class Span(NamedTuple):
-    """The time that is shown, Unix time in s."""
+    """Interval on the time axis, Unix time, s."""
 
     begin_s: float
     end_s: float
@@ -61,13 +61,13 @@ class Span(NamedTuple):
 
 @contextmanager
 def sensors(folder: Path) -> Iterator[Mapping[str, subprocess.Popen[str]]]:
-    """The simulated sensors, each behind `folder`/NAME."""
+    """Run the simulated sensors, each behind `folder`/NAME."""
     with ExitStack() as stack:
         running = {}
         for name, words in SENSORS.items():
             argv = [sys.executable, "-m", "imud.sim", *words, "--path", str(folder / name)]
             running[name] = stack.enter_context(child(argv, "a simulator", stdout=subprocess.PIPE))
-            assert running[name].stdout.readline(), f"{name} has no port"  # type: ignore[union-attr]
+            assert running[name].stdout.readline(), f"expected the port of {name} on standard output"  # type: ignore[union-attr]
         yield running
 
 
@@ -105,7 +105,7 @@ def _renamed(part: str, names: Mapping[str, str]) -> str:
 
 
 def drawn(prometheus: RealPrometheus, span: Span) -> tuple[list[str], int]:
-    """All panels, and the height."""
+    """Return the parts of all panels, and the height."""
     parts: list[str] = []
     bottom = 0
     for panel in dashboard()["panels"]:
@@ -133,14 +133,14 @@ def found(prometheus: RealPrometheus, panel: Mapping[str, Any], span: Span) -> l
 
 
 def named(legend: str, labels: Mapping[str, str]) -> str:
-    """A legend with its labels filled in; without one the labels that tell devices apart."""
+    """Return a legend with its labels. Without a legend, return the labels that distinguish the devices."""
     for name, value in labels.items():
         legend = legend.replace(f"{{{{{name}}}}}", value)
     return legend or "  ".join(labels.get(name, "") for name in ("device", "driver", "link", "product", "firmware"))
 
 
 def shown(value: float, unit: str) -> str:
-    """A value with its unit."""
+    """Return a value with its unit."""
     rows = UNITS[unit]
     factor, sign = next((row for row in rows if abs(value) >= row[0]), rows[-1])
     return f"{value / factor:.3g} {sign}".strip() if value else "0"
@@ -162,7 +162,7 @@ class Box(NamedTuple):
         )
 
     def say(self, x: float, y: float, words: str, fill: str, size: int, more: str = "") -> str:
-        """A line of text at a point of the panel."""
+        """Return a line of text at a point of the panel."""
         return text(self.x + x, self.y + y, words, more).replace("font-size='13' fill='#333'",
                                                                  f"font-size='{size}' fill='{fill}'")  # fmt: skip
 
@@ -176,7 +176,7 @@ def _nothing(box: Box) -> list[str]:
 
 
 def _lines(box: Box, panel: Mapping[str, Any], series: list[Series], span: Span) -> list[str]:
-    """A line for each series, three numbers on each axis, the legend below."""
+    """Draw a line for each series, three numbers on each axis, and the legend."""
     if not series:
         return _nothing(box)
     unit, chart = panel["fieldConfig"]["defaults"]["unit"], box.chart()
@@ -196,7 +196,7 @@ def _lines(box: Box, panel: Mapping[str, Any], series: list[Series], span: Span)
 
 
 def _path(chart: Box, one: Series, limits: tuple[float, float], span: Span, colour: str) -> str:
-    """A series as a line, with a gap where points are missing."""
+    """Draw a series as a line, with a gap if points are missing."""
     moves, before_s = "", 0.0
     for t_s, value in one.points:
         x = chart.x + chart.width * (t_s - span.begin_s) / (span.end_s - span.begin_s)
@@ -222,7 +222,7 @@ def _legend(box: Box, names: Sequence[str]) -> list[str]:
 
 
 def _stat(box: Box, panel: Mapping[str, Any], series: list[Series], _span: Span) -> list[str]:
-    """The newest values, large."""
+    """Draw the newest values in large letters."""
     unit, parts = panel["fieldConfig"]["defaults"]["unit"], []
     for number, one in enumerate(series):
         x = box.width * (number + 0.5) / len(series)
@@ -233,7 +233,7 @@ def _stat(box: Box, panel: Mapping[str, Any], series: list[Series], _span: Span)
 
 
 def _table(box: Box, _panel: Mapping[str, Any], series: list[Series], _span: Span) -> list[str]:
-    """A line for each series."""
+    """Draw a row of text for each series."""
     return [box.say(14, 52 + 22 * number, one.name, "#ccccdc", 11) for number, one in enumerate(series)]
 
 
@@ -272,7 +272,7 @@ KINDS: Final = {"timeseries": _lines, "stat": _stat, "table": _table, "heatmap":
 
 def main() -> None:
     """Write the picture."""
-    arguments = argparse.ArgumentParser(description="Writes docs/pictures/dashboard.svg.")
+    arguments = argparse.ArgumentParser(description="Write docs/pictures/dashboard.svg.")
     arguments.add_argument("--seconds", type=float, default=SECONDS)
     parts, height = observed(arguments.parse_args().seconds)
     width = 24 * CELL_X

@@ -1,6 +1,4 @@
-"""A real Prometheus for tests: its configuration, its process, its HTTP API; and the alerting rules, as they are and
-with all times shortened.
-"""
+"""A real Prometheus for tests: configuration, process and HTTP API, and the alerting rules with shorter times."""
 
 import json
 import re
@@ -31,18 +29,16 @@ UNIT_MS: Final = {"s": 1000, "m": 60_000, "h": 3_600_000}
 def needs(*programs: str) -> pytest.MarkDecorator:
     """Skip a test with the reason if a program is not installed."""
     missing = [program for program in programs if shutil.which(program) is None]
-    return pytest.mark.skipif(
-        bool(missing), reason=f"{', '.join(missing)} not installed: `make monitoring-deps` installs it"
-    )
+    return pytest.mark.skipif(bool(missing), reason=f"cannot find {', '.join(missing)}; try make monitoring-deps")
 
 
 def alerts_of(text: str) -> list[dict[str, Any]]:
-    """The alerts of a file of rules."""
+    """Return the alerts of a file of rules."""
     return [rule for group in yaml.safe_load(text)["groups"] for rule in group["rules"]]
 
 
 def shortened(text: str, divisor: int) -> str:
-    """The rules with every `for` and every range divided; nothing else changes."""
+    """Return the rules with each `for` and each range divided by `divisor`."""
 
     def shorter(found: re.Match[str]) -> str:
         return f"{int(found[1]) * UNIT_MS[found[2]] // divisor}ms"
@@ -62,7 +58,7 @@ class Pace(NamedTuple):
 
     interval_ms: int = INTERVAL_MS
     divisor: int = 90
-    """Of the times of the rules: 15 minutes are 10 s."""
+    """Divisor of the times of the rules: 15 minutes become 10 s."""
 
     @classmethod
     def of(cls, scrape_s: float) -> "Pace":
@@ -96,7 +92,7 @@ class RealPrometheus:
         fresh.rename(self._targets)
 
     def get(self, path: str, **parameters: str) -> Any:
-        """The data of an answer of the API."""
+        """Return the data of a reply of the API."""
         query = f"?{urllib.parse.urlencode(parameters)}" if parameters else ""
         with urllib.request.urlopen(f"{self._url}/api/v1/{path}{query}", timeout=LIMIT_S) as answer:
             found = json.load(answer)
@@ -104,7 +100,7 @@ class RealPrometheus:
         return found["data"]
 
     def ready(self) -> bool:
-        """Whether it answers."""
+        """Return whether Prometheus replies."""
         try:
             with urllib.request.urlopen(f"{self._url}/-/ready", timeout=LIMIT_S) as answer:
                 return bool(answer.status == 200)
@@ -112,7 +108,7 @@ class RealPrometheus:
             return False
 
     def alerts(self) -> list[Alert]:
-        """All alerts that are pending or fire."""
+        """Return all pending and active alerts."""
         found = []
         for alert in self.get("alerts")["alerts"]:
             labels = alert["labels"]
@@ -121,19 +117,19 @@ class RealPrometheus:
         return found
 
     def query(self, expression: str) -> list[dict[str, Any]]:
-        """The vector that an expression gives now."""
+        """Return the present vector of an expression."""
         result: list[dict[str, Any]] = self.get("query", query=expression)["result"]
         return result
 
     def query_range(self, expression: str, start_s: float, end_s: float, step_s: float) -> list[dict[str, Any]]:
-        """The matrix that an expression gives."""
+        """Return the matrix of an expression."""
         times = {"start": f"{start_s:.3f}", "end": f"{end_s:.3f}", "step": f"{step_s:.3f}"}
         result: list[dict[str, Any]] = self.get("query_range", query=expression, **times)["result"]
         return result
 
 
 def configuration(folder: Path, interval_ms: int, rules: Sequence[str]) -> str:
-    """prometheus.yml: job imud with its targets from a file."""
+    """Return prometheus.yml with the job imud. Its targets are in a file."""
     names = ("scrape_interval", "scrape_timeout", "evaluation_interval")
     times = json.dumps(dict.fromkeys(names, f"{interval_ms}ms"))
     return f"""\
@@ -147,7 +143,7 @@ scrape_configs:
 
 @contextmanager
 def real_prometheus(folder: Path, rules: str = "", pace: Pace | None = None) -> Iterator[RealPrometheus]:
-    """Run Prometheus in a folder with these rules; it scrapes nothing yet."""
+    """Run Prometheus in a folder with these rules. It has no targets at first."""
     port = free_port()
     running = RealPrometheus(folder, port)
     running.scrape()

@@ -1,5 +1,6 @@
-"""Every alert in a real Prometheus: silent without a fault, active with it, clear after it. Prometheus scrapes two
-daemons:
+"""Every alert in a real Prometheus: inactive without a fault, active with it, and inactive after it.
+
+Prometheus scrapes two daemons:
 
     site    in this process, a device per fault (`tests.monitoring.faults`)
     spare   `imud run`, which is killed and started again, has no devices, and can open few files
@@ -55,12 +56,12 @@ SPARE_ALERTS: Final = ("ImudDown", "ImudRestarts", "ImudNoDevices", "ImudFilesNe
 
 STARTS: Final = 4
 WHEN_TOLD: Final = "import sys, imud.cli, imud.daemon; sys.stdin.readline(); sys.exit(imud.cli.main())"
-"""Everything that takes long at a start is done before it, so that starts are some seconds apart on a slow machine."""
+"""Program that imports imud and waits for a line on standard input, so that a start is fast on a slow host."""
 STUCK_S: Final = 1.0
 
 
 class Spare:
-    """`imud run` on one wire or on no device; killed and started STARTS times at most."""
+    """`imud run` with one wire or without a device. The test kills and starts it at most STARTS times."""
 
     def __init__(self, folder: Path, port: int) -> None:
         self.folder = folder
@@ -71,7 +72,7 @@ class Spare:
 
     def _prepared(self) -> subprocess.Popen[bytes]:
         argv = [sys.executable, "-c", WHEN_TOLD, "run", "--config", str(self.folder / "imud.yaml")]
-        time.sleep(0.05)  # the kernel tells the time of a start in ticks of 10 ms
+        time.sleep(0.05)  # the start time of a process has a resolution of 10 ms
         with (self.folder / "log").open("ab") as log:
             return subprocess.Popen(argv, stdin=subprocess.PIPE, stderr=log)
 
@@ -129,7 +130,7 @@ class Watcher:
         self._expected = expected
         """Device and instance by alert."""
         self.texts: dict[str, Alert] = {}
-        """Every alert as it fired last."""
+        """The newest active alert of each kind."""
         self.begin(firing=True)
 
     def begin(self, *, firing: bool) -> None:
@@ -149,7 +150,7 @@ class Watcher:
         return fire
 
     def wait(self, *names: str) -> None:
-        """Wait until all of them have fired, or cleared, in this phase."""
+        """Wait until all alerts in `names` have fired, or cleared, in this phase."""
         while missing := set(names) - self.after_s.keys():
             late = f"not yet {'fired' if self._firing else 'cleared'}: {sorted(missing)}; {self.after_s}"
             assert time.monotonic() < self._begin + 2 * LIMIT_S, late
@@ -158,7 +159,7 @@ class Watcher:
 
 
 def wait_scraped(prometheus: RealPrometheus, watcher: Watcher, spare: Spare) -> None:
-    """Wait until a daemon that was started is seen, and no other."""
+    """Wait until Prometheus scrapes only the newly started daemon."""
     port = spare.port
     before = prometheus.query(f'max_over_time(process_start_time_seconds{{instance="127.0.0.1:{port}"}}[10m])')
 
@@ -167,7 +168,7 @@ def wait_scraped(prometheus: RealPrometheus, watcher: Watcher, spare: Spare) -> 
         now = prometheus.query(f'process_start_time_seconds{{instance="127.0.0.1:{port}"}}')
         return bool(now) and float(now[0]["value"][1]) > float(before[0]["value"][1])
 
-    wait_until(seen, "the new daemon is scraped", LIMIT_S)
+    wait_until(seen, "a scrape of the new daemon", LIMIT_S)
 
 
 def break_spare(prometheus: RealPrometheus, watcher: Watcher, spare: Spare) -> None:
@@ -216,7 +217,7 @@ def test_every_alert_fires_and_clears(tmp_path: Path) -> None:
 
         watcher.begin(firing=True)
         begin = time.monotonic()
-        while "ImudLoopLate" not in watcher.after_s:  # alone: scrapes fail while the loop is stuck
+        while "ImudLoopLate" not in watcher.after_s:  # only this alert: scrapes fail while the loop is blocked
             one.block_loop(max(STUCK_S, 1.5 * pace.interval_ms / 1000))
             time.sleep(2.17 * STUCK_S)  # out of step with the scrapes: one scrape must be in time
             watcher.look()
@@ -244,11 +245,13 @@ def test_every_alert_fires_and_clears(tmp_path: Path) -> None:
     print(table(fired, cleared, watcher, pace))
     for alert in watcher.texts.values():
         for text in alert.annotations.values():
-            assert "<" not in text, text  # how Prometheus shows an error of a template, and <no value>
+            assert "<" not in text, (
+                text
+            )  # Prometheus shows template errors with <error>, and missing values with <no value>
 
 
 def wait_calm(prometheus: RealPrometheus) -> None:
-    """Wait until every device runs and nothing fires, of any device."""
+    """Wait until every device runs and no alert is active."""
     end = time.monotonic() + 2 * LIMIT_S
     while wrong := unrest(prometheus):
         assert time.monotonic() < end, wrong
@@ -258,7 +261,7 @@ def wait_calm(prometheus: RealPrometheus) -> None:
 def unrest(prometheus: RealPrometheus) -> list[str]:
     firing = [f"{alert.name} {alert.device}" for alert in prometheus.alerts() if alert.state == "firing"]
     up = {one["metric"]["device"]: one["value"][1] == "1" for one in prometheus.query("imud_device_up")}
-    return firing + [f"{name} is not up" for name in (*WIRES, "boom", "module", "spare") if not up.get(name)]
+    return firing + [f"expected {name} to be up" for name in (*WIRES, "boom", "module", "spare") if not up.get(name)]
 
 
 def table(fired: dict[str, float], cleared: dict[str, float], watcher: Watcher, pace: Pace) -> str:

@@ -87,5 +87,5 @@ def assert_devices_are_told_apart(prometheus: RealPrometheus, one: Site) -> None
         if "$device" in expression:
             for series in prometheus.query(dashboard.filled_in(expression, device="quiet")):
                 assert series["metric"].get("device", "quiet") == "quiet", title
-    devices = prometheus.query("count(max_over_time(imud_device_up[5m]))")  # whether or not the last scrape was in time
+    devices = prometheus.query("count(max_over_time(imud_device_up[5m]))")  # also if the last scrape was late
     assert devices[0]["value"][1] == str(len(one.wires) + 2)

@@ -1,4 +1,4 @@
-"""Rules, examples and documents of monitoring, by Prometheus' and Alertmanager's own tools."""
+"""Rules, examples and documents of monitoring, checked with the tools of Prometheus and Alertmanager."""
 
 import re
 import subprocess
