@@ -1,6 +1,6 @@
-"""Makes shell completions from the parsers, by shtab: `python -m tests.packaging.completions FOLDER`.
+"""Creates shell completions from the parsers with shtab: `python -m tests.packaging.completions FOLDER`.
 
-FOLDER gets a file per shell, named as the shell looks for it: `bash/imud`, `zsh/_imud`, `fish/imud.fish`.
+FOLDER contains one file per shell, with the name that the shell expects: `bash/imud`, `zsh/_imud`, `fish/imud.fish`.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from imud.cli import build_parser
 
 FILES: Final = {"bash": "bash/imud", "zsh": "zsh/_imud", "fish": "fish/imud.fish"}
 PATHS: Final = ("FILE", "PATH", "PORT", "CAPTURE")
-"""Names of arguments in the help that are completed with names of files; a port is a node below /dev."""
+"""Names of arguments in the help with file names as completions. A port is a node below /dev."""
 
 
 def every_parser(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:

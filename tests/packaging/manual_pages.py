@@ -1,7 +1,7 @@
-"""Makes manual pages in roff: `python -m tests.packaging.manual_pages FOLDER`.
+"""Creates manual pages in roff: `python -m tests.packaging.manual_pages FOLDER`.
 
-imud(1) and a page for each command, imud-COMMAND(1), come from the parsers that print `--help`; imud.yaml(5) comes from
-the settings classes, as docs/configuration.md does. The Debian package installs them.
+imud(1) and one page per command, imud-COMMAND(1), come from the parsers that print `--help`. imud.yaml(5) comes from
+the option classes, like docs/configuration.md. The Debian package installs the pages.
 """
 
 import argparse
@@ -22,26 +22,26 @@ from tests.support import references
 
 EXIT_STATUS: Final = (
     ("0", "Done."),
-    ("1", "The command ran, and the answer is no."),
+    ("1", "The command ran, and its result is negative."),
     ("2", "The command could not run; the reason is on standard error."),
 )
 OWN_STATUS: Final = {
     "run": (
         ("0", "Stopped by SIGTERM or SIGINT."),
         ("1", "An internal error; the log has a traceback."),
-        ("2", "Wrong command line."),
-        ("75", "An output that is required cannot start."),
-        ("78", "The configuration cannot be used; the log has file, line and column."),
+        ("2", "Invalid command line."),
+        ("75", "A required output cannot start."),
+        ("78", "The configuration is invalid; the log contains file, line and column."),
     ),
     "doctor": (
-        ("0", "Nothing wrong was found in what could be checked."),
-        ("1", "A warning: what works does not work as well as it could."),
-        ("2", "An error: a device or an output does not work. Also: wrong command line."),
+        ("0", "The possible checks found no problem."),
+        ("1", "A warning: a device or an output works, but not as well as possible."),
+        ("2", "An error: a device or an output does not work. Also: invalid command line."),
     ),
     "setup": (
-        ("0", "Samples come from all configured devices; or the plan was shown, or nothing is left to take back."),
-        ("1", "No sensor was found, a device sends no samples, or something was not changed or not taken back."),
-        ("2", "It could not run, or a change failed; the reason is on standard error."),
+        ("0", "All configured devices send samples, or the plan was printed, or no change is left to undo."),
+        ("1", "No sensor was found, a device sends no samples, or a change was not made or not undone."),
+        ("2", "The command could not run, or a change failed; the reason is on standard error."),
     ),
 }
 ENVIRONMENT: Final = (
@@ -50,9 +50,9 @@ ENVIRONMENT: Final = (
 )
 FILES: Final = (
     ("/etc/imud.yaml", "The configuration, imud.yaml(5)."),
-    (DEFAULT_PATH, "The socket: questions, samples and events."),
+    (DEFAULT_PATH, "The socket: requests, samples and events."),
     ("/run/imud/shm", "The rings of shared memory."),
-    ("/var/lib/imud", "What the daemon remembers."),
+    ("/var/lib/imud", "The stored state of the daemon."),
 )
 
 RAGGED: Final = ".ad l"
@@ -64,7 +64,7 @@ EVEN: Final = ".ad b"
 
 
 def inside(text: str) -> str:
-    """Text within a line as roff prints it: hyphens stay hyphens, so that they can be copied."""
+    """Return text within a line for roff. Hyphens are escaped, so that users can copy them."""
     return text.replace("\\", "\\e").replace("-", "\\-").replace("^", "\\(ha").replace("~", "\\(ti")
 
 
@@ -81,7 +81,7 @@ def italic(text: str) -> str:
 
 
 def marked(text: str) -> str:
-    """Text of a document with its `code` in bold."""
+    """Return text of a document with its `code` in bold."""
     parts = text.split("`")
     return "".join(bold(part) if number % 2 else inside(part) for number, part in enumerate(parts))
 
@@ -125,7 +125,7 @@ def values_of(action: argparse.Action) -> str:
 
 
 def help_of(action: argparse.Action, parser: argparse.ArgumentParser) -> str:
-    """The help text with its %(…)s filled in, as `--help` prints it."""
+    """Return the help text with values for its %(…)s, like `--help`."""
     words = {**vars(action), "prog": parser.prog}
     if action.choices is not None:
         words["choices"] = ", ".join(map(str, action.choices))
@@ -134,7 +134,7 @@ def help_of(action: argparse.Action, parser: argparse.ArgumentParser) -> str:
 
 
 def arguments_of(parser: argparse.ArgumentParser) -> list[argparse.Action]:
-    """The arguments that `--help` shows, commands of a command not among them."""
+    """Return the arguments in the output of `--help`, without the subcommands."""
     return [
         action
         for action in parser._actions
@@ -173,12 +173,12 @@ def options(parser: argparse.ArgumentParser) -> Iterator[str]:
 
 
 def main_page(parser: argparse.ArgumentParser) -> Iterator[str]:
-    yield from header("imud", 1, "daemon that owns inertial sensors and gives programs their samples")
+    yield from header("imud", 1, "daemon that reads inertial sensors and sends their samples to programs")
     yield from (".SH SYNOPSIS", RAGGED, synopsis(parser), EVEN, ".SH DESCRIPTION")
     yield escaped(
-        "imud owns inertial sensors on serial ports, RS-485, CAN, I2C and SPI, gives each sample the time at which it "
-        "was measured, and hands it to any number of programs over a UNIX socket and shared memory. As a service it is "
-        "imud.service. Its commands find sensors, check a configuration, and ask the running daemon."
+        "imud reads inertial sensors on serial ports, RS-485, CAN, I2C and SPI. It time-stamps each sample with the "
+        "time of its measurement, and sends it to any number of programs over a UNIX socket and shared memory. The "
+        "service is imud.service. The commands find sensors, check a configuration, and send requests to the daemon."
     )
     yield ".SH COMMANDS"
     for name, command in COMMANDS.items():
@@ -210,8 +210,8 @@ def configuration_page() -> Iterator[str]:
     yield from header("imud.yaml", 5, "configuration of imud")
     yield from (".SH SYNOPSIS", escaped("/etc/imud.yaml"), ".SH DESCRIPTION")
     yield marked(
-        "A YAML file. All keys have defaults but those marked as needed. `imud check` says whether a file can be used "
-        "and what is wrong with it; `systemctl reload imud` makes the daemon read it again. The smallest useful file:"
+        "A YAML file. All keys have defaults except the keys marked as needed. `imud check` checks a file and prints "
+        "its errors. `systemctl reload imud` makes the daemon read the file again. The smallest useful file:"
     )
     yield from (".PP", ".EX", "devices:", "  front:", "    uart: {port: /dev/ttyUSB0}", ".EE")
     for title, path, schema in references.settings_parts():
@@ -238,7 +238,7 @@ def pages() -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    os.environ.pop("IMUD_SOCKET", None)  # a default that is printed must not be that of who makes the pages
+    os.environ.pop("IMUD_SOCKET", None)  # the default must not depend on the environment of the build
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
     for file, text in pages().items():

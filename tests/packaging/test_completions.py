@@ -1,4 +1,4 @@
-"""The shell completions know all commands, and each shell can read its own."""
+"""The shell completions contain all commands, and each shell accepts its file."""
 
 import shutil
 import subprocess
@@ -11,7 +11,7 @@ from tests.packaging.completions import FILES, completions
 from tests.support.daemon_process import LIMIT_S
 
 pytestmark = pytest.mark.live
-pytest.importorskip("shtab", reason="shtab is not installed (extra dev)")
+pytest.importorskip("shtab", reason="cannot find shtab (extra dev)")
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def test_every_shell_can_read_its_file_and_knows_all_commands(folder: Path) -> N
         assert "ned-frd" in text
     for shell in FILES:
         if shutil.which(shell) is None:
-            pytest.skip(f"no {shell} on this machine")
+            pytest.skip(f"cannot find {shell}")
         subprocess.run([shell, "-n", str(folder / FILES[shell])], check=True, timeout=LIMIT_S)
 
 
@@ -42,7 +42,7 @@ def completed_by_bash(folder: Path, *words: str) -> list[str]:
     return subprocess.run(argv, capture_output=True, text=True, check=True, timeout=LIMIT_S).stdout.split()
 
 
-@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash on this machine")
+@pytest.mark.skipif(shutil.which("bash") is None, reason="cannot find bash")
 def test_bash_completes_commands_options_values_and_files(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert completed_by_bash(folder, "imud", "wa") == ["watch"]
     assert completed_by_bash(folder, "imud", "watch", "--conv") == ["--convention"]

@@ -1,4 +1,4 @@
-"""The files of the Debian package that can be judged without building it; `make deb` builds it."""
+"""Checks of the Debian package without a build. `make deb` builds it."""
 
 import os
 import re
@@ -127,7 +127,7 @@ OTHERS = {
     "imud": "/usr/bin/imud, imud.service, 60-imud.rules; github.com/richcreations/imud, version 1.6.1",
     "libimud-dev": "/usr/include/imud.h; of the same project",
 }
-"""Packages of other projects, and the files that they and ours have at the same places."""
+"""Packages of other projects, with their files at the same paths as files of imud."""
 
 
 def test_conflicts_extras_units_files_and_groups_of_the_package() -> None:
@@ -200,7 +200,7 @@ def test_without_lintian_ci_makes_no_package(tmp_path: Path, ci: str, said: str)
     assert "THIS PACKAGE IS NOT CHECKED" in (DEBIAN / "build").read_text()
 
 
-@pytest.mark.skipif(shutil.which("pkg-config") is None, reason="no pkg-config on this machine")
+@pytest.mark.skipif(shutil.which("pkg-config") is None, reason="cannot find pkg-config")
 def test_pkg_config_reads_its_file(tmp_path: Path) -> None:
     (tmp_path / "imud.pc").write_text((DEBIAN / "imud.pc").read_text().replace("@VERSION@", __version__))
     argv = ["pkg-config", "--modversion", "imud"]
@@ -210,7 +210,7 @@ def test_pkg_config_reads_its_file(tmp_path: Path) -> None:
 
 
 def library(folder: Path, name: str, **texts: str) -> None:
-    """A library as an installed wheel, with these files of licences."""
+    """Create a library like an installed wheel, with these license files."""
     info = folder / f"{name}-1.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\nAuthor: A. Uthor\n")

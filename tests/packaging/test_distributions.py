@@ -1,4 +1,4 @@
-"""Wheel and sdist, built by the backend that is installed here, without the network: both have all files."""
+"""Wheel and sdist contain all files. The installed backend builds them without the network."""
 
 import importlib.util
 import os
@@ -25,7 +25,7 @@ pytestmark = [
     pytest.mark.live,
     pytest.mark.skipif(
         importlib.util.find_spec("hatchling") is None and not os.environ.get("CI"),
-        reason="no hatchling on this machine (it is in the extra dev)",
+        reason="cannot find hatchling (extra dev)",
     ),
 ]
 

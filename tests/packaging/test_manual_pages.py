@@ -1,4 +1,4 @@
-"""The manual pages say what `--help` and the settings classes say, in roff that every reader prints."""
+"""The manual pages match `--help` and the option classes, in roff that every reader supports."""
 
 import argparse
 import re
@@ -73,7 +73,7 @@ def test_exit_statuses_are_those_of_each_command() -> None:
     for severity, status in STATUS.items():
         assert f"\\fB{status}\\fR\nA{'n' * (severity[0] in 'aeiou')} {severity}: " in doctor
     assert "The command ran" not in doctor + setup
-    assert "not taken back" in setup
+    assert "not undone" in setup
     rows = re.findall(r"^\| (\d+) \|", (ROOT / "docs/operate.md").read_text(), re.MULTILINE)
     part = PAGES["imud-run.1"].partition(".SH EXIT STATUS")[2]
     assert re.findall(r"^\\fB(\d+)\\fR$", part, re.MULTILINE) == rows
@@ -91,7 +91,7 @@ def test_the_configuration_page_has_every_key_in_words_that_fit_a_line() -> None
 
 
 @pytest.mark.live
-@pytest.mark.skipif(shutil.which("mandoc") is None, reason="no mandoc on this machine")
+@pytest.mark.skipif(shutil.which("mandoc") is None, reason="cannot find mandoc")
 @pytest.mark.parametrize("name", PAGES)
 def test_mandoc_finds_nothing_wrong(name: str) -> None:
     argv = ["mandoc", "-T", "lint", "-W", "warning"]

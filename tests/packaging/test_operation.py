@@ -1,5 +1,4 @@
-"""The commands of docs/operate.md: the tests run backup and restore on a simulated host, and check that all other names
-exist.
+"""The commands of docs/operate.md: backup and restore run on a simulated host, all other names must exist.
 
 Upgrade and downgrade run on a booted Debian (tests/lab_debian/guest/removal.py).
 """
@@ -61,7 +60,7 @@ def commands(title: str) -> list[str]:
 
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Root of a machine with imud, and programs that only say how they were called, but for `imud check`."""
+    """Return the root of a simulated host with imud. All programs only log their calls, except `imud check`."""
     programs = tmp_path / "bin"
     programs.mkdir()
     for name in ("systemctl", "udevadm", "imud"):

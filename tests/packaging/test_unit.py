@@ -26,13 +26,13 @@ FLEET_UNIT = ROOT / "systemd" / "imud-fleet-collect.service"
 EXPOSURE_MAX = 2.0
 """Maximum exposure. docs/operate.md explains its parts. The check in the guest has the same limit."""
 REASON_WORDS = 5
-"""Of the shortest reason: fewer words repeat the directive's name."""
+"""Minimum number of words in a reason. A shorter reason only repeats the name of the directive."""
 PAGE = ROOT / "docs" / "operate.md"
 DROP_INS = re.findall(r"^```ini\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
 COLLECTOR_EXPOSURE_MAX = 2.5
 """Maximum exposure of the collector. It connects to brokers and databases anywhere: no IPAddressDeny."""
 OFFLINE_SINCE = 250
-"""Version of systemd whose systemd-analyze judges a file."""
+"""First version of systemd with a systemd-analyze that rates a file."""
 
 
 def values(name: str) -> list[str]:
@@ -57,7 +57,7 @@ def exposure(text: str, folder: str) -> float:
     return float(found[1])
 
 
-judged = pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file here")
+judged = pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="cannot find a systemd-analyze that rates files")
 
 
 @judged
@@ -89,7 +89,7 @@ def test_every_directive_of_the_unit_has_its_reason_in_the_document_and_nothing_
 
 
 def test_the_rings_are_where_removing_ipc_does_not_reach_unless_the_configuration_says_so() -> None:
-    """RemoveIPC= of systemd.exec(5): System V and POSIX IPC, which is /dev/shm and message queues."""
+    """RemoveIPC= of systemd.exec(5) removes System V and POSIX IPC: /dev/shm and message queues."""
     assert values("RemoveIPC") == ["yes"]
     assert not any(folder.startswith("/dev/shm") for folder in (ShmOptions().directory, FlightOptions().directory))
     assert f"/run/{values('RuntimeDirectory')[1]}" == ShmOptions().directory
