@@ -35,7 +35,7 @@ IO_MODULES = {
 
 
 def modules() -> dict[str, Path]:
-    """Every module of the package by name."""
+    """Return every module of the package by name."""
     found = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = ("imud", *path.relative_to(PACKAGE).with_suffix("").parts)
@@ -48,13 +48,13 @@ MODULES = modules()
 
 @cache
 def tree_of(path: Path) -> ast.Module:
-    """The syntax tree of a file."""
+    """Return the syntax tree of a file."""
     return ast.parse(path.read_text())
 
 
 @cache
 def imports(path: Path) -> frozenset[str]:
-    """Full names of everything that a module imports, at any depth of its code."""
+    """Return the full names of all imports of a module, at any depth of its code."""
     found: set[str] = set()
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
@@ -195,7 +195,7 @@ def length(node: ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 
 
 def limits_exceeded(module: str, node: ast.ClassDef) -> list[str]:
-    """Return the limits that a class exceeds, and the exceptions that it does not need any more."""
+    """Return the limits that a class exceeds, and its unnecessary exceptions."""
     found = []
     if (length(node) > CLASS_LINES_MAX) != (node.name in LONG_CLASSES):
         found.append(f"{node.name}: {length(node)} lines")
@@ -252,7 +252,7 @@ def test_the_name_of_a_module_is_a_noun() -> None:
 
 @cache
 def own_modules() -> dict[str, Path]:
-    """Modules that are files of their own: neither a package's `__init__` nor the entry point of a program."""
+    """Return the modules with code of their own: no `__init__` of a package, and no entry point of a program."""
     return {name: path for name, path in MODULES.items() if path.name not in ("__init__.py", "__main__.py")}
 
 
@@ -277,17 +277,17 @@ MAY_READ_CLOCKS = (
     "imud.daemon",
     "imud.host.clock",
     "imud.host.event_loop",  # the remaining time of a wait, by the clock of asyncio's timers
-    "imud.cli",  # a process of its own, as the client, the fleet reader and the simulator
+    "imud.cli",  # a process of its own, like the client, the fleet reader and the simulator
     "imud.client",
     "imud.fleet.reader",
     "imud.sim.__main__",
-    "imud.links",  # in the callback that reads, and in waits for the wire
+    "imud.links",  # in the callback that reads, and in waits for the end of a transfer
     "imud.web.foxglove",  # the server of `imud foxglove`, a process of its own
 )
 
 
 def clock_uses(path: Path) -> list[str]:
-    """Every place that reads a clock, or names a clock function as a default."""
+    """Return every place that reads a clock, or uses a clock function as a default."""
     found = []
     tree = tree_of(path)
     named = {
@@ -310,7 +310,7 @@ def clock_uses(path: Path) -> list[str]:
 
 
 def may_read_clocks(module: str) -> bool:
-    """Whether the module, or a package that it is in, may."""
+    """Return whether the module, or a package that contains it, may read clocks."""
     return any(module == name or module.startswith(name + ".") for name in MAY_READ_CLOCKS)
 
 
@@ -334,9 +334,9 @@ def test_the_search_for_clocks_finds_them(tmp_path: Path) -> None:
 
 
 def private_writes(path: Path) -> list[str]:
-    """Every place where a test sets an underscore member of another object, or patches one by name."""
+    """Return every place where a test sets an underscore member of another object, or patches such a member by name."""
     if not re.search(r"[.\"']_[a-z]", path.read_text()):
-        return []  # most files: parsing them takes seconds
+        return []  # most files: this avoids seconds of parsing
     found = []
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign):
@@ -376,8 +376,8 @@ ELSEWHERE = (
     "packaging",
     "monitoring",
 )
-"""Folders of tests that mirror no package: measurements, kernels, the C header, foreign bytes, helpers, packages, and
-what Prometheus makes of the metrics."""
+"""Folders of tests that do not belong to one package: measurements, kernels, the C header, fuzzing, helpers, packages,
+and monitoring."""
 
 CROSS_CUTTING = {
     "cli/test_main.py": "`main` of imud/cli/__init__.py",

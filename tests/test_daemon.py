@@ -1,4 +1,4 @@
-"""The daemon as a process: it comes back when the cable does, reads its configuration again, and dies with a reason."""
+"""The daemon as a process: reconnected devices, reloads of the configuration, and exits with a reason."""
 
 import asyncio
 import os
@@ -33,7 +33,7 @@ from tests.support.files import hi91
 
 
 class Cable:
-    """A pty whose slave has a stable name, as an adapter has below /dev/serial/by-id."""
+    """A pty with a stable name for its slave, like an adapter below /dev/serial/by-id."""
 
     def __init__(self, name: Path) -> None:
         self.name = name
@@ -47,7 +47,7 @@ class Cable:
         self.slave: int | None = slave
 
     def hold_no_more(self) -> None:
-        """Let only the daemon have the slave open."""
+        """Close the test's descriptor of the slave, so that only the daemon has it open."""
         if self.slave is not None:
             os.close(self.slave)
             self.slave = None
@@ -102,7 +102,7 @@ def test_a_port_that_appears_is_taken_each_time(tmp_path: Path) -> None:
 
 @in_loop
 async def test_the_thread_that_closes_is_there_from_the_beginning() -> None:
-    """Unplugging starts none: it would need memory and a process number that may not be left."""
+    """A new thread after an unplug would need memory and a process id, which may not be available."""
     daemon = Daemon(Config("info", "", {}, ()))
     running = asyncio.create_task(daemon.run())
     await asyncio.sleep(0)
@@ -156,7 +156,7 @@ async def test_whatever_an_output_raises_at_the_end_all_others_are_closed(caplog
     for output in outputs.values():
         output.ends = True
     daemon.stop()
-    with pytest.raises(RuntimeError, match="tick"):  # the first is the reason
+    with pytest.raises(RuntimeError, match="tick"):  # the first exception is the reason
         await running
     for output in outputs.values():
         assert output.did[-2:] == ["tick", "close"]
@@ -164,7 +164,7 @@ async def test_whatever_an_output_raises_at_the_end_all_others_are_closed(caplog
 
 
 def reload(daemon: RunningDaemon, devices: dict[str, Any], **more: Any) -> None:
-    """Write another configuration and let the daemon read it."""
+    """Write another configuration and reload the daemon."""
     write_config(daemon.folder, devices, **more)
     daemon.signal(signal.SIGHUP)
 
@@ -188,7 +188,10 @@ def test_reload_changes_what_differs_and_keeps_the_rest(tmp_path: Path) -> None:
         stern.send(2)
         wait_until(lambda: samples(daemon, "stern") == 2, "samples of the new device")
         assert Ring(tmp_path / "imud.stern").newest_seq == 2
-        for place, newest in (("first", 5), ("second", 7)):  # an output gets the samples in place of the old one
+        for place, newest in (
+            ("first", 5),
+            ("second", 7),
+        ):  # a new output receives the samples in place of the old output
             (tmp_path / place).mkdir(mode=0o755)
             ring = tmp_path / place / "imud.bow"
             reload(daemon, both, shm={"directory": str(tmp_path / place)})
@@ -239,7 +242,7 @@ def test_second_daemon_is_refused_with_the_reason(tmp_path: Path) -> None:
         assert re.search(r"CRITICAL .*imud\.sock", again.stderr)
         assert "Traceback" not in again.stderr
         assert daemon.statuses() == {}
-        daemon.signal(signal.SIGINT)  # SIGTERM ends all others
+        daemon.signal(signal.SIGINT)  # all other tests use SIGTERM
         assert daemon.process.wait(LIMIT_S) == 0
 
 

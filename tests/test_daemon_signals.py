@@ -1,4 +1,4 @@
-"""The daemon as a process that is treated badly: its log is not read, it is reloaded without end, and killed."""
+"""The daemon under stress: an unread log, continuous reloads, and kills."""
 
 import asyncio
 import os
@@ -27,13 +27,13 @@ RUN = (sys.executable, "-m", "imud", "run", "--config")
 
 
 def missing(folder: Path, count: int, **more: Any) -> dict[str, Any]:
-    """Devices whose ports are not there."""
+    """Return devices with missing ports."""
     return {f"m{number}": device(folder / f"none{number}", **more) for number in range(count)}
 
 
 @pytest.mark.live
 def test_a_log_that_nobody_reads_costs_no_sample(tmp_path: Path) -> None:
-    """Noise that is reported, and reloads, fill the log; its pipe is full from the beginning."""
+    """Reports of noise and of reloads fill the log. Its pipe is full from the start."""
     file = write_config(tmp_path, {"bow": device(tmp_path / "port")})
     with (
         pipe(full=True) as (_, descriptor),

@@ -111,7 +111,7 @@ def test_examples_read_from_a_running_daemon(tmp_path: Path) -> None:
 
 
 def compiled_reader(folder: Path) -> str:
-    """Compile the example in C with the command of the page; return the path of the program."""
+    """Compile the C example with the command of the page. Return the path of the program."""
     (example,) = examples("c")
     (folder / "reader.c").write_text(example.text.replace('"bow")', f'"{folder}/imud.bow")'))
     (folder / "imud").symlink_to(ROOT / "imud")

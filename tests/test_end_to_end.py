@@ -1,4 +1,4 @@
-"""The whole way, through real processes: bytes into a pty, samples out of the socket and out of shared memory."""
+"""The complete path with real processes: bytes into a pty, samples from the socket and from shared memory."""
 
 import csv
 import os
@@ -38,7 +38,7 @@ G = 9.8
 
 @contextmanager
 def raw_ports(count: int) -> Iterator[list[tuple[int, str]]]:
-    """Masters of raw ptys, and the paths of their slaves, which stay open."""
+    """Yield the masters of raw ptys and the paths of their slaves. The slaves stay open."""
     pairs = [pty.openpty() for _ in range(count)]
     for _, slave in pairs:
         tty.setraw(slave)
@@ -52,7 +52,7 @@ def device(path: str, **more: object) -> dict[str, object]:
 
 
 def f32(value: float) -> float:
-    """The nearest 32-bit float, as the wire carries it."""
+    """Return the nearest 32-bit float, as in a frame."""
     result: float = struct.unpack("<f", struct.pack("<f", value))[0]
     return result
 
@@ -61,7 +61,7 @@ Row = dict[str, str]
 
 
 def frame(row: Row) -> bytes:
-    """A row of the recording as the module sent it."""
+    """Return the frame of a row of the recording."""
     three = {name: tuple(float(row[f"{name}_{axis}"]) for axis in "xyz") for name in ("acc", "gyr", "mag")}
     acc, gyr, mag = three["acc"], three["gyr"], three["mag"]
     return encode_hi91(
@@ -128,12 +128,12 @@ def test_every_row_of_a_real_recording_arrives_on_both_ways(tmp_path: Path) -> N
     assert sum(ledger[name] for name in ledger if name.startswith("lost_")) == 0
 
 
-# --- a module of known attitude in a body -----------------------------------------------------------------------------
+# --- a device with a known attitude in a body -------------------------------------------------------------------------
 
 BODY = (radians(5.0), radians(-10.0), radians(30.0))
 """Roll, pitch, yaw of the body in enu-flu: left side up by 5°, nose up by 10°, its front 30° to the left of east."""
 IN_NED = (radians(5.0), radians(10.0), radians(60.0))
-"""The same attitude in ned-frd, computed by hand: right side down by 5°, nose up by 10°, 60° clockwise from north."""
+"""Attitude of BODY in ned-frd, computed by hand: right side down by 5°, nose up by 10°, 60° clockwise from north."""
 MOUNTINGS: dict[str, tuple[dict[str, object], Matrix3]] = {
     # lines of the configuration; rows: the axis of the sensor that points forward, left, up
     "side": ({"axes": {"x": "y", "y": "z", "z": "x"}}, ((0, 1, 0), (0, 0, 1), (1, 0, 0))),
@@ -144,7 +144,7 @@ MOUNTINGS: dict[str, tuple[dict[str, object], Matrix3]] = {
 
 @pytest.mark.live
 def test_simulated_modules_in_bodies_of_known_attitude(tmp_path: Path) -> None:
-    """The ring and a plain client get enu-flu; a binary one and `poll` ask for ned-frd. Everything is turned once."""
+    """The ring and a normal client receive enu-flu; a binary client and `poll` request ned-frd."""
     body = matrix_from_quat(quat_from_euler_zyx(BODY))
     up_m_s2 = (body[2][0] * G, body[2][1] * G, body[2][2] * G)
     field_t = matrix_times(transposed(body), FIELD_ENU_T)

@@ -155,7 +155,7 @@ def test_two_names_of_one_port_are_one_port(tmp_path: Path) -> None:
     ).devices
     assert owner_of(second, [first, second], LINKS) == ""
     late.unlink()
-    late.symlink_to("port")  # as udev makes it when the adapter is plugged in
+    late.symlink_to("port")  # udev creates this link when the adapter is plugged in
     assert owner_of(second, [first, second], LINKS) == "a"
     (found,) = problems(f"a {{uart: {{port: {port}}}}}", f"b {{uart: {{port: {late}}}}}")
     assert f"expected an unused port, got {late}; a (line 2) uses it" in found

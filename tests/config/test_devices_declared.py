@@ -1,4 +1,4 @@
-"""`settings:` of a device: typed by the driver's table, refused with their place, compared on reload."""
+"""`settings:` of a device: types from the driver's table, errors with their place, and the comparison on reload."""
 
 # ruff: noqa: E501 - a row of the table has the whole message
 

@@ -1,4 +1,4 @@
-"""The keys frame, convention, declination_deg and noise: all ways to give a rotation, and mistakes with their place."""
+"""The keys frame, convention, declination_deg and noise: all forms of a rotation, and errors with their place."""
 
 # ruff: noqa: E501 - a row of the table has the whole message
 

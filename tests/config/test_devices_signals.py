@@ -24,7 +24,7 @@ from imud.utc.receivers import RmcOptions
 
 
 def parse(*devices: str) -> tuple[DeviceConfig, ...]:
-    """Devices a, b, …, one a line."""
+    """Parse the devices a, b, …, one per line."""
     text = "".join(f"  {name}: {{{keys}}}\n" for name, keys in zip("abc", devices, strict=False))
     return config.parse("devices:\n" + text, "f").devices
 

@@ -73,7 +73,7 @@ class FakeRow:
     refuses: type[Options] | None = None
     """Options of a driver that does not fit this link."""
     faults: tuple[KeyProblem, ...] = ()
-    """Problems that a driver has with everything."""
+    """Problems that the driver reports for all options."""
     device_settings: SettingsTable | None = None
     declared_line_differences: Callable[[Mapping[str, Any], DeviceLines], Mapping[str, str]] = lambda _declared, _: {}
 
@@ -96,7 +96,7 @@ def fake_row(*args: Any, **kwargs: Any) -> Any:
 
 
 class Broken(Mapping[str, Any]):
-    """A table with a row whose library is not installed."""
+    """A registry with a row that needs a missing library."""
 
     def __getitem__(self, name: str) -> Any:
         raise ModuleNotFoundError(f"No module named {name!r}")
@@ -369,7 +369,7 @@ def test_got() -> None:
 
 
 def uncommented(text: str) -> str:
-    """The shipped file with all its examples active: a `#` right before a key or list goes away."""
+    """Return the shipped file with all its examples active: remove each `#` directly before a key or list."""
     return re.sub(r"^( *)#(?=( {2})*([a-z_0-9]+|\"\*\"):)", r"\1", text, flags=re.MULTILINE)
 
 

@@ -1,4 +1,4 @@
-"""YAML with positions: refused words with their place, and the values of plain data."""
+"""YAML with positions: errors with their place, and the values of plain data."""
 
 import math
 from typing import Any
@@ -100,7 +100,7 @@ def test_traps_are_refused(word: str, says: str) -> None:
 def test_refused_with_its_place(text: str, line: int, column: int, path: str, says: str) -> None:
     got = only_problem(text)
     assert got[:1] == (line,)
-    if "[1, 2\n" not in text:  # the two parsers disagree about the column of this one
+    if "[1, 2\n" not in text:  # the two parsers report different columns for this text
         assert got[1] == column
     assert got[2] == path
     assert says in got[3]
@@ -151,7 +151,7 @@ PLAIN_DATA = st.recursive(
 
 @given(data=PLAIN_DATA)
 def test_json_reads_as_itself(data: Any) -> None:
-    """JSON is YAML: the command line makes configurations by msgspec, and they are read unchanged."""
+    """The command line creates configurations with msgspec. The YAML parser must read this JSON unchanged."""
     tree = read_yaml(msgspec.json.encode(data))
     assert tree.problems == []
     assert tree.data == data

@@ -1,4 +1,4 @@
-"""Settings written as YAML are read back as the same by imud, and by a reader of YAML 1.1 as well."""
+"""imud, and a reader of YAML 1.1, read written settings with the same values."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Actions: arguments checked and described; and every driver's actions by their rows."""
+"""Actions: check and description of arguments, and the actions in the rows of all drivers."""
 
 from typing import Annotated
 

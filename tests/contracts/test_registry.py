@@ -1,4 +1,4 @@
-"""Every row of every table leads to an object of that name; a wrong name is answered with the right ones."""
+"""Each row of each registry refers to an object of that name. An error for a wrong name contains the valid names."""
 
 from typing import Any
 

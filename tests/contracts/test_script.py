@@ -1,4 +1,4 @@
-"""Request and reply: replies, refusals, silence, late replies, and text that answers nothing."""
+"""Requests and replies: valid replies, refusals, silence, late replies, and text that is not a reply."""
 
 from dataclasses import replace
 from inspect import GEN_CLOSED, getgeneratorstate
@@ -28,7 +28,7 @@ TIMEOUT_NS = 100
 
 
 def command(name: str, part: str = "", silent: bool = False) -> Request:
-    """A request whose reply is lines that begin with `part`, then OK; without `part`, OK alone."""
+    """Return a request. Its reply is lines that start with `part`, then OK; without `part`, only OK."""
     return Request(
         payload=name.encode(),
         name=name,
@@ -104,31 +104,31 @@ def test_other_text_is_unsolicited_and_not_part_of_the_reply(session: ScriptRunn
 
 
 Step = Request | str | ReplyFrame
-"""A request that is started, or a message that the device sends."""
+"""A request to start, or a frame that the device sends."""
 
 
 @pytest.mark.parametrize(
     ("first", "wait_ns", "steps", "outcomes", "late_and_unsolicited"),
     [
-        (["a"], 1, ["a=1", "OK", "OK"], [], (1, 1)),  # with nothing outstanding
-        ([], 1, ["ERR"], [], (1, 0)),  # a late refusal is late too
-        (["a"], LATE_WINDOW_NS + 1, ["OK"], [], (0, 1)),  # after the window nothing is late
-        # the reply to the next request is OK alone: the lines before an OK show its request
+        (["a"], 1, ["a=1", "OK", "OK"], [], (1, 1)),  # no pending request
+        ([], 1, ["ERR"], [], (1, 0)),  # a late refusal is also late
+        (["a"], LATE_WINDOW_NS + 1, ["OK"], [], (0, 1)),  # after the window, no reply is late
+        # the reply to the next request is only OK: the lines before an OK identify its request
         (["a"], 0, [command("set"), "a=1", "a=2", "OK", "OK"], [Reply(("OK",))], (1, 0)),
-        # the rest of a reply that timed out in the middle
+        # the rest of a reply with a timeout in the middle
         (["a", "a=1"], 0, [command("set"), "OK", "ERR"], [Rejection(("ERR",))], (1, 0)),
-        # the OK of a command that timed out comes after the question
+        # the OK of a request with a timeout arrives after the next request
         ([], 0, [command("ask", "a"), "OK", "a=1", "OK"], [Reply(("a=1", "OK"))], (1, 0)),
-        # lines that were late long ago do not cost a fresh reply
+        # much earlier late lines do not discard a new reply
         (["a", "a=1"], LATE_WINDOW_NS + 1, [command("set"), "OK"], [Reply(("OK",))], (0, 0)),
-        (["a"], 0, [command("ask", "a"), "a=1", "OK"], [Reply(("a=1", "OK"))], (0, 0)),  # the same question again
+        (["a"], 0, [command("ask", "a"), "a=1", "OK"], [Reply(("a=1", "OK"))], (0, 0)),  # the same request again
     ],
 )
 def test_a_late_reply_does_not_answer_the_next_request(
     session: ScriptRunner, ledger: Ledger, first: list[str], wait_ns: int, steps: list[Step], outcomes: list[Outcome],
     late_and_unsolicited: tuple[int, int],
 ) -> None:  # fmt: skip
-    """`first`: the part of the first request, and the lines that come in time; it then times out."""
+    """The first request expects `first`, receives some lines in time, and then times out."""
     session.start(command("first", first[0] if first else ""), 0)
     for line in first[1:]:
         session.on_message(line, 5)
@@ -237,7 +237,7 @@ def measured(tick: int) -> Measurement:
 
 
 def waiting(ledger: Ledger, tick: int) -> ScriptRunner:
-    """A session whose request waits for the measurement at `tick`."""
+    """Return a runner. Its request waits for the measurement at `tick`."""
     session = offline_runner(ledger)
     session.start(replace(command("once"), is_sample=lambda sample: sample.dev_ticks == tick), 0)
     return session

@@ -31,7 +31,7 @@ LANGUAGES: Final = {
     "c++11": ("c++", "-std=c++11", "-x", "c++"),
     "c++17": ("c++", "-std=c++17", "-x", "c++"),
 }
-STRESS_SAMPLES, STRESS_NS = 10_000, 200_000_000  # whichever comes first
+STRESS_SAMPLES, STRESS_NS = 10_000, 200_000_000  # the stress test ends at the first of both limits
 
 Build = Callable[[Path, str], Path]
 
@@ -43,7 +43,7 @@ def _build(tmp_path_factory: pytest.TempPathFactory) -> Build:
     def build(source: Path, language: str) -> Path:
         compiler, *options = LANGUAGES[language]
         if shutil.which(compiler) is None:
-            pytest.skip(f"no {compiler} on this machine: the C header cannot be compiled")
+            pytest.skip(f"cannot compile the C header: cannot find {compiler}")
         program = folder / f"{source.stem}-{language}"
         if not program.exists():
             command = [compiler, *STRICT, *options, str(source), "-o", str(program)]
@@ -56,7 +56,7 @@ def _build(tmp_path_factory: pytest.TempPathFactory) -> Build:
 
 
 class Reader:
-    """The compiled reader; each `ask` is one command and its answer."""
+    """The compiled reader. Each `ask` sends one command and returns its reply."""
 
     def __init__(self, program: Path, ring: str | Path, files: tuple[int, ...] = ()) -> None:
         self._process = subprocess.Popen(
@@ -75,7 +75,7 @@ class Reader:
         return self._process.stdout.readline().split()
 
     def next(self) -> tuple[int, int]:
-        """Number of the sample (0: none) and how many were missed before it."""
+        """Return the sequence number of the next sample (0: no sample), and the number of missed samples before it."""
         _, _, seq, missed = self.ask("next")
         return int(seq), int(missed)
 
@@ -91,7 +91,7 @@ class Reader:
 def _reader(build: Build, board: Board) -> Iterator[Reader]:
     program = build(READER, "c99")
     with Reader(program, board.path) as reader:
-        assert reader.ask("latest") == ["latest", "0", "0"]  # it is open from here on
+        assert reader.ask("latest") == ["latest", "0", "0"]  # the ring is now open
         yield reader
 
 
@@ -183,7 +183,7 @@ def test_torn_slot_is_refused(board: Board, reader: Reader, name: str) -> None:
 
 def test_number_that_changes_during_the_copy_and_gaps(board: Board, reader: Reader) -> None:
     board.publish([1])
-    reader.ask(f"poke {board.path} {slot_at(1) + 7} 255 1")  # high byte of the number
+    reader.ask(f"poke {board.path} {slot_at(1) + 7} 255 1")  # high byte of the sequence number
     assert reader.next() == (0, 0)
     board.poke(slot_at(1) + 7, b"\0")
     assert reader.next() == (1, 0)
@@ -214,7 +214,7 @@ def test_restarted_daemon(board: Board, reader: Reader, tmp_path: Path) -> None:
 
 
 def test_removed_ring(board: Board, reader: Reader) -> None:
-    """The same daemon continues its numbers in a new file: the reader counts no read sample as missed."""
+    """The same daemon continues its sequence numbers in a new file, so the reader must not count samples as missed."""
     board.publish([1, 2])
     assert reader.next() == (1, 0)
     board.path.unlink()
@@ -268,7 +268,7 @@ def test_new_ring_before_its_first_sample_and_descriptors_of_reopened_rings(boar
 
 
 def run_reader(build: Build, *arguments: str, language: str = "c99", **environment: str) -> str:
-    """Return the code of the error that opening a ring gives, or "open"."""
+    """Return the name of the error when the reader opens a ring, or "open"."""
     done = subprocess.run(
         [build(READER, language), "commands", *arguments], stdin=subprocess.DEVNULL, capture_output=True, text=True,
         check=False, env=environment or None, timeout=60,
@@ -308,7 +308,7 @@ def test_no_wait_for_a_fifo(build: Build, tmp_path: Path) -> None:
 @needs_root
 @pytest.mark.parametrize("language", ["c99", "c++17"])
 def test_owner(build: Build, board: Board, language: str) -> None:
-    """As of the Python reader: a ring of root, of the directory's owner, or of the user that is named."""
+    """Like the Python reader, accept a ring of root, of the owner of the directory, or of the given user."""
 
     def opened(directory_uid: int, file_uid: int, *named_uid: int) -> str:
         os.chown(board.path.parent, directory_uid, -1)
@@ -340,7 +340,7 @@ def test_ledger(board: Board, reader: Reader) -> None:
     expected = ["ledger", "1", *(str((1 << 40) + i) for i in range(len(LEDGER_FIELDS))), "hipnuc-uart"]
     assert reader.ask("ledger") == expected
     reader.ask(f"poke {board.path} {shm_layout.LEDGER_BLOCK_OFFSET + 7} 255 1")
-    assert reader.ask("ledger") == ["ledger", "0"]  # its number changed during the copy
+    assert reader.ask("ledger") == ["ledger", "0"]  # the ledger changed during the copy
     board.poke(shm_layout.LEDGER_BLOCK_OFFSET + 7, b"\0")
     assert reader.ask("ledger") == expected
     board.poke(shm_layout.LEDGER_BLOCK_OFFSET + 100, b"\1")
@@ -402,7 +402,7 @@ def test_names_that_cannot_be_opened(build: Build, name: str, code: int) -> None
 @pytest.mark.live
 @pytest.mark.parametrize("slots_in_ring", [1, SLOTS])
 def test_no_torn_sample_and_none_unaccounted_under_stress(build: Build, tmp_path: Path, slots_in_ring: int) -> None:
-    """In a ring of one slot, reader and writer always use the same slot."""
+    """A ring with one slot is the hardest case: reader and writer always use the same slot."""
     board = Board(tmp_path, slots=slots_in_ring)
     batches = stress_batches()
     command = [str(build(READER, "c99")), "stress", str(board.path)]
@@ -426,7 +426,7 @@ def test_no_torn_sample_and_none_unaccounted_under_stress(build: Build, tmp_path
 
 
 def stress_batches() -> list[Batch]:
-    """Encoded batches of sizes that the reader keeps up with, and of sizes that lap it."""
+    """Return encoded batches. Some are small enough for the reader, others overtake it."""
     random, batches, done = Random(2), [], 0
     while done < STRESS_SAMPLES:
         end = min(done + random.choice((1, 1, 1, 5, 20, 100)), STRESS_SAMPLES)
